@@ -62,6 +62,18 @@ def make(name: str, span: float, rise: float) -> Curve:
     raise UsageError(f"bridge.curve: expected one of {', '.join(NAMES)}, got {name!r}")
 
 
+def ring(radius: float) -> Curve:
+    """Return a full circle from its lowest point, the normal outward; ``radius`` in mm."""
+    return Curve(
+        span=2.0 * radius,
+        rise=2.0 * radius,
+        length=2.0 * math.pi * radius,
+        _position=lambda s: (radius * np.sin(s / radius), radius * (1.0 - np.cos(s / radius))),
+        _angle=lambda s: -s / radius,
+        _curvature=lambda s: np.full_like(s, 1.0 / radius),
+    )
+
+
 def _parabola(span: float, rise: float) -> Curve:
     k = 4.0 * rise / span**2  # z below the crown = k x^2
 

@@ -301,17 +301,18 @@ class DesignPart(Checked):
     name: str
     vertices: Floats = column("v", 3)
     faces: Ints = column("f", 3, dtype=np.int64)
-    bottom_edge_left: Floats = column("l", 3)  # from the start to the end of the component; left = +Y
+    bottom_edge_left: Floats = column("l", 3)  # from the start to the end of the component; left = +Y; () = none
     bottom_edge_right: Floats = column("r", 3)
     source: str = "mesh"  # of vertices and faces: mesh, or curves: the outer box between joints and bottom edges alone
 
 
 @dataclass(frozen=True)
 class ArchDesign(Checked):
-    """A bridge of components in assembly order. Bridge frame: X along the span, Z up, mm.
+    """A bridge, or another assembly, of components in assembly order. Bridge frame: X along the span, Z up, mm.
 
     ``joint_points`` are P1..P8 of each joint: the outer corners bottom-left, bottom-right, top-right, top-left
-    (left = +Y), then the middles of the outer bottom, right, top and left edges.
+    (left = +Y), then the middles of the outer bottom, right, top and left edges. Bottom and left are as seen from the
+    left part towards the right one. The joints may form any graph.
     """
 
     parts: tuple[DesignPart, ...] = ()  # in assembly order
@@ -319,6 +320,19 @@ class ArchDesign(Checked):
     joint_left: tuple[str, ...] = names("j")
     joint_right: tuple[str, ...] = names("j")
     joint_points: Floats = column("j", 8, 3)
+
+    @property
+    def joined(self) -> Ints:
+        """Rows (j, 2) of the left and the right part of each joint. Raises ValueError for an unknown name."""
+        row = [part.name for part in self.parts].index
+        pairs = zip(self.joint_left, self.joint_right, strict=True)
+        return np.array([(row(left), row(right)) for left, right in pairs], np.int64).reshape(-1, 2)
+
+    @property
+    def in_row(self) -> bool:
+        """Whether the parts form one row: each is joined to the next one, and there is no other joint."""
+        count = np.arange(len(self.parts) - 1)
+        return bool(np.array_equal(self.joined, np.stack([count, count + 1], axis=1)))
 
 
 @dataclass(frozen=True)
@@ -471,7 +485,8 @@ SOURCES = ("surface", "mixed", "outlier")  # the footprint on one surface; on se
 class ArchTruth(Checked):
     """The true pose and key points of each component. Axis of length 2: start, end; NaN where an end has none.
 
-    ``edges_bridge`` are points from the start to the end along the bottom edges, left and right.
+    ``edges_bridge`` are points from the start to the end along the bottom edges, left and right; NaN without any.
+    A component that is left or right part of several joints has the key points of each in a row of ``branch_*``.
     """
 
     names: tuple[str, ...] = names("c")
@@ -479,6 +494,10 @@ class ArchTruth(Checked):
     key_points_scan: Floats = column("c", 2, 8, 3)
     key_points_bridge: Floats = column("c", 2, 8, 3)
     edges_bridge: Floats = column("c", 2, "e", 3)
+    branch_component: Ints = column("b", dtype=np.int64, newer=True)  # row of names
+    branch_joint: Ints = column("b", dtype=np.int64, newer=True)  # row of the design's joints
+    branch_scan: Floats = column("b", 8, 3, newer=True)
+    branch_bridge: Floats = column("b", 8, 3, newer=True)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from designgen.asbuilt import imperfections
-from designgen.designs import arch_bridge, arch_mesh, arch_part
+from designgen.designs import arch_bridge, arch_mesh, arch_part, arch_ring
 from designgen.designs.patch import Surface
 from designgen.frames import inverse, rigid
 from designgen.randomness import generator, random_pose
@@ -26,6 +26,22 @@ EDGE_POINTS = 501  # on each bottom edge in the truth
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
     """Make the scene of an arch bridge, a scan of each part in a separate frame, and its truth."""
     parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
+    return _made(name, recipe, scanning, seed, parts, closed=False)
+
+
+def make_ring(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
+    """Make the scene of a closed ring of ribs, as of a bridge."""
+    parts = arch_ring.build(filled(arch_ring.Params, recipe, "ring"))
+    return _made(name, recipe, scanning, seed, parts, closed=True)
+
+
+Parts = tuple[arch_part.ArchPart, ...]
+
+
+def _made(
+    name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int, parts: Parts, *, closed: bool
+) -> tuple[Scene, Truth]:
+    """Make the scene of parts; ``closed``: the last one is joined to the first."""
     errors = filled(imperfections.ArchParams, recipe, "asbuilt")
     ledger = imperfections.Ledger()
     built = list(parts)
@@ -63,7 +79,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         name,
         "arch-bridge",
         tuple(scans),
-        arch=_design(parts),
+        arch=_design(parts, closed=closed),
         stations=survey.stations_of(station_truth.ids, np.concatenate(registered)) if station_truth else None,
         temperature_C=imperfections.stated(errors.temperature_C),
         units="mm",
@@ -117,11 +133,12 @@ def _bottom_edges(part: arch_part.ArchPart) -> Floats:
     return np.array([part.point(s, side * part.b(s), np.zeros_like(s)) for side in (1.0, -1.0)])
 
 
-def _design(parts: tuple[arch_part.ArchPart, ...]) -> ArchDesign:
+def _design(parts: Parts, *, closed: bool) -> ArchDesign:
+    left, right = (parts, (*parts[1:], parts[0])) if closed else (parts[:-1], parts[1:])
     return ArchDesign(
         tuple(DesignPart(part.name, *arch_mesh.triangulate(part), *part.bottom_edges()) for part in parts),
-        tuple(f"J{j + 1}" for j in range(len(parts) - 1)),
-        tuple(part.name for part in parts[:-1]),
-        tuple(part.name for part in parts[1:]),
-        np.array([part.key_points(part.s1) for part in parts[:-1]]),
+        tuple(f"J{j + 1}" for j in range(len(left))),
+        tuple(part.name for part in left),
+        tuple(part.name for part in right),
+        np.array([part.key_points(part.s1) for part in left]),
     )

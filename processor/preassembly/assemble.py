@@ -7,14 +7,13 @@ gaps of imperfect parts depend on: the weight lambda of the design's curve again
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 
 from processor.limits import standards
 from processor.model import ArchDesign, Floats, Scan, Scene, Tolerance
-from processor.preassembly import to_result
-from processor.preassembly.chain import adjustment, edge_errors, placement, span_and_closure
+from processor.preassembly import to_result, topology
+from processor.preassembly.chain import adjustment, edge_errors, loop_closure, placement, span_and_closure
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import Params, TrimParams
@@ -59,6 +58,7 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         placement=placed,
         edges=edge_errors.along_bridge(parts, adjusted, design),
         figures=figures,
+        loops=loop_closure.measure([part.member for part in parts], design, frames),
         joints=_judge_joints(parts, placed.gaps, adjusted, design, frames, limits, params.trim),
         chain=_judge_chain(parts, adjusted, figures, design, limits),
     )
@@ -68,7 +68,10 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
 def _adjust(parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats, weight: float) -> dict[float, Adjusted]:
     """Adjust the chain with lambda = ``weight`` and with each of TRADE_OFF."""
     members = [part.member for part in parts]
-    return {value: adjustment.adjust(members, design.joint_points, frames, value) for value in {*TRADE_OFF, weight}}
+    sides = topology.sides_of(design.joined)
+    return {
+        value: adjustment.adjust(members, design.joint_points, frames, value, sides) for value in {*TRADE_OFF, weight}
+    }
 
 
 def _judge_joints(
@@ -82,9 +85,10 @@ def _judge_joints(
 ) -> list[JudgedJoint]:
     """Measure every joint by its gaps (8, 3), compare it with the limits, and propose work on it."""
     judged = []
-    for j, (left, right) in enumerate(pairwise(parts)):
+    for j, sides in enumerate(topology.sides_of(design.joined)):
         measures = joint_measures.measure(gaps[j], adjusted.gap_covariance[j], frames[j], design.joint_points[j])
-        doubts, weak = reasons.of_joint(left, right), reasons.weak_parts(left, right)
+        left, right = (parts[side.part] for side in sides)
+        doubts, weak = reasons.of_joint(parts, sides), reasons.weak_parts(left, right)
         conformity = joints.left_open(joints.judge(measures, limits), doubts)
         proposal = trim_and_shim.propose(measures, limits, trim, doubts=doubts, weak_parts=weak)
         judged.append(JudgedJoint(measures, conformity, proposal))
@@ -101,5 +105,7 @@ def _judge_chain(
     """Compare span and edges with the limits of the whole chain."""
     members = [part.member for part in parts]
     quantities = chain_verdicts.quantities(members, adjusted, figures.span_departure, figures.span_ci95)
+    edges = any(len(part.bottom_edge_left) for part in design.parts)
+    limits = chain_verdicts.applicable(limits, span=span_and_closure.has_span(design), edges=edges)
     doubts = reasons.of_chain(parts, design.joint_names, adjusted.gaps)
     return chain_verdicts.judge(quantities, limits, span_and_closure.design_span(design), doubts)

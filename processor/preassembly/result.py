@@ -21,7 +21,9 @@ from processor.model import (
     Word,
     column,
     described,
+    name_lists,
     names,
+    newer,
     optional,
     reasons,
     words,
@@ -53,11 +55,21 @@ class EdgeSide(Word):
 
 
 @dataclass(frozen=True)
+class AtJoints(Rows):
+    """The key points P1..P8 of one component at each of its joints, in the frame of its scan."""
+
+    joint: tuple[str, ...] = names("e")
+    key_points_scan: Floats = column("e", 8, 3, axes=(KEY_POINTS,), unit="mm")
+    key_points_sd: Floats = column("e", 8, 3, axes=(KEY_POINTS,), unit="mm")
+
+
+@dataclass(frozen=True)
 class Components(Rows):
     """The components in assembly order. Axis of length 2: start and end of a component. NaN = not known.
 
     ``scans`` names those used; poses and key points P1..P8 are in the frame of the first. The paper's methods state no
-    covariance.
+    covariance. A component that is left or right part of several joints has no start and end; then ``at_joints`` has
+    the key points of all components by joint.
     """
 
     name: tuple[str, ...] = names("c")
@@ -68,6 +80,9 @@ class Components(Rows):
     covariance: Floats = column("c", 6, 6)
     key_points_scan: Floats = column("c", 2, 8, 3, axes=(ENDS, KEY_POINTS))
     key_points_sd: Floats = column("c", 2, 8, 3, axes=(ENDS, KEY_POINTS))
+    at_joints: tuple[AtJoints, ...] = dataclasses.field(
+        default=(), metadata={"json": "joints", "by": "joint", "newer": True}
+    )
 
 
 @dataclass(frozen=True)
@@ -158,6 +173,20 @@ class Residuals(Rows):
 
 
 @dataclass(frozen=True)
+class Loops(Rows):
+    """Closure of closed loops of parts by their joints alone.
+
+    ``joint`` was left open. The closure is the motion of its right part against its left one in the joint's axes: along
+    them in mm, about them in mrad. ``joints`` are the others of the loop.
+    """
+
+    joint: tuple[str, ...] = names("l")
+    joints: tuple[tuple[str, ...], ...] = name_lists("l")
+    closure: Floats = column("l", 2, 3, json="closure.*", keys=("mm", "mrad"))
+    closure_ci95: Floats = column("l", 2, 3, json="closure.ci95_*", keys=("mm", "mrad"))
+
+
+@dataclass(frozen=True)
 class Adjustment(Checked):
     """What the adjustment alone states.
 
@@ -183,6 +212,7 @@ class Adjustment(Checked):
     advice: tuple[Reason, ...] = reasons()
     budget_sd: Floats = optional(len(BudgetSource), json="budget_sd.*", keys=tuple(BudgetSource), unit="mm")
     residuals: Residuals = dataclasses.field(default_factory=Residuals, metadata={"json": ""})
+    loops: Loops | None = newer()
 
 
 @dataclass(frozen=True)

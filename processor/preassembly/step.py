@@ -43,6 +43,15 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
         result = assemble.assemble(scans, scene, design, params)
         remarks = (reason("preassemble.scans-without-part", scans=unused),) if unused else ()
         return replace(result, reasons=(*remarks, *result.reasons))
+    if not design.in_row:
+        raise InputError(
+            f"{scene.name}: method {params.method} takes components in a row, here the joints form another graph; use "
+            "method adjustment"
+        )
+    if not all(len(part.bottom_edge_left) for part in design.parts):
+        raise InputError(
+            f"{scene.name}: method {params.method} needs the bottom edges of all components; use adjustment"
+        )
     several = [part.name for part, of_part in zip(design.parts, scans, strict=True) if len(of_part) > 1]
     if several:
         raise InputError(f"{scene.name}: method {params.method} takes one scan a part, {several[0]} has several")

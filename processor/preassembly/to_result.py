@@ -10,6 +10,7 @@ import numpy as np
 
 from processor.geometry.polyline import Polyline
 from processor.model import NORMAL_95, ArchDesign, Floats, Reason, Tolerance, reason
+from processor.preassembly import topology
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.chain.edge_errors import EdgeErrors
 from processor.preassembly.chain.placement import Placement
@@ -20,6 +21,7 @@ from processor.preassembly.parts import systematic_errors
 from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.result import (
     Adjustment,
+    AtJoints,
     Components,
     Deviations,
     EdgeSide,
@@ -27,6 +29,7 @@ from processor.preassembly.result import (
     Joints,
     JudgedJoints,
     Linear,
+    Loops,
     MeanMax,
     Residuals,
     Result,
@@ -63,6 +66,7 @@ class Assembly:
     placement: Placement
     edges: EdgeErrors
     figures: Figures
+    loops: Loops | None
     joints: Sequence[JudgedJoint]
     chain: Conformity
 
@@ -70,6 +74,9 @@ class Assembly:
 def to_result(assembly: Assembly) -> Result:
     """Make the result record of an assembly."""
     parts, placement = assembly.parts, assembly.placement
+    joined = assembly.design.joined
+    ends = [topology.ends_of(joined, i) for i in range(len(parts))]
+    branched = [topology.is_branch(of_part) for of_part in ends]
     components = Components(
         name=tuple(part.name for part in parts),
         status=tuple(part.status for part in parts),
@@ -77,8 +84,9 @@ def to_result(assembly: Assembly) -> Result:
         scans=tuple(", ".join(scan.name for scan in part.scans) for part in parts),
         T_bridge_scan=placement.T_bridge_scan,
         covariance=placement.covariance,
-        key_points_scan=placement.key_points_scan,
-        key_points_sd=placement.key_points_sd,
+        key_points_scan=_starts_and_ends(placement.key_points_scan, branched),
+        key_points_sd=_starts_and_ends(placement.key_points_sd, branched),
+        at_joints=_at_joints(assembly, ends) if any(branched) else (),
     )
     joints, splicing = _joints(assembly)
     return Result(
@@ -92,6 +100,27 @@ def to_result(assembly: Assembly) -> Result:
         trade_off=_trade_off(assembly.trade_off),
         adjustment=_adjustment(assembly),
     )
+
+
+def _starts_and_ends(key_points: Sequence[Floats], branched: Sequence[bool]) -> Floats:
+    """Key points (c, 2, 8, 3) at start and end; NaN of branches."""
+    no_names = np.full((2, 8, 3), np.nan)
+    return np.array([no_names if branch else points for points, branch in zip(key_points, branched, strict=True)])
+
+
+def _at_joints(assembly: Assembly, ends: Sequence[Sequence[topology.PartEnd]]) -> tuple[AtJoints, ...]:
+    """Key points of each part by the names of its joints."""
+    found = []
+    for i, of_part in enumerate(ends):
+        rows = [e for e, end in enumerate(of_part) if end.joint is not None]
+        found.append(
+            AtJoints(
+                joint=tuple(assembly.design.joint_names[end.joint] for end in of_part if end.joint is not None),
+                key_points_scan=assembly.placement.key_points_scan[i][rows],
+                key_points_sd=assembly.placement.key_points_sd[i][rows],
+            )
+        )
+    return tuple(found)
 
 
 def _joints(assembly: Assembly) -> tuple[Joints, MeanMax]:
@@ -165,6 +194,7 @@ def _adjustment(assembly: Assembly) -> Adjustment:
             distance=np.concatenate([part.residuals for part in parts]),
             component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals) for p in parts]),
         ),
+        loops=assembly.loops,
         **figures._asdict(),
     )
 
@@ -199,9 +229,11 @@ def _budget(parts: Sequence[MeasuredPart], design: ArchDesign, systematic: Syste
         if end is not None and np.isfinite(end.covariance).all()
     ]
     median_sd = float(np.sqrt(max(np.median(variances), 0.0))) if variances else float("nan")
-    stated = systematic_errors.budget(
-        systematic, max(Polyline.through(part.bottom_edge_left).length for part in design.parts)
+    lengths = (
+        Polyline.through(part.bottom_edge_left).length if len(part.bottom_edge_left) else systematic_errors.chord(part)
+        for part in design.parts
     )
+    stated = systematic_errors.budget(systematic, max(lengths))
     return np.array([median_sd, *stated.values()])
 
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,58 +76,141 @@ def _text(path: Path) -> str:
 def _arch(folder: Path, design: Table) -> ArchDesign:
     design.only(("units", "kind", "name", "unsure", "order", "components", "joints"))
     scale = MM_PER_UNIT[design.unit("units")]
-    order = design.values.get("order")
     components = design.table("components")
-    if not isinstance(order, list) or not order or not all(isinstance(name, str) for name in order):
-        raise InputError(f"{design.where}: expected 'order', the names of the components from one end to the other")
-    if len(set(order)) != len(order) or set(order) != set(components.values):
+    joints = _joints(design, scale)
+    order = _order(design, list(components.values), joints)
+    unknown = sorted({name for joint in joints for name in (joint.left, joint.right)} - set(components.values))
+    if unknown:
         raise InputError(
-            f"{design.where}: expected each component ({', '.join(components.values)}) once in 'order', found "
-            f"{', '.join(order)}"
+            f"{design.where}: joint of {unknown[0]!r}, which is not in 'components' ({', '.join(components.values)})"
         )
-    joints = _joints(design, order, scale)
-    pairs = list(pairwise(order))
-    at = [None, *(joints[pair][1] for pair in pairs), None]
-    parts = tuple(
-        _part(folder, name, components.table(name), design.unit("units"), at[i : i + 2]) for i, name in enumerate(order)
-    )
-    return ArchDesign(
+    at = {name: _row_ends(name, joints) for name in order}
+    parts = tuple(_part(folder, name, components.table(name), design.unit("units"), at[name]) for name in order)
+    arch = ArchDesign(
         parts,
-        joint_names=tuple(joints[pair][0] for pair in pairs),
-        joint_left=tuple(left for left, _ in pairs),
-        joint_right=tuple(right for _, right in pairs),
-        joint_points=np.array([joints[pair][1] for pair in pairs]),
+        joint_names=tuple(joint.name for joint in joints),
+        joint_left=tuple(joint.left for joint in joints),
+        joint_right=tuple(joint.right for joint in joints),
+        joint_points=np.array([joint.points for joint in joints]).reshape(-1, 8, 3),
     )
+    if not arch.in_row:
+        _check_graph(design, arch)
+    return arch
 
 
-def _joints(design: Table, order: Sequence[str], scale: float) -> dict[tuple[str, str], tuple[str, Floats]]:
-    """Return the name and the key points (8, 3), mm, of the joint of each two neighbours in ``order``."""
-    joints: dict[tuple[str, str], tuple[str, Floats]] = {}
+class _Joint(NamedTuple):
+    """A joint of two components, and its key points (8, 3), mm."""
+
+    name: str
+    left: str
+    right: str
+    points: Floats
+
+
+def _joints(design: Table, scale: float) -> list[_Joint]:
+    joints: list[_Joint] = []
     for joint in design.tables("joints"):
         joint.only(("name", "left", "right", "points"))
         points = joint.table("points")
         points.only(KEY_POINTS)
         corners = np.stack([points.array(key, 3) for key in KEY_POINTS]) * scale
-        sides = (joint.text("left"), joint.text("right"))
-        if sides in joints:
-            raise InputError(f"{joint.where}: expected one joint of {sides[0]} and {sides[1]}, found a second")
-        joints[sides] = (joint.text("name"), corners)
-    neighbours = set(pairwise(order))
-    for left, right in sorted(set(joints) - neighbours):
+        made = _Joint(joint.text("name"), joint.text("left"), joint.text("right"), corners)
+        if any((made.left, made.right) == (other.left, other.right) for other in joints):
+            raise InputError(f"{joint.where}: expected one joint of {made.left} and {made.right}, found a second")
+        joints.append(made)
+    return joints
+
+
+def _order(design: Table, components: list[str], joints: list[_Joint]) -> list[str]:
+    """Return the components in assembly order, and put ``joints`` in the order of a row if they form one.
+
+    ``order`` in the file gives all of them, some, or none: the others follow in the order of 'components', unless all
+    joints form one row.
+    """
+    given = design.values.get("order")
+    if given is None:
+        given = _row_of(components, joints)
+    if not isinstance(given, list) or not all(isinstance(name, str) for name in given) or (not given and joints == []):
+        raise InputError(f"{design.where}: expected 'order', the names of the components from one end to the other")
+    if len(set(given)) != len(given) or not set(given) <= set(components):
+        raise InputError(
+            f"{design.where}: expected each component ({', '.join(components)}) once in 'order', found "
+            f"{', '.join(given)}"
+        )
+    pairs = {(joint.left, joint.right) for joint in joints}
+    neighbours = list(pairwise(given))
+    missing = sorted(set(neighbours) - pairs)
+    # A joint too many beside one too few has a wrong name; other joints make another graph than a row.
+    for left, right in sorted(pairs - set(neighbours)) if missing and set(given) == set(components) else ():
         raise InputError(
             f"{design.where}: joint of {left!r} and {right!r}, which are not neighbours in 'order'; correct one of them"
         )
-    for left, right in sorted(neighbours - set(joints)):
+    for left, right in missing:
         raise InputError(
             f"{design.where}: no joint of the neighbours {left!r} (left) and {right!r} (right); add it to 'joints'"
         )
-    return joints
+    number = {pair: k for k, pair in enumerate(neighbours)}
+    joints.sort(key=lambda joint: number.get((joint.left, joint.right), len(number)))
+    return [*given, *(name for name in components if name not in given)]
+
+
+def _row_of(components: list[str], joints: list[_Joint]) -> list[str]:
+    """Return the components from one end to the other if their joints form one row; else none."""
+    after = {joint.left: joint.right for joint in joints}
+    first = [name for name in components if name not in after.values()]
+    if len(after) != len(joints) or len(set(after.values())) != len(joints) or len(first) != 1:
+        return []
+    row = [first[0]]
+    while row[-1] in after:
+        row.append(after[row[-1]])
+    return row if set(row) == set(components) else []
+
+
+def _row_ends(name: str, joints: list[_Joint]) -> list[Floats | None]:
+    """Key points (8, 3) at the start and at the end of a component; None where it has none or several."""
+    starts = [joint.points for joint in joints if joint.right == name]
+    ends = [joint.points for joint in joints if joint.left == name]
+    return [points[0] if len(points) == 1 else None for points in (starts, ends)]
+
+
+def _check_graph(design: Table, arch: ArchDesign) -> None:
+    """Raise InputError for joints that do not join all components, share a name, or have left and right swapped."""
+    for name, left, right in zip(arch.joint_names, arch.joint_left, arch.joint_right, strict=True):
+        if left == right:
+            raise InputError(
+                f"{design.where}: joint {name!r}: expected two components, found {left!r} joined to itself"
+            )
+    if len(set(arch.joint_names)) != len(arch.joint_names):
+        raise InputError(
+            f"{design.where}: expected a name of its own for each joint, found {', '.join(arch.joint_names)}"
+        )
+    joined = arch.joined
+    reached = {0}
+    for _ in arch.parts:
+        reached |= {part for pair in joined.tolist() if reached & set(pair) for part in pair}
+    apart = [part.name for k, part in enumerate(arch.parts) if k not in reached]
+    if apart:
+        raise InputError(
+            f"{design.where}: no chain of joints joins {apart[0]!r} to {arch.parts[0].name!r}; add the joints"
+        )
+    for name, points, (left, right) in zip(arch.joint_names, arch.joint_points, joined.tolist(), strict=True):
+        along = np.cross(points[0] - points[1], points[3] - points[0])  # from left to right
+        for part, sense, side in ((left, -1.0, "left"), (right, 1.0, "right")):
+            x = (arch.parts[part].vertices - points[:4].mean(axis=0)) @ along
+            if sense * (x.max() + x.min()) < 0.0:
+                raise InputError(
+                    f"{design.where}: joint {name!r}: {arch.parts[part].name!r} is not on the {side} by P1..P4, "
+                    "counted from bottom left as seen from the left part; correct them or swap left and right"
+                )
 
 
 def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floats | None]) -> DesignPart:
     """Read a component; without a mesh one is made from its edges and the key points (8, 3), mm, of its joints."""
     scale = MM_PER_UNIT[unit]
     part.only(("mesh", "bottom_edge_left", "bottom_edge_right", "plate_mm"))
+    if "mesh" in part.values and not any(f"bottom_edge_{side}" in part.values for side in ("left", "right")):
+        vertices, faces, _ = read_surface(existing_file_in(folder, part.text("mesh"), part.where), unit)
+        return DesignPart(name, vertices, faces)
     edges = [part.array(f"bottom_edge_{side}", -1, 3) * scale for side in ("left", "right")]
     for side, edge in zip(("left", "right"), edges, strict=True):
         if len(edge) < 2 or (np.abs(np.diff(edge, axis=0)).max(axis=1) == 0).any():

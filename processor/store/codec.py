@@ -119,7 +119,8 @@ def write_record(
     """
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
-        newer_and_empty = field.metadata.get("newer") and isinstance(value, np.ndarray) and not value.size
+        size = value.size if isinstance(value, np.ndarray) else len(value) if isinstance(value, tuple) else 1
+        newer_and_empty = field.metadata.get("newer") and not size
         if field.name not in skip and not newer_and_empty:
             _write(group, field.name, value, field.metadata, hooks)
 
@@ -203,6 +204,8 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
             return None
         if "shape" in metadata and metadata.get("newer"):
             return np.empty(0, metadata["dtype"])
+        if metadata.get("newer") and typing.get_origin(hint) is tuple:
+            return ()
         raise DecodeError([f"{where}: missing"])
     kind = allowed[0] if union else hint
     if "shape" in metadata:

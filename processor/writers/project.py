@@ -76,16 +76,19 @@ def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
             component["mesh"] = f"design/{part.name}.ply"
             (folder / "design").mkdir(exist_ok=True)
             write_mesh(folder / component["mesh"], part.vertices, part.faces)
-        component["bottom_edge_left"] = part.bottom_edge_left.tolist()
-        component["bottom_edge_right"] = part.bottom_edge_right.tolist()
+        if len(part.bottom_edge_left):
+            component["bottom_edge_left"] = part.bottom_edge_left.tolist()
+            component["bottom_edge_right"] = part.bottom_edge_right.tolist()
     joints = [
         {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, points.tolist(), strict=True))}
         for name, left, right, points in zip(
             design.joint_names, design.joint_left, design.joint_right, design.joint_points, strict=True
         )
     ]
-    order = [part.name for part in design.parts]
-    return {"units": "mm", "kind": "arch-bridge", "order": order, "components": components, "joints": joints}
+    content: dict[str, Any] = {"units": "mm", "kind": "arch-bridge"}
+    if design.in_row:
+        content["order"] = [part.name for part in design.parts]
+    return {**content, "components": components, "joints": joints}
 
 
 def _frame_design(design: FrameDesign) -> dict[str, Any]:

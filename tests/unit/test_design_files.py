@@ -112,7 +112,7 @@ DESIGNS = {
     "unit": (change(["units"], "ell"), "unknown unit 'ell'"),
     "kind": (change(["kind"], "tower"), "expected kind arch-bridge or space-frame, found 'tower'"),
     "key": (change(["colour"], 1), "unknown key 'colour'"),
-    "order": (change(["order"], ["foot1"]), "expected each component"),
+    "order": (change(["order"], ["foot1", "rib9"]), "expected each component"),
     "order twice": (change(["order"], ["foot1", "foot1", "rib1"]), "expected each component"),
     "order of numbers": (change(["order"], [1, 2]), "expected 'order'"),
     "mesh missing": (

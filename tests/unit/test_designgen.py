@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import cadquery as cq
@@ -200,7 +201,7 @@ def test_truth_belongs_to_its_scan_and_seeds_repeat():
         ("scan.sigma_mm=nan", "scan.sigma_mm: expected a finite number"),
         ("scan.mode=beams", "scan.mode: expected surface or rays, got 'beams'"),
         ("bridge.plate_web_mm=700", "bridge.plate_web_mm: expected less than half of width_mm, got 700.0"),
-        ("bridge.joints=[0.5,0.4,0.6,0.8]", "bridge.joints: expected four rising fractions"),
+        ("bridge.joints=[0.5,0.4,0.6,0.8]", "bridge.joints: expected rising fractions"),
         ("bridge.rise_mm=90000", "bridge.rise_mm: expected less than half of span_mm"),
         ("bridge.span_mm=true", "bridge.span_mm: expected a float, got True"),
         ("bridge.curve=spiral", "bridge.curve: expected one of parabola, catenary, circle"),
@@ -338,3 +339,14 @@ def test_imports_go_one_way():
             assert not any(f"designgen.{later}" in text for later in LAYERS[number + 1 :]), path
     for path in (ROOT / "designgen/cad").glob("*.py"):
         assert not any(f"designgen.{layer}" in path.read_text("utf-8") for layer in LAYERS), path
+
+
+@pytest.mark.parametrize("count", [2, 3, 7, 9])
+def test_a_bridge_of_any_number_of_parts_meets_at_its_joints(count):
+    parts = arch_bridge.build(arch_bridge.Params(parts=count))
+    assert [part.name for part in parts] == ["foot1", *(f"rib{k}" for k in range(1, count - 1)), "foot2"]
+    for left, right in pairwise(parts):
+        np.testing.assert_allclose(left.key_points(left.s1), right.key_points(right.s0), atol=1e-9)
+    assert [part.closed for part in parts] == ["start", *[""] * (count - 2), "end"]
+    lengths = [part.s1 - part.s0 for part in parts]
+    np.testing.assert_allclose(lengths, parts[0].curve.length / count)

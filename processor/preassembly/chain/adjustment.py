@@ -1,4 +1,4 @@
-"""One adjustment of the whole chain: all joints and the design's curve at once.
+"""One adjustment of the whole assembly: all joints and the design's curve at once.
 
 Every part i, registered to its design, is moved by a small motion x_i (turn about its own centre, translation) that
 minimises
@@ -6,10 +6,13 @@ minimises
     sum of squared gaps + lambda sum of squared departures of the bottom edges
 
 over gaps of eight pairs a joint along three axes, and departures sideways and up at regular chainages of both edges.
+The joints may form any graph: a row, a closed ring, branches. A part without bottom edges has the departures of its key
+points across its joints in their place.
 The error of a part's registration moves both its ends and its edges, and the adjustment removes it. Parts beside a
-joint without an answer could slide along themselves: then the square of every part's movement along its chord is added
-with a weight of HOLD. The gaps of imperfect parts depend on lambda, so it is stated, and the curve over lambda is part
-of the result. All is linear in the measurements, and their covariance is propagated.
+joint without an answer could slide along themselves, and a ring could turn within itself: there, and wherever the
+joints form no row, the square of every part's movement along its chord is added with a weight of HOLD. The gaps of
+imperfect parts depend on lambda, so it is stated, and the curve over lambda is part of the result. All is linear in the
+measurements, and their covariance is propagated.
 """
 
 from __future__ import annotations
@@ -24,9 +27,11 @@ from scipy.linalg import block_diag
 
 from processor.geometry import rigid
 from processor.model import Floats, Ints
+from processor.preassembly import topology
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.parts.member import Member
+from processor.preassembly.topology import Side, Sides
 
 HOLD = 1e-3  # weight of a part's movement along its chord
 
@@ -70,13 +75,15 @@ class Adjusted:
 class _Rows(NamedTuple):
     """Some observations: derivative (n, p) by the parts' motions, values (n,), covariance without that of poses (n, n).
 
-    ``by_pose`` (n, p) is the derivative of their errors by those of the parts' registrations.
+    ``by_pose`` (n, p) is the derivative of their errors by those of the parts' registrations; ``with_end`` (n, 24) the
+    covariance of a line's departures with those of their end in the bridge's axes.
     """
 
     A: Floats
     value: Floats
     covariance: Floats
     by_pose: Floats
+    with_end: Floats = np.empty((0, 24))
 
 
 @dataclass(frozen=True)
@@ -84,8 +91,8 @@ class _Observations:
     """All observations: derivative A (n, p) by the parts' motions, values (n,), and their covariance (n, n).
 
     ``with_pose`` (n, p) is their covariance with the parts' registrations. Rows are the gaps of joints with an answer,
-    24 each, the edges' departures, and each part's movement along its chord. ``gap_row`` is -1 of joints without an
-    answer, ``edge_rows`` are those of each part.
+    24 each, the edges' departures, those of the key points of parts without edges, and each part's movement along its
+    chord. ``gap_row`` is -1 of joints without an answer, ``edge_rows`` are those of each part.
     """
 
     A: Floats
@@ -94,14 +101,19 @@ class _Observations:
     with_pose: Floats
     gap_row: Ints
     edge_rows: tuple[slice, ...]
+    in_row: bool
 
 
-def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats, weight: float) -> Adjusted:
-    """Adjust a chain; ``joint_points`` (j, 8, 3) are the design's, ``joint_frames`` (j, 4, 4) T_bridge_joint.
+def adjust(
+    members: Sequence[Member], joint_points: Floats, joint_frames: Floats, weight: float, sides: Sides | None = None
+) -> Adjusted:
+    """Adjust an assembly; ``joint_points`` (j, 8, 3) are the design's, ``joint_frames`` (j, 4, 4) T_bridge_joint.
 
-    ``weight`` is lambda. Joints with an unknown end have no observations; their gaps are NaN.
+    ``weight`` is lambda; ``sides`` of each joint, None for parts in a row. Joints with an unknown end have no
+    observations; their gaps are NaN.
     """
-    observed = _observations(members, joint_points, joint_frames)
+    of_row = topology.sides_of(topology.row(len(members)))
+    observed = _observations(members, joint_points, joint_frames, of_row if sides is None else sides)
     to_motion = _solve(observed, weight, len(members))
     x = to_motion @ observed.value
     # Residuals by observations, after the motion.
@@ -142,19 +154,37 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
     )
 
 
+def left_open(
+    members: Sequence[Member], joint_points: Floats, joint_frames: Floats, weight: float, sides: Sides, joint: int
+) -> tuple[Floats, Floats]:
+    """Gaps (8, 3) of a joint where all others alone place the parts, and their covariance (24, 24); NaN = unknown."""
+    observed = _observations(members, joint_points, joint_frames, sides)
+    start = int(observed.gap_row[joint])
+    if start < 0:
+        return np.full((8, 3), np.nan), np.full((24, 24), np.nan)
+    rows = slice(start, start + 24)
+    # What holds the parts must not keep them from following the joints.
+    to_motion = _solve(observed, weight, len(members), hold=weight, without=rows)
+    after = np.eye(len(observed.value))[rows] + observed.A[rows] @ to_motion
+    return (after @ observed.value).reshape(8, 3), after @ observed.covariance @ after.T
+
+
 def without_pose(end: JointEnd, pose: Floats) -> Floats:
     """Covariance (24, 24) of an end without what it follows of its part's registration, of covariance (6, 6)."""
     covariance: Floats = end.covariance - end.by_pose @ pose @ end.by_pose.T
     return covariance
 
 
-def _solve(observed: _Observations, weight: float, parts: int) -> Floats:
-    """Matrix (p, n) from observations to the motions of least weighted squares."""
+def _solve(
+    observed: _Observations, weight: float, parts: int, hold: float = HOLD, without: slice = slice(0, 0)
+) -> Floats:
+    """Matrix (p, n) from observations to the motions of least weighted squares; some rows may be left out."""
     root = np.ones(len(observed.value))
     root[24 * int((observed.gap_row >= 0).sum()) : -parts] = np.sqrt(weight)
     # A chain without a break slides as the objective has it: to hold it would move its gaps by hundredths of a mm.
     broken = (observed.gap_row < 0).any() or not len(observed.gap_row)
-    root[-parts:] = np.sqrt(HOLD) if broken else 0.0
+    root[-parts:] = np.sqrt(hold) if broken or not observed.in_row else 0.0
+    root[without] = 0.0
     weighted = observed.A * root[:, None]
     # Turns and translations differ in scale by thousands: unit columns keep the digits of the solution.
     size = np.linalg.norm(weighted, axis=0)
@@ -163,40 +193,81 @@ def _solve(observed: _Observations, weight: float, parts: int) -> Floats:
     return to_motion
 
 
-def _observations(members: Sequence[Member], joint_points: Floats, joint_frames: Floats) -> _Observations:
+def _observations(members: Sequence[Member], joint_points: Floats, joint_frames: Floats, sides: Sides) -> _Observations:
     gap_row = np.full(len(joint_points), -1, np.int64)
     blocks: list[_Rows] = []
     for j in range(len(joint_points)):
-        rows = _gap_rows(members, j, joint_points[j], joint_frames[j][:3, :3])
+        rows = _gap_rows(members, sides[j], joint_points[j], joint_frames[j][:3, :3])
         if rows is not None:
             gap_row[j] = 24 * len(blocks)
             blocks.append(rows)
     edges = [_edge_rows(members, i) for i in range(len(members))]
     ends = 24 * len(blocks) + np.cumsum([0, *(len(rows.value) for rows in edges)])
-    blocks += [*edges, _chord_rows(members)]
+    lines: list[tuple[_Rows, int, float]] = [
+        (_line_rows(members, side, joint_points[j], joint_frames[j][:3, :3]), int(gap_row[j]), sign)
+        for j, both in enumerate(sides)
+        for side, sign in zip(both, (-1.0, 1.0), strict=True)
+        if not len(members[side.part].edges.points) and _known(members, side) is not None
+    ]
+    blocks += [*edges, *(line[0] for line in lines), _chord_rows(members, sides, joint_points)]
     A, value = np.vstack([rows.A for rows in blocks]), np.concatenate([rows.value for rows in blocks])
     by_pose = np.vstack([rows.by_pose for rows in blocks])
     with_pose = by_pose @ block_diag(*(member.pose for member in members))
-    covariance = block_diag(*(rows.covariance for rows in blocks)) + with_pose @ by_pose.T
+    of_blocks = block_diag(*(rows.covariance for rows in blocks))
+    start = int(ends[-1])
+    for line, gap, sign in lines:
+        at = slice(start, start + len(line.value))
+        start = at.stop
+        if gap >= 0:  # the line's departures and the gaps are of the same end
+            of_blocks[at, gap : gap + 24] = sign * line.with_end
+            of_blocks[gap : gap + 24, at] = sign * line.with_end.T
+    covariance = of_blocks + with_pose @ by_pose.T
     edge_rows = tuple(slice(int(start), int(stop)) for start, stop in pairwise(ends))
     return _Observations(
-        A=A, value=value, covariance=covariance, with_pose=with_pose, gap_row=gap_row, edge_rows=edge_rows
+        A=A,
+        value=value,
+        covariance=covariance,
+        with_pose=with_pose,
+        gap_row=gap_row,
+        edge_rows=edge_rows,
+        in_row=sides == topology.sides_of(topology.row(len(members))),
     )
 
 
-def _gap_rows(members: Sequence[Member], joint: int, points: Floats, R: Floats) -> _Rows | None:
+def _known(members: Sequence[Member], side: Side) -> JointEnd | None:
+    """Return the end on a side of a joint; None where it is unknown."""
+    end = members[side.part].ends[side.end] if members[side.part].ends else None
+    return end if end is not None and np.isfinite(end.departure).all() else None
+
+
+def _gap_rows(members: Sequence[Member], sides: tuple[Side, Side], points: Floats, R: Floats) -> _Rows | None:
     """Gaps of a joint with key points (8, 3) and axes R (3, 3), or None where an end is unknown."""
-    left, right = members[joint].ends[1], members[joint + 1].ends[0]
-    if left is None or right is None or not (np.isfinite(left.departure).all() and np.isfinite(right.departure).all()):
+    left, right = (_known(members, side) for side in sides)
+    if left is None or right is None:
         return None
     A, by_pose = np.zeros((2, 24, 6 * len(members)))
     turn = np.kron(np.eye(8), R)
-    for part, end, sign in ((joint, left, -1.0), (joint + 1, right, 1.0)):
+    at = [side.part for side in sides]
+    for part, end, sign in ((at[0], left, -1.0), (at[1], right, 1.0)):
         columns = slice(6 * part, 6 * part + 6)
         A[:, columns] = sign * rigid.motion(points - members[part].centre).reshape(24, 6)
         by_pose[:, columns] = sign * turn @ end.by_pose
-    noise = without_pose(left, members[joint].pose) + without_pose(right, members[joint + 1].pose)
+    noise = without_pose(left, members[at[0]].pose) + without_pose(right, members[at[1]].pose)
     return _Rows(A, turn @ (right.departure - left.departure).ravel(), turn @ noise @ turn.T, by_pose)
+
+
+def _line_rows(members: Sequence[Member], side: Side, points: Floats, R: Floats) -> _Rows:
+    """Departures across a joint, sideways and up, of the key points (8, 3) of a part's end."""
+    end, member = _known(members, side), members[side.part]
+    assert end is not None
+    across = np.delete(np.arange(24), np.arange(0, 24, 3))
+    columns = slice(6 * side.part, 6 * side.part + 6)
+    A, by_pose = np.zeros((2, 16, 6 * len(members)))
+    local = np.kron(np.eye(8), R.T)
+    A[:, columns] = (local @ rigid.motion(points - member.centre).reshape(24, 6))[across]
+    by_pose[:, columns] = end.by_pose[across]
+    noise = without_pose(end, member.pose)[across]
+    return _Rows(A, end.departure.ravel()[across], noise[:, across], by_pose, noise @ local)
 
 
 def _edge_rows(members: Sequence[Member], part: int) -> _Rows:
@@ -214,12 +285,16 @@ def _edge_rows(members: Sequence[Member], part: int) -> _Rows:
     return _Rows(A, edges.departure.ravel()[known], of_known, by_pose)
 
 
-def _chord_rows(members: Sequence[Member]) -> _Rows:
-    """Movement of each part along its chord, which is to be zero."""
+def _chord_rows(members: Sequence[Member], sides: Sides, joint_points: Floats) -> _Rows:
+    """Movement of each part along its chord, which is to be zero; without edges that between its outermost joints."""
     count = len(members)
     A = np.zeros((count, count, 6))
     for i, member in enumerate(members):
-        chord = member.edges.points[-1] - member.edges.points[0]
+        points = member.edges.points
+        if not len(points):
+            at = [j for j, both in enumerate(sides) if i in (both[0].part, both[1].part)]
+            points = np.array([member.centre, *joint_points[at].mean(axis=1)])[-2:]
+        chord = points[-1] - points[0]
         A[i, i, 3:] = chord / max(float(np.linalg.norm(chord)), 1e-12)
     zeros = np.zeros((count, 6 * count))
     return _Rows(A.reshape(count, 6 * count), np.zeros(count), np.zeros((count, count)), zeros)

@@ -9,23 +9,24 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.model import ArchDesign, Floats
+from processor.preassembly import topology
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.measure import MeasuredPart
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Poses T_bridge_scan (c, 4, 4) with covariance (c, 6, 6), rival poses, key points (c, 2, 8, 3) and gaps (j, 8, 3).
+    """Poses T_bridge_scan (c, 4, 4) with covariance (c, 6, 6), rival poses, key points, and gaps (j, 8, 3).
 
-    Poses and key points are of the scan's frame with its origin, lengths of poses at the reference temperature and of
-    key points as scanned; mm, NaN = unknown.
+    Key points (e, 8, 3) are of the e ends of each part. Poses and key points are of the scan's frame with its origin,
+    lengths of poses at the reference temperature and of key points as scanned; mm, NaN = unknown.
     """
 
     T_bridge_scan: Floats
     covariance: Floats
     T_rival_scan: Floats
-    key_points_scan: Floats
-    key_points_sd: Floats
+    key_points_scan: tuple[Floats, ...]
+    key_points_sd: tuple[Floats, ...]
     gaps: Floats
 
 
@@ -34,19 +35,19 @@ def place(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign,
     poses = np.array([T @ part.T_bridge_scan for T, part in zip(adjusted.motions, parts, strict=True)])
     T_bridge_scan = _with_origins(parts, poses)
     key_points, key_points_sd = _key_points(parts, design, frames)
-    ends = np.array(
-        [
-            [rigid.apply(T, end * part.shrink) for end in ends]
-            for T, ends, part in zip(T_bridge_scan, key_points, parts, strict=True)
-        ]
-    )
+    ends = [
+        [rigid.apply(T, end * part.shrink) for end in ends]
+        for T, ends, part in zip(T_bridge_scan, key_points, parts, strict=True)
+    ]
+    # Equal to the linear ones of the adjustment, to second order.
+    gaps = [ends[right.part][right.end] - ends[left.part][left.end] for left, right in topology.sides_of(design.joined)]
     return Placement(
         T_bridge_scan=T_bridge_scan,
         covariance=_covariances(parts, adjusted, T_bridge_scan),
         T_rival_scan=_with_origins(parts, [part.T_rival for part in parts]),
         key_points_scan=key_points,
         key_points_sd=key_points_sd,
-        gaps=ends[1:, 0] - ends[:-1, 1],  # equal to the linear ones of the adjustment, to second order
+        gaps=np.array(gaps).reshape(-1, 8, 3),
     )
 
 
@@ -71,20 +72,24 @@ def _covariances(parts: Sequence[MeasuredPart], adjusted: Adjusted, poses: Float
     return covariances
 
 
-def _key_points(parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats) -> tuple[Floats, Floats]:
-    """Key points (c, 2, 8, 3) as scanned, and the standard deviation of each coordinate."""
-    points, sd = np.full((len(parts), 2, 8, 3), np.nan), np.full((len(parts), 2, 8, 3), np.nan)
+def _key_points(
+    parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats
+) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
+    """Key points (e, 8, 3) of each part's ends as scanned, and the standard deviation of each coordinate."""
+    joined, of_parts = design.joined, []
     for i, part in enumerate(parts):
-        for e, joint in enumerate((i - 1, i)):
-            end = part.member.ends[e]
-            if end is None or not np.isfinite(end.departure).all():
+        ends = topology.ends_of(joined, i)
+        points, sd = np.full((len(ends), 8, 3), np.nan), np.full((len(ends), 8, 3), np.nan)
+        for e, ((joint, _), end) in enumerate(zip(ends, part.member.ends, strict=True)):
+            if joint is None or end is None or not np.isfinite(end.departure).all():
                 continue
             R = frames[joint][:3, :3]
             in_bridge = design.joint_points[joint] + end.departure @ R.T
             in_scan = rigid.apply(rigid.invert(part.T_bridge_scan), in_bridge)
-            points[i, e] = in_scan / part.shrink + part.scans[0].origin
+            points[e] = in_scan / part.shrink + part.scans[0].origin
             turn = part.T_bridge_scan[:3, :3].T @ R
             for k in range(8):
                 block = end.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
-                sd[i, e, k] = np.sqrt(np.diag(turn @ block @ turn.T)) / part.shrink
-    return points, sd
+                sd[e, k] = np.sqrt(np.diag(turn @ block @ turn.T)) / part.shrink
+        of_parts.append((points, sd))
+    return tuple(points for points, _ in of_parts), tuple(sd for _, sd in of_parts)

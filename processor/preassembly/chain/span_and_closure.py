@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from processor.adjustment import extremes
 from processor.geometry import rigid
 from processor.model import KEY_POINTS, NORMAL_95, ArchDesign, Floats, Reason, Status, Word, reason
+from processor.preassembly import topology
 from processor.preassembly.chain import adjustment
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.measure import MeasuredPart
@@ -71,7 +72,7 @@ def span(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign) 
     part by its end face, and square to it by the bottom edges there; what was not seen of it is taken to be as
     designed.
     """
-    if not np.isfinite(adjusted.gaps).all():
+    if not has_span(design) or not np.isfinite(adjusted.gaps).all():
         return float("nan"), float("nan")
     ends = _outer_ends(design)
     chord = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
@@ -111,8 +112,15 @@ def _outer_end(parts: Sequence[MeasuredPart], adjusted: Adjusted, i: int, at: Fl
     return _OuterEnd(value, variance, by_value, along)
 
 
+def has_span(design: ArchDesign) -> bool:
+    """Whether the parts form a row with bottom edges at its outer ends."""
+    return design.in_row and all(len(part.bottom_edge_left) > 0 for part in (design.parts[0], design.parts[-1]))
+
+
 def design_span(design: ArchDesign) -> float:
-    """Distance of the bridge's outer ends as designed, mm."""
+    """Distance of the bridge's outer ends as designed, mm; NaN where it has none."""
+    if not has_span(design):
+        return float("nan")
     ends = _outer_ends(design)
     return float(np.linalg.norm(ends[1] - ends[0]))
 
@@ -123,6 +131,8 @@ def closure(parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats) -
     Departure (2, 3) from the design, mm along the bridge's axes and mrad about them, with 95 % half-widths (2, 3); NaN
     where a joint has no answer. The first part rests on its design.
     """
+    if not has_span(design):
+        return np.full((2, 3), np.nan), np.full((2, 3), np.nan)
     alone = adjustment.adjust([part.member for part in parts], design.joint_points, frames, JOINTS_ALONE)
     if not np.isfinite(alone.gaps).all():
         return np.full((2, 3), np.nan), np.full((2, 3), np.nan)
@@ -156,14 +166,16 @@ def limiting(
         return missing, missing
     j, point, axis = where
     variance: dict[PartEnd, float] = {}
-    for side, part, end in ((PartEnd.END, parts[j], 1), (PartEnd.START, parts[j + 1], 0)):
-        joint_end = part.member.ends[end]
+    left, right = topology.sides_of(design.joined)[j]
+    for side, of_joint in ((PartEnd.END, left), (PartEnd.START, right)):
+        part = parts[of_joint.part]
+        joint_end = part.member.ends[of_joint.end]
         if joint_end is not None:
             # An end's error by its part's registration is common to both ends: it cancels, so it limits nothing.
             covariance = adjustment.without_pose(joint_end, part.member.pose)
             variance[side] = float(np.diag(covariance)[3 * point + axis])
     side = max(variance, key=lambda side: variance[side])
-    name = parts[j].name if side is PartEnd.END else parts[j + 1].name
+    name = parts[left.part if side is PartEnd.END else right.part].name
     surface = tuple(EndSurface)[axis]
     limit = reason(
         "preassemble.limiting",
@@ -201,9 +213,9 @@ def _missing(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesi
     if others:
         return (reason("preassemble.assign-scans", parts=others),)
     joints: dict[tuple[str, ...], list[str]] = {}
-    for name, gaps, *beside in zip(design.joint_names, adjusted.gaps, parts, parts[1:], strict=False):
+    for name, gaps, beside in zip(design.joint_names, adjusted.gaps, design.joined.tolist(), strict=True):
         if not np.isfinite(gaps).all():
-            failed = tuple(part.name for part in beside if part.status == Status.FAILED)
+            failed = tuple(parts[i].name for i in beside if parts[i].status == Status.FAILED)
             joints.setdefault(failed, []).append(name)
     return tuple(
         reason("preassemble.scan-failed-parts", joints=tuple(names), parts=failed)

@@ -55,6 +55,20 @@ class EdgeDepartures:
     tails: Floats  # (2, 2) probabilities of residuals at least as large: of left and right edge, sideways and up
 
 
+NONE = EdgeDepartures(  # of a part whose design has no bottom edges
+    side=(),
+    chainage=np.empty(0),
+    points=np.empty((0, 3)),
+    axes=np.empty((0, 2, 3)),
+    departure=np.empty((0, 2)),
+    covariance=np.empty((2, 0, 0)),
+    by_pose=np.empty((0, 2, 6)),
+    by_view=np.empty((2, 0, 4)),
+    by_tilt=np.empty((2, 0, 4)),
+    tails=np.full((2, 2), np.nan),
+)
+
+
 class _FacePoints(NamedTuple):
     """Points (n,) of one face near an edge: interval, distances along and from the edge, residual, station."""
 

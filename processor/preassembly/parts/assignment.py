@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from processor.geometry import box_girder, principal, rigid, surface_registration
 from processor.geometry.neighbors import thinned
 from processor.model import ArchDesign, Floats, Reason, reason
-from processor.preassembly.parts import attitude
+from processor.preassembly.parts import attitude, same_shape
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, TELLING_MM, Shapes, Surface
 
 POINTS, NEAR_POINTS = 100_000, 3_000  # of a scan, by which rough poses are compared, and their share near a design
@@ -90,7 +90,7 @@ def _other_shapes(index: int, numbers: Sequence[int] | range, design: ArchDesign
     """Return those of the numbers of parts that differ in shape from part ``index``, one of each shape."""
     found = [index]
     for k in numbers:
-        if not any(k == one or box_girder.motions(design.parts[one], design.parts[k]) for one in found):
+        if not any(k == one or same_shape.motions(design.parts[one], design.parts[k]) for one in found):
             found.append(k)
     return found[1:]
 

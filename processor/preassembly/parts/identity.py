@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.geometry import box_girder, rigid
+from processor.geometry import rigid
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.neighbors import thinned
 from processor.model import Floats, Reason, reason
-from processor.preassembly.parts import attitude
+from processor.preassembly.parts import attitude, same_shape
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, SAMPLE_SPACING_MM
 
 AROUND = 30_000  # points that show the surface's departure near a mark: one in 50 mm on a long part
@@ -78,7 +78,7 @@ def identify(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> 
     rather, unseen, same = [], [], []
     part, surface = shapes.design.parts[index], shapes[index]
     for k, other in enumerate(shapes.design.parts):
-        motions = box_girder.motions(part, other) if k != index else []
+        motions = same_shape.motions(part, other) if k != index else []
         if not motions:
             continue
         # A part that is symmetric but for its mark lies on the other in two ways. Where the marks agree in one of them

@@ -14,6 +14,7 @@ from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.geometry.neighbors import by_cell, thinned
 from processor.geometry.polyline import Polyline
 from processor.model import DesignPart, Floats, Ints, Reason, Scan, Status, reason
+from processor.preassembly import topology
 from processor.preassembly.ends import bottom_edges, faces, joint_end, outer_end, viewpoints
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.faces import RegisteredPart
@@ -51,7 +52,7 @@ class MeasuredPart:
     residual_points: Floats  # (r, 3) of the scan, thinned, on the design
     residuals: Floats  # (r,) from the design's surface, outward
     identities: tuple[ScanParts, ...] = ()  # of its scans
-    outer: OuterEnd | None = None  # of the first and the last part
+    outer: OuterEnd | None = None  # of the first and the last part of a row
 
     @property
     def of_others(self) -> tuple[Reason, ...]:
@@ -122,7 +123,8 @@ def fit(
     """
     design, shape = shapes.design, shapes[index]
     part = design.parts[index]
-    joints = [j if 0 <= j < len(design.joint_names) else None for j in (index - 1, index)]
+    places = topology.ends_of(design.joined, index)
+    joints = [end.joint for end in places]
     placed = [_place(scan, index, shapes, shrink) for scan in scans]
     usable = [scan for scan in placed if not scan.rejected]
     if not usable:
@@ -133,7 +135,7 @@ def fit(
     registered = _registered(used, shape, [design.joint_points[j] for j in joints if j is not None])
     ends = tuple(
         None if joint is None else joint_end.fit(registered, end_place(design.joint_points[joint], outward))
-        for outward, joint in zip((-1.0, 1.0), joints, strict=True)
+        for joint, outward in places
     )
     edges = _edges(registered, part, first.registration.sigma_mm, systematic)
     known = [
@@ -149,15 +151,16 @@ def fit(
     status = Status.AMBIGUOUS if first.attitude.status == Status.AMBIGUOUS else status
     resemblance = _resemblance(first.points, index, shapes) if status != Status.OK else ()
     residual_points, residuals = _residuals(registered.points, shape.mesh)
-    outer = _outer_end(registered, part, joints)
-    unseen = (reason("preassemble.outer-end-not-seen"),) if None in joints and outer is None else ()
+    outer = _outer_end(registered, part, joints) if len(part.bottom_edge_left) else None
+    open_end = None in joints and len(part.bottom_edge_left) > 0
+    unseen = (reason("preassemble.outer-end-not-seen"),) if open_end and outer is None else ()
     measured = MeasuredPart(
         name=part.name,
         scans=tuple(scan.scan for scan in used),
         status=status,
         reasons=(*_reasons(placed, used, part, of_ends), *resemblance, *unseen),
         T_bridge_scan=first.registration.T_design_scan,
-        member=Member((None, None), edges, part.vertices.mean(axis=0), registered.pose),
+        member=Member((None,) * len(joints), edges, part.vertices.mean(axis=0), registered.pose),
         shrink=shrink,
         T_rival=first.attitude.T_rival,
         residual_points=residual_points,
@@ -184,10 +187,10 @@ def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[
     measured = []
     for part, contradiction in zip(seen, contradicted, strict=True):
         ends = [next(estimated) if isinstance(end, FittedEnd) else end for end in part.ends]
-        first, last = (
+        with_systematic = tuple(
             None if end is None else systematic_errors.added_to_end(end, systematic, part.part) for end in ends
         )
-        member = replace(part.measured.member, ends=(first, last))
+        member = replace(part.measured.member, ends=with_systematic)
         outer = part.measured.outer
         if outer is not None:
             variance = outer.variance + systematic_errors.end_variances(systematic, part.part)[0]
@@ -284,6 +287,8 @@ def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Se
 def _edges(
     registered: RegisteredPart, part: DesignPart, sigma_mm: float, systematic: SystematicParams
 ) -> EdgeDepartures:
+    if not len(part.bottom_edge_left):
+        return bottom_edges.NONE
     edges = bottom_edges.measure(registered, *_design_edges(part), sigma_mm)
     return systematic_errors.added_to_edges(
         bottom_edges.with_errors_of_views(edges, registered.between_stations), systematic
@@ -458,7 +463,7 @@ def _failed(part: DesignPart, joints: Sequence[int | None], placed: Sequence[_Pl
     why = placed[0].rejected
     if len(placed) > 1:
         why = tuple(reason("preassemble.of-scan", scan=scan.scan.name, reasons=scan.rejected) for scan in placed)
-    edges = bottom_edges.unknown(*_design_edges(part))
+    edges = bottom_edges.unknown(*_design_edges(part)) if len(part.bottom_edge_left) else bottom_edges.NONE
     nowhere = np.full((4, 4), np.nan)
     measured = MeasuredPart(
         name=part.name,
@@ -466,7 +471,7 @@ def _failed(part: DesignPart, joints: Sequence[int | None], placed: Sequence[_Pl
         status=Status.FAILED,
         reasons=why,
         T_bridge_scan=nowhere,
-        member=Member((None, None), edges, part.vertices.mean(axis=0), np.zeros((6, 6))),
+        member=Member((None,) * len(joints), edges, part.vertices.mean(axis=0), np.zeros((6, 6))),
         shrink=shrink,
         T_rival=nowhere,
         residual_points=np.empty((0, 3)),

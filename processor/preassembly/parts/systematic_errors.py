@@ -48,11 +48,20 @@ def added_to_end(end: JointEnd, params: SystematicParams, part: DesignPart) -> J
 
 def end_variances(params: SystematicParams, part: DesignPart) -> Floats:
     """Systematic variances (24,) of an end's coordinates, mm^2; all points of the end share their errors."""
-    ends: Floats = part.bottom_edge_left[[0, -1]]
-    terms = budget(params, float(np.linalg.norm(ends[1] - ends[0])))
+    terms = budget(params, chord(part))
     any_axis = terms[BudgetSource.REGISTRATION] ** 2 + terms[BudgetSource.OFFSET] ** 2
     along = terms[BudgetSource.SCALE] ** 2 + terms[BudgetSource.TEMPERATURE] ** 2
     return np.tile([any_axis + along, any_axis, any_axis], 8)
+
+
+def chord(part: DesignPart) -> float:
+    """Length of a part between the ends of its bottom edge, mm; without edges the diagonal of its box."""
+    ends = (
+        part.bottom_edge_left[[0, -1]]
+        if len(part.bottom_edge_left)
+        else np.stack([part.vertices.min(axis=0), part.vertices.max(axis=0)])
+    )
+    return float(np.linalg.norm(ends[1] - ends[0]))
 
 
 def added_to_edges(edges: EdgeDepartures, params: SystematicParams) -> EdgeDepartures:

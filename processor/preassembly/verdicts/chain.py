@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import ndtr
@@ -27,7 +28,8 @@ from processor.preassembly.verdicts.joints import (
     of_project,
 )
 
-MEASURES = ("span", "unit_length", "inner_arc", "lateral_axis", "elevation")
+OF_SPAN, OF_EDGES = ("span", "unit_length"), ("inner_arc", "lateral_axis", "elevation")
+MEASURES = (*OF_SPAN, *OF_EDGES)
 STEEPEST = 0.5  # cosine of an edge's slope; steeper edges have no height over a place
 
 Quantities = Mapping[str, tuple[Floats, Floats]]
@@ -61,6 +63,12 @@ def quantities(members: Sequence[Member], adjusted: Adjusted, span: float, span_
         "lateral_axis": (np.concatenate(sideways), np.concatenate(sideways_sd)),
         "elevation": (np.concatenate(height), np.concatenate(height_sd)),
     }
+
+
+def applicable(tolerance: Tolerance, *, span: bool, edges: bool) -> Tolerance:
+    """Return the limits without those of what an assembly does not have: a span, bottom edges."""
+    absent = (*(() if span else OF_SPAN), *(() if edges else OF_EDGES))
+    return replace(tolerance, limits=tuple(limit for limit in tolerance.limits if limit.measure not in absent))
 
 
 def judge(measured: Quantities, tolerance: Tolerance, span_mm: float, doubts: tuple[Reason, ...] = ()) -> Conformity:

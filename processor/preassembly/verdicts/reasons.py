@@ -9,6 +9,7 @@ import numpy as np
 from processor.model import Floats, Reason, Status, reason
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.measure import MeasuredPart
+from processor.preassembly.topology import Side
 
 
 def of_assignment(parts: Sequence[MeasuredPart]) -> tuple[Reason, ...]:
@@ -26,10 +27,11 @@ def _which(scan: ScanParts, count: int) -> str:
     return " / ".join(scan.parts) if 0 < len(scan.parts) < count else "?"
 
 
-def of_joint(left: MeasuredPart, right: MeasuredPart) -> tuple[Reason, ...]:
+def of_joint(parts: Sequence[MeasuredPart], sides: tuple[Side, Side]) -> tuple[Reason, ...]:
     """Why a joint's gaps may be wrong: an ambiguous part, a scan of another, an end of maybe another plate side."""
+    left, right = (parts[side.part] for side in sides)
     others = (*left.of_others, *right.of_others)
-    ends = ((left, left.member.ends[1]), (right, right.member.ends[0]))
+    ends = ((part, part.member.ends[side.end]) for part, side in zip((left, right), sides, strict=True))
     doubts = (reason("preassemble.at", place=part.name, reasons=end.doubts) for part, end in ends if end and end.doubts)
     return (*others, *_ambiguous((left, right)), *doubts)
 

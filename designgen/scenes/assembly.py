@@ -1,0 +1,135 @@
+"""Scenes of assemblies of prismatic parts, each part scanned in a frame of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from designgen.asbuilt.imperfections import Ledger
+from designgen.checks import expect
+from designgen.designs import assembly as design_of
+from designgen.designs.prismatic import EndErrors, Part
+from designgen.frames import inverse
+from designgen.randomness import generator, random_pose
+from designgen.reading import filled
+from designgen.scanning import sampler
+from designgen.scanning.scan_settings import ByRays, Scanning
+from designgen.scenes import MADE_IN_MM
+from processor.model import (
+    ArchDesign,
+    ArchTruth,
+    DesignPart,
+    Floats,
+    PointLabels,
+    Scan,
+    Scene,
+    Truth,
+    UsageError,
+)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Standard deviations of the errors of each end at a joint."""
+
+    length_mm: float = 0.0
+    skew_mrad: float = 0.0
+    corner_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        for key, value in self.__dict__.items():
+            expect(value >= 0.0, f"asbuilt.{key}", value, "0 or more")
+
+
+def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
+    """Make the scene of an assembly, a scan of each part in a separate frame, and its truth."""
+    if isinstance(scanning, ByRays):
+        raise UsageError("scan.mode: expected surface, assemblies are not scanned by rays")
+    nominal = design_of.build(filled(design_of.Params, recipe, "assembly"))
+    errors = filled(Errors, recipe, "asbuilt")
+    ledger = Ledger()
+    parts = [_built(part, errors, generator(seed, f"built {part.name}"), ledger) for part in nominal.parts]
+    names = tuple(part.name for part in parts)
+    scans, labels, poses, ends = [], [], [], []
+    for number, part in enumerate(parts):
+        T = random_pose(generator(seed, f"pose {part.name}"))
+        patches = [(number, patch) for patch in part.built()]
+        cloud = sampler.scan_patches(patches, scanning, generator(seed, f"scan {part.name}"))
+        points = cloud.points @ T[:3, :3].T + T[:3, 3]
+        scans.append(Scan(part.name, points, component=part.name, sigma_mm=scanning.sigma_mm))
+        labels.append(PointLabels(part.name, names, cloud.part, cloud.source))
+        poses.append(inverse(T))
+        for end in part.ends:
+            corners = end.key_points()
+            built = corners + part.displacement(corners)
+            built[np.isnan(end.section.key_points[:, 0])] = np.nan
+            ends.append((number, end.joint, end.outward, built @ T[:3, :3].T + T[:3, 3], built))
+    scene = Scene(name, "arch-bridge", tuple(scans), arch=_design(nominal), units="mm", units_reason=MADE_IN_MM)
+    return scene, Truth(
+        tuple(labels),
+        arch=_truth(nominal, names, poses, ends),
+        as_built=ledger.record() if "asbuilt" in recipe else None,
+        spacing_mm=scanning.spacing_mm,
+        sigma_mm=scanning.sigma_mm,
+    )
+
+
+def _built(part: Part, errors: Errors, rng: np.random.Generator, ledger: Ledger) -> Part:
+    """Draw the errors of a part's ends, and add them to the ledger."""
+    scale = np.array([errors.length_mm, 1e-3 * errors.skew_mrad, 1e-3 * errors.skew_mrad])
+    drawn = []
+    for end in part.ends:
+        plane, corners = rng.standard_normal(3) * scale, errors.corner_mm * rng.standard_normal((4, 3))
+        drawn.append(EndErrors(plane, corners))
+        where = f"{part.name} at {end.joint}"
+        for what, value, unit in zip(
+            ("length error", "skew about z", "skew about y"), plane, ("mm", "rad", "rad"), strict=True
+        ):
+            ledger.note(what, where, value, unit)
+        for k, axis in np.ndindex(4, 3):
+            ledger.note(f"corner P{k + 1}, {('along', 'left', 'up')[axis]}", where, corners[k, axis], "mm")
+    return part.with_errors(drawn)
+
+
+def _design(nominal: design_of.Assembly) -> ArchDesign:
+    return ArchDesign(
+        tuple(DesignPart(part.name, *part.mesh()) for part in nominal.parts),
+        tuple(joint.name for joint in nominal.joints),
+        tuple(joint.left for joint in nominal.joints),
+        tuple(joint.right for joint in nominal.joints),
+        np.array([_end_at(nominal, joint.name) for joint in nominal.joints]),
+    )
+
+
+def _end_at(nominal: design_of.Assembly, joint: str) -> Floats:
+    return next(end.key_points() for part in nominal.parts for end in part.ends if end.joint == joint)
+
+
+def _truth(
+    nominal: design_of.Assembly,
+    names: tuple[str, ...],
+    poses: Sequence[Floats],
+    ends: Sequence[tuple[int, str, float, Floats, Floats]],
+) -> ArchTruth:
+    """Put the key points at start and end, or by joint where a part has several starts or ends."""
+    in_scan, in_bridge = np.full((2, len(names), 2, 8, 3), np.nan)
+    several = {part for part, _, outward, *_ in ends if sum(o == outward and p == part for p, _, o, *_ in ends) > 1}
+    for part, _, outward, of_scan, of_bridge in ends:
+        if part not in several:
+            in_scan[part, int(outward > 0.0)], in_bridge[part, int(outward > 0.0)] = of_scan, of_bridge
+    branched = [end for end in ends if end[0] in several]
+    joints = [joint.name for joint in nominal.joints]
+    return ArchTruth(
+        names,
+        np.array(poses),
+        in_scan,
+        in_bridge,
+        np.full((len(names), 2, 1, 3), np.nan),
+        branch_component=np.array([end[0] for end in branched], np.int64),
+        branch_joint=np.array([joints.index(end[1]) for end in branched], np.int64),
+        branch_scan=np.array([end[3] for end in branched]).reshape(-1, 8, 3),
+        branch_bridge=np.array([end[4] for end in branched]).reshape(-1, 8, 3),
+    )
