@@ -145,8 +145,8 @@ def _sections(
             {
                 "title": step_report(run.step).title,
                 "message": _message(run.result, lang),
-                "lead": [_table(table, lang) for table in tables if table.file in LEAD],
-                "tables": [_table(table, lang) for table in tables if table.file not in LEAD],
+                "lead": [_table(table, lang) for table in tables if _leads(table)],
+                "tables": [_table(table, lang) for table in tables if not _leads(table)],
                 "step": run.step,
                 "live": run.step in live,
                 "figures": [
@@ -169,6 +169,11 @@ def _sections(
             }
         )
     return sections
+
+
+def _leads(table: Table) -> bool:
+    """Whether a table stands above the figures: what to do, and what is compared with limits."""
+    return table.file in LEAD or table.file.endswith(all_tables.LIMITS)
 
 
 def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:
