@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+import numpy as np
+
 from processor.language.messages import Text, messages, text
 from processor.limits.judging import JudgedLimits
 from processor.model import StepRun, Verdict
@@ -37,3 +39,13 @@ def of_limits(limits: JudgedLimits) -> Text:
     counts = Counter(limits.verdict)
     verdicts = [text(template, count=counts[word]) for word, template in VERDICTS.items() if counts[word]]
     return text("of {count} {count:?limit|limits} {verdicts}", count=len(limits), verdicts=verdicts)
+
+
+def unverified(execution: Execution) -> list[str]:
+    """Name the clauses of limits that were used and not compared with the published text of their standard."""
+    clauses: set[str] = set()
+    for run, _ in execution.by_step():
+        for limits in (getattr(run.result, "limits", None), *step_report(run.step).limits(run.result)):
+            if limits is not None:
+                clauses |= {limits.clause[k] for k in np.flatnonzero(~limits.verified).tolist()}
+    return sorted(clauses)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -35,9 +35,13 @@ def with_unverified(note: Text, clauses: Iterable[str]) -> Text:
     return text(UNVERIFIED, note=note, sources=", ".join(sources)) if sources else note
 
 
+def worst_first(limits: JudgedLimits) -> list[int]:
+    """Return the rows of comparisons, those of the worst verdict first."""
+    return sorted(range(len(limits)), key=lambda k: WORST_FIRST.index(str(limits.verdict[k])))
+
+
 def _rows(limits: JudgedLimits) -> Iterator[tuple[Any, ...]]:
-    order: Sequence[int] = sorted(range(len(limits)), key=lambda k: WORST_FIRST.index(str(limits.verdict[k])))
-    for k in order:
+    for k in worst_first(limits):
         numbers = (float(column[k]) for column in (limits.value, limits.ci95, limits.low, limits.high))
         clause = label(limits.clause[k])
         yield (label(limits.what[k]), limits.of[k], limits.verdict[k], *numbers, limits.unit[k], clause)

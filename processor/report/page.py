@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import itertools
 import json
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -99,7 +99,15 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]
             method = text("Method {method}. {text}", method=run.method, text=body)
         verdicts.append({"tone": _tone(run), "head": headline.of_step(run), "text": method})
         verdicts += [{"tone": "", "head": head, "text": body} for head, body in report_of.further_verdicts(run.result)]
+    if sources := headline.unverified(execution):
+        verdicts.append({"tone": "", "head": text("Limits that are not verified"), "text": _unverified(sources)})
     return [*verdicts, _truth(report)]
+
+
+def _unverified(sources: Sequence[str]) -> Text:
+    return text(
+        "{sources}: not compared with the published text; do so before verdicts are relied on.", sources=sources
+    )
 
 
 def _truth(report: ErrorReport) -> dict[str, Any]:
