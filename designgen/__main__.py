@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import traceback
 
 import click
 
@@ -24,11 +25,19 @@ def main() -> None:
         error.show()
         sys.exit(WRONG_USAGE)
     except UsageError as error:
+        _trace()
         click.echo(f"error: {error}", err=True)
         sys.exit(WRONG_USAGE)
     except (InputError, OSError) as error:
+        _trace()
         click.echo(f"error: {error}", err=True)
         sys.exit(BAD_INPUT)
+
+
+def _trace() -> None:
+    """Show where the current error arose, with --debug."""
+    if "--debug" in sys.argv:
+        traceback.print_exc()
 
 
 if __name__ == "__main__":

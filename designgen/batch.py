@@ -53,7 +53,9 @@ def make_scene(path: Path, name: str, recipe: recipe_files.Recipe, seed: int | N
 
     from designgen.scenes import make
     from processor.store import store
+    from processor.store.writable import check_file
 
+    check_file(path)
     # The last bits of BLAS results depend on the number of threads.
     with threadpool_limits(1, user_api="blas"):
         made, truth = make.make(name, recipe, seed)

@@ -14,6 +14,8 @@ from designgen.export import FORMATS
 from processor.progress import stage
 
 DONE, IN_PART, ALL_FAILED = 0, 1, 2
+json_option = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+debug_option = click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -23,7 +25,9 @@ def commands() -> None:
 
 
 @commands.command("list")
-def list_() -> None:
+@json_option
+@debug_option
+def list_(as_json: bool) -> None:
     """List the types of components and the recipes, a line each."""
     from designgen import recipe_files
 
@@ -31,6 +35,9 @@ def list_() -> None:
     modules = {name: importlib.import_module(f"designgen.designs.{name}") for name in names}
     types = {name: module.ABOUT for name, module in modules.items() if hasattr(module, "ABOUT")}
     named = {name: recipe["about"] for name, recipe in recipe_files.named().items()}
+    if as_json:
+        click.echo(json.dumps({"component_types": types, "recipes": named}, ensure_ascii=False))
+        return
     width = max(map(len, [*types, *named]))
     for heading, lines in (("component types", types), ("recipes", named)):
         click.echo(heading)
@@ -53,7 +60,8 @@ def list_() -> None:
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="number of processes for several scenes  [default: 1]")
 @click.option("--cluster", metavar="ADDRESS", help="Dask scheduler for several scenes, e.g. tcp://10.0.0.1:8786")
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+@json_option
+@debug_option
 @click.pass_context
 def make(
     context: click.Context,
@@ -107,7 +115,8 @@ def make(
 @click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="change a setting, e.g. scan.step_mrad=1; repeatable"
 )
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+@json_option
+@debug_option
 def scan(
     model: Path,
     output: Path,
@@ -145,8 +154,17 @@ def scan(
 @click.option("--spherical", is_flag=True, help="E57 with ranges and angles instead of x, y, z")
 @click.option("--step", is_flag=True, help="also write the solids of the design as STEP")
 @click.option("--without-meshes", is_flag=True, help="design of an arch bridge without meshes of its parts")
+@json_option
+@debug_option
 def export(
-    scene: Path, output: Path, format_: str, without_truth: bool, spherical: bool, step: bool, without_meshes: bool
+    scene: Path,
+    output: Path,
+    format_: str,
+    without_truth: bool,
+    spherical: bool,
+    step: bool,
+    without_meshes: bool,
+    as_json: bool,
 ) -> None:
     """Write SCENE as a scan folder: project.toml, design, scans, and the truth in truth.h5."""
     from designgen.export import folder
@@ -165,6 +183,10 @@ def export(
         )
     for name in written.left_out:
         click.echo(f"{output}: scan {name!r} is left out: it has almost no points", err=True)
+    if as_json:
+        content = {"folder": str(output), "format": format_, "scans": written.scans, "left_out": list(written.left_out)}
+        click.echo(json.dumps(content, ensure_ascii=False))
+        return
     click.echo(f"{output}: {written.scans} scan(s) as {format_}")
 
 
@@ -173,7 +195,8 @@ def export(
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="new folder")
 @click.option("--units", default="", help="unit of the numbers, instead of that in the file: mm, m, inch, ...")
 @click.option("--default-units", default="", metavar="UNIT", help="unit of the numbers where the file states none")
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+@json_option
+@debug_option
 @click.pass_context
 def import_(context: click.Context, file: Path, output: Path, units: str, default_units: str, as_json: bool) -> None:
     """Convert a STEP or IFC FILE to meshes in mm, one for each body, with their sizes in import.json.

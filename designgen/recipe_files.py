@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from processor.model import InputError, UsageError
+from processor.model import InputError, UsageError, did_you_mean
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -44,7 +44,8 @@ def load(name_or_path: str | PathLike[str]) -> tuple[str, Recipe]:
         return name, recipes[name]
     path = Path(name)
     if path.suffix != ".toml":
-        raise UsageError(f"no recipe {name!r}; there are {', '.join(recipes)}, or give a .toml file")
+        like = did_you_mean(name, recipes)
+        raise UsageError(f"no recipe {name!r}{like}; there are {', '.join(recipes)}, or give a .toml file")
     try:
         content = tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

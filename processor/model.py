@@ -11,6 +11,7 @@ The records are also the HDF5 schema: :mod:`processor.store` walks their fields,
 from __future__ import annotations
 
 import dataclasses
+import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -234,6 +235,18 @@ class Verdict(Word):
     NONE = "none"  # nothing is limited
 
 
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return " (did you mean ...?)" with the names most like one that is not known; nothing where none is like it."""
+    by_form = {_plain(one): one for one in known}
+    like = [by_form[form] for form in difflib.get_close_matches(_plain(name), by_form, n=2, cutoff=0.6)]
+    return f" (did you mean {' or '.join(map(repr, like))}?)" if like else ""
+
+
+def _plain(name: str) -> str:
+    """Return a name without case and separators, as names are mistyped."""
+    return "".join(character for character in name.lower() if character.isalnum())
+
+
 class InputError(Exception):
     """Input that cannot be used. The message names the file, what was expected, what came and what to do."""
 
@@ -345,6 +358,11 @@ class FrameDesign(Checked):
     member_a: Ints = column("m", dtype=np.int64)  # ids of the two nodes
     member_b: Ints = column("m", dtype=np.int64)
     tube_diameters: Floats = column("m")
+    supports: Codes = column("k", dtype=np.uint8, newer=True)  # 0 = none, else the place in SUPPORTS, from 1
+    deflections: Floats = column("k", newer=True)  # computed, downward; NaN = not stated
+
+
+SUPPORTS = ("perimeter", "multi-point")  # of a node: of a frame supported along its edges, or at single points
 
 
 @dataclass(frozen=True)
@@ -378,7 +396,8 @@ class Limit(Checked):
     ``low_ratio`` and ``high_ratio`` are multiples of the size named by ``of``; by ``rule`` the smaller of number and
     multiple counts, or their sum. The row is for sizes above ``above_mm`` up to ``up_to_mm``. ``measure`` is what of a
     joint is held against it: misalignment | groove_gap | eccentricity; or of a whole chain: span | unit_length |
-    inner_arc | lateral_axis | elevation; or nothing.
+    inner_arc | lateral_axis | elevation; or another of ``processor/limits/measures.py``; or nothing. ``component`` is a
+    pattern of the names of those that a project gives it for, None of all.
     """
 
     key: str
@@ -396,6 +415,7 @@ class Limit(Checked):
     clause: str = ""
     verified: bool = False  # the number was held against the published text
     source: str = ""
+    component: str | None = newer()
 
 
 @dataclass(frozen=True)

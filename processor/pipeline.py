@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from processor.model import InputError, Scan, Scene, Status, StepRun, UsageError, reason
+from processor.model import InputError, Scan, Scene, Status, StepRun, UsageError, did_you_mean, reason
 from processor.progress import stage
 from processor.store.json_values import json_ready
 from processor.version import __version__
@@ -188,13 +188,14 @@ def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any
     chosen = list(dict.fromkeys(wanted))
     for name in (*chosen, *params):
         if name not in modules:
-            raise UsageError(f"no step {name!r}; there are {', '.join(modules)}")
+            raise UsageError(f"no step {name!r}{did_you_mean(name, modules)}; there are {', '.join(modules)}")
     chosen = _in_order(chosen, modules)
     offered = {name: [m for m in methods if m in modules[name].METHODS] for name in chosen}
     for method in methods:
         if not any(method in named for named in offered.values()):
             known = "; ".join(f"{name}: {', '.join(modules[name].METHODS)}" for name in chosen)
-            raise UsageError(f"no method {method!r} for these steps ({known})")
+            like = did_you_mean(method, [one for name in chosen for one in modules[name].METHODS])
+            raise UsageError(f"no method {method!r} for these steps{like} ({known})")
     # Tables of steps that do not run are checked too: one file serves many inputs, and a slip in it should not wait.
     tables = {name: fill(modules[name].Params, params.get(name, {}), name) for name in (*chosen, *params)}
     jobs = []
@@ -228,7 +229,8 @@ def fill(cls: type, table: Any, where: str) -> Any:
     values: dict[str, Any] = {}
     for key, value in table.items():
         if key not in known:
-            raise UsageError(f"{where}.{key}: unknown parameter; there are {', '.join(known)}")
+            like = did_you_mean(key, known)
+            raise UsageError(f"{where}.{key}: unknown parameter{like}; there are {', '.join(known)}")
         if dataclasses.is_dataclass(known[key]):
             values[key] = fill(type(known[key]), value, f"{where}.{key}")
             continue

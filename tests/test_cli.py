@@ -12,10 +12,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from designgen import cli as designgen_cli
 from processor import __main__, pipeline
+from processor.cli import help_text, main
 from processor.evaluation.evaluate import evaluate
+from processor.language.messages import label
+from processor.limits import standards
 from processor.model import FrameDesign, FrameTruth, InputError, Scan, Scene, Truth, UsageError, Verdict
-from processor.report import write_results
+from processor.report import terminal, write_results
 from processor.space_frame.result import Result as FrameResult
 from processor.store import store
 from tests.support import arch_clouds
@@ -259,6 +263,116 @@ def test_a_verdict_sets_the_exit_code_where_asked(called, frame, tmp_path, monke
     assert found["headline"] in (tmp_path / "out" / "report.html").read_text("utf-8")
 
 
+def test_the_terminal_says_the_headline_what_to_do_why_and_where_the_report_is(called, frame, tmp_path):
+    store.write_scene(tmp_path / "s.h5", frame[0], None, {})
+    said = called("run", "s.h5", cwd=tmp_path)
+    found = json.loads((tmp_path / "s-results" / "results.json").read_text("utf-8"))
+    lines = said.stdout.splitlines()
+    assert (lines[0], lines[-1]) == (found["headline"], "report: s-results/report.html")
+    assert any(line.startswith("Bolt balls is ") or "wrong-size" in line for line in lines) or len(lines) == 2
+    assert len(lines) <= terminal.MOST_LINES
+    assert "results go to s-results" in said.stderr
+    quiet = called("run", "s.h5", "--quiet", cwd=tmp_path)
+    assert (quiet.stdout, quiet.stderr) == (found["headline"] + "\n", "")
+    verbose = called("run", "s.h5", "--verbose", cwd=tmp_path)
+    assert verbose.stdout.splitlines()[0] == lines[0]
+    assert "Lowest" in verbose.stdout or "lowest" in verbose.stdout
+    assert len(verbose.stdout) > 3 * len(said.stdout)
+    both = called("run", "s.h5", "--verbose", "--json", cwd=tmp_path)
+    assert (both.returncode, "exclude each other" in both.stderr) == (2, True)
+
+
+def test_many_lines_become_fifteen(frame, tmp_path, monkeypatch):
+    store.write_scene(tmp_path / "s.h5", frame[0], None, {})
+    _, report = run_in_process(tmp_path / "s.h5", tmp_path / "out")
+    execution = pipeline.read_execution(tmp_path / "out" / "results.h5", tmp_path / "s.h5", None)
+    monkeypatch.setattr(terminal, "_middle", lambda *_: iter([label("x" * 500)] * 40))
+    lines = terminal.lines(execution, report, "page")
+    assert len(lines) == terminal.MOST_LINES == 15
+    assert max(map(len, lines[1:])) <= terminal.LONGEST
+    assert "--verbose" in lines[-2]
+
+
+@pytest.mark.parametrize("option", [[], ["--quiet"], ["--json"]])
+def test_a_step_that_failed_says_why_and_exits_with_1(called, tmp_path, option):
+    rng = np.random.default_rng(0)
+    np.savetxt(tmp_path / "plane.xyz", np.c_[rng.uniform(size=(3000, 2)), 0.0005 * rng.normal(size=3000)])
+    said = called("run", "plane.xyz", "-o", "out", "--steps", "spheres", *option, cwd=tmp_path)
+    assert said.returncode == 1
+    assert said.stderr.splitlines()[-1].startswith("error: spheres (ray) failed: no ball stands out of 3000 points")
+    if not option:
+        assert "Bolt balls is failed: no ball stands out" in said.stdout
+
+
+def test_results_of_another_input_are_not_replaced_by_default(called, frame, tmp_path):
+    store.write_scene(tmp_path / "s.h5", frame[0], None, {})
+    np.savetxt(tmp_path / "s.xyz", ball_cloud() / 1000.0)
+    assert called("run", "s.h5", cwd=tmp_path).returncode in (0, 1)
+    said = called("run", "s.xyz", "--steps", "spheres", cwd=tmp_path)
+    assert (said.returncode, "holds results of 's.h5', not of 's.xyz'" in said.stderr) == (2, True)
+
+
+def test_outputs_are_tried_before_the_work(called, tmp_path, monkeypatch):
+    np.savetxt(tmp_path / "good.xyz", ball_cloud() / 1000.0)
+    (tmp_path / "file").touch()
+    (tmp_path / "done").mkdir()
+
+    def work(*_, **__):
+        raise AssertionError("work before the output was tried")
+
+    for place in ("processor.pipeline.prepare", "processor.compare.compare.compare", "processor.batch.batch.find"):
+        monkeypatch.setattr(place, work)
+    for arguments in (
+        ("run", "good.xyz", "--steps", "spheres"),
+        ("compare", "good.xyz", "good.xyz"),
+        ("batch", "."),
+        ("validate",),
+        ("export", "done", "--what", "registered", "--format", "e57"),
+    ):
+        for out in ("/proc/out", "file/out"):
+            said = called(*arguments, "-o", out, cwd=tmp_path)
+            assert said.returncode == 3, said.stderr
+            assert "cannot be written" in said.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["done", "file", "good.xyz"]
+
+
+def test_help_of_run_lists_what_there_is(called):
+    said = called("run", "--help").stdout
+    for name, module in pipeline.step_modules().items():
+        assert all(word in said for word in (name, *module.METHODS))
+    assert all(name in " ".join(said.split()) for name in standards.standards())
+    assert "  5  a verdict that --fail-on names" in said
+    assert all(command in said for command, _ in help_text.EXAMPLES)
+    assert len(help_text.EXAMPLES) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["rum"], "no command 'rum' (did you mean 'run'?)"),
+        (["run", "god.xyz"], "god.xyz: there is no such file or folder (did you mean 'good.xyz'?)"),
+        (["run", "good.xyz", "--steps", "sphere"], "no step 'sphere' (did you mean 'spheres'?)"),
+        (["run", "good.xyz", "--steps", "spheres", "--method", "ransak"], "(did you mean 'ransac'?)"),
+        (["compare", "good.xyz", "godo.xyz", "-o", "c"], "(did you mean 'good.xyz'?)"),
+        (["batch", "fodler", "-o", "c"], "(did you mean 'folder'?)"),
+    ],
+)
+def test_a_slip_is_answered_with_the_name_that_is_like_it(called, tmp_path, arguments, said):
+    np.savetxt(tmp_path / "good.xyz", ball_cloud(count=200) / 1000.0)
+    (tmp_path / "folder").mkdir()
+    done = called(*arguments, cwd=tmp_path)
+    assert done.returncode in (2, 3)
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) <= 4
+
+
+@pytest.mark.parametrize("program", [main.commands, designgen_cli.commands])
+def test_every_command_has_json_and_debug(program):
+    for name, command in program.commands.items():
+        options = {option for parameter in command.params for option in parameter.opts}
+        assert {"--json", "--debug"} <= options, name
+
+
 def test_names_from_outside_are_shown_as_text(frame, tmp_path):
     scene, truth = frame
     store.write_scene(tmp_path / "s.h5", dataclasses.replace(scene, name="<script>alert(1)</script>"), truth, {})
@@ -304,7 +418,7 @@ def test_a_bridge_through_the_pipeline(tmp_path):
         (["run", "good.xyz", "-o", "out", "--steps", "preassemble"], 3, "design"),
         (["run", "good.xyz", "-o", "taken", "--steps", "spheres"], 2, "not empty"),
         (["run", "good.xyz", "-o", "out", "--units", "parsec"], 2, "parsec"),
-        (["run", "good.xyz"], 2, "output"),
+        (["run", "good.xyz"], 2, "--steps"),
         (["check", "taken"], 3, "no readable results"),
         (["report", "taken", "good.xyz"], 2, "no earlier results"),
         (["run", "good.xyz", "-o", "good.xyz/out", "--steps", "spheres"], 3, "good.xyz"),

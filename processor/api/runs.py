@@ -12,11 +12,11 @@ from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import InputError, Metric, Scene, Truth, Verdict, worst
+from processor.model import Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
 from processor.report import write_results
-from processor.scan_folder import fingerprint
+from processor.scan_folder import files, fingerprint
 
 Names = str | Sequence[str] | None
 
@@ -83,7 +83,7 @@ def read(path: str | Path, units: str | None = None) -> Scene:
     """
     source = Path(path)
     if not source.exists():
-        raise InputError(f"{source}: there is no such file or folder")
+        raise files.missing(source)
     return pipeline.read(source, units)
 
 
@@ -131,7 +131,7 @@ def run(
         return _run_scene(input_, out, pipeline.jobs_for(input_, wanted, methods, parameters, seed), lang, log)
     path = Path(input_)
     if not path.exists():
-        raise InputError(f"{path}: there is no such file or folder")
+        raise files.missing(path)
     if out is not None:
         write_results.check_output(out, path)
     if wanted:

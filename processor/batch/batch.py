@@ -27,7 +27,9 @@ from processor.jobs.runner import StoppedError
 from processor.language.messages import messages
 from processor.model import InputError, UsageError, reason
 from processor.results.names import JOB_RECORD
+from processor.scan_folder.files import missing
 from processor.store.atomic_file import replace_text
+from processor.store.writable import check_folder
 
 LOGS = "logs"
 LONGEST_NAME = 240  # bytes of a file's name, with room for prefix and suffix
@@ -66,9 +68,12 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
     """
     root, out = settings.root.resolve(), settings.out.resolve()
     if not root.is_dir():
-        raise InputError(f"{settings.root}: expected a folder, found {'a file' if root.exists() else 'nothing'}")
+        if not root.exists():
+            raise missing(settings.root)
+        raise InputError(f"{settings.root}: expected a folder, found a file")
     if out == root or root.is_relative_to(out):
         raise UsageError(f"{settings.out}: holds the inputs; name another folder for the results")
+    check_folder(out / LOGS)
     inputs = find(root, out)
     for name in [each.name for each in inputs.inputs if each.name.split("/", 1)[0] in (*summary.FILES, LOGS)]:
         inputs.left_out[name] = reason("batch.reserved-name")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from processor.model import Status
@@ -12,7 +12,7 @@ SummaryValues = dict[str, Any]
 VERDICTS = ("fail", "indeterminate", "pass")  # the worst first
 COLUMNS = {
     "steps": "steps, with the status of those that did not end well",
-    "verdict": "the worst of joints, chain and nodes against their limits",
+    "verdict": "the worst of all steps, against the limits",
     "joints_pass": "",
     "joints_fail": "",
     "joints_indeterminate": "",
@@ -37,11 +37,10 @@ def summary_values(results: Mapping[str, Any]) -> SummaryValues:
     """Return the values of a results.json by the names of COLUMNS; absent are those of steps not run and of nulls."""
     steps: Mapping[str, Mapping[str, Any]] = results["steps"]
     values: SummaryValues = {"steps": ", ".join(_with_status(*each) for each in step_status(results).items())}
-    verdicts: Counter[str] = Counter()
     if "preassemble" in steps:
-        verdicts += _add_preassembly(steps["preassemble"], values)
+        _add_preassembly(steps["preassemble"], values)
     if "spheres" in steps:
-        verdicts += _add_spheres(steps["spheres"], values)
+        _add_spheres(steps["spheres"], values)
     if "stitch" in steps:
         states = [scan.get("status") for scan in steps["stitch"].get("scans", [])]
         values |= {"scans_stitched": states.count("ok"), "scans_not_stitched": len(states) - states.count("ok")}
@@ -51,7 +50,7 @@ def summary_values(results: Mapping[str, Any]) -> SummaryValues:
         values |= {name: steps["deviation"].get(key) for name, key in zip(names, keys, strict=True)}
     if "defects" in steps:
         values["defects"] = len(steps["defects"].get("defects", []))
-    values["verdict"] = next((verdict for verdict in VERDICTS if verdicts[verdict]), None)
+    values["verdict"] = results.get("verdict") if results.get("verdict") in VERDICTS else None
     if results["checks"]:
         passed = sum(bool(check["passed"]) for check in results["checks"])
         values |= {"checks_passed": passed, "checks_missed": len(results["checks"]) - passed}
@@ -67,21 +66,15 @@ def _with_status(name: str, status: str) -> str:
     return name if status == Status.OK else f"{name} ({status})"
 
 
-def _add_preassembly(step: Mapping[str, Any], values: SummaryValues) -> Counter[str]:
+def _add_preassembly(step: Mapping[str, Any], values: SummaryValues) -> None:
     verdicts = Counter(str(joint.get("verdict")) for joint in step.get("joints", []) if joint.get("verdict"))
     values.update({f"joints_{name}": verdicts[name] for name in VERDICTS} if verdicts else {})
     for error in ("splicing", "linear"):
         for statistic in ("mean", "max"):
             values[f"{error}_{statistic}_mm"] = step.get(f"{error}_error", {}).get(statistic)
-    return verdicts + _count(chain.get("verdict") for chain in step.get("chain_limits", []))
 
 
-def _add_spheres(step: Mapping[str, Any], values: SummaryValues) -> Counter[str]:
+def _add_spheres(step: Mapping[str, Any], values: SummaryValues) -> None:
     flags = [ball.get("flag") for ball in step.get("balls", [])]
     present = len(flags) - flags.count("not-found")
     values |= {"balls_found": present, "balls_flagged": len(flags) - flags.count("ok")}
-    return _count((ball.get("movement") or {}).get("verdict") for ball in step.get("balls", []))
-
-
-def _count(verdicts: Iterable[Any]) -> Counter[str]:
-    return Counter(verdict for verdict in verdicts if verdict in VERDICTS)

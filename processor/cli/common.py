@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -40,23 +42,52 @@ def split_names(_: click.Context, __: click.Parameter, value: str | None) -> tup
     return tuple(name.strip() for name in value.split(",") if name.strip()) if value else ()
 
 
+def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --verbose, --quiet and --json, of which one at most is given."""
+    for option in (
+        click.option("--json", "as_json", is_flag=True, help="print results.json instead of lines"),
+        click.option("-q", "--quiet", is_flag=True, help="print the headline alone, and no progress"),
+        click.option("-v", "--verbose", is_flag=True, help="print the tables as well"),
+    ):
+        command = option(command)
+    return command
+
+
+@dataclass(frozen=True)
+class Shown:
+    """How much is printed, by --json, --verbose and --quiet."""
+
+    as_json: bool = False
+    verbose: bool = False
+    quiet: bool = False
+
+    def __post_init__(self) -> None:
+        if self.as_json + self.verbose + self.quiet > 1:
+            raise UsageError("--json, --verbose and --quiet exclude each other; give one of them")
+
+
 def show_results(
-    context: click.Context, output: Path, results: Results, as_json: bool, fail_on: str | None = None
+    context: click.Context, output: Path, results: Results, shown: Shown, fail_on: str | None = None
 ) -> None:
-    """Print what was found, the headline first, and set the exit code."""
-    from processor.report import all_tables, headline
-    from processor.report import table as report_table
+    """Print what was found, the headline first, and set the exit code; why a step failed is for standard error."""
+    from processor.report import headline, terminal
     from processor.results.names import REPORT_PAGE, RESULTS_JSON
 
-    if as_json:
+    page = str(output / REPORT_PAGE)
+    if shown.as_json:
         click.echo((output / RESULTS_JSON).read_text("utf-8"), nl=False)
+    elif shown.quiet:
+        click.echo(printable(headline.of_run(results.execution)))
     else:
-        click.echo(printable(headline.of_run(results.execution)) + "\n")
-        for table in all_tables.tables_of_run(results.execution, results.report):
-            if table.on_terminal:
-                click.echo(report_table.plain_text(table) + "\n")
-        click.echo(f"report: {output / REPORT_PAGE}")
+        write = terminal.verbose if shown.verbose else terminal.lines
+        for line in write(results.execution, results.report, page):
+            click.echo(line)
+    for line in terminal.failures(results.execution):
+        print_error_line(f"error: {line}")
     complete = all(result.status == Status.OK for result in results.steps.values())
+    failed = any(result.status == Status.FAILED for result in results.steps.values())
+    if failed:
+        context.exit(IN_PART)
     if not results.report.passed:
         context.exit(LIMIT_MISSED)
     context.exit(VERDICT if is_refused([results.verdict], fail_on) else DONE if complete else IN_PART)

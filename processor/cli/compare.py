@@ -52,7 +52,11 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
     from processor.compare import compare as comparing
     from processor.language.messages import messages
     from processor.report import comparison
+    from processor.scan_folder.files import missing
 
+    for path in (reference, compared):
+        if not path.exists():
+            raise missing(path)
     comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
     given = {name: value for name, value in options.items() if value is not None}
     result = comparing.compare(comparing.Request(reference, compared, **given), print_error_line)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import click
 
 from processor.cli import batch, check, compare, export, init, report, run, validate
+from processor.cli.help_text import Suggesting
 from processor.version import __version__
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=Suggesting, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="processor")
 def commands() -> None:
     """Check steel structures from laser scans.
 
-    Exit codes: 0 done, 1 done in part, 2 wrong usage, 3 bad input, 4 an accuracy limit was missed.
+    Exit codes: 0 done, 1 done in part, 2 wrong usage, 3 bad input, 4 an accuracy limit was missed, 5 a verdict that
+    --fail-on names.
     """
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from processor.cli.common import LANGUAGES, UNITS, debug_option, show_results
+from processor.cli.common import LANGUAGES, UNITS, Shown, debug_option, output_options, show_results
 
 
 @click.command()
@@ -14,11 +14,11 @@ from processor.cli.common import LANGUAGES, UNITS, debug_option, show_results
 @click.argument("input_", metavar="[INPUT]", required=False, type=click.Path(path_type=Path))
 @click.option("--units", type=click.Choice(UNITS), help="as given to the run")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
-@click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
+@output_options
 @debug_option
 @click.pass_context
 def report(
-    context: click.Context, output: Path, input_: Path | None, units: str | None, lang: str, as_json: bool
+    context: click.Context, /, output: Path, input_: Path | None, units: str | None, lang: str, **options: bool
 ) -> None:
     """Check and report again what is in OUT, without running its steps on INPUT anew.
 
@@ -34,4 +34,4 @@ def report(
     input_ = input_ or pipeline.find_input(output / RESULTS_H5)
     execution = pipeline.read_execution(output / RESULTS_H5, input_, units)
     results = runs.write(runs.Results(execution, evaluate(input_, execution)), output, lang)
-    show_results(context, output, results, as_json)
+    show_results(context, output, results, Shown(**options))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +11,24 @@ import click
 from processor.cli.common import (
     LANGUAGES,
     UNITS,
+    Shown,
     debug_option,
     fail_on_option,
+    output_options,
     print_error_line,
     show_results,
     split_names,
 )
+from processor.cli.help_text import RunCommand
+from processor.model import UsageError
+from processor.results.names import RESULTS_JSON
 
 
-@click.command()
+@click.command(cls=RunCommand)
 @click.argument("input_", metavar="INPUT", type=click.Path(path_type=Path))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of the results")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="folder of results  [default: INPUT-results, created here]"
+)
 @click.option("--steps", callback=split_names, metavar="A,B", help="instead of those of the input's kind")
 @click.option(
     "--method", "methods", callback=split_names, metavar="NAME[,NAME]", help="further ones are run for comparison"
@@ -30,15 +38,21 @@ from processor.cli.common import (
 @click.option("--seed", type=click.IntRange(min=0), help="of all randomness  [default: 0, or the parameters']")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
 @fail_on_option
-@click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
+@output_options
 @debug_option
 @click.pass_context
-def run(
-    context: click.Context, /, input_: Path, output: Path, fail_on: str | None, as_json: bool, **options: Any
-) -> None:
+def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: str | None, **options: Any) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
     from processor.api import runs
+    from processor.scan_folder.files import missing
 
+    shown = Shown(options["as_json"], options["verbose"], options["quiet"])
+    if not input_.exists():
+        raise missing(input_)
+    if output is None:
+        output = _default_output(input_)
+        if not shown.quiet:
+            print_error_line(f"results go to {output}, as -o names no folder")
     results = runs.run(
         input_,
         output,
@@ -48,6 +62,22 @@ def run(
         options["units"],
         options["seed"],
         lang=options["lang"],
-        log=print_error_line,
+        log=(lambda _: None) if shown.quiet else print_error_line,
     )
-    show_results(context, output, results, as_json, fail_on)
+    show_results(context, output, results, shown, fail_on)
+
+
+def _default_output(input_: Path) -> Path:
+    """Return the folder of results of an input in the current folder.
+
+    Raises UsageError where it holds results of an input of another name.
+    """
+    name = input_.resolve().name
+    output = Path(f"{Path(name).stem if input_.is_file() else name}-results")
+    try:
+        made_of = str(json.loads((output / RESULTS_JSON).read_text("utf-8")).get("input", name))
+    except (OSError, ValueError, AttributeError):
+        return output
+    if made_of != name:
+        raise UsageError(f"{output}: holds results of {made_of!r}, not of {name!r}; name a folder with -o")
+    return output

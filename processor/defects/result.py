@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from processor.limits.judging import JudgedLimits
 from processor.model import (
     Checked,
     Codes,
@@ -18,10 +19,12 @@ from processor.model import (
     Rows,
     Shorts,
     Status,
+    Verdict,
     Word,
     column,
     described,
     names,
+    newer,
     optional,
     reasons,
     words,
@@ -157,3 +160,9 @@ class Result(Checked):
     defects: Defects = dataclasses.field(default_factory=Defects)
     pictures: tuple[Picture, ...] = described((), json="")
     surface: SurfacePlaces = dataclasses.field(default_factory=SurfacePlaces, metadata={"json": ""})
+    limits: JudgedLimits | None = newer()
+
+    @property
+    def overall(self) -> Verdict:
+        """The worst verdict on the defects; none without a limit."""
+        return Verdict.NONE if self.limits is None else self.limits.overall

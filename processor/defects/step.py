@@ -8,11 +8,13 @@ given rate of false alarms. ``paper`` follows paper 004 as far as its one availa
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from processor.defects import baseline, detect
 from processor.defects.params import METHODS, Params
 from processor.defects.result import Result
+from processor.defects.verdicts import depths_and_areas
 from processor.model import InputError, Scene, UsageError
 
 __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "run"]
@@ -41,4 +43,5 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
     if not any(len(scan.points) for scan in scene.scans):
         raise InputError(f"{scene.name}: expected scans of the structure, found no points")
     method = baseline.defects if params.method == "paper" else detect.defects
-    return method(scene, params, dict(earlier or {}))
+    result = method(scene, params, dict(earlier or {}))
+    return replace(result, limits=depths_and_areas.judge(scene, result))

@@ -9,6 +9,7 @@ import numpy as np
 
 from processor.geometry.m3c2 import Distances
 from processor.geometry.surface_registration import Registration
+from processor.limits.judging import JudgedLimits
 from processor.model import (
     Checked,
     Floats,
@@ -16,9 +17,11 @@ from processor.model import (
     Reason,
     Rows,
     Status,
+    Verdict,
     Word,
     column,
     described,
+    newer,
     optional,
     reasons,
 )
@@ -117,3 +120,9 @@ class Result(Checked):
         default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64, "json": ""}
     )
     core: CorePoints = dataclasses.field(default_factory=CorePoints, metadata={"json": ""})
+    limits: JudgedLimits | None = newer()
+
+    @property
+    def overall(self) -> Verdict:
+        """The worst verdict on the deviations of components; none without a limit."""
+        return Verdict.NONE if self.limits is None else self.limits.overall

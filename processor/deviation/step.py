@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from processor.deviation import baseline, cloud, measure
+from processor.deviation import baseline, cloud, measure, verdicts
 from processor.deviation.params import METHODS, Params
 from processor.deviation.result import Result
 from processor.geometry import merging
@@ -45,8 +45,8 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
     scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio, (earlier or {}).get("stitch"))
     method = baseline.measure if params.method == "paper" else measure.measure
     result = method(scene, scan, vertices, origin, params)
-    if not scan.unplaced:
-        return result
-    first = reason("deviation.scans-unplaced", scans=", ".join(scan.unplaced))
-    status = Status.WEAK if result.status is Status.OK else result.status
-    return replace(result, status=status, reasons=(first, *result.reasons))
+    if scan.unplaced:
+        first = reason("deviation.scans-unplaced", scans=", ".join(scan.unplaced))
+        status = Status.WEAK if result.status is Status.OK else result.status
+        result = replace(result, status=status, reasons=(first, *result.reasons))
+    return replace(result, limits=verdicts.judge(scene, result, vertices, origin))

@@ -24,6 +24,7 @@ from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints
 
 Bools = npt.NDArray[np.bool_]
+LEAST_AREA = 1e-9  # mm2, twice that of a facet; smaller ones are left out
 
 SHARP_COS = 0.94  # facets that meet at more than 20 deg belong to different faces
 WALK_STEPS = 24
@@ -147,7 +148,7 @@ class MeshSurface:
 def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurface:
     """Prepare a mesh; searches start from samples about ``spacing_mm`` apart, which is less than a plate is thick."""
     cross, size = double_areas(vertices, faces)
-    used = size > 1e-9
+    used = size > LEAST_AREA
     faces, cross, size = faces[used], cross[used], size[used]
     normals = cross / size[:, None]
     count = np.maximum(1, np.ceil(0.5 * size / spacing_mm**2)).astype(np.int64)

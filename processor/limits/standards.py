@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from functools import lru_cache
 from importlib import resources
 from typing import Any
 
-from processor.model import Floats, InputError, Limit, Tolerance
+from processor.limits import measures
+from processor.model import Floats, InputError, Limit, Tolerance, did_you_mean
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -22,18 +24,16 @@ else:
 
 DEFAULT = "GB 50205-2020"
 NAN = float("nan")
-NODE_PLACE = "node_place_mm"
-# Limited by no standard here, but possibly by a project.
-OF_PROJECTS = (Limit(NODE_PLACE, "distance of a space frame's node from its nominal place"),)
+NODE_PLACE = measures.NODE_PLACE
+OF_PROJECTS = measures.of_projects()
+NOT_OF_LIMITS = ("class", "needs")  # keys of rows that are no fields of a limit
 
 
 @lru_cache(maxsize=1)
 def standards() -> Mapping[str, Tolerance]:
     """Return all standards by name; one with classes is both ``NAME`` (its class 1) and ``NAME class N``."""
-    folder = resources.files("processor.limits")
     tolerances: dict[str, Tolerance] = {}
-    for file in sorted((f for f in folder.iterdir() if f.name.endswith(".toml")), key=lambda f: f.name):
-        content = tomllib.loads(file.read_text("utf-8"))
+    for content in files():
         name, rows = content["standard"], content["limit"]
         classes = sorted({row["class"] for row in rows if "class" in row})
         for suffix, number in [("", 1), *((f" class {n}", n) for n in classes)]:
@@ -42,8 +42,15 @@ def standards() -> Mapping[str, Tolerance]:
     return tolerances
 
 
+def files() -> Iterator[dict[str, Any]]:
+    """Yield the content of each file of limits: ``standard``, ``edition`` and the rows ``limit``."""
+    folder = resources.files("processor.limits")
+    for file in sorted((f for f in folder.iterdir() if f.name.endswith(".toml")), key=lambda f: f.name):
+        yield tomllib.loads(file.read_text("utf-8"))
+
+
 def _limit(row: Mapping[str, Any]) -> Limit:
-    return Limit(**{key: value for key, value in row.items() if key != "class"})
+    return Limit(**{key: value for key, value in row.items() if key not in NOT_OF_LIMITS})
 
 
 def load(standard: str) -> Tolerance:
@@ -51,7 +58,8 @@ def load(standard: str) -> Tolerance:
     known = standards()
     if standard not in known:
         raise InputError(
-            f"unknown standard {standard!r}; expected one of {', '.join(known)}, or limits given as numbers"
+            f"unknown standard {standard!r}{did_you_mean(standard, known)}; expected one of {', '.join(known)}, "
+            "or limits given as numbers"
         )
     return known[standard]
 
@@ -80,28 +88,53 @@ def two_sided(limit: Limit) -> bool:
     return not (math.isnan(limit.low) and math.isnan(limit.low_ratio))
 
 
-def override(base: Tolerance, values: Mapping[str, Floats], source: str, root_gap_mm: float = 0.0) -> Tolerance:
+def at_least(limit: Limit) -> bool:
+    """Whether a limit has a lower bound alone; then a project gives the least value."""
+    return two_sided(limit) and math.isnan(limit.high) and math.isnan(limit.high_ratio)
+
+
+def names_component(limit: Limit, component: str) -> bool:
+    """Whether a limit holds for a component of this name: one of all, or whose pattern fits."""
+    return limit.component is None or fnmatchcase(component, limit.component)
+
+
+def override(
+    base: Tolerance,
+    values: Mapping[str, Floats],
+    source: str,
+    root_gap_mm: float = 0.0,
+    of_components: Mapping[str, Mapping[str, Floats]] | None = None,
+) -> Tolerance:
     """Replace limits of a standard by those of a project, or add them.
 
-    ``values`` maps a key to the greatest value (1,), or to the least and the greatest (2,). These limits count as
-    verified. ``source`` names the file that gives them.
+    ``values`` maps a key to the greatest value (1,), to the least where only that is limited, or to the least and the
+    greatest (2,). ``of_components`` has such values by a pattern of the components' names; they come after those of
+    all. These limits count as verified. ``source`` names the file that gives them.
     """
     known = choice(base)
-    given = {}
-    for key, value in values.items():
-        given[key] = replace(
-            known[key],
-            low=float(value[0]) if len(value) == 2 else NAN,
-            high=float(value[-1]),
-            low_ratio=NAN,
-            high_ratio=NAN,
-            rule="",
-            clause="",
-            verified=True,
-            source=source,
-        )
+    given = {key: _given(known[key], value, source) for key, value in values.items()}
     limits = [given.pop(limit.key, limit) for limit in base.limits]
-    return replace(base, limits=(*limits, *given.values()), root_gap_mm=root_gap_mm)
+    own = [
+        replace(_given(known[key], value, source), component=pattern)
+        for pattern, of_one in (of_components or {}).items()
+        for key, value in of_one.items()
+    ]
+    return replace(base, limits=(*limits, *given.values(), *own), root_gap_mm=root_gap_mm)
+
+
+def _given(limit: Limit, value: Floats, source: str) -> Limit:
+    least_alone = at_least(limit)
+    return replace(
+        limit,
+        low=float(value[0]) if len(value) == 2 or least_alone else NAN,
+        high=NAN if least_alone else float(value[-1]),
+        low_ratio=NAN,
+        high_ratio=NAN,
+        rule="",
+        clause="",
+        verified=True,
+        source=source,
+    )
 
 
 def bounds(limit: Limit, sizes_mm: Mapping[str, float]) -> tuple[float, float]:

@@ -7,15 +7,20 @@ from collections.abc import Sequence
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, text
+from processor.limits.judging import JudgedLimits
 from processor.model import METRIC_NAMES, Metric, Statistic, StepRun
 from processor.pipeline import Execution
+from processor.report.limit_table import limit_table
 from processor.report.step_report import step_report
 from processor.report.table import Table
+
+LIMITS = "-limits"  # ends the file of what a step compared with limits
 
 
 def tables_of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     """Tables of a step's result, with those of other methods on the same scene."""
-    return step_report(run.step).tables((run, *others), report)
+    limits: JudgedLimits | None = getattr(run.result, "limits", None)
+    return [*limit_table(limits, f"{run.step}{LIMITS}"), *step_report(run.step).tables((run, *others), report)]
 
 
 def checks_table(report: ErrorReport) -> Table:

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
+import numpy as np
+
 from processor.language.messages import Text, messages, text
-from processor.model import StepRun
+from processor.limits.judging import JudgedLimits
+from processor.model import StepRun, Verdict
 from processor.pipeline import Execution
 from processor.report.step_report import step_report
+
+VERDICTS = {
+    Verdict.FAIL: "{count} fail",
+    Verdict.INDETERMINATE: "{count} indeterminate",
+    Verdict.PASS: "{count} pass",
+}  # the worst first
 
 
 def of_run(execution: Execution, lang: str = "en") -> str:
@@ -16,4 +27,25 @@ def of_run(execution: Execution, lang: str = "en") -> str:
 def of_step(run: StepRun) -> Text:
     """Return the headline of one step."""
     report_of = step_report(run.step)
-    return text("{step}: {head}", step=report_of.title, head=report_of.summary(run.result)[0])
+    head = report_of.summary(run.result)[0]
+    limits: JudgedLimits | None = getattr(run.result, "limits", None)
+    if limits is None:
+        return text("{step}: {head}", step=report_of.title, head=head)
+    return text("{step}: {head}; {verdicts}", step=report_of.title, head=head, verdicts=of_limits(limits))
+
+
+def of_limits(limits: JudgedLimits) -> Text:
+    """Return how many comparisons with limits have which verdict."""
+    counts = Counter(limits.verdict)
+    verdicts = [text(template, count=counts[word]) for word, template in VERDICTS.items() if counts[word]]
+    return text("of {count} {count:?limit|limits} {verdicts}", count=len(limits), verdicts=verdicts)
+
+
+def unverified(execution: Execution) -> list[str]:
+    """Name the clauses of limits that were used and not compared with the published text of their standard."""
+    clauses: set[str] = set()
+    for run, _ in execution.by_step():
+        for limits in (getattr(run.result, "limits", None), *step_report(run.step).limits(run.result)):
+            if limits is not None:
+                clauses |= {limits.clause[k] for k in np.flatnonzero(~limits.verified).tolist()}
+    return sorted(clauses)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import itertools
 import json
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -99,7 +99,15 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]
             method = text("Method {method}. {text}", method=run.method, text=body)
         verdicts.append({"tone": _tone(run), "head": headline.of_step(run), "text": method})
         verdicts += [{"tone": "", "head": head, "text": body} for head, body in report_of.further_verdicts(run.result)]
+    if sources := headline.unverified(execution):
+        verdicts.append({"tone": "", "head": text("Limits that are not verified"), "text": _unverified(sources)})
     return [*verdicts, _truth(report)]
+
+
+def _unverified(sources: Sequence[str]) -> Text:
+    return text(
+        "{sources}: not compared with the published text; do so before verdicts are relied on.", sources=sources
+    )
 
 
 def _truth(report: ErrorReport) -> dict[str, Any]:
@@ -145,8 +153,8 @@ def _sections(
             {
                 "title": step_report(run.step).title,
                 "message": _message(run.result, lang),
-                "lead": [_table(table, lang) for table in tables if table.file in LEAD],
-                "tables": [_table(table, lang) for table in tables if table.file not in LEAD],
+                "lead": [_table(table, lang) for table in tables if _leads(table)],
+                "tables": [_table(table, lang) for table in tables if not _leads(table)],
                 "step": run.step,
                 "live": run.step in live,
                 "figures": [
@@ -169,6 +177,11 @@ def _sections(
             }
         )
     return sections
+
+
+def _leads(table: Table) -> bool:
+    """Whether a table stands above the figures: what to do, and what is compared with limits."""
+    return table.file in LEAD or table.file.endswith(all_tables.LIMITS)
 
 
 def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,9 @@ from processor.report.table import Table
 class StepReport:
     """Functions that make the report of a step.
 
-    ``runs`` are its result, then those of other methods on the same scene for comparison.
+    ``to_do`` are the sentences of what is to be done first, ``why`` the reasons of a status that is not ok, ``limits``
+    records with columns ``clause`` and ``verified`` beside ``result.limits``. ``runs`` are its result, then those of
+    other methods on the same scene for comparison.
     """
 
     title: str | Message
@@ -27,6 +29,9 @@ class StepReport:
     tables: Callable[[Sequence[StepRun], ErrorReport], list[Table]]
     figures: Callable[[Execution, Sequence[StepRun], ErrorReport], CaptionedPngs]  # file names are the step's own
     further_verdicts: Callable[[Any], list[tuple[Any, Any]]] = lambda _: []  # headings and texts beside the verdict
+    to_do: Callable[[Any], Iterable[Any]] = lambda _: ()
+    why: Callable[[Any], Iterable[Any]] = lambda result: result.reasons
+    limits: Callable[[Any], Iterable[Any]] = lambda _: ()
     files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
     interactive_data: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None
 

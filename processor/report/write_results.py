@@ -16,6 +16,7 @@ from processor.results.names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5
 from processor.results.to_json import results_json
 from processor.store import store
 from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
+from processor.store.writable import check_folder
 
 # The record of a batch's job is replaced with its results: without it, the batch does the job again.
 OWN_NAMES = (RESULTS_JSON, RESULTS_H5, REPORT_PAGE, FIGURES, JOB_RECORD)
@@ -37,6 +38,7 @@ def check_output(out: Path, source: Path | None, mark: str = RESULTS_JSON, names
     others = [name for name in inside if name not in names and not name.endswith(OWN_ENDINGS)]
     if others:
         raise UsageError(f"{out}: holds more than earlier results ({others[0]}); take it out or name another folder")
+    check_folder(out)
 
 
 def write_results(out: Path, execution: Execution, report: ErrorReport, lang: str = "en") -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.model import Floats, InputError, UsageError
+from processor.model import Floats, InputError, UsageError, did_you_mean
 from processor.scan_folder.units import known_unit
 
 
@@ -52,7 +52,8 @@ class Table:
         """Raise InputError for a key that is not in ``known``."""
         unknown = [key for key in self.values if key not in known]
         if unknown:
-            raise InputError(f"{self.where}: unknown key {unknown[0]!r}; known are {', '.join(known)}")
+            like = did_you_mean(unknown[0], known)
+            raise InputError(f"{self.where}: unknown key {unknown[0]!r}{like}; known are {', '.join(known)}")
 
     def _error(self, key: str, expected: str) -> InputError:
         value = _kind(self.values[key]) if key in self.values else "nothing"

@@ -14,6 +14,7 @@ import numpy as np
 from processor.geometry import box_girder
 from processor.model import (
     KEY_POINTS,
+    SUPPORTS,
     ArchDesign,
     DesignBodies,
     DesignPart,
@@ -22,6 +23,7 @@ from processor.model import (
     InputError,
     Ints,
     UsageError,
+    did_you_mean,
 )
 from processor.scan_folder import cad
 from processor.scan_folder.checked_toml import Table, existing_file_in
@@ -230,9 +232,12 @@ def _frame(design: Table) -> FrameDesign:
     design.only(("units", "kind", "name", "unsure", "nodes", "members"))
     scale = MM_PER_UNIT[design.unit("units")]
     ids, centres, radii = [], [], []
+    supports, deflections = [], []
     for node in design.tables("nodes"):
-        node.only(("id", "centre", "radius"))
+        node.only(("id", "centre", "radius", "support", "deflection"))
         ids.append(node.integer("id"))
+        supports.append(_support(node))
+        deflections.append(node.number("deflection", float("nan"), positive=True) * scale)
         centres.append(node.array("centre", 3) * scale)
         radii.append(node.number("radius", positive=True) * scale)
     _check_ids(design.where, ids)
@@ -255,7 +260,20 @@ def _frame(design: Table) -> FrameDesign:
         member_a=np.array(a, np.int64),
         member_b=np.array(b, np.int64),
         tube_diameters=np.array(diameters),
+        supports=np.array(supports, np.uint8) if any(supports) else np.empty(0, np.uint8),
+        deflections=np.array(deflections) if np.isfinite(deflections).any() else np.empty(0),
     )
+
+
+def _support(node: Table) -> int:
+    """Return the kind of support that a node is, as :class:`FrameDesign` has it: 0 of none."""
+    kind = node.text("support", "")
+    if kind and kind not in SUPPORTS:
+        raise InputError(
+            f"{node.where}: expected one of {', '.join(SUPPORTS)} as 'support', found {kind!r}"
+            f"{did_you_mean(kind, SUPPORTS)}"
+        )
+    return SUPPORTS.index(kind) + 1 if kind else 0
 
 
 def _check_ids(where: str, ids: list[int]) -> None:

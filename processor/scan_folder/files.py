@@ -6,6 +6,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from processor import readers
+from processor.model import InputError, did_you_mean
 
 PROJECT = "project.toml"
 TRUTH = "truth.h5"
@@ -15,6 +16,12 @@ CONTROL = "control.csv"
 DESIGNS = ("design.json", "design.csv")
 SCANS = "scans"
 NOT_SCANS = ("design.csv", PICKS, "deviation.csv", CONTROL, "index.csv")
+
+
+def missing(path: Path) -> InputError:
+    """Return the error of a path that leads nowhere, with the names in its folder that are most like it."""
+    near = sorted(one.name for one in path.parent.iterdir()) if path.parent.is_dir() else []
+    return InputError(f"{path}: there is no such file or folder{did_you_mean(path.name, near)}")
 
 
 def scan_files(folder: Path, excluded: Collection[Path | None]) -> list[Path]:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from processor import readers, store
-from processor.limits import standards
 from processor.model import (
     KINDS,
     ArchDesign,
@@ -23,6 +22,7 @@ from processor.model import (
     Stations,
     StructureDesign,
     Tolerance,
+    did_you_mean,
 )
 from processor.progress import tracked
 from processor.readers import RawScan
@@ -38,6 +38,7 @@ from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
 from processor.scan_folder.shapes import files as surface_files
 from processor.scan_folder.text_files import read_text
+from processor.scan_folder.tolerance import read_tolerance
 from processor.scan_folder.units import MM_PER_UNIT, known_unit
 
 if sys.version_info >= (3, 11):
@@ -172,7 +173,9 @@ def _read_project(folder: Path) -> _Project:
     table.only(KEYS)
     kind = table.text("kind", "")
     if kind and kind not in KINDS:
-        raise InputError(f"{path}: unknown kind {kind!r}; expected one of {', '.join(KINDS)}")
+        like = did_you_mean(kind, KINDS)
+        raise InputError(f"{path}: unknown kind {kind!r}{like}; expected one of {', '.join(KINDS)}")
+
     named = table.text("design", "") or next((name for name in DESIGNS if (folder / name).exists()), "")
     design = existing_file_in(folder, named, str(path)) if named else None
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
@@ -187,7 +190,7 @@ def _read_project(folder: Path) -> _Project:
         design_units=table.unit("design_units", ""),
         temperature_C=table.number("temperature_C", NAN),
         entries=tuple(entries or [_Entry(scan) for scan in _open_scans(folder, (design, control_file))]),
-        tolerance=_tolerance(table),
+        tolerance=read_tolerance(table),
         control=control,
         guessed=guessed,
     )
@@ -199,29 +202,6 @@ def _guess(folder: Path) -> Guess | None:
         return None
     guessed = guess.guess(folder)
     return guessed if guessed.made else None
-
-
-def _tolerance(project: Table) -> Tolerance | None:
-    """Read [tolerance]: a standard, limits of the project, or both; None without any."""
-    if not project.values.get("tolerance"):
-        return None
-    table = project.table("tolerance")
-    standard = table.text("standard", "")
-    try:
-        base = standards.load(standard) if standard else Tolerance()
-        choice = standards.choice(base)
-    except InputError as error:
-        raise InputError(f"{table.where}: {error}") from None
-    table.only(("standard", "root_gap_mm", *choice))
-    limits = {}
-    for key in table.values:
-        if key in choice:
-            limit = table.array(key, 2) if standards.two_sided(choice[key]) else np.array([table.number(key)])
-            if not (limit[0] < limit[-1] if len(limit) == 2 else limit[0] > 0.0):
-                expected = "a number above 0" if len(limit) == 1 else "two numbers, least and greatest"
-                raise InputError(f"{table.where}: expected {expected} as {key!r}, found {limit.tolist()}")
-            limits[key] = limit
-    return standards.override(base, limits, PROJECT, table.number("root_gap_mm", 0.0))
 
 
 def _entry(folder: Path, scan: Table) -> _Entry:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from processor.limits.judging import JudgedLimits
 from processor.model import (
     Checked,
     Floats,
@@ -20,6 +21,7 @@ from processor.model import (
     column,
     described,
     names,
+    newer,
     reasons,
     words,
     worst,
@@ -182,6 +184,7 @@ class Result(Checked):
     stations: StationCorrections = dataclasses.field(default_factory=StationCorrections, metadata={"optional": True})
     datum: tuple[Reason, ...] = described((), reasons="", optional=True)  # what fixes all stations together
     control: ControlDeviations = dataclasses.field(default_factory=ControlDeviations, metadata={"optional": True})
+    limits: JudgedLimits | None = newer()  # of supports and deflections; those of nodes are in ``balls``
 
     @property
     def has_bounds(self) -> bool:
@@ -190,5 +193,5 @@ class Result(Checked):
 
     @property
     def overall(self) -> Verdict:
-        """The worst verdict of the nodes' movements."""
-        return worst(self.balls.verdict)
+        """The worst verdict on the nodes' movements, supports and deflections."""
+        return worst((*self.balls.verdict, *(() if self.limits is None else self.limits.verdict)))

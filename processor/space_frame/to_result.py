@@ -8,7 +8,7 @@ import numpy as np
 
 from processor.limits import standards
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
-from processor.space_frame import catalogue
+from processor.space_frame import catalogue, supports
 from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.design.matching import Matching
 from processor.space_frame.design.movement import Movement, size_of, verdict_of
@@ -79,7 +79,7 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
     balls = _balls(extracted, source.origin, scene)
     matched, movements, stations = extracted.matching, extracted.movement, extracted.stations
     limit = standards.find(standards.default_for(scene.tolerance), standards.NODE_PLACE)
-    reference = pose = None
+    reference = pose = judged = None
     if movements is not None:
         reference = MovementReference(
             gauge=movements.gauge,
@@ -87,6 +87,9 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
             limit_source="" if limit is None else limit.source,
         )
         balls = _with_movements(balls, movements, reference.limit, matched is not None and matched.status is Status.OK)
+        if scene.frame is not None:
+            sure = matched is not None and matched.status is Status.OK
+            judged = supports.judge(balls, scene.frame, standards.default_for(scene.tolerance), sure)
     if matched is not None:
         pose = DesignPose(
             status=matched.status,
@@ -105,6 +108,7 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
         stations=StationCorrections() if stations is None else _corrections(stations, source),
         datum=() if stations is None else stations.datum,
         control=ControlDeviations() if stations is None else _control(stations),
+        limits=judged,
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.limits.judging import JudgedLimits
 from processor.model import (
     Checked,
     Flags,
@@ -15,6 +16,7 @@ from processor.model import (
     Reason,
     Rows,
     Status,
+    Verdict,
     Word,
     column,
     described,
@@ -138,6 +140,12 @@ class Result(Checked):
     frame: ProjectFrame = described(ProjectFrame.PRCS, words=ProjectFrame)
     T_GLCS_PRCS: Floats = optional(4, 4)
     control: ControlPoints | None = newer()
+    limits: JudgedLimits | None = newer()
+
+    @property
+    def overall(self) -> Verdict:
+        """The worst verdict on the network of scans; none without a limit."""
+        return Verdict.NONE if self.limits is None else self.limits.overall
 
     @property
     def by_control(self) -> bool:

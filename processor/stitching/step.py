@@ -9,12 +9,13 @@ points that span a plane fix the frame of either method's result and correct its
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from processor.adjustment.scanner_class import VIEW_MM
 from processor.model import Floats, InputError, Reason, Scan, Scene, UsageError, reason
-from processor.stitching import automatic, three_point, to_result
+from processor.stitching import automatic, three_point, to_result, verdicts
 from processor.stitching.params import METHODS, Params
 from processor.stitching.result import Result
 from processor.stitching.three_point import PairFit, Picked
@@ -66,7 +67,8 @@ def run(scene: Scene, params: Params) -> Result:
         network = _by_picks(scene.scans, picked, reference, params)
     else:
         network = _automatic(scene.scans, picked, reference, params)
-    return to_result.result(scene.scans, to_result.controlled(network, scene), reference, params)
+    result = to_result.result(scene.scans, to_result.controlled(network, scene), reference, params)
+    return replace(result, limits=verdicts.judge(scene, result))
 
 
 def _automatic(scans: Sequence[Scan], picked: Picked, reference: int, params: Params) -> Network:

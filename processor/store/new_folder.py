@@ -11,12 +11,14 @@ from pathlib import Path
 
 from processor.model import InputError, UsageError
 from processor.store.atomic_file import sync
+from processor.store.writable import check_folder
 
 
 def check_new(folder: Path) -> None:
-    """Raise UsageError where a folder exists and is not empty, or is a file."""
+    """Raise UsageError where a folder exists and is not empty, or is a file; InputError where it cannot be made."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder}: exists and is not empty; name a new folder")
+    check_folder(folder)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from processor.language.messages import printable
 from processor.model import InputError, UsageError
+from processor.store.writable import check_folder
 from processor.validation import matrix as matrices
 from processor.validation import night as nights
 from processor.validation import running
@@ -32,6 +33,7 @@ def run(
 ) -> Summary:
     """Run a night; failed cells are reported on standard error, with a progress bar if that is a terminal."""
     night = _night(night)
+    check_folder(out / nights.HISTORY)
     wanted = matrices.read(matrix or matrices.DEFAULT, full)
     with (
         nights.locked_output(out) as scratch,

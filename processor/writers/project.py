@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.model import KEY_POINTS, ArchDesign, FrameDesign, Scan, Scene
+from processor.model import KEY_POINTS, SUPPORTS, ArchDesign, FrameDesign, Scan, Scene
 from processor.writers.ply import write_mesh
 
 
@@ -92,10 +92,16 @@ def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
 
 
 def _frame_design(design: FrameDesign) -> dict[str, Any]:
-    nodes = [
+    nodes: list[dict[str, Any]] = [
         {"id": int(i), "centre": centre.tolist(), "radius": float(radius)}
         for i, centre, radius in zip(design.ids, design.centres, design.radii, strict=True)
     ]
+    for node, support in zip(nodes, design.supports.tolist(), strict=False):
+        if support:
+            node["support"] = SUPPORTS[support - 1]
+    for node, deflection in zip(nodes, design.deflections.tolist(), strict=False):
+        if deflection > 0.0:
+            node["deflection"] = deflection
     members = [
         {"a": int(a), "b": int(b), "tube_diameter": float(d)}
         for a, b, d in zip(design.member_a, design.member_b, design.tube_diameters, strict=True)

@@ -583,7 +583,7 @@ def test_roots_and_outputs_refused(tmp_path):
     (tmp_path / "file").touch()
     for root, out, error, says in (
         ("root", "out", InputError, "found none"),
-        ("none", "out", InputError, "expected a folder, found nothing"),
+        ("none", "out", InputError, "there is no such file or folder"),
         ("file", "out", InputError, "expected a folder, found a file"),
         ("root", ".", UsageError, "holds the inputs"),
         ("root", "root", UsageError, "holds the inputs"),

@@ -15,6 +15,7 @@ from scipy.special import ndtr
 
 from processor.adjustment import extremes
 from processor.limits import standards as limits_of
+from processor.limits.guard_band import guard_band
 from processor.model import NORMAL_95, Floats, Limit, Reason, Tolerance, Verdict, reason, worst
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.member import Member
@@ -24,7 +25,6 @@ from processor.preassembly.verdicts.joints import (
     Conformity,
     LimitOrigin,
     compose,
-    guard_band,
     of_project,
 )
 

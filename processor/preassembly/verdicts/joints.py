@@ -17,6 +17,8 @@ import numpy.typing as npt
 
 from processor.adjustment.extremes import draws
 from processor.limits import standards as limits_of
+from processor.limits.guard_band import guard_band
+from processor.limits.judging import clause_of
 from processor.model import (
     Checked,
     Flags,
@@ -45,13 +47,6 @@ class LimitOrigin(Word):
     """Where limits are from, if from no standard."""
 
     PROJECT = "the project"
-
-
-class LimitStanding(Word):
-    """Whether a limit was compared with the standard's published text."""
-
-    VERIFIED = "verified"
-    NOT_VERIFIED = "NOT VERIFIED"
 
 
 @dataclass(frozen=True)
@@ -185,7 +180,7 @@ def compose(
         high=np.array([comparison.high for comparison in comparisons]),
         verdict=tuple(comparison.verdict for comparison in comparisons),
         probability=np.array([comparison.probability for comparison in comparisons]),
-        clause=tuple(f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source for limit in limits),
+        clause=tuple(clause_of(limit, tolerance) for limit in limits),
         edition=tuple("" if of_project(limit) else tolerance.edition for limit in limits),
         source=tuple(limit.source for limit in limits),
         verified=np.array([limit.verified for limit in limits], np.bool_),
@@ -214,13 +209,6 @@ def left_open(conformity: Conformity, doubts: tuple[Reason, ...]) -> Conformity:
 def of_project(limit: Limit) -> bool:
     """Whether the project gave the limit itself: of a standard's rows only those with a clause are verified."""
     return limit.verified and not limit.clause
-
-
-def guard_band(interval: tuple[float, float], low: float, high: float) -> Verdict:
-    """Judge a 95 % interval against bounds: pass wholly within, fail wholly beyond one, else indeterminate."""
-    if interval[0] >= low and interval[1] <= high:
-        return Verdict.PASS
-    return Verdict.FAIL if interval[1] < low or interval[0] > high else Verdict.INDETERMINATE
 
 
 def conforms(gaps: Floats, points: Floats, allowed: Allowed) -> Bools:

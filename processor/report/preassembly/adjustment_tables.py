@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from processor.geometry import rigid
@@ -11,7 +11,8 @@ from processor.language.messages import Message, label, text
 from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.result import Adjustment, Result
 from processor.preassembly.verdicts.joint_measures import JointQuantity
-from processor.preassembly.verdicts.joints import ComparedLimits, LimitStanding
+from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
+from processor.report.limit_table import with_unverified
 from processor.report.table import NAN, Table
 
 TO_DO, LIMITS, CHAIN = "what-to-do", "limits", "limits-chain"
@@ -40,10 +41,7 @@ _NOTE = text(
     "interval keeps the limit; fail: the whole interval exceeds it; indeterminate: the limit lies within it. "
     "Probabilities: as it is, and after the proposed work."
 )
-LIMITS_NOTE = text(
-    "Least and greatest allowed; a dash is no bound. Limits that are not verified were not compared with the "
-    "standard's text: do so before the verdicts are relied on."
-)
+LIMITS_NOTE = text("Least and greatest allowed; a dash is no bound, or one that depends on a size that is not known.")
 CHAIN_NOTE = text(
     "Span and length of a unit: the distance of the outer ends, less the design's. Inner arc, axis and elevation: the "
     "bottom edges at all chainages, of which the one nearest to its limit is shown, its interval widened for their "
@@ -141,7 +139,7 @@ def _joint_rows(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
 
 def _limits(adjustment: Adjustment, method: str) -> Table:
     columns = (
-        "joint", "limit", "verdict", "standing", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability",
+        "joint", "limit", "verdict", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability",
         "clause",
     )  # fmt: skip
     rows = tuple(
@@ -149,23 +147,28 @@ def _limits(adjustment: Adjustment, method: str) -> Table:
         for joint, conformity in zip(adjustment.joints.name, adjustment.joints.conformity, strict=True)
         for row in _limit_rows(conformity.limits)
     )
-    return Table(text("Limits, method {method} (mm)", method=method), columns, rows, file=LIMITS, note=LIMITS_NOTE)
+    note = with_unverified(LIMITS_NOTE, _unverified(adjustment.joints.conformity))
+    return Table(text("Limits, method {method} (mm)", method=method), columns, rows, file=LIMITS, note=note)
+
+
+def _unverified(judged: Sequence[Conformity]) -> Iterator[str]:
+    """Yield the clauses of limits that were not compared with the standard's text."""
+    for conformity in judged:
+        limits = conformity.limits
+        yield from (clause for clause, verified in zip(limits.clause, limits.verified, strict=True) if not verified)
 
 
 def _limit_rows(limits: ComparedLimits) -> Iterator[tuple[Any, ...]]:
     for k, quantity in enumerate(limits.what):
-        standing: Message = LimitStanding.VERIFIED if limits.verified[k] else LimitStanding.NOT_VERIFIED
-        if not limits.bounds_known[k]:
-            standing = text("{standing}; depends on a size that is not known", standing=standing)
         numbers = (limits.value, limits.ci95, limits.low, limits.high, limits.probability)
         values = (float(column[k]) for column in numbers)
-        yield (label(quantity), limits.verdict[k], standing, *values, label(limits.clause[k]))
+        yield (label(quantity), limits.verdict[k], *values, label(limits.clause[k]))
 
 
 def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     """Yield the limits of the whole chain, and those stated ones that nothing is compared with."""
     columns = (
-        "limit", "verdict", "standing", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability", "clause",
+        "limit", "verdict", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability", "clause",
         "edition", "source",
     )  # fmt: skip
     rows = tuple(
@@ -177,7 +180,7 @@ def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     )
     if rows:
         title = text("Limits of the whole chain, method {method} (mm)", method=method)
-        yield Table(title, columns, rows, file=CHAIN, note=CHAIN_NOTE)
+        yield Table(title, columns, rows, file=CHAIN, note=with_unverified(CHAIN_NOTE, _unverified(adjustment.chain)))
     if adjustment.unused_limits:
         yield Table(
             text("Limits that nothing is compared with"),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import collections
+from collections.abc import Iterator
 
 import numpy as np
 
 from processor.language.messages import Message, Text, text
 from processor.model import Floats, Status, Verdict
 from processor.preassembly.result import MeanMax, Result
+from processor.preassembly.verdicts.joints import ComparedLimits
 from processor.report.preassembly import figures, live_data, tables
 from processor.report.step_report import StepReport
 
@@ -92,11 +94,44 @@ def _with_ci95(value: float, ci95: float) -> Text:
     return text("{value} ± {ci95}", value=value, ci95=ci95)
 
 
+def _to_do(result: Result) -> Iterator[Message]:
+    """Yield the work at the joints that do not pass, then the scan that would help."""
+    if result.adjustment is None:
+        return
+    joints = result.adjustment.joints
+    for name, verdict, proposal in zip(joints.name, result.joints.verdict, joints.proposal, strict=True):
+        if verdict is not Verdict.PASS:
+            sentence = text("{reasons:.}", reasons=proposal.reasons)
+            yield text("joint {joint} ({verdict}): {sentence}", joint=name, verdict=verdict, sentence=sentence)
+    yield from result.adjustment.advice[:1]
+
+
+def _why(result: Result) -> Iterator[Message]:
+    """Yield the reasons of the components that are not ok, those of the whole where there are none."""
+    parts = result.components
+    found = [
+        text("{part} {status}: {reasons}", part=name, status=status, reasons=reasons)
+        for name, status, reasons in zip(parts.name, parts.status, parts.reasons, strict=True)
+        if status != Status.OK
+    ]
+    yield from found or result.reasons
+
+
+def _limits(result: Result) -> list[ComparedLimits]:
+    adjustment = result.adjustment
+    if adjustment is None:
+        return []
+    return [one.limits for one in (*adjustment.joints.conformity, *adjustment.chain)]
+
+
 REPORT = StepReport(
     title=text("Preassembly"),
     summary=_summary,
     tables=tables.step_tables,
     figures=lambda execution, runs, _: figures.draw(execution.scene, runs),
     further_verdicts=_further,
+    to_do=_to_do,
+    why=_why,
+    limits=_limits,
     interactive_data=live_data.live_data,
 )

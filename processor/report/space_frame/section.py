@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import collections
+from collections.abc import Iterator
 
 from processor.language.messages import Message, text
-from processor.model import StepRun
+from processor.model import Status, StepRun
 from processor.pipeline import Execution
 from processor.report.space_frame import close_ups, dxf, figures, live_data, tables
 from processor.report.step_report import StepReport
@@ -34,11 +35,27 @@ def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
     return files
 
 
+def _why(result: Result) -> Iterator[Message]:
+    """Yield the reasons of flags, the most frequent flag's ball first as an example; those of the step before them."""
+    if (result.matching is not None and result.matching.status is not Status.OK) or not len(result.balls):
+        yield from result.reasons
+    balls = result.balls
+    for flag in (Flag.NOT_FOUND, Flag.WRONG_SIZE, Flag.LOW_CONFIDENCE):
+        rows = [row for row, one in enumerate(balls.flag) if one is flag]
+        if rows:
+            ball = int(balls.ids[rows[0]])
+            yield text(
+                "{count} {flag}, e.g. ball {ball}: {reasons}",
+                count=len(rows), flag=flag, ball=ball, reasons=balls.reasons[rows[0]],
+            )  # fmt: skip
+
+
 REPORT = StepReport(
     title=text("Bolt balls"),
     summary=_summary,
     tables=tables.step_tables,
     figures=lambda execution, runs, report: figures.draw(execution.scene, runs, report, execution.stored),
     files=_files,
+    why=_why,
     interactive_data=live_data.live_data,
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 
 from processor.language.messages import Message, text
 from processor.model import Status, StepRun
@@ -33,11 +34,23 @@ def _files(_: Execution, run: StepRun) -> dict[str, bytes]:
     return {"stitch.csv": tables.poses_csv(run.result)}
 
 
+def _why(result: Result) -> Iterator[Message]:
+    """Yield the reasons of the scans that are not ok, those of the step where there are none."""
+    scans = result.scans
+    found = [
+        text("{scan} {status}: {reasons}", scan=name, status=status, reasons=reasons)
+        for name, status, reasons in zip(scans.name, scans.status, scans.reasons, strict=True)
+        if status != Status.OK
+    ]
+    yield from found or result.reasons
+
+
 REPORT = StepReport(
     title=text("Stitching"),
     summary=_summary,
     tables=tables.step_tables,
     figures=figures.draw,
     files=_files,
+    why=_why,
     interactive_data=live_data.live_data,
 )

@@ -1,0 +1,57 @@
+"""Commands of which help says more: names that are computed when it is asked for, and names that are like a slip."""
+
+from __future__ import annotations
+
+import click
+
+from processor.model import did_you_mean
+
+EXIT_CODES = (
+    (0, "done"),
+    (1, "done in part: a step, a scan or an input failed; standard error has the reason"),
+    (2, "wrong usage"),
+    (3, "bad input"),
+    (4, "an accuracy limit was missed (of an input with its truth)"),
+    (5, "a verdict that --fail-on names"),
+)
+EXAMPLES = (
+    ("processor run my-frame -o results", "a scan folder, the steps of its kind"),
+    ("processor run target.e57 --steps spheres --fail-on fail", "one scan file, one step, for a script"),
+)
+
+
+class Suggesting(click.Group):
+    """A group that names the command that is most like one that is not known."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command that the arguments name."""
+        name = args[0] if args else ""
+        if name and not name.startswith("-") and name not in self.commands:
+            like = did_you_mean(name, self.commands)
+            raise click.UsageError(f"no command {name!r}{like}; there are {', '.join(sorted(self.commands))}", ctx)
+        return super().resolve_command(ctx, args)
+
+
+class RunCommand(click.Command):
+    """The command ``run``, whose help lists steps with their methods, standards, examples and exit codes."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write what is listed."""
+        from processor import pipeline
+        from processor.limits import standards
+
+        steps = [(name, ", ".join(module.METHODS)) for name, module in pipeline.step_modules().items()]
+        lists = (
+            ("Steps, and their methods (the first is the default)", steps),
+            ("Standards, for [tolerance] of project.toml", [(", ".join(standards.standards()), "")]),
+            ("Examples", list(EXAMPLES)),
+            ("Exit codes", [(str(code), meaning) for code, meaning in EXIT_CODES]),
+        )
+        for heading, rows in lists:
+            with formatter.section(heading):
+                if len(rows) == 1:
+                    formatter.write_text(rows[0][0])
+                else:
+                    formatter.write_dl(rows)

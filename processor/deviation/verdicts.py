@@ -1,0 +1,89 @@
+"""Verdicts on the deviation of each component: the extremes, or the share of the surface within the limits.
+
+A pass of an extreme needs the whole 95 % interval of every core point within the limit, which holds whatever their
+errors have in common. A fail needs one core point beyond it by an interval that is widened for the number of points
+(Bonferroni), so that of many points within the limit one does not fail by chance. Where a project gives the share of
+the surface that is to keep the limit, that share is compared in place of the extremes: at least the points that are
+within with their whole intervals, at most those that are not wholly beyond.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.special import ndtri
+
+from processor.deviation.result import ErrorSource, Result
+from processor.geometry import mesh_distance
+from processor.geometry.mesh_distance import Bools
+from processor.limits import judging, measures, standards
+from processor.limits.judging import Comparison, JudgedLimits, Measured
+from processor.model import NORMAL_95, Floats, Ints, Limit, Scene, Status, StructureDesign, Verdict
+
+WHOLE = "surface"
+BADNESS = (Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS)
+
+
+def judge(scene: Scene, result: Result, vertices: Floats, origin: Floats) -> JudgedLimits | None:
+    """Compare the deviations of a result with the limits of a scene; None where none is given.
+
+    ``vertices`` (v, 3) are those of the design less ``origin`` (3,).
+    """
+    tolerance = standards.default_for(scene.tolerance)
+    if scene.structure is None or not any(limit.measure == measures.DEVIATION for limit in tolerance.limits):
+        return None
+    unsure = result.status in (Status.FAILED, Status.AMBIGUOUS)
+    unsure |= result.registration_error_from is ErrorSource.UNKNOWN
+    rows: list[Comparison] = []
+    for name, of_it in _components(result, scene.structure, vertices, origin).items():
+        shares = judging.limits_for(tolerance, measures.DEVIATION_SHARE, name)
+        core = result.core
+        values, half = core.distance[of_it], core.lod95[of_it]
+        known = np.isfinite(values) & np.isfinite(half)
+        for limit in judging.limits_for(tolerance, measures.DEVIATION, name):
+            if shares:
+                rows.append(judging.compare(shares[0], _share(name, values[known], half[known], limit, unsure)))
+            else:
+                rows.append(_extreme(name, values[known], half[known], limit, unsure))
+    return judging.judged(rows, tolerance)
+
+
+def _components(result: Result, design: StructureDesign, vertices: Floats, origin: Floats) -> Mapping[str, Bools]:
+    """Mark the core points (k,) of each named body of the design, of the whole surface without any."""
+    count = len(result.core)
+    if design.bodies is None or not count:
+        return {WHOLE: np.ones(count, bool)}
+    surface = mesh_distance.of_design(vertices, design.faces)
+    facet, _, _ = surface.distances(result.core.points + (result.origin - origin), np.inf)
+    of_facet = design.bodies.of_facet[mesh_distance.double_areas(vertices, design.faces)[1] > mesh_distance.LEAST_AREA]
+    body: Ints = np.where(facet >= 0, of_facet[np.maximum(facet, 0)], -1)
+    return {name: body == row for row, name in enumerate(design.bodies.names)}
+
+
+def _share(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool) -> Measured:
+    """Share of core points within a limit: at least, as measured, and at most."""
+    low, high = standards.bounds(limit, {})
+    if not len(values):
+        return Measured(name, np.nan, np.nan, np.nan, doubtful=True)
+    within = float(np.mean((values >= low) & (values <= high)))
+    surely = float(np.mean((values - half >= low) & (values + half <= high)))
+    beyond = float(np.mean((values + half < low) | (values - half > high)))
+    return Measured(name, within, surely, 1.0 - beyond, doubtful=unsure)
+
+
+def _extreme(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool) -> Comparison:
+    """Compare the least and the greatest deviation; return the one of the worse verdict, then nearer to its bound."""
+    low, high = standards.bounds(limit, {})
+    if not len(values):
+        return judging.compare(limit, Measured(name, np.nan, np.nan, np.nan, doubtful=True))
+    widened = half * float(ndtri(1.0 - 0.025 / len(values))) / NORMAL_95
+    sides = []
+    for sign, bound in ((-1.0, -low), (1.0, high)):
+        signed = sign * values
+        most = float((signed + half).max())
+        ends = (sign * float((signed - widened).max()), sign * most)
+        measured = Measured(name, sign * float(signed.max()), min(ends), max(ends), doubtful=unsure)
+        compared = judging.compare(limit, measured)
+        sides.append((BADNESS.index(compared.verdict), bound - most, compared))
+    return min(sides, key=lambda side: side[:2])[2]

@@ -1,0 +1,97 @@
+"""What a run found, for the terminal: the headline, what to do, why, and where the report is."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Sequence
+
+from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import Message, label, messages, printable, text
+from processor.limits.judging import JudgedLimits
+from processor.model import Status, StepRun, Verdict
+from processor.pipeline import Execution
+from processor.report import all_tables, headline
+from processor.report import table as report_table
+from processor.report.limit_table import worst_first
+from processor.report.step_report import step_report
+
+MOST_LINES, LONGEST = 15, 200
+TO_DO, REASONS, LIMITS = 4, 3, 3  # most lines of each step
+MORE = text("... more in the report; --verbose prints the tables")
+
+
+def lines(execution: Execution, report: ErrorReport, page: str) -> list[str]:
+    """Return at most MOST_LINES lines; the headline stands first, the path of the page last."""
+    middle = list(_middle(execution, report))
+    if len(middle) > MOST_LINES - 2:
+        middle = [*middle[: MOST_LINES - 3], MORE]
+    written = [_short(messages("en").text(line)) for line in middle]
+    return [printable(headline.of_run(execution)), *written, f"report: {page}"]
+
+
+def verbose(execution: Execution, report: ErrorReport, page: str) -> Iterator[str]:
+    """Yield the lines of :func:`lines`, and before the last the tables that have rows, each as one text."""
+    *brief, last = lines(execution, report, page)
+    yield from brief
+    yield ""
+    for table in all_tables.tables_of_run(execution, report):
+        if table.on_terminal and table.rows:
+            yield report_table.plain_text(table) + "\n"
+    yield last
+
+
+def failures(execution: Execution) -> Iterator[str]:
+    """Yield a line for each step that failed altogether, with its reasons."""
+    for run, _ in execution.by_step():
+        if run.result.status == Status.FAILED:
+            reasons = _reasons(run)
+            why = messages("en").text(reasons) if reasons else "no reason is known"
+            yield f"{run.step} ({run.method}) failed: {why}"
+
+
+def _short(line: str) -> str:
+    return textwrap.shorten(printable(line), LONGEST, placeholder=" ...")
+
+
+def _middle(execution: Execution, report: ErrorReport) -> Iterator[Message]:
+    firsts = [run for run, _ in execution.by_step()]
+    if sources := headline.unverified(execution):
+        yield text("not verified against the published text: limits from {sources}", sources=sources)
+    for run in firsts:
+        yield from _beyond_limits(run)
+    for run in firsts:
+        for sentence in list(step_report(run.step).to_do(run.result))[:TO_DO]:
+            yield text("to do: {sentence}", sentence=sentence)
+    for run in firsts:
+        if run.result.status != Status.OK:
+            title = step_report(run.step).title
+            for one in _reasons(run)[:REASONS]:
+                yield text("{step} is {status}: {reason}", step=title, status=run.result.status, reason=one)
+    missed = [metric for metric in report.metrics if not metric.passed]
+    for metric in missed[:LIMITS]:
+        name = all_tables.metric_name(metric)
+        yield text(
+            "accuracy limit missed: {figure} {value:g} {unit}, limit {limit:g}",
+            figure=name, value=metric.value, unit=metric.unit, limit=metric.limit,
+        )  # fmt: skip
+
+
+def _reasons(run: StepRun) -> Sequence[Message]:
+    return list(step_report(run.step).why(run.result))
+
+
+def _beyond_limits(run: StepRun) -> Iterator[Message]:
+    """Yield the comparisons that did not pass, the worst first."""
+    limits: JudgedLimits | None = getattr(run.result, "limits", None)
+    if limits is None:
+        return
+    rows = [k for k in worst_first(limits) if limits.verdict[k] != Verdict.PASS]
+    for k in rows[:LIMITS]:
+        low, high = float(limits.low[k]), float(limits.high[k])
+        yield text(
+            "{verdict}: {of}, {what}: {value} ± {ci95} {unit}, allowed {low} to {high}",
+            verdict=limits.verdict[k], of=limits.of[k], what=label(limits.what[k]), value=float(limits.value[k]),
+            ci95=float(limits.ci95[k]), unit=limits.unit[k], low=low, high=high,
+        )  # fmt: skip
+    if len(rows) > LIMITS:
+        yield text("... and {count} more of {step}", count=len(rows) - LIMITS, step=step_report(run.step).title)
