@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from processor import pipeline
+from processor import meaning, pipeline
 from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import InputError, Metric, Scene, Truth, Verdict, worst
+from processor.model import LONGEST_NAME, InputError, Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
 from processor.report import write_results
@@ -150,6 +150,7 @@ def run(
 def _run_scene(
     scene: Scene, out: Path | None, jobs: Sequence[pipeline.Job], lang: str, log: Callable[[str], None]
 ) -> Results:
+    meaning.check(scene, f"scene {scene.name[:LONGEST_NAME]!r}")
     if out is not None:
         write_results.check_output(out, None)
     return write(Results(pipeline.execute(Path(scene.name), scene, jobs, log)), out, lang)

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
+import processor.meaning as meaning
 import processor.store.codec as codec
 import processor.store.file_structure_checks as file_structure_checks
 import processor.store.scan_tiles as scan_tiles
@@ -44,7 +45,7 @@ HISTORY = [
 # Exceptions of HDF5 and h5py for a damaged file; none of them names the file.
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
-T = TypeVar("T")
+Record = TypeVar("Record")
 Pieces = Callable[[int, str], tuple[tuple[int, ...], Iterator[Any]]]
 
 
@@ -216,11 +217,15 @@ def read_scene(path: Path, points: bool = True) -> Scene:
 
 
 def _decode_scene(file: Any, read_scan: Callable[[Any], Scan]) -> Scene:
-    scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: read_scan})
-    names = [scan.name for scan in scene.scans]
-    if len(set(names)) != len(names):
-        raise DecodeError(["/scene/scans: two scans have the same name"])
-    return scene
+    return _possible(codec.read_record(_group(file, "scene"), Scene, hooks={Scan: read_scan}), "/scene")
+
+
+def _possible(record: Record, where: str) -> Record:
+    """Return a record of the group ``where`` that is possible in meaning. Raises DecodeError that lists all faults."""
+    faults = meaning.problems(record, where)
+    if faults:
+        raise DecodeError(faults)
+    return record
 
 
 def read_truth(path: Path, labels: bool = True) -> Truth | None:
@@ -231,7 +236,9 @@ def read_truth(path: Path, labels: bool = True) -> Truth | None:
     with opened(path, ["scene", "truth"]) as file:
         if "truth" not in file and _attribute(file, "format") == FORMATS["scene"]:
             return None
-        return codec.read_record(_group(file, "truth"), Truth, given={} if labels else {"labels": ()})
+        return _possible(
+            codec.read_record(_group(file, "truth"), Truth, given={} if labels else {"labels": ()}), "/truth"
+        )
 
 
 def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRun, ...]:
@@ -247,7 +254,7 @@ def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRu
         if not isinstance(group.get("result"), h5py.Group):
             raise DecodeError([f"{group.name}/result: missing"])
         result: object = codec.read_record(group["result"], result_classes[step])
-        return codec.read_record(group, StepRun, given={"result": result})
+        return _possible(codec.read_record(group, StepRun, given={"result": result}), group.name)
 
     with opened(path, ["results"]) as file:
         return tuple(read_run(group) for group in codec.numbered_groups(_group(file, "results")))

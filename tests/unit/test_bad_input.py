@@ -268,7 +268,7 @@ TAMPERED = {
     "tile edge": (set_to(POINTS + "/edge", 0.0), "grid of the tiles"),
     "tile lower": (poke(POINTS + "/lower", 0, np.inf), "grid of the tiles"),
     "members": (lambda f: f.move(SCAN, "scene/scans/7"), "expected groups 0000"),
-    "two of one name": (set_to("scene/scans/0001/name", np.bytes_("s1")), "two scans have the same name"),
+    "two of one name": (set_to("scene/scans/0001/name", np.bytes_("s1")), "scans/0001/name: expected another name for each, found 's1'"),
 }  # fmt: skip
 
 
