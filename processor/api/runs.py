@@ -128,6 +128,7 @@ def run(
     )
     out = None if output is None else Path(output)
     if isinstance(input_, Scene):
+        meaning.check(input_, f"scene {input_.name[:LONGEST_NAME]!r}")
         return _run_scene(input_, out, pipeline.jobs_for(input_, wanted, methods, parameters, seed), lang, log)
     path = Path(input_)
     if not path.exists():
@@ -150,7 +151,6 @@ def run(
 def _run_scene(
     scene: Scene, out: Path | None, jobs: Sequence[pipeline.Job], lang: str, log: Callable[[str], None]
 ) -> Results:
-    meaning.check(scene, f"scene {scene.name[:LONGEST_NAME]!r}")
     if out is not None:
         write_results.check_output(out, None)
     return write(Results(pipeline.execute(Path(scene.name), scene, jobs, log)), out, lang)
