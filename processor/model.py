@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -66,6 +66,44 @@ def reason(code: str, /, **values: Any) -> Reason:
 
 
 # --- How a record declares its fields, and how they are checked
+
+
+LARGEST_MM = 1e11  # a length beyond it, 100,000 km, is none of a structure; float64 has steps of 0.00002 mm there
+LONGEST_NAME = 256
+LONGEST_TEXT = 1 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Meaning:
+    """What the values of a field must be beyond type and shape; :mod:`processor.meaning` checks it where data come in.
+
+    Numbers: ``finite``, else NaN stands for unknown; from ``least`` to ``most``, beyond ``above``; ``rows_of`` names
+    what they are row numbers of, from ``lowest_row`` on (-1 = none). Names and numbers: ``among`` names the values
+    that they may have; ``unique``; ``unlike`` names a column that has another value in each row. Texts: one of
+    ``words``; at most ``longest`` characters. A reference is a field of the record, or one of the scene after a "/".
+    """
+
+    finite: bool = False
+    least: float = float("-inf")
+    most: float = float("inf")
+    above: float = float("-inf")
+    rows_of: str = ""
+    lowest_row: int = 0
+    among: str = ""
+    unique: bool = False
+    unlike: str = ""
+    words: tuple[str, ...] = ()
+    longest: int = LONGEST_NAME
+
+
+PLACE = Meaning(finite=True, least=-LARGEST_MM, most=LARGEST_MM)
+SIZE = Meaning(finite=True, above=0.0, most=LARGEST_MM)
+DEVIATION = Meaning(finite=True, least=0.0, most=LARGEST_MM)  # one standard deviation
+BOUND = Meaning()  # NaN = none; never infinite
+NAMES = Meaning(unique=True)
+LONG = Meaning(longest=LONGEST_TEXT)
+LARGEST_GRID, GRID_CELLS_PER_POINT = 1 << 24, 1024  # cells of a scanner's grid; of the open sky few have returns
+GRID_NUMBER = Meaning(least=-1, most=(1 << 24) - 1)
 
 
 def column(*shape: int | str, dtype: type = np.float64, **shown: Any) -> Any:
@@ -159,6 +197,10 @@ class Checked:
             elif "shape" in metadata:
                 array = _checked_array(value, metadata, where, lengths)
                 object.__setattr__(self, field.name, array)
+
+    def contradictions(self) -> Iterable[str]:
+        """Yield what its fields, each possible, contradict: place within the record, expected, found."""
+        return ()
 
 
 class Rows(Checked):
@@ -275,21 +317,24 @@ class Scan(Checked):
     """
 
     name: str
-    points: Floats = column("n", 3)
+    points: Floats = column("n", 3, means=PLACE)
     origin: Floats = dataclasses.field(
-        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
+        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64, "means": PLACE}
     )
     intensity: Floats = column("n")
-    point_station: Labels = column("n", dtype=np.int32)  # row of Scene.stations a point was seen from, -1 = unknown
-    grid_row: Labels = column("n", dtype=np.int32)  # of the scanner's grid: of one height; -1 = not on a grid
-    grid_column: Labels = column("n", dtype=np.int32)  # of one direction about the scanner's axis
+    # row of Scene.stations a point was seen from, -1 = unknown
+    point_station: Labels = column("n", dtype=np.int32, means=Meaning(rows_of="/stations.ids", lowest_row=-1))
+    # of the scanner's grid: of one height; -1 = not on a grid
+    grid_row: Labels = column("n", dtype=np.int32, means=GRID_NUMBER)
+    grid_column: Labels = column("n", dtype=np.int32, means=GRID_NUMBER)  # of one direction about the scanner's axis
     component: str = ""  # arch bridge: the part this is a scan of
     station: str = ""
-    position: Floats = optional(3)  # of the scanner, in the scan's frame
+    position: Floats = optional(3, means=PLACE)  # of the scanner, in the scan's frame
     T_project_scan: Floats = optional(
-        4, 4
+        4, 4, means=PLACE
     )  # absent: the scan is in the project's frame already, or its pose is unknown
-    sigma_mm: float = float("nan")  # range noise, one standard deviation; NaN = unknown
+    # range noise, one standard deviation; NaN = unknown
+    sigma_mm: float = described(float("nan"), means=Meaning(above=0.0, most=LARGEST_MM))
     colour: Codes = column("n", 3, dtype=np.uint8, newer=True)  # red, green, blue
 
     @property
@@ -297,14 +342,22 @@ class Scan(Checked):
         """T_project_scan (4, 4); the identity for a scan without a pose."""
         return self.T_project_scan if self.T_project_scan.size else np.eye(4)
 
+    def contradictions(self) -> Iterable[str]:
+        """Yield that a few points claim a grid that fills the memory."""
+        if len(self.grid_row) and len(self.grid_column):
+            rows, columns = int(self.grid_row.max()) + 1, int(self.grid_column.max()) + 1
+            most = LARGEST_GRID + GRID_CELLS_PER_POINT * len(self.grid_row)
+            if rows * columns > most:
+                yield f"/grid_row: expected a grid of at most {most} cells for its points, found {rows} x {columns}"
+
 
 @dataclass(frozen=True)
 class Stations(Checked):
     """Scanner positions in the project's frame, and the poses of the scanners where they are known."""
 
-    ids: tuple[str, ...] = names("k")
-    positions: Floats = column("k", 3)
-    T_project_station: Floats = column("k", 4, 4)
+    ids: tuple[str, ...] = names("k", means=NAMES)
+    positions: Floats = column("k", 3, means=PLACE)
+    T_project_station: Floats = column("k", 4, 4, means=PLACE)
 
 
 @dataclass(frozen=True)
@@ -312,11 +365,15 @@ class DesignPart(Checked):
     """The nominal geometry of one component, in the bridge's frame (mm)."""
 
     name: str
-    vertices: Floats = column("v", 3)
-    faces: Ints = column("f", 3, dtype=np.int64)
-    bottom_edge_left: Floats = column("l", 3)  # from the start to the end of the component; left = +Y; () = none
-    bottom_edge_right: Floats = column("r", 3)
-    source: str = "mesh"  # of vertices and faces: mesh, or curves: the outer box between joints and bottom edges alone
+    vertices: Floats = column("v", 3, means=PLACE)
+    faces: Ints = column("f", 3, dtype=np.int64, means=Meaning(rows_of="vertices"))
+    # From the start to the end of the component; left = +Y; empty = none.
+    bottom_edge_left: Floats = column(
+        "l", 3, means=PLACE
+    )  # from the start to the end of the component; left = +Y; () = none
+    bottom_edge_right: Floats = column("r", 3, means=PLACE)
+    # of vertices and faces: mesh, or curves: the outer box between joints and bottom edges alone
+    source: str = described("mesh", means=Meaning(words=("mesh", "curves")))
 
 
 @dataclass(frozen=True)
@@ -329,10 +386,14 @@ class ArchDesign(Checked):
     """
 
     parts: tuple[DesignPart, ...] = ()  # in assembly order
-    joint_names: tuple[str, ...] = names("j")
-    joint_left: tuple[str, ...] = names("j")
-    joint_right: tuple[str, ...] = names("j")
-    joint_points: Floats = column("j", 8, 3)
+    joint_names: tuple[str, ...] = names("j", means=NAMES)
+    joint_left: tuple[str, ...] = names("j", means=Meaning(among="parts.name", unlike="joint_right"))
+    joint_right: tuple[str, ...] = names("j", means=Meaning(among="parts.name"))
+    joint_points: Floats = column("j", 8, 3, means=PLACE)
+
+    def contradictions(self) -> Iterable[str]:
+        """Yield parts of one name."""
+        yield from _repeated("/parts", tuple(part.name for part in self.parts))
 
     @property
     def joined(self) -> Ints:
@@ -352,13 +413,15 @@ class ArchDesign(Checked):
 class FrameDesign(Checked):
     """A space frame: nodes and the members between them, mm."""
 
-    ids: Ints = column("k", dtype=np.int64)
-    centres: Floats = column("k", 3)
-    radii: Floats = column("k")
-    member_a: Ints = column("m", dtype=np.int64)  # ids of the two nodes
-    member_b: Ints = column("m", dtype=np.int64)
-    tube_diameters: Floats = column("m")
-    supports: Codes = column("k", dtype=np.uint8, newer=True)  # 0 = none, else the place in SUPPORTS, from 1
+    ids: Ints = column("k", dtype=np.int64, means=NAMES)
+    centres: Floats = column("k", 3, means=PLACE)
+    radii: Floats = column("k", means=SIZE)
+    # ids of the two nodes
+    member_a: Ints = column("m", dtype=np.int64, means=Meaning(among="ids", unlike="member_b"))
+    member_b: Ints = column("m", dtype=np.int64, means=Meaning(among="ids"))
+    tube_diameters: Floats = column("m", means=SIZE)
+    # 0 = none, else the place in SUPPORTS, from 1
+    supports: Codes = column("k", dtype=np.uint8, newer=True, means=Meaning(most=2))
     deflections: Floats = column("k", newer=True)  # computed, downward; NaN = not stated
 
 
@@ -373,10 +436,10 @@ class DesignBodies(Checked):
     reader numbered them.
     """
 
-    names: tuple[str, ...] = names("b")
-    of_facet: Ints = column("f", dtype=np.int64)
-    shared: int = 0
-    unnamed: int = 0
+    names: tuple[str, ...] = names("b", means=NAMES)
+    of_facet: Ints = column("f", dtype=np.int64, means=Meaning(rows_of="names"))
+    shared: int = described(0, means=Meaning(least=0))
+    unnamed: int = described(0, means=Meaning(least=0))
 
 
 @dataclass(frozen=True)
@@ -384,9 +447,15 @@ class StructureDesign(Checked):
     """One mesh of a whole structure, in the design's frame (mm); ``bodies`` are None where the mesh has no names."""
 
     name: str
-    vertices: Floats = column("v", 3)
-    faces: Ints = column("f", 3, dtype=np.int64)
+    vertices: Floats = column("v", 3, means=PLACE)
+    faces: Ints = column("f", 3, dtype=np.int64, means=Meaning(rows_of="vertices"))
     bodies: DesignBodies | None = newer()
+
+    def contradictions(self) -> Iterable[str]:
+        """Yield that bodies are not given for each facet."""
+        given = len(self.faces) if self.bodies is None else len(self.bodies.of_facet)
+        if given != len(self.faces):
+            yield f"/bodies/of_facet: expected a row for each of {len(self.faces)} faces, found {given}"
 
 
 @dataclass(frozen=True)
@@ -401,21 +470,27 @@ class Limit(Checked):
     """
 
     key: str
-    what: str
+    what: str = dataclasses.field(metadata={"means": LONG})
     unit: str = "mm"
-    low: float = float("nan")
-    high: float = float("nan")
-    low_ratio: float = float("nan")
-    high_ratio: float = float("nan")
+    low: float = described(float("nan"), means=BOUND)
+    high: float = described(float("nan"), means=BOUND)
+    low_ratio: float = described(float("nan"), means=BOUND)
+    high_ratio: float = described(float("nan"), means=BOUND)
     of: str = ""  # length | thickness | diameter | spacing | depth
     rule: str = ""  # smaller | sum
-    above_mm: float = float("nan")
-    up_to_mm: float = float("nan")
+    above_mm: float = described(float("nan"), means=Meaning(least=0.0))
+    up_to_mm: float = described(float("nan"), means=Meaning(least=0.0))
     measure: str = ""
-    clause: str = ""
+    clause: str = described("", means=LONG)
     verified: bool = False  # the number was held against the published text
-    source: str = ""
+    source: str = described("", means=LONG)
     component: str | None = newer()
+
+    def contradictions(self) -> Iterable[str]:
+        """Yield a lower bound above the upper one."""
+        for low, high in (("low", "high"), ("low_ratio", "high_ratio"), ("above_mm", "up_to_mm")):
+            if getattr(self, low) > getattr(self, high):
+                yield f"/{low}: expected at most {high}, {getattr(self, high):g}, found {getattr(self, low):g}"
 
 
 @dataclass(frozen=True)
@@ -423,9 +498,10 @@ class Tolerance(Checked):
     """The limits that results are held against: those of a standard, of the project, or both (the project's win)."""
 
     standard: str = ""
-    edition: str = ""
+    edition: str = described("", means=LONG)
     limits: tuple[Limit, ...] = ()
-    root_gap_mm: float = 0.0  # between two ends as assembled, by the design; their gap is held against it
+    # between two ends as assembled, by the design; their gap is held against it
+    root_gap_mm: float = described(0.0, means=PLACE)
 
 
 @dataclass(frozen=True)
@@ -437,25 +513,25 @@ class Control(Checked):
     several stations ``station`` (m,), a row of Scene.stations, says which one saw it; -1 = the scan's own.
     """
 
-    ids: tuple[str, ...] = names("k")
-    positions: Floats = column("k", 3)
-    sd: Floats = column("k")  # of each coordinate of a position
-    point: Ints = column("m", dtype=np.int64)
-    scan: Ints = column("m", dtype=np.int64)
-    station: Ints = column("m", dtype=np.int64)
-    seen: Floats = column("m", 3)
-    seen_sd: Floats = column("m")  # of each coordinate as seen
+    ids: tuple[str, ...] = names("k", means=NAMES)
+    positions: Floats = column("k", 3, means=PLACE)
+    sd: Floats = column("k", means=SIZE)  # of each coordinate of a position
+    point: Ints = column("m", dtype=np.int64, means=Meaning(rows_of="ids"))
+    scan: Ints = column("m", dtype=np.int64, means=Meaning(rows_of="/scans"))
+    station: Ints = column("m", dtype=np.int64, means=Meaning(rows_of="/stations.ids", lowest_row=-1))
+    seen: Floats = column("m", 3, means=PLACE)
+    seen_sd: Floats = column("m", means=DEVIATION)  # of each coordinate as seen
 
 
 @dataclass(frozen=True)
 class Picks(Checked):
     """Common points that were picked in two scans each, in these scans' frames (mm)."""
 
-    scan_a: tuple[str, ...] = names("q")
-    scan_b: tuple[str, ...] = names("q")
+    scan_a: tuple[str, ...] = names("q", means=Meaning(among="/scans.name", unlike="scan_b"))
+    scan_b: tuple[str, ...] = names("q", means=Meaning(among="/scans.name"))
     points: tuple[str, ...] = names("q")
-    in_a: Floats = column("q", 3)
-    in_b: Floats = column("q", 3)
+    in_a: Floats = column("q", 3, means=PLACE)
+    in_b: Floats = column("q", 3, means=PLACE)
 
 
 @dataclass(frozen=True)
@@ -463,18 +539,34 @@ class Scene(Checked):
     """What was scanned, and what it was meant to be. Steps read this and nothing else."""
 
     name: str
-    kind: str  # one of KINDS
+    kind: str = dataclasses.field(metadata={"means": Meaning(words=KINDS)})
     scans: tuple[Scan, ...] = ()
     arch: ArchDesign | None = None
     frame: FrameDesign | None = None
     stations: Stations | None = None
-    temperature_C: float = float("nan")  # of the steel while it was scanned
+    # of the steel while it was scanned
+    temperature_C: float = described(float("nan"), means=Meaning(least=-100.0, most=500.0))
     units: str = "mm"  # of the input's coordinates, and why they were read so
-    units_reason: str = ""
+    units_reason: str = described("", means=LONG)
     structure: StructureDesign | None = None
     tolerance: Tolerance | None = None  # None: nothing was said
     control: Control | None = newer()
     picks: Picks | None = newer()
+
+    def contradictions(self) -> Iterable[str]:
+        """Yield scans of one name, and parts that the design does not have."""
+        yield from _repeated("/scans", tuple(scan.name for scan in self.scans))
+        parts = {part.name for part in self.arch.parts} if self.arch else set()
+        for i, scan in enumerate(self.scans):
+            if parts and scan.component and scan.component not in parts:
+                yield f"/scans/{i:04d}/component: expected a part of the design, found {scan.component!r}"
+
+
+def _repeated(where: str, names: tuple[str, ...]) -> Iterator[str]:
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            yield f"{where}/{i:04d}/name: expected another name for each, found {name!r} a second time"
+            return
 
 
 # --- the truth: evaluation alone reads it --------------------------------------------------------------------------
@@ -721,7 +813,7 @@ class StepRun:
 
     step: str
     method: str
-    params: str
+    params: str = dataclasses.field(metadata={"means": LONG})
     result: Any
 
     @property

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from processor import pipeline
+from processor import meaning, pipeline
 from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import Metric, Scene, Truth, Verdict, worst
+from processor.model import LONGEST_NAME, Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
 from processor.report import write_results
@@ -128,6 +128,7 @@ def run(
     )
     out = None if output is None else Path(output)
     if isinstance(input_, Scene):
+        meaning.check(input_, f"scene {input_.name[:LONGEST_NAME]!r}")
         return _run_scene(input_, out, pipeline.jobs_for(input_, wanted, methods, parameters, seed), lang, log)
     path = Path(input_)
     if not path.exists():

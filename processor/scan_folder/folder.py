@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from processor import readers, store
+from processor import meaning, readers, store
 from processor.model import (
     KINDS,
     ArchDesign,
@@ -32,7 +32,7 @@ from processor.scan_folder import guess, scanner_grid, units
 from processor.scan_folder.checked_toml import Table, existing_file_in
 from processor.scan_folder.control_points import Measured, control_points, read_control
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
-from processor.scan_folder.files import DESIGNS, PICKS, PROJECT, SCANS, STATIONS, TRUTH, scan_files
+from processor.scan_folder.files import CONTROL, DESIGNS, PICKS, PROJECT, SCANS, STATIONS, TRUTH, scan_files
 from processor.scan_folder.guess import Guess
 from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
@@ -50,7 +50,6 @@ KEYS = ("name", "kind", "units", "design", "design_units", "temperature_C", "sca
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FEWEST_POINTS = 4
 FLOAT_STEP_MM = 1.0
-POSE_TOLERANCE = 1e-3  # of R^T R - I
 NAN = float("nan")
 GUESSED = "guessed from the scans' size"
 GUESSED_DESIGN = "design and components as processor init guesses them, as there is no project.toml"
@@ -117,7 +116,7 @@ def read_input(path: Path, units: str | None = None, keep: Keep = as_read) -> Sc
         return _read_folder(path, option, keep)
     if path.suffix.lower() == ".h5":
         return store.read_scene(path)
-    return _scene(_Project(scan_name(path), (_Entry(path),)), None, option, keep=keep)
+    return meaning.check(_scene(_Project(scan_name(path), (_Entry(path),)), None, option, keep=keep), str(path))
 
 
 def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
@@ -136,8 +135,17 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
         source = f"given in {PROJECT}" if named else "given by --units" if option else "not given, so metres"
         advice = f"give the unit by 'design_units' or 'units' in {PROJECT}"
         units.check_extent(f"{project.design}: the design", scene.structure.vertices, unit, source, advice)
-    if not (folder / PICKS).exists():
-        return scene
+    if (folder / PICKS).exists():
+        scene = _with_picks(folder, scene)
+    files = {"stations": STATIONS, "picks": PICKS, "control": CONTROL if (folder / CONTROL).exists() else PROJECT}
+    files |= dict.fromkeys(
+        ("arch", "frame", "structure"), str(project.design.relative_to(folder) if project.design else PROJECT)
+    )
+    files |= dict.fromkeys(("tolerance", "temperature_C", "name"), PROJECT)
+    return meaning.check(scene, str(folder), {field: str(folder / file) for field, file in files.items()})
+
+
+def _with_picks(folder: Path, scene: Scene) -> Scene:
     # Picks are in the unit of their scans; scans in different units need one by --units.
     unit = scene.units if scene.units in MM_PER_UNIT else ""
     if not unit:
@@ -208,7 +216,7 @@ def _entry(folder: Path, scan: Table) -> _Entry:
     scan.only(SCAN_KEYS)
     pose = scan.array("pose", 4, 4) if "pose" in scan.values else None
     if pose is not None and not (
-        np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() < POSE_TOLERANCE
+        np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() < meaning.POSE_TOLERANCE
         and np.linalg.det(pose[:3, :3]) > 0
         and (pose[3] == [0, 0, 0, 1]).all()
     ):

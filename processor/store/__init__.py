@@ -6,6 +6,7 @@ Functions of whole files are in :mod:`processor.store.store`, points of a file p
 
 from processor.store.store import (
     copy_truth,
+    damage,
     problems,
     read_provenance,
     read_results,
@@ -21,6 +22,7 @@ from processor.store.streaming import StoredPoints, points_of
 __all__ = [
     "StoredPoints",
     "copy_truth",
+    "damage",
     "points_of",
     "problems",
     "read_provenance",

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
+import processor.store.checksums as checksums
 from processor.model import VOCABULARIES, Reason, RecordError, Word
 
 CHUNK_ROWS = 65_536
@@ -50,12 +51,18 @@ def write_array(group: Any, name: str, array: np.typing.NDArray[np.generic]) -> 
         compression="gzip",
         compression_opts=GZIP_LEVEL,
         shuffle=True,
+        fletcher32=True,
     )
 
 
 def _create(group: Any, name: str, data: Any, **options: Any) -> None:
-    """Write a dataset and close it, so that its place in the file is independent of Python's garbage collection."""
-    group.create_dataset(name, data=data, **options).id.close()
+    """Write a dataset with its checksum and close it.
+
+    It is closed so that its place in the file is independent of Python's garbage collection.
+    """
+    dataset = group.create_dataset(name, data=data, **options)
+    checksums.seal(dataset, np.asarray(data))
+    dataset.id.close()
 
 
 def write_text(group: Any, name: str, text: str) -> None:
@@ -221,11 +228,12 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
         return read_text(group, name)
     if kind in (bool, int, float):
         stored = {bool: "u1", int: "i8", float: "f8"}[kind]
-        return kind(_dataset(group, name, stored, 0)[()])
+        return kind(_whole(group, name, stored, 0)[()])
     if typing.get_origin(kind) is tuple and issubclass(typing.get_args(kind)[0], str):
-        return tuple(_decoded(item, where) for item in _dataset(group, name, "S", 1)[()].tolist())
+        return tuple(_decoded(item, where) for item in _whole(group, name, "S", 1).tolist())
     if not isinstance(group[name], h5py.Group):
         if typing.get_origin(kind) is tuple and group[name].shape == (0,):
+            _whole(group, name, "S", 1)
             return ()
         raise DecodeError([f"{where}: expected a group, found a dataset"])
     if typing.get_origin(kind) is tuple:
@@ -237,7 +245,7 @@ def _read_json(group: Any, name: str, decode: Callable[[Any], Any]) -> tuple[Any
     """Read texts of JSON, each mapped by ``decode``."""
     where = f"{group.name}/{name}"
     try:
-        return tuple(decode(json.loads(_decoded(item, where))) for item in _dataset(group, name, "S", 1)[()].tolist())
+        return tuple(decode(json.loads(_decoded(item, where))) for item in _whole(group, name, "S", 1).tolist())
     except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         raise DecodeError([f"{where}: expected JSON ({error})"]) from None
 
@@ -273,17 +281,25 @@ def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
     stored = np.dtype(np.uint8 if dtype is np.bool_ else dtype).str[1:]
     if name in group and isinstance(group[name], h5py.Dataset) and group[name].size == 0:
         ndim = group[name].ndim
-    return _dataset(group, name, stored, ndim)[()]
+    return _whole(group, name, stored, ndim)
 
 
 def column(group: Any, name: str, dtype: type, ndim: int = 1) -> Any:
     """Return the dataset of a column, to be read in slices; an absent optional column is empty."""
-    return _dataset(group, name, np.dtype(dtype).str[1:], ndim)
+    return sliced(_dataset(group, name, np.dtype(dtype).str[1:], ndim))
+
+
+def sliced(dataset: Any) -> checksums.Column:
+    """Return a dataset to be read in slices. Raises DecodeError for damage; reading does so by ChecksumError."""
+    try:
+        return checksums.Column(dataset)
+    except checksums.ChecksumError as error:
+        raise DecodeError([str(error)]) from None
 
 
 def read_text(group: Any, name: str) -> str:
     """Read a text."""
-    return _decoded(_dataset(group, name, "S", 0)[()], f"{group.name}/{name}")
+    return _decoded(_whole(group, name, "S", 0)[()], f"{group.name}/{name}")
 
 
 def _decoded(data: bytes, where: str) -> str:
@@ -291,6 +307,14 @@ def _decoded(data: bytes, where: str) -> str:
         return bytes(data).decode("utf-8")
     except UnicodeDecodeError:
         raise DecodeError([f"{where}: not UTF-8 text"]) from None
+
+
+def _whole(group: Any, name: str, stored: str, ndim: int) -> Any:
+    """Read a dataset of a type, with a check of its checksum."""
+    try:
+        return checksums.read(_dataset(group, name, stored, ndim))
+    except checksums.ChecksumError as error:
+        raise DecodeError([str(error)]) from None
 
 
 def _dataset(group: Any, name: str, stored: str, ndim: int) -> Any:

@@ -19,7 +19,7 @@ import h5py
 GZIP_LIMIT = 1032  # deflate's largest possible expansion
 CHUNK_LIMIT = 64 * 2**20
 SMALL_DATASET_BYTES = 1 << 16  # cannot fill the memory; may expand by more than GZIP_LIMIT
-FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
+FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 MEMORY_BYTES = 1 << 30  # for a file's structure
 
 
@@ -103,11 +103,11 @@ def _dataset(dataset: Any) -> list[str]:
         return [f"type {dataset.dtype} is not accepted"]
     filters = {plist.get_filter(i)[0] for i in range(plist.get_nfilters())}
     if filters - FILTERS:
-        return [f"filter {min(filters - FILTERS)} is not accepted (gzip and shuffle are)"]
+        return [f"filter {min(filters - FILTERS)} is not accepted (gzip, shuffle and fletcher32 are)"]
     if dataset.shape is None:
         return ["has no extent"]
     size = dataset.dtype.itemsize * math.prod(int(length) for length in dataset.shape)
-    room = dataset.id.get_storage_size() * (GZIP_LIMIT if filters else 1)
+    room = dataset.id.get_storage_size() * (GZIP_LIMIT if h5py.h5z.FILTER_DEFLATE in filters else 1)
     if size > room and not (filters and size <= SMALL_DATASET_BYTES and room):
         return [f"declares {size} bytes but stores {dataset.id.get_storage_size()}"]
     if not dataset.chunks:

@@ -11,7 +11,7 @@ import numpy as np
 
 import processor.store.codec as codec
 import processor.store.tiles as tiles
-from processor.model import Floats, Ints, Scan, per_point_fields
+from processor.model import Floats, Ints, Labels, Scan, per_point_fields
 from processor.store.codec import DecodeError
 
 AXES = ("x", "y", "z")
@@ -49,7 +49,10 @@ def read_scan(group: Any) -> Scan:
     """Read a scan. Raises DecodeError also for points that are not finite or lie outside their tile."""
     stored = _read_tiles(group)
     grid = stored.grid
-    data = tuple(column[()] for column in stored.columns)
+    data = tuple(
+        codec.read_array(group["points"], axis, column.dtype, 1)
+        for axis, column in zip(AXES, stored.columns, strict=True)
+    )
     if not all(np.isfinite(column).all() for column in data):
         raise DecodeError([f"{group.name}/points: holds coordinates that are not finite"])
     wrong = tiles.misplaced(grid, stored.cell, stored.counts, (data[0], data[1], data[2]))
@@ -68,6 +71,12 @@ def read_scan_alone(group: Any) -> Scan:
         f.name: np.empty(0, f.metadata["dtype"]) for f in dataclasses.fields(Scan) if f.name in per_point_fields(Scan)
     }
     return codec.read_record(group, Scan, given=none)
+
+
+def extreme_stations(group: Any, size: int = 1 << 20) -> Labels:
+    """Return the least and the greatest station (2,) of the points of a scan's group; (0,) where they have none."""
+    parts = [np.array([part.min(), part.max()]) for part in pieces(group, "point_station", size)]
+    return np.array([np.min(parts), np.max(parts)], np.int32) if parts else NO_STATIONS
 
 
 def count(group: Any) -> int:
@@ -156,6 +165,7 @@ def _read_tiles(group: Any) -> StoredTiles:
     lengths = {len(column) for column in columns}
     if len(lengths) != 1 or offset.shape != (3,) or lower.shape != (3,) or cell.shape[1:] != (3,):
         raise DecodeError([f"{where}: its columns differ in length or shape"])
+    columns = [codec.sliced(column) for column in columns]
     grid = tiles.Grid(steps, offset, lower, edge)
     faults = tiles.problems(grid, cell, start, count, lengths.pop())
     if faults:

@@ -21,6 +21,8 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
+import processor.meaning as meaning
+import processor.store.checksums as checksums
 import processor.store.codec as codec
 import processor.store.file_structure_checks as file_structure_checks
 import processor.store.scan_tiles as scan_tiles
@@ -29,22 +31,29 @@ from processor.store.atomic_file import replacing
 from processor.store.codec import DecodeError
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
-FORMAT_VERSION = "1.3"  # of scenes and truths
-READABLE = ("1.2", FORMAT_VERSION)  # fields added since may be absent
-RESULTS_VERSION = "2.0"
-RESULTS_HISTORY = ["1.0 to 1.3: one flat record a step", "2.0: nested tables; words and reasons with codes"]
+FORMAT_VERSION = "1.4"  # of scenes and truths
+READABLE = ("1.2", "1.3", FORMAT_VERSION)  # fields added since may be absent
+RESULTS_VERSION = "2.1"
+RESULTS_READABLE = ("2.0", RESULTS_VERSION)
+WITHOUT_CHECKSUMS = ("1.2", "1.3", "2.0")
+RESULTS_HISTORY = [
+    "1.0 to 1.3: one flat record a step",
+    "2.0: nested tables; words and reasons with codes",
+    "2.1: checksums",
+]
 HISTORY = [
     "1.0: first",
     "1.1: grid and surface of each point, scanner poses, whole structures, what was built otherwise",
     "1.2: bottom edges as built, in the truth of arch bridges; limits that the project names; "
     "what a part's mesh is made from",
     "1.3: control points",
+    "1.4: checksums",
 ]
 
 # Exceptions of HDF5 and h5py for a damaged file; none of them names the file.
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
-T = TypeVar("T")
+Record = TypeVar("Record")
 Pieces = Callable[[int, str], tuple[tuple[int, ...], Iterator[Any]]]
 
 
@@ -63,6 +72,7 @@ def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterat
             file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
         codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
         yield file
+        checksums.seal_root(file)
         if small:
             file.flush()
             temporary.write_bytes(file.id.get_file_image())
@@ -159,6 +169,8 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
             yield file
     except DecodeError as error:
         raise InputError(f"{path}: {_listed(error.problems)}") from error
+    except checksums.ChecksumError as error:
+        raise InputError(f"{path}: {error}") from error
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except DAMAGE as error:
@@ -185,14 +197,18 @@ def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
         return [f"expected format {' or '.join(wanted)}, found {header['format'] or 'none'}"]
     faults = []
     results = header["format"] == FORMATS["results"]
-    readable = (RESULTS_VERSION,) if results else READABLE
+    readable = RESULTS_READABLE if results else READABLE
     if header["format_version"] not in readable:
         version = header["format_version"] or "none"
         advice = "; run processor run again" if results else ""
         faults.append(f"expected format_version {' or '.join(readable)}, found {version}{advice}")
     if header["units"] != "mm":
         faults.append(f"expected units mm, found {header['units'] or 'none'}")
-    return faults
+    return faults or _checksum_problems(file, str(header["format_version"]))
+
+
+def _checksum_problems(file: Any, version: str) -> list[str]:
+    return [] if version in WITHOUT_CHECKSUMS and not checksums.has_any(file) else checksums.root_problems(file)
 
 
 def _attribute(file: Any, name: str) -> str:
@@ -212,15 +228,24 @@ def read_scene(path: Path, points: bool = True) -> Scene:
     With ``points`` false the per-point columns of the scans are empty; see :mod:`processor.store.streaming`.
     """
     with opened(path, ["scene"]) as file:
-        return _decode_scene(file, scan_tiles.read_scan if points else scan_tiles.read_scan_alone)
+        read_scan = scan_tiles.read_scan if points else scan_tiles.read_scan_alone
+        scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: read_scan})
+        if points:
+            return _possible(scene, "/scene")
+        # Steps look stations up by the numbers of the points: their range is known before any step begins.
+        groups = codec.numbered_groups(file["scene"]["scans"]) if scene.scans else []
+        extremes = [scan_tiles.extreme_stations(group) for group in groups]
+        scans = (dataclasses.replace(s, point_station=e) for s, e in zip(scene.scans, extremes, strict=True))
+        _possible(dataclasses.replace(scene, scans=tuple(scans)), "/scene")
+        return scene
 
 
-def _decode_scene(file: Any, read_scan: Callable[[Any], Scan]) -> Scene:
-    scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: read_scan})
-    names = [scan.name for scan in scene.scans]
-    if len(set(names)) != len(names):
-        raise DecodeError(["/scene/scans: two scans have the same name"])
-    return scene
+def _possible(record: Record, where: str) -> Record:
+    """Return a record of the group ``where`` that is possible in meaning. Raises DecodeError that lists all faults."""
+    faults = meaning.problems(record, where)
+    if faults:
+        raise DecodeError(faults)
+    return record
 
 
 def read_truth(path: Path, labels: bool = True) -> Truth | None:
@@ -231,7 +256,9 @@ def read_truth(path: Path, labels: bool = True) -> Truth | None:
     with opened(path, ["scene", "truth"]) as file:
         if "truth" not in file and _attribute(file, "format") == FORMATS["scene"]:
             return None
-        return codec.read_record(_group(file, "truth"), Truth, given={} if labels else {"labels": ()})
+        return _possible(
+            codec.read_record(_group(file, "truth"), Truth, given={} if labels else {"labels": ()}), "/truth"
+        )
 
 
 def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRun, ...]:
@@ -247,7 +274,7 @@ def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRu
         if not isinstance(group.get("result"), h5py.Group):
             raise DecodeError([f"{group.name}/result: missing"])
         result: object = codec.read_record(group["result"], result_classes[step])
-        return codec.read_record(group, StepRun, given={"result": result})
+        return _possible(codec.read_record(group, StepRun, given={"result": result}), group.name)
 
     with opened(path, ["results"]) as file:
         return tuple(read_run(group) for group in codec.numbered_groups(_group(file, "results")))
@@ -298,6 +325,20 @@ def _read_run_headers(path: Path) -> None:
     with opened(path, ["results"]) as file:
         for group in _group(file, "results").values():
             codec.read_record(group, StepRun, given={"result": None}) if isinstance(group, h5py.Group) else None
+
+
+def damage(path: Path) -> tuple[bool, list[str]]:
+    """Return whether a scene, truth or results file has checksums, and list all that is damaged in it.
+
+    All data are read, of any size, and compared with their checksums; a file without them is only tried to be read.
+    """
+    try:
+        with opened(path, list(FORMATS)) as file:
+            if checksums.has_any(file):
+                return True, checksums.problems(file)
+    except InputError as error:
+        return True, [str(error).removeprefix(f"{path}: ")]
+    return False, problems(path)
 
 
 # --- identity --------------------------------------------------------------------------------------------------------

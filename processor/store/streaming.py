@@ -9,10 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import processor.store.scan_tiles as scan_tiles
-from processor.model import Floats, Labels
+from processor.model import Floats, InputError, Labels
+from processor.store.checksums import ChecksumError
+from processor.store.codec import DecodeError
 from processor.store.store import opened
 
 PIECE = 1 << 20
+
+
+@contextmanager
+def _naming_the_file(group: Any) -> Iterator[None]:
+    """Raise InputError for damage that is found while points are read: a step takes no other error for the input's."""
+    try:
+        yield
+    except (DecodeError, ChecksumError, OSError) as error:
+        raise InputError(f"{group.file.filename}: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -27,9 +38,10 @@ class StoredPoints:
 
     def read(self, scan: int, size: int = PIECE) -> Iterator[tuple[Floats, Labels]]:
         """Yield points (n, 3), relative to the scan's origin, and their stations: (n,), or empty where unknown."""
-        stations = scan_tiles.pieces(self.scans[scan], "point_station", size)
-        for points in scan_tiles.pieces(self.scans[scan], "points", size):
-            yield points, next(stations, scan_tiles.NO_STATIONS)
+        with _naming_the_file(self.scans[scan]):
+            stations = scan_tiles.pieces(self.scans[scan], "point_station", size)
+            for points in scan_tiles.pieces(self.scans[scan], "points", size):
+                yield points, next(stations, scan_tiles.NO_STATIONS)
 
     def column(self, scan: int, name: str) -> Any:
         """Return a per-point column of a scan, to be read in slices; one that is absent is empty."""
@@ -57,7 +69,8 @@ class Boxed:
 
     def read(self, scan: int, size: int = PIECE) -> Iterator[tuple[Floats, Labels]]:
         """Yield points (n, 3), relative to the scan's origin, in the order of the file."""
-        points = scan_tiles.read_box(self.scans[scan], *self.boxes[scan])
+        with _naming_the_file(self.scans[scan]):
+            points = scan_tiles.read_box(self.scans[scan], *self.boxes[scan])
         for start in range(0, len(points), size):
             yield points[start : start + size], scan_tiles.NO_STATIONS
 

@@ -38,14 +38,14 @@ def a_scene(n=50_000):
             points,
             origin=[5e8, 4e8, 0],
             intensity=points[:, 0] * 2.0,
-            point_station=np.floor(points[:, 1]).astype(np.int64),
+            point_station=np.clip(np.floor(points[:, 1]), -1, 2_000).astype(np.int64),
             component="肋1",
             T_project_scan=np.diag([-1.0, -1.0, 1.0, 1.0]),
             sigma_mm=2.0,
         ),
         Scan("s2", points[:10] + 1.0),
     )
-    stations = Stations(("S1",), [[1.0, 2.0, 3.0]])
+    stations = Stations(tuple(f"S{k}" for k in range(2_001)), np.arange(6_003.0).reshape(-1, 3))
     scene = Scene("桥", "arch-bridge", scans, arch, None, stations, 21.5, "m", "said")
     labels = PointLabels("s1", ("肋1", "b"), np.floor(points[:, 2]).astype(np.int64), np.arange(n) % 3)
     ends, edges = np.full((1, 2, 8, 3), np.nan), np.zeros((1, 2, 5, 3))

@@ -138,6 +138,7 @@ STEPS = ("defects", "deviation", "preassembly", "space_frame", "stitching")
 LAYERS = (
     ("version",),
     ("model",),
+    ("meaning",),
     ("progress", "language", "jobs", "unit_ratio"),
     ("geometry",),
     ("adjustment",),

@@ -1,0 +1,204 @@
+"""What comes in is checked for what it means: ranges, references, uniqueness, poses, lengths of names.
+
+The fields of a record say what their values must be (:class:`processor.model.Meaning`); :func:`problems` walks any
+record and those within it, so a new record is checked without further code. Every way in calls it once: the store for
+scenes, truths and results, the scan folder and the API for what they have made of files and arrays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from processor.model import LARGEST_MM, Checked, InputError, Meaning, Scene, Word
+
+POSE_TOLERANCE = 1e-3  # of R^T R - I
+MOST_PROBLEMS = 20
+SHOWN = 60  # characters of a value
+UNDECLARED = Meaning()  # of a field that says nothing
+
+Array = np.typing.NDArray[Any]
+
+
+def problems(record: Any, where: str = "", root: Any = None) -> list[str]:
+    """List what is impossible in a record and those within it: place (field or dataset, row), expected, found.
+
+    Places begin with ``where``; references from the root of all are to ``root``, without it to ``record``.
+    """
+    top = record if root is None else root
+    found: list[str] = []
+    for field in dataclasses.fields(record):
+        value, place = getattr(record, field.name), f"{where}/{field.name}"
+        if dataclasses.is_dataclass(value):
+            found += problems(value, place, top)
+        elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+            if "reasons" not in field.metadata:
+                for i, item in enumerate(value):
+                    found += problems(item, f"{place}/{i:04d}", top)
+        else:
+            meaning = field.metadata.get("means", UNDECLARED)
+            found += [f"{place}{fault}" for fault in _faults(field, value, meaning, record, top)]
+    if isinstance(record, Checked) and not found:
+        found += [f"{where}{fault}" for fault in record.contradictions()]
+    return found
+
+
+def check(scene: Scene, source: str, files: Mapping[str, str] | None = None) -> Scene:
+    """Return a scene that is possible. Raises InputError that names the file, by the scene's field that came from it.
+
+    ``source`` is the input; ``files`` names the file of a field of the scene, as ``{"frame": "design.json"}``.
+    """
+    found = problems(scene)
+    if found:
+        by_field = files or {}
+        first = found[0].removeprefix("/").replace("/", ".")
+        place = by_field.get(first.partition(".")[0].partition(",")[0].partition(":")[0], source)
+        more = f" (and {len(found) - 1} more of the kind)" if len(found) > 1 else ""
+        raise InputError(f"{place}: {first}{more}; correct the input")
+    return scene
+
+
+def _faults(field: dataclasses.Field[Any], value: Any, meaning: Meaning, record: Any, root: Any) -> Iterator[str]:
+    if isinstance(value, Word):
+        return
+    if isinstance(value, str):
+        yield from _of_text(value, meaning, record, root)
+    elif isinstance(value, tuple):
+        if "lists" in field.metadata:
+            value = tuple(item for row in value for item in row)
+        if all(isinstance(item, str) and not isinstance(item, Word) for item in value):
+            yield from _of_texts(value, meaning, record, root)
+    elif isinstance(value, np.ndarray) and value.size and value.dtype.kind in "iuf":
+        if field.name.startswith("T_") and value.shape[-2:] == (4, 4):
+            yield from _of_poses(value, meaning)
+        else:
+            yield from _of_numbers(value, meaning, record, root)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        yield from _of_numbers(np.asarray(value), meaning, record, root)
+
+
+# --- texts -----------------------------------------------------------------------------------------------------------
+
+
+def _of_text(value: str, meaning: Meaning, record: Any, root: Any) -> Iterator[str]:
+    if len(value) > meaning.longest:
+        yield f": expected at most {meaning.longest} characters, found {len(value)}: {_shown(value)}"
+    elif meaning.words and value not in meaning.words:
+        yield f": expected one of {', '.join(filter(None, meaning.words))}, found {_shown(value)}"
+    elif meaning.among and value and value not in _referred(meaning.among, record, root):
+        yield f": expected one of {meaning.among.strip('/')}, found {_shown(value)}"
+
+
+def _of_texts(values: tuple[str, ...], meaning: Meaning, record: Any, root: Any) -> Iterator[str]:
+    known = set(_referred(meaning.among, record, root)) if meaning.among else None
+    unlike = getattr(record, meaning.unlike) if meaning.unlike else ()
+    seen: set[str] = set()
+    for row, value in enumerate(values):
+        if len(value) > meaning.longest:
+            fault = f"expected at most {meaning.longest} characters, found {len(value)}: {_shown(value)}"
+        elif known is not None and value not in known:
+            fault = f"expected one of {meaning.among.strip('/')}, found {_shown(value)}"
+        elif meaning.unique and value in seen:
+            fault = f"expected each once, found {_shown(value)} a second time"
+        elif row < len(unlike) and unlike[row] == value:
+            fault = f"expected another than in {meaning.unlike}, found {_shown(value)} in both"
+        else:
+            seen.add(value)
+            continue
+        yield f", row {row}: {fault}"
+        return
+
+
+def _shown(value: object) -> str:
+    text = repr(value) if isinstance(value, str) else f"{value:.9g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+
+
+# --- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def _of_numbers(values: Array, meaning: Meaning, record: Any, root: Any) -> Iterator[str]:
+    real = values.dtype.kind == "f"
+    if meaning.finite and real:
+        yield from _first(values, ~np.isfinite(values), "expected finite numbers")
+    elif real and meaning is not UNDECLARED:
+        yield from _first(values, np.isinf(values), "expected finite numbers, or NaN where unknown")
+    low, high = meaning.least, meaning.most
+    if meaning.rows_of:
+        low, high = meaning.lowest_row, len(_referred(meaning.rows_of, record, root)) - 1
+    with np.errstate(invalid="ignore"):
+        if low > -np.inf or high < np.inf:
+            outside = (values < low) | (values > high)
+            yield from _first(values, outside, _interval(low, high, meaning.rows_of))
+        if meaning.above > -np.inf:
+            yield from _first(values, values <= meaning.above, f"expected numbers above {meaning.above:g}")
+    if meaning.among:
+        known = np.asarray(_referred(meaning.among, record, root))
+        yield from _first(values, ~np.isin(values, known), f"expected one of {meaning.among.strip('/')}")
+    if meaning.unlike:
+        yield from _first(
+            values, values == getattr(record, meaning.unlike), f"expected another than in {meaning.unlike}"
+        )
+    if meaning.unique:
+        first = np.zeros(len(values), bool)
+        first[np.unique(values, return_index=True)[1]] = True
+        yield from _first(values, ~first, "expected each once")
+
+
+def _interval(low: float, high: float, rows_of: str) -> str:
+    if rows_of:
+        name = rows_of.strip("/")
+        return (
+            f"expected rows of {name} ({low:g} to {high:g})" if high >= low else f"expected no row, as {name} is empty"
+        )
+    if np.isinf(high):
+        return f"expected numbers of {low:g} or more"
+    return f"expected numbers from {low:g} to {high:g}" if low > -np.inf else f"expected numbers up to {high:g}"
+
+
+def _first(values: Array, bad: Array, expected: str) -> Iterator[str]:
+    """Yield the fault of the first bad value, and how many rows have one."""
+    if not bad.any():
+        return
+    if not values.ndim:
+        yield f": {expected}, found {_shown(values.item())}"
+        return
+    rows = bad.reshape(len(bad), -1).any(axis=1)
+    row = int(rows.argmax())
+    item = values[row].reshape(-1)[bad[row].reshape(-1)].tolist()[0]
+    more = f" ({int(rows.sum())} such rows)" if rows.sum() > 1 else ""
+    yield f", row {row}: {expected}, found {_shown(item)}{more}"
+
+
+def _of_poses(values: Array, meaning: Meaning) -> Iterator[str]:
+    poses = values.reshape(-1, 4, 4)
+    unknown = np.zeros(len(poses), bool) if meaning.finite else np.isnan(poses).any(axis=(1, 2))
+    with np.errstate(invalid="ignore", over="ignore"):
+        rotation = poses[:, :3, :3]
+        off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
+        proper = (off < POSE_TOLERANCE) & (np.linalg.det(np.where(np.isfinite(rotation), rotation, 0.0)) > 0)
+        far = ~(np.abs(poses[:, :3, 3]) <= min(meaning.most, LARGEST_MM)).all(axis=1)
+        bad = (~proper | far | (poses[:, 3] != [0.0, 0.0, 0.0, 1.0]).any(axis=1)) & ~unknown
+    if bad.any():
+        row = int(bad.argmax())
+        place = f", row {row}" if values.ndim > 2 else ""
+        yield (
+            f"{place}: expected a rotation and a finite translation above a row of 0, 0, 0, 1, found "
+            f"[{'; '.join(', '.join(f'{x:.6g}' for x in line) for line in poses[row].tolist())}]"
+        )
+
+
+def _referred(path: str, record: Any, root: Any) -> Any:
+    """Return what a reference names: a field of the record, or from the root of all where it begins with "/".
+
+    A part of a path that follows a tuple of records names a field of each.
+    """
+    target = root if path.startswith("/") else record
+    for name in path.strip("/").split("."):
+        target = [getattr(item, name) for item in target] if isinstance(target, tuple | list) else getattr(target, name)
+        if target is None:
+            return ()
+    return target

@@ -1,0 +1,174 @@
+"""Checksums of HDF5 files: what is read is what was written, or an error names the dataset.
+
+Every dataset carries the SHA-256 of its path, type, shape and bytes, as they are before compression, in an attribute.
+The root group carries that of its other attributes and of the paths and checksums of all datasets, so none can be
+missing; it is a hash of the whole content. Datasets in chunks have the Fletcher-32 of HDF5 as well, for parts of them
+that are read alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import h5py
+import numpy as np
+
+ATTRIBUTE = "sha256"
+PART_ITEMS = 1 << 20
+DAMAGED = "is damaged: its checksum is not that of what was written; make or copy the file again"
+
+
+class ChecksumError(ValueError):
+    """A dataset holds something else than was written; the message names it."""
+
+
+def begin(path: str, dataset: Any) -> Any:
+    """Return the SHA-256 of a dataset's path, type and shape, to be continued with its bytes."""
+    return hashlib.sha256(f"{path}:{dataset.dtype.str}{tuple(dataset.shape)};".encode())
+
+
+def seal(dataset: Any, array: np.typing.NDArray[Any]) -> None:
+    """Give a dataset the checksum of the array that was written to it."""
+    digest = begin(dataset.name, dataset)
+    same = np.ascontiguousarray(array, dataset.dtype)
+    digest.update(same.data if same.size else b"")
+    _write(dataset, digest)
+
+
+def seal_root(file: Any) -> None:
+    """Give the root group the checksum of all that was written."""
+    _write(file, _of_all(file, {path: _stored(dataset) or "" for path, dataset in datasets(file)}))
+
+
+def _write(item: Any, digest: Any) -> None:
+    item.attrs.create(ATTRIBUTE, digest.hexdigest().encode(), dtype=h5py.string_dtype("ascii", 64))
+
+
+def _of_all(file: Any, known: Mapping[str, str]) -> Any:
+    """Return the SHA-256 of the root attributes and of the checksums of all datasets by their paths."""
+    digest = hashlib.sha256()
+    for name in sorted(file.attrs):
+        if name != ATTRIBUTE:
+            value = np.asarray(file.attrs[name], file.attrs.get_id(name).dtype)
+            digest.update(f"{name}:{value.dtype.str}{value.shape};".encode() + value.tobytes())
+    for path in sorted(known):
+        digest.update(f"{path}={known[path]};".encode())
+    return digest
+
+
+def _stored(item: Any) -> str | None:
+    value = item.attrs.get(ATTRIBUTE)
+    return bytes(value).decode("ascii", "replace") if isinstance(value, bytes) else None
+
+
+def has_any(file: Any) -> bool:
+    """Whether the root group has a checksum."""
+    return ATTRIBUTE in file.attrs
+
+
+def datasets(group: Any) -> Iterator[tuple[str, Any]]:
+    """Yield paths and datasets of a group and of those below it."""
+    for name in group:
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            yield from datasets(item)
+        else:
+            yield item.name, item
+
+
+def root_problems(file: Any) -> list[str]:
+    """List what the root group's checksum and those of the datasets contradict; no data are read."""
+    known = {path: _stored(dataset) for path, dataset in datasets(file)}
+    missing = [f"{path}: has no checksum, as every dataset of this version has" for path in known if not known[path]]
+    if not has_any(file):
+        missing.append("/: has no checksum, as every file of this version has")
+    if missing or _stored(file) == _of_all(file, {path: text or "" for path, text in known.items()}).hexdigest():
+        return missing
+    return [
+        "/: is damaged: its attributes, or the names of what it holds, are not those written; make or copy it again"
+    ]
+
+
+def problems(file: Any) -> list[str]:
+    """List the datasets that hold something else than was written; all data are read, a part at a time."""
+    faults = []
+    for _, dataset in datasets(file):
+        try:
+            column = Column(dataset)
+            rows = max(1, PART_ITEMS // max(1, math.prod(column.shape[1:])))
+            for start in range(0, len(column) if column.shape and dataset.chunks else 0, rows):
+                column[start : start + rows]
+        except ChecksumError as error:
+            faults.append(str(error))
+    return faults
+
+
+def whole(dataset: Any) -> np.typing.NDArray[Any]:
+    """Read a dataset as an array of its type, without a check."""
+    array = np.empty(dataset.shape, dataset.dtype)
+    if array.size:
+        try:
+            dataset.read_direct(array)
+        except (OSError, RuntimeError) as error:
+            raise ChecksumError(f"{dataset.name}: is damaged ({error}); make or copy the file again") from error
+    return array
+
+
+def read(dataset: Any) -> np.typing.NDArray[Any]:
+    """Read a dataset, with a check where it has a checksum. Raises ChecksumError."""
+    array, known = whole(dataset), _stored(dataset)
+    if known is not None:
+        digest = begin(dataset.name, dataset)
+        digest.update(array.data if array.size else b"")
+        if digest.hexdigest() != known:
+            raise ChecksumError(f"{dataset.name}: {DAMAGED}")
+    return array
+
+
+class Column:
+    """A dataset to be read in slices of rows.
+
+    Slices from the first row to the last, one after the other, are checked as a whole when the last one is read; others
+    by the checksums of their chunks. A dataset in one piece is read and checked at once. Raises ChecksumError.
+    """
+
+    def __init__(self, dataset: Any) -> None:
+        self.dataset = dataset
+        self.shape: tuple[int, ...] = dataset.shape
+        self.dtype = dataset.dtype
+        self.ndim: int = dataset.ndim
+        self._known = _stored(dataset)
+        self._digest: Any = None
+        self._next = 0
+        self._all = None if dataset.chunks else read(dataset)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self.shape[0]
+
+    def __getitem__(self, rows: Any) -> np.typing.NDArray[Any]:
+        """Read a slice of rows, or all by ``[()]``."""
+        data: np.typing.NDArray[Any]
+        if self._all is not None or not isinstance(rows, slice):
+            data = (read(self.dataset) if self._all is None else self._all)[rows]
+            return data
+        try:
+            data = self.dataset[rows]
+        except (OSError, RuntimeError) as error:
+            raise ChecksumError(f"{self.dataset.name}: is damaged ({error}); make or copy the file again") from error
+        if self._known is not None and rows.step in (None, 1):
+            self._continue(rows.indices(len(self))[0], data)
+        return data
+
+    def _continue(self, start: int, data: np.typing.NDArray[Any]) -> None:
+        if start == 0:
+            self._digest, self._next = begin(self.dataset.name, self.dataset), 0
+        if self._digest is None or start != self._next:
+            return
+        self._digest.update(np.ascontiguousarray(data).data if data.size else b"")
+        self._next += len(data)
+        if self._next == len(self) and self._digest.hexdigest() != self._known:
+            raise ChecksumError(f"{self.dataset.name}: {DAMAGED}")

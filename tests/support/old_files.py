@@ -1,0 +1,29 @@
+"""Files as earlier versions wrote them, or as somebody else might: without checksums."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+
+from processor.store import checksums, store
+
+
+def without_checksums(path):
+    """Turn a file into one of the version before checksums came; returns its path."""
+    with h5py.File(path, "r+") as file:
+        for _, dataset in list(checksums.datasets(file)):
+            del dataset.attrs[checksums.ATTRIBUTE]
+        del file.attrs[checksums.ATTRIBUTE]
+        results = bytes(file.attrs["format"]) == store.FORMATS["results"].encode()
+        del file.attrs["format_version"]
+        file.attrs["format_version"] = np.bytes_("2.0" if results else "1.3")
+    return path
+
+
+def sealed_again(path):
+    """Give a changed file the checksums of its new content, as somebody who wants to mislead would."""
+    with h5py.File(path, "r+") as file:
+        for _, dataset in list(checksums.datasets(file)):
+            checksums.seal(dataset, checksums.whole(dataset))
+        checksums.seal_root(file)
+    return path
