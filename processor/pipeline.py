@@ -143,10 +143,19 @@ def steps_for(scene: Scene) -> tuple[str, ...]:
     modules = step_modules()
     found = tuple(name for name, module in modules.items() if _applies(module, scene))
     if not found:
-        raise UsageError(
-            f"no step runs by itself on a scene of kind {scene.kind}; name one with --steps: {', '.join(modules)}"
-        )
+        raise UsageError(f"{_nothing_to_do(scene)}; the steps are {', '.join(modules)}")
     return found
+
+
+def _nothing_to_do(scene: Scene) -> str:
+    """Say why no step runs by itself, and the line that leads to one."""
+    if scene.kind == "structure" and scene.structure is None and len(scene.scans) == 1:
+        return (
+            f"{scene.name}: one scan without a design, so no step runs by itself: for a sphere target or balls add "
+            "--steps spheres; to compare it with a design put that beside it and run processor init; to compare it "
+            "with another scan: processor compare REFERENCE COMPARED -o OUT"
+        )
+    return f"{scene.name}: no step runs by itself on this scene of kind {scene.kind}; name one with --steps"
 
 
 def jobs_for(

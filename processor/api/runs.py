@@ -142,6 +142,8 @@ def run(
     with stage(f"reading {path.name}"):
         scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
     log(f"{path.name}: read as {scene.units} ({scene.units_reason})")
+    if not wanted and len(scene.scans) == 2 and [job.step for job in jobs] == ["stitch"]:
+        log("two scans without a design are stitched; to measure between them: processor compare A B -o OUT")
     execution = pipeline.execute(path, scene, jobs, log, piecewise)
     report = evaluate.evaluate(path, execution)
     fingerprint.check_unchanged(path.resolve(), before, place)

@@ -41,13 +41,15 @@ class _Diameters(click.Command):
 @click.option("--max-depth", type=LENGTH, help="of the cylinder, to either side of the core point")
 @click.option("--registration-error", type=click.FloatRange(min=0.0), default=0.0, help="a length, part of the LOD95")
 @click.option("--normals", type=FILE, help="nx, ny, nz of every core point, PLY or text, instead of fitted ones")
+@click.option("--units", metavar="U[/V][,U[/V]]", help="of all files, or of both; V of their heights, e.g. m/us-ft,m")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print compare.json")
 @debug_option
 def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: bool, **options: Any) -> None:
     """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
 
-    All lengths are in the unit of the clouds; those not given are derived from their density.
+    All lengths are in the unit of the clouds, with --units in that of REFERENCE; those not given are derived from the
+    clouds' density.
     """
     from processor.compare import compare as comparing
     from processor.language.messages import messages

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from processor import readers, store
-from processor.compare import diagnosis
+from processor.compare import diagnosis, units
 from processor.geometry import m3c2, neighbors, normal_orientation
 from processor.geometry.m3c2 import CloudNormals, Distances, Scales, Summary
 from processor.geometry.normal_orientation import Turned
@@ -21,6 +21,7 @@ from processor.model import Floats, InputError, Reason, UsageError, reason
 from processor.readers import RawScan
 from processor.readers.raw_scan import FAR, ORIGIN_STEP
 from processor.scan_folder import normals as scan_folder_normals
+from processor.scan_folder.units import MM_PER_UNIT
 
 CLOUDS = ("reference", "compared", "core")
 
@@ -37,6 +38,7 @@ class Request:
     projection_diameter: float = 0.0
     max_depth: float = 0.0
     registration_error: float = 0.0
+    units: str = ""  # of the files, see units.of_files; "" = as they give them
 
     def __post_init__(self) -> None:
         for name in ("normal_diameter", "projection_diameter", "max_depth", "registration_error"):
@@ -102,11 +104,13 @@ class _Cloud:
     path: Path
     scans: list[RawScan]
     sha256: str
+    stated: str = ""  # unit that the command line gives the file
+    scale: Floats = field(default_factory=lambda: np.ones(3))  # to the unit of the comparison, along x, y, z
 
     @property
     def unit(self) -> str:
-        """Unit that the file gives, "" for none."""
-        return next((scan.unit for scan in self.scans if scan.unit), "")
+        """Unit that the command line or else the file gives, "" for none."""
+        return self.stated or next((scan.unit for scan in self.scans if scan.unit), "")
 
     @property
     def count(self) -> int:
@@ -131,13 +135,15 @@ class _Cloud:
             for scan in self.scans
         ]
 
-    @staticmethod
-    def _placed(scan: RawScan, origin: Floats) -> Floats:
-        if not scan.T_project_scan.size:
-            return scan.points + (scan.origin - origin)
-        T = scan.T_project_scan
-        points: Floats = scan.points @ T[:3, :3].T + (T[:3, :3] @ scan.origin + (T[:3, 3] - origin))
-        return points
+    def _placed(self, scan: RawScan, origin: Floats) -> Floats:
+        points, offset, scale = scan.points, scan.origin, self.scale
+        if scan.T_project_scan.size:
+            T = scan.T_project_scan
+            points, offset = points @ T[:3, :3].T, T[:3, :3] @ offset + T[:3, 3]
+        placed: Floats = (
+            points + (offset - origin) if (scale == 1.0).all() else points * scale + (offset * scale - origin)
+        )
+        return placed
 
 
 def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Comparison:
@@ -202,7 +208,14 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
 
 def _read_clouds(request: Request) -> dict[str, _Cloud]:
     """Read the clouds of CLOUDS; without a core file there is no "core"."""
-    clouds = {name: _read(path) for name in CLOUDS if (path := getattr(request, name)) is not None}
+    files = {name: path for name in CLOUDS if (path := getattr(request, name)) is not None}
+    stated = units.of_files(request.units, tuple(files))
+    clouds = {name: _read(path) for name, path in files.items()}
+    if stated:
+        into = MM_PER_UNIT[stated["reference"].horizontal]
+        for name, unit in stated.items():
+            scale = np.array([MM_PER_UNIT[axis] for axis in (unit.horizontal, unit.horizontal, unit.vertical)]) / into
+            clouds[name] = replace(clouds[name], stated=stated["reference"].horizontal, scale=scale)
     for cloud in (clouds["reference"], clouds["compared"]):
         if cloud.count < m3c2.FEWEST_FOR_LOD:
             raise InputError(
@@ -276,7 +289,10 @@ def _unit(clouds: list[_Cloud]) -> str:
     paths = {cloud.unit: cloud.path for cloud in clouds if cloud.unit}
     if len(paths) > 1:
         (a, first), (b, second) = list(paths.items())[:2]
-        raise InputError(f"{second}: expected clouds in one unit, found {b}, and {a} in {first}; convert one of them")
+        raise InputError(
+            f"{second}: expected clouds in one unit, found {b}, and {a} in {first}; state them by "
+            f"--units {a},{b}, or convert one of them"
+        )
     return next((cloud.unit for cloud in clouds[:2] if cloud.unit), "")
 
 
@@ -294,7 +310,7 @@ def _log_scales(request: Request, used: Scales, unit: str, log: Callable[[str], 
 
     spacing = max(used.reference_spacing_mm, used.compared_spacing_mm)
     log(
-        f"lengths are in the unit of the files{f' ({unit})' if unit else ', which they do not give'}; "
+        f"{_unit_said(request, unit)}; "
         f"spacing {used.reference_spacing_mm:.4g} (reference), {used.compared_spacing_mm:.4g} (compared)"
     )
     if request.normals is not None:
@@ -306,6 +322,12 @@ def _log_scales(request: Request, used: Scales, unit: str, log: Callable[[str], 
     log(f"max depth to either side {used.max_depth_mm:.6g}, {source(request.max_depth, 'the distance of the clouds')}")
     points = np.pi / 4.0 * (used.projection_diameter_mm / spacing) ** 2
     log(f"a cylinder holds about {points:.3g} points of the sparser cloud")
+
+
+def _unit_said(request: Request, unit: str) -> str:
+    if request.units:
+        return f"files read as {request.units} (--units), lengths are in {unit}"
+    return f"lengths are in the unit of the files{f' ({unit})' if unit else ', which they do not give'}"
 
 
 def _log_warnings(comparison: Comparison, log: Callable[[str], None]) -> None:

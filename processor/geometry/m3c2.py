@@ -307,7 +307,7 @@ def share(marked: Bools, places: Floats, cell: float) -> Share:
 
 
 HALF_DIAGONAL = 0.5 * SIDE * 3.0**0.5 * (1.0 + 1e-9)  # of a block, in cells
-FEWEST_OF_PLANE = 4
+FEWEST_OF_PLANE = 3
 
 
 @njit(cache=True, nogil=True)
@@ -379,7 +379,7 @@ def along_normals(cells, places, normals, order, first, last, cylinder, count, m
 def normals_at(cells, places, order, first, last, radius, normals, roughness, count):  # type: ignore[no-untyped-def]
     """Fit a plane to the points within ``radius`` of each place: fill its normal, their sd from it and their number.
 
-    NaN for fewer than FEWEST_OF_PLANE points, and for points on a line.
+    NaN for fewer than FEWEST_OF_PLANE points, and for points on a line. Of so few points the sd is NaN: none is off.
     """
     size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
     tops = SIDE * cells.extent - 1
@@ -436,4 +436,5 @@ def normals_at(cells, places, order, first, last, radius, normals, roughness, co
         length = np.sqrt(V[0, least] ** 2 + V[1, least] ** 2 + V[2, least] ** 2)
         for k in range(3):
             normals[row, k] = V[k, least] / length
-        roughness[row] = np.sqrt(max(0.0, A[least, least]))
+        if n > FEWEST_OF_PLANE:
+            roughness[row] = np.sqrt(max(0.0, A[least, least]))

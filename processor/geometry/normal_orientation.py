@@ -103,8 +103,10 @@ def turned(fitted: CloudNormals, core: Floats, normal_diameter: float, scanner: 
 
 
 def _noise(fitted: CloudNormals, normal_diameter: float) -> Floats:
-    """Return the standard deviation (k,) of a normal's direction, rad."""
+    """Return the standard deviation (k,) of a normal's direction, rad; for a plane through all its points MOST_LEAN."""
     noise: Floats = fitted.roughness / (np.sqrt(np.maximum(fitted.count, 1)) * 0.25 * normal_diameter)
+    exact = np.isnan(noise) & np.isfinite(fitted.normals).all(axis=1)
+    noise[exact] = MOST_LEAN
     return noise
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from processor import readers
 from processor.model import InputError, did_you_mean
+from processor.scan_folder.meshes import CAD_SUFFIXES
 
 PROJECT = "project.toml"
 TRUTH = "truth.h5"
@@ -16,6 +17,12 @@ CONTROL = "control.csv"
 DESIGNS = ("design.json", "design.csv")
 SCANS = "scans"
 NOT_SCANS = ("design.csv", PICKS, "deviation.csv", CONTROL, "index.csv")
+
+
+def only_cad_file(folder: Path) -> str:
+    """Return the name of the one CAD file of a folder, which no scan can be; "" where there is none or several."""
+    found = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in CAD_SUFFIXES and path.is_file()]
+    return found[0] if len(found) == 1 else ""
 
 
 def missing(path: Path) -> InputError:

@@ -32,7 +32,17 @@ from processor.scan_folder import guess, scanner_grid, units
 from processor.scan_folder.checked_toml import Table, existing_file_in
 from processor.scan_folder.control_points import Measured, control_points, read_control
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
-from processor.scan_folder.files import CONTROL, DESIGNS, PICKS, PROJECT, SCANS, STATIONS, TRUTH, scan_files
+from processor.scan_folder.files import (
+    CONTROL,
+    DESIGNS,
+    PICKS,
+    PROJECT,
+    SCANS,
+    STATIONS,
+    TRUTH,
+    only_cad_file,
+    scan_files,
+)
 from processor.scan_folder.guess import Guess
 from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
@@ -183,8 +193,10 @@ def _read_project(folder: Path) -> _Project:
     if kind and kind not in KINDS:
         like = did_you_mean(kind, KINDS)
         raise InputError(f"{path}: unknown kind {kind!r}{like}; expected one of {', '.join(KINDS)}")
-
-    named = table.text("design", "") or next((name for name in DESIGNS if (folder / name).exists()), "")
+    found = next((name for name in DESIGNS if (folder / name).exists()), "")
+    named = table.text("design", "") or found
+    if not named and guessed is None and not path.exists():
+        named = only_cad_file(folder)
     design = existing_file_in(folder, named, str(path)) if named else None
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
     if guessed:
@@ -327,6 +339,8 @@ def _unit(raw: RawScan, path: Path, project: _Project, option: str) -> tuple[str
         return known_unit(raw.unit), f"given by the {path.suffix.lower()[1:]} file or its format"
     if project.units:
         return project.units, GUESSED if project.guessed else f"given in {PROJECT}"
+    if project.design is None and project.guessed is None and (why := units.not_metres(raw.points)):
+        return "mm", why
     return "m", "taken as metres, as scanners write: neither the format nor the project gives a unit"
 
 

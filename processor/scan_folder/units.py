@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from processor import unit_ratio
 from processor.model import Floats, InputError, UsageError
@@ -45,6 +46,9 @@ CERTAIN_RATIO = 100.0  # and its inverse: ratios that no surroundings of a part 
 SHAPE_TOLERANCE = 2.0  # ratio of extents along the principal axes, of which a part seen from one side lacks some
 THIN = 0.05  # of the largest extent: such an extent is not compared
 SAMPLE = 100_000  # points
+# In metres no scan of a structure is larger, and none has points farther apart.
+LARGEST_M, WIDEST_SPACING_M = 2000.0, 0.5
+FEWEST_FOR_SPACING, SPACING_POINTS = 1000, 2000
 
 
 def known_unit(text: str) -> str:
@@ -59,6 +63,37 @@ def radius(points: Floats) -> float:
     """Return the largest distance of points (n, 3) from the middle of their box: a size that hardly depends on pose."""
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     return float(np.linalg.norm(points - middle, axis=1).max())
+
+
+def not_metres(points: Floats) -> str:
+    """Return why points (n, 3) of a format without a unit are taken as mm, "" where they may be metres.
+
+    As metres the scan would be larger than any structure, or its points too far apart to show one. Points nearer to
+    each other than half a millimetre in a scan below 2 m are not told from metres.
+    """
+    sample = points[:: max(1, len(points) // SAMPLE)]
+    if not len(sample):
+        return ""
+    low, high = np.quantile(sample, [STRAY, 1.0 - STRAY], axis=0)
+    extent = float((high - low).max())
+    if extent > LARGEST_M:
+        return f"taken as millimetres: in metres the scan would be {extent / 1000.0:.3g} km across; no unit is given"
+    spacing = _spacing(points, int(np.argmax(high - low))) if len(points) >= FEWEST_FOR_SPACING else 0.0
+    if spacing > WIDEST_SPACING_M:
+        return f"taken as millimetres: in metres its points would be {spacing:.3g} m apart; no unit is given"
+    return ""
+
+
+def _spacing(points: Floats, axis: int) -> float:
+    """Median distance of points (n, 3) from the nearest other one, in a slab of SAMPLE points across an axis."""
+    along = points[:, axis]
+    first = max((len(points) - SAMPLE) // 2, 0)
+    last = min(first + SAMPLE, len(points)) - 1
+    low, high = np.partition(along, (first, last))[[first, last]]
+    slab = points[(along >= low) & (along <= high)]
+    chosen = slab[:: max(1, len(slab) // SPACING_POINTS)]
+    distance, _ = cKDTree(slab).query(chosen, k=2)
+    return float(np.median(distance[:, 1]))
 
 
 def check_extent(what: str, points: Floats, unit: str, reason: str, advice: str, stray: float = 0.0) -> None:

@@ -307,3 +307,51 @@ def test_the_command_runs_as_its_own_process(clouds, tmp_path):
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["summary"]["core_points"] == 50
     assert "projection diameter" in done.stderr
+
+
+def test_units_of_each_file_and_of_heights(tmp_path, monkeypatch):
+    """The same two clouds in m; the compared one in feet; and the reference with its heights in survey feet."""
+    first, second = wavy(3000, 1) / 1000.0, wavy(3000, 2, 5.0) / 1000.0
+    us_ft = 1200.0 / 3937.0
+    in_m = [written(tmp_path / f"{k}.xyz", one) for k, one in enumerate((first, second))]
+    in_ft = written(tmp_path / "ft.xyz", second / 0.3048)
+    heights = written(tmp_path / "heights.xyz", first / [1.0, 1.0, us_ft])
+    options = ("--normal-diameter", 0.08, "--projection-diameter", 0.05, "--max-depth", 0.04)
+    found = []
+    for name, units, files in (("a", (), in_m), ("b", ("--units", "m,ft"), (in_m[0], in_ft)),
+                               ("c", ("--units", "m/us-ft,ft"), (heights, in_ft))):  # fmt: skip
+        assert called(monkeypatch, *files, "-o", tmp_path / name, *options, *units) == 0
+        found.append(table(tmp_path / name))
+    for other in found[1:]:
+        np.testing.assert_allclose(other["distance"], found[0]["distance"], atol=1e-9)
+        np.testing.assert_allclose(other["z"], found[0]["z"], atol=1e-12)
+    assert json.loads((tmp_path / "c/compare.json").read_text())["unit"] == "m"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("furlong", "--units furlong: unknown unit 'furlong'"),
+        ("m,m,m", "expected one unit, or two"),
+        ("m,", "expected one unit, or two"),
+        ("m/", "expected a unit of the heights after the slash"),
+    ],
+)
+def test_a_slip_in_units_is_named(clouds, text, said):
+    with pytest.raises(UsageError, match=said):
+        compare.compare(Request(clouds[0], clouds[1], units=text))
+
+
+def test_three_points_give_a_normal(tmp_path):
+    """As in PDAL and CloudCompare: a plane through three points; two give none."""
+    plane = np.array([[0.0, 0, 0], [1, 0, 0.5], [0, 1, 0], [50, 0, 0], [51, 0, 0], [100, 0, 0]])
+    first = written(tmp_path / "first.xyz", plane)
+    second = written(tmp_path / "second.xyz", plane + np.array([0.0, 0, 0.1]))
+    core = written(tmp_path / "core.xyz", plane[[0, 3, 5]])
+    found = compare.compare(
+        Request(first, second, core=core, normal_diameter=4.0, projection_diameter=4.0, max_depth=2.0)
+    )
+    expected = np.array([-0.5, 0.0, 1.0]) / np.sqrt(1.25)
+    np.testing.assert_allclose(found.normals[0], expected, atol=1e-12)
+    assert np.isnan(found.normals[1:]).all()
+    assert found.distances.distance[0] == pytest.approx(0.1 * expected[2])
