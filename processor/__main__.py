@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import traceback
 
 import click
 
-from processor.cli.common import print_error_line
+from processor.cli.common import log_line, print_error_line
 from processor.cli.main import commands
 from processor.model import InputError, UsageError
 
@@ -19,6 +20,14 @@ OUTPUT_CUT = 141  # as a shell reports SIGPIPE
 def main() -> None:
     """Run the command line; the exit codes are those of processor --help."""
     try:
+        _main()
+    except SystemExit as end:
+        log_line(f"exit code {end.code or 0}")
+        raise
+
+
+def _main() -> None:
+    try:
         sys.exit(commands(standalone_mode=False))
     except click.exceptions.Exit as end:
         sys.exit(end.exit_code)
@@ -28,7 +37,7 @@ def main() -> None:
         error.show()
         sys.exit(WRONG_USAGE)
     except UsageError as error:
-        print_error_line(f"error: {error}")
+        print_error_line(f"error: {error}", logging.ERROR)
         sys.exit(WRONG_USAGE)
     except BrokenPipeError:
         # Whoever read the output has seen enough. Python would complain once more when it flushes at exit.
@@ -38,7 +47,8 @@ def main() -> None:
         if "--debug" in sys.argv:
             traceback.print_exc()
         foreseen = isinstance(error, (InputError, OSError))
-        print_error_line(f"error: {error}" if foreseen else f"error: internal error: {error!r}; --debug shows where")
+        line = f"error: {error}" if foreseen else f"error: internal error: {error!r}; --debug shows where"
+        print_error_line(line, logging.ERROR)
         sys.exit(BAD_INPUT)
 
 

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -364,6 +365,24 @@ def test_a_slip_is_answered_with_the_name_that_is_like_it(called, tmp_path, argu
     assert done.returncode in (2, 3)
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) <= 4
+
+
+def test_a_log_file_has_times_levels_and_the_exit_code(called, tmp_path):
+    np.savetxt(tmp_path / "good.xyz", ball_cloud(count=200) / 1000.0)
+    said = called("run", "good.xyz", "--steps", "magic", "--log-file", "log.txt", cwd=tmp_path)
+    assert said.returncode == 2
+    assert called("run", "good.xyz", "--steps", "spheres", "-q", "--log-file", "log.txt", cwd=tmp_path).returncode == 0
+    lines = (tmp_path / "log.txt").read_text("utf-8").splitlines()
+    pattern = r"20\d\d-\d\d-\d\dT\d\d:\d\d:\d\dZ (INFO|WARNING|ERROR) \S"
+    assert all(re.match(pattern, line) for line in lines)
+    assert "INFO run good.xyz --steps magic" in lines[0]
+    assert any("ERROR error: no step 'magic'" in line for line in lines)
+    assert [line.rpartition(" ")[2] for line in lines if "exit code" in line] == ["2", "0"]
+    assert any("INFO spheres (ray): ok" in line for line in lines)
+    assert called("check", "nowhere", "--log-file", "log.txt/x", cwd=tmp_path).returncode in (2, 3)
+    before = (tmp_path / "log.txt").read_text("utf-8")
+    called("run", "nowhere", cwd=tmp_path)
+    assert (tmp_path / "log.txt").read_text("utf-8") == before
 
 
 @pytest.mark.parametrize("program", [main.commands, designgen_cli.commands])

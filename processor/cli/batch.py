@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -134,4 +135,4 @@ def _report_input(record: Record, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"event": "input", **as_object(record)}))
     elif record.reason is not None:
-        print_error_line(f"{record.input}: failed: {messages('en').text(record.reason)}")
+        print_error_line(f"{record.input}: failed: {messages('en').text(record.reason)}", logging.WARNING)

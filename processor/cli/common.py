@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import shlex
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +15,7 @@ import click
 
 from processor.jobs.exit_codes import DONE, FAIL_ON, IN_PART, LIMIT_MISSED, VERDICT, is_refused
 from processor.language.messages import printable
-from processor.model import Status, UsageError
+from processor.model import InputError, Status, UsageError
 
 if TYPE_CHECKING:
     from processor.api.runs import Results
@@ -23,12 +27,53 @@ UNITS = ("m", "mm", "cm", "inch", "ft")
 fail_on_option = click.option(
     "--fail-on", type=click.Choice(tuple(FAIL_ON)), help="exit code 5 where a verdict is so, or worse"
 )
-debug_option = click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+LOG = logging.getLogger("processor")
+LOG_FORMAT, LOG_TIME = "%(asctime)sZ %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%S"
 
 
-def print_error_line(line: str) -> None:
-    """Write one line on standard error; control characters, as of a file's name, are replaced."""
+def print_error_line(line: str, level: int = logging.INFO) -> None:
+    """Write one line on standard error, and to the log file; control characters, as of a file's name, are replaced."""
     click.echo(printable(line), err=True)
+    log_line(line, level)
+
+
+def log_line(line: str, level: int = logging.INFO) -> None:
+    """Write one line to the log file alone, if there is one."""
+    LOG.log(level, "%s", printable(line))
+
+
+def _log_to(_: click.Context, __: click.Parameter, path: Path | None) -> None:
+    """Append to a log file from now on; InputError where it cannot be written."""
+    for earlier in LOG.handlers[:]:
+        LOG.removeHandler(earlier)
+        earlier.close()
+    LOG.propagate = False
+    if path is None:
+        LOG.addHandler(logging.NullHandler())
+        return
+    try:
+        handler = logging.FileHandler(path, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"--log-file {path}: cannot be written ({error.strerror or error})") from error
+    formatter = logging.Formatter(LOG_FORMAT, LOG_TIME)
+    formatter.converter = time.gmtime
+    handler.setFormatter(formatter)
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.INFO)
+    LOG.info("%s", printable(shlex.join(sys.argv[1:])))
+
+
+def debug_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --log-file and --debug, which every command has."""
+    log_file = click.option(
+        "--log-file",
+        type=click.Path(path_type=Path, dir_okay=False),
+        callback=_log_to,
+        expose_value=False,
+        help="append progress, errors and the exit code, with times (UTC) and levels",
+    )
+    debug = click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+    return log_file(debug(command))
 
 
 def check_jobs(jobs: int | None, cluster: str | None) -> None:
@@ -74,6 +119,7 @@ def show_results(
     from processor.results.names import REPORT_PAGE, RESULTS_JSON
 
     page = str(output / REPORT_PAGE)
+    log_line(headline.of_run(results.execution))
     if shown.as_json:
         click.echo((output / RESULTS_JSON).read_text("utf-8"), nl=False)
     elif shown.quiet:
@@ -83,7 +129,7 @@ def show_results(
         for line in write(results.execution, results.report, page):
             click.echo(line)
     for line in terminal.failures(results.execution):
-        print_error_line(f"error: {line}")
+        print_error_line(f"error: {line}", logging.ERROR)
     complete = all(result.status == Status.OK for result in results.steps.values())
     failed = any(result.status == Status.FAILED for result in results.steps.values())
     if failed:

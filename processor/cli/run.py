@@ -14,6 +14,7 @@ from processor.cli.common import (
     Shown,
     debug_option,
     fail_on_option,
+    log_line,
     output_options,
     print_error_line,
     show_results,
@@ -62,7 +63,7 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
         options["units"],
         options["seed"],
         lang=options["lang"],
-        log=(lambda _: None) if shown.quiet else print_error_line,
+        log=log_line if shown.quiet else print_error_line,
     )
     show_results(context, output, results, shown, fail_on)
 
