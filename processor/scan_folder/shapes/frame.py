@@ -64,10 +64,10 @@ def _members(nodes: Balls, pipes: Tubes) -> tuple[Ints, Ints, Ints, Floats]:
     lengths = np.linalg.norm(pipes.ends[:, 1] - pipes.ends[:, 0], axis=1)
     for tube in np.flatnonzero(lengths > 0.0).tolist():
         way = (pipes.ends[tube, 1] - pipes.ends[tube, 0]) / lengths[tube]
-        found = [_ball_at(nodes, tree, pipes.ends[tube, k], sign * way) for k, sign in ((0, -1.0), (1, 1.0))]
-        if found[0] is None or found[1] is None or found[0][0] == found[1][0]:
+        first, second = (_ball_at(nodes, tree, pipes.ends[tube, k], sign * way) for k, sign in ((0, -1.0), (1, 1.0)))
+        if first is None or second is None or first[0] == second[0]:
             continue
-        (i, off_i), (k, off_k) = found
+        (i, off_i), (k, off_k) = first, second
         clear = np.linalg.norm(nodes.centres[i] - nodes.centres[k]) - nodes.radii[i] - nodes.radii[k]
         if lengths[tube] < SHORT * clear:
             continue
