@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from processor.api.runs import Results
 
 LANGUAGES = ("en", "zh")
-UNITS = ("m", "mm", "cm", "inch", "ft")
+UNITS = ("m", "mm", "cm", "dm", "km", "inch", "ft", "us-ft")
 
 
 fail_on_option = click.option(

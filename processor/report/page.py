@@ -37,6 +37,7 @@ NAMES = (
     "loop",
     "matrix",
     "key",
+    "of",
 )  # columns that no language translates
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 

@@ -22,6 +22,7 @@ from processor.model import (
     DesignBodies,
     FrameDesign,
     InputError,
+    Scan,
     Scene,
     Status,
     StructureDesign,
@@ -30,13 +31,17 @@ from processor.model import (
     did_you_mean,
     reason,
 )
+from processor.report import headline, limit_table
 from processor.scan_folder import folder
 from processor.space_frame import supports
 from processor.space_frame.result import Balls, Evidence, Flag
 from processor.stitching import verdicts as of_network
 from processor.stitching.result import Closures, Scans
 from processor.stitching.result import Result as StitchResult
+from processor.store import store
+from processor.writers import project
 
+WORST = ("fail", "indeterminate", "pass")
 PASS, FAIL, OPEN = Verdict.PASS, Verdict.FAIL, Verdict.INDETERMINATE
 SQUARE = np.array([[0.0, 0, 0], [1000, 0, 0], [1000, 1000, 0], [0, 1000, 0]])
 RIGHT = np.array([3000.0, 0, 0])
@@ -348,6 +353,37 @@ def test_a_support_is_read_and_a_slip_is_named(tmp_path):
     (tmp_path / "design.json").write_text(text.replace("KIND", "multipoint"))
     with pytest.raises(InputError, match=r"'support', found 'multipoint' .did you mean 'multi-point'"):
         folder.read_input(tmp_path)
+
+
+def test_supports_and_deflections_go_through_files(tmp_path):
+    _, design = frame(np.zeros((5, 3)), supports_=(1, 2, 0, 1, 0))
+    scene = Scene("f", "space-frame", (Scan("s", np.random.default_rng(0).uniform(size=(50, 3))),), frame=design)
+    assert project.write_design(scene, tmp_path, 1.0, with_meshes=False) == "design.json"
+    np.savetxt(tmp_path / "scan.xyz", design.centres / 1000.0)
+    found = folder.read_input(tmp_path).frame
+    store.write_scene(tmp_path / "s.h5", scene, None, {})
+    for one in (found, store.read_scene(tmp_path / "s.h5").frame):
+        np.testing.assert_array_equal(one.supports, design.supports)
+        np.testing.assert_array_equal(one.deflections, design.deflections)
+    without = dataclasses.replace(scene, frame=dataclasses.replace(design, supports=[], deflections=[]))
+    assert store.scene_hash(without) != store.scene_hash(scene)
+
+
+# --- the page
+
+
+def test_the_page_and_the_table_have_the_worst_first_and_name_what_is_not_verified():
+    moved = np.zeros((5, 3))
+    moved[1, :2] = 0.0, 11.0
+    limits = supports.judge(*frame(moved), standards.load("GB 50205-2020"), True)
+    (table,) = limit_table.limit_table(limits, "x-limits")
+    assert [str(row[2]) for row in table.rows] == sorted([str(row[2]) for row in table.rows], key=WORST.index)
+    assert "Not verified" not in str(table.note)
+    unsure = dataclasses.replace(limits, verified=np.zeros(len(limits), bool))
+    (table,) = limit_table.limit_table(unsure, "x-limits")
+    assert "Not verified: the limits from GB 50205-2020 11.3.6 were not" in str(table.note)
+    assert str(headline.of_limits(limits)) == f"of {len(limits)} limits 1 fail, {len(limits) - 1} pass"
+    assert limit_table.limit_table(None, "x") == []
 
 
 # --- networks
