@@ -12,7 +12,7 @@ import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, messages, text
-from processor.model import Scene, StepRun, Verdict, Word
+from processor.model import Scene, Status, StepRun, Verdict, Word
 from processor.pipeline import Execution
 from processor.report import all_tables, headline, page_script, templates
 from processor.report.step_report import step_report
@@ -140,8 +140,10 @@ def _tone(run: StepRun) -> str:
     return "" if provisional else "good"
 
 
-def _message(result: Any, lang: str) -> str:
-    return messages(lang).sentences(result.reasons) if hasattr(result, "reasons") else str(result.message)
+def _message(run: StepRun, lang: str) -> str:
+    """Write the reasons of a step; of one that failed first why."""
+    why: list[Any] = list(step_report(run.step).why(run.result)) if run.result.status == Status.FAILED else []
+    return messages(lang).sentences([*why, *(reason for reason in run.result.reasons if reason not in why)])
 
 
 def _sections(
@@ -150,10 +152,12 @@ def _sections(
     sections = []
     for run, others in execution.by_step():
         tables = [table for table in all_tables.tables_of_step(run, others, report) if table.on_page]
+        if run.result.status == Status.FAILED:
+            tables = [table for table in tables if table.rows]
         sections.append(
             {
                 "title": step_report(run.step).title,
-                "message": _message(run.result, lang),
+                "message": _message(run, lang),
                 "lead": [_table(table, lang) for table in tables if _leads(table)],
                 "tables": [_table(table, lang) for table in tables if not _leads(table)],
                 "step": run.step,

@@ -87,9 +87,9 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
             limit_source="" if limit is None else limit.source,
         )
         balls = _with_movements(balls, movements, reference.limit, matched is not None and matched.status is Status.OK)
-        if scene.frame is not None:
-            sure = matched is not None and matched.status is Status.OK
-            judged = supports.judge(balls, scene.frame, standards.default_for(scene.tolerance), sure)
+    if scene.frame is not None:
+        sure = matched is not None and matched.status is Status.OK
+        judged = supports.judge(balls, scene.frame, standards.default_for(scene.tolerance), sure)
     if matched is not None:
         pose = DesignPose(
             status=matched.status,
