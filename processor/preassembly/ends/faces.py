@@ -177,7 +177,9 @@ def _with_waves(coefficients: Floats, used: UsedPoints, at: Floats, face: EndFac
     trend = basis(found.centre[:, 0], found.centre[:, 1] / half)[:, terms]
     noise = max(found.noise, FLOOR_MM**2)
     freedom = len(used.residual) - len(found.mean)
-    means = kriging.Means(found.centre, found.mean, noise / found.number, trend, freedom, -coefficients[terms], REACH_MM)
+    means = kriging.Means(
+        found.centre, found.mean, noise / found.number, trend, freedom, -coefficients[terms], REACH_MM
+    )
     nodes = np.stack([np.zeros(len(NODES)), half * np.array(NODES)], axis=1)
     hypotheses = kriging.by_hypotheses(means, nodes)
     if face.narrow:

@@ -11,10 +11,11 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from processor.language.messages import Message, text
-from processor.model import ArchDesign, Floats, Scene, StepRun
+from processor.model import Floats, Scene, StepRun
 from processor.preassembly.result import Deviations, EdgeSide, Joints, Result
 from processor.report.preassembly import residual_map
 from processor.report.preassembly.joint_figures import by_axis, gap_vectors
+from processor.report.preassembly.part_lines import part_lines
 from processor.report.style import (
     BEHIND_TEXT,
     COLOURS,
@@ -66,14 +67,14 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     times = _times(scene, joints)
     for axes, up, ends in ((side, 2, (4, 6)), (plan, 1, (5, 7))):
         for i in range(len(scene.arch.parts)):
-            for edge in _lines(scene.arch, i):
+            for edge in part_lines(scene.arch, i):
                 axes.plot(edge[:, 0] / 1e3, edge[:, up] / 1e3, color="0.35" if i % 2 else "0.6", linewidth=2.0)
         for j in range(len(joints)):
             _joint_drawn(axes, scene.arch.joint_points[j], joints.gaps[j], up, ends, times)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("along the span, m")
     for i, part in enumerate(scene.arch.parts):
-        x, _, z = _lines(scene.arch, i)[0].T / 1e3
+        x, _, z = part_lines(scene.arch, i)[0].T / 1e3
         middle = (x[len(x) // 2], z[len(z) // 2]) if len(x) else (0.0, 0.0)
         _write(side, printable_name(part.name, i), middle, -20)
     labels = [printable_name(name, j) for j, name in enumerate(joints.name)]
@@ -99,16 +100,6 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     return text("Joints of the bridge, method {method}", method=run.method), png(figure)
 
 
-def _lines(design: ArchDesign, i: int) -> list[Floats]:
-    """Lines (n, 3) that stand for a part: its bottom edges, or from its middle to its joints where it has none."""
-    part = design.parts[i]
-    if len(part.bottom_edge_left) or not len(part.vertices):
-        return [part.bottom_edge_left, part.bottom_edge_right]
-    middle = 0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0))
-    joints = design.joint_points[(design.joined == i).any(axis=1), :4].mean(axis=1)
-    return [np.stack([joint, middle]) for joint in joints]
-
-
 def _times(scene: Scene, joints: Joints) -> float:
     """Return the enlargement of gaps: 1, 2 or 5 times a power of ten.
 
@@ -119,7 +110,7 @@ def _times(scene: Scene, joints: Joints) -> float:
     largest = float(sizes[np.isfinite(sizes)].max(initial=0.0))
     if not np.isfinite(joints.gaps).any():
         return 0.0
-    lines = [line for i in range(len(scene.arch.parts)) for line in _lines(scene.arch, i)[:1]]
+    lines = [line for i in range(len(scene.arch.parts)) for line in part_lines(scene.arch, i)[:1]]
     points = np.concatenate([scene.arch.joint_points.reshape(-1, 3), *lines])
     wanted = GAP_SHARE * float(np.ptp(points[:, 0])) / max(largest, LEAST_SHOWN_MM)
     return rounded(wanted)
