@@ -34,7 +34,7 @@ class Params(sections.Params):
         expect(self.type in TYPES, "assembly.type", self.type, f"one of {', '.join(TYPES)}")
         expect(2 <= self.parts <= 100, "assembly.parts", self.parts, "2 to 100")
         least = 2.0 * self.height_mm
-        for key in ("length_mm", "stub_mm"):
+        for key in ("length_mm",) if self.type == "row" else ("length_mm", "stub_mm"):
             expect(getattr(self, key) >= least, f"assembly.{key}", getattr(self, key), f"{least:g} or more")
         box = self.type == "row" or self.section != "i"
         expect(box, "assembly.section", self.section, "a box: nodes are made of boxes alone")

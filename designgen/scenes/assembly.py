@@ -65,7 +65,6 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         for end in part.ends:
             corners = end.key_points()
             built = corners + part.displacement(corners)
-            built[np.isnan(end.section.key_points[:, 0])] = np.nan
             ends.append((number, end.joint, end.outward, built @ T[:3, :3].T + T[:3, 3], built))
     scene = Scene(name, "arch-bridge", tuple(scans), arch=_design(nominal), units="mm", units_reason=MADE_IN_MM)
     return scene, Truth(

@@ -15,7 +15,9 @@ from processor.model import ArchDesign, Floats, Scan, Scene, Tolerance
 from processor.preassembly import to_result, topology
 from processor.preassembly.chain import adjustment, edge_errors, loop_closure, placement, span_and_closure
 from processor.preassembly.chain.adjustment import Adjusted
-from processor.preassembly.ends.joint_frame import joint_frame
+from processor.preassembly.ends import section
+from processor.preassembly.ends.joint_frame import end_place, joint_frame
+from processor.preassembly.ends.section import Bools
 from processor.preassembly.params import Params, TrimParams
 from processor.preassembly.parts import measure
 from processor.preassembly.parts.attitude import Shapes
@@ -45,7 +47,7 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
     parts = measure.assigned(measure.estimate(fitted, params.systematic))
     curve = _adjust(parts, design, frames, params.adjust.weight)
     adjusted = curve[params.adjust.weight]
-    placed = placement.place(parts, adjusted, design, frames)
+    placed = placement.place(parts, adjusted, design, frames, _on_steel(shapes, design))
     figures = span_and_closure.measure(parts, adjusted, design, frames)
     assembly = Assembly(
         design=design,
@@ -63,6 +65,15 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         chain=_judge_chain(parts, adjusted, figures, design, limits),
     )
     return to_result.to_result(assembly)
+
+
+def _on_steel(shapes: Shapes, design: ArchDesign) -> Bools:
+    """Mark the key points (j, 8) of the joints that lie on steel: the middle of an open side of an I does not."""
+    marks = [
+        section.on_steel([end_place(points, 1.0, shapes[part].mesh).section for part in pair])
+        for points, pair in zip(design.joint_points, design.joined.tolist(), strict=True)
+    ]
+    return np.array(marks, bool).reshape(-1, 8)
 
 
 def _adjust(parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats, weight: float) -> dict[float, Adjusted]:

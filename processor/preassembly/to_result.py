@@ -15,6 +15,7 @@ from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.chain.edge_errors import EdgeErrors
 from processor.preassembly.chain.placement import Placement
 from processor.preassembly.chain.span_and_closure import Figures, mean_max_ci95
+from processor.preassembly.ends.section import Bools
 from processor.preassembly.errors import mean_max, splicing_error
 from processor.preassembly.params import Params, SystematicParams
 from processor.preassembly.parts import systematic_errors
@@ -84,8 +85,8 @@ def to_result(assembly: Assembly) -> Result:
         scans=tuple(", ".join(scan.name for scan in part.scans) for part in parts),
         T_bridge_scan=placement.T_bridge_scan,
         covariance=placement.covariance,
-        key_points_scan=_starts_and_ends(placement.key_points_scan, branched),
-        key_points_sd=_starts_and_ends(placement.key_points_sd, branched),
+        key_points_scan=_starts_and_ends(_on_steel(placement.key_points_scan, ends, placement.steel), branched),
+        key_points_sd=_starts_and_ends(_on_steel(placement.key_points_sd, ends, placement.steel), branched),
         at_joints=_at_joints(assembly, ends) if any(branched) else (),
     )
     joints, splicing = _joints(assembly)
@@ -102,6 +103,15 @@ def to_result(assembly: Assembly) -> Result:
     )
 
 
+def _on_steel(key_points: Sequence[Floats], ends: Sequence[Sequence[topology.PartEnd]], steel: Bools) -> list[Floats]:
+    """Key points (e, 8, 3) of each part's ends, NaN of those that do not lie on steel, by joint (j, 8)."""
+    masked = []
+    for points, of_part in zip(key_points, ends, strict=True):
+        on = np.array([np.ones(8, bool) if end.joint is None else steel[end.joint] for end in of_part])
+        masked.append(np.where(on[:, :, None], points, np.nan))
+    return masked
+
+
 def _starts_and_ends(key_points: Sequence[Floats], branched: Sequence[bool]) -> Floats:
     """Key points (c, 2, 8, 3) at start and end; NaN of branches."""
     no_names = np.full((2, 8, 3), np.nan)
@@ -110,14 +120,15 @@ def _starts_and_ends(key_points: Sequence[Floats], branched: Sequence[bool]) -> 
 
 def _at_joints(assembly: Assembly, ends: Sequence[Sequence[topology.PartEnd]]) -> tuple[AtJoints, ...]:
     """Key points of each part by the names of its joints."""
-    found = []
+    placement, found = assembly.placement, []
+    points, sd = (_on_steel(of, ends, placement.steel) for of in (placement.key_points_scan, placement.key_points_sd))
     for i, of_part in enumerate(ends):
         rows = [e for e, end in enumerate(of_part) if end.joint is not None]
         found.append(
             AtJoints(
                 joint=tuple(assembly.design.joint_names[end.joint] for end in of_part if end.joint is not None),
-                key_points_scan=assembly.placement.key_points_scan[i][rows],
-                key_points_sd=assembly.placement.key_points_sd[i][rows],
+                key_points_scan=points[i][rows],
+                key_points_sd=sd[i][rows],
             )
         )
     return tuple(found)
@@ -125,8 +136,9 @@ def _at_joints(assembly: Assembly, ends: Sequence[Sequence[topology.PartEnd]]) -
 
 def _joints(assembly: Assembly) -> tuple[Joints, MeanMax]:
     """Return the joints and their splicing error."""
-    gaps, design = assembly.placement.gaps, assembly.design
-    sd = _gap_sd(assembly.adjusted)
+    design, on = assembly.design, assembly.placement.steel[:, :, None]
+    gaps = np.where(on, assembly.placement.gaps, np.nan)
+    sd = np.where(on, _gap_sd(assembly.adjusted), np.nan)
     mean, largest = splicing_error(gaps)
     joints = Joints(
         name=design.joint_names,

@@ -2,6 +2,7 @@
 
 import json
 
+import h5py
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from designgen.designs import assembly, prismatic
 from designgen.scenes.make import make
 from processor.evaluation import preassembly as evaluation
 from processor.geometry import rigid
+from processor.language.messages import text
 from processor.model import ArchDesign, DesignPart, InputError
 from processor.preassembly import step, topology
 from processor.preassembly.chain import adjustment, loop_closure
@@ -16,7 +18,11 @@ from processor.preassembly.ends import bottom_edges, joint_end
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import Params
 from processor.preassembly.parts.member import Member
+from processor.preassembly.result import Adjustment, Loops, Result
+from processor.report.preassembly import adjustment_tables
+from processor.results.fields_to_json import as_object
 from processor.scan_folder import folder
+from processor.store import codec
 from processor.writers import project
 from tests.support import arch_clouds
 
@@ -149,6 +155,24 @@ def test_key_points_of_parts_without_edges_hold_the_line():
     assert sizes[0] < sizes[1] < sizes[2]
 
 
+def test_the_covariance_of_motions_is_that_of_repeated_measurements():
+    """Gaps and the line of key points come of the same ends: their errors are not independent."""
+    design, frames = graph("node")
+    rng, sides = np.random.default_rng(17), topology.sides_of(design.joined)
+    perfect = exact_ends(design, rng, 0.0)
+    shifts = []
+    for _ in range(300):
+        members = members_of(design, frames, perfect, 0.5, rng)
+        adjusted = adjustment.adjust(members, design.joint_points, frames, 1.0, sides)
+        shifts.append([rigid.apply(T, one.centre[None])[0] - one.centre
+                       for T, one in zip(adjusted.motions, members, strict=True)])  # fmt: skip
+    stated = np.diag(adjusted.motion_covariance).reshape(-1, 6)[:, 3:]
+    ratio = np.var(shifts, axis=0) / stated
+    assert ratio.min() > 0.7  # a variance of 300 draws is off by 8 %
+    assert ratio.max() < 1.3
+    assert ratio.mean() == pytest.approx(1.0, abs=0.08)
+
+
 # --- as built: corners in closed form
 
 
@@ -207,9 +231,9 @@ def test_a_row_needs_no_order_and_some_may_be_given(tmp_path):
             tmp_path / str(number), design, components=shuffled, joints=content["joints"][::-1], order=order
         )
         if order is None:
-            text = json.loads((place / "design.json").read_text())
-            del text["order"]
-            (place / "design.json").write_text(json.dumps(text))
+            without = json.loads((place / "design.json").read_text())
+            del without["order"]
+            (place / "design.json").write_text(json.dumps(without))
         read = folder.read_input(place).arch
         if order == names[:2]:
             assert [part.name for part in read.parts] == [*names[:2], *names[:1:-1]]
@@ -236,6 +260,26 @@ def test_joints_that_make_no_assembly_are_refused(tmp_path, change, said):
         folder.read_input(written(tmp_path, design, joints=joints))
 
 
+# --- what is written of loops
+
+
+def test_the_closure_of_each_loop_has_rows_and_keys_of_its_own():
+    closure = np.arange(12.0).reshape(2, 2, 3)
+    loops = Loops(
+        joint=("J3", "J8"), joints=(("J1", "J2"), ("J7",)), closure=closure, closure_ci95=np.full((2, 2, 3), 2.5)
+    )
+    (table,) = adjustment_tables._loops(Adjustment(loops=loops), "adjustment")
+    assert [row[:2] for row in table.rows] == [("J3", "J1 > J2")] * 6 + [("J8", "J7")] * 6
+    assert [row[3] for row in table.rows] == list(range(12))
+    assert [row[5] for row in table.rows] == (["mm"] * 3 + ["mrad"] * 3) * 2
+    assert [row[6] for row in table.rows[:4]] == [text("no")] * 3 + [text("yes")]
+    assert adjustment_tables._loops(Adjustment(), "adjustment") == []
+    keys = as_object(Adjustment(loops=loops))["loops"][1]
+    assert keys["joint"] == "J8"
+    assert keys["closure"].keys() == {"mm", "mrad", "ci95_mm", "ci95_mrad"}
+    np.testing.assert_array_equal(keys["closure"]["mrad"], [9.0, 10.0, 11.0])
+
+
 # --- from scans to key points
 
 
@@ -260,6 +304,15 @@ def test_a_node_with_three_branches_is_measured_at_each_joint():
     start = rigid.apply(T[2], at[2].key_points_scan[0])
     end = rigid.apply(T[0], at[0].key_points_scan[1])
     np.testing.assert_allclose(result.joints.gaps[1], start - end, atol=1e-9)
+    written = as_object(result)["components"][0]
+    assert written["key_points_scan"] == {"start": {}, "end": {}}
+    assert list(written["joints"]) == ["J1", "J2", "J3"]
+    np.testing.assert_array_equal(written["joints"]["J2"]["key_points_scan"]["P3"], at_node.key_points_scan[1, 2])
+    with h5py.File("memory", "w", driver="core", backing_store=False) as file:
+        codec.write_record(file, result)
+        again = codec.read_record(file, Result)
+    assert [one.joint for one in again.components.at_joints] == [one.joint for one in result.components.at_joints]
+    np.testing.assert_array_equal(again.components.at_joints[0].key_points_sd, at_node.key_points_sd)
 
 
 def test_methods_of_the_paper_refuse_what_is_no_row():

@@ -13,7 +13,7 @@ from processor.language import messages as messages_
 from processor.language.messages import messages
 from processor.language.messages import text as message
 from processor.model import Status, reason
-from processor.preassembly.ends.faces import PlateFace
+from processor.preassembly.ends.section import PlateFace
 from processor.preassembly.result import Gauge
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
 from processor.report import all_figures, page, page_script

@@ -11,6 +11,7 @@ from processor.geometry import rigid
 from processor.model import ArchDesign, Floats
 from processor.preassembly import topology
 from processor.preassembly.chain.adjustment import Adjusted
+from processor.preassembly.ends.section import Bools
 from processor.preassembly.parts.measure import MeasuredPart
 
 
@@ -19,7 +20,8 @@ class Placement:
     """Poses T_bridge_scan (c, 4, 4) with covariance (c, 6, 6), rival poses, key points, and gaps (j, 8, 3).
 
     Key points (e, 8, 3) are of the e ends of each part. Poses and key points are of the scan's frame with its origin,
-    lengths of poses at the reference temperature and of key points as scanned; mm, NaN = unknown.
+    lengths of poses at the reference temperature and of key points as scanned; mm, NaN = unknown. ``steel`` (j, 8)
+    marks the key points that lie on steel.
     """
 
     T_bridge_scan: Floats
@@ -28,10 +30,16 @@ class Placement:
     key_points_scan: tuple[Floats, ...]
     key_points_sd: tuple[Floats, ...]
     gaps: Floats
+    steel: Bools
 
 
-def place(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign, frames: Floats) -> Placement:
-    """Place the measured parts by their adjusted motions; ``frames`` (j, 4, 4) are T_bridge_joint."""
+def place(
+    parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign, frames: Floats, steel: Bools
+) -> Placement:
+    """Place the measured parts by their adjusted motions; ``frames`` (j, 4, 4) are T_bridge_joint.
+
+    ``steel`` (j, 8) marks the key points of the joints that lie on steel.
+    """
     poses = np.array([T @ part.T_bridge_scan for T, part in zip(adjusted.motions, parts, strict=True)])
     T_bridge_scan = _with_origins(parts, poses)
     key_points, key_points_sd = _key_points(parts, design, frames)
@@ -48,6 +56,7 @@ def place(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign,
         key_points_scan=key_points,
         key_points_sd=key_points_sd,
         gaps=np.array(gaps).reshape(-1, 8, 3),
+        steel=steel,
     )
 
 

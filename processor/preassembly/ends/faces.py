@@ -16,36 +16,25 @@ import numpy as np
 from processor.adjustment import clusters, kriging
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
-from processor.model import Floats, Ints, Reason, Word, reason
+from processor.model import Floats, Ints, Reason, reason
 from processor.preassembly.ends import plate_sides, viewpoints
 from processor.preassembly.ends.joint_frame import EndPlace, end_place
 from processor.preassembly.ends.plate_sides import Bools
+from processor.preassembly.ends.section import EndFace
 from processor.preassembly.ends.viewpoints import Thickness
 
-
-class PlateFace(Word):
-    """An outer face of a part."""
-
-    BOTTOM = "bottom"
-    RIGHT = "right"
-    TOP = "top"
-    LEFT = "left"
-
-
-FACES = (  # axis and sense of the normal
-    (PlateFace.BOTTOM, 2, -1.0),
-    (PlateFace.RIGHT, 1, -1.0),
-    (PlateFace.TOP, 2, 1.0),
-    (PlateFace.LEFT, 1, 1.0),
-)
 FACE = 8  # coefficients of a face
+PLAIN = [0, 1, 4]  # of these terms: those of a face too narrow to have a shape across
+SQUARE_MM = 0.2  # standard deviation of the others there: a cut edge is off square by less over a plate's thickness
 NODES = (-1.0, 0.0, 1.0)  # places w at the joint where a face's waves are estimated
 PATCH_MM, PATCH_SPACINGS = 50.0, 3.0  # least size of a patch, whose mean departure is one observation of the waves
 ALONG = 0.9  # cosine between a facet's normal and an axis, above which the facet is of a face across that axis
 NEAR_MM = 500.0  # of a joint, beyond the facet nearest to it
 ZONE_MM = 500.0
+BESIDE_MM = 30.0  # of an edge's width, in which its points are looked for
 REACH_MM = 80.0  # largest departure of an end from the design
 LEAST_POINTS = 60
+LEAST_POINTS_OF_EDGE = 20
 CELLS = (5, 6)  # of a face, along and across, for its outermost layer and its lack of fit
 FLOOR_MM = 0.004  # least standard deviation: of the design's mesh and of rounding
 
@@ -117,59 +106,91 @@ def outer_faces(surface: MeshSurface, joints: Sequence[Floats]) -> MeshSurface:
     chosen = np.zeros(len(surface.faces), bool)
     centre = surface.vertices[surface.faces].mean(axis=1)
     for key_points in joints:
-        place = end_place(key_points, 1.0)
+        place = end_place(key_points, 1.0, surface)
         local = rigid.apply(rigid.invert(place.T_bridge_joint), centre)
         normal = surface.normals @ place.T_bridge_joint[:3, :3]
-        for _, axis, sense in FACES:
-            candidates = (np.abs(normal[:, axis]) > ALONG) & (sense * local[:, axis] > 0.0)
+        for face in place.section.faces:
+            candidates = (np.abs(normal[:, face.axis]) > ALONG) & (face.sense * local[:, face.axis] > 0.0)
+            if not face.plate:
+                candidates &= np.abs(face.w(local)) < 1.0
             if not candidates.any():
                 return surface
             candidates &= np.abs(local[:, 0]) < NEAR_MM + np.abs(local[candidates, 0]).min()
             groups, group = np.unique(surface.part_of[candidates], return_inverse=True)
-            off = np.abs(sense * local[candidates, axis] - place.half[axis])
+            off = np.abs(face.sense * local[candidates, face.axis] - face.offset)
             chosen |= surface.part_of == groups[np.argmin(np.bincount(group, off) / np.bincount(group))]
     return surface.only(chosen) if chosen.any() else surface
 
 
 def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] | Reason:
-    """Fit the four faces to the points of the joint's zone, ``local`` (n, 3) in its frame; or the reason why not."""
+    """Fit the outer faces to the points of the joint's zone, ``local`` (n, 3) in its frame; or the reason why not."""
     faces = _on_faces(part, local, place)
     centred = [sheets.out - np.median(sheets.out) for sheets in faces if len(sheets.out)]
     margin = 3.0 * _noise(np.concatenate(centred or [np.empty(0)])) + 2.0
     fits = []
-    for (name, axis, _), (rows, out, cell, behind, behind_out, single_layer) in zip(FACES, faces, strict=True):
-        across = 1 if axis == 2 else 2
-        clear = np.abs(local[rows, across]) < place.half[across] - margin
+    for of_design, (rows, out, cell, behind, behind_out, single_layer) in zip(place.section.faces, faces, strict=True):
+        across, half = of_design.across, of_design.half
+        clear = np.abs(of_design.from_middle(local[rows])) < half - (
+            min(margin, 0.5 * half) if of_design.narrow else margin
+        )
         clear &= -place.outward * local[rows, 0] > margin
         rows = rows[clear]
-        columns = basis(local[rows, 0], local[rows, across] / place.half[across])
-        coefficients, residual, inliers = least_squares(columns, out[clear])
+        columns = basis(local[rows, 0], of_design.w(local[rows]))
+        coefficients, residual, inliers = _fitted(of_design, columns, out[clear])
         if not len(coefficients):
-            return reason("preassemble.few-points-on-face", face=name)
+            return reason("preassemble.few-points-on-face", face=of_design.name)
         used = UsedPoints(columns[inliers], residual, part.station[rows][inliers], cell[clear][inliers])
-        hypotheses = _with_waves(coefficients, used, local[rows][inliers][:, [0, across]], place.half[across])
+        at = local[rows][inliers][:, [0, across]] - np.array([0.0, of_design.middle])
+        hypotheses = _with_waves(coefficients, used, at, of_design)
         mean = kriging.average(hypotheses).mean
-        level = basis(local[behind, 0], local[behind, across] / place.half[across]) @ mean[:FACE]
-        inner = _inner_side(local[behind], level - behind_out, place, across)
-        both = np.concatenate([rows[inliers], behind[inner]])
-        height = np.concatenate([out[clear][inliers], behind_out[inner]])
-        terms = basis(local[both, 0], local[both, across] / place.half[across])[:, : viewpoints.TERMS]
-        marked = np.arange(len(both)) >= int(inliers.sum())
-        plate = viewpoints.thickness(terms, local[both][:, [0, across]], height, marked)
+        plate = None
+        if of_design.plate:
+            level = basis(local[behind, 0], of_design.w(local[behind])) @ mean[:FACE]
+            inner = _inner_side(local[behind], level - behind_out, place, across)
+            both = np.concatenate([rows[inliers], behind[inner]])
+            height = np.concatenate([out[clear][inliers], behind_out[inner]])
+            terms = basis(local[both, 0], of_design.w(local[both]))[:, : viewpoints.TERMS]
+            marked = np.arange(len(both)) >= int(inliers.sum())
+            plate = viewpoints.thickness(terms, local[both][:, [0, across]], height, marked)
         fits.append(FaceFit(mean, hypotheses, used, plate, single_layer))
     return fits
 
 
-def _with_waves(coefficients: Floats, used: UsedPoints, at: Floats, half: float) -> kriging.Hypotheses:
-    """Estimate a face with its waves by points ``at`` (n, 2), along and across the face of half the width ``half``."""
+def _fitted(face: EndFace, columns: Floats, out: Floats) -> tuple[Floats, Floats, Bools]:
+    """Coefficients (8,), residuals of the inliers and a mark of these; a narrow face has the PLAIN terms alone."""
+    if not face.narrow:
+        return least_squares(columns, out)
+    plain, residual, inliers = least_squares(columns[:, PLAIN], out, LEAST_POINTS_OF_EDGE)
+    if not len(plain):
+        return plain, residual, inliers
+    coefficients = np.zeros(FACE)
+    coefficients[PLAIN] = plain
+    return coefficients, residual, inliers
+
+
+def _with_waves(coefficients: Floats, used: UsedPoints, at: Floats, face: EndFace) -> kriging.Hypotheses:
+    """Estimate a face with its waves by points ``at`` (n, 2), along and across it from its middle."""
+    half = face.half
     spacing = np.sqrt(2.0 * half * ZONE_MM / len(at))
     found = clusters.patches(at, used.residual, max(PATCH_MM, PATCH_SPACINGS * float(spacing)))
-    trend = basis(found.centre[:, 0], found.centre[:, 1] / half)
+    terms = PLAIN if face.narrow else list(range(FACE))
+    trend = basis(found.centre[:, 0], found.centre[:, 1] / half)[:, terms]
     noise = max(found.noise, FLOOR_MM**2)
     freedom = len(used.residual) - len(found.mean)
-    means = kriging.Means(found.centre, found.mean, noise / found.number, trend, freedom, -coefficients, REACH_MM)
+    means = kriging.Means(
+        found.centre, found.mean, noise / found.number, trend, freedom, -coefficients[terms], REACH_MM
+    )
     nodes = np.stack([np.zeros(len(NODES)), half * np.array(NODES)], axis=1)
     hypotheses = kriging.by_hypotheses(means, nodes)
+    if face.narrow:
+        rows = np.array([*PLAIN, *range(FACE, FACE + len(NODES))])
+        means_of, covariances = np.zeros((len(hypotheses.means), FACE + len(NODES))), []
+        means_of[:, rows] = hypotheses.means
+        for covariance in hypotheses.covariances:
+            whole = SQUARE_MM**2 * np.eye(FACE + len(NODES))
+            whole[np.ix_(rows, rows)] = covariance
+            covariances.append(whole)
+        hypotheses = hypotheses._replace(means=means_of, covariances=np.array(covariances))
     hypotheses.means[:, :FACE] += coefficients
     return hypotheses
 
@@ -188,7 +209,7 @@ def basis(x: Floats, w: Floats) -> Floats:
 
 
 def _on_faces(part: RegisteredPart, local: Floats, place: EndPlace) -> list[_Sheets]:
-    """Points on each of FACES."""
+    """Points on each of the section's faces."""
     turn = place.T_bridge_joint[:3, :3]
     nearest = part.surface.distances(part.points, REACH_MM)[0]
     face, residual, beyond = part.outer.distances(part.points, 2.0 * REACH_MM)
@@ -196,12 +217,14 @@ def _on_faces(part: RegisteredPart, local: Floats, place: EndPlace) -> list[_She
     outer_normal, normal = part.outer.normals[face] @ turn, part.surface.normals[nearest] @ turn
     near = (nearest >= 0) & on_face(face, beyond) & (np.abs(residual) < REACH_MM)
     faces = []
-    for _, axis, sense in FACES:
-        across = 1 if axis == 2 else 2
+    for of_design in place.section.faces:
+        axis, sense = of_design.axis, of_design.sense
         looks = (np.abs(outer_normal[:, axis]) > ALONG) & (np.abs(normal[:, axis]) > ALONG)
+        if not of_design.plate:  # the edges of the plates at either corner are faces of one direction
+            looks &= np.abs(of_design.from_middle(local)) < of_design.half + BESIDE_MM
         rows = np.flatnonzero(near & looks & (sense * local[:, axis] > 0.0))
         out = residual[rows] * np.sign(sense * outer_normal[rows, axis])
-        x, w = local[rows, 0] / ZONE_MM, local[rows, across] / place.half[across]
+        x, w = local[rows, 0] / ZONE_MM, of_design.w(local[rows])
         column, row = np.floor(CELLS[0] * np.abs(x)), np.clip(np.floor(0.5 * CELLS[1] * (w + 1.0)), 0, CELLS[1] - 1)
         cell = (column * CELLS[1] + row).astype(np.int64)
         layer = plate_sides.outer_surface(out, np.stack([np.ones_like(x), x, w, x * w], axis=1), cell)
@@ -225,7 +248,7 @@ def _noise(residual: Floats) -> float:
     return float(1.4826 * np.median(np.abs(residual - middle))) if len(residual) else 0.0
 
 
-def least_squares(basis: Floats, value: Floats) -> tuple[Floats, Floats, Bools]:
+def least_squares(basis: Floats, value: Floats, least: int = LEAST_POINTS) -> tuple[Floats, Floats, Bools]:
     """Coefficients (k,), residuals of the inliers, and a mark of these; empty for too few points.
 
     Coefficients that the points do not determine, as of a face seen as one strip, are 0 within REACH_MM.
@@ -234,7 +257,7 @@ def least_squares(basis: Floats, value: Floats) -> tuple[Floats, Floats, Bools]:
     expected = np.eye(basis.shape[1]) / REACH_MM
     coefficients: Floats = np.empty(0, np.float64)
     for _ in range(6):
-        if used.sum() < LEAST_POINTS:
+        if used.sum() < least:
             return np.empty(0), np.empty(0), used
         rows = np.vstack([basis[used], expected]), np.append(value[used], np.zeros(len(expected)))
         coefficients = np.asarray(np.linalg.lstsq(*rows, rcond=None)[0], np.float64)

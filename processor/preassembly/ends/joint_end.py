@@ -3,8 +3,8 @@
 In the joint's zone each outer face departs from the design by a plane in x (along the bridge from the joint) and w
 (across the face), a warp x w, and bending terms x^2, x^2 w, w^2 - 1 and x (w^2 - 1). The ring departs by a plane in u
 and v and bending terms, see :mod:`processor.preassembly.ends.ring`. A corner is where its two faces and the ring meet,
-as built; its covariance is that of these 40 coefficients, so points of one corner are correlated. Waves of a face, what
-its 8 coefficients do not follow, are estimated at its corners and its middle by kriging.
+as built; its covariance is that of these coefficients, 40 of a box, so points of one corner are correlated. Waves of a
+face, what its 8 coefficients do not follow, are estimated at its corners and its middle by kriging.
 
 Departure and noise are separated for all ends of a bridge together, see :mod:`processor.adjustment.model_averaging`:
 the sizes of the other ends' departures set the weights of the hypotheses for each end.
@@ -25,22 +25,21 @@ from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import NORMAL_95, Floats, Ints, Reason, reason
 from processor.preassembly.ends import faces as ends_faces
-from processor.preassembly.ends import plate_sides, viewpoints
+from processor.preassembly.ends import plate_sides, section, viewpoints
 from processor.preassembly.ends import ring as ends_ring
 from processor.preassembly.ends.faces import (
     FACE,
-    FACES,
     FLOOR_MM,
     LEAST_POINTS,
     NODES,
     REACH_MM,
     ZONE_MM,
     FaceFit,
-    PlateFace,
     RegisteredPart,
     UsedPoints,
 )
 from processor.preassembly.ends.joint_frame import EndPlace
+from processor.preassembly.ends.section import EndFace, PlateFace
 from processor.preassembly.ends.viewpoints import Thickness, Variances
 
 # Sizes of bending terms, the finest for scans without noise, and their prior weights: ends are cut by a plane.
@@ -53,12 +52,28 @@ ITERATIONS = 4  # of a corner's place on its faces
 # is. For a corner 20 mm off, on faces tilted by as much over their width, the difference is 0.5 mm. The coefficients
 # follow most of it; the rest lies, uniformly distributed, within 0.005 of the departure.
 SECOND_ORDER = 0.005 / np.sqrt(3.0)
-COUNT = len(FACES) * FACE + RING
-OF_FACES, OF_RING = slice(0, COUNT - RING), slice(COUNT - RING, COUNT)
-LEVELS = [FACE * face for face in range(len(FACES))]
-WAVES = slice(COUNT, COUNT + len(FACES) * len(NODES))  # after the coefficients, face by face
-# P1..P4, bottom left, bottom right, top right, top left: u, v, and the numbers of their upright and their level face.
-CORNERS = ((1.0, -1.0, 3, 0), (-1.0, -1.0, 1, 0), (-1.0, 1.0, 1, 2), (1.0, 1.0, 3, 2))
+ACROSS = [2, 3, 5, 6, 7]  # coefficients of a face that change across it
+WIDE_MM = 200.0  # half the width of a face from which its shape across is as large as any
+
+
+class _Layout(NamedTuple):
+    """Rows of the coefficients of an end with a number of faces: of the faces, its ring, all, and the waves."""
+
+    faces: slice
+    ring: slice
+    known: slice
+    waves: slice  # after the coefficients, face by face
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients without the waves."""
+        return int(self.known.stop)
+
+
+def _layout(faces: int) -> _Layout:
+    count = faces * FACE + RING
+    waves = slice(count, count + faces * len(NODES))
+    return _Layout(slice(0, faces * FACE), slice(faces * FACE, count), slice(0, count), waves)
 
 
 @dataclass(frozen=True)
@@ -76,7 +91,7 @@ class JointEnd:
 
 
 class PlateSides(NamedTuple):
-    """Thicknesses (4,) by which the faces may lie further in, and what is to be said of the sides of the plates."""
+    """Thicknesses (f,) by which the faces may lie further in, and what is to be said of the sides of the plates."""
 
     either: Floats
     doubts: tuple[Reason, ...]
@@ -87,8 +102,8 @@ class PlateSides(NamedTuple):
 class FittedEnd:
     """The faces of an end with their waves, and its ring, as fitted before model averaging.
 
-    ``shared`` (40, 40) is the covariance of their coefficients by errors that points of a station share. ``motion``
-    (40, 6) is their derivative by a motion of the part, ``pose`` (6, 6) the covariance of its registration.
+    ``shared`` (n, n) is the covariance of their coefficients by errors that points of a station share. ``motion``
+    (n, 6) is their derivative by a motion of the part, ``pose`` (6, 6) the covariance of its registration.
     """
 
     faces: tuple[kriging.Hypotheses, ...]
@@ -99,7 +114,7 @@ class FittedEnd:
     place: EndPlace
     plates: tuple[Thickness | None, ...]  # of the faces; none where the points' stations are known
     sides: PlateSides
-    thickness: Floats  # (2,) of webs and flanges as designed; 0 = unknown
+    thickness: Floats  # (f,) of the faces' plates as designed; 0 = unknown
     ring_noise: float  # variance of the ring's points, mm^2
 
     @property
@@ -175,9 +190,9 @@ def estimate(ends: Sequence[FittedEnd], between: Sequence[Variances] = ()) -> li
         return []
     every = [face for end in ends for face in end.faces]
     weighted = zip(every, kriging.learned_weights(every), strict=True)
-    faces = [kriging.average(*face) for face in weighted]
+    faces = iter([kriging.average(*face) for face in weighted])
     viewed = between or (viewpoints.NONE,) * len(ends)
-    fitted = [_joined(faces[4 * k : 4 * k + 4], end, viewed[k]) for k, end in enumerate(ends)]
+    fitted = [_joined([next(faces) for _ in end.faces], end, view) for end, view in zip(ends, viewed, strict=True)]
     averaged = _averaged(ends, fitted)
     return [_corners_of(*of_end) for of_end in zip(ends, fitted, averaged, strict=True)]
 
@@ -192,15 +207,15 @@ def _outer_sides(
     one. Where they are too few, the inner side is the more probable one, for a departure by just the plate's thickness
     is rare. The other side then is within the interval.
     """
-    outer, either = list(faces), np.zeros(len(FACES))
+    outer, either = list(faces), np.zeros(len(faces))
     shown: list[PlateFace] = []
     doubtful: list[PlateFace] = []
     level = np.eye(1, FACE + len(NODES))[0]
-    for k, ((name, axis, sense), face) in enumerate(zip(FACES, faces, strict=True)):
-        plate = float(thickness[axis - 1])
-        if not (face.single_layer and face.coefficients[0] < -0.5 * plate < 0.0):
+    for k, (of_design, face) in enumerate(zip(place.section.faces, faces, strict=True)):
+        name, plate = of_design.name, float(thickness[k])
+        if not (of_design.plate and face.single_layer and face.coefficients[0] < -0.5 * plate < 0.0):
             continue
-        inward, wide = _inward(local, face, place, axis, sense)
+        inward, wide = _inward(local, face, of_design)
         beyond = place.outward * local[wide, 0]
         outside, inside = plate_sides.beside(beyond, inward[wide], sigma)
         if inside >= max(plate_sides.FEWEST_BESIDE, 2 * outside):
@@ -221,52 +236,65 @@ def _outer_sides(
     return outer, PlateSides(either, doubts, remarks)
 
 
-def _inward(local: Floats, face: FaceFit, place: EndPlace, axis: int, sense: float) -> tuple[Floats, Bools]:
+def _inward(local: Floats, face: FaceFit, of_design: EndFace) -> tuple[Floats, Bools]:
     """Distances (n,) of points inward from a face, and a mark of those away from the section's corners."""
-    across = 1 if axis == 2 else 2
-    half = place.half[across]
-    departure = ends_faces.departures(local[:, 0], local[:, across] / half) @ face.coefficients
-    wide = np.abs(local[:, across]) < half - np.minimum(plate_sides.REACH_MM, 0.5 * half)
-    return place.half[axis] + departure - sense * local[:, axis], wide
+    half = of_design.half
+    departure = ends_faces.departures(local[:, 0], of_design.w(local)) @ face.coefficients
+    wide = np.abs(of_design.from_middle(local)) < half - np.minimum(plate_sides.REACH_MM, 0.5 * half)
+    return of_design.offset + departure - of_design.sense * local[:, of_design.axis], wide
 
 
 def _joined(faces: Sequence[kriging.Kriged], end: FittedEnd, between: Variances) -> kriging.Kriged:
-    """Coefficients and waves (52,) of an end, and their covariance (52, 52)."""
+    """Coefficients and waves (n,) of an end, and their covariance (n, n)."""
+    count = _layout(len(faces)).size
     blocks = (*(face.covariance[:FACE, :FACE] for face in faces), end.ring.covariance)
     covariance = block_diag(*blocks, *(face.covariance[FACE:, FACE:] for face in faces))
     tilted = (between.level, between.along, between.across, *np.zeros(FACE - 3))
     ring = (between.ring, between.across, between.across, *np.zeros(RING - 3))
-    covariance[:COUNT, :COUNT] += end.shared
+    covariance[:count, :count] += end.shared
     if end.plates:
-        covariance[:COUNT, :COUNT] += np.diag([*(tilted * len(FACES)), *ring])
+        covariance[:count, :count] += np.diag([*(tilted * len(faces)), *ring])
     for number, face in enumerate(faces):
         rows = slice(FACE * number, FACE * (number + 1))
-        waves = slice(COUNT + len(NODES) * number, COUNT + len(NODES) * (number + 1))
+        waves = slice(count + len(NODES) * number, count + len(NODES) * (number + 1))
         covariance[rows, waves], covariance[waves, rows] = face.covariance[:FACE, FACE:], face.covariance[FACE:, :FACE]
     coefficients = [*(face.mean[:FACE] for face in faces), end.ring.mean, *(face.mean[FACE:] for face in faces)]
     return kriging.Kriged(np.concatenate(coefficients), covariance)
 
 
 def _corners_of(end: FittedEnd, fitted: kriging.Kriged, averaged: Estimate) -> JointEnd:
-    """Key points of an end by its coefficients (40,) as averaged; the waves follow what the average changed."""
-    known = slice(0, COUNT)
-    noise = fitted.covariance[known, known] + FLOOR_MM**2 * np.eye(COUNT)
-    gain = np.linalg.solve(noise, fitted.covariance[known, WAVES]).T
-    rest = fitted.covariance[WAVES, WAVES] - gain @ fitted.covariance[known, WAVES]
-    waves = fitted.mean[WAVES] + gain @ (averaged.mean - fitted.mean[known])
-    follow = np.vstack([np.eye(COUNT), gain])
+    """Key points of an end by its coefficients (n,) as averaged; the waves follow what the average changed."""
+    _, _, known, of_waves = layout = _layout(len(end.faces))
+    noise = fitted.covariance[known, known] + FLOOR_MM**2 * np.eye(layout.size)
+    gain = np.linalg.solve(noise, fitted.covariance[known, of_waves]).T
+    rest = fitted.covariance[of_waves, of_waves] - gain @ fitted.covariance[known, of_waves]
+    waves = fitted.mean[of_waves] + gain @ (averaged.mean - fitted.mean[known])
+    follow = np.vstack([np.eye(layout.size), gain])
     covariance = follow @ averaged.covariance @ follow.T
-    covariance[WAVES, WAVES] += rest
+    covariance[of_waves, of_waves] += rest
     departure, derivative = _key_points(end.place, np.concatenate([averaged.mean, waves]))
     second_order = np.repeat(SECOND_ORDER * np.linalg.norm(departure.reshape(8, 3), axis=1), 3)
     covariance = derivative @ covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
-    levels = derivative[:, LEVELS] * end.sides.either / NORMAL_95
+    levels = derivative[:, : layout.faces.stop : FACE] * end.sides.either / NORMAL_95
     covariance += levels @ levels.T
     by_pose = derivative @ follow @ averaged.not_followed(end.motion)
     return JointEnd(departure.reshape(8, 3), covariance, by_pose, end.doubts, end.remarks)
 
 
 def _design_thickness(surface: MeshSurface, place: EndPlace) -> Floats:
+    """Thickness (f,) of the faces' plates at the joint as designed; 0 = unknown, and of edges."""
+    of_box = _thickness_by_end_face(surface, place)
+    found = []
+    for face in place.section.faces:
+        thickness = float(of_box[face.axis - 1]) if face.plate else 0.0
+        if thickness > section.THICKEST_OF_RING_MM or (face.plate and not all(f.plate for f in place.section.faces)):
+            # The end faces of stiffeners, or of a web between flanges, reach deeper than the plate.
+            thickness = section.plate_thickness(place.half, place.T_bridge_joint, surface, face.axis, face.sense)
+        found.append(thickness)
+    return np.array(found)
+
+
+def _thickness_by_end_face(surface: MeshSurface, place: EndPlace) -> Floats:
     """Thickness (2,) of webs and flanges at the joint: the depth of the facets of the design's end face."""
     T_joint_bridge = rigid.invert(place.T_bridge_joint)
     across = np.flatnonzero(np.abs(surface.normals @ T_joint_bridge[0, :3]) > 0.9)
@@ -288,14 +316,18 @@ def _fit_ring(
     """
     half = place.half
     depth, plates, x = [], [], place.outward * local[:, 0]
-    for (_, axis, sense), face in zip(FACES, faces, strict=True):
-        e, wide = _inward(local, face, place, axis, sense)
-        plates.append(plate_sides.plate_thickness(x[wide], e[wide], sigma, float(thickness[axis - 1])))
+    for k, (of_design, face) in enumerate(zip(place.section.faces, faces, strict=True)):
+        e, wide = _inward(local, face, of_design)
+        known = float(thickness[k])
+        plates.append(plate_sides.plate_thickness(x[wide], e[wide], sigma, known) if of_design.plate else 0.0)
         depth.append(e)
-    clear = np.array([max(plates[1], plates[3]), max(plates[0], plates[2])]) + ends_ring.REACH * sigma + 1.0
+    thickest = [max(plates[k] for k, one in enumerate(place.section.faces) if one.axis == axis) for axis in (1, 2)]
+    clear = np.array(thickest) + ends_ring.REACH * sigma + 1.0
     columns = []
-    for (_, axis, _), e, plate in zip(FACES, depth, plates, strict=True):
-        across = 1 if axis == 2 else 2
+    for of_design, e, plate in zip(place.section.faces, depth, plates, strict=True):
+        if not of_design.plate:
+            continue
+        across = of_design.across
         near = np.abs(local[:, across]) < half[across] - clear[across - 1]  # off the corners, where two walls meet
         near &= (e < plate + 60.0) & (e > -60.0) & (np.abs(x) < 80.0)
         basis = _ring_basis(local[near, 1] / half[1], local[near, 2] / half[2])
@@ -317,35 +349,49 @@ def _ring_basis(u: Floats, v: Floats) -> Floats:
 
 
 def _averaged(ends: Sequence[FittedEnd], fitted: Sequence[kriging.Kriged]) -> list[Estimate]:
-    """Average the coefficients (40,) of ends over hypotheses of their departures' sizes.
+    """Average the coefficients (n,) of ends over hypotheses of their departures' sizes.
 
     The levels of the faces have one unknown size, their tilts another, their bends a third; likewise the ring's plane
     and its bends. Faces and ring share the error of the registration.
     """
-    averaged = [Estimate(np.zeros(COUNT), *np.zeros((2, COUNT, COUNT))) for _ in ends]
+    layouts = [_layout(len(end.faces)) for end in ends]
+    averaged = [Estimate(np.zeros(of.size), *np.zeros((2, of.size, of.size))) for of in layouts]
     bends = list(zip(BENDS_MM, BEND_WEIGHTS, strict=True))
     faces = [
-        (weight, np.tile(np.repeat([level, tilt, bend], (1, 3, 4)), 4))
+        (weight, np.repeat([level, tilt, bend], (1, 3, 4)))
         for level in SIZES_MM
         for tilt in SIZES_MM
         for bend, weight in bends
     ]
     ring = [(weight, np.repeat([plane, bend], (3, RING - 3))) for plane in SIZES_MM for bend, weight in bends]
-    for rows, hypotheses in ((OF_FACES, faces), (OF_RING, ring)):
+    for of_faces, hypotheses in ((True, faces), (False, ring)):
         prior = np.array([weight for weight, _ in hypotheses])
         sizes = np.array([size for _, size in hypotheses])
-        blocks = [_block(end, of_end, rows, sizes) for end, of_end in zip(ends, fitted, strict=True)]
+        at = [of.faces if of_faces else of.ring for of in layouts]
+        every = [
+            np.hstack([sizes * _shares(face) for face in end.place.section.faces]) if of_faces else sizes
+            for end in ends
+        ]
+        blocks = [_block(*of_end) for of_end in zip(ends, fitted, at, every, strict=True)]
         logs = np.array([model_averaging.log_likelihoods(*block) for block in blocks])
         weights = model_averaging.weights_by_others(logs, prior, _traits(sizes))
-        for whole, block, log, weight in zip(averaged, blocks, logs, weights, strict=True):
+        for whole, rows, block, log, weight in zip(averaged, at, blocks, logs, weights, strict=True):
             part = _average_block(block, log, sizes, prior, weight)
             whole.mean[rows], whole.covariance[rows, rows] = part.mean, part.covariance
             whole.gain[rows, rows] = part.gain
-    for end, whole in zip(ends, averaged, strict=True):
+    for end, of, whole in zip(ends, layouts, averaged, strict=True):
         by_pose = whole.not_followed(end.motion)
-        common = by_pose[OF_FACES] @ end.pose @ by_pose[OF_RING].T
-        whole.covariance[OF_FACES, OF_RING], whole.covariance[OF_RING, OF_FACES] = common, common.T
+        common = by_pose[of.faces] @ end.pose @ by_pose[of.ring].T
+        whole.covariance[of.faces, of.ring], whole.covariance[of.ring, of.faces] = common, common.T
     return averaged
+
+
+def _shares(face: EndFace) -> Floats:
+    """Sizes (8,) of a face's departures by those of a wide face; a narrow one changes less across."""
+    shares = np.ones(FACE)
+    if face.narrow:
+        shares[ACROSS] = face.half / WIDE_MM
+    return shares
 
 
 def _traits(sizes: Floats) -> Ints:
@@ -379,13 +425,13 @@ def _average_block(block: _Block, logs: Floats, sizes: Floats, prior: Floats, we
 
 
 def _motion(place: EndPlace) -> Floats:
-    """Return the derivative (40, 6) of an end's coefficients by a motion of the part about the bridge's origin."""
+    """Return the derivative (n, 6) of an end's coefficients by a motion of the part about the bridge's origin."""
     T, half = place.T_bridge_joint, place.half
     rows = []
     x, w = (a.ravel() for a in np.meshgrid([0.0, -place.outward * ZONE_MM], [-1.0, 1.0]))
-    for _, axis, sense in FACES:
-        local = np.zeros((4, 3))
-        local[:, 0], local[:, axis], local[:, 3 - axis] = x, sense * half[axis], w * half[3 - axis]
+    for face in place.section.faces:
+        axis, sense, local = face.axis, face.sense, np.zeros((4, 3))
+        local[:, 0], local[:, axis], local[:, face.across] = x, sense * face.offset, w * face.half + face.middle
         field = sense * np.einsum("i,nij->nj", T[:3, axis], rigid.motion(rigid.apply(T, local)))
         rows += [np.linalg.solve(ends_faces.basis(x, w)[:, :4], field), np.zeros((FACE - 4, 6))]
     u, v = np.array([1.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -396,38 +442,44 @@ def _motion(place: EndPlace) -> Floats:
 
 
 def _key_points(place: EndPlace, coefficients: Floats) -> tuple[Floats, Floats]:
-    """Departures (24,) of P1..P8 by the coefficients and waves (52,) of faces and ring, and their derivative (24, 52).
+    """Departures (24,) of P1..P8 by the coefficients and waves (n,) of faces and ring, and their derivative (24, n).
 
     A corner is where its faces and the ring meet. Each surface is evaluated at the corner as the others place it, by
-    fixed-point iteration.
+    fixed-point iteration. The middle of an open side is that of its corners.
     """
-    half = place.half
+    half, (_, faces, corners, middles) = place.half, place.section
+    ring = _layout(len(faces)).ring
     departure, derivative = np.zeros((8, 3)), np.zeros((8, 3, len(coefficients)))
-    for k, (u, v, upright, level) in enumerate(CORNERS):
+    for k, (u, v, upright, level) in enumerate(corners):
         for _ in range(ITERATIONS):
             at_u, at_v = u + departure[k, 1] / half[1], v + departure[k, 2] / half[2]
-            derivative[k, 0, OF_RING] = place.outward * _ring_basis(np.array([at_u]), np.array([at_v]))[0]
+            derivative[k, 0, ring] = place.outward * _ring_basis(np.array([at_u]), np.array([at_v]))[0]
             for axis, face, w in ((1, upright, at_v), (2, level, at_u)):
-                derivative[k, axis] = _on_face(face, departure[k, 0], w)
+                one = faces[face]
+                at = w if one.plate else (w * half[one.across] - one.middle) / one.half
+                derivative[k, axis] = _on_face(faces, face, departure[k, 0], at)
             departure[k] = derivative[k] @ coefficients
     for k, (a, b) in enumerate(((0, 1), (1, 2), (2, 3), (3, 0))):  # the middles of the edges
         derivative[4 + k] = 0.5 * (derivative[a] + derivative[b])
         departure[4 + k] = 0.5 * (departure[a] + departure[b])
+        if middles[k] < 0:
+            continue
         u, v = (
-            0.5 * (CORNERS[a][i] + CORNERS[b][i]) + departure[4 + k, axis] / half[axis] for i, axis in ((0, 1), (1, 2))
+            0.5 * (corners[a][i] + corners[b][i]) + departure[4 + k, axis] / half[axis] for i, axis in ((0, 1), (1, 2))
         )
-        derivative[4 + k, 0, OF_RING] = place.outward * _ring_basis(np.array([u]), np.array([v]))[0]
+        derivative[4 + k, 0, ring] = place.outward * _ring_basis(np.array([u]), np.array([v]))[0]
         axis, w = (2, u) if k % 2 == 0 else (1, v)
-        derivative[4 + k, axis] = _on_face(k, departure[4 + k, 0], w)
+        derivative[4 + k, axis] = _on_face(faces, middles[k], departure[4 + k, 0], w)
         departure[4 + k] = derivative[4 + k] @ coefficients
     return departure.ravel(), derivative.reshape(24, len(coefficients))
 
 
-def _on_face(face: int, x: float, w: float) -> Floats:
-    """Return the derivative (52,) of a coordinate on a face, at x and w, by coefficients and waves."""
-    derivative = np.zeros(WAVES.stop)
-    departures = FACES[face][2] * ends_faces.departures(np.array([x]), np.array([w]))[0]
-    waves = COUNT + len(NODES) * face
+def _on_face(faces: Sequence[EndFace], face: int, x: float, w: float) -> Floats:
+    """Return the derivative (n,) of a coordinate on a face, at x and w, by coefficients and waves."""
+    layout = _layout(len(faces))
+    derivative = np.zeros(layout.waves.stop)
+    departures = faces[face].sense * ends_faces.departures(np.array([x]), np.array([w]))[0]
+    waves = layout.size + len(NODES) * face
     derivative[FACE * face : FACE * (face + 1)] = departures[:FACE]
     derivative[waves : waves + len(NODES)] = departures[FACE:]
     return derivative

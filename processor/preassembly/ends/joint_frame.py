@@ -7,19 +7,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
+from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Floats
+from processor.preassembly.ends import section
+from processor.preassembly.ends.section import Section
 
 
 @dataclass(frozen=True)
 class EndPlace:
-    """A part's end as designed: T_bridge_joint (4, 4), half the section's size (3,), and the direction of the part.
+    """A part's end as designed: T_bridge_joint (4, 4), its section, and the direction of the part.
 
     ``outward`` is +1 where the part ends at the joint and -1 where it starts.
     """
 
     T_bridge_joint: Floats
-    half: Floats
+    section: Section
     outward: float
+
+    @property
+    def half(self) -> Floats:
+        """Half the section's size (3,), mm."""
+        return self.section.half
 
 
 def joint_frame(key_points: Floats) -> Floats:
@@ -34,7 +42,12 @@ def joint_frame(key_points: Floats) -> Floats:
     return rigid.transform(np.stack([x, np.cross(z, x), z], axis=1), key_points[:4].mean(axis=0))
 
 
-def end_place(key_points: Floats, outward: float) -> EndPlace:
-    """Place of the end of a part at a joint with the design's P1..P8 (8, 3)."""
+def end_place(key_points: Floats, outward: float, surface: MeshSurface | None = None) -> EndPlace:
+    """Place of the end of a part at a joint with the design's P1..P8 (8, 3).
+
+    Its section is by the design's ``surface``, or a box.
+    """
     frame = joint_frame(key_points)
-    return EndPlace(frame, 0.5 * np.ptp(rigid.apply(rigid.invert(frame), key_points[:4]), axis=0), outward)
+    half = 0.5 * np.ptp(rigid.apply(rigid.invert(frame), key_points[:4]), axis=0)
+    of_end = section.of_box(half) if surface is None else section.of_surface(half, frame, surface)
+    return EndPlace(frame, of_end, outward)

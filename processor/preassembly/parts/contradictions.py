@@ -16,9 +16,9 @@ from processor.adjustment import global_test, kriging
 from processor.model import Reason, reason
 from processor.preassembly.ends import viewpoints
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
-from processor.preassembly.ends.faces import FACES, PlateFace
 from processor.preassembly.ends.joint_end import FittedEnd
 from processor.preassembly.ends.plate_sides import Bools
+from processor.preassembly.ends.section import PlateFace
 
 # The faces of a part that give the departures of its left and right edge, sideways and up.
 OF_EDGES = ((PlateFace.LEFT, PlateFace.BOTTOM), (PlateFace.RIGHT, PlateFace.BOTTOM))
@@ -40,7 +40,7 @@ def find(parts: Sequence[Examined]) -> list[tuple[Reason, ...]]:
     plates = viewpoints.tails([[plate for plate in end.plates if plate is not None] for end in ends])
     edges = [part.edges.tails.ravel() for part in parts]
     failed = global_test.contradicted(np.concatenate([faces, plates, *edges]))
-    of_faces = failed[: len(faces)].reshape(len(ends), len(FACES))
+    of_faces = np.split(failed[: len(faces)], np.cumsum([len(end.faces) for end in ends])[:-1])
     of_plates = failed[len(faces) : len(faces) + len(plates)] | np.array(
         [_of_no_other(end, ends) for end in ends], bool
     )
@@ -48,8 +48,8 @@ def find(parts: Sequence[Examined]) -> list[tuple[Reason, ...]]:
     found, number = [], 0
     for part, beyond in zip(parts, of_edges, strict=True):
         reasons = []
-        for joint, _ in part.ends:
-            why = (*_of_faces(of_faces[number]), *_of_plates(bool(of_plates[number])))
+        for joint, end in part.ends:
+            why = (*_of_faces(end, of_faces[number]), *_of_plates(bool(of_plates[number])))
             reasons += [reason("preassemble.at", place=joint, reasons=why)] if why else []
             number += 1
         found.append((*reasons, *_of_edges(beyond)))
@@ -59,16 +59,17 @@ def find(parts: Sequence[Examined]) -> list[tuple[Reason, ...]]:
 def _of_no_other(end: FittedEnd, ends: Sequence[FittedEnd]) -> bool:
     """Whether a plate of an end has a thickness that neither the design nor a plate of another end has."""
     others = [plate.value[0] for other in ends if other is not end for plate in other.plates if plate is not None]
-    for (_, axis, _), plate in zip(FACES, end.plates or (None,) * len(FACES), strict=True):
+    for thickness, plate in zip(end.thickness, end.plates or (None,) * len(end.faces), strict=True):
         if plate is not None:
-            known = np.array([*others, end.thickness[axis - 1]])
-            if end.thickness[axis - 1] > 0.0 and np.abs(known - plate.value[0]).min() > viewpoints.ALIKE_MM:
+            known = np.array([*others, thickness])
+            if thickness > 0.0 and np.abs(known - plate.value[0]).min() > viewpoints.ALIKE_MM:
                 return True
     return False
 
 
-def _of_faces(beyond: Bools) -> tuple[Reason, ...]:
-    names = tuple(name for (name, *_), one in zip(FACES, beyond, strict=True) if one)
+def _of_faces(end: FittedEnd, beyond: Bools) -> tuple[Reason, ...]:
+    failed = {face.name for face, one in zip(end.place.section.faces, beyond, strict=True) if one}
+    names = tuple(name for name in PlateFace if name in failed)
     return (reason("preassemble.face-contradicts-noise", faces=names),) if names else ()
 
 

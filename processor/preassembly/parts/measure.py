@@ -134,7 +134,7 @@ def fit(
     used = [first, *(scan for scan in usable[1:] if scan.sure == (True, True))]
     registered = _registered(used, shape, [design.joint_points[j] for j in joints if j is not None])
     ends = tuple(
-        None if joint is None else joint_end.fit(registered, end_place(design.joint_points[joint], outward))
+        None if joint is None else joint_end.fit(registered, end_place(design.joint_points[joint], outward, shape.mesh))
         for joint, outward in places
     )
     edges = _edges(registered, part, first.registration.sigma_mm, systematic)

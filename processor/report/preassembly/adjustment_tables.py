@@ -56,6 +56,19 @@ SPAN_NOTE = text(
     "design where the joints alone place all parts after the first."
 )
 
+LOOP = (
+    text("along the joint's x"),
+    text("along its y"),
+    text("along its z"),
+    text("about the joint's x"),
+    text("about its y"),
+    text("about its z"),
+)
+LOOP_NOTE = text(
+    "The joint is left open and the further joints alone place the parts: where its right part then lies against its "
+    "left one. x leads from the left to the right part, y to P1 from P2, z up."
+)
+
 
 def adjusted(result: Result, method: str) -> list[Table]:
     """Tables of the adjustment's own records, what to do first; none for a result without them."""
@@ -80,6 +93,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
             file="span",
             note=SPAN_NOTE,
         ),
+        *_loops(adjustment, method),
         Table(
             text("Budget of the uncertainty, method {method}", method=method),
             ("source", "sd_mm"),
@@ -240,6 +254,22 @@ def _span_and_closure(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
         finite = math.isfinite(value) and math.isfinite(half)
         beyond = (text("yes") if abs(value) > half else text("no")) if finite else ""
         yield (name, value, half, unit, beyond)
+
+
+def _loops(adjustment: Adjustment, method: str) -> list[Table]:
+    """Tabulate the closure of each loop of parts; none without loops."""
+    loops, rows = adjustment.loops, []
+    if loops is None:
+        return []
+    for i, joint in enumerate(loops.joint):
+        values, halves = loops.closure[i].ravel().tolist(), loops.closure_ci95[i].ravel().tolist()
+        for name, value, half, unit in zip(LOOP, values, halves, ["mm"] * 3 + ["mrad"] * 3, strict=True):
+            finite = math.isfinite(value) and math.isfinite(half)
+            beyond = (text("yes") if abs(value) > half else text("no")) if finite else ""
+            rows.append((joint, " > ".join(loops.joints[i]), name, value, half, unit, beyond))
+    columns = ("joint", "further_joints", "figure", "departure", "ci95", "unit", "beyond_its_interval")
+    title = text("Closure of loops of parts, method {method}", method=method)
+    return [Table(title, columns, tuple(rows), file="loops", note=LOOP_NOTE)]
 
 
 def _trade_off(result: Result, adjustment: Adjustment, method: str) -> Table:

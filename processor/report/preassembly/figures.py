@@ -15,6 +15,7 @@ from processor.model import Floats, Scene, StepRun
 from processor.preassembly.result import Deviations, EdgeSide, Joints, Result
 from processor.report.preassembly import residual_map
 from processor.report.preassembly.joint_figures import by_axis, gap_vectors
+from processor.report.preassembly.part_lines import part_lines
 from processor.report.style import (
     BEHIND_TEXT,
     COLOURS,
@@ -36,7 +37,9 @@ TRADED = (("splicing error, mean |d|", 0, 2, "mean"), ("splicing error, largest 
 def draw(scene: Scene, runs: Sequence[StepRun]) -> CaptionedPngs:
     """Draw the first run's bridge and the linear error of all; what a result does not have is left out."""
     result: Result = runs[0].result
-    figures: CaptionedPngs = {"bridge.png": _bridge(scene, runs[0]), "linear-error.png": _linear_error(scene, runs)}
+    figures: CaptionedPngs = {"bridge.png": _bridge(scene, runs[0])}
+    if any(len(run.result.linear.chainage) for run in runs):
+        figures["linear-error.png"] = _linear_error(scene, runs)
     adjustment = result.adjustment
     if adjustment is not None and np.isfinite(adjustment.linear_offset_ci95).any():
         figures["linear-offset.png"] = _linear_offset(scene, runs[0])
@@ -63,15 +66,15 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     joints = run.result.joints
     times = _times(scene, joints)
     for axes, up, ends in ((side, 2, (4, 6)), (plan, 1, (5, 7))):
-        for i, part in enumerate(scene.arch.parts):
-            for edge in (part.bottom_edge_left, part.bottom_edge_right):
+        for i in range(len(scene.arch.parts)):
+            for edge in part_lines(scene.arch, i):
                 axes.plot(edge[:, 0] / 1e3, edge[:, up] / 1e3, color="0.35" if i % 2 else "0.6", linewidth=2.0)
         for j in range(len(joints)):
             _joint_drawn(axes, scene.arch.joint_points[j], joints.gaps[j], up, ends, times)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("along the span, m")
     for i, part in enumerate(scene.arch.parts):
-        x, _, z = part.bottom_edge_left.T / 1e3
+        x, _, z = part_lines(scene.arch, i)[0].T / 1e3
         middle = (x[len(x) // 2], z[len(z) // 2]) if len(x) else (0.0, 0.0)
         _write(side, printable_name(part.name, i), middle, -20)
     labels = [printable_name(name, j) for j, name in enumerate(joints.name)]
@@ -107,7 +110,8 @@ def _times(scene: Scene, joints: Joints) -> float:
     largest = float(sizes[np.isfinite(sizes)].max(initial=0.0))
     if not np.isfinite(joints.gaps).any():
         return 0.0
-    points = np.concatenate([scene.arch.joint_points.reshape(-1, 3), *[p.bottom_edge_left for p in scene.arch.parts]])
+    lines = [line for i in range(len(scene.arch.parts)) for line in part_lines(scene.arch, i)[:1]]
+    points = np.concatenate([scene.arch.joint_points.reshape(-1, 3), *lines])
     wanted = GAP_SHARE * float(np.ptp(points[:, 0])) / max(largest, LEAST_SHOWN_MM)
     return rounded(wanted)
 
@@ -283,7 +287,7 @@ def _linear_offset(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
 def _mark_joints(axes: Axes, scene: Scene, joints: Sequence[str]) -> None:
     assert scene.arch is not None
     chainage_m = 0.0
-    for j, part in enumerate(scene.arch.parts[: len(joints)]):
+    for j, part in enumerate(scene.arch.parts[: len(joints)] if scene.arch.in_row else ()):
         chainage_m += float(np.linalg.norm(np.diff(part.bottom_edge_left, axis=0), axis=1).sum()) / 1000.0
         axes.axvline(chainage_m, color="0.4", linewidth=0.9, linestyle=(0, (1, 2)))
         axes.annotate(

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from processor.language.messages import text
 from processor.model import KEY_POINTS, Floats, Scene, StepRun
 from processor.preassembly.result import Residuals, Result
+from processor.report.preassembly.part_lines import part_lines
 from processor.report.style import DIVERGING_STOPS, colour_limit
 from processor.report.table import shown
 from processor.store.json_values import json_ready
@@ -71,7 +72,7 @@ def _part(scene: Scene, result: Result, residuals: Residuals, i: int) -> dict[st
     rows = np.flatnonzero(_of_component(result, residuals, part.name))[::step]
     return {
         "name": shown(part.name),
-        "edges": [np.round(_thinned(edge), 1) for edge in (part.bottom_edge_left, part.bottom_edge_right)],
+        "edges": [np.round(_thinned(edge), 1) for edge in part_lines(scene.arch, i)],
         "points": np.rint(residuals.points[rows]).astype(int).ravel(),
         "residual": np.round(residuals.distance[rows], 3),
     }
