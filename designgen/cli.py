@@ -207,6 +207,6 @@ def import_(context: click.Context, file: Path, output: Path, units: str, defaul
 
     report = files.import_file(file, output, units, default_units)
     click.echo(json.dumps(report, ensure_ascii=False) if as_json else "\n".join(files.summary(report)))
-    for problem in report["problems"]:
-        click.echo(f"{file}: {problem}", err=True)
+    for line in (*report["problems"], *report["notes"]):
+        click.echo(f"{file}: {line}", err=True)
     context.exit(IN_PART if report["problems"] else DONE)

@@ -443,13 +443,26 @@ class DesignBodies(Checked):
 
 
 @dataclass(frozen=True)
+class DesignFaults(Checked):
+    """What was wrong with a structure's mesh: facets that were ``turned`` outward, and open edges of so many parts."""
+
+    turned: int = 0
+    open_edges: int = 0
+    open_parts: int = 0
+
+
+@dataclass(frozen=True)
 class StructureDesign(Checked):
-    """One mesh of a whole structure, in the design's frame (mm); ``bodies`` are None where the mesh has no names."""
+    """One mesh of a whole structure, in the design's frame (mm); ``bodies`` are None where the mesh has no names.
+
+    ``faults`` are None where none were found, or the mesh is not from a file.
+    """
 
     name: str
     vertices: Floats = column("v", 3, means=PLACE)
     faces: Ints = column("f", 3, dtype=np.int64, means=Meaning(rows_of="vertices"))
     bodies: DesignBodies | None = newer()
+    faults: DesignFaults | None = newer()
 
     def contradictions(self) -> Iterable[str]:
         """Yield that bodies are not given for each facet."""

@@ -14,6 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from designgen.cad import faults
 from designgen.cad.bodies import UNITS_MM, CadFile
 from designgen.cad.process import received
 from processor.jobs.process import Cause, isolated, run
@@ -143,12 +144,14 @@ def import_file(path: Path, folder: Path, units: str = "", default_units: str = 
         "unit_stated": cad.unit_stated or None,
         "bodies": [],
         "problems": list(cad.problems),
+        "notes": _notes(cad, path.stem),
     }
     with new_folder(folder) as making:
         taken = set[str]()
         for body in cad.bodies:
             file = f"{_file_stem(body.name, taken)}.ply"
-            write_mesh(making / file, body.vertices, body.faces)
+            inward = body.closed and faults.volume(body.vertices, body.faces) < 0.0
+            write_mesh(making / file, body.vertices, body.faces[:, ::-1] if inward else body.faces)
             report["bodies"].append(
                 {
                     "name": body.name,
@@ -165,6 +168,18 @@ def import_file(path: Path, folder: Path, units: str = "", default_units: str = 
         text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
         (making / "import.json").write_text(text, encoding="utf-8")
     return report
+
+
+def _notes(cad: CadFile, stem: str) -> list[str]:
+    """Return what is wrong with bodies that could be read: their names, open shells, overlaps."""
+    bodies = [faults.Named(body.name, body.vertices, body.faces, body.closed) for body in cad.bodies]
+    open_ = [body.name for body in cad.bodies if not body.closed]
+    inverted = [body.name for body in bodies if body.closed and faults.volume(body.vertices, body.triangles) < 0.0]
+    return [
+        *faults.of_names([body.name for body in bodies], stem),
+        *faults.of_shells(open_, inverted, "written as it is"),
+        *faults.of_bodies(bodies),
+    ]
 
 
 def _unit_from(cad: CadFile, units: str) -> str:

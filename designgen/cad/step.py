@@ -27,6 +27,9 @@ from designgen.cad.bodies import NO_UNIT, UNITS_MM, Body, CadFile, unit_name
 from designgen.cad.shapes import body_of, parts, pieces
 from processor.model import InputError, UsageError
 
+# What Open CASCADE, and with it CadQuery and FreeCAD, writes for a product that has no name.
+WRITTEN_BY_KERNEL = r"Open CASCADE STEP translator [\d.]+( [\d.]+)?"
+
 
 def parse(path: str, content: bytes, units: str, default_units: str, *, exact: bool = False) -> CadFile:
     """Read the text of a STEP file; arguments and errors as of :func:`process.parse`.
@@ -184,7 +187,11 @@ def _text(entity: Any) -> str:
         name = str(entity.Name().ToCString()).strip()
     except (AttributeError, UnicodeDecodeError):
         return ""
-    return "" if name.upper() == "NONE" else name.encode("utf-8", "replace").decode()
+    return (
+        ""
+        if name.upper() == "NONE" or re.fullmatch(WRITTEN_BY_KERNEL, name)
+        else name.encode("utf-8", "replace").decode()
+    )
 
 
 class _FaceNames:

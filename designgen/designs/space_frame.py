@@ -25,6 +25,8 @@ HEXAGON = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.arange(6) * np.pi / 
 class Params:
     """A grid of ``nodes_x`` by ``nodes_y`` balls, mm; a second layer above it has one less in both directions.
 
+    One layer may be a row of balls, or one ball alone.
+
     ``shape``: flat; free-form, which rises and falls by ``rise_mm``; dome, a spherical cap of that rise.
     """
 
@@ -48,7 +50,7 @@ class Params:
         least = 4.0 * max(self.radii_mm, default=0.0)
         expect_all(
             "frame",
-            (min(nodes) >= 2, "nodes_x, nodes_y", nodes, "2 or more"),
+            (min(nodes) >= self.layers, "nodes_x, nodes_y", nodes, "2 or more, or with one layer 1 or more"),
             (count <= 1_000_000, "nodes_x * nodes_y", count, "a million at most"),
             (self.layers in (1, 2), "layers", self.layers, "1 or 2"),
             (self.shape in SHAPES, "shape", self.shape, f"one of {', '.join(SHAPES)}"),

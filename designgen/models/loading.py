@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from designgen.cad import files
-from designgen.cad.bodies import Body
+from designgen.cad import faults, files
+from designgen.cad.bodies import Body, is_closed
 from designgen.models import cadquery_objects, mesh_bodies, mesh_files
-from designgen.models.model import Model, ModelBody, of_cad, repeated, shared_count, turned, unique, volume
+from designgen.models.model import Model, ModelBody, of_cad, turned, unique
 from processor.model import Floats, InputError, Ints, UsageError
 
 PYTHON = ".py"
@@ -54,11 +54,15 @@ def _arrays(model: Any) -> tuple[Floats, Ints]:
 
 
 def say(model: Model) -> None:
-    """Log the notes of a model as warnings, a line each."""
-    for note in model.notes[:MOST_NOTES]:
+    """Log the notes of a model, and what is wrong with its bodies together, as warnings, a line each."""
+    bodies = [
+        faults.Named(body.name, body.vertices, body.triangles, is_closed(body.triangles)) for body in model.bodies
+    ]
+    notes = [*model.notes, *faults.of_bodies(bodies)]
+    for note in notes[:MOST_NOTES]:
         LOG.warning("%s: %s", model.name, note)
-    if len(model.notes) > MOST_NOTES:
-        LOG.warning("%s: and %d further notes", model.name, len(model.notes) - MOST_NOTES)
+    if len(notes) > MOST_NOTES:
+        LOG.warning("%s: and %d further notes", model.name, len(notes) - MOST_NOTES)
 
 
 def _of_file(path: Path, units: str) -> tuple[Sequence[Body | ModelBody], list[str]]:
@@ -74,7 +78,13 @@ def _of_file(path: Path, units: str) -> tuple[Sequence[Body | ModelBody], list[s
         pieces = [(name, unit_mm * vertices, faces) for name, vertices, faces in mesh_files.read(path)]
         bodies, notes = mesh_bodies.bodies_of(str(path), pieces, path.stem)
         if not units:
-            notes.insert(0, "a mesh names no unit: its numbers are taken as mm; state another by --units")
+            ends = np.array([[body.vertices.min(axis=0), body.vertices.max(axis=0)] for body in bodies])
+            x, y, z = ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0)
+            notes.insert(
+                0,
+                f"a mesh names no unit: its numbers are taken as mm, {x:.4g} x {y:.4g} x {z:.4g} mm in all; state "
+                "another by --units",
+            )
         return bodies, notes
     cad = files.read(path, units, exact=True)
     notes = list(cad.problems)
@@ -89,25 +99,15 @@ def _named(model: str, file: str, found: tuple[Sequence[Body | ModelBody], list[
     bodies, notes = found
     if bodies and isinstance(bodies[0], ModelBody):
         return Model(model, tuple(bodies), tuple(notes))  # type: ignore[arg-type]
-    names = [body.name for body in bodies]
-    notes += repeated(names)
-    stem = Path(file).stem
-    numbered = sum(name.startswith(f"{stem}-") and name[len(stem) + 1 :].isdigit() for name in names)
-    if numbered:
-        notes.append(f"{numbered} bodies have no names in the file: they are numbered, as {stem}-1")
+    names, stem = [body.name for body in bodies], Path(file).stem
+    notes += faults.of_names(names, stem)
     result, open_, inverted = [], [], []
     for body, name in zip(bodies, unique(names), strict=True):
         assert isinstance(body, Body)
-        inward = body.closed and volume(body.vertices, body.faces) < 0.0
+        inward = body.closed and faults.volume(body.vertices, body.faces) < 0.0
         inverted += [name] if inward else []
         open_ += [] if body.closed else [name]
         result.append(of_cad(turned(body) if inward else body, name))
-    if open_:
-        notes.append(f"{_listed(open_)} not closed: scanned as it is, from both sides; check it in the CAD program")
-    if inverted:
-        notes.append(f"{_listed(inverted)} inside out: the normals were turned outward")
-    return Model(model, tuple(result), tuple(notes), shared_count(names), numbered)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return f"{names[0]!r} is" if len(names) == 1 else f"{len(names)} bodies, {names[0]!r} first, are"
+    notes += faults.of_shells(open_, inverted, "scanned as it is, from both sides")
+    unnamed = len(faults.numbered(names, stem))
+    return Model(model, tuple(result), tuple(notes), faults.shared_count(names), unnamed)

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from designgen.cad import faults
 from designgen.models.mesh_files import Piece
-from designgen.models.model import ModelBody, components, of_mesh, repeated, shared_edges, unique, volume
+from designgen.models.model import ModelBody, components, of_mesh, shared_edges, unique
 from processor.model import Floats, InputError, Ints
 
 JOIN_SHARE = 1e-9  # of the model's size: vertices nearer to each other are one
@@ -36,10 +37,13 @@ def bodies_of(path: str, pieces: Sequence[Piece], stem: str) -> tuple[list[Model
     names = [name or (f"{stem}-{i + 1}" if len(found) > 1 else stem) for i, (name, _, _) in enumerate(found)]
     if unnamed > 1:
         notes.append(f"{unnamed} connected parts have no names and are numbered as bodies {names[0]} to {names[-1]}")
-    notes += repeated(names)
+    notes += faults.repeated(names)
     for name, (_, _, faces) in zip(unique(names), found, strict=True):
         if holes := _open_edges(faces):
-            notes.append(f"{name!r} is not closed ({holes} open edges): it is scanned as it is, from both sides")
+            notes.append(
+                f"{name!r} is not closed ({holes} open edges): it is scanned as it is, from both sides; close its "
+                "holes if it is a solid"
+            )
     return [of_mesh(name, points, faces) for name, (_, points, faces) in zip(unique(names), found, strict=True)], notes
 
 
@@ -82,7 +86,7 @@ def _oriented(vertices: Floats, triangles: Ints, name: str, notes: list[str]) ->
     order = np.argsort(label, kind="stable")
     rows = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
     parts = [faces[part] for part in rows]
-    volumes = [volume(vertices, part) for part in parts]
+    volumes = [faults.volume(vertices, part) for part in parts]
     result, cavities = {}, []
     for i, part in enumerate(parts):
         host = _around(vertices, part, parts, volumes) if volumes[i] < 0.0 else -1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -109,12 +108,6 @@ def turned(body: Body) -> Body:
     return dataclasses.replace(body, faces=body.faces[:, ::-1], forms=forms)
 
 
-def volume(vertices: Floats, triangles: Ints) -> float:
-    """Return the volume that triangles (f, 3) enclose, mm3; negative where their normals point inward."""
-    corners = vertices[triangles] - vertices[triangles[0, 0]]
-    return float(np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum()) / 6.0
-
-
 def of_mesh(name: str, vertices: Floats, triangles: Ints, most_deg: float = 20.0) -> ModelBody:
     """Return a mesh as a body; triangles that meet at less than ``most_deg`` are one face."""
     first, second, third = (vertices[triangles[:, i]] for i in range(3))
@@ -134,27 +127,6 @@ def of_mesh(name: str, vertices: Floats, triangles: Ints, most_deg: float = 20.0
         flat=(True,) * count,
         smooth=tuple(range(count)),
     )
-
-
-def repeated(names: Sequence[str]) -> list[str]:
-    """Return a note on names that several bodies have, which :func:`unique` numbers; empty without such names."""
-    shared = _shared(names)
-    if not shared:
-        return []
-    most = max(shared, key=lambda name: shared[name])
-    return [
-        f"{shared_count(names)} bodies share {len(shared)} name(s), as {most!r} {shared[most]} times: they "
-        f"are numbered, {most!r}, '{most} (2)', ..."
-    ]
-
-
-def shared_count(names: Sequence[str]) -> int:
-    """Return the number of bodies with a name that others have."""
-    return sum(_shared(names).values())
-
-
-def _shared(names: Sequence[str]) -> dict[str, int]:
-    return {name: count for name, count in Counter(names).items() if count > 1}
 
 
 def unique(names: Sequence[str]) -> list[str]:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from designgen.cad.faults import distances
 from designgen.models.model import ModelBody
 from processor.model import Floats, Ints
 
@@ -52,28 +53,9 @@ def _long(corners: Floats, spacings: Sequence[Spacing]) -> np.ndarray:
     lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
     result = np.zeros(lengths.shape, bool)
     for centre, reach, longest in spacings:
-        near = np.ones(len(corners), bool) if not np.isfinite(reach) else _distance(corners, centre) < reach
+        near = np.ones(len(corners), bool) if not np.isfinite(reach) else distances(corners, centre) < reach
         result |= near[:, None] & (lengths > longest)
     return result
-
-
-def _distance(corners: Floats, point: Floats) -> Floats:
-    """Return the distance (f,) of triangles (f, 3, 3) from a point (3,)."""
-    nearest = np.full(len(corners), np.inf)
-    for k in range(3):
-        a, b = corners[:, k], corners[:, (k + 1) % 3]
-        along = b - a
-        share = np.einsum("ni,ni->n", point - a, along) / np.maximum(np.einsum("ni,ni->n", along, along), 1e-300)
-        foot = a + np.clip(share, 0.0, 1.0)[:, None] * along
-        nearest = np.minimum(nearest, np.linalg.norm(foot - point, axis=1))
-    a, b, c = np.moveaxis(corners, 1, 0)
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-    height = np.einsum("ni,ni->n", point - a, normal)
-    inside = np.ones(len(corners), bool)
-    for start, end in ((a, b), (b, c), (c, a)):
-        inside &= np.einsum("ni,ni->n", np.cross(end - start, point - start), normal) >= 0.0
-    return np.where(inside, np.abs(height), nearest)
 
 
 def _middles(

@@ -17,6 +17,7 @@ from designgen.scanning.surfaces import Surfaces
 from designgen.sequences import in_square, on_sphere
 from processor.model import Floats, PointLabels, Scan, Shorts, Stations, StationTruth
 
+OF_ONE_MM = 4_000.0  # width of the area on which stations stand below a ball or a row of balls
 LABELS = ("part", "source", "surface", "range_error_mm", "incidence_cos")  # columns of Returns and PointLabels
 
 
@@ -25,10 +26,12 @@ def stations_below_box(low: Floats, high: Floats, params: scanner.Params, seed: 
 
     ``low`` and ``high`` (3,) are corners of the box, mm; the ground is at z = 0. Two numbers of ``stations`` give a
     grid, which covers the area best. One number gives as many places of a sequence: more stations leave the first
-    unchanged.
+    unchanged. Below a box without width, as of one ball, they stand on an area of OF_ONE_MM.
     """
     grid = params.stations if len(params.stations) == 2 else None
     poses = {}
+    wider = np.where(high > low, 0.0, 0.5 * OF_ONE_MM)
+    low, high = low - wider, high + wider
     for i in range(math.prod(params.stations)):
         name = f"S{i + 1}"
         rng = generator(seed, f"place {name}")

@@ -36,9 +36,12 @@ def make(
     if kind not in MAKERS:
         raise UsageError(f"recipe {name}: kind: expected one of {', '.join(MAKERS)}, got {kind!r}")
     section, maker = MAKERS[kind]
+    of_part = False
     if kind == "structure" and "model" in recipe:
         section, maker = "model", partial(model.make, model=of_model)
+        of_part = isinstance(recipe["model"], Mapping) and bool(recipe["model"].get("part"))
     keys = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section} | EXTRA.get(kind, set())
+    keys |= {"bridge"} if of_part else set()
     if unknown := sorted(set(recipe) - keys):
         raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(keys))}")
     used = recipe.get("seed", 0) if seed is None else seed

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from designgen.designs import arch_bridge, arch_part
 from designgen.models import as_built, loading, placement
 from designgen.models.model import Model, ModelBody
 from designgen.reading import filled
@@ -25,9 +26,13 @@ from processor.model import Floats, Scene, StructureDesign, Truth, UsageError
 
 @dataclass(frozen=True)
 class Params:
-    """The model's file, the unit of its numbers ("": as the file states), and a file of stations ("": placed)."""
+    """The model's file, the unit of its numbers ("": as the file states), and a file of stations ("": placed).
+
+    In place of a file, ``part`` is a part of an arch bridge (foot1, rib1, ...) whose sizes are in [bridge].
+    """
 
     file: str = ""
+    part: str = ""
     units: str = ""
     stations: str = ""
 
@@ -55,12 +60,12 @@ def make(
 ) -> tuple[Scene, Truth]:
     """Make the scene of a model and its truth; without a model, that of the file which the recipe names."""
     section = filled(Params, recipe, "model")
-    if not section.file:
-        raise UsageError('model.file: expected a file, got ""')
+    if bool(section.file) == bool(section.part) and model is None:
+        raise UsageError(f'model.file: expected a file, or a part in its place, got "{section.file}"')
     if not isinstance(scanning, ByRays):
         raise UsageError('scan.mode: a model is scanned from stations; set scan.mode = "rays"')
     if model is None:
-        model = loading.load(Path(section.file), section.units)
+        model = _part(section.part, recipe) if section.part else loading.load(Path(section.file), section.units)
     loading.say(model)
     params, origin = scanning.params, np.array(scanning.params.origin_mm)
     names = tuple(body.name for body in model.bodies)
@@ -89,6 +94,17 @@ def make(
         spacing_mm=scanning.spacing_mm,
         sigma_mm=scanning.sigma_mm,
     )
+
+
+def _part(name: str, recipe: Mapping[str, Any]) -> Model:
+    """Return a part of an arch bridge, in the bridge's frame, as a model of one body with the part's name."""
+    import cadquery as cq
+
+    if name not in arch_bridge.NAMES:
+        raise UsageError(f'model.part: expected one of {", ".join(arch_bridge.NAMES)}, got "{name}"')
+    parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
+    solid = arch_part.solid(parts[arch_bridge.NAMES.index(name)])
+    return loading.load(cq.Assembly(name="bridge").add(solid, name=name), name=name)
 
 
 def _surfaces(built: Sequence[ModelBody | None]) -> Surfaces:

@@ -26,6 +26,7 @@ MOST_BUMPS, MASK_RADII, MOST_MASKED = 3, 1.15, 0.5
 RIGID_SHARE = 0.05  # of the chi-square that a shape explains, from which on the component has moved as well
 GOLDEN, GOLDEN_STEPS = 0.6180339887498949, 18
 RIGID = "misalignment"
+LEAST_OWN = 0.01  # of the square of a shape, that a rigid motion does not explain
 WEAK = 1e-6  # of a column's weight: keeps factors without observations at zero
 
 
@@ -347,7 +348,11 @@ def _best(kind: str, places: list[At], seen: Observations, residual: Floats) -> 
 
 
 def _gain_of(kind: str, seen: Observations, residual: Floats) -> Callable[[At], float]:
-    """Return the function of a shape's parameters: reduction of chi-square, a rigid motion free beside the shape."""
+    """Return the function of a shape's parameters: reduction of chi-square, a rigid motion free beside the shape.
+
+    It is 0 for a shape that is nearly such a motion where blocks were seen, as a step with none before it: the two
+    would be fitted against each other, by any amount.
+    """
     rigid = seen.basis(RIGID, ())
     w = seen.blocks.weight
     A = rigid.T @ (w[:, None] * rigid)
@@ -357,8 +362,11 @@ def _gain_of(kind: str, seen: Observations, residual: Floats) -> Callable[[At], 
 
     def gain(at: At) -> float:
         columns = seen.basis(kind, at)
+        whole = w @ columns**2
         columns = columns - rigid @ (projected @ columns)
         B = columns.T @ (w[:, None] * columns)
+        if (np.diag(B) < LEAST_OWN * whole).any():
+            return 0.0
         b = columns.T @ (w * rest)
         return float(b @ np.linalg.solve(B + (WEAK * np.trace(B) + 1e-12) * np.eye(len(B)), b))
 

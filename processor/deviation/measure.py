@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import opposite_sides, scanner_class
-from processor.deviation import stable_fit, surface_movement, to_result
+from processor.deviation import common_errors, stable_fit, surface_movement, to_result
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
@@ -218,9 +218,7 @@ def _result(
         reasons.append(reason("deviation.unposed-scans", scans=scan.unposed))
     known = distance.std2[np.isfinite(distance.lod95)]
     area = 1e-6 * measured.spacing**2 * float(np.isfinite(measured.moved.along).sum())
-    covariance = fits.of(params.fit).covariance if fits.determined else placed.covariance
-    if _views_by_class(scan, placed):
-        covariance = covariance + scanner_class.pose_covariance(core.points)
+    covariance, mean_sd = _uncertainty(scan, placed, measured, fits, params)
     return Result(
         status=status,
         method=params.method,
@@ -250,19 +248,33 @@ def _result(
         max_depth=measured.depth,
         origin=origin,
         core=points,
+        mean_ci95=total.mean + m3c2.Z95 * mean_sd * np.array([-1.0, 1.0]),
         **to_result.statistics(points, total),
     )
 
 
-def _views_by_class(scan: ScanCloud, placed: Placed) -> bool:
-    """Whether the pose was found by views that are not named: what they have in common is stated."""
-    return scan.unnamed_views and placed.registration is not Registration.AS_GIVEN
+def _uncertainty(
+    scan: ScanCloud, placed: Placed, measured: Measured, fits: Fits, params: Params
+) -> tuple[Floats, float]:
+    """Return the covariance (6, 6) of the pose, and the standard deviation of the mean, with what scans share."""
+    core = measured.core
+    covariance = fits.of(params.fit).covariance if fits.determined else placed.covariance
+    common = scanner_class.pose_covariance(core.points)
+    registered = placed.registration is not Registration.AS_GIVEN
+    covariance = covariance + common if registered else covariance
+    of_pose = covariance if registered and np.isfinite(covariance).all() else common
+    overlap = stable_fit.overlap(measured.diameter, measured.spacing)
+    return covariance, common_errors.mean_sd(scan, placed.T, core, measured.moved, of_pose, overlap)
 
 
 def _of_views(scan: ScanCloud, placed: Placed, measured: Measured) -> Iterator[Reason]:
-    """Yield what is taken of the errors of views that are not named."""
-    if _views_by_class(scan, placed):
-        yield reason("deviation.views-by-class", shift=scanner_class.SHIFT_MM, offset=scanner_class.OFFSET_MM)
+    """Yield what is taken of the errors that all views have in common, where these placed the scan."""
+    if placed.registration is not Registration.AS_GIVEN:
+        sizes = {"shift": scanner_class.SHIFT_MM, "offset": scanner_class.OFFSET_MM}
+        if scan.unnamed_views:
+            yield reason("deviation.views-by-class", **sizes)
+        else:
+            yield reason("deviation.stations-by-class", **sizes)
     if measured.views > 0.0:
         yield reason("deviation.views-differ", sd=measured.views)
 

@@ -101,6 +101,7 @@ class Result(Checked):
     significant_share_ci95: Floats = optional(2, percent=True, heading="beyond LOD95, 95 % interval")
     within_10mm_share: float = described(NAN, percent=True, heading="within 10 mm")
     mean: float = described(NAN, unit="mm", heading="mean")
+    mean_ci95: Floats = optional(2, unit="mm", heading="mean, 95 % interval")
     median: float = described(NAN, unit="mm", heading="median")
     sd: float = described(NAN, unit="mm", heading="standard deviation")
     min: float = described(NAN, unit="mm", heading="least")

@@ -45,6 +45,7 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
     scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio, (earlier or {}).get("stitch"))
     method = baseline.measure if params.method == "paper" else measure.measure
     result = method(scene, scan, vertices, origin, params)
+    result = replace(result, reasons=(*result.reasons, *merging.design_faults(scene.structure)))
     if scan.unplaced:
         first = reason("deviation.scans-unplaced", scans=", ".join(scan.unplaced))
         status = Status.WEAK if result.status is Status.OK else result.status

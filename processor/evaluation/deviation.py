@@ -104,7 +104,7 @@ def _moved_and_not(result: Result, truth: StructureTruth) -> list[Metric]:
     """Return what was found of steel that moved and of steel that did not, in the true frame of the design.
 
     A core point moved where the movement along its normal is over twice its LOD95. Limits are for structures of which
-    one part moved, and for the mean of those exactly as designed.
+    one part moved, and for the mean of those exactly as designed: zero within AS_DESIGNED_MM or its interval.
     """
     displacement = truth.displacement[_nearest(result, truth)]
     still = np.linalg.norm(displacement, axis=1) < STABLE_MM
@@ -112,9 +112,11 @@ def _moved_and_not(result: Result, truth: StructureTruth) -> list[Metric]:
     lod95, found = result.core.lod95, np.abs(result.core.distance)
     known, limited = np.isfinite(found) & np.isfinite(lod95), _limited(result)
     if still.all() and known.any():
-        mean = abs(float(result.core.distance[known].mean()))
-        limit = AS_DESIGNED_MM if limited else NAN
-        return [Metric("deviation", "mean of steel as designed", mean, unit="mm", limit=limit)]
+        mean = float(result.core.distance[known].mean())
+        half = 0.5 * float(np.ptp(result.mean_ci95)) if result.mean_ci95.size else 0.0
+        limit = max(AS_DESIGNED_MM, half) if limited else NAN
+        metric = Metric("deviation", "mean of steel as designed", abs(mean), unit="mm", limit=limit)
+        return [metric, *(covered("deviation", "means", np.array([mean]), np.array([half])) if half > 0.0 else [])]
     moved = known & (along > LODS * lod95)
     if not LEAST_SHARE < still.mean() < 1.0 or not moved.any():
         return []

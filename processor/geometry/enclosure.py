@@ -33,19 +33,26 @@ def enclosed(points: Floats, normals: Floats, grid: FacetGrid, body: Ints) -> Bo
     places = np.ascontiguousarray(points + OUTSIDE_MM * normals + JITTER_MM)
     inside = np.zeros(len(places), np.bool_)
     axis = int(np.argmin(grid.shape))
-    over_ranges(lambda a, b: _inside(grid, body, places, axis, inside, a, b), len(places), least=LEAST_RANGE)
+    about = _boxes(grid.corners, body)
+    over_ranges(lambda a, b: _inside(grid, body, about, places, axis, inside, a, b), len(places), least=LEAST_RANGE)
     return inside
 
 
 def boxes(vertices: Floats, faces: Ints, body: Ints) -> tuple[Floats, Floats]:
     """Return the corners low and high (b, 3) of boxes about the closed bodies; of other bodies they are empty."""
+    about = _boxes(vertices[faces], body)
+    return about[:, 0], about[:, 1]
+
+
+def _boxes(corners: Floats, body: Ints) -> Floats:
+    """Return the low and high corners (b, 2, 3) of boxes about the bodies (f,) of facets (f, 3, 3)."""
     count = int(body.max(initial=-1)) + 1
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    about = np.stack([np.full((count, 3), np.inf), np.full((count, 3), -np.inf)], axis=1)
     closed = body >= 0
     for corner in range(3):
-        np.minimum.at(low, body[closed], vertices[faces[closed, corner]])
-        np.maximum.at(high, body[closed], vertices[faces[closed, corner]])
-    return low, high
+        np.minimum.at(about[:, 0], body[closed], corners[closed, corner])
+        np.maximum.at(about[:, 1], body[closed], corners[closed, corner])
+    return about
 
 
 def closed_bodies(faces: Ints) -> Ints:
@@ -65,14 +72,27 @@ def closed_bodies(faces: Ints) -> Ints:
 
 
 @njit(cache=True, nogil=True)
-def _inside(grid, body, places, axis, inside, first, last):  # type: ignore[no-untyped-def]
-    """Mark places first to last - 1 from which a ray along an axis leaves more bodies than it enters."""
+def _inside(grid, body, about, places, axis, inside, first, last):  # type: ignore[no-untyped-def]
+    """Mark places first to last - 1 from which a ray along an axis leaves more bodies than it enters.
+
+    Bodies with a place in the box ``about`` (b, 2, 3) them count alone, and the ray ends where their boxes do.
+    """
     low, size, shape = grid.low, grid.size, grid.shape
     u, v = (axis + 1) % 3, (axis + 2) % 3
     cell = np.empty(3, np.int64)
+    held = np.full(len(about), -1, np.int64)  # row of the place that was in the box of each body last
     for row in range(first, last):
         p = places[row]
-        within = True
+        end, within = -np.inf, True
+        for b in range(len(about)):
+            low_b, high_b = about[b, 0], about[b, 1]
+            if not (low_b[axis] <= p[axis] <= high_b[axis] and low_b[u] <= p[u] <= high_b[u]):
+                continue
+            if low_b[v] <= p[v] <= high_b[v]:
+                held[b] = row
+                end = max(end, high_b[axis])
+        if end < p[axis]:
+            continue
         for k in range(3):
             at = (p[k] - low[k]) / size
             within = within and 0.0 <= at < shape[k]
@@ -80,13 +100,13 @@ def _inside(grid, body, places, axis, inside, first, last):  # type: ignore[no-u
         if not within:
             continue
         winding = 0
-        for step in range(cell[axis], shape[axis]):
+        for step in range(cell[axis], min(shape[axis], int((end - low[axis]) / size) + 1)):
             cell[axis] = step
             voxel = (cell[0] * shape[1] + cell[1]) * shape[2] + cell[2]
             for k in range(grid.start[voxel], grid.start[voxel + 1]):
                 f = grid.facet[k]
                 n = grid.normals[f, axis]
-                if body[f] < 0 or abs(n) < 1e-12:
+                if body[f] < 0 or held[body[f]] != row or abs(n) < 1e-12:
                     continue
                 a, b, c = grid.corners[f, 0], grid.corners[f, 1], grid.corners[f, 2]
                 d = (b[u] - a[u]) * (p[v] - a[v]) - (b[v] - a[v]) * (p[u] - a[u])

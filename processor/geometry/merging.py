@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from processor.geometry import mesh_distance, rigid
-from processor.model import Floats, InputError, Scene, Status, StructureDesign
+from processor.model import Floats, InputError, Reason, Scene, Status, StructureDesign, reason
 
 ORIGIN_STEP_MM = 1000.0
 UNPLACED = (Status.FAILED, Status.AMBIGUOUS)  # of a scan: its pose may be wrong
@@ -68,6 +69,15 @@ def stitched(scene: Scene, result: Any) -> Scene:
         if scan.name not in T or np.isfinite(T[scan.name]).all()
     )
     return replace(scene, scans=scans)
+
+
+def design_faults(design: StructureDesign) -> Iterator[Reason]:
+    """Yield what was wrong with the design's mesh."""
+    faults = design.faults
+    if faults is not None and faults.turned:
+        yield reason("design.turned", turned=faults.turned)
+    if faults is not None and faults.open_edges:
+        yield reason("design.open", edges=faults.open_edges, parts=faults.open_parts)
 
 
 def local_design(design: StructureDesign) -> tuple[Floats, Floats]:

@@ -33,7 +33,8 @@ LEAST_RANGE = 5_000  # points per task of a thread
 EDGE_MM = 1.0  # a foot up to this far outside the edge of its face still counts as on it
 MOST_BULGE_MM = 1.0  # facets with a larger bulge are meant to be flat: no mesh is that coarse
 DESIGN_SAMPLES, DESIGN_SPACING_MM = 1_000_000, (8.0, 40.0)  # samples on a whole design; least and greatest spacing
-MOST_VOXELS = 20_000_000
+MOST_VOXELS, MOST_ENTRIES = 20_000_000, 40_000_000
+FULL, EMPTY, PIECES = 64, 8.0, 64  # voxels of a box that is not halved; of it to those of its facet; largest stack
 GRAZING_COS = 0.02  # cosine of incidence below which a facet is seen edge-on
 
 
@@ -321,10 +322,17 @@ class FacetGrid(NamedTuple):
 
 
 def facet_grid(vertices: Floats, faces: Ints, normals: Floats, reach: float) -> FacetGrid:
-    """Sort facets into voxels about as large as ``reach``, larger where the design is very large."""
+    """Sort facets into voxels about as large as ``reach``, larger where the design is very large.
+
+    They are larger, too, where long thin facets, as of tubes, would be in too many: MOST_ENTRIES in all.
+    """
     corners = np.ascontiguousarray(vertices[faces])
     low, high = corners.min(axis=(0, 1)) - reach, corners.max(axis=(0, 1)) + reach
     size = max(float(reach), float(np.prod(high - low) / MOST_VOXELS) ** (1.0 / 3.0))
+    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
+    width = double_areas(vertices, faces)[1] / np.maximum(longest, 1e-12)
+    while _entries(longest, width, size, reach) > MOST_ENTRIES:
+        size *= 1.2
     shape = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
     none = np.empty(0, np.int64)
     count = _facets_of_voxels(corners, normals, low, size, shape, reach, none, none)
@@ -336,12 +344,17 @@ def facet_grid(vertices: Floats, faces: Ints, normals: Floats, reach: float) -> 
     )
 
 
+def _entries(longest: Floats, width: Floats, size: float, reach: float) -> float:
+    """Return about how often facets (f,) with a longest edge and a width across it stand in voxels of a size."""
+    about = 2.0 * reach / size + 1.5
+    return float(((longest / size + 1.0) * (width / size + about) * about).sum())
+
+
 def touching(vertices: Floats, faces: Ints, within: float) -> tuple[Ints, Ints]:
     """Pairs of a vertex (k,) and a facet (k,) that come within a distance of each other."""
     cross, double = double_areas(vertices, faces)
     normals = cross / np.maximum(double, 1e-12)[:, None]
-    span = float(np.median(np.ptp(vertices[faces], axis=1).max(axis=1)))
-    grid = facet_grid(vertices, faces, normals, max(within, 0.25 * span))
+    grid = facet_grid(vertices, faces, normals, max(within, float(np.sqrt(0.5 * double.mean()))))
     return _touching(grid, vertices, within)
 
 
@@ -461,33 +474,77 @@ def _facets_of_voxels(
 ) -> Ints:
     """Count the facets of each voxel (voxels,); write them to ``out`` where ``start`` (voxels + 1,) is given.
 
-    A facet belongs to the voxels of its bounding box that its plane comes within ``reach`` of.
+    A facet belongs to the voxels of its bounding box that its plane comes within ``reach`` of. The box of a long thin
+    facet askew is mostly empty: such a facet is halved until boxes are not, and the voxels are those of its pieces.
     """
     count = np.zeros(shape[0] * shape[1] * shape[2], np.int64)
+    last = np.full(len(count), -1, np.int32)  # facet that a voxel had last, so that pieces of one count once
+    stack = np.empty((PIECES, 3, 3))
+    lo, hi = np.empty(3, np.int64), np.empty(3, np.int64)
     half = 0.5 * size
     for f in range(len(corners)):
-        lo, hi = np.empty(3, np.int64), np.empty(3, np.int64)
-        for k in range(3):
-            least, most = corners[f, :, k].min() - reach, corners[f, :, k].max() + reach
-            lo[k] = max(0, int((least - low[k]) / size))
-            hi[k] = min(shape[k] - 1, int((most - low[k]) / size))
         n = normals[f]
         span = half * (abs(n[0]) + abs(n[1]) + abs(n[2])) + reach
-        for i in range(lo[0], hi[0] + 1):
-            for j in range(lo[1], hi[1] + 1):
-                for m in range(lo[2], hi[2] + 1):
-                    off = (
-                        (low[0] + i * size + half - corners[f, 0, 0]) * n[0]
-                        + (low[1] + j * size + half - corners[f, 0, 1]) * n[1]
-                        + (low[2] + m * size + half - corners[f, 0, 2]) * n[2]
-                    )
-                    if abs(off) > span:
-                        continue
-                    voxel = (i * shape[1] + j) * shape[2] + m
-                    if len(start):
-                        out[start[voxel] + count[voxel]] = f
-                    count[voxel] += 1
+        stack[0] = corners[f]
+        left = 1
+        while left:
+            left -= 1
+            piece = stack[left]
+            boxed = 1
+            for k in range(3):
+                least, most = piece[:, k].min() - reach, piece[:, k].max() + reach
+                lo[k] = max(0, int((least - low[k]) / size))
+                hi[k] = min(shape[k] - 1, int((most - low[k]) / size))
+                boxed *= hi[k] - lo[k] + 1
+            if left + 2 < PIECES and boxed > FULL and boxed > EMPTY * _voxels_of(piece, size):
+                _halved(stack, left)
+                left += 2
+                continue
+            for i in range(lo[0], hi[0] + 1):
+                for j in range(lo[1], hi[1] + 1):
+                    for m in range(lo[2], hi[2] + 1):
+                        off = (
+                            (low[0] + i * size + half - corners[f, 0, 0]) * n[0]
+                            + (low[1] + j * size + half - corners[f, 0, 1]) * n[1]
+                            + (low[2] + m * size + half - corners[f, 0, 2]) * n[2]
+                        )
+                        voxel = (i * shape[1] + j) * shape[2] + m
+                        if abs(off) > span or last[voxel] == f:
+                            continue
+                        last[voxel] = f
+                        if len(start):
+                            out[start[voxel] + count[voxel]] = f
+                        count[voxel] += 1
     return count
+
+
+@njit(cache=True, nogil=True)
+def _voxels_of(corner: Floats, size: float) -> Any:
+    """Return about how many voxels a triangle (3, 3) and its edges meet."""
+    rim = 0.0
+    for k in range(3):
+        e = corner[(k + 1) % 3] - corner[k]
+        rim += np.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+    u, v = corner[1] - corner[0], corner[2] - corner[0]
+    x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+    return 0.5 * np.sqrt(x * x + y * y + z * z) / (size * size) + 3.0 * rim / size
+
+
+@njit(cache=True, nogil=True)
+def _halved(stack: Floats, at: int) -> None:
+    """Replace the triangle ``at`` of a stack (p, 3, 3) by two: its longest edge is halved."""
+    longest, k = -1.0, 0
+    for i in range(3):
+        e = stack[at, (i + 1) % 3] - stack[at, i]
+        square = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
+        if square > longest:
+            longest, k = square, i
+    a, b = k, (k + 1) % 3
+    stack[at + 1] = stack[at]
+    for axis in range(3):
+        middle = 0.5 * (stack[at, a, axis] + stack[at, b, axis])
+        stack[at, b, axis] = middle
+        stack[at + 1, a, axis] = middle
 
 
 @njit(cache=True, nogil=True)

@@ -28,7 +28,7 @@ from processor.progress import tracked
 from processor.readers import RawScan
 from processor.readers.encoding import file_name_as_text
 from processor.readers.raw_scan import scaled_in_place, scan_name
-from processor.scan_folder import guess, scanner_grid, units
+from processor.scan_folder import guess, mesh_faults, scanner_grid, units
 from processor.scan_folder.checked_toml import Table, existing_file_in
 from processor.scan_folder.control_points import Measured, control_points, read_control
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
@@ -136,7 +136,9 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     if project.design is not None:
         unit = project.design_units or project.units or option or "m"
         if is_surface(project.design) and project.kind in ("", "structure"):
-            design = StructureDesign(scan_name(project.design), *read_surface(project.design, unit))
+            vertices, faces, bodies = read_surface(project.design, unit)
+            faces, found = mesh_faults.mended(vertices, faces)
+            design = StructureDesign(scan_name(project.design), vertices, faces, bodies, found)
         else:
             design = read_design(folder, project.design, unit)
     scene = _scene(project, design, option, _read_stations(folder, project.units or option or "m"), keep)

@@ -407,7 +407,8 @@ def test_what_is_lost_is_said(tmp_path):
     said = json.loads((tmp_path / "out/import.json").read_text("utf-8"))
     assert done.returncode == 1
     assert done.stdout.splitlines() == cad_files.summary(said)
-    assert done.stderr.splitlines() == [f"{path}: {problem}" for problem in said["problems"]]
+    assert done.stderr.splitlines() == [f"{path}: {line}" for line in (*said["problems"], *said["notes"])]
+    assert said["notes"] == ["'torn' is not closed: written as it is; check it in the CAD program"]
     assert any("did not become one" in problem for problem in said["problems"])
     assert [body["name"] for body in said["bodies"] if body["kind"] == "solid"] == ["whole"]
 

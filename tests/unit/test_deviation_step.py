@@ -12,11 +12,15 @@ import trimesh
 from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline
-from processor.deviation import baseline
+from processor.adjustment import scanner_class
+from processor.deviation import baseline, common_errors
 from processor.deviation import step as deviation_step
+from processor.deviation.cloud import ScanCloud
+from processor.deviation.local_translation import Movement
 from processor.evaluation import deviation as deviation_evaluation
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
+from processor.geometry.mesh_distance import Samples
 from processor.language.messages import messages
 from processor.model import (
     InputError,
@@ -392,8 +396,43 @@ def test_the_least_and_the_greatest_have_their_intervals(tmp_path):
     run = StepRun("deviation", "default", "{}", result)
     (table,) = section.REPORT.tables([run], ErrorReport())
     rows = {str(row[0]): row[1] for row in table.rows}
+    low, high = written["mean_ci95"]
+    assert (low + high) / 2.0 == pytest.approx(result.mean)
+    assert rows["mean, 95 % interval, from"] == pytest.approx(low)
     assert rows["least, 95 % interval, to"] == pytest.approx(written["min_ci95"][1])
     assert rows["greatest, 95 % interval, from"] == pytest.approx(written["max_ci95"][0])
+
+
+def test_the_mean_has_what_stations_have_alone_and_in_common():
+    """Ranges of six stations around a cube are off, alone and together: the mean scatters as its interval states."""
+    rng = np.random.default_rng(15)
+    points = rng.uniform(-500.0, 500.0, (6000, 3))
+    axis, side = rng.integers(0, 3, len(points)), rng.choice([-1.0, 1.0], len(points))
+    rows = np.arange(len(points))
+    normals = np.zeros_like(points)
+    points[rows, axis], normals[rows, axis] = 500.0 * side, side
+    positions = np.array(
+        [[4e3, 1e3, 0], [-4e3, 2e3, 1e3], [0, 3e3, 3e3], [1e3, -4e3, 0], [0, 500, -5e3], [3e3, 3e3, 0]]
+    )
+    arm = positions[:, None] - points
+    cosine = np.einsum("kni,ni->kn", arm, normals) / np.linalg.norm(arm, axis=2)
+    station = np.argmax(cosine, axis=0)
+    scan = ScanCloud(
+        points=points, origin=np.zeros(3), scanner=positions[station], removed=np.empty((0, 3)), removed_scanner=None,
+        spacing_mm=30.0, read=6000, kept=6000, source=station, sources=tuple("ABCDEF"),
+    )  # fmt: skip
+    core = Samples(points, normals, rows)
+    moved = Movement(np.zeros(6000), np.full(6000, 20), np.full(6000, 0.2), np.zeros((6000, 3)), np.ones(6000))
+    sd = common_errors.mean_sd(scan, np.eye(4), core, moved, np.zeros((6, 6)), 1.0)
+    ranges = rng.normal(0.0, 0.5, (4000, 6)) + rng.normal(0.0, 0.2, (4000, 1))
+    share = np.bincount(station, cosine[station, rows], 6) / len(points)
+    assert np.std(ranges @ share) == pytest.approx(sd, rel=0.05)
+    pose = scanner_class.pose_covariance(points)
+    assert common_errors.mean_sd(scan, np.eye(4), core, moved, pose, 1.0) == pytest.approx(sd, rel=0.02), "all around"
+    front = Samples(points[normals[:, 0] > 0.5], normals[normals[:, 0] > 0.5], rows)
+    few = Movement(*(value[: len(front.points)] for value in vars(moved).values()))
+    alone = common_errors.mean_sd(scan, np.eye(4), front, few, pose, 1.0)
+    assert alone > np.hypot(0.2, 0.2), "of one face the pose itself is in the mean"
 
 
 def test_marks_of_the_legend_can_be_seen():

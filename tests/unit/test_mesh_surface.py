@@ -82,3 +82,39 @@ def test_walks_end_where_they_do_step_by_step():
         assert face[i] == expected[0]
         assert distance[i] == pytest.approx(expected[1], abs=1e-9)
         assert beyond[i] == pytest.approx(expected[2], abs=1e-9)
+
+
+# --- facets by voxels -------------------------------------------------------------------------------------------------
+
+
+def slivers(count, length=3000.0, width=3.0, seed=3):
+    """Long thin triangles askew: vertices (3f, 3) and faces (f, 3)."""
+    rng = np.random.default_rng(seed)
+    start, along = rng.uniform(0.0, 2000.0, (count, 3)), rng.normal(size=(count, 3))
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    across = np.cross(along, rng.normal(size=(count, 3)))
+    across *= width / np.linalg.norm(across, axis=1)[:, None]
+    far = start + length * along
+    return np.stack([start, far, far + across], axis=1).reshape(-1, 3), np.arange(3 * count).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("count", [20, 4000], ids=["few", "so many that voxels are larger"])
+def test_every_voxel_that_a_sliver_comes_near_has_it_once(count, monkeypatch):
+    vertices, faces = slivers(count)
+    monkeypatch.setattr(mesh_distance, "MOST_ENTRIES", 200_000)
+    cross, double = mesh_distance.double_areas(vertices, faces)
+    reach = 20.0
+    grid = mesh_distance.facet_grid(vertices, faces, cross / double[:, None], reach)
+    assert (grid.size > 1.5 * reach) == (count > 1000)
+    rng = np.random.default_rng(4)
+    facet = rng.integers(0, count, 5000)
+    on_it = np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), 5000), vertices[faces[facet]])
+    off = rng.normal(size=(5000, 3))
+    near = on_it + off * (0.99 * reach * rng.uniform(0.0, 1.0, 5000) / np.linalg.norm(off, axis=1))[:, None]
+    i, j, k = np.floor((near - grid.low) / grid.size).astype(int).T
+    voxel = (i * grid.shape[1] + j) * grid.shape[2] + k
+    listed = [grid.facet[grid.start[v] : grid.start[v + 1]] for v in voxel]
+    assert all(f in those for f, those in zip(facet, listed, strict=True))
+    assert all(len(np.unique(those)) == len(those) for those in listed)
+    # About the voxels of a sliver's length times those across it, not those of its box or of its plane in the box.
+    assert len(grid.facet) < 30 * count * (3000.0 / grid.size + 2.0)
