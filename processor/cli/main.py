@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from processor.cli import batch, check, compare, export, init, report, run, validate
+from processor.cli import batch, check, compare, export, init, papers, report, run, validate
 from processor.version import __version__
 
 
@@ -17,5 +17,5 @@ def commands() -> None:
     """
 
 
-for module in (run, batch, check, compare, export, init, report, validate):
+for module in (run, batch, check, compare, export, init, report, validate, papers):
     commands.add_command(getattr(module, module.__name__.rpartition(".")[2]))

@@ -138,7 +138,7 @@ STEPS = ("defects", "deviation", "preassembly", "space_frame", "stitching")
 LAYERS = (
     ("version",),
     ("model",),
-    ("progress", "language", "jobs", "unit_ratio"),
+    ("progress", "language", "jobs", "unit_ratio", "user_methods"),
     ("geometry",),
     ("adjustment",),
     ("limits", "store"),
@@ -150,7 +150,7 @@ LAYERS = (
     ("results",),
     ("report", "clouds"),
     ("api",),
-    ("batch", "validation"),
+    ("batch", "validation", "papers"),
     ("cli",),
     ("__main__",),
 )

@@ -338,3 +338,14 @@ def test_imports_go_one_way():
             assert not any(f"designgen.{later}" in text for later in LAYERS[number + 1 :]), path
     for path in (ROOT / "designgen/cad").glob("*.py"):
         assert not any(f"designgen.{layer}" in path.read_text("utf-8") for layer in LAYERS), path
+
+
+def test_a_net_of_points_has_points_on_the_edges_of_every_face():
+    part = arch_bridge.build(arch_bridge.Params())[1]
+    cloud = sampler.scan_part(part, 0, sampler.Params(spacing_mm=40.0, sigma_mm=0.0, net=True), generator(0, "x"))
+    for s in (part.s0, part.s1):
+        corners = part.key_points(s)[:4]
+        off = np.linalg.norm(cloud.points[:, None] - corners, axis=2).min(axis=0)
+        np.testing.assert_allclose(off, 0.0, atol=1e-6)
+    random = sampler.scan_part(part, 0, sampler.Params(spacing_mm=40.0, sigma_mm=0.0), generator(0, "x"))
+    assert len(cloud.points) == pytest.approx(len(random.points), rel=0.15)
