@@ -35,8 +35,7 @@ def test_the_example_of_the_page_runs_beside_ours(place):
     done = CliRunner().invoke(commands, COMMAND.split(), standalone_mode=False)
     assert done.exception is None, done.output
     found = json.loads((place / "results/results.json").read_text("utf-8"))
-    assert [one["method"] for one in found["comparison"]["spheres"]] if "comparison" in found else True
-    assert "my_module.my_method" in json.dumps(found)
+    assert [one["method"] for one in found["comparison"]["spheres"]] == ["my_module.my_method"]
     assert "my_module:my_method" in json.dumps(found)  # among the parameters
     assert "my_module.my_method" in (place / "results/report.html").read_text("utf-8")
     assert (place / "results/balls-my_module.my_method.csv").exists()
