@@ -32,12 +32,13 @@ bench: $(VENV)/.test
 	$(BIN)/python -m tests.bench.m3c2 --output $(OUT)/bench-m3c2.json
 	$(BIN)/python -m tests.bench.peers_spheres --output $(OUT)/bench-peers-spheres.json
 	$(BIN)/python -m tests.bench.bolt_balls --cases frame-1040 --seeds 1 --output $(OUT)/bench-frame-1040.json
-	$(BIN)/python -m tests.bench.paper_comparison --output $(OUT)/bench.json
+	$(BIN)/processor papers -o $(OUT)/bench-papers --only 001 --seeds 1
 	$(BIN)/python -m tests.bench.generator --whole --output $(OUT)/bench-generator.json
 	$(BIN)/python -m tests.bench.readers --speed --output $(OUT)/bench-readers.json
 
 paper: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/paper
+	$(BIN)/processor papers -o $(OUT)/papers --jobs $(JOBS)
 
 # Exit code 4: a limit was missed or a figure got worse. --again replaces a run of today by other software.
 nightly: $(VENV)/.demo
@@ -48,7 +49,6 @@ weekend: $(VENV)/.test paper
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term --cov-fail-under=85
 	$(BIN)/python -m tests.bench.bolt_balls --output $(OUT)/nightly-bolt-balls.json
 	$(BIN)/python -m tests.bench.readers --mutations 2000 --output $(OUT)/nightly-damaged-files.json
-	$(BIN)/python -m tests.bench.paper_comparison --seeds 5 --sets D1,D2,D3 --output $(OUT)/nightly.json
 
 system:
 	@sh .ci/system-libraries

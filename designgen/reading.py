@@ -30,7 +30,7 @@ def _like(default: Any, value: Any, where: str) -> Any:
     """Check a value against the type of the default and return it; as a tuple if the default is one."""
     if isinstance(default, tuple):
         items = value if isinstance(value, list) else [value]
-        return tuple(_like(default[0], item, where) for item in items)
+        return tuple(_like(default[0] if default else 0.0, item, where) for item in items)  # empty: of numbers
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not type(default):

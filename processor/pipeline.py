@@ -19,6 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from processor import user_methods
 from processor.model import InputError, Scan, Scene, Status, StepRun, UsageError, did_you_mean, reason
 from processor.progress import stage
 from processor.store.json_values import json_ready
@@ -40,6 +41,12 @@ class Job:
     step: str
     module: ModuleType
     params: Any
+    function: Callable[..., Any] | None = None  # of a method of the user's own, instead of the module's ``run``
+
+    @property
+    def method(self) -> str:
+        """The name of the method in results."""
+        return user_methods.shown(self.params.method)
 
 
 @dataclass(frozen=True)
@@ -190,8 +197,9 @@ def _applies(module: ModuleType, scene: Scene) -> bool:
 def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int | None) -> tuple[Job, ...]:
     """Put steps in the order of their needs, with their methods; every name and type is checked.
 
-    The first method named for a step gives the result; further ones are run for comparison. Without a ``seed`` that
-    of the parameters holds. Raises UsageError for whatever is not known, saying what is.
+    The first method named for a step gives the result; further ones are run for comparison. A method of the user's own,
+    ``module:function``, is of the one step that is run. Without a ``seed`` that of the parameters holds. Raises
+    UsageError for whatever is not known, saying what is.
     """
     modules = step_modules()
     chosen = list(dict.fromkeys(wanted))
@@ -199,7 +207,11 @@ def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any
         if name not in modules:
             raise UsageError(f"no step {name!r}{did_you_mean(name, modules)}; there are {', '.join(modules)}")
     chosen = _in_order(chosen, modules)
-    offered = {name: [m for m in methods if m in modules[name].METHODS] for name in chosen}
+    if len(chosen) > 1 and (own := next(filter(user_methods.is_named, methods), None)):
+        raise UsageError(
+            f"method {own!r}: expected one step that it is of, named with --steps; got {', '.join(chosen)}"
+        )
+    offered = {name: [m for m in methods if m in modules[name].METHODS or user_methods.is_named(m)] for name in chosen}
     for method in methods:
         if not any(method in named for named in offered.values()):
             known = "; ".join(f"{name}: {', '.join(modules[name].METHODS)}" for name in chosen)
@@ -211,16 +223,20 @@ def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any
     for name in chosen:
         module, filled = modules[name], tables[name]
         first = filled.method
-        if first not in module.METHODS:
+        if first not in module.METHODS and not user_methods.is_named(first):
             raise UsageError(f"{name}.method: expected one of {', '.join(module.METHODS)}, got {first!r}")
         used_seed = seed if seed is not None else filled.seed
         jobs += [
-            Job(name, module, dataclasses.replace(filled, method=method, seed=used_seed))
+            Job(name, module, dataclasses.replace(filled, method=method, seed=used_seed), _own_function(method))
             for method in dict.fromkeys(offered[name] or [first])
         ]
     # Answers before comparisons, in the order of the steps.
     firsts = [next(job for job in jobs if job.step == name) for name in chosen]
     return (*firsts, *(job for job in jobs if job not in firsts))
+
+
+def _own_function(method: str) -> Callable[..., Any] | None:
+    return user_methods.load(method) if user_methods.is_named(method) else None
 
 
 def _in_order(chosen: Sequence[str], modules: Mapping[str, ModuleType]) -> list[str]:
@@ -309,26 +325,30 @@ def _stopping(job: Job, answers: Mapping[str, Any]) -> str:
 def _stopped(job: Job, step: str, log: Callable[[str], None]) -> StepRun:
     """Return the result of a step that does not run, as the scans have no sure poses."""
     result = job.module.Result(
-        status=Status.FAILED, method=job.params.method, reasons=(reason("pipeline.scans-not-placed", step=step),)
+        status=Status.FAILED, method=job.method, reasons=(reason("pipeline.scans-not-placed", step=step),)
     )
-    log(f"{job.step} ({job.params.method}): not run, {step} failed or is ambiguous")
-    return StepRun(job.step, job.params.method, _json_text(job.params), result)
+    log(f"{job.step} ({job.method}): not run, {step} failed or is ambiguous")
+    return StepRun(job.step, job.method, _json_text(job.params), result)
 
 
 def _run(path: Path, scene: Scene, job: Job, given: Mapping[str, Any], log: Callable[[str], None]) -> StepRun:
     started = time.monotonic()
     try:
-        with stage(f"{job.step} ({job.params.method})"):
-            result = job.module.run(scene, job.params, **given)
+        with stage(f"{job.step} ({job.method})"):
+            if job.function is None:
+                result = job.module.run(scene, job.params, **given)
+            else:
+                called = user_methods.call(job.function, job.params.method, scene, job.params, given, job.module.Result)
+                result = dataclasses.replace(called, method=job.method)
     except (InputError, UsageError):
         raise
     except Exception as error:
         # No input may end in a traceback: what a step did not foresee is the input's error until proved otherwise.
         raise InputError(
-            f"{path.name}: internal error in step {job.step} ({job.params.method}): {error!r}; --debug shows where"
+            f"{path.name}: internal error in step {job.step} ({job.method}): {error!r}; --debug shows where"
         ) from error
-    log(f"{job.step} ({job.params.method}): {result.status}, {time.monotonic() - started:.1f} s")
-    return StepRun(job.step, job.params.method, _json_text(job.params), result)
+    log(f"{job.step} ({job.method}): {result.status}, {time.monotonic() - started:.1f} s")
+    return StepRun(job.step, job.method, _json_text(job.params), result)
 
 
 def _json_text(params: Any) -> str:

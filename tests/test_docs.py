@@ -67,6 +67,10 @@ ELSEWHERE = {
     "processor validate mine.toml -o nights --jobs 2": "tests/unit/test_validation_running.py",
     "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": "tests/unit/test_validation_running.py",
     "processor validate -o nights --accept": "tests/unit/test_validation.py",
+    "processor papers -o papers": "make weekend",
+    "processor run my-frame -o results --steps spheres --method ray,my_module:my_method": (
+        "tests/unit/test_user_methods.py"
+    ),
     "designgen make frame-1040 -o roof.h5 --seed 3": "make weekend",
     "designgen scan hall.ifczip -o hall.h5 --stations places.json --scanner pulse --set scan.step_mrad=0.5": (
         "tests/unit/test_models.py"

@@ -17,6 +17,7 @@ from designgen.designs.space_frame import Frame
 from processor.model import AsBuilt, Floats, UsageError
 
 EXPANSION_PER_K = 12e-6
+MOST_GAP_MM = 500.0
 CORNER_REACH_MM = 1500.0  # distance from an end over which the errors of its corners fade out
 REFERENCE_C = 20.0
 MOST_DRAWS = 200  # attempts to find a place for a dent or a missing piece
@@ -44,6 +45,7 @@ class ArchParams:
     missing_pieces: int = 0  # rectangles cut from webs, total of all parts
     missing_size_mm: float = 250.0
     temperature_C: float = REFERENCE_C
+    gap_table_mm: tuple[float, ...] = ()  # gaps of P1 to P4 along, to the left and up, joint after joint
 
     def __post_init__(self) -> None:
         _check(self)
@@ -70,6 +72,11 @@ def _check(params: ArchParams | FrameParams) -> None:
         value = getattr(params, key)
         if key == "temperature_C":
             expect(-60.0 <= value <= 200.0, f"asbuilt.{key}", value, "-60 to 200")
+        elif key == "gap_table_mm":
+            known = all(-MOST_GAP_MM <= gap <= MOST_GAP_MM for gap in value)
+            expect(
+                known and len(value) % 12 == 0, f"asbuilt.{key}", value, f"12 numbers a joint, each to {MOST_GAP_MM:g}"
+            )
         else:
             expect(value >= 0, f"asbuilt.{key}", value, "0 or more")
 
@@ -207,9 +214,13 @@ def arch(
 
     Raises UsageError for drawn plates or sections that cannot be built, and for damage that does not fit on the webs.
     """
+    if params.gap_table_mm:
+        expect(len(params.gap_table_mm) == 12 * (len(parts) - 1), "asbuilt.gap_table_mm", len(params.gap_table_mm),
+               f"{12 * (len(parts) - 1)} numbers for {len(parts) - 1} joints")  # fmt: skip
     built = []
     for number, (part, rng) in enumerate(zip(parts, rngs, strict=True)):
         errors, plates = _draw_errors(part, params, rng, ledger)
+        errors = dataclasses.replace(errors, corners=errors.corners + _of_table(part, number, params, ledger))
         damaged: list[_Spot] = []
         dents = _share(params.dents, number, len(parts))
         errors = dataclasses.replace(
@@ -219,6 +230,18 @@ def arch(
         holes = tuple(_hole(part, params, rng, ledger, damaged) for _ in range(pieces))
         built.append(fabricate(part, errors, plates, holes))
     return built
+
+
+def _of_table(part: ArchPart, number: int, params: ArchParams, ledger: Ledger) -> Floats:
+    """Return the errors of corners (2, 4, 3) that open the joint before part ``number`` by the gaps of the table."""
+    corners = np.zeros((2, 4, 3))
+    if params.gap_table_mm and number:
+        corners[0] = np.reshape(params.gap_table_mm, (-1, 4, 3))[number - 1]
+        for k, axis in np.ndindex(4, 3):
+            ledger.note(
+                f"gap P{k + 1}, {('along', 'left', 'up')[axis]}", f"{part.name} start", corners[0, k, axis], "mm"
+            )
+    return corners
 
 
 def _draw_errors(

@@ -28,6 +28,7 @@ class Params:
     outlier_share: float = 0.0  # of all points; uniform in the part's box enlarged by a tenth
     inner_depth_mm: float = 1000.0  # depth from an open end to which inner faces are sampled
     member_reach_mm: float = 0.0  # frames: members are sampled to this distance from each ball; 0 = over their length
+    net: bool = False  # arch parts: points on a net over each face, its edges included, instead of at random
 
     def __post_init__(self) -> None:
         expect_all(
@@ -52,7 +53,8 @@ class Cloud:
 def scan_part(part: arch_part.ArchPart, number: int, params: Params, rng: np.random.Generator) -> Cloud:
     """Sample one arch part in the bridge's frame; its points are labelled with its number."""
     faces = arch_part.faces(part, params.inner_depth_mm)
-    points = np.vstack([_on_face(face, params.spacing_mm, rng) for face in faces])
+    on_face = _on_net if params.net else _on_face
+    points = np.vstack([on_face(face, params.spacing_mm, rng) for face in faces])
     return _with_errors(points, np.full(len(points), number), params, rng)
 
 
@@ -111,6 +113,20 @@ def _on_face(face: Face, spacing_mm: float, rng: np.random.Generator) -> Floats:
     p, q = rng.uniform(size=count), rng.uniform(size=count)
     accepted = (rng.uniform(size=count) * highest < face.element(p, q)) & face.present(p, q)
     return face.at(p[accepted], q[accepted])
+
+
+def _on_net(face: Face, spacing_mm: float, _: np.random.Generator) -> Floats:
+    """Return the points (n, 3) of a net over a face, as of a model that is meshed: its borders carry points."""
+    edge = np.linspace(0.0, 1.0, 201)
+    middle = np.full_like(edge, 0.5)
+    length = [
+        float(np.linalg.norm(np.diff(face.at(*line), axis=0), axis=1).sum())
+        for line in ((edge, middle), (middle, edge))
+    ]
+    lines = [np.linspace(0.0, 1.0, max(2, 1 + round(one / spacing_mm))) for one in length]
+    p, q = (grid.ravel() for grid in np.meshgrid(*lines, indexing="ij"))
+    there = face.present(p, q)
+    return face.at(p[there], q[there])
 
 
 def _unit_vectors(count: int, rng: np.random.Generator) -> Floats:

@@ -27,6 +27,7 @@ Scanning = sampler.Params | ByRays
 # Keys of [scan] that only some kinds of scene use.
 KEYS_BY_KIND = {
     "inner_depth_mm": ("arch-bridge",),
+    "net": ("arch-bridge",),
     "member_reach_mm": ("space-frame",),
     "distance_mm": ("arch-bridge", "structure"),
     "height_mm": ("space-frame", "structure"),

@@ -100,10 +100,10 @@ def _part(name: str, recipe: Mapping[str, Any]) -> Model:
     """Return a part of an arch bridge, in the bridge's frame, as a model of one body with the part's name."""
     import cadquery as cq
 
-    if name not in arch_bridge.NAMES:
-        raise UsageError(f'model.part: expected one of {", ".join(arch_bridge.NAMES)}, got "{name}"')
-    parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
-    solid = arch_part.solid(parts[arch_bridge.NAMES.index(name)])
+    parts = {part.name: part for part in arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))}
+    if name not in parts:
+        raise UsageError(f'model.part: expected one of {", ".join(parts)}, got "{name}"')
+    solid = arch_part.solid(parts[name])
     return loading.load(cq.Assembly(name="bridge").add(solid, name=name), name=name)
 
 

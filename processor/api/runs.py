@@ -123,9 +123,7 @@ def run(
     UsageError : a name or parameter is unknown.
     """
     wanted, methods = _names(steps), _names(method)
-    parameters = (
-        params if isinstance(params, Mapping) else pipeline.read_params(None if params is None else Path(params))
-    )
+    parameters = _parameters(params)
     out = None if output is None else Path(output)
     if isinstance(input_, Scene):
         meaning.check(input_, f"scene {input_.name[:LONGEST_NAME]!r}")
@@ -148,6 +146,12 @@ def run(
     report = evaluate.evaluate(path, execution)
     fingerprint.check_unchanged(path.resolve(), before, place)
     return write(Results(execution, report), out, lang)
+
+
+def _parameters(params: str | Path | Mapping[str, Any] | None) -> Mapping[str, Any]:
+    if isinstance(params, Mapping):
+        return params
+    return pipeline.read_params(None if params is None else Path(params))
 
 
 def _run_scene(

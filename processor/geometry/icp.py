@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
+from processor.geometry.polyline import Polyline
 from processor.model import Floats, Ints
 
 MOST_WEIGHT = 100.0  # of a point on a face that few points lie on
@@ -51,6 +53,41 @@ def point_to_point(
             break
         last = rms
         T = rigid.fit(source[paired], target[index[paired]])
+    return Alignment(T, rms, share, iteration)
+
+
+def point_to_lines(
+    source: Floats,
+    lines: Sequence[Polyline],
+    start: Floats,
+    *,
+    max_distance_mm: float = np.inf,
+    max_iterations: int = 100,
+    tolerance: float = 1e-6,
+) -> Alignment:
+    """Align source (n, 3) to polylines from a start (4, 4): the pair of a point is its nearest place on any of them.
+
+    Paper 000, section 2.7, names it as another way to find pairs. Points of the target in place of lines hold a point
+    back along the line, by as much as the target's spacing. Stops as :func:`point_to_point` does.
+    """
+    T, last, iteration = start, np.inf, 0
+    rms, share = np.inf, 0.0
+    for iteration in range(1, max_iterations + 1):
+        placed = rigid.apply(T, source)
+        offsets = np.stack([line.nearest(placed)[1] for line in lines])
+        distances = np.linalg.norm(offsets, axis=2)
+        nearest = distances.argmin(axis=0)
+        rows = np.arange(len(source))
+        distance, offset = distances[nearest, rows], offsets[nearest, rows]
+        paired = distance <= max_distance_mm
+        share = float(paired.mean())
+        if paired.sum() < 3:
+            return Alignment(T, np.inf, share, iteration)
+        rms = float(np.sqrt(np.mean(distance[paired] ** 2)))
+        if abs(last - rms) <= tolerance * max(rms, 1e-9):
+            break
+        last = rms
+        T = rigid.fit(source[paired], (placed - offset)[paired])
     return Alignment(T, rms, share, iteration)
 
 

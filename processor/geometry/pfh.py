@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
 from processor.model import Floats, Ints
+
+SAMPLE = 3  # pairs that determine a pose
 
 
 def normals(points: Floats, radius_mm: float) -> Floats:
@@ -75,6 +79,25 @@ def histograms(points: Floats, point_normals: Floats, radius_mm: float, bins: in
     return result
 
 
+@dataclass(frozen=True)
+class Prior:
+    """A first pose T_target_source (4, 4), and how far from it the coarse pose may be: in deg, and in mm at any point.
+
+    A rectangle of points lies on itself when turned by 180 degrees about any of its three axes: its histograms are the
+    same at four places, and nothing but a first pose can tell them apart.
+    """
+
+    T_target_source: Floats
+    limit_deg: float
+    limit_mm: float
+
+    def allows(self, T: Floats, points: Floats) -> bool:
+        """Whether a pose (4, 4) of points (n, 3) is within the limits."""
+        turn = np.degrees(rigid.rotation_angle(T[:3, :3] @ self.T_target_source[:3, :3].T))
+        moved = np.linalg.norm(rigid.apply(T, points) - rigid.apply(self.T_target_source, points), axis=1)
+        return bool(turn <= self.limit_deg and moved.max() <= self.limit_mm)
+
+
 def coarse_alignment(
     source: Floats,
     target: Floats,
@@ -84,23 +107,55 @@ def coarse_alignment(
     tolerance_mm: float,
     iterations: int,
     rng: np.random.Generator,
-) -> Floats:
+    prior: Prior | None = None,
+) -> Floats | None:
     """T_target_source (4, 4) from pairs of nearest histograms: poses by three pairs; the one with most pairs is taken.
 
-    A sample of three is skipped if its sides differ by more than the tolerance between the clouds. The result may be
-    wrong on repeated or straight shapes, whatever the share of pairs that agree.
+    A sample of three is skipped if its sides differ by more than the tolerance between the clouds. With a ``prior`` a
+    point is paired only with points near its first place, and poses beyond the limits do not count; None where none is
+    within them. Without, the result may be wrong on repeated or straight shapes, whatever share of the pairs agrees.
     """
-    match = cKDTree(target_histograms).query(source_histograms)[1]
-    paired = target[match]
-    best, best_count = np.eye(4), -1
+    rows, match = _nearest_histograms(source, target, source_histograms, target_histograms, prior)
+    best, best_count = None if prior else np.eye(4), -1
+    if len(rows) < SAMPLE:
+        return best
+    points, paired = source[rows], target[match]
     for _ in range(iterations):
-        pick = rng.choice(len(source), 3, replace=False)
-        a, b = source[pick], paired[pick]
+        pick = rng.choice(len(points), SAMPLE, replace=False)
+        a, b = points[pick], paired[pick]
         sides = np.linalg.norm(a - np.roll(a, 1, axis=0), axis=1) - np.linalg.norm(b - np.roll(b, 1, axis=0), axis=1)
         if np.abs(sides).max() > tolerance_mm:
             continue
         T = rigid.fit(a, b)
-        count = int((np.linalg.norm(rigid.apply(T, source) - paired, axis=1) <= tolerance_mm).sum())
-        if count > best_count:
+        count = int((np.linalg.norm(rigid.apply(T, points) - paired, axis=1) <= tolerance_mm).sum())
+        if count > best_count and (prior is None or prior.allows(T, source)):
             best, best_count = T, count
-    return best
+    return best if best is None else _refitted(best, points, paired, source, tolerance_mm, prior)
+
+
+def _refitted(
+    T: Floats, points: Floats, paired: Floats, source: Floats, tolerance_mm: float, prior: Prior | None
+) -> Floats:
+    """Fit a pose to all pairs (k, 3) that agree with it, where that keeps within the limits."""
+    agree = np.linalg.norm(rigid.apply(T, points) - paired, axis=1) <= tolerance_mm
+    if agree.sum() < SAMPLE:
+        return T
+    fitted = rigid.fit(points[agree], paired[agree])
+    return fitted if prior is None or prior.allows(fitted, source) else T
+
+
+def _nearest_histograms(
+    source: Floats, target: Floats, source_histograms: Floats, target_histograms: Floats, prior: Prior | None
+) -> tuple[Ints, Ints]:
+    """Rows (k,) of the source that have a pair, and of the target's points with the nearest histograms."""
+    if prior is None:
+        match: Ints = np.asarray(cKDTree(target_histograms).query(source_histograms)[1], np.int64)
+        return np.arange(len(source)), match
+    rows, matches = [], []
+    placed = rigid.apply(prior.T_target_source, source)
+    for i, near in enumerate(cKDTree(target).query_ball_point(placed, prior.limit_mm)):
+        if near:
+            at = np.array(sorted(near))
+            rows.append(i)
+            matches.append(at[np.argmin(np.linalg.norm(target_histograms[at] - source_histograms[i], axis=1))])
+    return np.array(rows, np.int64), np.array(matches, np.int64)

@@ -60,12 +60,15 @@ class TrimParams:
 class BoxParams:
     """Parameters of the reduced boxes (mm); the paper's values where it gives them."""
 
-    joint_zone_mm: float = 500.0  # length of the joint's zone
-    edge_box_mm: float = 42.0  # L_edge: 1.5 times the plates' thickness
+    end_search_mm: float = 1000.0  # a part ends this near to its joint by principal axes
+    # A wall that tapers by 40 mrad, or axes that tilt, leave a box of L_edge where the zone is longer.
+    joint_zone_mm: float = 150.0  # length of the zone that is cut out at the end
+    edge_box_mm: float = 0.0  # L_edge; 0 = 1.5 times the thickness of the plate at hand, as its two sides are scanned
+    plate_mm: float = 28.0  # thickness of a plate of which one side alone is scanned
     box_count: int = 10  # boxes an edge
     box_range: float = 0.4  # k1, k2 run from -range to +range
     search_offset_mm: float = 200.0  # of P beyond the end
-    line_threshold_mm: float = 5.0  # of the RANSAC line
+    line_threshold: float = 1.0  # of the RANSAC line, in spacings
     line_probability: float = 0.99
     line_iterations: int = 500
     distance_threshold: float = 1.0  # d_t in spacings
@@ -77,12 +80,15 @@ class BoxParams:
 class SliceParams:
     """Parameters of the slices; the paper's values where it gives them."""
 
-    thickness: float = 0.5  # of a slice, in spacings
+    # The paper has 0.5: such a slice of random points holds few, the nearest of them is half a spacing off the edge,
+    # and the part is placed by that. On a net every other slice has none on the edge.
+    thickness: float = 4.0  # of a slice, in spacings
     check_thickness: float = 4.0  # of a slice for the linear error, in spacings
     search_offset_mm: float = 200.0  # of the lines l1, l2 outside the part's bounding box
     filter_radius: float = 4.0  # of the radius filter, in spacings or slices, whichever is longer
     filter_neighbours: int = 3
-    direction_radius: float = 20.0  # neighbourhood of the direction filter, in the same unit
+    direction_radius: float = 8.0  # neighbourhood of the direction filter, in the same unit
+    direction_offset: float = 0.5  # largest distance from the line of that neighbourhood, in the same unit
     direction_limit_deg: float = 30.0  # from the part's main direction
 
 
@@ -96,7 +102,7 @@ class MatchParams:
     pfh_tolerance_mm: float = 100.0
     pfh_iterations: int = 2000
     pfh_limit_deg: float = 15.0  # largest turn of the coarse pose from the principal axes' attitude
-    pfh_limit_mm: float = 500.0  # largest move of a feature point from its place by joint and attitude
+    pfh_limit_mm: float = 100.0  # largest move of a feature point from its place by joint and attitude
     icp_max_distance_mm: float = 200.0
     icp_iterations: int = 200
     icp_tolerance: float = 1e-7

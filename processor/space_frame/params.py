@@ -25,6 +25,7 @@ class Params:
     datum_mm: float = 0.0  # ray: sd an axis of a shift common to all stations, without control points
     members: members.Params = field(default_factory=members.Params)  # ray
     crop_margin_mm: float = 20.0  # the paper's methods: beyond the nominal radius, about the nominal centre
+    raw_crops: bool = True  # the paper's methods beside ray: on all points about its nodes; false: on those it used
     tau_mm: float = 4.0  # ransac: largest distance of an inlier from the surface; two sd of a 2 mm scanner
     probability: float = 0.99  # ransac: that one minimal set has no outliers
     max_iterations: int = 10_000  # ransac: minimal sets at most

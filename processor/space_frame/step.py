@@ -2,8 +2,8 @@
 
 Method ``ray`` uses the whole scan, with or without a design: members first, then the nodes where they meet, then the
 spheres at them. Where a cloud has no members, spheres are searched for by themselves. ``ransac`` and ``least-squares``
-are the source paper's (paper 001), fitted to a crop about every node of the design, or for comparison with ``ray`` to
-the points that it used.
+are the source paper's (paper 001), fitted to a crop about every node of the design, or for comparison with ``ray``
+about every node that it found.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ def run(scene: Scene, params: Params, points: PointReader | None = None, answer_
 
     ``status``: ok = an answer for every sphere, partial = for some or ``max_balls`` reached, failed = for none; the
     flag of each sphere grades its answer. Where ``answer_given`` is that of a frame by ``ray``, the paper's methods run
-    on its points, for comparison. ``points`` reads the points of a scene that is larger than memory.
+    about its nodes, for comparison. ``points`` reads the points of a scene that is larger than memory.
     Raises UsageError for invalid parameters, InputError for a cloud without members that is larger than memory.
     """
     params.check(scene.frame is not None)
     limits = standards.default_for(scene.tolerance)
     if params.method != "ray":
         if answer_given is not None and answer_given.method == "ray" and len(answer_given.tubes):
-            same = to_result.of_same_points(scene, params)
-            if same is not None:
-                return same
+            beside = to_result.beside_ray(scene, params)
+            if beside is not None:
+                return beside
         if scene.frame is None:
             return _with_unused_control(scene, isolated.search(merged(scene, with_scanner=True), params))
         return _with_unused_control(

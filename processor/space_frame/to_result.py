@@ -46,13 +46,13 @@ def of_frame(scene: Scene, params: Params, points: PointReader | None = None) ->
     return None if extracted is None else _result(extracted, source, scene)
 
 
-def of_same_points(scene: Scene, params: Params) -> Result | None:
-    """Fit the spheres that method ``ray`` finds by one of the paper's methods to the same points; None as above."""
+def beside_ray(scene: Scene, params: Params) -> Result | None:
+    """Fit the spheres that method ``ray`` finds by one of the paper's methods; None as above."""
     extracted = _extracted(of_scene(scene), scene, params)
     if extracted is None:
         return None
     ids, limits = _ids(extracted.design_row, scene.frame), standards.default_for(scene.tolerance)
-    return baselines.fit_same_points(
+    return baselines.fit_beside(
         extracted.source, extracted.nodes, extracted.members, extracted.spheres, ids, params, limits
     )
 

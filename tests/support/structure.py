@@ -139,7 +139,7 @@ LAYERS = (
     ("version",),
     ("model",),
     ("meaning",),
-    ("progress", "language", "jobs", "unit_ratio"),
+    ("progress", "language", "jobs", "unit_ratio", "user_methods"),
     ("geometry",),
     ("adjustment",),
     ("limits", "store"),
@@ -151,7 +151,7 @@ LAYERS = (
     ("results",),
     ("report", "clouds"),
     ("api",),
-    ("batch", "validation"),
+    ("batch", "validation", "papers"),
     ("cli",),
     ("__main__",),
 )

@@ -320,3 +320,23 @@ def test_nine_scans_of_a_truss_come_from_six_stations():
     assert len(np.unique(places.round(3), axis=0)) == 6
     assert all(not scan.T_project_scan.size for scan in scene.scans)
     assert dataclasses.asdict(scene)["stations"] is None
+
+
+def test_a_table_of_gaps_opens_the_joints_by_it():
+    parts = arch_bridge.build(arch_bridge.Params())
+    table = np.random.default_rng(4).normal(0.0, 10.0, (len(parts) - 1, 4, 3))
+    ledger = imperfections.Ledger()
+    rngs = [generator(0, part.name) for part in parts]
+    params = imperfections.ArchParams(gap_table_mm=tuple(table.ravel().tolist()))
+    made = imperfections.arch(parts, params, rngs, ledger)
+    for before, after, gaps in zip(made[:-1], made[1:], table, strict=True):
+        _, along, up = (axis for axis in after.curve.frame(np.array([after.s0])))
+        off = (after.key_points(after.s0) - before.key_points(before.s1))[:4]
+        # along the tangent and the normal of the axis; left is +Y. Above the axis the arc is longer by its curvature.
+        np.testing.assert_allclose(off[:, 1], gaps[:, 1], atol=1e-9)
+        np.testing.assert_allclose(off @ up[0], gaps[:, 2], atol=0.02)
+        np.testing.assert_allclose(off @ along[0], gaps[:, 0], rtol=0.1, atol=0.02)
+    assert ("gap P2, left", f"{parts[1].name} start", table[0, 1, 1], "mm") in ledger.rows
+    for wrong in ((1.0,) * 11, (1.0,) * 12, (1e4,) * (12 * len(table))):
+        with pytest.raises(UsageError, match="gap_table_mm"):
+            imperfections.arch(parts, imperfections.ArchParams(gap_table_mm=wrong), rngs, ledger)

@@ -350,3 +350,14 @@ def test_a_bridge_of_any_number_of_parts_meets_at_its_joints(count):
     assert [part.closed for part in parts] == ["start", *[""] * (count - 2), "end"]
     lengths = [part.s1 - part.s0 for part in parts]
     np.testing.assert_allclose(lengths, parts[0].curve.length / count)
+
+
+def test_a_net_of_points_has_points_on_the_edges_of_every_face():
+    part = arch_bridge.build(arch_bridge.Params())[1]
+    cloud = sampler.scan_part(part, 0, sampler.Params(spacing_mm=40.0, sigma_mm=0.0, net=True), generator(0, "x"))
+    for s in (part.s0, part.s1):
+        corners = part.key_points(s)[:4]
+        off = np.linalg.norm(cloud.points[:, None] - corners, axis=2).min(axis=0)
+        np.testing.assert_allclose(off, 0.0, atol=1e-6)
+    random = sampler.scan_part(part, 0, sampler.Params(spacing_mm=40.0, sigma_mm=0.0), generator(0, "x"))
+    assert len(cloud.points) == pytest.approx(len(random.points), rel=0.15)

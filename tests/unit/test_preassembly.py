@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from processor.evaluation import preassembly as preassembly_evaluation
-from processor.geometry import pfh, rigid
+from processor.geometry import icp, rigid
 from processor.geometry.polyline import Polyline
 from processor.model import InputError, Scene, UsageError, Verdict, reason
 from processor.preassembly import errors
@@ -265,20 +265,49 @@ def test_the_design_keeps_the_line(runs):
     assert mean["design-aided"] < 0.5 * mean["corner"]
 
 
-@pytest.mark.parametrize(("slide", "believed"), [(300.0, True), (1500.0, False)])
-def test_a_coarse_pose_slid_along_the_bridge_is_not_believed(slide, believed, monkeypatch):
-    # Histograms do not change along a straight line: a pose may be right in attitude and metres off along it.
-    def slid(*_, **__):
-        return rigid.transform(np.eye(3), np.array([slide, 0.0, 0.0]))
+def ring(length=1400.0, height=1800.0, spacing=25.0):
+    """Points along the four edges of a joint."""
+    y, z = np.arange(0.0, length, spacing), np.arange(0.0, height, spacing)
+    sides = [(y, 0.0 * y), (y, 0.0 * y + height), (0.0 * z, z), (0.0 * z + length, z)]
+    return np.vstack([np.column_stack([0.0 * a, a - 0.5 * length, b - 0.5 * height]) for a, b in sides])
 
-    monkeypatch.setattr(pfh, "coarse_alignment", slid)
-    x = np.linspace(0.0, 5000.0, 400)
-    lines = np.vstack([np.column_stack([x, np.full_like(x, y), np.zeros_like(x)]) for y in (-450.0, 450.0)])
-    T, reasons = joint_alignment._coarse(lines, lines, np.eye(4), MatchParams(), np.random.default_rng(0))
-    assert (T[0, 3], reasons == ()) == ((slide, True) if believed else (0.0, False))
-    if not believed:
-        assert [one.code for one in reasons] == ["preassemble.coarse-pose-shifted"]
-        assert reasons[0].values["shift"] == pytest.approx(1500.0, abs=0.5)
+
+def test_a_coarse_pose_is_sought_near_the_principal_axes():
+    # The ring lies on itself when turned by 180 degrees about any axis: histograms alone find each of the four poses.
+    source = ring()
+    start = rigid.transform(rigid.rotation_from_vector(np.array([0.01, -0.02, 0.01])), np.array([30.0, -20.0, 10.0]))
+    found = [joint_alignment._coarse(source, ring(), start, MatchParams(), np.random.default_rng(i)) for i in range(4)]
+    for T, reasons in found:
+        assert reasons == ()
+        assert np.degrees(rigid.rotation_angle(T[:3, :3])) < 8.0
+        assert np.linalg.norm(T[:3, 3]) < 100.0
+    nowhere = MatchParams(pfh_limit_mm=1e-6)
+    T, reasons = joint_alignment._coarse(source, ring(), start, nowhere, np.random.default_rng(0))
+    assert [one.code for one in reasons] == ["preassemble.no-coarse-pose"]
+    np.testing.assert_array_equal(T, start)
+
+
+def test_pairs_on_lines_leave_no_shift_along_the_lines_points():
+    # Points of one end lie between those of the other; the ends themselves are the same.
+    source = ring(spacing=25.0)[5:]
+    corners = np.array([[0, 700, -900], [0, -700, -900], [0, -700, 900], [0, 700, 900.0], [0, 700, -900]])
+    start = rigid.transform(rigid.rotation_from_vector(np.array([0.004, 0.003, -0.002])), np.array([3.0, 9.0, -8.0]))
+    fine = icp.point_to_lines(source, [Polyline.through(corners)], start, max_iterations=200, tolerance=1e-9)
+    np.testing.assert_allclose(rigid.apply(fine.T_target_source, source), source, atol=0.01)
+    far = icp.point_to_lines(source + 1e4, [Polyline.through(corners)], start, max_distance_mm=10.0)
+    assert far.paired_share == 0.0
+
+
+def test_the_edge_box_is_of_the_plate_at_hand():
+    rng = np.random.default_rng(0)
+    for plate in (16.0, 24.0, 40.0):
+        cut = edge_features.cut_joint_end(box_end(plate=plate), np.eye(4), 1.0, np.array([900.0, 1100.0]), BoxParams())
+        across = cut[:, 2].max() - cut[:, 2]
+        middle = across[np.abs(cut[:, 1]) < 300.0]
+        assert edge_features.edge_box(middle, BoxParams()) == pytest.approx(1.5 * plate, abs=1.5)
+        one_side = np.abs(rng.normal(size=500))
+        assert edge_features.edge_box(one_side, BoxParams(plate_mm=20.0)) == 30.0
+        assert edge_features.edge_box(middle, BoxParams(edge_box_mm=33.0)) == 33.0
 
 
 @pytest.mark.slow

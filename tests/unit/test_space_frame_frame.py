@@ -238,7 +238,7 @@ def test_a_ball_that_rays_went_through_is_missing_and_one_that_was_not_seen_has_
 
 def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
     scene, truth = square
-    params = {"spheres": {"min_points": 8}}
+    params = {"spheres": {"min_points": 8, "raw_crops": False}}
     jobs = pipeline.plan(("spheres",), ("ray", "ransac", "least-squares"), params, 0)
     runs = pipeline.execute(tmp_path / "s.h5", scene, jobs).runs
     ray = runs[0].result
@@ -256,6 +256,7 @@ def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
     assert np.median(error["ray"]) < np.median(error["least-squares"])
     again = pipeline.execute(tmp_path / "s.h5", scene, jobs[1:]).runs[0].result
     assert baselines.SAME not in again.reasons
+    assert baselines.RAW not in again.reasons
 
 
 def test_a_wrong_size_is_told_without_a_catalogue(square):

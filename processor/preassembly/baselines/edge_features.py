@@ -20,14 +20,26 @@ from processor.model import Floats
 from processor.preassembly.params import BoxParams, SliceParams
 
 EDGES = ("bottom", "right", "top", "left")
+EDGE_BOX = 1.5  # L_edge in thicknesses (paper 000, section 2.3)
+OUTER_SIDE_MM, THICKEST_MM = 6.0, 120.0  # depths of an inner side
+REFITS = 5  # each takes five sixths of the error of the line before
+LEAST_INNER = 50  # points of an inner side
 
 
 @dataclass(frozen=True)
 class JointEdges:
-    """One end of a part in its scan's frame: the points on its four edges and P1..P8 (8, 3)."""
+    """One end of a part in its scan's frame: the points on its four edges, P1..P8 (8, 3), and corner points (4, 3).
+
+    The corner points are the scanned ones nearest to P1..P4, where the edges' lines cross.
+    """
 
     points: Floats
     key_points: Floats
+    corners: Floats
+
+    def moved(self, T: Floats) -> JointEdges:
+        """Return the edges in another frame."""
+        return JointEdges(rigid.apply(T, self.points), rigid.apply(T, self.key_points), rigid.apply(T, self.corners))
 
 
 def cut_joint_end(points: Floats, T_joint_scan: Floats, outward: float, size: Floats, params: BoxParams) -> Floats:
@@ -37,8 +49,8 @@ def cut_joint_end(points: Floats, T_joint_scan: Floats, outward: float, size: Fl
     and height. The end itself is found in the scan, since principal axes do not place it accurately.
     """
     local = rigid.apply(T_joint_scan, points)
-    reach = 2.0 * params.joint_zone_mm
-    local = local[(np.abs(local[:, 0]) <= reach + params.joint_zone_mm) & (np.abs(local[:, 1:]) <= size).all(axis=1)]
+    reach = params.end_search_mm + params.joint_zone_mm
+    local = local[(np.abs(local[:, 0]) <= reach) & (np.abs(local[:, 1:]) <= size).all(axis=1)]
     if len(local) < 100:
         return local
     # The last points along the axis are the end, but for a few outliers.
@@ -65,30 +77,57 @@ def reduced_boxes(
     lines: list[Line] = []
     for edge in EDGES:
         across, along = (2, 1) if edge in ("top", "bottom") else (1, 2)
-        if edge in ("top", "left"):
-            strip = cut[:, across] > high[across] - params.edge_box_mm
-        else:
-            strip = cut[:, across] < low[across] + params.edge_box_mm
+        depth = high[across] - cut[:, across] if edge in ("top", "left") else cut[:, across] - low[across]
+        q = cut[:, along] - middle[along]
+        strip = depth < edge_box(depth[np.abs(q) < params.box_range * extent[along]], params)
         nearest = []
         for k1, k2 in pairwise(k):
-            q = cut[:, along] - middle[along]
             inside = np.flatnonzero(strip & (q > k1 * extent[along]) & (q < k2 * extent[along]))
             if len(inside) == 0:
                 return None
             nearest.append(cut[inside[np.argmin(to_P[inside])]])
         line = ransac_line(
-            np.array(nearest), params.line_threshold_mm, params.line_probability, params.line_iterations, rng
+            np.array(nearest), params.line_threshold * spacing_mm, params.line_probability, params.line_iterations, rng
         )
         if line is None:
             return None
         lines.append(line)
-    edges = [cut[line.distances(cut) < params.distance_threshold * spacing_mm] for line in lines]
+    d_t = params.distance_threshold * spacing_mm
+    edges = [_on_line(cut, line, d_t) for line in lines]
     if min(len(edge) for edge in edges) < 2:
         return None
     bottom, right, top, left = (fit_line(edge) for edge in edges)
     corners = [crossing(bottom, left), crossing(bottom, right), crossing(top, right), crossing(top, left)]
     middles = [0.5 * (corners[i] + corners[j]) for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))]
-    return JointEdges(np.vstack(edges), np.array(corners + middles))
+    key_points = np.array(corners + middles)
+    at_corners = cut[cKDTree(cut).query(np.nan_to_num(key_points[:4]))[1]]
+    return JointEdges(np.vstack(edges), key_points, at_corners)
+
+
+def _on_line(cut: Floats, line: Line, d_t: float) -> Floats:
+    """Points (k, 3) of a cut end within ``d_t`` of a line, which is fitted to them again and again.
+
+    The first line is that of ten points, as far from the edge as points are apart. The band about it holds points of
+    the end and of the inner side; fitted again, it settles 0.3 ``d_t`` inward of the edge in both.
+    """
+    points = cut[line.distances(cut) < d_t]
+    for _ in range(REFITS):
+        if len(points) < 2:
+            break
+        points = cut[fit_line(points).distances(cut) < d_t]
+    return points
+
+
+def edge_box(depth: Floats, params: BoxParams) -> float:
+    """L_edge: 1.5 times the thickness of a plate, from the depths (n,) of points below its outer side.
+
+    Points of the inner side are many more than those of the plate's end, so that the median depth of all that are not
+    on the outer side is the thickness.
+    """
+    if params.edge_box_mm > 0.0:
+        return params.edge_box_mm
+    below = depth[(depth > OUTER_SIDE_MM) & (depth < THICKEST_MM)]
+    return EDGE_BOX * (float(np.median(below)) if len(below) >= LEAST_INNER else params.plate_mm)
 
 
 def slice_edges(
@@ -121,12 +160,16 @@ def slice_edges(
         np.minimum.at(nearest, in_slice[side], distance)
         picked = side[distance == nearest[in_slice[side]]]
         radius, reach = (k * max(1.0, thickness) * spacing_mm for k in (params.filter_radius, params.direction_radius))
-        sides.append(points[picked[_runs_along(level[picked], radius, reach, params)]])
+        across = params.direction_offset * max(1.0, thickness) * spacing_mm
+        sides.append(points[picked[_runs_along(level[picked], radius, reach, across, params)]])
     return sides[0], sides[1]
 
 
-def _runs_along(level: Floats, radius_mm: float, reach_mm: float, params: SliceParams) -> np.ndarray:
-    """Mark points (n,) with enough neighbours and a local direction near the part's (its X axis)."""
+def _runs_along(level: Floats, radius_mm: float, reach_mm: float, across_mm: float, params: SliceParams) -> np.ndarray:
+    """Mark points (n,) with enough neighbours and a local direction near the part's (its X axis), along which they lie.
+
+    In the last slice of a part the nearest point may be one high up on the end: it is off the line of its neighbours.
+    """
     tree = cKDTree(level)
     counts = tree.query_ball_point(level, radius_mm, return_length=True) - 1
     keep = counts >= params.filter_neighbours
@@ -135,6 +178,8 @@ def _runs_along(level: Floats, radius_mm: float, reach_mm: float, params: SliceP
     filtered = level[keep]
     for i, point in zip(np.flatnonzero(keep), filtered, strict=True):
         neighbours = filtered[near.query_ball_point(point, reach_mm)]
-        local = neighbours - neighbours.mean(axis=0)
-        keep[i] = abs(np.linalg.eigh(local.T @ local)[1][0, 2]) >= limit
+        local = neighbours - np.median(neighbours, axis=0)
+        direction = np.linalg.eigh(local.T @ local)[1][:, 2]
+        off = np.cross(point - np.median(neighbours, axis=0), direction)
+        keep[i] = abs(direction[0]) >= limit and float(np.linalg.norm(off)) <= across_mm
     return np.asarray(keep, bool)

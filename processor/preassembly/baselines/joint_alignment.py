@@ -6,12 +6,14 @@ with the bottom edges, with the design's as their target.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from processor.geometry import icp, pfh, rigid
+from processor.geometry import icp, pfh
 from processor.geometry.neighbors import voxel_means
+from processor.geometry.polyline import Polyline
 from processor.model import Floats, Reason, reason
 from processor.preassembly.params import MatchParams
 
@@ -24,16 +26,23 @@ class Alignment:
     reasons: tuple[Reason, ...] = ()
 
 
-def by_lines(source: Floats, target: Floats, start: Floats, params: MatchParams, rng: np.random.Generator) -> Alignment:
-    """Align feature points source (n, 3), scan's frame, to target (m, 3), bridge's frame.
+def by_lines(
+    source: Floats,
+    target: Floats,
+    lines: Sequence[Polyline],
+    start: Floats,
+    params: MatchParams,
+    rng: np.random.Generator,
+) -> Alignment:
+    """Align feature points source (n, 3), scan's frame, to target (m, 3) and the ``lines`` it is of, bridge's frame.
 
-    ``start`` (4, 4) is the attitude from the principal axes. The coarse pose from histograms is used only where it is
-    near that attitude: on straight lines it is often turned over with a perfect score.
+    ``start`` (4, 4) is the attitude from the principal axes. The coarse pose from histograms is sought near it: the
+    ring of a joint's edges lies on itself when turned over, with a perfect score.
     """
     coarse, reasons = _coarse(source, target, start, params, rng)
-    fine = icp.point_to_point(
+    fine = icp.point_to_lines(
         source,
-        target,
+        lines,
         coarse,
         max_distance_mm=params.icp_max_distance_mm,
         max_iterations=params.icp_iterations,
@@ -61,11 +70,8 @@ def _coarse(
         tolerance_mm=params.pfh_tolerance_mm,
         iterations=params.pfh_iterations,
         rng=rng,
+        prior=pfh.Prior(start, params.pfh_limit_deg, params.pfh_limit_mm),
     )
-    turn = np.degrees(rigid.rotation_angle(T[:3, :3] @ start[:3, :3].T))
-    if turn > params.pfh_limit_deg:
-        return start, (reason("preassemble.coarse-pose-rotated", degrees=float(turn)),)
-    shift = float(np.linalg.norm(rigid.apply(T, thin_source) - rigid.apply(start, thin_source), axis=1).max())
-    if shift > params.pfh_limit_mm:
-        return start, (reason("preassemble.coarse-pose-shifted", shift=shift),)
+    if T is None:
+        return start, (reason("preassemble.no-coarse-pose", degrees=params.pfh_limit_deg, shift=params.pfh_limit_mm),)
     return T, ()

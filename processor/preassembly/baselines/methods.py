@@ -1,9 +1,9 @@
 """The source paper's three methods, as baselines: corner (W1), line (W2) and design-aided (W3).
 
-They chain the parts by the edges of their joints: ``corner`` pairs the four corners of a joint, ``line`` aligns the
-points on its edges, ``design-aided`` aligns them together with the bottom edges, with the design's as their target.
-They state no uncertainty (:mod:`~processor.preassembly.baselines.bootstrap_bands` adds a band), and their key points
-lie on the inner edges of the plates. Source: paper 000.
+They chain the parts by the edges of their joints: ``corner`` pairs the four scanned points at the corners of a joint,
+``line`` aligns the points on its edges, ``design-aided`` aligns them together with the bottom edges, with the design's
+as their target. They state no uncertainty (:mod:`~processor.preassembly.baselines.bootstrap_bands` adds a band), and
+their key points lie on the inner edges of the plates. Source: paper 000.
 """
 
 from __future__ import annotations
@@ -164,8 +164,7 @@ def _joint_end(
     edges = edge_features.reduced_boxes(cut, outward, spacing, params.boxes, rng)
     if edges is None:
         return None, reason("preassemble.no-joint-edges")
-    T_scan_joint = rigid.invert(T_joint_scan)
-    edges = JointEdges(rigid.apply(T_scan_joint, edges.points), rigid.apply(T_scan_joint, edges.key_points))
+    edges = edges.moved(rigid.invert(T_joint_scan))
     off = rigid.apply(pose.T_surface, edges.key_points[:4]).mean(axis=0) - corners.mean(axis=0)
     distance = float(np.linalg.norm(off))
     if not distance <= params.end_limit_mm:
@@ -194,26 +193,33 @@ def _place_first(part: PartFeatures, design: ArchDesign, params: Params) -> Floa
     T = _at_corners(part.attitude.T_principal, end, corners)
     if params.method != "design-aided":
         return T
-    ring = Polyline.through(np.vstack([corners, corners[:1]]))
+    ring, lines = _ring(corners), (part.edges.design_left, part.edges.design_right)
     outline = ring.at(np.arange(0.0, ring.length, LINE_SPACING_MM))
     source, target = np.vstack([end.points, part.lines]), np.vstack([outline, _design_lines(part)])
     rng = generator(params, "match " + part.name)
-    return joint_alignment.by_lines(source, target, T, params.match, rng).T_bridge_scan
+    return joint_alignment.by_lines(source, target, (ring, *lines), T, params.match, rng).T_bridge_scan
 
 
 def _place_next(before: PartFeatures, T_before: Floats, part: PartFeatures, params: Params) -> Alignment:
     end_before, end = before.ends[1], part.ends[0]
     if end_before is None or end is None or not np.isfinite(T_before).all():
         return Alignment(NOWHERE, (reason("preassemble.chain-broken"),))
-    corners = rigid.apply(T_before, end_before.key_points[:4])
     if params.method == "corner":
-        return Alignment(rigid.fit(end.key_points[:4], corners))
+        return Alignment(rigid.fit(end.corners, rigid.apply(T_before, end_before.corners)))
+    corners = rigid.apply(T_before, end_before.key_points[:4])
     start = _at_corners(part.attitude.T_principal, end, corners)
     source, target = end.points, rigid.apply(T_before, end_before.points)
+    lines = [_ring(corners)]
     if params.method == "design-aided":
         source = np.vstack([source, part.lines])
         target = np.vstack([target, _design_lines(part)])
-    return joint_alignment.by_lines(source, target, start, params.match, generator(params, "match " + part.name))
+        lines += [part.edges.design_left, part.edges.design_right]
+    return joint_alignment.by_lines(source, target, lines, start, params.match, generator(params, "match " + part.name))
+
+
+def _ring(corners: Floats) -> Polyline:
+    """Return the outline through the corners (4, 3) of a joint: its four edges."""
+    return Polyline.through(np.vstack([corners, corners[:1]]))
 
 
 def _at_corners(T: Floats, end: JointEdges, corners: Floats) -> Floats:

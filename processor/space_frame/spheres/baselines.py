@@ -1,5 +1,7 @@
-"""The source paper's two estimators on the points that method ``ray`` used, for comparison.
+"""The source paper's two estimators beside method ``ray``: on raw crops about its nodes, or on the points that it used.
 
+A raw crop holds the sleeves and tubes at a ball, as those that the paper cuts out by hand: RANSAC is then far better
+than least squares. On the points of ``ray``, cleaned of them, least squares is a little better: it uses all of them.
 Source: paper 001 (Huang et al. 2019), equations 12-15 and section 2.2.
 """
 
@@ -21,9 +23,10 @@ from processor.space_frame.spheres.records import Spheres
 MARGIN_MM = 8.0  # on both sides of a sphere's surface: about what the ray fit uses with 2 mm of noise
 SLEEVES_MM = 26.0  # beyond a sphere: sleeves are measured there
 SAME = reason("spheres.points-of-ray")
+RAW = reason("spheres.raw-crops")
 
 
-def fit_same_points(
+def fit_beside(
     source: Source,
     nodes: Nodes,
     members: Members,
@@ -32,13 +35,25 @@ def fit_same_points(
     params: Params,
     limits: Tolerance,
 ) -> Result:
-    """Fit the spheres (k,) of method ``ray`` by one of the paper's methods to the same points of a source."""
+    """Fit the spheres (k,) of method ``ray`` by one of the paper's methods to raw crops, or to the same points."""
+    if params.raw_crops:
+        raw = raw_crops(source, nodes, spheres, params.crop_margin_mm)
+        return isolated.fit_points(raw, nodes.positions, ids, spheres.nominal, source.origin, params, limits, (RAW,))
     seen = spheres.radii[spheres.points > 0]
     largest = float(seen.max()) if len(seen) else 0.0
     off = np.linalg.norm(spheres.centres - nodes.positions, axis=1)[spheres.points > 0].max(initial=0.0)
     crops = gather(source, nodes.positions, largest + float(off) + SLEEVES_MM)
     points = points_of_spheres(crops, nodes, members, spheres)
     return isolated.fit_points(points, nodes.positions, ids, spheres.nominal, source.origin, params, limits, (SAME,))
+
+
+def raw_crops(source: Source, nodes: Nodes, spheres: Spheres, margin_mm: float) -> list[Floats]:
+    """All points (n, 3) about each node, relative to it, to ``margin_mm`` beyond the radius of its sphere."""
+    sizes = np.where(np.isfinite(spheres.nominal), spheres.nominal, spheres.radii)
+    reach = np.nan_to_num(sizes, nan=0.0) + margin_mm
+    crops = gather(source, nodes.positions, float(reach.max(initial=margin_mm)))
+    every = [crops.points[crops.start[i] : crops.start[i + 1]] for i in range(nodes.count)]
+    return [points[np.linalg.norm(points, axis=1) <= reach[i]] for i, points in enumerate(every)]
 
 
 def points_of_spheres(crops: Crops, nodes: Nodes, members: Members, spheres: Spheres) -> list[Floats]:

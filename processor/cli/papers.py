@@ -1,0 +1,34 @@
+"""Command ``processor papers``: the tables and figures of the source papers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from processor.cli.common import LANGUAGES, debug_option, split_names
+from processor.jobs.exit_codes import DONE, IN_PART
+
+
+@click.command()
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of papers.json and page")
+@click.option("--only", callback=split_names, metavar="000,001", help="the papers of these numbers  [default: all]")
+@click.option("--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="of every data set")
+@click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True, help="data sets at a time")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@click.option("--json", "as_json", is_flag=True, help="print papers.json instead of one line")
+@debug_option
+@click.pass_context
+def papers(
+    context: click.Context, /, output: Path, only: tuple[str, ...], seeds: int, jobs: int, lang: str, as_json: bool
+) -> None:
+    """Repeat the tables and figures of the source papers by their methods, beside ours.
+
+    The data sets are simulated by designgen, which must be installed. Exit codes: 0 done, 1 some data sets failed.
+    """
+    from processor.papers import command
+
+    found = command.run(output, only, seeds, jobs, lang)
+    click.echo(json.dumps(found.content, ensure_ascii=False) if as_json else str(found.line))
+    context.exit(IN_PART if found.failed else DONE)

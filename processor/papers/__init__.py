@@ -1,0 +1,1 @@
+"""The tables and figures of the source papers: the papers' methods on data sets of their sizes, beside ours."""

@@ -1,0 +1,96 @@
+"""Data sets of the papers' sizes: each scene is made by designgen in a child process, and measured in another."""
+
+from __future__ import annotations
+
+import importlib
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from processor.jobs import process
+from processor.jobs.child import Lost
+from processor.jobs.process import Cause
+
+PAPERS = {
+    "000": "preassembly",
+    "001": "bolt_balls",
+    "002": "deviation",
+    "003": "stitching",
+    "004": "defects",
+}
+TIMEOUT_S = 1800.0
+TAIL = 300  # characters of an error message
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A scene: ``name`` in the tables, recipe of designgen with settings of ``make --set``, and seed."""
+
+    paper: str
+    name: str
+    recipe: str
+    settings: tuple[str, ...]
+    seed: int
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a paper's methods found in a data set: figures by name, and lists of numbers for tables and charts."""
+
+    data_set: DataSet
+    figures: Mapping[str, float] = field(default_factory=dict)
+    series: Mapping[str, list[Any]] = field(default_factory=dict)
+    failed: str = ""
+    seconds: float = 0.0
+
+
+class Found:
+    """All that was measured for one paper."""
+
+    def __init__(self, measured: Sequence[Measured]) -> None:
+        self.measured = sorted(measured, key=lambda one: (one.data_set.name, one.data_set.seed))
+
+    def values(self, data: str, figure: str) -> tuple[float, ...]:
+        """Return a figure of a data set over its seeds; NaN where a seed has none."""
+        return tuple(one.figures.get(figure, float("nan")) for one in self.of(data))
+
+    def series(self, data: str, name: str) -> list[Any]:
+        """Return a list of the first seed that has it; empty without any."""
+        return next((one.series[name] for one in self.of(data) if name in one.series), [])
+
+    def of(self, data: str) -> list[Measured]:
+        """Return what was measured in a data set, in the order of the seeds."""
+        return [one for one in self.measured if one.data_set.name == data]
+
+
+def module_of(paper: str) -> Any:
+    """Return the module of a paper: ``data_sets(seed)``, ``measure(path, data_set)``, ``rows(found)``, ``charts``."""
+    return importlib.import_module(f"processor.papers.{PAPERS[paper]}")
+
+
+def measured(job: tuple[DataSet, str]) -> Measured:
+    """Measure a data set whose scene is the file named. Runs in a child process."""
+    data_set, scene = job
+    found: Measured = module_of(data_set.paper).measure(Path(scene), data_set)
+    return found
+
+
+def make_and_measure(data_set: DataSet, stopped: Callable[[], bool] = process.never, *, scratch: str) -> Measured:
+    """Make the scene of a data set and measure it, in child processes; the scene is deleted afterwards."""
+    started = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="set-", dir=scratch, ignore_cleanup_errors=True) as made:
+        scene = Path(made) / "scene.h5"
+        words = ["designgen", "make", data_set.recipe, "-o", str(scene), "--seed", str(data_set.seed)]
+        words += [word for setting in data_set.settings for word in ("--set", setting)]
+        ended = process.run(
+            (*process.GUARDED, "0", *words), env=process.environment(1), timeout_s=TIMEOUT_S, stopped=stopped
+        )
+        if ended.cause is not Cause.EXIT or ended.code != 0:
+            return Measured(data_set, failed=f"designgen make: {ended.last_line[:TAIL] or ended.cause.value}")
+        found = process.in_process(measured, (data_set, str(scene)), stopped)
+    if isinstance(found, Lost):
+        return Measured(data_set, failed=found.error[:TAIL] or found.loss.value)
+    return Measured(data_set, found.figures, found.series, found.failed, time.monotonic() - started)

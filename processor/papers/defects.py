@@ -1,0 +1,113 @@
+"""Paper 004: defects of plates by the one page of the paper that is available. It states no number of a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from processor.defects import step
+from processor.defects.params import Params
+from processor.defects.result import Result
+from processor.evaluation import evaluate
+from processor.language.messages import Text, text
+from processor.model import Reason, Scene, StepRun, reason
+from processor.papers.charts import Chart
+from processor.papers.data_sets import DataSet, Found, Measured
+from processor.papers.rows import Row, Rule
+from processor.pipeline import Execution
+from processor.store import store
+
+PAPER = "004"
+PLATES = "12 plates"
+METHODS = ("paper", "default")
+NAN = float("nan")
+
+
+def data_sets(seed: int) -> list[DataSet]:
+    """Return the data set of one seed."""
+    return [DataSet(PAPER, PLATES, "plates-defects", ("scan.step_mrad=1.0",), seed)]
+
+
+def measure(path: Path, data_set: DataSet) -> Measured:
+    """Find the defects of a scene by the paper's method and by ours."""
+    scene = store.read_scene(path)
+    figures: dict[str, float] = {}
+    series: dict[str, list[float]] = {}
+    for method in METHODS:
+        result = step.run(scene, Params(method=method, seed=data_set.seed), {})
+        figures |= _figures(method, result, path, scene)
+        curves = [curve for curve in result.defects.deflection if len(curve.along)]
+        if curves:
+            longest = max(curves, key=lambda curve: float(np.ptp(curve.along)))
+            series[f"{method}: along"] = (longest.along - longest.along.min()).tolist()
+            series[f"{method}: deflection"] = longest.displacement.tolist()
+    return Measured(data_set, figures, series)
+
+
+def _figures(method: str, result: Result, path: Path, scene: Scene) -> dict[str, float]:
+    report = evaluate.evaluate(path, Execution(scene, (StepRun(step.NAME, method, "{}", result),), {}))
+    values = {metric.name: metric.value for metric in report.metrics}
+    missed = [value for name, value in values.items() if name.startswith("missed: ")]
+    return {
+        f"{method}: missed": float(sum(missed)),
+        f"{method}: true": float(len(missed)),
+        f"{method}: false alarms": values.get("false alarms", NAN),
+        f"{method}: depth error": values.get("depth error, median", NAN),
+        f"{method}: threshold": result.lod95,
+        f"{method}: curves": float(sum(len(curve.along) > 0 for curve in result.defects.deflection)),
+        f"{method}: clustered": _stated(result, "defects.paper-clusters", "points"),
+        f"{method}: rms": _stated(result, "defects.paper-fit", "rms"),
+    }
+
+
+def _stated(result: Result, code: str, value: str) -> float:
+    """Return a value that a remark of the result states; NaN without the remark."""
+    return next((float(one.values[value]) for one in result.reasons if one.code == code), NAN)
+
+
+def rows(found: Found) -> list[Row]:
+    """Return rows of ours alone: the page that is available states steps and equations, and no number of a result."""
+    none, beside = reason("papers.defects-no-number"), reason("papers.beside")
+    made = []
+    for place, quantity, figure, unit in (
+        (text("section {number}", number="1.2"), text("points after the density clusters"), "clustered", ""),
+        (text("figure {number}", number="2"), text("rms after histograms, consensus and registration"), "rms", "mm"),
+        (text("section {number}", number="1.3"), text("threshold of a defect"), "threshold", "mm"),
+        (text("section {number}", number="1.4"), text("defects with a deflection curve by slopes"), "curves", ""),
+    ):
+        made.append(_row(place, "paper", quantity, found.values(PLATES, f"paper: {figure}"), none, unit))
+    section = text("section {number}", number="1.3")
+    for method in METHODS:
+        for quantity, figure, unit in (
+            (text("defects not found"), "missed", ""),
+            (text("false alarms"), "false alarms", ""),
+            (text("depth error, median"), "depth error", "mm"),
+            (text("level of detection"), "threshold", "mm"),
+        ):
+            if method == "default" or figure != "threshold":
+                made.append(_row(section, method, quantity, found.values(PLATES, f"{method}: {figure}"), beside, unit))
+    return made
+
+
+def _row(place: Text, method: str, quantity: Text, values: tuple[float, ...], why: Reason, unit: str) -> Row:
+    return Row(
+        paper=PAPER, place=place, data=PLATES, method=method, quantity=quantity, unit=unit, published=NAN,
+        values=values, rule=Rule.AT_MOST, reason=why,
+    )  # fmt: skip
+
+
+def charts(found: Found) -> list[Chart]:
+    """Return the longest deflection curve by slopes, of the first seed."""
+    curve = found.series(PLATES, "paper: deflection")
+    if not curve:
+        return []
+    return [
+        Chart(
+            title=text("deflection curve by slopes of paper {paper}", paper=PAPER),
+            x=text("along, mm"),
+            y=text("displacement, mm"),
+            lines=(("paper", curve),),
+            places=tuple(found.series(PLATES, "paper: along")),
+        )
+    ]

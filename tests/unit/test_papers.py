@@ -1,0 +1,155 @@
+"""The comparison with the source papers: what counts as reproduced, and every paper on a tiny data set."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from processor.cli.main import commands
+from processor.language.messages import text
+from processor.model import UsageError, reason
+from processor.papers import bolt_balls, command, data_sets, preassembly
+from processor.papers.data_sets import DataSet, Found, Measured
+from processor.papers.rows import Outcome, Row, Rule
+
+TINY = {
+    "000": ("arch-s1", ("scan.spacing_mm=25.0", "scan.sigma_mm=0.0", "scan.net=true")),
+    "001": ("balls-100", ("frame.nodes_x=3", "frame.nodes_y=3", "scan.spacing_mm=5.0")),
+    "002": ("stadium-roof", ("structure.trusses=4", "structure.bays=1", "scan.spacing_mm=120.0")),
+    "003": ("truss-bridge-picks", ("structure.bays=2", "scan.step_mrad=12.0")),
+    "004": ("plates-defects", ('structure.components=["none", "dent"]', "scan.step_mrad=3.0")),
+}
+
+
+def row(published, values, rule):
+    return Row(
+        paper="000",
+        place=text("table {number}", number="2"),
+        data="D1",
+        method="line",
+        quantity=text("splicing error, mean"),
+        unit="mm",
+        published=published,
+        values=values,
+        rule=rule,
+        reason=reason("papers.beside"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("rule", "published", "values", "outcome", "worst"),
+    [
+        (Rule.AT_MOST, 1.0, (0.2, 1.2, 9.0), Outcome.YES, 9.0),
+        (Rule.AT_MOST, 1.0, (1.3, 1.3, 0.1), Outcome.NO, 1.3),
+        (Rule.NEAR, 20.0, (19.0, 21.0, 40.0), Outcome.YES, 40.0),
+        (Rule.NEAR, 20.0, (1.0, 1.0, 20.0), Outcome.NO, 1.0),
+        (Rule.NEAR, -20.0, (-21.0, -19.0), Outcome.YES, -19.0),
+        (Rule.MAGNITUDE, 5.8, (2.0, 17.0, 9.0), Outcome.YES, 17.0),
+        (Rule.MAGNITUDE, 5.8, (0.05, 0.05), Outcome.NO, 0.05),
+        (Rule.HOLDS, 1.0, (1.0, 1.0), Outcome.YES, 1.0),
+        (Rule.HOLDS, 1.0, (1.0, 0.0, 1.0), Outcome.NO, 0.0),
+        (Rule.NEAR, 1.0, (), Outcome.NOT_MADE, math.nan),
+        (Rule.NEAR, 1.0, (math.nan,), Outcome.NOT_MADE, math.nan),
+        (Rule.AT_MOST, math.nan, (3.0, 1.0), None, 3.0),
+        (Rule.AT_MOST, math.nan, (), None, math.nan),
+        (Rule.NONE, math.nan, (), Outcome.NOT_MADE, math.nan),
+    ],
+)
+def test_what_counts_as_reproduced(rule, published, values, outcome, worst):
+    made = row(published, values, rule)
+    assert made.outcome == outcome
+    np.testing.assert_equal(made.worst, worst)
+    assert json.dumps(made.as_object(), allow_nan=False)
+
+
+def test_differences_of_two_methods_by_motions_are_told_from_others():
+    # Corners and middles of a section, gaps changed by a small rotation and a shift of the part.
+    rng = np.random.default_rng(1)
+    corners = np.array([[0, 700, -900], [0, -700, -900], [0, -700, 900], [0, 700, 900.0]])
+    points = np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))])
+    moved = [np.cross(1e-3 * rng.normal(size=3), points) + rng.normal(size=3) for _ in range(4)]
+    left, before = preassembly.beyond_rigid(np.hstack(moved))
+    assert left < 1e-9
+    assert before > 0.3
+    picked = np.hstack(moved) + 0.5 * rng.normal(size=(8, 12))
+    assert preassembly.beyond_rigid(picked)[0] == pytest.approx(0.5, rel=0.25)
+
+
+def test_the_papers_tables_keep_the_papers_statement():
+    # "At most 1 mm" between both methods, and nothing of it by a motion: see the page.
+    tables = {key: np.array(value) for key, value in preassembly.published().items() if key.startswith("table")}
+    assert {table.shape for table in tables.values()} == {(8, 12)}
+    for line, aided in (("table_4", "table_6"), ("table_5", "table_7")):
+        between = tables[aided] - tables[line]
+        assert np.abs(between).max() < preassembly.PUBLISHED_DIFFERENCE_MM
+        left, before = preassembly.beyond_rigid(between)
+        assert left > 0.9 * before
+
+
+def test_four_points_with_one_behind_the_ball_make_a_sphere_of_metres():
+    class Design:
+        centres, radii = np.zeros((100, 3)), np.full(100, 45.0)
+
+    found = bolt_balls._by_total_station(Design, np.random.default_rng(0))
+    assert found[bolt_balls.BLUNDER_ROW, 3] > 1000.0
+    assert np.median(np.abs(found[:, 3] - 45.0)) < 10.0
+
+
+@pytest.mark.parametrize("number", TINY)
+def test_a_paper_on_a_tiny_data_set(number, tmp_path):
+    recipe, settings = TINY[number]
+    module = data_sets.module_of(number)
+    named = [one.name for one in module.data_sets(3)]
+    assert [one.seed for one in module.data_sets(3)] == [3] * len(named)
+    made = data_sets.make_and_measure(DataSet(number, named[0], recipe, settings, 1), scratch=str(tmp_path))
+    assert not made.failed, made.failed
+    assert not list(tmp_path.iterdir())
+    found = Found([made])
+    rows = module.rows(found)
+    assert any(len(one.values) for one in rows if one.data == named[0])
+    assert {one.paper for one in rows} == {number}
+    empty = module.rows(Found([]))
+    assert len(empty) == len(rows)
+    assert not [one for one in empty if one.outcome in (Outcome.YES, Outcome.NO)]
+    assert module.charts(Found([])) == []
+    assert all(chart.lines for chart in module.charts(found))
+
+
+def measured_without_scenes(data_set, *_, **__):
+    figures = {"ransac: radius, mean": 1.0, "ransac: radius, largest": 9.0, "blunder, m": 6.0}
+    if data_set.seed == 1:
+        return Measured(data_set, failed="designgen make: out of paper")
+    return Measured(data_set, figures, {"ransac": [1.0, 2.0]})
+
+
+def test_the_command_writes_one_page_and_one_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(data_sets, "make_and_measure", measured_without_scenes)
+    out = tmp_path / "out"
+    words = ["papers", "-o", str(out), "--only", "001", "--seeds", "2", "--lang", "zh"]
+    for _ in range(2):  # the second replaces the first
+        done = CliRunner().invoke(commands, words, standalone_mode=False)
+        assert done.return_value == 1  # a data set failed
+        assert "2 of 7 published numbers" in done.output
+    assert sorted(path.name for path in out.iterdir()) == [command.PAGE, command.JSON] == ["papers.html", "papers.json"]
+    content = json.loads((out / command.JSON).read_text("utf-8"))
+    assert (content["format"], content["seeds"]) == ("processor-papers", 2)
+    mean = content["rows"][0]
+    assert (mean["published"], mean["median"], mean["reproduced"]) == (pytest.approx(1.35), 1.0, "yes")
+    assert mean["values"] == [1.0, None]
+    assert mean["reason"]["text"]
+    assert content["rows"][1]["reproduced"] == "no"
+    assert [one["failed"] for one in content["data_sets"]] == ["", "designgen make: out of paper"]
+    page = (out / command.PAGE).read_text("utf-8")
+    assert "来源论文逐表对照" in page
+    assert "data:image/png;base64," in page
+    assert "out of paper" in page
+
+
+def test_an_unknown_paper_and_a_full_folder_are_refused(tmp_path):
+    with pytest.raises(UsageError, match="no paper '007'"):
+        command.run(tmp_path / "out", ("007",), 1, 1)
+    (tmp_path / "mine.txt").write_text("x")
+    with pytest.raises(UsageError, match="not empty"):
+        command.run(tmp_path, ("001",), 1, 1)
