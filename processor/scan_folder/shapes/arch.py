@@ -17,7 +17,7 @@ from processor.scan_folder.shapes.part_names import numbered_backwards
 from processor.scan_folder.shapes.sections import STRAIGHT_MM, SectionPlane, corners, key_points, skin_at_end
 
 SAME_MM = 0.5  # between the corners of two ends, and between a corner and the skin's
-SKIN_MM = 1.0
+SKIN_MM = 0.5
 OVERLAP_MM = 0.2
 PLAUSIBLE_MM = (150.0, 10_000.0)  # sizes of a section
 END_MM = 0.5  # between the end of a bottom edge and the corner of the next joint
