@@ -202,6 +202,8 @@ def _read_project(folder: Path) -> _Project:
     design = existing_file_in(folder, named, str(path)) if named else None
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
     if guessed:
+        gap = guessed.made.root_gap_mm if guessed.made else 0.0
+        table = Table(str(path), {"tolerance": {"root_gap_mm": gap}} if gap > 0.0 else {})
         components = {folder / scan.file: scan.component for scan in guessed.scans}
         entries = [_Entry(scan, component=components[scan]) for scan in _open_scans(folder, list(components))]
     control, control_file = read_control(folder, table)

@@ -119,20 +119,22 @@ def bevelled(vertices, faces):
     return vertices, faces
 
 
-def chamfered(vertices, faces):
-    """The start's face with the lower left corner of its outline cut off by 40 mm, all along the part."""
-    rows = bridge_parts.ROWS
+def chamfered(vertices, faces, steps=1):
+    """The part's outer faces with the lower left corner cut off by 40 mm, or rounded in several steps."""
+    rows, count = bridge_parts.ROWS, steps + 4
     four = vertices[: 4 * rows].reshape(rows, 4, 3)
     up, right = four[:, 3] - four[:, 0], four[:, 1] - four[:, 0]
     one = four[:, 0] + 40.0 * up / np.linalg.norm(up, axis=1, keepdims=True)
     two = four[:, 0] + 40.0 * right / np.linalg.norm(right, axis=1, keepdims=True)
-    loops = np.stack([one, two, four[:, 1], four[:, 2], four[:, 3]], axis=1)
-    k = np.arange(5)
+    round_ = [(1 - t) ** 2 * one + 2 * t * (1 - t) * four[:, 0] + t**2 * two for t in np.linspace(0, 1, steps + 1)]
+    round_ = [one, two] if steps == 1 else round_
+    loops = np.stack([*round_, four[:, 1], four[:, 2], four[:, 3]], axis=1)
+    k = np.arange(count)
     triangles = []
     for i in range(rows - 1):
-        a, b = 5 * i + k, 5 * i + np.roll(k, -1)
-        triangles += [*np.stack([a, b, b + 5], axis=1), *np.stack([a, b + 5, a + 5], axis=1)]
-    ends = [(e, e + m, e + m + 1) for e in (0, 5 * (rows - 1)) for m in (1, 2, 3)]
+        a, b = count * i + k, count * i + np.roll(k, -1)
+        triangles += [*np.stack([a, b, b + count], axis=1), *np.stack([a, b + count, a + count], axis=1)]
+    ends = [(e, e + m, e + m + 1) for e in (0, count * (rows - 1)) for m in range(1, count - 1)]
     return loops.reshape(-1, 3), np.array([*triangles, *ends])
 
 
@@ -154,6 +156,17 @@ def test_corners_that_are_not_clear_are_not_sure(flaw, reason):
     one = found(meshes)
     assert order(one.design) == bridge_parts.names(5)
     assert any(reason in text for text in one.doubts), one.doubts
+
+
+def test_edges_that_are_not_sharp_are_left_out(tmp_path):
+    meshes, _ = bridge_parts.bridge(5, 0)
+    meshes[2] = chamfered(*meshes[2], steps=8)
+    for name, mesh in zip(bridge_parts.names(5), meshes, strict=True):
+        bridge_parts.write_obj(tmp_path / f"design/{name}.obj", *mesh)
+    write_scans(tmp_path, meshes, bridge_parts.names(5))
+    assert "? bottom edges of rib2: left out" in init(tmp_path)
+    parts = scan_folder.read_input(tmp_path).arch.parts
+    assert [len(part.bottom_edge_left) > 0 for part in parts] == [True, True, False, True, True]
 
 
 def test_behind_a_bevel_or_an_end_plate_the_outer_faces_are_followed():
@@ -324,6 +337,9 @@ def test_two_files_of_one_name_and_a_root_gap(tmp_path):
     bridge_parts.write_stl(tmp_path / "design/rib1.stl", *meshes[1])
     write_scans(tmp_path, meshes, bridge_parts.names(5), 0.001, "x_m,y_m,z_m")
     assert "? rib1: there are rib1.stl, rib1.obj; rib1.stl is read" in init(tmp_path)
+    assert scan_folder.read_input(tmp_path).tolerance.root_gap_mm == pytest.approx(6.0, abs=0.01)
+    (tmp_path / "project.toml").unlink()
+    (tmp_path / "design.json").unlink()
     assert scan_folder.read_input(tmp_path).tolerance.root_gap_mm == pytest.approx(6.0, abs=0.01)
 
 

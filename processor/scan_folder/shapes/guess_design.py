@@ -192,14 +192,13 @@ def content(guessed: GuessedDesign, questions: Sequence[str]) -> dict[str, Any]:
 
 
 def _arch(design: ArchDesign, mesh_of: Mapping[str, str], scale: float) -> dict[str, Any]:
-    components = {
-        part.name: {
-            "mesh": mesh_of[part.name],
-            "bottom_edge_left": _rounded(part.bottom_edge_left, scale),
-            "bottom_edge_right": _rounded(part.bottom_edge_right, scale),
+    components: dict[str, dict[str, Any]] = {}
+    for part in design.parts:
+        components[part.name] = {"mesh": mesh_of[part.name]} | {
+            f"bottom_edge_{side}": _rounded(edge, scale)
+            for side, edge in (("left", part.bottom_edge_left), ("right", part.bottom_edge_right))
+            if len(edge)
         }
-        for part in design.parts
-    }
     joints = [
         {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, _rounded(p, scale), strict=True))}
         for name, left, right, p in zip(
