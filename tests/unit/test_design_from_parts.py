@@ -1,6 +1,7 @@
 """The design of an arch bridge from a mesh or CAD body a part: order, joints, bottom edges, and what is not sure."""
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -176,6 +177,34 @@ def test_behind_a_bevel_or_an_end_plate_the_outer_faces_are_followed():
     one = found(meshes)
     assert np.abs(one.design.joint_points - joints).max() < 1.0
     assert sum("off its outer faces" in text for text in one.doubts) == 2
+
+
+def test_a_ring_has_no_order():
+    angles = np.arange(0.0, 2.0 * np.pi + 0.1, np.pi / 3.0)
+    planes = [(np.array([0.0, 0.0, 0.0]), np.array([-np.sin(a), 0.0, np.cos(a)])) for a in angles]
+
+    def section(plane, y, r):
+        return plane[0] + np.array([r * plane[1][2], y, -r * plane[1][0]])
+
+    def segment(a, b):
+        outer, inner = (
+            np.array(
+                [
+                    section(p, y, r)
+                    for p in (a, b)
+                    for y, r in ((w, 5e3 + t), (-w, 5e3 + t), (-w, 6e3 - t), (w, 6e3 - t))
+                ]
+            )
+            for w, t in ((400.0, 0.0), (380.0, 20.0))
+        )
+        sides = [q for k in range(4) for q in ((k, (k + 1) % 4, (k + 1) % 4 + 4), (k, (k + 1) % 4 + 4, k + 4))]
+        rings = [(e + k, e + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
+        rings += [(e + (k + 1) % 4, e + 8 + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
+        return np.vstack([outer, inner]), np.array([*sides, *((i + 8, j + 8, k + 8) for i, j, k in sides), *rings])
+
+    one = found([segment(a, b) for a, b in pairwise(planes)], list("abcdef"))
+    assert one.design is None
+    assert "make up a ring" in one.doubts[0]
 
 
 @pytest.mark.parametrize(
