@@ -37,9 +37,14 @@ def scan_files(folder: Path, excluded: Collection[Path | None]) -> list[Path]:
 
 
 def scan_files_below(folder: Path, excluded: Collection[Path | None]) -> list[Path]:
-    """Return the same; without any there, those in the other folders below."""
+    """Return the same; without any there, those in the folders below that are no scan folders themselves."""
     found = scan_files(folder, excluded)
-    return found or _scans_in([place for place in sorted(folder.glob("[!.]*")) if place.is_dir()], excluded)
+    return found or _scans_in([place for place in sorted(folder.glob("[!.]*")) if belongs(place)], excluded)
+
+
+def belongs(place: Path) -> bool:
+    """Whether a path is a folder that belongs to the scan folder it lies in, and is none of its own."""
+    return place.is_dir() and not place.is_symlink() and not (place / PROJECT).exists() and not (place / SCANS).exists()
 
 
 def _scans_in(places: Collection[Path], excluded: Collection[Path | None]) -> list[Path]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -202,7 +202,10 @@ def _read_project(folder: Path) -> _Project:
     design = existing_file_in(folder, named, str(path)) if named else None
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
     if guessed:
-        entries = [_Entry(folder / scan.file, component=scan.component) for scan in guessed.scans]
+        gap = guessed.made.root_gap_mm if guessed.made else 0.0
+        table = Table(str(path), {"tolerance": {"root_gap_mm": gap}} if gap > 0.0 else {})
+        components = {folder / scan.file: scan.component for scan in guessed.scans}
+        entries = [_Entry(scan, component=components[scan]) for scan in _open_scans(folder, list(components))]
     control, control_file = read_control(folder, table)
     return _Project(
         name=table.text("name", file_name_as_text(folder.resolve().name)),
@@ -211,7 +214,9 @@ def _read_project(folder: Path) -> _Project:
         design=design,
         design_units=table.unit("design_units", ""),
         temperature_C=table.number("temperature_C", NAN),
-        entries=tuple(entries or [_Entry(scan) for scan in _open_scans(folder, (design, control_file))]),
+        entries=tuple(
+            entries or [_Entry(scan) for scan in _open_scans(folder, scan_files(folder, (design, control_file)))]
+        ),
         tolerance=read_tolerance(table),
         control=control,
         guessed=guessed,
@@ -223,7 +228,7 @@ def _guess(folder: Path) -> Guess | None:
     if any((folder / name).exists() for name in DESIGNS) or not surface_files.candidates(folder):
         return None
     guessed = guess.guess(folder)
-    return guessed if guessed.made else None
+    return guessed if guessed.made and not guessed.made.kind_doubt else None
 
 
 def _entry(folder: Path, scan: Table) -> _Entry:
@@ -247,9 +252,8 @@ def _entry(folder: Path, scan: Table) -> _Entry:
     )
 
 
-def _open_scans(folder: Path, excluded: Collection[Path | None]) -> list[Path]:
-    """Return the scan files of a folder. Raises InputError for none, and for one in a closed format only."""
-    files = scan_files(folder, excluded)
+def _open_scans(folder: Path, files: Sequence[Path]) -> list[Path]:
+    """Return the scan files that can be read. Raises InputError for none, and for one in a closed format only."""
     for path in files:
         existing_file_in(folder, str(path.relative_to(folder)), str(folder))
     scans = [path for path in files if not readers.is_closed(path)]

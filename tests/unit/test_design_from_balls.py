@@ -85,6 +85,12 @@ def test_what_is_not_sure_is_told():
     assert "1 (4) may be no ball" in told
     assert "no tube leads to it" in told
     assert "1 tube(s) lead to no two balls" in told
+    start, end = next(v for name, v, _ in bodies if name == "tube 3").reshape(2, 24, 3)
+    bent = np.vstack([start, 0.5 * (start + end) + np.array([0.0, 0.0, 200.0]), end])
+    _, faces = frame_solids.lathe([(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)], np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    others = [body for body in bodies if body[0] != "tube 3"]
+    one = frame.find(welded("all", *frame_solids.joined([*others, ("bent", bent, faces)])))
+    assert any("are some missing" in text for text in one.doubts)
     off = np.array([0.0, 0.0, 9.0])
     aside = [(name, vertices + off * (name == "tube 0"), faces) for name, vertices, faces in bodies]
     one = frame.find(welded("all", *frame_solids.joined(aside)))

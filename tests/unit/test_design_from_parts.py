@@ -1,15 +1,19 @@
 """The design of an arch bridge from a mesh or CAD body a part: order, joints, bottom edges, and what is not sure."""
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from designgen import batch, recipe_files
 from designgen.curves import make as make_curve
 from designgen.designs import arch_rib
 from designgen.designs.arch_part import Plates, solid
+from designgen.export import folder as export_folder
 from designgen.export import solids
+from processor.api import runs
 from processor.cli import main
 from processor.geometry.polyline import Polyline
 from processor.model import ArchDesign
@@ -116,20 +120,22 @@ def bevelled(vertices, faces):
     return vertices, faces
 
 
-def chamfered(vertices, faces):
-    """The start's face with the lower left corner of its outline cut off by 40 mm, all along the part."""
-    rows = bridge_parts.ROWS
+def chamfered(vertices, faces, steps=1):
+    """The part's outer faces with the lower left corner cut off by 40 mm, or rounded in several steps."""
+    rows, count = bridge_parts.ROWS, steps + 4
     four = vertices[: 4 * rows].reshape(rows, 4, 3)
     up, right = four[:, 3] - four[:, 0], four[:, 1] - four[:, 0]
     one = four[:, 0] + 40.0 * up / np.linalg.norm(up, axis=1, keepdims=True)
     two = four[:, 0] + 40.0 * right / np.linalg.norm(right, axis=1, keepdims=True)
-    loops = np.stack([one, two, four[:, 1], four[:, 2], four[:, 3]], axis=1)
-    k = np.arange(5)
+    round_ = [(1 - t) ** 2 * one + 2 * t * (1 - t) * four[:, 0] + t**2 * two for t in np.linspace(0, 1, steps + 1)]
+    round_ = [one, two] if steps == 1 else round_
+    loops = np.stack([*round_, four[:, 1], four[:, 2], four[:, 3]], axis=1)
+    k = np.arange(count)
     triangles = []
     for i in range(rows - 1):
-        a, b = 5 * i + k, 5 * i + np.roll(k, -1)
-        triangles += [*np.stack([a, b, b + 5], axis=1), *np.stack([a, b + 5, a + 5], axis=1)]
-    ends = [(e, e + m, e + m + 1) for e in (0, 5 * (rows - 1)) for m in (1, 2, 3)]
+        a, b = count * i + k, count * i + np.roll(k, -1)
+        triangles += [*np.stack([a, b, b + count], axis=1), *np.stack([a, b + count, a + count], axis=1)]
+    ends = [(e, e + m, e + m + 1) for e in (0, count * (rows - 1)) for m in range(1, count - 1)]
     return loops.reshape(-1, 3), np.array([*triangles, *ends])
 
 
@@ -153,6 +159,17 @@ def test_corners_that_are_not_clear_are_not_sure(flaw, reason):
     assert any(reason in text for text in one.doubts), one.doubts
 
 
+def test_edges_that_are_not_sharp_are_left_out(tmp_path):
+    meshes, _ = bridge_parts.bridge(5, 0)
+    meshes[2] = chamfered(*meshes[2], steps=8)
+    for name, mesh in zip(bridge_parts.names(5), meshes, strict=True):
+        bridge_parts.write_obj(tmp_path / f"design/{name}.obj", *mesh)
+    write_scans(tmp_path, meshes, bridge_parts.names(5))
+    assert "? bottom edges of rib2: left out" in init(tmp_path)
+    parts = scan_folder.read_input(tmp_path).arch.parts
+    assert [len(part.bottom_edge_left) > 0 for part in parts] == [True, True, False, True, True]
+
+
 def test_behind_a_bevel_or_an_end_plate_the_outer_faces_are_followed():
     meshes, joints = bridge_parts.bridge(5, 0)
     meshes[1] = bevelled(*meshes[1])
@@ -160,6 +177,34 @@ def test_behind_a_bevel_or_an_end_plate_the_outer_faces_are_followed():
     one = found(meshes)
     assert np.abs(one.design.joint_points - joints).max() < 1.0
     assert sum("off its outer faces" in text for text in one.doubts) == 2
+
+
+def test_a_ring_has_no_order():
+    angles = np.arange(0.0, 2.0 * np.pi + 0.1, np.pi / 3.0)
+    planes = [(np.array([0.0, 0.0, 0.0]), np.array([-np.sin(a), 0.0, np.cos(a)])) for a in angles]
+
+    def section(plane, y, r):
+        return plane[0] + np.array([r * plane[1][2], y, -r * plane[1][0]])
+
+    def segment(a, b):
+        outer, inner = (
+            np.array(
+                [
+                    section(p, y, r)
+                    for p in (a, b)
+                    for y, r in ((w, 5e3 + t), (-w, 5e3 + t), (-w, 6e3 - t), (w, 6e3 - t))
+                ]
+            )
+            for w, t in ((400.0, 0.0), (380.0, 20.0))
+        )
+        sides = [q for k in range(4) for q in ((k, (k + 1) % 4, (k + 1) % 4 + 4), (k, (k + 1) % 4 + 4, k + 4))]
+        rings = [(e + k, e + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
+        rings += [(e + (k + 1) % 4, e + 8 + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
+        return np.vstack([outer, inner]), np.array([*sides, *((i + 8, j + 8, k + 8) for i, j, k in sides), *rings])
+
+    one = found([segment(a, b) for a, b in pairwise(planes)], list("abcdef"))
+    assert one.design is None
+    assert "make up a ring" in one.doubts[0]
 
 
 @pytest.mark.parametrize(
@@ -251,7 +296,9 @@ def write_scans(place, meshes, names, scale=1.0, header=""):
     rng = np.random.default_rng(0)
     for name, (vertices, faces) in zip(names, meshes, strict=True):
         share = rng.dirichlet([1.0, 1.0, 1.0], 4000)
-        points = np.einsum("nk,nki->ni", share, vertices[faces[rng.integers(0, len(faces), 4000)]]) * scale
+        corners = vertices[faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        points = np.einsum("nk,nki->ni", share, corners[rng.choice(len(faces), 4000, p=area / area.sum())]) * scale
         np.savetxt(place / f"scans/{name}.csv", points, fmt="%.4f", delimiter=",", header=header, comments="")
 
 
@@ -320,6 +367,9 @@ def test_two_files_of_one_name_and_a_root_gap(tmp_path):
     write_scans(tmp_path, meshes, bridge_parts.names(5), 0.001, "x_m,y_m,z_m")
     assert "? rib1: there are rib1.stl, rib1.obj; rib1.stl is read" in init(tmp_path)
     assert scan_folder.read_input(tmp_path).tolerance.root_gap_mm == pytest.approx(6.0, abs=0.01)
+    (tmp_path / "project.toml").unlink()
+    (tmp_path / "design.json").unlink()
+    assert scan_folder.read_input(tmp_path).tolerance.root_gap_mm == pytest.approx(6.0, abs=0.01)
 
 
 def test_a_design_that_is_there_is_not_changed(tmp_path):
@@ -377,7 +427,7 @@ def test_a_step_file_a_part_of_an_independent_bridge(tmp_path):
             for which in (0, 1)
         )
         (tmp_path / "Teile").mkdir(exist_ok=True)
-        cq.exporters.export(cq.Workplane(outer.cut(inner)), str(tmp_path / f"Teile/{name}.stp"))
+        cq.exporters.export(cq.Workplane(outer.cut(inner)), str(tmp_path / f"Teile/{name}.step"))
         expected.append(cut[0][0])
     (tmp_path / "scans").mkdir()
     np.savetxt(tmp_path / "scans/a.xyz", np.random.default_rng(0).uniform(0.0, 1.0, (500, 3)))
@@ -394,3 +444,21 @@ def section_of_stretch(k):
         np.array([bridge_parts.edge(c, bridge_parts.crossing(c, point, normal, inner), inner) for c in range(4)])
         for inner in (False, True)
     ]
+
+
+@pytest.mark.slow
+def test_the_gaps_of_a_bridge_are_those_with_its_own_design(tmp_path):
+    name, recipe = recipe_files.load("arch-s1")
+    batch.make_scene(tmp_path / "s1.h5", name, recipe_files.overridden(recipe, ["scan.spacing_mm=20"]), 3)
+    given, left = tmp_path / "given", tmp_path / "left"
+    for place in (given, left):
+        export_folder.export(tmp_path / "s1.h5", place, "ply", with_truth=False)
+    (left / "design.json").unlink()
+    (left / "project.toml").unlink()
+    without = runs.run(left).steps["preassemble"]
+    init(left)
+    written, expected = runs.run(left).steps["preassemble"], runs.run(given).steps["preassemble"]
+    assert np.isfinite(expected.joints.gaps).all()
+    for result in (without, written):
+        # The edges of the two designs differ by the sag of chords, 2 microns.
+        assert result.joints.gaps == pytest.approx(expected.joints.gaps, abs=0.002)

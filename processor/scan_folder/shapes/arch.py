@@ -17,7 +17,7 @@ from processor.scan_folder.shapes.part_names import numbered_backwards
 from processor.scan_folder.shapes.sections import STRAIGHT_MM, SectionPlane, corners, key_points, skin_at_end
 
 SAME_MM = 0.5  # between the corners of two ends, and between a corner and the skin's
-SKIN_MM = 1.0
+SKIN_MM = 0.5
 OVERLAP_MM = 0.2
 PLAUSIBLE_MM = (150.0, 10_000.0)  # sizes of a section
 END_MM = 0.5  # between the end of a bottom edge and the corner of the next joint
@@ -76,8 +76,6 @@ def find(bodies: Sequence[Body]) -> GuessedArch:
     parts = []
     for number in range(len(chain.parts)):
         part, doubt = _part(chain, joints, number)
-        if part is None:
-            return GuessedArch(None, (doubt, *doubts))
         parts.append(part)
         doubts += [doubt] if doubt else []
     doubts += _numbering(chain)
@@ -166,8 +164,8 @@ def _end(body: Body, face: PlaneFace, joint: SectionPlane, inward: float) -> _En
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _part(chain: Chain, joints: Sequence[_Joint], number: int) -> tuple[DesignPart | None, str]:
-    """Return a part with its bottom edges from start to end, and why they are not sure; None without edges."""
+def _part(chain: Chain, joints: Sequence[_Joint], number: int) -> tuple[DesignPart, str]:
+    """Return a part with its bottom edges from start to end, or none, and why they are not sure."""
     body = chain.parts[number]
     start = joints[number - 1] if number else None
     end = joints[number] if number < len(joints) else None
@@ -176,14 +174,15 @@ def _part(chain: Chain, joints: Sequence[_Joint], number: int) -> tuple[DesignPa
         near, far = (start.right, end.left if end else None) if start else (end.left if end else None, None)
         assert near is not None
         edge = follow(body, near.corners[k], -near.outward[k])
-        if not len(edge) and far is None:
-            return None, f"{body.name}: no sharp edge begins at the lower {side} corner of its end"
         edge, doubt = _between(edge, near.corners[k], None if far is None else far.corners[k])
-        if far is None and _reach(body, edge) < REACH_SHARE:
+        if len(edge) and far is None and _reach(body, edge) < REACH_SHARE:
             doubt = f"ends {np.linalg.norm(edge[-1] - edge[0]):.0f} mm from the joint"
         doubts += [f"the lower {side} edge {doubt}"] if doubt else []
         edges.append(smooth(edge if start is not None else edge[::-1]))
     lengths = [float(np.linalg.norm(np.diff(edge, axis=0), axis=1).sum()) for edge in edges]
+    if min(lengths) == 0.0:
+        text = f"bottom edges of {body.name}: left out: {'; '.join(doubts)}"
+        return DesignPart(body.name, body.vertices, body.faces), text
     if abs(lengths[0] - lengths[1]) > ALIKE * max(lengths):
         doubts.append(f"its bottom edges are {lengths[0]:.0f} and {lengths[1]:.0f} mm long")
     text = f"bottom edges of {body.name}: {'; '.join(doubts)}" if doubts else ""
@@ -191,21 +190,26 @@ def _part(chain: Chain, joints: Sequence[_Joint], number: int) -> tuple[DesignPa
 
 
 def _between(edge: Floats, first: Floats, last: Floats | None) -> tuple[Floats, str]:
-    """Return an edge (n, 3) that begins and ends at the corners (3,) of the joints, and why it is not sure."""
+    """Return an edge (n, 3) that begins and ends at the corners (3,) of the joints, and why it is not sure.
+
+    n = 0 for none.
+    """
+    if not len(edge):
+        return edge, "is not sharp at the corner of the joint"
     doubt = ""
-    if len(edge) and np.linalg.norm(edge[0] - first) > END_MM:
+    if np.linalg.norm(edge[0] - first) > END_MM:
         edge, doubt = np.vstack([first, edge]), "begins behind the corner"
-    elif len(edge):
+    else:
         edge = np.vstack([first, edge[1:]])
     if last is None:
         return edge, doubt
-    away = np.linalg.norm(edge - last, axis=1) if len(edge) else np.full(1, np.inf)
+    away = np.linalg.norm(edge - last, axis=1)
     if away[-1] <= END_MM:
         return np.vstack([edge[:-1], last]), doubt
     if away.min() < BEVEL_MM:
         kept = edge[: max(1, int((away > BEVEL_MM).sum()))]
         return np.vstack([kept, last]), "ends before the corner of the next joint"
-    return np.stack([first, last]), "does not lead from joint to joint, so it is taken as straight"
+    return edge[:0], "does not lead from joint to joint"
 
 
 def _reach(body: Body, edge: Floats) -> float:

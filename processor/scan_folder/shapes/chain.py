@@ -57,6 +57,8 @@ def find(bodies: Sequence[Body]) -> Chain | str:
         i = crowded[0]
         return f"{bodies[i].name} meets {_names(bodies, beside[i])}: the order of the parts is not clear"
     chains = _paths(beside)
+    if not chains and contacts:
+        return f"{_names(bodies, range(len(bodies)))} make up a ring, which has no first part"
     if not chains:
         return (
             f"no two of {_names(bodies, range(len(bodies)))} meet end to end, or lie {GAP_MM:g} mm apart at most"

@@ -16,7 +16,8 @@ PARALLEL_COS = np.cos(np.radians(3.0))
 OVERLAP_SHARE = 0.5  # of the smaller face's extents, in both directions of the plane
 LARGER_MM = 200.0  # one section may project so far beyond the other
 OVERLAP_MM = 10.0  # bodies that overlap more do not meet
-RIVAL_SHARE = 0.5  # of the best pair's area: another pair of faces may as well be the joint
+RIVAL_SHARE = 0.5  # of the largest pair's area: smaller pairs of faces are not the joint
+BESIDE_MM = 5.0  # a pair of faces that is hardly farther apart, in another plane, may as well be the joint
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Contact:
 
 
 def contact(a: Body, b: Body, limit_mm: float) -> Contact | None:
-    """Return the largest pair of faces of two bodies that meet or lie ``limit_mm`` apart at most; None without any."""
+    """Return the nearest of the large pairs of opposite faces of two bodies, ``limit_mm`` apart at most; else None."""
     near_a, near_b = _facets_near(a, b, limit_mm), _facets_near(b, a, limit_mm)
     if not len(near_a) or not len(near_b):
         return None
@@ -61,9 +62,11 @@ def contact(a: Body, b: Body, limit_mm: float) -> Contact | None:
                 found.append((min(face_a.area, face_b.area), gap, face_a, face_b))
     if not found:
         return None
-    found.sort(key=lambda pair: -pair[0])
-    area, gap, face_a, face_b = found[0]
-    rival = any(other[0] > RIVAL_SHARE * area and not _same_plane(other[2], face_a) for other in found[1:])
+    largest = max(pair[0] for pair in found)
+    large = [pair for pair in found if pair[0] > RIVAL_SHARE * largest]
+    # A diaphragm or the back of an end plate lies behind the end.
+    _, gap, face_a, face_b = min(large, key=lambda pair: (pair[1], -pair[0]))
+    rival = any(pair[1] < gap + BESIDE_MM and not _same_plane(pair[2], face_a) for pair in large)
     return Contact(face_a, face_b, gap, rival)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from processor.model import DesignBodies, Floats, InputError, Ints
 from processor.scan_folder import cad
 from processor.scan_folder.checked_toml import existing_file_in
-from processor.scan_folder.files import SCANS
+from processor.scan_folder.files import SCANS, belongs
 from processor.scan_folder.meshes import CAD_SUFFIXES, MESH_SUFFIXES, read_mesh
 
 MADE = "design-parts"  # folder of the meshes that `processor init` writes
@@ -45,7 +45,7 @@ def _places(folder: Path, depth: int) -> Iterator[Path]:
     yield folder
     if depth:
         for place in sorted(folder.iterdir()):
-            if place.is_dir() and not place.is_symlink() and place.name[0] != "." and place.name not in (SCANS, MADE):
+            if belongs(place) and place.name[0] != "." and place.name not in (SCANS, MADE):
                 yield from _places(place, depth - 1)
 
 

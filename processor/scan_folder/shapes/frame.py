@@ -19,6 +19,9 @@ OFF_AXIS = 0.3  # of a ball's radius: its centre may lie so far from the axis of
 TRUE_AXIS = 0.05  # of the radius: with more the design is eccentric, or the ball another's
 SHORT = 0.3  # of the clear distance between two balls: a shorter cylinder is a sleeve, a bolt or a bore
 LONG = 10.0  # a tube that leads to no two balls, this many radii long, is told
+OTHER_SHARE = 0.01  # of the surface that may be neither a ball nor along a member
+NEAR_BALL, NEAR_AXIS = 1.3, 2.5  # radii within which a facet belongs to a ball or a member
+SAMPLE = 40_000  # facets
 PLAUSIBLE_MM = (20.0, 600.0)  # radii of balls
 
 
@@ -40,6 +43,9 @@ def find(body: Body) -> GuessedFrame:
     if len(a) < FEWEST_MEMBERS:
         return GuessedFrame(None, (f"{len(nodes.radii)} balls found, but {len(a)} tube(s) between two of them",))
     doubts = _doubts(nodes, a, b, off)
+    aside = _aside(body, nodes, pipes.ends[which], pipes.radii[which])
+    if aside > OTHER_SHARE:
+        doubts.append(f"members: {100.0 * aside:.0f} % of the surface lies along none of them; are some missing?")
     if body.step_mm:
         doubts.append("members: coordinates are rounded to 0.1 mm or more, so some may not be found")
     lengths = np.linalg.norm(pipes.ends[:, 1] - pipes.ends[:, 0], axis=1)
@@ -92,6 +98,25 @@ def _ball_at(nodes: Balls, tree: cKDTree, end: Floats, out: Floats) -> tuple[int
         if off < OFF_AXIS and along > -nodes.radii[ball]:
             return ball, off
     return None
+
+
+def _aside(body: Body, nodes: Balls, ends: Floats, radii: Floats) -> float:
+    """Return the share of the surface that is neither near a ball nor along a member with ends (m, 2, 3)."""
+    step = max(1, len(body.faces) // SAMPLE)
+    middles, areas = body.vertices[body.faces[::step]].mean(axis=1), body.areas[::step]
+    near = cKDTree(nodes.centres).query(middles, k=1)
+    other = near[0] > NEAR_BALL * nodes.radii[near[1]]
+    # From ball to ball: sleeves and cones lie beyond the tube's ends.
+    way = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(way, axis=1)
+    thick = float(radii.max())
+    count = np.ceil(1.6 * length / thick).astype(np.int64) + 1
+    member = np.repeat(np.arange(len(ends)), count)
+    share = (np.arange(len(member)) - np.repeat(np.cumsum(count) - count, count)) / np.repeat(count - 1, count)
+    axis = ends[member, 0] + (1.6 * share - 0.3)[:, None] * way[member]
+    away, which = cKDTree(axis).query(middles[other], k=1)
+    other[other] = away > NEAR_AXIS * np.maximum(radii[member[which]], 0.4 * thick)
+    return float(areas[other].sum() / areas.sum())
 
 
 def _coaxial(pipes: Tubes, which: Ints) -> np.ndarray:

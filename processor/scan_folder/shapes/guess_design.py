@@ -114,12 +114,18 @@ def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_u
         doubts=(*doubts, *parts.doubts, *found.doubts),
         units="mm" if parts.meshes else json_unit,
         reason=f"{len(mesh_of)} parts that meet end to end, in {_some(names)}",
-        kind_doubt="" if found.arched else "the parts follow each other in a straight line, which is no arch",
+        kind_doubt=_kind_doubt(found.arched, named),
         root_gap_mm=found.root_gap_mm,
         files=tuple(names),
         mesh_of=mesh_of,
         meshes=tuple(mesh for mesh in parts.meshes if mesh[0] in mesh_of.values()),
     )
+
+
+def _kind_doubt(arched: bool, named: bool) -> str:
+    if not arched:
+        return "the parts follow each other in a straight line, which is no arch"
+    return "" if named else "the parts meet end to end and rise, but no name says that they are an arch's"
 
 
 def _some(names: Sequence[str]) -> str:
@@ -186,14 +192,13 @@ def content(guessed: GuessedDesign, questions: Sequence[str]) -> dict[str, Any]:
 
 
 def _arch(design: ArchDesign, mesh_of: Mapping[str, str], scale: float) -> dict[str, Any]:
-    components = {
-        part.name: {
-            "mesh": mesh_of[part.name],
-            "bottom_edge_left": _rounded(part.bottom_edge_left, scale),
-            "bottom_edge_right": _rounded(part.bottom_edge_right, scale),
+    components: dict[str, dict[str, Any]] = {}
+    for part in design.parts:
+        components[part.name] = {"mesh": mesh_of[part.name]} | {
+            f"bottom_edge_{side}": _rounded(edge, scale)
+            for side, edge in (("left", part.bottom_edge_left), ("right", part.bottom_edge_right))
+            if len(edge)
         }
-        for part in design.parts
-    }
     joints = [
         {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, _rounded(p, scale), strict=True))}
         for name, left, right, p in zip(

@@ -11,7 +11,7 @@ from processor.model import Floats
 from processor.scan_folder.units import MM_PER_UNIT, radius
 
 UNITS = ("mm", "m", "inch", "cm", "ft")
-TOLERANCE = 0.25  # relative difference of a scan's size from its design's
+SURE, TOLERANCE = 0.05, 0.25  # relative difference of a scan's size from its design's: in one unit, and in no other
 SIZES_M = (3.0, 300.0)  # of most structures
 USUAL = ("mm", "m")  # what CAD writes
 
@@ -38,11 +38,9 @@ def guess(surfaces: Sequence[Floats], scans: Sequence[tuple[float, str]], single
             unit: max(float(np.abs(np.log(size / (sizes * MM_PER_UNIT[unit]))).min()) for size in stated)
             for unit in UNITS
         }
-        fitting = [unit for unit in UNITS if misfit[unit] <= np.log1p(TOLERANCE)]
-        if len(fitting) == 1:
-            return DesignUnit(
-                fitting[0], "the scans, whose formats state a unit, are as large as the design in it", True
-            )
+        best, second = sorted(UNITS, key=misfit.__getitem__)[:2]
+        if misfit[best] <= np.log1p(SURE) and misfit[second] > np.log1p(TOLERANCE):
+            return DesignUnit(best, "the scans, whose formats state a unit, are as large as the design in it", True)
     extent = float(np.ptp(whole, axis=0).max())
     possible = [u for u in UNITS if SIZES_M[0] <= extent * MM_PER_UNIT[u] / 1000.0 <= SIZES_M[1]]
     likely = [u for u in possible if u in USUAL]
