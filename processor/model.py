@@ -435,7 +435,9 @@ class FrameDesign(Checked):
     tube_diameters: Floats = column("m", means=SIZE)
     # 0 = none, else the place in SUPPORTS, from 1
     supports: Codes = column("k", dtype=np.uint8, newer=True, means=Meaning(most=2))
-    deflections: Floats = column("k", newer=True)  # computed, downward; NaN = not stated
+    deflections: Floats = column(
+        "k", newer=True, means=Meaning(least=-LARGEST_MM, most=LARGEST_MM)
+    )  # computed, downward; NaN = not stated
 
 
 SUPPORTS = ("perimeter", "multi-point")  # of a node: of a frame supported along its edges, or at single points
@@ -459,9 +461,9 @@ class DesignBodies(Checked):
 class DesignFaults(Checked):
     """What was wrong with a structure's mesh: facets that were ``turned`` outward, and open edges of so many parts."""
 
-    turned: int = 0
-    open_edges: int = 0
-    open_parts: int = 0
+    turned: int = described(0, means=Meaning(least=0))
+    open_edges: int = described(0, means=Meaning(least=0))
+    open_parts: int = described(0, means=Meaning(least=0))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import dataclasses
+import io
 import json
 import os
 import random
@@ -11,8 +14,11 @@ import numpy as np
 import pytest
 
 from processor import meaning
+from processor.cli import main
 from processor.model import InputError, UsageError
 from processor.scan_folder import cad, folder
+from processor.store import store
+from tests.support import step_results
 
 POINTS = np.random.default_rng(3).uniform(0.0, 3.0, (60, 3)).round(3)
 FILES = {
@@ -139,3 +145,27 @@ def test_a_cache_of_another_user_is_not_used(tmp_path, monkeypatch):
     cache.chmod(0o770)
     with cad._cache() as other:
         assert not other.is_relative_to(tmp_path)
+
+
+# --- names in what is written ----------------------------------------------------------------------------------------
+
+
+def test_names_are_harmless_in_pages_tables_and_terminals(tmp_path, capsys):
+    """One scene whose every name attacks the page, the spreadsheet or the terminal."""
+    script, formula, clear = "</script><script>alert(1)</script>", "=HYPERLINK(1)", "a\x1b[2Jb\u202ec"
+    hostile = dataclasses.replace(step_results.scene((formula, script, clear)), name=script)
+    place = tmp_path / "scene.h5"
+    store.write_scene(place, hostile, None, {})
+    main.commands.main(["run", str(place), "-o", str(tmp_path / "out"), "--steps", "deviation"], standalone_mode=False)
+    shown = "".join(capsys.readouterr())
+    texts = {path: path.read_text("utf-8") for path in (tmp_path / "out").glob("*") if path.suffix in (".html", ".csv")}
+    assert texts
+    for path, text in {**texts, "terminal": shown}.items():
+        assert "\x1b" not in text, path
+        assert "\u202e" not in text, path
+        if str(path).endswith(".html"):
+            assert "<script>alert" not in text
+            assert "alert(1)" in text  # as text
+        if str(path).endswith(".csv"):
+            cells = [cell for row in csv.reader(io.StringIO(text)) for cell in row]
+            assert not [cell for cell in cells if re.match(r"[=@]|[+-](?![\d.])", cell)], path
