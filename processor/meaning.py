@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
-from processor.model import LARGEST_MM, Checked, InputError, Meaning, Scene, Word
+from processor.model import LARGEST_MM, Checked, InputError, Meaning, Word
 
 POSE_TOLERANCE = 1e-3  # of R^T R - I
-MOST_PROBLEMS = 20
 SHOWN = 60  # characters of a value
 UNDECLARED = Meaning()  # of a field that says nothing
 
-Array = np.typing.NDArray[Any]
+Record = TypeVar("Record")
+Array = npt.NDArray[Any]
 
 
 def problems(record: Any, where: str = "", root: Any = None) -> list[str]:
@@ -46,19 +47,20 @@ def problems(record: Any, where: str = "", root: Any = None) -> list[str]:
     return found
 
 
-def check(scene: Scene, source: str, files: Mapping[str, str] | None = None) -> Scene:
-    """Return a scene that is possible. Raises InputError that names the file, by the scene's field that came from it.
+def check(record: Record, source: str, files: Mapping[str, str] | None = None) -> Record:
+    """Return a scene, or a record of it without references to others, that is possible.
 
-    ``source`` is the input; ``files`` names the file of a field of the scene, as ``{"frame": "design.json"}``.
+    ``source`` is the input; ``files`` names the file of a field of a scene, as ``{"frame": "design.json"}``.
+    Raises InputError that names the file.
     """
-    found = problems(scene)
+    found = problems(record)
     if found:
         by_field = files or {}
         first = found[0].removeprefix("/").replace("/", ".")
         place = by_field.get(first.partition(".")[0].partition(",")[0].partition(":")[0], source)
         more = f" (and {len(found) - 1} more of the kind)" if len(found) > 1 else ""
         raise InputError(f"{place}: {first}{more}; correct the input")
-    return scene
+    return record
 
 
 def _faults(field: dataclasses.Field[Any], value: Any, meaning: Meaning, record: Any, root: Any) -> Iterator[str]:
@@ -176,12 +178,7 @@ def _first(values: Array, bad: Array, expected: str) -> Iterator[str]:
 def _of_poses(values: Array, meaning: Meaning) -> Iterator[str]:
     poses = values.reshape(-1, 4, 4)
     unknown = np.zeros(len(poses), bool) if meaning.finite else np.isnan(poses).any(axis=(1, 2))
-    with np.errstate(invalid="ignore", over="ignore"):
-        rotation = poses[:, :3, :3]
-        off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
-        proper = (off < POSE_TOLERANCE) & (np.linalg.det(np.where(np.isfinite(rotation), rotation, 0.0)) > 0)
-        far = ~(np.abs(poses[:, :3, 3]) <= min(meaning.most, LARGEST_MM)).all(axis=1)
-        bad = (~proper | far | (poses[:, 3] != [0.0, 0.0, 0.0, 1.0]).any(axis=1)) & ~unknown
+    bad = ~are_poses(poses) & ~unknown
     if bad.any():
         row = int(bad.argmax())
         place = f", row {row}" if values.ndim > 2 else ""
@@ -189,6 +186,16 @@ def _of_poses(values: Array, meaning: Meaning) -> Iterator[str]:
             f"{place}: expected a rotation and a finite translation above a row of 0, 0, 0, 1, found "
             f"[{'; '.join(', '.join(f'{x:.6g}' for x in line) for line in poses[row].tolist())}]"
         )
+
+
+def are_poses(poses: Array) -> npt.NDArray[np.bool_]:
+    """Return which of matrices (k, 4, 4) are a rotation and a translation of at most LARGEST_MM."""
+    rotation = np.where(np.abs(poses[:, :3, :3]) <= 2.0, poses[:, :3, :3], 0.0)  # no rotation has larger numbers
+    off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
+    near = (np.abs(poses[:, :3, 3]) <= LARGEST_MM).all(axis=1)
+    last = (poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    found: npt.NDArray[np.bool_] = (off < POSE_TOLERANCE) & (np.linalg.det(rotation) > 0) & near & last
+    return found
 
 
 def _referred(path: str, record: Any, root: Any) -> Any:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -286,10 +287,22 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 def _plain(name: str) -> str:
     """Return a name without case and separators, as names are mistyped."""
-    return "".join(character for character in name.lower() if character.isalnum())
+    return "".join(character for character in name[:LONGEST_NAME].lower() if character.isalnum())
 
 
-class InputError(Exception):
+LONGEST_WORD, LONGEST_MESSAGE = 1_000, 6_000
+
+
+class PlainError(Exception):
+    """An error of one message for people; of what came by the megabyte, the message shows the beginning."""
+
+    def __init__(self, message: str = "") -> None:
+        short = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][: LONGEST_WORD // 5]}...", message)
+        cut = len(short) - LONGEST_MESSAGE
+        super().__init__(f"{short[:LONGEST_MESSAGE]}... ({cut} characters more)" if cut > 0 else short)
+
+
+class InputError(PlainError):
     """Input that cannot be used. The message names the file, what was expected, what came and what to do."""
 
 
@@ -301,7 +314,7 @@ def worst(verdicts: Iterable[Verdict]) -> Verdict:
     )
 
 
-class UsageError(Exception):
+class UsageError(PlainError):
     """A command, recipe or parameter that the program does not understand; the message says what it would take."""
 
 
@@ -422,7 +435,9 @@ class FrameDesign(Checked):
     tube_diameters: Floats = column("m", means=SIZE)
     # 0 = none, else the place in SUPPORTS, from 1
     supports: Codes = column("k", dtype=np.uint8, newer=True, means=Meaning(most=2))
-    deflections: Floats = column("k", newer=True)  # computed, downward; NaN = not stated
+    deflections: Floats = column(
+        "k", newer=True, means=Meaning(least=-LARGEST_MM, most=LARGEST_MM)
+    )  # computed, downward; NaN = not stated
 
 
 SUPPORTS = ("perimeter", "multi-point")  # of a node: of a frame supported along its edges, or at single points
@@ -446,9 +461,9 @@ class DesignBodies(Checked):
 class DesignFaults(Checked):
     """What was wrong with a structure's mesh: facets that were ``turned`` outward, and open edges of so many parts."""
 
-    turned: int = 0
-    open_edges: int = 0
-    open_parts: int = 0
+    turned: int = described(0, means=Meaning(least=0))
+    open_edges: int = described(0, means=Meaning(least=0))
+    open_parts: int = described(0, means=Meaning(least=0))
 
 
 @dataclass(frozen=True)

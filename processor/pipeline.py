@@ -277,8 +277,11 @@ def execute(
     jobs: Sequence[Job],
     log: Callable[[str], None] = lambda _: None,
     piecewise: bool = False,
+    so_far: Callable[[Execution], None] | None = None,
 ) -> Execution:
     """Run the jobs on a scene read from ``path``, ``piecewise`` on one whose points are still there.
+
+    ``so_far`` receives what is done before each step.
 
     Raises InputError and UsageError as the steps do, and InputError for whatever else goes wrong within one.
     """
@@ -290,7 +293,14 @@ def execute(
         runs: list[StepRun] = []
         answers: dict[str, Any] = {}
         kept: dict[str, dict[str, Any]] = {}
+
+        def hashed() -> str:
+            return store.scene_hash(scene, None if points is None else points.pieces)
+
+        digest = hashed() if so_far is not None else ""
         for job in jobs:
+            if so_far is not None:
+                so_far(_execution(path, scene, runs, digest, piecewise))
             needs: dict[str, Any] = {}
             if job.module.NEEDS:
                 needs["earlier"] = {name: answers[name] for name in job.module.NEEDS if name in answers}
@@ -304,13 +314,17 @@ def execute(
                 needs["kept"] = kept.setdefault(job.step, {})
             runs.append(_run(path, scene, job, {**given, **needs}, log))
             answers.setdefault(job.step, runs[-1].result)
-        digest = store.scene_hash(scene, None if points is None else points.pieces)
+        return _execution(path, scene, runs, digest or hashed(), piecewise)
+
+
+def _execution(path: Path, scene: Scene, runs: Sequence[StepRun], digest: str, piecewise: bool) -> Execution:
+    parameters = _parameters(runs)
     provenance = {
         "input": path.name,
         "input_sha256": digest,
-        "seed": jobs[0].params.seed if jobs else 0,
+        "seed": parameters[0]["seed"] if parameters else 0,
         "software": software(),
-        "parameters": _parameters(runs),
+        "parameters": parameters,
     }
     return Execution(scene, tuple(runs), provenance, path if piecewise else None)
 

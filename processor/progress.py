@@ -32,7 +32,9 @@ def stage(title: str) -> Iterator[None]:
     if not sys.stderr.isatty():
         yield
         return
-    ended, current = threading.Event(), _Stage(title)
+    # A title may hold the name of a file, which a terminal must not obey.
+    shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in title)
+    ended, current = threading.Event(), _Stage(shown)
     display = threading.Thread(target=_show, args=(current, ended), daemon=True)
     _stages.append(current)
     display.start()

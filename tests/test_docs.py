@@ -37,6 +37,7 @@ RUN = (
     "processor run my-frame -o results --params mine.toml",
     "processor run my-frame -o results --method ray,ransac",
     "processor check results",
+    "processor verify results",
     "processor report results",
     "processor export results -o registered --what registered --format e57",
     "processor export results -o merged --what merged --format laz --spacing-mm 5",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from processor.model import LONGEST_NAME, Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
 from processor.report import write_results
+from processor.results.names import RESULTS_H5
 from processor.scan_folder import files, fingerprint
+from processor.store import store
 
 Names = str | Sequence[str] | None
 
@@ -98,6 +101,7 @@ def run(
     *,
     lang: str = "en",
     log: Callable[[str], None] = lambda _: None,
+    so_far: str | Path | None = None,
 ) -> Results:
     """Process an input as ``processor run`` does.
 
@@ -112,6 +116,7 @@ def run(
     seed : of all randomness; None = that of the parameters.
     lang : language of report.html, "en" or "zh".
     log : receives a line of progress at a time.
+    so_far : folder whose results.h5 holds the steps that are done, while others run; None = they are not kept.
 
     Returns
     -------
@@ -122,8 +127,7 @@ def run(
     InputError : the input cannot be used, or the output cannot be written.
     UsageError : a name or parameter is unknown.
     """
-    wanted, methods = _names(steps), _names(method)
-    parameters = _parameters(params)
+    wanted, methods, parameters = _names(steps), _names(method), _parameters(params)
     out = None if output is None else Path(output)
     if isinstance(input_, Scene):
         meaning.check(input_, f"scene {input_.name[:LONGEST_NAME]!r}")
@@ -142,16 +146,18 @@ def run(
     log(f"{path.name}: read as {scene.units} ({scene.units_reason})")
     if not wanted and len(scene.scans) == 2 and [job.step for job in jobs] == ["stitch"]:
         log("two scans without a design are stitched; to measure between them: processor compare A B -o OUT")
-    execution = pipeline.execute(path, scene, jobs, log, piecewise)
+    keep = None if so_far is None else partial(_keep, Path(so_far), jobs)
+    execution = pipeline.execute(path, scene, jobs, log, piecewise, keep)
     report = evaluate.evaluate(path, execution)
     fingerprint.check_unchanged(path.resolve(), before, place)
     return write(Results(execution, report), out, lang)
 
 
-def _parameters(params: str | Path | Mapping[str, Any] | None) -> Mapping[str, Any]:
-    if isinstance(params, Mapping):
-        return params
-    return pipeline.read_params(None if params is None else Path(params))
+def _keep(folder: Path, jobs: Sequence[pipeline.Job], execution: Execution) -> None:
+    """Write what is done, and what was planned, so that it is there whatever ends the run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    planned = [f"{job.step} ({job.params.method})" for job in jobs]
+    store.write_results(folder / RESULTS_H5, execution.runs, {**execution.provenance, "planned": planned})
 
 
 def _run_scene(
@@ -214,6 +220,10 @@ def export(
     """
     source = results.execution if isinstance(results, Results) else Path(results)
     return clouds_export.export(source, Path(folder), what, format, spacing_mm or 0.0)
+
+
+def _parameters(params: str | Path | Mapping[str, Any] | None) -> Mapping[str, Any]:
+    return params if isinstance(params, Mapping) else pipeline.read_params(None if params is None else Path(params))
 
 
 def _names(value: Names) -> tuple[str, ...]:

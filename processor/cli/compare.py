@@ -52,7 +52,7 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
     clouds' density.
     """
     from processor.compare import compare as comparing
-    from processor.language.messages import messages
+    from processor.language.messages import messages, printable
     from processor.report import comparison
     from processor.scan_folder.files import missing
 
@@ -67,5 +67,5 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
         click.echo(json.dumps(record, ensure_ascii=False))
         return
     for line in comparison.lines(result):
-        click.echo(messages("en").text(line))
+        click.echo(printable(messages("en").text(line)))
     click.echo(f"report: {output / comparison.PAGE}")

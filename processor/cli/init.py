@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from processor.cli.common import UNITS, debug_option
+from processor.language.messages import printable
 from processor.model import UsageError
 
 
@@ -44,4 +45,4 @@ def init(folder: Path, force: bool, design_units: str | None, as_json: bool) -> 
         click.echo(f"{folder / project.design}: {guess.summary(project)}")
     click.echo(f"{path}: kind {project.kind}, {len(project.scans)} file(s) of scans")
     for question in project.unsure:
-        click.echo(f"? {question}")
+        click.echo(printable(f"? {question}"))

@@ -30,7 +30,7 @@ def report(
     from processor.report import write_results
     from processor.results.names import RESULTS_H5
 
-    write_results.check_output(output, input_)
+    write_results.check_output(output, input_, RESULTS_H5)
     input_ = input_ or pipeline.find_input(output / RESULTS_H5)
     execution = pipeline.read_execution(output / RESULTS_H5, input_, units)
     results = runs.write(runs.Results(execution, evaluate(input_, execution)), output, lang)

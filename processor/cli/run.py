@@ -38,12 +38,18 @@ from processor.results.names import RESULTS_JSON
 @click.option("--units", type=click.Choice(UNITS), help="of the scans' coordinates, whatever the format says")
 @click.option("--seed", type=click.IntRange(min=0), help="of all randomness  [default: 0, or the parameters']")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), help="end the run after so long")
+@click.option("--memory-mb", type=click.IntRange(min=64), help="end the run if it takes more")
+@click.option("--so-far", type=click.Path(path_type=Path), hidden=True)
 @fail_on_option
 @output_options
 @debug_option
 @click.pass_context
 def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: str | None, **options: Any) -> None:
-    """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
+    """Process INPUT: a scan folder, a scene file (.h5) or one scan file.
+
+    A run that a limit ends leaves OUT as it was, and the steps that were done in OUT.part; it exits with 3.
+    """
     from processor.api import runs
     from processor.scan_folder.files import missing
 
@@ -54,6 +60,11 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
         output = _default_output(input_)
         if not shown.quiet:
             print_error_line(f"results go to {output}, as -o names no folder")
+    limits = options.pop("timeout_s"), options.pop("memory_mb")
+    if any(limit is not None for limit in limits):
+        from processor.cli.limited_run import limited_run
+
+        context.exit(limited_run(input_, output, *limits, _arguments({**options, "fail_on": fail_on})))
     results = runs.run(
         input_,
         output,
@@ -64,6 +75,7 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
         options["seed"],
         lang=options["lang"],
         log=log_line if shown.quiet else print_error_line,
+        so_far=options["so_far"],
     )
     show_results(context, output, results, shown, fail_on)
 
@@ -82,3 +94,15 @@ def _default_output(input_: Path) -> Path:
     if made_of != name:
         raise UsageError(f"{output}: holds results of {made_of!r}, not of {name!r}; name a folder with -o")
     return output
+
+
+def _arguments(options: dict[str, Any]) -> list[str]:
+    """Return options as they are given on a command line."""
+    arguments = []
+    for name, value in options.items():
+        option = {"methods": "--method", "as_json": "--json"}.get(name, f"--{name.replace('_', '-')}")
+        if value is True:
+            arguments.append(option)
+        elif value not in (None, False, ()):
+            arguments += [option, ",".join(value) if isinstance(value, tuple) else str(value)]
+    return arguments

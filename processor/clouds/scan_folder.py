@@ -12,6 +12,7 @@ import numpy as np
 from processor.clouds import contents
 from processor.clouds.poses import Placed
 from processor.clouds.run import Run
+from processor.language.messages import spreadsheet_text
 from processor.model import Control, Floats, Picks, Scan, Stations, Tolerance
 from processor.scan_folder import picks as picks_table
 from processor.scan_folder.control_points import COLUMNS
@@ -104,7 +105,7 @@ def _write_picks(path: Path, run: Run, scans: Sequence[Placed], names: dict[int,
         ):
             if a in read_as and b in read_as:
                 places: Floats = np.concatenate([at_a * read_as[a][1], at_b * read_as[b][1]])
-                rows.writerow([read_as[a][0], read_as[b][0], point, *places.tolist()])
+                rows.writerow([read_as[a][0], read_as[b][0], spreadsheet_text(point), *places.tolist()])
 
 
 def _write_control(path: Path, control: Control | None, run: Run, names: dict[int, str], scale: float) -> None:
@@ -113,7 +114,7 @@ def _write_control(path: Path, control: Control | None, run: Run, names: dict[in
         return
     stations = run.scene.stations
     rows: list[list[object]] = [
-        [name, "", *(position * scale).tolist(), float(sd)]
+        [spreadsheet_text(name), "", *(position * scale).tolist(), float(sd)]
         for name, position, sd in zip(control.ids, control.positions, control.sd, strict=True)
     ]
     for point, scan, station, seen, sd in zip(
@@ -121,7 +122,7 @@ def _write_control(path: Path, control: Control | None, run: Run, names: dict[in
     ):
         if int(scan) in names:
             name = stations.ids[station] if stations is not None and station >= 0 else names[int(scan)]
-            rows.append([control.ids[point], name, *(seen * scale).tolist(), float(sd)])
+            rows.append([spreadsheet_text(control.ids[point]), name, *(seen * scale).tolist(), float(sd)])
     if len(rows) > len(control.ids):
         with path.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")

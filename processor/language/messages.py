@@ -61,6 +61,15 @@ def printable(characters: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in characters)
 
 
+FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute
+
+
+def spreadsheet_text(characters: str) -> str:
+    """Return a text without control characters; an apostrophe before it where a spreadsheet would execute it."""
+    harmless = printable(characters)
+    return "'" + harmless if harmless.startswith(FORMULA) else harmless
+
+
 def label(english: str) -> Text:
     """Return a text without fields, which may be a name: translated where a catalogue has exactly this text."""
     return Text(english, None)

@@ -21,7 +21,7 @@ PIECE_ROWS = 1 << 17  # more rows than a worker's part of a piece has
 MOST_WORKERS = 4
 LEAST_PART = 1 << 16
 ODD_LIMIT = 4096  # numbers converted by float() before a piece ends
-ENDED, FULL, ODD, SHORT_ROW = range(4)  # reasons why parsing stopped
+ENDED, FULL, ODD, SHORT_ROW, LONG_ROW = range(5)  # reasons why parsing stopped
 LONGEST_LINE = 1 << 20
 NUMBERS = frozenset(b"+-0123456789.eE")
 WORDS = ("nan", "inf", "infinity")
@@ -90,19 +90,19 @@ class Rows:
         self._file.seek(place)
         return lines + int(1.05 * beyond * lines / size)
 
-    def pieces(self, columns: Sequence[int], most: int = 2**62) -> Iterator[Floats]:
+    def pieces(self, columns: Sequence[int], most: int = 2**62, width: int = 0) -> Iterator[Floats]:
         """Yield the numbers (n, k) of some columns of the next rows, at most ``most`` of them, piece by piece.
 
-        A piece is valid until the next one is requested.
+        A piece is valid until the next one is requested. Rows have ``width`` columns, for 0 any that hold those wanted.
         """
-        slots = np.full(max(columns) + 1, -1, np.int64)
+        slots = np.full(max(*columns, width - 1) + 1, -1, np.int64)
         slots[list(columns)] = np.arange(len(columns))
         workers = max(1, min(MOST_WORKERS, os.cpu_count() or 1))
         buffers = [_Buffer(min(most, PIECE_ROWS), len(columns)) for _ in range(workers)]
         with ThreadPoolExecutor(workers) as pool:
             while most > 0 and self._fill():
                 parts = self._parts(workers)
-                parse = partial(self._parse, slots, most)
+                parse = partial(self._parse, slots, width > 0, most)
                 rest = zip(buffers[1:], parts[1:], strict=False)
                 jobs = [pool.submit(parse, buffer, *part) for buffer, part in rest]
                 for i, part in enumerate(parts):
@@ -112,7 +112,11 @@ class Rows:
                     self._convert_odd(buffers[i], odds)
                     if reason == SHORT_ROW:
                         line = self._at_line(end)
-                        raise ValueError(f"line {line}: expected {len(slots)} columns or more, found {column}")
+                        more = "" if width else " or more"
+                        raise ValueError(f"line {line}: expected {len(slots)} columns{more}, found {column}")
+                    if reason == LONG_ROW:
+                        line = self._at_line(end)
+                        raise ValueError(f"line {line}: expected {width} columns as in other lines, found more")
                     self._at = end
                     most -= rows
                     if rows:
@@ -135,11 +139,13 @@ class Rows:
                 cuts.append(start + int(ends[0]) + 1)
         return list(pairwise([*cuts, len(self._text)]))
 
-    def _parse(self, slots: Ints, most: int, buffer: _Buffer, start: int, stop: int) -> tuple[int, int, int, int, int]:
+    def _parse(
+        self, slots: Ints, exact: bool, most: int, buffer: _Buffer, start: int, stop: int
+    ) -> tuple[int, int, int, int, int]:
         most = min(most, len(buffer.out))
         form = self._separator, self._commas, self._comments
         stopped: tuple[int, int, int, int, int] = parse(
-            self._text[:stop], start, most, slots, *form, buffer.out, buffer.odd
+            self._text[:stop], start, most, slots, (*form, exact), buffer.out, buffer.odd
         )
         return stopped
 
@@ -311,19 +317,19 @@ def parse(
     start: int,
     most: int,
     slots: npt.NDArray[np.int64],
-    separator: int,
-    commas: bool,
-    comments: bool,
+    form: tuple[int, bool, bool, bool],
     out: Floats,
     odd: npt.NDArray[np.int64],
 ) -> tuple[int, int, int, int, int]:
     """Parse rows of ``text`` (bytes of whole lines) from ``start`` into ``out`` (n, k), at most ``most`` of them.
 
-    ``slots[c]`` is the column of ``out`` for column c of the file, -1 for none. ``separator`` is 0 for blanks, else a
-    byte that blanks may surround. ``commas``: numbers may have decimal commas. ``comments``: // and % begin comments,
-    as # always does. Returns why it stopped (ENDED, FULL, ODD, SHORT_ROW), the number of rows, the next byte, the count
-    of numbers in ``odd`` (row, slot, first byte, byte after the last) and the number of columns of a short row.
+    ``slots[c]`` is the column of ``out`` for column c of the file, -1 for none. ``form``: the separator, 0 for blanks,
+    else a byte that blanks may surround; whether numbers may have decimal commas; whether // and % begin comments, as #
+    always does; whether rows have no more columns than ``slots``. Returns why it stopped (ENDED, FULL, ODD, SHORT_ROW,
+    LONG_ROW), the number of rows, the next byte, the count of numbers in ``odd`` (row, slot, first byte, byte after the
+    last) and the number of columns of a short row.
     """
+    separator, commas, comments, exact = form
     size, columns = len(text), len(slots)
     at, rows, odds = start, 0, 0
     while at < size:
@@ -337,6 +343,13 @@ def parse(
         begin, column, done = at, 0, False
         while not done:
             if column == columns:  # the rest of the line is not wanted
+                if exact:
+                    at = _after_blanks(text, at, size, separator)
+                    if separator != 0 and at < size and text[at] == separator:  # one behind the last cell
+                        at = _after_blanks(text, at + 1, size, separator)
+                    ended = at == size or text[at] == 10 or text[at] == 13 or _is_comment(text, at, size, comments)
+                    if not ended:
+                        return LONG_ROW, rows, begin, odds, column
                 at = _line_end(text, at, size, 10) + 1
                 break
             at = _after_blanks(text, at, size, separator)

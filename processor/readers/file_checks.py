@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,3 +32,33 @@ def check_declared_points(path: Path, kind: str, declared: int, least_bytes: flo
             f"{path}: the header declares {declared} points, but the file has only {room} bytes for them; "
             f"this {kind} file is cut off or damaged: copy or export it again"
         )
+
+
+TAIL_BYTES, TAIL_ROWS = 1 << 14, 20
+
+
+def check_last_row(path: Path, kind: str) -> None:
+    """Raise InputError if the file ends within a number of its last row: it has no end of line, and fewer decimals.
+
+    The rows before, all with as many decimals in their last column, are the pattern; without it nothing is known.
+    """
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - TAIL_BYTES))
+        lines = file.read().splitlines(keepends=True)
+    if len(lines) <= TAIL_ROWS + 1 or lines[-1].endswith((b"\n", b"\r")):
+        return
+    decimals = [_last_decimals(line) for line in lines[-TAIL_ROWS - 1 :]]
+    if len(set(decimals[:-1])) == 1 and decimals[0] > 0 and 0 <= decimals[-1] < decimals[0]:
+        with path.open("rb") as file:
+            number = sum(block.count(b"\n") for block in iter(lambda: file.read(1 << 20), b"")) + 1
+        text = lines[-1].decode("latin-1").strip()[-40:]
+        raise InputError(
+            f"{path}: not a readable {kind} file: line {number}: expected {decimals[0]} decimals as in the lines "
+            f"before, found the end of the file within a row ({text!r}); copy or export it again"
+        )
+
+
+def _last_decimals(line: bytes) -> int:
+    """Return the number of decimals of the last number of a line; 0 for a whole number, -1 for another word."""
+    match = re.search(rb"(?:^|[\s,;])[+-]?\d+(?:[.,](\d*))?\s*$", line)
+    return len(match.group(1) or b"") if match else -1

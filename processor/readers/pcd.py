@@ -60,7 +60,7 @@ def read(path: Path) -> list[RawScan]:
         file.seek(header.start)
         if header.data == "ascii":
             first = np.cumsum([0, *header.counts])
-            fill_columns(columns, Rows(file).pieces([int(first[field]) for field in fields], count))
+            fill_columns(columns, Rows(file).pieces([int(first[field]) for field in fields], count, sum(header.counts)))
         elif header.data == "binary":
             pieces = columns_of_records(file, header.dtype(), [str(field) for field in fields], count)
             fill_columns(columns, ([column[:, 0] for column in piece] for piece in pieces))

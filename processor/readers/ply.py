@@ -81,7 +81,7 @@ def read(path: Path) -> list[RawScan]:
             for _ in range(sum(element.count for element in before)):
                 rows.skip_line()
             names = list(vertex.types)
-            fill_columns(every, rows.pieces([names.index(name) for name in read], vertex.count))
+            fill_columns(every, rows.pieces([names.index(name) for name in read], vertex.count, len(names)))
     scan = build_scan(
         path,
         scan_name(path),

@@ -16,7 +16,7 @@ from numba import njit
 from processor.model import Codes, Floats, InputError, Labels
 from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
-from processor.readers.file_checks import check_declared_points, errors_name_the_file
+from processor.readers.file_checks import check_declared_points, check_last_row, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".ptx",)
@@ -30,6 +30,7 @@ def read(path: Path) -> list[RawScan]:
     """Read every grid of a PTX file as a scan."""
     scans: list[RawScan] = []
     size = path.stat().st_size
+    check_last_row(path, "PTX")
     with path.open("rb") as file:
         rows = Rows(file)
         with errors_name_the_file(path, "PTX"):
@@ -73,7 +74,7 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
         row, column = (allocate(gridded, dtype=np.int32) for _ in range(2))
         colour = allocate(cells if width == 7 else 0, 3, dtype=np.uint8)
         read = count = 0
-        for piece in rows.pieces(tuple(range(width if wide else 3)), cells):
+        for piece in rows.pieces(tuple(range(width if wide else 3)), cells, width if wide else 0):
             count = copy_returns(piece, read, lines, count, points, (intensity, colour), (row, column))
             read += len(piece)
     if read != cells:

@@ -23,7 +23,7 @@ from processor.readers.colours import coloured
 from processor.readers.colours import named as colours_named
 from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, first_named
 from processor.readers.encoding import decoded
-from processor.readers.file_checks import check_declared_points, errors_name_the_file
+from processor.readers.file_checks import check_declared_points, check_last_row, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".asc", ".csv", ".pts", ".txt", ".xyz")
@@ -33,6 +33,7 @@ SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
 COMMENTS = ("#", "//", "%")
 COUNTED = 5  # rows by which a column of row numbers is recognised
 SAMPLED = 200  # rows
+MOST_OTHERS = 0.1  # share of sampled rows of another width that are errors, not a habit of the file
 AXES = {
     "x": "x|easting|east",
     "y": "y|northing|north",
@@ -55,10 +56,17 @@ class Layout:
     encoding: str = "latin-1"
     sample: tuple[tuple[str, ...], ...] = ()  # of rows
 
+    @property
+    def width(self) -> int:
+        """The number of columns that every row must have; 0 where the rows differ, as those that end in a remark."""
+        others = sum(len(row) != self.columns for row in self.sample)
+        return self.columns if others <= MOST_OTHERS * len(self.sample) else 0
+
 
 def read(path: Path) -> list[RawScan]:
     """Read a table of points as one scan, or a PTS file of several scans, each after its number of points."""
     layout = sniff(path)
+    check_last_row(path, "text")
     columns = _columns(path, layout)
     wanted = [*columns.axes, *(index for index in (columns.intensity, columns.station) if index is not None)]
     colours = [len(wanted) - 3 + i for i in range(len(columns.colour))]
@@ -70,7 +78,7 @@ def read(path: Path) -> list[RawScan]:
         rows = _rows(file, layout)
         while True:
             check_declared_points(path, "text", max(declared, 0), SHORTEST_ROW, size)
-            tables.append(_filled(rows, wanted, declared))
+            tables.append(_filled(rows, wanted, declared, layout.width))
             following = rows.line()
             if following is None or declared < 0:
                 break
@@ -94,11 +102,11 @@ def read(path: Path) -> list[RawScan]:
     ]
 
 
-def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, Floats]:
+def _filled(rows: Rows, wanted: Sequence[int], declared: int, width: int) -> tuple[Floats, Floats]:
     """Return coordinates (n, 3) and the other wanted columns (n, k) of the declared rows, for -1 of all rows."""
     room, count = declared if declared >= 0 else rows.likely_left(), 0
     points, others = allocate(room, 3), allocate(room, len(wanted) - 3)
-    for piece in rows.pieces(wanted, declared if declared >= 0 else 2**62):
+    for piece in rows.pieces(wanted, declared if declared >= 0 else 2**62, width):
         if count + len(piece) > room:
             room = room + room // 4 + len(piece)
             points, others = (_grown(column[:count], room) for column in (points, others))
@@ -120,7 +128,7 @@ def numbers(path: Path, layout: Layout) -> Floats:
     """Return all columns (n, k) of a table. Raises InputError for a cell that is not a number."""
     with errors_name_the_file(path, "text"), _opened(path, layout) as file:
         rows = _rows(file, layout)
-        pieces = [piece.copy() for piece in rows.pieces(range(layout.columns))]
+        pieces = [piece.copy() for piece in rows.pieces(range(layout.columns), width=layout.width)]
     return np.concatenate(pieces) if pieces else np.empty((0, layout.columns))
 
 

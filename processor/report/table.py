@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.language.messages import Message, Text, label, messages, printable, text
+from processor.language.messages import Message, Text, label, messages, printable, spreadsheet_text, text
 from processor.model import Checked, Reason, StepRun
 
 NAN = float("nan")
@@ -62,9 +62,6 @@ def _figures(result: Checked) -> Iterator[tuple[Message, Any, str]]:
             yield label(heading), 100.0 * value if percent else value, unit
 
 
-FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute
-
-
 def csv_text(table: Table) -> str:
     """Write a table as CSV; a leading apostrophe protects text that a spreadsheet would execute as a formula."""
     return csv_of_rows(table.columns, table.rows)
@@ -84,8 +81,7 @@ def csv_cell(cell: Any) -> Any:
     if isinstance(cell, float | np.floating):
         return "" if not math.isfinite(cell) else repr(round(float(cell), 6))
     if isinstance(cell, str | Text | Reason | list | tuple):
-        text = shown(cell)
-        return "'" + text if text.startswith(FORMULA) else text
+        return spreadsheet_text(shown(cell))
     return cell
 
 

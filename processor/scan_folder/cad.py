@@ -5,12 +5,15 @@ No CAD kernel is loaded here. Meshes are cached in the user's cache folder under
 
 from __future__ import annotations
 
+import grp
 import hashlib
 import importlib.util
 import json
 import os
+import pwd
 import re
 import shutil
+import stat
 import sys
 import tempfile
 from collections import Counter
@@ -117,17 +120,40 @@ def _record(meshes: Path, path: Path) -> tuple[list[tuple[str, str]], str]:
 
 @contextmanager
 def _cache() -> Iterator[Path]:
-    """Yield the cache folder, or a temporary one if the user's cannot be written."""
+    """Yield the cache folder, or a temporary one where the user's cannot be written, or others can write to it."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     place = Path(home, "steel-scan-check", "cad")
     if place.is_absolute():
         with suppress(OSError):
-            place.mkdir(parents=True, exist_ok=True)
-            if os.access(place, os.W_OK):
+            place.mkdir(parents=True, exist_ok=True, mode=0o700)
+            place = place.resolve()  # a link in it may be changed meanwhile
+            if os.access(place, os.W_OK) and _is_private(place):
                 yield place
                 return
     with tempfile.TemporaryDirectory() as temporary:
         yield Path(temporary)
+
+
+def _is_private(place: Path) -> bool:
+    """Whether nobody else can put meshes into a folder, or another folder in its place (root can)."""
+    me = os.geteuid()
+    for folder in (place, *place.parents):
+        found = folder.stat()
+        if found.st_uid not in ((me,) if folder == place else (me, 0)):
+            return False
+        sticky = folder != place and found.st_mode & stat.S_ISVTX  # only its owner renames what lies in it
+        writable = found.st_mode & stat.S_IWOTH or (found.st_mode & stat.S_IWGRP and not _own_group(found.st_gid, me))
+        if writable and not sticky:
+            return False
+    return True
+
+
+def _own_group(number: int, user: int) -> bool:
+    """Whether a group is that of one user alone: of the same name and without further members, or root's."""
+    with suppress(KeyError):
+        group, name = grp.getgrgid(number), pwd.getpwuid(user).pw_name
+        return number == 0 or (group.gr_name == name and set(group.gr_mem) <= {name})
+    return False
 
 
 def _designgen(path: Path) -> list[str]:

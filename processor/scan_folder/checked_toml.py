@@ -29,7 +29,11 @@ def existing_file_in(folder: Path, text: str, where: str) -> Path:
         stays = False
     if not stays:
         raise InputError(f"{where}: {text!r} is a link that leads out of the folder; copy the file there")
-    if not path.exists():
+    try:
+        found = path.exists()
+    except OSError:  # a name of any length may come
+        found = False
+    if not found:
         raise InputError(f"{where}: there is no file {text!r} in {folder}")
     return path
 

@@ -81,6 +81,8 @@ def _from_csv(path: Path) -> list[Measured]:
     for line, row in rows[1:]:
         where = f"{path}: line {line}"
         cells = dict(zip(header, (cell.strip() for cell in row), strict=False))
+        if len(row) != len(header):
+            raise InputError(f"{where}: expected {len(header)} cells, found {len(row)}: {','.join(row)[:80]!r}")
         try:
             position = np.array([float(cells[axis]) for axis in "xyz"])
             sd_mm = float(cells["sd_mm"] or "0")

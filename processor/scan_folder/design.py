@@ -306,6 +306,8 @@ def _read_nodes(path: Path, table_unit: str) -> FrameDesign:
         raise InputError(f"{path}: {error}") from None
     ids, numbers = [], []
     for line, row in rows[1:]:
+        if len(row) > len(header) and any(cell.strip() for cell in row[len(header) :]):
+            raise InputError(f"{path}: line {line}: expected {len(header)} cells, found {len(row)}: {row}")
         try:
             cells = [row[columns[key]].strip() for key in ("x", "y", "z", "radius")]
             values = [float(cell.replace(",", ".") if separator != "," else cell) for cell in cells]

@@ -141,6 +141,7 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
             design = StructureDesign(scan_name(project.design), vertices, faces, bodies, found)
         else:
             design = read_design(folder, project.design, unit)
+        meaning.check(design, str(project.design))  # before scans are compared with it
     scene = _scene(project, design, option, _read_stations(folder, project.units or option or "m"), keep)
     if scene.structure is not None and project.design is not None and project.design.suffix.lower() in MESH_SUFFIXES:
         named = project.design_units or project.units
@@ -234,11 +235,7 @@ def _guess(folder: Path) -> Guess | None:
 def _entry(folder: Path, scan: Table) -> _Entry:
     scan.only(SCAN_KEYS)
     pose = scan.array("pose", 4, 4) if "pose" in scan.values else None
-    if pose is not None and not (
-        np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() < meaning.POSE_TOLERANCE
-        and np.linalg.det(pose[:3, :3]) > 0
-        and (pose[3] == [0, 0, 0, 1]).all()
-    ):
+    if pose is not None and not meaning.are_poses(pose[None])[0]:
         raise InputError(
             f"{scan.where}: 'pose' is not a rotation and a translation above a row of 0, 0, 0, 1; correct the matrix"
         )

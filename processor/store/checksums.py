@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -18,6 +19,8 @@ import numpy as np
 
 ATTRIBUTE = "sha256"
 PART_ITEMS = 1 << 20
+# Columns found whole by this process. Steps read a column several times; later passes rely on the chunks' checksums.
+_WHOLE: set[tuple[object, ...]] = set()
 DAMAGED = "is damaged: its checksum is not that of what was written; make or copy the file again"
 
 
@@ -97,7 +100,7 @@ def problems(file: Any) -> list[str]:
     faults = []
     for _, dataset in datasets(file):
         try:
-            column = Column(dataset)
+            column = Column(dataset, again=True)
             rows = max(1, PART_ITEMS // max(1, math.prod(column.shape[1:])))
             for start in range(0, len(column) if column.shape and dataset.chunks else 0, rows):
                 column[start : start + rows]
@@ -132,15 +135,16 @@ class Column:
     """A dataset to be read in slices of rows.
 
     Slices from the first row to the last, one after the other, are checked as a whole when the last one is read; others
-    by the checksums of their chunks. A dataset in one piece is read and checked at once. Raises ChecksumError.
+    by the checksums of their chunks. This is done once a process, with ``again`` also for a column found whole before.
+    A dataset in one piece is read and checked at once. Raises ChecksumError.
     """
 
-    def __init__(self, dataset: Any) -> None:
+    def __init__(self, dataset: Any, again: bool = False) -> None:
         self.dataset = dataset
         self.shape: tuple[int, ...] = dataset.shape
         self.dtype = dataset.dtype
         self.ndim: int = dataset.ndim
-        self._known = _stored(dataset)
+        self._known, self._place = _stored(dataset), (object(),) if again else _place(dataset)
         self._digest: Any = None
         self._next = 0
         self._all = None if dataset.chunks else read(dataset)
@@ -159,7 +163,7 @@ class Column:
             data = self.dataset[rows]
         except (OSError, RuntimeError) as error:
             raise ChecksumError(f"{self.dataset.name}: is damaged ({error}); make or copy the file again") from error
-        if self._known is not None and rows.step in (None, 1):
+        if self._known is not None and self._place not in _WHOLE and rows.step in (None, 1):
             self._continue(rows.indices(len(self))[0], data)
         return data
 
@@ -170,5 +174,17 @@ class Column:
             return
         self._digest.update(np.ascontiguousarray(data).data if data.size else b"")
         self._next += len(data)
-        if self._next == len(self) and self._digest.hexdigest() != self._known:
+        if self._next < len(self):
+            return
+        if self._digest.hexdigest() != self._known:
             raise ChecksumError(f"{self.dataset.name}: {DAMAGED}")
+        _WHOLE.add(self._place)
+
+
+def _place(dataset: Any) -> tuple[object, ...]:
+    """Return what names a dataset of a file as the file is now."""
+    try:
+        status = os.stat(dataset.file.filename)
+    except OSError:
+        return (object(),)
+    return (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, dataset.name)

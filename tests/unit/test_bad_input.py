@@ -85,6 +85,17 @@ CASES = {
     "text declares fewer": ("a.pts", "1\n1 2 3\n4 5 6\n", "expected 1 points as declared, found more"),
     "text declares 1e15": ("a.pts", "1000000000000000\n1 2 3\n", "declares 10{15} points"),
     "other columns than header": ("a.csv", "x,y,z,r\n1,2,3\n", "names 4 columns .* have 3"),
+    "two rows run together": ("a.xyz", "1 2 3\n" * 30 + "1 2 3 4 5 6\n" + "1 2 3\n" * 9, "line 31: expected 3"),
+    "two rows without a blank": ("a.xyz", "1.5 2.5 3.5\n" * 9 + "1.5 2.5 3.51.5 2.5 3.5\n", r"line 10: .*'3\.51\.5'"),
+    "a row of a table too long": ("a.csv", "x,y,z\n" + "1,2,3\n" * 5 + "1,2,3,4\n" + "1,2,3\n" * 5, "line 7"),
+    "text cut within a row": ("a.xyz", "1.25 2.25 3.25\n" * 40 + "1.25 2.25 3.2", r"line 41: .* 2 decimals.*3\.2'"),
+    "CSV cut within a row": ("a.csv", "x,y,z\n" + "1,2,3.25\n" * 40 + "1,2,3", "line 42: expected 2 decimals"),
+    "PTS cut within a row": ("a.pts", "41\n" + "1.25 2.25 3.25\n" * 40 + "1.25 2.25 3.", "line 42: .* 2 decimals"),
+    "PTX cut within a row": ("a.ptx", "30\n2\n" + TURNED + "1 2 3 0.25\n" * 59 + "1 2 3 0.2", "line 70: .*2 decimals"),
+    "PTX rows run together": ("a.ptx", "2\n3\n" + TURNED + "1 2 3 4\n" * 3 + "1 2 3 4 1 2 3 4\n" + "1 2 3 4\n",
+                              "line 14: expected 4 columns"),
+    "PLY rows run together": ("a.ply", ASCII_PLY + b"1 2 3\n1 2 3 1 2 3\n1 2 3\n", "expected 3 columns"),
+    "PCD rows run together": ("a.pcd", pcd_header("ascii") + b"1 2 3 1\n1 2 3 1 2\n1 2 3 1\n", "expected 4 columns"),
     "two units": ("a.csv", "x_mm,y_m,z_m\n1,2,3\n", "different units"),
 }  # fmt: skip
 

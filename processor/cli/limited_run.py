@@ -1,0 +1,79 @@
+"""One run in a process of its own, within limits of time and memory."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from processor.cli.common import print_error_line
+from processor.jobs import process
+from processor.jobs.exit_codes import WITH_RESULTS
+from processor.jobs.process import Cause, Ended
+from processor.model import InputError
+from processor.results.names import RESULTS_H5
+
+ENDED_BY_LIMIT = 3
+
+
+def limited_run(
+    input_: Path, output: Path, timeout_s: float | None, memory_mb: int | None, arguments: Sequence[str]
+) -> int:
+    """Run ``processor run`` with its arguments and print what a limit ended; returns the exit code.
+
+    Steps that were done are kept in the folder OUTPUT.part, which is removed when the run comes to its end.
+    """
+    part = output.with_name(f"{output.name}.part")
+    _remove(part)
+    command = (*process.GUARDED, str(memory_mb or 0), "processor", "run", *arguments, "--so-far", str(part))
+    ended = process.run(
+        (*command, "-o", str(output), "--", str(input_)),
+        log=Path("/dev/stderr"),
+        stdout=1,
+        timeout_s=timeout_s or float("inf"),
+        memory_mb=memory_mb or float("inf"),
+    )
+    why = _why(ended, timeout_s, memory_mb)
+    if why:
+        print_error_line(f"error: {input_}: {why}; {_what_is_done(part, input_)}")
+        return ENDED_BY_LIMIT
+    if ended.code in WITH_RESULTS:
+        _remove(part)
+    return ended.code
+
+
+def _remove(part: Path) -> None:
+    """Remove the folder of an earlier run; one that holds anything else stays, and is an error of its own later."""
+    (part / RESULTS_H5).unlink(missing_ok=True)
+    with suppress(OSError):
+        part.rmdir()
+
+
+def _why(ended: Ended, timeout_s: float | None, memory_mb: int | None) -> str:
+    if ended.cause is Cause.TIME:
+        return f"expected the run to end within {timeout_s:g} s (--timeout-s), it did not"
+    if ended.cause is Cause.MEMORY or "MemoryError" in ended.last_line or "Unable to allocate" in ended.last_line:
+        return f"expected the run to take at most {memory_mb} MB (--memory-mb), it took more"
+    if ended.cause is Cause.SIGNAL:
+        with suppress(ValueError):
+            return f"the run was ended by {signal.Signals(ended.code).name}"
+        return f"the run was ended by signal {ended.code}"
+    return ""
+
+
+def _what_is_done(part: Path, input_: Path) -> str:
+    """Say which steps were done before the end, and where they are."""
+    from processor import pipeline
+
+    try:
+        runs, provenance = pipeline.read_runs(part / RESULTS_H5)
+    except InputError:
+        return "it had not begun its first step, and nothing is kept; give it more, or fewer steps (--steps)"
+    done = [f"{run.step} ({run.method})" for run in runs]
+    planned = [str(name) for name in provenance.get("planned", ())]
+    left = ", ".join(planned[len(done) :])
+    if not done:
+        _remove(part)
+        return f"nothing was done before {left}; give it more, or fewer steps (--steps)"
+    return f"done: {', '.join(done)}; not done: {left}; see what is done by processor report {part} {input_}"
