@@ -1,6 +1,7 @@
 """Characteristics of parts held against those of the parts as built.
 
-Those of the ends follow from the true key points; sweep, camber and the width half way from the true bottom edges.
+Those of a bridge's part follow from its true key points and bottom edges, those of a body from the true displacements
+of its faces.
 """
 
 from __future__ import annotations
@@ -10,14 +11,27 @@ from collections import defaultdict
 import numpy as np
 
 from processor.evaluation.error_statistics import covered
+from processor.geometry import merging, mesh_distance
 from processor.geometry.polyline import Polyline
-from processor.inspection import part_geometry
+from processor.inspection import bodies, flat_faces, part_geometry
 from processor.inspection.arch_parts import design_ends
 from processor.inspection.result import InspectedComponent, Quantity, Result
-from processor.model import ArchDesign, DesignPart, Floats, Metric, Scene, Statistic, Truth
+from processor.model import (
+    ArchDesign,
+    ArchTruth,
+    DesignPart,
+    Floats,
+    Metric,
+    Scene,
+    Statistic,
+    StructureDesign,
+    StructureTruth,
+    Truth,
+)
 
 NAMES = {
     Quantity.LENGTH: "lengths",
+    Quantity.THICKNESS: "thicknesses",
     Quantity.WIDTH: "widths and heights",
     Quantity.HEIGHT: "widths and heights",
     Quantity.DIAGONAL: "diagonals",
@@ -27,21 +41,26 @@ NAMES = {
     Quantity.CAMBER: "sweeps and cambers",
     Quantity.SQUARENESS: "squareness of end faces",
 }
+OF_SIZE = (Quantity.SWEEP, Quantity.CAMBER)
+REACH_MM, ALIKE = 50.0, 0.99  # of a true point to its facet, and cosine between their normals
+PIECE_MM, LEAST_FACE_MM = 100.0, 1.0
 
 
 def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
-    """Compare the characteristics of the parts of a bridge with the truth; all figures are for information."""
-    if truth.arch is None or scene.arch is None:
+    """Compare the characteristics of parts and bodies with the truth; all figures are for information."""
+    if truth.arch is not None and scene.arch is not None:
+        true = {component.name: _of_part(scene.arch, component, truth.arch) for component in result.components}
+    elif truth.structure is not None and scene.structure is not None and len(truth.structure.points):
+        true = _of_bodies(scene.structure, truth.structure)
+    else:
         return []
     errors: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for component in result.components:
-        row = truth.arch.names.index(component.name)
-        true = _true(scene.arch, component, truth.arch.key_points_bridge[row], truth.arch.edges_bridge[row])
-        found = component.characteristics
+        found, true_values = component.characteristics, true.get(component.name, {})
         for id_, quantity, deviation, ci95 in zip(found.id, found.quantity, found.deviation, found.ci95, strict=True):
-            if id_ in true:
-                of_size = quantity in (Quantity.SWEEP, Quantity.CAMBER)
-                error = abs(deviation) - abs(true[id_]) if of_size else deviation - true[id_]
+            if id_ in true_values:
+                value = true_values[id_]
+                error = abs(deviation) - abs(value) if quantity in OF_SIZE else deviation - value
                 errors[NAMES[quantity]].append((float(error), float(ci95)))
     metrics = []
     for name, found_errors in sorted(errors.items()):
@@ -53,8 +72,10 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     return metrics
 
 
-def _true(design: ArchDesign, component: InspectedComponent, ends: Floats, edges: Floats) -> dict[str, float]:
-    """Return the true deviations of a component by id; edges (2, e, 3) left and right."""
+def _of_part(design: ArchDesign, component: InspectedComponent, truth: ArchTruth) -> dict[str, float]:
+    """Return the true deviations of a part of a bridge by id."""
+    row = truth.names.index(component.name)
+    ends, edges = truth.key_points_bridge[row], truth.edges_bridge[row]
     index = [part.name for part in design.parts].index(component.name)
     joints = [None, *design.joint_points, None]
     as_designed = design_ends(joints[index], joints[index + 1])
@@ -74,6 +95,25 @@ def _true(design: ArchDesign, component: InspectedComponent, ends: Floats, edges
         at = int(np.argmin(np.abs(component.axis.chainage - component.axis.chainage.mean())))
         true["middle-width-bottom"] = float(departures[0, at, 0] - departures[1, at, 0])
     return true
+
+
+def _of_bodies(design: StructureDesign, truth: StructureTruth) -> dict[str, dict[str, float]]:
+    """Return the true deviations of bodies by name and id: the step's own functions of the true displacements.
+
+    Of flatness there is none, as points of the truth are not dense enough.
+    """
+    vertices, origin = merging.local_design(design)
+    surface = mesh_distance.of_design(vertices, design.faces)
+    facet, _, beyond = surface.distances(truth.points - origin, REACH_MM)
+    on = mesh_distance.on_face(facet, beyond) & (np.einsum("ni,ni->n", surface.normals[facet], truth.normals) > ALIKE)
+    points, normals, facet = truth.points[on] - origin, truth.normals[on], facet[on]
+    moved = np.einsum("ni,ni->n", truth.displacement[on], normals)
+    none = np.zeros(len(points))
+    seen = flat_faces.Observed(places=points, facet=facet, deviation=moved, noise=none, shared=none, side=PIECE_MM)
+    return {
+        body.name: {one.id: one.deviation for one in bodies.measured(body)[0] if one.quantity is not Quantity.FLATNESS}
+        for body in flat_faces.bodies(design, seen, LEAST_FACE_MM)
+    }
 
 
 def _departures(part: DesignPart, edges: Floats, chainage: Floats) -> Floats:

@@ -35,7 +35,7 @@ class Quantity(Word):
     CAMBER = "camber"
     FLATNESS = "flatness"
     SQUARENESS = "squareness"
-    PARALLELISM = "parallelism"
+    THICKNESS = "thickness"
 
 
 @dataclass(frozen=True)

@@ -131,8 +131,9 @@ def test_lengths_include_the_scale_of_the_scanner():
     assert by_id(inspected(shape()).characteristics, "length").ci95 == pytest.approx(1.96 * 5e-6 * L, rel=1e-3)
 
 
-@pytest.mark.parametrize(("bow", "least"), [(0.0, 0.93), (3.0, 0.93), (-3.0, 0.93)])
+@pytest.mark.parametrize(("bow", "least"), [(0.0, 0.88), (3.0, 0.88), (-3.0, 0.88)])
 def test_sweep_is_measured_from_the_parts_own_ends(bow, least):
+    """Of 80 cases 71 or more are held with a probability of 99 %, if it is 95 % in each."""
     rng = np.random.default_rng(7)
     n = len(CHAINAGE)
     tilted = 5.0 + 4e-3 * CHAINAGE  # a motion of the part is no sweep
@@ -141,13 +142,13 @@ def test_sweep_is_measured_from_the_parts_own_ends(bow, least):
     root = np.linalg.cholesky(covariance[0])
     true = np.abs(part_geometry.off_the_chord(CHAINAGE) @ curve).max()
     held, signs = 0, []
-    for _ in range(150):
+    for _ in range(80):
         noisy = np.tile(curve + tilted, 2) + root @ rng.standard_normal(2 * n)
         found = inspected(shape(sideways=noisy.reshape(2, n), edge_covariance=covariance))
         one = by_id(found.characteristics, "sweep")
         held += abs(abs(one.deviation) - true) <= one.ci95
         signs.append(np.sign(one.deviation))
-    assert held / 150 >= least
+    assert held / 80 >= least
     if bow:
         assert set(signs) == {np.sign(bow)}
 
