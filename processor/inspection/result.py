@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from processor.model import (
     Checked,
     Flags,
@@ -59,7 +61,7 @@ class Characteristics(Rows):
     verdict: tuple[Verdict, ...] = words("r", Verdict)
     limit: tuple[str, ...] = names("r")
     clause: tuple[str, ...] = names("r")
-    verified: Flags = column("r", dtype=bool)
+    verified: Flags = column("r", dtype=np.bool_)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("r")
 
 
