@@ -77,11 +77,11 @@ def _of_part(design: ArchDesign, component: InspectedComponent, truth: ArchTruth
     row = truth.names.index(component.name)
     ends, edges = truth.key_points_bridge[row], truth.edges_bridge[row]
     index = [part.name for part in design.parts].index(component.name)
-    joints = [None, *design.joint_points, None]
-    as_designed = design_ends(joints[index], joints[index + 1])
+    as_designed = design_ends(design, index)
     true = part_geometry.deviations(as_designed, ends)
-    if index in (0, len(design.parts) - 1):
-        end, outermost = (1, 0) if index == 0 else (0, -1)
+    joined = [bool(np.isfinite(end).all()) for end in as_designed]
+    if sum(joined) == 1 and len(design.parts[index].bottom_edge_left):
+        end, outermost = (1, 0) if joined[1] else (0, -1)
         designed = [design.parts[index].bottom_edge_left, design.parts[index].bottom_edge_right]
         outer = [np.mean([edge[outermost] for edge in pair], axis=0) for pair in (edges, designed)]
         lengths = [float(np.linalg.norm(at[end, 4] - o)) for at, o in zip((ends, as_designed), outer, strict=True)]

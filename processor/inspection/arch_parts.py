@@ -30,6 +30,7 @@ from processor.model import (
     reason,
 )
 
+NAN = float("nan")
 LEAST_REACH = 0.7  # of the edges' length, over which both have to be seen
 
 
@@ -37,11 +38,10 @@ def inspect(design: ArchDesign, assembled: Any, tolerance: Tolerance | None, met
     """Inspect the parts of a bridge by the result of step ``preassemble``."""
     if assembled is None or assembled.adjustment is None or not assembled.adjustment.shapes:
         return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-measured-ends"),))
-    joints = [None, *design.joint_points, None]
     shapes = {shape.name: shape for shape in assembled.adjustment.shapes}
     states = dict(zip(assembled.components.name, assembled.components.status, strict=True))
     components = tuple(
-        _part(part, design_ends(joints[i], joints[i + 1]), shapes[part.name], states[part.name], tolerance)
+        _part(part, design_ends(design, i), shapes[part.name], states[part.name], tolerance)
         for i, part in enumerate(design.parts)
     )
     failed = [component.status is Status.FAILED for component in components]
@@ -50,9 +50,17 @@ def inspect(design: ArchDesign, assembled: Any, tolerance: Tolerance | None, met
     return Result(status=status, method=method, reasons=remarks, components=components)
 
 
-def design_ends(start: Floats | None, end: Floats | None) -> Floats:
-    """Return the ends (2, 8, 3) of a part between joints of P1..P8 (8, 3); NaN at an end without a joint."""
-    return np.array([np.full((8, 3), np.nan) if points is None else points for points in (start, end)])
+def design_ends(design: ArchDesign, part: int) -> Floats:
+    """Return the ends (2, 8, 3) of a part as designed; NaN at an end without a joint, and at both of a branch."""
+    joined = design.joined
+    ends = np.full((2, 8, 3), np.nan)
+    for end, side in enumerate((1, 0)):  # a part starts at the joint whose right part it is
+        at = np.flatnonzero(joined[:, side] == part)
+        if len(at) > 1:
+            return np.full((2, 8, 3), np.nan)
+        if len(at):
+            ends[end] = design.joint_points[at[0]]
+    return ends
 
 
 def _part(
@@ -60,12 +68,13 @@ def _part(
 ) -> InspectedComponent:
     if status is Status.FAILED:
         return InspectedComponent(name=part.name, status=status, reasons=(reason("inspect.not-registered"),))
+    if np.isnan(design).all():
+        return InspectedComponent(name=part.name, reasons=(reason("inspect.branch"),))
     remarks = (reason("inspect.ambiguous"),) if status is Status.AMBIGUOUS else ()
     axis, departures = _axis(part, shape)
     found = [*_sections(design, shape), *_lengths(part, design, shape), *departures]
     width, height = part_geometry.section_sizes(design)
-    edges = [Polyline.through(edge).length for edge in (part.bottom_edge_left, part.bottom_edge_right)]
-    sizes = {"length": float(np.mean(edges)), "width": width, "height": height}
+    sizes = {"length": _length(part, design), "width": width, "height": height}
     return InspectedComponent(
         name=part.name,
         status=status,
@@ -73,6 +82,14 @@ def _part(
         characteristics=characteristic.table(found, tolerance, sizes, status is Status.AMBIGUOUS),
         axis=axis,
     )
+
+
+def _length(part: DesignPart, design: Floats) -> float:
+    """Return the length of a part as designed, along its bottom edges if it has any."""
+    edges = [edge for edge in (part.bottom_edge_left, part.bottom_edge_right) if len(edge) > 1]
+    if edges:
+        return float(np.mean([Polyline.through(edge).length for edge in edges]))
+    return float(np.linalg.norm(design[1, :4].mean(axis=0) - design[0, :4].mean(axis=0)))
 
 
 def _sections(design: Floats, shape: Any) -> Iterator[Characteristic]:
@@ -88,7 +105,9 @@ def _lengths(part: DesignPart, design: Floats, shape: Any) -> Iterator[Character
     if joined.all():
         yield from _of_ends(list(part_geometry.of_both_ends(design)), design, shape, [0, 1])
         return
-    nominal, deviation, variance = _foot_length(part, design, shape, int(np.flatnonzero(joined)[0]))
+    nominal, deviation, variance = NAN, NAN, NAN
+    if len(part.bottom_edge_left) and len(part.bottom_edge_right):
+        nominal, deviation, variance = _foot_length(part, design, shape, int(np.flatnonzero(joined)[0]))
     if np.isfinite(deviation):
         yield characteristic.normal("length-bottom", Quantity.LENGTH, nominal, deviation, variance)
     else:

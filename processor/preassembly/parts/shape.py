@@ -31,7 +31,8 @@ class Shape(NamedTuple):
 def measured(part: MeasuredPart, joint_points: Sequence[Floats | None]) -> Shape:
     """Return the shape of a part between joints with the design's P1..P8 (8, 3) at its start and its end.
 
-    Other ends than these, of a branch, are not known. Both ends share the error of the registration, which cancels in all that does not depend on the part's pose.
+    The ends of a branch, which are others than these, are not known. Both ends share the error of the registration,
+    which cancels in all that does not depend on the part's pose.
     """
     member = part.member
     ends, noise, by_pose = np.full((2, 8, 3), np.nan), np.full((48, 48), np.nan), np.full((48, 6), np.nan)
