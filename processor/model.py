@@ -490,7 +490,7 @@ class Limit(Checked):
     high: float = described(float("nan"), means=BOUND)
     low_ratio: float = described(float("nan"), means=BOUND)
     high_ratio: float = described(float("nan"), means=BOUND)
-    of: str = ""  # length | thickness | diameter | spacing | depth
+    of: str = ""  # length | height | thickness | diameter | spacing | depth
     rule: str = ""  # smaller | sum
     above_mm: float = described(float("nan"), means=Meaning(least=0.0))
     up_to_mm: float = described(float("nan"), means=Meaning(least=0.0))
