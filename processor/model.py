@@ -493,8 +493,9 @@ class Limit(Checked):
     ``low_ratio`` and ``high_ratio`` are multiples of the size named by ``of``; by ``rule`` the smaller of number and
     multiple counts, or their sum. The row is for sizes above ``above_mm`` up to ``up_to_mm``. ``measure`` is what of a
     joint is held against it: misalignment | groove_gap | eccentricity; or of a whole chain: span | unit_length |
-    inner_arc | lateral_axis | elevation; or another of ``processor/limits/measures.py``; or nothing. ``component`` is a
-    pattern of the names of those that a project gives it for, None of all.
+    inner_arc | lateral_axis | elevation; or another of ``processor/limits/measures.py``; or "part " and a
+    quantity of step inspect; or nothing. ``component`` is a pattern of the names of those that a project gives it for,
+    None of all.
     """
 
     key: str
@@ -504,7 +505,7 @@ class Limit(Checked):
     high: float = described(float("nan"), means=BOUND)
     low_ratio: float = described(float("nan"), means=BOUND)
     high_ratio: float = described(float("nan"), means=BOUND)
-    of: str = ""  # length | thickness | diameter | spacing | depth
+    of: str = ""  # length | height | thickness | diameter | spacing | depth
     rule: str = ""  # smaller | sum
     above_mm: float = described(float("nan"), means=Meaning(least=0.0))
     up_to_mm: float = described(float("nan"), means=Meaning(least=0.0))

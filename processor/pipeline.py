@@ -168,8 +168,14 @@ def _nothing_to_do(scene: Scene) -> str:
 def jobs_for(
     scene: Scene, wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int | None
 ) -> tuple[Job, ...]:
-    """Plan the steps ``wanted``, or those that run by themselves on a scene; raises UsageError as :func:`plan` does."""
-    return plan(wanted or steps_for(scene), methods, params, seed)
+    """Plan the steps ``wanted``, or those that run by themselves on a scene; raises UsageError as :func:`plan` does.
+
+    A step whose module names steps as ``needed`` on the scene runs with them.
+    """
+    modules = step_modules()
+    chosen = wanted or steps_for(scene)
+    needs = [_needed(modules[name], scene) for name in chosen if name in modules]
+    return plan((*chosen, *(name for of_step in needs for name in of_step)), methods, params, seed)
 
 
 def prepare(
@@ -192,6 +198,11 @@ def prepare(
 def _applies(module: ModuleType, scene: Scene) -> bool:
     applies: Callable[[Scene], bool] | None = getattr(module, "applies", None)
     return scene.kind == module.KIND if applies is None else applies(scene)
+
+
+def _needed(module: ModuleType, scene: Scene) -> tuple[str, ...]:
+    needed: Callable[[Scene], tuple[str, ...]] | None = getattr(module, "needed", None)
+    return () if needed is None else needed(scene)
 
 
 def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int | None) -> tuple[Job, ...]:

@@ -61,6 +61,7 @@ RUN = (
 ELSEWHERE = {
     "processor run my-bridge -o results": "make demo",
     "processor run my-bridge -o results --method adjustment,design-aided": "make demo",
+    "processor run my-bridge -o results --steps inspect": "tests/unit/test_inspection.py",
     "processor run my-truss -o results --steps stitch": "tests/unit/test_stitching.py",
     "processor run my-truss -o results --steps stitch --method three-point": "tests/unit/test_stitching_picks.py",
     "processor export results -o assembled --what assembled --format e57": "tests/unit/test_export.py",

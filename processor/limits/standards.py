@@ -27,6 +27,7 @@ NAN = float("nan")
 NODE_PLACE = measures.NODE_PLACE
 OF_PROJECTS = measures.of_projects()
 NOT_OF_LIMITS = ("class", "needs")  # keys of rows that are no fields of a limit
+PART = "part "  # before the quantity of step inspect, in ``Limit.measure`` of what is compared with a single part
 
 
 @lru_cache(maxsize=1)

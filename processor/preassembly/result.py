@@ -187,6 +187,27 @@ class Loops(Rows):
 
 
 @dataclass(frozen=True)
+class PartShape(Checked):
+    """The ends and bottom edges of one component as measured, for steps that judge it by itself; NaN = not known.
+
+    Bridge frame, at the pose of the component's registration and the reference temperature, mm. Axis of length 2: start
+    and end of the component. ``covariance`` (48, 48) is of the ends' coordinates, point by point. Departures (k, 2) of
+    the edges are to the left and up, with a ``covariance`` (k, k) of each. ``outer`` is by what the end that no joint
+    measures departs outward along the component, at the middle of its bottom.
+    """
+
+    name: str = described("")
+    ends: Floats = column(2, 8, 3)
+    ends_covariance: Floats = column(48, 48)
+    edge: tuple[EdgeSide, ...] = words("k", EdgeSide)
+    chainage: Floats = column("k")  # from the component's start
+    departure: Floats = column("k", 2)
+    departure_covariance: Floats = column(2, "k", "k")
+    outer: float = described(NAN)
+    outer_variance: float = described(NAN)
+
+
+@dataclass(frozen=True)
 class Adjustment(Checked):
     """What the adjustment alone states.
 
@@ -213,6 +234,7 @@ class Adjustment(Checked):
     budget_sd: Floats = optional(len(BudgetSource), json="budget_sd.*", keys=tuple(BudgetSource), unit="mm")
     residuals: Residuals = dataclasses.field(default_factory=Residuals, metadata={"json": ""})
     loops: Loops | None = newer()
+    shapes: tuple[PartShape, ...] = described((), json="")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from processor.preassembly.chain.span_and_closure import Figures, mean_max_ci95
 from processor.preassembly.ends.section import Bools
 from processor.preassembly.errors import mean_max, splicing_error
 from processor.preassembly.params import Params, SystematicParams
-from processor.preassembly.parts import systematic_errors
+from processor.preassembly.parts import shape, systematic_errors
 from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.result import (
     Adjustment,
@@ -32,6 +32,7 @@ from processor.preassembly.result import (
     Linear,
     Loops,
     MeanMax,
+    PartShape,
     Residuals,
     Result,
     Rivals,
@@ -207,8 +208,29 @@ def _adjustment(assembly: Assembly) -> Adjustment:
             component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals) for p in parts]),
         ),
         loops=assembly.loops,
+        shapes=tuple(_shapes(parts, assembly.design)),
         **figures._asdict(),
     )
+
+
+def _shapes(parts: Sequence[MeasuredPart], design: ArchDesign) -> Iterator[PartShape]:
+    """Yield the shape of each part, in the design's order."""
+    joined = design.joined
+    for index, part in enumerate(parts):
+        ends = topology.ends_of(joined, index)
+        measured = shape.measured(part, [None if end.joint is None else design.joint_points[end.joint] for end in ends])
+        edges = part.member.edges
+        yield PartShape(
+            name=part.name,
+            ends=measured.ends,
+            ends_covariance=measured.ends_covariance,
+            edge=tuple(map(EdgeSide, edges.side)),
+            chainage=edges.chainage,
+            departure=edges.departure,
+            departure_covariance=measured.edges_covariance,
+            outer=measured.outer,
+            outer_variance=measured.outer_variance,
+        )
 
 
 def _gap_sd(adjusted: Adjusted) -> Floats:

@@ -27,6 +27,7 @@ NAMES = (
     "method",
     "joint",
     "component",
+    "characteristic",
     "left_part",
     "right_part",
     "station",

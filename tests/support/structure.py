@@ -134,7 +134,7 @@ def layer_groups():
     return groups
 
 
-STEPS = ("defects", "deviation", "preassembly", "space_frame", "stitching")
+STEPS = ("defects", "deviation", "inspection", "preassembly", "space_frame", "stitching")
 LAYERS = (
     ("version",),
     ("model",),

@@ -9,9 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from processor.limits import standards
+from processor.limits.guard_band import guard_band
 from processor.model import Limit, Tolerance, reason
 from processor.preassembly.ends.joint_frame import joint_frame
-from processor.preassembly.verdicts import joint_measures, joints
+from processor.preassembly.verdicts import joint_measures
 from processor.preassembly.verdicts.joint_measures import measure
 from processor.preassembly.verdicts.joints import judge
 
@@ -187,7 +188,7 @@ def test_a_lone_extreme_has_the_interval_of_a_single_value():
     ],
 )
 def test_guard_band(interval, verdict):
-    assert joints.guard_band(interval, -1.0, 2.0) == verdict
+    assert guard_band(interval, -1.0, 2.0) == verdict
 
 
 def lone(value, sd, point=5, axis=1):

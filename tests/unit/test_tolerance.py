@@ -42,7 +42,9 @@ def test_every_row_says_what_it_is():
                 row.key
             )
             assert bool(row.of) == (not all(map(math.isnan, (row.high_ratio, row.above_mm, row.up_to_mm))))
-            low, high = standards.bounds(row, dict.fromkeys(("length", "thickness", "diameter", "spacing"), 1000.0))
+            low, high = standards.bounds(
+                row, dict.fromkeys(("length", "thickness", "diameter", "spacing", "height"), 1000.0)
+            )
             assert low < high < math.inf
             assert not (row.verified and not row.clause), "a verified row has its clause"
 

@@ -87,7 +87,9 @@ def judge(measured: Quantities, tolerance: Tolerance, span_mm: float, doubts: tu
 
 def unused_limits(tolerance: Tolerance) -> list[Limit]:
     """Return the limits given by a project that apply to nothing of a bridge."""
-    return [limit for limit in tolerance.limits if of_project(limit) and limit.measure not in (*OF_JOINTS, *MEASURES)]
+    of_chain = (*OF_JOINTS, *MEASURES)
+    unused = [limit for limit in tolerance.limits if of_project(limit) and limit.measure not in of_chain]
+    return [limit for limit in unused if not limit.measure.startswith(limits_of.PART)]
 
 
 def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, doubtful: bool) -> Comparison:

@@ -1,0 +1,131 @@
+"""Characteristics of parts held against those of the parts as built.
+
+Those of a bridge's part follow from its true key points and bottom edges, those of a body from the true displacements
+of its faces.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+
+from processor.evaluation.error_statistics import covered
+from processor.geometry import merging, mesh_distance
+from processor.geometry.polyline import Polyline
+from processor.inspection import bodies, flat_faces, part_geometry
+from processor.inspection.arch_parts import design_ends
+from processor.inspection.result import InspectedComponent, Quantity, Result
+from processor.model import (
+    ArchDesign,
+    ArchTruth,
+    DesignPart,
+    Floats,
+    Metric,
+    Scene,
+    Statistic,
+    StructureDesign,
+    StructureTruth,
+    Truth,
+)
+
+NAMES = {
+    Quantity.LENGTH: "lengths",
+    Quantity.THICKNESS: "thicknesses",
+    Quantity.WIDTH: "widths and heights",
+    Quantity.HEIGHT: "widths and heights",
+    Quantity.DIAGONAL: "diagonals",
+    Quantity.DIAGONAL_DIFFERENCE: "diagonals",
+    Quantity.TWIST: "twists",
+    Quantity.SWEEP: "sweeps and cambers",
+    Quantity.CAMBER: "sweeps and cambers",
+    Quantity.SQUARENESS: "squareness of end faces",
+}
+OF_SIZE = (Quantity.SWEEP, Quantity.CAMBER)
+REACH_MM, ALIKE = 50.0, 0.99  # of a true point to its facet, and cosine between their normals
+PIECE_MM, LEAST_FACE_MM = 100.0, 1.0
+
+
+def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
+    """Compare the characteristics of parts and bodies with the truth; all figures are for information."""
+    if truth.arch is not None and scene.arch is not None:
+        true = {component.name: _of_part(scene.arch, component, truth.arch) for component in result.components}
+    elif truth.structure is not None and scene.structure is not None and len(truth.structure.points):
+        true = _of_bodies(scene.structure, truth.structure)
+    else:
+        return []
+    errors: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    for component in result.components:
+        found, true_values = component.characteristics, true.get(component.name, {})
+        for id_, quantity, deviation, ci95 in zip(found.id, found.quantity, found.deviation, found.ci95, strict=True):
+            if id_ in true_values:
+                value = true_values[id_]
+                error = abs(deviation) - abs(value) if quantity in OF_SIZE else deviation - value
+                errors[NAMES[quantity]].append((float(error), float(ci95)))
+    metrics = []
+    for name, found_errors in sorted(errors.items()):
+        error, half = np.array(found_errors).T
+        known = np.isfinite(error)
+        if known.any():
+            rms = float(np.sqrt(np.mean(error[known] ** 2)))
+            metrics += [Metric("inspect", name, rms, Statistic.RMS, unit="mm"), *covered("inspect", name, error, half)]
+    return metrics
+
+
+def _of_part(design: ArchDesign, component: InspectedComponent, truth: ArchTruth) -> dict[str, float]:
+    """Return the true deviations of a part of a bridge by id."""
+    row = truth.names.index(component.name)
+    ends, edges = truth.key_points_bridge[row], truth.edges_bridge[row]
+    index = [part.name for part in design.parts].index(component.name)
+    as_designed = design_ends(design, index)
+    true = part_geometry.deviations(as_designed, ends)
+    joined = [bool(np.isfinite(end).all()) for end in as_designed]
+    if sum(joined) == 1 and len(design.parts[index].bottom_edge_left):
+        end, outermost = (1, 0) if joined[1] else (0, -1)
+        designed = [design.parts[index].bottom_edge_left, design.parts[index].bottom_edge_right]
+        outer = [np.mean([edge[outermost] for edge in pair], axis=0) for pair in (edges, designed)]
+        lengths = [float(np.linalg.norm(at[end, 4] - o)) for at, o in zip((ends, as_designed), outer, strict=True)]
+        true["length-bottom"] = lengths[0] - lengths[1]
+    if len(component.axis):
+        departures = _departures(design.parts[index], edges, component.axis.chainage)
+        off = part_geometry.off_the_chord(component.axis.chainage)
+        axis = off @ departures.mean(axis=0)
+        for a, quantity in enumerate((Quantity.SWEEP, Quantity.CAMBER)):
+            true[str(quantity)] = float(np.abs(axis[:, a]).max())
+        at = int(np.argmin(np.abs(component.axis.chainage - component.axis.chainage.mean())))
+        true["middle-width-bottom"] = float(departures[0, at, 0] - departures[1, at, 0])
+    return true
+
+
+def _of_bodies(design: StructureDesign, truth: StructureTruth) -> dict[str, dict[str, float]]:
+    """Return the true deviations of bodies by name and id: the step's own functions of the true displacements.
+
+    Of flatness there is none, as points of the truth are not dense enough.
+    """
+    vertices, origin = merging.local_design(design)
+    surface = mesh_distance.of_design(vertices, design.faces)
+    facet, _, beyond = surface.distances(truth.points - origin, REACH_MM)
+    on = mesh_distance.on_face(facet, beyond) & (np.einsum("ni,ni->n", surface.normals[facet], truth.normals) > ALIKE)
+    points, normals, facet = truth.points[on] - origin, truth.normals[on], facet[on]
+    moved = np.einsum("ni,ni->n", truth.displacement[on], normals)
+    none = np.zeros(len(points))
+    seen = flat_faces.Observed(places=points, facet=facet, deviation=moved, noise=none, shared=none, side=PIECE_MM)
+    return {
+        body.name: {one.id: one.deviation for one in bodies.measured(body)[0] if one.quantity is not Quantity.FLATNESS}
+        for body in flat_faces.bodies(design, seen, LEAST_FACE_MM)
+    }
+
+
+def _departures(part: DesignPart, edges: Floats, chainage: Floats) -> Floats:
+    """Return the departures (2, k, 2) of the true edges from the design's at chainages (k,), to the left and up."""
+    lines = [Polyline.through(edge) for edge in (part.bottom_edge_left, part.bottom_edge_right)]
+    points = [line.at(chainage) for line in lines]
+    left = points[0] - points[1]
+    left = left / np.linalg.norm(left, axis=1)[:, None]
+    found = []
+    for line, at, edge in zip(lines, points, edges, strict=True):
+        along = line.at(chainage + 5.0) - line.at(chainage - 5.0)
+        up = np.cross(along / np.linalg.norm(along, axis=1)[:, None], left)
+        off = -Polyline.through(edge).nearest(at)[1]
+        found.append(np.stack([np.einsum("ki,ki->k", off, left), np.einsum("ki,ki->k", off, up)], axis=1))
+    return np.array(found)

@@ -1,0 +1,328 @@
+"""Inspection of the bodies of a structure with flat faces, by the deviations that step ``deviation`` measured.
+
+A body's axes are the normals of its outermost pairs of parallel faces: length along the longest, then height and width,
+the more upright one being the height. Shapes fitted to the faces give its sizes, squareness, twist, sweep, camber and
+flatness. All depend on the shape of a body alone: where it is moved to or turned is no part of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+
+from processor.adjustment import extremes, scanner_class
+from processor.inspection import characteristic, flat_faces
+from processor.inspection.characteristic import Characteristic
+from processor.inspection.flat_faces import Body, Fit, Pieces
+from processor.inspection.part_geometry import off_the_chord
+from processor.inspection.result import InspectedComponent, Quantity, Result
+from processor.model import Floats, Scene, Status, Tolerance, reason
+
+PARALLEL, SQUARE = 0.9999, 0.02  # cosines between normals of opposite faces, and of different axes
+SLENDER = 4.0  # length by height and width from which a body is a member with an axis
+THIN_MM, THIN_SHARE = 100.0, 0.25  # the least size, alone and by the next one, below which it is a thickness
+PLACES = np.linspace(-1.0, 1.0, 41)  # along a body, at which its axis is compared with its chord
+COLUMNS = 20.0  # pieces along half a face count as different
+DEGREES = ((6, 14), (4, 9), (2, 5))  # of the polynomial along a face, and least number of pieces along it
+BOWED = 8  # pieces along a face from which its curvature is fitted as well
+FEWEST_FLAT = 9  # pieces of a face whose flatness is stated
+UP = np.array([0.0, 0.0, 1.0])
+SEED, REPETITIONS = 20, 200  # of the noise, for the bias of a flatness
+LEAST_FOUND = 3  # pieces of a face that is fitted
+
+
+class Axis(NamedTuple):
+    """A direction (3,) of a body with the rows of its outermost faces, looking backwards and forwards, and its size."""
+
+    direction: Floats
+    faces: tuple[int, int]
+    size: float
+
+
+class Side(NamedTuple):
+    """A fitted face: its pieces, their places along and across it from -1 to 1, and the shape fitted, outward.
+
+    Coefficients are level, slope along, slope across, warp, and curvature along where it is fitted.
+    """
+
+    pieces: Pieces
+    along: Floats
+    across: Floats
+    fit: Fit
+
+
+def inspect(scene: Scene, deviation: Any, least_mm: float, method: str) -> Result:
+    """Inspect the bodies of a structure by the result of step ``deviation``."""
+    if deviation is None or scene.structure is None or not len(deviation.core):
+        return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-deviation"),))
+    seen = flat_faces.observed(scene.structure, deviation)
+    if seen is None:
+        return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-deviation"),))
+    components = tuple(
+        component
+        for body in flat_faces.bodies(scene.structure, seen, least_mm)
+        if (component := _component(body, scene.tolerance)) is not None
+    )
+    remarks = () if scene.tolerance is not None else (reason("inspect.no-limits"),)
+    if not components:
+        remarks = (reason("inspect.no-flat-bodies"), *remarks)
+    if deviation.status is Status.AMBIGUOUS:
+        remarks = (reason("inspect.pose-ambiguous"), *remarks)
+    return Result(status=Status.OK, method=method, reasons=remarks, components=components)
+
+
+def _component(body: Body, tolerance: Tolerance | None) -> InspectedComponent | None:
+    found, sizes = measured(body)
+    if not found:
+        return None
+    if all(np.isnan(one.deviation) for one in found):
+        return InspectedComponent(name=body.name, status=Status.FAILED, reasons=(reason("inspect.body-not-seen"),))
+    return InspectedComponent(
+        name=body.name, characteristics=characteristic.table(found, tolerance, sizes, doubtful=False)
+    )
+
+
+def measured(body: Body) -> tuple[list[Characteristic], dict[str, float]]:
+    """Return the characteristics of a body and its sizes as designed; none of a body without flat sides."""
+    axes = body_axes(body)
+    if len(axes) < 2:
+        return [], {}
+    names = axis_names(axes)
+    middle = np.mean([face.corners.mean(axis=0) for face in body.faces], axis=0)
+    sides = {row: _side(body, row, axes, middle) for axis in axes for row in axis.faces}
+    found = [*_sizes(axes, names, sides), *_squareness(axes, names, sides)]
+    if len(axes) == 3 and axes[0].size > SLENDER * axes[1].size:
+        found += [*_twist(axes, names, sides), *_bows(axes, sides)]
+    else:
+        found += _flatness(axes, names, sides)
+    return found, {str(name): axis.size for name, axis in zip(names, axes, strict=True)}
+
+
+def body_axes(body: Body) -> list[Axis]:
+    """Return the axes of a body, longest first: square to each other, with an outermost face on either side."""
+    axes: list[Axis] = []
+    for k, face in enumerate(body.faces):
+        others = [j for j, other in enumerate(body.faces) if other.normal @ face.normal < -PARALLEL]
+        first = next((i for i, axis in enumerate(axes) if abs(axis.direction @ face.normal) > PARALLEL), None)
+        if not others or first is not None:
+            continue
+        looks = [body.faces[j].normal @ face.normal for j in range(len(body.faces))]
+        at = [float(one.corners.mean(axis=0) @ face.normal) for one in body.faces]
+        front = max((j for j in range(len(looks)) if looks[j] > PARALLEL), key=lambda j: at[j])
+        back = min(others, key=lambda j: at[j])
+        if at[front] > at[back]:
+            axes.append(Axis(body.faces[k].normal, (back, front), at[front] - at[back]))
+    square: list[Axis] = []
+    for axis in sorted(axes, key=lambda one: -one.size):
+        if all(abs(axis.direction @ other.direction) < SQUARE for other in square):
+            square.append(axis)
+    return [_forwards(axis) for axis in square]
+
+
+def _forwards(axis: Axis) -> Axis:
+    """Let an axis look the way of its largest component, so that its sense does not depend on the order of faces."""
+    if axis.direction[np.argmax(np.abs(axis.direction))] > 0.0:
+        return axis
+    return Axis(-axis.direction, (axis.faces[1], axis.faces[0]), axis.size)
+
+
+def axis_names(axes: list[Axis]) -> list[Quantity]:
+    """Name the sizes along the axes of a body."""
+    names = [Quantity.LENGTH, Quantity.WIDTH, Quantity.HEIGHT][: len(axes)]
+    if len(axes) < 3:
+        return names
+    if axes[2].size < THIN_MM and axes[2].size < THIN_SHARE * axes[1].size:
+        return [Quantity.LENGTH, Quantity.WIDTH, Quantity.THICKNESS]
+    if abs(axes[1].direction @ UP) > abs(axes[2].direction @ UP):
+        return [Quantity.LENGTH, Quantity.HEIGHT, Quantity.WIDTH]
+    return names
+
+
+def _side(body: Body, row: int, axes: list[Axis], middle: Floats) -> Side | None:
+    """Fit a face of a body; None where too little of it was seen.
+
+    Places are relative to the body's middle, in halves of the body's size along the axes of the face.
+    """
+    face, pieces = body.faces[row], body.pieces[row]
+    if len(pieces.value) < LEAST_FOUND:
+        return None
+    own = [axis for axis in axes if abs(axis.direction @ face.normal) < SQUARE]
+    off = pieces.places - middle
+    x, y = ((off @ own[k].direction / (0.5 * own[k].size) if k < len(own) else np.zeros(len(off))) for k in range(2))
+    terms = [np.ones_like(x), x, y, x * y, x**2 - 1.0 / 3.0]
+    for count in (5, 4, 3):
+        bowed = count < 5 or len(np.unique(np.round(BOWED * x))) >= BOWED
+        fitted = flat_faces.fit(np.stack(terms[:count], axis=1), pieces, x) if bowed else None
+        if fitted is not None:
+            return Side(pieces, x, y, fitted)
+    return None
+
+
+def _term(side: Side, k: int) -> tuple[float, float]:
+    """Coefficient of a fitted face and its variance; NaN where it was not fitted."""
+    if k >= len(side.fit.mean):
+        return float("nan"), float("nan")
+    return float(side.fit.mean[k]), float(side.fit.covariance[k, k])
+
+
+def _sizes(axes: list[Axis], names: list[Quantity], sides: dict[int, Side | None]) -> Iterator[Characteristic]:
+    """Yield the distances of opposite faces at the body's middle."""
+    for axis, name in zip(axes, names, strict=True):
+        pair = [sides[row] for row in axis.faces]
+        if pair[0] is None or pair[1] is None:
+            yield characteristic.absent(str(name), name, axis.size, reason("inspect.face-not-seen"))
+            continue
+        (back, of_back), (front, of_front) = (_term(side, 0) for side in pair if side is not None)
+        by_scale = (scanner_class.SCALE * axis.size) ** 2
+        yield characteristic.normal(str(name), name, axis.size, back + front, of_back + of_front + by_scale)
+
+
+def _turn(axes: list[Axis], k: int, sides: dict[int, Side | None]) -> tuple[float, float]:
+    """Angle by which the body's longest axis leans towards axis ``k``, by the faces across that, and its variance."""
+    half = 0.5 * axes[0].size
+    found = []
+    for row, sense in zip(axes[k].faces, (-1.0, 1.0), strict=True):
+        side = sides[row]
+        if side is not None:
+            slope, variance = _term(side, 1)
+            found.append((sense * slope / half, variance / half**2))
+    if not found:
+        return float("nan"), float("nan")
+    value, variance = np.mean(found, axis=0)
+    return float(value), float(variance) / len(found)
+
+
+def _squareness(axes: list[Axis], names: list[Quantity], sides: dict[int, Side | None]) -> Iterator[Characteristic]:
+    """Yield the tilt of each end face against the long faces, times the size that it is tilted over."""
+    for end, (row, sense) in enumerate(zip(axes[0].faces, (-1.0, 1.0), strict=True)):
+        side = sides[row]
+        for k in range(1, len(axes)):
+            if names[k] is Quantity.THICKNESS:
+                continue
+            name = f"{('start', 'end')[end]}-squareness-over-{names[k]}"
+            turn, of_turn = _turn(axes, k, sides)
+            if side is None or not np.isfinite(turn):
+                yield characteristic.absent(name, Quantity.SQUARENESS, 0.0, reason("inspect.face-not-seen"))
+                continue
+            slope, variance = _term(side, k)  # over half the size
+            tilt = 2.0 * slope + sense * turn * axes[k].size
+            yield characteristic.normal(
+                name, Quantity.SQUARENESS, 0.0, tilt, 4.0 * variance + of_turn * axes[k].size ** 2
+            )
+
+
+def _twist(axes: list[Axis], names: list[Quantity], sides: dict[int, Side | None]) -> Iterator[Characteristic]:
+    """Yield the rotation of the end against the start about the body's axis, times its height.
+
+    A rotation by w per unit of length moves a face at the side outward by w x times the place across it.
+    """
+    height = axes[names.index(Quantity.HEIGHT)].size if Quantity.HEIGHT in names else axes[1].size
+    right_handed = float(np.sign(np.linalg.det(np.stack([axis.direction for axis in axes]))))
+    found = []
+    for k, other in ((1, 2), (2, 1)):
+        for row, sense in zip(axes[k].faces, (-1.0, 1.0), strict=True):
+            side = sides[row]
+            if side is None or len(side.fit.mean) < 4:
+                continue
+            # About the first axis the second turns towards the third: points at the third move against the second.
+            handed = right_handed * sense * (1.0 if k == 2 else -1.0)
+            warp, variance = _term(side, 3)
+            arm = 0.5 * axes[other].size
+            found.append((2.0 * handed * warp / arm, 4.0 * variance / arm**2))
+    if not found:
+        yield characteristic.absent("twist", Quantity.TWIST, 0.0, reason("inspect.face-not-seen"))
+        return
+    value, variance = np.array(found).T
+    weight = 1.0 / np.maximum(variance, 1e-18)
+    mean, of_mean = float(weight @ value / weight.sum()), float(1.0 / weight.sum())
+    yield characteristic.normal("twist", Quantity.TWIST, 0.0, height * mean, height**2 * of_mean)
+
+
+def _bows(axes: list[Axis], sides: dict[int, Side | None]) -> Iterator[Characteristic]:
+    """Yield the greatest departures of the axis from straight along both other axes."""
+    upright = 1 if abs(axes[1].direction @ UP) > abs(axes[2].direction @ UP) else 2
+    for k in (1, 2):
+        quantity = Quantity.CAMBER if k == upright else Quantity.SWEEP
+        seen = [(sides[row], sense) for row, sense in zip(axes[k].faces, (-1.0, 1.0), strict=True)]
+        known = [(side, sense) for side, sense in seen if side is not None]
+        curve = _axis_curve(known)
+        if curve is None:
+            yield characteristic.absent(str(quantity), quantity, 0.0, reason("inspect.face-not-seen"))
+            continue
+        departure, covariance = curve
+        sign = np.where(departure < 0.0, -1.0, 1.0)
+        inner = slice(1, -1)
+        size, low, high = extremes.of_correlated(
+            np.abs(departure)[inner], (covariance * np.outer(sign, sign))[inner, inner], folded=True
+        )
+        at = 1 + int(np.argmax(np.abs(departure)[inner]))
+        yield Characteristic(str(quantity), quantity, 0.0, deviation=sign[at] * size, low=low, high=high, size=True)
+
+
+def _axis_curve(sides: list[tuple[Side, float]]) -> tuple[Floats, Floats] | None:
+    """Departures (p,) of the axis from the chord between its ends at PLACES, and their covariance.
+
+    Along each face a Legendre polynomial is fitted together with its slope across and its warp. None where no face
+    has enough pieces along it for a curve.
+    """
+    values, covariances = [], []
+    for side, sense in sides:
+        columns = len(np.unique(np.round(side.along * COLUMNS)))
+        degree = next((degree for degree, least in DEGREES if columns >= least), 0)
+        if not degree:
+            continue
+        terms = [legvander(side.along, degree), side.across[:, None], (side.along * side.across)[:, None]]
+        fitted = flat_faces.fit(np.hstack(terms), side.pieces, side.along)
+        if fitted is not None:
+            curve = legvander(PLACES, degree)
+            values.append(sense * curve @ fitted.mean[: degree + 1])
+            covariances.append(curve @ fitted.covariance[: degree + 1, : degree + 1] @ curve.T)
+    if not values:
+        return None
+    off = off_the_chord(PLACES)
+    return off @ np.mean(values, axis=0), off @ np.sum(covariances, axis=0) @ off.T / len(values) ** 2
+
+
+def _flatness(axes: list[Axis], names: list[Quantity], sides: dict[int, Side | None]) -> Iterator[Characteristic]:
+    """Yield the flatness of faces: the greatest less the least departure from their plane, noise taken out.
+
+    The plane is fitted to all of a face. The extremes of noisy values are too far apart: departures are shrunk by their
+    variance against their noise (empirical Bayes), and what their noise still adds is taken off (parametric bootstrap).
+    The interval is a simultaneous band over all pieces.
+    """
+    for axis, name in zip(axes, names, strict=True):
+        for row, sign in zip(axis.faces, "-+", strict=True):
+            side = sides[row]
+            id_ = f"flatness-{name}{sign}"
+            if side is None or len(side.pieces.value) < FEWEST_FLAT:
+                continue
+            yield _peak_to_valley(id_, side)
+
+
+def _peak_to_valley(id_: str, side: Side) -> Characteristic:
+    plane = np.stack([np.ones_like(side.along), side.along, side.across], axis=1)
+    root = 1.0 / np.sqrt(side.pieces.noise)
+    solve = np.linalg.pinv(plane * root[:, None]) * root
+    off = np.eye(len(plane)) - plane @ solve
+    rest = off @ side.pieces.value
+    variance = np.maximum(np.einsum("ij,j,ij->i", off, side.pieces.noise, off), flat_faces.FLOOR_MM**2)
+    form = max(float(np.mean(rest**2 - variance)), 0.0)
+    gain, sd = form / (form + variance), np.sqrt(variance)
+    shrunk = gain * rest
+    # Of several pieces that are about equal the noise picks the extremes: its effect is found by repetition.
+    repeated = shrunk + gain * sd * np.random.default_rng(SEED).standard_normal((REPETITIONS, len(sd)))
+    by_noise = float(np.ptp(repeated, axis=1).mean() - np.ptp(shrunk))
+    _, high_low, high_high = extremes.of_independent(rest, sd)
+    _, low_low, low_high = extremes.of_independent(-rest, sd)
+    return Characteristic(
+        id_,
+        Quantity.FLATNESS,
+        0.0,
+        deviation=max(float(np.ptp(shrunk)) - by_noise, 0.0),
+        low=max(high_low + low_low, 0.0),
+        high=high_high + low_high,
+        size=True,
+    )

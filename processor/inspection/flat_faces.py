@@ -1,0 +1,219 @@
+"""Flat faces of a design's bodies, and what was measured on them.
+
+Deviations at the core points of step ``deviation`` are combined in pieces of a face. The errors of a piece are the
+noise of its points and what the points of a view share, as ``deviation`` states both. Of the shared error the level of
+a whole face and its slope from one half to the other are taken as seen from one place each: neither face nor half is
+seen better than one view is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from processor.adjustment import groups, scanner_class
+from processor.geometry import merging, mesh_distance
+from processor.model import Floats, Ints, StructureDesign
+
+NORMALS, OFFSETS_MM = 1e-3, 0.5  # by which facets of one flat face may differ
+PIECE_DIAMETERS = 3.0  # side of a piece, in diameters of the core points' circles
+FEWEST_POINTS = 3  # of a piece
+FLOOR_MM = 0.004  # least standard deviation: of the design's mesh and of rounding
+SAME_PLACE_MM = 1e-3
+# Share of the shared variance that the halves of a face have against each other, if they are FAR_MM apart or more: a
+# smaller face is seen from the same places all over.
+HALVES, FAR_MM = 0.5, 2000.0
+CLIP = 4.5  # robust standard deviations beyond which a piece is none of the face's plane
+ROUNDS = 5
+LEAST_SIDE = 0.5  # side of the smallest face that tells a body's size, in least widths of one that is measured
+MOST_CONDITION = 1e6
+
+
+@dataclass(frozen=True)
+class FlatFace:
+    """A flat face as designed: outward normal (3,), corners (n, 3) of its facets, area in mm^2."""
+
+    normal: Floats
+    corners: Floats
+    area: float
+
+    def extent(self, direction: Floats) -> tuple[float, float]:
+        """Return where the face begins and ends along a unit direction (3,)."""
+        along = self.corners @ direction
+        return float(along.min()), float(along.max())
+
+
+class Pieces(NamedTuple):
+    """Pieces of a face: places (m, 3), mean deviation outward (m,), its variance by noise (m,), the shared sd, mm."""
+
+    places: Floats
+    value: Floats
+    noise: Floats
+    shared: float
+
+    def covariance(self, along: Floats, form: float = 0.0) -> Floats:
+        """Covariance (m, m) of the values, the halves of a face by the places' coordinates (m,) ``along`` it.
+
+        ``form`` is the variance of what the fitted shape does not follow.
+        """
+        half = np.where(along > 0.5 * (along.min() + along.max()), 1.0, -1.0)
+        apart = min(float(np.linalg.norm(np.ptp(self.places, axis=0))) / FAR_MM, 1.0)
+        both = np.ones((len(half), len(half))) + HALVES * apart**2 * np.outer(half, half)
+        covariance: Floats = np.diag(self.noise + form) + self.shared**2 * both
+        return covariance
+
+
+class Body(NamedTuple):
+    """A body's name and its flat faces as designed, with the pieces measured of each; none where too few were seen."""
+
+    name: str
+    faces: tuple[FlatFace, ...]
+    pieces: tuple[Pieces, ...]
+
+
+class Fit(NamedTuple):
+    """Coefficients (p,) of a shape fitted to the values of pieces, and their covariance (p, p)."""
+
+    mean: Floats
+    covariance: Floats
+
+
+class Observed(NamedTuple):
+    """Deviations (k,) outward at places (k, 3) on facets (k,) of the design, with noise, in mm and mm^2.
+
+    ``shared`` (k,) is the standard deviation of what the points of a view share; pieces have a ``side`` in mm.
+    """
+
+    places: Floats
+    facet: Ints
+    deviation: Floats
+    noise: Floats
+    shared: Floats
+    side: float
+
+
+def observed(design: StructureDesign, result: Any) -> Observed | None:
+    """Return what a ``result`` of step ``deviation`` states of a design; None where its places are of another one."""
+    vertices, _ = merging.local_design(design)
+    core = result.core
+    at = mesh_distance.spread(vertices, design.faces, lambda _: len(core))
+    if not np.allclose(at.points, core.points, rtol=0.0, atol=SAME_PLACE_MM):
+        return None
+    spacing = float(np.sqrt(mesh_distance.area(vertices, design.faces) / len(core)))
+    overlap = max(1.0, 0.25 * np.pi * (result.projection_diameter / spacing) ** 2)
+    shared = core.std1 / np.sqrt(np.maximum(core.n1, 1))
+    if any(reason.code == "deviation.views-by-class" for reason in result.reasons):
+        # Two opposite faces: their sum has twice the offset of all ranges.
+        by_class = scanner_class.SHIFT_MM**2 + 2.0 * scanner_class.OFFSET_MM**2
+        shared = np.sqrt(shared**2 + by_class)
+    return Observed(
+        places=core.points,
+        facet=at.facet,
+        deviation=np.where(np.isfinite(core.lod95), core.distance, np.nan),
+        noise=overlap * core.std2**2 / np.maximum(core.n2, 1),
+        shared=shared,
+        side=PIECE_DIAMETERS * result.projection_diameter,
+    )
+
+
+def bodies(design: StructureDesign, seen: Observed, least_mm: float) -> Iterator[Body]:
+    """Yield the bodies of a design with what was seen of their flat faces.
+
+    Faces narrower than ``least_mm`` are among those as designed, and without pieces.
+    """
+    vertices, _ = merging.local_design(design)
+    names, of_facet = _bodies(design, vertices)
+    cross, double = mesh_distance.double_areas(vertices, design.faces)
+    normals = cross / np.maximum(double, 1e-12)[:, None]
+    plane = _planes(vertices[design.faces], normals, of_facet)
+    area = 0.5 * np.bincount(plane, double)
+    first = np.unique(plane, return_index=True)[1]
+    facets, rows = _members(plane), _members(plane[seen.facet], len(first))
+    large = np.flatnonzero(area >= (LEAST_SIDE * least_mm) ** 2)
+    for number, name in enumerate(names):
+        faces, pieces = [], []
+        for k in large[of_facet[first[large]] == number]:
+            corners = vertices[design.faces[facets[k]]].reshape(-1, 3)
+            faces.append(FlatFace(normals[first[k]], corners, float(area[k])))
+            wide = _width(faces[-1]) >= least_mm
+            pieces.append(_pieces(seen, normals, rows[k] if wide else rows[k][:0]))
+        yield Body(name, tuple(faces), tuple(pieces))
+
+
+def _members(group: Ints, count: int = 0) -> list[Ints]:
+    """Return the rows of each group."""
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(group, minlength=count))[:-1])
+
+
+def _bodies(design: StructureDesign, vertices: Floats) -> tuple[tuple[str, ...], Ints]:
+    """Return the names of bodies, and the body (f,) of each facet; without names they are what hangs together."""
+    if design.bodies is not None:
+        return design.bodies.names, design.bodies.of_facet
+    place = np.unique(np.rint(vertices / SAME_PLACE_MM), axis=0, return_inverse=True)[1].reshape(-1)[design.faces]
+    a, b = place[:, [0, 1]].ravel(), place[:, [1, 2]].ravel()
+    links = coo_array((np.ones(len(a), np.int8), (a, b)), (int(place.max()) + 1,) * 2)
+    body = connected_components(links, directed=False)[1][place[:, 0]]
+    number: Ints = np.unique(body, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    return tuple(f"body {k + 1}" for k in range(int(number.max()) + 1)), number
+
+
+def _planes(corners: Floats, normals: Floats, body: Ints) -> Ints:
+    """Return the number (f,) of each facet's plane: facets of one body, direction and offset have the same one."""
+    offset = np.einsum("fi,fi->f", normals, corners.mean(axis=1))
+    # Shifted, as many designs have planes right between two steps.
+    keys = np.column_stack([body, np.rint(normals / NORMALS + 0.137), np.rint(offset / OFFSETS_MM + 0.137)])
+    number: Ints = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    return number
+
+
+def _width(face: FlatFace) -> float:
+    """Return the least width of a face, by the second principal direction of its corners."""
+    centred = face.corners - face.corners.mean(axis=0)
+    second = np.linalg.svd(centred, full_matrices=False)[2][1]
+    return float(np.ptp(centred @ second))
+
+
+def _pieces(seen: Observed, normals: Floats, rows: Ints) -> Pieces:
+    """Combine what was seen at ``rows`` of a face into pieces."""
+    rows = rows[np.isfinite(seen.deviation[rows])]
+    if not len(rows):
+        return Pieces(np.empty((0, 3)), np.empty(0), np.empty(0), 0.0)
+    piece = groups.pieces(seen.places[rows], normals[seen.facet[rows]], seen.side)
+    count = np.bincount(piece)
+    enough = count >= FEWEST_POINTS
+    return Pieces(
+        places=groups.group_means(seen.places[rows], piece)[enough],
+        value=(np.bincount(piece, seen.deviation[rows]) / count)[enough],
+        noise=(np.bincount(piece, seen.noise[rows]) / count**2)[enough] + FLOOR_MM**2,
+        shared=float(np.median(seen.shared[rows])),
+    )
+
+
+def fit(basis: Floats, pieces: Pieces, along: Floats) -> Fit | None:
+    """Fit a shape with ``basis`` (m, p) to pieces; None where they do not determine it.
+
+    Pieces far off the shape (dents, other steel) have no weight. What the shape does not follow is a variance of the
+    pieces (method of moments).
+    """
+    used, form = np.ones(len(basis), bool), 0.0
+    for _ in range(ROUNDS):
+        kept, freedom = used, int(used.sum()) - basis.shape[1]
+        if freedom < 1 or np.linalg.cond(basis[kept]) > MOST_CONDITION:
+            return None
+        root = 1.0 / np.sqrt(pieces.noise[kept] + form)
+        solve = np.linalg.pinv(basis[kept] * root[:, None]) * root
+        mean = solve @ pieces.value[kept]
+        rest = pieces.value - basis @ mean
+        form = max(float((rest[kept] ** 2).sum()) / freedom - float(pieces.noise[kept].mean()), 0.0)
+        spread = 1.4826 * float(np.median(np.abs(rest[kept])))
+        used = np.abs(rest) <= CLIP * np.maximum(spread, np.sqrt(pieces.noise))
+        if (used == kept).all():
+            break
+    covariance = pieces.covariance(along, form)[np.ix_(kept, kept)]
+    return Fit(mean, solve @ covariance @ solve.T)

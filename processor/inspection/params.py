@@ -1,0 +1,23 @@
+"""Parameters of step ``inspect``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from processor.model import UsageError
+
+METHODS = ("default",)
+
+
+@dataclass(frozen=True)
+class Params:
+    """Parameters (lengths in mm)."""
+
+    method: str = METHODS[0]
+    seed: int = 0
+    least_face_mm: float = 60.0  # least width of a face of a body that is inspected
+
+    def check(self) -> None:
+        """Raise UsageError for parameters that make no sense."""
+        if not 0.0 < self.least_face_mm < 1e6:
+            raise UsageError("inspect: least_face_mm makes no sense")

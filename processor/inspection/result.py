@@ -1,0 +1,110 @@
+"""The result of step ``inspect``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from processor.model import (
+    Checked,
+    Flags,
+    Floats,
+    Reason,
+    Rows,
+    Status,
+    Verdict,
+    Word,
+    column,
+    described,
+    names,
+    reasons,
+    words,
+    worst,
+)
+
+
+class Quantity(Word):
+    """What a characteristic measures."""
+
+    LENGTH = "length"
+    WIDTH = "width"
+    HEIGHT = "height"
+    DIAGONAL = "diagonal"
+    DIAGONAL_DIFFERENCE = "diagonal-difference"
+    TWIST = "twist"
+    SWEEP = "sweep"
+    CAMBER = "camber"
+    FLATNESS = "flatness"
+    SQUARENESS = "squareness"
+    THICKNESS = "thickness"
+
+
+@dataclass(frozen=True)
+class Characteristics(Rows):
+    """The characteristics of one component; NaN = not measured, for the ``reasons`` of the row.
+
+    ``ci95`` is the half-width of the 95 % interval of the deviation, actual less nominal; that of a greatest departure
+    is its wider side. ``lower`` and ``upper`` bound the deviation, -inf or inf without a bound, NaN where nothing
+    limits it or the bound depends on an unknown size. ``clause`` is of the standard, or the source of the limit.
+    """
+
+    id: tuple[str, ...] = names("r")
+    quantity: tuple[Quantity, ...] = words("r", Quantity)
+    nominal: Floats = column("r")
+    actual: Floats = column("r")
+    deviation: Floats = column("r")
+    ci95: Floats = column("r")
+    lower: Floats = column("r")
+    upper: Floats = column("r")
+    unit: tuple[str, ...] = names("r")
+    verdict: tuple[Verdict, ...] = words("r", Verdict)
+    limit: tuple[str, ...] = names("r")
+    clause: tuple[str, ...] = names("r")
+    verified: Flags = column("r", dtype=np.bool_)
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("r")
+
+
+@dataclass(frozen=True)
+class AxisDepartures(Rows):
+    """Departure of a component's axis from the design's, the chord between its own ends as reference; mm.
+
+    ``chainage`` is from the component's start; ``sideways`` is positive to the left, ``up`` upward.
+    """
+
+    chainage: Floats = column("a", unit="mm")
+    sideways: Floats = column("a", unit="mm")
+    sideways_ci95: Floats = column("a", unit="mm")
+    up: Floats = column("a", unit="mm")
+    up_ci95: Floats = column("a", unit="mm")
+
+
+@dataclass(frozen=True)
+class InspectedComponent(Checked):
+    """One component: its characteristics, and why some or all of them are not known."""
+
+    name: str = described("")
+    status: Status = described(Status.OK, words=Status)
+    reasons: tuple[Reason, ...] = reasons()
+    characteristics: Characteristics = field(default_factory=Characteristics)
+    axis: AxisDepartures = field(default_factory=AxisDepartures)
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst verdict on its characteristics."""
+        return worst(self.characteristics.verdict)
+
+
+@dataclass(frozen=True)
+class Result(Checked):
+    """The characteristics of all components."""
+
+    status: Status = described(words=Status)
+    method: str = described()
+    reasons: tuple[Reason, ...] = reasons()
+    components: tuple[InspectedComponent, ...] = described(())
+
+    @property
+    def overall(self) -> Verdict:
+        """The worst verdict on the components."""
+        return worst(component.verdict for component in self.components)

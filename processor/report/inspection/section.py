@@ -1,0 +1,51 @@
+"""The report of step ``inspect``."""
+
+from __future__ import annotations
+
+import collections
+
+from processor.inspection.result import Result
+from processor.language.messages import Message, Text, text
+from processor.model import Status, Verdict
+from processor.report.inspection import tables
+from processor.report.step_report import StepReport
+
+VERDICTS = {
+    Verdict.PASS: text("{count} pass"),
+    Verdict.FAIL: text("{count} fail"),
+    Verdict.INDETERMINATE: text("{count} indeterminate"),
+}
+
+
+def _summary(result: Result) -> tuple[Message, Message]:
+    if not result.components:
+        return result.status, text("{reasons}", reasons=result.reasons)
+    rows = [component.characteristics for component in result.components]
+    counts = collections.Counter(verdict for found in rows for verdict in found.verdict)
+    head = text(
+        "{status}, {measured} of {number} characteristics of {components} components measured",
+        status=result.status,
+        measured=sum(int((found.ci95 >= 0.0).sum()) for found in rows),
+        number=sum(len(found) for found in rows),
+        components=len(result.components),
+    )
+    verdicts = [Text(said.template, {"count": counts[name]}) for name, said in VERDICTS.items() if counts[name]]
+    body: list[Message] = [text("Limits: {verdicts}.", verdicts=verdicts)] if verdicts else []
+    if any(verdict is not Verdict.NONE and not known for found in rows for verdict, known in _compared(found)):
+        body.insert(0, text("Limits not checked against the standard: verdicts are provisional."))
+    body += [text("{name}: {reasons}.", name=c.name, reasons=c.reasons) for c in result.components if c.reasons]
+    if result.status is Status.OK or not result.reasons:
+        body += [text("{reasons:.}", reasons=result.reasons)] if result.reasons else []
+    return head, text("{sentences:.}", sentences=body) if body else text("")
+
+
+def _compared(found: tables.Characteristics) -> list[tuple[Verdict, bool]]:
+    return list(zip(found.verdict, found.verified.tolist(), strict=True))
+
+
+REPORT = StepReport(
+    title=text("Inspection of components"),
+    summary=_summary,
+    tables=tables.step_tables,
+    figures=lambda *_: {},
+)
