@@ -152,7 +152,7 @@ def scan(
 @click.option("--format", "format_", required=True, type=click.Choice(FORMATS), help="format of the scans")
 @click.option("--without-truth", is_flag=True, help="do not write the truth")
 @click.option("--spherical", is_flag=True, help="E57 with ranges and angles instead of x, y, z")
-@click.option("--step", is_flag=True, help="also write the solids of the design as STEP")
+@click.option("--step", is_flag=True, help="also write the solids as STEP, as designed and as built")
 @click.option("--without-meshes", is_flag=True, help="design of an arch bridge without meshes of its parts")
 @json_option
 @debug_option

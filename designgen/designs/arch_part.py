@@ -320,7 +320,8 @@ def _pad_faces(part: ArchPart) -> list[Face]:
 def solid(part: ArchPart) -> cq.Solid:
     """Return the CadQuery solid of a part: ruled faces between splines through the section corners, capped and sewn.
 
-    Raises RuntimeError where the kernel does not make one solid of it.
+    A part as built has the ends, twist, bow, section, corners and plates that it was built with, but no waves, dents
+    and missing pieces. Raises RuntimeError where the kernel does not make one solid of it.
     """
     import cadquery as cq
 
@@ -332,7 +333,7 @@ def solid(part: ArchPart) -> cq.Solid:
         s = part.chainages(start, end, SECTION_STEP_MM)
         b, h = part.b(s) - (t.web if inner else 0.0), part.h(s)
         v = (h - (t.top if inner else 0.0)) if top else np.full_like(s, t.bottom if inner else 0.0)
-        points = part.curve.point(s, side * b, v)
+        points = part.point(s, side * b, v)
         # All splines have the arc length as parameter, so that a ruling joins points of the same section.
         return cq.Edge.makeSpline([cq.Vector(*p) for p in points], parameters=s.tolist())
 
@@ -342,18 +343,16 @@ def solid(part: ArchPart) -> cq.Solid:
             corners = [edge(start, end, side, top, inner) for side, top in sides]
             shell += [cq.Face.makeRuledSurface(corners[i], corners[(i + 1) % 4]) for i in range(4)]
 
-    def rectangle(s: float, inner: bool) -> cq.Wire:
+    def corners_of(s: float, inner: bool) -> list[cq.Vector]:
         b = float(part.b(np.array(s))) - (t.web if inner else 0.0)
         h = float(part.h(np.array(s)))
         low, high = (t.bottom, h - t.top) if inner else (0.0, h)
-        corners = part.curve.point(np.full(4, s), np.array([b, -b, -b, b]), np.array([low, low, high, high]))
-        return cq.Wire.makePolygon([cq.Vector(*p) for p in corners], close=True)
+        corners = part.point(np.full(4, s), np.array([b, -b, -b, b]), np.array([low, low, high, high]))
+        return [cq.Vector(*p) for p in corners]
 
     for s, c, end in ((part.s0, part.cavity[0], "start"), (part.s1, part.cavity[1], "end")):
-        if part.closed == end:
-            shell += [cq.Face.makeFromWires(rectangle(s, False)), cq.Face.makeFromWires(rectangle(c, True))]
-        else:
-            shell.append(cq.Face.makeFromWires(rectangle(s, False), [rectangle(s, True)]))
+        outer, inner_ = corners_of(s, False), corners_of(c if part.closed == end else s, True)
+        shell += _cap(outer, inner_, closed=part.closed == end, flat=part.built is None)
     box = cq.Solid.makeSolid(cq.Shell.makeShell(shell))
     if box.Volume() < 0.0:  # sewing does not define the orientation of the shell
         box = cq.Solid(box.wrapped.Reversed())
@@ -366,3 +365,25 @@ def solid(part: ArchPart) -> cq.Solid:
     if len(solids) != 1:
         raise RuntimeError(f"{part.name}: the CAD kernel made {len(solids)} solids of one part")
     return solids[0]
+
+
+def _cap(outer: list[cq.Vector], inner: list[cq.Vector], *, closed: bool, flat: bool) -> list[cq.Face]:
+    """Return the faces of an end with corners P1 to P4 outside and inside: two if it is closed, else a ring.
+
+    An end that is not ``flat``, as its corners were built off a plane, has ruled faces.
+    """
+    import cadquery as cq
+
+    if flat:
+        wires = [cq.Wire.makePolygon(corners, close=True) for corners in (outer, inner)]
+        return (
+            [cq.Face.makeFromWires(wire) for wire in wires] if closed else [cq.Face.makeFromWires(wires[0], wires[1:])]
+        )
+
+    def ruled(a: cq.Vector, b: cq.Vector, c: cq.Vector, d: cq.Vector) -> cq.Face:
+        return cq.Face.makeRuledSurface(cq.Edge.makeLine(a, b), cq.Edge.makeLine(c, d))
+
+    if closed:
+        return [ruled(corners[0], corners[1], corners[3], corners[2]) for corners in (outer, inner)]
+    hole = cq.Wire.makePolygon(inner, close=True)
+    return [ruled(outer[0], outer[1], outer[3], outer[2]).addHole(hole)]

@@ -10,6 +10,7 @@ import numpy as np
 
 from designgen.checks import expect_all
 from designgen.designs import bolt_ball
+from designgen.frames import perpendicular
 from processor.model import Floats, Ints, UsageError
 
 if TYPE_CHECKING:
@@ -203,7 +204,7 @@ def solid(frame: Frame) -> cq.Compound:
         length, unit = float(np.linalg.norm(span)), span / np.linalg.norm(span)
         for node, out, (sleeve, cone, _) in zip((i, j), (unit, -unit), stacks, strict=True):
             foot, tip = (frame.centres[node] + start * out for start in (sleeve, cone))
-            plane = cq.Plane(origin=tuple(foot), normal=tuple(out))
+            plane = cq.Plane(origin=tuple(foot), xDir=tuple(perpendicular(out)), normal=tuple(out))
             corners = [plane.toWorldCoords(tuple(c)) for c in connection.sleeve_corner_radius * HEXAGON]
             hexagon = cq.Wire.makePolygon(corners, close=True)
             shapes.append(cq.Solid.extrudeLinear(hexagon, [], cq.Vector(*(connection.sleeve_length * out))))

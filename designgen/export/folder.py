@@ -51,9 +51,9 @@ def export(
     """Write the scene file ``source`` as a new scan folder.
 
     The folder is made under a temporary name and renamed. ``spherical`` is for E57; ``step`` adds the design's solids
-    as STEP; without ``with_meshes`` the design of an arch bridge has bottom edges and joints only. Scans of less than
-    FEWEST_POINTS points are left out. With the truth, files of the formats LABELLED have the
-    points' labels as columns. The truth's labels have the names and order of the scans as read from the folder.
+    as STEP, with the truth also those as built; without ``with_meshes`` the design of an arch bridge has bottom edges
+    and joints only. Scans of less than FEWEST_POINTS points are left out. With the truth, files of the formats LABELLED
+    have the points' labels as columns. The truth's labels have the names and order of the scans as the folder is read.
 
     Raises UsageError where the folder exists and is not empty, for a format that cannot hold the scene, where no scan
     is left, and for a scene other than an arch bridge without meshes.
@@ -75,7 +75,11 @@ def export(
         if not (with_truth and store.copy_truth(source, making / "truth.h5", write)):
             write(())
         if step:
-            solids.write_design(store.read_provenance(source).get("parameters") or {}, making / "design")
+            provenance = store.read_provenance(source)
+            solids.write_design(provenance.get("parameters") or {}, making / "design")
+            if with_truth:
+                recipe, seed = provenance.get("parameters") or {}, int(provenance.get("seed") or 0)
+                solids.write_as_built(recipe, seed, making / "as-built")
     return Exported(len(scans), tuple(scan.name for scan in whole.scans if len(scan.points) < FEWEST_POINTS))
 
 

@@ -8,8 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from designgen.asbuilt import imperfections
 from designgen.cad.process import escape
 from designgen.designs import arch_bridge, arch_part, box_and_tube, space_frame, structure_registry
+from designgen.export import model_solids
+from designgen.models import as_built
+from designgen.randomness import generator
 from designgen.reading import filled
 from processor.model import UsageError
 from processor.store.atomic_file import replacing
@@ -20,10 +24,41 @@ if TYPE_CHECKING:
 WRITTEN = "1970-01-01T00:00:00"  # date in every file, so that the same design gives the same bytes
 
 
+def write_as_built(recipe: Mapping[str, Any], seed: int, folder: Path) -> list[Path]:
+    """Write the solids of what a recipe built otherwise than designed; return the files, none where all is as designed.
+
+    Parts of an arch have their ends, twist, bow, section, corners and plates at the design's temperature, but no waves,
+    dents and missing pieces; bodies of a model are moved and turned or missing, but not bent or dented.
+    """
+    if "asbuilt" not in recipe:
+        return []
+    kind, written = recipe.get("kind"), []
+    if kind == "arch-bridge":
+        parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
+        errors = filled(imperfections.ArchParams, recipe, "asbuilt")
+        rngs = [generator(seed, f"built {part.name}") for part in parts]
+        folder.mkdir(exist_ok=True)
+        for part in imperfections.arch(parts, errors, rngs, imperfections.Ledger()):
+            written.append(folder / f"{part.name}.step")
+            write_step(written[-1], {part.name: arch_part.solid(part)})
+    elif "model" in recipe:
+        shapes, model = model_solids.of_recipe(recipe)
+        params = as_built.params_of(recipe, tuple(shapes))
+        built = {
+            body.name: shapes[body.name].moved(model_solids.movement(body, params.get(body.name)))
+            for body in model.bodies
+            if not (body.name in params and params[body.name].missing)
+        }
+        folder.mkdir(exist_ok=True)
+        written.append(folder / "structure.step")
+        write_step(written[-1], built, recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0)))
+    return written
+
+
 def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
     """Write the solids of a recipe's design in the scene's frame, a file for each arch part; return the files.
 
-    Raises UsageError where the recipe has no design.
+    Raises UsageError where the recipe has no design, or its model no solids.
     """
     folder.mkdir(exist_ok=True)
     kind = recipe.get("kind")
@@ -36,6 +71,8 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
     if kind == "space-frame":
         path = folder / "frame.step"
         shapes = {"frame": space_frame.solid(space_frame.build(filled(space_frame.Params, recipe, "frame")))}
+    elif kind == "structure" and "model" in recipe:
+        path, (shapes, _) = folder / "structure.step", model_solids.of_recipe(recipe)
     elif kind == "structure":
         path = folder / "structure.step"
         components = structure_registry.design(recipe)

@@ -64,6 +64,16 @@ def bodies_of(path: str, model: Any, stem: str) -> tuple[list[Body], list[str]]:
     return bodies, notes
 
 
+def solids(path: str, model: Any) -> list[Any]:
+    """Return the solids of a CadQuery object in the order of :func:`bodies_of`; none where it has other pieces."""
+    import cadquery as cq
+
+    from designgen.cad.shapes import pieces
+
+    found = [piece for _, shape in _shapes(path, model) for piece in pieces(shape)]
+    return [cq.Solid(piece) for piece, _ in found] if all(solid for _, solid in found) else []
+
+
 def _shapes(path: str, model: Any) -> Iterator[tuple[str, Any]]:
     """Yield names, "" for none, and shapes of the kernel."""
     import cadquery as cq

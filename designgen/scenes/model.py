@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder, Surfaces
 from designgen.scenes import MADE_IN_MM
 from processor.model import Floats, Scene, StructureDesign, Truth, UsageError
+
+if TYPE_CHECKING:
+    import cadquery as cq
 
 
 @dataclass(frozen=True)
@@ -98,13 +101,17 @@ def make(
 
 def _part(name: str, recipe: Mapping[str, Any]) -> Model:
     """Return a part of an arch bridge, in the bridge's frame, as a model of one body with the part's name."""
+    return loading.load(part_solid(name, recipe), name=name)
+
+
+def part_solid(name: str, recipe: Mapping[str, Any]) -> cq.Assembly:
+    """Return the solid of a part of an arch bridge under its name; UsageError for a part that there is none of."""
     import cadquery as cq
 
     parts = {part.name: part for part in arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))}
     if name not in parts:
         raise UsageError(f'model.part: expected one of {", ".join(parts)}, got "{name}"')
-    solid = arch_part.solid(parts[name])
-    return loading.load(cq.Assembly(name="bridge").add(solid, name=name), name=name)
+    return cq.Assembly(name="bridge").add(arch_part.solid(parts[name]), name=name)
 
 
 def _surfaces(built: Sequence[ModelBody | None]) -> Surfaces:
