@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from designgen.asbuilt import imperfections
 from designgen.cad.process import escape
-from designgen.designs import arch_bridge, arch_part, box_and_tube, space_frame, structure_registry
+from designgen.designs import arch_bridge, arch_part, arch_ring, box_and_tube, space_frame, structure_registry
 from designgen.export import model_solids
 from designgen.models import as_built
 from designgen.randomness import generator
@@ -62,8 +62,11 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
     """
     folder.mkdir(exist_ok=True)
     kind = recipe.get("kind")
-    if kind == "arch-bridge":
-        parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
+    if kind in ("arch-bridge", "ring"):
+        if kind == "ring":
+            parts = arch_ring.build(filled(arch_ring.Params, recipe, "ring"))
+        else:
+            parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
         written = [folder / f"{part.name}.step" for part in parts]
         for path, part in zip(written, parts, strict=True):
             write_step(path, {part.name: arch_part.solid(part)})
@@ -77,6 +80,8 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
         path = folder / "structure.step"
         components = structure_registry.design(recipe)
         shapes = {component.name: box_and_tube.solid([component]) for component in components}
+    elif kind == "assembly":
+        raise UsageError("--step: assemblies of girders are made as meshes alone; export the scene without --step")
     else:
         raise UsageError("--step: the scene does not name the recipe it was made from, so its solids are not known")
     write_step(path, shapes, recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0)))

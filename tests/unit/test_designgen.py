@@ -16,7 +16,7 @@ from scipy.integrate import quad
 import designgen
 from designgen import batch, curves, recipe_files
 from designgen.cli import commands
-from designgen.designs import arch_bridge, arch_mesh, arch_part, bolt_ball, space_frame
+from designgen.designs import arch_bridge, arch_mesh, arch_part, arch_ring, bolt_ball, space_frame
 from designgen.export import folder as export_folder
 from designgen.randomness import generator
 from designgen.scanning import sampler
@@ -361,3 +361,14 @@ def test_a_net_of_points_has_points_on_the_edges_of_every_face():
         np.testing.assert_allclose(off, 0.0, atol=1e-6)
     random = sampler.scan_part(part, 0, sampler.Params(spacing_mm=40.0, sigma_mm=0.0), generator(0, "x"))
     assert len(cloud.points) == pytest.approx(len(random.points), rel=0.15)
+
+
+def test_a_ring_is_closed_and_has_the_volume_of_a_turned_section():
+    """Pappus: the area of the section times the way of its centroid, and six pads of 200 x 200 x 20 mm."""
+    parts = arch_ring.build(arch_ring.Params())
+    for left, right in zip(parts, (*parts[1:], parts[0]), strict=True):
+        np.testing.assert_allclose(left.key_points(left.s1), right.key_points(right.s0), atol=1e-9)
+    meshes = [trimesh.Trimesh(*arch_mesh.triangulate(part)) for part in parts]
+    assert all(mesh.is_watertight for mesh in meshes)
+    turned = 2.0 * np.pi * 4400.0 * (600.0 * 800.0 - 560.0 * 760.0)
+    assert sum(mesh.volume for mesh in meshes) == pytest.approx(turned + 6 * 200.0 * 200.0 * 20.0, rel=1e-4)
