@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Iterator, Sequence
 
@@ -87,11 +88,23 @@ def _beyond_limits(run: StepRun) -> Iterator[Message]:
         return
     rows = [k for k in worst_first(limits) if limits.verdict[k] != Verdict.PASS]
     for k in rows[:LIMITS]:
-        low, high = float(limits.low[k]), float(limits.high[k])
+        allowed = _allowed(float(limits.low[k]), float(limits.high[k]))
         yield text(
-            "{verdict}: {of}, {what}: {value} ± {ci95} {unit}, allowed {low} to {high}",
+            "{verdict}: {of}, {what}: {value} ± {ci95} {unit}, {allowed}",
             verdict=limits.verdict[k], of=limits.of[k], what=label(limits.what[k]), value=float(limits.value[k]),
-            ci95=float(limits.ci95[k]), unit=limits.unit[k], low=low, high=high,
+            ci95=float(limits.ci95[k]), unit=limits.unit[k], allowed=allowed,
         )  # fmt: skip
     if len(rows) > LIMITS:
         yield text("... and {count} more of {step}", count=len(rows) - LIMITS, step=step_report(run.step).title)
+
+
+def _allowed(low: float, high: float) -> Message:
+    if math.isnan(low) or math.isnan(high):
+        return text("allowed by a size that is not known")
+    if math.isinf(low):
+        return text("at most {high} allowed", high=high)
+    return (
+        text("at least {low} allowed", low=low)
+        if math.isinf(high)
+        else text("{low} to {high} allowed", low=low, high=high)
+    )

@@ -48,7 +48,7 @@ from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
 from processor.scan_folder.shapes import files as surface_files
 from processor.scan_folder.text_files import read_text
-from processor.scan_folder.tolerance import read_tolerance
+from processor.scan_folder.tolerance import check_components, read_tolerance
 from processor.scan_folder.units import MM_PER_UNIT, known_unit
 
 if sys.version_info >= (3, 11):
@@ -142,6 +142,7 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
         else:
             design = read_design(folder, project.design, unit)
         meaning.check(design, str(project.design))  # before scans are compared with it
+    check_components(str(folder / PROJECT), project.tolerance, _component_names(design))
     scene = _scene(project, design, option, _read_stations(folder, project.units or option or "m"), keep)
     if scene.structure is not None and project.design is not None and project.design.suffix.lower() in MESH_SUFFIXES:
         named = project.design_units or project.units
@@ -165,6 +166,13 @@ def _with_picks(folder: Path, scene: Scene) -> Scene:
         raise InputError(f"{folder / PICKS}: expected scans in one unit, found {scene.units}; give one by --units")
     existing_file_in(folder, PICKS, str(folder))
     return dataclasses.replace(scene, picks=read_picks(folder / PICKS, scene.scans, unit))
+
+
+def _component_names(design: Design | None) -> Sequence[str]:
+    """Return the names that a design gives its components."""
+    if isinstance(design, ArchDesign):
+        return [part.name for part in design.parts]
+    return design.bodies.names if isinstance(design, StructureDesign) and design.bodies is not None else ()
 
 
 def _read_stations(folder: Path, unit: str) -> Stations | None:

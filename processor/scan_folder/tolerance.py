@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from processor.model import Floats, InputError, Limit, Tolerance, did_you_mean
 from processor.scan_folder.checked_toml import Table
 
 COMPONENTS = "component"
+MOST_NAMES = 12
 KEYS = ("standard", "root_gap_mm", COMPONENTS)  # beside those of limits
 OF_COMPONENTS = (measures.DEVIATION, measures.DEVIATION_SHARE, measures.DEFECT_DEPTH, measures.DEFECT_AREA)
 
@@ -83,6 +85,18 @@ def _limit(table: Table, limit: Limit) -> Floats:
         expected = "a number from 0" if none_allowed else "a number above 0"
         raise InputError(f"{table.where}: expected {expected} as {key!r}, found [{greatest}]")
     return np.array([greatest])
+
+
+def check_components(where: str, tolerance: Tolerance | None, names: Sequence[str]) -> None:
+    """Raise InputError for limits of components that no name of the design fits; without names nothing is checked."""
+    for limit in tolerance.limits if tolerance is not None and names else ():
+        if not any(standards.names_component(limit, name) for name in names):
+            assert limit.component is not None
+            known = ", ".join(names[:MOST_NAMES]) + (", ..." if len(names) > MOST_NAMES else "")
+            raise InputError(
+                f"{where}: tolerance: no component {limit.component!r}{did_you_mean(limit.component, names)}; the "
+                f"design has {known}"
+            )
 
 
 def _check_share(table: Table, tolerance: Tolerance) -> None:

@@ -32,7 +32,7 @@ from processor.model import (
     reason,
 )
 from processor.report import headline, limit_table
-from processor.scan_folder import folder
+from processor.scan_folder import folder, tolerance
 from processor.space_frame import supports
 from processor.space_frame.result import Balls, Evidence, Flag
 from processor.stitching import verdicts as of_network
@@ -458,6 +458,15 @@ def test_a_slip_is_one_clear_line(tmp_path, text, said):
     with pytest.raises(InputError, match=said) as found:
         read(tmp_path, text)
     assert "\n" not in str(found.value)
+
+
+def test_a_component_that_the_design_has_not_is_named(tmp_path):
+    found = given({"wed*": {"deviation_mm": [-3.0, 3.0]}})
+    with pytest.raises(InputError, match=r"no component 'wed\*' \(did you mean 'web'\?\); the design has web, flange"):
+        tolerance.check_components("project.toml", found, ("web", "flange"))
+    tolerance.check_components("project.toml", found, ("wedge", "flange"))
+    tolerance.check_components("project.toml", found, ())
+    tolerance.check_components("project.toml", None, ("web",))
 
 
 def test_names_are_suggested_by_their_letters():
