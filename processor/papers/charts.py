@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from processor.language.messages import Message
 from processor.report import style
 
+MOST_JOINED = 60  # values of a line that are joined
+
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart: ``lines`` are names with values (n,), drawn over their numbers from 1 on, or over ``places`` (n,)."""
+    """A chart: ``lines`` are names with values (n,), drawn over their numbers from 1 on, or over ``places`` (n,).
+
+    A map has a list of places (n,) for each line in ``plan``, at the scale of the values.
+    """
 
     title: Message
     x: Message
@@ -22,20 +27,25 @@ class Chart:
     lines: tuple[tuple[str, list[float]], ...]
     places: tuple[float, ...] = ()
     logarithmic: bool = False
+    plan: tuple[list[float], ...] = ()
 
 
 def png(chart: Chart) -> bytes:
     """Draw a chart as PNG; its texts are in English, as those of all figures."""
     with style.default_settings():
-        figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+        figure = Figure(figsize=(9.0, 6.0 if chart.plan else 3.2), layout="constrained")
         axes = figure.add_subplot()
         for k, (name, values) in enumerate(chart.lines):
-            x = chart.places if len(chart.places) == len(values) else np.arange(1, len(values) + 1)
+            x: Sequence[float] = chart.places if len(chart.places) == len(values) else range(1, len(values) + 1)
+            x = chart.plan[k] if chart.plan else x
             kind = k % len(style.COLOURS)
+            line = "none" if chart.plan or len(values) >= MOST_JOINED else style.DASHES[kind]
+            marker, size = ("o", 0.8) if chart.plan else (style.MARKERS[kind], 3.5)
             axes.plot(
-                x, values, style.MARKERS[kind], color=style.COLOURS[kind], markersize=3.5, label=name,
-                linestyle=style.DASHES[kind] if len(values) < 60 else "none", linewidth=1.0,
-            )  # fmt: skip
+                x, values, marker, color=style.COLOURS[kind], markersize=size, label=name, linestyle=line, linewidth=1.0
+            )
+        if chart.plan:
+            axes.set_aspect("equal")
         if chart.logarithmic:
             axes.set_yscale("log")
         axes.set_xlabel(str(chart.x))

@@ -28,6 +28,7 @@ PAPER = "002"
 ROOF = "roof, 500 points/m2"
 DENSE = "roof, 8000 points/m2"
 ATTITUDES = 8
+MOST_SHOWN = 6000  # core points on a map
 WRONG_DEG = 20.0  # an attitude farther off is another one
 CHANGE_MM = {"sag_mm": 8.0, "lean_mm": 4.0, "ripple_mm": 3.0}  # such that few deviations are over a centimetre
 NAN = float("nan")
@@ -75,7 +76,7 @@ def measure(path: Path, data_set: DataSet) -> Measured:
     paper = step.run(scene, params)
     ours = step.run(scene, replace(params, method="default", register="none"))
     figures |= _figures("paper", paper) | _figures("default", ours)
-    return Measured(data_set, figures, {"deviations": _histogram(paper)})
+    return Measured(data_set, figures, {"deviations": _histogram(paper), **_map(ours)})
 
 
 def _attitude(rng: np.random.Generator) -> Floats:
@@ -131,6 +132,20 @@ def _histogram(result: Result) -> list[float]:
     counts = np.histogram(known, bins=np.linspace(-25.0, 25.0, 51))[0]
     shares: list[float] = (100.0 * counts / max(len(known), 1)).tolist()
     return shares
+
+
+def _map(result: Result) -> dict[str, list[float]]:
+    """Plan, m, of core points beyond their level of detection and within it, as in figure 8."""
+    core = result.core
+    known = np.flatnonzero(np.isfinite(core.lod95))
+    shown = known[:: max(1, len(known) // MOST_SHOWN)]
+    beyond = np.abs(core.distance[shown]) > core.lod95[shown]
+    plan = core.points[shown, :2] / 1000.0
+    return {
+        f"{name} {axis}": plan[rows, k].tolist()
+        for name, rows in (("changed", beyond), ("unchanged", ~beyond))
+        for k, axis in enumerate("xy")
+    }
 
 
 def rows(found: Found) -> list[Row]:
@@ -202,11 +217,19 @@ def _row(
 
 
 def charts(found: Found) -> list[Chart]:
-    """Return figure 7 in kind: the distribution of the deviations, of the first seed."""
+    """Return figures 7 and 8 in kind, of the first seed: the distribution of the deviations, and the map by ours."""
+    made = []
     lines = tuple((data, found.series(data, "deviations")) for data in (ROOF, DENSE))
     lines = tuple(line for line in lines if line[1])
     title = text("figure {number} of paper {paper}", number="7", paper=PAPER)
     places = tuple(np.linspace(-24.5, 24.5, 50).tolist())
-    return (
-        [Chart(title=title, x=text("deviation, mm"), y=text("share, %"), lines=lines, places=places)] if lines else []
-    )
+    if lines:
+        made.append(Chart(title=title, x=text("deviation, mm"), y=text("share, %"), lines=lines, places=places))
+    parts = [
+        (name, found.series(ROOF, f"{name} x"), found.series(ROOF, f"{name} y")) for name in ("unchanged", "changed")
+    ]
+    if any(x for _, x, _ in parts):
+        title = text("figure {number} of paper {paper}", number="8", paper=PAPER)
+        points, plan = tuple((name, y) for name, _, y in parts), tuple(x for _, x, _ in parts)
+        made.append(Chart(title=title, x=text("x, m"), y=text("y, m"), lines=points, plan=plan))
+    return made
