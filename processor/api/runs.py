@@ -139,18 +139,23 @@ def run(
         write_results.check_output(out, path)
     if wanted:
         pipeline.plan(wanted, methods, parameters, seed)  # wrong names are reported before a long reading
-    place = None if out is None else out.resolve()
+    place = out.resolve() if out else None
     before = fingerprint.signature(path.resolve(), place)
     with stage(f"reading {path.name}"):
         scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
-    log(f"{path.name}: read as {scene.units} ({scene.units_reason})")
-    if not wanted and len(scene.scans) == 2 and [job.step for job in jobs] == ["stitch"]:
-        log("two scans without a design are stitched; to measure between them: processor compare A B -o OUT")
+    _log_reading(path, scene, [] if wanted else jobs, log)
     keep = None if so_far is None else partial(_keep, Path(so_far), jobs)
     execution = pipeline.execute(path, scene, jobs, log, piecewise, keep)
     report = evaluate.evaluate(path, execution)
     fingerprint.check_unchanged(path.resolve(), before, place)
     return write(Results(execution, report), out, lang)
+
+
+def _log_reading(path: Path, scene: Scene, chosen: Sequence[pipeline.Job], log: Callable[[str], None]) -> None:
+    """Log the unit; of steps that were ``chosen`` by the scene's kind, what else two clouds may be meant for."""
+    log(f"{path.name}: read as {scene.units} ({scene.units_reason})")
+    if len(scene.scans) == 2 and [job.step for job in chosen] == ["stitch"]:
+        log("two scans without a design are stitched; to measure between them: processor compare A B -o OUT")
 
 
 def _keep(folder: Path, jobs: Sequence[pipeline.Job], execution: Execution) -> None:
