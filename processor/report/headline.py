@@ -47,5 +47,5 @@ def unverified(execution: Execution) -> list[str]:
     for run, _ in execution.by_step():
         for limits in (getattr(run.result, "limits", None), *step_report(run.step).limits(run.result)):
             if limits is not None:
-                clauses |= {limits.clause[k] for k in np.flatnonzero(~limits.verified).tolist()}
+                clauses |= {limits.clause[k] for k in np.flatnonzero(~limits.verified).tolist() if limits.clause[k]}
     return sorted(clauses)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import collections
+from collections.abc import Iterator
 
 from processor.inspection.result import Result
-from processor.language.messages import Message, Text, text
+from processor.language.messages import Message, Text, label, text
 from processor.model import Status, Verdict
 from processor.report.inspection import tables
 from processor.report.step_report import StepReport
@@ -43,9 +44,24 @@ def _compared(found: tables.Characteristics) -> list[tuple[Verdict, bool]]:
     return list(zip(found.verdict, found.verified.tolist(), strict=True))
 
 
+def _beyond(result: Result) -> Iterator[Message]:
+    """Yield the characteristics that fail their limits."""
+    for component in result.components:
+        found = component.characteristics
+        for k, verdict in enumerate(found.verdict):
+            if verdict is Verdict.FAIL:
+                yield text(
+                    "correct {component}: {quantity} is off by {deviation} ± {ci95} mm",
+                    component=component.name, quantity=label(found.quantity[k]), deviation=float(found.deviation[k]),
+                    ci95=float(found.ci95[k]),
+                )  # fmt: skip
+
+
 REPORT = StepReport(
     title=text("Inspection of components"),
     summary=_summary,
     tables=tables.step_tables,
     figures=lambda *_: {},
+    to_do=_beyond,
+    limits=lambda result: [component.characteristics for component in result.components],
 )
