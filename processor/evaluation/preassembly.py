@@ -33,13 +33,15 @@ AS_DESIGNED_MM = 0.01  # key points this near to the design's are those of perfe
 class TrueAssembly(NamedTuple):
     """The true parts, assembled by the objective; NaN where the objective has no weight.
 
-    ``gaps`` (j, 8, 3); departures (s, 3) of the edges from the design's at chainages (s,), part by part, left before
-    right; ``span`` is the distance of the bottom's middles at both ends of the bridge less the design's;
-    ``motions`` (c, 4, 4) move the parts from the truth's poses.
+    ``gaps`` (j, 8, 3); departures (s, 3) of the edges from the design's, and directions (s, 3) square to these and to
+    the left, upward on an arch and outward on a ring, at chainages (s,), part by part, left before right; ``span`` is
+    the distance of the bottom's middles at both ends of the bridge less the design's; ``motions`` (c, 4, 4) move the
+    parts from the truth's poses.
     """
 
     gaps: Floats
     departures: Floats
+    up: Floats
     chainage: Floats
     span: float
     motions: Floats
@@ -212,7 +214,8 @@ def _of_the_chain(
         result.linear.chainage, assembly.chainage, atol=1.0
     ):
         x, left, z = assembly.departures.T
-        true = np.stack([left, np.copysign(np.hypot(x, z), z)], axis=1)
+        up = np.einsum("si,si->s", assembly.departures, assembly.up)
+        true = np.stack([left, np.copysign(np.hypot(x, z), up)], axis=1)
         metrics += covered("preassemble", "edges", stated.linear_offset - true, stated.linear_offset_ci95)
     sides = zip(topology.sides_of(design.joined), design.joint_points, strict=True)
     off = np.array([ends[side.part][side.end] - at for both, at in sides for side in both])
@@ -300,17 +303,23 @@ def by_objective(design: ArchDesign, key_points: Sequence[Floats], edges: Floats
 
     solution = least_squares(objective, np.zeros(6 * len(lines)), xtol=1e-12, ftol=1e-12, gtol=1e-12).x
     before = np.cumsum([[0.0, 0.0], *([left.length, right.length] for left, right in lines)], axis=0)
-    outer = (
-        placed(solution, 0, edges[0][:, 0]).mean(axis=0),
-        placed(solution, len(lines) - 1, edges[-1][:, -1]).mean(axis=0),
-    )
+    at_ends = ((0, edges[0][:, 0]), (len(lines) - 1, edges[-1][:, -1]))
+    outer = [placed(solution, i, points).mean(axis=0) for i, points in at_ends]
     return TrueAssembly(
         gaps=gaps(solution),
         departures=departures(solution),
+        up=np.vstack([np.zeros((0, 3)), *(_up(lines[i][k]) for i, k in at_chainages)]),
         chainage=np.concatenate([before[i, k] + _chainages(lines[i][k]) for i, k in at_chainages] or [np.empty(0)]),
         span=float(np.linalg.norm(outer[1] - outer[0]) - design_span(design)),
         motions=np.stack([_motion(solution, i, middle) for i, middle in enumerate(middles)]),
     )
+
+
+def _up(line: Polyline) -> Floats:
+    """Directions (n, 3) square to an edge and to the bridge's Y, at the chainages of the linear error."""
+    at = _chainages(line)
+    up: Floats = np.cross(line.at(at + 5.0) - line.at(at - 5.0), np.array([0.0, 1.0, 0.0]))
+    return up
 
 
 def _chord(design: ArchDesign, i: int) -> Floats:
