@@ -36,7 +36,7 @@ def of_recipe(recipe: Mapping[str, Any]) -> tuple[dict[str, cq.Shape], Model]:
         import cadquery as cq
 
         model = loading.load(path)
-        solids = list(cq.importers.importStep(str(path)).solids().vals())  # type: ignore[arg-type]
+        solids = list(cq.importers.importStep(str(path)).solids().vals())
     else:
         solids, model = [], Model(path.stem, ())
     if not solids or len(solids) != len(model.bodies):
