@@ -62,7 +62,7 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
     """
     folder.mkdir(exist_ok=True)
     kind = recipe.get("kind")
-    shapes: Mapping[str, cq.Shape]
+    shapes: dict[str, cq.Shape]
     if kind in ("arch-bridge", "ring"):
         if kind == "ring":
             parts = arch_ring.build(filled(arch_ring.Params, recipe, "ring"))

@@ -17,7 +17,7 @@ def test_one_ball_alone():
     (centre,), (radius,) = truth.frame.centres, truth.frame.radii
     positions = np.array([scan.T_project_scan[:3, 3] for scan in scene.scans])
     assert np.ptp(positions[:, :2], axis=0).max() > 1000.0, "stations below it stand apart"
-    (found,) = spheres_step.run(scene, spheres_step.Params(), {}).balls.centre
+    (found,) = spheres_step.run(scene, spheres_step.Params()).balls.centres
     assert radius == 60.0
     assert np.linalg.norm(found - centre) < 1.0
 

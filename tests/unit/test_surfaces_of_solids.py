@@ -159,7 +159,7 @@ def test_bodies_as_built_go_out_as_step(tmp_path):
         "result.add(cq.Solid.makeBox(9, 9, 9), name='c')\n"
     )
     settings = ["asbuilt.b.move_mm=[5.0, -3.0, 8.0]", "asbuilt.b.turn_deg=[0.5, 0.0, 2.0]", "asbuilt.c.missing=true"]
-    settings += ["scan.step_mrad=4.0", "scanner.noise_mm=0.0"]
+    settings += ["scan.step_mrad=4.0", "scanner.noise_mm=0.0005"]
     recipe = models.recipe_of(str(tmp_path / "parts.py"), 3, "plain-2mm", "", settings)
     batch.make_scene(tmp_path / "s.h5", "parts", recipe, 1)
     export_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=True, step=True)
