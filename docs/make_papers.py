@@ -34,8 +34,9 @@ def tables(content: dict[str, Any]) -> list[str]:
         for row in rows:
             unit = f" {row['unit']}" if row["unit"] else ""
             ours = f"{number(row['median'])} ({number(row['worst'])}){unit}"
+            published = "" if row["published"] is None else number(row["published"]) + unit
             cells = (
-                row["place"], row["data"], row["method"], row["quantity"], number(row["published"]) + unit if row["published"] is not None else "",
+                row["place"], row["data"], row["method"], row["quantity"], published,
                 ours if row["median"] is not None else "–", row["reproduced"] or "",
                 str(reasons.index(row["reason"]["text"]) + 1),
             )  # fmt: skip
@@ -44,10 +45,10 @@ def tables(content: dict[str, Any]) -> list[str]:
     return lines
 
 
-def number(value: float | None, none: str = "–") -> str:
-    """Write a number with three significant digits, or what stands for none."""
+def number(value: float | None) -> str:
+    """Write a number with three significant digits, a dash for none."""
     if value is None:
-        return none
+        return "–"
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
