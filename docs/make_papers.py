@@ -1,4 +1,4 @@
-"""Write the tables of docs/papers.md from papers.json: ``python -m docs.make_papers OUT/papers.json``."""
+"""Write the tables of docs/papers.md: ``python -m docs.make_papers OUT/papers.json``, of one such file or several."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ MARK = "<!-- below: written by docs/make_papers.py from papers.json -->"
 
 def main() -> None:
     """Replace what stands below the mark."""
-    content = json.loads(Path(sys.argv[1]).read_text("utf-8"))
+    contents = [json.loads(Path(path).read_text("utf-8")) for path in sys.argv[1:]]
+    lines = [line for content in contents for line in (*tables(content), "")]
     above = PAGE.read_text("utf-8").partition(MARK)[0]
-    PAGE.write_text(above + MARK + "\n\n" + "\n".join(tables(content)) + "\n", "utf-8")
+    PAGE.write_text(above + MARK + "\n\n" + "\n".join(lines[:-1]) + "\n", "utf-8")
 
 
 def tables(content: dict[str, Any]) -> list[str]:
     """Return the lines of the tables, and of the reasons below each, which their rows number."""
     seeds = content["seeds"]
-    lines = [f"{content['line']}. Median and worst over {seeds} seeds." if seeds > 1 else f"{content['line']}."]
-    for paper in dict.fromkeys(row["paper"] for row in content["rows"]):
+    papers = list(dict.fromkeys(row["paper"] for row in content["rows"]))
+    lines = [f"Papers {', '.join(papers)}: {content['line']}."]
+    lines = [f"{lines[0]} Ours is the median (worst) over the seeds."] if seeds > 1 else lines
+    for paper in papers:
         rows = [row for row in content["rows"] if row["paper"] == paper]
         reasons = list(dict.fromkeys(row["reason"]["text"] for row in rows))
         lines += ["", f"### Paper {paper}", ""]
@@ -31,8 +34,9 @@ def tables(content: dict[str, Any]) -> list[str]:
         for row in rows:
             unit = f" {row['unit']}" if row["unit"] else ""
             ours = f"{number(row['median'])} ({number(row['worst'])}){unit}"
+            published = "" if row["published"] is None else number(row["published"]) + unit
             cells = (
-                row["place"], row["data"], row["method"], row["quantity"], number(row["published"], "") + unit,
+                row["place"], row["data"], row["method"], row["quantity"], published,
                 ours if row["median"] is not None else "–", row["reproduced"] or "",
                 str(reasons.index(row["reason"]["text"]) + 1),
             )  # fmt: skip
@@ -41,10 +45,10 @@ def tables(content: dict[str, Any]) -> list[str]:
     return lines
 
 
-def number(value: float | None, none: str = "–") -> str:
-    """Write a number with three significant digits, or what stands for none."""
+def number(value: float | None) -> str:
+    """Write a number with three significant digits, a dash for none."""
     if value is None:
-        return none
+        return "–"
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 

@@ -179,14 +179,15 @@ def _of_density(found: Found, data: str, section: Text, figure_7: Text, figure_8
     """Rows of one density."""
     # 20 points in a cylinder of 55.27 mm need a density of 8300 points a square metre
     few, built = reason("papers.roof-few-points"), reason("papers.roof-built", **CHANGE_MM)
+    depth = reason("papers.roof-depth", depth=Params().paper.max_depth_mm)
     listed: list[tuple[Text, Text, float, str, Rule, Reason, str]] = [
         (section, text("sampling rate of the voxels"), RATE, "sampling rate, %", Rule.NEAR,
          reason("papers.roof-rate"), "%"),
         (section, text("registration error by a clone"), ERROR_MM, "paper: registration error", Rule.AT_MOST,
          reason("papers.roof-clone"), "mm"),
         (section, text("points in a cylinder"), POINTS_A_CYLINDER, "paper: points a cylinder", Rule.NEAR, few, ""),
-        (figure_7, text("least deviation"), RANGE_MM[0], "paper: least", Rule.NEAR, built, "mm"),
-        (figure_7, text("greatest deviation"), RANGE_MM[1], "paper: greatest", Rule.NEAR, built, "mm"),
+        (figure_7, text("least deviation"), RANGE_MM[0], "paper: least", Rule.NEAR, depth, "mm"),
+        (figure_7, text("greatest deviation"), RANGE_MM[1], "paper: greatest", Rule.NEAR, depth, "mm"),
         (figure_7, text("deviations within 10 mm"), WITHIN_10_SHARE, "paper: within 10 mm, %", Rule.NEAR, built, "%"),
         (figure_8, text("share without change"), UNCHANGED_SHARE, "paper: unchanged, %", Rule.NEAR, built, "%"),
         (figure_8, text("LOD95, median"), LOD95_MM, "paper: lod95", Rule.AT_MOST, few, "mm"),
