@@ -84,10 +84,7 @@ def read(path: str | Path, units: str | None = None) -> Scene:
     InputError : the input cannot be used.
     UsageError : the unit is unknown, or ``units`` is given for a scene file, which states its own.
     """
-    source = Path(path)
-    if not source.exists():
-        raise files.missing(source)
-    return pipeline.read(source, units)
+    return pipeline.read(files.existing(Path(path)), units)
 
 
 def run(
@@ -132,9 +129,7 @@ def run(
     if isinstance(input_, Scene):
         meaning.check(input_, f"scene {input_.name[:LONGEST_NAME]!r}")
         return _run_scene(input_, out, pipeline.jobs_for(input_, wanted, methods, parameters, seed), lang, log)
-    path = Path(input_)
-    if not path.exists():
-        raise files.missing(path)
+    path = files.existing(Path(input_))
     if out is not None:
         write_results.check_output(out, path)
     if wanted:

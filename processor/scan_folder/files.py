@@ -31,6 +31,13 @@ def missing(path: Path) -> InputError:
     return InputError(f"{path}: there is no such file or folder{did_you_mean(path.name, near)}")
 
 
+def existing(path: Path) -> Path:
+    """Return a path that leads to something. Raises InputError as :func:`missing` has it."""
+    if not path.exists():
+        raise missing(path)
+    return path
+
+
 def scan_files(folder: Path, excluded: Collection[Path | None]) -> list[Path]:
     """Return the files in ``folder`` and ``folder/scans`` in a format of scans, open or closed, except ``excluded``."""
     return _scans_in([place for place in (folder, folder / SCANS) if place.is_dir()], excluded)

@@ -154,7 +154,7 @@ VALUES = {
     "structure/bodies/names": {"long": (LONG,)},
     "arch/parts/1/name": {"long": LONG},
     "arch/parts/1/source": {"unknown": "guess"},
-    "arch/joint_left": {"unknown": ("p1", "p9"), "twice": ("p1", "p1"), "other way": ("p2", "p1")},
+    "arch/joint_left": {"unknown": ("p1", "p9"), "itself": ("p2", "p1")},
     "arch/joint_right": {"itself": ("p1", "p3")},
     "arch/joint_names": {"twice": ("J1", "J1"), "long": ("J1", LONG)},
     "stations/ids": {"twice": ("S1", "S1"), "long": ("S1", LONG)},

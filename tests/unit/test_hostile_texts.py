@@ -15,7 +15,10 @@ import pytest
 
 from processor import meaning
 from processor.cli import main
+from processor.evaluation.evaluate import ErrorReport
 from processor.model import InputError, UsageError
+from processor.report import all_tables
+from processor.report import table as report_table
 from processor.scan_folder import cad, folder
 from processor.store import store
 from tests.support import step_results
@@ -166,6 +169,12 @@ def test_names_are_harmless_in_pages_tables_and_terminals(tmp_path, capsys):
         if str(path).endswith(".html"):
             assert "<script>alert" not in text
             assert "alert(1)" in text  # as text
-        if str(path).endswith(".csv"):
-            cells = [cell for row in csv.reader(io.StringIO(text)) for cell in row]
-            assert not [cell for cell in cells if re.match(r"[=@]|[+-](?![\d.])", cell)], path
+
+
+def test_names_are_harmless_in_tables_of_scans():
+    names = ("=HYPERLINK(1)", "+1+2", "@a", "-x", "\t=y", "S6", "S7", "S8", "S9")
+    run = step_results.execution(("stitch", "automatic", "{}", step_results.stitching(names)), names=names)
+    tables = {table.file: report_table.csv_text(table) for table in all_tables.tables_of_run(run, ErrorReport())}
+    cells = [cell for text in tables.values() for row in csv.reader(io.StringIO(text)) for cell in row]
+    assert "'=HYPERLINK(1)" in cells
+    assert not [cell for cell in cells if re.match(r"[=@\t]|[+-](?![\d.])|\+\d\+", cell)]
