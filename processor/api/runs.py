@@ -143,9 +143,7 @@ def run(
     before = fingerprint.signature(path.resolve(), place)
     with stage(f"reading {path.name}"):
         scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
-    _log_reading(path, scene, log)
-    if not wanted:
-        _log_comparison(scene, jobs, log)
+    _log_reading(path, scene, log, () if wanted else jobs)
     keep = None if so_far is None else partial(_keep, Path(so_far), jobs)
     execution = pipeline.execute(path, scene, jobs, log, piecewise, keep)
     results = Results(execution, evaluate.evaluate(path, execution))
@@ -153,15 +151,13 @@ def run(
     return write(results, out, lang)
 
 
-def _log_comparison(scene: Scene, jobs: Sequence[pipeline.Job], log: Callable[[str], None]) -> None:
-    if len(scene.scans) == 2 and [job.step for job in jobs] == ["stitch"]:
-        log("two scans without a design are stitched; to measure between them: processor compare A B -o OUT")
-
-
-def _log_reading(path: Path, scene: Scene, log: Callable[[str], None]) -> None:
+def _log_reading(path: Path, scene: Scene, log: Callable[[str], None], chosen: Sequence[pipeline.Job]) -> None:
+    """Say how an input was read; ``chosen`` are the jobs if the program chose them."""
     log(f"{path.name}: read as {scene.units} ({scene.units_reason})")
     if scene.clips is not None:
         log(f"{path.name}: {headline.clipped(scene.clips)}")
+    if len(scene.scans) == 2 and [job.step for job in chosen] == ["stitch"]:
+        log("two scans without a design are stitched; to measure between them: processor compare A B -o OUT")
 
 
 def _keep(folder: Path, jobs: Sequence[pipeline.Job], execution: Execution) -> None:
