@@ -166,12 +166,13 @@ def per_point_fields(record: type) -> tuple[str, ...]:
     return tuple(field.name for field in fields if field.metadata.get("shape", ("",))[0] == "n")
 
 
-def newer() -> Any:
+def newer(hashed: bool = True) -> Any:
     """Declare a record that came to the schema later: absent, it changes no scene's hash.
 
-    A column with ``newer`` in its metadata is of this kind too: where it is empty it is not stored.
+    A column with ``newer`` in its metadata is of this kind too: where it is empty it is not stored. Not ``hashed``, it
+    never changes the hash: no step reads it, so results stay those of the scene whatever it says.
     """
-    return dataclasses.field(default=None, metadata={"newer": True})
+    return dataclasses.field(default=None, metadata={"newer": True, "hashed": hashed})
 
 
 class Checked:
@@ -564,6 +565,31 @@ class Picks(Checked):
 
 
 @dataclass(frozen=True)
+class Clips(Checked):
+    """Boxes that the scans were cut by as they were read: corners in the project's frame, mm, and the points in each.
+
+    ``keep`` marks boxes whose points are the ones kept, the others are left out. ``scan`` is the one meant, "" all.
+    """
+
+    scan: tuple[str, ...] = names("c")
+    low: Floats = column("c", 3)
+    high: Floats = column("c", 3)
+    keep: Flags = column("c", dtype=np.bool_)
+    inside: Ints = column("c", dtype=np.int64)
+    read: int = 0  # points of all scans
+    kept: int = 0
+
+
+@dataclass(frozen=True)
+class TitleBlock(Checked):
+    """What the project writes on its report: names and texts in their order, and a logo (bytes of a PNG or JPEG)."""
+
+    keys: tuple[str, ...] = names("k")
+    values: tuple[str, ...] = names("k")
+    logo: Codes = column("bytes", dtype=np.uint8)
+
+
+@dataclass(frozen=True)
 class Scene(Checked):
     """What was scanned, and what it was meant to be. Steps read this and nothing else."""
 
@@ -581,6 +607,8 @@ class Scene(Checked):
     tolerance: Tolerance | None = None  # None: nothing was said
     control: Control | None = newer()
     picks: Picks | None = newer()
+    title_block: TitleBlock | None = newer(hashed=False)
+    clips: Clips | None = newer()
 
     def contradictions(self) -> Iterable[str]:
         """Yield scans of one name, and parts that the design does not have."""

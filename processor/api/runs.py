@@ -16,7 +16,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.model import LONGEST_NAME, Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
-from processor.report import write_results
+from processor.report import headline, write_results
 from processor.results.names import RESULTS_H5
 from processor.scan_folder import files, fingerprint
 from processor.store import store
@@ -138,17 +138,19 @@ def run(
     before = fingerprint.signature(path.resolve(), place)
     with stage(f"reading {path.name}"):
         scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
-    _log_reading(path, scene, [] if wanted else jobs, log)
+    _log_reading(path, scene, log, () if wanted else jobs)
     keep = None if so_far is None else partial(_keep, Path(so_far), jobs)
     execution = pipeline.execute(path, scene, jobs, log, piecewise, keep)
-    report = evaluate.evaluate(path, execution)
+    results = Results(execution, evaluate.evaluate(path, execution))
     fingerprint.check_unchanged(path.resolve(), before, place)
-    return write(Results(execution, report), out, lang)
+    return write(results, out, lang)
 
 
-def _log_reading(path: Path, scene: Scene, chosen: Sequence[pipeline.Job], log: Callable[[str], None]) -> None:
-    """Log the unit; of steps that were ``chosen`` by the scene's kind, what else two clouds may be meant for."""
+def _log_reading(path: Path, scene: Scene, log: Callable[[str], None], chosen: Sequence[pipeline.Job]) -> None:
+    """Say how an input was read; ``chosen`` are the jobs if the program chose them."""
     log(f"{path.name}: read as {scene.units} ({scene.units_reason})")
+    if scene.clips is not None:
+        log(f"{path.name}: {headline.clipped(scene.clips)}")
     if len(scene.scans) == 2 and [job.step for job in chosen] == ["stitch"]:
         log("two scans without a design are stitched; to measure between them: processor compare A B -o OUT")
 
@@ -161,18 +163,22 @@ def _keep(folder: Path, jobs: Sequence[pipeline.Job], execution: Execution) -> N
 
 
 def _run_scene(
-    scene: Scene, out: Path | None, jobs: Sequence[pipeline.Job], lang: str, log: Callable[[str], None]
+    scene: Scene,
+    out: Path | None,
+    jobs: Sequence[pipeline.Job],
+    lang: str,
+    log: Callable[[str], None],
 ) -> Results:
     if out is not None:
         write_results.check_output(out, None)
     return write(Results(pipeline.execute(Path(scene.name), scene, jobs, log)), out, lang)
 
 
-def write(results: Results, out: Path | None, lang: str = "en") -> Results:
+def write(results: Results, out: Path | None, lang: str = "en", further: Sequence[str] = ()) -> Results:
     """Write the folder of results, in place of an earlier one; returns the results."""
     if out is not None:
         with stage("drawing and writing the report"):
-            write_results.write_results(out, results.execution, results.report, lang)
+            write_results.write_results(out, results.execution, results.report, lang, further)
     return results
 
 

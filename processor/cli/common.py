@@ -87,6 +87,22 @@ def split_names(_: click.Context, __: click.Parameter, value: str | None) -> tup
     return tuple(name.strip() for name in value.split(",") if name.strip()) if value else ()
 
 
+def form_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --pdf and --xlsx, further forms of the report."""
+    for name, said in (("xlsx", "write report.xlsx, too (extra xlsx)"), ("pdf", "write report.pdf, too")):
+        command = click.option(f"--{name}", is_flag=True, help=said)(command)
+    return command
+
+
+def forms(pdf: bool, xlsx: bool) -> tuple[str, ...]:
+    """Return the further forms of the report that are wanted. Raises UsageError for one that cannot be written."""
+    if xlsx:
+        from processor.report import workbook
+
+        workbook.check()
+    return tuple(name for name, wanted in (("pdf", pdf), ("xlsx", xlsx)) if wanted)
+
+
 def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add --verbose, --quiet and --json, of which one at most is given."""
     for option in (

@@ -6,7 +6,16 @@ from pathlib import Path
 
 import click
 
-from processor.cli.common import LANGUAGES, UNITS, Shown, debug_option, output_options, show_results
+from processor.cli.common import (
+    LANGUAGES,
+    UNITS,
+    Shown,
+    debug_option,
+    form_options,
+    forms,
+    output_options,
+    show_results,
+)
 
 
 @click.command()
@@ -14,6 +23,7 @@ from processor.cli.common import LANGUAGES, UNITS, Shown, debug_option, output_o
 @click.argument("input_", metavar="[INPUT]", required=False, type=click.Path(path_type=Path))
 @click.option("--units", type=click.Choice(UNITS), help="as given to the run")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@form_options
 @output_options
 @debug_option
 @click.pass_context
@@ -30,8 +40,9 @@ def report(
     from processor.report import write_results
     from processor.results.names import RESULTS_H5
 
+    further = forms(options.pop("pdf"), options.pop("xlsx"))
     write_results.check_output(output, input_, RESULTS_H5)
     input_ = input_ or pipeline.find_input(output / RESULTS_H5)
     execution = pipeline.read_execution(output / RESULTS_H5, input_, units)
-    results = runs.write(runs.Results(execution, evaluate(input_, execution)), output, lang)
+    results = runs.write(runs.Results(execution, evaluate(input_, execution)), output, lang, further)
     show_results(context, output, results, Shown(**options))

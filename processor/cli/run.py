@@ -14,6 +14,8 @@ from processor.cli.common import (
     Shown,
     debug_option,
     fail_on_option,
+    form_options,
+    forms,
     log_line,
     output_options,
     print_error_line,
@@ -41,6 +43,7 @@ from processor.results.names import RESULTS_JSON
 @click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), help="end the run after so long")
 @click.option("--memory-mb", type=click.IntRange(min=64), help="end the run if it takes more")
 @click.option("--so-far", type=click.Path(path_type=Path), hidden=True)
+@form_options
 @fail_on_option
 @output_options
 @debug_option
@@ -56,6 +59,7 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
     shown = Shown(options["as_json"], options["verbose"], options["quiet"])
     if not input_.exists():
         raise missing(input_)
+    further = forms(options["pdf"], options["xlsx"])
     if output is None:
         output = _default_output(input_)
         if not shown.quiet:
@@ -77,6 +81,8 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
         log=log_line if shown.quiet else print_error_line,
         so_far=options["so_far"],
     )
+    if further:
+        runs.write(results, output, options["lang"], further)
     show_results(context, output, results, shown, fail_on)
 
 

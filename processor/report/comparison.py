@@ -15,7 +15,7 @@ from processor.geometry.m3c2 import FEWEST_FOR_LOD
 from processor.geometry.normal_orientation import CONVENTION, Turned
 from processor.language.messages import NO_NUMBER, Message, messages, text
 from processor.report import templates, write_results
-from processor.report.deviation import core_points_csv
+from processor.report.deviation import core_points_csv, face_maps
 from processor.report.deviation import figures as deviation_figures
 from processor.report.style import default_settings
 from processor.results.fields_to_json import reason_json
@@ -108,8 +108,12 @@ def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
     record = as_json(result)
     with default_settings():
         drawn = [
-            deviation_figures.deviation_map(
-                result.core + result.origin, result.normals, result.distances, LABEL, result.unit
+            face_maps.face_maps(
+                result.core + result.origin,
+                result.normals,
+                result.distances,
+                face_maps.not_sure(result.distances, result.unit),
+                (LABEL, result.unit),
             ),
             deviation_figures.histogram(result.distances, LABEL, result.unit),
         ]

@@ -8,7 +8,7 @@ import numpy as np
 
 from processor.language.messages import Text, messages, text
 from processor.limits.judging import JudgedLimits
-from processor.model import StepRun, Verdict
+from processor.model import Clips, StepRun, Verdict
 from processor.pipeline import Execution
 from processor.report.step_report import step_report
 
@@ -17,6 +17,16 @@ VERDICTS = {
     Verdict.INDETERMINATE: "{count} indeterminate",
     Verdict.PASS: "{count} pass",
 }  # the worst first
+
+
+def clipped(clips: Clips) -> Text:
+    """Say how many points were left out of what was read."""
+    return text(
+        "{count:,} of {read:,} points clipped by {boxes} {boxes:?box|boxes}",
+        count=clips.read - clips.kept,
+        read=clips.read,
+        boxes=len(clips.keep),
+    )
 
 
 def of_run(execution: Execution, lang: str = "en") -> str:

@@ -26,7 +26,7 @@ def limit_table(limits: JudgedLimits | None, file: str) -> list[Table]:
         return []
     note = with_unverified(NOTE, [limits.clause[k] for k in np.flatnonzero(~limits.verified).tolist()])
     title = text("Compared with limits")
-    return [Table(title, COLUMNS, tuple(_rows(limits)), file, note)]
+    return [Table(title, COLUMNS, tuple(_rows(limits)), file, note, on_page=False)]
 
 
 def with_unverified(note: Text, clauses: Iterable[str]) -> Text:

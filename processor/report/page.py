@@ -12,16 +12,16 @@ import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, messages, text
-from processor.model import Scene, Status, StepRun, Verdict, Word
+from processor.model import Scene, Status, StepRun, Verdict, Word, worst
 from processor.pipeline import Execution
-from processor.report import all_tables, headline, page_script, templates
+from processor.report import all_tables, characteristics, headline, page_script, templates, title_block
 from processor.report.step_report import step_report
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table, headings, numeric, shown
 
 GOOD = "ok"
 LONG_CELL = 24  # characters
-LEAD = ("what-to-do", "limits", "limits-chain", "limits-not-held")  # tables above the figures
+LEAD = ("what-to-do", "limits-not-held")  # tables above the figures, below the characteristics
 PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
 NAMES = (
     "method",
@@ -39,7 +39,15 @@ NAMES = (
     "matrix",
     "key",
     "of",
+    "id",
 )  # columns that no language translates
+BANNER = {
+    Verdict.PASS: text("PASS"),
+    Verdict.FAIL: text("FAIL"),
+    Verdict.INDETERMINATE: text("INDETERMINATE"),
+    Verdict.NONE: text("No verdict"),
+}
+TONES = {Verdict.PASS: "good", Verdict.FAIL: "bad", Verdict.INDETERMINATE: "open", Verdict.NONE: ""}
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
 
@@ -56,7 +64,12 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Captio
     script, digest = page_script.script()
     page: str = environment.get_template("page.html").render(
         title=scene.name,
+        block=title_block.of(scene, execution.provenance),
+        running_foot=title_block.running_foot(execution.provenance),
+        running_head=title_block.running_head(scene),
+        banner=_banner(execution),
         about=_about(scene),
+        clipped=None if scene.clips is None else headline.clipped(scene.clips),
         lang=lang,
         live=page_script.embedded({"words": messages(lang).of_scripts(script), "steps": messages(lang).rendered(live)}),
         script=script,
@@ -91,6 +104,18 @@ def _about(scene: Scene) -> Text:
     )
 
 
+def _banner(execution: Execution) -> dict[str, Any]:
+    """Return the verdict on everything, in a word, and what it rests on."""
+    runs = [run for run, _ in execution.by_step()]
+    verdict = worst(run.verdict for run in runs)
+    told = characteristics.told(one for run in runs for one in characteristics.of_run(execution.scene, run))
+    sentences, tone = [told], TONES[verdict]
+    if verdict is not Verdict.NONE and headline.unverified(execution):
+        tone = tone if verdict is Verdict.FAIL else "open"
+        sentences.append(text("Provisional: not all limits were checked against the standard's text."))
+    return {"tone": tone, "word": BANNER[verdict], "text": text("{sentences:.}", sentences=sentences)}
+
+
 def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]:
     verdicts: list[dict[str, Any]] = []
     for run, _ in execution.by_step():
@@ -100,7 +125,8 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]
         if body:
             method = text("Method {method}. {text}", method=run.method, text=body)
         verdicts.append({"tone": _tone(run), "head": headline.of_step(run), "text": method})
-        verdicts += [{"tone": "", "head": head, "text": body} for head, body in report_of.further_verdicts(run.result)]
+        verified = getattr(run.result, "verified", True)
+        verdicts += [_further(verified, *further) for further in report_of.further_verdicts(run.result)]
     if sources := headline.unverified(execution):
         verdicts.append({"tone": "", "head": text("Limits that are not verified"), "text": _unverified(sources)})
     return [*verdicts, _truth(report)]
@@ -110,6 +136,13 @@ def _unverified(sources: Sequence[str]) -> Text:
     return text(
         "{sources}: not compared with the published text; do so before verdicts are relied on.", sources=sources
     )
+
+
+def _further(verified: bool, head: Any, body: Any, verdict: Verdict = Verdict.NONE) -> dict[str, Any]:
+    tone = TONES[verdict] if verified or verdict is Verdict.FAIL else ""
+    if verdict is not Verdict.NONE:
+        head = text("{head}: {verdict}", head=head, verdict=verdict)
+    return {"tone": tone, "head": head, "text": body}
 
 
 def _truth(report: ErrorReport) -> dict[str, Any]:
@@ -150,50 +183,61 @@ def _message(run: StepRun, lang: str) -> str:
 def _sections(
     execution: Execution, report: ErrorReport, figures: Mapping[str, CaptionedPngs], live: Container[str], lang: str
 ) -> list[dict[str, Any]]:
-    sections = []
-    for run, others in execution.by_step():
-        tables = [table for table in all_tables.tables_of_step(run, others, report) if table.on_page]
-        if run.result.status == Status.FAILED:
-            tables = [table for table in tables if table.rows]
-        sections.append(
-            {
-                "title": step_report(run.step).title,
-                "message": _message(run, lang),
-                "lead": [_table(table, lang) for table in tables if _leads(table)],
-                "tables": [_table(table, lang) for table in tables if not _leads(table)],
-                "step": run.step,
-                "live": run.step in live,
-                "figures": [
-                    {"caption": caption, "data": base64.b64encode(png).decode("ascii")}
-                    for caption, png in figures.get(run.step, {}).values()
-                ],
-            }
-        )
+    sections = [_section(execution, run, others, report, lang) for run, others in execution.by_step()]
+    for section in sections:
+        section["live"] = section["step"] in live
+        section["figures"] = _pictures(section["step"], figures.get(section["step"], {}), section["live"])
     if report.metrics:
-        checks = _table(all_tables.checks_table(report), lang)
-        sections.append(
-            {
-                "title": text("Truth"),
-                "message": "",
-                "lead": [],
-                "tables": [checks],
-                "figures": [],
-                "live": False,
-                "step": "",
-            }
-        )
+        table = _table(all_tables.checks_table(report), lang)
+        empty: dict[str, Any] = {"message": "", "lead": [], "further": [], "figures": [], "live": False, "step": ""}
+        sections.append({**empty, "title": text("Truth"), "tables": [table]})
     return sections
 
 
-def _leads(table: Table) -> bool:
-    """Whether a table stands above the figures: what to do, and what is compared with limits."""
-    return table.file in LEAD or table.file.endswith(all_tables.LIMITS)
+def _section(
+    execution: Execution, run: StepRun, others: list[StepRun], report: ErrorReport, lang: str
+) -> dict[str, Any]:
+    """Return the tables of a step: what is held against limits, what to look at first, the others, and further ones."""
+    report_of = step_report(run.step)
+    tables = [table for table in all_tables.tables_of_step(run, others, report) if table.on_page]
+    if run.result.status == Status.FAILED:
+        tables = [table for table in tables if table.rows]
+    held = [] if report_of.own_table else characteristics.of_run(execution.scene, run)
+    lead = [characteristics.table(held, report_of.characteristics_note)] if held else []
+    lead += [table for table in tables if table.file in LEAD]
+    further = [table for table in tables if table.file not in LEAD and table.folded]
+    return {
+        "title": report_of.title,
+        "message": _message(run, lang),
+        "lead": [_table(table, lang) for table in lead],
+        "tables": [_table(table, lang) for table in tables if table.file not in LEAD and not table.folded],
+        "further": [_table(table, lang) for table in further],
+        "further_titles": list(dict.fromkeys(messages(lang).text(table.title) for table in further)),
+        "step": run.step,
+    }
+
+
+def _pictures(step: str, drawn: CaptionedPngs, live: bool) -> list[dict[str, Any]]:
+    """Return the pictures of a step; ``twin`` are those that the page's script shows alive, which print shows alone."""
+    report_of = step_report(step)
+    twins = report_of.live_figures if live else ()
+    return [
+        {
+            "caption": caption,
+            "data": base64.b64encode(png).decode("ascii"),
+            "twin": name in twins,
+            "further": name in report_of.further_figures,
+        }
+        for name, (caption, png) in drawn.items()
+    ]
 
 
 def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:
     """Return the style of a cell and its text; names from the input are not translated."""
     if isinstance(cell, int | float | np.number):
         return "number", shown(cell)
+    if isinstance(cell, Verdict):
+        return f"verdict {TONES[cell]}", messages(lang).text(cell)
     if not isinstance(cell, str) or isinstance(cell, Word):
         written = shown(messages(lang).text(cell))
     else:

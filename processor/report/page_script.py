@@ -19,7 +19,7 @@ def embedded(data: dict[str, Any]) -> str:
 
 def script() -> tuple[str, str]:
     """Return the page's script and its SHA-256 as a content security policy writes it."""
-    folder = importlib.resources.files("processor.report")
+    folder = importlib.resources.files("processor.report.scripts")
     text = "".join((folder / name).read_text("utf-8") for name in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
     return text, f"'sha256-{digest}'"

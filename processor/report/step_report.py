@@ -9,7 +9,7 @@ from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message
-from processor.model import Scene, StepRun
+from processor.model import Scene, StepRun, Verdict
 from processor.pipeline import Execution, package_of
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table
@@ -28,10 +28,16 @@ class StepReport:
     summary: Callable[[Any], tuple[Any, Any]]  # of a result: the verdict's heading, and the sentences below it
     tables: Callable[[Sequence[StepRun], ErrorReport], list[Table]]
     figures: Callable[[Execution, Sequence[StepRun], ErrorReport], CaptionedPngs]  # file names are the step's own
-    further_verdicts: Callable[[Any], list[tuple[Any, Any]]] = lambda _: []  # headings and texts beside the verdict
     to_do: Callable[[Any], Iterable[Any]] = lambda _: ()
     why: Callable[[Any], Iterable[Any]] = lambda result: result.reasons
     limits: Callable[[Any], Iterable[Any]] = lambda _: ()
+    # Headings and texts beside the verdict, each with a verdict of its own where it has one.
+    further_verdicts: Callable[[Any], Sequence[tuple[Any, Any] | tuple[Any, Any, Verdict]]] = lambda _: []
+    characteristics: Callable[[Scene, StepRun], list[Any]] = lambda *_: []  # what is held against limits
+    characteristics_note: str | Message = ""
+    own_table: bool = False  # whether the step's own tables list the characteristics
+    live_figures: tuple[str, ...] = ()  # file names of the pictures that the live figures show as well
+    further_figures: tuple[str, ...] = ()  # file names of the pictures that stand among the further tables
     files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
     interactive_data: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None
 

@@ -94,6 +94,11 @@ def printable_name(name: str, row: int) -> str:
     return name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 1] + "…"
 
 
+def drawable(text: str) -> str:
+    """Return a text with question marks for what Matplotlib's font lacks."""
+    return "".join(c if c.isprintable() and _font().get_char_index(ord(c)) else "?" for c in text)
+
+
 def colour_limit(values: Floats) -> float:
     """Return the magnitude at which the colours of values (n,) end: 98 % of the finite ones are within."""
     magnitudes = np.abs(values[np.isfinite(values)])

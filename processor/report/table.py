@@ -35,6 +35,7 @@ class Table:
     groups: tuple[str | Message, ...] = ()
     on_page: bool = True
     on_terminal: bool = True
+    folded: bool = False  # on the page: among the further tables, which a reader opens
 
 
 def figures_of(title: str, runs: Sequence[StepRun], file: str) -> Table:

@@ -9,9 +9,10 @@ from pathlib import Path
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import UsageError
 from processor.pipeline import Execution
-from processor.report import all_figures, all_tables, headline, page
+from processor.report import all_figures, all_tables, document, headline, page, workbook
 from processor.report import table as report_table
 from processor.report.step_report import step_report
+from processor.report.style import default_settings
 from processor.results.names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
 from processor.results.to_json import results_json
 from processor.store import store
@@ -20,7 +21,8 @@ from processor.store.writable import check_folder
 
 # The record of a batch's job is replaced with its results: without it, the batch does the job again.
 OWN_NAMES = (RESULTS_JSON, RESULTS_H5, REPORT_PAGE, FIGURES, JOB_RECORD)
-OWN_ENDINGS = (".csv", ".dxf", ".pdf")
+OWN_ENDINGS = (".csv", ".dxf", ".pdf", ".xlsx")
+FURTHER = ("pdf", "xlsx")  # forms of the report that are written on request
 
 
 def check_output(out: Path, source: Path | None, mark: str = RESULTS_JSON, names: Collection[str] = OWN_NAMES) -> None:
@@ -41,11 +43,13 @@ def check_output(out: Path, source: Path | None, mark: str = RESULTS_JSON, names
     check_folder(out)
 
 
-def write_results(out: Path, execution: Execution, report: ErrorReport, lang: str = "en") -> None:
+def write_results(
+    out: Path, execution: Execution, report: ErrorReport, lang: str = "en", further: Collection[str] = ()
+) -> None:
     """Write results.h5, results.json, CSV tables, figures, drawings and report.html into ``out``, in place of others.
 
-    Only the page is in the language ``lang``. Raises InputError where they cannot be written, and leaves ``out`` as it
-    was.
+    Only the page is in the language ``lang``. ``further`` names forms of the report, of FURTHER, that are written too.
+    Raises InputError where they cannot be written, and leaves ``out`` as it was.
     """
     with replacing_folder(out) as making:
         store.write_results(making / RESULTS_H5, execution.runs, execution.provenance)
@@ -64,3 +68,8 @@ def write_results(out: Path, execution: Execution, report: ErrorReport, lang: st
             for name, (_, png) in of_step.items():
                 write_bytes(making / FIGURES / name, png)
         write_text(making / REPORT_PAGE, page.html(execution, report, drawn, lang))
+        if "pdf" in further:
+            with default_settings():
+                write_bytes(making / document.NAME, document.document(execution, drawn))
+        if "xlsx" in further:
+            write_bytes(making / workbook.NAME, workbook.workbook(execution, report))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import StepRun, worst
+from processor.model import Scene, StepRun, worst
 from processor.pipeline import Execution
 from processor.results.fields_to_json import as_object
 from processor.results.names import FORMAT, FORMAT_VERSION
@@ -24,6 +24,7 @@ def results_json(execution: Execution, report: ErrorReport, headline: str = "") 
         "input": made["input"],
         "input_sha256": made["input_sha256"],
         "units": {"read_as": execution.scene.units, "reason": execution.scene.units_reason, "written_as": "mm"},
+        **_clips(execution.scene),
         "seed": made["seed"],
         "software": made["software"],
         "parameters": made["parameters"],
@@ -47,6 +48,19 @@ def results_json(execution: Execution, report: ErrorReport, headline: str = "") 
     }
     written: dict[str, Any] = json_ready(content)
     return written
+
+
+def _clips(scene: Scene) -> dict[str, Any]:
+    """Write what the scans were cut by, mm, project's frame; nothing where they were not."""
+    clips = scene.clips
+    if clips is None:
+        return {}
+    rows = zip(clips.low, clips.high, clips.keep.tolist(), clips.scan, clips.inside.tolist(), strict=True)
+    boxes = [
+        {"box": [low, high], "keep": keep, "scan": scan or None, "points": inside}
+        for low, high, keep, scan, inside in rows
+    ]
+    return {"clip": {"points_read": clips.read, "points_clipped": clips.read - clips.kept, "boxes": boxes}}
 
 
 def step_json(run: StepRun) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from processor.model import (
     Scene,
     Stations,
     StructureDesign,
+    TitleBlock,
     Tolerance,
     did_you_mean,
 )
@@ -30,6 +31,7 @@ from processor.readers.encoding import file_name_as_text
 from processor.readers.raw_scan import scaled_in_place, scan_name
 from processor.scan_folder import guess, mesh_faults, scanner_grid, units
 from processor.scan_folder.checked_toml import Table, existing_file_in
+from processor.scan_folder.clips import Clipper, read_boxes
 from processor.scan_folder.control_points import Measured, control_points, read_control
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
 from processor.scan_folder.files import (
@@ -48,6 +50,7 @@ from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
 from processor.scan_folder.shapes import files as surface_files
 from processor.scan_folder.text_files import read_text
+from processor.scan_folder.title_block import read_title_block
 from processor.scan_folder.tolerance import check_components, read_tolerance
 from processor.scan_folder.units import MM_PER_UNIT, known_unit
 
@@ -56,7 +59,10 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-KEYS = ("name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control")
+KEYS = (
+    "name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control", "report",
+    "clip",
+)  # fmt: skip
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FEWEST_POINTS = 4
 FLOAT_STEP_MM = 1.0
@@ -95,6 +101,8 @@ class _Project:
     tolerance: Tolerance | None = None
     control: tuple[Measured, ...] = ()
     guessed: Guess | None = None  # instead of a project.toml
+    title_block: TitleBlock | None = None
+    table: Table = Table("", {})  # of which [[clip]] is read once the unit is known
 
 
 def truth_file(path: Path) -> Path | None:
@@ -229,6 +237,8 @@ def _read_project(folder: Path) -> _Project:
         tolerance=read_tolerance(table),
         control=control,
         guessed=guessed,
+        title_block=read_title_block(folder, table),
+        table=table,
     )
 
 
@@ -293,6 +303,7 @@ def _scene(
     scans: list[Scan] = []
     scan_units: list[str] = []
     reasons: dict[str, str] = {}
+    clipper = Clipper(read_boxes(project.table, MM_PER_UNIT[project.units or option or "m"]))
     for entry in tracked(project.entries):
         if entry.component and parts and entry.component not in parts:
             raise InputError(
@@ -301,7 +312,7 @@ def _scene(
         for raw in _read_raws(entry, scans):
             unit, reason = _unit(raw, entry.path, project, option)
             reasons.setdefault(unit, reason)
-            scan = _scan(raw, entry, unit, parts, stations)
+            scan = clipper.clip(_scan(raw, entry, unit, parts, stations))
             if any(scan.name == other.name for other in scans):
                 raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
             _check_unit(entry.path, scan, unit, reason, design)
@@ -321,6 +332,8 @@ def _scene(
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
         control=control_points(project.control, scans, scan_units, where, project.units or option or "m"),
+        title_block=project.title_block,
+        clips=clipper.record(),
     )
 
 

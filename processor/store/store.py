@@ -365,6 +365,8 @@ def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int =
         digest.update(f"{name}:{type(value).__name__}(".encode())
         for field in dataclasses.fields(value):
             newer = field.metadata.get("newer", False)
+            if not field.metadata.get("hashed", True):
+                continue
             if pieces is not None and isinstance(value, Scan) and field.name in per_point_fields(Scan):
                 shape, parts = pieces(scan, field.name)
                 if newer and not shape[0]:

@@ -33,6 +33,8 @@ IN_FILES = {
     "json",
     "plausible",
     "candidates",
+    "SHA",
+    "processor",
 }
 SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm", "bow_mm", "max_balls"}
 STAYS = UNITS | METHODS | STANDARDS | IN_FILES | SYMBOLS

@@ -4,7 +4,6 @@ import dataclasses
 import json
 from types import SimpleNamespace
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 import trimesh
@@ -36,7 +35,7 @@ from processor.model import (
 )
 from processor.pipeline import Execution
 from processor.report import write_results
-from processor.report.deviation import figures, section
+from processor.report.deviation import section
 from processor.results import fields_to_json, to_json
 from tests.support import plate_clouds
 from tests.support.meshes import bracket
@@ -433,16 +432,6 @@ def test_the_mean_has_what_stations_have_alone_and_in_common():
     few = Movement(*(value[: len(front.points)] for value in vars(moved).values()))
     alone = common_errors.mean_sd(scan, np.eye(4), front, few, pose, 1.0)
     assert alone > np.hypot(0.2, 0.2), "of one face the pose itself is in the mean"
-
-
-def test_marks_of_the_legend_can_be_seen():
-    legend = figures._legend(3, 5, 7)
-    assert [one.get_label().rsplit("(", 1)[1] for one in legend] == ["3)", "5)", "7)"]
-    for one in legend:
-        assert max(mpl.colors.to_rgb(one.get_color())) < 0.5  # white is 1
-        assert one.get_markersize() >= 2.5
-        assert one.get_linestyle() == "None"
-    assert legend[2].get_markersize() > 1.5 * legend[1].get_markersize()
 
 
 def test_it_is_written_as_the_interface_says(tmp_path):

@@ -14,12 +14,14 @@ from processor.language.messages import Message, text
 from processor.model import Floats, Ints, Scene, Status, StepRun
 from processor.pipeline import Execution
 from processor.report import surface_view
-from processor.report.deviation import core_points_csv, figures
+from processor.report.deviation import core_points_csv, face_maps, figures
+from processor.report.deviation.face_maps import Band
 from processor.report.step_report import StepReport
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table, figures_of
 
 MAP, HISTOGRAM = "deviation-map.png", "deviation-histogram.png"
+LIMIT = "deviation_mm"  # of a project
 LABEL = "scan minus design along the normal"
 
 
@@ -62,13 +64,23 @@ def _tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     return [figures_of("Deviation of the surface from the design", runs, "deviation-figures")]
 
 
-def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> CaptionedPngs:
+def _band(scene: Scene, run: StepRun) -> Band:
+    """Return the deviations that the project allows, or those that the scan does not tell from none."""
+    limits = () if scene.tolerance is None else scene.tolerance.limits
+    for limit in limits:
+        if limit.key == LIMIT and np.isfinite([limit.low, limit.high]).all():
+            name = text("allowed, {low:g} to {high:g} mm", low=limit.low, high=limit.high)
+            return Band(limit.low, limit.high, name)
+    return face_maps.not_sure(run.result.core.distances, "mm")
+
+
+def _figures(execution: Execution, runs: Sequence[StepRun], __: ErrorReport) -> CaptionedPngs:
     core = runs[0].result.core
     if not np.isfinite(core.lod95).any():
         return {}
     points = core.points + runs[0].result.origin
     return {
-        MAP: figures.deviation_map(points, core.normals, core.distances, LABEL, "mm"),
+        MAP: face_maps.face_maps(points, core.normals, core.distances, _band(execution.scene, runs[0]), (LABEL, "mm")),
         HISTOGRAM: figures.histogram(core.distances, LABEL, "mm"),
     }
 

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 from processor.inspection.result import Result
 from processor.language.messages import Message, Text, label, text
-from processor.model import Status, Verdict
+from processor.model import Scene, Status, StepRun, Verdict
+from processor.report.characteristics import Characteristic
 from processor.report.inspection import tables
 from processor.report.step_report import StepReport
 
@@ -57,6 +58,28 @@ def _beyond(result: Result) -> Iterator[Message]:
                 )  # fmt: skip
 
 
+def _characteristics(_: Scene, run: StepRun) -> list[Characteristic]:
+    """Return what of the components is held against limits."""
+    return [
+        Characteristic(
+            id=f"{component.name} {found.id[i]}",
+            quantity=found.quantity[i],
+            nominal=float(found.nominal[i]),
+            deviation=float(found.deviation[i]),
+            ci95=float(found.ci95[i]),
+            lower=float(found.lower[i]),
+            upper=float(found.upper[i]),
+            unit=found.unit[i],
+            verdict=found.verdict[i],
+            limit_from=label(found.clause[i]),
+        )
+        for component in run.result.components
+        for found in (component.characteristics,)
+        for i in range(len(found))
+        if found.verdict[i] is not Verdict.NONE
+    ]
+
+
 REPORT = StepReport(
     title=text("Inspection of components"),
     summary=_summary,
@@ -64,4 +87,6 @@ REPORT = StepReport(
     figures=lambda *_: {},
     to_do=_beyond,
     limits=lambda result: [component.characteristics for component in result.components],
+    characteristics=_characteristics,
+    own_table=True,
 )

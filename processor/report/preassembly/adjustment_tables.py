@@ -85,6 +85,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
             tuple(_measures(adjustment)),
             file="measures",
             on_terminal=False,
+            folded=True,
         ),
         Table(
             text("Span and closure, method {method}", method=method),
@@ -92,6 +93,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
             tuple(_span_and_closure(adjustment)),
             file="span",
             note=SPAN_NOTE,
+            folded=True,
         ),
         *_loops(adjustment, method),
         Table(
@@ -100,6 +102,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
             tuple(zip(BudgetSource, adjustment.budget_sd.tolist(), strict=False)),
             file="budget",
             note=BUDGET_NOTE,
+            folded=True,
         ),
         Table(
             text("What limits the accuracy, and which scan would help"),
@@ -162,7 +165,7 @@ def _limits(adjustment: Adjustment, method: str) -> Table:
         for row in _limit_rows(conformity.limits)
     )
     note = with_unverified(LIMITS_NOTE, _unverified(adjustment.joints.conformity))
-    return Table(text("Limits, method {method} (mm)", method=method), columns, rows, file=LIMITS, note=note)
+    return Table(text("Limits, method {method} (mm)", method=method), columns, rows, LIMITS, note, on_page=False)
 
 
 def _unverified(judged: Sequence[Conformity]) -> Iterator[str]:
@@ -194,7 +197,8 @@ def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     )
     if rows:
         title = text("Limits of the whole chain, method {method} (mm)", method=method)
-        yield Table(title, columns, rows, file=CHAIN, note=with_unverified(CHAIN_NOTE, _unverified(adjustment.chain)))
+        note = with_unverified(CHAIN_NOTE, _unverified(adjustment.chain))
+        yield Table(title, columns, rows, file=CHAIN, note=note, on_page=False)
     if adjustment.unused_limits:
         yield Table(
             text("Limits that nothing is compared with"),
@@ -282,4 +286,5 @@ def _trade_off(result: Result, adjustment: Adjustment, method: str) -> Table:
         note=text("The result was made with lambda {weight:g}.", weight=adjustment.weight),
         groups=("", *[text("splicing error")] * 2, *[text("linear error")] * 2),
         on_terminal=False,
+        folded=True,
     )

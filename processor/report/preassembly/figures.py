@@ -7,14 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from processor.language.messages import Message, text
-from processor.model import Floats, Scene, StepRun
+from processor.model import KEY_POINTS, Floats, Scene, StepRun, Verdict
 from processor.preassembly.result import Deviations, EdgeSide, Joints, Result
 from processor.report.preassembly import residual_map
-from processor.report.preassembly.joint_figures import by_axis, gap_vectors
+from processor.report.preassembly.joint_figures import WITHIN, by_axis, gap_vectors, is_beyond
 from processor.report.preassembly.part_lines import part_lines
 from processor.report.style import (
     BEHIND_TEXT,
@@ -30,7 +31,11 @@ from processor.report.style import (
 )
 
 AS_DESIGNED_ALPHA = 0.4  # of the lines of a method's error for parts exactly as designed
+# Dark enough to be read; a failed joint is told by its word as well.
+CALLOUTS = {Verdict.FAIL: "#b34700", Verdict.PASS: "#005a94", Verdict.INDETERMINATE: "black", Verdict.NONE: "black"}
 GAP_SHARE = 0.04  # of the bridge's length: how long the largest gap is drawn
+SHOWN_LIVE = ("linear-error.png", "trade-off.png")  # the page's charts have the same lines
+OF_OTHER_METHODS = ("gaps-by-axis.png",)
 TRADED = (("splicing error, mean |d|", 0, 2, "mean"), ("splicing error, largest |d|", 1, 3, "largest"))
 
 
@@ -70,7 +75,7 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
             for edge in part_lines(scene.arch, i):
                 axes.plot(edge[:, 0] / 1e3, edge[:, up] / 1e3, color="0.35" if i % 2 else "0.6", linewidth=2.0)
         for j in range(len(joints)):
-            _joint_drawn(axes, scene.arch.joint_points[j], joints.gaps[j], up, ends, times)
+            _joint_drawn(axes, scene.arch.joint_points[j], joints, j, (up, ends, times))
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("along the span, m")
     for i, part in enumerate(scene.arch.parts):
@@ -80,11 +85,9 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     labels = [printable_name(name, j) for j, name in enumerate(joints.name)]
     for j, name in enumerate(labels):
         x, _, z = scene.arch.joint_points[j].mean(axis=0) / 1e3
-        size = np.abs(joints.gaps[j])
-        finite = bool(np.isfinite(size).any())
-        _write(side, f"{name}\n{np.nanmax(size):.2f} mm" if finite else f"{name}\nno gap computed", (x, z), 30)
+        _write(side, callout(name, joints, j), (x, z), 30, CALLOUTS[joints.verdict[j]])
     drawn = f"gaps drawn {times:,.0f} times their size" if times else "no gap is known"
-    side.set(ylabel="height, m", title=f"side view, with the largest |d| of each joint; {drawn}")
+    side.set(ylabel="height, m", title=f"side view, with the largest gap of each joint; {drawn}")
     plan.set(ylabel="across, left up, m", title=f"plan; {drawn}")
     for axes, below, above in ((side, 0.12, 0.42), (plan, 0.3, 0.3)):  # room for the names
         low, high = axes.dataLim.intervaly
@@ -92,8 +95,9 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     handles = [
         Patch(facecolor="none", edgecolor="0.2", label="end of the left part"),
         Patch(facecolor="none", edgecolor=COLOURS[1], linestyle="--", label="start of the right part"),
+        Line2D([], [], color=WITHIN, marker="o", linestyle="", label="gap within its 95 % region: not drawn"),
     ]
-    plan.legend(handles=handles, fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.28))
+    plan.legend(handles=handles, fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.28))
     _all_gaps(gaps, joints, labels)
     for axes in (side, plan, gaps):
         axes.grid(alpha=0.3)
@@ -116,17 +120,40 @@ def _times(scene: Scene, joints: Joints) -> float:
     return rounded(wanted)
 
 
-def _joint_drawn(axes: Axes, points: Floats, gaps: Floats, up: int, ends: tuple[int, int], times: float) -> None:
-    """Draw the left part's end as designed and the right part's moved by its gaps, enlarged."""
-    here = points[list(ends)][:, [0, up]] / 1e3
+def callout(name: str, joints: Joints, j: int) -> str:
+    """Write the name of a joint, its largest gap with point and axis, and its verdict, as "J3 P7 dx -7.9 mm FAIL"."""
+    size = np.abs(joints.gaps[j])
+    if not np.isfinite(size).any():
+        return f"{name}\nno gap computed"
+    point, axis = np.unravel_index(int(np.nanargmax(size)), size.shape)
+    verdict = "" if joints.verdict[j] is Verdict.NONE else f"\n{joints.verdict[j].upper()}"
+    return f"{name} {KEY_POINTS[point]} d{'xyz'[axis]} {joints.gaps[j, point, axis]:+.2f} mm{verdict}"
+
+
+def _joint_drawn(axes: Axes, points: Floats, joints: Joints, j: int, seen: tuple[int, tuple[int, int], float]) -> None:
+    """Draw the left part's end as designed and the right part's moved by its gaps, enlarged.
+
+    ``seen`` are the axis up, the two points drawn, and the enlargement. A gap within its 95 % region is a grey dot.
+    """
+    up, ends, times = seen
+    rows = list(ends)
+    here = points[rows][:, [0, up]] / 1e3
     axes.plot(here[:, 0], here[:, 1], color="0.2", linewidth=1.6)
-    there = here + times * gaps[list(ends)][:, [0, up]] / 1e3
+    gaps, half = joints.gaps[j, rows][:, [0, up]], joints.gap_ci95[j, rows][:, [0, up]]
+    there = here + times * gaps / 1e3
     if not np.isfinite(there).all():
         x, z = here.mean(axis=0)
         axes.plot(x, z, "x", color=COLOURS[1], markersize=10, markeredgewidth=2.0)
         return
+    beyond = is_beyond(gaps, half)
+    if not beyond.any():
+        axes.plot(here[:, 0], here[:, 1], "o", color=WITHIN, markersize=5, zorder=3)
+        return
     axes.plot(there[:, 0], there[:, 1], color=COLOURS[1], linewidth=1.6, linestyle=(0, (3, 1.2)))
-    for start, end in zip(here, there, strict=True):
+    for start, end, arrow in zip(here, there, beyond, strict=True):
+        if not arrow:
+            axes.plot(*start, "o", color=WITHIN, markersize=5, zorder=3)
+            continue
         axes.annotate(
             "",
             end,
@@ -142,10 +169,10 @@ def _joint_drawn(axes: Axes, points: Floats, gaps: Floats, up: int, ends: tuple[
         )
 
 
-def _write(axes: Axes, text: str, at: tuple[float, float], up: int) -> None:
+def _write(axes: Axes, text: str, at: tuple[float, float], up: int, colour: str = "black") -> None:
     axes.annotate(
         text, at, xytext=(0, up), textcoords="offset points", ha="center", fontsize=9, bbox=BEHIND_TEXT,
-        va="bottom" if up > 0 else "top",
+        va="bottom" if up > 0 else "top", color=colour, fontweight="normal" if colour == "black" else "bold",
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Polygon
 
 from processor.language.messages import Message, text
-from processor.model import KEY_POINTS, NORMAL_95, Floats, StepRun
+from processor.model import KEY_POINTS, NORMAL_95, Flags, Floats, StepRun
 from processor.preassembly.result import Result
 from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
 from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, png, printable_name, rounded
@@ -22,6 +22,19 @@ ARROW_SHARE = 0.3  # of the section: how long the longest arrow is drawn
 # Where the numbers of P1..P8 stand: outward of the section, left of the bridge is left on the page.
 OUTWARD = ((-1, -1), (1, -1), (1, 1), (-1, 1), (0, -1), (1, 0), (0, 1), (-1, 0))
 ALIGNED = {-1: ("right", "top"), 0: ("center", "center"), 1: ("left", "bottom")}
+
+
+WITHIN = "0.45"  # colour of the dot that stands for a gap within its interval
+
+
+def is_beyond(vectors: Floats, half: Floats) -> Flags:
+    """Mark which of vectors (n, 2) lie beyond the 95 % region that half-widths (n, 2) along the axes stand for.
+
+    All of them where the half-widths are not known.
+    """
+    if not np.isfinite(half).all() or not (half > 0.0).all():
+        return np.ones(len(vectors), bool)
+    return np.asarray(NORMAL_95 * np.linalg.norm(vectors / half, axis=1) > RAYLEIGH_95, bool)
 
 
 def gap_vectors(result: Result) -> tuple[Message, bytes]:
@@ -40,12 +53,13 @@ def gap_vectors(result: Result) -> tuple[Message, bytes]:
         else:
             axes.set(xticks=[], yticks=[])
             axes.text(0.5, 0.5, "no gaps computed", ha="center", transform=axes.transAxes, fontsize=9)
-        axes.set_title(f"{printable_name(result.joints.name[j], j)}: {result.joints.verdict[j]}", fontsize=11)
+        axes.set_title(f"{printable_name(result.joints.name[j], j)}: {result.joints.verdict[j].upper()}", fontsize=11)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     handles = [
         Line2D([], [], color=COLOURS[0], marker=">", label=f"gap across, drawn {times:,.0f} times its size"),
         Line2D([], [], color=COLOURS[1], label="95 % region of the gap across"),
+        Line2D([], [], color=WITHIN, marker="o", linestyle="", label="gap across within its 95 % region"),
         Line2D([], [], color="black", marker="o", fillstyle="none", linestyle="", label="dx +: open along the bridge"),
         Line2D([], [], color="black", marker="s", linestyle="", label="dx −: overlap"),
     ]
@@ -106,19 +120,10 @@ def _section(axes: Axes, measures: Measures, times: float) -> None:
         tip = at[k] + times * gaps[k, 1:]
         block = measures.covariance[3 * k + 1 : 3 * k + 3, 3 * k + 1 : 3 * k + 3]
         axes.add_patch(_ellipse(tip, block * times**2))
-        axes.annotate(
-            "",
-            tip,
-            at[k],
-            arrowprops={
-                "arrowstyle": "-|>",
-                "color": COLOURS[0],
-                "lw": 1.4,
-                "mutation_scale": 7,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            },
-        )
+        if _is_noise(gaps[k, 1:], block):
+            axes.plot(*at[k], "o", color=WITHIN, markersize=8, zorder=2)
+        else:
+            _arrow(axes, at[k], tip)
         is_open = gaps[k, 0] >= 0.0
         axes.plot(*at[k], "o" if is_open else "s", color="black", markersize=5, fillstyle="none" if is_open else "full")
         side, up = OUTWARD[k]
@@ -141,6 +146,16 @@ def _section(axes: Axes, measures: Measures, times: float) -> None:
     axes.set(xlabel="to the left, mm", ylabel="up, mm")
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.25)
+
+
+def _is_noise(gap: Floats, covariance: Floats) -> bool:
+    """Whether a gap across (2,) is within the 95 % region of its covariance (2, 2) about none."""
+    return bool(gap @ np.linalg.pinv(covariance) @ gap <= RAYLEIGH_95**2)
+
+
+def _arrow(axes: Axes, start: Floats, tip: Floats) -> None:
+    props = {"arrowstyle": "-|>", "color": COLOURS[0], "lw": 1.4, "mutation_scale": 7, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", (float(tip[0]), float(tip[1])), (float(start[0]), float(start[1])), arrowprops=props)
 
 
 def _ellipse(at: Floats, covariance: Floats) -> Ellipse:

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from processor.language.messages import Message, Text, text
-from processor.model import Floats, Status, Verdict
-from processor.preassembly.result import MeanMax, Result
+from processor.model import Floats, Status, Verdict, worst
+from processor.preassembly.result import Adjustment, MeanMax, Result
 from processor.preassembly.verdicts.joints import ComparedLimits
-from processor.report.preassembly import figures, live_data, tables
+from processor.report.preassembly import characteristics, figures, live_data, tables
 from processor.report.step_report import StepReport
 
 VERDICTS = {
@@ -37,8 +37,9 @@ def _summary(result: Result) -> tuple[Message, Message]:
     body = [
         text("Splicing error {errors}.", errors=_mean_max(result.splicing)),
         text("Linear error {errors}.", errors=_mean_max(linear)),
-        text("Joints: {verdicts}.", verdicts=verdicts or text("none")),
     ]
+    if result.adjustment is None:
+        body.append(text("Joints: {verdicts}.", verdicts=verdicts or text("none")))
     if result.adjustment is not None:
         head = text(
             "of {joints} joints {verdicts}; assembly {head}", joints=len(result.joints), verdicts=verdicts, head=head
@@ -60,24 +61,34 @@ def _mean_max(error: MeanMax) -> Text:
     )  # fmt: skip
 
 
-def _further(result: Result) -> list[tuple[Message, Message]]:
+def _further(result: Result) -> list[tuple[Message, Message] | tuple[Message, Message, Verdict]]:
     """Return what the adjustment states of the whole bridge, beside the verdict."""
     adjustment = result.adjustment
     if adjustment is None:
         return []
-    rows: list[tuple[Message, Message]] = []
+    rows: list[tuple[Message, Message] | tuple[Message, Message, Verdict]] = []
     if np.isfinite(adjustment.span_departure):
         sentences = [
             text("{span} mm against the design", span=_with_ci95(adjustment.span_departure, adjustment.span_ci95))
         ]
         if np.isfinite(adjustment.closure).any():
             sentences.append(_closure(adjustment.closure[0], adjustment.closure_ci95[0]))
-        rows.append((text("Span"), text("{sentences:.}", sentences=sentences)))
+        rows.append((text("Span"), text("{sentences:.}", sentences=sentences), _verdict_on_span(adjustment)))
     if adjustment.limiting:
         rows.append((text("What limits the accuracy"), text("{reasons:.}", reasons=adjustment.limiting)))
     if adjustment.advice:
         rows.append((text("Which scan would help"), text("{reasons:.}", reasons=adjustment.advice)))
     return rows
+
+
+def _verdict_on_span(adjustment: Adjustment) -> Verdict:
+    """Return the worst verdict on the limits of the distance of the outer ends; none without such a limit."""
+    return worst(
+        verdict
+        for one in adjustment.chain
+        for key, verdict in zip(one.limits.key, one.limits.verdict, strict=True)
+        if key.startswith(characteristics.CHORDS)
+    )
 
 
 def _closure(shift: Floats, ci95: Floats) -> Text:
@@ -133,5 +144,9 @@ REPORT = StepReport(
     to_do=_to_do,
     why=_why,
     limits=_limits,
+    characteristics=characteristics.of_run,
+    characteristics_note=characteristics.NOTE,
+    live_figures=figures.SHOWN_LIVE,
+    further_figures=figures.OF_OTHER_METHODS,
     interactive_data=live_data.live_data,
 )

@@ -36,10 +36,11 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     tables += _by_point(first, text("Splicing error, method {method} (mm)", method=method), first.joints.gaps)
     if np.isfinite(first.joints.gap_ci95).any():
         title = text("95 % half-widths, method {method} (mm)", method=method)
-        tables += _by_point(first, title, first.joints.gap_ci95)
+        tables += [replace(table, folded=True) for table in _by_point(first, title, first.joints.gap_ci95)]
     for run in runs[1:]:
         title = text("Splicing error, method {method} (mm)", method=run.method)
-        tables += [replace(table, on_terminal=False) for table in _by_point(run.result, title, run.result.joints.gaps)]
+        by_point = _by_point(run.result, title, run.result.joints.gaps)
+        tables += [replace(table, on_terminal=False, folded=True) for table in by_point]
     tables += [_gaps(run, "gaps" if run is runs[0] else f"gaps-{run.method}") for run in runs]
     return [*tables, _linear(first, method)]
 
@@ -114,7 +115,11 @@ def _others(runs: Sequence[StepRun]) -> list[Table]:
         if status != Status.OK or reasons
     )
     columns = ("method", "component", "status", "remark")
-    return [Table(text("Components by the methods compared"), columns, rows, "components-compared")] if rows else []
+    return (
+        [Table(text("Components by the methods compared"), columns, rows, "components-compared", folded=True)]
+        if rows
+        else []
+    )
 
 
 def _joints(result: Result, method: str) -> Table:

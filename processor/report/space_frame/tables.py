@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,8 @@ def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     for run in runs:
         true = report.true_radii.get(run.method, np.full(len(run.result.balls), NAN))
         file = "balls" if run is runs[0] else f"balls-{run.method}"
-        tables.append(_with_bounds(run, true, file) if run.result.has_bounds else _formal(run, true, file, runs[0]))
+        table = _with_bounds(run, true, file) if run.result.has_bounds else _formal(run, true, file, runs[0])
+        tables.append(replace(table, folded=run is not runs[0]))
     if whole:
         tables += [_brief(first, runs[0].method), _lowest(first.balls), *_nodes(first), *_tubes(first)]
         tables += [*_stations(first), *_control(first)]

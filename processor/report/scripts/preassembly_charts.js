@@ -8,7 +8,7 @@ function preassemblyCharts(panel, data) {
     const beyond = (sign) => half && y.map((value, i) => (value === null || half[i] === null ? null : Math.max(value + sign * half[i], 1e-3)));
     const x = rows.map((i) => one.chainage[i] / 1000);
     return {
-      name: `${one.method}, ${say(edge)}`, colour: colours[m % 4], style: m, thin: edge === "right", x, y,
+      name: `${one.method}, ${say(edge)}`, colour: colours[m % 4], style: m, further: m > 0, thin: edge === "right", x, y,
       low: beyond(-1), high: beyond(1),
       read: (i) => `${one.method}, ${say(edge === "left" ? "left edge" : "right edge")}, ${x[i].toFixed(2)} m: ${millimetres(y[i])}${half && half[i] !== null ? ` ± ${millimetres(half[i])}` : ""} mm`,
     };
@@ -21,7 +21,7 @@ function preassemblyCharts(panel, data) {
     if (!known(values)) continue;
     const series = lines(values, band);
     lineChart(panel(say(title)), {
-      xLabel: say("chainage along the bottom edge, m"), yLabel: say("linear error, mm"), series, logY: data.linear.length > 1,
+      xLabel: say("chainage along the bottom edge, m"), yLabel: say("linear error, mm"), series, logY: false,
       note: series.some((one) => one.high) ? say("The shaded band holds 95 % or more.") : "",
     });
   }

@@ -25,6 +25,12 @@ function colourTable(stops, size) {
   });
 }
 
+const BEYOND = 1.4263; // sqrt(chi-square, 3 axes, 95 %) / 1.96: of a vector in units of its axes' 95 % half-widths
+function isBeyond(by, ci95) { // what lies within its interval is noise, and is drawn as a dot
+  if (!ci95 || ci95.some((half) => !(half > 0))) return true;
+  return Math.hypot(...by.map((value, axis) => value / ci95[axis])) > BEYOND;
+}
+
 function reachOf(sizes) { // a square seen from a corner is wider than its side
   const [, middle, largest] = [...sizes].sort((a, b) => a - b);
   return Math.max(largest, 0.75 * (largest + middle), 1);
@@ -45,7 +51,8 @@ function spaceView(host, data) {
   marks.forEach((mark) => hold(mark.at));
   const whole = { target: low.map((value, k) => (value + high[k]) / 2), reach: reachOf(low.map((v, k) => high[k] - v)) };
   const vectors = joints.flatMap((joint) => joint.gap).concat(marks.map((mark) => mark.by || []));
-  const largest = vectors.flat().reduce((m, v) => Math.max(m, Math.abs(v || 0)), 0);
+  const half = joints.flatMap((joint) => joint.ci95 || []).concat(marks.map((mark) => mark.ci95 || []));
+  const largest = vectors.concat(vectors.length ? half : []).flat().reduce((m, v) => Math.max(m, Math.abs(v || 0)), 0);
   const camera = { yaw: -0.5, pitch: 0.35, zoom: 1, ...whole };
   const state = { times: 1, limit: data.limit, points: true, arrows: true, joint: -1 };
 
@@ -190,7 +197,7 @@ function spaceView(host, data) {
   function gap(at, joint, p, k) {
     const by = joint.gap[k];
     if (by.some((value) => value === null)) return;
-    const to = arrow(at, p, by);
+    const to = isBeyond(by, joint.ci95[k]) ? arrow(at, p, by) : dot(at, p);
     tips.push({ x: to[0], y: to[1], reach: 9 * ratio, text: () => `${joint.name} (${say(joint.verdict)}), ${data.keys[k]}: ${vector(by, joint.ci95[k])}` });
   }
   function circle(at, mark) {
@@ -203,7 +210,7 @@ function spaceView(host, data) {
     context.stroke();
     tips.push({ x, y, reach: Math.max(radius, 6 * ratio), text: () => `${mark.name}: ${mark.text}${mark.by ? `; ${vector(mark.by, mark.ci95)}` : ""}` });
     if (mark.label) label(mark.name, x + radius + 3 * ratio, y);
-    if (state.arrows && mark.by && mark.by.every((value) => value !== null)) arrow(at, mark.at, mark.by);
+    if (state.arrows && mark.by && mark.by.every((value) => value !== null) && isBeyond(mark.by, mark.ci95)) arrow(at, mark.at, mark.by);
   }
   function label(text, x, y) {
     context.font = `bold ${12 * ratio}px system-ui, sans-serif`;
@@ -213,6 +220,14 @@ function spaceView(host, data) {
     context.strokeText(text, x, y + 4 * ratio);
     context.fillStyle = "#000";
     context.fillText(text, x, y + 4 * ratio);
+  }
+  function dot(at, p) {
+    const to = at(...p);
+    context.fillStyle = "#666";
+    context.beginPath();
+    context.arc(to[0], to[1], 3.5 * ratio, 0, 2 * Math.PI);
+    context.fill();
+    return to;
   }
   function arrow(at, p, by) {
     const from = at(...p), to = at(...p.map((value, axis) => value + state.times * by[axis]));

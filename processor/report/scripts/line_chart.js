@@ -7,7 +7,7 @@ function lineChart(host, wanted) {
   canvas.setAttribute("aria-label", `${yLabel} ${say("against")} ${xLabel}`);
   const said = make("output", { className: "said" }, say("Point at a line to read it; names switch lines on and off."));
   const context = canvas.getContext("2d");
-  const lines = series.map((one) => ({ ...one, on: true }));
+  const lines = series.map((one) => ({ ...one, on: !one.further }));
   let waiting = false, ratio = 1, spots = [];
   const swatch = (one) => {
     const found = make("span", { className: "swatch" });
@@ -20,7 +20,7 @@ function lineChart(host, wanted) {
     return make("label", {}, box, ...parts);
   };
   host.append(canvas, said, make("div", { className: "tools" },
-    ...lines.map((one) => tick([swatch(one), one.name], true, (on) => { one.on = on; })),
+    ...lines.map((one) => tick([swatch(one), one.name], one.on, (on) => { one.on = on; })),
     ...(logX ? [] : [tick([` ${say("logarithmic")}`], logY, (on) => { logY = on; })])));
   if (note) host.append(make("p", { className: "soft" }, note));
 

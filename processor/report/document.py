@@ -1,0 +1,154 @@
+"""The report as a document (PDF, A4): title block and verdicts, what is held against limits, and the figures.
+
+Texts are in English, with the characters of the font that Matplotlib brings; others are drawn as question marks.
+"""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from processor.language.messages import messages
+from processor.model import Verdict, worst
+from processor.pipeline import Execution
+from processor.report import characteristics, headline, title_block
+from processor.report.characteristics import Characteristic
+from processor.report.style import CaptionedPngs, drawable, pdf
+from processor.report.table import shown
+
+NAME = "report.pdf"
+A4 = (8.27, 11.69)  # inches
+LEFT, RIGHT, TOP, BOTTOM = 0.08, 0.94, 0.93, 0.06  # shares of the page
+LINE = 0.0165
+ROWS_A_PAGE = 44
+COLOURS = {Verdict.PASS: "#005a94", Verdict.FAIL: "#b34700"}
+# Where the columns of the table stand: share of the page, and how they are aligned.
+COLUMNS = (
+    ("id", 0.08, "left"), ("verdict", 0.32, "left"), ("nominal", 0.51, "right"), ("actual", 0.61, "right"),
+    ("deviation", 0.70, "right"), ("± 95 %", 0.77, "right"), ("lower", 0.84, "right"), ("upper", 0.91, "right"),
+    ("unit", 0.92, "left"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of text, its size in points, weight and colour."""
+
+    text: str
+    size: float = 9.0
+    weight: str = "normal"
+    colour: str = "black"
+
+
+def document(execution: Execution, figures: Mapping[str, CaptionedPngs]) -> bytes:
+    """Write the document; the same run gives the same bytes."""
+    pages = [*_front(execution), *_characteristics(execution)]
+    drawn = [(str(caption), png) for of_step in figures.values() for caption, png in of_step.values()]
+    count = len(pages) + len(drawn)
+    head = drawable(" · ".join(filter(None, [*_heads(execution), execution.scene.name])))
+    foot = drawable(", ".join(value for _, value in title_block.facts(execution.provenance)))
+
+    def finished() -> Iterator[Figure]:
+        for number in range(count):
+            page = pages[number] if number < len(pages) else _picture(*drawn[number - len(pages)])
+            page.text(LEFT, 0.97, head[:110], fontsize=7, color="0.35")
+            page.text(LEFT, 0.025, foot[:110], fontsize=7, color="0.35")
+            page.text(RIGHT, 0.025, f"{number + 1} / {count}", fontsize=7, color="0.35", ha="right")
+            yield page
+
+    return pdf(finished())
+
+
+def _heads(execution: Execution) -> list[str]:
+    given = title_block.entries(execution.scene)
+    return [given.get(key, "") for key in ("company", "project", "drawing")]
+
+
+def _front(execution: Execution) -> Iterator[Figure]:
+    """Yield the pages of title block, verdict, headlines and lines to sign."""
+    runs = [run for run, _ in execution.by_step()]
+    scene, verdict = execution.scene, worst(run.verdict for run in runs)
+    word = "NO VERDICT" if verdict is Verdict.NONE else verdict.upper()
+    held = [one for run in runs for one in characteristics.of_run(scene, run)]
+    lines = [Line(scene.name, 16, "bold"), Line("")]
+    lines += [
+        Line(word, 18, "bold", COLOURS.get(verdict, "black")),
+        Line(""),
+        *_wrapped(str(characteristics.told(held))),
+    ]
+    if verdict is not Verdict.NONE and headline.unverified(execution):
+        lines += _wrapped("Provisional: not all limits were checked against the standard's text.")
+    lines.append(Line(""))
+    given = [*title_block.entries(scene).items(), *title_block.facts(execution.provenance)]
+    for name, value in given:
+        lines += _wrapped(f"{str(name).replace('_', ' ')}: {value}")
+    lines.append(Line(""))
+    if scene.title_block is not None:
+        for who, _ in title_block.SIGNATURES:
+            lines += [Line(""), Line(f"{who}: {'_' * 36}   date: {'_' * 14}")]
+        lines.append(Line(""))
+    for run in runs:
+        lines += _wrapped(str(headline.of_step(run)), weight="bold")
+        reasons = getattr(run.result, "reasons", ())
+        lines += [*_wrapped(messages("en").sentences(reasons)), Line("")] if reasons else [Line("")]
+    for start in range(0, len(lines), ROWS_A_PAGE):
+        yield _page(lines[start : start + ROWS_A_PAGE])
+
+
+def _wrapped(text: str, weight: str = "normal") -> list[Line]:
+    return [Line(part, weight=weight) for part in textwrap.wrap(text, 98)]
+
+
+def _page(lines: Sequence[Line]) -> Figure:
+    page = Figure(figsize=A4)
+    for row, line in enumerate(lines):
+        page.text(
+            LEFT, TOP - 1.15 * LINE * row, drawable(line.text), fontsize=line.size, fontweight=line.weight,
+            color=line.colour, va="top",
+        )  # fmt: skip
+    return page
+
+
+def _characteristics(execution: Execution) -> Iterator[Figure]:
+    """Yield the pages of the table, worst first in each step."""
+    for run, _ in execution.by_step():
+        held = characteristics.of_run(execution.scene, run)
+        for start in range(0, len(held), ROWS_A_PAGE):
+            page = Figure(figsize=A4)
+            page.text(LEFT, TOP, f"Characteristics, step {run.step}", fontsize=11, fontweight="bold", va="top")
+            for name, x, side in COLUMNS:
+                page.text(x, TOP - 2 * LINE, name, fontsize=7, color="0.35", ha=side, va="top")
+            for row, one in enumerate(held[start : start + ROWS_A_PAGE]):
+                _row(page, TOP - (3.2 + row) * 1.15 * LINE, one)
+            yield page
+
+
+def _row(page: Figure, y: float, one: Characteristic) -> None:
+    verdict = one.verdict.upper() if one.verdict is Verdict.FAIL else str(one.verdict)
+    numbers = (one.nominal, one.actual, one.deviation, one.ci95, one.lower, one.upper)
+    cells = (str(one.id)[:34], verdict, *(shown(number) for number in numbers), one.unit)
+    for (name, x, side), cell in zip(COLUMNS, cells, strict=True):
+        colour = COLOURS.get(one.verdict, "black") if name == "verdict" else "black"
+        weight = "bold" if name == "verdict" else "normal"
+        page.text(x, y, drawable(cell), fontsize=7.5, ha=side, va="top", color=colour, fontweight=weight)
+
+
+def _picture(caption: str, png: bytes) -> Figure:
+    """Show a figure as large as the page holds it, above its caption."""
+    image = imread(io.BytesIO(png), format="png")
+    page = Figure(figsize=A4)
+    lines = textwrap.wrap(drawable(caption), 98)
+    room = (RIGHT - LEFT) * A4[0], (TOP - BOTTOM - LINE * (len(lines) + 2)) * A4[1]
+    scale = min(room[0] / image.shape[1], room[1] / image.shape[0])
+    width, height = scale * image.shape[1] / A4[0], scale * image.shape[0] / A4[1]
+    axes = page.add_axes((LEFT, TOP - height, width, height))
+    axes.axis("off")
+    axes.imshow(image, aspect="auto", interpolation="antialiased")
+    for row, line in enumerate(lines):
+        page.text(LEFT, TOP - height - LINE * (row + 1.2), line, fontsize=8, color="0.25", va="top")
+    return page

@@ -1,0 +1,62 @@
+"""What of a bridge is held against limits: each joint, and the whole chain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from processor.language.messages import Message, label, text
+from processor.limits.judging import NOT_VERIFIED
+from processor.model import ArchDesign, Scene, StepRun
+from processor.preassembly.chain.span_and_closure import design_span
+from processor.preassembly.result import Result
+from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
+from processor.report.characteristics import Characteristic
+from processor.report.table import NAN
+
+GROOVE_GAP, CHORDS = "groove_gap", ("span", "unit_length")
+CHAIN = text("chain")
+NOTE = text(
+    "Span and length of a unit: the distance of the outer ends. Inner arc, axis and elevation: the bottom edges at all "
+    "chainages, of which the one nearest to its limit is shown, its interval widened for their number."
+)
+
+
+def of_run(scene: Scene, run: StepRun) -> list[Characteristic]:
+    """Return a characteristic for each limit of each joint and of the chain; none of a method without intervals."""
+    result: Result = run.result
+    adjustment = result.adjustment
+    if adjustment is None:
+        return []
+    judged: list[tuple[str | Message, Conformity]] = [
+        *zip(adjustment.joints.name, adjustment.joints.conformity, strict=True),
+        *((CHAIN, conformity) for conformity in adjustment.chain),
+    ]
+    return [one for name, conformity in judged for one in _held(name, conformity.limits, scene)]
+
+
+def _held(name: str | Message, limits: ComparedLimits, scene: Scene) -> Iterator[Characteristic]:
+    for k, key in enumerate(limits.key):
+        standing = label("verified" if limits.verified[k] else NOT_VERIFIED)
+        clause = text("{clause}, {standing}", clause=label(limits.clause[k]), standing=standing)
+        if not limits.bounds_known[k]:
+            clause = text("{clause}; depends on a size that is not known", clause=clause)
+        yield Characteristic(
+            id=text("{place} {what}", place=name, what=label(key.removesuffix("_mm").replace("_", " "))),
+            quantity=label(limits.what[k]),
+            nominal=_nominal(key, scene),
+            deviation=float(limits.value[k]),
+            ci95=float(limits.ci95[k]),
+            lower=float(limits.low[k]),
+            upper=float(limits.high[k]),
+            verdict=limits.verdict[k],
+            limit_from=clause,
+        )
+
+
+def _nominal(key: str, scene: Scene) -> float:
+    """Return the design's value: of what departs from the design itself it is 0."""
+    if key.startswith(GROOVE_GAP):
+        return 0.0 if scene.tolerance is None else scene.tolerance.root_gap_mm
+    if key.startswith(CHORDS):
+        return design_span(scene.arch) if isinstance(scene.arch, ArchDesign) else NAN
+    return 0.0

@@ -1,0 +1,80 @@
+"""The title block of the report: what the project writes on it, what was read, and where it is signed."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from typing import Any
+
+from processor.language.messages import Message, label, text
+from processor.model import Scene
+
+LABELS: Mapping[str, Message] = {
+    "project": text("Project"),
+    "drawing": text("Drawing"),
+    "order": text("Order"),
+    "scanner": text("Scanner"),
+    "serial": text("Serial number"),
+    "scanned": text("Scanned on"),
+}
+COMPANY, OPERATOR, APPROVED = "company", "operator", "approved"
+SIGNATURES = ((text("Inspected"), OPERATOR), (text("Approved"), APPROVED))
+DIGEST = 16  # hexadecimal digits of the input's hash that are shown; all are in the provenance
+PNG = b"\x89PNG"
+
+
+def of(scene: Scene, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the page shows: company, logo as a data address, rows of names and texts, and who signs."""
+    given = entries(scene)
+    elsewhere = (COMPANY, *(key for _, key in SIGNATURES))
+    rows = [
+        (LABELS.get(key) or label(key.replace("_", " ")), value) for key, value in given.items() if key not in elsewhere
+    ]
+    rows += facts(provenance)
+    signed = scene.title_block is not None
+    return {
+        "company": given.get(COMPANY, ""),
+        "logo": _address(scene),
+        "rows": rows,
+        "signatures": [(who, given.get(key, "")) for who, key in SIGNATURES] if signed else [],
+    }
+
+
+def entries(scene: Scene) -> dict[str, str]:
+    """Return the texts of the project's title block by their keys."""
+    block = scene.title_block
+    return {} if block is None else dict(zip(block.keys, block.values, strict=True))
+
+
+def facts(provenance: Mapping[str, Any]) -> list[tuple[Message, str]]:
+    """Return what identifies the input and the software."""
+    return [
+        (text("Input"), f"{provenance['input']}, SHA-256 {str(provenance['input_sha256'])[:DIGEST]}"),
+        (text("Software"), f"processor {provenance['software'].get('processor', '')}"),
+    ]
+
+
+def running_head(scene: Scene) -> str:
+    """Return the line that stands on top of every printed page, as a string of CSS."""
+    given = entries(scene)
+    parts = [given.get(key, "") for key in (COMPANY, "project", "drawing")]
+    return css_string(" · ".join(filter(None, [*parts, scene.name])))
+
+
+def running_foot(provenance: Mapping[str, Any]) -> str:
+    """Return the line that stands below every printed page, as a string of CSS: what identifies input and software."""
+    return css_string(", ".join(value for _, value in facts(provenance)))
+
+
+def css_string(written: str) -> str:
+    """Quote a text for a style sheet; no character of it can end the string or the element."""
+    return '"' + "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):06x}" for c in written) + '"'
+
+
+def _address(scene: Scene) -> str:
+    block = scene.title_block
+    if block is None or not len(block.logo):
+        return ""
+    data = block.logo.tobytes()
+    kind = "png" if data.startswith(PNG) else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,0 +1,116 @@
+"""The tables [[clip]] of project.toml: boxes in the project's frame that scans are cut by as they are read."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from processor.model import Clips, Flags, Floats, InputError, Scan, per_point_fields
+from processor.scan_folder.checked_toml import Table
+
+KEYS = ("box", "keep", "scan")
+FEWEST_POINTS = 4
+AT_ONCE = 1_000_000  # points whose places are computed at a time
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of the project's frame, mm: points in it are the ones kept, or the ones left out; of one scan or of all."""
+
+    where: str  # in project.toml
+    low: Floats
+    high: Floats
+    keep: bool
+    scan: str = ""
+
+
+def read_boxes(project: Table, mm: float) -> tuple[Box, ...]:
+    """Read [[clip]] of a project whose unit is ``mm`` millimetres. Raises InputError for a box that holds nothing."""
+    boxes = []
+    for table in project.tables("clip"):
+        table.only(KEYS)
+        low, high = table.array("box", 2, 3) * mm
+        if not (low < high).all():
+            raise InputError(
+                f"{table.where}: expected 'box' = [[x0, y0, z0], [x1, y1, z1]] with x0 < x1, y0 < y1 and z0 < z1, "
+                f"found {table.values['box']}; put the lower corner first"
+            )
+        keep = table.values.get("keep", True)
+        if not isinstance(keep, bool):
+            raise InputError(f"{table.where}: expected true or false as 'keep', found {keep!r}")
+        boxes.append(Box(table.where, low, high, keep, table.text("scan", "")))
+    return tuple(boxes)
+
+
+@dataclass
+class Clipper:
+    """Cuts scans one after the other, and counts."""
+
+    boxes: Sequence[Box]
+    inside: list[int] = field(default_factory=list)  # points of all scans so far, by box
+    names: list[str] = field(default_factory=list)
+    read: int = 0
+    kept: int = 0
+
+    def clip(self, scan: Scan) -> Scan:
+        """Return a scan without what is clipped. Raises InputError where too little of it is left."""
+        self.inside = self.inside or [0] * len(self.boxes)
+        self.names.append(scan.name)
+        kept = np.ones(len(scan.points), bool)
+        for start in range(0, len(kept), AT_ONCE):
+            kept[start : start + AT_ONCE] = self._kept(scan, slice(start, start + AT_ONCE))
+        self.read += len(kept)
+        self.kept += int(kept.sum())
+        if kept.all():
+            return scan
+        if kept.sum() < FEWEST_POINTS:
+            where = self.boxes[0].where.rsplit(": ", 1)[0]
+            raise InputError(
+                f"{where}: [[clip]] keeps {int(kept.sum())} of the {len(kept)} points of scan {scan.name!r}, expected "
+                f"{FEWEST_POINTS} or more; correct the boxes (the project's frame and units), limit them to other "
+                "scans by 'scan', or leave this file out by [[scan]]"
+            )
+        columns = {
+            name: getattr(scan, name)[kept] for name in per_point_fields(Scan) if len(getattr(scan, name)) == len(kept)
+        }
+        return dataclasses.replace(scan, **columns)
+
+    def _kept(self, scan: Scan, rows: slice) -> Flags:
+        """Mark the points to keep: in one of the boxes to keep, if there are any for this scan, and in none other."""
+        pose = scan.pose
+        places = (scan.points[rows] + scan.origin) @ pose[:3, :3].T + pose[:3, 3]
+        wanted, unwanted = np.zeros(len(places), bool), np.zeros(len(places), bool)
+        limited = False
+        for k, box in enumerate(self.boxes):
+            if box.scan not in ("", scan.name):
+                continue
+            inside = ((places >= box.low) & (places <= box.high)).all(axis=1)
+            self.inside[k] += int(inside.sum())
+            limited |= box.keep
+            (wanted if box.keep else unwanted)[inside] = True
+        return ~unwanted & (wanted if limited else True)
+
+    def record(self) -> Clips | None:
+        """Return what was clipped; None without boxes. Raises InputError for a box that is for nothing."""
+        if not self.boxes:
+            return None
+        for box, inside in zip(self.boxes, self.inside, strict=True):
+            if box.scan and box.scan not in self.names:
+                raise InputError(f"{box.where}: there is no scan {box.scan!r}; there are {', '.join(self.names)}")
+            if box.keep and not inside:
+                raise InputError(
+                    f"{box.where}: no point lies in the box; it is in the project's frame and units (of a scan without "
+                    "a pose: its own frame): correct it, or leave it out"
+                )
+        return Clips(
+            scan=tuple(box.scan for box in self.boxes),
+            low=np.array([box.low for box in self.boxes]),
+            high=np.array([box.high for box in self.boxes]),
+            keep=np.array([box.keep for box in self.boxes]),
+            inside=np.array(self.inside),
+            read=self.read,
+            kept=self.kept,
+        )

@@ -1,0 +1,90 @@
+"""The table [report] of project.toml: what stands on the report's title block, and a logo."""
+
+from __future__ import annotations
+
+import datetime
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processor.language.messages import printable
+from processor.model import InputError, TitleBlock
+from processor.scan_folder.checked_toml import Table, existing_file_in
+
+KEYS = ("company", "project", "drawing", "order", "operator", "scanner", "serial", "scanned", "approved")
+LOGO = "logo"
+FORMATS = ("PNG", "JPEG")
+MOST_KEYS, LONGEST, LONGEST_KEY = 30, 200, 40
+MOST_BYTES, MOST_PIXELS = 1_000_000, 4_000_000  # the logo is part of the page
+
+
+def read_title_block(folder: Path, project: Table) -> TitleBlock | None:
+    """Return the table [report] of a project, its known keys first; None without one.
+
+    Values are texts, numbers and dates; empty texts are left out. Raises InputError for anything else, and for a logo
+    that is no PNG or JPEG picture below ``folder``.
+    """
+    if not project.values.get("report"):
+        return None
+    table = project.table("report")
+    written = {key: _written(table, key) for key in table.values if key != LOGO}
+    if len(written) > MOST_KEYS:
+        raise InputError(f"{table.where}: expected at most {MOST_KEYS} keys, found {len(written)}; leave some out")
+    kept = [key for key in (*KEYS, *(key for key in written if key not in KEYS)) if written.get(key)]
+    logo = _logo(folder, table) if table.values.get(LOGO) else b""
+    return TitleBlock(tuple(kept), tuple(written[key] for key in kept), np.frombuffer(logo, np.uint8))
+
+
+def _written(table: Table, key: str) -> str:
+    if len(key) > LONGEST_KEY or not key.strip():
+        raise InputError(
+            f"{table.where}: expected keys of 1 to {LONGEST_KEY} characters, found {key[:60]!r}; shorten it"
+        )
+    value: Any = table.values[key]
+    if isinstance(value, datetime.datetime):
+        return value.isoformat(" ", "minutes")
+    if isinstance(value, datetime.date):
+        return value.isoformat()
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        kind = {bool: "true or false", list: "a list", dict: "a table"}.get(type(value), type(value).__name__)
+        raise InputError(f"{table.where}: expected a text, number or date as {key!r}, found {kind}; write it as a text")
+    text = printable(" ".join(str(value).split()))
+    if len(text) > LONGEST:
+        raise InputError(
+            f"{table.where}: expected at most {LONGEST} characters as {key!r}, found {len(text)}; shorten it"
+        )
+    return text
+
+
+def _logo(folder: Path, table: Table) -> bytes:
+    path = existing_file_in(folder, table.text(LOGO), f"{table.where}: {LOGO}")
+    advice = f"expected a picture in {' or '.join(FORMATS)}"
+    try:
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise InputError(f"{path}: expected a logo of at most {MOST_BYTES} bytes, found {size}; make it smaller")
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: {advice}, it cannot be read ({error.strerror or error})") from None
+    problem = _problem(data)
+    if problem:
+        raise InputError(f"{path}: {advice}, found {problem}; export the logo again as PNG")
+    return data
+
+
+def _problem(data: bytes) -> str:
+    """Say why bytes are no picture that a page may show; nothing if they are one."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings(), Image.open(io.BytesIO(data), formats=FORMATS) as picture:
+            warnings.simplefilter("ignore")
+            if picture.width * picture.height > MOST_PIXELS:
+                return f"{picture.width} x {picture.height} pixels, more than {MOST_PIXELS} in all"
+            picture.load()
+    except (OSError, ValueError, SyntaxError, ArithmeticError, MemoryError, Image.DecompressionBombError):
+        return "a file that is none, or is damaged"
+    return ""
