@@ -194,7 +194,10 @@ def test_a_step_file_by_the_command(tmp_path, monkeypatch, capsys, caplog):
     assert run(monkeypatch, *arguments) == 0
     printed = json.loads(capsys.readouterr().out)
     assert (printed["scene"], printed["seed"], printed["scans"]) == (str(output), 3, 2)
-    assert caplog.messages == ["part: its numbers are in inch (25.4 mm, given by --units); the scene is in mm"]
+    assert caplog.messages == [
+        "part: its numbers are in inch (25.4 mm, given by --units); the scene is in mm",
+        "part: 1 bodies have no names in the file: they are numbered, as part-1",
+    ]
     scene, truth = designgen.scan(path, 2, seed=3, units="inch", settings=FINE)
     points = joined(scene, truth)[0]
     assert len(points) == printed["points"]
