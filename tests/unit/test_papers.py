@@ -16,7 +16,7 @@ from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Outcome, Row, Rule
 
 TINY = {
-    "000": ("arch-s1", ("scan.spacing_mm=25.0", "scan.sigma_mm=0.0", "scan.net=true")),
+    "000": ("arch-s1", ("scan.spacing_mm=25.0", "scan.sigma_mm=0.001", "scan.net=true")),
     "001": ("balls-100", ("frame.nodes_x=3", "frame.nodes_y=3", "scan.spacing_mm=5.0")),
     "002": ("stadium-roof", ("structure.trusses=4", "structure.bays=1", "scan.spacing_mm=120.0")),
     "003": ("truss-bridge-picks", ("structure.bays=2", "scan.step_mrad=12.0")),
