@@ -100,3 +100,39 @@ def test_corners_are_where_the_faces_and_the_end_meet(of):
         assert (np.abs(off) < 4.5 * np.hypot(sd, 0.05)).all()  # an end by itself learns from no other
     assert np.mean(held) > 0.75  # some eight independent coordinates an end
     assert np.mean(rms) < 0.35
+
+
+@pytest.mark.parametrize("radius_mm", [1_500.0, 3_000.0])
+def test_outer_faces_of_a_strongly_curved_part_are_those_that_hold_its_corners(radius_mm):
+    """Over the zone of the joint the inner side of the flange lies nearer to the level of the corners."""
+    part, joint = curved_box(radius_mm)
+    outer = faces.outer_faces(part, [joint])
+    for corner in joint[:4]:
+        assert np.linalg.norm(outer.vertices[outer.faces].reshape(-1, 3) - corner, axis=1).min() < 1e-6
+    height = np.linalg.norm(outer.vertices[outer.faces].reshape(-1, 3)[:, [0, 2]], axis=1)
+    assert not ((height > radius_mm + 1.0) & (height < radius_mm + 799.0)).any()  # nothing of the inner sides
+
+
+def curved_box(radius_mm):
+    """A box of 600 x 800 mm with plates of 20 mm, bent about the y axis over 1.2 rad; P1..P8 of the end at x = 0."""
+    angles = np.linspace(0.0, 1.2, 121)
+    skins = []
+    for depth in (0.0, 20.0):
+        section = [(y * (300.0 - depth), z) for z in (depth, 800.0 - depth) for y in (1.0, -1.0)]
+        section[2:] = section[:1:-1]  # P1, P2, P3, P4
+        ring = np.array(section)
+        r = radius_mm + ring[:, 1]
+        skins.append(np.stack([np.stack([-r * np.sin(a), ring[:, 0], r * np.cos(a)], axis=1) for a in angles]))
+    vertices = np.concatenate([skin.reshape(-1, 3) for skin in skins])
+    quads = []
+    for skin in range(2):
+        first = 4 * len(angles) * skin
+        for k in range(len(angles) - 1):
+            at = first + 4 * k
+            quads += [(at + i, at + (i + 1) % 4, at + 4 + (i + 1) % 4, at + 4 + i) for i in range(4)]
+    behind = 4 * len(angles)
+    quads += [(i, (i + 1) % 4, behind + (i + 1) % 4, behind + i) for i in range(4)]
+    triangles = np.array([t for q in quads for t in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))])
+    corners = skins[0][0]
+    middles = np.array([0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0))])
+    return mesh_distance.of_mesh(vertices, triangles), np.vstack([corners, middles])

@@ -29,6 +29,7 @@ SQUARE_MM = 0.2  # standard deviation of the others there: a cut edge is off squ
 NODES = (-1.0, 0.0, 1.0)  # places w at the joint where a face's waves are estimated
 PATCH_MM, PATCH_SPACINGS = 50.0, 3.0  # least size of a patch, whose mean departure is one observation of the waves
 ALONG = 0.9  # cosine between a facet's normal and an axis, above which the facet is of a face across that axis
+ALONG_SHARE = 0.1  # of a distance along a part that counts as one off a face
 NEAR_MM = 500.0  # of a joint, beyond the facet nearest to it
 ZONE_MM = 500.0
 BESIDE_MM = 30.0  # of an edge's width, in which its points are looked for
@@ -116,10 +117,19 @@ def outer_faces(surface: MeshSurface, joints: Sequence[Floats]) -> MeshSurface:
             if not candidates.any():
                 return surface
             candidates &= np.abs(local[:, 0]) < NEAR_MM + np.abs(local[candidates, 0]).min()
-            groups, group = np.unique(surface.part_of[candidates], return_inverse=True)
-            off = np.abs(face.sense * local[candidates, face.axis] - face.offset)
-            chosen |= surface.part_of == groups[np.argmin(np.bincount(group, off) / np.bincount(group))]
+            chosen |= surface.part_of == _nearest_face(surface, place, face, np.flatnonzero(candidates))
     return surface.only(chosen) if chosen.any() else surface
+
+
+def _nearest_face(surface: MeshSurface, place: EndPlace, face: EndFace, facets: Ints) -> int:
+    """Return the smooth face, of those with some ``facets``, that is nearest to a face of the section at the joint.
+
+    By its places nearest to the joint: over some distance a curved plate departs by more than it is thick.
+    """
+    corners = rigid.apply(rigid.invert(place.T_bridge_joint), surface.vertices[surface.faces[facets]])
+    along, off = np.abs(corners[:, :, 0]), np.abs(face.sense * corners[:, :, face.axis] - face.offset)
+    score = (off + ALONG_SHARE * along).min(axis=1)
+    return int(surface.part_of[facets[np.argmin(score)]])
 
 
 def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] | Reason:
