@@ -348,7 +348,7 @@ class Scan(Checked):
         4, 4, means=PLACE
     )  # absent: the scan is in the project's frame already, or its pose is unknown
     # range noise, one standard deviation; NaN = unknown
-    sigma_mm: float = described(float("nan"), means=Meaning(above=0.0, most=LARGEST_MM))
+    sigma_mm: float = described(float("nan"), means=Meaning(least=0.0, most=LARGEST_MM))
     colour: Codes = column("n", 3, dtype=np.uint8, newer=True)  # red, green, blue
 
     @property
@@ -572,12 +572,12 @@ class Clips(Checked):
     """
 
     scan: tuple[str, ...] = names("c")
-    low: Floats = column("c", 3)
-    high: Floats = column("c", 3)
-    keep: Flags = column("c", dtype=np.bool_)
-    inside: Ints = column("c", dtype=np.int64)
-    read: int = 0  # points of all scans
-    kept: int = 0
+    low: Floats = column("c", 3, means=PLACE)
+    high: Floats = column("c", 3, means=PLACE)
+    keep: Flags = column("c", dtype=np.bool_, means=Meaning())
+    inside: Ints = column("c", dtype=np.int64, means=Meaning(least=0))
+    read: int = described(0, means=Meaning(least=0))  # points of all scans
+    kept: int = described(0, means=Meaning(least=0))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class Params:
     beam_mm: float = 350.0
 
     def __post_init__(self) -> None:
-        expect(2 <= self.bays <= 100, "structure.bays", self.bays, "2 to 100")
+        expect(3 <= self.bays <= 100, "structure.bays", self.bays, "3 to 100")
         sizes = ("bay_mm", "depth_mm", "width_mm", "height_mm", "chord_mm", "web_mm", "beam_mm")
         expect_positive(self, "structure", *sizes)
         fits = self.chord_mm < 0.3 * min(self.bay_mm, self.depth_mm, self.width_mm)

@@ -139,7 +139,7 @@ COLUMNS = {
     "scans/1/grid_column": {"below": -2, "huge": 2**31 - 1},
 }
 VALUES = {
-    "scans/0/sigma_mm": {"zero": 0.0, "negative": -1.0, "infinite": INF},
+    "scans/0/sigma_mm": {"negative": -1.0, "infinite": INF},
     "temperature_C": {"infinite": INF, "below absolute zero": -300.0, "molten": 1e6},
     "kind": {"unknown": "tower", "long": LONG, "empty": ""},
     "name": {"long": LONG},

@@ -91,6 +91,6 @@ def test_a_step_file_beside_a_scan_is_its_design(tmp_path):
     cadquery.exporters.export(cadquery.Workplane().box(200.0, 100.0, 20.0), str(folder / "part.step"))
     scene = read_input(folder)
     assert (scene.kind, scene.structure is not None) == ("structure", True)
-    assert pipeline.steps_for(scene) == ("defects", "deviation")
+    assert pipeline.steps_for(scene) == ("defects", "deviation", "inspect")
     shutil.copy(folder / "part.step", folder / "other.step")  # which of them is not for the program to say
     assert read_input(folder).structure is None

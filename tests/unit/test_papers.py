@@ -19,7 +19,7 @@ TINY = {
     "000": ("arch-s1", ("scan.spacing_mm=25.0", "scan.sigma_mm=0.001", "scan.net=true")),
     "001": ("balls-100", ("frame.nodes_x=3", "frame.nodes_y=3", "scan.spacing_mm=5.0")),
     "002": ("stadium-roof", ("structure.trusses=4", "structure.bays=1", "scan.spacing_mm=120.0")),
-    "003": ("truss-bridge-picks", ("structure.bays=2", "scan.step_mrad=12.0")),
+    "003": ("truss-bridge-picks", ("structure.bays=3", "scan.step_mrad=12.0")),
     "004": ("plates-defects", ('structure.components=["none", "dent"]', "scan.step_mrad=3.0")),
 }
 

@@ -352,7 +352,9 @@ def test_a_folder_with_control_points_says_what_they_hold(tmp_path):
     with (folder / "control.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)
     (folder / "project.toml").write_text('kind = "structure"\n')
-    ran = CliRunner().invoke(main.commands, ["run", str(folder), "-o", str(tmp_path / "out"), "--steps", "stitch"])
+    ran = CliRunner().invoke(
+        main.commands, ["run", str(folder), "-o", str(tmp_path / "out"), "--steps", "stitch", "--verbose"]
+    )
     assert ran.exit_code in (0, 1), ran.output
     said = ran.output.replace("\n", " ")
     assert "fixed by 5 control points in 20 sightings" in said

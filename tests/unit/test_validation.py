@@ -79,7 +79,10 @@ def test_a_cell_is_known_by_all_that_is_asked_for(tmp_path):
         ("fixed_seeds = [1]", "at least one"),
         ("[[cell]]\nrecipe = 3", "recipe = a name"),
         ('[[cell]]\nrecipe = "frame-small"', "names of those to run"),
-        ('[[cell]]\nrecipe = "frame-small"\nsteps = ["stich"]', "cell 1: no step 'stich'; there are"),
+        (
+            '[[cell]]\nrecipe = "frame-small"\nsteps = ["stich"]',
+            r"cell 1: no step 'stich' \(did you mean 'stitch'\?\); there are",
+        ),
         ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nmethods = ["magic"]', "no method 'magic'"),
         ('[[cell]]\nrecipe = "nothing"\nsteps = ["spheres"]', "no recipe 'nothing'"),
         ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nseeds = [-1]', "whole numbers from 0"),

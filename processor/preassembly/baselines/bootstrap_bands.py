@@ -86,10 +86,11 @@ def with_bands(result: Result, repeated: list[list[PartFeatures]], design: ArchD
 
 def _with_band(deviations: Deviations, repeated: list[errors.LinearError]) -> Deviations:
     figures = np.array([(error.mean, error.max) for error in repeated])
+    band = bound(np.array([error.vector for error in repeated]))
     return replace(
         deviations,
         error=replace(deviations.error, ci95=bound(figures[:, :, None])),
-        ci95=bound(np.array([error.vector for error in repeated])),
+        ci95=np.where(np.isfinite(deviations.deviation), band, np.nan),
     )
 
 

@@ -31,6 +31,7 @@ NEIGHBOURS, SPARSEST, SAMPLE = 3, 0.9, 5_000  # of spacing: the third neighbour,
 LONG = 0.4  # height by width below which panels are put one below the other
 FEWEST = 12  # core points with a value of a face that is drawn
 OVERLAP = 0.05  # share of a face that may lie over another of its panel
+LEAST_BAND = 1e-3  # of a step of colour
 STEPS = 4  # of colour beyond the band, to either side
 COLOUR_QUANTILE = 0.995
 WITHIN = "#e9e9e9"
@@ -108,7 +109,8 @@ def steps(values: Floats, band: Band) -> tuple[BoundaryNorm, Colormap, list[floa
     wanted = max(largest - widest, widest) / STEPS
     ten = 10.0 ** np.floor(np.log10(wanted))
     step = float(next(ten * one for one in (1.0, 2.0, 5.0, 10.0) if ten * one >= wanted * (1.0 - 1e-9)))
-    up, down = _multiples(band.high, step), [-level for level in _multiples(-band.low, step)]
+    least = LEAST_BAND * step if band.high - band.low < LEAST_BAND * step else 0.0  # clouds without noise have no band
+    up, down = _multiples(band.high + least, step), [-level for level in _multiples(least - band.low, step)]
     outer = np.linspace(0.0, 0.42, STEPS + 1), np.linspace(0.58, 1.0, STEPS + 1)
     colours: Colormap = ListedColormap([*DIVERGING(outer[0][1:]), WITHIN, *DIVERGING(outer[1][:-1])])
     colours = colours.with_extremes(under=DIVERGING(0.0), over=DIVERGING(1.0))
