@@ -586,7 +586,7 @@ class TitleBlock(Checked):
 
     keys: tuple[str, ...] = names("k")
     values: tuple[str, ...] = names("k")
-    logo: Codes = column("bytes", dtype=np.uint8)
+    logo: Codes = column("bytes", dtype=np.uint8, means=Meaning())
 
 
 @dataclass(frozen=True)
