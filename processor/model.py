@@ -103,7 +103,7 @@ DEVIATION = Meaning(finite=True, least=0.0, most=LARGEST_MM)  # one standard dev
 BOUND = Meaning()  # NaN = none; never infinite
 NAMES = Meaning(unique=True)
 LONG = Meaning(longest=LONGEST_TEXT)
-LARGEST_GRID, GRID_CELLS_PER_POINT = 1 << 24, 1024  # cells of a scanner's grid; of the open sky few have returns
+LARGEST_GRID, GRID_CELLS_PER_POINT = 1 << 28, 1024  # cells of a scanner's grid; of the open sky few have returns
 GRID_NUMBER = Meaning(least=-1, most=(1 << 24) - 1)
 
 

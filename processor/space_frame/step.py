@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from processor.adjustment import scanner_class
 from processor.geometry.merging import merged
 from processor.limits import standards
 from processor.model import InputError, Scene, Tolerance, reason
 from processor.space_frame import to_result
 from processor.space_frame.params import METHODS, Params
 from processor.space_frame.points.scene_source import PointReader
-from processor.space_frame.result import Result
+from processor.space_frame.result import Balls, Result
 from processor.space_frame.spheres import isolated
 
 __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "STREAMS", "Params", "Result", "run"]
@@ -71,4 +74,12 @@ def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
         return isolated.search(merged(scene, with_scanner=True), params)
     ransac = replace(params, method="ransac")
     result = isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, ransac, limits)
-    return replace(result, method=params.method, reasons=(reason("spheres.no-members"), *result.reasons))
+    reasons = (reason("spheres.no-members"), *result.reasons, reason("spheres.by-class", sd=scanner_class.VIEW_MM))
+    return replace(result, method=params.method, reasons=reasons, balls=_with_class(result.balls))
+
+
+def _with_class(balls: Balls) -> Balls:
+    """Add what the views of a ball have in common, by the scanner's class: a ball alone does not show it."""
+    variance = scanner_class.VIEW_MM**2
+    lowest_sd = np.sqrt(balls.lowest_sd**2 + 2.0 * variance)  # of the centre's height and the radius
+    return replace(balls, covariance=balls.covariance + variance * np.eye(4), lowest_sd=lowest_sd)

@@ -120,6 +120,21 @@ def test_a_cloud_without_members_is_still_held_against_its_design():
     assert set(space_frame_step.run(small, Params()).balls.flag) == {"wrong-size"}
 
 
+def test_balls_without_members_have_an_interval_that_holds_a_range_offset():
+    """A scanner whose ranges are 0.6 mm too long, below three balls: their fits are moved by as much."""
+    scene, truth = frame(k=3)
+    true = truth.frame.centres[::-1]
+    points = scene.scans[0].points
+    below = true.mean(axis=0) - [0.0, 0.0, 4_000.0]
+    rays = (points - below) / np.linalg.norm(points - below, axis=1)[:, None]
+    moved = replace(scene, scans=(Scan("all", points + 0.6 * rays),))
+    balls = space_frame_step.run(moved, Params()).balls
+    off = np.column_stack([balls.centres - true, balls.radii - 45.0])
+    assert np.abs(off[:, 2]).max() > 0.4
+    assert (np.abs(off) < 1.96 * np.sqrt(np.einsum("kii->ki", balls.covariance))).all()
+    assert (np.abs(balls.lowest[:, 2] - (true[:, 2] - 45.0)) < 1.96 * balls.lowest_sd).all()
+
+
 def test_four_points_give_a_sphere_of_low_confidence():
     scene, _ = frame(k=1)
     quad = scene.frame.centres[0] + 45.0 * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]])
