@@ -9,10 +9,12 @@ WIDTH, HEIGHT = 1060, 1240
 PICTURE = Path(__file__).resolve().parent / "report.png"
 # The verdicts and the view in space stand next to each other in the picture; on the page tables lie between them.
 HIDE_TABLES = """() => {
-    for (const element of document.querySelectorAll('ul.verdicts ~ *')) {
-        if (element.classList.contains('live')) break;
-        element.style.display = 'none';
-    }
+    const verdicts = document.querySelector('ul.verdicts');
+    let node = document.querySelector('.live');
+    for (; node && !node.contains(verdicts); node = node.parentElement)
+        for (let before = node.previousElementSibling; before; before = before.previousElementSibling)
+            if (verdicts.compareDocumentPosition(before) & Node.DOCUMENT_POSITION_FOLLOWING)
+                before.style.display = 'none';
     window.dispatchEvent(new Event('resize'));
 }"""
 
