@@ -47,7 +47,7 @@ def results_file(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("flips", [300, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("flips", [100, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_bits_of_a_scene(scene_file, flips):
     noticed, same, wrong = unnoticed(scene_file, read_scene, flips)
     assert wrong == []
@@ -55,7 +55,7 @@ def test_bits_of_a_scene(scene_file, flips):
     assert noticed > flips / 4  # most bytes of the file are data
 
 
-@pytest.mark.parametrize("flips", [60, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("flips", [20, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_bits_of_results(results_file, flips):
     noticed, same, wrong = unnoticed(results_file, read_results, flips)
     assert wrong == []

@@ -98,7 +98,9 @@ def test_four_points_with_one_behind_the_ball_make_a_sphere_of_metres():
     assert np.median(np.abs(found[:, 3] - 45.0)) < 10.0
 
 
-@pytest.mark.parametrize("number", [pytest.param("000", marks=pytest.mark.slow), *sorted(TINY)[1:]])
+@pytest.mark.parametrize(
+    "number", [*(pytest.param(number, marks=pytest.mark.slow) for number in ("000", "002")), "001", "003", "004"]
+)
 def test_a_paper_on_a_tiny_data_set(number, tmp_path):
     recipe, settings = TINY[number]
     module = data_sets.module_of(number)
