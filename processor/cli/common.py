@@ -89,8 +89,8 @@ def split_names(_: click.Context, __: click.Parameter, value: str | None) -> tup
 
 def form_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add --pdf and --xlsx, further forms of the report."""
-    for name, said in (("xlsx", "write report.xlsx, too (extra xlsx)"), ("pdf", "write report.pdf, too")):
-        command = click.option(f"--{name}", is_flag=True, help=said)(command)
+    for name, help_text in (("xlsx", "write report.xlsx, too (extra xlsx)"), ("pdf", "write report.pdf, too")):
+        command = click.option(f"--{name}", is_flag=True, help=help_text)(command)
     return command
 
 

@@ -1,4 +1,4 @@
-"""Commands of which help says more: names that are computed when it is asked for, and names that are like a slip."""
+"""Commands whose help lists names that are computed when it is asked for, with suggestions for mistyped names."""
 
 from __future__ import annotations
 
