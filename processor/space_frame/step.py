@@ -15,7 +15,7 @@ import numpy as np
 from processor.adjustment import scanner_class
 from processor.geometry.merging import merged
 from processor.limits import standards
-from processor.model import InputError, Scene, Tolerance, reason
+from processor.model import InputError, Reason, Scene, Tolerance, reason
 from processor.space_frame import to_result
 from processor.space_frame.params import METHODS, Params
 from processor.space_frame.points.scene_source import PointReader
@@ -71,15 +71,21 @@ def _with_unused_control(scene: Scene, result: Result) -> Result:
 def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
     """Find spheres of a cloud without members: at the design's nodes, or without a design those that stand out."""
     if scene.frame is None:
-        return isolated.search(merged(scene, with_scanner=True), params)
-    ransac = replace(params, method="ransac")
-    result = isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, ransac, limits)
-    reasons = (reason("spheres.no-members"), *result.reasons, reason("spheres.by-class", sd=scanner_class.VIEW_MM))
-    return replace(result, method=params.method, reasons=reasons, balls=_with_class(result.balls))
+        result = isolated.search(merged(scene, with_scanner=True), params)
+        before: tuple[Reason, ...] = ()
+    else:
+        ransac = replace(params, method="ransac")
+        result = isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, ransac, limits)
+        before = (reason("spheres.no-members"),)
+    if not len(result.balls):
+        return replace(result, method=params.method, reasons=(*before, *result.reasons))
+    reasons = (*before, *result.reasons, reason("spheres.by-class", sd=scanner_class.VIEW_MM))
+    balls = _with_class(result.balls, radius_known=scene.frame is None and not np.isnan(params.radius_mm))
+    return replace(result, method=params.method, reasons=reasons, balls=balls)
 
 
-def _with_class(balls: Balls) -> Balls:
+def _with_class(balls: Balls, radius_known: bool) -> Balls:
     """Add what the views of a ball have in common, by the scanner's class: a ball alone does not show it."""
-    variance = scanner_class.VIEW_MM**2
-    lowest_sd = np.sqrt(balls.lowest_sd**2 + 2.0 * variance)  # of the centre's height and the radius
-    return replace(balls, covariance=balls.covariance + variance * np.eye(4), lowest_sd=lowest_sd)
+    variance = scanner_class.VIEW_MM**2 * np.array([1.0, 1.0, 1.0, 0.0 if radius_known else 1.0])
+    lowest_sd = np.sqrt(balls.lowest_sd**2 + variance[2:].sum())  # of the centre's height and the radius
+    return replace(balls, covariance=balls.covariance + np.diag(variance), lowest_sd=lowest_sd)
