@@ -75,7 +75,7 @@ class Balls(Rows):
     """The spheres in the input's own frame (its offset added), mm. NaN = no value.
 
     Only method ``ray`` fills the columns from ``sizes`` on. ``bound_sd`` are the Cramér-Rao bounds of x, y, z, radius
-    and lowest point, ``efficiency`` is bound over standard deviation, as the points alone give it, of centre, radius and
+    and lowest point, ``efficiency`` is bound over standard deviation, as by the points alone, of centre, radius and
     lowest point. Movements are in the design's frame; ``verdict`` compares them with the limit.
     """
 
