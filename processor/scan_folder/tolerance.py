@@ -10,6 +10,7 @@ import numpy as np
 from processor.limits import measures, standards
 from processor.model import Floats, InputError, Limit, Tolerance, did_you_mean
 from processor.scan_folder.checked_toml import Table
+from processor.scan_folder.files import PROJECT
 
 COMPONENTS = "component"
 MOST_NAMES = 12
@@ -39,13 +40,9 @@ def read_tolerance(project: Table) -> Tolerance | None:
     for entry in table.tables(COMPONENTS):
         _only(entry, ("name", *of_one))
         of_components[entry.text("name")] = {key: _limit(entry, of_one[key]) for key in entry.values if key in of_one}
-    tolerance = standards.override(base, values, _file_of(project), table.number("root_gap_mm", 0.0), of_components)
+    tolerance = standards.override(base, values, PROJECT, table.number("root_gap_mm", 0.0), of_components)
     _check_share(table, tolerance)
     return tolerance
-
-
-def _file_of(project: Table) -> str:
-    return project.where.replace("\\", "/").rpartition("/")[2]
 
 
 def _only(table: Table, known: tuple[str, ...]) -> None:
