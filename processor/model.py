@@ -307,12 +307,13 @@ class InputError(PlainError):
     """Input that cannot be used. The message names the file, what was expected, what came and what to do."""
 
 
+WORST_FIRST = (Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS)
+
+
 def worst(verdicts: Iterable[Verdict]) -> Verdict:
     """Return the worst of verdicts: fail, then indeterminate, then pass; none of none."""
     known = set(verdicts)
-    return next(
-        (verdict for verdict in (Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS) if verdict in known), Verdict.NONE
-    )
+    return next((verdict for verdict in WORST_FIRST if verdict in known), Verdict.NONE)
 
 
 class UsageError(PlainError):

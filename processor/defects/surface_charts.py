@@ -24,7 +24,6 @@ FLAT_COS = np.cos(np.radians(1.0))
 PIECE_COS = np.cos(np.radians(15.0))
 ROUND_SHARE = 0.02  # of the radius, the largest distance of a vertex from its cylinder
 WELD_MM = 0.01
-LEAST_AREA_MM2 = 1e-9  # of twice a facet; smaller ones have no normal
 TOUCH_MM = 0.5
 MOST_BODIES = 12  # of a component
 MOST_SIDES = 60  # edges tried for the direction of a face
@@ -198,7 +197,7 @@ def with_components(vertices: Floats, faces: Ints, bodies: DesignBodies | None =
 def _joined(vertices: Floats, faces: Ints, bodies: DesignBodies | None) -> tuple[Floats, Ints, Ints]:
     """Return a mesh with one vertex at a place, without facets of no area, and the component (f,) of each facet."""
     vertices, faces = _welded(vertices, faces, None if bodies is None else bodies.of_facet)
-    has_area = mesh_distance.double_areas(vertices, faces)[1] > LEAST_AREA_MM2
+    has_area = mesh_distance.double_areas(vertices, faces)[1] > mesh_distance.LEAST_AREA
     faces = faces[has_area]
     return vertices, faces, _components(vertices, faces) if bodies is None else bodies.of_facet[has_area]
 

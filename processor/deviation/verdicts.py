@@ -19,10 +19,9 @@ from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import Bools
 from processor.limits import judging, measures, standards
 from processor.limits.judging import Comparison, JudgedLimits, Measured
-from processor.model import NORMAL_95, Floats, Ints, Limit, Scene, Status, StructureDesign, Verdict
+from processor.model import NORMAL_95, WORST_FIRST, Floats, Ints, Limit, Scene, Status, StructureDesign
 
 WHOLE = "surface"
-BADNESS = (Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS)
 
 
 def judge(scene: Scene, result: Result, vertices: Floats, origin: Floats) -> JudgedLimits | None:
@@ -85,5 +84,5 @@ def _extreme(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool
         ends = (sign * float((signed - widened).max()), sign * most)
         measured = Measured(name, sign * float(signed.max()), min(ends), max(ends), doubtful=unsure)
         compared = judging.compare(limit, measured)
-        sides.append((BADNESS.index(compared.verdict), bound - most, compared))
+        sides.append((WORST_FIRST.index(compared.verdict), bound - most, compared))
     return min(sides, key=lambda side: side[:2])[2]

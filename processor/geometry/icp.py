@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,20 +40,12 @@ def point_to_point(
     by less than ``tolerance`` of itself.
     """
     tree = cKDTree(target)
-    T, last, iteration = start, np.inf, 0
-    rms, share = np.inf, 0.0
-    for iteration in range(1, max_iterations + 1):
-        distance, index = tree.query(rigid.apply(T, source), distance_upper_bound=max_distance_mm, workers=-1)
-        paired = np.isfinite(distance)
-        share = float(paired.mean())
-        if paired.sum() < 3:
-            return Alignment(T, np.inf, share, iteration)
-        rms = float(np.sqrt(np.mean(distance[paired] ** 2)))
-        if abs(last - rms) <= tolerance * max(rms, 1e-9):
-            break
-        last = rms
-        T = rigid.fit(source[paired], target[index[paired]])
-    return Alignment(T, rms, share, iteration)
+
+    def pair(placed: Floats) -> tuple[Floats, Floats]:
+        distance, index = tree.query(placed, distance_upper_bound=max_distance_mm, workers=-1)
+        return distance, target[index[np.isfinite(distance)]]
+
+    return _iterated(source, pair, start, max_iterations, tolerance)
 
 
 def point_to_lines(
@@ -70,16 +62,36 @@ def point_to_lines(
     Paper 000, section 2.7, names it as another way to find pairs. Points of the target in place of lines hold a point
     back along the line, by as much as the target's spacing. Stops as :func:`point_to_point` does.
     """
-    T, last, iteration = start, np.inf, 0
-    rms, share = np.inf, 0.0
-    for iteration in range(1, max_iterations + 1):
-        placed = rigid.apply(T, source)
+    rows = np.arange(len(source))
+
+    def pair(placed: Floats) -> tuple[Floats, Floats]:
         offsets = np.stack([line.nearest(placed)[1] for line in lines])
         distances = np.linalg.norm(offsets, axis=2)
         nearest = distances.argmin(axis=0)
-        rows = np.arange(len(source))
-        distance, offset = distances[nearest, rows], offsets[nearest, rows]
+        distance = distances[nearest, rows]
         paired = distance <= max_distance_mm
+        return np.where(paired, distance, np.inf), (placed - offsets[nearest, rows])[paired]
+
+    return _iterated(source, pair, start, max_iterations, tolerance)
+
+
+def _iterated(
+    source: Floats,
+    pair: Callable[[Floats], tuple[Floats, Floats]],
+    start: Floats,
+    max_iterations: int,
+    tolerance: float,
+) -> Alignment:
+    """Pair and fit in turns until the rms distance of the pairs changes by less than ``tolerance`` of itself.
+
+    ``pair`` returns the distances (n,) of placed points to their partners, inf for none, and the partners (k, 3) that
+    there are.
+    """
+    T, last, iteration = start, np.inf, 0
+    rms, share = np.inf, 0.0
+    for iteration in range(1, max_iterations + 1):
+        distance, partner = pair(rigid.apply(T, source))
+        paired = np.isfinite(distance)
         share = float(paired.mean())
         if paired.sum() < 3:
             return Alignment(T, np.inf, share, iteration)
@@ -87,7 +99,7 @@ def point_to_lines(
         if abs(last - rms) <= tolerance * max(rms, 1e-9):
             break
         last = rms
-        T = rigid.fit(source[paired], (placed - offset)[paired])
+        T = rigid.fit(source[paired], partner)
     return Alignment(T, rms, share, iteration)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.inspection.result import Characteristics, Quantity
-from processor.limits import standards
+from processor.limits import judging, standards
 from processor.limits.guard_band import guard_band
 from processor.model import NORMAL_95, Limit, Reason, Tolerance, Verdict
 
@@ -61,7 +61,6 @@ def table(
     """
     limits = [_limit(one, tolerance, sizes) for one in found]
     bounds = [(NAN, NAN) if limit is None else standards.bounds(limit, sizes) for limit in limits]
-    standard = "" if tolerance is None else tolerance.standard
     return Characteristics(
         id=tuple(one.id for one in found),
         quantity=tuple(one.quantity for one in found),
@@ -76,7 +75,9 @@ def table(
             _verdict(one, limit, bound, doubtful) for one, limit, bound in zip(found, limits, bounds, strict=True)
         ),
         limit=tuple("" if limit is None else limit.key for limit in limits),
-        clause=tuple("" if limit is None else _clause(limit, standard) for limit in limits),
+        clause=tuple(
+            "" if limit is None or tolerance is None else judging.clause_of(limit, tolerance) for limit in limits
+        ),
         verified=np.array([limit is not None and limit.verified for limit in limits], np.bool_),
         reasons=tuple(one.why for one in found),
     )
@@ -89,10 +90,6 @@ def _limit(one: Characteristic, tolerance: Tolerance | None, sizes: Sizes) -> Li
     measure = standards.PART + one.quantity
     rows = (limit for limit in tolerance.limits if limit.measure == measure)
     return next((limit for limit in rows if standards.applies(limit, sizes.get(limit.of, NAN))), None)
-
-
-def _clause(limit: Limit, standard: str) -> str:
-    return f"{standard} {limit.clause}" if limit.clause else limit.source
 
 
 def _verdict(one: Characteristic, limit: Limit | None, bounds: tuple[float, float], doubtful: bool) -> Verdict:

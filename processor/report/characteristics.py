@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from processor.language.messages import Message, label, text
 from processor.limits.judging import JudgedLimits
-from processor.model import Scene, StepRun, Verdict
+from processor.model import WORST_FIRST, Scene, StepRun, Verdict
 from processor.report.step_report import step_report
 from processor.report.table import NAN, Table
 
@@ -16,7 +16,7 @@ FILE = "characteristics"
 COLUMNS = (
     "id", "verdict", "quantity", "nominal", "actual", "deviation", "ci95", "lower", "upper", "unit", "limit_from",
 )  # fmt: skip
-ORDER = {verdict: place for place, verdict in enumerate((Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS))}
+ORDER = {verdict: place for place, verdict in enumerate(WORST_FIRST)}
 MOST_NAMED = 4
 NOTE = text(
     "Worst first. Deviation is actual less nominal, ci95 the half-width of its 95 % interval, lower and upper the "

@@ -47,9 +47,10 @@ def read_boxes(project: Table, mm: float) -> tuple[Box, ...]:
 
 @dataclass
 class Clipper:
-    """Cuts scans one after the other, and counts."""
+    """Cuts scans one after the other, and counts; ``file`` has the boxes."""
 
     boxes: Sequence[Box]
+    file: str = ""
     inside: list[int] = field(default_factory=list)  # points of all scans so far, by box
     names: list[str] = field(default_factory=list)
     read: int = 0
@@ -67,11 +68,10 @@ class Clipper:
         if kept.all():
             return scan
         if kept.sum() < FEWEST_POINTS:
-            where = self.boxes[0].where.rsplit(": ", 1)[0]
             raise InputError(
-                f"{where}: [[clip]] keeps {int(kept.sum())} of the {len(kept)} points of scan {scan.name!r}, expected "
-                f"{FEWEST_POINTS} or more; correct the boxes (the project's frame and units), limit them to other "
-                "scans by 'scan', or leave this file out by [[scan]]"
+                f"{self.file}: [[clip]] keeps {int(kept.sum())} of the {len(kept)} points of scan {scan.name!r}, "
+                f"expected {FEWEST_POINTS} or more; correct the boxes (the project's frame and units), limit them to "
+                "other scans by 'scan', or leave this file out by [[scan]]"
             )
         columns = {
             name: getattr(scan, name)[kept] for name in per_point_fields(Scan) if len(getattr(scan, name)) == len(kept)

@@ -31,7 +31,7 @@ from processor.readers.encoding import file_name_as_text
 from processor.readers.raw_scan import scaled_in_place, scan_name
 from processor.scan_folder import guess, mesh_faults, scanner_grid, units
 from processor.scan_folder.checked_toml import Table, existing_file_in
-from processor.scan_folder.clips import Clipper, read_boxes
+from processor.scan_folder.clips import FEWEST_POINTS, Clipper, read_boxes
 from processor.scan_folder.control_points import Measured, control_points, read_control
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
 from processor.scan_folder.files import (
@@ -64,7 +64,6 @@ KEYS = (
     "clip",
 )  # fmt: skip
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
-FEWEST_POINTS = 4
 FLOAT_STEP_MM = 1.0
 NAN = float("nan")
 GUESSED = "guessed from the scans' size"
@@ -303,7 +302,7 @@ def _scene(
     scans: list[Scan] = []
     scan_units: list[str] = []
     reasons: dict[str, str] = {}
-    clipper = Clipper(read_boxes(project.table, MM_PER_UNIT[project.units or option or "m"]))
+    clipper = Clipper(read_boxes(project.table, MM_PER_UNIT[project.units or option or "m"]), project.table.where)
     for entry in tracked(project.entries):
         if entry.component and parts and entry.component not in parts:
             raise InputError(

@@ -1,4 +1,4 @@
-"""A run with limits: what ended it is said, and what was done is kept."""
+"""A run with limits: what ended it is named, and what was done is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bad models: what is said of bodies that overlap, shells, names and sizes, and what is done to a design's mesh."""
+"""Bad models: messages on bodies that overlap, shells, names and sizes, and what is done to a design's mesh."""
 
 import json
 import logging
