@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 from processor.geometry.linalg_small import eigen
 from processor.geometry.m3c2 import FEWEST_FOR_LOD, HALF_DIAGONAL, LEAST_RANGE, Z95
 from processor.geometry.parallel import over_ranges
-from processor.geometry.point_grid import SIDE, PointGrid, block_at
+from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
 from processor.model import Floats, Ints
 
 DETERMINED = 0.05  # least eigenvalue of the mean of n n' for which the translation along its vector is estimated
@@ -106,7 +106,6 @@ def _movement(cells, feet, wanted, first, last, moved):  # type: ignore[no-untyp
     places, directions, order = wanted.places, wanted.directions, wanted.order
     distance, normals, radius, least_cos = feet.distance, feet.normals, feet.radius, feet.least_cos
     size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
-    tops = SIDE * cells.extent - 1
     points, starts = cells.points, cells.starts
     rim, extent = radius * radius, radius * (1.0 + 1e-9)
     reach2 = (radius + HALF_DIAGONAL * size) ** 2
@@ -119,11 +118,7 @@ def _movement(cells, feet, wanted, first, last, moved):  # type: ignore[no-untyp
         moved.number[row], moved.free[row] = 0, 0
         if not np.isfinite(a + b + c + x + y + z) or len(points) == 0:
             continue
-        if x + extent < xl or y + extent < yl or z + extent < zl:
-            continue
-        i0, i1 = int(max((x - extent - xl) / size, 0.0)), int(min((x + extent - xl) / size, float(tops[0])))
-        j0, j1 = int(max((y - extent - yl) / size, 0.0)), int(min((y + extent - yl) / size, float(tops[1])))
-        k0, k1 = int(max((z - extent - zl) / size, 0.0)), int(min((z + extent - zl) / size, float(tops[2])))
+        i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, extent, extent, extent)
         n, square = 0, 0.0
         A[:, :], g[:] = 0.0, 0.0
         for bi in range(i0 // SIDE, i1 // SIDE + 1):

@@ -18,7 +18,7 @@ from numba import njit
 from processor.geometry import neighbors, point_grid
 from processor.geometry.linalg_small import eigen
 from processor.geometry.parallel import over_ranges
-from processor.geometry.point_grid import SIDE, PointGrid, block_at
+from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
 from processor.model import Floats, InputError, Ints
 
 Bools = npt.NDArray[np.bool_]
@@ -318,7 +318,6 @@ def along_normals(cells, places, normals, order, first, last, cylinder, count, m
     """
     radius, depth = cylinder
     size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
-    tops = SIDE * cells.extent - 1
     points, starts = cells.points, cells.starts
     rim, reach = radius * radius, radius + HALF_DIAGONAL * size
     reach2, end = reach * reach, depth + HALF_DIAGONAL * size
@@ -333,11 +332,7 @@ def along_normals(cells, places, normals, order, first, last, cylinder, count, m
         ex = depth * abs(a) + radius * np.sqrt(max(0.0, 1.0 - a * a)) + slack
         ey = depth * abs(b) + radius * np.sqrt(max(0.0, 1.0 - b * b)) + slack
         ez = depth * abs(c) + radius * np.sqrt(max(0.0, 1.0 - c * c)) + slack
-        if x + ex < xl or y + ey < yl or z + ez < zl:
-            continue
-        i0, i1 = int(max((x - ex - xl) / size, 0.0)), int(min((x + ex - xl) / size, float(tops[0])))
-        j0, j1 = int(max((y - ey - yl) / size, 0.0)), int(min((y + ey - yl) / size, float(tops[1])))
-        k0, k1 = int(max((z - ez - zl) / size, 0.0)), int(min((z + ez - zl) / size, float(tops[2])))
+        i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, ex, ey, ez)
         n, shift, total, square = 0, 0.0, 0.0, 0.0
         for bi in range(i0 // SIDE, i1 // SIDE + 1):
             for bj in range(j0 // SIDE, j1 // SIDE + 1):
@@ -381,8 +376,6 @@ def normals_at(cells, places, order, first, last, radius, normals, roughness, co
 
     NaN for fewer than FEWEST_OF_PLANE points, and for points on a line. Of so few points the sd is NaN: none is off.
     """
-    size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
-    tops = SIDE * cells.extent - 1
     points, starts = cells.points, cells.starts
     rim, extent = radius * radius, radius * (1.0 + 1e-9)
     A, V = np.empty((3, 3)), np.empty((3, 3))
@@ -392,11 +385,7 @@ def normals_at(cells, places, order, first, last, radius, normals, roughness, co
         normals[row, :], roughness[row], count[row] = np.nan, np.nan, 0
         if not np.isfinite(x + y + z) or len(points) == 0:
             continue
-        if x + extent < xl or y + extent < yl or z + extent < zl:
-            continue
-        i0, i1 = int(max((x - extent - xl) / size, 0.0)), int(min((x + extent - xl) / size, float(tops[0])))
-        j0, j1 = int(max((y - extent - yl) / size, 0.0)), int(min((y + extent - yl) / size, float(tops[1])))
-        k0, k1 = int(max((z - extent - zl) / size, 0.0)), int(min((z + extent - zl) / size, float(tops[2])))
+        i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, extent, extent, extent)
         n = 0
         su = sv = sw = suu = suv = suw = svv = svw = sww = 0.0
         for bi in range(i0 // SIDE, i1 // SIDE + 1):

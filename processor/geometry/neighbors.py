@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import point_grid
 from processor.geometry.parallel import over_ranges
-from processor.geometry.point_grid import SIDE, PointGrid, block_at
+from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
 from processor.model import Floats, Ints
 
 T = TypeVar("T", bound=np.generic)
@@ -193,9 +193,7 @@ def _nearest(cells, places, own, order, first, last, k, mean, farthest):  # type
         away = max(away, z - zl - size * (tops[2] + 1), 0.0)
         reach = guess + away
         while True:
-            i0, i1 = int(max((x - reach - xl) / size, 0.0)), int(min((x + reach - xl) / size, float(tops[0])))
-            j0, j1 = int(max((y - reach - yl) / size, 0.0)), int(min((y + reach - yl) / size, float(tops[1])))
-            k0, k1 = int(max((z - reach - zl) / size, 0.0)), int(min((z + reach - zl) / size, float(tops[2])))
+            i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, reach, reach, reach)
             n = 0
             best[:] = np.inf
             for bi in range(i0 // SIDE, i1 // SIDE + 1):
@@ -224,10 +222,8 @@ def _nearest(cells, places, own, order, first, last, k, mean, farthest):  # type
                                         best[m] = best[m - 1]
                                         m -= 1
                                     best[m] = d
-            if best[k - 1] <= reach * reach:
-                break
             whole = i0 == 0 and j0 == 0 and k0 == 0 and i1 == tops[0] and j1 == tops[1] and k1 == tops[2]
-            if whole:
+            if whole or best[k - 1] <= reach * reach:
                 break
             # The k-th of any k points is an upper bound of the distance wanted: that search radius is sufficient.
             reach = np.sqrt(best[k - 1]) * (1.0 + 1e-9) if n >= k else GROWTH * reach + size

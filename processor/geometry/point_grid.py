@@ -114,6 +114,21 @@ def block_at(cells, i, j, k):  # type: ignore[no-untyped-def]
     return cells.blocks[at]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def cells_within(cells, x, y, z, ex, ey, ez):  # type: ignore[no-untyped-def]
+    """Find the first and last cell along each axis of the box about (x, y, z) with half edges ex, ey, ez.
+
+    Of a box below the grid the last cell along z is -1, so that a loop over the cells is empty.
+    """
+    size, xl, yl, zl = cells.size, cells.lower[0], cells.lower[1], cells.lower[2]
+    i0, i1 = int(max((x - ex - xl) / size, 0.0)), int(min((x + ex - xl) / size, SIDE * cells.extent[0] - 1.0))
+    j0, j1 = int(max((y - ey - yl) / size, 0.0)), int(min((y + ey - yl) / size, SIDE * cells.extent[1] - 1.0))
+    k0, k1 = int(max((z - ez - zl) / size, 0.0)), int(min((z + ez - zl) / size, SIDE * cells.extent[2] - 1.0))
+    if x + ex < xl or y + ey < yl or z + ez < zl:
+        k1 = -1
+    return i0, i1, j0, j1, k0, k1
+
+
 @njit(cache=True, nogil=True)
 def _fill(keys, blocks, block_keys):  # type: ignore[no-untyped-def]
     """Enter the rows of blocks with ``block_keys`` (b,) into the hash table."""

@@ -209,6 +209,9 @@ def _powers() -> tuple[Floats, Floats]:
     return np.array(high), np.array(low)
 
 
+# Separator, 0 for blanks, else a byte that blanks may surround; whether numbers may have decimal commas; whether // and
+# % begin comments, as # always does; whether a row has no more columns than slots.
+Form = tuple[int, bool, bool, bool]
 HIGH, LOW = _powers()  # compile-time constants: as arguments they cost more than the arithmetic
 
 
@@ -312,45 +315,87 @@ def _line_end(text: npt.NDArray[np.uint8], at: int, size: int, stop: int) -> int
 
 
 @njit(cache=True, nogil=True)
+def _row_ends(text: npt.NDArray[np.uint8], at: int, size: int, comments: bool) -> bool:
+    return at == size or text[at] == 10 or text[at] == 13 or _is_comment(text, at, size, comments)
+
+
+@njit(cache=True, nogil=True)
+def _after_row(text: npt.NDArray[np.uint8], at: int, form: Form) -> int:
+    """Skip what follows the last column wanted. Returns the start of the next line, -1 for a column too many."""
+    separator, _, comments, exact = form
+    size = len(text)
+    if exact:
+        at = _after_blanks(text, at, size, separator)
+        if separator != 0 and at < size and text[at] == separator:  # one behind the last cell
+            at = _after_blanks(text, at + 1, size, separator)
+        if not _row_ends(text, at, size, comments):
+            return -1
+    return _line_end(text, at, size, 10) + 1
+
+
+@njit(cache=True, nogil=True)
+def _cell_end(
+    text: npt.NDArray[np.uint8], first: int, at: int, form: Form, wanted: bool
+) -> tuple[int, int, bool, bool, bool]:
+    """Find the end of the cell that begins at ``first`` and was parsed up to ``at``.
+
+    Returns the byte after its words, the next byte, whether there is a cell, whether nothing follows what was parsed,
+    and whether the row ends there.
+    """
+    separator, _, comments, _ = form
+    size, parsed = len(text), at
+    while at < size:
+        c = text[at]
+        if c == 10 or c == 13 or c == 32 or c == 9 or (separator != 0 and c == separator):
+            break
+        if _is_comment(text, at, size, comments):
+            break
+        at += 1
+    last, plain = at, at == parsed
+    at = _after_blanks(text, at, size, separator)
+    ended = _row_ends(text, at, size, comments)
+    found = last > first or not ended
+    if separator != 0 and found:
+        if wanted and last < at and not ended and text[at] != separator:
+            plain = False  # two words in one cell
+            at = last = _line_end(text, at, size, separator)
+            ended = at == size or text[at] == 10 or text[at] == 13
+        elif not wanted:
+            while at < size and text[at] != 35 and text[at] != separator and text[at] != 10 and text[at] != 13:
+                at += 1
+            ended = at == size or text[at] == 10 or text[at] == 13 or text[at] == 35
+    return last, at, found, plain, ended
+
+
+@njit(cache=True, nogil=True)
 def parse(
     text: npt.NDArray[np.uint8],
-    start: int,
+    at: int,
     most: int,
     slots: npt.NDArray[np.int64],
-    form: tuple[int, bool, bool, bool],
+    form: Form,
     out: Floats,
     odd: npt.NDArray[np.int64],
 ) -> tuple[int, int, int, int, int]:
-    """Parse rows of ``text`` (bytes of whole lines) from ``start`` into ``out`` (n, k), at most ``most`` of them.
+    """Parse rows of ``text`` (bytes of whole lines) from byte ``at`` into ``out`` (n, k), at most ``most`` of them.
 
-    ``slots[c]`` is the column of ``out`` for column c of the file, -1 for none. ``form``: the separator, 0 for blanks,
-    else a byte that blanks may surround; whether numbers may have decimal commas; whether // and % begin comments, as #
-    always does; whether rows have no more columns than ``slots``. Returns why it stopped (ENDED, FULL, ODD, SHORT_ROW,
-    LONG_ROW), the number of rows, the next byte, the count of numbers in ``odd`` (row, slot, first byte, byte after the
-    last) and the number of columns of a short row.
+    ``slots[c]`` is the column of ``out`` for column c of the file, -1 for none. Returns why it stopped (ENDED, FULL,
+    ODD, SHORT_ROW, LONG_ROW), the number of rows, the next byte, the count of numbers in ``odd`` (row, slot, first
+    byte, byte after the last) and the number of columns of a short row.
     """
-    separator, commas, comments, exact = form
+    separator, commas, _, _ = form
     size, columns = len(text), len(slots)
-    at, rows, odds = start, 0, 0
+    rows, odds = 0, 0
     while at < size:
-        if rows == most:
-            return FULL, rows, at, odds, 0
-        if odds + columns > len(odd):
-            return ODD, rows, at, odds, 0
+        if rows == most or odds + columns > len(odd):
+            return FULL if rows == most else ODD, rows, at, odds, 0
         if text[at] == 10:  # a blank line, or the second byte of a line's end
             at += 1
             continue
-        begin, column, done = at, 0, False
-        while not done:
-            if column == columns:  # the rest of the line is not wanted
-                if exact:
-                    at = _after_blanks(text, at, size, separator)
-                    if separator != 0 and at < size and text[at] == separator:  # one behind the last cell
-                        at = _after_blanks(text, at + 1, size, separator)
-                    ended = at == size or text[at] == 10 or text[at] == 13 or _is_comment(text, at, size, comments)
-                    if not ended:
-                        return LONG_ROW, rows, begin, odds, column
-                at = _line_end(text, at, size, 10) + 1
+        begin, column, ended = at, 0, False
+        while not ended:
+            if column == columns:
+                at = _after_row(text, at, form)
                 break
             at = _after_blanks(text, at, size, separator)
             first, slot = at, slots[column]
@@ -359,52 +404,26 @@ def parse(
                 at, negative, digits, count, power = _decimal(text, at, size, commas)
                 plain = 0 < count <= 19 and -REACH <= power <= REACH
                 if plain:
-                    value = _times_power(digits, power)
-                    value = -value if negative else value
+                    value = _times_power(digits, power) * (-1.0 if negative else 1.0)
                 if plain and at < size:
                     c = text[at]
                     if c == 10 or c == 13 or (c == separator if separator != 0 else c == 32):  # nearly always
                         out[rows, slot] = value
                         column += 1
                         at += 1
-                        done = c == 10 or c == 13
+                        ended = c == 10 or c == 13
                         continue
-            # What follows ends the token, or makes it one that is not a plain number.
-            while at < size:
-                c = text[at]
-                if c == 10 or c == 13 or c == 32 or c == 9 or (separator != 0 and c == separator):
-                    break
-                if _is_comment(text, at, size, comments):
-                    break
-                plain = False
-                at += 1
-            last = at
-            at = _after_blanks(text, at, size, separator)
-            ended = at == size or text[at] == 10 or text[at] == 13 or _is_comment(text, at, size, comments)
-            if last > first or not ended:
-                if slot >= 0:
-                    if separator != 0 and last < at and not ended and text[at] != separator:
-                        plain = False  # two words in one cell
-                        at = last = _line_end(text, at, size, separator)
-                        ended = at == size or text[at] == 10 or text[at] == 13
-                    if plain:
-                        out[rows, slot] = value
-                    else:
-                        odd[odds, 0], odd[odds, 1], odd[odds, 2], odd[odds, 3] = rows, slot, first, last
-                        odds += 1
-                elif separator != 0:
-                    while at < size and text[at] != 35 and text[at] != separator and text[at] != 10 and text[at] != 13:
-                        at += 1
-                    ended = at == size or text[at] == 10 or text[at] == 13 or text[at] == 35
-                column += 1
-            if ended:
-                at = _line_end(text, at, size, 10) + 1
-                done = True
-            elif separator != 0 and text[at] == separator:
-                at += 1
-        if column == 0:
-            continue
-        if column < columns:
+            last, at, found, alone, ended = _cell_end(text, first, at, form, slot >= 0)
+            if found and slot >= 0 and plain and alone:
+                out[rows, slot] = value
+            elif found and slot >= 0:
+                odd[odds, 0], odd[odds, 1], odd[odds, 2], odd[odds, 3] = rows, slot, first, last
+                odds += 1
+            column += found
+            at = _line_end(text, at, size, 10) + 1 if ended else at + (separator != 0 and text[at] == separator)
+        if at < 0:
+            return LONG_ROW, rows, begin, odds, column
+        if 0 < column < columns:
             return SHORT_ROW, rows, begin, odds, column
-        rows += 1
+        rows += column > 0
     return ENDED, rows, at, odds, 0

@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("processor", "designgen")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-MOST_FILES, MOST_LINES, MOST_KERNEL_LINES, MOST_ARGUMENTS = 20, 60, 100, 10
+MOST_FILES, MOST_LINES, MOST_ARGUMENTS = 20, 60, 10
 
 
 def module_name(path):
@@ -93,7 +93,7 @@ def crowded_folders():
 
 
 def long_functions():
-    """Functions with too many lines or arguments; compiled kernels may have more lines."""
+    """Functions with too many lines or arguments."""
     found = []
     for path in SOURCES:
         for node in ast.walk(tree(path)):
@@ -101,8 +101,7 @@ def long_functions():
                 continue
             lines = node.end_lineno - min([node.lineno, *(one.lineno for one in node.decorator_list)]) + 1
             arguments = len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs)
-            kernel = any("njit" in ast.dump(one) for one in node.decorator_list)
-            if lines > (MOST_KERNEL_LINES if kernel else MOST_LINES) or arguments > MOST_ARGUMENTS:
+            if lines > MOST_LINES or arguments > MOST_ARGUMENTS:
                 found.append(
                     f"{path.relative_to(ROOT)}:{node.lineno} {node.name}: {lines} lines, {arguments} arguments"
                 )

@@ -132,20 +132,7 @@ def _choose_at(k, crops, masks, model, sizes, vote_half_width, first_reach_mm, c
         count += 1
     if count == 0:
         return
-    best = least_of(energies, count)
-    comparable = np.ones(n, np.uint8)
-    for j in range(count):
-        if abs(radii[j] - radii[best]) <= NEIGHBOURS_MM:
-            for i in range(n):
-                if codes[j, i] == MASKED:
-                    comparable[i] = 0
-    for j in range(count):
-        for i in range(n):
-            codes[j, i] *= comparable[i]
-        prior = Prior(sizes.centre_weight[k], radii[j], w)
-        energies[j] = energy(observations, codes[j], model.noise, prior, all_states[j], all_shifts[j])
-        if known and radii[j] != nominal:
-            energies[j] += sizes.other_size_penalty
+    _compare_alike(k, observations, model.noise, sizes, all_states, all_shifts, radii, codes, energies[:count])
     best = least_of(energies, count)
     choice.energy[k], choice.sizes[k] = energies[best], all_states[best, 3] if sizes.free else radii[best]
     for i in range(4):
@@ -155,6 +142,26 @@ def _choose_at(k, crops, masks, model, sizes, vote_half_width, first_reach_mm, c
         runner_up = least_of(energies, count)
         choice.second[k] = all_states[runner_up, 3] if sizes.free else radii[runner_up]
         choice.second_energy[k] = energies[runner_up]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _compare_alike(k, observations, noise, sizes, states, shifts, radii, codes, energies):  # type: ignore[no-untyped-def]
+    """Compute the energies (m,) again without the points that are masked for any of the sizes near the best."""
+    nominal = sizes.nominal[k]
+    best = least_of(energies, len(energies))
+    comparable = np.ones(codes.shape[1], np.uint8)
+    for j in range(len(energies)):
+        if abs(radii[j] - radii[best]) <= NEIGHBOURS_MM:
+            for i in range(len(comparable)):
+                if codes[j, i] == MASKED:
+                    comparable[i] = 0
+    for j in range(len(energies)):
+        for i in range(len(comparable)):
+            codes[j, i] *= comparable[i]
+        prior = Prior(sizes.centre_weight[k], radii[j], 0.0 if sizes.free else sizes.weight)
+        energies[j] = energy(observations, codes[j], noise, prior, states[j], shifts[j])
+        if not np.isnan(nominal) and radii[j] != nominal:
+            energies[j] += sizes.other_size_penalty
 
 
 # --- one fit and its energy ------------------------------------------------------------------------------------------

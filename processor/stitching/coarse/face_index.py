@@ -161,19 +161,12 @@ def mark_matches(index, T, patches, bound, off, like, out):  # type: ignore[no-u
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(small, large, T, patches, weight, bound, gate, like):  # type: ignore[no-untyped-def]
-    """Return point-to-plane normal equations of patches transformed by T onto the nearest indexed ones.
-
-    H (6, 6), g (6,), centre (3,), reach and the number of matches. Rotations are about the centre of the matches, in mm
-    at the reach, their root mean square distance from it. ``large`` is searched where ``small`` has no patch in reach.
-    """
+def _matches(small, large, T, patches, weight, bound, gate, like):  # type: ignore[no-untyped-def]
+    """Find for each patch, transformed by T, the nearest indexed one: place, its normal, distance and weight (m, 8)."""
     points, normals = patches.points, patches.normals
-    n = len(points)
-    matched = np.empty((n, 8))
+    matched = np.empty((len(points), 8))
     count = 0
-    centre = np.zeros(3)
-    H, g = np.zeros((6, 6)), np.zeros(6)
-    for k in range(n):
+    for k in range(len(points)):
         p, q, r = points[k, 0], points[k, 1], points[k, 2]
         x = T[0, 0] * p + T[0, 1] * q + T[0, 2] * r + T[0, 3]
         y = T[1, 0] * p + T[1, 1] * q + T[1, 2] * r + T[1, 3]
@@ -197,10 +190,25 @@ def normal_equations(small, large, T, patches, weight, bound, gate, like):  # ty
         matched[count, 0], matched[count, 1], matched[count, 2] = x, y, z
         matched[count, 3:6] = m
         matched[count, 6], matched[count, 7] = off, weight[k]
-        centre += matched[count, :3]
         count += 1
+    return matched[:count]
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(small, large, T, patches, weight, bound, gate, like):  # type: ignore[no-untyped-def]
+    """Return point-to-plane normal equations of patches transformed by T onto the nearest indexed ones.
+
+    H (6, 6), g (6,), centre (3,), reach and the number of matches. Rotations are about the centre of the matches, in mm
+    at the reach, their root mean square distance from it. ``large`` is searched where ``small`` has no patch in reach.
+    """
+    matched = _matches(small, large, T, patches, weight, bound, gate, like)
+    count = len(matched)
+    centre = np.zeros(3)
+    H, g = np.zeros((6, 6)), np.zeros(6)
     if count == 0:
         return H, g, centre, 1.0, 0
+    for k in range(count):
+        centre += matched[k, :3]
     centre /= count
     reach = 0.0
     for k in range(count):
