@@ -27,7 +27,7 @@ Ints = npt.NDArray[np.int64]
 Labels = npt.NDArray[np.int32]
 Codes = npt.NDArray[np.uint8]
 Shorts = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
+Bools = npt.NDArray[np.bool_]
 
 
 class RecordError(ValueError):
@@ -575,7 +575,7 @@ class Clips(Checked):
     scan: tuple[str, ...] = names("c")
     low: Floats = column("c", 3, means=PLACE)
     high: Floats = column("c", 3, means=PLACE)
-    keep: Flags = column("c", dtype=np.bool_, means=Meaning())
+    keep: Bools = column("c", dtype=np.bool_, means=Meaning())
     inside: Ints = column("c", dtype=np.int64, means=Meaning(least=0))
     read: int = described(0, means=Meaning(least=0))  # points of all scans
     kept: int = described(0, means=Meaning(least=0))
@@ -719,10 +719,10 @@ class BodyTruth(Checked):
     turn: Floats = column("b", 3)  # rad
 
     @property
-    def moved(self) -> Flags:
+    def moved(self) -> Bools:
         """Whether each body (b,) moved as a whole."""
         known = np.isfinite(self.shift).all(axis=1)
-        changed: Flags = known & ((self.shift != 0.0).any(axis=1) | (self.turn != 0.0).any(axis=1))
+        changed: Bools = known & ((self.shift != 0.0).any(axis=1) | (self.turn != 0.0).any(axis=1))
         return changed
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from designgen.checks import expect
 from designgen.designs import plate_row
 from designgen.designs.box_and_tube import Box, Component
-from designgen.designs.patch import Bools, Displacement, Patch, outside
-from processor.model import Floats, UsageError
+from designgen.designs.patch import Displacement, Patch, outside
+from processor.model import Bools, Floats, UsageError
 
 CLASSES = (
     "dent", "bulge", "bend", "twist", "waviness", "edge-loss", "missing-part", "pit", "crack", "step", "misalignment",

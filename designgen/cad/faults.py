@@ -7,11 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from processor.model import Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, Floats, Ints
 
 TOUCHING_MM = 0.1  # bodies that run into each other by less are in contact: chords of round faces depart by half of it
 MOST_POINTS = 400  # of a body, by which it is tried whether it lies in another one

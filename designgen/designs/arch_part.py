@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from designgen.curves import Curve
-from designgen.designs.patch import Bools, Patch, Surface, outside
-from processor.model import Floats
+from designgen.designs.patch import Patch, Surface, outside
+from processor.model import Bools, Floats
 
 if TYPE_CHECKING:
     import cadquery as cq

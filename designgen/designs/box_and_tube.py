@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from designgen.designs.patch import Bools, Patch, Surface
+from designgen.designs.patch import Patch, Surface
 from designgen.frames import perpendicular
-from processor.model import Floats
+from processor.model import Bools, Floats
 
 if TYPE_CHECKING:
     import cadquery as cq

@@ -7,11 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
-Bools = npt.NDArray[np.bool_]
 Surface = Callable[[Floats, Floats], Floats]  # p, q (n,) in 0..1 -> points (n, 3), mm
 Displacement = Callable[[Floats], Floats]  # points (n, 3) -> their displacements (n, 3), mm
 

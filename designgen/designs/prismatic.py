@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from designgen.designs.patch import Bools, Patch
+from designgen.designs.patch import Patch
 from designgen.designs.sections import Section
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
 NET_MM = 250.0
 PAD_SIZE_MM, PAD_HEIGHT_MM = 200.0, 20.0  # of the mark that tells a part's ends and attitudes apart

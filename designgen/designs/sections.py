@@ -9,7 +9,6 @@ import numpy as np
 from processor.model import Floats, UsageError
 
 NAMES = ("box", "stiffened-box", "i")
-INSIDE_MM = 1e-6
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from designgen.export import formats, solids
+from designgen.export import formats, step_files
 from designgen.export.formats import Written
 from processor.model import (
     Picks,
@@ -24,6 +24,7 @@ from processor.store import store
 from processor.store.new_folder import check_new, new_folder
 from processor.writers import project
 from processor.writers.cloud import METRES
+from processor.writers.toml import as_toml
 
 LABELS = "labels.json"  # names of the parts and surfaces by the numbers in the scans' files
 PICKS, PICK_COLUMNS = "picks.csv", ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
@@ -76,10 +77,10 @@ def export(
             write(())
         if step:
             provenance = store.read_provenance(source)
-            solids.write_design(provenance.get("parameters") or {}, making / "design")
+            step_files.write_design(provenance.get("parameters") or {}, making / "design")
             if with_truth:
                 recipe, seed = provenance.get("parameters") or {}, int(provenance.get("seed") or 0)
-                solids.write_as_built(recipe, seed, making / "as-built")
+                step_files.write_as_built(recipe, seed, making / "as-built")
     return Exported(len(scans), tuple(scan.name for scan in whole.scans if len(scan.points) < FEWEST_POINTS))
 
 
@@ -108,12 +109,12 @@ def _write(
     with_meshes: bool,
 ) -> list[Written]:
     (folder / "scans").mkdir()
-    lines = [f"name = {project.quoted(scene.name)}", f"kind = {project.quoted(scene.kind)}"]
+    lines = [f"name = {as_toml(scene.name)}", f"kind = {as_toml(scene.kind)}"]
     lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
     scale = 1.0 if format_ == "ply" else METRES
     design = project.write_design(scene, folder, scale, with_meshes=with_meshes)
     if design:
-        lines.append(f"design = {project.quoted(design)}")
+        lines.append(f"design = {as_toml(design)}")
     if np.isfinite(scene.temperature_C):
         lines.append(f"temperature_C = {scene.temperature_C!r}")
     named = list(zip(project.stems(scene.scans), scene.scans, strict=True))
@@ -122,7 +123,7 @@ def _write(
         first = labels[0]
         project.write_json(folder / LABELS, {"part": list(first.part_names), "surface": list(first.surface_names)})
     for file in written:
-        lines += ["", "[[scan]]", f"file = {project.quoted(f'scans/{file.name}')}"]
+        lines += ["", "[[scan]]", f"file = {as_toml(f'scans/{file.name}')}"]
         if len(file.scans) > 1:
             lines += _of_file(file.scans)
         else:

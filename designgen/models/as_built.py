@@ -16,14 +16,14 @@ import numpy as np
 
 from designgen.asbuilt.imperfections import Ledger
 from designgen.checks import expect_all
-from designgen.designs.patch import Bools, Displacement, Surface
+from designgen.designs.patch import Displacement, Surface
 from designgen.models.model import Model, ModelBody
-from designgen.models.placement import spread
 from designgen.models.subdivision import Spacing, subdivided
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import triangle_tree
-from processor.model import AsBuilt, BodyTruth, DefectTruth, Floats, StructureTruth, UsageError
+from designgen.scanning.station_placement import spread
+from processor.model import AsBuilt, BodyTruth, Bools, DefectTruth, Floats, StructureTruth, UsageError
 
 TRUTH_POINTS, LEAST_TRUTH_POINTS = 20_000, 60  # of the whole model, by area; of a body, at least
 DENT_TRUTH_POINTS = 400  # in addition, in and about a dent

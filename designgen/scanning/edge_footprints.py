@@ -13,10 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from designgen.designs.patch import Bools
 from designgen.scanning.raycast import Grid
 from designgen.scanning.surfaces import TRIANGLE, Surfaces
-from processor.model import Floats, Labels
+from processor.model import Bools, Floats, Labels
 
 MOST_CELLS = 16
 # An edge lies up to one cell beyond the last ray on a surface; this fraction of the cell is searched.

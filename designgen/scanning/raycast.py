@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from designgen.designs.patch import Bools, Surface
+from designgen.designs.patch import Surface
 from designgen.scanning import angular_bounds, ray_kernels, tree_kernels
 from designgen.scanning.surfaces import CONE, DISC, SPHERE, TRIANGLE, Surfaces
-from processor.model import Floats, Labels, Shorts
+from processor.model import Bools, Floats, Labels, Shorts
 
 WEIGHTS = (-3.0, 4.0)  # bounds of the weights of a net triangle's edges within which a hit on the face is sought
 POINTS = {SPHERE: (0,), CONE: (0,), DISC: (0,), TRIANGLE: (0, 3, 6)}  # columns of points in a shape's numbers

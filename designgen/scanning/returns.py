@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from designgen.designs.patch import Bools
 from designgen.frames import inverse
 from designgen.randomness import generator
 from designgen.scanning import edge_footprints, ray_kernels, raycast
@@ -24,7 +23,7 @@ from designgen.scanning.ray_kernels import Strip
 from designgen.scanning.raycast import Grid, View
 from designgen.scanning.scanner import BEAM_RINGS, Params, Scanner
 from designgen.scanning.surfaces import Surfaces
-from processor.model import SOURCES, Codes, Floats, Labels, Shorts
+from processor.model import SOURCES, Bools, Codes, Floats, Labels, Shorts
 
 STRIP = 64  # columns processed at a time
 LOWEST_DEG, HIGHEST_DEG = -60.0, 90.0

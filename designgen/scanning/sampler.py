@@ -10,9 +10,9 @@ import numpy as np
 from designgen.checks import expect_all
 from designgen.designs import arch_part, bolt_ball, space_frame
 from designgen.designs.arch_part import Face
-from designgen.designs.patch import Bools, Patch, within_triangle
+from designgen.designs.patch import Patch, within_triangle
 from designgen.frames import perpendicular
-from processor.model import SOURCES, Codes, Floats, Labels
+from processor.model import SOURCES, Bools, Codes, Floats, Labels
 
 MODE = "surface"
 OUTLIER = SOURCES.index("outlier")

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from designgen.designs.patch import Bools
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
 LEAF = 4  # triangles at which a node is not divided any more
 BINS = 16

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from designgen.designs import arch_bridge, arch_part
-from designgen.models import as_built, loading, placement
+from designgen.models import as_built, loading
 from designgen.models.model import Model, ModelBody
 from designgen.reading import filled
 from designgen.recipe_files import Recipe, overridden
 from designgen.scanning import scanner as scanner_module
-from designgen.scanning import survey
+from designgen.scanning import station_placement, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder, Surfaces
 from designgen.scenes import MADE_IN_MM
@@ -127,6 +127,6 @@ def _poses(model: Model, recipe: Mapping[str, Any], scanning: ByRays, seed: int)
     """Return the stations' poses, given or placed so that most of the surface is seen."""
     given = filled(Params, recipe, "model").stations
     if given:
-        return placement.given(Path(given), seed)
+        return station_placement.given(Path(given), seed)
     distance = scanning.params.distance_mm if "distance_mm" in recipe.get("scan", {}) else None
-    return placement.placed(model, math.prod(scanning.params.stations), distance, scanning.device, seed)
+    return station_placement.placed(model, math.prod(scanning.params.stations), distance, scanning.device, seed)

@@ -12,7 +12,7 @@ import numpy as np
 from designgen.asbuilt import defects as asbuilt_defects
 from designgen.asbuilt import imperfections
 from designgen.designs import box_and_tube, plate_row, structure_registry
-from designgen.designs.patch import Bools, Displacement, Patch
+from designgen.designs.patch import Displacement, Patch
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import clutter, picking, sampler, scanner, survey
@@ -22,6 +22,7 @@ from designgen.scenes import MADE_IN_MM
 from designgen.sequences import van_der_corput
 from processor.model import (
     AsBuilt,
+    Bools,
     DefectTruth,
     Floats,
     Labels,

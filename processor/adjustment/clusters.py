@@ -1,27 +1,13 @@
-"""Covariance of least-squares fits whose residuals agree over patches: cluster-robust, and by scale of the patches.
-
-Points of one scan share errors of range, of a station's registration, and of the surface's form. Residuals show what
-is shared: their sums over clusters (patches, faces, stations) scatter by more than noise explains. The covariance is
-the jackknife over clusters, which does not underestimate with few clusters (Bell and McCaffrey 2002, "CR3"). Its number
-of degrees of freedom is Satterthwaite's, for Student's t.
-"""
+"""Means of residuals over patches, and Student's factor for variances of few degrees of freedom."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from processor.model import NORMAL_95, Floats, Ints
-
-
-class ClusterCovariance(NamedTuple):
-    """Covariance (k, k) of coefficients and degrees of freedom (k,) of their variances; NaN, 0 where undetermined."""
-
-    covariance: Floats
-    freedom: Floats
 
 
 class Patches(NamedTuple):
@@ -34,39 +20,6 @@ class Patches(NamedTuple):
     number: Floats
     centre: Floats
     noise: float
-
-
-def covariance(basis: Floats, residual: Floats, cluster: Ints, weight: Floats | None = None) -> ClusterCovariance:
-    """Jackknife covariance over clusters of a (weighted) least-squares fit.
-
-    ``basis`` (n, k) and ``residual`` (n,) are of the fitted points, ``cluster`` (n,) numbers the cluster of each. A
-    coefficient that fewer than two clusters determine has no covariance.
-    """
-    weighted = basis if weight is None else basis * weight[:, None]
-    number = np.unique(cluster, return_inverse=True)[1].reshape(-1)
-    count, k = int(number.max(initial=-1)) + 1, basis.shape[1]
-    gradient = _sums(weighted * residual[:, None], number, count)
-    products = _sums((weighted[:, :, None] * basis[:, None, :]).reshape(len(basis), k * k), number, count)
-    products = products.reshape(count, k, k)
-    normal = products.sum(axis=0)
-    undetermined = ClusterCovariance(np.full((k, k), np.nan), np.zeros(k))
-    if count < 2 or np.linalg.cond(normal) > 1e14:
-        return undetermined
-    left = normal - products
-    if np.linalg.cond(left).max() > 1e14:  # one cluster alone determines a coefficient
-        return undetermined
-    moved = np.linalg.solve(left, gradient[:, :, None])[:, :, 0]
-    inverse = np.linalg.inv(normal)
-    share = np.einsum("ij,gjk,ki->gi", inverse, products, inverse)
-    freedom = share.sum(axis=0) ** 2 / np.maximum((share**2).sum(axis=0), 1e-300) - 1.0
-    return ClusterCovariance((count - 1) / count * moved.T @ moved, np.maximum(freedom, 1.0))
-
-
-def jackknife(estimates: Floats) -> Floats:
-    """Covariance (k, k) of an estimate by repeating it without one block at a time, ``estimates`` (g, k)."""
-    off = estimates - estimates.mean(axis=0)
-    found: Floats = (len(estimates) - 1) / len(estimates) * off.T @ off
-    return found
 
 
 def widening(freedom: Floats | float) -> Floats:
@@ -93,21 +46,6 @@ def cubes(place: Floats, size_mm: float) -> Ints:
     key = np.ravel_multi_index(tuple(index.T), tuple(index.max(axis=0, initial=0) + 1))
     number: Ints = np.unique(key, return_inverse=True)[1].reshape(-1).astype(np.int64)
     return number
-
-
-def variance_by_scale(place: Floats, residual: Floats, sizes_mm: Sequence[float]) -> Floats:
-    """Variance (s,) of patches' mean residuals beyond white noise, for each patch size, mm^2; NaN with one patch.
-
-    White residuals give zero (negative by chance) at every size. A size at which the variance falls is the length over
-    which residuals agree; what is left at the largest size is common to faces or to the whole scan.
-    """
-    return np.array([_beyond_noise(patches(place, residual, size)) for size in sizes_mm])
-
-
-def _beyond_noise(found: Patches) -> float:
-    if len(found.mean) < 2:
-        return float("nan")
-    return float(np.mean(found.mean**2 - found.noise / found.number))
 
 
 def _sums(values: Floats, number: Ints, count: int) -> Floats:

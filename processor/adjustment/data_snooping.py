@@ -13,14 +13,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import chdtri
 
 from processor.adjustment.control_points import LEAST_POINTS
 from processor.geometry.linalg_small import cholesky, solve
-from processor.model import Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, Floats, Ints
 
 # --- Tests of the misfits of one adjustment
 

@@ -13,14 +13,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry.parallel import over_ranges
-from processor.model import Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, Floats, Ints
 
 WINDOW_STEPS = 1.6  # of the scanner, within which a point is a neighbour: those of a square grid and its diagonals
 HALF_BEAM_MM = 4.0  # of scanners up to 20 m away, by which the window is wider

@@ -12,11 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import chdtrc
 
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
 SIZES_MM = (0.0, 0.1, 1.0, 3.0, 10.0, 30.0)
 LEAST_SHARE = 1e-4  # a hypothesis of less weight is left out of the average
@@ -24,8 +23,6 @@ LEAST_MM = 1e-4  # standard deviation that keeps a covariance invertible where a
 ROUNDS = 50  # until the weights that each other's rows determine have converged
 LENGTHS_MM = (400.0, 1200.0, 4000.0)  # correlation lengths of a curve along a part
 LEAST_VALUES = 5
-
-Bools = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

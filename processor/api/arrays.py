@@ -17,7 +17,7 @@ from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Floats, Reason, Status
 from processor.space_frame.params import Params
 from processor.space_frame.result import Flag
-from processor.space_frame.spheres import isolated
+from processor.space_frame.spheres import search_without_design
 
 LEAST_EXTENT_MM = 2.0  # nothing that is scanned is smaller: the coordinates are in metres
 LEAST_POINTS = 10
@@ -97,7 +97,7 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     if scanner is not None:
         seen_from = _positions(scanner, "scanner", cloud.shape) - origin
     params = Params(radius_mm=float("nan") if radius is None else float(radius), max_balls=1)
-    measured = isolated.search(MergedCloud(cloud - origin, origin, seen_from), params)
+    measured = search_without_design.search(MergedCloud(cloud - origin, origin, seen_from), params)
     balls = measured.balls
     if not len(balls):
         return SphereFit(

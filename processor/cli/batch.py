@@ -51,17 +51,25 @@ class BatchOptions:
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of all results")
 @click.option("--jobs", type=click.IntRange(min=1), help="inputs processed at a time  [default: 1]")
 @click.option("--cluster", metavar="ADDRESS", help="Dask scheduler whose workers do it, e.g. tcp://10.0.0.1:8786")
-@click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), default=3600.0, show_default=True)
-@click.option("--memory-mb", type=click.IntRange(min=64), help="of a job  [default: its share of 80 % of the machine]")
+@click.option(
+    "--timeout-s",
+    type=click.FloatRange(min=0, min_open=True),
+    default=3600.0,
+    show_default=True,
+    help="limit of each input",
+)
+@click.option(
+    "--memory-mb", type=click.IntRange(min=64), help="limit of each job  [default: its share of 80 % of the machine]"
+)
 @click.option("--retry", is_flag=True, help="try again what failed, though nothing has changed")
-@click.option("--steps", callback=split_names, metavar="A,B", help="as of run; so are the options below")
-@click.option("--method", "methods", callback=split_names, metavar="NAME[,NAME]")
-@click.option("--params", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--units", type=click.Choice(UNITS), help="of scans; scene files state theirs")
-@click.option("--seed", type=click.IntRange(min=0))
-@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of all pages")
+@click.option("--steps", callback=split_names, metavar="A,B", help="steps, as in `processor run`")
+@click.option("--method", "methods", callback=split_names, metavar="NAME[,NAME]", help="as in `processor run`")
+@click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="a TOML file of parameters")
+@click.option("--units", type=click.Choice(UNITS), help="unit of the scans; scene files contain theirs")
+@click.option("--seed", type=click.IntRange(min=0), help="seed of all randomness")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of all pages")
 @fail_on_option
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object a line for each input, then one for all")
+@click.option("--json", "as_json", is_flag=True, help="print a JSON line for each input, then one for all")
 @debug_option
 @click.pass_context
 def batch(context: click.Context, /, root: Path, **options: Any) -> None:

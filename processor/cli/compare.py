@@ -36,13 +36,17 @@ class _Diameters(click.Command):
 @click.argument("compared", type=FILE)
 @click.option("-o", "--output", required=True, type=FILE, help="folder of the results")
 @click.option("--core", type=FILE, help="cloud of core points  [default: every point of REFERENCE]")
-@click.option("--normal-diameter", type=LENGTH, help="of the sphere that a normal is fitted in")
-@click.option("--projection-diameter", type=LENGTH, help="of the cylinder along the normal")
-@click.option("--max-depth", type=LENGTH, help="of the cylinder, to either side of the core point")
-@click.option("--registration-error", type=click.FloatRange(min=0.0), default=0.0, help="a length, part of the LOD95")
+@click.option("--normal-diameter", type=LENGTH, help="diameter of the sphere in which a normal is fitted")
+@click.option("--projection-diameter", type=LENGTH, help="diameter of the cylinder along the normal")
+@click.option("--max-depth", type=LENGTH, help="reach of the cylinder to either side of the core point")
+@click.option(
+    "--registration-error", type=click.FloatRange(min=0.0), default=0.0, help="length that is added to the LOD95"
+)
 @click.option("--normals", type=FILE, help="nx, ny, nz of every core point, PLY or text, instead of fitted ones")
-@click.option("--units", metavar="U[/V][,U[/V]]", help="of all files, or of both; V of their heights, e.g. m/us-ft,m")
-@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@click.option(
+    "--units", metavar="U[/V][,U[/V]]", help="unit of all files, or of each; V: unit of heights, e.g. m/us-ft,m"
+)
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @click.option("--json", "as_json", is_flag=True, help="print compare.json")
 @debug_option
 def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: bool, **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""Commands whose help lists names that are computed when it is asked for, with suggestions for mistyped names."""
+"""Click classes: a group that suggests names for mistyped commands, and the command run with its long help."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ EXIT_CODES = (
     (0, "done"),
     (1, "done in part: a step, a scan or an input failed; standard error has the reason"),
     (2, "wrong usage"),
-    (3, "bad input"),
+    (3, "bad input, or a limit of time or memory ended the run"),
     (4, "an accuracy limit was missed (of an input with its truth)"),
     (5, "a verdict that --fail-on names"),
 )

@@ -15,7 +15,7 @@ from processor.model import UsageError
 @click.command()
 @click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
 @click.option("--force", is_flag=True, help="replace the project.toml that is there")
-@click.option("--design-units", type=click.Choice(UNITS), help="of a design that states none  [default: guessed]")
+@click.option("--design-units", type=click.Choice(UNITS), help="unit of a design that states none  [default: guessed]")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @debug_option
 def init(folder: Path, force: bool, design_units: str | None, as_json: bool) -> None:

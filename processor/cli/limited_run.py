@@ -9,12 +9,12 @@ from pathlib import Path
 
 from processor.cli.common import print_error_line
 from processor.jobs import process
-from processor.jobs.exit_codes import WITH_RESULTS
+from processor.jobs.exit_codes import ENDED_BY_LIMIT, WITH_RESULTS
 from processor.jobs.process import Cause, Ended
 from processor.model import InputError
 from processor.results.names import RESULTS_H5
 
-ENDED_BY_LIMIT = 3
+MORE = "raise --timeout-s or --memory-mb, or run fewer --steps"
 
 
 def limited_run(
@@ -63,17 +63,17 @@ def _why(ended: Ended, timeout_s: float | None, memory_mb: int | None) -> str:
 
 
 def _what_is_done(part: Path, input_: Path) -> str:
-    """Say which steps were done before the end, and where they are."""
+    """Return which steps were done before the end, and where they are."""
     from processor import pipeline
 
     try:
         runs, provenance = pipeline.read_runs(part / RESULTS_H5)
     except InputError:
-        return "it had not begun its first step, and nothing is kept; give it more, or fewer steps (--steps)"
+        return f"ended before the first step; nothing is kept; {MORE}"
     done = [f"{run.step} ({run.method})" for run in runs]
     planned = [str(name) for name in provenance.get("planned", ())]
     left = ", ".join(planned[len(done) :])
     if not done:
         _remove(part)
-        return f"nothing was done before {left}; give it more, or fewer steps (--steps)"
+        return f"no step was done of {left}; {MORE}"
     return f"done: {', '.join(done)}; not done: {left}; see what is done by processor report {part} {input_}"

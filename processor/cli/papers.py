@@ -14,9 +14,9 @@ from processor.jobs.exit_codes import DONE, IN_PART
 @click.command()
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of papers.json and page")
 @click.option("--only", callback=split_names, metavar="000,001", help="the papers of these numbers  [default: all]")
-@click.option("--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="of every data set")
+@click.option("--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="seeds of every data set")
 @click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True, help="data sets at a time")
-@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @click.option("--json", "as_json", is_flag=True, help="print papers.json instead of one line")
 @debug_option
 @click.pass_context

@@ -21,8 +21,8 @@ from processor.cli.common import (
 @click.command()
 @click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("input_", metavar="[INPUT]", required=False, type=click.Path(path_type=Path))
-@click.option("--units", type=click.Choice(UNITS), help="as given to the run")
-@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@click.option("--units", type=click.Choice(UNITS), help="unit of the scans, as given to the run")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @form_options
 @output_options
 @debug_option

@@ -37,9 +37,9 @@ from processor.results.names import RESULTS_JSON
     "--method", "methods", callback=split_names, metavar="NAME[,NAME]", help="further ones are run for comparison"
 )
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, a table a step")
-@click.option("--units", type=click.Choice(UNITS), help="of the scans' coordinates, whatever the format states")
-@click.option("--seed", type=click.IntRange(min=0), help="of all randomness  [default: 0, or the parameters']")
-@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@click.option("--units", type=click.Choice(UNITS), help="unit of the scans' coordinates, whatever the format states")
+@click.option("--seed", type=click.IntRange(min=0), help="seed of all randomness  [default: 0, or the parameters']")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), help="end the run after so long")
 @click.option("--memory-mb", type=click.IntRange(min=64), help="end the run if it takes more")
 @click.option("--so-far", type=click.Path(path_type=Path), hidden=True)

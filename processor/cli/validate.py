@@ -39,7 +39,7 @@ class ValidateOptions:
 @click.option("--night", metavar="YYYY-MM-DD", help="whose seeds are used  [default: today, UTC]")
 @click.option("--again", is_flag=True, help="do all of a night again that other software began")
 @click.option("--accept", is_flag=True, help="do nothing but accept what got worse in the night as the new level")
-@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the pages")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the pages")
 @click.option("--json", "as_json", is_flag=True, help="print summary.json instead of one line")
 @debug_option
 @click.pass_context

@@ -10,12 +10,11 @@ from pathlib import Path
 import click
 
 from processor.cli.common import debug_option
-from processor.jobs.exit_codes import DONE, IN_PART
+from processor.jobs.exit_codes import BAD_INPUT, DONE, IN_PART
 from processor.language.messages import printable
 from processor.model import InputError
 
 WHOLE, UNKNOWN, DAMAGED = "whole", "no-checksums", "damaged"
-BAD_INPUT = 3
 
 
 @dataclass(frozen=True)
@@ -38,8 +37,9 @@ def verify(context: click.Context, path: Path, as_json: bool) -> None:
     The results.json of a batch is compared with the record beside it. Exit codes: 0 all files are whole, 1 some have no
     checksums (of an earlier version), 3 one is damaged or there is none.
     """
-    if not path.exists():
-        raise InputError(f"{path}: there is no such file or folder")
+    from processor.scan_folder.files import existing
+
+    existing(path)
     found = []
     for one in _looked_at(path):
         found.append(one)

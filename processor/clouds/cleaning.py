@@ -19,13 +19,13 @@ from processor.clouds.run import Run
 from processor.deviation.measure import REACH_MM
 from processor.geometry import merging, mesh_distance, neighbors, rigid
 from processor.geometry.mesh_distance import MeshSurface
-from processor.model import Flags, Floats
+from processor.model import Bools, Floats
 from processor.writers.cloud import Block, Cloud
 
 NEIGHBOURS, RATIO = 20, 3.0
 LEAST_RANGE_MM = 1.0
 HALO = 20.0  # spacings of a cloud, within which the neighbours of a point are searched beyond its slab
-OfDesign = Callable[[Floats], Flags]  # marks points (n, 3), less the origin of a cloud, that are of the design
+OfDesign = Callable[[Floats], Bools]  # marks points (n, 3), less the origin of a cloud, that are of the design
 
 
 @dataclass
@@ -130,11 +130,11 @@ class DesignSurfaces:
     def marks(self, T: Floats) -> OfDesign:
         """Return the function that marks points placed by T (4, 4)."""
 
-        def of_design(points: Floats) -> Flags:
+        def of_design(points: Floats) -> Bools:
             reach = self.depth + mesh_distance.DESIGN_SPACING_MM[1]  # to a sample of the surface
             facet, distance, beyond = self.surface.distances(rigid.apply(T, points), reach)
             with np.errstate(invalid="ignore"):
-                near: Flags = (facet >= 0) & (np.abs(distance) <= self.depth) & (beyond <= self.depth)
+                near: Bools = (facet >= 0) & (np.abs(distance) <= self.depth) & (beyond <= self.depth)
             return near
 
         return of_design

@@ -11,9 +11,10 @@ from typing import Any
 
 from processor import pipeline
 from processor.clouds.points import InMemory, Points, Spool
-from processor.model import InputError, Scene, UsageError
+from processor.model import Scene, UsageError
 from processor.pipeline import Execution
 from processor.results.names import RESULTS_H5
+from processor.scan_folder.files import missing
 from processor.store import store
 from processor.store.streaming import points_of
 
@@ -61,7 +62,7 @@ def opened(out: Path, input_: Path | None, units: str | None, aside: Path) -> It
         raise UsageError(f"{out}: expected a folder of results of processor run ({RESULTS_H5}), found none")
     path = input_ or pipeline.find_input(results)
     if not path.exists():
-        raise InputError(f"{path}: there is no such file or folder")
+        raise missing(path)
     runs, provenance = pipeline.read_runs(results)
     is_scene = path.is_file() and path.suffix.lower() == ".h5"
     with tempfile.TemporaryDirectory(prefix=".points-", dir=aside) as spooled:

@@ -19,6 +19,7 @@ from processor.scan_folder.control_points import COLUMNS
 from processor.scan_folder.files import CONTROL, PICKS, PROJECT, STATIONS
 from processor.writers import project
 from processor.writers.cloud import METRES
+from processor.writers.toml import as_toml
 
 NO_POSE = np.empty(0)
 EACH_SCAN = ("registered", "clean")  # contents with a file a scan, in the scan's own frame
@@ -27,22 +28,22 @@ EACH_SCAN = ("registered", "clean")  # contents with a file a scan, in the scan'
 def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str], what: str, format_: str) -> None:
     """Write what `processor run` needs beside the ``files`` of ``scans`` in a folder."""
     scene, scale = run.scene, 1.0 if format_ == "ply" else METRES
-    lines = [f"name = {project.quoted(scene.name)}", f"kind = {project.quoted(scene.kind)}"]
+    lines = [f"name = {as_toml(scene.name)}", f"kind = {as_toml(scene.kind)}"]
     lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
     design = project.write_design(scene, folder, scale, with_meshes=True)
     if design:
-        lines.append(f"design = {project.quoted(design)}")
+        lines.append(f"design = {as_toml(design)}")
     if np.isfinite(scene.temperature_C) and what != "assembled":  # the assembled parts have their reference lengths
         lines.append(f"temperature_C = {scene.temperature_C!r}")
     lines += _tolerance(scene.tolerance)
     if what == "merged":
         stations = contents.stations_of(run, scans)
-        lines += ["", "[[scan]]", f"file = {project.quoted(files[0])}", *_common_noise(scans)]
+        lines += ["", "[[scan]]", f"file = {as_toml(files[0])}", *_common_noise(scans)]
     else:
         stations = contents.stations_moved(run, scans)
         for one, file in zip(scans, files, strict=True):
             written = _as_written(one, what)
-            lines += ["", "[[scan]]", f"file = {project.quoted(file)}"]
+            lines += ["", "[[scan]]", f"file = {as_toml(file)}"]
             in_file = format_ == "e57" and written.T_project_scan.size > 0
             lines += project.scan_lines(
                 dataclasses.replace(written, T_project_scan=NO_POSE) if in_file else written, scale, with_pose=False
@@ -76,7 +77,7 @@ def _tolerance(tolerance: Tolerance | None) -> list[str]:
         return []
     lines = ["", "[tolerance]"]
     if tolerance.standard:
-        lines.append(f"standard = {project.quoted(tolerance.standard)}")
+        lines.append(f"standard = {as_toml(tolerance.standard)}")
     if tolerance.root_gap_mm:
         lines.append(f"root_gap_mm = {tolerance.root_gap_mm!r}")
     for limit in tolerance.limits:

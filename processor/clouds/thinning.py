@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from processor.clouds import slabs
-from processor.model import Flags, Floats
+from processor.model import Bools, Floats
 from processor.writers.cloud import Block, Cloud
 
 FIELD = 21  # bits of a cell's number for each axis; cells that far apart share a number, which costs time alone
@@ -39,7 +39,7 @@ def thinned(cloud: Cloud, spacing_mm: float, aside: Path) -> Cloud:
     return replace(cloud, blocks=blocks, count=None)
 
 
-def keep(before: Floats, points: Floats, spacing_mm: float) -> Flags:
+def keep(before: Floats, points: Floats, spacing_mm: float) -> Bools:
     """Mark the points (n, 3) to be kept beside those kept ``before`` (m, 3)."""
     every = np.concatenate([before, points])
     kept = np.zeros(len(every), np.bool_)
@@ -47,7 +47,7 @@ def keep(before: Floats, points: Floats, spacing_mm: float) -> Flags:
         cell = np.floor((every - every.min(axis=0)) / spacing_mm).astype(np.int64)
         slots = 1 << max(4, int(2 * len(every)).bit_length())
         _keep(every, cell, len(before), spacing_mm**2, np.full(slots, -1, np.int64), np.full(slots, -1, np.int64), kept)
-    marked: Flags = kept[len(before) :]
+    marked: Bools = kept[len(before) :]
     return marked
 
 

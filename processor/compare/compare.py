@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from processor import readers, store
 from processor.compare import diagnosis, units
+from processor.compare import normals_file as scan_folder_normals
 from processor.geometry import m3c2, neighbors, normal_orientation
 from processor.geometry.m3c2 import CloudNormals, Distances, Scales, Summary
 from processor.geometry.normal_orientation import Turned
@@ -20,7 +21,6 @@ from processor.language.messages import messages
 from processor.model import Floats, InputError, Reason, UsageError, reason
 from processor.readers import RawScan
 from processor.readers.raw_scan import FAR, ORIGIN_STEP
-from processor.scan_folder import normals as scan_folder_normals
 from processor.scan_folder.units import MM_PER_UNIT
 
 CLOUDS = ("reference", "compared", "core")

@@ -18,8 +18,7 @@ from processor.adjustment import scanner_class
 from processor.defects.observations import Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
-from processor.geometry.mesh_distance import Bools
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
 BLOCK_MM = 80.0
 BLOCK_RAD = 0.25  # of a block around a tube: within it, a movement of the tube is nearly one deviation

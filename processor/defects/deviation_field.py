@@ -13,8 +13,7 @@ from processor.defects import surface_charts
 from processor.defects.alignment import Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
-from processor.geometry.mesh_distance import Bools
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
 POOLED_CELLS = 9  # side of the square over which noise is pooled
 ABOUT_CELLS, SEEN_SHARE = 3, 0.5  # side of the square about a cell, and the least share of it that was seen

@@ -16,8 +16,7 @@ from processor.defects.observations import Observed, cells_of
 from processor.defects.places.profiles import PlaceCells
 from processor.defects.regions import Region, unrolled
 from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
-from processor.geometry.mesh_distance import Bools
-from processor.model import NORMAL_95, Floats, Ints
+from processor.model import NORMAL_95, Bools, Floats, Ints
 
 SMOOTH_SHARE = 0.35  # of a region's radius, over which deviations are averaged to find the deepest place
 FIT_SHARE = 0.45  # of a region's radius, within which a paraboloid is fitted for its depth

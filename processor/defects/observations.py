@@ -10,8 +10,8 @@ from numba import njit
 from processor.adjustment import foreground
 from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
 from processor.geometry import mesh_distance, rigid
-from processor.geometry.mesh_distance import Bools, FacetGrid
-from processor.model import Floats, InputError, Ints, Scan, Scene
+from processor.geometry.mesh_distance import FacetGrid
+from processor.model import Bools, Floats, InputError, Ints, Scan, Scene
 
 CHUNK = 500_000
 BEHIND_MM = 4.0  # a face, from which on a beam must have passed through it as designed

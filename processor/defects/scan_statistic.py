@@ -17,9 +17,8 @@ from scipy.special import ndtr, ndtri
 
 from processor.defects.deviation_field import Field
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
-from processor.model import Floats
+from processor.model import Bools, Floats
 
-Bools = npt.NDArray[np.bool_]
 SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of windows, in cells
 COVERED = 0.5  # share of a window that must have been seen
 FEWEST_WINDOWS = 60  # to estimate a scatter from

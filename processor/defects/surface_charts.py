@@ -17,8 +17,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from processor.geometry import enclosure, mesh_distance
-from processor.geometry.mesh_distance import Bools, FacetGrid, MeshSurface
-from processor.model import DesignBodies, Floats, Ints
+from processor.geometry.mesh_distance import FacetGrid, MeshSurface
+from processor.model import Bools, DesignBodies, Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
 PIECE_COS = np.cos(np.radians(15.0))

@@ -25,8 +25,7 @@ from processor.defects.result import DOUBTFUL, Curve, DefectClass, Defects, Resu
 from processor.defects.scan_statistic import Levels
 from processor.defects.shape_models import RIGID, Frame
 from processor.defects.surface_charts import PLANE, DesignSurface
-from processor.geometry.mesh_distance import Bools
-from processor.model import NORMAL_95, Floats, Ints, Reason, Status, reason
+from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Status, reason
 
 CHANCE_MM2 = 1e8  # the area that false alarms are counted on
 CURVE_STRIPS = 40

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 from processor.model import UsageError
 
@@ -46,18 +47,18 @@ class Params:
         if self.fit not in FIT:
             raise UsageError(f"deviation.fit: expected one of {', '.join(FIT)}, got {self.fit!r}")
         paper = self.paper
-        for name, sound in (
-            ("neighbours", self.neighbours >= 1),
-            ("outlier_ratio", 0.0 <= self.outlier_ratio < 1e6),
-            ("projection_diameter_mm", 0.0 <= self.projection_diameter_mm < 1e6),
-            ("max_depth_mm", 0.0 <= self.max_depth_mm < 1e6),
-            ("core_spacing_mm", 0.0 <= self.core_spacing_mm < 1e6),
-            ("registration_error_mm", not self.registration_error_mm < 0.0),
-            ("paper.voxel_mm", 0.0 < paper.voxel_mm < 1e6),
-            ("paper.voxel_points", paper.voxel_points >= 1),
-            ("paper.normal_diameter_mm", 0.0 < paper.normal_diameter_mm < 1e6),
-            ("paper.projection_diameter_mm", 0.0 < paper.projection_diameter_mm < 1e6),
-            ("paper.max_depth_mm", 0.0 < paper.max_depth_mm < 1e6),
+        for name, sound, expected in (
+            ("neighbours", self.neighbours >= 1, "1 or more"),
+            ("outlier_ratio", 0.0 <= self.outlier_ratio < 1e6, "0 or more and below 1e6"),
+            ("projection_diameter_mm", 0.0 <= self.projection_diameter_mm < 1e6, "0 or more and below 1e6"),
+            ("max_depth_mm", 0.0 <= self.max_depth_mm < 1e6, "0 or more and below 1e6"),
+            ("core_spacing_mm", 0.0 <= self.core_spacing_mm < 1e6, "0 or more and below 1e6"),
+            ("registration_error_mm", not self.registration_error_mm < 0.0, "0 or more"),
+            ("paper.voxel_mm", 0.0 < paper.voxel_mm < 1e6, "above 0 and below 1e6"),
+            ("paper.voxel_points", paper.voxel_points >= 1, "1 or more"),
+            ("paper.normal_diameter_mm", 0.0 < paper.normal_diameter_mm < 1e6, "above 0 and below 1e6"),
+            ("paper.projection_diameter_mm", 0.0 < paper.projection_diameter_mm < 1e6, "above 0 and below 1e6"),
+            ("paper.max_depth_mm", 0.0 < paper.max_depth_mm < 1e6, "above 0 and below 1e6"),
         ):
             if not sound:
-                raise UsageError(f"deviation: {name} makes no sense")
+                raise UsageError(f"deviation: {name}: expected {expected}, found {attrgetter(name)(self)}")

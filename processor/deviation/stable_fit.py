@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.adjustment.opposite_sides import CHI2_MEDIAN
@@ -22,8 +21,6 @@ from processor.geometry import rigid
 from processor.geometry.m3c2 import Z95
 from processor.geometry.mesh_distance import Samples
 from processor.model import Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
 
 BLOCKS_ALONG = 40.0  # blocks along the extent of the structure
 BLOCK_DIAMETERS = 3.0  # least side of a block

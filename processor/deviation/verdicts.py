@@ -16,10 +16,9 @@ from scipy.special import ndtri
 
 from processor.deviation.result import ErrorSource, Result
 from processor.geometry import mesh_distance
-from processor.geometry.mesh_distance import Bools
 from processor.limits import judging, measures, standards
 from processor.limits.judging import Comparison, JudgedLimits, Measured
-from processor.model import NORMAL_95, WORST_FIRST, Floats, Ints, Limit, Scene, Status, StructureDesign
+from processor.model import NORMAL_95, WORST_FIRST, Bools, Floats, Ints, Limit, Scene, Status, StructureDesign
 
 WHOLE = "surface"
 

@@ -9,7 +9,7 @@ from processor.deviation.result import Result
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls
 from processor.geometry import principal, rigid
 from processor.geometry.surface_registration import Registration
-from processor.model import Flags, Floats, Ints, Metric, Scene, Statistic, Status, StructureTruth, Truth
+from processor.model import Bools, Floats, Ints, Metric, Scene, Statistic, Status, StructureTruth, Truth
 
 NEIGHBOURS = 24
 REACH_MM = 500.0  # of a core point: a movement is smooth
@@ -163,7 +163,7 @@ def _nearest(result: Result, truth: StructureTruth) -> Ints:
     return rows
 
 
-def _first_alike(result: Result, truth: StructureTruth, at: Ints, near: Flags) -> Ints:
+def _first_alike(result: Result, truth: StructureTruth, at: Ints, near: Bools) -> Ints:
     """Return which (k,) of the neighbours ``at`` (k, n) of each core point is the first on a face as its own, or 0.
 
     Bodies that touch move apart: what is true of one is not of the other.

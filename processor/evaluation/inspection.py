@@ -13,7 +13,7 @@ import numpy as np
 from processor.evaluation.error_statistics import covered
 from processor.geometry import merging, mesh_distance
 from processor.geometry.polyline import Polyline
-from processor.inspection import bodies, flat_faces, part_geometry
+from processor.inspection import flat_faces, part_geometry, structure_bodies
 from processor.inspection.arch_parts import design_ends
 from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.model import (
@@ -111,7 +111,9 @@ def _of_bodies(design: StructureDesign, truth: StructureTruth) -> dict[str, dict
     none = np.zeros(len(points))
     seen = flat_faces.Observed(places=points, facet=facet, deviation=moved, noise=none, shared=none, side=PIECE_MM)
     return {
-        body.name: {one.id: one.deviation for one in bodies.measured(body)[0] if one.quantity is not Quantity.FLATNESS}
+        body.name: {
+            one.id: one.deviation for one in structure_bodies.measured(body)[0] if one.quantity is not Quantity.FLATNESS
+        }
         for body in flat_faces.bodies(design, seen, LEAST_FACE_MM)
     }
 

@@ -21,8 +21,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_distance, neighbors, rigid
-from processor.geometry.mesh_distance import Bools, FacetGrid, MeshSurface
-from processor.model import Floats, Ints
+from processor.geometry.mesh_distance import FacetGrid, MeshSurface
+from processor.model import Bools, Floats, Ints
 
 ERROR_RATE = 0.05  # probability that one group of points deviates so that it fits the wrong pose
 SURE_ODDS = 19.0  # 95 % against 5 %

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.interpolate import Akima1DInterpolator, make_interp_spline
 
 from processor.geometry import rigid
-from processor.model import ArchDesign, DesignPart, Floats, InputError, Ints
+from processor.model import DesignPart, Floats, InputError, Ints
 
 SOURCE = "curves"
 PLATE_MM = 20.0
@@ -105,14 +105,6 @@ def mesh(
         faces.append((triangles[:, ::-1] if share == 1.0 else triangles) + sum(map(len, vertices)))
         vertices.append(ring)
     return np.vstack(vertices), np.vstack(faces).astype(np.int64)
-
-
-def alike(part: DesignPart, design: ArchDesign) -> tuple[str, ...]:
-    """Name the other parts with the same edges except for a motion: their scans are not distinguishable.
-
-    Sections are not compared, so that parts with equal edges and different heights are named, too.
-    """
-    return tuple(other.name for other in design.parts if other.name != part.name and motions(part, other))
 
 
 def motions(part: DesignPart, other: DesignPart) -> list[Floats]:

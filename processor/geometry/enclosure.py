@@ -9,16 +9,13 @@ surface is not closed are left out.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from processor.geometry.mesh_distance import FacetGrid
 from processor.geometry.parallel import over_ranges
-from processor.model import Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, Floats, Ints
 
 OUTSIDE_MM = 0.5  # above the surface: closer bodies are in contact
 JITTER_MM = np.array([1.3e-4, 2.1e-4, 1.7e-4])  # so that no ray meets an edge between two facets

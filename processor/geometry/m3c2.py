@@ -12,16 +12,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from processor.geometry import neighbors, point_grid
 from processor.geometry.linalg_small import eigen
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
-from processor.model import Floats, InputError, Ints
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, Floats, InputError, Ints
 
 CELLS_PER_DIAMETER = 4.0
 FEWEST_FOR_LOD = 4  # points of either cloud, below which there is no level of detection

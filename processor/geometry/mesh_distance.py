@@ -14,16 +14,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.geometry.parallel import over_ranges
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
-Bools = npt.NDArray[np.bool_]
 LEAST_AREA = 1e-9  # mm2, twice that of a facet; smaller ones are left out
 
 SHARP_COS = 0.94  # facets that meet at more than 20 deg belong to different faces

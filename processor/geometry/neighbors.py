@@ -13,10 +13,9 @@ from scipy.spatial import cKDTree
 from processor.geometry import point_grid
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
 T = TypeVar("T", bound=np.generic)
-Bools = npt.NDArray[np.bool_]
 
 SPACING_NEIGHBOURS, SPACING_SAMPLE = 8, 20_000
 SLICES, SLICE_POINTS, SLICE_SAMPLE = 5, 40_000, 5_000

@@ -13,15 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry.m3c2 import CloudNormals, oriented
 from processor.geometry.parallel import over_ranges
-from processor.model import Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, Floats, Ints
 
 UP = np.array([0.0, 0.0, 1.0])
 LEAN, MOST_LEAN = 0.2, 0.5  # least vertical part of a normal turned upwards: 12 degrees, more for noisy normals

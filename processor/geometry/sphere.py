@@ -10,11 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from processor.model import Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, Floats, Ints
 
 
 @dataclass(frozen=True)

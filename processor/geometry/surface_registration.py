@@ -14,10 +14,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import attitude, icp, mesh_distance, principal, rigid
-from processor.geometry.mesh_distance import Bools, MeshSurface, Samples, on_face
+from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
 from processor.geometry.neighbors import thinned, voxel_means
 from processor.geometry.principal import CoarsePose, PrincipalAxes
-from processor.model import NORMAL_95, Floats, Ints, Word
+from processor.model import NORMAL_95, Bools, Floats, Ints, Word
 
 # --- Fine registration
 

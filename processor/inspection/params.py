@@ -20,4 +20,4 @@ class Params:
     def check(self) -> None:
         """Raise UsageError for parameters that make no sense."""
         if not 0.0 < self.least_face_mm < 1e6:
-            raise UsageError("inspect: least_face_mm makes no sense")
+            raise UsageError(f"inspect: expected least_face_mm above 0 and below 1e6, found {self.least_face_mm}")

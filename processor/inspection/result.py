@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from processor.model import (
+    Bools,
     Checked,
-    Flags,
     Floats,
     Reason,
     Rows,
@@ -61,7 +61,7 @@ class Characteristics(Rows):
     verdict: tuple[Verdict, ...] = words("r", Verdict)
     limit: tuple[str, ...] = names("r")
     clause: tuple[str, ...] = names("r")
-    verified: Flags = column("r", dtype=np.bool_)
+    verified: Bools = column("r", dtype=np.bool_)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("r")
 
 

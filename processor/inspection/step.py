@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from processor.inspection import arch_parts, bodies
+from processor.inspection import arch_parts, structure_bodies
 from processor.inspection.params import METHODS, Params
 from processor.inspection.result import Result
 from processor.model import InputError, Scene, Status, UsageError, reason
@@ -55,5 +55,5 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
     if found is not None and found.status is Status.FAILED:
         return Result(status=Status.FAILED, method=params.method, reasons=(reason("inspect.failed", step=measuring),))
     if scene.arch is None:
-        return bodies.inspect(scene, found, params.least_face_mm, params.method)
+        return structure_bodies.inspect(scene, found, params.least_face_mm, params.method)
     return arch_parts.inspect(scene.arch, found, scene.tolerance, params.method)

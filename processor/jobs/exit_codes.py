@@ -6,7 +6,8 @@ from collections.abc import Iterable
 
 from processor.model import Verdict
 
-DONE, IN_PART, LIMIT_MISSED, VERDICT = 0, 1, 4, 5
+DONE, IN_PART, BAD_INPUT, LIMIT_MISSED, VERDICT = 0, 1, 3, 4, 5
+ENDED_BY_LIMIT = BAD_INPUT  # of time or memory
 WITH_RESULTS = (DONE, IN_PART, LIMIT_MISSED, VERDICT)
 FAIL_ON = {
     "fail": frozenset({Verdict.FAIL}),

@@ -15,7 +15,7 @@ import numpy as np
 
 from processor.limits import standards
 from processor.limits.guard_band import guard_band
-from processor.model import Flags, Floats, Limit, Rows, Tolerance, Verdict, column, names, words, worst
+from processor.model import Bools, Floats, Limit, Rows, Tolerance, Verdict, column, names, words, worst
 
 NOT_VERIFIED = "not verified"
 
@@ -40,7 +40,7 @@ class JudgedLimits(Rows):
     verdict: tuple[Verdict, ...] = words("v", Verdict)
     clause: tuple[str, ...] = names("v")
     source: tuple[str, ...] = names("v")
-    verified: Flags = column("v", dtype=np.bool_)
+    verified: Bools = column("v", dtype=np.bool_)
 
     @property
     def overall(self) -> Verdict:
@@ -136,8 +136,3 @@ def judged(comparisons: Iterable[Comparison], tolerance: Tolerance) -> JudgedLim
 def clause_of(limit: Limit, tolerance: Tolerance) -> str:
     """Name where a limit is from: standard and clause, or the source of a limit without one."""
     return f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source
-
-
-def unverified(tolerance: Tolerance, limits: Iterable[bool]) -> str:
-    """Return the standard's name, with a remark where one of the limits used was not compared with its text."""
-    return tolerance.standard if all(limits) else f"{tolerance.standard} ({NOT_VERIFIED})"

@@ -21,7 +21,7 @@ from processor.store import store
 
 PAPER = "003"
 BRIDGE = "truss bridge"
-SCANS, STATIONS, POINTS, PARAMETERS = 9.0, 6.0, 3.0, 7.0
+SCANS, STATIONS, POINTS = 9.0, 6.0, 3.0
 SIX, SEVEN, OURS = "three-point, six", "three-point, seven", "automatic"
 NAN = float("nan")
 

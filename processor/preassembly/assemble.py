@@ -11,13 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from processor.limits import standards
-from processor.model import ArchDesign, Floats, Scan, Scene, Tolerance
+from processor.model import ArchDesign, Bools, Floats, Scan, Scene, Tolerance
 from processor.preassembly import to_result, topology
 from processor.preassembly.chain import adjustment, edge_errors, loop_closure, placement, span_and_closure
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
-from processor.preassembly.ends.section import Bools
 from processor.preassembly.params import Params, TrimParams
 from processor.preassembly.parts import measure
 from processor.preassembly.parts.attitude import Shapes

@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.geometry.polyline import Polyline
-from processor.model import NORMAL_95, ArchDesign, Floats, Reason, Tolerance, reason
+from processor.model import NORMAL_95, ArchDesign, Bools, Floats, Reason, Tolerance, reason
 from processor.preassembly import topology
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.chain.edge_errors import EdgeErrors
 from processor.preassembly.chain.placement import Placement
 from processor.preassembly.chain.span_and_closure import Figures, mean_max_ci95
-from processor.preassembly.ends.section import Bools
 from processor.preassembly.errors import mean_max, splicing_error
 from processor.preassembly.params import Params, SystematicParams
 from processor.preassembly.parts import shape, systematic_errors

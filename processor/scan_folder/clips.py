@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from processor.model import Clips, Flags, Floats, InputError, Scan, per_point_fields
-from processor.scan_folder.checked_toml import Table
+from processor.model import Bools, Clips, Floats, InputError, Scan, per_point_fields
+from processor.scan_folder.checked_table import Table
 
 KEYS = ("box", "keep", "scan")
 FEWEST_POINTS = 4
@@ -78,7 +78,7 @@ class Clipper:
         }
         return dataclasses.replace(scan, **columns)
 
-    def _kept(self, scan: Scan, rows: slice) -> Flags:
+    def _kept(self, scan: Scan, rows: slice) -> Bools:
         """Mark the points to keep: in one of the boxes to keep, if there are any for this scan, and in none other."""
         pose = scan.pose
         places = (scan.points[rows] + scan.origin) @ pose[:3, :3].T + pose[:3, 3]

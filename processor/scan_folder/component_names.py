@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections import defaultdict
 from collections.abc import Sequence
+from itertools import pairwise
 
 DIGITS = {digit: str(i) for i, digit in enumerate("零一二三四五六七八九")}
 # Terms with their synonyms as patterns: Chinese, longer words before their parts, and English.
@@ -80,3 +82,14 @@ def station(stem: str) -> str:
     match = re.search(r"(?:^|[\s_\-.])(?:s|st|station|setup|pos|position)[\s_\-.]*0*(\d+)(?!\d)", text)
     match = match or re.search(r"(?:测站|站点|站)[\s_\-.]*0*(\d+)|(?:第)?0*(\d+)[号\s]*(?:测站|站点|站)", text)
     return f"S{next(number for number in match.groups() if number)}" if match else ""
+
+
+def numbered_backwards(names: Sequence[str]) -> bool:
+    """Whether the numbers of names in order fall wherever a word has several, and rise nowhere."""
+    of_word = defaultdict(list)
+    for name in names:
+        match = re.search(r"(\d+)\D*$", plain(name))
+        if match:
+            of_word[plain(name)[: match.start()].strip(" _-.")].append(int(match[1]))
+    steps = [b - a for numbers in of_word.values() for a, b in pairwise(numbers)]
+    return bool(steps) and max(steps) < 0

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import Control, Floats, InputError, Scan, Stations
-from processor.scan_folder.checked_toml import Table, existing_file_in
+from processor.scan_folder.checked_table import Table, existing_file_in
 from processor.scan_folder.files import CONTROL
 from processor.scan_folder.text_files import csv_rows
 from processor.scan_folder.units import MM_PER_UNIT

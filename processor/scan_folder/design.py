@@ -26,7 +26,7 @@ from processor.model import (
     did_you_mean,
 )
 from processor.scan_folder import cad
-from processor.scan_folder.checked_toml import Table, existing_file_in
+from processor.scan_folder.checked_table import Table, existing_file_in
 from processor.scan_folder.meshes import MESH_SUFFIXES, read_mesh
 from processor.scan_folder.text_files import csv_rows, read_text
 from processor.scan_folder.units import MM_PER_UNIT, known_unit

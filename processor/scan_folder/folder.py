@@ -30,7 +30,7 @@ from processor.readers import RawScan
 from processor.readers.encoding import file_name_as_text
 from processor.readers.raw_scan import scaled_in_place, scan_name
 from processor.scan_folder import guess, mesh_faults, scanner_grid, units
-from processor.scan_folder.checked_toml import Table, existing_file_in
+from processor.scan_folder.checked_table import Table, existing_file_in
 from processor.scan_folder.clips import FEWEST_POINTS, Clipper, read_boxes
 from processor.scan_folder.control_points import Measured, control_points, read_control
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
@@ -42,13 +42,14 @@ from processor.scan_folder.files import (
     SCANS,
     STATIONS,
     TRUTH,
+    missing,
     only_cad_file,
     scan_files,
 )
 from processor.scan_folder.guess import Guess
 from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
-from processor.scan_folder.shapes import files as surface_files
+from processor.scan_folder.shapes import surface_files
 from processor.scan_folder.text_files import read_text
 from processor.scan_folder.title_block import read_title_block
 from processor.scan_folder.tolerance import check_components, read_tolerance
@@ -128,7 +129,7 @@ def read_input(path: Path, units: str | None = None, keep: Keep = as_read) -> Sc
     """
     option = known_unit(units) if units else ""
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
+        raise missing(path)
     if path.is_dir() and not readers.is_closed(path):
         return _read_folder(path, option, keep)
     if path.suffix.lower() == ".h5":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,17 +15,17 @@ from processor.geometry import mesh_distance, principal
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints
 from processor.readers import RawScan
 from processor.scan_folder import component_names
-from processor.scan_folder.checked_toml import existing_file_in
+from processor.scan_folder.checked_table import existing_file_in
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
 from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, scan_files, scan_files_below
 from processor.scan_folder.meshes import MESH_SUFFIXES
-from processor.scan_folder.shapes import files as surface_files
-from processor.scan_folder.shapes import guess_design
+from processor.scan_folder.shapes import guess_design, surface_files
 from processor.scan_folder.shapes.guess_design import GuessedDesign
 from processor.scan_folder.units import MM_PER_UNIT, known_unit, radius
 from processor.store.atomic_file import replacing
 from processor.writers.ply import write_mesh
 from processor.writers.project import write_json
+from processor.writers.toml import as_toml
 
 UNITS = ("m", "mm", "cm", "inch", "ft")  # candidates, the likeliest first
 UNIT_TOLERANCE = 0.25  # relative difference of a scan's size from its design's
@@ -354,20 +353,20 @@ def to_toml(project: Guess) -> str:
     """Return the text of project.toml, with reasons and further keys as comments."""
     lines = ["# Made by `processor init`. What is unsure is marked with a question mark."]
     lines += [f"# ? {_one_line(text)}" for text in project.unsure] + [""]
-    lines.append(f"name = {_text(project.name)}")
-    lines.append(f"kind = {_text(project.kind)}  # {_one_line(project.kind_reason)}")
+    lines.append(f"name = {as_toml(project.name)}")
+    lines.append(f"kind = {as_toml(project.kind)}  # {_one_line(project.kind_reason)}")
     if project.units:
         lines.append(
-            f"units = {_text(project.units)}  # of scans whose format gives none: {_one_line(project.units_reason)}"
+            f"units = {as_toml(project.units)}  # of scans whose format gives none: {_one_line(project.units_reason)}"
         )
     else:
         lines.append(f'# units = "m"  # not needed: {_one_line(project.units_reason)}')
     if project.design:
-        lines.append(f"design = {_text(project.design)}  # {_one_line(project.design_reason)}")
+        lines.append(f"design = {as_toml(project.design)}  # {_one_line(project.design_reason)}")
     else:
         lines.append('# design = "design.json"  # or one mesh, STEP or IFC file of the whole, of kind structure')
     if project.design_units:
-        lines.append(f"design_units = {_text(project.design_units)}  # of the mesh, which has no unit")
+        lines.append(f"design_units = {as_toml(project.design_units)}  # of the mesh, which has no unit")
     lines.append("# temperature_C = 20.0  # of the steel while it was scanned")
     if project.stations:
         lines.append(f"# {_one_line(project.stations)}")
@@ -391,22 +390,17 @@ def _scan_lines(scan: ScanGuess) -> list[str]:
         return [
             f"# {scan.file!a} cannot be read: {_one_line(scan.error)}",
             "# [[scan]]",
-            f"# file = {_text(scan.file)}",
+            f"# file = {as_toml(scan.file)}",
         ]
-    lines = ["[[scan]]", f"file = {_text(scan.file)}"]
+    lines = ["[[scan]]", f"file = {as_toml(scan.file)}"]
     reason = f"  # {'' if scan.sure else '? '}{_one_line(scan.reason)}" if scan.reason else ""
     if scan.component:
-        lines.append(f"component = {_text(scan.component)}{reason}")
+        lines.append(f"component = {as_toml(scan.component)}{reason}")
     elif reason:
         lines.append(reason.strip())
     if scan.station:
-        lines.append(f"# station = {_text(scan.station)}")
+        lines.append(f"# station = {as_toml(scan.station)}")
     return lines
-
-
-def _text(text: str) -> str:
-    """Return a text quoted as in TOML."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _one_line(text: str) -> str:

@@ -6,13 +6,10 @@ The side of a deviation is that of the facets' normals: of a mesh that is inside
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from processor.model import DesignFaults, Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, DesignFaults, Floats, Ints
 
 JOIN_SHARE = 1e-9  # of the mesh's size: vertices nearer to each other are one, as STL repeats them
 

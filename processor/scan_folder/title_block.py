@@ -12,7 +12,7 @@ import numpy as np
 
 from processor.language.messages import printable
 from processor.model import InputError, TitleBlock
-from processor.scan_folder.checked_toml import Table, existing_file_in
+from processor.scan_folder.checked_table import Table, existing_file_in
 
 KEYS = ("company", "project", "drawing", "order", "operator", "scanner", "serial", "scanned", "approved")
 LOGO = "logo"

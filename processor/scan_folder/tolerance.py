@@ -9,7 +9,7 @@ import numpy as np
 
 from processor.limits import measures, standards
 from processor.model import Floats, InputError, Limit, Tolerance, did_you_mean
-from processor.scan_folder.checked_toml import Table
+from processor.scan_folder.checked_table import Table
 from processor.scan_folder.files import PROJECT
 
 COMPONENTS = "component"

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
-from processor.model import Floats, FrameDesign, Ints, Reason, Status, Tolerance, reason
+from processor.model import Bools, Floats, FrameDesign, Ints, Reason, Status, Tolerance, reason
 from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.design import matching
 from processor.space_frame.design.matching import Matching, NodePattern
@@ -22,8 +22,7 @@ from processor.space_frame.members.members import Measured
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.result import Flag
-from processor.space_frame.spheres import ball_or_none, fit_all, hidden_or_missing, quality
-from processor.space_frame.spheres.quality import Bools
+from processor.space_frame.spheres import assessment, ball_or_none, fit_all, hidden_or_missing
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
 from processor.space_frame.stations.control_points import ControlPoints
@@ -141,13 +140,13 @@ def extract(
     nodes, spheres = _fit_spheres(registered.source, measured, start, design, catalogue, options, registered.trusted)
     shared_offset = registered.shared_offset_at(spheres.centres)
     if registered.stations is not None:
-        spheres = quality.with_shared_offset(spheres, shared_offset)
+        spheres = assessment.with_shared_offset(spheres, shared_offset)
     matched = movements = None
     if design is not None and (start.design_row >= 0).any():
         matched, movements = _compare(registered, spheres, shared_offset, design, start.pose, options)
         if matched.status is Status.AMBIGUOUS:
             listed = start.pose is not None and len(start.pose.rivals) > 0
-            spheres = quality.with_ambiguous_matching(spheres, start.design_row >= 0, listed)
+            spheres = assessment.with_ambiguous_matching(spheres, start.design_row >= 0, listed)
     of_stations = registered.stations.messages if registered.stations is not None else ()
     return Extracted(
         source=registered.source,
@@ -275,7 +274,7 @@ def _fit_spheres(
     between = None if stations is None else stations.between
     spheres = fit_all.fit_spheres(source, nodes, measured.members, catalogue, expected, between, limits=options.limits)
     smallest = float(catalogue.radii.min()) if len(catalogue.radii) else np.nan
-    spheres = quality.with_ambiguous_design(spheres, disputed)
+    spheres = assessment.with_ambiguous_design(spheres, disputed)
     return nodes, hidden_or_missing.with_cause_of_absence(spheres, source, smallest)
 
 

@@ -37,19 +37,19 @@ class Params:
         """Raise UsageError for invalid parameters."""
         if self.method not in METHODS:
             raise UsageError(f"spheres: unknown method {self.method!r}; it has {', '.join(METHODS)}")
-        for name, sound in (
-            ("crop_margin_mm", self.crop_margin_mm > 0.0),
-            ("tau_mm", self.tau_mm > 0.0),
-            ("probability", 0.0 < self.probability < 1.0),
-            ("max_iterations", self.max_iterations >= 1),
-            ("min_points", self.min_points >= 1),
-            ("max_balls", self.max_balls >= 1),
-            ("seed", self.seed >= 0),
-            ("datum_mm", 0.0 <= self.datum_mm < np.inf),
-            ("radius_mm", np.isnan(self.radius_mm) or 0.0 < self.radius_mm < np.inf),
+        for name, sound, expected in (
+            ("crop_margin_mm", self.crop_margin_mm > 0.0, "above 0"),
+            ("tau_mm", self.tau_mm > 0.0, "above 0"),
+            ("probability", 0.0 < self.probability < 1.0, "between 0 and 1"),
+            ("max_iterations", self.max_iterations >= 1, "1 or more"),
+            ("min_points", self.min_points >= 1, "1 or more"),
+            ("max_balls", self.max_balls >= 1, "1 or more"),
+            ("seed", self.seed >= 0, "0 or more"),
+            ("datum_mm", 0.0 <= self.datum_mm < np.inf, "0 or more"),
+            ("radius_mm", np.isnan(self.radius_mm) or 0.0 < self.radius_mm < np.inf, "above 0"),
         ):
             if not sound:
-                raise UsageError(f"spheres: {name} = {getattr(self, name)} makes no sense")
+                raise UsageError(f"spheres: {name}: expected {expected}, found {getattr(self, name)}")
         if not np.isnan(self.radius_mm) and (has_design or self.method == "least-squares"):
             raise UsageError(
                 "spheres: radius_mm holds the radius of a ball searched for without a design; "

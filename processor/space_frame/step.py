@@ -20,7 +20,7 @@ from processor.space_frame import to_result
 from processor.space_frame.params import METHODS, Params
 from processor.space_frame.points.scene_source import PointReader
 from processor.space_frame.result import Balls, Result
-from processor.space_frame.spheres import isolated
+from processor.space_frame.spheres import baselines, search_without_design
 
 __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "STREAMS", "Params", "Result", "run"]
 
@@ -47,9 +47,9 @@ def run(scene: Scene, params: Params, points: PointReader | None = None, answer_
             if beside is not None:
                 return beside
         if scene.frame is None:
-            return _with_unused_control(scene, isolated.search(merged(scene, with_scanner=True), params))
+            return _with_unused_control(scene, search_without_design.search(merged(scene, with_scanner=True), params))
         return _with_unused_control(
-            scene, isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits)
+            scene, baselines.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits)
         )
     result = to_result.of_frame(scene, params, points)
     if result is not None:
@@ -71,11 +71,11 @@ def _with_unused_control(scene: Scene, result: Result) -> Result:
 def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
     """Find spheres of a cloud without members: at the design's nodes, or without a design those that stand out."""
     if scene.frame is None:
-        result = isolated.search(merged(scene, with_scanner=True), params)
+        result = search_without_design.search(merged(scene, with_scanner=True), params)
         before: tuple[Reason, ...] = ()
     else:
         ransac = replace(params, method="ransac")
-        result = isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, ransac, limits)
+        result = baselines.fit_nodes(merged(scene, with_scanner=False), scene.frame, ransac, limits)
         before = (reason("spheres.no-members"),)
     if not len(result.balls):
         return replace(result, method=params.method, reasons=(*before, *result.reasons))

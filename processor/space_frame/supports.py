@@ -16,7 +16,7 @@ import numpy as np
 
 from processor.limits import judging, measures
 from processor.limits.judging import Comparison, JudgedLimits, Measured
-from processor.model import NORMAL_95, SUPPORTS, Flags, Floats, FrameDesign, Ints, Tolerance
+from processor.model import NORMAL_95, SUPPORTS, Bools, Floats, FrameDesign, Ints, Tolerance
 from processor.space_frame.result import Balls, Evidence
 
 PERIMETER, MULTI_POINT = (number for number, _ in enumerate(SUPPORTS, 1))
@@ -157,7 +157,7 @@ def _below_supports(nodes: _Nodes, rows: Ints) -> tuple[Floats, Floats]:
     return deflection, np.sqrt(variance)
 
 
-def _known(movement: Floats) -> Flags:
+def _known(movement: Floats) -> Bools:
     return np.asarray(np.isfinite(movement).all(axis=1))
 
 

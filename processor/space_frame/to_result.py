@@ -30,7 +30,7 @@ from processor.space_frame.result import (
 )
 from processor.space_frame.spheres import baselines
 from processor.space_frame.spheres.records import ViewErrors
-from processor.space_frame.spheres.unnamed_views import of_tubes
+from processor.space_frame.spheres.view_errors import of_tubes
 from processor.space_frame.stations.records import Stations
 from processor.space_frame.stations.sightings import control_of
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from processor.limits.judging import JudgedLimits
 from processor.model import (
+    Bools,
     Checked,
-    Flags,
     Floats,
     Ints,
     Reason,
@@ -66,7 +66,7 @@ class Scans(Rows):
     to_frame: tuple[str, ...] = names("k", json="to")
 
     @property
-    def placed(self) -> Flags:
+    def placed(self) -> Bools:
         """Which scans (k,) have a pose."""
         return np.asarray(np.isfinite(self.T_project_scan).all(axis=(1, 2)))
 
@@ -79,7 +79,7 @@ class Pairs(Rows):
     b: tuple[str, ...] = names("p")
     overlap: Floats = column("p")  # share of the surface of both scans that the other one sees too
     residual: Floats = column("p", unit="mm")  # rms
-    used: Flags = column("p", dtype=np.bool_)
+    used: Bools = column("p", dtype=np.bool_)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("p")
     shared: Ints = column("p", dtype=np.int64)  # planar pieces or picked points that both scans have
     T_a_b: Floats = column("p", 4, 4)  # with ``scale`` where that is free
@@ -109,7 +109,7 @@ class ControlSightings(Rows):
     off: Floats = column("c", 3, unit="mm")  # known less seen place
     sd: Floats = column("c", 3, unit="mm")  # of ``off``; of an unused sighting that of its prediction by the others
     share: Floats = column("c")  # of an error of the sighting that is visible in ``off``; the poses absorb the rest
-    used: Flags = column("c", dtype=np.bool_)
+    used: Bools = column("c", dtype=np.bool_)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from processor.validation.cells import Case, Origin
 from processor.validation.coverage import Coverage
 from processor.validation.history import Row
 from processor.validation.matrix import Matrix
-from processor.validation.software import Software
+from processor.validation.software_identity import Software
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -12,9 +12,9 @@ from tqdm import tqdm
 from processor.language.messages import printable
 from processor.model import InputError, UsageError
 from processor.store.writable import check_folder
+from processor.validation import cell_runner
 from processor.validation import matrix as matrices
 from processor.validation import night as nights
-from processor.validation import running
 from processor.validation.cells import Cell, Outcome
 from processor.validation.history import History
 from processor.validation.summary import Summary
@@ -37,7 +37,7 @@ def run(
     wanted = matrices.read(matrix or matrices.DEFAULT, full)
     with (
         nights.locked_output(out) as scratch,
-        running.cell_runner(cluster, jobs, scratch, lambda line: print(line, file=sys.stderr)) as runner,
+        cell_runner.cell_runner(cluster, jobs, scratch, lambda line: print(line, file=sys.stderr)) as runner,
         tqdm(total=0, unit="cell", disable=not sys.stderr.isatty()) as bar,
     ):
 

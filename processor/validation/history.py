@@ -22,7 +22,7 @@ from processor.language.messages import Text
 from processor.model import InputError
 from processor.store.codec import value_from_json, value_to_json
 from processor.validation.cells import Cell, CheckValue, Origin, Outcome, check_values
-from processor.validation.software import Software
+from processor.validation.software_identity import Software
 
 VERSION = 3
 # Columns added by version. Earlier figures have no statistic: certificates are of the present software.

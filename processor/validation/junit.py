@@ -7,7 +7,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 from processor.validation.cells import CheckValue
-from processor.validation.changes import ALARMS, Detected
+from processor.validation.change_detection import ALARMS, Detected
 from processor.validation.coverage import Coverage
 from processor.validation.coverage import missed as beyond_limits
 

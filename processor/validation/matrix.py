@@ -35,7 +35,6 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import itertools
-import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -45,13 +44,14 @@ from typing import Any
 from processor.model import InputError, UsageError
 from processor.validation.cells import Case, Cell, Origin, fresh_seed
 from processor.validation.coverage import Limits
+from processor.writers.toml import as_toml
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
-DEFAULT = Path(__file__).with_name("default.toml")
+DEFAULT = Path(__file__).with_name("default_matrix.toml")
 TOP_KEYS = {"name", "about", "fixed_seeds", "fresh_seeds", "aim", "coverage", "cell"}
 CELL_KEYS = {"name", "recipe", "generator", "steps", "methods", "seeds", "fresh", "set", "params", "full"}
 AIMS = ("low", "high")
@@ -185,7 +185,7 @@ def _combinations(table: Any, where: str) -> list[tuple[str, ...]]:
     if not all(lists):
         raise UsageError(f"{where}: set: a list of values is empty")
     return [
-        tuple(f"{key}={_as_toml(value)}" for key, value in zip(flat, chosen, strict=True))
+        tuple(f"{key}={as_toml(value)}" for key, value in zip(flat, chosen, strict=True))
         for chosen in itertools.product(*lists)
     ]
 
@@ -195,10 +195,6 @@ def _flat(table: dict[str, Any], above: str = "") -> dict[str, Any]:
     for key, value in table.items():
         flat |= _flat(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
     return flat
-
-
-def _as_toml(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False)  # the same for numbers, texts, truth values and lists of these
 
 
 def _generator(name: str, path: Path, where: str) -> tuple[str, bool]:

@@ -23,18 +23,18 @@ from processor.jobs.runner import locked
 from processor.model import UsageError
 from processor.results.names import RESULTS_JSON
 from processor.store.atomic_file import replacing
-from processor.validation import certificate, changes, coverage, junit, software, summary
+from processor.validation import certificate, change_detection, coverage, junit, software_identity, summary
+from processor.validation.cell_runner import Runner
 from processor.validation.cells import Cell, Outcome
 from processor.validation.history import History
 from processor.validation.matrix import Matrix
-from processor.validation.running import Runner
-from processor.validation.software import Software
+from processor.validation.software_identity import Software
 from processor.validation.summary import Summary
 
 LOCK, SCRATCH, CELLS, NIGHTS = ".validation", ".making", "cells", "nights"
 HISTORY = "history.sqlite"
 KEPT_NIGHTS = 14  # whose results.json of cells are kept
-SEEN_NIGHTS = changes.MOST_NIGHTS + 10
+SEEN_NIGHTS = change_detection.MOST_NIGHTS + 10
 
 
 def number_of(night: str) -> int:
@@ -81,7 +81,7 @@ def run(
     is called with the numbers of cells done and of all, and the last cell with its outcome.
     """
     cells = matrix.cells(number_of(night))
-    present = made_by or software.present()
+    present = made_by or software_identity.present()
     with closing(History(history_file or out / HISTORY)) as history:
         begun_by = history.begun_by(night)
         if begun_by not in (None, present.code):
@@ -121,7 +121,7 @@ def _report(
     wanted = {cell.key for cell in cells}
     nights = [each for each in history.nights() if each.night <= night]
     rows = history.rows(nights[-SEEN_NIGHTS:][0].night, night)
-    detected = changes.find(rows, night, history.worse(night), matrix.aim)
+    detected = change_detection.find(rows, night, history.worse(night), matrix.aim)
     done = tuple(cell for cell in history.cells(night) if cell["cell"] in wanted)
     missed = {key: figures for key, figures in history.missed(night).items() if key in wanted}
     same = [each.night for each in nights if each.code == present.code]

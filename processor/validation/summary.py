@@ -13,13 +13,13 @@ from processor.language.messages import NO_NUMBER, Text, label, text
 from processor.model import Statistic
 from processor.report import templates
 from processor.report.all_tables import figure_name
-from processor.validation import changes
+from processor.validation import change_detection
 from processor.validation import coverage as intervals
 from processor.validation.cells import CheckValue, Origin
-from processor.validation.changes import ALARMS, Change, ChangeKind, Detected, Direction
+from processor.validation.change_detection import ALARMS, Change, ChangeKind, Detected, Direction
 from processor.validation.coverage import Coverage
 from processor.validation.history import Name, Night, Row
-from processor.validation.software import Software
+from processor.validation.software_identity import Software
 
 FORMAT, FORMAT_VERSION = "processor-validation", "1.0"
 MOST_NAMED = 2  # changes that the line names
@@ -31,9 +31,9 @@ TEST = text(
     "the night are compared with {least} to {most} earlier nights by an exact stratified rank test (normal scores)."
     " Holm's correction covers all tests of a night: if nothing got worse, the chance of any alarm is at most "
     "{rate:g} %. The same holds for improvements.",
-    least=changes.LEAST_NIGHTS,
-    most=changes.MOST_NIGHTS,
-    rate=100.0 * changes.ALARM_RATE,
+    least=change_detection.LEAST_NIGHTS,
+    most=change_detection.MOST_NIGHTS,
+    rate=100.0 * change_detection.ALARM_RATE,
 )
 
 
@@ -123,7 +123,7 @@ class Summary:
             "changes": [change_object(change) for change in self.detected.of(*ChangeKind)],
             "test": {
                 "about": str(TEST),
-                "alarm_rate": changes.ALARM_RATE,
+                "alarm_rate": change_detection.ALARM_RATE,
                 "figures": self.detected.figures,
                 "paired": self.detected.paired,
                 "fresh": self.detected.fresh,

@@ -11,13 +11,14 @@ import numpy as np
 
 from processor.model import KEY_POINTS, SUPPORTS, ArchDesign, FrameDesign, Scan, Scene
 from processor.writers.ply import write_mesh
+from processor.writers.toml import as_toml
 
 
 def scan_lines(scan: Scan, scale: float, *, with_pose: bool) -> list[str]:
     """Return the lines of project.toml about one scan; ``with_pose``: the file contains the scanner's pose."""
-    lines = [f"component = {quoted(scan.component)}"] if scan.component else []
+    lines = [f"component = {as_toml(scan.component)}"] if scan.component else []
     if scan.station:
-        lines.append(f"station = {quoted(scan.station)}")
+        lines.append(f"station = {as_toml(scan.station)}")
     if np.isfinite(scan.sigma_mm):
         lines.append(f"sigma_mm = {scan.sigma_mm!r}")
     if scan.T_project_scan.size and not with_pose:
@@ -27,11 +28,6 @@ def scan_lines(scan: Scan, scale: float, *, with_pose: bool) -> list[str]:
     if scan.position.size and not with_pose:
         lines.append(f"position = {json.dumps((scan.position * scale).tolist())}")
     return lines
-
-
-def quoted(text: str) -> str:
-    """Return a text as a TOML string."""
-    return json.dumps(text, ensure_ascii=False)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

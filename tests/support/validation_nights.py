@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from processor.validation import cells, changes
+from processor.validation import cells, change_detection
 from processor.validation.cells import Outcome
 from processor.validation.history import Row
 from processor.validation.matrix import Entry, Matrix
-from processor.validation.software import Software
+from processor.validation.software_identity import Software
 from tests.support.metrics import described
 
 STORED = Path(__file__).resolve().parents[2] / "fixtures" / "validation" / "stored-cells.json"
@@ -93,8 +93,8 @@ class Simulated:
                         *map(str, described(figure["name"])),
                     )  # fmt: skip
                     self.rows.append(dataclasses.replace(row, value=spoil(row, stored)))
-        found = changes.find(self.rows, name, self.worse)
-        for one in found.of(*changes.ALARMS):
+        found = change_detection.find(self.rows, name, self.worse)
+        for one in found.of(*change_detection.ALARMS):
             self.alarms.append((name, one))
             self.worse.setdefault(one.name, set()).add(name)
         return found

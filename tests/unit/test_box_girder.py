@@ -214,15 +214,6 @@ def test_ends_are_measured_as_with_meshes(without_meshes):
         assert np.mean(np.abs(known) < 3.5 * spread) > 0.97
 
 
-def test_parts_of_one_shape_are_named():
-    scene, _ = made(["scan.spacing_mm=200"])
-    assert [box_girder.alike(part, scene.arch) for part in scene.arch.parts] == [
-        ("foot2",), ("rib3",), (), ("rib1",), ("foot1",)
-    ]  # fmt: skip
-    scene, _ = made(["scan.spacing_mm=200", "bridge.joints=[0.18, 0.38, 0.63, 0.81]"])
-    assert [box_girder.alike(part, scene.arch) for part in scene.arch.parts] == [()] * 5
-
-
 def measured(scan, index, design):
     systematic = SystematicParams()
     return measure.estimate([measure.fit([scan], index, attitude.Shapes(design), 1.0, systematic)], systematic)[0]

@@ -27,7 +27,7 @@ from designgen import recipe_files
 from designgen.cad import files as cad_files
 from designgen.cad import process
 from designgen.designs import arch_bridge, arch_part
-from designgen.export import solids
+from designgen.export import step_files
 from processor.jobs.process import Cause
 from processor.model import InputError, UsageError
 
@@ -52,7 +52,7 @@ def here(monkeypatch):
 def box(tmp_path):
     """A box of 100 x 200 x 300 mm as STEP."""
     path = tmp_path / "box.step"
-    solids.write_step(path, {"梁-1": cq.Solid.makeBox(100.0, 200.0, 300.0)})
+    step_files.write_step(path, {"梁-1": cq.Solid.makeBox(100.0, 200.0, 300.0)})
     return path
 
 
@@ -79,7 +79,7 @@ def test_a_box_comes_back_in_its_unit(box, tmp_path):
 
 @pytest.mark.usefixtures("here")
 def test_surfaces_without_a_solid_are_said_to_be_such(tmp_path):
-    solids.write_step(tmp_path / "s.step", {"sheet": cq.Shell.makeShell([cq.Face.makePlane(50.0, 20.0)])})
+    step_files.write_step(tmp_path / "s.step", {"sheet": cq.Shell.makeShell([cq.Face.makePlane(50.0, 20.0)])})
     (body,) = cad_files.read(tmp_path / "s.step").bodies
     assert not body.solid
     assert body.area_mm2 == pytest.approx(1000.0)
@@ -178,7 +178,7 @@ def test_real_files_in_inches(name, tmp_path):
 @pytest.mark.usefixtures("here")
 def test_designs_go_out_as_step_and_keep_their_volumes(tmp_path):
     recipe = recipe_files.load("arch-s1")[1]
-    files = solids.write_design(recipe, tmp_path / "design")
+    files = step_files.write_design(recipe, tmp_path / "design")
     bridge = {k: tuple(v) if isinstance(v, list) else v for k, v in recipe["bridge"].items()}
     parts = arch_bridge.build(arch_bridge.Params(**bridge))
     assert [f.stem for f in files] == [part.name for part in parts]
@@ -186,10 +186,10 @@ def test_designs_go_out_as_step_and_keep_their_volumes(tmp_path):
         (body,) = cad_files.read(path).bodies
         assert body.volume_mm3 == pytest.approx(arch_part.solid(part).Volume(), rel=1e-6)
         first = path.read_bytes()
-        solids.write_step(path, {part.name: arch_part.solid(part)})
+        step_files.write_step(path, {part.name: arch_part.solid(part)})
         assert path.read_bytes() == first
     for name, bodies in (("plates-defects", 13), ("truss-bridge", None)):
-        (path,) = solids.write_design(recipe_files.load(name)[1], tmp_path / name)
+        (path,) = step_files.write_design(recipe_files.load(name)[1], tmp_path / name)
         found = cad_files.read(path).bodies
         assert bodies is None or len(found) == bodies
         assert all(body.solid for body in found)
@@ -198,7 +198,7 @@ def test_designs_go_out_as_step_and_keep_their_volumes(tmp_path):
 @pytest.mark.usefixtures("here")
 def test_names_make_safe_and_different_files(tmp_path):
     shapes = {"a/../b": cq.Solid.makeBox(1, 1, 1), "A_.._B": cq.Solid.makeBox(2, 2, 2)}
-    solids.write_step(tmp_path / "n.step", shapes)
+    step_files.write_step(tmp_path / "n.step", shapes)
     said = cad_files.import_file(tmp_path / "n.step", tmp_path / "out")
     files = {body["mesh"].lower() for body in said["bodies"]}
     assert len(files) == 2
@@ -266,7 +266,7 @@ def test_inches_go_by_their_factor(box, tmp_path):
 @pytest.mark.usefixtures("here")
 def test_names_are_escaped_when_written_and_read_however_written(tmp_path):
     path = tmp_path / "n.step"
-    solids.write_step(path, {"梁 'A'": cq.Solid.makeBox(1, 1, 1), "\U00020000\\x": cq.Solid.makeBox(2, 2, 2)})
+    step_files.write_step(path, {"梁 'A'": cq.Solid.makeBox(1, 1, 1), "\U00020000\\x": cq.Solid.makeBox(2, 2, 2)})
     content = path.read_bytes()
     assert rb"\X2\6881\X0\ ''A''" in content
     assert rb"\X4\00020000\X0\\\x" in content
@@ -342,7 +342,7 @@ def mutations(content, rng, count):
 def test_damaged_files_end_in_a_result_or_an_input_error(tmp_path, capfd, each):
     """A process a file, two at a time."""
     shapes = {"a": cq.Workplane().box(30, 20, 10).edges("|Z").fillet(2).faces(">Z").hole(4).val()}
-    solids.write_step(tmp_path / "whole.step", shapes)
+    step_files.write_step(tmp_path / "whole.step", shapes)
     wall(tmp_path / "whole.ifc", "MILLI", (4000, 200, 2700))
     rng, files = random.Random(7), []
     for whole in (tmp_path / "whole.step", tmp_path / "whole.ifc"):
@@ -396,7 +396,7 @@ def test_memory_is_limited(box):
 def test_what_is_lost_is_said(tmp_path):
     shapes = {"whole": cq.Solid.makeBox(1, 2, 3), "torn": cq.Solid.makeBox(40, 50, 60)}
     path = tmp_path / "torn.step"
-    solids.write_step(path, shapes)
+    step_files.write_step(path, shapes)
     text = path.read_text()
     assert cad_files.read(path).problems == ()
     faces = list(re.finditer(r"#\d+ = ADVANCED_FACE\([^;]*;\n", text))
@@ -416,7 +416,7 @@ def test_what_is_lost_is_said(tmp_path):
 @pytest.mark.slow
 def test_a_large_sphere_takes_seconds_and_says_its_deviation(tmp_path):
     radius = 2500.0
-    solids.write_step(tmp_path / "s.step", {"tank": cq.Solid.makeSphere(radius, angleDegrees1=-90)})
+    step_files.write_step(tmp_path / "s.step", {"tank": cq.Solid.makeSphere(radius, angleDegrees1=-90)})
     started = time.monotonic()
     (body,) = cad_files.read(tmp_path / "s.step").bodies
     assert time.monotonic() - started < 20.0
@@ -438,7 +438,7 @@ def test_georeferenced_designs_lie_where_their_scene_has_them(name, tmp_path):
         recipe["frame"] |= {"nodes_x": 2, "nodes_y": 2, "layers": 1}
     corners = []
     for section in (recipe["scan"], {**recipe["scan"], "origin_mm": origin}):
-        (path,) = solids.write_design({**recipe, "scan": section}, tmp_path / name)
+        (path,) = step_files.write_design({**recipe, "scan": section}, tmp_path / name)
         vertices = np.vstack([body.vertices for body in cad_files.read(path).bodies])
         corners.append([vertices.min(axis=0), vertices.max(axis=0)])
     assert np.abs(corners[1] - (np.array(corners[0]) + origin)).max() < 1e-5
@@ -451,6 +451,6 @@ def test_a_step_file_that_cannot_be_written_leaves_the_old_one(box, monkeypatch)
     before = box.read_bytes()
     monkeypatch.setattr(cq.Assembly, "export", fails)
     with pytest.raises(InputError, match=r"box\.step: cannot be written \(No space"):
-        solids.write_step(box, {"b": cq.Solid.makeBox(1.0, 1.0, 1.0)})
+        step_files.write_step(box, {"b": cq.Solid.makeBox(1.0, 1.0, 1.0)})
     assert box.read_bytes() == before
     assert [one.name for one in box.parent.iterdir()] == [box.name]

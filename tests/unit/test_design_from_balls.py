@@ -7,12 +7,12 @@ import pytest
 from click.testing import CliRunner
 
 from designgen.designs import space_frame
-from designgen.export import solids as step_files
+from designgen.export import step_files
 from processor.cli import main
 from processor.model import FrameDesign
 from processor.scan_folder import folder as scan_folder
 from processor.scan_folder import guess
-from processor.scan_folder.shapes import frame
+from processor.scan_folder.shapes import space_frame as frame_shapes
 from processor.scan_folder.shapes.body import stacked, welded
 from tests.support import bridge_parts, frame_solids
 
@@ -41,7 +41,7 @@ def compare(design, truth):
 def test_all_nodes_and_members_are_found(hollow, fused):
     for seed in range(3):
         bodies, truth = frame_solids.solids(seed, hollow=hollow)
-        one = frame.find(
+        one = frame_shapes.find(
             welded("all", *frame_solids.joined(bodies)) if fused else stacked("all", [welded(*body) for body in bodies])
         )
         assert one.doubts == ()
@@ -54,17 +54,18 @@ def test_rounded_coordinates(step_mm, limit_mm):
     bodies, truth = frame_solids.solids(1)
     vertices, faces = frame_solids.joined(bodies)
     assert (
-        max(compare(frame.find(welded("all", np.round(vertices / step_mm) * step_mm, faces)).design, truth)) < limit_mm
+        max(compare(frame_shapes.find(welded("all", np.round(vertices / step_mm) * step_mm, faces)).design, truth))
+        < limit_mm
     )
 
 
 def test_hollow_balls_and_coarse_ones():
     bodies, truth = frame_solids.solids(2)
     shells = [frame_solids.ball(c, r - 8.0) for c, r in zip(truth[0], truth[1], strict=True)]
-    one = frame.find(welded("all", *frame_solids.joined([*bodies, *(("shell", *mesh) for mesh in shells)])))
+    one = frame_shapes.find(welded("all", *frame_solids.joined([*bodies, *(("shell", *mesh) for mesh in shells)])))
     assert max(compare(one.design, truth)) < NODE_MM
     coarse = [(f"ball {k}", *frame_solids.ball(c, r, 1)) for k, (c, r) in enumerate(zip(*truth[:2], strict=True))]
-    one = frame.find(welded("all", *frame_solids.joined([*coarse, *bodies[len(coarse) :]])))
+    one = frame_shapes.find(welded("all", *frame_solids.joined([*coarse, *bodies[len(coarse) :]])))
     assert max(compare(one.design, truth)) < NODE_MM
 
 
@@ -79,7 +80,7 @@ def test_what_is_not_sure_is_told():
     )
     cut = bodies[4][1][bodies[4][2]].mean(axis=1)[:, 2] > centres[4, 2] + 0.85 * radii[4]
     cap = ("cap", bodies[4][1], bodies[4][2][cut])
-    one = frame.find(welded("all", *frame_solids.joined([*bodies[:4], cap, *bodies[5:], lone, pole])))
+    one = frame_shapes.find(welded("all", *frame_solids.joined([*bodies[:4], cap, *bodies[5:], lone, pole])))
     assert len(one.design.ids) == len(centres) + 1
     told = " ".join(one.doubts)
     assert "1 (4) may be no ball" in told
@@ -89,19 +90,21 @@ def test_what_is_not_sure_is_told():
     bent = np.vstack([start, 0.5 * (start + end) + np.array([0.0, 0.0, 200.0]), end])
     _, faces = frame_solids.lathe([(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)], np.zeros(3), np.array([0.0, 0.0, 1.0]))
     others = [body for body in bodies if body[0] != "tube 3"]
-    one = frame.find(welded("all", *frame_solids.joined([*others, ("bent", bent, faces)])))
+    one = frame_shapes.find(welded("all", *frame_solids.joined([*others, ("bent", bent, faces)])))
     assert any("are some missing" in text for text in one.doubts)
     off = np.array([0.0, 0.0, 9.0])
     aside = [(name, vertices + off * (name == "tube 0"), faces) for name, vertices, faces in bodies]
-    one = frame.find(welded("all", *frame_solids.joined(aside)))
+    one = frame_shapes.find(welded("all", *frame_solids.joined(aside)))
     assert any("do not lead through the centres" in text for text in one.doubts)
 
 
 def test_bodies_without_balls_are_no_frame():
     meshes, _ = bridge_parts.bridge()
-    assert frame.find(stacked("all", [welded("part", *mesh) for mesh in meshes])).design is None
+    assert frame_shapes.find(stacked("all", [welded("part", *mesh) for mesh in meshes])).design is None
     bodies, _ = frame_solids.solids()
-    assert frame.find(welded("all", *frame_solids.joined([b for b in bodies if "ball" not in b[0]]))).design is None
+    assert (
+        frame_shapes.find(welded("all", *frame_solids.joined([b for b in bodies if "ball" not in b[0]]))).design is None
+    )
 
 
 def write_scan(place, centres, header="x_m,y_m,z_m"):

@@ -12,14 +12,14 @@ from designgen.curves import make as make_curve
 from designgen.designs import arch_rib
 from designgen.designs.arch_part import Plates, solid
 from designgen.export import folder as export_folder
-from designgen.export import solids
+from designgen.export import step_files
 from processor.api import runs
 from processor.cli import main
 from processor.geometry.polyline import Polyline
 from processor.model import ArchDesign
 from processor.scan_folder import folder as scan_folder
 from processor.scan_folder import guess
-from processor.scan_folder.shapes import arch
+from processor.scan_folder.shapes import arch_bridge
 from processor.scan_folder.shapes.body import welded
 from tests.support import bridge_parts
 from tests.support.scan_folders import write_ply
@@ -30,7 +30,7 @@ I_HEIGHT, I_WIDTH, I_FLANGE, I_WEB = 900.0, 400.0, 30.0, 16.0
 
 def found(meshes, names=None):
     names = names or bridge_parts.names(len(meshes))
-    return arch.find([welded(name, *mesh) for name, mesh in zip(names, meshes, strict=True)])
+    return arch_bridge.find([welded(name, *mesh) for name, mesh in zip(names, meshes, strict=True)])
 
 
 def order(design):
@@ -393,7 +393,7 @@ def test_a_step_file_with_all_parts_of_our_own_bridge(tmp_path):
         for k in range(7)
     ]
     tmp_path.joinpath("CAD").mkdir()
-    solids.write_step(tmp_path / "CAD/bridge v3.step", {part.name: solid(part) for part in reversed(parts)})
+    step_files.write_step(tmp_path / "CAD/bridge v3.step", {part.name: solid(part) for part in reversed(parts)})
     (tmp_path / "scans").mkdir()
     np.savetxt(tmp_path / "scans/a.xyz", np.random.default_rng(0).uniform(0.0, 1.0, (500, 3)))
     guessed = guess.guess(tmp_path)

@@ -10,7 +10,7 @@ import processor
 from processor.deviation import step as deviation_step
 from processor.evaluation import inspection as evaluation
 from processor.geometry import rigid
-from processor.inspection import bodies, flat_faces
+from processor.inspection import flat_faces, structure_bodies
 from processor.inspection import step as inspection_step
 from processor.inspection.flat_faces import Body, Pieces
 from processor.inspection.result import Quantity
@@ -140,7 +140,7 @@ def flat_plate(wave, noise, seed):
     pieces = list(body.pieces)
     top = next(k for k, face in enumerate(body.faces) if face.normal[2] > 0.9)
     pieces[top] = Pieces(places, value, np.full(len(x), noise**2 + 1e-6), 0.0)
-    return {one.id: one for one in bodies.measured(Body("plate", body.faces, tuple(pieces)))[0]}
+    return {one.id: one for one in structure_bodies.measured(Body("plate", body.faces, tuple(pieces)))[0]}
 
 
 @pytest.mark.parametrize(("wave", "noise"), [(0.0, 0.2), (0.1, 0.2), (1.0, 0.2), (2.0, 0.02)])

@@ -16,7 +16,7 @@ from processor.language.messages import label, messages
 from processor.model import reason
 from processor.report import all_figures, comparison, page
 from processor.stitching.result import ControlPoints, ControlSightings
-from processor.validation import changes
+from processor.validation import change_detection
 from processor.validation import summary as nights_summary
 from tests.support import step_results, validation_nights
 from tests.support.metrics import metric
@@ -178,8 +178,17 @@ def test_a_comparison_in_chinese(tmp_path):
 
 
 def change(kind, size, is_ratio=True, unit="mm", cases=3, name=("spheres", "ray", "radii, bias")):
-    return changes.Change(
-        name, changes.ChangeKind(kind), "paired", size, is_ratio, unit, 0.001, cases, quantity="radii", statistic="bias"
+    return change_detection.Change(
+        name,
+        change_detection.ChangeKind(kind),
+        "paired",
+        size,
+        is_ratio,
+        unit,
+        0.001,
+        cases,
+        quantity="radii",
+        statistic="bias",
     )
 
 
@@ -194,7 +203,7 @@ CHANGES = (
 def a_night(failed=1, missed=2, found=CHANGES, **more):
     cells = tuple({"failed": "x" if i < failed else ""} for i in range(3))
     figure = nights_summary.CheckValue("spheres", "ray", "radii, bias", 1.0, 0.5, "mm")
-    of = changes.Detected(found, 12, 3, 4, **more)
+    of = change_detection.Detected(found, 12, 3, 4, **more)
     return nights_summary.Summary(
         "2026-11-21", validation_nights.SOFTWARE, cells, {"a": [figure] * missed} if missed else {}, of
     )

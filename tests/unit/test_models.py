@@ -16,9 +16,9 @@ from OCP.gp import gp_Pnt
 
 import designgen
 from designgen import __main__, recipe_files
-from designgen.models import as_built, loading, placement
+from designgen.models import as_built, loading
 from designgen.models.model import of_mesh, unique
-from designgen.scanning import returns, scanner, surfaces, survey
+from designgen.scanning import returns, scanner, station_placement, surfaces, survey
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import make
 from designgen.scenes.model import recipe_of
@@ -116,7 +116,7 @@ def surfaces_of(model):
 def hits_on(model, step_mrad=6.0, stations=4):
     """Places that the middles of whole footprints hit, in the model's frame."""
     found = []
-    for name, T in placement.placed(model, stations, None, QUIET, 0).items():
+    for name, T in station_placement.placed(model, stations, None, QUIET, 0).items():
         seen = returns.scan_station(
             surfaces_of(model.bodies), T, QUIET, scanner.Params(step_mrad=step_mrad), 1, name, keep_hits=True
         ).returns
@@ -252,17 +252,17 @@ def test_stations_from_a_file_and_placed(tmp_path):
     np.testing.assert_allclose(scene.scans[0].T_project_scan[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
     device = scanner.Scanner(**scanner.preset("phase"))
     model = loading.load((CORNERS, SIDES))
-    few, more, many = (placement.placed(model, count, None, device, 1) for count in (2, 3, 4))
+    few, more, many = (station_placement.placed(model, count, None, device, 1) for count in (2, 3, 4))
     assert list(more) == ["S1", "S2", "S3"]
     for name, T in few.items():
         np.testing.assert_array_equal(T, more[name])
         np.testing.assert_array_equal(T, many[name])
     path.write_text(json.dumps([{"id": "A", "position": [0, -3000, 500], "heading_deg": 90.0}]))
-    np.testing.assert_allclose(placement.given(path, 0)["A"][:3, 3], [0, -3000, 500])
+    np.testing.assert_allclose(station_placement.given(path, 0)["A"][:3, 3], [0, -3000, 500])
     for wrong in ("{}", "[1]", '{"A": {"position": [1, 2]}}', '{"A": {"position": [1, 2, 3], "heading_deg": "x"}}'):
         path.write_text(wrong)
         with pytest.raises(InputError, match=r"places\.json: expected stations as"):
-            placement.given(path, 1)
+            station_placement.given(path, 1)
 
 
 def test_stations_see_what_can_be_seen():

@@ -8,7 +8,7 @@ import pytest
 from processor.space_frame.catalogue import of_radii
 from processor.space_frame.members.records import Members
 from processor.space_frame.spheres import fit_all
-from processor.space_frame.spheres.unnamed_views import of_tubes
+from processor.space_frame.spheres.view_errors import of_tubes
 from tests.support import ball_clouds
 from tests.support.memory_source import InMemory
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processor.geometry.parallel import over_ranges
-from processor.space_frame.members import linearity, segments
+from processor.space_frame.members import voxel_linearity, voxel_lines
 from processor.space_frame.points import hash_sampling, line_crops, voxels
 from tests.support.memory_source import InMemory
 
@@ -36,12 +36,12 @@ def test_voxels_are_those_of_numpy(cloud):
 
 def test_linearity_is_that_of_the_window(cloud):
     found = voxels.gathered(np.rint(cloud * 100.0).astype(np.int32), 100.0, 2)
-    linear = linearity.linearity(found, 2.0)  # never linear enough: the better of both windows
+    linear = voxel_linearity.linearity(found, 2.0)  # never linear enough: the better of both windows
     for i in np.random.default_rng(2).integers(0, found.number, 100):
         best = 0.0
-        for radius2 in (linearity.SMALL2, linearity.LARGE2):
+        for radius2 in (voxel_linearity.SMALL2, voxel_linearity.LARGE2):
             near = ((found.cells - found.cells[i]) ** 2).sum(axis=1) <= radius2
-            if near.sum() < linearity.LEAST_VOXELS:
+            if near.sum() < voxel_linearity.LEAST_VOXELS:
                 continue
             values, vectors = np.linalg.eigh(np.cov(found.means[near].T, bias=True))
             value = 1.0 - np.sqrt(max(values[1], 0.0) / values[2])
@@ -59,7 +59,7 @@ def test_principal_axes_of_any_matrix():
         for _ in range(20):
             Q, _ = np.linalg.qr(rng.standard_normal((3, 3)))
             M = Q @ np.diag(scale) @ Q.T
-            first, second, *axis = linearity.principal(M[0, 0], M[1, 1], M[2, 2], M[0, 1], M[0, 2], M[1, 2])
+            first, second, *axis = voxel_linearity.principal(M[0, 0], M[1, 1], M[2, 2], M[0, 1], M[0, 2], M[1, 2])
             values = np.linalg.eigvalsh(M)
             assert (first, second) == pytest.approx((values[2], values[1]), abs=1e-7)
             assert np.linalg.norm(axis) == pytest.approx(1.0)
@@ -69,7 +69,7 @@ def test_principal_axes_of_any_matrix():
 
 def test_a_line_is_one_segment(cloud):
     found = voxels.gathered(np.rint(cloud[:20_000] * 100.0).astype(np.int32), 100.0, 2)
-    one = segments.segments(found, linearity.linearity(found, 0.72), 0.72, 400.0)
+    one = voxel_lines.segments(found, voxel_linearity.linearity(found, 0.72), 0.72, 400.0)
     assert one.count == 1
     assert one.directions[0] == pytest.approx([0.6, 0.64, 0.48], abs=3e-3)
     assert 2.0 * one.halves[0] == pytest.approx(5000.0, abs=250.0)

@@ -12,7 +12,7 @@ from processor.limits import measures, standards
 from processor.model import InputError, Limit, Scan, Scene, Tolerance
 from processor.preassembly.verdicts import chain, joints
 from processor.scan_folder import folder
-from processor.space_frame.spheres import quality
+from processor.space_frame.spheres import assessment
 from processor.store import store
 
 MEASURES = ("", *(measure for of_step in measures.MEASURES.values() for measure in of_step))
@@ -145,8 +145,8 @@ def test_blanks_of_balls():
     # Half of +2/-1 up to a diameter of 120 and of +3/-1.5 above.
     gb = standards.load("GB 50205-2020")
     for limits in (gb, Tolerance(), standards.load("JGJ 7-2010")):
-        assert quality.blank_tolerance(60.0, limits) == (0.5, 1.0)
-        assert quality.blank_tolerance(60.001, limits) == (0.75, 1.5)
+        assert assessment.blank_tolerance(60.0, limits) == (0.5, 1.0)
+        assert assessment.blank_tolerance(60.001, limits) == (0.75, 1.5)
     own = Tolerance(limits=(Limit("ball_blank_diameter_small_mm", "x", low=-4.0, high=6.0, up_to_mm=120.0),))
-    assert quality.blank_tolerance(50.0, own) == (2.0, 3.0)
-    assert quality.blank_tolerance(75.0, own) == (0.75, 1.5)
+    assert assessment.blank_tolerance(50.0, own) == (2.0, 3.0)
+    assert assessment.blank_tolerance(75.0, own) == (0.75, 1.5)

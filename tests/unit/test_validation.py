@@ -17,7 +17,7 @@ import pytest
 
 from processor.language.messages import text
 from processor.model import InputError, UsageError
-from processor.validation import cells, certificate, coverage, history, matrix, night, running, software
+from processor.validation import cell_runner, cells, certificate, coverage, history, matrix, night, software_identity
 from processor.validation.cells import Outcome
 from processor.validation.history import History
 from tests.support import validation_nights
@@ -189,7 +189,7 @@ def test_done_cells_are_not_done_again_and_failed_ones_are(tmp_path):
 def test_other_software_does_a_night_again_only_where_that_is_asked_for(tmp_path):
     asked, done = validation_nights.matrix(validation_nights.case()), []
     run(tmp_path / "out", asked, done=done)
-    other = software.Software("code-2", "", {})
+    other = software_identity.Software("code-2", "", {})
     with pytest.raises(UsageError, match="--again does all of it again"):
         run(tmp_path / "out", asked, made_by=other)
     run(tmp_path / "out", asked, made_by=other, again=True, done=done)
@@ -548,9 +548,9 @@ def test_a_generator_beside_the_matrix(tmp_path):
     (tmp_path / "m.toml").write_text(FOREIGN, "utf-8")
     (cell,) = matrix.read(tmp_path / "m.toml", False).cells(1)
     assert (cell.case.origin, cell.case.recipe) == (cells.Origin.FOREIGN, "mine")
-    found = running.do(cell, scratch=str(tmp_path))
+    found = cell_runner.do(cell, scratch=str(tmp_path))
     assert not found.failed
     assert [figure.name for figure in cells.check_values(found.results)][:1] == ["scans not placed"]
     (tmp_path / "mine.py").write_text("import sys; sys.exit('no idea')", "utf-8")
     (cell,) = matrix.read(tmp_path / "m.toml", False).cells(1)
-    assert running.do(cell, scratch=str(tmp_path)).failed == "mine: exit code 1: no idea"
+    assert cell_runner.do(cell, scratch=str(tmp_path)).failed == "mine: exit code 1: no idea"

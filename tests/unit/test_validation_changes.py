@@ -13,10 +13,10 @@ from processor.evaluation import space_frame
 from processor.geometry.sphere import algebraic
 from processor.model import Better, FrameDesign, FrameTruth, Scan, Scene, Truth
 from processor.space_frame import step as space_frame_step
-from processor.space_frame.spheres import isolated
-from processor.validation import changes
-from processor.validation.badness import badness
+from processor.space_frame.spheres import baselines
+from processor.validation import change_detection
 from processor.validation.history import Row
+from processor.validation.loss import loss
 from tests.support import validation_nights
 from tests.support.metrics import described
 from tests.support.validation_nights import night_name
@@ -63,28 +63,28 @@ def rows(night, values, fixed=True, name=NAME, unit="mm", recipe=None, digest=No
     ],
 )
 def test_where_better_lies(name, unit, better, worse):
-    measure = badness(name, unit, described(name)[2], {})
+    measure = loss(name, unit, described(name)[2], {})
     assert measure.of(worse) - measure.of(better) > 0.0
 
 
 def test_the_matrix_may_say_where_better_lies():
-    assert badness("share", "%", Better.HIGH, {"share": "low"}).of(2.0) > badness(
+    assert loss("share", "%", Better.HIGH, {"share": "low"}).of(2.0) > loss(
         "share", "%", Better.HIGH, {"share": "low"}
     ).of(1.0)
-    toward = badness("ratio", "", Better.LOW, {"ratio": 1.0})
+    toward = loss("ratio", "", Better.LOW, {"ratio": 1.0})
     assert toward.of(2.0) == pytest.approx(toward.of(0.5))
 
 
 def test_the_paired_test_is_a_t_test_of_log_ratios():
     before = np.array([0.5, 0.6, 0.4, 0.8, 0.7])
     after = before * np.array([1.2, 1.19, 1.22, 1.18, 1.21])
-    found = changes.find(rows("2026-01-01", before) + rows("2026-01-02", after), "2026-01-02", {})
+    found = change_detection.find(rows("2026-01-01", before) + rows("2026-01-02", after), "2026-01-02", {})
     (change,) = found.changes
     expected = stats.ttest_1samp(np.log(after / before), math.log(1.02), alternative="greater").pvalue
     assert (change.kind, change.test, change.cases) == ("regression", "paired", 5)
     assert change.p == pytest.approx(2.0 * expected, rel=1e-9)  # by one of two tests
     assert str(change.message) == "20 % worse"
-    (back,) = changes.find(rows("2026-01-02", after) + rows("2026-01-03", before), "2026-01-03", {}).changes
+    (back,) = change_detection.find(rows("2026-01-02", after) + rows("2026-01-03", before), "2026-01-03", {}).changes
     assert (back.kind, str(back.message)) == ("improvement", "20 % better")
 
 
@@ -103,8 +103,8 @@ def test_few_scenes_are_held_against_the_scatter_from_seed_to_seed():
     mean, root = differences.mean() - math.log(1.02), math.sqrt(3)
     own = stats.t.sf(mean / (differences.std(ddof=1) / root), 2)
     by_seeds = stats.t.sf(mean / (math.sqrt(2.0) * levels.std(ddof=1) / root), 42)
-    assert own > changes.ALARM_RATE > 2.0 * by_seeds  # two degrees of freedom would not do
-    (change,) = changes.find(given, night_name(41), {}).changes
+    assert own > change_detection.ALARM_RATE > 2.0 * by_seeds  # two degrees of freedom would not do
+    (change,) = change_detection.find(given, night_name(41), {}).changes
     assert (change.kind, change.p) == ("regression", pytest.approx(2.0 * by_seeds, rel=1e-9))
 
 
@@ -112,31 +112,33 @@ def test_settings_of_one_scene_count_once():
     before = rows("2026-01-01", [0.5] * 6)
     same_scene = [dataclasses.replace(row, recipe="one", seed=1) for row in before]
     after = [dataclasses.replace(row, night="2026-01-02", value=0.6 + 0.001 * i) for i, row in enumerate(same_scene)]
-    (change,) = changes.find(same_scene + after, "2026-01-02", {}).changes
+    (change,) = change_detection.find(same_scene + after, "2026-01-02", {}).changes
     assert (change.kind, change.cases) == ("changed", 1)
 
 
 def test_rounding_is_no_change_and_scatter_is_no_regression():
     before = np.array([0.5, 0.6, 0.4, 0.8, 0.7])
     rounded = rows("2026-01-02", before * (1.0 + 1e-9))
-    assert changes.find(rows("2026-01-01", before) + rounded, "2026-01-02", {}).changes == ()
+    assert change_detection.find(rows("2026-01-01", before) + rounded, "2026-01-02", {}).changes == ()
     scattered = rows("2026-01-02", before * np.array([1.3, 0.75, 1.1, 0.9, 1.0]))
-    (change,) = changes.find(rows("2026-01-01", before) + scattered, "2026-01-02", {}).changes
+    (change,) = change_detection.find(rows("2026-01-01", before) + scattered, "2026-01-02", {}).changes
     assert change.kind == "changed"
 
 
 def test_other_scenes_are_not_compared_and_lost_figures_are_told():
     before = rows("2026-01-01", [0.5] * 5)
     others = rows("2026-01-02", [0.9] * 5, digest="another")
-    found = changes.find(before + others, "2026-01-02", {})
+    found = change_detection.find(before + others, "2026-01-02", {})
     assert (found.changes, found.moved_scenes) == ((), 5)
     other = ("spheres", "ray", "radii, number")
     seen = rows("2026-01-02", [60.0] * 5, name=other)
-    (gone,) = changes.find(before + seen, "2026-01-02", {}).changes
+    (gone,) = change_detection.find(before + seen, "2026-01-02", {}).changes
     assert (gone.kind, str(gone.message)) == ("lost", "no longer measured in 5 cells")
-    assert changes.find(before + rows("2026-01-02", [math.nan] * 5), "2026-01-02", {}).changes[0].kind == "lost"
+    assert (
+        change_detection.find(before + rows("2026-01-02", [math.nan] * 5), "2026-01-02", {}).changes[0].kind == "lost"
+    )
     method = ("spheres", "ransac", "radii, number")  # the matrix asks for another method: nothing is lost
-    assert changes.find(before + rows("2026-01-02", [60.0] * 5, name=method), "2026-01-02", {}).changes == ()
+    assert change_detection.find(before + rows("2026-01-02", [60.0] * 5, name=method), "2026-01-02", {}).changes == ()
 
 
 def test_the_rank_test_is_exact():
@@ -144,10 +146,10 @@ def test_the_rank_test_is_exact():
     table = np.round(rng.lognormal(size=(3, 6)), 1)  # three cases, this night and five before it; with ties
     given = [row for n in range(1, 6) for row in rows(night_name(n), table[:, n], fixed=False)]
     given += rows(night_name(6), table[:, 0], fixed=False)
-    series = changes._Series()
+    series = change_detection._Series()
     for row in given:
         series.add(row, row.night == night_name(6))
-    test = changes._fresh(NAME, series.fresh, series.earlier, badness(NAME[2], "mm", Better.LOW, {}))
+    test = change_detection._fresh(NAME, series.fresh, series.earlier, loss(NAME[2], "mm", Better.LOW, {}))
     scores = [np.rint(64 * stats.norm.ppf(stats.rankdata(own) / 7)) for own in table]
     seen = sum(own[0] for own in scores)
     sums = np.array([sum(one) for one in itertools.product(*scores)])
@@ -157,20 +159,22 @@ def test_the_rank_test_is_exact():
 
 def test_an_unaccepted_regression_is_no_level():
     given = rows("2026-01-01", [0.5] * 5) + rows("2026-01-02", [0.6] * 5) + rows("2026-01-03", [0.6] * 5)
-    assert changes.find(given, "2026-01-03", {}).changes == ()
-    (again,) = changes.find(given, "2026-01-03", {NAME: {"2026-01-02"}}).changes
+    assert change_detection.find(given, "2026-01-03", {}).changes == ()
+    (again,) = change_detection.find(given, "2026-01-03", {NAME: {"2026-01-02"}}).changes
     assert again.kind == "regression"
 
 
 def test_holm_by_hand():
     def tests(*values):
-        return [changes._Test(("s", "m", str(i)), "fresh", 1.0, p, 1.0, 3) for i, p in enumerate(values)]
+        return [change_detection._Test(("s", "m", str(i)), "fresh", 1.0, p, 1.0, 3) for i, p in enumerate(values)]
 
-    called = changes._holm(tests(0.0012, 0.5, 0.0016, 0.0024), "p_worse")  # against 0.005 / 4, / 3, / 2, / 1
+    called = change_detection._holm(tests(0.0012, 0.5, 0.0016, 0.0024), "p_worse")  # against 0.005 / 4, / 3, / 2, / 1
     assert [one.p_worse for one in called] == [0.0012, 0.0016, 0.0024]
-    called = changes._holm(tests(0.0017, 0.0001, 0.002, 0.9), "p_worse")  # 0.0017 is over 0.005 / 3: it ends there
+    called = change_detection._holm(
+        tests(0.0017, 0.0001, 0.002, 0.9), "p_worse"
+    )  # 0.0017 is over 0.005 / 3: it ends there
     assert [one.p_worse for one in called] == [0.0001]
-    assert changes._holm(tests(0.0013, 0.0013, 0.0013, 0.0013), "p_worse") == []
+    assert change_detection._holm(tests(0.0013, 0.0013, 0.0013, 0.0013), "p_worse") == []
 
 
 # --- an estimator made worse ----------------------------------------------------------------------------------------
@@ -228,11 +232,11 @@ def one_night(number, check=checks):
 def test_an_estimator_20_percent_worse_is_reported_the_first_night(earlier, monkeypatch):
     as_it_was = functools.cache(checks)  # the fixed seeds' figures are the same every night
     given = [row for number in range(earlier) for row in one_night(number, as_it_was)]
-    undisturbed = changes.find(given, night_name(earlier - 1), {})
+    undisturbed = change_detection.find(given, night_name(earlier - 1), {})
     assert undisturbed.changes == ()
     # An estimator that uses 1 / 1.2^2 of the points has 1.2 times the standard deviation.
-    monkeypatch.setattr(isolated, "algebraic", lambda points: algebraic(points[: int(len(points) / 1.44)]))
-    found = changes.find(given + one_night(earlier), night_name(earlier), {})
+    monkeypatch.setattr(baselines, "algebraic", lambda points: algebraic(points[: int(len(points) / 1.44)]))
+    found = change_detection.find(given + one_night(earlier), night_name(earlier), {})
     worse = {one.name[2]: one for one in found.of("regression")}
     assert {"radii, standard deviation", "centres, standard deviation"} <= set(worse)
     assert math.expm1(worse["centres, standard deviation"].size) == pytest.approx(0.2, abs=0.06)

@@ -9,16 +9,16 @@ import pytest
 
 from processor.jobs import runner
 from processor.model import UsageError
-from processor.validation import running
+from processor.validation import cell_runner
 from processor.validation.cells import Case, Cell, Outcome
 from tests.support import validation_nights
 
 CELL = Cell(Case("frame", "frame-small", "", False, (), ("spheres",), ()), 1, True)
 PARENT = """
 import sys
-from processor.validation import running
+from processor.validation import cell_runner
 from tests.unit.test_validation_running import CELL
-running.do(CELL, scratch=sys.argv[1])
+cell_runner.do(CELL, scratch=sys.argv[1])
 """
 
 
@@ -52,7 +52,7 @@ def alive(pid):
 
 
 def test_a_cell_that_takes_too_long_fails(tmp_path):
-    found = running.do(CELL, scratch=str(tmp_path), timeout_s=0.05)
+    found = cell_runner.do(CELL, scratch=str(tmp_path), timeout_s=0.05)
     assert found.failed == "took longer than 0.05 s"
     assert list(tmp_path.iterdir()) == []
 
@@ -61,13 +61,13 @@ def test_parameters_are_written_as_toml():
     tomllib = pytest.importorskip("tomllib")
 
     table = {"spheres": {"radius_mm": 50.0, "catalogue": 'a "b"', "deep": {"list": [1.0, 2.0], "on": True}}}
-    assert tomllib.loads(running._toml(table)) == table
+    assert tomllib.loads(cell_runner._toml(table)) == table
 
 
 def test_stopping_ends_what_is_under_way(tmp_path):
     cell = Cell(validation_nights.case(), 1, True)
     started = time.monotonic()
-    with running.cell_runner(None, 1, tmp_path, print) as run:
+    with cell_runner.cell_runner(None, 1, tmp_path, print) as run:
         coming = run([cell, cell])
         next(coming)  # fails soon: its recipe is no recipe
         coming.close()
@@ -84,11 +84,11 @@ def test_cells_on_a_cluster(tmp_path, monkeypatch):
             raise MemoryError("none left")
         return Outcome("", {"seed": cell.seed, "pid": os.getpid()}, 1.0, 1.0)
 
-    monkeypatch.setattr(running, "do", do)
+    monkeypatch.setattr(cell_runner, "do", do)
     cells = [Cell(validation_nights.case(), seed, True) for seed in (1, 2, 3)]
     with (
         distributed.LocalCluster(1, processes=False, threads_per_worker=2, dashboard_address=None) as cluster,
-        running.cell_runner(cluster.scheduler_address, 1, tmp_path, print) as run,
+        cell_runner.cell_runner(cluster.scheduler_address, 1, tmp_path, print) as run,
     ):
         found = {cell.seed: outcome for cell, outcome in run(cells)}
     assert {seed: outcome.results.get("seed") for seed, outcome in found.items()} == {1: 1, 2: None, 3: 3}
@@ -99,6 +99,6 @@ def test_a_cluster_that_does_not_answer(tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "CONNECT_S", 1)
     with (
         pytest.raises(UsageError, match="expected the address of a Dask scheduler that answers"),
-        running.cell_runner("tcp://127.0.0.1:1", 1, tmp_path, print),
+        cell_runner.cell_runner("tcp://127.0.0.1:1", 1, tmp_path, print),
     ):
         pass

@@ -18,8 +18,7 @@ from processor.defects.observations import Observed, cells_of
 from processor.defects.regions import EMPTY_SHARE, Region, chernoff
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import enclosure, mesh_distance
-from processor.geometry.mesh_distance import Bools
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
 STEP_MM = 2.0  # between places by which contacts are measured
 WITHIN_MM = 4.0  # from the outline of a contact: beams at its border hit the face beside it

@@ -19,8 +19,7 @@ from processor.defects.places import other_side
 from processor.defects.regions import EIGHT_NEIGHBOURS, EMPTY_SHARE, Region, chernoff
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import mesh_distance
-from processor.geometry.mesh_distance import Bools
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
 BEFORE_MM = 1.0  # start of a line of sight above the face
 DIRECTIONS = 400  # about a face, 5 degrees apart

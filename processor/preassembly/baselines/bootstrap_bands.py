@@ -12,22 +12,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import stdtrit
 
 from processor.geometry import rigid, surface_registration
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import by_cell
 from processor.geometry.parallel import each
-from processor.model import ArchDesign, DesignPart, Floats, Ints, Status, reason
+from processor.model import ArchDesign, Bools, DesignPart, Floats, Ints, Status, reason
 from processor.preassembly import errors
 from processor.preassembly.baselines import methods
 from processor.preassembly.baselines.methods import PartFeatures
 from processor.preassembly.params import Params
 from processor.preassembly.parts import attitude
 from processor.preassembly.result import Deviations, Result
-
-Bools = npt.NDArray[np.bool_]
 
 CELL_MM = 40.0  # a part's form does not change within a cell
 NEAR_MM = 30.0  # largest distance of a part as built from its design

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import ArchDesign, Floats
+from processor.model import ArchDesign, Bools, Floats
 from processor.preassembly import topology
 from processor.preassembly.chain.adjustment import Adjusted
-from processor.preassembly.ends.section import Bools
 from processor.preassembly.parts.measure import MeasuredPart
 
 

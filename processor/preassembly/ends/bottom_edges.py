@@ -22,10 +22,9 @@ from processor.adjustment.model_averaging import smooth
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.polyline import Polyline
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 from processor.preassembly.ends import plate_sides
 from processor.preassembly.ends.faces import ALONG, RegisteredPart
-from processor.preassembly.ends.plate_sides import Bools
 from processor.preassembly.errors import INTERVAL_MM
 
 REACH_MM = 200.0  # across each face

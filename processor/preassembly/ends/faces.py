@@ -16,10 +16,9 @@ import numpy as np
 from processor.adjustment import clusters, kriging
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
-from processor.model import Floats, Ints, Reason, reason
+from processor.model import Bools, Floats, Ints, Reason, reason
 from processor.preassembly.ends import plate_sides, viewpoints
 from processor.preassembly.ends.joint_frame import EndPlace, end_place
-from processor.preassembly.ends.plate_sides import Bools
 from processor.preassembly.ends.section import EndFace
 from processor.preassembly.ends.viewpoints import Thickness
 

@@ -20,10 +20,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from processor.adjustment import kriging, model_averaging, variance_components
-from processor.adjustment.model_averaging import SIZES_MM, Bools, Estimate
+from processor.adjustment.model_averaging import SIZES_MM, Estimate
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
-from processor.model import NORMAL_95, Floats, Ints, Reason, reason
+from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, reason
 from processor.preassembly.ends import faces as ends_faces
 from processor.preassembly.ends import plate_sides, section, viewpoints
 from processor.preassembly.ends import ring as ends_ring

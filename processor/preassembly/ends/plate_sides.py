@@ -7,11 +7,8 @@ points are found near the outer face, a plate's thickness inside it.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from processor.model import Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, Floats, Ints
 
 BIN_MM = 3.0
 REACH_MM = 60.0  # inward and outward

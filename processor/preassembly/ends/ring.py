@@ -21,9 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 from processor.preassembly.ends import plate_sides
-from processor.preassembly.ends.plate_sides import Bools
 
 REACH = 4.0  # standard deviations from ring and walls
 LEAST_REACH_MM = 3.0

@@ -11,13 +11,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
-from processor.model import Floats, Word
-
-Bools = npt.NDArray[np.bool_]
+from processor.model import Bools, Floats, Word
 
 OFF_STEEL_MM = 25.0  # of a key point from the surface: corners of rolled hollow sections are rounded by less
 NEAR_MM = 600.0  # of the joint, in which walls are looked for

@@ -22,8 +22,7 @@ from scipy.special import chdtri
 
 from processor.adjustment import clusters, global_test
 from processor.adjustment.scanner_class import VIEW_MM
-from processor.model import Floats, Ints
-from processor.preassembly.ends.plate_sides import Bools
+from processor.model import Bools, Floats, Ints
 
 TERMS = 3  # of a plate's thickness: its mean, its changes along and across
 ALIKE_MM = 2.0  # plates that differ by less are of one nominal thickness: rolling and viewpoints differ by less

@@ -13,11 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import global_test, kriging
-from processor.model import Reason, reason
+from processor.model import Bools, Reason, reason
 from processor.preassembly.ends import viewpoints
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import FittedEnd
-from processor.preassembly.ends.plate_sides import Bools
 from processor.preassembly.ends.section import PlateFace
 
 # The faces of a part that give the departures of its left and right edge, sideways and up.

@@ -13,15 +13,14 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from processor.adjustment.extremes import draws
 from processor.limits import standards as limits_of
 from processor.limits.guard_band import guard_band
 from processor.limits.judging import clause_of
 from processor.model import (
+    Bools,
     Checked,
-    Flags,
     Floats,
     Limit,
     Reason,
@@ -39,7 +38,6 @@ from processor.model import (
 )
 from processor.preassembly.verdicts.joint_measures import ACROSS, Measures, motion_of
 
-Bools = npt.NDArray[np.bool_]
 MEASURES = ("misalignment", "groove_gap", "eccentricity")
 
 
@@ -69,10 +67,10 @@ class ComparedLimits(Rows):
     clause: tuple[str, ...] = names("v")
     edition: tuple[str, ...] = names("v")
     source: tuple[str, ...] = names("v")
-    verified: Flags = column("v", dtype=np.bool_)
+    verified: Bools = column("v", dtype=np.bool_)
 
     @property
-    def bounds_known(self) -> Flags:
+    def bounds_known(self) -> Bools:
         """Mark the limits (v,) that do not depend on an unknown size."""
         return ~(np.isnan(self.low) | np.isnan(self.high))
 

@@ -30,6 +30,7 @@ from processor.adjustment.extremes import SEED, draws
 from processor.limits import standards as limits_of
 from processor.model import (
     KEY_POINTS,
+    Bools,
     Checked,
     Floats,
     Limit,
@@ -44,7 +45,7 @@ from processor.model import (
 )
 from processor.preassembly.params import TrimParams
 from processor.preassembly.verdicts.joint_measures import ACROSS, Measures
-from processor.preassembly.verdicts.joints import Bools, allowed, conforms, joint_limits, judge
+from processor.preassembly.verdicts.joints import allowed, conforms, joint_limits, judge
 
 SHOWN_MM = 0.1  # resolution of amounts in the reasons
 ALIKE = 0.01  # difference of probabilities that does not count

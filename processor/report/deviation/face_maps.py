@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry.m3c2 import Distances
 from processor.language.messages import Message, text
-from processor.model import Flags, Floats, Ints
+from processor.model import Bools, Floats, Ints
 from processor.report.style import DIVERGING, png
 
 AXES = "xyz"
@@ -151,9 +151,9 @@ def faces(core: Floats, normals: Floats) -> list[tuple[str, Ints]]:
     return sorted(found, key=lambda face: -len(face[1]))
 
 
-def _panels(core: Floats, normals: Floats, known: Flags) -> tuple[list[Panel], int]:
+def _panels(core: Floats, normals: Floats, known: Bools) -> tuple[list[Panel], int]:
     """Lay faces out on panels; also count the core points that are on none."""
-    panels: list[tuple[str, Flags, list[Ints]]] = []
+    panels: list[tuple[str, Bools, list[Ints]]] = []
     left_out = 0
     low = core.min(axis=0) if len(core) else np.zeros(3)
     cell = max(spacing(core), float(np.ptp(core, axis=0).max()) / FINEST if len(core) else 0.0, 1e-9)
@@ -229,7 +229,7 @@ def _draw(
     axes.set_aspect("equal", anchor="W")
 
 
-def _smooth(at: tuple[Ints, ...], values: Floats, shape: tuple[int, ...]) -> tuple[Floats, Flags]:
+def _smooth(at: tuple[Ints, ...], values: Floats, shape: tuple[int, ...]) -> tuple[Floats, Bools]:
     """Return the mean of values in cells and their neighbours, extended to those without, and which have one."""
     known = np.isfinite(values)
     total, count = np.zeros(shape), np.zeros(shape)
@@ -246,7 +246,7 @@ def _smooth(at: tuple[Ints, ...], values: Floats, shape: tuple[int, ...]) -> tup
     return extended, has_value
 
 
-def _extremes(values: Floats, known: Flags) -> list[int]:
+def _extremes(values: Floats, known: Bools) -> list[int]:
     rows = np.flatnonzero(known)
     if not len(rows):
         return []

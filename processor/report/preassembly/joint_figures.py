@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Polygon
 
 from processor.language.messages import Message, text
-from processor.model import KEY_POINTS, NORMAL_95, Flags, Floats, StepRun
+from processor.model import KEY_POINTS, NORMAL_95, Bools, Floats, StepRun
 from processor.preassembly.result import Result
 from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
 from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, png, printable_name, rounded
@@ -27,7 +27,7 @@ ALIGNED = {-1: ("right", "top"), 0: ("center", "center"), 1: ("left", "bottom")}
 WITHIN = "0.45"  # colour of the dot that stands for a gap within its interval
 
 
-def is_beyond(vectors: Floats, half: Floats) -> Flags:
+def is_beyond(vectors: Floats, half: Floats) -> Bools:
     """Mark which of vectors (n, 2) lie beyond the 95 % region that half-widths (n, 2) along the axes stand for.
 
     All of them where the half-widths are not known.

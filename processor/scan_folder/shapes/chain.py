@@ -10,7 +10,7 @@ import numpy as np
 
 from processor.model import Floats
 from processor.scan_folder.shapes.body import Body
-from processor.scan_folder.shapes.end_faces import Contact, contact
+from processor.scan_folder.shapes.contact_faces import Contact, contact
 
 GAP_MM = 60.0  # largest root gap of a joint
 SPAN_RAD = np.radians(10.0)  # largest angle in plan between the span and X

@@ -11,7 +11,7 @@ import numpy as np
 
 from processor.model import KEY_POINTS, ArchDesign, Floats, FrameDesign, Ints
 from processor.scan_folder import component_names
-from processor.scan_folder.shapes import arch, files, frame, unit
+from processor.scan_folder.shapes import arch_bridge, guess_unit, space_frame, surface_files
 from processor.scan_folder.shapes.body import Body, stacked, welded
 from processor.scan_folder.units import MM_PER_UNIT
 
@@ -55,15 +55,15 @@ def guess(
     ``scans`` are the radius of each scan and the unit that its format states. Raises InputError for a file that cannot
     be read.
     """
-    chosen, doubts = files.one_a_stem(group)
-    surfaces = [files.read(folder, path, given_unit or "mm") for path in chosen]
+    chosen, doubts = surface_files.one_a_stem(group)
+    surfaces = [surface_files.read(folder, path, given_unit or "mm") for path in chosen]
     names = _names(folder, chosen)
     # Scans are of a whole frame, but of single parts of a bridge.
     units = _unit(surfaces, scans, given_unit, as_whole=True)
     bodies = _bodies(folder, surfaces, units.unit or "mm").bodies
     if not bodies:
         return GuessedDesign(doubts=(*doubts, "no surface has an area"), files=names)
-    balls = frame.find(stacked("all", bodies))
+    balls = space_frame.find(stacked("all", bodies))
     if balls.design is not None:
         return GuessedDesign(
             design=balls.design if units.unit else None,
@@ -80,30 +80,30 @@ def guess(
 
 
 def _unit(
-    surfaces: Sequence[files.Surface], scans: Sequence[tuple[float, str]], given: str, as_whole: bool
-) -> unit.DesignUnit:
+    surfaces: Sequence[surface_files.Surface], scans: Sequence[tuple[float, str]], given: str, as_whole: bool
+) -> guess_unit.DesignUnit:
     if given:
-        return unit.DesignUnit(given, "given", True)
+        return guess_unit.DesignUnit(given, "given", True)
     if all(surface.unit for surface in surfaces):
-        return unit.DesignUnit("mm", "the CAD files state their units", True)
-    return unit.guess([surface.vertices for surface in surfaces], scans, as_whole)
+        return guess_unit.DesignUnit("mm", "the CAD files state their units", True)
+    return guess_unit.guess([surface.vertices for surface in surfaces], scans, as_whole)
 
 
-def _unit_doubts(units: unit.DesignUnit) -> list[str]:
+def _unit_doubts(units: guess_unit.DesignUnit) -> list[str]:
     if units.sure:
         return []
     taken = f"taken as {units.unit}" if units.unit else "not clear"
     return [f"units of the design: {taken}: {units.reason}; state it by --design-units"]
 
 
-def _json_unit(surfaces: Sequence[files.Surface], units: unit.DesignUnit) -> str:
+def _json_unit(surfaces: Sequence[surface_files.Surface], units: guess_unit.DesignUnit) -> str:
     """Return the unit of design.json, which is also that of the meshes it names."""
     return "mm" if all(surface.unit for surface in surfaces) else units.unit or "mm"
 
 
 def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_unit: str) -> GuessedDesign:
     whole = len(names) == 1
-    found = arch.find(parts.bodies)
+    found = arch_bridge.find(parts.bodies)
     named = _named_as_parts(parts.bodies)
     if found.design is None or (whole and not found.arched and not named):
         told = [f"as an arch bridge: {text}" for text in found.doubts if named or not whole]
@@ -140,7 +140,7 @@ def _named_as_parts(bodies: Sequence[Body]) -> bool:
     return any(word in component_names.plain(body.name).split() for body in bodies for word in PARTS)
 
 
-def _bodies(folder: Path, surfaces: Sequence[files.Surface], units: str) -> _Parts:
+def _bodies(folder: Path, surfaces: Sequence[surface_files.Surface], units: str) -> _Parts:
     """Return the parts in mm: a part a file, or of one file a part a body."""
     bodies, mesh_of = list[Body](), dict[str, str]()
     scales = [1.0 if surface.bodies is not None else MM_PER_UNIT[units] for surface in surfaces]
@@ -153,11 +153,11 @@ def _bodies(folder: Path, surfaces: Sequence[files.Surface], units: str) -> _Par
         return _Parts(bodies, mesh_of)
     (surface,), (scale,) = surfaces, scales
     meshes, doubts = list[tuple[str, Floats, Ints]](), list[str]()
-    for name, vertices, faces in files.bodies(surface):
+    for name, vertices, faces in surface_files.bodies(surface):
         body = welded(name, vertices * scale, faces)
         if body is not None:
             bodies.append(body)
-            mesh_of[name] = f"{files.MADE}/{_stem(name, mesh_of)}.ply"
+            mesh_of[name] = f"{surface_files.MADE}/{_stem(name, mesh_of)}.ply"
             meshes.append((mesh_of[name], body.vertices, body.faces))
     if surface.bodies is None:
         doubts.append(f"names: the parts are pieces of {surface.path.name}, numbered in its order")

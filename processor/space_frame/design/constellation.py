@@ -11,13 +11,10 @@ The search is deterministic: triangles are tried in a fixed order, from the midd
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
 from processor.model import Floats, Ints
-
-Bools = npt.NDArray[np.bool_]
 
 NEIGHBOURS = 12  # of a node, for triangles
 CORNERS = 24  # triangles tried at most

@@ -11,10 +11,10 @@ import numpy.typing as npt
 from processor.model import Floats, Ints
 from processor.space_frame.members import axis_intersection, junctions
 from processor.space_frame.members.cylinder_fit import Errors
-from processor.space_frame.members.linearity import linearity
 from processor.space_frame.members.records import Members, Nodes
-from processor.space_frame.members.segments import segments
 from processor.space_frame.members.tube_fits import Fits, least_cosine, refined, rough, station_variance
+from processor.space_frame.members.voxel_linearity import linearity
+from processor.space_frame.members.voxel_lines import segments
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM, thinned
 from processor.space_frame.points.line_crops import Gathered, corridors, gather
 from processor.space_frame.points.source import Source

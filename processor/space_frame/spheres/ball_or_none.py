@@ -14,21 +14,18 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from processor.geometry.parallel import over_ranges
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 from processor.space_frame.members.members import Measured
 from processor.space_frame.points import sphere_crops
 from processor.space_frame.points.source import Source
-from processor.space_frame.spheres import sleeves
+from processor.space_frame.spheres import sleeve_radii
 from processor.space_frame.spheres.gauss_newton import residual
 from processor.space_frame.spheres.rays import with_rays
-
-Bools = npt.NDArray[np.bool_]
 
 REACH_MM = 240.0  # about a node: sleeve and cone of an ordinary ball
 POINTS = 512  # of a node, at most
@@ -56,11 +53,11 @@ def nodes_with_ball(source: Source, measured: Measured, starts: Floats, threads:
     lost = ~np.isfinite(measured.nodes.positions).all(axis=1, keepdims=True)
     nodes = replace(measured.nodes, positions=np.where(lost, starts, measured.nodes.positions))
     noise = float(np.median(members.rms)) if len(members.rms) else 1.0
-    sd = float(np.sqrt(noise**2 + measured.station_sd_mm**2 + sleeves.AXIS_MM**2))
+    sd = float(np.sqrt(noise**2 + measured.station_sd_mm**2 + sleeve_radii.AXIS_MM**2))
     near = sphere_crops.gather(source, nodes.positions, REACH_MM, threads, POINTS * nodes.count)
     crops = with_rays(near, nodes.positions, np.array(source.scanners, np.float64), threads)
     sphere, neck = np.zeros(nodes.count), np.zeros(nodes.count)
-    evidence_range = partial(_evidence, crops, sleeves.member_ends(nodes, members), sd, sphere, neck)
+    evidence_range = partial(_evidence, crops, sleeve_radii.member_ends(nodes, members), sd, sphere, neck)
     over_ranges(evidence_range, nodes.count, threads)
     joined = (members.node_a >= 0) & (members.node_b >= 0)
     pairs = np.unique(np.sort(np.stack([members.node_a, members.node_b], axis=1)[joined], axis=1), axis=0)
@@ -152,7 +149,7 @@ def _beside_members(points, rays, feet, axes, tubes, sd):  # type: ignore[no-unt
         free = True
         for m in range(len(tubes)):
             along, off = _by_axis(x, feet[m], axes[m])
-            free = free and (along <= 0.0 or off > sleeves.SLEEVE_OF_TUBE * tubes[m] + sleeves.FLAT_MM + sd)
+            free = free and (along <= 0.0 or off > sleeve_radii.SLEEVE_OF_TUBE * tubes[m] + sleeve_radii.FLAT_MM + sd)
         if free:
             rows[n] = i
             n += 1
@@ -188,7 +185,7 @@ def _neck_ratio(points, foot, axis, tube, beyond, sd):  # type: ignore[no-untype
     totals = np.zeros(len(NECKS))
     wide = np.sqrt(sd * sd + (SLEEVE_SPREAD * tube) ** 2)
     stray = 1.0 / (tube + 3.0 * sd)
-    sleeve = sleeves.SLEEVE_OF_TUBE * sleeves.MEDIAN_OF_CORNER * tube
+    sleeve = sleeve_radii.SLEEVE_OF_TUBE * sleeve_radii.MEDIAN_OF_CORNER * tube
     for i in range(len(points)):
         along, off = _by_axis(points[i], foot, axis)
         if along < beyond or off > tube + 3.0 * sd:

@@ -1,4 +1,4 @@
-"""Compiled final fit of every sphere whose size is surface: state, covariance, bound and what it rests on."""
+"""Compiled final fit of each sphere once its size is chosen: state, covariance, bound and what it rests on."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.points.sphere_crops import Crops, gather
-from processor.space_frame.spheres import noise_model, quality, sleeves
+from processor.space_frame.spheres import assessment, noise_model, sleeve_radii
 from processor.space_frame.spheres.final_fit import fit_final
 from processor.space_frame.spheres.gauss_newton import CUT_SD, LEAST_COSINE
 from processor.space_frame.spheres.rays import with_rays
@@ -33,9 +33,9 @@ from processor.space_frame.spheres.records import (
     StochasticModel,
 )
 from processor.space_frame.spheres.size_selection import choose
-from processor.space_frame.spheres.sleeves import AXIS_MM, FLAT_MM, MemberEnds
+from processor.space_frame.spheres.sleeve_radii import AXIS_MM, FLAT_MM, MemberEnds
 from processor.space_frame.spheres.station_scatter import shift_sd
-from processor.space_frame.spheres.unnamed_views import view_errors
+from processor.space_frame.spheres.view_errors import view_errors
 
 NAN = float("nan")
 MARGIN_MM = 26.0  # of a crop beyond the largest sphere: sleeves are measured there
@@ -133,7 +133,7 @@ def fit_crops(
     params = params or RayFitParams()
     problem = _Problem(
         crops=with_rays(crops, np.array(nodes.positions), np.array(scanners, np.float64), params.threads),
-        ends=sleeves.member_ends(nodes, members),
+        ends=sleeve_radii.member_ends(nodes, members),
         centre_weight=centre_weights(nodes.covariance),
         nominal=np.full(nodes.count, NAN) if nominal_mm is None else np.asarray(nominal_mm, np.float64),
         catalogue=catalogue,
@@ -148,7 +148,7 @@ def fit_crops(
         offset = noise_model.radius_offset(
             fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
         )
-    context = quality.FitContext(
+    context = assessment.FitContext(
         catalogue=catalogue,
         scanners_known=scanners_known,
         views=None
@@ -160,7 +160,7 @@ def fit_crops(
         radius_offset=offset,
         limits=standards.default_for(limits),
     )
-    return quality.assess(fits, nodes, problem.nominal, context)
+    return assessment.assess(fits, nodes, problem.nominal, context)
 
 
 def _rounds(problem: _Problem, scanners: int, station_covariance: Floats | None) -> tuple[Fits, _Setting, Residuals]:
@@ -169,7 +169,7 @@ def _rounds(problem: _Problem, scanners: int, station_covariance: Floats | None)
     setting = _Setting(
         noise=np.array([problem.params.sigma_mm**2, 0.0, 0.0]),
         model_points=10.0,
-        sleeve_radii=sleeves.sleeve_radii_from_tubes(problem.ends),
+        sleeve_radii=sleeve_radii.from_tubes(problem.ends),
         radius_sd=catalogue.sd_mm,
         least_cosine=problem.params.least_cosine,
         station_sd=0.0,
@@ -196,7 +196,7 @@ def _estimated(problem: _Problem, setting: _Setting, fits: Fits, residuals: Resi
     """Estimate the next round's setting from all spheres of one round."""
     crops, catalogue, threads = problem.crops, problem.catalogue, problem.params.threads
     errors, cosines, weights = residuals
-    sleeve_radii = sleeves.sleeve_radii(problem.ends, crops.start, crops.points, fits.states, threads)
+    radii = sleeve_radii.estimated(problem.ends, crops.start, crops.points, fits.states, threads)
     noise, count = noise_model.noise_model(errors, cosines, crops.ranges, weights, setting.noise)
     limb = noise_model.limb_cosine(errors, cosines, crops.ranges, weights, noise, setting.least_cosine)
     sure, radius_sd, size_weight = fits.clear, setting.radius_sd, setting.size_weight(problem.free)
@@ -212,7 +212,7 @@ def _estimated(problem: _Problem, setting: _Setting, fits: Fits, residuals: Resi
     return _Setting(
         noise=noise,
         model_points=min(count, MOST_MODEL_POINTS),
-        sleeve_radii=sleeve_radii,
+        sleeve_radii=radii,
         radius_sd=radius_sd,
         least_cosine=limb,
         station_sd=station_sd,

@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from processor.geometry.linalg_small import inverse_of
@@ -62,9 +61,6 @@ class NormalEquations(NamedTuple):
 
     H: Floats
     g: Floats
-
-
-Flags = npt.NDArray[np.uint8]
 
 
 # --- residuals and the choice of points ------------------------------------------------------------------------------

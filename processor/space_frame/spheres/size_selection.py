@@ -10,10 +10,10 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from processor.geometry.parallel import over_ranges
+from processor.model import Bools
 from processor.space_frame.spheres.gauss_newton import (
     CUT_SD,
     MASKED,
@@ -28,8 +28,6 @@ from processor.space_frame.spheres.gauss_newton import (
     variance,
 )
 from processor.space_frame.spheres.records import CropsWithRays, Masks, SizeChoice, Sizes, StochasticModel
-
-Bools = npt.NDArray[np.bool_]
 
 REWARD = 9.0  # of a point on the sphere, in chi-square: at 3 sd a residual is as likely an outlier as not
 THROUGH = 9.0  # cost of a ray that ends beyond the sphere it meets: steel is opaque

@@ -6,15 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from processor.adjustment import control_points, data_snooping
 from processor.geometry import rigid
 from processor.geometry.linalg_small import cholesky, product, solve
-from processor.model import Checked, Floats, Ints, Reason, column, names, reason
+from processor.model import Bools, Checked, Floats, Ints, Reason, column, names, reason
 from processor.space_frame.stations.residual_kernels import STATION
-
-Bools = npt.NDArray[np.bool_]
 
 OFF_LINE = 0.05  # least second extent of targets that determine the whole cloud's pose, as a share of the first
 

@@ -17,18 +17,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from processor.geometry.linalg_small import product
-from processor.model import Floats, Ints, Reason, reason
+from processor.model import Bools, Floats, Ints, Reason, reason
 from processor.space_frame.result import StationMotion
 from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
 from processor.space_frame.stations.control_points import ControlPoints, Doubt
 from processor.space_frame.stations.posterior import Posterior, common_motion, corrections
 from processor.space_frame.stations.records import Stations, StationStatus, TubePoints
-
-Bools = npt.NDArray[np.bool_]
 
 MOST_STATIONS = 10  # of those that see a tube: the others are far away and have few points on it
 ROUNDS = 3

@@ -12,16 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
 from processor.adjustment import control_points, data_snooping
 from processor.geometry import rigid
-from processor.model import Control, Floats, InputError, Ints, Reason, reason
+from processor.model import Bools, Control, Floats, InputError, Ints, Reason, reason
 from processor.stitching import common_points
 from processor.stitching.result import ControlPoints, ControlSightings
-
-Bools = npt.NDArray[np.bool_]
 
 CLEAR = 10.0  # least distance from a line in standard deviations; nearer points do not determine the rotation about it
 LEAST_SD_MM = 1e-3  # of a sighting; the covariance would be singular without

@@ -11,7 +11,7 @@ import numpy as np
 
 from processor.model import DesignBodies, Floats, InputError, Ints
 from processor.scan_folder import cad
-from processor.scan_folder.checked_toml import existing_file_in
+from processor.scan_folder.checked_table import existing_file_in
 from processor.scan_folder.files import SCANS, belongs
 from processor.scan_folder.meshes import CAD_SUFFIXES, MESH_SUFFIXES, read_mesh
 

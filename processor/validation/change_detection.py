@@ -35,8 +35,8 @@ from scipy import special, stats
 
 from processor.language.messages import Text, text
 from processor.model import Better, Word
-from processor.validation.badness import Badness, badness
 from processor.validation.history import Name, Row
+from processor.validation.loss import Loss, loss
 
 ALARM_RATE = 0.005  # of a night, for worse and for better each
 SAME = 1e-6  # relative: what another library's rounding may move
@@ -68,7 +68,7 @@ ALARMS = (ChangeKind.REGRESSION, ChangeKind.LOST)
 
 @dataclass(frozen=True)
 class Change:
-    """A figure that changed. ``size``: of its badness, in the median over the cases; ``p`` as the test gave it."""
+    """A figure that changed. ``size``: of its loss, in the median over the cases; ``p`` as the test gave it."""
 
     name: Name
     kind: ChangeKind
@@ -161,7 +161,7 @@ def find(
     """
     series, present = _by_figure(rows, night, worse)
     measures = {
-        name: badness(name[2], figure.unit, Better(figure.better or Better.LOW), aims or {})
+        name: loss(name[2], figure.unit, Better(figure.better or Better.LOW), aims or {})
         for name, figure in series.items()
     }
     tests: list[_Test] = []
@@ -230,11 +230,11 @@ def _by_figure(rows: Sequence[Row], night: str, worse: Mapping[Name, set[str]]) 
 
 # --- on the fixed seeds ---------------------------------------------------------------------------------------------
 
-_Pair = tuple[tuple[str, int], float, float]  # recipe and seed, the difference of badness, its size before
+_Pair = tuple[tuple[str, int], float, float]  # recipe and seed, the difference of loss, its size before
 
 
 def _pairs(
-    figure: _Series, present: _Present, name: Name, measure: Badness
+    figure: _Series, present: _Present, name: Name, measure: Loss
 ) -> tuple[list[_Pair], int, set[tuple[str, int]]]:
     """Pair fixed cells with the last night's; also how many lost their figure, and those whose scene has changed."""
     pairs: list[_Pair] = []
@@ -255,7 +255,7 @@ def _pairs(
     return pairs, lost, scenes
 
 
-def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Badness) -> _Test:
+def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Loss) -> _Test:
     """Test the differences; p is NaN where there are too few."""
     groups: dict[tuple[str, int], list[float]] = defaultdict(list)
     for key, difference, _ in pairs:
@@ -279,7 +279,7 @@ def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Badnes
     return _Test(name, "paired", size, worse, p_better=better, cases=count)
 
 
-def _between_seeds(figure: _Series, measure: Badness) -> tuple[float, int]:
+def _between_seeds(figure: _Series, measure: Loss) -> tuple[float, int]:
     """Return the standard deviation of a case's figures from seed to seed before this night; its degrees of freedom."""
     of_case: dict[str, list[float]] = defaultdict(list)
     for (case, _), row in figure.last.items():
@@ -298,7 +298,7 @@ def _between_seeds(figure: _Series, measure: Badness) -> tuple[float, int]:
 # --- on the seeds of the night --------------------------------------------------------------------------------------
 
 
-def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Badness) -> _Test | None:
+def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Loss) -> _Test | None:
     """Test this night's ranks among the earlier nights', over all cases; None where there is nothing to rank."""
     total, null = 0, np.ones(1)
     offset = 0
@@ -328,8 +328,8 @@ def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Badness) -> _Test
     return _Test(name, "fresh", size, worse, p_better=better, cases=len(sizes))
 
 
-def _mean(measure: Badness, values: Sequence[float]) -> float:
-    """Mean badness of a night's seeds; infinite where a figure could not be measured."""
+def _mean(measure: Loss, values: Sequence[float]) -> float:
+    """Mean loss of a night's seeds; infinite where a figure could not be measured."""
     mean = sum(map(measure.of, values)) / len(values)
     return mean if math.isfinite(mean) else math.inf
 

@@ -47,14 +47,14 @@ def member_ends(nodes: Nodes, members: Members) -> MemberEnds:
     return MemberEnds(start, foot, direction * sign[:, None], members.radii[row])
 
 
-def sleeve_radii_from_tubes(ends: MemberEnds) -> Floats:
+def from_tubes(ends: MemberEnds) -> Floats:
     """Corner radii (m,) of sleeves from the radii of the tubes alone, mm."""
     radii = ends.tube_radii
     guess: Floats = np.where(np.isfinite(radii), SLEEVE_OF_TUBE * radii, SLEEVE_MM)
     return guess
 
 
-def sleeve_radii(ends: MemberEnds, start: Ints, points: Floats, states: Floats, threads: int = 0) -> Floats:
+def estimated(ends: MemberEnds, start: Ints, points: Floats, states: Floats, threads: int = 0) -> Floats:
     """Corner radii (m,) of sleeves from the points (n, 3) just beyond the spheres (k, 4), mm.
 
     The larger of an end's own radius and the median over ends of the same class is taken: masking too much loses a few
@@ -67,7 +67,7 @@ def sleeve_radii(ends: MemberEnds, start: Ints, points: Floats, states: Floats, 
     median_range = partial(_medians, start, points, ends, widest, states, medians, counts)
     over_ranges(median_range, len(states), threads)
     single = np.where(counts >= LEAST_POINTS, medians / MEDIAN_OF_CORNER, np.nan)
-    corner = sleeve_radii_from_tubes(ends)
+    corner = from_tubes(ends)
     classes = np.where(np.isfinite(radii), np.rint(radii / RADIUS_BIN_MM), -1.0)
     for number in np.unique(classes):
         rows = classes == number

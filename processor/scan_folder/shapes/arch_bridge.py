@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.model import ArchDesign, DesignPart, Floats
+from processor.scan_folder.component_names import numbered_backwards
 from processor.scan_folder.shapes import chain as chains
 from processor.scan_folder.shapes.body import Body
 from processor.scan_folder.shapes.bottom_edges import BEVEL_MM, follow, smooth
 from processor.scan_folder.shapes.chain import Chain
-from processor.scan_folder.shapes.end_faces import Contact, PlaneFace
-from processor.scan_folder.shapes.part_names import numbered_backwards
+from processor.scan_folder.shapes.contact_faces import Contact, PlaneFace
 from processor.scan_folder.shapes.sections import STRAIGHT_MM, SectionPlane, corners, key_points, skin_at_end
 
 SAME_MM = 0.5  # between the corners of two ends, and between a corner and the skin's

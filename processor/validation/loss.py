@@ -16,7 +16,7 @@ BIAS_MARGIN = 0.1  # of the size that the figure has
 
 
 @dataclass(frozen=True)
-class Badness:
+class Loss:
     r"""Maps a value to a number ``of`` it that grows as the value gets worse.
 
     Differences up to ``margin`` + ``margin_share`` times the value are not reported. ``is_ratio``: a difference is the
@@ -29,21 +29,21 @@ class Badness:
     is_ratio: bool
 
 
-def badness(name: str, unit: str, better: Better, aims: Mapping[str, str | float]) -> Badness:
+def loss(name: str, unit: str, better: Better, aims: Mapping[str, str | float]) -> Loss:
     """Return how a figure is judged; ``aims`` of the matrix, by name, take precedence over ``better``."""
     aim = aims.get(name, TARGETS.get(better, str(better)))
     if isinstance(aim, int | float):
         if unit == "%":
-            return Badness(lambda v: abs(v - aim), POINTS_MARGIN, 0.0, False)
+            return Loss(lambda v: abs(v - aim), POINTS_MARGIN, 0.0, False)
         if aim > 0.0:
-            return Badness(lambda v: abs(_log(v / aim)), RATIO_MARGIN, 0.0, False)
-        return Badness(lambda v: abs(v - aim), 0.0, BIAS_MARGIN, False)
+            return Loss(lambda v: abs(_log(v / aim)), RATIO_MARGIN, 0.0, False)
+        return Loss(lambda v: abs(v - aim), 0.0, BIAS_MARGIN, False)
     sign = 1.0 if aim == Better.LOW else -1.0
     if unit == "%":
-        return Badness(lambda v: sign * v, POINTS_MARGIN, 0.0, False)
+        return Loss(lambda v: sign * v, POINTS_MARGIN, 0.0, False)
     if unit == "" and aim == Better.LOW:  # numbers of things that should not be, mostly none
-        return Badness(lambda v: v, 0.0, 0.0, False)
-    return Badness(lambda v: sign * _log(v), RATIO_MARGIN, 0.0, True)
+        return Loss(lambda v: v, 0.0, 0.0, False)
+    return Loss(lambda v: sign * _log(v), RATIO_MARGIN, 0.0, True)
 
 
 def _log(value: float) -> float:

@@ -1,9 +1,10 @@
 """Errors that the points of one view have in common, where a merged cloud does not name its views.
 
-They displace surfaces by a smooth field (:mod:`processor.space_frame.spheres.view_field`), whose size the residuals of
-all balls show. A shift of all views together, and an offset of all their ranges, look like places and radii: they are
-stated by the scanner's class. If radii are off their sizes on the mean, this may be an offset of ranges, which moves
-surfaces that are seen from below, or a wide beam, which does not; both are taken to be equally likely.
+They displace surfaces by a smooth field (:mod:`processor.space_frame.spheres.displacement_field`), whose size the
+residuals of all balls show. A shift of all views together, and an offset of all their ranges, look like places and
+radii: they are stated by the scanner's class. If radii are off their sizes on the mean, this may be an offset of
+ranges, which moves surfaces that are seen from below, or a wide beam, which does not; both are taken to be equally
+likely.
 """
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
 from processor.geometry.sphere import sphere_cells
 from processor.model import NORMAL_95, Floats, Ints
 from processor.space_frame.members.records import Members
-from processor.space_frame.spheres.records import CropsWithRays, Fits, Priors, ViewErrors
-from processor.space_frame.spheres.view_field import (
+from processor.space_frame.spheres.displacement_field import (
     BallResiduals,
     ViewField,
     correlation,
@@ -27,6 +27,7 @@ from processor.space_frame.spheres.view_field import (
     field_of,
     modes,
 )
+from processor.space_frame.spheres.records import CropsWithRays, Fits, Priors, ViewErrors
 
 LEAST_POINTS = 30
 LEAST_CELLS = 8

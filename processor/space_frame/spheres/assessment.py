@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import chdtrc
 
 from processor.adjustment.scanner_class import SHIFT_MM
 from processor.geometry.sphere import BANDS, SECTORS
 from processor.limits import standards
-from processor.model import NORMAL_95, Floats, Reason, Tolerance, reason
+from processor.model import NORMAL_95, Bools, Floats, Reason, Tolerance, reason
 from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.members.records import Nodes
 from processor.space_frame.result import Evidence, Flag
@@ -28,8 +27,6 @@ from processor.space_frame.spheres.records import (
     Spheres,
     ViewErrors,
 )
-
-Bools = npt.NDArray[np.bool_]
 
 LEAST_POINTS = 8
 LARGEST_LOWEST_SD_MM = 0.8  # an error of 3 mm is then nearly four standard deviations

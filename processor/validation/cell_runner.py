@@ -18,6 +18,7 @@ from processor.jobs.exit_codes import WITH_RESULTS
 from processor.jobs.process import Cause, Ended
 from processor.results.names import RESULTS_JSON
 from processor.validation.cells import Cell, Origin, Outcome
+from processor.writers import toml
 
 # Runs cells and yields each with its outcome as it comes; closing the generator stops those under way.
 Runner = Callable[[Sequence[Cell]], Generator[tuple[Cell, Outcome], None, None]]
@@ -70,7 +71,7 @@ def _results(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) 
     options = ["--steps", ",".join(spec["steps"])]
     options += ["--method", ",".join(spec["methods"])] if spec["methods"] else []
     if spec["params"]:
-        (folder / "params.toml").write_text(_toml(spec["params"]), "utf-8")
+        (folder / "params.toml").write_text(toml.document(spec["params"]), "utf-8")
         options += ["--params", str(folder / "params.toml")]
     ran = command("processor", "run", str(scene), "-o", str(results), *options)
     if ran.cause is not Cause.EXIT or ran.code not in WITH_RESULTS:
@@ -102,21 +103,6 @@ def _reason(program: str, ended: Ended) -> str:
         return f"{program}: stopped"
     how = f"signal {ended.code} (out of memory?)" if ended.cause is Cause.SIGNAL else f"exit code {ended.code}"
     return f"{program}: {how}: {ended.last_line[:TAIL]}" if ended.last_line else f"{program}: {how}"
-
-
-def _toml(table: dict[str, Any], above: str = "") -> str:
-    """Write parameters as TOML; numbers, texts, truth values and lists are written as in JSON."""
-    values = [f"{_key(k)} = {json.dumps(v, ensure_ascii=False)}" for k, v in table.items() if not isinstance(v, dict)]
-    below = [
-        f"[{above}{_key(key)}]\n{_toml(value, f'{above}{_key(key)}.')}"
-        for key, value in table.items()
-        if isinstance(value, dict)
-    ]
-    return "\n".join([*values, *below]) + "\n"
-
-
-def _key(name: str) -> str:
-    return json.dumps(name, ensure_ascii=False)
 
 
 @contextmanager

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from designgen.designs.patch import Bools
 from designgen.models.model import Model
 from designgen.randomness import generator
 from designgen.scanning import triangle_tree
@@ -22,7 +21,7 @@ from designgen.scanning.scanner import Scanner
 from designgen.scanning.survey import levelled_pose
 from designgen.scanning.triangle_tree import Tree
 from designgen.sequences import in_square
-from processor.model import Floats, InputError
+from processor.model import Bools, Floats, InputError
 
 SAMPLES = 4000  # points of the surface by which candidates are compared
 AROUND, HEIGHTS_DEG = 12, (-30.0, 5.0, 35.0, 65.0)  # directions of candidates from the middle of the box

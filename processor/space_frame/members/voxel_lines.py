@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from processor.model import Floats, Ints
-from processor.space_frame.members.linearity import HALO, SMALL2, WIDE, Linearity, ball, fill, principal
+from processor.space_frame.members.voxel_linearity import HALO, SMALL2, WIDE, Linearity, ball, fill, principal
 from processor.space_frame.points.voxels import SIDE, Voxels
 
 MOST_TURN = np.cos(np.deg2rad(12.0))  # between the axes of two windows of one tube

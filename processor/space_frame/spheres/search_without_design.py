@@ -1,0 +1,81 @@
+"""Spheres searched for in a whole cloud, without a design and without members, and fitted robustly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from processor.geometry.merging import MergedCloud
+from processor.geometry.sphere import Sphere, algebraic, bound
+from processor.model import Status, Tolerance, reason
+from processor.space_frame.params import NAN, Params
+from processor.space_frame.result import Flag, Result
+from processor.space_frame.spheres import sphere_search
+from processor.space_frame.spheres.assessment import LARGEST_SCALE
+from processor.space_frame.spheres.single_fits import Row, as_result, assessed, generator, missing
+
+
+def search(cloud: MergedCloud, params: Params) -> Result:
+    """Search a cloud for spheres that stand out of it by themselves."""
+    radius = None if np.isnan(params.radius_mm) else params.radius_mm
+    least = max(params.min_points, sphere_search.LEAST_POINTS)
+    # fixed: the result must not depend on the seed
+    fixed = generator(replace(params, seed=0), "search")
+    candidates = sphere_search.find_balls(cloud.points, fixed, params.max_balls, least, radius, cloud.scanner)
+    if not candidates:
+        return Result(Status.FAILED, params.method, (reason("spheres.no-ball", points=len(cloud.points)),))
+    rows = [_searched(id_, candidate, cloud, params) for id_, candidate in enumerate(candidates)]
+    messages = [reason("spheres.searched")]
+    if params.method == "least-squares":
+        messages.append(reason("spheres.algebraic-fit"))
+    elif cloud.scanner is None:
+        messages.append(reason("spheres.robust-distances"))
+    else:
+        messages.append(reason("spheres.robust-ranges"))
+    if radius is not None:
+        messages.append(reason("spheres.radius-held", radius=radius))
+    complete = len(candidates) < params.max_balls
+    if not complete:
+        messages.append(reason("spheres.most-balls", balls=len(candidates)))
+    result = as_result(rows, cloud.origin, params, tuple(messages), complete)
+    return _with_bounds(result, rows) if params.method == "ray" else result
+
+
+def _searched(id_: int, candidate: sphere_search.Ball, cloud: MergedCloud, params: Params) -> Row:
+    on = cloud.points[candidate.fit.inliers]
+    sphere: Sphere | None = candidate.fit.sphere
+    if params.method == "least-squares":
+        sphere = algebraic(on)
+    if sphere is None:
+        return missing(id_, NAN, len(on), reason("spheres.no-sphere"))
+    row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
+    times = candidate.fit.scale / sphere_search.flat_noise(cloud.points, sphere.radius)
+    if times > LARGEST_SCALE:
+        row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, reason("spheres.rough", times=times)))
+    if params.method == "least-squares":
+        return row
+    seen_from = None if cloud.scanner is None else cloud.scanner[candidate.fit.inliers]
+    stations = 0 if seen_from is None else len(np.unique(seen_from, axis=0))
+    least = bound(cloud.points, candidate.fit, not np.isnan(params.radius_mm), cloud.scanner)
+    return replace(row, stations=stations, bound=least)
+
+
+def _with_bounds(result: Result, rows: list[Row]) -> Result:
+    """Add the Cramér-Rao bounds of each sphere, and the efficiencies."""
+    balls, bounds = result.balls, np.array([row.bound for row in rows])
+    down = np.array([0.0, 0.0, 1.0, -1.0])
+    variance, least = (np.einsum("kii->ki", C) for C in (balls.covariance, bounds))
+    least_lowest = np.sqrt(np.einsum("i,kij,j->k", down, bounds, down))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        centre = np.sqrt(least[:, :3].sum(axis=1) / variance[:, :3].sum(axis=1))
+        efficiency = np.stack([centre, np.sqrt(least[:, 3] / variance[:, 3]), least_lowest / balls.lowest_sd], axis=1)
+    balls = replace(
+        balls,
+        sizes=np.full(len(rows), NAN),
+        axes=np.zeros(len(rows), np.int64),
+        stations=np.array([row.stations for row in rows], np.int64),
+        bound_sd=np.column_stack([np.sqrt(least), least_lowest]),
+        efficiency=efficiency,
+    )
+    return replace(result, balls=balls)
