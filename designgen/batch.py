@@ -53,7 +53,7 @@ def make_scene(path: Path, name: str, recipe: recipe_files.Recipe, seed: int | N
 
     from designgen.scenes import make
     from processor.store import store
-    from processor.store.writable import check_file
+    from processor.store.output_checks import check_file
 
     check_file(path)
     # The last bits of BLAS results depend on the number of threads.

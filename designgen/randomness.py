@@ -6,7 +6,7 @@ import hashlib
 
 import numpy as np
 
-from designgen.frames import rigid
+from designgen.rigid import rigid
 from processor.model import Floats
 
 POSE_REACH_MM = 5000.0  # largest offset of a scan's frame along each axis

@@ -76,7 +76,7 @@ LONGEST_TEXT = 1 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class Meaning:
-    """What the values of a field must be beyond type and shape; :mod:`processor.meaning` checks it where data come in.
+    """What the values of a field must be beyond type and shape; :mod:`processor.record_checks` checks it at input.
 
     Numbers: ``finite``, else NaN stands for unknown; from ``least`` to ``most``, beyond ``above``; ``rows_of`` names
     what they are row numbers of, from ``lowest_row`` on (-1 = none). Names and numbers: ``among`` names the values
@@ -494,8 +494,8 @@ class Limit(Checked):
 
     ``low_ratio`` and ``high_ratio`` are multiples of the size named by ``of``; by ``rule`` the smaller of number and
     multiple counts, or their sum. The row is for sizes above ``above_mm`` up to ``up_to_mm``. ``measure`` is what of a
-    joint is held against it: misalignment | groove_gap | eccentricity; or of a whole chain: span | unit_length |
-    inner_arc | lateral_axis | elevation; or another of ``processor/limits/measures.py``; or "part " and a
+    joint is compared with it: misalignment | groove_gap | eccentricity; or of a whole chain: span | unit_length |
+    inner_arc | lateral_axis | elevation; or another of ``processor/limits/measurands.py``; or "part " and a
     quantity of step inspect; or nothing. ``component`` is a pattern of the names of those that a project gives it for,
     None of all.
     """
@@ -513,7 +513,7 @@ class Limit(Checked):
     up_to_mm: float = described(float("nan"), means=Meaning(least=0.0))
     measure: str = ""
     clause: str = described("", means=LONG)
-    verified: bool = False  # the number was held against the published text
+    verified: bool = False  # the number was compared with the published text
     source: str = described("", means=LONG)
     component: str | None = newer()
 
@@ -526,12 +526,12 @@ class Limit(Checked):
 
 @dataclass(frozen=True)
 class Tolerance(Checked):
-    """The limits that results are held against: those of a standard, of the project, or both (the project's win)."""
+    """The limits that results are compared with: those of a standard, of the project, or both (the project's win)."""
 
     standard: str = ""
     edition: str = described("", means=LONG)
     limits: tuple[Limit, ...] = ()
-    # between two ends as assembled, by the design; their gap is held against it
+    # between two ends as assembled, by the design; their gap is compared with it
     root_gap_mm: float = described(0.0, means=PLACE)
 
 

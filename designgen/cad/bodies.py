@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from designgen.cad.forms import Forms
+from designgen.cad.face_surfaces import Forms
 from processor.model import Floats, InputError, Ints
 
 TESSELLATION_MM = 0.05  # deviation aimed at

@@ -11,16 +11,16 @@ from OCP.GeomAbs import GeomAbs_CurveType, GeomAbs_SurfaceType
 from OCP.GeomConvert import GeomConvert
 from OCP.TopAbs import TopAbs_REVERSED
 
-from designgen.cad import forms
-from designgen.cad.forms import Form, Forms
+from designgen.cad import face_surfaces
+from designgen.cad.face_surfaces import Form, Forms
 from designgen.cad.tessellation import merged, meshes
 from processor.model import Floats, Ints
 
 QUADRICS = {
-    GeomAbs_SurfaceType.GeomAbs_Cylinder: (forms.CYLINDER, "Cylinder", ("Radius",)),
-    GeomAbs_SurfaceType.GeomAbs_Cone: (forms.CONE, "Cone", ("RefRadius", "SemiAngle")),
-    GeomAbs_SurfaceType.GeomAbs_Sphere: (forms.SPHERE, "Sphere", ("Radius",)),
-    GeomAbs_SurfaceType.GeomAbs_Torus: (forms.TORUS, "Torus", ("MajorRadius", "MinorRadius")),
+    GeomAbs_SurfaceType.GeomAbs_Cylinder: (face_surfaces.CYLINDER, "Cylinder", ("Radius",)),
+    GeomAbs_SurfaceType.GeomAbs_Cone: (face_surfaces.CONE, "Cone", ("RefRadius", "SemiAngle")),
+    GeomAbs_SurfaceType.GeomAbs_Sphere: (face_surfaces.SPHERE, "Sphere", ("Radius",)),
+    GeomAbs_SurfaceType.GeomAbs_Torus: (face_surfaces.TORUS, "Torus", ("MajorRadius", "MinorRadius")),
 }
 # Straight in one direction: the number of triangles is that of the points on the edges.
 FEW_TRIANGLES = (
@@ -51,7 +51,7 @@ def facets_and_forms(shape: Any, name_of: NameOf) -> tuple[Floats, Ints, float, 
         form = _form(face, name_of(face) or f"face {row + 1}")
         at = np.array([mesh.UVNode(i).Coord() for i in nodes], np.float64) if mesh.HasUVNodes() else None
         if at is None:
-            form = Form(form.name, forms.FACETS, np.empty(0))
+            form = Form(form.name, face_surfaces.FACETS, np.empty(0))
         points.append(of_face)
         triangles.append(corners - 1 + count)
         uv.append(np.zeros((len(corners), 3, 2)) if at is None else at.reshape(-1, 2)[corners - 1])
@@ -68,7 +68,7 @@ def facets_and_forms(shape: Any, name_of: NameOf) -> tuple[Floats, Ints, float, 
 def is_meshed_finer(face: Any) -> bool:
     """Return whether a face is to have a finer mesh: it takes few triangles, or its triangles are its form."""
     kind = BRepAdaptor_Surface(face).GetType()
-    return kind in FEW_TRIANGLES or _form(face, "").kind == forms.FACETS
+    return kind in FEW_TRIANGLES or _form(face, "").kind == face_surfaces.FACETS
 
 
 def _form(face: Any, name: str) -> Form:
@@ -76,25 +76,25 @@ def _form(face: Any, name: str) -> Form:
     surface = BRepAdaptor_Surface(face)
     kind = surface.GetType()
     if kind == GeomAbs_SurfaceType.GeomAbs_Plane:
-        return Form(name, forms.PLANE, _frame(surface.Plane().Position()))
+        return Form(name, face_surfaces.PLANE, _frame(surface.Plane().Position()))
     if kind in QUADRICS:
         said, getter, sizes = QUADRICS[kind]
         quadric = getattr(surface, getter)()
         return Form(name, said, np.array([*_frame(quadric.Position()), *(getattr(quadric, size)() for size in sizes)]))
     if kind == GeomAbs_SurfaceType.GeomAbs_BSplineSurface:
-        return Form(name, forms.SPLINE, _spline(surface.BSpline()))
+        return Form(name, face_surfaces.SPLINE, _spline(surface.BSpline()))
     if kind == GeomAbs_SurfaceType.GeomAbs_BezierSurface:
-        return Form(name, forms.SPLINE, _spline(GeomConvert.SurfaceToBSplineSurface_s(surface.Bezier())))
+        return Form(name, face_surfaces.SPLINE, _spline(GeomConvert.SurfaceToBSplineSurface_s(surface.Bezier())))
     if kind == GeomAbs_SurfaceType.GeomAbs_SurfaceOfExtrusion:
         curve = _curve(surface.BasisCurve())
         if curve is not None:
-            return Form(name, forms.EXTRUSION, np.array([*surface.Direction().Coord(), *curve]))
+            return Form(name, face_surfaces.EXTRUSION, np.array([*surface.Direction().Coord(), *curve]))
     if kind == GeomAbs_SurfaceType.GeomAbs_SurfaceOfRevolution:
         axis, curve = surface.AxeOfRevolution(), _curve(surface.BasisCurve())
         if curve is not None:
             numbers = [*axis.Location().Coord(), *axis.Direction().Coord(), *curve]
-            return Form(name, forms.REVOLUTION, np.array(numbers))
-    return Form(name, forms.FACETS, np.empty(0))
+            return Form(name, face_surfaces.REVOLUTION, np.array(numbers))
+    return Form(name, face_surfaces.FACETS, np.empty(0))
 
 
 def _frame(position: Any) -> Floats:
@@ -107,7 +107,7 @@ def _sequence(array: Any) -> list[float]:
 
 
 def _spline(surface: Any) -> Floats:
-    """Return the numbers of a spline surface, see :func:`designgen.cad.forms._spline_surface`."""
+    """Return the numbers of a spline surface, see :func:`designgen.cad.face_surfaces._spline_surface`."""
     surface = surface.Copy()
     if surface.IsUPeriodic():
         surface.SetUNotPeriodic()
@@ -126,18 +126,18 @@ def _spline(surface: Any) -> Floats:
 
 
 def _curve(adaptor: Any) -> list[float] | None:
-    """Return the numbers of a curve, see :func:`designgen.cad.forms._curve`; None for one without a formula here."""
+    """Return the numbers of a curve, see :func:`designgen.cad.face_surfaces._curve`; None without a formula."""
     kind = adaptor.GetType()
     if kind == GeomAbs_CurveType.GeomAbs_Line:
         line = adaptor.Line()
-        return [forms.LINE, *line.Location().Coord(), *line.Direction().Coord()]
+        return [face_surfaces.LINE, *line.Location().Coord(), *line.Direction().Coord()]
     if kind in (GeomAbs_CurveType.GeomAbs_Circle, GeomAbs_CurveType.GeomAbs_Ellipse):
         circle = kind == GeomAbs_CurveType.GeomAbs_Circle
         conic = adaptor.Circle() if circle else adaptor.Ellipse()
         radii = (conic.Radius(), conic.Radius()) if circle else (conic.MajorRadius(), conic.MinorRadius())
         directions = (conic.Position().XDirection(), conic.Position().YDirection())
         axes = [radius * c for radius, unit in zip(radii, directions, strict=True) for c in unit.Coord()]
-        return [forms.ELLIPSE, *conic.Location().Coord(), *axes]
+        return [face_surfaces.ELLIPSE, *conic.Location().Coord(), *axes]
     if kind in (GeomAbs_CurveType.GeomAbs_BSplineCurve, GeomAbs_CurveType.GeomAbs_BezierCurve):
         if kind == GeomAbs_CurveType.GeomAbs_BSplineCurve:
             spline = adaptor.BSpline().Copy()
@@ -151,5 +151,5 @@ def _curve(adaptor: Any) -> list[float] | None:
             for i in range(1, spline.NbPoles() + 1)
             for c in (*(spline.Weight(i) * x for x in spline.Pole(i).Coord()), spline.Weight(i))
         ]
-        return [forms.CURVE, float(spline.Degree()), float(len(knots)), *knots, *poles]
+        return [face_surfaces.CURVE, float(spline.Degree()), float(len(knots)), *knots, *poles]
     return None

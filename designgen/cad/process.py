@@ -18,7 +18,7 @@ from typing import IO, Any
 import numpy as np
 
 from designgen.cad.bodies import Body, CadFile
-from designgen.cad.forms import Form, Forms, surface_of
+from designgen.cad.face_surfaces import Form, Forms, surface_of
 from processor.jobs.child import end_with_parent
 from processor.model import InputError, UsageError
 

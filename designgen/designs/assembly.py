@@ -12,7 +12,7 @@ from designgen.designs import prismatic, sections
 from designgen.designs.patch import Patch
 from designgen.designs.prismatic import End, Part
 from designgen.designs.sections import Section
-from designgen.frames import rigid
+from designgen.rigid import rigid
 from processor.model import Floats
 
 ABOUT = "assembly of box or I girders: a row, a node with three branches, two ribs with bracing"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from designgen.designs.patch import Patch, Surface
-from designgen.frames import perpendicular
+from designgen.rigid import perpendicular
 from processor.model import Bools, Floats
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 
 from designgen.checks import expect_all
 from designgen.designs import bolt_ball
-from designgen.frames import perpendicular
+from designgen.rigid import perpendicular
 from processor.model import Floats, Ints, UsageError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any
 
 from designgen.designs import plate_row, stadium_roof, truss_bridge
 from designgen.designs.box_and_tube import Component
-from designgen.reading import filled
+from designgen.recipe_params import filled
 from processor.model import UsageError
 
 TYPES: dict[Any, ModuleType] = {"stadium-roof": stadium_roof, "truss-bridge": truss_bridge, "plate-row": plate_row}

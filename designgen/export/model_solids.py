@@ -11,7 +11,7 @@ import numpy as np
 from designgen.cad import files
 from designgen.models import as_built, cadquery_objects, loading
 from designgen.models.model import Model, ModelBody
-from designgen.reading import filled
+from designgen.recipe_params import filled
 from designgen.scenes.model import Params, part_solid
 from processor.model import UsageError
 

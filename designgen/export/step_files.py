@@ -14,7 +14,7 @@ from designgen.designs import arch_bridge, arch_part, arch_ring, box_and_tube, s
 from designgen.export import model_solids
 from designgen.models import as_built
 from designgen.randomness import generator
-from designgen.reading import filled
+from designgen.recipe_params import filled
 from processor.model import UsageError
 from processor.store.atomic_file import replacing
 

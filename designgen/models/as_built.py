@@ -20,7 +20,7 @@ from designgen.designs.patch import Displacement, Surface
 from designgen.models.model import Model, ModelBody
 from designgen.models.subdivision import Spacing, subdivided
 from designgen.randomness import generator
-from designgen.reading import filled
+from designgen.recipe_params import filled
 from designgen.scanning import triangle_tree
 from designgen.scanning.station_placement import spread
 from processor.model import AsBuilt, BodyTruth, Bools, DefectTruth, Floats, StructureTruth, UsageError

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from designgen.cad.bodies import Body
-from designgen.cad.forms import PLANE, surface_of
+from designgen.cad.face_surfaces import PLANE, surface_of
 from designgen.designs.patch import Surface, Trimmed
 from processor.model import DesignBodies, Floats, Ints
 

@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from designgen.frames import inverse
 from designgen.randomness import generator
+from designgen.rigid import inverse
 from designgen.scanning import edge_footprints, ray_kernels, raycast
 from designgen.scanning.ray_kernels import Strip
 from designgen.scanning.raycast import Grid, View

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from designgen.reading import filled
+from designgen.recipe_params import filled
 from designgen.scanning import sampler, scanner
 from processor.model import UsageError
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from designgen.low_discrepancy import in_square
 from designgen.models.model import Model
 from designgen.randomness import generator
 from designgen.scanning import triangle_tree
@@ -20,7 +21,6 @@ from designgen.scanning.returns import LOWEST_DEG
 from designgen.scanning.scanner import Scanner
 from designgen.scanning.survey import levelled_pose
 from designgen.scanning.triangle_tree import Tree
-from designgen.sequences import in_square
 from processor.model import Bools, Floats, InputError
 
 SAMPLES = 4000  # points of the surface by which candidates are compared

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from designgen.designs.patch import Patch, Trimmed, within_triangle
+from designgen.low_discrepancy import in_square
 from designgen.scanning import triangle_tree
 from designgen.scanning.triangle_tree import Tree
-from designgen.sequences import in_square
 from processor.model import Floats, Ints, Labels
 
 SPHERE, CONE, DISC, TRIANGLE = range(4)

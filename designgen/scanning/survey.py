@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from designgen.frames import perpendicular, rigid, translation
+from designgen.low_discrepancy import in_square, on_sphere
 from designgen.randomness import generator, small_motion
+from designgen.rigid import perpendicular, rigid, translation
 from designgen.scanning import returns, scanner
 from designgen.scanning.surfaces import Surfaces
-from designgen.sequences import in_square, on_sphere
 from processor.model import Floats, PointLabels, Scan, Shorts, Stations, StationTruth
 
 OF_ONE_MM = 4_000.0  # width of the area on which stations stand below a ball or a row of balls

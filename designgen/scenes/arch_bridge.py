@@ -11,9 +11,9 @@ import numpy as np
 from designgen.asbuilt import imperfections
 from designgen.designs import arch_bridge, arch_mesh, arch_part, arch_ring
 from designgen.designs.patch import Surface
-from designgen.frames import inverse, rigid
 from designgen.randomness import generator, random_pose
-from designgen.reading import filled
+from designgen.recipe_params import filled
+from designgen.rigid import inverse, rigid
 from designgen.scanning import clutter, sampler, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder

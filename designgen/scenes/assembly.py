@@ -12,9 +12,9 @@ from designgen.asbuilt.imperfections import Ledger
 from designgen.checks import expect
 from designgen.designs import assembly as design_of
 from designgen.designs.prismatic import EndErrors, Part
-from designgen.frames import inverse
 from designgen.randomness import generator, random_pose
-from designgen.reading import filled
+from designgen.recipe_params import filled
+from designgen.rigid import inverse
 from designgen.scanning import sampler
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scenes import MADE_IN_MM

@@ -10,8 +10,8 @@ import numpy as np
 from designgen.asbuilt import imperfections
 from designgen.designs import space_frame
 from designgen.randomness import generator
-from designgen.reading import filled
-from designgen.scanning import clutter, frame_surfaces, sampler, survey
+from designgen.recipe_params import filled
+from designgen.scanning import clutter, sampler, space_frame_surfaces, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
@@ -32,7 +32,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         params = scanning.params
         origin = np.array(params.origin_mm)
         builder = Builder()
-        frame_surfaces.add_frame(builder, built)
+        space_frame_surfaces.add_frame(builder, built)
         low, high = built.centres.min(axis=0), built.centres.max(axis=0)
         clutter.add_below_roof(builder, low, high, params.clutter, generator(seed, "clutter"))
         poses = survey.stations_below_box(low, high, params, seed)

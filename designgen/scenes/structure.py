@@ -13,13 +13,13 @@ from designgen.asbuilt import defects as asbuilt_defects
 from designgen.asbuilt import imperfections
 from designgen.designs import box_and_tube, plate_row, structure_registry
 from designgen.designs.patch import Displacement, Patch
+from designgen.low_discrepancy import van_der_corput
 from designgen.randomness import generator
-from designgen.reading import filled
+from designgen.recipe_params import filled
 from designgen.scanning import clutter, picking, sampler, scanner, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
-from designgen.sequences import van_der_corput
 from processor.model import (
     AsBuilt,
     Bools,

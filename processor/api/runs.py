@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from processor import meaning, pipeline
+from processor import pipeline, record_checks
 from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
@@ -17,7 +17,7 @@ from processor.model import LONGEST_NAME, Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
 from processor.report import headline, write_results
-from processor.results.names import RESULTS_H5
+from processor.results.file_names import RESULTS_H5
 from processor.scan_folder import files, fingerprint
 from processor.store import store
 
@@ -127,7 +127,7 @@ def run(
     wanted, methods, parameters = _names(steps), _names(method), _parameters(params)
     out = None if output is None else Path(output)
     if isinstance(input_, Scene):
-        meaning.check(input_, f"scene {input_.name[:LONGEST_NAME]!r}")
+        record_checks.check(input_, f"scene {input_.name[:LONGEST_NAME]!r}")
         return _run_scene(input_, out, pipeline.jobs_for(input_, wanted, methods, parameters, seed), lang, log)
     path = files.existing(Path(input_))
     if out is not None:

@@ -26,10 +26,10 @@ from processor.jobs.child import Loss, Lost
 from processor.jobs.runner import StoppedError
 from processor.language.messages import messages
 from processor.model import InputError, UsageError, reason
-from processor.results.names import JOB_RECORD
+from processor.results.file_names import JOB_RECORD
 from processor.scan_folder.files import missing
 from processor.store.atomic_file import replace_text
-from processor.store.writable import check_folder
+from processor.store.output_checks import check_folder
 
 LOGS = "logs"
 LONGEST_NAME = 240  # bytes of a file's name, with room for prefix and suffix

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from processor import readers
 from processor.model import Reason, reason
-from processor.results.names import RESULTS_H5, RESULTS_JSON
+from processor.results.file_names import RESULTS_H5, RESULTS_JSON
 from processor.scan_folder.files import DESIGNS, NOT_SCANS, PROJECT, SCANS, TRUTH
 
 MARKS = (PROJECT, *DESIGNS)

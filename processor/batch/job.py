@@ -26,7 +26,7 @@ from processor.jobs.process import Cause
 from processor.jobs.software import OtherSoftwareError, check_same, source_digest, versions
 from processor.language.messages import messages, printable
 from processor.model import InputError, Reason, reason
-from processor.results.names import FORMAT, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
+from processor.results.file_names import FORMAT, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
 from processor.scan_folder import fingerprint
 from processor.store.atomic_file import sync
 from processor.version import __version__

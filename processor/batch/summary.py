@@ -21,7 +21,7 @@ from processor.language.messages import Text, label, messages, printable, text
 from processor.model import InputError, Reason, Status, Verdict
 from processor.report import templates
 from processor.report.table import csv_of_rows
-from processor.results.names import REPORT_PAGE
+from processor.results.file_names import REPORT_PAGE
 from processor.store.atomic_file import replace_text
 
 CSV, JSON, PAGE, TIMINGS = "summary.csv", "summary.json", "index.html", "timings.csv"

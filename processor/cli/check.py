@@ -11,7 +11,7 @@ import click
 from processor.cli.common import debug_option
 from processor.jobs.exit_codes import DONE, LIMIT_MISSED
 from processor.model import InputError, Metric, Statistic
-from processor.results.names import FORMAT, RESULTS_JSON
+from processor.results.file_names import FORMAT, RESULTS_JSON
 
 
 @click.command()

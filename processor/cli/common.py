@@ -132,7 +132,7 @@ def show_results(
 ) -> None:
     """Print what was found, the headline first, and set the exit code; why a step failed is for standard error."""
     from processor.report import headline, terminal
-    from processor.results.names import REPORT_PAGE, RESULTS_JSON
+    from processor.results.file_names import REPORT_PAGE, RESULTS_JSON
 
     page = str(output / REPORT_PAGE)
     log_line(headline.of_run(results.execution))

@@ -12,7 +12,7 @@ from processor.jobs import process
 from processor.jobs.exit_codes import ENDED_BY_LIMIT, WITH_RESULTS
 from processor.jobs.process import Cause, Ended
 from processor.model import InputError
-from processor.results.names import RESULTS_H5
+from processor.results.file_names import RESULTS_H5
 
 MORE = "raise --timeout-s or --memory-mb, or run fewer --steps"
 

@@ -38,7 +38,7 @@ def report(
     from processor.api import runs
     from processor.evaluation.evaluate import evaluate
     from processor.report import write_results
-    from processor.results.names import RESULTS_H5
+    from processor.results.file_names import RESULTS_H5
 
     further = forms(options.pop("pdf"), options.pop("xlsx"))
     write_results.check_output(output, input_, RESULTS_H5)

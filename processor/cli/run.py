@@ -24,7 +24,7 @@ from processor.cli.common import (
 )
 from processor.cli.help_text import RunCommand
 from processor.model import UsageError
-from processor.results.names import RESULTS_JSON
+from processor.results.file_names import RESULTS_JSON
 
 
 @click.command(cls=RunCommand)
@@ -36,7 +36,7 @@ from processor.results.names import RESULTS_JSON
 @click.option(
     "--method", "methods", callback=split_names, metavar="NAME[,NAME]", help="further ones are run for comparison"
 )
-@click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, a table a step")
+@click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, one table per step")
 @click.option("--units", type=click.Choice(UNITS), help="unit of the scans' coordinates, whatever the format states")
 @click.option("--seed", type=click.IntRange(min=0), help="seed of all randomness  [default: 0, or the parameters']")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")

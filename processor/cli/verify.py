@@ -58,7 +58,7 @@ def verify(context: click.Context, path: Path, as_json: bool) -> None:
 
 def _looked_at(path: Path) -> Iterator[_Found]:
     from processor.batch import record
-    from processor.results.names import JOB_RECORD, RESULTS_JSON
+    from processor.results.file_names import JOB_RECORD, RESULTS_JSON
     from processor.scan_folder import fingerprint
     from processor.store import store
 

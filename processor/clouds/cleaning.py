@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
+from processor import scene_cloud
 from processor.clouds import poses, slabs
+from processor.clouds.earlier_run import Run
 from processor.clouds.poses import Placed
-from processor.clouds.run import Run
 from processor.deviation.measure import REACH_MM
-from processor.geometry import merging, mesh_distance, neighbors, rigid
+from processor.geometry import mesh_distance, neighbors, rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Bools, Floats
 from processor.writers.cloud import Block, Cloud
@@ -148,7 +149,7 @@ def of_structure(run: Run) -> DesignSurfaces | None:
     result = run.steps.get("deviation")
     if run.scene.structure is None or result is None or not result.T_design_scan.size:
         return None
-    vertices, _ = merging.local_design(run.scene.structure)
+    vertices, _ = scene_cloud.local_design(run.scene.structure)
     depth = result.max_depth if np.isfinite(result.max_depth) else REACH_MM
     return DesignSurfaces(mesh_distance.of_design(vertices, run.scene.structure.faces), depth)
 
@@ -169,7 +170,7 @@ def filters(run: Run, scans: Sequence[Placed]) -> list[OfDesign | None]:
     """
     structure = of_structure(run)
     if structure is not None and run.scene.structure is not None:
-        origin = merging.local_design(run.scene.structure)[1]
+        origin = scene_cloud.local_design(run.scene.structure)[1]
         T = run.steps["deviation"].T_design_scan
         return [structure.marks(one.to_local(T @ one.T, origin)) for one in scans]
     if "preassemble" not in run.steps:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from processor.clouds import CONTENTS, FORMATS, cleaning, contents, poses, scan_folder
-from processor.clouds import run as runs
+from processor.clouds import CONTENTS, FORMATS, cleaning, exported_clouds, poses, scan_folder
+from processor.clouds import earlier_run as runs
 from processor.clouds.cleaning import Removed
+from processor.clouds.earlier_run import Run
 from processor.clouds.poses import Placed, Poses
-from processor.clouds.run import Run
 from processor.clouds.thinning import thinned
 from processor.model import Reason, UsageError, reason
 from processor.pipeline import Execution
@@ -111,7 +111,11 @@ def _opened(
 def _write(run: Run, content: _Content, target: tuple[Path, Path], names: tuple[str, str]) -> Exported:
     """Write the files of a content into a folder that is still being made."""
     (folder, making), (what, format_) = target, names
-    bright = contents.brightest(run, [placed.number for placed in content.scans]) if format_ in ("las", "laz") else 0.0
+    bright = (
+        exported_clouds.brightest(run, [placed.number for placed in content.scans])
+        if format_ in ("las", "laz")
+        else 0.0
+    )
     files = {}
     for stem, cloud in tracked(list(content.clouds.items())):
         name = f"{stem}.{format_}"
@@ -122,7 +126,7 @@ def _write(run: Run, content: _Content, target: tuple[Path, Path], names: tuple[
         scan_folder.write(making, run, content.scans, list(files), what, format_)
     remarks = list(content.remarks)
     if format_ == "e57":
-        lost = tuple(one.scan.name for one in content.scans if contents.has_stations(run, one))
+        lost = tuple(one.scan.name for one in content.scans if exported_clouds.has_stations(run, one))
         remarks += [reason("export.stations-lost", scans=lost)] if lost else []
     for stem, removed in content.removed.items():
         if not removed.compared:
@@ -137,7 +141,9 @@ def _registered(run: Run, aside: Path) -> _Content:
 
 def _scans(run: Run, placed: Poses) -> _Content:
     stems = project.stems([one.scan for one in placed.scans])
-    clouds = {f"{SCANS}/{stem}": contents.scan_cloud(run, one) for stem, one in zip(stems, placed.scans, strict=True)}
+    clouds = {
+        f"{SCANS}/{stem}": exported_clouds.scan_cloud(run, one) for stem, one in zip(stems, placed.scans, strict=True)
+    }
     return _Content(clouds, placed.scans, placed.remarks, "frame of the scan")
 
 
@@ -153,19 +159,21 @@ def _clean(run: Run, aside: Path) -> _Content:
 
 def _merged(run: Run, aside: Path) -> _Content:
     placed = poses.in_project(run, "merged")
-    cloud = contents.merged_cloud(run, placed.scans)
+    cloud = exported_clouds.merged_cloud(run, placed.scans)
     return _Content({"merged": cloud}, placed.scans, placed.remarks, "frame of the project")
 
 
 def _assembled(run: Run, aside: Path) -> _Content:
     placed = poses.in_bridge(run)
     stems = project.stems([replace(one.scan, name=one.component) for one in placed.scans])
-    clouds = {f"{SCANS}/{stem}": contents.part_cloud(run, one) for stem, one in zip(stems, placed.scans, strict=True)}
+    clouds = {
+        f"{SCANS}/{stem}": exported_clouds.part_cloud(run, one) for stem, one in zip(stems, placed.scans, strict=True)
+    }
     return _Content(clouds, placed.scans, placed.remarks, "frame of the bridge")
 
 
 def _deviation(run: Run, aside: Path) -> _Content:
-    return _Content({"deviation": contents.core_cloud(run)}, frame="frame of the design")
+    return _Content({"deviation": exported_clouds.core_cloud(run)}, frame="frame of the design")
 
 
 CONTENT_OF: dict[str, Callable[[Run, Path], _Content]] = {

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from processor.clouds.run import Run
+from processor.clouds.earlier_run import Run
 from processor.geometry import rigid
 from processor.model import Floats, InputError, Reason, Scan, Status, UsageError, reason
 from processor.preassembly.assemble import REFERENCE_C
 from processor.preassembly.parts.systematic_errors import EXPANSION_PER_K
-from processor.stitching import frames
+from processor.stitching import pose_covariance
 
 UNPLACED = (Status.FAILED, Status.AMBIGUOUS)  # of a scan: its pose may be wrong
 
@@ -94,10 +94,10 @@ def _stitched(run: Run, what: str) -> Poses:
             continue
         if status != Status.OK:
             remarks.append(reason("export.scan-doubtful", scan=scan.name, status=status))
-        scale = frames.scale_of(T) if run.parameters["stitch"].get("scale") == "free" else 1.0
+        scale = pose_covariance.scale_of(T) if run.parameters["stitch"].get("scale") == "free" else 1.0
         if scale != 1.0:
             remarks.append(reason("export.scan-scaled", scan=scan.name, scale=scale))
-        pose = rigid.transform(frames.rotation_of(T) if scale != 1.0 else T[:3, :3], T[:3, 3])
+        pose = rigid.transform(pose_covariance.rotation_of(T) if scale != 1.0 else T[:3, :3], T[:3, 3])
         placed.append(Placed(number, scan, pose, scale))
     if not placed:
         raise InputError(f"{run.name}: step stitch placed no scan, so there is nothing to export as {what}")

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from processor.clouds import contents
+from processor.clouds import exported_clouds
+from processor.clouds.earlier_run import Run
 from processor.clouds.poses import Placed
-from processor.clouds.run import Run
 from processor.language.messages import spreadsheet_text
 from processor.model import Control, Floats, Picks, Scan, Stations, Tolerance
 from processor.scan_folder import picks as picks_table
@@ -37,10 +37,10 @@ def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str],
         lines.append(f"temperature_C = {scene.temperature_C!r}")
     lines += _tolerance(scene.tolerance)
     if what == "merged":
-        stations = contents.stations_of(run, scans)
+        stations = exported_clouds.stations_of(run, scans)
         lines += ["", "[[scan]]", f"file = {as_toml(files[0])}", *_common_noise(scans)]
     else:
-        stations = contents.stations_moved(run, scans)
+        stations = exported_clouds.stations_moved(run, scans)
         for one, file in zip(scans, files, strict=True):
             written = _as_written(one, what)
             lines += ["", "[[scan]]", f"file = {as_toml(file)}"]

@@ -18,13 +18,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from processor.defects import pictures
+from processor import scene_cloud
+from processor.defects import defect_grids
+from processor.defects.defect_grids import MOST_PLACES
 from processor.defects.params import Paper, Params
-from processor.defects.pictures import MOST_PLACES
 from processor.defects.result import DefectClass, Result, SurfacePlaces
 from processor.defects.surface_charts import of_mesh
 from processor.defects.to_result import table
-from processor.geometry import icp, merging, mesh_distance, pfh, rigid
+from processor.geometry import icp, mesh_distance, pfh, rigid
 from processor.geometry.neighbors import surface_spacing, voxel_means
 from processor.model import NORMAL_95, Floats, Ints, Scene, Status, StructureDesign, reason
 
@@ -62,8 +63,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     """Find the defects of a structure as in paper 004."""
     paper = params.paper
     assert scene.structure is not None
-    vertices, origin = merging.local_design(scene.structure)
-    cloud = merging.merged(merging.stitched(scene, earlier.get("stitch")), with_scanner=False)
+    vertices, origin = scene_cloud.local_design(scene.structure)
+    cloud = scene_cloud.merged(scene_cloud.stitched(scene, earlier.get("stitch")), with_scanner=False)
     size, points = _thinned(cloud.points + (cloud.origin - origin), paper)
     radius = paper.cluster_radius_mm or RADIUS_VOXELS * size
     label = density_clusters(points, radius, paper.cluster_points)
@@ -169,7 +170,7 @@ def _rows(deviations: Deviations, size: float, paper: Paper) -> Iterator[dict[st
             "z": abs(deepest) / max(deviations.sigma, 1e-12),
             "chance": np.nan,
             "reasons": (),
-            "deflection": pictures.by_slopes(along, distance, strips),
+            "deflection": defect_grids.by_slopes(along, distance, strips),
         }
 
 

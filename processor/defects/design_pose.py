@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from processor import scene_cloud
 from processor.defects.params import Params
-from processor.geometry import merging, mesh_distance, rigid, surface_registration
+from processor.geometry import mesh_distance, rigid, surface_registration
 from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Reason, Scene, Status, reason
 
@@ -48,10 +49,10 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
         return DesignPose(before.T_design_scan, error, (source,))
     error = params.registration_error_mm if math.isfinite(params.registration_error_mm) else DEFAULT_ERROR_MM
     assert scene.structure is not None
-    cloud = merging.merged(scene, with_scanner=False)
-    if len(cloud.points) < merging.FEWEST_POINTS:
+    cloud = scene_cloud.merged(scene, with_scanner=False)
+    if len(cloud.points) < scene_cloud.FEWEST_POINTS:
         return DesignPose(None, error, (reason("defects.too-few-points"),))
-    vertices, origin = merging.local_design(scene.structure)
+    vertices, origin = scene_cloud.local_design(scene.structure)
     few = cloud.points[:: max(1, len(cloud.points) // SAMPLE)]
     given = rigid.transform(np.eye(3), cloud.origin - origin)
     surface = mesh_distance.of_design(vertices, scene.structure.faces)

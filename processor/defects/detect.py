@@ -9,21 +9,22 @@ from typing import Any
 
 import numpy as np
 
+from processor import scene_cloud
 from processor.adjustment import scanner_class
 from processor.defects import (
     alignment,
     component_shapes,
     design_pose,
     deviation_field,
+    expected_points,
     measures,
-    missing_material,
     observations,
     regions,
     scan_statistic,
     surface_charts,
     to_result,
 )
-from processor.defects.absence import contacts, exposure
+from processor.defects.absence import holes, missing_bodies
 from processor.defects.alignment import Alignment
 from processor.defects.component_shapes import ComponentShape
 from processor.defects.deviation_field import Field
@@ -33,7 +34,7 @@ from processor.defects.params import Params
 from processor.defects.regions import Region
 from processor.defects.result import Result
 from processor.defects.surface_charts import DesignSurface
-from processor.geometry import merging, mesh_distance, rigid
+from processor.geometry import mesh_distance, rigid
 from processor.model import DesignBodies, Floats, InputError, Ints, Reason, Scene, Status, StructureDesign, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
@@ -62,8 +63,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     design = scene.structure
     if design is None or not len(design.faces):
         raise InputError(f"{scene.name}: defects need the structure's design (a mesh or STEP in project.toml)")
-    vertices, origin = merging.local_design(design)
-    scene = merging.stitched(scene, earlier.get("stitch"))
+    vertices, origin = scene_cloud.local_design(design)
+    scene = scene_cloud.stitched(scene, earlier.get("stitch"))
     pose = design_pose.pose(scene, earlier, params)
     if pose.T_design_project is None:
         return Result(status=Status.FAILED, method=params.method, reasons=pose.reasons)
@@ -98,7 +99,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         reasons=(
             *pose.reasons,
             *_of_names(design.bodies),
-            *merging.design_faults(design),
+            *scene_cloud.design_faults(design),
             *_of_views(search),
             *result.reasons,
         ),
@@ -169,7 +170,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     shape_values = component_shapes.values(surface, shapes, chosen)
     residuals = field.less(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
     finding = scan_statistic.search(residuals, surface, levels)
-    expected = missing_material.expected(scene, registered.T_design_project, pairs, surface, observed.stations)
+    expected = expected_points.expected(scene, registered.T_design_project, pairs, surface, observed.stations)
     missing = regions.missing(field, expected, surface, alarms_per_mm2)
     missing += _inferred(scene, registered, field, missing, alarms_per_mm2)
     deviating = regions.of_finding(finding, surface)
@@ -200,11 +201,11 @@ def _inferred(
     gone: list[Region] = []
     if registered.observed.stations.unnamed:
         hidden = surface_charts.hidden(surface)
-        gone = contacts.of_bodies(registered.observed, field, surface, hidden, alarms_per_mm2)
+        gone = missing_bodies.of_bodies(registered.observed, field, surface, hidden, alarms_per_mm2)
     points = _sample(scene, registered.T_design_project)
     known = {cell for region in missing + gone for cell in region.cells.tolist()}
-    holes = exposure.holes(field, surface, points, alarms_per_mm2)
-    return gone + [region for region in holes if known.isdisjoint(region.cells.tolist())]
+    cut = holes.holes(field, surface, points, alarms_per_mm2)
+    return gone + [region for region in cut if known.isdisjoint(region.cells.tolist())]
 
 
 def _sample(scene: Scene, T_design_project: Floats) -> Floats:

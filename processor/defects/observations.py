@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from processor.adjustment import foreground
+from processor.adjustment import mixed_pixels
 from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import FacetGrid
@@ -136,7 +136,7 @@ def _of_scan(
             rows = station_of[on] == k
             of_face = surface.normals[facet[on[rows]]], deviation[on[rows]], chart[rows]
             every = points[station_of == k], every_chart[station_of == k]
-            mixed[rows] |= foreground.beside(points[on[rows]], positions[k], *of_face, every)
+            mixed[rows] |= mixed_pixels.beside(points[on[rows]], positions[k], *of_face, every)
     return chart, layout(surface.charts, chart, points[on]), station_of[on], deviation[on], mixed
 
 
@@ -154,7 +154,7 @@ def _at_outline(surface: DesignSurface, facet: Ints, points: Floats, scanners: F
     across /= np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None]
     off = np.abs(np.einsum("ni,ni->n", arm, across))
     is_convex = np.einsum("ni,ni->n", arm, surface.normals[facet[rows]]) > 0.0
-    marked[rows] = is_convex & (off > charts.radius[chart] - foreground.HALF_BEAM_MM)
+    marked[rows] = is_convex & (off > charts.radius[chart] - mixed_pixels.HALF_BEAM_MM)
     return marked
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from processor.defects.classes import CRACK_RATIO
+from processor.defects.classification import CRACK_RATIO
 from processor.defects.deviation_field import Field
 from processor.defects.scan_statistic import Finding
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface

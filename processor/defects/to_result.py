@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from processor.adjustment.finite_median import finite_median
-from processor.defects import classes, measures, pictures
+from processor.defects import classification, defect_grids, measures
 from processor.defects.alignment import Alignment
-from processor.defects.classes import Classification
+from processor.defects.classification import Classification
 from processor.defects.component_shapes import ComponentShape, SignificantShape, cells_of_shape, with_corners
 from processor.defects.deviation_field import Field
 from processor.defects.measures import CellPoints, Measures
@@ -95,8 +95,8 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
         expected_mm2=float(surface.share[search.expected > 0.0].sum()) * cell**2,
         least_depth=_least_depth(search.levels, cell, noise, finite_median(field.count[seen]), field.views),
         defects=table([defect.values for defect in defects], origin, doubt),
-        pictures=pictures.of_defects(drawn, surface),
-        surface=pictures.of_surface([defect.cells for defect in defects], field, surface, origin),
+        pictures=defect_grids.of_defects(drawn, surface),
+        surface=defect_grids.of_surface([defect.cells for defect in defects], field, surface, origin),
     )
 
 
@@ -117,7 +117,7 @@ def table(rows: Sequence[dict[str, Any]], origin: Floats, doubt: Reason | None =
     columns["doubtful"] = np.array(columns["chance"]) > DOUBTFUL
     if doubt is not None:
         columns["doubtful"] = np.ones(len(rows), bool)
-        columns["confidence"] = np.minimum(columns["confidence"], classes.COIN)
+        columns["confidence"] = np.minimum(columns["confidence"], classification.COIN)
         columns["reasons"] = tuple((*of_row, doubt) for of_row in columns["reasons"])
     return Defects(id=np.arange(len(rows)), **columns)
 
@@ -196,7 +196,7 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
         inward, outward = (float(np.maximum(way * value, 0.0) @ area) for way in (-1.0, 1.0))
         volume = inward if inward >= outward else -outward
     values = _row(
-        classes.of_shape(kind, judged.margin),
+        classification.of_shape(kind, judged.margin),
         surface.names[component],
         centre=surface.centres[rows[part]].mean(axis=0),
         axes=frame.axes,
@@ -217,7 +217,7 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
     if kind == "bend" and len(seen):
         along = frame.local(surface.centres[seen])[:, int(judged.shape.at[0])]
         bent = search.residuals.deviation[seen] + value[np.searchsorted(rows, seen)]
-        values["deflection"] = pictures.by_strips(along, bent, search.field.variance[seen], CURVE_STRIPS)
+        values["deflection"] = defect_grids.by_strips(along, bent, search.field.variance[seen], CURVE_STRIPS)
     return Defect(values=values, component=component, cells=rows[part], field=search.field)
 
 
@@ -290,7 +290,7 @@ def _wave(lobes: list[Defect]) -> Defect:
     values = deepest.values | sums | {
         "defect_class": DefectClass.WAVINESS,
         "otherwise": deepest.values["defect_class"],
-        "confidence": max(deepest.values["confidence"], classes.BORDER_CONFIDENCE),
+        "confidence": max(deepest.values["confidence"], classification.BORDER_CONFIDENCE),
         "centre": 0.5 * (centres[0] + centres[-1]),
         "axes": np.stack([along, np.cross(outward, along), outward]),
         "extent": np.array([np.linalg.norm(span) + 2.0 * half, max(max(lobe.values["extent"]) for lobe in lobes)]),
@@ -321,15 +321,15 @@ def _place_values(
     length, width = float(measured.extent[0]), float(measured.extent[1])
     reasons: tuple[Reason, ...] = ()
     if region.sign == 0:
-        classification = classes.of_missing(measured.borders, length, width, assumed, region.z)
+        chosen = classification.of_missing(measured.borders, length, width, assumed, region.z)
         if not np.isfinite(thickness):
             reasons = (reason("defects.no-thickness"),)
     else:
         if abs(measured.depth) < SHALLOW_SHARE * amplitude:
             return None
         stayed = other_side.stayed(search.residuals, surface, region.cells) if region.sign < 0 else np.nan
-        classification = classes.of_deviation(region.sign, measured.diameter, length, width, assumed, region.z, stayed)
-        crack = classification.defect_class is DefectClass.CRACK
+        chosen = classification.of_deviation(region.sign, measured.diameter, length, width, assumed, region.z, stayed)
+        crack = chosen.defect_class is DefectClass.CRACK
         if measured.diameter < SMALL_CELLS * cell and not crack:
             measured = measures.refined(measured, region, search.points, search.field, search.shape_values, inflation)
         if not abs(measured.depth) > measured.lod95:
@@ -337,10 +337,8 @@ def _place_values(
         if crack:
             measured, reasons = _crack_depth(search, region, measured, thickness)
         else:
-            classification, measured, reasons = _by_profile(
-                search, region, measured, classification, assumed, inflation, claimed
-            )
-    return _row_of(measured, classification, surface.names[component], region, reasons)
+            chosen, measured, reasons = _by_profile(search, region, measured, chosen, assumed, inflation, claimed)
+    return _row_of(measured, chosen, surface.names[component], region, reasons)
 
 
 def _row_of(
@@ -372,7 +370,7 @@ def _by_profile(
     search: Search,
     region: Region,
     measured: Measures,
-    classification: Classification,
+    chosen: Classification,
     thickness: float,
     inflation: float,
     claimed: Bools,
@@ -381,15 +379,15 @@ def _by_profile(
     cells = measures.cells_about(region, search.residuals, search.surface, claimed)
     fitted = None if cells is None else profiles.fit(cells, region.sign)
     if fitted is None or fitted.profile is Profile.BUMP:
-        return classification, measured, ()
+        return chosen, measured, ()
     place, outward = measured.centre, measured.axes[2]
     registration = measures.registration_sd(search.alignment, search.residuals, place, outward, region.cells)
     measured = dataclasses.replace(
         measured, depth=-fitted.depth, depth_ci95=NORMAL_95 * float(np.hypot(fitted.sd * inflation, registration))
     )
-    classification = classes.of_profile(fitted, thickness, classification)
-    is_crack = classification.defect_class is DefectClass.CRACK
-    return classification, measured, (reason("defects.depth-bound"),) if is_crack else ()
+    by_profile = classification.of_profile(fitted, thickness, chosen)
+    is_crack = by_profile.defect_class is DefectClass.CRACK
+    return by_profile, measured, (reason("defects.depth-bound"),) if is_crack else ()
 
 
 def _crack_depth(

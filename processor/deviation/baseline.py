@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from processor.adjustment.groups import group_means
-from processor.deviation import cloud, to_result
+from processor.deviation import cloud, result_fields
 from processor.deviation import measure as deviation_measure
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Params
@@ -59,7 +59,7 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
         status = Status.AMBIGUOUS if status is Status.OK else status
         reasons.append(reason("deviation.paper-ambiguous", ratio=ambiguity))
     used = known if (known := distances.std2[np.isfinite(distances.lod95)]).size else np.array([NAN])
-    points = to_result.core_points(core, normals, distances)
+    points = result_fields.core_points(core, normals, distances)
     how = {"none": Registration.AS_GIVEN, "fine": Registration.FINE}.get(params.register, Registration.COARSE)
     return Result(
         status=status,
@@ -79,7 +79,7 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
         max_depth=preset.max_depth_mm,
         origin=origin,
         core=points,
-        **to_result.statistics(points, total),
+        **result_fields.statistics(points, total),
     )
 
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from processor.geometry import merging, neighbors
+from processor import scene_cloud
+from processor.geometry import neighbors
 from processor.model import Floats, InputError, Ints, Scene
 
 MOST_POINTS = 3_000_000  # of a scan; more are thinned evenly
@@ -60,12 +61,12 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
 
     Raises InputError for too few points.
     """
-    whole, scene = scene, merging.stitched(scene, stitched)
+    whole, scene = scene, scene_cloud.stitched(scene, stitched)
     unposed = sum(not scan.T_project_scan.size for scan in scene.scans)
-    cloud = merging.merged(scene, with_scanner=True)
-    if len(cloud.points) < merging.FEWEST_POINTS:
+    cloud = scene_cloud.merged(scene, with_scanner=True)
+    if len(cloud.points) < scene_cloud.FEWEST_POINTS:
         raise InputError(
-            f"{scene.name}: expected a scan of {merging.FEWEST_POINTS} points or more, got {len(cloud.points)}"
+            f"{scene.name}: expected a scan of {scene_cloud.FEWEST_POINTS} points or more, got {len(cloud.points)}"
         )
     grid = neighbors.of_spacing(cloud.points)
     spacing = neighbors.spacing(grid)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import opposite_sides, scanner_class
-from processor.deviation import common_errors, stable_fit, surface_movement, to_result
+from processor.deviation import mean_uncertainty, result_fields, stable_fit, surface_movement
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
@@ -206,7 +206,7 @@ def _result(
 ) -> Result:
     core = measured.core
     total = m3c2.summary(distance, core.points, core.normals, measured.diameter, m3c2.PAPER_POINTS_A_CYLINDER)
-    points = to_result.core_points(core.points, core.normals, distance)
+    points = result_fields.core_points(core.points, core.normals, distance)
     if not fits.determined and placed.registration is Registration.AS_GIVEN:
         best = _shifted(scan, placed.T, placed.T_best_fit)
     else:
@@ -249,7 +249,7 @@ def _result(
         origin=origin,
         core=points,
         mean_ci95=total.mean + m3c2.Z95 * mean_sd * np.array([-1.0, 1.0]),
-        **to_result.statistics(points, total),
+        **result_fields.statistics(points, total),
     )
 
 
@@ -264,7 +264,7 @@ def _uncertainty(
     covariance = covariance + common if registered else covariance
     of_pose = covariance if registered and np.isfinite(covariance).all() else common
     overlap = stable_fit.overlap(measured.diameter, measured.spacing)
-    return covariance, common_errors.mean_sd(scan, placed.T, core, measured.moved, of_pose, overlap)
+    return covariance, mean_uncertainty.mean_sd(scan, placed.T, core, measured.moved, of_pose, overlap)
 
 
 def _of_views(scan: ScanCloud, placed: Placed, measured: Measured) -> Iterator[Reason]:

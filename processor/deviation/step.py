@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from processor import scene_cloud
 from processor.deviation import baseline, cloud, measure, verdicts
 from processor.deviation.params import METHODS, Params
 from processor.deviation.result import Result
-from processor.geometry import merging
 from processor.model import InputError, Scene, Status, UsageError, reason
 
 __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "run"]
@@ -41,11 +41,11 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
             f"{scene.name}: deviation needs a design, a mesh named by 'design' in project.toml; without one, "
             "processor compare holds one scan against another"
         )
-    vertices, origin = merging.local_design(scene.structure)
+    vertices, origin = scene_cloud.local_design(scene.structure)
     scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio, (earlier or {}).get("stitch"))
     method = baseline.measure if params.method == "paper" else measure.measure
     result = method(scene, scan, vertices, origin, params)
-    result = replace(result, reasons=(*result.reasons, *merging.design_faults(scene.structure)))
+    result = replace(result, reasons=(*result.reasons, *scene_cloud.design_faults(scene.structure)))
     if scan.unplaced:
         first = reason("deviation.scans-unplaced", scans=", ".join(scan.unplaced))
         status = Status.WEAK if result.status is Status.OK else result.status

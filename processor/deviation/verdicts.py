@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from processor.deviation.result import ErrorSource, Result
 from processor.geometry import mesh_distance
-from processor.limits import judging, measures, standards
+from processor.limits import judging, measurands, standards
 from processor.limits.judging import Comparison, JudgedLimits, Measured
 from processor.model import NORMAL_95, WORST_FIRST, Bools, Floats, Ints, Limit, Scene, Status, StructureDesign
 
@@ -29,17 +29,17 @@ def judge(scene: Scene, result: Result, vertices: Floats, origin: Floats) -> Jud
     ``vertices`` (v, 3) are those of the design less ``origin`` (3,).
     """
     tolerance = standards.default_for(scene.tolerance)
-    if scene.structure is None or not any(limit.measure == measures.DEVIATION for limit in tolerance.limits):
+    if scene.structure is None or not any(limit.measure == measurands.DEVIATION for limit in tolerance.limits):
         return None
     unsure = result.status in (Status.FAILED, Status.AMBIGUOUS)
     unsure |= result.registration_error_from is ErrorSource.UNKNOWN
     rows: list[Comparison] = []
     for name, of_it in _components(result, scene.structure, vertices, origin).items():
-        shares = judging.limits_for(tolerance, measures.DEVIATION_SHARE, name)
+        shares = judging.limits_for(tolerance, measurands.DEVIATION_SHARE, name)
         core = result.core
         values, half = core.distance[of_it], core.lod95[of_it]
         known = np.isfinite(values) & np.isfinite(half)
-        for limit in judging.limits_for(tolerance, measures.DEVIATION, name):
+        for limit in judging.limits_for(tolerance, measurands.DEVIATION, name):
             if shares:
                 rows.append(judging.compare(shares[0], _share(name, values[known], half[known], limit, unsure)))
             else:

@@ -1,4 +1,4 @@
-"""Deviations held against a movement that is known: at each core point, that of the nearest points of the truth."""
+"""Deviations compared with a movement that is known: at each core point, that of the nearest points of the truth."""
 
 from __future__ import annotations
 

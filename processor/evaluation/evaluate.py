@@ -1,4 +1,4 @@
-"""Results held against the truth. The only reader of truth."""
+"""Results compared with the truth. The only reader of truth."""
 
 from __future__ import annotations
 

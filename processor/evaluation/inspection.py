@@ -1,4 +1,4 @@
-"""Characteristics of parts held against those of the parts as built.
+"""Characteristics of parts compared with those of the parts as built.
 
 Those of a bridge's part follow from its true key points and bottom edges, those of a body from the true displacements
 of its faces.
@@ -10,8 +10,9 @@ from collections import defaultdict
 
 import numpy as np
 
+from processor import scene_cloud
 from processor.evaluation.error_statistics import covered
-from processor.geometry import merging, mesh_distance
+from processor.geometry import mesh_distance
 from processor.geometry.polyline import Polyline
 from processor.inspection import flat_faces, part_geometry, structure_bodies
 from processor.inspection.arch_parts import design_ends
@@ -102,7 +103,7 @@ def _of_bodies(design: StructureDesign, truth: StructureTruth) -> dict[str, dict
 
     Of flatness there is none, as points of the truth are not dense enough.
     """
-    vertices, origin = merging.local_design(design)
+    vertices, origin = scene_cloud.local_design(design)
     surface = mesh_distance.of_design(vertices, design.faces)
     facet, _, beyond = surface.distances(truth.points - origin, REACH_MM)
     on = mesh_distance.on_face(facet, beyond) & (np.einsum("ni,ni->n", surface.normals[facet], truth.normals) > ALIKE)

@@ -17,7 +17,7 @@ from processor.evaluation.error_statistics import covered, covered_pulls, pose_p
 from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
 from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Status, Truth
-from processor.preassembly import errors, topology
+from processor.preassembly import assembly_errors, topology
 from processor.preassembly.chain.adjustment import HOLD
 from processor.preassembly.chain.span_and_closure import design_span
 from processor.preassembly.ends.joint_frame import joint_frame
@@ -348,7 +348,9 @@ def _at_chainages(edge: Floats, line: Polyline) -> Floats:
 
 def _chainages(line: Polyline) -> Floats:
     """Chainages of the linear error along one edge of a part."""
-    return np.asarray(errors.INTERVAL_MM * (np.arange(max(1, int(line.length / errors.INTERVAL_MM))) + 0.5))
+    return np.asarray(
+        assembly_errors.INTERVAL_MM * (np.arange(max(1, int(line.length / assembly_errors.INTERVAL_MM))) + 0.5)
+    )
 
 
 def _true_linear_error(

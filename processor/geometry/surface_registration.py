@@ -1,8 +1,8 @@
 """Registration of a scan to the surface of its design: coarse by principal axes, then fine by least squares.
 
 The fine registration needs a pose that is right to a few millimetres; see :mod:`processor.geometry.principal` for the
-search from any pose, and :mod:`processor.geometry.attitude` for the choice between the attitudes of a nearly symmetric
-structure. :func:`place` decides which of these a scan needs.
+search from any pose, and :mod:`processor.geometry.pose_choice` for the choice between the attitudes of a nearly
+symmetric structure. :func:`place` decides which of these a scan needs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.geometry import attitude, icp, mesh_distance, principal, rigid
+from processor.geometry import icp, mesh_distance, pose_choice, principal, rigid
 from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
 from processor.geometry.neighbors import thinned, voxel_means
 from processor.geometry.principal import CoarsePose, PrincipalAxes
@@ -233,7 +233,7 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
         poses = _attitudes(even(points), surface, axes)
         starts = [T for error, T in poses if error <= PROMISING * poses[0][0]]
         fits = [fine(few, surface, axes.axes, start) for start in starts]
-        choice = attitude.choose(points, surface, [fit.T_design_scan for fit in fits], scanner)
+        choice = pose_choice.choose(points, surface, [fit.T_design_scan for fit in fits], scanner)
         start, fitted = starts[choice.best], fits[choice.best]
         rivals = [fits[k].T_design_scan for k in choice.rivals]
         others = [error for k, (error, _) in enumerate(poses) if k != choice.best]
@@ -314,7 +314,7 @@ def _surely_turned(
             fits.append(fine(few, surface, axes.axes, T))
             turned_back.append(rigid.invert(turn) @ fits[-1].T_design_scan)
     poses = [*(fit.T_design_scan for fit in fits), given.T_design_scan, *turned_back]
-    choice = attitude.choose(points, surface, poses, scanner)
+    choice = pose_choice.choose(points, surface, poses, scanner)
     if choice.best >= len(fits) or any(rival >= len(fits) for rival in choice.rivals):
         return []
     return [fits[choice.best], *(fits[rival] for rival in choice.rivals)]

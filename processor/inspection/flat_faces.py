@@ -16,8 +16,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from processor import scene_cloud
 from processor.adjustment import groups, scanner_class
-from processor.geometry import merging, mesh_distance
+from processor.geometry import mesh_distance
 from processor.model import Floats, Ints, StructureDesign
 
 NORMALS, OFFSETS_MM = 1e-3, 0.5  # by which facets of one flat face may differ
@@ -99,7 +100,7 @@ class Observed(NamedTuple):
 
 def observed(design: StructureDesign, result: Any) -> Observed | None:
     """Return what a ``result`` of step ``deviation`` states of a design; None where its places are of another one."""
-    vertices, _ = merging.local_design(design)
+    vertices, _ = scene_cloud.local_design(design)
     core = result.core
     at = mesh_distance.spread(vertices, design.faces, lambda _: len(core))
     if not np.allclose(at.points, core.points, rtol=0.0, atol=SAME_PLACE_MM):
@@ -126,7 +127,7 @@ def bodies(design: StructureDesign, seen: Observed, least_mm: float) -> Iterator
 
     Faces narrower than ``least_mm`` are among those as designed, and without pieces.
     """
-    vertices, _ = merging.local_design(design)
+    vertices, _ = scene_cloud.local_design(design)
     names, of_facet = _bodies(design, vertices)
     cross, double = mesh_distance.double_areas(vertices, design.faces)
     normals = cross / np.maximum(double, 1e-12)[:, None]

@@ -14,7 +14,7 @@ from functools import lru_cache
 from importlib import resources
 from typing import Any
 
-from processor.limits import measures
+from processor.limits import measurands
 from processor.model import Floats, InputError, Limit, Tolerance, did_you_mean
 
 if sys.version_info >= (3, 11):
@@ -24,8 +24,8 @@ else:
 
 DEFAULT = "GB 50205-2020"
 NAN = float("nan")
-NODE_PLACE = measures.NODE_PLACE
-OF_PROJECTS = measures.of_projects()
+NODE_PLACE = measurands.NODE_PLACE
+OF_PROJECTS = measurands.of_projects()
 NOT_OF_LIMITS = ("class", "needs")  # keys of rows that are no fields of a limit
 PART = "part "  # before the quantity of step inspect, in ``Limit.measure`` of what is compared with a single part
 

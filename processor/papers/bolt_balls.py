@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from processor.geometry.merging import merged
 from processor.geometry.neighbors import nearest_crops
 from processor.geometry.sphere import algebraic, ransac
 from processor.language.messages import Text, text
@@ -18,6 +17,7 @@ from processor.model import Floats, FrameDesign, Reason, reason
 from processor.papers.charts import Chart
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Row, Rule
+from processor.scene_cloud import merged
 from processor.space_frame import step
 from processor.space_frame.params import Params
 from processor.store import store

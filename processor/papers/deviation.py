@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from processor import scene_cloud
 from processor.adjustment.groups import group_means
 from processor.deviation import baseline, cloud, step
 from processor.deviation.params import Params
 from processor.deviation.result import Result
-from processor.geometry import merging, mesh_distance, rigid
+from processor.geometry import mesh_distance, rigid
 from processor.geometry.neighbors import thinned
 from processor.language.messages import Text, text
 from processor.model import Floats, Reason, reason
@@ -51,7 +52,7 @@ def measure(path: Path, data_set: DataSet) -> Measured:
     scene = store.read_scene(path)
     assert scene.structure is not None
     params = Params(method="paper", register="fine", seed=data_set.seed)
-    vertices, origin = merging.local_design(scene.structure)
+    vertices, origin = scene_cloud.local_design(scene.structure)
     scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio)
     group = cloud.adaptive_voxels(scan.points, params.paper.voxel_mm, params.paper.voxel_points)
     source = thinned(group_means(scan.points, group) + (scan.origin - origin), baseline.MOST_ICP_POINTS)

@@ -13,7 +13,7 @@ import numpy as np
 from processor.limits import standards
 from processor.model import ArchDesign, Bools, Floats, Scan, Scene, Tolerance
 from processor.preassembly import to_result, topology
-from processor.preassembly.chain import adjustment, edge_errors, loop_closure, placement, span_and_closure
+from processor.preassembly.chain import adjustment, bottom_edge_departures, loop_closure, placement, span_and_closure
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
@@ -25,7 +25,7 @@ from processor.preassembly.parts.systematic_errors import EXPANSION_PER_K
 from processor.preassembly.result import Result
 from processor.preassembly.to_result import Assembly, JudgedJoint
 from processor.preassembly.verdicts import chain as chain_verdicts
-from processor.preassembly.verdicts import joint_measures, joints, reasons, trim_and_shim
+from processor.preassembly.verdicts import joint_measures, joints, reasons, trim_and_build_up
 from processor.preassembly.verdicts.joints import Conformity
 from processor.progress import tracked
 
@@ -57,7 +57,7 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         adjusted=adjusted,
         trade_off={weight: curve[weight] for weight in TRADE_OFF},
         placement=placed,
-        edges=edge_errors.along_bridge(parts, adjusted, design),
+        edges=bottom_edge_departures.along_bridge(parts, adjusted, design),
         figures=figures,
         loops=loop_closure.measure([part.member for part in parts], design, frames),
         joints=_judge_joints(parts, placed.gaps, adjusted, design, frames, limits, params.trim),
@@ -100,7 +100,7 @@ def _judge_joints(
         left, right = (parts[side.part] for side in sides)
         doubts, weak = reasons.of_joint(parts, sides), reasons.weak_parts(left, right)
         conformity = joints.left_open(joints.judge(measures, limits), doubts)
-        proposal = trim_and_shim.propose(measures, limits, trim, doubts=doubts, weak_parts=weak)
+        proposal = trim_and_build_up.propose(measures, limits, trim, doubts=doubts, weak_parts=weak)
         judged.append(JudgedJoint(measures, conformity, proposal))
     return judged
 

@@ -32,7 +32,7 @@ from processor.model import (
 from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.verdicts.joint_measures import Measures
 from processor.preassembly.verdicts.joints import Conformity
-from processor.preassembly.verdicts.trim_and_shim import Proposal
+from processor.preassembly.verdicts.trim_and_build_up import Proposal
 
 NAN = float("nan")
 MEAN_MAX = ("mean", "max")

@@ -54,7 +54,7 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
         )
     several = [part.name for part, of_part in zip(design.parts, scans, strict=True) if len(of_part) > 1]
     if several:
-        raise InputError(f"{scene.name}: method {params.method} takes one scan a part, {several[0]} has several")
+        raise InputError(f"{scene.name}: method {params.method} takes one scan per part, {several[0]} has several")
     kept = {} if kept is None else kept
     if "parts" not in kept:
         kept["parts"] = methods.extract([of_part[0] for of_part in scans], design, params)

@@ -11,13 +11,13 @@ import numpy as np
 from processor.geometry.polyline import Polyline
 from processor.model import NORMAL_95, ArchDesign, Bools, Floats, Reason, Tolerance, reason
 from processor.preassembly import topology
+from processor.preassembly.assembly_errors import mean_max, splicing_error
 from processor.preassembly.chain.adjustment import Adjusted
-from processor.preassembly.chain.edge_errors import EdgeErrors
+from processor.preassembly.chain.bottom_edge_departures import EdgeErrors
 from processor.preassembly.chain.placement import Placement
 from processor.preassembly.chain.span_and_closure import Figures, mean_max_ci95
-from processor.preassembly.errors import mean_max, splicing_error
 from processor.preassembly.params import Params, SystematicParams
-from processor.preassembly.parts import shape, systematic_errors
+from processor.preassembly.parts import part_covariance, systematic_errors
 from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.result import (
     Adjustment,
@@ -42,7 +42,7 @@ from processor.preassembly.verdicts.chain import unused_limits
 from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
 from processor.preassembly.verdicts.joints import Conformity, LimitOrigin
 from processor.preassembly.verdicts.reasons import of_assignment
-from processor.preassembly.verdicts.trim_and_shim import Proposal
+from processor.preassembly.verdicts.trim_and_build_up import Proposal
 
 
 class JudgedJoint(NamedTuple):
@@ -217,7 +217,9 @@ def _shapes(parts: Sequence[MeasuredPart], design: ArchDesign) -> Iterator[PartS
     joined = design.joined
     for index, part in enumerate(parts):
         ends = topology.ends_of(joined, index)
-        measured = shape.measured(part, [None if end.joint is None else design.joint_points[end.joint] for end in ends])
+        measured = part_covariance.measured(
+            part, [None if end.joint is None else design.joint_points[end.joint] for end in ends]
+        )
         edges = part.member.edges
         yield PartShape(
             name=part.name,

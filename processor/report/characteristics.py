@@ -1,4 +1,4 @@
-"""The table of characteristics: quantities held against limits, with nominal, actual value and verdict."""
+"""The table of characteristics: quantities compared with limits, with nominal, actual value and verdict."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NOTE = text(
 
 @dataclass(frozen=True, kw_only=True)
 class Characteristic:
-    """A quantity held against limits: ``deviation`` = actual - nominal, allowed from ``lower`` to ``upper``; NaN: none.
+    """One quantity compared with limits: ``deviation`` (actual - nominal), allowed from ``lower`` to ``upper``; NaN none.
 
     ``limit_from`` says where the limit is from, and whether it was checked against the standard's text.
     """
@@ -93,7 +93,7 @@ def told(found: Iterable[Characteristic]) -> Message:
     """Say how many characteristics have which verdict, and name the first of the worst."""
     ordered = sorted(found, key=lambda one: ORDER.get(one.verdict, len(ORDER)))
     if not ordered:
-        return text("Nothing here was held against limits.")
+        return text("Nothing was compared with limits.")
     worst = ordered[0].verdict
     of_worst = [one for one in ordered if one.verdict is worst]
     if worst is Verdict.PASS:

@@ -197,7 +197,7 @@ def _sections(
 def _section(
     execution: Execution, run: StepRun, others: list[StepRun], report: ErrorReport, lang: str
 ) -> dict[str, Any]:
-    """Return the tables of a step: what is held against limits, what to look at first, the others, and further ones."""
+    """Return the tables of a step: what is compared with limits, what to look at first, the others, and more."""
     report_of = step_report(run.step)
     tables = [table for table in all_tables.tables_of_step(run, others, report) if table.on_page]
     if run.result.status == Status.FAILED:

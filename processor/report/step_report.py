@@ -33,7 +33,7 @@ class StepReport:
     limits: Callable[[Any], Iterable[Any]] = lambda _: ()
     # Headings and texts beside the verdict, each with a verdict of its own where it has one.
     further_verdicts: Callable[[Any], Sequence[tuple[Any, Any] | tuple[Any, Any, Verdict]]] = lambda _: []
-    characteristics: Callable[[Scene, StepRun], list[Any]] = lambda *_: []  # what is held against limits
+    characteristics: Callable[[Scene, StepRun], list[Any]] = lambda *_: []  # what is compared with limits
     characteristics_note: str | Message = ""
     own_table: bool = False  # whether the step's own tables list the characteristics
     live_figures: tuple[str, ...] = ()  # file names of the pictures that the live figures show as well

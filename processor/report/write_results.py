@@ -9,15 +9,15 @@ from pathlib import Path
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import UsageError
 from processor.pipeline import Execution
-from processor.report import all_figures, all_tables, document, headline, page, workbook
+from processor.report import all_figures, all_tables, headline, page, pdf, workbook
 from processor.report import table as report_table
 from processor.report.step_report import step_report
 from processor.report.style import default_settings
-from processor.results.names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
+from processor.results.file_names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
 from processor.results.to_json import results_json
 from processor.store import store
+from processor.store.output_checks import check_folder
 from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
-from processor.store.writable import check_folder
 
 # The record of a batch's job is replaced with its results: without it, the batch does the job again.
 OWN_NAMES = (RESULTS_JSON, RESULTS_H5, REPORT_PAGE, FIGURES, JOB_RECORD)
@@ -70,6 +70,6 @@ def write_results(
         write_text(making / REPORT_PAGE, page.html(execution, report, drawn, lang))
         if "pdf" in further:
             with default_settings():
-                write_bytes(making / document.NAME, document.document(execution, drawn))
+                write_bytes(making / pdf.NAME, pdf.document(execution, drawn))
         if "xlsx" in further:
             write_bytes(making / workbook.NAME, workbook.workbook(execution, report))

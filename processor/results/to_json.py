@@ -8,7 +8,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.model import Scene, StepRun, worst
 from processor.pipeline import Execution
 from processor.results.fields_to_json import as_object
-from processor.results.names import FORMAT, FORMAT_VERSION
+from processor.results.file_names import FORMAT, FORMAT_VERSION
 from processor.store.json_values import json_ready
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from processor import meaning, readers, store
+from processor import readers, record_checks, store
 from processor.model import (
     KINDS,
     ArchDesign,
@@ -134,7 +134,7 @@ def read_input(path: Path, units: str | None = None, keep: Keep = as_read) -> Sc
         return _read_folder(path, option, keep)
     if path.suffix.lower() == ".h5":
         return store.read_scene(path)
-    return meaning.check(_scene(_Project(scan_name(path), (_Entry(path),)), None, option, keep=keep), str(path))
+    return record_checks.check(_scene(_Project(scan_name(path), (_Entry(path),)), None, option, keep=keep), str(path))
 
 
 def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
@@ -149,7 +149,7 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
             design = StructureDesign(scan_name(project.design), vertices, faces, bodies, found)
         else:
             design = read_design(folder, project.design, unit)
-        meaning.check(design, str(project.design))  # before scans are compared with it
+        record_checks.check(design, str(project.design))  # before scans are compared with it
     check_components(str(folder / PROJECT), project.tolerance, _component_names(design))
     scene = _scene(project, design, option, _read_stations(folder, project.units or option or "m"), keep)
     if scene.structure is not None and project.design is not None and project.design.suffix.lower() in MESH_SUFFIXES:
@@ -164,7 +164,7 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
         ("arch", "frame", "structure"), str(project.design.relative_to(folder) if project.design else PROJECT)
     )
     files |= dict.fromkeys(("tolerance", "temperature_C", "name"), PROJECT)
-    return meaning.check(scene, str(folder), {field: str(folder / file) for field, file in files.items()})
+    return record_checks.check(scene, str(folder), {field: str(folder / file) for field, file in files.items()})
 
 
 def _with_picks(folder: Path, scene: Scene) -> Scene:
@@ -253,7 +253,7 @@ def _guess(folder: Path) -> Guess | None:
 def _entry(folder: Path, scan: Table) -> _Entry:
     scan.only(SCAN_KEYS)
     pose = scan.array("pose", 4, 4) if "pose" in scan.values else None
-    if pose is not None and not meaning.are_poses(pose[None])[0]:
+    if pose is not None and not record_checks.are_poses(pose[None])[0]:
         raise InputError(
             f"{scan.where}: 'pose' is not a rotation and a translation above a row of 0, 0, 0, 1; correct the matrix"
         )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from processor.limits import measures, standards
+from processor.limits import measurands, standards
 from processor.model import Floats, InputError, Limit, Tolerance, did_you_mean
 from processor.scan_folder.checked_table import Table
 from processor.scan_folder.files import PROJECT
@@ -15,7 +15,7 @@ from processor.scan_folder.files import PROJECT
 COMPONENTS = "component"
 MOST_NAMES = 12
 KEYS = ("standard", "root_gap_mm", COMPONENTS)  # beside those of limits
-OF_COMPONENTS = (measures.DEVIATION, measures.DEVIATION_SHARE, measures.DEFECT_DEPTH, measures.DEFECT_AREA)
+OF_COMPONENTS = (measurands.DEVIATION, measurands.DEVIATION_SHARE, measurands.DEFECT_DEPTH, measurands.DEFECT_AREA)
 
 
 def read_tolerance(project: Table) -> Tolerance | None:
@@ -50,7 +50,7 @@ def _only(table: Table, known: tuple[str, ...]) -> None:
     unknown = next((key for key in table.values if key not in known), None)
     if unknown is None:
         return
-    of_classes = tuple(f"{name.replace('-', '_')}_" for name in measures.DEFECT_CLASSES)
+    of_classes = tuple(f"{name.replace('-', '_')}_" for name in measurands.DEFECT_CLASSES)
     ends = ("_depth_mm", "_area_mm2")
     single = [key for key in known if not (key.endswith(ends) and key.startswith(of_classes))]
     raise InputError(
@@ -77,7 +77,7 @@ def _limit(table: Table, limit: Limit) -> Floats:
             )
         return both
     greatest = table.number(key)
-    none_allowed = limit.measure in (measures.DEFECT_DEPTH, measures.DEFECT_AREA)
+    none_allowed = limit.measure in (measurands.DEFECT_DEPTH, measurands.DEFECT_AREA)
     if greatest < 0.0 or (greatest == 0.0 and not none_allowed):
         expected = "a number from 0" if none_allowed else "a number above 0"
         raise InputError(f"{table.where}: expected {expected} as {key!r}, found [{greatest}]")
@@ -98,9 +98,9 @@ def check_components(where: str, tolerance: Tolerance | None, names: Sequence[st
 
 def _check_share(table: Table, tolerance: Tolerance) -> None:
     """Raise InputError for a share of points within a deviation that is not limited, of all or of a component."""
-    limited = {limit.component for limit in tolerance.limits if limit.measure == measures.DEVIATION}
+    limited = {limit.component for limit in tolerance.limits if limit.measure == measurands.DEVIATION}
     for limit in tolerance.limits:
-        stated = limit.measure == measures.DEVIATION_SHARE and math.isfinite(limit.low)
+        stated = limit.measure == measurands.DEVIATION_SHARE and math.isfinite(limit.low)
         if stated and not {limit.component, None} & limited:
             raise InputError(
                 f"{table.where}: deviation_share is the share of points that keep deviation_mm; give that as well, "

@@ -22,7 +22,7 @@ class Params:
     catalogue: str = "plausible"  # ray: of radii, by name; "none" leaves radii free
     radii_mm: tuple[float, ...] = ()  # ray: the user's catalogue, instead
     register_stations: bool = True  # ray: against each other, on the tubes, where their errors require it
-    datum_mm: float = 0.0  # ray: sd an axis of a shift common to all stations, without control points
+    datum_mm: float = 0.0  # ray: standard deviation per axis of a shift common to all stations, without control points
     members: members.Params = field(default_factory=members.Params)  # ray
     crop_margin_mm: float = 20.0  # the paper's methods: beyond the nominal radius, about the nominal centre
     raw_crops: bool = True  # the paper's methods beside ray: on all points about its nodes; false: on those it used

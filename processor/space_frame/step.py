@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from processor.adjustment import scanner_class
-from processor.geometry.merging import merged
 from processor.limits import standards
 from processor.model import InputError, Reason, Scene, Tolerance, reason
+from processor.scene_cloud import merged
 from processor.space_frame import to_result
 from processor.space_frame.params import METHODS, Params
 from processor.space_frame.points.scene_source import PointReader

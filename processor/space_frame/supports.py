@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from processor.limits import judging, measures
+from processor.limits import judging, measurands
 from processor.limits.judging import Comparison, JudgedLimits, Measured
 from processor.model import NORMAL_95, SUPPORTS, Bools, Floats, FrameDesign, Ints, Tolerance
 from processor.space_frame.result import Balls, Evidence
@@ -162,9 +162,9 @@ def _known(movement: Floats) -> Bools:
 
 
 _QUANTITIES: Mapping[str, Callable[[_Nodes], Iterator[Measured]]] = {
-    measures.SUPPORT_CENTRE: _centres,
-    measures.SUPPORT_HEIGHT: _heights,
-    measures.ADJACENT: partial(_adjacent, kind=PERIMETER),
-    measures.MULTI_POINT: partial(_adjacent, kind=MULTI_POINT),
-    measures.DEFLECTION: _deflections,
+    measurands.SUPPORT_CENTRE: _centres,
+    measurands.SUPPORT_HEIGHT: _heights,
+    measurands.ADJACENT: partial(_adjacent, kind=PERIMETER),
+    measurands.MULTI_POINT: partial(_adjacent, kind=MULTI_POINT),
+    measurands.DEFLECTION: _deflections,
 }

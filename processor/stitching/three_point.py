@@ -16,7 +16,7 @@ from scipy.special import fdtri, stdtrit
 from processor.adjustment import data_snooping
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Picks, Reason, Scan, reason
-from processor.stitching import frames
+from processor.stitching import pose_covariance
 from processor.stitching.common_points import LEAST_HEIGHT, LEAST_POINTS, units_slip
 from processor.stitching.fine.pair_checks import Pair
 
@@ -101,7 +101,7 @@ def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
     J = J.reshape(3 * n, -1)
     T = rigid.transform(used * R, middle_a - used * R @ middle_b)
     # From motions about the centroid of the points to motions about the origin of b, in a.
-    covariance = frames.about(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
+    covariance = pose_covariance.about(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
     return PairFit(
         T_a_b=T, scale=scale, scale_sd=scaled_sd / float(np.sqrt((rotated**2).sum())), residuals=residuals,
         sd_mm=difference_sd / np.sqrt(2.0), covariance=covariance, freedoms=freedoms,
@@ -241,7 +241,7 @@ def _chained(pairs: list[Pair], count: int, reference: int) -> Floats:
         if pair.a in placed:
             T[pair.b] = T[pair.a] @ pair.T_a_b
         else:
-            T[pair.a] = T[pair.b] @ frames.invert(pair.T_a_b)
+            T[pair.a] = T[pair.b] @ pose_covariance.invert(pair.T_a_b)
         placed |= {pair.a, pair.b}
     return T
 
@@ -251,9 +251,9 @@ def _equation(pair: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
 
     With m = 6 unknowns a scan, or 7 with its scale: (m, 2m), (m,) and (m, m).
     """
-    m, to_a = len(pair.covariance), frames.invert(T[pair.a])
-    R, S = frames.rotation_of(T[pair.a]).T, to_a[:3, :3]
-    r = frames.difference(to_a @ T[pair.b], pair.T_a_b)[:m]
+    m, to_a = len(pair.covariance), pose_covariance.invert(T[pair.a])
+    R, S = pose_covariance.rotation_of(T[pair.a]).T, to_a[:3, :3]
+    r = pose_covariance.difference(to_a @ T[pair.b], pair.T_a_b)[:m]
     arm = T[pair.b, :3, 3] - T[pair.a, :3, 3]
     A = np.zeros((7, 14))
     A[:3, :3], A[:3, 7:10] = -R, R

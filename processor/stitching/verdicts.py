@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from processor.limits import judging, measures, standards
+from processor.limits import judging, measurands, standards
 from processor.limits.judging import JudgedLimits, Measured
 from processor.model import NORMAL_95, Scene, Status
 from processor.stitching.result import Result
@@ -16,9 +16,9 @@ def judge(scene: Scene, result: Result) -> JudgedLimits | None:
     """Compare a network with the limits of a scene; None where none is given."""
     tolerance = standards.default_for(scene.tolerance)
     quantities = {
-        measures.CLOSURE: _closures,
-        measures.CONTROL_POINT: _control_points,
-        measures.SCAN_POSITION: _positions,
+        measurands.CLOSURE: _closures,
+        measurands.CONTROL_POINT: _control_points,
+        measurands.SCAN_POSITION: _positions,
     }
     return judging.judged(
         (

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from processor.model import InputError, UsageError
 from processor.store.atomic_file import sync
-from processor.store.writable import check_folder
+from processor.store.output_checks import check_folder
 
 
 def check_new(folder: Path) -> None:

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
-import processor.meaning as meaning
+import processor.record_checks as meaning
 import processor.store.checksums as checksums
 import processor.store.codec as codec
 import processor.store.file_structure_checks as file_structure_checks

@@ -1,1 +1,1 @@
-"""Accuracy validated every night: a matrix of scenes made, run and held against their truth, and what changed since."""
+"""Accuracy validated every night: a matrix of scenes made, run and compared with their truth, and its changes."""

@@ -16,7 +16,7 @@ from processor.jobs import process, runner
 from processor.jobs.child import Lost
 from processor.jobs.exit_codes import WITH_RESULTS
 from processor.jobs.process import Cause, Ended
-from processor.results.names import RESULTS_JSON
+from processor.results.file_names import RESULTS_JSON
 from processor.validation.cells import Cell, Origin, Outcome
 from processor.writers import toml
 

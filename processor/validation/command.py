@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from processor.language.messages import printable
 from processor.model import InputError, UsageError
-from processor.store.writable import check_folder
+from processor.store.output_checks import check_folder
 from processor.validation import cell_runner
 from processor.validation import matrix as matrices
 from processor.validation import night as nights

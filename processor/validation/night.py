@@ -21,7 +21,7 @@ from typing import Any
 from processor import pipeline
 from processor.jobs.runner import locked
 from processor.model import UsageError
-from processor.results.names import RESULTS_JSON
+from processor.results.file_names import RESULTS_JSON
 from processor.store.atomic_file import replacing
 from processor.validation import certificate, change_detection, coverage, junit, software_identity, summary
 from processor.validation.cell_runner import Runner

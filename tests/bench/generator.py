@@ -22,7 +22,7 @@ import numpy as np
 import open3d
 
 from designgen.designs import arch_bridge, arch_part, space_frame, truss_bridge
-from designgen.scanning import frame_surfaces, raycast, returns, scanner, survey
+from designgen.scanning import raycast, returns, scanner, space_frame_surfaces, survey
 from designgen.scanning.surfaces import Builder
 
 ROUNDS = 3
@@ -42,7 +42,7 @@ def roof():
     """A roof from below: most rays meet the sky."""
     builder = Builder()
     frame = space_frame.build(space_frame.Params(nodes_x=9, nodes_y=9))
-    frame_surfaces.add_frame(builder, frame)
+    space_frame_surfaces.add_frame(builder, frame)
     return builder.to_surfaces(), survey.levelled_pose(np.array([11_000.0, 13_000.0, 1_600.0]), 0.0)
 
 

@@ -34,7 +34,7 @@ from processor.preassembly.result import (
     TradeOff,
 )
 from processor.preassembly.verdicts import chain as verdicts_chain
-from processor.preassembly.verdicts import joint_measures, trim_and_shim
+from processor.preassembly.verdicts import joint_measures, trim_and_build_up
 from processor.preassembly.verdicts import joints as verdicts_joints
 
 NAN = float("nan")
@@ -177,7 +177,7 @@ def judged_joints(names, records):
         name=names,
         measures=tuple(records),
         conformity=tuple(verdicts_joints.judge(one, LIMITS) for one in records),
-        proposal=tuple(trim_and_shim.propose(one, LIMITS) for one in records),
+        proposal=tuple(trim_and_build_up.propose(one, LIMITS) for one in records),
     )
 
 

@@ -137,9 +137,10 @@ STEPS = ("defects", "deviation", "inspection", "preassembly", "space_frame", "st
 LAYERS = (
     ("version",),
     ("model",),
-    ("meaning",),
+    ("record_checks",),
     ("progress", "language", "jobs", "unit_ratio", "user_methods"),
     ("geometry",),
+    ("scene_cloud",),
     ("adjustment",),
     ("limits", "store"),
     ("readers", "writers"),
@@ -154,7 +155,7 @@ LAYERS = (
     ("cli",),
     ("__main__",),
 )
-FOR_STEPS = ("version", "model", "progress", "unit_ratio", "geometry", "adjustment", "limits")
+FOR_STEPS = ("version", "model", "progress", "unit_ratio", "geometry", "scene_cloud", "adjustment", "limits")
 
 
 def wrong_arrows():

@@ -12,7 +12,7 @@ from processor.model import ArchTruth, Scene, Truth
 from processor.preassembly.chain import adjustment
 from processor.preassembly.ends import bottom_edges, joint_end
 from processor.preassembly.ends.joint_frame import joint_frame
-from processor.preassembly.parts.member import Member
+from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.result import Adjustment, Components, Joints, Linear, Result
 from tests.support import arch_clouds
 

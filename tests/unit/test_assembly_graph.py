@@ -17,7 +17,7 @@ from processor.preassembly.chain import adjustment, loop_closure
 from processor.preassembly.ends import bottom_edges, joint_end
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import Params
-from processor.preassembly.parts.member import Member
+from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.result import Adjustment, Loops, Result
 from processor.report.preassembly import adjustment_tables
 from processor.results.fields_to_json import as_object

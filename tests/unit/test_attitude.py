@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.geometry import attitude, mesh_distance, principal, rigid, surface_registration
+from processor.geometry import mesh_distance, pose_choice, principal, rigid, surface_registration
 
 GIRDER = (6000.0, 800.0, 1400.0)
 PLATE = (400.0, 140.0, 14.0)  # a bracket, its upper side in the girder's middle
@@ -90,10 +90,10 @@ def test_a_contradiction_as_large_as_the_evidence_is_no_choice():
     points = np.asarray(trimesh.sample.sample_surface(structure(bracket(-1500.0, 1.0)), 60_000, seed=1)[0])
     surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
     turned = rigid.transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-    assert attitude.choose(points, surface, [np.eye(4), turned]) == attitude.Choice(best=0, rivals=())
+    assert pose_choice.choose(points, surface, [np.eye(4), turned]) == pose_choice.Choice(best=0, rivals=())
     both = structure(bracket(-1500.0, 1.0), bracket(1500.0, -1.0))  # one where each of the attitudes has one
     points = np.asarray(trimesh.sample.sample_surface(both, 60_000, seed=1)[0])
-    assert len(attitude.choose(points, surface, [np.eye(4), turned]).rivals) == 1
+    assert len(pose_choice.choose(points, surface, [np.eye(4), turned]).rivals) == 1
 
 
 def test_turns_of_a_plate_with_a_box_on_it_keep_the_plate_in_its_plane():

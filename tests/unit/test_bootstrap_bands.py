@@ -8,7 +8,7 @@ import pytest
 
 from processor.geometry import rigid
 from processor.model import Scan
-from processor.preassembly import errors
+from processor.preassembly import assembly_errors
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import bootstrap_bands, methods
 from processor.preassembly.params import PAPER_METHODS
@@ -96,7 +96,9 @@ def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
         # The last intervals of a part may have points in some repetitions only.
         apart = np.isfinite(band) != np.isfinite(said)
         assert apart.sum() <= len(borders)
-        assert (np.abs(borders[:, None] - result.linear.chainage[apart]) < errors.INTERVAL_MM).any(axis=0).all()
+        assert (
+            (np.abs(borders[:, None] - result.linear.chainage[apart]) < assembly_errors.INTERVAL_MM).any(axis=0).all()
+        )
         known = np.isfinite(said) & np.isfinite(band)
         assert (said <= band)[known].mean() > 0.9
     figures = [value for error in result.errors for value in (error.mean, error.max)]

@@ -11,7 +11,7 @@ from processor.model import ArchDesign, DesignPart, Tolerance, reason
 from processor.preassembly import to_result
 from processor.preassembly.chain import span_and_closure
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
-from processor.preassembly.parts.member import Member
+from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.verdicts import chain, joints
 
 GB, JTG = standards.load("GB 50205-2020"), standards.load("JTG arch rib")

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from processor.adjustment import clusters
+from processor.adjustment import patches
 
 
 def test_patches_have_the_means_and_the_noise_of_their_points():
     rng = np.random.default_rng(6)
     place = rng.uniform(0.0, 2000.0, (80_000, 2))
     waves = 0.7 * np.sin(2.0 * np.pi * place[:, 0] / 8000.0)
-    found = clusters.patches(place, waves + 0.5 * rng.standard_normal(len(place)), 100.0)
+    found = patches.patches(place, waves + 0.5 * rng.standard_normal(len(place)), 100.0)
     assert len(found.mean) == 400
     assert found.number.sum() == len(place)
     assert found.noise == pytest.approx(0.25, rel=0.03)
@@ -22,5 +22,5 @@ def test_patches_have_the_means_and_the_noise_of_their_points():
 
 def test_widened_variances_cover_as_students_t():
     for freedom in (1.0, 4.0, 30.0):
-        reach = 1.96 * np.sqrt(clusters.widening(freedom))
+        reach = 1.96 * np.sqrt(patches.widening(freedom))
         assert 2.0 * stats.t.cdf(reach, freedom) - 1.0 == pytest.approx(0.95, abs=1e-4)

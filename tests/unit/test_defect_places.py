@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.defects import classes
+from processor.defects import classification
 from processor.defects.places import profiles, waves
 from processor.defects.places.profiles import Profile
 from processor.defects.result import DefectClass
@@ -46,8 +46,8 @@ def test_a_bent_edge_is_deepest_where_the_plate_ends(seed):
     fitted = profiles.fit(cells, 1)
     assert fitted.profile is Profile.EDGE
     assert fitted.depth == pytest.approx(14.0, rel=0.06)  # the border itself has no cell
-    before = classes.of_deviation(1, 300.0, 600.0, 120.0, 14.0, 30.0)
-    assert classes.of_profile(fitted, 14.0, before).defect_class is DefectClass.BEND
+    before = classification.of_deviation(1, 300.0, 600.0, 120.0, 14.0, 30.0)
+    assert classification.of_profile(fitted, 14.0, before).defect_class is DefectClass.BEND
 
 
 @pytest.mark.parametrize(("reach", "depth", "kind"), [(500.0, 4.0, "step"), (55.0, 3.5, "crack")])
@@ -60,8 +60,8 @@ def test_a_step_jumps_along_a_line(reach, depth, kind):
         fitted = profiles.fit(cells, 1)
         assert fitted.profile is Profile.STEP
         assert fitted.depth == pytest.approx(depth, rel=0.12)
-        before = classes.of_deviation(1, 300.0, 600.0, 300.0, 16.0, 30.0)
-        assert classes.of_profile(fitted, 16.0, before).defect_class == kind
+        before = classification.of_deviation(1, 300.0, 600.0, 300.0, 16.0, 30.0)
+        assert classification.of_profile(fitted, 16.0, before).defect_class == kind
 
 
 def test_where_the_cells_end_is_no_step():

@@ -9,9 +9,9 @@ import trimesh
 from processor.defects import (
     alignment,
     baseline,
+    defect_grids,
     detect,
     deviation_field,
-    pictures,
     regions,
     scan_statistic,
     shape_models,
@@ -448,7 +448,7 @@ def test_numbers_by_hand():
     assert baseline.huber(np.array([1.0, 3.0]), 2.0) == pytest.approx(4.5)
     # A parabola of 1 mm at 100 mm: slopes of its chords add up to what it is at the end.
     x = np.linspace(0.0, 100.0, 2001)
-    curve = pictures.by_slopes(x, (x / 100.0) ** 2, 10)
+    curve = defect_grids.by_slopes(x, (x / 100.0) ** 2, 10)
     np.testing.assert_allclose(curve.displacement, (curve.along / 100.0) ** 2, atol=5e-4)
 
 

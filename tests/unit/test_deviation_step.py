@@ -12,7 +12,7 @@ from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline
 from processor.adjustment import scanner_class
-from processor.deviation import baseline, common_errors
+from processor.deviation import baseline, mean_uncertainty
 from processor.deviation import step as deviation_step
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
@@ -422,15 +422,17 @@ def test_the_mean_has_what_stations_have_alone_and_in_common():
     )  # fmt: skip
     core = Samples(points, normals, rows)
     moved = Movement(np.zeros(6000), np.full(6000, 20), np.full(6000, 0.2), np.zeros((6000, 3)), np.ones(6000))
-    sd = common_errors.mean_sd(scan, np.eye(4), core, moved, np.zeros((6, 6)), 1.0)
+    sd = mean_uncertainty.mean_sd(scan, np.eye(4), core, moved, np.zeros((6, 6)), 1.0)
     ranges = rng.normal(0.0, 0.5, (4000, 6)) + rng.normal(0.0, 0.2, (4000, 1))
     share = np.bincount(station, cosine[station, rows], 6) / len(points)
     assert np.std(ranges @ share) == pytest.approx(sd, rel=0.05)
     pose = scanner_class.pose_covariance(points)
-    assert common_errors.mean_sd(scan, np.eye(4), core, moved, pose, 1.0) == pytest.approx(sd, rel=0.02), "all around"
+    assert mean_uncertainty.mean_sd(scan, np.eye(4), core, moved, pose, 1.0) == pytest.approx(sd, rel=0.02), (
+        "all around"
+    )
     front = Samples(points[normals[:, 0] > 0.5], normals[normals[:, 0] > 0.5], rows)
     few = Movement(*(value[: len(front.points)] for value in vars(moved).values()))
-    alone = common_errors.mean_sd(scan, np.eye(4), front, few, pose, 1.0)
+    alone = mean_uncertainty.mean_sd(scan, np.eye(4), front, few, pose, 1.0)
     assert alone > np.hypot(0.2, 0.2), "of one face the pose itself is in the mean"
 
 

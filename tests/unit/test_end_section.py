@@ -7,9 +7,9 @@ from designgen.designs import assembly, prismatic
 from designgen.scanning import sampler
 from processor.geometry import mesh_distance
 from processor.model import Reason
-from processor.preassembly.ends import faces, joint_end, section
-from processor.preassembly.ends.faces import RegisteredPart
+from processor.preassembly.ends import joint_end, outer_faces, section
 from processor.preassembly.ends.joint_frame import end_place
+from processor.preassembly.ends.outer_faces import RegisteredPart
 from processor.preassembly.ends.section import PlateFace
 
 B, H, FLANGE, WEB = 250.0, 500.0, 30.0, 14.0
@@ -71,7 +71,7 @@ def measured(of, errors, seed, spacing_mm=8.0, sigma_mm=1.0):
     points = sampler.scan_patches(patches, settings, np.random.default_rng(seed)).points
     registered = RegisteredPart(
         points=points, station=np.zeros(len(points), np.int64), between_stations=0.0, pose=np.zeros((6, 6)),
-        surface=surface, outer=faces.outer_faces(surface, [key_points]),
+        surface=surface, outer=outer_faces.outer_faces(surface, [key_points]),
     )  # fmt: skip
     fitted = joint_end.fit(registered, end_place(key_points, 1.0, surface))
     assert not isinstance(fitted, Reason | joint_end.JointEnd), fitted
@@ -106,7 +106,7 @@ def test_corners_are_where_the_faces_and_the_end_meet(of):
 def test_outer_faces_of_a_strongly_curved_part_are_those_that_hold_its_corners(radius_mm):
     """Over the zone of the joint the inner side of the flange lies nearer to the level of the corners."""
     part, joint = curved_box(radius_mm)
-    outer = faces.outer_faces(part, [joint])
+    outer = outer_faces.outer_faces(part, [joint])
     for corner in joint[:4]:
         assert np.linalg.norm(outer.vertices[outer.faces].reshape(-1, 3) - corner, axis=1).min() < 1e-6
     height = np.linalg.norm(outer.vertices[outer.faces].reshape(-1, 3)[:, [0, 2]], axis=1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.adjustment import foreground
+from processor.adjustment import mixed_pixels
 from processor.defects import observations, surface_charts
 
 SCANNER, STEP, WALL, POST = np.array([0.0, -5000.0, 0.0]), 1.7e-3, 0.0, -300.0
@@ -26,7 +26,7 @@ def marked(points, wall, every, is_wall=None):
     """The wall is face 0, the post another."""
     normals, is_wall = np.tile([0.0, -1.0, 0.0], (wall.sum(), 1)), wall if is_wall is None else is_wall
     face = np.zeros(wall.sum(), np.int64)
-    return foreground.beside(points[wall], SCANNER, normals, -points[wall, 1], face, (every, np.where(is_wall, 0, 1)))
+    return mixed_pixels.beside(points[wall], SCANNER, normals, -points[wall, 1], face, (every, np.where(is_wall, 0, 1)))
 
 
 def test_points_beside_a_post_are_marked_and_no_others():
@@ -36,7 +36,7 @@ def test_points_beside_a_post_are_marked_and_no_others():
     off = np.abs(points[wall, 0]) - shadow
     step_mm = 5000.0 * STEP
     assert found[off < step_mm].all()
-    assert not found[off > foreground.WINDOW_STEPS * step_mm + foreground.HALF_BEAM_MM + step_mm].any()
+    assert not found[off > mixed_pixels.WINDOW_STEPS * step_mm + mixed_pixels.HALF_BEAM_MM + step_mm].any()
 
 
 def test_without_the_post_nothing_is_marked_whatever_the_noise_of_a_point_itself():

@@ -13,7 +13,7 @@ import re
 import numpy as np
 import pytest
 
-from processor import meaning
+from processor import record_checks
 from processor.cli import main
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import InputError, UsageError
@@ -108,7 +108,7 @@ def test_five_hundred_damaged_files(tmp_path, name):
         except (InputError, UsageError) as error:
             refused, said = refused + 1, str(error)
         else:
-            assert meaning.problems(scene) == []
+            assert record_checks.problems(scene) == []
             continue
         assert str(place) in said, (text[:500], said[:500])
         assert len(said) < 6_100, (text[:500], said[:200])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import processor
-from processor import meaning
+from processor import record_checks
 from processor.model import Checked, InputError, Scene
 from processor.store import store
 from tests.support.impossible_scenes import impossible_scenes, possible
@@ -22,7 +22,7 @@ def test_there_are_a_hundred_and_what_is_possible_is_taken(tmp_path):
     store.write_scene(tmp_path / "s.h5", possible(), None, {})
     assert store.read_scene(tmp_path / "s.h5").name == "site"
     assert store.read_scene(tmp_path / "s.h5", points=False).name == "site"
-    assert meaning.problems(possible()) == []
+    assert record_checks.problems(possible()) == []
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -72,6 +72,6 @@ def test_what_is_unknown_is_not_impossible():
     class Found(Checked):
         T_a_b: np.ndarray = processor.model.column("k", 4, 4)
 
-    assert meaning.problems(Found(poses)) == []
-    (fault,) = meaning.problems(Found(poses + 1.0))
+    assert record_checks.problems(Found(poses)) == []
+    (fault,) = record_checks.problems(Found(poses + 1.0))
     assert fault.startswith("/T_a_b, row 0: expected a rotation")

@@ -8,11 +8,11 @@ import pytest
 from processor.geometry import mesh_distance, rigid
 from processor.model import reason
 from processor.preassembly.chain import adjustment, span_and_closure
-from processor.preassembly.ends import faces as ends_faces
 from processor.preassembly.ends import joint_end, plate_sides
+from processor.preassembly.ends import outer_faces as ends_faces
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_frame import end_place
-from processor.preassembly.parts.member import Member
+from processor.preassembly.parts.part_in_chain import Member
 
 LENGTH, B, H, T = 1600.0, 600.0, 800.0, 26.0  # the end at x = 0, the part towards -x; half width, height; plates
 

@@ -15,7 +15,7 @@ from processor.language.messages import text as message
 from processor.model import Status, reason
 from processor.preassembly.ends.section import PlateFace
 from processor.preassembly.result import Gauge
-from processor.preassembly.verdicts import joint_measures, trim_and_shim
+from processor.preassembly.verdicts import joint_measures, trim_and_build_up
 from processor.report import all_figures, page, page_script
 from processor.space_frame.design.matching import FrameRelation
 from tests.support.ball_results import of_frame, whole, with_truth
@@ -150,7 +150,7 @@ def test_no_proposal_keeps_a_word_of_english(size_mm):
         tilt = np.outer(SECTION[:, 1] / 450.0, rng.normal(0.0, [size_mm, 0.0, 0.0]))
         gaps = rng.normal(0.0, size_mm, 3) + tilt + rng.normal(0.0, 0.3, (8, 3))
         found = joint_measures.measure(gaps, sd**2 * np.eye(24), np.eye(4), SECTION)
-        said.add(chinese.sentences(trim_and_shim.propose(found, LIMITS).reasons))
+        said.add(chinese.sentences(trim_and_build_up.propose(found, LIMITS).reasons))
     assert len(said) > 1
     assert latin(said) == []
 

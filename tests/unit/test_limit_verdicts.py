@@ -16,7 +16,7 @@ from processor.defects.verdicts import depths_and_areas
 from processor.deviation import verdicts as of_surface
 from processor.deviation.result import CorePoints, ErrorSource
 from processor.deviation.result import Result as DeviationResult
-from processor.limits import judging, measures, standards
+from processor.limits import judging, measurands, standards
 from processor.limits.judging import Measured
 from processor.model import (
     DesignBodies,
@@ -78,7 +78,7 @@ def test_a_limit_by_an_unknown_size_decides_nothing():
 
 
 def test_every_row_is_read_or_says_what_it_needs():
-    read = {measure for of_step in measures.MEASURES.values() for measure in of_step}
+    read = {measure for of_step in measurands.MEASURES.values() for measure in of_step}
     rows = [row for content in standards.files() for row in content["limit"]]
     for row in rows:
         is_read = row.get("measure", "") in read or row.get("measure", "").startswith("part ")
@@ -87,10 +87,10 @@ def test_every_row_is_read_or_says_what_it_needs():
 
 
 def test_classes_of_defects_are_those_of_the_step():
-    assert {str(kind) for kind in DefectClass} == set(measures.DEFECT_CLASSES)
+    assert {str(kind) for kind in DefectClass} == set(measurands.DEFECT_CLASSES)
     for limit in standards.OF_PROJECTS:
-        if limit.measure in (measures.DEFECT_DEPTH, measures.DEFECT_AREA):
-            assert measures.class_of(limit) in ("", *measures.DEFECT_CLASSES)
+        if limit.measure in (measurands.DEFECT_DEPTH, measurands.DEFECT_AREA):
+            assert measurands.class_of(limit) in ("", *measurands.DEFECT_CLASSES)
 
 
 # --- surfaces

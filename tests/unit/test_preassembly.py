@@ -9,7 +9,7 @@ from processor.evaluation import preassembly as preassembly_evaluation
 from processor.geometry import icp, rigid
 from processor.geometry.polyline import Polyline
 from processor.model import InputError, Scene, UsageError, Verdict, reason
-from processor.preassembly import errors
+from processor.preassembly import assembly_errors
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import edge_features, joint_alignment, methods
 from processor.preassembly.ends.joint_frame import joint_frame
@@ -141,7 +141,7 @@ def test_linear_error_of_a_lifted_edge_by_hand():
     edge = np.column_stack([x, np.zeros_like(x), np.zeros_like(x)])
     design = Polyline.through(edge[[0, -1]])
     noisy = edge + np.array([0.0, 3.0, 4.0]) + np.random.default_rng(0).normal(0.0, 2.0, edge.shape)
-    found = errors.linear_error([errors.BottomEdges(noisy, edge, design, design)], [np.eye(4)])
+    found = assembly_errors.linear_error([assembly_errors.BottomEdges(noisy, edge, design, design)], [np.eye(4)])
     assert set(found.edge) == {"left", "right"}
     left = np.array(found.edge) == "left"
     assert found.deviation[left].mean() == pytest.approx(5.0, abs=0.3)  # the noise does not add to it
@@ -153,7 +153,7 @@ def test_splicing_error_by_hand():
     gaps = np.zeros((2, 8, 3))
     gaps[0, 0] = [-3.0, 1.0, 0.0]
     gaps[1, 7] = np.nan
-    mean, largest = errors.splicing_error(gaps)
+    mean, largest = assembly_errors.splicing_error(gaps)
     assert mean == pytest.approx(4.0 / 45.0)
     assert largest == 3.0
 

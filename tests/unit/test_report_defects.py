@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from processor.defects import pictures, surface_charts
+from processor.defects import defect_grids, surface_charts
 from processor.defects.deviation_field import Field
 from processor.defects.result import Result
 from processor.evaluation.evaluate import ErrorReport
@@ -80,7 +80,7 @@ def plates():
 def test_all_places_are_drawn_where_there_are_few(plates):
     found, field = plates
     origin = np.array([1000.0, 2000.0, 0.0])
-    made = pictures.of_surface([], field, found, origin)
+    made = defect_grids.of_surface([], field, found, origin)
     np.testing.assert_array_equal(made.points, found.centres + origin)
     assert (made.defect == -1).all()
 
@@ -88,7 +88,7 @@ def test_all_places_are_drawn_where_there_are_few(plates):
 @pytest.mark.parametrize("most", [2000, 500, 60])
 def test_many_are_thinned_alike_on_every_face(plates, most):
     found, field = plates
-    made = pictures.of_surface([], field, found, np.zeros(3), most)
+    made = defect_grids.of_surface([], field, found, np.zeros(3), most)
     at = made.points
     assert 0.3 * most < len(at) <= most
     np.testing.assert_allclose(made.deviation, 1e-3 * at[:, 0])
@@ -102,12 +102,12 @@ def test_small_defects_are_drawn_whole_and_lie_on_large_ones(plates):
     found, field = plates
     away = np.linalg.norm(found.centres - [1000.0, 0.0, 500.0], axis=1)
     small, large = np.flatnonzero(away < 60.0), np.flatnonzero(found.centres[:, 1] == 0.0)
-    made = pictures.of_surface([large, small], field, found, np.zeros(3), 500)
+    made = defect_grids.of_surface([large, small], field, found, np.zeros(3), 500)
     count = np.bincount(made.defect + 1, minlength=3)
     assert count[2] == len(small)
     assert 300 < count[1] < 500
     unseen = dataclasses.replace(field, count=np.where(away < 60.0, 0, 1))
-    assert (pictures.of_surface([small], unseen, found, np.zeros(3), 500).defect == -1).all()
+    assert (defect_grids.of_surface([small], unseen, found, np.zeros(3), 500).defect == -1).all()
 
 
 def test_results_are_stored_and_read_again(tmp_path):

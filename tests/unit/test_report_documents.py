@@ -11,7 +11,7 @@ import pytest
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import TitleBlock
-from processor.report import all_tables, document, workbook
+from processor.report import all_tables, pdf, workbook
 from processor.report.style import default_settings
 from tests.support.bridge_results import of_bridge
 from tests.support.report_pages import drawn
@@ -27,7 +27,7 @@ def signed(names=("foot1", "rib1", "foot2")):
 
 def written(execution):
     with default_settings():
-        return document.document(execution, drawn(execution))
+        return pdf.document(execution, drawn(execution))
 
 
 def test_the_document_has_a_page_a_figure_and_the_same_bytes_again():

@@ -11,7 +11,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 from designgen.designs import arch_bridge, arch_part, box_and_tube, space_frame
 from designgen.designs.patch import Patch
-from designgen.scanning import clutter, frame_surfaces, ray_kernels, raycast, scanner, survey
+from designgen.scanning import clutter, ray_kernels, raycast, scanner, space_frame_surfaces, survey
 from designgen.scanning import returns as scanning_returns
 from designgen.scanning.surfaces import Builder
 from processor.model import UsageError
@@ -32,7 +32,7 @@ def frame_of_balls():
 
 def surfaces_of(frame, things=0):
     builder = Builder()
-    frame_surfaces.add_frame(builder, frame)
+    space_frame_surfaces.add_frame(builder, frame)
     low, high = frame.centres.min(axis=0), frame.centres.max(axis=0)
     clutter.add_below_roof(builder, low, high, things, np.random.default_rng(0))
     return builder.to_surfaces()

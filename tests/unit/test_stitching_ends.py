@@ -4,7 +4,7 @@ import numpy as np
 
 from processor.geometry import scanner_rays
 from processor.stitching.fine import edge_constraints
-from processor.stitching.planes import borders, edges
+from processor.stitching.planes import borders, face_ends
 from processor.stitching.planes.extraction import Planes
 from tests.support.stitch_clouds import pose, scan
 
@@ -39,7 +39,7 @@ def post(width_mm, phase, step=5e-3, range_mm=20_000.0):
     piece = np.where(low[hit], -1, 0)
     piece[~low[hit] & (r % 7 > 0)] = -1  # in a planar piece in few rows only
     rays = scanner_rays.fitted(p[hit], r, c)
-    return edges.ends_of(p[hit], r, c, piece, plane, 2.0, rays)
+    return face_ends.ends_of(p[hit], r, c, piece, plane, 2.0, rays)
 
 
 def test_ends_of_a_post_are_unbiased_for_all_phases_of_the_rays():
@@ -105,7 +105,9 @@ def test_far_edges_of_an_inclined_face_are_unbiased():
             np.ones(1), np.array([[0.0, 0.0, -height]]), np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3)), np.eye(3)[None]
         )
         r, c = row.ravel()[keep], column.ravel()[keep]
-        ends = edges.ends_of(p[keep], r, c, np.where(hit[keep], 0, -1), plane, 2.0, scanner_rays.fitted(p[keep], r, c))
+        ends = face_ends.ends_of(
+            p[keep], r, c, np.where(hit[keep], 0, -1), plane, 2.0, scanner_rays.fitted(p[keep], r, c)
+        )
         far = (ends.across[:, 0] > 0.0) & (np.abs(ends.across[:, 1]) < 0.5 * ends.across[:, 0])
         assert far.sum() >= 40
         off += (ends.points[far, 0] - edge).tolist()

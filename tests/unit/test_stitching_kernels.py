@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from processor.stitching.coarse import face_index
 from processor.stitching.fine import correspondences
 from processor.stitching.planes import borders, extraction, hashing
-from processor.stitching.planes.samples import Patches
+from processor.stitching.planes.patches import Patches
 
 
 def test_keys_are_numbered_as_numpy_does():

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from processor.stitching.fine import bundle_adjustment, jackknife, noise_model
 from processor.stitching.fine.correspondences import Blocks
 from processor.stitching.planes import extraction
-from processor.stitching.planes.edges import Ends
 from processor.stitching.planes.extraction import Planes
+from processor.stitching.planes.face_ends import Ends
 from processor.stitching.planes.scan_planes import Cloud
 
 HALL = np.array([60000.0, 40000.0, 12000.0])

@@ -9,7 +9,7 @@ from designgen.asbuilt import imperfections
 from designgen.designs import arch_bridge, arch_part, box_and_tube, plate_row, space_frame, stadium_roof, truss_bridge
 from designgen.export import folder as export_folder
 from designgen.randomness import generator
-from designgen.scanning import frame_surfaces, returns, sampler, scanner
+from designgen.scanning import returns, sampler, scanner, space_frame_surfaces
 from designgen.scanning.surfaces import Builder
 from designgen.scanning.survey import levelled_pose
 from designgen.scenes import model as models
@@ -61,7 +61,7 @@ def test_rays_meet_frames_where_their_solids_are(built):
     if built:
         frame = imperfections.frame(frame, BUILT, generator(3, "built"), imperfections.Ledger())
     builder = Builder()
-    frame_surfaces.add_frame(builder, frame)
+    space_frame_surfaces.add_frame(builder, frame)
     points, names = hits(builder, [(400.0, 500.0, 4000.0), (2500.0, -600.0, 4400.0)], 2.0)
     shells, seen = shells_of(space_frame.solid(frame)), set()
     for name, few in of_each(points, names, np.random.default_rng(0)):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from designgen import recipe_files, sequences
+from designgen import low_discrepancy, recipe_files
 from designgen.designs import structure_registry
 from designgen.scanning import scanner, survey
 from designgen.scanning.surfaces import Builder
@@ -17,10 +17,10 @@ HALF = np.array([2200.0, 450.0, 550.0])
 
 
 def test_sequences_by_hand():
-    assert [sequences.van_der_corput(i) for i in range(8)] == [0.0, 0.5, 0.25, 0.75, 0.125, 0.625, 0.375, 0.875]
-    np.testing.assert_allclose(sequences.in_square(0), [0.5, 0.5])
-    np.testing.assert_allclose(sequences.in_square(1), [0.25487767, 0.06984029], atol=1e-8)
-    np.testing.assert_allclose([np.linalg.norm(sequences.on_sphere(i)) for i in range(20)], 1.0)
+    assert [low_discrepancy.van_der_corput(i) for i in range(8)] == [0.0, 0.5, 0.25, 0.75, 0.125, 0.625, 0.375, 0.875]
+    np.testing.assert_allclose(low_discrepancy.in_square(0), [0.5, 0.5])
+    np.testing.assert_allclose(low_discrepancy.in_square(1), [0.25487767, 0.06984029], atol=1e-8)
+    np.testing.assert_allclose([np.linalg.norm(low_discrepancy.on_sphere(i)) for i in range(20)], 1.0)
 
 
 @pytest.mark.parametrize("count", [1, 3, 8])
@@ -77,7 +77,7 @@ def seen_shares(places, half):
 @pytest.mark.parametrize("count", [4, 6, 8, 12])
 def test_all_sides_are_seen_as_well_as_from_evenly_spread_places(count, half):
     half = np.array(half)
-    places = np.array([sequences.on_sphere(i) for i in range(count)]) * (half + 4000.0)
+    places = np.array([low_discrepancy.on_sphere(i) for i in range(count)]) * (half + 4000.0)
     k = np.arange(count) + 0.5
     height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
     level = np.sqrt(1.0 - height**2)

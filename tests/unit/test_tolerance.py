@@ -8,14 +8,14 @@ import math
 import numpy as np
 import pytest
 
-from processor.limits import measures, standards
+from processor.limits import measurands, standards
 from processor.model import InputError, Limit, Scan, Scene, Tolerance
 from processor.preassembly.verdicts import chain, joints
 from processor.scan_folder import folder
 from processor.space_frame.spheres import assessment
 from processor.store import store
 
-MEASURES = ("", *(measure for of_step in measures.MEASURES.values() for measure in of_step))
+MEASURES = ("", *(measure for of_step in measurands.MEASURES.values() for measure in of_step))
 
 
 def limit(standard, key):
@@ -50,7 +50,7 @@ def test_every_row_says_what_it_is():
 
 
 def test_measures_are_those_of_the_bridges_steps():
-    assert (*joints.MEASURES, *chain.MEASURES) == measures.MEASURES["preassemble"]
+    assert (*joints.MEASURES, *chain.MEASURES) == measurands.MEASURES["preassemble"]
 
 
 def test_only_what_was_seen_in_print_is_verified():

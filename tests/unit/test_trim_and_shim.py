@@ -13,8 +13,8 @@ from processor.language.messages import messages
 from processor.limits import standards
 from processor.model import Checked, StepRun, Tolerance, UsageError, reason
 from processor.preassembly.params import TrimParams
-from processor.preassembly.verdicts import joint_measures, joints, trim_and_shim
-from processor.preassembly.verdicts.trim_and_shim import propose
+from processor.preassembly.verdicts import joint_measures, joints, trim_and_build_up
+from processor.preassembly.verdicts.trim_and_build_up import propose
 from processor.store import store
 
 B, H = 700.0, 900.0  # half the width and the height of the section; y left, z up
@@ -108,7 +108,7 @@ def test_cuts_are_planes_that_take_nothing_on(seed):
     rng = np.random.default_rng(seed)
     A = np.column_stack([np.ones(8), POINTS[:, 1:] / 1000.0])
     lacking = rng.normal(1.0, 2.0, 8) + A[:, 1:] @ rng.normal(0.0, 3.0, 2)
-    nearest = A @ trim_and_shim._nearest(A, lacking)
+    nearest = A @ trim_and_build_up._nearest(A, lacking)
     assert nearest.min() > -1e-8
     solved = minimize(
         lambda p: ((A @ p - lacking) ** 2).sum(),
@@ -118,11 +118,11 @@ def test_cuts_are_planes_that_take_nothing_on(seed):
         options={"ftol": 1e-12},
     )
     np.testing.assert_allclose(nearest, A @ solved.x, atol=1e-4)
-    even = A @ trim_and_shim._even(A, lacking)
+    even = A @ trim_and_build_up._even(A, lacking)
     assert even.min() > -1e-9
     rest = even - lacking
     np.testing.assert_allclose(A[:, 1:].T @ rest, 0.0, atol=1e-9)  # the residual has no tilt
-    covering = A @ trim_and_shim._covering(A, lacking)
+    covering = A @ trim_and_build_up._covering(A, lacking)
     assert (covering - np.maximum(lacking, 0.0)).min() > -1e-9
     assert covering.sum() <= 8.0 * max(lacking.max(), 0.0) + 1e-9  # no more than a straight cut of that depth
     found = proposed(along(-lacking), 0.01 * np.eye(24), params=TrimParams())
@@ -277,7 +277,7 @@ def test_the_same_proposal_every_time():
 class Judged(Checked):
     measures: tuple[joint_measures.Measures, ...]
     verdicts: tuple[joints.Conformity, ...]
-    trim_and_shim: tuple[trim_and_shim.Proposal, ...]
+    trim_and_shim: tuple[trim_and_build_up.Proposal, ...]
 
 
 def test_the_records_go_through_the_store(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processor.adjustment import scanner_class
-from processor.preassembly.ends import viewpoints
+from processor.preassembly.ends import view_variance
 
 
 def plate(rng, apart, thick=24.0, waves=0.0):
@@ -18,7 +18,7 @@ def plate(rng, apart, thick=24.0, waves=0.0):
         inner.append(np.full(len(at), side))
     at = np.vstack(places)
     terms = np.stack([np.ones(len(at)), at[:, 0] / 500.0, at[:, 1] / 450.0], axis=1)
-    return viewpoints.thickness(terms, at, np.concatenate(heights), np.concatenate(inner))
+    return view_variance.thickness(terms, at, np.concatenate(heights), np.concatenate(inner))
 
 
 def test_waves_of_a_plate_do_not_change_its_thickness():
@@ -35,7 +35,7 @@ def test_waves_of_a_plate_do_not_change_its_thickness():
 def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart, wider):
     rng = np.random.default_rng(1)
     found = [
-        viewpoints.variances([plate(rng, apart, thick) for thick in (24.0, 20.0, 30.0) for _ in range(8)])
+        view_variance.variances([plate(rng, apart, thick) for thick in (24.0, 20.0, 30.0) for _ in range(8)])
         for _ in range(20)
     ]
     assert np.mean([one.level for one in found]) == pytest.approx(wider * apart**2, rel=0.2)
@@ -44,7 +44,7 @@ def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart, wid
 
 def test_noise_alone_is_no_difference_between_viewpoints():
     rng = np.random.default_rng(2)
-    found = [viewpoints.variances([plate(rng, 0.0) for _ in range(16)]) for _ in range(20)]
+    found = [view_variance.variances([plate(rng, 0.0) for _ in range(16)]) for _ in range(20)]
     assert not any(one.evident for one in found)
     assert np.sqrt(np.mean([one.level for one in found])) < 0.02
 
@@ -52,14 +52,14 @@ def test_noise_alone_is_no_difference_between_viewpoints():
 def test_a_plate_of_which_one_side_was_seen_has_no_thickness():
     at = np.random.default_rng(3).uniform(0.0, 500.0, (1_000, 2))
     terms = np.stack([np.ones(1_000), *(at / 500.0).T], axis=1)
-    assert viewpoints.thickness(terms, at, np.zeros(1_000), np.zeros(1_000, bool)) is None
-    assert viewpoints.variances([]) == viewpoints.NONE
+    assert view_variance.thickness(terms, at, np.zeros(1_000), np.zeros(1_000, bool)) is None
+    assert view_variance.variances([]) == view_variance.NONE
 
 
 def test_what_no_plates_show_is_of_the_scanners_class_and_what_they_show_is_kept():
     term = scanner_class.VIEW_MM**2
-    assert viewpoints.variances([]).or_of_class() == viewpoints.NONE._replace(level=term, ring=term)
-    one = viewpoints.variances([plate(np.random.default_rng(1), 0.3)])
+    assert view_variance.variances([]).or_of_class() == view_variance.NONE._replace(level=term, ring=term)
+    one = view_variance.variances([plate(np.random.default_rng(1), 0.3)])
     assert (one.level, one.or_of_class().level, one.or_of_class().ring) == (0.0, term, term)
-    shown = viewpoints.variances([plate(np.random.default_rng(k), 0.0) for k in range(4)])
+    shown = view_variance.variances([plate(np.random.default_rng(k), 0.0) for k in range(4)])
     assert shown.or_of_class() == shown

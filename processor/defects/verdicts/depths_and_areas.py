@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from processor.defects.result import DefectClass, Result
-from processor.limits import judging, measures, standards
+from processor.limits import judging, measurands, standards
 from processor.limits.judging import Comparison, JudgedLimits, Measured
 from processor.model import Limit, Scene, Status, Tolerance, Verdict
 
@@ -26,7 +26,7 @@ SURFACE = "surface"  # of what may be there and was not found
 def judge(scene: Scene, result: Result) -> JudgedLimits | None:
     """Compare the defects of a result with the limits of a scene; None where none is given."""
     tolerance = standards.default_for(scene.tolerance)
-    kinds = (measures.DEFECT_DEPTH, measures.DEFECT_AREA)
+    kinds = (measurands.DEFECT_DEPTH, measurands.DEFECT_AREA)
     if not any(limit.measure in kinds for limit in tolerance.limits):
         return None
     rows: list[Comparison] = []
@@ -47,7 +47,7 @@ def _of_defect(result: Result, row: int, tolerance: Tolerance, measure: str) -> 
     defects = result.defects
     limits = judging.limits_for(tolerance, measure, defects.component[row])
     limit = _limit(limits, defects.defect_class[row])
-    measured = _depth(result, row) if measure == measures.DEFECT_DEPTH else _area(result, row)
+    measured = _depth(result, row) if measure == measurands.DEFECT_DEPTH else _area(result, row)
     sure = bool(defects.confidence[row] >= SURE)
     other = limit if sure else _limit(limits, defects.otherwise[row])
     if limit is None:
@@ -60,7 +60,7 @@ def _of_defect(result: Result, row: int, tolerance: Tolerance, measure: str) -> 
 
 def _limit(limits: Sequence[Limit], kind: DefectClass) -> Limit | None:
     """Return the limit of a class, of any class without one."""
-    by_class = {measures.class_of(limit): limit for limit in limits}
+    by_class = {measurands.class_of(limit): limit for limit in limits}
     return by_class.get(str(kind), by_class.get(""))
 
 
@@ -88,7 +88,7 @@ def _area(result: Result, row: int) -> Measured:
 
 def _not_found(result: Result, tolerance: Tolerance) -> Iterator[Comparison]:
     """Compare the least depth that is found with the strictest limit of depth: shallower defects may be there."""
-    depths = [limit for limit in tolerance.limits if limit.measure == measures.DEFECT_DEPTH]
+    depths = [limit for limit in tolerance.limits if limit.measure == measurands.DEFECT_DEPTH]
     if not depths:
         return
     strictest = min(depths, key=lambda limit: limit.high)

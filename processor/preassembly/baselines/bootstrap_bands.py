@@ -19,7 +19,7 @@ from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import by_cell
 from processor.geometry.parallel import each
 from processor.model import ArchDesign, Bools, DesignPart, Floats, Ints, Status, reason
-from processor.preassembly import errors
+from processor.preassembly import assembly_errors
 from processor.preassembly.baselines import methods
 from processor.preassembly.baselines.methods import PartFeatures
 from processor.preassembly.params import Params
@@ -68,7 +68,7 @@ def with_bands(result: Result, repeated: list[list[PartFeatures]], design: ArchD
     assemblies = [methods.place(parts, design, params) for parts in repeated]
     linear = [assembly.linear for assembly in assemblies]
     best_fit = [assembly.best_fit for assembly in assemblies]
-    splicing = np.array([errors.splicing_error(assembly.gaps) for assembly in assemblies])
+    splicing = np.array([assembly_errors.splicing_error(assembly.gaps) for assembly in assemblies])
     return replace(
         result,
         reasons=(reason("preassemble.bands-as-designed"), reason("preassemble.inner-edges")),
@@ -81,7 +81,7 @@ def with_bands(result: Result, repeated: list[list[PartFeatures]], design: ArchD
     )
 
 
-def _with_band(deviations: Deviations, repeated: list[errors.LinearError]) -> Deviations:
+def _with_band(deviations: Deviations, repeated: list[assembly_errors.LinearError]) -> Deviations:
     figures = np.array([(error.mean, error.max) for error in repeated])
     band = bound(np.array([error.vector for error in repeated]))
     return replace(

@@ -19,7 +19,7 @@ from processor.geometry import rigid
 from processor.geometry.neighbors import surface_spacing
 from processor.geometry.polyline import Polyline
 from processor.model import ArchDesign, Floats, Reason, Scan, Status, Verdict, reason
-from processor.preassembly import errors
+from processor.preassembly import assembly_errors
 from processor.preassembly.baselines import edge_features, joint_alignment
 from processor.preassembly.baselines.edge_features import JointEdges
 from processor.preassembly.baselines.joint_alignment import Alignment
@@ -52,7 +52,7 @@ class PartFeatures:
     attitude: attitude.Attitude
     ends: tuple[JointEdges | None, JointEdges | None]  # start, end
     lines: Floats  # (n, 3) along both bottom edges, for the alignment
-    edges: errors.BottomEdges  # the same from thicker slices, for the linear error
+    edges: assembly_errors.BottomEdges  # the same from thicker slices, for the linear error
     reasons: tuple[Reason, ...]  # why a joint end was not found
 
 
@@ -64,8 +64,8 @@ class Assembly:
     status: list[Status]
     reasons: list[tuple[Reason, ...]]
     gaps: Floats
-    linear: errors.LinearError
-    best_fit: errors.LinearError
+    linear: assembly_errors.LinearError
+    best_fit: assembly_errors.LinearError
 
 
 def extract(scans: Sequence[Scan], design: ArchDesign, params: Params) -> list[PartFeatures]:
@@ -107,7 +107,7 @@ def features_of(scan: Scan, index: int, pose: attitude.Attitude, design: ArchDes
         edge_features.slice_edges(points, pose.T_principal, spacing, thickness, slices)
         for thickness in (slices.thickness, slices.check_thickness)
     )
-    bottom = errors.BottomEdges(
+    bottom = assembly_errors.BottomEdges(
         *checked, Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right)
     )
     return PartFeatures(
@@ -142,8 +142,8 @@ def place(parts: list[PartFeatures], design: ArchDesign, params: Params) -> Asse
         status=status,
         reasons=remarks,
         gaps=gaps,
-        linear=errors.linear_error(edges, poses),
-        best_fit=errors.linear_error(edges, [to_design @ pose for pose in poses]),
+        linear=assembly_errors.linear_error(edges, poses),
+        best_fit=assembly_errors.linear_error(edges, [to_design @ pose for pose in poses]),
     )
 
 
@@ -241,7 +241,7 @@ def _status(part: PartFeatures, pose: Floats) -> Status:
 
 
 def _result(parts: list[PartFeatures], assembly: Assembly, design: ArchDesign, params: Params) -> Result:
-    splicing_mean, splicing_max = errors.splicing_error(assembly.gaps)
+    splicing_mean, splicing_max = assembly_errors.splicing_error(assembly.gaps)
     components = Components(
         name=tuple(part.name for part in parts),
         status=tuple(assembly.status),
@@ -281,7 +281,7 @@ def _result(parts: list[PartFeatures], assembly: Assembly, design: ArchDesign, p
     )
 
 
-def _deviations(error: errors.LinearError) -> Deviations:
+def _deviations(error: assembly_errors.LinearError) -> Deviations:
     return Deviations(error=MeanMax(mean=error.mean, max=error.max), deviation=error.deviation)
 
 

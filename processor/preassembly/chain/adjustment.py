@@ -30,7 +30,7 @@ from processor.model import Floats, Ints
 from processor.preassembly import topology
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import JointEnd
-from processor.preassembly.parts.member import Member
+from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.topology import Side, Sides
 
 HOLD = 1e-3  # weight of a part's movement along its chord

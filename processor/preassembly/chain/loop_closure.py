@@ -15,7 +15,7 @@ from processor.model import NORMAL_95, ArchDesign, Floats
 from processor.preassembly import topology
 from processor.preassembly.chain import adjustment
 from processor.preassembly.chain.span_and_closure import JOINTS_ALONE
-from processor.preassembly.parts.member import Member
+from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.result import Loops
 from processor.preassembly.verdicts import joint_measures
 

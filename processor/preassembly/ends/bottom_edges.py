@@ -23,9 +23,9 @@ from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.polyline import Polyline
 from processor.model import Bools, Floats, Ints
+from processor.preassembly.assembly_errors import INTERVAL_MM
 from processor.preassembly.ends import plate_sides
-from processor.preassembly.ends.faces import ALONG, RegisteredPart
-from processor.preassembly.errors import INTERVAL_MM
+from processor.preassembly.ends.outer_faces import ALONG, RegisteredPart
 
 REACH_MM = 200.0  # across each face
 LEAST_POINTS = 30

@@ -2,9 +2,9 @@
 
 In the joint's zone each outer face departs from the design by a plane in x (along the bridge from the joint) and w
 (across the face), a warp x w, and bending terms x^2, x^2 w, w^2 - 1 and x (w^2 - 1). The ring departs by a plane in u
-and v and bending terms, see :mod:`processor.preassembly.ends.ring`. A corner is where its two faces and the ring meet,
-as built; its covariance is that of these coefficients, 40 of a box, so points of one corner are correlated. Waves of a
-face, what its 8 coefficients do not follow, are estimated at its corners and its middle by kriging.
+and v and bending terms, see :mod:`processor.preassembly.ends.end_ring`. A corner is where its two faces and the ring
+meet, as built; its covariance is that of these coefficients, 40 of a box, so points of one corner are correlated. Waves
+of a face, what its 8 coefficients do not follow, are estimated at its corners and its middle by kriging.
 
 Departure and noise are separated for all ends of a bridge together, see :mod:`processor.adjustment.model_averaging`:
 the sizes of the other ends' departures set the weights of the hypotheses for each end.
@@ -24,10 +24,11 @@ from processor.adjustment.model_averaging import SIZES_MM, Estimate
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, reason
-from processor.preassembly.ends import faces as ends_faces
-from processor.preassembly.ends import plate_sides, section, viewpoints
-from processor.preassembly.ends import ring as ends_ring
-from processor.preassembly.ends.faces import (
+from processor.preassembly.ends import end_ring as ends_ring
+from processor.preassembly.ends import outer_faces as ends_faces
+from processor.preassembly.ends import plate_sides, section, view_variance
+from processor.preassembly.ends.joint_frame import EndPlace
+from processor.preassembly.ends.outer_faces import (
     FACE,
     FLOOR_MM,
     LEAST_POINTS,
@@ -38,9 +39,8 @@ from processor.preassembly.ends.faces import (
     RegisteredPart,
     UsedPoints,
 )
-from processor.preassembly.ends.joint_frame import EndPlace
 from processor.preassembly.ends.section import EndFace, PlateFace
-from processor.preassembly.ends.viewpoints import Thickness, Variances
+from processor.preassembly.ends.view_variance import Thickness, Variances
 
 # Sizes of bending terms, the finest for scans without noise, and their prior weights: ends are cut by a plane.
 BENDS_MM = (0.0, 0.02, *SIZES_MM[1:])
@@ -191,7 +191,7 @@ def estimate(ends: Sequence[FittedEnd], between: Sequence[Variances] = ()) -> li
     every = [face for end in ends for face in end.faces]
     weighted = zip(every, kriging.learned_weights(every), strict=True)
     faces = iter([kriging.average(*face) for face in weighted])
-    viewed = between or (viewpoints.NONE,) * len(ends)
+    viewed = between or (view_variance.NONE,) * len(ends)
     fitted = [_joined([next(faces) for _ in end.faces], end, view) for end, view in zip(ends, viewed, strict=True)]
     averaged = _averaged(ends, fitted)
     return [_corners_of(*of_end) for of_end in zip(ends, fitted, averaged, strict=True)]

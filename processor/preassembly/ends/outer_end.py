@@ -13,7 +13,14 @@ import numpy as np
 from processor.adjustment import variance_components
 from processor.geometry.mesh_distance import on_face
 from processor.model import Floats
-from processor.preassembly.ends.faces import ALONG, FLOOR_MM, LEAST_POINTS, REACH_MM, RegisteredPart, least_squares
+from processor.preassembly.ends.outer_faces import (
+    ALONG,
+    FLOOR_MM,
+    LEAST_POINTS,
+    REACH_MM,
+    RegisteredPart,
+    least_squares,
+)
 
 NEAR_MM = 100.0  # of the end along the part: the thickest base plate
 

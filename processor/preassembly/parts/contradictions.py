@@ -14,7 +14,7 @@ import numpy as np
 
 from processor.adjustment import global_test, kriging
 from processor.model import Bools, Reason, reason
-from processor.preassembly.ends import viewpoints
+from processor.preassembly.ends import view_variance
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import FittedEnd
 from processor.preassembly.ends.section import PlateFace
@@ -36,7 +36,7 @@ def find(parts: Sequence[Examined]) -> list[tuple[Reason, ...]]:
     every = [face for end in ends for face in end.faces]
     weights = kriging.learned_weights(every) if every else np.empty((0, 0))
     faces = np.array([kriging.tail(*face) for face in zip(every, weights, strict=True)])
-    plates = viewpoints.tails([[plate for plate in end.plates if plate is not None] for end in ends])
+    plates = view_variance.tails([[plate for plate in end.plates if plate is not None] for end in ends])
     edges = [part.edges.tails.ravel() for part in parts]
     failed = global_test.contradicted(np.concatenate([faces, plates, *edges]))
     of_faces = np.split(failed[: len(faces)], np.cumsum([len(end.faces) for end in ends])[:-1])
@@ -61,7 +61,7 @@ def _of_no_other(end: FittedEnd, ends: Sequence[FittedEnd]) -> bool:
     for thickness, plate in zip(end.thickness, end.plates or (None,) * len(end.faces), strict=True):
         if plate is not None:
             known = np.array([*others, thickness])
-            if thickness > 0.0 and np.abs(known - plate.value[0]).min() > viewpoints.ALIKE_MM:
+            if thickness > 0.0 and np.abs(known - plate.value[0]).min() > view_variance.ALIKE_MM:
                 return True
     return False
 

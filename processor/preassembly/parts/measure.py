@@ -15,16 +15,16 @@ from processor.geometry.neighbors import by_cell, thinned
 from processor.geometry.polyline import Polyline
 from processor.model import DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly import topology
-from processor.preassembly.ends import bottom_edges, faces, joint_end, outer_end, viewpoints
+from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, view_variance
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
-from processor.preassembly.ends.faces import RegisteredPart
 from processor.preassembly.ends.joint_end import FittedEnd, JointEnd
 from processor.preassembly.ends.joint_frame import end_place
 from processor.preassembly.ends.outer_end import OuterEnd
+from processor.preassembly.ends.outer_faces import RegisteredPart
 from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import assignment, attitude, contradictions, identity, systematic_errors
 from processor.preassembly.parts.assignment import ScanParts
-from processor.preassembly.parts.member import Member
+from processor.preassembly.parts.part_in_chain import Member
 
 CELL_MM = 40.0  # points of a cell are looked up one after the other
 SLICES, LEAST_OF_TYPICAL = (
@@ -208,7 +208,7 @@ def _examined(part: FittedPart) -> contradictions.Examined:
     )
 
 
-def _viewpoint_remarks(part: FittedPart, between: viewpoints.Variances) -> Iterator[Reason]:
+def _viewpoint_remarks(part: FittedPart, between: view_variance.Variances) -> Iterator[Reason]:
     """Yield what is known of differences between the views of a part whose points' stations are not named."""
     if any(isinstance(end, FittedEnd) and end.plates for end in part.ends):
         if between.evident:
@@ -219,14 +219,14 @@ def _viewpoint_remarks(part: FittedPart, between: viewpoints.Variances) -> Itera
             yield reason("preassemble.viewpoints-not-compared")
 
 
-def _between_viewpoints(parts: Sequence[FittedPart]) -> viewpoints.Variances:
+def _between_viewpoints(parts: Sequence[FittedPart]) -> view_variance.Variances:
     """Variances between viewpoints by the plates of all parts."""
     ends = [end for part in parts for end in part.ends if isinstance(end, FittedEnd)]
     plates = [plate for end in ends for plate in end.plates if plate is not None]
-    return viewpoints.variances(plates, [end.ring_noise for end in ends if end.plates])
+    return view_variance.variances(plates, [end.ring_noise for end in ends if end.plates])
 
 
-def _as_seen(part: FittedPart, between: viewpoints.Variances) -> FittedPart:
+def _as_seen(part: FittedPart, between: view_variance.Variances) -> FittedPart:
     """Return a part with variances between viewpoints in the covariances of its registration and its edges.
 
     What the registration follows of them cancels in the adjustment, where the edges have all of their views' errors.
@@ -280,7 +280,7 @@ def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Se
         between_stations=_between_stations(points, station, shape),
         pose=used[0].registration.covariance,
         surface=shape.mesh,
-        outer=faces.outer_faces(shape.mesh, joints),
+        outer=outer_faces.outer_faces(shape.mesh, joints),
     )
 
 

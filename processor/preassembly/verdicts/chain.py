@@ -18,7 +18,7 @@ from processor.limits import standards as limits_of
 from processor.limits.guard_band import guard_band
 from processor.model import NORMAL_95, Floats, Limit, Reason, Tolerance, Verdict, reason, worst
 from processor.preassembly.chain.adjustment import Adjusted
-from processor.preassembly.parts.member import Member
+from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.verdicts.joints import MEASURES as OF_JOINTS
 from processor.preassembly.verdicts.joints import (
     Comparison,

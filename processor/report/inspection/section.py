@@ -59,7 +59,7 @@ def _beyond(result: Result) -> Iterator[Message]:
 
 
 def _characteristics(_: Scene, run: StepRun) -> list[Characteristic]:
-    """Return what of the components is held against limits."""
+    """Return what of the components is compared with limits."""
     return [
         Characteristic(
             id=f"{component.name} {found.id[i]}",

@@ -1,4 +1,4 @@
-"""What of a bridge is held against limits: each joint, and the whole chain."""
+"""What of a bridge is compared with limits: each joint, and the whole chain."""
 
 from __future__ import annotations
 

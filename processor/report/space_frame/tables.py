@@ -343,5 +343,5 @@ def _control(result: Result) -> list[Table]:
         for name, off, used, scan in zip(control.points, control.off, control.used, control.scans, strict=True)
     )
     columns = ("control_point", "dx_mm", "dy_mm", "dz_mm", "off_mm", "used", "scan")
-    note = text("Known place minus sighting after the corrections of the stations; a row a sighting.")
+    note = text("Known place minus sighting after the corrections of the stations; one row per sighting.")
     return [Table(text("Control points (mm)"), columns, rows, "control", note)] if rows else []

@@ -152,7 +152,7 @@ def _control(result: Result, method: str, suffix: str) -> list[Table]:
     )
     columns = ("point", "scan", "dx_mm", "dy_mm", "dz_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "share_percent", "used")
     note = text(
-        "Known minus measured place after the adjustment, a row a sighting. Share: how much of an error of the "
+        "Known minus measured place after the adjustment, one row per sighting. Share: how much of an error of the "
         "sighting is visible here; the poses absorb the rest. The sd of an unused sighting is that of its prediction."
     )
     return [Table(text("Control points (mm), method {method}", method=method), columns, rows, f"control{suffix}", note)]

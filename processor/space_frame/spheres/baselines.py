@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.geometry.merging import MergedCloud
 from processor.geometry.neighbors import nearest_crops
 from processor.geometry.sphere import Sphere, algebraic, ransac
 from processor.model import Bools, Floats, FrameDesign, Ints, Reason, Tolerance, reason
+from processor.scene_cloud import MergedCloud
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.params import Params
 from processor.space_frame.points.source import Source

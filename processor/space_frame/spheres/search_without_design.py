@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from processor.geometry.merging import MergedCloud
 from processor.geometry.sphere import Sphere, algebraic, bound
 from processor.model import Status, Tolerance, reason
+from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Flag, Result
 from processor.space_frame.spheres import sphere_search

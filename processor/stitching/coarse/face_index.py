@@ -14,7 +14,7 @@ from numba import njit
 
 from processor.model import Floats, Ints
 from processor.stitching.planes.hashing import EMPTY, place
-from processor.stitching.planes.samples import Patches
+from processor.stitching.planes.patches import Patches
 
 FIELD = 21  # bits of a cell's index along each axis
 MASK = (1 << FIELD) - 1

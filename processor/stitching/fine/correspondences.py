@@ -16,7 +16,7 @@ from processor.stitching.coarse import candidate_rotations
 from processor.stitching.fine import noise_model
 from processor.stitching.planes import extraction, hashing
 from processor.stitching.planes.extraction import Planes
-from processor.stitching.planes.samples import facing
+from processor.stitching.planes.patches import facing
 from processor.stitching.planes.scan_planes import LIMIT_SIGMAS, Cloud
 
 LEVELS = 7

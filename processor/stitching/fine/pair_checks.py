@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from processor.geometry import rigid
 from processor.model import Floats
-from processor.stitching import frames
+from processor.stitching import pose_covariance
 from processor.stitching.fine import bundle_adjustment
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import Blocks
@@ -58,7 +58,7 @@ def measure(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
     start = np.stack([np.eye(4), rigid.invert(network.T[a]) @ network.T[b]])
     solution = bundle_adjustment.solve(local, start, 0, iterations=3, robust=False, tau=network.tau)
     covariance = solution.covariance[6:, 6:]
-    d = frames.difference(solution.T[1], start[1])[:6]
+    d = pose_covariance.difference(solution.T[1], start[1])[:6]
     points = local.kind == 0
     weight = local.sums[points, 9]
     residual = float(np.sqrt((weight * solution.offset[points] ** 2).sum() / max(weight.sum(), 1e-12)))
@@ -108,22 +108,22 @@ def _loop(path: list[Pair], start: int) -> Loop:
     for pair in path:
         forward = pair.a == at
         # With rotations about the origin of a's frame the adjoint transforms the covariance.
-        covariance = frames.about(pair.covariance, pair.T_a_b[:3, 3])
+        covariance = pose_covariance.about(pair.covariance, pair.T_a_b[:3, 3])
         if forward:
             C = C + _transformed(covariance, T)
             T = T @ pair.T_a_b
         else:
-            T = T @ frames.invert(pair.T_a_b)
+            T = T @ pose_covariance.invert(pair.T_a_b)
             C = C + _transformed(covariance, T)
         at = pair.b if forward else pair.a
         rows.append(at)
-    xi = frames.difference(T, np.eye(4))[:size]
+    xi = pose_covariance.difference(T, np.eye(4))[:size]
     ratio = float(xi @ np.linalg.solve(C, xi)) / size
     return Loop(tuple(rows), float(np.linalg.norm(xi[3:6])), float(1e3 * np.linalg.norm(xi[:3])), ratio)
 
 
 def _transformed(covariance: Floats, T: Floats) -> Floats:
     """Transform the covariance of a small motion to the frame that T (4, 4) maps to, by the adjoint of T."""
-    J = frames.adjoint(T, len(covariance))
+    J = pose_covariance.adjoint(T, len(covariance))
     transformed: Floats = J @ covariance @ J.T
     return transformed

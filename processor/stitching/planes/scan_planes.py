@@ -9,8 +9,8 @@ import numpy as np
 from processor.geometry import scanner_rays
 from processor.model import Floats, Ints, Scan
 from processor.stitching.planes import borders, extraction, hashing
-from processor.stitching.planes.edges import Ends, ends_of, grid_of
 from processor.stitching.planes.extraction import Planes
+from processor.stitching.planes.face_ends import Ends, ends_of, grid_of
 from processor.stitching.planes.free_space import FreeSpace
 
 POINTS_A_CELL = 5.0

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from processor.adjustment import clusters, global_test
+from processor.adjustment import global_test, patches
 from processor.adjustment.scanner_class import VIEW_MM
 from processor.model import Bools, Floats, Ints
 
@@ -73,7 +73,7 @@ def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickn
     The two sides are compared patch by patch: ``at`` (n, 2) is the place of the points along and across the plate, mm,
     ``trend`` (n, 3) are the terms there, and ``inner`` (n,) marks the points behind the outer side.
     """
-    patch = clusters.cubes(at, PATCH_MM)
+    patch = patches.cubes(at, PATCH_MM)
     count = int(patch.max(initial=-1)) + 1
     difference, variance = np.zeros(count), np.zeros(count)
     enough = np.ones(count, bool)
@@ -182,7 +182,7 @@ def _with_class(between: float, squares: float, by_noise: float, freedom: int) -
 
 def _variance(squares: float, by_noise: float, freedom: int) -> float:
     """Variance on one side of a plate, widened for the number of differences it comes from."""
-    return float(clusters.widening(freedom / OF_PAIR)) * _estimate(squares, by_noise, freedom) if freedom >= 1 else 0.0
+    return float(patches.widening(freedom / OF_PAIR)) * _estimate(squares, by_noise, freedom) if freedom >= 1 else 0.0
 
 
 def _estimate(squares: float, by_noise: float, freedom: int) -> float:

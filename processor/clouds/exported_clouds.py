@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from processor import scene_cloud
+from processor.clouds.earlier_run import Run
 from processor.clouds.points import NAMES, TYPES, blocks
 from processor.clouds.poses import Placed
-from processor.clouds.run import Run
 from processor.defects import surface_charts
-from processor.geometry import merging, rigid
+from processor.geometry import rigid
 from processor.model import Floats, Ints, Stations
 from processor.writers.cloud import BLOCK, COLOURS, COLUMN, GRID, INTENSITY, ROW, STATION, Block, Cloud
 
@@ -103,7 +104,7 @@ def merged_cloud(run: Run, scans: Sequence[Placed]) -> Cloud:
     fields = fields_of(run, [placed.number for placed in scans], grid=False)
     if len(numbers.ids) > 1:
         fields[STATION] = TYPES["point_station"]
-    origin = np.floor(scans[0].origin() / merging.ORIGIN_STEP_MM) * merging.ORIGIN_STEP_MM
+    origin = np.floor(scans[0].origin() / scene_cloud.ORIGIN_STEP_MM) * scene_cloud.ORIGIN_STEP_MM
 
     def read() -> Iterator[Block]:
         for placed, number in zip(scans, numbers.of_scan, strict=True):
@@ -186,7 +187,7 @@ def core_cloud(run: Run) -> Cloud:
     core = result.core
     component = np.zeros(len(core.points), np.int32)
     if run.scene.structure is not None and len(core.points):
-        vertices, origin = merging.local_design(run.scene.structure)
+        vertices, origin = scene_cloud.local_design(run.scene.structure)
         design = run.scene.structure
         surface, of_facet = surface_charts.with_components(vertices, design.faces, design.bodies)
         facet, _, _ = surface.distances(core.points + (result.origin - origin), FOUND_MM)

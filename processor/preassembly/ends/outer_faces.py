@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.adjustment import clusters, kriging
+from processor.adjustment import kriging, patches
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.model import Bools, Floats, Ints, Reason, reason
-from processor.preassembly.ends import plate_sides, viewpoints
+from processor.preassembly.ends import plate_sides, view_variance
 from processor.preassembly.ends.joint_frame import EndPlace, end_place
 from processor.preassembly.ends.section import EndFace
-from processor.preassembly.ends.viewpoints import Thickness
+from processor.preassembly.ends.view_variance import Thickness
 
 FACE = 8  # coefficients of a face
 PLAIN = [0, 1, 4]  # of these terms: those of a face too narrow to have a shape across
@@ -158,9 +158,9 @@ def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] |
             inner = _inner_side(local[behind], level - behind_out, place, across)
             both = np.concatenate([rows[inliers], behind[inner]])
             height = np.concatenate([out[clear][inliers], behind_out[inner]])
-            terms = basis(local[both, 0], of_design.w(local[both]))[:, : viewpoints.TERMS]
+            terms = basis(local[both, 0], of_design.w(local[both]))[:, : view_variance.TERMS]
             marked = np.arange(len(both)) >= int(inliers.sum())
-            plate = viewpoints.thickness(terms, local[both][:, [0, across]], height, marked)
+            plate = view_variance.thickness(terms, local[both][:, [0, across]], height, marked)
         fits.append(FaceFit(mean, hypotheses, used, plate, single_layer))
     return fits
 
@@ -181,7 +181,7 @@ def _with_waves(coefficients: Floats, used: UsedPoints, at: Floats, face: EndFac
     """Estimate a face with its waves by points ``at`` (n, 2), along and across it from its middle."""
     half = face.half
     spacing = np.sqrt(2.0 * half * ZONE_MM / len(at))
-    found = clusters.patches(at, used.residual, max(PATCH_MM, PATCH_SPACINGS * float(spacing)))
+    found = patches.patches(at, used.residual, max(PATCH_MM, PATCH_SPACINGS * float(spacing)))
     terms = PLAIN if face.narrow else list(range(FACE))
     trend = basis(found.centre[:, 0], found.centre[:, 1] / half)[:, terms]
     noise = max(found.noise, FLOOR_MM**2)

@@ -1,4 +1,4 @@
-"""The report as a document (PDF, A4): title block and verdicts, what is held against limits, and the figures.
+"""The report as a document (PDF, A4): title block and verdicts, what is compared with limits, and the figures.
 
 Texts are in English, with the characters of the font that Matplotlib brings; others are drawn as question marks.
 """

@@ -6,7 +6,7 @@ import numpy as np
 
 from designgen.designs import bolt_ball
 from designgen.designs.space_frame import HEXAGON, Frame
-from designgen.frames import perpendicular
+from designgen.rigid import perpendicular
 from designgen.scanning.surfaces import Builder
 from processor.model import Floats
 

@@ -13,7 +13,7 @@ from processor import pipeline
 from processor.clouds.points import InMemory, Points, Spool
 from processor.model import Scene, UsageError
 from processor.pipeline import Execution
-from processor.results.names import RESULTS_H5
+from processor.results.file_names import RESULTS_H5
 from processor.scan_folder.files import missing
 from processor.store import store
 from processor.store.streaming import points_of
