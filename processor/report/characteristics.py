@@ -26,7 +26,7 @@ NOTE = text(
 
 @dataclass(frozen=True, kw_only=True)
 class Characteristic:
-    """One quantity compared with limits: ``deviation`` (actual - nominal), allowed from ``lower`` to ``upper``; NaN none.
+    """A quantity compared with limits: ``deviation`` = actual - nominal, allowed from ``lower`` to ``upper``; NaN none.
 
     ``limit_from`` says where the limit is from, and whether it was checked against the standard's text.
     """
