@@ -1,4 +1,4 @@
-"""Random generators, one a purpose, and random poses."""
+"""Random generators, one per purpose, and random poses."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ HEAD = """\
 
 This page is generated from the code by `make docs`; do not edit it by hand.
 
-Parameters are given in a TOML file, one table a step, nested records as tables within it:
+Parameters are given in a TOML file, one table per step, nested records as tables within it:
 
 ```toml
 [preassemble.adjust]

@@ -161,7 +161,7 @@ def described(default: Any = dataclasses.MISSING, **shown: Any) -> Any:
 
 
 def per_point_fields(record: type) -> tuple[str, ...]:
-    """Return the names of the fields of a scan or its labels that have one row a point."""
+    """Return the names of the fields of a scan or its labels that have one row per point."""
     fields = dataclasses.fields(record)
     return tuple(field.name for field in fields if field.metadata.get("shape", ("",))[0] == "n")
 
@@ -206,7 +206,7 @@ class Checked:
 
 
 class Rows(Checked):
-    """A table stored as columns of one length, a row an item; results.json has a list of its rows."""
+    """A table stored as columns of one length, a row per item; results.json has a list of its rows."""
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -697,7 +697,7 @@ class StationTruth(Checked):
 
 @dataclass(frozen=True)
 class AsBuilt(Checked):
-    """What was built or happened otherwise than designed: a row a number, e.g. ("bow, up", "rib1", 3.2, "mm")."""
+    """What was built or happened otherwise than designed: a row per number, e.g. ("bow, up", "rib1", 3.2, "mm")."""
 
     what: tuple[str, ...] = names("i")
     where: tuple[str, ...] = names("i")

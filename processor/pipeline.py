@@ -132,7 +132,7 @@ def streams(jobs: Sequence[Job]) -> bool:
 
 
 def read_params(path: Path | None) -> dict[str, Any]:
-    """Read a parameter file: a table a step. UsageError where it is not TOML."""
+    """Read a parameter file: a table per step. UsageError where it is not TOML."""
     if path is None:
         return {}
     try:

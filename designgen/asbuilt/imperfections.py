@@ -75,7 +75,10 @@ def _check(params: ArchParams | FrameParams) -> None:
         elif key == "gap_table_mm":
             known = all(-MOST_GAP_MM <= gap <= MOST_GAP_MM for gap in value)
             expect(
-                known and len(value) % 12 == 0, f"asbuilt.{key}", value, f"12 numbers a joint, each to {MOST_GAP_MM:g}"
+                known and len(value) % 12 == 0,
+                f"asbuilt.{key}",
+                value,
+                f"12 numbers per joint, each to {MOST_GAP_MM:g}",
             )
         else:
             expect(value >= 0, f"asbuilt.{key}", value, "0 or more")

@@ -22,7 +22,7 @@ from processor.writers.cloud import METRES
 from processor.writers.toml import as_toml
 
 NO_POSE = np.empty(0)
-EACH_SCAN = ("registered", "clean")  # contents with a file a scan, in the scan's own frame
+EACH_SCAN = ("registered", "clean")  # contents with a file per scan, in the scan's own frame
 
 
 def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str], what: str, format_: str) -> None:

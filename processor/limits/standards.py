@@ -1,4 +1,4 @@
-"""Limits of standards, from the files in ``processor/limits``: one file a standard, one row a limit.
+"""Limits of standards, from the files in ``processor/limits``: one file per standard, one row per limit.
 
 Most rows are not verified, and verdicts that depend on them are marked. Limits of a project override the standard.
 """

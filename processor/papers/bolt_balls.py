@@ -78,7 +78,7 @@ def measure(path: Path, data_set: DataSet) -> Measured:
 
 
 def _by_total_station(design: FrameDesign, rng: np.random.Generator) -> Floats:
-    """Return centre and radius (k, 4) by least squares of four points a ball, sighted from below; one is a blunder."""
+    """Return centre and radius (k, 4) fitted to four points per ball, sighted from below; one is a blunder."""
     found = np.full((len(design.radii), 4), np.nan)
     for i, (centre, radius) in enumerate(zip(design.centres, design.radii.tolist(), strict=True)):
         directions = rng.normal(size=(200, 3))

@@ -248,7 +248,7 @@ def beyond_rigid(between: Floats) -> tuple[float, float]:
     """Rms, mm, of differences (8, 3 j) of two methods' gaps that no rigid motion of the parts explains, and of all.
 
     Two methods that measure the same key points differ by rigid motions of the parts alone. Over a section of any size
-    these change dx linearly to the left and upward, dy upward, and dz to the left: seven unknowns a joint.
+    these change dx linearly to the left and upward, dy upward, and dz to the left: seven unknowns per joint.
     """
     left = np.array([1.0, -1.0, -1.0, 1.0, 0.0, -1.0, 0.0, 1.0])
     up = np.array([-1.0, -1.0, 1.0, 1.0, -1.0, 0.0, 1.0, 0.0])

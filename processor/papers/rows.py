@@ -36,7 +36,7 @@ class Outcome(Word):
 
 @dataclass(frozen=True)
 class Row:
-    """A number that a table or figure of a paper states; ``values`` holds ours, one a seed, empty where not made.
+    """A number that a table or figure of a paper states; ``values`` holds ours, one per seed, empty where not made.
 
     ``published`` is NaN where the row is of a method of ours. A statement has the published value 1, and ours is 1 in
     each seed in which it holds.

@@ -1,4 +1,4 @@
-"""Paper 003: nine scans from six stations chained by three picked points a pair, with six and with seven parameters."""
+"""Paper 003: nine scans from six stations chained by three picked points per pair, with six and seven parameters."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def measure(path: Path, data_set: DataSet) -> Measured:
     figures = {"scans": float(len(scene.scans))}
     if scene.picks is not None:
         pairs = set(zip(scene.picks.scan_a, scene.picks.scan_b, strict=True))
-        figures["points a pair"] = len(scene.picks.scan_a) / len(pairs)
+        figures["points per pair"] = len(scene.picks.scan_a) / len(pairs)
     figures |= _figures(SIX, step.run(scene, params), path, scene)
     figures |= _figures(SEVEN, step.run(scene, replace(params, scale="free")), path, scene)
     figures |= _figures(OURS, step.run(replace(scene, picks=None), Params(seed=data_set.seed)), path, scene)
@@ -64,7 +64,9 @@ def rows(found: Found) -> list[Row]:
     section = text("section {number}", number="2")
     why, none = reason("papers.stitch-placed"), reason("papers.stitch-no-error")
     made = [_row(section, "", text("scans"), SCANS, found.values(BRIDGE, "scans"), Rule.NEAR, why)]
-    made.append(_row(section, "", text("points a pair"), POINTS, found.values(BRIDGE, "points a pair"), Rule.NEAR, why))
+    made.append(
+        _row(section, "", text("points per pair"), POINTS, found.values(BRIDGE, "points per pair"), Rule.NEAR, why)
+    )
     for method in (SIX, SEVEN, OURS):
         published = NAN if method == OURS else SCANS
         because = reason("papers.beside") if method == OURS else why

@@ -65,7 +65,7 @@ class BoxParams:
     joint_zone_mm: float = 150.0  # length of the zone that is cut out at the end
     edge_box_mm: float = 0.0  # L_edge; 0 = 1.5 times the thickness of the plate at hand, as its two sides are scanned
     plate_mm: float = 28.0  # thickness of a plate of which one side alone is scanned
-    box_count: int = 10  # boxes an edge
+    box_count: int = 10  # boxes per edge
     box_range: float = 0.4  # k1, k2 run from -range to +range
     search_offset_mm: float = 200.0  # of P beyond the end
     line_threshold: float = 1.0  # of the RANSAC line, in spacings

@@ -1,4 +1,4 @@
-"""Readers of scan files: one module a format, chosen by the suffix of the file."""
+"""Readers of scan files: one module per format, chosen by the suffix of the file."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ class Rows:
                     job.result()
 
     def _parts(self, workers: int) -> list[tuple[int, int]]:
-        """Cut the text at ends of lines into one part a worker, or leave it whole where it is short."""
+        """Cut the text at ends of lines into one part per worker, or leave it whole where it is short."""
         size = len(self._text) - self._at
         if size < workers * LEAST_PART:
             return [(self._at, len(self._text))]

@@ -1,4 +1,4 @@
-"""E57 (ASTM E2807): several scans a file, each with a name and the pose of its scanner, in metres.
+"""E57 (ASTM E2807): several scans per file, each with a name and the pose of its scanner, in metres.
 
 Points stay in the frame of their scan. Points with an invalid state are left out; the others keep the row and column of
 the scanner's grid, if the scan has both.

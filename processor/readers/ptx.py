@@ -1,4 +1,4 @@
-"""PTX: a grid a scan, each with the pose of its scanner; points stay in the scanner's frame. Metres.
+"""PTX: a grid per scan, each with the pose of its scanner; points stay in the scanner's frame. Metres.
 
 A scan has lines for its columns, its rows, the scanner's position, the scanner's three axes, the 4x4 matrix for row
 vectors (transposed here), and for each grid cell ``x y z intensity [r g b]``, column by column. A cell of ``0 0 0`` had

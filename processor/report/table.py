@@ -39,7 +39,7 @@ class Table:
 
 
 def figures_of(title: str, runs: Sequence[StepRun], file: str) -> Table:
-    """Tabulate the fields of results that have a heading, a column a method; see :func:`processor.model.described`."""
+    """Tabulate the fields of results with a heading, a column per method; see :func:`processor.model.described`."""
     columns = [list(_figures(run.result)) for run in runs]
     rows = tuple(
         (heading, *(column[i][1] for column in columns), unit) for i, (heading, _, unit) in enumerate(columns[0])

@@ -1,8 +1,8 @@
 """Stitching: scans without poses into one frame, ``automatic`` by the structure itself, or by picked common points.
 
 ``automatic`` places the scans by the flat faces they share and by what each scanner looked through, then adjusts all of
-them at once on these faces and their ends. ``three-point`` takes three or more picked points a pair (picks.csv), as in
-paper 003, and chains the pairs; six parameters, or the paper's seven with ``scale = "free"``. Three or more control
+them at once on these faces and their ends. ``three-point`` takes three or more picked points per pair (picks.csv), as
+in paper 003, and chains the pairs; six parameters, or the paper's seven with ``scale = "free"``. Three or more control
 points that span a plane fix the frame of either method's result and correct its poses.
 """
 

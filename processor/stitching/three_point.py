@@ -249,7 +249,7 @@ def _chained(pairs: list[Pair], count: int, reference: int) -> Floats:
 def _equation(pair: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the derivative by both scans' motions, the misclosure in a's axes, and the weight.
 
-    With m = 6 unknowns a scan, or 7 with its scale: (m, 2m), (m,) and (m, m).
+    With m = 6 unknowns per scan, or 7 with its scale: (m, 2m), (m,) and (m, m).
     """
     m, to_a = len(pair.covariance), pose_covariance.invert(T[pair.a])
     R, S = pose_covariance.rotation_of(T[pair.a]).T, to_a[:3, :3]

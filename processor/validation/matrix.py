@@ -145,7 +145,7 @@ def _entries(cell: dict[str, Any], path: Path, where: str, fixed: tuple[int, ...
         raise UsageError(f"{where}: expected steps = the names of those to run")
     params = cell.get("params", {})
     if not isinstance(params, dict):
-        raise UsageError(f"{where}: params: expected a table a step, got {params!r}")
+        raise UsageError(f"{where}: params: expected a table per step, got {params!r}")
     try:
         pipeline.plan(steps, methods, params, None)
     except UsageError as error:

@@ -1,4 +1,4 @@
-"""Text: a line a point, in metres to 0.1 micrometre; a line of names if there are columns besides the coordinates."""
+"""Text: a line per point, in metres to 0.1 micrometre; a line of names if there are columns besides the coordinates."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ minimises
 
     sum of squared gaps + lambda sum of squared departures of the bottom edges
 
-over gaps of eight pairs a joint along three axes, and departures sideways and up at regular chainages of both edges.
+over gaps of eight pairs per joint along three axes, and departures sideways and up at regular chainages of both edges.
 The joints may form any graph: a row, a closed ring, branches. A part without bottom edges has the departures of its key
 points across its joints in their place.
 The error of a part's registration moves both its ends and its edges, and the adjustment removes it. Parts beside a

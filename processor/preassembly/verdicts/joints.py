@@ -49,7 +49,7 @@ class LimitOrigin(Word):
 
 @dataclass(frozen=True)
 class ComparedLimits(Rows):
-    """Values compared with limits, a row a limit.
+    """Values compared with limits, a row per limit.
 
     Of the groove gap the value is the extreme nearer to its limit, less the design's root gap. ``low`` and ``high`` are
     allowed, -inf and inf without a bound; NaN: they depend on an unknown size. ``clause`` is of the standard, or the

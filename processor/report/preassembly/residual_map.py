@@ -97,7 +97,7 @@ def _can_show(part: DesignPart, residuals: Residuals, i: int) -> bool:
 
 
 def draw(scene: Scene, result: Result) -> tuple[Message, bytes] | None:
-    """Draw the distances from the design's surface, a panel a part, up to MOST_PARTS of them; None without any."""
+    """Draw the distances from the design's surface, a panel per part, up to MOST_PARTS of them; None without any."""
     assert scene.arch is not None
     if result.adjustment is None:
         return None

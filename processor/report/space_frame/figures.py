@@ -198,7 +198,7 @@ def _ball_errors(run: StepRun, report: ErrorReport) -> tuple[Message, bytes]:
 
 
 def _errors(axes: Axes, off: Floats, sd: Floats, bound: Floats, xlabel: str, ylabel: str) -> None:
-    """Draw errors, and the distribution that they would have: a normal one a ball, all added up."""
+    """Draw errors, and the distribution that they would have: a normal one per ball, all added up."""
     finite = np.isfinite(off)
     errors = off[finite]
     reach = float(np.quantile(np.abs(errors), 0.99)) if len(errors) else 1.0

@@ -169,7 +169,7 @@ def _yes_no(value: np.bool_) -> Message:
 
 
 def poses_csv(result: Result) -> bytes:
-    """Write poses as CSV: a row a scan, the 4 x 4 matrix row by row, mm, and the frames it maps from and to."""
+    """Write poses as CSV: a row per scan, the 4 x 4 matrix row by row, mm, and the frames it maps from and to."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["scan", "status", *(f"m{i}{j}" for i in range(4) for j in range(4)), "from", "to"])

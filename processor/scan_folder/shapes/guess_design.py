@@ -141,7 +141,7 @@ def _named_as_parts(bodies: Sequence[Body]) -> bool:
 
 
 def _bodies(folder: Path, surfaces: Sequence[surface_files.Surface], units: str) -> _Parts:
-    """Return the parts in mm: a part a file, or of one file a part a body."""
+    """Return the parts in mm: a part per file, or of one file per part a body."""
     bodies, mesh_of = list[Body](), dict[str, str]()
     scales = [1.0 if surface.bodies is not None else MM_PER_UNIT[units] for surface in surfaces]
     if len(surfaces) > 1:

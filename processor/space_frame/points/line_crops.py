@@ -24,7 +24,7 @@ CELL_MM = 200.0
 FIELD = 21  # bits for each coordinate of a point less its line's middle
 HALF = 1 << (FIELD - 1)  # 10.5 m in steps of 0.01 mm
 CELL_FIELD = 20
-LEAST_RANGE = 50_000  # points a thread takes at once
+LEAST_RANGE = 50_000  # points that a thread takes at once
 
 
 class Gathered(NamedTuple):
@@ -254,7 +254,7 @@ def gather(
     room: int,
     threads: int = 0,
 ) -> Gathered:
-    """Gather up to ``room`` points a line from stretches of (coordinates (n, 3), stations (n,) or empty).
+    """Gather up to ``room`` points per line from stretches of (coordinates (n, 3), stations (n,) or empty).
 
     ``scale`` turns coordinates into steps of 0.01 mm: 100 for mm.
     """

@@ -20,7 +20,7 @@ from processor.model import Floats, Ints, Labels, UsageError
 from processor.space_frame.points.hash_sampling import WHOLE, hashed
 from processor.space_frame.points.source import Source
 
-GREATEST_REACH_MM = 1000.0  # 21 bits an axis
+GREATEST_REACH_MM = 1000.0  # 21 bits per axis
 BLOCK = 1 << 14
 EMPTY = -1
 MOST_POINTS = 2_000_000  # of all crops together, and of each

@@ -160,7 +160,7 @@ def _scales(cloud: Cloud, radius_mm: float | None) -> Floats:
 def thinned(points: Floats, cell: float) -> Ints:
     """Rows of the first point in every cell of a grid of this edge."""
     lower = points.min(axis=0)
-    size = max(cell, float(np.ptp(points, axis=0).max()) / (1 << 20))  # 21 bits an axis
+    size = max(cell, float(np.ptp(points, axis=0).max()) / (1 << 20))  # 21 bits per axis
     i, j, k = np.floor((points - lower) / size).astype(np.int64).T
     return np.sort(np.unique(i << 42 | j << 21 | k, return_index=True)[1])
 

@@ -65,7 +65,7 @@ class Stations(Checked):
     axis_directions: Floats = column("m", 3)
     axis_radii: Floats = column("m")
     datum: tuple[Reason, ...] = described((), reasons="")  # what fixes all stations together, and its uncertainty
-    control: tuple[str, ...] = names("c")  # control points, a row a sighting
+    control: tuple[str, ...] = names("c")  # control points, a row per sighting
     control_scan: tuple[str, ...] = names("c")  # the stations that saw them
     control_off: Floats = column("c", 3)  # target minus sighting after the corrections
     control_used: Ints = column("c", dtype=np.int64)  # 1 = yes

@@ -96,7 +96,7 @@ def _is_on(place, middle, tubes, j):  # type: ignore[no-untyped-def]
 
 
 def tube_points(gathered: Gathered, lines: Ints, members: Members, most: int = MOST, threads: int = 0) -> TubePoints:
-    """Take up to ``most`` points a member from those gathered near its line, ``lines`` (m,).
+    """Take up to ``most`` points per member from those gathered near its line, ``lines`` (m,).
 
     The choice of points and their order depend on their coordinates alone.
     """

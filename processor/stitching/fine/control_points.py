@@ -29,7 +29,7 @@ LOOSENED = 30  # rounds at most
 
 @dataclass(frozen=True)
 class Sightings:
-    """Sightings of control points by scans, a row a sighting; mm.
+    """Sightings of control points by scans, a row per sighting; mm.
 
     ``seen`` (m, 3) is in the frame of scan ``scan`` (m,) less its cloud's origin, ``known`` (m, 3) in that of the
     control points less ``centre``. Rows of one ``point`` (m,) share the known place and its error.
