@@ -6,10 +6,9 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-from processor.model import Status
+from processor.model import WORST_FIRST, Status
 
 SummaryValues = dict[str, Any]
-VERDICTS = ("fail", "indeterminate", "pass")  # the worst first
 COLUMNS = {
     "steps": "steps, with the status of those that did not end well",
     "verdict": "the worst of all steps, against the limits",
@@ -50,7 +49,7 @@ def summary_values(results: Mapping[str, Any]) -> SummaryValues:
         values |= {name: steps["deviation"].get(key) for name, key in zip(names, keys, strict=True)}
     if "defects" in steps:
         values["defects"] = len(steps["defects"].get("defects", []))
-    values["verdict"] = results.get("verdict") if results.get("verdict") in VERDICTS else None
+    values["verdict"] = results.get("verdict") if results.get("verdict") in WORST_FIRST else None
     if results["checks"]:
         passed = sum(bool(check["passed"]) for check in results["checks"])
         values |= {"checks_passed": passed, "checks_missed": len(results["checks"]) - passed}
@@ -68,7 +67,7 @@ def _with_status(name: str, status: str) -> str:
 
 def _add_preassembly(step: Mapping[str, Any], values: SummaryValues) -> None:
     verdicts = Counter(str(joint.get("verdict")) for joint in step.get("joints", []) if joint.get("verdict"))
-    values.update({f"joints_{name}": verdicts[name] for name in VERDICTS} if verdicts else {})
+    values.update({f"joints_{name}": verdicts[name] for name in WORST_FIRST} if verdicts else {})
     for error in ("splicing", "linear"):
         for statistic in ("mean", "max"):
             values[f"{error}_{statistic}_mm"] = step.get(f"{error}_error", {}).get(statistic)

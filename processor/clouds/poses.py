@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from processor.adjustment import temperature
 from processor.clouds.earlier_run import Run
 from processor.geometry import rigid
 from processor.model import Floats, InputError, Reason, Scan, Status, UsageError, reason
-from processor.preassembly.assemble import REFERENCE_C
-from processor.preassembly.parts.systematic_errors import EXPANSION_PER_K
+from processor.scene_cloud import UNPLACED
 from processor.stitching import pose_covariance
-
-UNPLACED = (Status.FAILED, Status.AMBIGUOUS)  # of a scan: its pose may be wrong
 
 
 @dataclass(frozen=True)
@@ -111,9 +109,7 @@ def in_bridge(run: Run) -> Poses:
     """
     result = run.step("preassemble", "assembled")
     scene, table = run.scene, result.components
-    scale = 1.0
-    if np.isfinite(scene.temperature_C) and result.method == "adjustment":
-        scale = 1.0 / (1.0 + EXPANSION_PER_K * (scene.temperature_C - REFERENCE_C))
+    scale = 1.0 / temperature.expansion(scene.temperature_C) if result.method == "adjustment" else 1.0
     placed, remarks = [], []
     for row, name in enumerate(table.name):
         T, status = table.T_bridge_scan[row], table.status[row]

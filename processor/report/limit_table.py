@@ -9,10 +9,10 @@ import numpy as np
 
 from processor.language.messages import Text, label, text
 from processor.limits.judging import JudgedLimits
+from processor.model import WORST_FIRST
 from processor.report.table import Table
 
 COLUMNS = ("limit", "of", "verdict", "value", "ci95", "least", "greatest", "unit", "clause")
-WORST_FIRST = ("fail", "indeterminate", "pass")
 NOTE = text(
     "± is the 95 % half-width, a dash is no bound or no number. Pass: the whole interval keeps the limit; fail: the "
     "whole interval exceeds it; indeterminate: the limit lies within it, or the value is in doubt."
@@ -37,7 +37,7 @@ def with_unverified(note: Text, clauses: Iterable[str]) -> Text:
 
 def worst_first(limits: JudgedLimits) -> list[int]:
     """Return the rows of comparisons, those of the worst verdict first."""
-    return sorted(range(len(limits)), key=lambda k: WORST_FIRST.index(str(limits.verdict[k])))
+    return sorted(range(len(limits)), key=lambda k: WORST_FIRST.index(limits.verdict[k]))
 
 
 def _rows(limits: JudgedLimits) -> Iterator[tuple[Any, ...]]:

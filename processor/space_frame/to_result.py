@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from processor.adjustment import temperature
 from processor.limits import standards
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
 from processor.space_frame import catalogue, supports
@@ -34,8 +35,6 @@ from processor.space_frame.spheres.view_errors import of_tubes
 from processor.space_frame.stations.records import Stations
 from processor.space_frame.stations.sightings import control_of
 
-REFERENCE_C = 20.0
-EXPANSION_PER_K = 12e-6
 UNUSED_CONTROL = reason("spheres.unused-control")
 
 
@@ -58,10 +57,9 @@ def beside_ray(scene: Scene, params: Params) -> Result | None:
 
 
 def _extracted(source: SceneSource, scene: Scene, params: Params) -> Extracted | None:
-    degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
     options = Options(
         members=params.members,
-        expansion=1.0 + EXPANSION_PER_K * degrees,
+        expansion=temperature.expansion(scene.temperature_C),
         register_stations=params.register_stations,
         datum_mm=params.datum_mm,
         limits=standards.default_for(scene.tolerance),

@@ -274,7 +274,7 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
         parts.append(Member((None, end) if sense < 0.0 else (end, None), edges, middle, pose))
     stated = adjustment.adjust(parts, joints, np.eye(4)[None], 0.1)
     for end in (parts[0].ends[1], parts[1].ends[0]):
-        left = np.sqrt(np.diag(adjustment.without_pose(end, pose)))
+        left = np.sqrt(np.diag(end.without_pose(pose)))
         np.testing.assert_allclose(left, noise, rtol=1e-3)  # the error of the registration cancels in the gap
     gaps, moved, at_rest, largest = [], [], [], []
     for _ in range(400):

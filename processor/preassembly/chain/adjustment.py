@@ -169,12 +169,6 @@ def left_open(
     return (after @ observed.value).reshape(8, 3), after @ observed.covariance @ after.T
 
 
-def without_pose(end: JointEnd, pose: Floats) -> Floats:
-    """Covariance (24, 24) of an end without what it follows of its part's registration, of covariance (6, 6)."""
-    covariance: Floats = end.covariance - end.by_pose @ pose @ end.by_pose.T
-    return covariance
-
-
 def _solve(
     observed: _Observations, weight: float, parts: int, hold: float = HOLD, without: slice = slice(0, 0)
 ) -> Floats:
@@ -252,7 +246,7 @@ def _gap_rows(members: Sequence[Member], sides: tuple[Side, Side], points: Float
         columns = slice(6 * part, 6 * part + 6)
         A[:, columns] = sign * rigid.motion(points - members[part].centre).reshape(24, 6)
         by_pose[:, columns] = sign * turn @ end.by_pose
-    noise = without_pose(left, members[at[0]].pose) + without_pose(right, members[at[1]].pose)
+    noise = left.without_pose(members[at[0]].pose) + right.without_pose(members[at[1]].pose)
     return _Rows(A, turn @ (right.departure - left.departure).ravel(), turn @ noise @ turn.T, by_pose)
 
 
@@ -266,7 +260,7 @@ def _line_rows(members: Sequence[Member], side: Side, points: Floats, R: Floats)
     local = np.kron(np.eye(8), R.T)
     A[:, columns] = (local @ rigid.motion(points - member.centre).reshape(24, 6))[across]
     by_pose[:, columns] = end.by_pose[across]
-    noise = without_pose(end, member.pose)[across]
+    noise = end.without_pose(member.pose)[across]
     return _Rows(A, end.departure.ravel()[across], noise[:, across], by_pose, noise @ local)
 
 

@@ -172,7 +172,7 @@ def limiting(
         joint_end = part.member.ends[of_joint.end]
         if joint_end is not None:
             # An end's error by its part's registration is common to both ends: it cancels, so it limits nothing.
-            covariance = adjustment.without_pose(joint_end, part.member.pose)
+            covariance = joint_end.without_pose(part.member.pose)
             variance[side] = float(np.diag(covariance)[3 * point + axis])
     side = max(variance, key=lambda side: variance[side])
     name = parts[left.part if side is PartEnd.END else right.part].name

@@ -89,6 +89,11 @@ class JointEnd:
     doubts: tuple[Reason, ...] = ()  # why the end is not known, or may be that of another plate side
     remarks: tuple[Reason, ...] = ()  # that do not put it in doubt
 
+    def without_pose(self, pose: Floats) -> Floats:
+        """Covariance (24, 24) without what it follows of the part's registration, of covariance ``pose`` (6, 6)."""
+        covariance: Floats = self.covariance - self.by_pose @ pose @ self.by_pose.T
+        return covariance
+
 
 class PlateSides(NamedTuple):
     """Thicknesses (f,) by which the faces may lie further in, and what is to be said of the sides of the plates."""

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.model import Floats
-from processor.preassembly.chain.adjustment import without_pose
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.parts.measure import MeasuredPart
 
@@ -43,7 +42,7 @@ def measured(part: MeasuredPart, joint_points: Sequence[Floats | None]) -> Shape
         R = joint_frame(points)[:3, :3]
         turn = np.kron(np.eye(8), R)
         ends[k] = points + end.departure @ R.T
-        noise[rows, rows] = turn @ without_pose(end, member.pose) @ turn.T
+        noise[rows, rows] = turn @ end.without_pose(member.pose) @ turn.T
         by_pose[rows] = turn @ end.by_pose
     noise[:24, 24:] = noise[24:, :24] = 0.0
     edges = member.edges
