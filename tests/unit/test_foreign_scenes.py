@@ -126,6 +126,16 @@ def test_the_volume_of_a_dent_is_that_of_its_points(tmp_path):
     assert -moved.sum() * 0.25 == pytest.approx(bump.volume, rel=1e-4)
 
 
+def test_a_piece_that_reaches_two_borders_is_a_missing_part(tmp_path):
+    """As docs/defects.md defines the classes: the corner of a rib, whose borders are at 430 and 700 mm."""
+    path = make("steelwork", tmp_path, "case=defects", "step_mrad=8", "spacing=40")
+    truth = truth_json.read(path).defects
+    off = np.array([430.0, 700.0]) - np.abs(truth.centres[:, 1:])
+    sides = np.sqrt(truth.area_mm2)
+    corner = np.flatnonzero((np.abs(off - sides[:, None] / 2) < 1e-6).all(axis=1))
+    assert [truth.classes[k] for k in corner] == ["missing-part"]
+
+
 # --- the truth as JSON ------------------------------------------------------------------------------------------------
 
 
