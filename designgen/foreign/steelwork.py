@@ -137,26 +137,56 @@ def turned(points: Array, station: Array, settings: dict[str, Any], rng: np.rand
     return np.asarray(points + np.cross(turn, points - station) + number(settings, "shift") * rng.normal(size=3))
 
 
-def thinned(points: Array, spacing: float) -> Array:
-    """One point of each voxel."""
+def thinned(points: Array, spacing: float) -> npt.NDArray[np.int64]:
+    """Return the row of one point of each voxel."""
     cell = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
     size = cell.max(axis=0) + 1
     _, first = np.unique((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_index=True)
-    return np.asarray(points[np.sort(first)])
+    return np.sort(first)
+
+
+def by_stations(points: Array, normals: Array, of: npt.NDArray[np.int64], stations: Array,
+                settings: dict[str, Any]) -> Array:  # fmt: skip
+    """Covariance (6, 6) of the motion, turn about the origin and shift, that errors of stations look like.
+
+    A station, number ``of`` (n,), has a shift, a turn and an offset of ranges; the motion is the one of least squares
+    along the normals (n, 3) of steel at rest. Nothing tells it from a movement of the whole.
+    """
+    J = np.hstack([np.cross(points, normals), normals])
+    inverse, total = np.linalg.inv(J.T @ J), np.zeros((6, 6))
+    for k, station in enumerate(stations):
+        on = of == k
+        ray, normal = points[on] - station, normals[on]
+        along = np.einsum("ni,ni->n", ray, normal) / np.linalg.norm(ray, axis=1)
+        turn = 1e-6 * number(settings, "rotation_urad") * np.cross(ray, normal)
+        errors = [number(settings, "shift") * normal, turn, number(settings, "range_offset") * along[:, None]]
+        gain = inverse @ (J[on].T @ np.hstack(errors))
+        total += gain @ gain.T
+    return total
 
 
 def merged(cuboids: list[Cuboid], stations: Array, move: Move, cut: Callable[[Array], Mask], settings: dict[str, Any],
-           rng: np.random.Generator) -> Array:  # fmt: skip
-    """Return the cloud of all stations, design frame; points in ``cut`` are not there."""
-    clouds = []
-    for station in stations:
+           rng: np.random.Generator) -> tuple[Array, Array]:  # fmt: skip
+    """Return the cloud of all stations, design frame, and the covariance :func:`by_stations` of steel at rest.
+
+    Points in ``cut`` are not there.
+    """
+    clouds, seen_at = [], []
+    for k, station in enumerate(stations):
         seen = seen_from(cuboids, station, 1e-3 * number(settings, "step_mrad"), rng)
-        raw = measured(seen, seen.points + move(seen.points), station, settings, rng)
-        clouds.append(turned(raw, station, settings, rng)[~cut(seen.points)])
-    points = np.concatenate(clouds)
-    steel = thinned(points[rng.permutation(len(points))], number(settings, "spacing"))
+        moved = move(seen.points)
+        raw = measured(seen, seen.points + moved, station, settings, rng)
+        there = ~cut(seen.points)
+        clouds.append(turned(raw, station, settings, rng)[there])
+        at_rest = (moved == 0.0).all(axis=1)
+        seen_at.append(np.column_stack([seen.points, seen.normals, np.full(len(raw), k), at_rest])[there])
+    order = rng.permutation(sum(len(cloud) for cloud in clouds))
+    points, seen_points = np.concatenate(clouds)[order], np.concatenate(seen_at)[order]
+    rows = thinned(points, number(settings, "spacing"))
+    steel, rest = points[rows], seen_points[rows][seen_points[rows, 7] > 0.0]
     stray = rng.uniform(steel.min(axis=0), steel.max(axis=0), (int(number(settings, "outliers") * len(steel)), 3))
-    return np.concatenate([steel, stray])
+    covariance = by_stations(rest[:, :3], rest[:, 3:6], rest[:, 6].astype(np.int64), stations, settings)
+    return np.concatenate([steel, stray]), covariance
 
 
 # --- what is built ----------------------------------------------------------------------------------------------------
@@ -309,14 +339,16 @@ def write_stl(path: Path, cuboids: list[Cuboid]) -> None:
     path.write_text("\n".join([*lines, "endsolid steelwork"]) + "\n")
 
 
-def write_structure(folder: Path, cuboids: list[Cuboid], cloud: Array, truth: dict[str, Any], T: Array) -> None:
-    """Write design, one merged cloud in a frame of its own, and the truth."""
+def write_structure(folder: Path, cuboids: list[Cuboid], scan: tuple[Array, Array], truth: dict[str, Any],
+                    T: Array) -> None:  # fmt: skip
+    """Write design, one :func:`merged` cloud in a frame of its own, and the truth."""
+    cloud, covariance = scan
     write_stl(folder / "steel.stl", cuboids)
     write_ply(folder / "Merge_2 (clean).ply", cloud @ T[:3, :3].T + T[:3, 3])
     (folder / "project.toml").write_text(
         'kind = "structure"\ndesign = "steel.stl"\ndesign_units = "mm"\n[[scan]]\nfile = "Merge_2 (clean).ply"\n'
     )
-    pose = {"T_design_project": np.linalg.inv(T).tolist()}
+    pose = {"T_design_project": np.linalg.inv(T).tolist(), "covariance": covariance.tolist()}
     (folder / "truth.json").write_text(json.dumps({"format": "processor-truth", "pose": pose} | truth))
 
 
@@ -325,8 +357,8 @@ def make_deviation(folder: Path, settings: dict[str, Any], rng: np.random.Genera
     length = number(settings, "length")
     cuboids, move = lattice(length), half_moved(length, number(settings, "moved"))
     stations = around(np.array([0, 0, -900.0]), np.array([length, 2600.0, 1900]), 6, 3500.0, (1700.0, 3900.0), rng)
-    cloud, T = merged(cuboids, stations, move, nothing, settings, rng), frame_of(rng)
-    write_structure(folder, cuboids, cloud, {"structure": surface(cuboids, move)}, T)
+    scan, T = merged(cuboids, stations, move, nothing, settings, rng), frame_of(rng)
+    write_structure(folder, cuboids, scan, {"structure": surface(cuboids, move)}, T)
 
 
 def make_defects(folder: Path, settings: dict[str, Any], rng: np.random.Generator) -> None:
@@ -353,11 +385,12 @@ def make_defects(folder: Path, settings: dict[str, Any], rng: np.random.Generato
         plate = cuboids[notched]
         corner = plate.centre + plate.half * [0, np.sign(plate.centre[1]), 1]
         side = rng.uniform(50, 90)
-        rows.append(("edge-loss", corner - side / 2 * np.array([0, np.sign(corner[1]), 1]), side**2, np.nan, np.nan))
+        # A piece that reaches two borders of its plate is a missing part: docs/defects.md, classes.
+        rows.append(("missing-part", corner - side / 2 * np.array([0, np.sign(corner[1]), 1]), side**2, np.nan, np.nan))
         cut = _notch(corner, side)
     stations = around(np.array([0, -300.0, -700]), np.array([6400, 300.0, 760]), 6, 2600.0, (500.0, 3300.0), rng)
     move: Move = lambda points: np.asarray(sum((b(points) for b in found), np.zeros_like(points)))  # noqa: E731
-    cloud, T = merged(built, stations, move, cut, settings, rng), frame_of(rng)
+    scan, T = merged(built, stations, move, cut, settings, rng), frame_of(rng)
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [()] * 5
     truth = {
         "ids": list(range(1, len(rows) + 1)), "classes": list(columns[0]), "components": ["steel"] * len(rows),
@@ -365,7 +398,7 @@ def make_defects(folder: Path, settings: dict[str, Any], rng: np.random.Generato
         **{key: [None if np.isnan(v) else float(v) for v in column]
            for key, column in zip(("area_mm2", "depth_max_mm", "volume_mm3"), columns[2:], strict=True)},
     }  # fmt: skip
-    write_structure(folder, cuboids, cloud, {"defects": truth}, T)
+    write_structure(folder, cuboids, scan, {"defects": truth}, T)
 
 
 def _notch(corner: Array, side: float) -> Callable[[Array], Mask]:
@@ -379,8 +412,8 @@ def make_plate(folder: Path, settings: dict[str, Any], rng: np.random.Generator)
     stations = np.array([[-900.0, -700, 1900], [1500, 1400, 2100], [-700, 1500, 1700], [300, -1500, 1500]])
     if number(settings, "sides") > 1:
         stations = np.vstack([stations, stations * [1, 1, -1]])
-    cloud, T = merged(cuboids, stations, still, nothing, settings, rng), frame_of(rng)
-    write_structure(folder, cuboids, cloud, {"structure": surface(cuboids, still)}, T)
+    scan, T = merged(cuboids, stations, still, nothing, settings, rng), frame_of(rng)
+    write_structure(folder, cuboids, scan, {"structure": surface(cuboids, still)}, T)
 
 
 def hall(bays: int, rng: np.random.Generator) -> list[Cuboid]:

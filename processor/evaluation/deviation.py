@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import chdtri
 
 from processor.deviation.result import Result
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls
 from processor.geometry import principal, rigid
 from processor.geometry.surface_registration import Registration
-from processor.model import Bools, Floats, Ints, Metric, Scene, Statistic, Status, StructureTruth, Truth
+from processor.model import Bools, Floats, Ints, Metric, PoseTruth, Scene, Statistic, Status, StructureTruth, Truth
 
 NEIGHBOURS = 24
 REACH_MM = 500.0  # of a core point: a movement is smooth
@@ -20,7 +21,8 @@ STABLE_MM = 1e-6  # of the largest movement of a structure that is as designed
 LODS = 2.0  # levels of detection beyond which a movement has to be found
 LEAST_SHARE = 0.2  # of a structure's surface that did not move
 MOST_FALSE, MOST_MISSED = 6.0, 10.0  # %
-STABLE_POSE_MM, STABLE_POSE_MRAD, AS_DESIGNED_MM = 0.5, 0.05, 0.05
+STABLE_POSE_MM, STABLE_POSE_MRAD, AS_DESIGNED_MM = 0.5, 0.05, 0.05  # of the method, where stations have no errors
+BY_STATIONS = 0.99  # of draws of the stations' errors, that the limits of a pose admit
 ALIKE = 0.9  # cosine between normals of one face at places near each other
 BEYOND_LIMIT = 5.0  # % of core points farther from the truth than their level of detection
 
@@ -64,7 +66,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         *covered("deviation", "deviations", error, result.core.lod95),
         *_extremes(result, true[known], result.core.distance[known]),
         *_moved_and_not(result, truth.structure),
-        *([] if truth.pose is None else _pose(result, truth.structure, true_pose)),
+        *([] if truth.pose is None else _pose(result, truth.structure, truth.pose)),
     ]
 
 
@@ -77,18 +79,23 @@ def _extremes(result: Result, true: Floats, found: Floats) -> list[Metric]:
     return covered("deviation", "least and greatest deviations", errors, half)
 
 
-def _pose(result: Result, truth: StructureTruth, true_pose: Floats) -> list[Metric]:
+def _pose(result: Result, truth: StructureTruth, truth_pose: PoseTruth) -> list[Metric]:
     """Error of the pose of a structure that is not in the design's frame, at the middle of what did not move.
 
-    The covariance is that of the fit, which has the true pose where enough of the structure did not move.
+    The covariance is that of the fit, which has the true pose where enough of the structure did not move. Errors that
+    stations share move and turn the scan as a whole, by a normal law that the truth states; they add to what the method
+    may be off by. Of three components with covariance C the norm is below sqrt(chi2_3(p) max eig C) with probability p.
     """
+    true_pose = truth_pose.T_design_project
     size = np.linalg.norm(truth.displacement, axis=1)
     still = size < STABLE_MM
     in_part = bool(LEAST_SHARE < still.mean() < 1.0)
     middle = truth.points[still if still.any() else slice(None)].mean(axis=0)
     off = result.T_design_scan @ rigid.invert(true_pose)
     shift, turn = rigid.apply(off, middle[None])[0] - middle, rigid.vector_from_rotation(off[:3, :3])
-    shift_limit, turn_limit = (STABLE_POSE_MM, STABLE_POSE_MRAD) if in_part and _limited(result) else (NAN, NAN)
+    by_stations = _by_stations(truth_pose, middle)
+    limits = np.hypot([STABLE_POSE_MM, STABLE_POSE_MRAD], by_stations) if in_part and _limited(result) else (NAN, NAN)
+    shift_limit, turn_limit = (float(limit) for limit in limits)
     wrong = result.status == Status.OK and _otherwise(result, true_pose) is not None
     metrics = [
         Metric("deviation", "wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
@@ -98,6 +105,18 @@ def _pose(result: Result, truth: StructureTruth, true_pose: Floats) -> list[Metr
     if result.covariance.size and still.mean() > LEAST_SHARE:
         metrics += covered_pulls("deviation", "poses", pose_pulls(result.T_design_scan, true_pose, result.covariance))
     return metrics
+
+
+def _by_stations(truth: PoseTruth, middle: Floats) -> tuple[float, float]:
+    """Return by how much stations' errors may shift the middle (3,), mm, and turn the scan, mrad; see BY_STATIONS."""
+    if not truth.covariance.size:
+        return 0.0, 0.0
+    at_middle = rigid.motion(middle[None])[0]
+    most = [
+        float(np.sqrt(chdtri(3, 1.0 - BY_STATIONS) * np.linalg.eigvalsh(covariance)[-1]))
+        for covariance in (at_middle @ truth.covariance @ at_middle.T, truth.covariance[:3, :3])
+    ]
+    return most[0], 1e3 * most[1]
 
 
 def _moved_and_not(result: Result, truth: StructureTruth) -> list[Metric]:

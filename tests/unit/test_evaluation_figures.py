@@ -38,7 +38,7 @@ def figures(metrics):
 # --- deviation --------------------------------------------------------------------------------------------------------
 
 
-def slab(error, turn=0.0, half=True):
+def slab(error, turn=0.0, half=True, by_stations=()):
     """A slab of which x > 0 moved up by 5 mm, measured ``error`` too high with an LOD95 of 0.5, in a frame of its own.
 
     The pose found is turned by ``turn`` mrad about the middle of the part that did not move.
@@ -62,7 +62,7 @@ def slab(error, turn=0.0, half=True):
         status="ok", method="default", T_design_scan=off @ PROJECT, core=core, covariance=1e-6 * np.eye(6),
         min_ci95=found.min() + np.array([-0.5, 0.5]), max_ci95=found.max() + np.array([-0.5, 0.5]),
     )  # fmt: skip
-    truth = Truth(structure=StructureTruth(at, up, moved[:, None] * up), pose=PoseTruth(PROJECT))
+    truth = Truth(structure=StructureTruth(at, up, moved[:, None] * up), pose=PoseTruth(PROJECT, by_stations))
     scene = Scene("slab", "structure", (Scan("s", at),))
     return figures(deviation.check(scene, result, truth))
 
@@ -111,6 +111,19 @@ def test_a_pose_that_is_turned_is_told_by_its_error_and_by_the_steel_that_did_no
     # Of the unmoved part what is farther than 500 mm from its middle is 0.5 mm off, of 2000 mm.
     assert found["unmoved steel beyond LOD95"].value == pytest.approx(50.0, abs=3.0)
     assert found["deviations within their 95 % intervals"].value > 95.0  # what is true of that pose
+
+
+def test_limits_of_a_pose_admit_what_errors_of_stations_look_like():
+    """99 % of the draws of a motion by the covariance that the truth states, beside what the method may be off by."""
+    rng = np.random.default_rng(0)
+    turns, shifts = 25e-6 * rng.standard_normal((200_000, 3)), 0.12 * rng.standard_normal((200_000, 3))
+    most_turn, most_shift = (np.quantile(np.linalg.norm(x, axis=1), 0.99) for x in (turns, shifts))
+    about_middle = np.diag([25e-6**2] * 3 + [0.12**2] * 3)
+    found = slab(0.0, turn=0.09, by_stations=rigid.about_origin(about_middle, np.array([-1000.0, 0.0, 0.0])))
+    assert found["pose, turn"].limit == pytest.approx(np.hypot(0.05, 1e3 * most_turn), rel=0.01)
+    assert found["pose, shift of the middle"].limit == pytest.approx(np.hypot(0.5, most_shift), rel=0.01)
+    assert found["pose, turn"].passed
+    assert not slab(0.0, turn=0.09)["pose, turn"].passed
 
 
 def test_steel_as_designed_has_the_mean_and_the_pose_of_the_truth():

@@ -126,6 +126,38 @@ def test_the_volume_of_a_dent_is_that_of_its_points(tmp_path):
     assert -moved.sum() * 0.25 == pytest.approx(bump.volume, rel=1e-4)
 
 
+def test_errors_of_stations_look_like_the_motion_that_the_truth_states():
+    """The covariance against fits to draws of the errors, as the generator draws them."""
+    module = runpy.run_path(str(FOREIGN / "steelwork.py"))
+    rng = np.random.default_rng(5)
+    points = rng.uniform([0.0, 0.0, 0.0], [4000.0, 2000.0, 1500.0], (600, 3))
+    normals = np.eye(3)[rng.integers(0, 3, 600)] * rng.choice([-1.0, 1.0], (600, 1))
+    stations = np.array([[-3000.0, 500, 900], [7000, 900, 2500], [2000, -4000, 1000]])
+    of, settings = rng.integers(0, 3, 600), module["SETTINGS"]
+    J = np.hstack([np.cross(points, normals), normals])
+    solve, draws = np.linalg.pinv(J), np.empty((3000, 6))
+    for draw in draws:
+        moved = points.copy()
+        for k, station in enumerate(stations):
+            ray = points[of == k] - station
+            offset = settings["range_offset"] * rng.normal() * ray / np.linalg.norm(ray, axis=1)[:, None]
+            moved[of == k] = module["turned"](points[of == k] + offset, station, settings, rng)
+        draw[:] = solve @ np.einsum("ni,ni->n", moved - points, normals)
+    stated = module["by_stations"](points, normals, of, stations, settings)
+    root = np.linalg.inv(np.linalg.cholesky(stated))
+    np.testing.assert_allclose(root @ np.cov(draws.T) @ root.T, np.eye(6), atol=0.12)  # 3000 draws: 0.026 each
+
+
+def test_a_piece_that_reaches_two_borders_is_a_missing_part(tmp_path):
+    """As docs/defects.md defines the classes: the corner of a rib, whose borders are at 430 and 700 mm."""
+    path = make("steelwork", tmp_path, "case=defects", "step_mrad=8", "spacing=40")
+    truth = truth_json.read(path).defects
+    off = np.array([430.0, 700.0]) - np.abs(truth.centres[:, 1:])
+    sides = np.sqrt(truth.area_mm2)
+    corner = np.flatnonzero((np.abs(off - sides[:, None] / 2) < 1e-6).all(axis=1))
+    assert [truth.classes[k] for k in corner] == ["missing-part"]
+
+
 # --- the truth as JSON ------------------------------------------------------------------------------------------------
 
 

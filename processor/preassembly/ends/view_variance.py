@@ -113,10 +113,11 @@ def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Varia
     count = np.bincount(group)
     level = value[:, 0] - (np.bincount(group, value[:, 0]) / count)[group]
     # The mean of a group takes its share of the noise out of the differences.
-    by_noise = float(noise[:, 0].mean()) * (len(plates) - len(count))
-    freedom = len(plates) - len(count)
+    differences = len(plates) - len(count)
+    by_noise = float(noise[:, 0].mean()) * differences
+    freedom = int(_freedom(count).sum())
     squares = float((level**2).sum())
-    evident = squares > float(chdtri(max(freedom, 1), RISK)) * float(noise[:, 0].mean())
+    evident = freedom > 0 and squares > float(chdtri(differences, RISK)) * float(noise[:, 0].mean())
     between = _variance(squares, by_noise, freedom)
     if evident:
         between = max(between, _with_class(between, squares, by_noise, freedom))
@@ -145,7 +146,7 @@ def tails(ends: Sequence[Sequence[Thickness]]) -> Floats:
     for number in np.unique(of_end):
         own, others = of_end == number, of_end != number
         count = np.bincount(group[others], minlength=int(group.max()) + 1)
-        freedom = int((count - 1)[count > 0].sum())
+        freedom = int(_freedom(count).sum())
         own &= count[group] > 0
         if not own.any() or freedom < 1:
             continue
@@ -154,7 +155,7 @@ def tails(ends: Sequence[Sequence[Thickness]]) -> Floats:
         squares = float(((value - mean[group])[others] ** 2).sum())
         between = max(squares - float((by_noise * (count - 1))[count > 0].sum()), 0.0) / freedom
         share = 1.0 / count[group[own]]
-        variance = noise[own] + by_noise[group[own]] * share + between * (1.0 + share)
+        variance = noise[own] + by_noise[group[own]] * share + between * (1.0 + np.minimum(OF_PAIR * share, 1.0))
         independent = own.sum() / OF_PAIR
         mean_square = float(np.mean((value[own] - mean[group[own]]) ** 2 / variance))
         found[number] = global_test.tail(mean_square * independent, independent, freedom / OF_PAIR)
@@ -167,6 +168,12 @@ def _alike(level: Floats) -> Ints:
     group = np.zeros(len(level), np.int64)
     group[order] = np.cumsum(np.diff(level[order], prepend=level[order[:1]]) > ALIKE_MM)
     return group
+
+
+def _freedom(count: Ints) -> Ints:
+    """Plates (g,) of groups of ``count`` (g,) less those that a group's mean takes: two, as opposite plates are one."""
+    free: Ints = np.maximum(count - OF_PAIR, 0)
+    return free
 
 
 def _with_class(between: float, squares: float, by_noise: float, freedom: int) -> float:
