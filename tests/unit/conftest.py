@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from tests.support import cad_in_process
 from tests.support.scan_folders import BOX, arch_design, surface, write_ply, write_xyz
 
 
@@ -17,3 +18,9 @@ def bridge(tmp_path):
         write_ply(place / f"design/{name}.ply", (BOX + np.array([4.0 * i, 0, 0])) * 1000.0)
     (place / "design.json").write_text(json.dumps(arch_design()))
     return place
+
+
+@pytest.fixture
+def cad_here(monkeypatch):
+    """CAD files are read by this process: see :mod:`tests.support.cad_in_process`."""
+    cad_in_process.read_here(monkeypatch)

@@ -8,7 +8,6 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import SimpleNamespace
 
 import cadquery as cq
 import ifcopenshell
@@ -25,27 +24,12 @@ import trimesh
 
 from designgen import recipe_files
 from designgen.cad import files as cad_files
-from designgen.cad import process
 from designgen.designs import arch_bridge, arch_part
 from designgen.export import step_files
-from processor.jobs.process import Cause
 from processor.model import InputError, UsageError
 
 ROOT = Path(__file__).resolve().parents[2]
 REAL = ROOT.parent / "shared/data/design"
-
-
-@pytest.fixture
-def here(monkeypatch):
-    """Files are read by this process, which has the CAD kernel at hand; what they answer goes the same way."""
-
-    def run(_command, *, stdout, pass_fds, **_limits):
-        with open(pass_fds[0], "rb", closefd=False) as question:
-            job, content = json.loads(question.readline()), question.read()
-        process.answer(job, content, stdout)
-        return SimpleNamespace(cause=Cause.EXIT, code=0)
-
-    monkeypatch.setattr(cad_files, "run", run)
 
 
 @pytest.fixture
@@ -56,6 +40,7 @@ def box(tmp_path):
     return path
 
 
+@pytest.mark.usefixtures("cad_here")
 def test_a_box_comes_back_in_its_unit(box, tmp_path):
     found = cad_files.read(box)
     (body,) = found.bodies
@@ -77,7 +62,7 @@ def test_a_box_comes_back_in_its_unit(box, tmp_path):
         cad_files.read(box, "furlong")
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_surfaces_without_a_solid_are_said_to_be_such(tmp_path):
     step_files.write_step(tmp_path / "s.step", {"sheet": cq.Shell.makeShell([cq.Face.makePlane(50.0, 20.0)])})
     (body,) = cad_files.read(tmp_path / "s.step").bodies
@@ -126,7 +111,7 @@ def test_a_wall_in_ifc_has_its_size_in_any_unit(prefix, sizes, unit, tmp_path):
     assert body.volume_mm3 == pytest.approx(4000.0 * 200.0 * 2700.0)
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_an_ifc_without_geometry_is_refused(tmp_path):
     model = ifcopenshell.api.project.create_file(version="IFC4")
     ifcopenshell.api.root.create_entity(model, ifc_class="IfcProject", name="p")
@@ -135,7 +120,7 @@ def test_an_ifc_without_geometry_is_refused(tmp_path):
         cad_files.read(tmp_path / "empty.ifc")
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_bad_files_are_refused(box, tmp_path):
     content = box.read_bytes()
     for name, data, said in [
@@ -175,7 +160,7 @@ def test_real_files_in_inches(name, tmp_path):
     assert mesh.volume == pytest.approx(body["volume_mm3"], rel=1e-3)
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_designs_go_out_as_step_and_keep_their_volumes(tmp_path):
     recipe = recipe_files.load("arch-s1")[1]
     files = step_files.write_design(recipe, tmp_path / "design")
@@ -195,7 +180,7 @@ def test_designs_go_out_as_step_and_keep_their_volumes(tmp_path):
         assert all(body.solid for body in found)
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_names_make_safe_and_different_files(tmp_path):
     shapes = {"a/../b": cq.Solid.makeBox(1, 1, 1), "A_.._B": cq.Solid.makeBox(2, 2, 2)}
     step_files.write_step(tmp_path / "n.step", shapes)
@@ -210,7 +195,7 @@ def test_names_make_safe_and_different_files(tmp_path):
 # --- what the file says ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_a_file_without_a_known_unit_needs_one(box, tmp_path):
     text = box.read_text()
     path = tmp_path / "unknown.step"
@@ -245,7 +230,7 @@ def test_a_file_without_a_known_unit_needs_one(box, tmp_path):
     assert cad_files.read(tmp_path / "none.ifc", "cm").bodies[0].size_mm == pytest.approx([40000.0, 2000.0, 27000.0])
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_inches_go_by_their_factor(box, tmp_path):
     text, inch = box.read_text(), tmp_path / "inch.step"
     numbers = re.findall(r"#(\d+) = \( LENGTH_UNIT\(\) NAMED_UNIT\(\*\) SI_UNIT\(.MILLI.,.METRE.\) \);", text)
@@ -263,7 +248,7 @@ def test_inches_go_by_their_factor(box, tmp_path):
     assert found.bodies[0].size_mm == pytest.approx([2540.0, 5080.0, 7620.0])
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_names_are_escaped_when_written_and_read_however_written(tmp_path):
     path = tmp_path / "n.step"
     step_files.write_step(path, {"梁 'A'": cq.Solid.makeBox(1, 1, 1), "\U00020000\\x": cq.Solid.makeBox(2, 2, 2)})
@@ -282,7 +267,7 @@ def test_names_are_escaped_when_written_and_read_however_written(tmp_path):
         assert cad_files.read(tmp_path / "w.ifc").bodies[0].name == "钢墙 1"
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_openings_are_cut_and_spaces_are_no_bodies(tmp_path):
     def more(model, made, representation):
         item = representation.Items[0]
@@ -304,7 +289,7 @@ def test_openings_are_cut_and_spaces_are_no_bodies(tmp_path):
     assert body.volume_mm3 == pytest.approx(200.0 * (4000.0 * 2700.0 - 1000.0 * 2000.0))
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_round_walls_in_ifc_keep_the_deviation(tmp_path):
     wall(tmp_path / "w.ifc", "MILLI", (4000, 200, 2700))
     text = (tmp_path / "w.ifc").read_text()
@@ -431,7 +416,7 @@ def test_a_large_sphere_takes_seconds_and_says_its_deviation(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["plates-defects", "frame-small"])
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("cad_here")
 def test_georeferenced_designs_lie_where_their_scene_has_them(name, tmp_path):
     origin, recipe = [5.0e8, 4.3e9, 1.0e5], recipe_files.load(name)[1]
     if name == "frame-small":

@@ -114,6 +114,7 @@ def test_bodies_are_components_even_where_their_corners_coincide():
     assert surface_charts.of_mesh(both, np.vstack([faces, faces + 8]), 20.0).names == ("component-1",)
 
 
+@pytest.mark.usefixtures("cad_here")
 def test_names_of_a_step_file_reach_the_results(tmp_path):
     whole = cq.Assembly(name="row")
     for k, name in enumerate(("web", "rib", "flange")):

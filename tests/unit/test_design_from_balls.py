@@ -136,6 +136,7 @@ def test_a_file_for_each_ball_and_tube(tmp_path):
     assert max(compare(scan_folder.read_input(tmp_path).frame, truth)) < NODE_MM
 
 
+@pytest.mark.usefixtures("cad_here")
 def test_our_own_frame_as_step(tmp_path):
     """Balls with flats, bores and process holes, hexagonal sleeves, cones and tubes."""
     design = space_frame.build(

@@ -384,6 +384,7 @@ def test_a_design_that_is_there_is_not_changed(tmp_path):
     assert (tmp_path / "design.json").read_bytes() == before
 
 
+@pytest.mark.usefixtures("cad_here")
 def test_a_step_file_with_all_parts_of_our_own_bridge(tmp_path):
     """Seven ribs as solids of one file, whose names are those of the bodies."""
     curve = make_curve("parabola", 9000.0, 2000.0)
@@ -413,6 +414,7 @@ def test_a_step_file_with_all_parts_of_our_own_bridge(tmp_path):
     assert guess.guess(tmp_path).made.doubts == ()
 
 
+@pytest.mark.usefixtures("cad_here")
 def test_a_step_file_a_part_of_an_independent_bridge(tmp_path):
     import cadquery as cq
 

@@ -84,6 +84,7 @@ def test_two_scans_alone_are_stitched(tmp_path):
     assert pipeline.steps_for(read_input(tmp_path / "two")) == ("stitch",)
 
 
+@pytest.mark.usefixtures("cad_here")
 def test_a_step_file_beside_a_scan_is_its_design(tmp_path):
     cadquery = pytest.importorskip("cadquery")
     folder = tmp_path / "part"

@@ -50,6 +50,7 @@ def test_a_bolt_in_its_hole_touches_and_one_in_the_full_overlaps():
     assert [pair[:2] for pair in inside] == [("plate", "pin")], "wholly inside"
 
 
+@pytest.mark.usefixtures("cad_here")
 def test_what_is_wrong_is_said_on_import_and_on_scan(tmp_path, monkeypatch, capsys, caplog):
     web, rib = cq.Solid.makeBox(400, 300, 20), cq.Solid.makeBox(20, 300, 200, cq.Vector(10, 0, 5))
     shell = cq.Workplane().box(100, 100, 100).faces("<X").val()

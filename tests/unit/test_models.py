@@ -25,6 +25,7 @@ from designgen.scenes.model import recipe_of
 from processor.model import InputError, UsageError
 from processor.store import store
 
+pytestmark = pytest.mark.usefixtures("cad_here")
 QUIET = scanner.Scanner(**{**scanner.preset("phase"), "flying_share": 0.0, "threshold": 0.0})
 FINE = {"scan.scanner": "plain-2mm", "scanner.noise_mm": 0.0, "scan.step_mrad": 2.5}
 FEW = {"scan.step_mrad": 4.0}
