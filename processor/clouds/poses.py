@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from processor.adjustment import thermal
 from processor.clouds.run import Run
 from processor.geometry import rigid
 from processor.model import Floats, InputError, Reason, Scan, Status, UsageError, reason
-from processor.preassembly.assemble import REFERENCE_C
-from processor.preassembly.parts.systematic_errors import EXPANSION_PER_K
 from processor.stitching import frames
 
 UNPLACED = (Status.FAILED, Status.AMBIGUOUS)  # of a scan: its pose may be wrong
@@ -113,7 +112,7 @@ def in_bridge(run: Run) -> Poses:
     scene, table = run.scene, result.components
     scale = 1.0
     if np.isfinite(scene.temperature_C) and result.method == "adjustment":
-        scale = 1.0 / (1.0 + EXPANSION_PER_K * (scene.temperature_C - REFERENCE_C))
+        scale = 1.0 / thermal.expansion(scene.temperature_C)
     placed, remarks = [], []
     for row, name in enumerate(table.name):
         T, status = table.T_bridge_scan[row], table.status[row]

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from processor.adjustment import thermal
 from processor.limits import standards
 from processor.model import ArchDesign, Floats, Scan, Scene, Tolerance
 from processor.preassembly import to_result, topology
@@ -22,7 +23,6 @@ from processor.preassembly.params import Params, TrimParams
 from processor.preassembly.parts import measure
 from processor.preassembly.parts.attitude import Shapes
 from processor.preassembly.parts.measure import MeasuredPart
-from processor.preassembly.parts.systematic_errors import EXPANSION_PER_K
 from processor.preassembly.result import Result
 from processor.preassembly.to_result import Assembly, JudgedJoint
 from processor.preassembly.verdicts import chain as chain_verdicts
@@ -30,14 +30,12 @@ from processor.preassembly.verdicts import joint_measures, joints, reasons, trim
 from processor.preassembly.verdicts.joints import Conformity
 from processor.progress import tracked
 
-REFERENCE_C = 20.0
 TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)
 
 
 def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, params: Params) -> Result:
     """Assemble a bridge; ``scans`` are those of each part, in the design's order."""
-    degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
-    shrink = 1.0 / (1.0 + EXPANSION_PER_K * degrees)
+    shrink = 1.0 / thermal.expansion(scene.temperature_C)
     limits = standards.default_for(scene.tolerance)
     frames = np.array([joint_frame(points) for points in design.joint_points])
     shapes = Shapes(design)
@@ -53,7 +51,7 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         design=design,
         params=params,
         limits=limits,
-        temperature_corrected=bool(degrees),
+        temperature_corrected=shrink != 1.0,
         parts=parts,
         adjusted=adjusted,
         trade_off={weight: curve[weight] for weight in TRADE_OFF},

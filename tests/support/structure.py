@@ -142,7 +142,7 @@ LAYERS = (
     ("progress", "language", "jobs", "unit_ratio", "user_methods"),
     ("geometry",),
     ("adjustment",),
-    ("limits", "store"),
+    ("components", "limits", "store"),
     ("readers", "writers"),
     ("scan_folder",),
     STEPS,
@@ -155,7 +155,7 @@ LAYERS = (
     ("cli",),
     ("__main__",),
 )
-FOR_STEPS = ("version", "model", "progress", "unit_ratio", "geometry", "adjustment", "limits")
+FOR_STEPS = ("version", "model", "progress", "unit_ratio", "geometry", "adjustment", "components", "limits")
 
 
 def wrong_arrows():

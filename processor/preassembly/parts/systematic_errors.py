@@ -10,13 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from processor.adjustment.thermal import EXPANSION_PER_K
 from processor.model import DesignPart, Floats, Word
 from processor.preassembly.ends import bottom_edges
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.params import SystematicParams
-
-EXPANSION_PER_K = 12e-6
 
 
 class BudgetSource(Word):
