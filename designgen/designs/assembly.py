@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from designgen.checks import expect
-from designgen.designs import prismatic, sections
+from designgen.designs import bolting, prismatic, sections
+from designgen.designs.bolting import Bore
 from designgen.designs.patch import Patch
-from designgen.designs.prismatic import End, Part
+from designgen.designs.prismatic import End, Girder, Part
 from designgen.designs.sections import Section
 from designgen.rigid import rigid
 from processor.model import Floats
@@ -59,22 +61,37 @@ class Assembly:
     joints: tuple[Joint, ...]
 
 
-def build(params: Params) -> Assembly:
-    """Build an assembly."""
-    return TYPES[params.type](params, sections.make(params))
+Shifts = Mapping[str, Floats]  # by girder: by how much each hole as drilled (n, 3) lies off its place, mm
+
+
+def build(params: Params, bolts: bolting.Params | None = None, shifts: Shifts | None = None) -> Assembly:
+    """Build an assembly; of I girders with ``bolts`` at their joints, their holes drilled off by ``shifts``."""
+    if bolts is not None:
+        expect(
+            params.section == "i" and params.type == "row", "bolts", params.section, 'a row of I girders, section "i"'
+        )
+    maker = _Maker(params, sections.make(params), bolts, shifts or {})
+    TYPES[params.type](maker)
+    return maker.assembly()
 
 
 class _Maker:
     """Collects girders and nodes; joints are named by the order in which they are made."""
 
-    def __init__(self, params: Params, section: Section) -> None:
-        self.params, self.section = params, section
+    def __init__(
+        self, params: Params, section: Section, bolts: bolting.Params | None = None, shifts: Shifts | None = None
+    ) -> None:
+        self.params, self.section, self.bolts, self.shifts = params, section, bolts, shifts or {}
+        self.girders: dict[str, Girder] = {}
         self.faces: dict[str, list[Patch]] = {}
         self.reach: dict[str, float] = {}
         self.joints: list[Joint] = []
 
-    def girder(self, name: str, T: Floats, length: float) -> Floats:
-        """Add a girder from the origin of T (4, 4) along its x; return the frame at its end."""
+    def girder(self, name: str, T: Floats, length: float, joined: tuple[bool, bool] = (False, False)) -> Floats:
+        """Add a girder from the origin of T (4, 4) along its x; return the frame at its end.
+
+        It has bolt holes, if any, at the start and end that are ``joined``.
+        """
         number = len(self.faces)
         outer = self.section.outlines[0]
         top = next(
@@ -82,16 +99,28 @@ class _Maker:
             for k, (a, b) in enumerate(zip(outer, np.roll(outer, -1, axis=0), strict=True))
             if a[1] == b[1] == outer[:, 1].max()
         )
-        edge = outer[top], np.roll(outer, -1, axis=0)[top]
-        faces = [
-            *prismatic.walls(T, 0.0, length, outer, skip=[top]),
-            *prismatic.marked(T, 0.0, length, edge, (0.25 + 0.03 * (number % 6)) * length),
-        ]
+        edge, mark = (outer[top], np.roll(outer, -1, axis=0)[top]), (0.25 + 0.03 * (number % 6)) * length
+        bores = self._bores(name, length, joined)
+        wall, *pad = prismatic.marked(T, 0.0, length, edge, mark)
+        faces = [*bolting.holed(wall, T, length, *edge, bores), *pad]
+        others = [k for k in range(len(outer)) if k != top]
+        for k, wall in zip(others, prismatic.walls(T, 0.0, length, outer, skip=[top]), strict=True):
+            faces += bolting.holed(wall, T, length, outer[k], outer[(k + 1) % len(outer)], bores)
+        faces += [bolting.bore_patch(f"bore{k}", T, bore) for k, bore in enumerate(bores)]
         for hole in self.section.outlines[1:]:
             faces += prismatic.walls(T, 0.0, length, hole, "inner")
         faces += prismatic.end_face(T, 0.0, self.section, "start") + prismatic.end_face(T, length, self.section, "end")
         self.faces[name], self.reach[name] = faces, min(prismatic.FADES_MM, 0.4 * length)
+        self.girders[name] = Girder(T, length, self.section, mark, tuple(bores))
         return T @ _along(length)
+
+    def _bores(self, name: str, length: float, joined: tuple[bool, bool]) -> list[Bore]:
+        """Return the holes of a girder as drilled."""
+        if self.bolts is None:
+            return []
+        bores = bolting.of_girder(self.bolts, self.section, length, joined)
+        shifts = self.shifts.get(name, np.zeros((len(bores), 3)))
+        return [dataclasses.replace(bore, shift=shift) for bore, shift in zip(bores, shifts, strict=True)]
 
     def node(self, name: str, T: Floats) -> None:
         """Add a node with its middle at T (4, 4): stubs along x to both sides and a shorter one along z."""
@@ -108,7 +137,7 @@ class _Maker:
         # Half a turn about the third stub would lay the node on itself but for its mark.
         outer = self.section.outlines[0]
         faces += prismatic.marked(T, -stub, -h, (outer[TOP], outer[TOP + 1]), -h - prismatic.PAD_SIZE_MM)
-        faces += prismatic.end_face(T, -stub, self.section, "end") + prismatic.end_face(T, stub, self.section, "end")
+        faces += prismatic.end_face(T, -stub, self.section, "start") + prismatic.end_face(T, stub, self.section, "end")
         faces += prismatic.end_face(up, self.upright, self.section, "end")
         self.faces[name], self.reach[name] = faces, 0.8 * (self.upright - h)
 
@@ -131,7 +160,7 @@ class _Maker:
                 for part, outward in ((joint.left, 1.0), (joint.right, -1.0))
                 if part == name
             ]
-            parts.append(Part(name, tuple(faces), tuple(ends)))
+            parts.append(Part(name, tuple(faces), tuple(ends), self.girders.get(name)))
         return Assembly(tuple(parts), tuple(self.joints))
 
 
@@ -143,17 +172,17 @@ def _along(x: float) -> Floats:
     return rigid(np.eye(3), np.array([x, 0.0, 0.0]))
 
 
-def _row(params: Params, section: Section) -> Assembly:
-    maker, T = _Maker(params, section), np.eye(4)
+def _row(maker: _Maker) -> None:
+    params, T = maker.params, np.eye(4)
     for k in range(params.parts):
         if k:
             maker.join(f"girder{k}", f"girder{k + 1}", T)
-        T = maker.girder(f"girder{k + 1}", T, params.length_mm + params.step_mm * k)
-    return maker.assembly()
+        joined = k > 0, k < params.parts - 1
+        T = maker.girder(f"girder{k + 1}", T, params.length_mm + params.step_mm * k, joined)
 
 
-def _node(params: Params, section: Section) -> Assembly:
-    maker, stub = _Maker(params, section), params.stub_mm
+def _node(maker: _Maker) -> None:
+    params, stub = maker.params, maker.params.stub_mm
     maker.node("node", np.eye(4))
     ends = _along(-stub), _along(stub), UP @ _along(maker.upright)
     maker.girder("arm1", _along(-stub - params.length_mm), params.length_mm)
@@ -162,12 +191,11 @@ def _node(params: Params, section: Section) -> Assembly:
     maker.join("arm1", "node", ends[0])
     maker.join("node", "arm2", ends[1])
     maker.join("node", "arm3", ends[2])
-    return maker.assembly()
 
 
-def _ribs(params: Params, section: Section) -> Assembly:
+def _ribs(maker: _Maker) -> None:
     """Two ribs of three girders and two nodes each, with two braces between the nodes: one closed loop."""
-    maker, stub = _Maker(params, section), params.stub_mm
+    params, stub = maker.params, maker.params.stub_mm
     middle = 0.5 * params.length_mm + stub  # half the distance between the nodes of a rib
     places = {}
     for name, sign in (("left", 1.0), ("right", -1.0)):
@@ -194,7 +222,6 @@ def _ribs(params: Params, section: Section) -> Assembly:
         maker.girder(f"brace{number}", start, length)
         maker.join(f"left{k}", f"brace{number}", start)
         maker.join(f"brace{number}", f"right{k}", start @ _along(length))
-    return maker.assembly()
 
 
-TYPES: dict[str, Callable[[Params, Section], Assembly]] = {"row": _row, "node": _node, "ribs": _ribs}
+TYPES: dict[str, Callable[[_Maker], None]] = {"row": _row, "node": _node, "ribs": _ribs}

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from designgen.designs.bolting import Bore
 from designgen.designs.patch import Patch
 from designgen.designs.sections import Section
 from processor.model import Bools, Floats, Ints
@@ -69,12 +70,24 @@ class End:
 
 
 @dataclass(frozen=True)
+class Girder:
+    """A girder along x of T (4, 4), with the mark on its top at x ``mark`` (mm) and its bolt holes."""
+
+    T: Floats
+    length: float
+    section: Section
+    mark: float
+    bores: tuple[Bore, ...] = ()
+
+
+@dataclass(frozen=True)
 class Part:
-    """A part: its faces as designed, and its ends."""
+    """A part: its faces, its ends, and what it is made of if it is a girder."""
 
     name: str
     patches: tuple[Patch, ...]
     ends: tuple[End, ...]
+    girder: Girder | None = None
 
     def displacement(self, points: Floats) -> Floats:
         """Displacements (n, 3) of points (n, 3) of the design, as built."""
@@ -106,11 +119,14 @@ class Part:
 def walls(
     T: Floats, x0: float, x1: float, outline: Floats, name: str = "wall", skip: Sequence[int] = ()
 ) -> list[Patch]:
-    """Return walls of a prism along x of T (4, 4) from x0 to x1 over edges of an outline (n, 2), without ``skip``."""
+    """Return walls of a prism along x of T (4, 4) from x0 to x1 over edges of an outline (n, 2), without ``skip``.
+
+    q runs from the end of an edge to its start, for the material lies to the left of an outline.
+    """
     p = np.linspace(0.0, 1.0, max(2, int(np.ceil((x1 - x0) / NET_MM)) + 1))
     q, along = np.array([0.0, 1.0]), np.array([x1 - x0, 0.0, 0.0])
     return [
-        _plane(f"{name}-{edge}", T, np.array([x0, *a]), along, np.array([0.0, *(b - a)]), p, q)
+        _plane(f"{name}-{edge}", T, np.array([x0, *b]), along, np.array([0.0, *(a - b)]), p, q)
         for edge, (a, b) in enumerate(zip(outline, np.roll(outline, -1, axis=0), strict=True))
         if edge not in skip
     ]
@@ -121,6 +137,7 @@ def marked(T: Floats, x0: float, x1: float, edge: tuple[Floats, Floats], at: flo
     a, b = edge
     half = 0.5 * PAD_SIZE_MM
     middle = np.array([at, a[0] + 0.25 * (b[0] - a[0]), a[1]])
+    a, b = b, a  # as in walls
     of_pad = (
         (at + np.array([-half, half]) - x0) / (x1 - x0),
         np.sort((middle[1] + np.array([-half, half]) - a[0]) / (b[0] - a[0])),
@@ -148,12 +165,14 @@ def marked(T: Floats, x0: float, x1: float, edge: tuple[Floats, Floats], at: flo
 
 
 def end_face(T: Floats, x: float, section: Section, name: str) -> list[Patch]:
-    """Rectangles of the end face of a prism at ``x``."""
+    """Rectangles of the end face of a prism at ``x``, facing outward: back at its "start", else forwards."""
     ends = np.array([0.0, 1.0])
-    return [
-        _plane(name, T, np.array([x, y0, z0]), np.array([0.0, y1 - y0, 0.0]), np.array([0.0, 0.0, z1 - z0]), ends, ends)
-        for y0, y1, z0, z1 in section.plates
-    ]
+    faces = []
+    for y0, y1, z0, z1 in section.plates:
+        first, last = (y1, y0) if name == "start" else (y0, y1)
+        across, up = np.array([0.0, last - first, 0.0]), np.array([0.0, 0.0, z1 - z0])
+        faces.append(_plane(name, T, np.array([x, first, z0]), across, up, ends, ends))
+    return faces
 
 
 def _plane(

@@ -29,7 +29,7 @@ KEYS_BY_KIND = {
     "inner_depth_mm": ("arch-bridge",),
     "net": ("arch-bridge",),
     "member_reach_mm": ("space-frame",),
-    "distance_mm": ("arch-bridge", "structure"),
+    "distance_mm": ("arch-bridge", "assembly", "structure"),
     "height_mm": ("space-frame", "structure"),
     "registered": ("structure",),
     "repeated": ("structure",),

@@ -118,6 +118,12 @@ def survey(
     return Survey(tuple(scans), tuple(labels), np.array(registered), truth)
 
 
+def moved(surveyed: Survey, T: Floats) -> Survey:
+    """Return a survey with the poses of its stations, registered and true, moved by T (4, 4)."""
+    truth = dataclasses.replace(surveyed.truth, T_project_station=T @ surveyed.truth.T_project_station)
+    return dataclasses.replace(surveyed, registered=T @ surveyed.registered, truth=truth)
+
+
 def _median(sigmas_mm: Sequence[float] | Shorts) -> float:
     return float(np.median(sigmas_mm)) if len(sigmas_mm) else float("nan")
 

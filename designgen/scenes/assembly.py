@@ -11,12 +11,15 @@ import numpy as np
 from designgen.asbuilt.imperfections import Ledger
 from designgen.checks import expect
 from designgen.designs import assembly as design_of
+from designgen.designs import bolting
 from designgen.designs.prismatic import EndErrors, Part
 from designgen.randomness import generator, random_pose
 from designgen.recipe_params import filled
 from designgen.rigid import inverse
-from designgen.scanning import sampler
+from designgen.scanning import sampler, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
+from designgen.scanning.surfaces import Builder
+from designgen.scanning.survey import Survey
 from designgen.scenes import MADE_IN_MM
 from processor.model import (
     ArchDesign,
@@ -27,17 +30,17 @@ from processor.model import (
     Scan,
     Scene,
     Truth,
-    UsageError,
 )
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard deviations of the errors of each end at a joint."""
+    """Standard deviations of the errors of each end at a joint, and of the place of each bolt hole along its plate."""
 
     length_mm: float = 0.0
     skew_mrad: float = 0.0
     corner_mm: float = 0.0
+    hole_mm: float = 0.0
 
     def __post_init__(self) -> None:
         for key, value in self.__dict__.items():
@@ -46,34 +49,87 @@ class Errors:
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
     """Make the scene of an assembly, a scan of each part in a separate frame, and its truth."""
-    if isinstance(scanning, ByRays):
-        raise UsageError("scan.mode: expected surface, assemblies are not scanned by rays")
-    nominal = design_of.build(filled(design_of.Params, recipe, "assembly"))
+    sizes = filled(design_of.Params, recipe, "assembly")
+    bolts = filled(bolting.Params, recipe, "bolts") if "bolts" in recipe else None
+    nominal = design_of.build(sizes, bolts)
     errors = filled(Errors, recipe, "asbuilt")
     ledger = Ledger()
-    parts = [_built(part, errors, generator(seed, f"built {part.name}"), ledger) for part in nominal.parts]
+    shifts = {
+        part.name: _drilled(part, errors, generator(seed, f"holes {part.name}"), ledger) for part in nominal.parts
+    }
+    drilled = design_of.build(sizes, bolts, shifts).parts
+    parts = [_built(part, errors, generator(seed, f"built {part.name}"), ledger) for part in drilled]
     names = tuple(part.name for part in parts)
     scans, labels, poses, ends = [], [], [], []
+    surveys: list[Survey] = []
     for number, part in enumerate(parts):
         T = random_pose(generator(seed, f"pose {part.name}"))
-        patches = [(number, patch) for patch in part.built()]
-        cloud = sampler.scan_patches(patches, scanning, generator(seed, f"scan {part.name}"))
-        points = cloud.points @ T[:3, :3].T + T[:3, 3]
-        scans.append(Scan(part.name, points, component=part.name, sigma_mm=scanning.sigma_mm))
-        labels.append(PointLabels(part.name, names, cloud.part, cloud.source))
+        if isinstance(scanning, ByRays):
+            surveyed = _surveyed(part, number, names, scanning, seed)
+            before = sum(len(one.registered) for one in surveys)
+            scan, label = survey.merged(surveyed, part.name, T, before, part.name)
+            surveys.append(survey.moved(surveyed, T))
+        else:
+            patches = [(number, patch) for patch in part.built()]
+            cloud = sampler.scan_patches(patches, scanning, generator(seed, f"scan {part.name}"))
+            points = cloud.points @ T[:3, :3].T + T[:3, 3]
+            scan = Scan(part.name, points, component=part.name, sigma_mm=scanning.sigma_mm)
+            label = PointLabels(part.name, names, cloud.part, cloud.source)
+        scans.append(scan)
+        labels.append(label)
         poses.append(inverse(T))
         for end in part.ends:
             corners = end.key_points()
             built = corners + part.displacement(corners)
             ends.append((number, end.joint, end.outward, built @ T[:3, :3].T + T[:3, 3], built))
-    scene = Scene(name, "arch-bridge", tuple(scans), arch=_design(nominal), units="mm", units_reason=MADE_IN_MM)
+    stations = survey.joined_truth([one.truth for one in surveys]) if surveys else None
+    scene = Scene(
+        name,
+        "arch-bridge",
+        tuple(scans),
+        arch=_design(nominal),
+        stations=survey.stations_of(stations.ids, np.concatenate([one.registered for one in surveys]))
+        if stations
+        else None,
+        units="mm",
+        units_reason=MADE_IN_MM,
+    )
     return scene, Truth(
         tuple(labels),
         arch=_truth(nominal, names, poses, ends),
+        stations=stations,
         as_built=ledger.record() if "asbuilt" in recipe else None,
         spacing_mm=scanning.spacing_mm,
         sigma_mm=scanning.sigma_mm,
     )
+
+
+def _drilled(part: Part, errors: Errors, rng: np.random.Generator, ledger: Ledger) -> Floats:
+    """Draw by how much each hole (n, 3) of a part lies off its place along its plate, and add it to the ledger."""
+    bores = part.girder.bores if part.girder is not None else ()
+    shifts = np.zeros((len(bores), 3))
+    for k, bore in enumerate(bores):
+        depth = np.array([0.0, *(bore.end - bore.start)])
+        across = np.cross(depth / np.linalg.norm(depth), [1.0, 0.0, 0.0])
+        along, beside = errors.hole_mm * rng.standard_normal(2)
+        shifts[k] = [along, 0.0, 0.0] + beside * across
+        for axis, value in zip(("along", "left", "up"), shifts[k], strict=True):
+            ledger.note(f"hole {k + 1}, {axis}", part.name, value, "mm")
+    return shifts
+
+
+def _surveyed(part: Part, number: int, names: tuple[str, ...], scanning: ByRays, seed: int) -> Survey:
+    """Scan one part as built from stations around it, in the bridge's frame."""
+    builder = Builder()
+    for patch in part.built():
+        builder.patch(number, patch)
+    box = np.concatenate([end.key_points() for end in part.ends] + [part.mesh()[0]])
+    T = part.ends[0].T if part.girder is None else part.girder.T
+    local = (box - T[:3, 3]) @ T[:3, :3]
+    low, high = local.min(axis=0), local.max(axis=0)
+    middle = T[:3, :3] @ (0.5 * (low + high)) + T[:3, 3]
+    poses = survey.stations_around_box(T[:3, :3].T, middle, 0.5 * (high - low), scanning.params, seed, f"{part.name}/")
+    return survey.survey(builder.to_surfaces(), names, poses, scanning.device, scanning.params, seed)
 
 
 def _built(part: Part, errors: Errors, rng: np.random.Generator, ledger: Ledger) -> Part:

@@ -21,7 +21,7 @@ MAKERS: dict[str, tuple[str, Maker]] = {
     "ring": ("ring", arch_bridge.make_ring),
     "assembly": ("assembly", assembly.make),
 }
-EXTRA = {"structure": {"picks"}}  # sections of one kind only
+EXTRA = {"structure": {"picks"}, "assembly": {"bolts"}}  # sections of one kind only
 
 
 def make(

@@ -133,6 +133,22 @@ class Defects(Rows):
 
 
 @dataclass(frozen=True)
+class PartPoses(Rows):
+    """The parts of a bridge, each at the best fit to its own design; poses are of the bridge's frame as registered."""
+
+    name: tuple[str, ...] = names("p")
+    status: tuple[Status, ...] = words("p", Status)
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("p")
+    T_design_project: Floats = column("p", 4, 4)
+    covariance: Floats = column("p", 6, 6)
+    noise: Floats = column("p", unit="mm")
+    lod95: Floats = column("p", unit="mm")
+    examined_mm2: Floats = column("p")
+    expected_mm2: Floats = column("p")
+    defects: Ints = column("p", dtype=np.int64)
+
+
+@dataclass(frozen=True)
 class Result(Checked):
     """Defects of a structure.
 
@@ -161,6 +177,7 @@ class Result(Checked):
     pictures: tuple[Picture, ...] = described((), json="")
     surface: SurfacePlaces = dataclasses.field(default_factory=SurfacePlaces, metadata={"json": ""})
     limits: JudgedLimits | None = newer()
+    parts: PartPoses | None = newer()  # of a bridge; then the fields of one pose are empty
 
     @property
     def overall(self) -> Verdict:

@@ -11,16 +11,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from processor.components import bridge_parts, frame_members
 from processor.defects import baseline, detect
+from processor.defects.bridges import parts
 from processor.defects.params import METHODS, Params
 from processor.defects.result import Result
 from processor.defects.verdicts import depths_and_areas
 from processor.model import InputError, Scene, UsageError
 
-__all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "run"]
+__all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "needed", "run"]
 
 NAME = "defects"
-NEEDS = ("stitch", "deviation")
+NEEDS = ("stitch", "preassemble", "spheres", "deviation")
 KIND = "structure"
 
 
@@ -28,6 +30,13 @@ def applies(scene: Scene) -> bool:
     """Return whether the step runs by itself: a structure with a design, its scans in one frame."""
     one_frame = len(scene.scans) == 1 or all(scan.T_project_scan.size for scan in scene.scans)
     return scene.kind == KIND and scene.structure is not None and bool(scene.scans) and one_frame
+
+
+def needed(scene: Scene) -> tuple[str, ...]:
+    """Name the steps that run with this one: those that place the parts of a bridge, or balls and tubes of a frame."""
+    if scene.arch is not None:
+        return ("preassemble", "deviation")
+    return ("spheres", "deviation") if scene.frame is not None else ()
 
 
 def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) -> Result:
@@ -38,10 +47,17 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
     if params.method not in METHODS:
         raise UsageError(f"defects: unknown method {params.method!r}; it has {', '.join(METHODS)}")
     params.check()
+    method = baseline.defects if params.method == "paper" else detect.defects
+    if scene.arch is not None:
+        found, before = bridge_parts.of_bridge(scene, (earlier or {}).get("preassemble"), NAME), earlier or {}
+        return parts.defects(
+            scene, list(found), params.method, before.get("deviation"), lambda part, pose: method(part, params, pose)
+        )
+    if scene.frame is not None:
+        scene = frame_members.of_frame(scene, (earlier or {}).get("spheres"), NAME)
     if scene.structure is None or not len(scene.structure.faces):
         raise InputError(f"{scene.name}: defects need the structure's design (a mesh or STEP, see project.toml)")
     if not any(len(scan.points) for scan in scene.scans):
         raise InputError(f"{scene.name}: expected scans of the structure, found no points")
-    method = baseline.defects if params.method == "paper" else detect.defects
     result = method(scene, params, dict(earlier or {}))
     return replace(result, limits=depths_and_areas.judge(scene, result))

@@ -21,9 +21,11 @@ from processor.model import (
     Word,
     column,
     described,
+    names,
     newer,
     optional,
     reasons,
+    words,
 )
 
 NAN = float("nan")
@@ -61,6 +63,29 @@ class CorePoints(Rows):
         return Distances(
             distance=self.distance, lod95=self.lod95, n1=self.n1, n2=self.n2, std1=self.std1, std2=self.std2
         )
+
+
+@dataclass(frozen=True)
+class PartFits(Rows):
+    """The parts of a bridge, each at the best fit to its own design; poses are of the part's first scan.
+
+    The core points of the result are those of the parts one after the other, ``core_points`` of each.
+    """
+
+    name: tuple[str, ...] = names("p")
+    status: tuple[Status, ...] = words("p", Status)
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("p")
+    registration: tuple[Registration, ...] = words("p", Registration)
+    T_design_scan: Floats = column("p", 4, 4)
+    covariance: Floats = column("p", 6, 6)
+    registration_error: Floats = column("p", unit="mm")
+    core_points: Ints = column("p", dtype=np.int64)
+    core_points_measured: Ints = column("p", dtype=np.int64)
+    mean: Floats = column("p", unit="mm")
+    sd: Floats = column("p", unit="mm")
+    min: Floats = column("p", unit="mm")
+    max: Floats = column("p", unit="mm")
+    lod95_median: Floats = column("p", unit="mm")
 
 
 @dataclass(frozen=True)
@@ -122,6 +147,7 @@ class Result(Checked):
     )
     core: CorePoints = dataclasses.field(default_factory=CorePoints, metadata={"json": ""})
     limits: JudgedLimits | None = newer()
+    parts: PartFits | None = newer()  # of a bridge; then the fields of one registration are empty
 
     @property
     def overall(self) -> Verdict:

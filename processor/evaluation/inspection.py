@@ -1,7 +1,7 @@
 """Characteristics of parts compared with those of the parts as built.
 
 Those of a bridge's part follow from its true key points and bottom edges, those of a body from the true displacements
-of its faces.
+of its faces, those of a member from the true centres of its nodes and the bows that were built.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from collections import defaultdict
 import numpy as np
 
 from processor import scene_cloud
+from processor.adjustment import thermal
 from processor.evaluation.error_statistics import covered
 from processor.geometry import mesh_distance
 from processor.geometry.polyline import Polyline
-from processor.inspection import flat_faces, part_geometry, structure_bodies
+from processor.inspection import flat_faces, members, part_geometry, structure_bodies
 from processor.inspection.arch_parts import design_ends
 from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.model import (
@@ -22,6 +23,7 @@ from processor.model import (
     ArchTruth,
     DesignPart,
     Floats,
+    FrameDesign,
     Metric,
     Scene,
     Statistic,
@@ -41,8 +43,10 @@ NAMES = {
     Quantity.SWEEP: "sweeps and cambers",
     Quantity.CAMBER: "sweeps and cambers",
     Quantity.SQUARENESS: "squareness of end faces",
+    Quantity.DIAMETER: "diameters",
+    Quantity.BOW: "bows",
 }
-OF_SIZE = (Quantity.SWEEP, Quantity.CAMBER)
+OF_SIZE = (Quantity.SWEEP, Quantity.CAMBER, Quantity.BOW)
 REACH_MM, ALIKE = 50.0, 0.99  # of a true point to its facet, and cosine between their normals
 PIECE_MM, LEAST_FACE_MM = 100.0, 1.0
 
@@ -51,6 +55,8 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     """Compare the characteristics of parts and bodies with the truth; all figures are for information."""
     if truth.arch is not None and scene.arch is not None:
         true = {component.name: _of_part(scene.arch, component, truth.arch) for component in result.components}
+    elif truth.frame is not None and scene.frame is not None:
+        true = _of_members(scene, scene.frame, truth)
     elif truth.structure is not None and scene.structure is not None and len(truth.structure.points):
         true = _of_bodies(scene.structure, truth.structure)
     else:
@@ -95,6 +101,24 @@ def _of_part(design: ArchDesign, component: InspectedComponent, truth: ArchTruth
             true[str(quantity)] = float(np.abs(axis[:, a]).max())
         at = int(np.argmin(np.abs(component.axis.chainage - component.axis.chainage.mean())))
         true["middle-width-bottom"] = float(departures[0, at, 0] - departures[1, at, 0])
+    return true
+
+
+def _of_members(scene: Scene, design: FrameDesign, truth: Truth) -> dict[str, dict[str, float]]:
+    """Return the true deviations of members by name and id; tubes have the diameters of the design."""
+    assert truth.frame is not None
+    built = truth.as_built
+    bows = {} if built is None else dict(zip(zip(built.what, built.where, strict=True), built.value, strict=True))
+    as_built = dict(zip(truth.frame.ids.tolist(), truth.frame.centres, strict=True))
+    as_designed = dict(zip(design.ids.tolist(), design.centres, strict=True))
+    factor = thermal.expansion(scene.temperature_C)
+    true: dict[str, dict[str, float]] = {}
+    for m, (a, b) in enumerate(zip(design.member_a.tolist(), design.member_b.tolist(), strict=True)):
+        of_member = {"diameter": 0.0, "bow": float(bows.get(("bow", f"member {m}"), 0.0))}
+        if a in as_built and b in as_built:
+            actual, nominal = (np.linalg.norm(centres[b] - centres[a]) for centres in (as_built, as_designed))
+            of_member["length"] = float(actual / factor - nominal)
+        true[members.name_of(design, m)] = of_member
     return true
 
 

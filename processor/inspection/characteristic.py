@@ -10,8 +10,8 @@ import numpy as np
 
 from processor.inspection.result import Characteristics, Quantity
 from processor.limits import judging, standards
-from processor.limits.guard_band import guard_band
-from processor.model import NORMAL_95, Limit, Reason, Tolerance, Verdict
+from processor.limits.judging import Comparison, Measured
+from processor.model import NORMAL_95, Reason, Tolerance, Verdict
 
 NAN = float("nan")
 Sizes = Mapping[str, float]
@@ -56,11 +56,10 @@ def table(
 ) -> Characteristics:
     """Compare characteristics with the limits of a project, if it names any.
 
-    ``sizes`` of the component, mm, by the names of ``Limit.of``. Of a ``doubtful`` component, all that is limited is
-    indeterminate.
+    ``sizes`` of the component, mm, by the names of ``Limit.of``; of a pitch its own is the spacing. Of a ``doubtful``
+    component, all that is limited is indeterminate.
     """
-    limits = [_limit(one, tolerance, sizes) for one in found]
-    bounds = [(NAN, NAN) if limit is None else standards.bounds(limit, sizes) for limit in limits]
+    rows = [_compared(one, tolerance, sizes, doubtful) for one in found]
     return Characteristics(
         id=tuple(one.id for one in found),
         quantity=tuple(one.quantity for one in found),
@@ -68,36 +67,29 @@ def table(
         actual=np.array([one.nominal + one.deviation for one in found]),
         deviation=np.array([one.deviation for one in found]),
         ci95=np.array([one.ci95 for one in found]),
-        lower=np.array([low for low, _ in bounds]),
-        upper=np.array([high for _, high in bounds]),
+        lower=np.array([NAN if row is None else row.low for row in rows]),
+        upper=np.array([NAN if row is None else row.high for row in rows]),
         unit=("mm",) * len(found),
-        verdict=tuple(
-            _verdict(one, limit, bound, doubtful) for one, limit, bound in zip(found, limits, bounds, strict=True)
-        ),
-        limit=tuple("" if limit is None else limit.key for limit in limits),
+        verdict=tuple(Verdict.NONE if row is None else row.verdict for row in rows),
+        limit=tuple("" if row is None else row.limit.key for row in rows),
         clause=tuple(
-            "" if limit is None or tolerance is None else judging.clause_of(limit, tolerance) for limit in limits
+            "" if row is None or tolerance is None else judging.clause_of(row.limit, tolerance) for row in rows
         ),
-        verified=np.array([limit is not None and limit.verified for limit in limits], np.bool_),
+        verified=np.array([row is not None and row.limit.verified for row in rows], np.bool_),
         reasons=tuple(one.why for one in found),
     )
 
 
-def _limit(one: Characteristic, tolerance: Tolerance | None, sizes: Sizes) -> Limit | None:
-    """Return the limit of a characteristic for a component of these sizes."""
+def _compared(one: Characteristic, tolerance: Tolerance | None, sizes: Sizes, doubtful: bool) -> Comparison | None:
+    """Compare a characteristic with the limit for a component of these sizes; None without a limit."""
     if tolerance is None:
         return None
+    own = {**sizes, "spacing": one.nominal} if one.quantity is Quantity.HOLE_PITCH else sizes
     measure = standards.PART + one.quantity
     rows = (limit for limit in tolerance.limits if limit.measure == measure)
-    return next((limit for limit in rows if standards.applies(limit, sizes.get(limit.of, NAN))), None)
-
-
-def _verdict(one: Characteristic, limit: Limit | None, bounds: tuple[float, float], doubtful: bool) -> Verdict:
+    limit = next((limit for limit in rows if standards.applies(limit, own.get(limit.of, NAN))), None)
     if limit is None:
-        return Verdict.NONE
-    if doubtful or not all(map(math.isfinite, (one.low, one.high))) or any(map(math.isnan, bounds)):
-        return Verdict.INDETERMINATE
-    low, high = bounds
-    if one.size:  # the sign of the greatest departure is not sure, so the tighter bound counts
-        low, high = -math.inf, min(-low, high)
-    return guard_band((one.low, one.high), low, high)
+        return None
+    unknown = doubtful or not all(map(math.isfinite, (one.low, one.high)))
+    measured = Measured(one.id, one.deviation, one.low, one.high, sizes_mm=own, doubtful=unknown, unsigned=one.size)
+    return judging.compare(limit, measured)

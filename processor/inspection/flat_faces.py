@@ -19,6 +19,8 @@ from scipy.sparse.csgraph import connected_components
 from processor import scene_cloud
 from processor.adjustment import groups, scanner_class
 from processor.geometry import mesh_distance
+from processor.inspection import design_holes
+from processor.inspection.design_holes import Hole
 from processor.model import Floats, Ints, StructureDesign
 
 NORMALS, OFFSETS_MM = 1e-3, 0.5  # by which facets of one flat face may differ
@@ -70,11 +72,15 @@ class Pieces(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A body's name and its flat faces as designed, with the pieces measured of each; none where too few were seen."""
+    """A body's name, its flat faces as designed with the pieces measured of each, and its holes as designed.
+
+    A face of which too little was seen has no pieces.
+    """
 
     name: str
     faces: tuple[FlatFace, ...]
     pieces: tuple[Pieces, ...]
+    holes: tuple[Hole, ...] = ()
 
 
 class Fit(NamedTuple):
@@ -136,14 +142,18 @@ def bodies(design: StructureDesign, seen: Observed, least_mm: float) -> Iterator
     first = np.unique(plane, return_index=True)[1]
     facets, rows = _members(plane), _members(plane[seen.facet], len(first))
     large = np.flatnonzero(area >= (LEAST_SIDE * least_mm) ** 2)
+    of_large = _members(of_facet[first[large]], len(names))
+    of_body = _members(of_facet, len(names))
     for number, name in enumerate(names):
         faces, pieces = [], []
-        for k in large[of_facet[first[large]] == number]:
+        own = of_body[number]
+        holes = design_holes.of_body(vertices, design.faces[own], normals[own], plane[own]) if len(own) else []
+        for k in large[of_large[number]]:
             corners = vertices[design.faces[facets[k]]].reshape(-1, 3)
             faces.append(FlatFace(normals[first[k]], corners, float(area[k])))
             wide = _width(faces[-1]) >= least_mm
             pieces.append(_pieces(seen, normals, rows[k] if wide else rows[k][:0]))
-        yield Body(name, tuple(faces), tuple(pieces))
+        yield Body(name, tuple(faces), tuple(pieces), tuple(holes))
 
 
 def _members(group: Ints, count: int = 0) -> list[Ints]:

@@ -38,6 +38,10 @@ class Quantity(Word):
     FLATNESS = "flatness"
     SQUARENESS = "squareness"
     THICKNESS = "thickness"
+    HOLE_POSITION = "hole-position"
+    HOLE_PITCH = "hole-pitch"
+    DIAMETER = "diameter"
+    BOW = "bow"
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
+from processor import scene_cloud
 from processor.adjustment import extremes, scanner_class
-from processor.inspection import characteristic, flat_faces
+from processor.inspection import characteristic, flat_faces, holes
 from processor.inspection.characteristic import Characteristic
 from processor.inspection.flat_faces import Body, Fit, Pieces
+from processor.inspection.holes import Cloud
 from processor.inspection.part_geometry import off_the_chord
 from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.model import Floats, Scene, Status, Tolerance, reason
@@ -54,17 +56,19 @@ class Side(NamedTuple):
     fit: Fit
 
 
-def inspect(scene: Scene, deviation: Any, least_mm: float, method: str) -> Result:
-    """Inspect the bodies of a structure by the result of step ``deviation``."""
+def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method: str) -> Result:
+    """Inspect the bodies of a structure by the results of steps ``deviation`` and, if it ran, stitch."""
     if deviation is None or scene.structure is None or not len(deviation.core):
         return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-deviation"),))
     seen = flat_faces.observed(scene.structure, deviation)
     if seen is None:
         return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-deviation"),))
+    found = list(flat_faces.bodies(scene.structure, seen, least_mm))
+    cloud = None
+    if any(body.holes for body in found):
+        cloud = holes.cloud_of(scene, deviation, stitched, scene_cloud.local_design(scene.structure)[1])
     components = tuple(
-        component
-        for body in flat_faces.bodies(scene.structure, seen, least_mm)
-        if (component := _component(body, scene.tolerance)) is not None
+        component for body in found if (component := _component(body, scene.tolerance, cloud)) is not None
     )
     remarks = () if scene.tolerance is not None else (reason("inspect.no-limits"),)
     if not components:
@@ -74,8 +78,10 @@ def inspect(scene: Scene, deviation: Any, least_mm: float, method: str) -> Resul
     return Result(status=Status.OK, method=method, reasons=remarks, components=components)
 
 
-def _component(body: Body, tolerance: Tolerance | None) -> InspectedComponent | None:
+def _component(body: Body, tolerance: Tolerance | None, cloud: Cloud | None) -> InspectedComponent | None:
     found, sizes = measured(body)
+    if cloud is not None:
+        found = [*found, *_holes(body, cloud)]
     if not found:
         return None
     if all(np.isnan(one.deviation) for one in found):
@@ -83,6 +89,14 @@ def _component(body: Body, tolerance: Tolerance | None) -> InspectedComponent | 
     return InspectedComponent(
         name=body.name, characteristics=characteristic.table(found, tolerance, sizes, doubtful=False)
     )
+
+
+def _holes(body: Body, cloud: Cloud) -> Iterator[Characteristic]:
+    """Yield the characteristics of a body's holes, numbered over the whole body."""
+    first = 1
+    for group in holes.groups(list(body.holes), [axis.direction for axis in body_axes(body)]):
+        yield from holes.measured(cloud, group, first)
+        first += len(group.holes)
 
 
 def measured(body: Body) -> tuple[list[Characteristic], dict[str, float]]:

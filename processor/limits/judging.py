@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from itertools import chain
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +55,8 @@ class Measured:
     """A quantity as measured: of what, its value and the ends of its 95 % interval, in the limit's unit.
 
     ``sizes_mm`` are for limits that depend on a size, by the names of ``Limit.of``. NaN: not known. ``doubtful``: it
-    may be wrong altogether, beyond what the interval covers.
+    may be wrong altogether, beyond what the interval covers. ``unsigned``: the interval is that of a size whose sign is
+    not sure, so the tighter bound counts.
     """
 
     of: str
@@ -62,6 +65,7 @@ class Measured:
     high: float
     sizes_mm: Mapping[str, float] = field(default_factory=dict)
     doubtful: bool = False
+    unsigned: bool = False
 
     @classmethod
     def within(
@@ -91,8 +95,11 @@ def compare(limit: Limit, measured: Measured) -> Comparison:
     """Compare a quantity with a limit; indeterminate where either is not known."""
     low, high = standards.bounds(limit, measured.sizes_mm)
     unknown = any(map(math.isnan, (low, high, measured.low, measured.high)))
+    least, most = (-math.inf, min(-low, high)) if measured.unsigned else (low, high)
     verdict = (
-        Verdict.INDETERMINATE if unknown or measured.doubtful else guard_band((measured.low, measured.high), low, high)
+        Verdict.INDETERMINATE
+        if unknown or measured.doubtful
+        else guard_band((measured.low, measured.high), least, most)
     )
     return Comparison(limit=limit, measured=measured, low=low, high=high, verdict=verdict)
 
@@ -131,6 +138,17 @@ def judged(comparisons: Iterable[Comparison], tolerance: Tolerance) -> JudgedLim
         source=tuple(row.limit.source for row in rows),
         verified=np.array([row.limit.verified for row in rows], np.bool_),
     )
+
+
+def joined(tables: Sequence[JudgedLimits]) -> JudgedLimits:
+    """Return the rows of several tables as one."""
+    columns: dict[str, Any] = {}
+    for field_ in fields(JudgedLimits):
+        values = [getattr(table, field_.name) for table in tables]
+        columns[field_.name] = (
+            np.concatenate(values) if isinstance(values[0], np.ndarray) else tuple(chain.from_iterable(values))
+        )
+    return JudgedLimits(**columns)
 
 
 def clause_of(limit: Limit, tolerance: Tolerance) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from processor.adjustment import temperature
+from processor.adjustment import thermal
 from processor.limits import standards
 from processor.model import ArchDesign, Bools, Floats, Scan, Scene, Tolerance
 from processor.preassembly import to_result, topology
@@ -34,7 +34,7 @@ TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)
 
 def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, params: Params) -> Result:
     """Assemble a bridge; ``scans`` are those of each part, in the design's order."""
-    shrink = 1.0 / temperature.expansion(scene.temperature_C)
+    shrink = 1.0 / thermal.expansion(scene.temperature_C)
     limits = standards.default_for(scene.tolerance)
     frames = np.array([joint_frame(points) for points in design.joint_points])
     shapes = Shapes(design)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.adjustment import temperature
+from processor.adjustment import thermal
 from processor.model import ArchDesign, InputError, Scan, Scene, UsageError, reason
 from processor.preassembly import assemble
 from processor.preassembly.baselines import bootstrap_bands, methods
@@ -62,7 +62,7 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
         kept["scanned again"] = bootstrap_bands.repeat_scans(kept["parts"], design, params)
     result = methods.assemble(kept["parts"], design, params)
     result = bootstrap_bands.with_bands(result, kept["scanned again"], design, params)
-    if np.isfinite(scene.temperature_C) and scene.temperature_C != temperature.REFERENCE_C:
+    if np.isfinite(scene.temperature_C) and scene.temperature_C != thermal.REFERENCE_C:
         remark = reason("preassemble.temperature-not-corrected", temperature=scene.temperature_C)
         result = replace(result, reasons=(*result.reasons, remark))
     return result

@@ -118,7 +118,7 @@ class Balls(Rows):
 class Tubes(Rows):
     """Members as tubes from ``start`` to ``end`` of their axes, mm, between spheres of ids ``a`` and ``b``.
 
-    Half-widths of 95 % intervals are of the radius and of the axis across at both ends, along x, y and z.
+    Half-widths of 95 % intervals are of the radius, of the axis across at both ends, along x, y and z, and of the bow.
     """
 
     a: Ints = column("m", dtype=np.int64)  # -1 = none
@@ -130,6 +130,7 @@ class Tubes(Rows):
     radius_ci95: Floats = column("m", unit="mm")
     start_ci95: Floats = column("m", 3, unit="mm")
     end_ci95: Floats = column("m", 3, unit="mm")
+    bow_ci95: Floats = column("m", unit="mm", newer=True)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from processor.adjustment import temperature
+from processor.adjustment import thermal
 from processor.limits import standards
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
 from processor.space_frame import catalogue, supports
@@ -59,7 +59,7 @@ def beside_ray(scene: Scene, params: Params) -> Result | None:
 def _extracted(source: SceneSource, scene: Scene, params: Params) -> Extracted | None:
     options = Options(
         members=params.members,
-        expansion=temperature.expansion(scene.temperature_C),
+        expansion=thermal.expansion(scene.temperature_C),
         register_stations=params.register_stations,
         datum_mm=params.datum_mm,
         limits=standards.default_for(scene.tolerance),
@@ -191,7 +191,17 @@ def _tubes(members: Members, ids: Ints, origin: Floats, views: ViewErrors | None
         radius_ci95=NORMAL_95 * np.sqrt(members.covariance[:, 4, 4] + common[:, 2, 2]),
         start_ci95=_across(members, -0.5 * members.lengths, common[:, :2, :2]),
         end_ci95=_across(members, 0.5 * members.lengths, common[:, :2, :2]),
+        bow_ci95=NORMAL_95 * _bow_sd(members),
     )
+
+
+def _bow_sd(members: Members) -> Floats:
+    """Return the standard deviation (m,) of each bow along its own direction; of a tube without bow the larger one."""
+    size = np.hypot(*members.bow.T)
+    along = members.bow / np.maximum(size, 1e-9)[:, None]
+    variance = np.einsum("mi,mij,mj->m", along, members.bow_covariance, along)
+    sd: Floats = np.sqrt(np.where(size > 1e-9, variance, np.einsum("mii->mi", members.bow_covariance).max(axis=1)))
+    return sd
 
 
 def _across(members: Members, t: Floats, common: Floats) -> Floats:

@@ -142,7 +142,7 @@ LAYERS = (
     ("geometry",),
     ("scene_cloud",),
     ("adjustment",),
-    ("limits", "store"),
+    ("components", "limits", "store"),
     ("readers", "writers"),
     ("scan_folder",),
     STEPS,
@@ -155,7 +155,9 @@ LAYERS = (
     ("cli",),
     ("__main__",),
 )
-FOR_STEPS = ("version", "model", "progress", "unit_ratio", "geometry", "scene_cloud", "adjustment", "limits")
+FOR_STEPS = (
+    "version", "model", "progress", "unit_ratio", "geometry", "scene_cloud", "adjustment", "components", "limits"
+)  # fmt: skip
 
 
 def wrong_arrows():

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from processor.adjustment.temperature import EXPANSION_PER_K
+from processor.adjustment.thermal import EXPANSION_PER_K
 from processor.model import DesignPart, Floats, Word
 from processor.preassembly.ends import bottom_edges
 from processor.preassembly.ends.bottom_edges import EdgeDepartures

@@ -327,6 +327,9 @@ def _store(fits, m, frame, p, h, sigma, solution):  # type: ignore[no-untyped-de
     for i in range(5):
         for j in range(5):
             fits.covariance[m, i, j] = sigma * sigma * scale[i] * scale[j] * solution.inverse[i, j]
+    for i in range(2):
+        for j in range(2):
+            fits.bow_covariance[m, i, j] = sigma * sigma * solution.inverse[5 + i, 5 + j]
 
 
 @njit(cache=True, nogil=True)

@@ -181,6 +181,7 @@ def _members(fits: Fits, pairs: Ints) -> Members:
         radii=fits.radii[rows],
         bow=fits.bow[rows],
         covariance=fits.covariance[rows],
+        bow_covariance=fits.bow_covariance[rows],
         node_a=pairs[rows, 0],
         node_b=pairs[rows, 1],
         count=fits.number[rows],

@@ -38,7 +38,7 @@ class Members(Checked):
         point + t direction + (1 - (2 t / length)^2) (bow[0] side + bow[1] other).
 
     ``covariance`` is of (offset along side, offset along other, turn along side, turn along other, radius): the line at
-    t moves across by offset + t turn, mm and rad.
+    t moves across by offset + t turn, mm and rad. That of the bow is its own.
     """
 
     points: Floats = column("m", 3)
@@ -48,6 +48,7 @@ class Members(Checked):
     radii: Floats = column("m")
     bow: Floats = column("m", 2)
     covariance: Floats = column("m", 5, 5)
+    bow_covariance: Floats = column("m", 2, 2)
     node_a: Ints = column("m", dtype=np.int64)  # rows of Nodes; -1 = none
     node_b: Ints = column("m", dtype=np.int64)
     count: Ints = column("m", dtype=np.int64)  # points that the fit rests on

@@ -49,6 +49,7 @@ class Fits(NamedTuple):
     radii: Floats
     bow: Floats
     covariance: Floats  # (m, 5, 5)
+    bow_covariance: Floats  # (m, 2, 2)
     response: Floats
     number: Ints  # of points used
     sigma: Floats
@@ -108,6 +109,7 @@ def refined(
         radii=start.radii.copy(),
         bow=np.zeros((m, 2)),
         covariance=np.zeros((m, 5, 5)),
+        bow_covariance=np.zeros((m, 2, 2)),
         response=np.zeros((m, len(scanners) if errors.a or errors.b else 0, 4, 2)),
         number=np.zeros(m, np.int64),
         sigma=start.sigma.copy(),

@@ -4,12 +4,12 @@ import math
 
 import pytest
 
-from processor.adjustment import temperature
+from processor.adjustment import thermal
 
 
 def test_ten_metres_of_steel_25_kelvin_warmer_are_3_mm_longer():
-    assert 10_000.0 * (temperature.expansion(45.0) - 1.0) == pytest.approx(3.0)
+    assert 10_000.0 * (thermal.expansion(45.0) - 1.0) == pytest.approx(3.0)
 
 
 def test_an_unknown_temperature_changes_nothing():
-    assert temperature.expansion(math.nan) == 1.0
+    assert thermal.expansion(math.nan) == 1.0

@@ -1,0 +1,149 @@
+"""Defects of the parts of a bridge, each against its own design at its own best fit, as one result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, replace
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from processor.components.bridge_parts import PartScene
+from processor.defects.design_pose import Measured
+from processor.defects.result import Defects, PartPoses, Picture, Result, SurfacePlaces, Windows
+from processor.defects.verdicts import depths_and_areas
+from processor.limits import judging
+from processor.model import Floats, Reason, Scene, Status, reason
+
+
+def defects(
+    scene: Scene,
+    parts: Sequence[PartScene],
+    method: str,
+    deviation: Any,
+    one: Callable[[Scene, dict[str, Any]], Result],
+) -> Result:
+    """Find the defects of each part by ``one``, from the pose that step ``deviation`` found, and join them.
+
+    Poses are those of the parts, in the table ``parts``; defects are numbered over all parts.
+    """
+    results = [_of_part(part, method, deviation, one) for part in parts]
+    failed = [result.status is Status.FAILED for result in results]
+    status = Status.FAILED if all(failed) else Status.PARTIAL if any(failed) else Status.OK
+    known = [result for result in results if result.status is not Status.FAILED]
+    reasons = (reason("parts.each-at-its-best-fit"), *_doubts(parts, results))
+    if not known:
+        return Result(status=status, method=method, reasons=reasons, parts=_table(parts, results))
+    if status is Status.OK and any(result.status is not Status.OK for result in known):
+        status = Status.WEAK
+    found = list(_numbered(known))
+    judged = [depths_and_areas.judge(scene, result) for result in found]
+    limits = [rows for rows in judged if rows is not None]
+    return Result(
+        status=status,
+        method=method,
+        reasons=reasons,
+        registration_error=float(np.sqrt(np.mean([result.registration_error**2 for result in known]))),
+        cell=max(result.cell for result in known),
+        noise=float(np.median([result.noise for result in known])),
+        lod95=float(np.median([result.lod95 for result in known])),
+        examined_mm2=sum(result.examined_mm2 for result in known),
+        expected_mm2=sum(result.expected_mm2 for result in known),
+        points=sum(result.points for result in known),
+        points_used=sum(result.points_used for result in known),
+        least_depth=_least_depth(known),
+        defects=_joined(Defects, [result.defects for result in found if len(result.defects)]),
+        pictures=tuple(chain.from_iterable(_pictures(result) for result in found)),
+        surface=_joined(SurfacePlaces, [result.surface for result in found if len(result.surface)]),
+        limits=judging.joined(limits) if limits else None,
+        parts=_table(parts, results),
+    )
+
+
+def _of_part(part: PartScene, method: str, deviation: Any, one: Callable[[Scene, dict[str, Any]], Result]) -> Result:
+    if part.scene is None:
+        return Result(status=Status.FAILED, method=method, reasons=part.reasons)
+    return one(part.scene, _pose(part.name, deviation))
+
+
+def _pose(name: str, deviation: Any) -> dict[str, Any]:
+    """Return the pose of a part as step deviation states it; nothing where the step did not run."""
+    table = None if deviation is None else deviation.parts
+    if table is None or name not in table.name:
+        return {}
+    row = table.name.index(name)
+    if not np.isfinite(table.T_design_scan[row]).all():
+        return {}
+    return {
+        "deviation": Measured(
+            status=table.status[row],
+            reasons=table.reasons[row],
+            T_design_scan=table.T_design_scan[row],
+            registration=table.registration[row],
+            registration_error=float(table.registration_error[row]),
+        )
+    }
+
+
+def _doubts(parts: Sequence[PartScene], results: Sequence[Result]) -> Iterator[Reason]:
+    for part, result in zip(parts, results, strict=True):
+        if result.status is not Status.OK and result.reasons:
+            yield reason("parts.of-part", part=part.name, why=result.reasons[:1])
+
+
+def _numbered(results: Sequence[Result]) -> Iterator[Result]:
+    """Yield the results with the defects numbered over all of them, and the rows that places refer to."""
+    before = 0
+    for result in results:
+        places = result.surface.defect
+        yield replace(
+            result,
+            defects=replace(result.defects, id=result.defects.id + before),
+            surface=replace(result.surface, defect=np.where(places < 0, places, places + before)),
+        )
+        before += len(result.defects)
+
+
+def _joined(record: Any, tables: Sequence[Any]) -> Any:
+    """Return the rows of tables of one record as one table."""
+    if not tables:
+        return record()
+    columns = {}
+    for field in fields(record):
+        values = [getattr(table, field.name) for table in tables]
+        array = isinstance(values[0], np.ndarray)
+        columns[field.name] = np.concatenate(values) if array else tuple(chain.from_iterable(values))
+    return record(**columns)
+
+
+def _pictures(result: Result) -> Iterator[Picture]:
+    """Yield a picture a defect; empty ones for those of which there is none."""
+    for row in range(len(result.defects)):
+        yield result.pictures[row] if row < len(result.pictures) else Picture()
+
+
+def _least_depth(results: Sequence[Result]) -> Windows:
+    """Return the windows of the part whose least depths are the largest: what is found on every part."""
+    known = [result.least_depth for result in results if len(result.least_depth)]
+    return max(known, key=lambda table: float(np.max(table.depth))) if known else Windows()
+
+
+def _table(parts: Sequence[PartScene], results: Sequence[Result]) -> PartPoses:
+    def column(name: str) -> Floats:
+        return np.array([getattr(result, name) for result in results], np.float64)
+
+    none, unknown = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
+    poses = [result.T_design_project if result.T_design_project.size else none for result in results]
+    return PartPoses(
+        name=tuple(part.name for part in parts),
+        status=tuple(result.status for result in results),
+        reasons=tuple(result.reasons for result in results),
+        T_design_project=np.array(poses),
+        covariance=np.array([result.covariance if result.covariance.size else unknown for result in results]),
+        noise=column("noise"),
+        lod95=column("lod95"),
+        examined_mm2=column("examined_mm2"),
+        expected_mm2=column("expected_mm2"),
+        defects=np.array([len(result.defects) for result in results], np.int64),
+    )

@@ -1,0 +1,114 @@
+"""Deviations of the parts of a bridge, each from its own design at its own best fit, as one result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+
+from processor.components.bridge_parts import PartScene
+from processor.deviation import result_fields
+from processor.deviation.result import CorePoints, ErrorSource, PartFits, Result
+from processor.geometry import m3c2
+from processor.limits import judging
+from processor.model import Floats, Reason, Scene, Status, reason
+
+
+def deviations(parts: Sequence[PartScene], method: str, one: Callable[[Scene], Result]) -> Result:
+    """Compare each part with its design by ``one``, and join what was found.
+
+    Registrations and poses are those of the parts, in the table ``parts``; the statistics are of all core points.
+    """
+    results = [part_result(part, method, one) for part in parts]
+    known = [result for result in results if len(result.core)]
+    table = _table(parts, results)
+    failed = [result.status is Status.FAILED for result in results]
+    status = Status.FAILED if all(failed) else Status.PARTIAL if any(failed) else Status.OK
+    if status is Status.OK and any(result.status is not Status.OK for result in results):
+        status = Status.WEAK
+    reasons = (reason("parts.each-at-its-best-fit"), *_doubts(parts, results))
+    if not known:
+        return Result(status=status, method=method, reasons=reasons, parts=table)
+    origin = known[0].origin
+    core = _joined([result.core for result in known], [result.origin - origin for result in known])
+    total = m3c2.summary(
+        core.distances, core.points, core.normals, known[0].projection_diameter, m3c2.PAPER_POINTS_A_CYLINDER
+    )
+    limits = [result.limits for result in known if result.limits is not None]
+    error = np.array([result.registration_error for result in known])
+    return Result(
+        status=status,
+        method=method,
+        reasons=reasons,
+        registration=known[0].registration,
+        registration_error=float(np.sqrt(np.mean(error**2))),
+        registration_error_from=ErrorSource.COVARIANCE,
+        points_read=sum(result.points_read for result in known),
+        points_kept=sum(result.points_kept for result in known),
+        on_surface_share=_mean(known, "on_surface_share"),
+        spacing=_mean(known, "spacing"),
+        sigma=_mean(known, "sigma"),
+        projection_diameter=max(result.projection_diameter for result in known),
+        max_depth=max(result.max_depth for result in known),
+        origin=origin,
+        core=core,
+        limits=judging.joined(limits) if limits else None,
+        parts=table,
+        **result_fields.statistics(core, total),
+    )
+
+
+def part_result(part: PartScene, method: str, one: Callable[[Scene], Result]) -> Result:
+    """Return the result of one part; a failed one where it cannot be compared."""
+    if part.scene is None:
+        return Result(status=Status.FAILED, method=method, reasons=part.reasons)
+    found = one(part.scene)
+    if part.status is Status.AMBIGUOUS and found.status is not Status.FAILED:
+        return replace(found, status=Status.AMBIGUOUS, reasons=(*part.reasons, *found.reasons))
+    return found
+
+
+def _doubts(parts: Sequence[PartScene], results: Sequence[Result]) -> list[Reason]:
+    return [
+        reason("parts.of-part", part=part.name, why=result.reasons[:1])
+        for part, result in zip(parts, results, strict=True)
+        if result.status is not Status.OK and result.reasons
+    ]
+
+
+def _joined(cores: Sequence[CorePoints], shifts: Sequence[Floats]) -> CorePoints:
+    columns = {
+        field.name: np.concatenate([getattr(core, field.name) for core in cores])
+        for field in fields(CorePoints)
+        if field.name != "points"
+    }
+    points = np.concatenate([core.points + shift for core, shift in zip(cores, shifts, strict=True)])
+    return CorePoints(points=points, **columns)
+
+
+def _table(parts: Sequence[PartScene], results: Sequence[Result]) -> PartFits:
+    def column(name: str) -> Floats:
+        return np.array([getattr(result, name) for result in results], np.float64)
+
+    none, unknown = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
+    return PartFits(
+        name=tuple(part.name for part in parts),
+        status=tuple(result.status for result in results),
+        reasons=tuple(result.reasons for result in results),
+        registration=tuple(result.registration for result in results),
+        T_design_scan=np.array([result.T_design_scan if result.T_design_scan.size else none for result in results]),
+        covariance=np.array([result.covariance if result.covariance.size else unknown for result in results]),
+        registration_error=column("registration_error"),
+        core_points=np.array([len(result.core) for result in results], np.int64),
+        core_points_measured=np.array([result.core_points_measured for result in results], np.int64),
+        mean=column("mean"),
+        sd=column("sd"),
+        min=column("min"),
+        max=column("max"),
+        lod95_median=column("lod95_median"),
+    )
+
+
+def _mean(results: Sequence[Result], name: str) -> float:
+    return float(np.mean([getattr(result, name) for result in results]))

@@ -1,0 +1,100 @@
+"""Inspection of the members of a space frame, by the spheres and tubes that step ``spheres`` measured.
+
+A member is named by the ids of its nodes. Its length is the distance of the centres of its nodes' spheres, its bow the
+greatest distance of the tube's axis from the straight line through the ends of the tube as seen, its diameter that of
+the tube. None depends on where the member lies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from processor.adjustment import scanner_class, thermal
+from processor.inspection import characteristic
+from processor.inspection.characteristic import Characteristic
+from processor.inspection.result import InspectedComponent, Quantity, Result
+from processor.model import NORMAL_95, FrameDesign, Scene, Status, reason
+
+LOCATED = ("ball", "fused")  # what the centre of a sphere that was seen is estimated from
+
+
+def inspect(scene: Scene, found: Any, method: str) -> Result:
+    """Inspect the members of a frame with a design by the result of step ``spheres``."""
+    design = scene.frame
+    if design is None or found is None or not len(found.tubes):
+        return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-tubes"),))
+    ball = {int(id_): k for k, id_ in enumerate(found.balls.ids)}
+    pairs = zip(found.tubes.a.tolist(), found.tubes.b.tolist(), strict=True)
+    tube = {frozenset(pair): m for m, pair in enumerate(pairs) if -1 not in pair}
+    doubtful = found.matching is not None and found.matching.status is Status.AMBIGUOUS
+    components = tuple(_member(scene, design, m, found, ball, tube, doubtful) for m in range(len(design.member_a)))
+    remarks = () if scene.tolerance is not None else (reason("inspect.no-limits"),)
+    if doubtful:
+        remarks = (reason("inspect.pose-ambiguous"), *remarks)
+    return Result(status=Status.OK, method=method, reasons=remarks, components=components)
+
+
+def name_of(design: FrameDesign, member: int) -> str:
+    """Name a member by its nodes."""
+    return f"{design.member_a[member]}-{design.member_b[member]}"
+
+
+def _member(
+    scene: Scene,
+    design: FrameDesign,
+    member: int,
+    found: Any,
+    ball: dict[int, int],
+    tube: dict[frozenset[int], int],
+    doubtful: bool,
+) -> InspectedComponent:
+    nodes = int(design.member_a[member]), int(design.member_b[member])
+    length = _length(scene, design, nodes, found, ball)
+    row = tube.get(frozenset(nodes))
+    own = list(_of_tube(float(design.tube_diameters[member]), found, row))
+    sizes = {"length": length.nominal, "diameter": float(design.tube_diameters[member])}
+    seen = row is not None or np.isfinite(length.deviation)
+    return InspectedComponent(
+        name=name_of(design, member),
+        status=Status.OK if seen else Status.FAILED,
+        reasons=() if seen else (reason("inspect.member-not-seen"),),
+        characteristics=characteristic.table([length, *own], scene.tolerance, sizes, doubtful),
+    )
+
+
+def _length(
+    scene: Scene, design: FrameDesign, nodes: tuple[int, int], found: Any, ball: dict[int, int]
+) -> Characteristic:
+    """Distance of the centres of a member's nodes, at the reference temperature if the steel's is known."""
+    row = {int(id_): k for k, id_ in enumerate(design.ids)}
+    a, b = (design.centres[row[node]] for node in nodes)
+    nominal = float(np.linalg.norm(b - a))
+    at = [ball.get(node, -1) for node in nodes]
+    balls = found.balls
+    if min(at) < 0 or any(str(balls.evidence[k]) not in LOCATED or not balls.placed[k] for k in at):
+        return characteristic.absent("length", Quantity.LENGTH, nominal, reason("inspect.node-not-seen"))
+    off = balls.centres[at[1]] - balls.centres[at[0]]
+    actual = float(np.linalg.norm(off))
+    along = off / actual
+    variance = float(sum(along @ balls.covariance[k][:3, :3] @ along for k in at)) + (scanner_class.SCALE * actual) ** 2
+    deviation = actual / thermal.expansion(scene.temperature_C) - nominal
+    return characteristic.normal("length", Quantity.LENGTH, nominal, deviation, variance)
+
+
+def _of_tube(diameter: float, found: Any, row: int | None) -> Iterator[Characteristic]:
+    """Yield diameter and bow of the tube that is row ``row`` of what was found."""
+    if row is None:
+        why = reason("inspect.tube-not-seen")
+        yield characteristic.absent("diameter", Quantity.DIAMETER, diameter, why)
+        yield characteristic.absent("bow", Quantity.BOW, 0.0, why)
+        return
+    tubes = found.tubes
+    sd = 2.0 * float(tubes.radius_ci95[row]) / NORMAL_95
+    yield characteristic.normal(
+        "diameter", Quantity.DIAMETER, diameter, 2.0 * float(tubes.radii[row]) - diameter, sd**2
+    )
+    bow, half = float(tubes.bow[row]), float(tubes.bow_ci95[row]) if len(tubes.bow_ci95) else float("nan")
+    yield Characteristic("bow", Quantity.BOW, 0.0, deviation=bow, low=max(bow - half, 0.0), high=bow + half, size=True)
