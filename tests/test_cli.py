@@ -153,9 +153,9 @@ def test_what_a_step_did_not_foresee_is_said_in_one_line(frame, tmp_path, monkey
     assert not (tmp_path / "out").exists()
 
 
-def test_names_with_control_characters_stay_in_one_line(tmp_path):
+def test_names_with_control_characters_stay_in_one_line(called, tmp_path):
     (tmp_path / "a\n\x1b[31m.xyz").touch()
-    done = processor("run", "a\n\x1b[31m.xyz", "-o", "out", cwd=tmp_path)
+    done = called("run", "a\n\x1b[31m.xyz", "-o", "out", cwd=tmp_path)
     assert done.returncode == 3
     assert len(done.stderr.splitlines()) == 1
     assert "\x1b" not in done.stderr

@@ -1,5 +1,6 @@
 """Every script of examples runs as it stands there."""
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -20,17 +21,17 @@ NEEDS = {
 }
 
 
-def run(script, *arguments):
-    done = subprocess.run(
-        [sys.executable, script, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), "LANG": "C.UTF-8", "MPLBACKEND": "Agg"},
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """``run(script, *arguments)``: run a script as Python does, in this process, and return what it prints."""
+
+    def run_here(script, *arguments):
+        monkeypatch.chdir(ROOT)
+        monkeypatch.setattr(sys, "argv", [str(script), *map(str, arguments)])
+        runpy.run_path(str(script), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run_here
 
 
 def test_every_example_is_run():
@@ -38,7 +39,7 @@ def test_every_example_is_run():
 
 
 @pytest.mark.parametrize("name", NEEDS)
-def test_an_example(name):
+def test_an_example(run, name):
     needed, printed = NEEDS[name]
     missing = [f"{module.__name__}.{function}" for module, function in needed if not hasattr(module, function)]
     if missing:
@@ -47,14 +48,17 @@ def test_an_example(name):
 
 
 def test_results_are_read(tmp_path):
+    """The script needs nothing of this project: it runs in a process of its own."""
+    processor.run(ROOT / "fixtures/scan-folder", tmp_path / "out")
     done = subprocess.run(
-        [sys.executable, "-m", "processor", "run", ROOT / "fixtures/scan-folder", "-o", tmp_path / "out"],
+        [sys.executable, EXAMPLES["read_results"], tmp_path / "out"],
         capture_output=True,
-        cwd=ROOT,
+        text=True,
+        cwd=tmp_path,
+        env={"PATH": "/usr/bin:/bin", "LANG": "C.UTF-8"},
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    printed = run(EXAMPLES["read_results"], tmp_path / "out")
-    assert "step spheres: ok, method ray" in printed
-    assert "ball 3:" in printed
-    assert "centres (4, 3) float64" in printed
+    assert "step spheres: ok, method ray" in done.stdout
+    assert "ball 3:" in done.stdout
+    assert "centres (4, 3) float64" in done.stdout

@@ -43,7 +43,7 @@ def seal(dataset: Any, array: np.typing.NDArray[Any]) -> None:
 
 def seal_root(file: Any) -> None:
     """Give the root group the checksum of all that was written."""
-    _write(file, _of_all(file, {path: _stored(dataset) or "" for path, dataset in datasets(file)}))
+    _write(file, _of_all(file, {path: text or "" for path, text in _all_stored(file.id)}))
 
 
 def _write(item: Any, digest: Any) -> None:
@@ -63,8 +63,25 @@ def _of_all(file: Any, known: Mapping[str, str]) -> Any:
 
 
 def _stored(item: Any) -> str | None:
-    value = item.attrs.get(ATTRIBUTE)
-    return bytes(value).decode("ascii", "replace") if isinstance(value, bytes) else None
+    """Return the checksum that a dataset or group, one of h5py's low-level interface, carries; None without one."""
+    if not h5py.h5a.exists(item, ATTRIBUTE.encode()):
+        return None
+    attribute = h5py.h5a.open(item, ATTRIBUTE.encode())
+    if attribute.dtype.kind != "S" or attribute.get_space().get_simple_extent_type() != h5py.h5s.SCALAR:
+        return None
+    value = np.empty((), attribute.dtype)
+    attribute.read(value)
+    return bytes(value[()]).decode("ascii", "replace")
+
+
+def _all_stored(group: Any, place: str = "") -> Iterator[tuple[str, str | None]]:
+    """Yield the paths of all datasets of a low-level group at a place, and their checksums."""
+    for name in group:
+        item, path = h5py.h5o.open(group, name), f"{place}/{name.decode('utf-8', 'surrogateescape')}"
+        if isinstance(item, h5py.h5g.GroupID):
+            yield from _all_stored(item, path)
+        else:
+            yield path, _stored(item)
 
 
 def has_any(file: Any) -> bool:
@@ -84,11 +101,11 @@ def datasets(group: Any) -> Iterator[tuple[str, Any]]:
 
 def root_problems(file: Any) -> list[str]:
     """List what the root group's checksum and those of the datasets contradict; no data are read."""
-    known = {path: _stored(dataset) for path, dataset in datasets(file)}
+    known = dict(_all_stored(file.id))
     missing = [f"{path}: has no checksum, as every dataset of this version has" for path in known if not known[path]]
     if not has_any(file):
         missing.append("/: has no checksum, as every file of this version has")
-    if missing or _stored(file) == _of_all(file, {path: text or "" for path, text in known.items()}).hexdigest():
+    if missing or _stored(file.id) == _of_all(file, {path: text or "" for path, text in known.items()}).hexdigest():
         return missing
     return [
         "/: is damaged: its attributes, or the names of what it holds, are not those written; make or copy it again"
@@ -114,7 +131,7 @@ def whole(dataset: Any) -> np.typing.NDArray[Any]:
     array = np.empty(dataset.shape, dataset.dtype)
     if array.size:
         try:
-            dataset.read_direct(array)
+            dataset.id.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
         except (OSError, RuntimeError) as error:
             raise ChecksumError(f"{dataset.name}: is damaged ({error}); make or copy the file again") from error
     return array
@@ -122,7 +139,7 @@ def whole(dataset: Any) -> np.typing.NDArray[Any]:
 
 def read(dataset: Any) -> np.typing.NDArray[Any]:
     """Read a dataset, with a check where it has a checksum. Raises ChecksumError."""
-    array, known = whole(dataset), _stored(dataset)
+    array, known = whole(dataset), _stored(dataset.id)
     if known is not None:
         digest = begin(dataset.name, dataset)
         digest.update(array.data if array.size else b"")
@@ -144,7 +161,7 @@ class Column:
         self.shape: tuple[int, ...] = dataset.shape
         self.dtype = dataset.dtype
         self.ndim: int = dataset.ndim
-        self._known, self._place = _stored(dataset), (object(),) if again else _place(dataset)
+        self._known, self._place = _stored(dataset.id), (object(),) if again else _place(dataset)
         self._digest: Any = None
         self._next = 0
         self._all = None if dataset.chunks else read(dataset)

@@ -13,6 +13,7 @@ import math
 import types
 import typing
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cache
 from typing import Any, TypeVar
 
 import h5py
@@ -171,6 +172,12 @@ def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type
         raise TypeError(f"{group.name}/{name}: a {type(value).__name__} cannot be stored")
 
 
+@cache
+def _fields(cls: Any) -> tuple[dict[str, Any], dict[str, dataclasses.Field[Any]]]:
+    """Return the types and the fields of a record by their names."""
+    return typing.get_type_hints(cls), {field.name: field for field in dataclasses.fields(cls)}
+
+
 def read_record(
     group: Any,
     cls: type[Record],
@@ -184,8 +191,7 @@ def read_record(
     """
     problems: list[str] = []
     values = dict(given)
-    hints = typing.get_type_hints(cls)
-    known = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    hints, known = _fields(cls)
     problems += [f"{group.name}/{name}: unknown" for name in group if name not in known]
     for name, field in known.items():
         if name in given:
@@ -231,14 +237,15 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
         return kind(_whole(group, name, stored, 0)[()])
     if typing.get_origin(kind) is tuple and issubclass(typing.get_args(kind)[0], str):
         return tuple(_decoded(item, where) for item in _whole(group, name, "S", 1).tolist())
-    if not isinstance(group[name], h5py.Group):
-        if typing.get_origin(kind) is tuple and group[name].shape == (0,):
+    item = group[name]
+    if not isinstance(item, h5py.Group):
+        if typing.get_origin(kind) is tuple and item.shape == (0,):
             _whole(group, name, "S", 1)
             return ()
         raise DecodeError([f"{where}: expected a group, found a dataset"])
     if typing.get_origin(kind) is tuple:
-        return _read_members(group[name], typing.get_args(kind)[0], hooks)
-    return _read_member(group[name], kind, hooks)
+        return _read_members(item, typing.get_args(kind)[0], hooks)
+    return _read_member(item, kind, hooks)
 
 
 def _read_json(group: Any, name: str, decode: Callable[[Any], Any]) -> tuple[Any, ...]:
@@ -258,9 +265,10 @@ def _read_member(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> Any:
 def numbered_groups(group: Any) -> list[Any]:
     """Return the groups 0000, 0001, ... of a group. Raises DecodeError for other content."""
     expected = [f"{i:04d}" for i in range(len(group))]
-    if list(group) != expected or not all(isinstance(group[name], h5py.Group) for name in expected):
+    members = [group[name] for name in expected] if list(group) == expected else []
+    if len(members) != len(expected) or not all(isinstance(member, h5py.Group) for member in members):
         raise DecodeError([f"{group.name}: expected groups 0000, 0001, ..."])
-    return [group[name] for name in expected]
+    return members
 
 
 def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[Any, ...]:
@@ -279,9 +287,7 @@ def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[An
 def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
     """Read an array with ``ndim`` axes, bool from uint8; an absent optional array is empty, with any number of axes."""
     stored = np.dtype(np.uint8 if dtype is np.bool_ else dtype).str[1:]
-    if name in group and isinstance(group[name], h5py.Dataset) and group[name].size == 0:
-        ndim = group[name].ndim
-    return _whole(group, name, stored, ndim)
+    return _whole(group, name, stored, ndim, empty_of_any=True)
 
 
 def column(group: Any, name: str, dtype: type, ndim: int = 1) -> Any:
@@ -309,24 +315,24 @@ def _decoded(data: bytes, where: str) -> str:
         raise DecodeError([f"{where}: not UTF-8 text"]) from None
 
 
-def _whole(group: Any, name: str, stored: str, ndim: int) -> Any:
-    """Read a dataset of a type, with a check of its checksum."""
+def _whole(group: Any, name: str, stored: str, ndim: int, *, empty_of_any: bool = False) -> Any:
+    """Read a dataset of a type, with a check of its checksum; of an empty one, the number of axes may be any."""
     try:
-        return checksums.read(_dataset(group, name, stored, ndim))
+        return checksums.read(_dataset(group, name, stored, ndim, empty_of_any=empty_of_any))
     except checksums.ChecksumError as error:
         raise DecodeError([str(error)]) from None
 
 
-def _dataset(group: Any, name: str, stored: str, ndim: int) -> Any:
+def _dataset(group: Any, name: str, stored: str, ndim: int, *, empty_of_any: bool = False) -> Any:
     where = f"{group.name}/{name}"
     if name not in group:
         raise DecodeError([f"{where}: missing"])
     dataset = group[name]
     if not isinstance(dataset, h5py.Dataset):
         raise DecodeError([f"{where}: expected a dataset, found a group"])
-    actual = dataset.dtype.kind + ("" if dataset.dtype.kind == "S" else str(dataset.dtype.itemsize))
-    if actual != stored or dataset.ndim != ndim or dataset.dtype.byteorder == ">":
-        raise DecodeError(
-            [f"{where}: expected type {stored} with {ndim} axes, found {dataset.dtype.str} with {dataset.ndim}"]
-        )
+    dtype, axes = dataset.dtype, dataset.ndim
+    actual = dtype.kind + ("" if dtype.kind == "S" else str(dtype.itemsize))
+    fits = axes == ndim or (empty_of_any and dataset.size == 0)
+    if actual != stored or not fits or dtype.byteorder == ">":
+        raise DecodeError([f"{where}: expected type {stored} with {ndim} axes, found {dtype.str} with {axes}"])
     return dataset

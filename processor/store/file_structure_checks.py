@@ -20,6 +20,7 @@ GZIP_LIMIT = 1032  # deflate's largest possible expansion
 CHUNK_LIMIT = 64 * 2**20
 SMALL_DATASET_BYTES = 1 << 16  # cannot fill the memory; may expand by more than GZIP_LIMIT
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
+LINKS = {h5py.h5l.TYPE_SOFT: "SoftLink", h5py.h5l.TYPE_EXTERNAL: "ExternalLink"}
 MEMORY_BYTES = 1 << 30  # for a file's structure
 
 
@@ -49,44 +50,49 @@ def problems(file: Any, path: Path) -> list[str]:
     """List all faults of an open file; only its structure is read."""
     faults: list[str] = []
     seen: set[int] = {h5py.h5o.get_info(file.id).addr}
-    stored = _group(file, faults, seen)
+    stored = _group(file.id, "", faults, seen)
     if stored > path.stat().st_size:
         faults.append(f"its datasets have {stored} bytes in a file of {path.stat().st_size}")
     return faults
 
 
-def _group(group: Any, faults: list[str], seen: set[int]) -> int:
-    """Append the faults of a group and of all below it; returns the bytes stored by its datasets."""
+def _group(group: Any, place: str, faults: list[str], seen: set[int]) -> int:
+    """Append the faults of a group at a place and of all below it; returns the bytes stored by its datasets.
+
+    Groups and datasets are the low-level ones of h5py: a scene has hundreds, and is opened several times in a run.
+    """
     stored = 0
-    _attributes(group, faults)
+    _attributes(group, place or "/", faults)
     for name in group:
-        where = f"{group.name.rstrip('/')}/{name}"
-        link = group.get(name, getlink=True)
-        if not isinstance(link, h5py.HardLink):
-            faults.append(f"{where}: a link to another place ({type(link).__name__}) is not accepted")
+        where = f"{place}/{name.decode('utf-8', 'surrogateescape')}"
+        link = group.links.get_info(name).type
+        if link != h5py.h5l.TYPE_HARD:
+            kind = LINKS.get(link, f"link of type {link}")
+            faults.append(f"{where}: a link to another place ({kind}) is not accepted")
             continue
-        item = group[name]
-        address = h5py.h5o.get_info(item.id).addr
+        item = h5py.h5o.open(group, name)
+        address = h5py.h5o.get_info(item).addr
         if address in seen:
             faults.append(f"{where}: is linked a second time")
             continue
         seen.add(address)
-        if isinstance(item, h5py.Group):
-            stored += _group(item, faults, seen)
-        elif isinstance(item, h5py.Dataset):
+        if isinstance(item, h5py.h5g.GroupID):
+            stored += _group(item, where, faults, seen)
+        elif isinstance(item, h5py.h5d.DatasetID):
             faults += [f"{where}: {fault}" for fault in _dataset(item)]
-            stored += item.id.get_storage_size()
-            _attributes(item, faults)
+            stored += item.get_storage_size()
+            _attributes(item, where, faults)
         else:
             faults.append(f"{where}: neither a group nor a dataset")
     return stored
 
 
-def _attributes(item: Any, faults: list[str]) -> None:
-    for name in item.attrs:
-        attribute = item.attrs.get_id(name)
+def _attributes(item: Any, where: str, faults: list[str]) -> None:
+    for number in range(h5py.h5a.get_num_attrs(item)):
+        attribute = h5py.h5a.open(item, index=number)
         if not _plain(attribute.dtype):
-            faults.append(f"{item.name}@{name}: type {attribute.dtype} is not accepted")
+            name = attribute.name.decode("utf-8", "surrogateescape")
+            faults.append(f"{where}@{name}: type {attribute.dtype} is not accepted")
 
 
 def _plain(dtype: Any) -> bool:
@@ -94,29 +100,31 @@ def _plain(dtype: Any) -> bool:
 
 
 def _dataset(dataset: Any) -> list[str]:
-    plist = dataset.id.get_create_plist()
-    if plist.get_layout() == h5py.h5d.VIRTUAL:
+    plist, dtype, shape = dataset.get_create_plist(), dataset.dtype, dataset.shape
+    layout = plist.get_layout()
+    if layout == h5py.h5d.VIRTUAL:
         return ["a virtual dataset is not accepted"]
     if plist.get_external_count():
         return ["data in another file is not accepted"]
-    if not _plain(dataset.dtype):
-        return [f"type {dataset.dtype} is not accepted"]
+    if not _plain(dtype):
+        return [f"type {dtype} is not accepted"]
     filters = {plist.get_filter(i)[0] for i in range(plist.get_nfilters())}
     if filters - FILTERS:
         return [f"filter {min(filters - FILTERS)} is not accepted (gzip, shuffle and fletcher32 are)"]
-    if dataset.shape is None:
+    if shape is None:
         return ["has no extent"]
-    size = dataset.dtype.itemsize * math.prod(int(length) for length in dataset.shape)
-    room = dataset.id.get_storage_size() * (GZIP_LIMIT if h5py.h5z.FILTER_DEFLATE in filters else 1)
+    size = dtype.itemsize * math.prod(int(length) for length in shape)
+    room = dataset.get_storage_size() * (GZIP_LIMIT if h5py.h5z.FILTER_DEFLATE in filters else 1)
     if size > room and not (filters and size <= SMALL_DATASET_BYTES and room):
-        return [f"declares {size} bytes but stores {dataset.id.get_storage_size()}"]
-    if not dataset.chunks:
+        return [f"declares {size} bytes but stores {dataset.get_storage_size()}"]
+    if layout != h5py.h5d.CHUNKED:
         return []
-    chunk = dataset.dtype.itemsize * math.prod(int(length) for length in dataset.chunks)
+    chunks = plist.get_chunk()
+    chunk = dtype.itemsize * math.prod(int(length) for length in chunks)
     if chunk > CHUNK_LIMIT:
         return [f"chunks of {chunk} bytes are not accepted (at most {CHUNK_LIMIT})"]
-    expected = math.prod(-(-int(n) // int(c)) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
-    if dataset.id.get_num_chunks() != expected:
+    expected = math.prod(-(-int(n) // int(c)) for n, c in zip(shape, chunks, strict=True))
+    if dataset.get_num_chunks() != expected:
         # HDF5 reads a chunk that was never written as zeros.
-        return [f"holds {dataset.id.get_num_chunks()} of its {expected} chunks"]
+        return [f"holds {dataset.get_num_chunks()} of its {expected} chunks"]
     return []
