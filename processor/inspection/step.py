@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from processor.inspection import arch_parts, bodies, members
+from processor.inspection import arch_parts, bodies, bridge_holes, members
 from processor.inspection.params import METHODS, Params
 from processor.inspection.result import Result
 from processor.model import InputError, Scene, Status, UsageError, reason
@@ -61,4 +61,5 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
         return members.inspect(scene, found, params.method)
     if scene.arch is None:
         return bodies.inspect(scene, found, (earlier or {}).get("stitch"), params.least_face_mm, params.method)
-    return arch_parts.inspect(scene.arch, found, scene.tolerance, params.method)
+    drilled = {} if found is None else bridge_holes.of_parts(scene, found)
+    return arch_parts.inspect(scene.arch, found, scene.tolerance, params.method, drilled)
