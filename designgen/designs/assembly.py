@@ -38,6 +38,8 @@ class Params(sections.Params):
         least = 2.0 * self.height_mm
         for key in ("length_mm",) if self.type == "row" else ("length_mm", "stub_mm"):
             expect(getattr(self, key) >= least, f"assembly.{key}", getattr(self, key), f"{least:g} or more")
+        widest = 2.0 * prismatic.PAD_SIZE_MM  # the mark lies on one half of the top
+        expect(self.width_mm >= widest, "assembly.width_mm", self.width_mm, f"{widest:g} or more")
         box = self.type == "row" or self.section != "i"
         expect(box, "assembly.section", self.section, "a box: nodes are made of boxes alone")
 

@@ -7,7 +7,8 @@ pose. The scale of the scanner, which no part shows, is added by its class.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -34,14 +35,20 @@ NAN = float("nan")
 LEAST_REACH = 0.7  # of the edges' length, over which both have to be seen
 
 
-def inspect(design: ArchDesign, assembled: Any, tolerance: Tolerance | None, method: str) -> Result:
-    """Inspect the parts of a bridge by the result of step ``preassemble``."""
+def inspect(
+    design: ArchDesign,
+    assembled: Any,
+    tolerance: Tolerance | None,
+    method: str,
+    others: Mapping[str, Sequence[Characteristic]] = MappingProxyType({}),
+) -> Result:
+    """Inspect the parts of a bridge by the result of step ``preassemble``; ``others`` are measured of parts by name."""
     if assembled is None or assembled.adjustment is None or not assembled.adjustment.shapes:
         return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-measured-ends"),))
     shapes = {shape.name: shape for shape in assembled.adjustment.shapes}
     states = dict(zip(assembled.components.name, assembled.components.status, strict=True))
     components = tuple(
-        _part(part, design_ends(design, i), shapes[part.name], states[part.name], tolerance)
+        _part(part, design_ends(design, i), shapes[part.name], states[part.name], tolerance, others.get(part.name, ()))
         for i, part in enumerate(design.parts)
     )
     failed = [component.status is Status.FAILED for component in components]
@@ -64,7 +71,12 @@ def design_ends(design: ArchDesign, part: int) -> Floats:
 
 
 def _part(
-    part: DesignPart, design: Floats, shape: Any, status: Status, tolerance: Tolerance | None
+    part: DesignPart,
+    design: Floats,
+    shape: Any,
+    status: Status,
+    tolerance: Tolerance | None,
+    others: Sequence[Characteristic],
 ) -> InspectedComponent:
     if status is Status.FAILED:
         return InspectedComponent(name=part.name, status=status, reasons=(reason("inspect.not-registered"),))
@@ -72,14 +84,14 @@ def _part(
         return InspectedComponent(name=part.name, reasons=(reason("inspect.branch"),))
     remarks = (reason("inspect.ambiguous"),) if status is Status.AMBIGUOUS else ()
     axis, departures = _axis(part, shape)
-    found = [*_sections(design, shape), *_lengths(part, design, shape), *departures]
+    found = [*_sections(design, shape), *_lengths(part, design, shape), *departures, *others]
     width, height = part_geometry.section_sizes(design)
     sizes = {"length": _length(part, design), "width": width, "height": height}
     return InspectedComponent(
         name=part.name,
         status=status,
         reasons=remarks,
-        characteristics=characteristic.table(found, tolerance, sizes, status is Status.AMBIGUOUS),
+        characteristics=characteristic.table(found, tolerance, part.name, sizes, status is Status.AMBIGUOUS),
         axis=axis,
     )
 

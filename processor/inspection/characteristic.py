@@ -19,7 +19,7 @@ Sizes = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Characteristic:
-    """A deviation from ``nominal`` with its 95 % interval ``low`` to ``high``, mm; NaN = not measured.
+    """A deviation from ``nominal`` with its 95 % interval ``low`` to ``high``, in ``unit``; NaN = not measured.
 
     A greatest departure is stated with its sign, and its interval is that of its ``size``.
     """
@@ -31,6 +31,7 @@ class Characteristic:
     low: float = NAN
     high: float = NAN
     size: bool = False
+    unit: str = "mm"
     why: tuple[Reason, ...] = ()
 
     @property
@@ -52,14 +53,14 @@ def absent(id_: str, quantity: Quantity, nominal: float, *why: Reason) -> Charac
 
 
 def table(
-    found: Sequence[Characteristic], tolerance: Tolerance | None, sizes: Sizes, doubtful: bool
+    found: Sequence[Characteristic], tolerance: Tolerance | None, component: str, sizes: Sizes, doubtful: bool
 ) -> Characteristics:
-    """Compare characteristics with the limits of a project, if it names any.
+    """Compare characteristics of a ``component`` with the limits of a project, if it names any.
 
     ``sizes`` of the component, mm, by the names of ``Limit.of``; of a pitch its own is the spacing. Of a ``doubtful``
     component, all that is limited is indeterminate.
     """
-    rows = [_compared(one, tolerance, sizes, doubtful) for one in found]
+    rows = [_compared(one, tolerance, component, sizes, doubtful) for one in found]
     return Characteristics(
         id=tuple(one.id for one in found),
         quantity=tuple(one.quantity for one in found),
@@ -69,7 +70,7 @@ def table(
         ci95=np.array([one.ci95 for one in found]),
         lower=np.array([NAN if row is None else row.low for row in rows]),
         upper=np.array([NAN if row is None else row.high for row in rows]),
-        unit=("mm",) * len(found),
+        unit=tuple(one.unit for one in found),
         verdict=tuple(Verdict.NONE if row is None else row.verdict for row in rows),
         limit=tuple("" if row is None else row.limit.key for row in rows),
         clause=tuple(
@@ -80,16 +81,21 @@ def table(
     )
 
 
-def _compared(one: Characteristic, tolerance: Tolerance | None, sizes: Sizes, doubtful: bool) -> Comparison | None:
-    """Compare a characteristic with the limit for a component of these sizes; None without a limit."""
+def _compared(
+    one: Characteristic, tolerance: Tolerance | None, component: str, sizes: Sizes, doubtful: bool
+) -> Comparison | None:
+    """Compare a characteristic with the limit for a component of these sizes; None without a limit.
+
+    Of several the last holds: a project's own come after those of its standard.
+    """
     if tolerance is None:
         return None
     own = {**sizes, "spacing": one.nominal} if one.quantity is Quantity.HOLE_PITCH else sizes
     measure = standards.PART + one.quantity
-    rows = (limit for limit in tolerance.limits if limit.measure == measure)
-    limit = next((limit for limit in rows if standards.applies(limit, own.get(limit.of, NAN))), None)
-    if limit is None:
+    limits = judging.limits_for(tolerance, measure, component)
+    fitting = [limit for limit in limits if standards.applies(limit, own.get(limit.of, NAN))]
+    if not fitting:
         return None
     unknown = doubtful or not all(map(math.isfinite, (one.low, one.high)))
     measured = Measured(one.id, one.deviation, one.low, one.high, sizes_mm=own, doubtful=unknown, unsigned=one.size)
-    return judging.compare(limit, measured)
+    return judging.compare(fitting[-1], measured)

@@ -156,6 +156,15 @@ def bodies(design: StructureDesign, seen: Observed, least_mm: float) -> Iterator
         yield Body(name, tuple(faces), tuple(pieces), tuple(holes))
 
 
+def holes_of(vertices: Floats, faces: Ints) -> tuple[Floats, list[Hole]]:
+    """Return the round holes through one body, less an origin (3,) that is returned as well."""
+    vertices, origin = scene_cloud.local_design(StructureDesign("", vertices, faces))
+    cross, double = mesh_distance.double_areas(vertices, faces)
+    normals = cross / np.maximum(double, 1e-12)[:, None]
+    plane = _planes(vertices[faces], normals, np.zeros(len(faces), np.int64))
+    return origin, design_holes.of_body(vertices, faces, normals, plane)
+
+
 def _members(group: Ints, count: int = 0) -> list[Ints]:
     """Return the rows of each group."""
     order = np.argsort(group, kind="stable")

@@ -24,6 +24,8 @@ from processor.model import Floats, Ints, Scene, reason
 REACH_MM, PITCH_SHARE = 25.0, 0.4  # of a hole from its designed place, and at most this share of the way to the next
 RING_MM = 15.0  # around a hole, of the face that tells the height of its plate
 FEWEST_LEVEL = 20
+UNDER_MM = 1.0  # of a gauge pin below the nominal diameter of a hole, as steel is checked for high-strength bolts
+SEED, DRAWS = 21, 2000  # of the errors, for the share of holes that a pin passes
 PARALLEL, SAME_PLATE_MM, ROW_MM = 0.9999, 1.0, 1.0
 
 
@@ -47,11 +49,10 @@ class Group(NamedTuple):
     axes: Floats
 
 
-def cloud_of(scene: Scene, deviation: Any, stitched: Any, origin: Floats) -> Cloud:
-    """Return all points of a scene in the design's frame less ``origin``, by the pose that step ``deviation`` found."""
+def cloud_of(scene: Scene, T: Floats, stitched: Any, origin: Floats) -> Cloud:
+    """Return all points of a scene in the design's frame less ``origin``, by a pose (4, 4) of the scans as merged."""
     placed = scene_cloud.stitched(scene, stitched)
     cloud = scene_cloud.merged(placed, with_scanner=True)
-    T = deviation.T_design_scan if deviation.T_design_scan.size else np.eye(4)
     # The large offsets are subtracted from each other first: added to the points, either would cost them digits.
     points = cloud.points @ T[:3, :3].T + (T[:3, :3] @ cloud.origin + T[:3, 3] - origin)
     count = [len(scan.points) for scan in placed.scans]
@@ -138,7 +139,9 @@ def _characteristics(places: Floats, radius: Floats, fitted: Fitted, first: int)
     known = np.flatnonzero(np.isfinite(fitted.departure).all(axis=1))
     why = reason("inspect.hole-not-seen")
     if len(known) > 2:
-        yield from _places(places, fitted, known, first)
+        departure, covariance = _within(places, fitted, known)
+        yield from _places(places, (departure, covariance), known, first)
+        yield _passing(radius[known], fitted, (departure, covariance), known, (first, first + len(places) - 1))
     for a, b in _neighbours(places):
         id_, nominal = f"pitch-{first + a}-{first + b}", float(np.linalg.norm(places[b] - places[a]))
         if a in known and b in known:
@@ -151,22 +154,37 @@ def _characteristics(places: Floats, radius: Floats, fitted: Fitted, first: int)
         if k in known:
             variance = 4.0 * float(fitted.covariance[3 * k + 2, 3 * k + 2])
             deviation = 2.0 * float(fitted.departure[k, 2])
-            yield characteristic.normal(id_, Quantity.DIAMETER, 2.0 * r, deviation, variance)
+            yield characteristic.normal(id_, Quantity.HOLE_DIAMETER, 2.0 * r, deviation, variance)
         else:
-            yield characteristic.absent(id_, Quantity.DIAMETER, 2.0 * r, why)
+            yield characteristic.absent(id_, Quantity.HOLE_DIAMETER, 2.0 * r, why)
 
 
-def _places(places: Floats, fitted: Fitted, known: Ints, first: int) -> Iterator[Characteristic]:
-    """Yield the places of holes within their group, along and across: its best fit as a rigid body is taken off."""
-    middle = places.mean(axis=0)
+def _within(places: Floats, fitted: Fitted, known: Ints) -> tuple[Floats, Floats]:
+    """Departures (2k,) of holes from the best fit of their group as a rigid body, and their covariance with radii.
+
+    The covariance (3k, 3k) is of these and of the departures of the k radii.
+    """
     off = places[known] - places[known].mean(axis=0)
     rows = (3 * known[:, None] + [0, 1]).ravel()
     motions = np.zeros((len(rows), 3))
     motions[0::2, 0] = motions[1::2, 1] = 1.0
     motions[0::2, 2], motions[1::2, 2] = -off[:, 1], off[:, 0]
     off_the_fit = np.eye(len(rows)) - motions @ np.linalg.pinv(motions)
-    departure = off_the_fit @ fitted.departure[known, :2].ravel()
-    variance = np.diag(off_the_fit @ fitted.covariance[np.ix_(rows, rows)] @ off_the_fit.T)
+    radii = 3 * known + 2
+    both = np.concatenate([rows, radii])
+    change = np.zeros((len(both), len(both)))
+    change[: len(rows), : len(rows)] = off_the_fit
+    change[len(rows) :, len(rows) :] = np.eye(len(radii))
+    return (
+        off_the_fit @ fitted.departure[known, :2].ravel(),
+        change @ fitted.covariance[np.ix_(both, both)] @ change.T,
+    )
+
+
+def _places(places: Floats, within: tuple[Floats, Floats], known: Ints, first: int) -> Iterator[Characteristic]:
+    """Yield the places of holes within their group, along and across."""
+    middle = places.mean(axis=0)
+    departure, variance = within[0], np.diag(within[1])
     at = {int(k): i for i, k in enumerate(known)}
     for k in range(len(places)):
         for a, name in enumerate(("along", "across")):
@@ -178,6 +196,35 @@ def _places(places: Floats, fitted: Fitted, known: Ints, first: int) -> Iterator
                 )
             else:
                 yield characteristic.absent(id_, Quantity.HOLE_POSITION, nominal, reason("inspect.hole-not-seen"))
+
+
+def _passing(
+    radius: Floats, fitted: Fitted, within: tuple[Floats, Floats], known: Ints, numbers: tuple[int, int]
+) -> Characteristic:
+    """Return the share of a group's holes that a gauge pin passes together with a splice plate drilled as designed.
+
+    The pin is thinner than the nominal hole by UNDER_MM. It passes a hole of radius r, off the plate's hole of radius R
+    by e, if e <= r + R - d for the pin's diameter d. The share is the mean of the holes' probabilities, its interval
+    that of draws of all errors together.
+    """
+    mean, covariance = np.concatenate([within[0], fitted.departure[known, 2]]), within[1]
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    drawn = mean + np.random.default_rng(SEED).standard_normal((DRAWS, len(mean))) @ root.T
+    count = len(known)
+    off = np.hypot(drawn[:, 0 : 2 * count : 2], drawn[:, 1 : 2 * count : 2])
+    pin = 2.0 * radius - UNDER_MM
+    passed = (off <= 2.0 * radius - pin + drawn[:, 2 * count :]).mean(axis=1)
+    low, high = np.quantile(passed, [0.025, 0.975]) - 1.0
+    return Characteristic(
+        f"holes-{numbers[0]}-{numbers[1]}-pass-through",
+        Quantity.PASS_THROUGH,
+        1.0,
+        deviation=float(passed.mean()) - 1.0,
+        low=float(low),
+        high=float(high),
+        unit="1",
+    )
 
 
 def _neighbours(places: Floats) -> Iterator[tuple[int, int]]:

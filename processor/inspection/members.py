@@ -56,12 +56,12 @@ def _member(
     row = tube.get(frozenset(nodes))
     own = list(_of_tube(float(design.tube_diameters[member]), found, row))
     sizes = {"length": length.nominal, "diameter": float(design.tube_diameters[member])}
-    seen = row is not None or np.isfinite(length.deviation)
+    seen, name = row is not None or np.isfinite(length.deviation), name_of(design, member)
     return InspectedComponent(
-        name=name_of(design, member),
+        name=name,
         status=Status.OK if seen else Status.FAILED,
         reasons=() if seen else (reason("inspect.member-not-seen"),),
-        characteristics=characteristic.table([length, *own], scene.tolerance, sizes, doubtful),
+        characteristics=characteristic.table([length, *own], scene.tolerance, name, sizes, doubtful),
     )
 
 

@@ -40,6 +40,8 @@ class Quantity(Word):
     THICKNESS = "thickness"
     HOLE_POSITION = "hole-position"
     HOLE_PITCH = "hole-pitch"
+    PASS_THROUGH = "pass-through"
+    HOLE_DIAMETER = "hole-diameter"
     DIAMETER = "diameter"
     BOW = "bow"
 

@@ -66,7 +66,8 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     found = list(flat_faces.bodies(scene.structure, seen, least_mm))
     cloud = None
     if any(body.holes for body in found):
-        cloud = holes.cloud_of(scene, deviation, stitched, scene_cloud.local_design(scene.structure)[1])
+        T = deviation.T_design_scan if deviation.T_design_scan.size else np.eye(4)
+        cloud = holes.cloud_of(scene, T, stitched, scene_cloud.local_design(scene.structure)[1])
     components = tuple(
         component for body in found if (component := _component(body, scene.tolerance, cloud)) is not None
     )
@@ -87,7 +88,7 @@ def _component(body: Body, tolerance: Tolerance | None, cloud: Cloud | None) -> 
     if all(np.isnan(one.deviation) for one in found):
         return InspectedComponent(name=body.name, status=Status.FAILED, reasons=(reason("inspect.body-not-seen"),))
     return InspectedComponent(
-        name=body.name, characteristics=characteristic.table(found, tolerance, sizes, doubtful=False)
+        name=body.name, characteristics=characteristic.table(found, tolerance, body.name, sizes, doubtful=False)
     )
 
 

@@ -61,10 +61,30 @@ def of_projects() -> tuple[Limit, ...]:
             low=0.0,
             measure=DEVIATION_SHARE,
         ),
+        *_of_holes_and_members(),
         *_of_defects(),
         Limit("closure_mm", "misclosure of a loop of scans", measure=CLOSURE),
         Limit("control_point_mm", "distance of a control point as scanned from its known place", measure=CONTROL_POINT),
         Limit("scan_position_mm", "95 % uncertainty of a scan's place", measure=SCAN_POSITION),
+    )
+
+
+def _of_holes_and_members() -> Iterator[Limit]:
+    for quantity, what in (
+        ("hole-position", "place of a hole within its group, along and across, less the design's"),
+        ("hole-pitch", "distance of two neighbouring holes less the design's"),
+        ("hole-diameter", "diameter of a hole less the design's"),
+        ("diameter", "diameter of a tube less the design's"),
+        ("bow", "bow of a tube"),
+    ):
+        key = f"part_{quantity.replace('-', '_')}_mm"
+        yield Limit(key, what, low=-math.inf, high=math.inf, measure=f"part {quantity}")
+    yield Limit(
+        "part_pass_through",
+        "share of a group's holes that a gauge pin passes, 1 mm thinner than the hole, less 1",
+        unit="1",
+        low=-1.0,
+        measure="part pass-through",
     )
 
 

@@ -191,7 +191,7 @@ def read_record(
     """
     problems: list[str] = []
     values = dict(given)
-    hints, known = _fields(cls)
+    hints, known = _fields(typing.cast(typing.Hashable, cls))
     problems += [f"{group.name}/{name}: unknown" for name in group if name not in known]
     for name, field in known.items():
         if name in given:

@@ -155,6 +155,32 @@ def test_a_plate_that_is_moved_and_turned_keeps_its_holes():
         assert after[id_].deviation == pytest.approx(one.deviation, abs=0.05), id_
 
 
+@pytest.mark.parametrize(("off", "share"), [(0.0, 1.0), (0.8, 1.0), (3.0, 5.0 / 6.0)])
+def test_a_gauge_pin_passes_holes_that_are_less_than_its_play_off(off, share):
+    """A pin 1 mm thinner than two holes passes them if they are less than 1 mm off each other."""
+    departure = np.zeros(GRID.shape)
+    departure[1] = [
+        0.0,
+        off,
+    ]  # the best fit of the group takes a sixth of it, and turns with none as it is in the middle
+    one = measured(*bore_cloud(np.random.default_rng(1), departure, sigma=0.1))["holes-1-6-pass-through"]
+    assert 1.0 + one.deviation == pytest.approx(share, abs=0.02)
+    assert one.low <= share - 1.0 <= one.high
+    assert one.unit == "1"
+
+
+def test_the_share_that_a_pin_passes_is_unsure_where_the_play_is_used_up():
+    found = []
+    for off in (0.9, 1.1, 1.15, 1.2, 1.25, 1.3, 1.35, 1.6):  # five sixths of it are left by the best fit
+        departure = np.zeros(GRID.shape)
+        departure[1] = [0.0, off]
+        found.append(measured(*bore_cloud(np.random.default_rng(1), departure))["holes-1-6-pass-through"])
+    shares, widths = np.array([(one.deviation, one.high - one.low) for one in found]).T
+    assert (np.diff(shares) <= 1e-6).all()
+    np.testing.assert_allclose(shares[[0, -1]], [0.0, -1.0 / 6.0], atol=1e-3)
+    assert widths[[0, -1]].max() < 1e-6 < 0.1 < widths.max()
+
+
 def test_mixed_pixels_in_the_bore_do_not_move_it():
     errors = []
     for seed in range(6):

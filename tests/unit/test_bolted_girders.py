@@ -1,0 +1,116 @@
+"""Girders with bolt holes: scanned surfaces against their CadQuery solids, meshes, and where holes were drilled."""
+
+import cadquery as cq
+import numpy as np
+import pytest
+
+from designgen.designs import assembly, bolting, girder
+from designgen.scenes import make as scenes
+from processor.model import UsageError
+
+SIZES = assembly.Params(
+    type="row", section="i", parts=2, length_mm=1400.0, width_mm=420.0, height_mm=600.0, flange_mm=20.0, web_mm=12.0
+)
+BOLTS = bolting.Params()
+HOLES = 12  # of a girder's end: 24 a joint
+TOLERANCE_MM = 0.01
+
+
+def shells(shape):
+    return cq.Compound.makeCompound([shell for solid in shape.Solids() for shell in solid.Shells()])
+
+
+def test_a_joint_has_24_holes():
+    for part in assembly.build(SIZES, BOLTS).parts:
+        assert len(part.girder.bores) == HOLES
+
+
+def test_the_mesh_of_a_girder_encloses_the_volume_of_its_solid():
+    for part in assembly.build(SIZES, BOLTS).parts:
+        vertices, faces = part.mesh()
+        corners = (vertices - vertices.mean(axis=0))[faces]
+        volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
+        # Bores are polygons in the mesh: of 64 corners, smaller than the circle by 1.6 parts in a thousand.
+        bores = sum(np.pi * b.radius**2 * np.linalg.norm(b.end - b.start) for b in part.girder.bores)
+        solid = girder.solid(part.girder).Volume()
+        assert volume - solid == pytest.approx(bores * (1.0 - np.sin(2 * np.pi / 64) * 64 / (2 * np.pi)), rel=1e-3)
+
+
+@pytest.mark.parametrize("mode", ["surface", "rays"])
+def test_what_is_scanned_lies_on_the_solid_as_drilled(mode):
+    settings = {"surface": {"spacing_mm": 12.0, "sigma_mm": 0.0}, "rays": QUIET}[mode]
+    scene, truth, shifts = made(seed=2, scan=settings, mode=mode)
+    drilled = assembly.build(SIZES, BOLTS, shifts)
+    rng = np.random.default_rng(0)
+    for part, scan, T in zip(drilled.parts, scene.scans, truth.arch.T_bridge_scan, strict=True):
+        solid = shells(girder.solid(part.girder))
+        points = scan.points @ T[:3, :3].T + T[:3, 3]
+        in_bore = np.zeros(len(points), bool)
+        for bore in part.girder.bores:
+            axis = part.girder.T[:3, :3] @ np.array([0.0, *(bore.end - bore.start)])
+            middle = part.girder.T[:3, :3] @ (bore.middle + bore.shift) + part.girder.T[:3, 3]
+            depth = np.linalg.norm(axis)
+            along = (points - middle) @ axis / depth
+            off = np.linalg.norm(points - middle - along[:, None] * axis / depth, axis=1)
+            in_bore |= (np.abs(along) < 0.5 * depth - 0.1) & (off < bore.radius + 0.5)
+        assert in_bore.sum() > 30
+        for rows in (np.flatnonzero(in_bore), np.flatnonzero(~in_bore)):
+            few = points[rng.choice(rows, min(len(rows), 40), replace=False)]
+            assert max(cq.Vertex.makeVertex(*p).distance(solid) for p in few) < TOLERANCE_MM
+
+
+QUIET = {
+    "scanner": "plain-2mm",
+    "step_mrad": 2.0,
+    "stations": [4],
+    "distance_mm": 1500.0,
+    "sub_rays": 1,
+}
+
+
+def made(seed, scan, mode="surface", hole_mm=1.0):
+    recipe = {
+        "kind": "assembly",
+        "assembly": {
+            "type": "row", "section": "i", "parts": 2, "length_mm": 1400.0, "width_mm": 420.0, "height_mm": 600.0,
+            "flange_mm": 20.0, "web_mm": 12.0,
+        },
+        "bolts": {},
+        "asbuilt": {"hole_mm": hole_mm},
+        "scan": {"mode": mode, **scan},
+    }  # fmt: skip
+    if mode == "rays":
+        recipe["scanner"] = {"noise_mm": 0.0}
+    scene, truth = scenes.make("bolted", recipe, seed)
+    noted = {
+        (what, where): value
+        for what, where, value in zip(truth.as_built.what, truth.as_built.where, truth.as_built.value, strict=True)
+    }
+    shifts = {
+        part.name: np.array(
+            [[noted[f"hole {k + 1}, {a}", part.name] for a in ("along", "left", "up")] for k in range(HOLES)]
+        )
+        for part in scene.arch.parts
+    }
+    return scene, truth, shifts
+
+
+def test_holes_are_drilled_off_their_places_along_their_plates():
+    _, _, shifts = made(seed=5, scan={"spacing_mm": 200.0})
+    for part in assembly.build(SIZES, BOLTS).parts:
+        for bore, shift in zip(part.girder.bores, shifts[part.name], strict=True):
+            assert shift @ np.array([0.0, *(bore.end - bore.start)]) == pytest.approx(0.0, abs=1e-12)
+    drawn = np.concatenate([np.concatenate(list(made(s, {"spacing_mm": 500.0})[2].values())) for s in range(6)])
+    across = np.linalg.norm(drawn, axis=1) ** 2
+    assert across.mean() == pytest.approx(2.0, rel=0.35)  # two coordinates of 1 mm each, 144 draws
+
+
+@pytest.mark.parametrize("changes", [{"hole_mm": 200.0}, {"pitch_mm": 20.0}, {"web_bolts": 30}])
+def test_holes_that_do_not_fit_are_refused(changes):
+    with pytest.raises(UsageError, match=r"bolts\."):
+        assembly.build(SIZES, bolting.Params(**changes))
+
+
+def test_only_rows_of_i_girders_have_bolts():
+    with pytest.raises(UsageError, match="bolts"):
+        assembly.build(assembly.Params(type="node"), BOLTS)

@@ -1,0 +1,152 @@
+"""Parts of bridges and balls and tubes of frames as structures: where they are compared, and what is no defect."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+
+from processor.components import bridge_parts, frame_members
+from processor.defects import step as defects
+from processor.deviation import step as deviation
+from processor.model import ArchDesign, DesignPart, FrameDesign, Scan, Scene, Status, UsageError
+
+SIZE = np.array([2000.0, 600.0, 400.0])
+JOINT = np.array([[0, 300, 0], [0, -300, 0], [0, -300, 400], [0, 300, 400],
+                  [0, 0, 0], [0, -300, 200], [0, 0, 400], [0, 300, 200]], float)  # fmt: skip
+DENT_MM, DENT_RADIUS = 8.0, 120.0
+
+
+def box(x):
+    """A box from x on, its section about the x axis."""
+    mesh = trimesh.creation.box(SIZE)
+    mesh.apply_translation([x + 0.5 * SIZE[0], 0.0, 0.5 * SIZE[2]])
+    return np.array(mesh.vertices), np.array(mesh.faces, np.int64)
+
+
+def design():
+    parts = tuple(DesignPart(name, *box(x)) for name, x in (("left", -SIZE[0]), ("right", 0.0)))
+    return ArchDesign(parts, ("J1",), ("left",), ("right",), JOINT[None])
+
+
+def scanned(part, rng, dent):
+    """Points on a part's faces, 20 mm apart, with a dent in the middle of its top."""
+    mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+    points, face = trimesh.sample.sample_surface(mesh, int(mesh.area / 20.0**2), seed=int(rng.integers(1 << 30)))
+    top = mesh.face_normals[face][:, 2] > 0.9
+    off = np.linalg.norm(points[:, :2] - part.vertices.mean(axis=0)[:2], axis=1)
+    points[top, 2] -= dent * np.exp(-((off[top] / DENT_RADIUS) ** 2))
+    return points + 0.5 * rng.normal(size=points.shape)
+
+
+@pytest.fixture(scope="module")
+def bridge():
+    """Two boxes; the right one is dented, and lies 25 mm off in the assembly. Each is in a scan frame of its own."""
+    rng, made = np.random.default_rng(4), design()
+    scans, poses = [], []
+    for part, dent, off in zip(made.parts, (0.0, DENT_MM), (0.0, 25.0), strict=True):
+        points = scanned(part, rng, dent) + np.array([0.0, off, 0.0])
+        T = trimesh.transformations.rotation_matrix(0.7, [0.2, 0.3, 0.9], [1e3, 2e3, 3e3])
+        scans.append(Scan(part.name, points @ T[:3, :3].T + T[:3, 3], component=part.name, sigma_mm=0.5))
+        # As preassembly fits the part: to its design, a little off.
+        back = np.linalg.inv(T)
+        back[:3, 3] += [2.0, -1.5 - off, 1.0]
+        poses.append(back)
+    scene = Scene("two", "arch-bridge", tuple(scans), arch=made)
+    table = SimpleNamespace(
+        name=("left", "right"), status=(Status.OK,) * 2, scans=("left", "right"), T_bridge_scan=np.array(poses)
+    )
+    return scene, SimpleNamespace(components=table, method="adjustment")
+
+
+@pytest.fixture(scope="module")
+def compared(bridge):
+    scene, assembled = bridge
+    found = deviation.run(scene, deviation.Params(), {"preassemble": assembled})
+    return found, defects.run(scene, defects.Params(), {"preassemble": assembled, "deviation": found})
+
+
+def test_each_part_is_compared_at_its_own_best_fit(compared):
+    found, _ = compared
+    assert found.parts.name == ("left", "right")
+    assert [str(status) for status in found.parts.status] == ["ok", "ok"]
+    assert len(found.core) == found.parts.core_points.sum()
+    assert np.abs(found.parts.mean).max() < 0.2  # a dent of 8 mm moves the mean of 5 m2 by less
+    left = found.core.distance[: found.parts.core_points[0]]
+    assert np.nanmax(np.abs(left)) < 2.0
+
+
+def test_the_dent_is_found_on_its_part_and_nothing_else(compared):
+    _, result = compared
+    found = result.defects
+    assert found.component == ("right",)
+    assert str(found.defect_class[0]) in ("dent", "pit")  # a block has no other side that tells them apart
+    assert abs(found.depth_max[0] - DENT_MM) < found.depth_ci95[0]
+    middle = np.array([0.5 * SIZE[0], 0.0, SIZE[2]])  # of the top of the right part, as designed
+    assert np.linalg.norm(found.centre[0] - middle) < 0.5 * DENT_RADIUS
+    assert result.parts.defects.tolist() == [0, 1]
+
+
+def test_a_part_that_was_not_registered_fails_alone(bridge):
+    scene, assembled = bridge
+    table = SimpleNamespace(**{**vars(assembled.components), "status": (Status.FAILED, Status.OK)})
+    broken = SimpleNamespace(components=table, method="adjustment")
+    found = deviation.run(scene, deviation.Params(), {"preassemble": broken})
+    assert found.status is Status.PARTIAL
+    assert [str(status) for status in found.parts.status] == ["failed", "ok"]
+
+
+def test_parts_need_preassembly(bridge):
+    with pytest.raises(UsageError, match="preassemble"):
+        deviation.run(bridge[0], deviation.Params(), {})
+    assert deviation.needed(bridge[0]) == ("preassemble",)
+    assert defects.needed(bridge[0]) == ("preassemble", "deviation")
+    assert not deviation.applies(bridge[0])  # by itself a bridge is assembled alone
+
+
+def test_warm_steel_is_compared_at_the_reference_temperature(bridge):
+    scene, assembled = bridge
+    grown = 1.0 + 12e-6 * 30.0
+    warm = Scene(
+        "warm", "arch-bridge",
+        tuple(Scan(s.name, s.points * grown, component=s.component) for s in scene.scans),
+        arch=scene.arch, temperature_C=50.0,
+    )  # fmt: skip
+    for cold, part in zip(scene.scans, bridge_parts.of_bridge(warm, assembled, "deviation"), strict=True):
+        np.testing.assert_allclose(part.scene.scans[0].points, cold.points, atol=1e-6)
+
+
+def test_balls_and_tubes_lie_where_they_were_measured():
+    frame = FrameDesign(
+        ids=np.array([1, 2]), centres=np.array([[0.0, 0, 0], [2000.0, 0, 0]]), radii=np.array([60.0, 60.0]),
+        member_a=np.array([1]), member_b=np.array([2]), tube_diameters=np.array([80.0]),
+    )  # fmt: skip
+    moved = np.array([[5.0, -3.0, 8.0], [2004.0, 6.0, -2.0]])
+    balls = SimpleNamespace(ids=np.array([1, 2]), evidence=("ball", "fused"), placed=np.ones(2, bool), centres=moved)
+
+    class Found(SimpleNamespace):
+        def __len__(self):
+            return 1
+
+    axis = (moved[1] - moved[0]) / np.linalg.norm(moved[1] - moved[0])
+    tubes = Found(
+        a=np.array([1]), b=np.array([2]), start=(moved[0] + 150 * axis)[None], end=(moved[1] - 150 * axis)[None],
+        radii=np.array([40.0]),
+    )  # fmt: skip
+    found = SimpleNamespace(balls=balls, tubes=tubes, stations=SimpleNamespace(names=(), T=np.empty((0, 4, 4))))
+    made = frame_members.of_frame(Scene("f", "space-frame", frame=frame), found, "deviation").structure
+    assert made.bodies.names == ("node 1", "node 2", "1-2")
+    corners = made.vertices[made.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    for row, (centre, radius) in enumerate(((moved[0], 60.0), (moved[1], 60.0), (None, 40.0))):
+        own = made.bodies.of_facet == row
+        off = corners[own].reshape(-1, 3) - (moved[0] if centre is None else centre)
+        if centre is None:
+            off = off - (off @ axis)[:, None] * axis
+        np.testing.assert_allclose(np.linalg.norm(off, axis=1), radius, atol=1e-9)
+        assert (np.einsum("fi,fi->f", normal[own], off.reshape(-1, 3, 3).mean(axis=1)) > 0.0).all()
+    # The ball is open where the member's sleeve hides it.
+    own = corners[made.bodies.of_facet == 0].mean(axis=1) - moved[0]
+    assert np.linalg.norm(own - 60.0 * axis, axis=1).min() > 40.0
