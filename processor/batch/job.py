@@ -24,8 +24,9 @@ from processor.batch.summary_values import step_status, summary_values
 from processor.jobs import exit_codes, process
 from processor.jobs.process import Cause
 from processor.jobs.software import OtherSoftwareError, check_same, source_digest, versions
-from processor.language.messages import messages, printable
+from processor.language.messages import messages
 from processor.model import InputError, Reason, reason
+from processor.plain_text import printable
 from processor.results.names import FORMAT, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
 from processor.scan_folder import fingerprint
 from processor.store.atomic_file import sync

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from processor.language.messages import printable
 from processor.model import InputError, UsageError
+from processor.plain_text import printable
 from processor.store.writable import check_folder
 from processor.validation import matrix as matrices
 from processor.validation import night as nights

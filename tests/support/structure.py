@@ -136,7 +136,7 @@ def layer_groups():
 
 STEPS = ("defects", "deviation", "inspection", "preassembly", "space_frame", "stitching")
 LAYERS = (
-    ("version",),
+    ("version", "plain_text"),
     ("model",),
     ("meaning",),
     ("progress", "language", "jobs", "unit_ratio", "user_methods"),
@@ -155,7 +155,7 @@ LAYERS = (
     ("cli",),
     ("__main__",),
 )
-FOR_STEPS = ("version", "model", "progress", "unit_ratio", "geometry", "adjustment", "limits")
+FOR_STEPS = ("version", "plain_text", "model", "progress", "unit_ratio", "geometry", "adjustment", "limits")
 
 
 def wrong_arrows():

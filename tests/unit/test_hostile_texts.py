@@ -13,6 +13,7 @@ import re
 import numpy as np
 import pytest
 
+import designgen.__main__
 from processor import meaning
 from processor.cli import main
 from processor.evaluation.evaluate import ErrorReport
@@ -169,6 +170,22 @@ def test_names_are_harmless_in_pages_tables_and_terminals(tmp_path, capsys):
         if str(path).endswith(".html"):
             assert "<script>alert" not in text
             assert "alert(1)" in text  # as text
+
+
+@pytest.mark.parametrize(
+    "arguments", [("make", "{0}", "-o", "x.h5"), ("scan", "{0}", "-o", "x.h5"), ("import", "{0}", "-o", "x")]
+)
+def test_names_are_harmless_in_errors_of_designgen(tmp_path, monkeypatch, capsys, arguments):
+    name = tmp_path / "a\x1b[2Jb\u202ec.toml"
+    name.write_text("x = ")
+    monkeypatch.setattr("sys.argv", ["designgen", *(one.format(name) for one in arguments)])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        designgen.__main__.main()
+    said = capsys.readouterr().err
+    assert end.value.code in (2, 3)
+    assert "a\N{REPLACEMENT CHARACTER}[2Jb\N{REPLACEMENT CHARACTER}c" in said
+    assert all(line.isprintable() for line in said.splitlines())
 
 
 def test_names_are_harmless_in_tables_of_scans():
