@@ -54,7 +54,7 @@ STATUS = {
 WITH_RESULTS = tuple(STATUS.values())
 # Errors of the output folder, not of an input.
 OUTPUT_GONE = tuple(os.strerror(code) for code in (errno.ENOSPC, errno.EDQUOT, errno.EROFS))
-STOPPED = reason("batch.stopped")
+STOPPED, KILLED = reason("batch.stopped"), reason("batch.killed")
 
 
 class OutputGoneError(InputError):
@@ -159,6 +159,8 @@ def _processed(job: Job, input_sha256: str, identity: str, batch_ended: Callable
         ended = _run(job, identity, new_results, batch_ended)
         if ended.cause is Cause.STOPPED:
             return _failure_to_retry(job, STOPPED)
+        if ended.cause is Cause.SIGNAL and ended.code == signal.SIGKILL:  # it says nothing of the input
+            return _failure_to_retry(job, KILLED)
         status, why, limits, results = _assessed(job, ended, new_results)
         if why is not None and any(sign in ended.last_line for sign in OUTPUT_GONE):
             raise OutputGoneError(messages("en").text(why))

@@ -232,6 +232,16 @@ def test_every_way_to_fail_is_recorded_with_its_reason(tmp_path):
     assert attempts(tmp_path / "out") == {**dict.fromkeys(PLANTS, 2), "hang": 3, "good": 1, "talk": 1}
 
 
+def test_a_job_that_something_else_killed_is_tried_again(tmp_path):
+    folder(tmp_path / "root/a", "killed")
+    for count in (1, 2):
+        run(tmp_path / "root", "-o", tmp_path / "out", code=1)
+        assert said(tmp_path / "out")["a"]["reason"].startswith("was killed by another process")
+        assert attempts(tmp_path / "out") == {"a": count}
+    (tmp_path / "root/a/plant").write_text("")
+    run(tmp_path / "root", "-o", tmp_path / "out")
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """Six inputs of the real processor, two of them bad, with its results."""
