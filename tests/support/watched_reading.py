@@ -57,11 +57,20 @@ class Watched:
 
 def run(format_, count, keep=None, say=lambda _: None):
     """Read ``count`` damaged files of a format: how many came to what, and the faults, each with its number."""
+    return _read_all(((f"{format_} {number}", *damaged(format_, number)) for number in range(count)), keep, say)
+
+
+def run_corpus(folder, suffix, keep=None, say=lambda _: None):
+    """Read all files below a folder whose names end in a suffix, as :func:`run` does."""
+    files = sorted(path for path in folder.rglob(f"*{suffix}") if path.is_file())
+    return _read_all(((str(path.relative_to(folder)), path.name, path.read_bytes()) for path in files), keep, say)
+
+
+def _read_all(files, keep, say):
     found, faults, slowest = Counter(), [], 0.0
     watched = Watched()
     with tempfile.TemporaryDirectory() as folder:
-        for number in range(count):
-            name, content = damaged(format_, number)
+        for label, name, content in files:
             path = Path(folder) / name
             path.write_bytes(content)
             began = time.monotonic()
@@ -72,10 +81,10 @@ def run(format_, count, keep=None, say=lambda _: None):
                 if sign in said:
                     found[f"library {sign}"] += 1
             if what in FAULTS:
-                faults.append((number, what, said))
-                say(f"{format_} {number}: {what} {said[:300]}")
+                faults.append((label, what, said))
+                say(f"{label}: {what} {said[:300]}")
                 if keep is not None:
-                    (keep / f"{format_}-{number}-{name}").write_bytes(content)
+                    (keep / f"{label.replace('/', '-').replace(' ', '-')}-{name}").write_bytes(content)
             path.unlink()
     watched.close()
     return found, faults, slowest
