@@ -23,6 +23,7 @@ from processor.report import table as report_table
 from processor.scan_folder import cad, folder
 from processor.store import store
 from tests.support import step_results
+from tests.support.impossible_texts import impossible_texts
 
 POINTS = np.random.default_rng(3).uniform(0.0, 3.0, (60, 3)).round(3)
 FILES = {
@@ -96,12 +97,13 @@ def mutated(text, rng):
     return text
 
 
+@pytest.mark.parametrize("count", [500, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FILES)
-def test_five_hundred_damaged_files(tmp_path, name):
+def test_damaged_files(tmp_path, name, count):
     place, rng = write(tmp_path), random.Random(name)
     assert folder.read_input(place).frame is not None
     refused, said = 0, ""
-    for _ in range(500):
+    for _ in range(count):
         text = mutated(FILES[name], rng)
         (place / name).write_bytes(text.encode("utf-8", "surrogatepass"))
         try:
@@ -113,7 +115,28 @@ def test_five_hundred_damaged_files(tmp_path, name):
             continue
         assert str(place) in said, (text[:500], said[:500])
         assert len(said) < 6_100, (text[:500], said[:200])
-    assert refused > 150  # the others are harmless: a name, a coordinate
+    assert refused > 0.3 * count  # the others are harmless: a name, a coordinate
+
+
+TEXTS = {name: case for name, *case in impossible_texts(FILES)}
+
+
+def test_there_are_a_hundred_impossible_texts():
+    assert len(TEXTS) >= 100
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_an_impossible_text_is_refused_with_its_place(tmp_path, name):
+    file, text, named = TEXTS[name]
+    write(tmp_path)
+    (tmp_path / file).write_text(text)
+    with pytest.raises((InputError, UsageError)) as caught:
+        folder.read_input(tmp_path)
+    said = str(caught.value)
+    assert said.startswith((f"{tmp_path / file}: ", f"{tmp_path}: scans."))  # a scan's record is of the whole folder
+    # Tables are named by their lines; a cell of megabytes ends the reading of the table.
+    assert any(one and one in said for one in named) or re.search(r"(line|row) \d|field limit", said), said
+    assert len(said) < 1_500
 
 
 # --- the cache of meshes ---------------------------------------------------------------------------------------------
