@@ -4,8 +4,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 JOBS ?= 2
+# What make test installs: newest (the newest versions that pyproject.toml allows), locked (those of .ci/locked.txt,
+# checked by their hashes) or lowest (the oldest that pyproject.toml allows). For a new $(VENV): make clean before another.
+DEPENDENCIES ?= newest
 
-.PHONY: demo test lint docs bench paper nightly weekend clean system
+.PHONY: demo test test-lowest lint docs bench paper nightly weekend lock audit clean system
 
 demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
@@ -17,6 +20,12 @@ test: $(VENV)/.test
 	@$(BIN)/mypy >$(VENV)/mypy.log 2>&1 & types=$$!; \
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"; tests=$$?; \
 	wait $$types; types=$$?; cat $(VENV)/mypy.log; exit $$((tests || types))
+
+# All tests but the slow ones with the oldest versions that pyproject.toml allows. Those warn of what is new since.
+test-lowest:
+	$(MAKE) VENV=.venv-lowest DEPENDENCIES=lowest .venv-lowest/.test
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 .venv-lowest/bin/python -m pytest -n 2 --dist worksteal -m "not slow" \
+		-W ignore::DeprecationWarning -W ignore::PendingDeprecationWarning
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check --fix .
@@ -49,6 +58,20 @@ weekend: $(VENV)/.test paper
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term --cov-fail-under=85
 	$(BIN)/python -m tests.bench.bolt_balls --output $(OUT)/nightly-bolt-balls.json
 	$(BIN)/python -m tests.bench.readers --mutations 2000 --output $(OUT)/nightly-damaged-files.json
+	$(BIN)/python -m tests.bench.soak --minutes 60 --output $(OUT)/nightly-soak.json
+
+# The versions of .ci/locked.txt and .ci/lowest.txt again; rm .ci/locked.txt first for the newest ones.
+UV = $(BIN)/uv pip compile --quiet --no-emit-index-url --no-strip-extras --custom-compile-command "make lock" --python-version 3.10
+WITH = --extra designgen --extra test pyproject.toml .ci/build.in
+lock: | $(BIN)/python
+	$(BIN)/python -m pip install --quiet uv
+	$(UV) --universal --generate-hashes $(WITH) -o .ci/locked.txt
+	$(UV) --resolution lowest-direct $(WITH) -o .ci/lowest.txt
+
+# Known vulnerabilities of the locked versions.
+audit: | $(BIN)/python
+	$(BIN)/python -m pip install --quiet pip-audit
+	$(BIN)/pip-audit --require-hashes --disable-pip --requirement .ci/locked.txt
 
 system:
 	@sh .ci/system-libraries
@@ -61,12 +84,12 @@ $(VENV)/.demo: pyproject.toml .ci/system-libraries | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable ".[designgen]"
 	@touch $@
 
-$(VENV)/.test: pyproject.toml .ci/system-libraries .ci/browser | $(BIN)/python
+$(VENV)/.test: pyproject.toml .ci/system-libraries .ci/browser .ci/install | $(BIN)/python
 	@sh .ci/system-libraries
 	@sh .ci/browser
-	$(BIN)/python -m pip install --quiet --editable ".[designgen,test]"
+	BIN=$(BIN) sh .ci/install $(DEPENDENCIES)
 	@touch $@ $(VENV)/.demo
 
 clean:
-	rm -rf $(VENV) $(OUT) build *.egg-info .coverage .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-lowest $(OUT) build *.egg-info .coverage .pytest_cache .mypy_cache .ruff_cache
 	find processor designgen -name "*.nb[ci]" -delete

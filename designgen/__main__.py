@@ -9,6 +9,7 @@ import click
 
 from designgen.cli import commands
 from processor.model import InputError, UsageError
+from processor.plain_text import printable
 
 WRONG_USAGE, BAD_INPUT = 2, 3
 
@@ -26,11 +27,11 @@ def main() -> None:
         sys.exit(WRONG_USAGE)
     except UsageError as error:
         _trace()
-        click.echo(f"error: {error}", err=True)
+        click.echo(printable(f"error: {error}"), err=True)
         sys.exit(WRONG_USAGE)
     except (InputError, OSError) as error:
         _trace()
-        click.echo(f"error: {error}", err=True)
+        click.echo(printable(f"error: {error}"), err=True)
         sys.exit(BAD_INPUT)
 
 

@@ -28,6 +28,7 @@ from processor.jobs import process, runner
 from processor.jobs.child import Loss, Lost
 from processor.jobs.software import check_same, versions
 from processor.model import InputError, UsageError
+from processor.plain_text import printable
 
 INDEX = "index.csv"
 MOST_SCENES = 99_999  # in one folder: file names number them by five digits
@@ -306,7 +307,7 @@ def print_error_line(line: str) -> None:
     """Write one line on standard error, above a progress bar, with its control characters replaced."""
     from tqdm import tqdm
 
-    tqdm.write("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line), file=sys.stderr)
+    tqdm.write(printable(line), file=sys.stderr)
 
 
 def _outcomes(results: runner.Results[Job, Outcome | Lost], total: int) -> dict[str, Outcome]:

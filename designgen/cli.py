@@ -11,11 +11,17 @@ import click
 
 from designgen import __version__, designs
 from designgen.export import FORMATS
+from processor.plain_text import printable
 from processor.progress import stage
 
 DONE, IN_PART, ALL_FAILED = 0, 1, 2
 json_option = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 debug_option = click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+
+
+def _print_line(line: str, err: bool = False) -> None:
+    """Write one line, which may hold a file's or a body's name, with its control characters replaced."""
+    click.echo(printable(line), err=err)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -91,16 +97,16 @@ def make(
         planned = batch.plan(output, name, loaded, varied, seed, count or 1)
         report = batch.make_many(output, planned, list(varied), jobs or 1, cluster)
         for failure in report["failed"]:
-            click.echo(f"{failure['file']}: failed: {failure['reason']}", err=True)
+            _print_line(f"{failure['file']}: failed: {failure['reason']}", err=True)
         text = "{index}: {done} of {scenes} scene(s), {made} made now".format(**report)
-        click.echo(json.dumps(report) if as_json else text)
+        click.echo(json.dumps(report) if as_json else printable(text))
         context.exit(DONE if not report["failed"] else IN_PART if report["done"] else ALL_FAILED)
     with stage(f"making {name}"):
         used, scans, points = batch.make_scene(output, name, loaded, seed)
     if as_json:
         click.echo(json.dumps({"scene": str(output), "recipe": name, "seed": used, "scans": scans, "points": points}))
     else:
-        click.echo(f"{output}: recipe {name}, seed {used}, {scans} scan(s), {points:,} points")
+        _print_line(f"{output}: recipe {name}, seed {used}, {scans} scan(s), {points:,} points")
 
 
 @commands.command()
@@ -143,7 +149,7 @@ def scan(
             json.dumps({"scene": str(output), "model": str(model), "seed": used, "scans": scans, "points": points})
         )
     else:
-        click.echo(f"{output}: model {model.name}, seed {used}, {scans} scan(s), {points:,} points")
+        _print_line(f"{output}: model {model.name}, seed {used}, {scans} scan(s), {points:,} points")
 
 
 @commands.command()
@@ -182,12 +188,12 @@ def export(
             with_meshes=not without_meshes,
         )
     for name in written.left_out:
-        click.echo(f"{output}: scan {name!r} is left out: it has almost no points", err=True)
+        _print_line(f"{output}: scan {name!r} is left out: it has almost no points", err=True)
     if as_json:
         content = {"folder": str(output), "format": format_, "scans": written.scans, "left_out": list(written.left_out)}
         click.echo(json.dumps(content, ensure_ascii=False))
         return
-    click.echo(f"{output}: {written.scans} scan(s) as {format_}")
+    _print_line(f"{output}: {written.scans} scan(s) as {format_}")
 
 
 @commands.command("import")
@@ -206,7 +212,11 @@ def import_(context: click.Context, file: Path, output: Path, units: str, defaul
     from designgen.cad import files
 
     report = files.import_file(file, output, units, default_units)
-    click.echo(json.dumps(report, ensure_ascii=False) if as_json else "\n".join(files.summary(report)))
+    if as_json:
+        click.echo(json.dumps(report, ensure_ascii=False))
+    else:
+        for line in files.summary(report):
+            _print_line(line)
     for line in (*report["problems"], *report["notes"]):
-        click.echo(f"{file}: {line}", err=True)
+        _print_line(f"{file}: {line}", err=True)
     context.exit(IN_PART if report["problems"] else DONE)

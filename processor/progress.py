@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
+from processor.plain_text import printable
+
 Item = TypeVar("Item")
 PATIENCE_S = 2.0
 REFRESH_S = 0.25
@@ -33,8 +35,7 @@ def stage(title: str) -> Iterator[None]:
         yield
         return
     # A title may hold the name of a file, which a terminal must not obey.
-    shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in title)
-    ended, current = threading.Event(), _Stage(shown)
+    ended, current = threading.Event(), _Stage(printable(title))
     display = threading.Thread(target=_show, args=(current, ended), daemon=True)
     _stages.append(current)
     display.start()

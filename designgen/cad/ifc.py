@@ -75,7 +75,8 @@ def _exact(path: str, product: Any, to_mm: float) -> list[Any]:
     settings.set("iterator-output", ifcopenshell.ifcopenshell_wrapper.SERIALIZED)
     shape = TopoDS_Shape()
     try:
-        text = ifcopenshell.geom.create_shape(settings, product).geometry.brep_data
+        element = ifcopenshell.geom.create_shape(settings, product)  # kept, as the geometry is a part of its memory
+        text = element.geometry.brep_data
         with tempfile.TemporaryDirectory() as folder:  # the kernel reads it from a file alone
             file = Path(folder, "product.brep")
             file.write_text(text, "ascii")
@@ -106,7 +107,9 @@ def _body(path: str, product: Any, to_mm: float) -> Body | None:
         settings.set("weld-vertices", True)
         settings.set("mesher-linear-deflection", deviation_mm / to_mm)
         settings.set("mesher-angular-deflection", ANGLE_RAD)
-        made["shape"] = ifcopenshell.geom.create_shape(settings, product).geometry
+        # The element is kept, as the geometry is a part of its memory.
+        made["element"] = ifcopenshell.geom.create_shape(settings, product)
+        made["shape"] = made["element"].geometry
         return len(made["shape"].faces) // 3
 
     try:

@@ -11,6 +11,7 @@ from OCP.IFSelect import IFSelect_RetDone
 from OCP.StepBasic import StepBasic_SiUnitAndLengthUnit, StepBasic_SiUnitName
 from OCP.STEPConstruct import STEPConstruct_UnitContext
 from OCP.STEPControl import STEPControl_Reader
+from OCP.StepData import StepData_Factors
 from OCP.StepRepr import (
     StepRepr_NextAssemblyUsageOccurrence,
     StepRepr_RepresentationItem,
@@ -87,7 +88,8 @@ def _units(reader: Any, entities: list[Any]) -> tuple[str, list[float]]:
     for entity in entities:
         if hasattr(entity, "GlobalUnitAssignedContext"):
             context = STEPConstruct_UnitContext()
-            context.ComputeFactors(entity.GlobalUnitAssignedContext())
+            # OCP 7.8 has no default for the factors, which is that of Open CASCADE.
+            context.ComputeFactors(entity.GlobalUnitAssignedContext(), StepData_Factors())
             size = float(context.LengthFactor())
             if context.LengthDone() and not any(abs(size / earlier - 1.0) < 1e-9 for earlier in sizes if earlier):
                 sizes.append(size)
@@ -149,10 +151,9 @@ class _Names:
                     products[unnamed] = products[named]
         self._products: dict[Any, str] = {}  # of items
         for representation, name in products.items():
-            items = representation.Items() if representation is not None else None
-            if items is not None:
-                for i in range(1, items.Length() + 1):
-                    self._products.setdefault(items.Value(i), name)
+            if representation is not None:
+                for i in range(1, representation.NbItems() + 1):  # OCP 7.8 does not read the array of them
+                    self._products.setdefault(representation.ItemsValue(i), name)
 
     def of(self, shape: Any) -> str:
         """Return the name of a shape in the file, "" for none."""

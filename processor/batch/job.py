@@ -24,8 +24,9 @@ from processor.batch.summary_values import step_status, summary_values
 from processor.jobs import exit_codes, process
 from processor.jobs.process import Cause
 from processor.jobs.software import OtherSoftwareError, check_same, source_digest, versions
-from processor.language.messages import messages, printable
+from processor.language.messages import messages
 from processor.model import InputError, Reason, reason
+from processor.plain_text import printable
 from processor.results.file_names import FORMAT, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
 from processor.scan_folder import fingerprint
 from processor.store.atomic_file import sync
@@ -53,7 +54,7 @@ STATUS = {
 WITH_RESULTS = tuple(STATUS.values())
 # Errors of the output folder, not of an input.
 OUTPUT_GONE = tuple(os.strerror(code) for code in (errno.ENOSPC, errno.EDQUOT, errno.EROFS))
-STOPPED = reason("batch.stopped")
+STOPPED, KILLED = reason("batch.stopped"), reason("batch.killed")
 
 
 class OutputGoneError(InputError):
@@ -158,6 +159,8 @@ def _processed(job: Job, input_sha256: str, identity: str, batch_ended: Callable
         ended = _run(job, identity, new_results, batch_ended)
         if ended.cause is Cause.STOPPED:
             return _failure_to_retry(job, STOPPED)
+        if ended.cause is Cause.SIGNAL and ended.code == signal.SIGKILL:  # it says nothing of the input
+            return _failure_to_retry(job, KILLED)
         status, why, limits, results = _assessed(job, ended, new_results)
         if why is not None and any(sign in ended.last_line for sign in OUTPUT_GONE):
             raise OutputGoneError(messages("en").text(why))

@@ -17,8 +17,9 @@ from urllib.parse import quote
 from processor.batch.job import Job
 from processor.batch.record import JobStatus, Record
 from processor.batch.summary_values import COLUMNS
-from processor.language.messages import Text, label, messages, printable, text
+from processor.language.messages import Text, label, messages, text
 from processor.model import InputError, Reason, Status, Verdict
+from processor.plain_text import printable
 from processor.report import templates
 from processor.report.table import csv_of_rows
 from processor.results.file_names import REPORT_PAGE

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from processor.jobs.exit_codes import DONE, FAIL_ON, IN_PART, LIMIT_MISSED, VERDICT, is_refused
-from processor.language.messages import printable
 from processor.model import InputError, Status, UsageError
+from processor.plain_text import printable
 
 if TYPE_CHECKING:
     from processor.api.runs import Results

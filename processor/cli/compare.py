@@ -56,7 +56,8 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
     clouds' density.
     """
     from processor.compare import compare as comparing
-    from processor.language.messages import messages, printable
+    from processor.language.messages import messages
+    from processor.plain_text import printable
     from processor.report import comparison
     from processor.scan_folder.files import missing
 

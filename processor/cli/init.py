@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 
 from processor.cli.common import UNITS, debug_option
-from processor.language.messages import printable
 from processor.model import UsageError
+from processor.plain_text import printable
 
 
 @click.command()

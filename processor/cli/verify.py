@@ -11,8 +11,8 @@ import click
 
 from processor.cli.common import debug_option
 from processor.jobs.exit_codes import BAD_INPUT, DONE, IN_PART
-from processor.language.messages import printable
 from processor.model import InputError
+from processor.plain_text import printable
 
 WHOLE, UNKNOWN, DAMAGED = "whole", "no-checksums", "damaged"
 

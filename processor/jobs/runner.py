@@ -112,7 +112,7 @@ class Cluster:
 def executor(cluster: str | None, at_once: int, say: Callable[[str], None]) -> Iterator[Local | Cluster]:
     """Give what runs jobs: the Dask cluster whose scheduler has the address ``cluster``, or this machine.
 
-    Raises UsageError if Dask is not installed or no scheduler answers.
+    Raises UsageError if Dask is not installed, has no key for TLS, or no scheduler answers.
     """
     if not cluster:
         yield Local(at_once)
@@ -123,6 +123,11 @@ def executor(cluster: str | None, at_once: int, say: Callable[[str], None]) -> I
         raise UsageError("--cluster needs Dask: pip install 'steel-scan-check[cluster]'") from None
     # The messages here say what is wrong with the connection; the library's log prints stack traces of it.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    if cluster.startswith("tls://") and not distributed.Security().get_connection_args("client").get("ssl_context"):
+        raise UsageError(
+            f"--cluster {cluster}: expected a certificate and a key in Dask's configuration (distributed.comm.tls), "
+            "found none; DASK_CONFIG names its file"
+        )
     try:
         client = distributed.Client(cluster, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:

@@ -24,6 +24,7 @@ from functools import cache
 from typing import Any
 
 from processor.model import Reason, Word
+from processor.plain_text import printable
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -54,11 +55,6 @@ class Text:
 def text(template: str, /, **values: Any) -> Text:
     """Return a :class:`Text`."""
     return Text(template, values)
-
-
-def printable(characters: str) -> str:
-    """Replace control characters, as of a file's name, which a terminal or a spreadsheet may obey."""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in characters)
 
 
 FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute

@@ -16,11 +16,12 @@ from tqdm import tqdm
 
 from processor.jobs import runner
 from processor.jobs.child import Lost
-from processor.language.messages import Text, printable
+from processor.language.messages import Text
 from processor.model import UsageError
 from processor.papers import data_sets, page
 from processor.papers.data_sets import PAPERS, DataSet, Found, Measured
 from processor.papers.rows import Row
+from processor.plain_text import printable
 from processor.report import write_results
 from processor.store.replaced_folder import replacing_folder, write_text
 

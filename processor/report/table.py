@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from processor.language.messages import Message, Text, label, messages, printable, spreadsheet_text, text
+from processor.language.messages import Message, Text, label, messages, spreadsheet_text, text
 from processor.model import Checked, Reason, StepRun
+from processor.plain_text import printable
 
 NAN = float("nan")
 

@@ -7,10 +7,11 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.language.messages import Message, label, messages, printable, text
+from processor.language.messages import Message, label, messages, text
 from processor.limits.judging import JudgedLimits
 from processor.model import Status, StepRun, Verdict
 from processor.pipeline import Execution
+from processor.plain_text import printable
 from processor.report import all_tables, headline
 from processor.report import table as report_table
 from processor.report.limit_table import worst_first

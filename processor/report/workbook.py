@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.language.messages import printable
 from processor.model import UsageError, worst
 from processor.pipeline import Execution
+from processor.plain_text import printable
 from processor.report import all_tables, headline, title_block
 from processor.report.table import Table, headings, shown
 

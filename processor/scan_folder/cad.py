@@ -1,6 +1,7 @@
 """STEP and IFC designs as meshes, converted by ``designgen import`` in a separate process.
 
-No CAD kernel is loaded here. Meshes are cached in the user's cache folder under the hash of the file's bytes.
+No CAD kernel is loaded here. Meshes are cached in the user's cache folder under the hash of the file's bytes,
+with a hash of their own: those that have changed are made again.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from processor.version import __version__
 __all__ = ["SUFFIXES", "read"]
 
 LIMIT_S = 900.0  # designgen has a lower limit, with a better message
-RECORD = "import.json"
+RECORD, CHECKSUM = "import.json", "sha256"
 SOURCE = "design"  # stem of the copy that is imported, by which bodies without names are numbered
 UNNAMED = rf"{SOURCE}-\d+"
 
@@ -67,7 +68,8 @@ def read_design(path: Path, unit: str) -> CadDesign:
     key = hashlib.sha256(b"\0".join((content, path.suffix.lower().encode(), unit.encode(), __version__.encode())))
     with _cache() as cache:
         meshes = cache / key.hexdigest()
-        if not (meshes / RECORD).is_file():
+        if not _is_whole(meshes):
+            shutil.rmtree(meshes, ignore_errors=True)
             _import(path, content, unit, cache, meshes)
         record, stated = _record(meshes, path)
         bodies = [read_mesh(meshes / mesh) for _, mesh in record]
@@ -75,6 +77,23 @@ def read_design(path: Path, unit: str) -> CadDesign:
     faces = [faces + first for (_, faces), first in zip(bodies, counts.tolist(), strict=False)]
     named = _named([name for name, _ in record], [len(triangles) for _, triangles in bodies])
     return CadDesign(np.concatenate([vertices for vertices, _ in bodies]), np.concatenate(faces), named, stated)
+
+
+def _is_whole(meshes: Path) -> bool:
+    """Whether an import is there and has the bytes that it was made with."""
+    with suppress(OSError):
+        return (meshes / CHECKSUM).read_text("ascii") == _sha256(meshes)
+    return False
+
+
+def _sha256(meshes: Path) -> str:
+    """Return the hash of the names and bytes of an import's files."""
+    digest = hashlib.sha256()
+    for file in sorted(meshes.iterdir()):
+        if file.name != CHECKSUM:
+            content = file.read_bytes()
+            digest.update(f"{file.name}\0{len(content)}\0".encode("utf-8", "surrogateescape") + content)
+    return digest.hexdigest()
 
 
 def _named(names: list[str], facets: list[int]) -> DesignBodies:
@@ -182,6 +201,7 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
         failure = _run(command, source, making / "meshes", unit)
         if failure:
             raise InputError(f"{path}: {failure.replace(f'{source}: ', '')}")
+        (making / "meshes" / CHECKSUM).write_text(_sha256(making / "meshes"), "ascii")
         with suppress(OSError):  # another process has made them meanwhile
             os.replace(making / "meshes", meshes)
         if not meshes.is_dir():

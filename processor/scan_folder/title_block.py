@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from processor.language.messages import printable
 from processor.model import InputError, TitleBlock
+from processor.plain_text import printable
 from processor.scan_folder.checked_table import Table, existing_file_in
 
 KEYS = ("company", "project", "drawing", "order", "operator", "scanner", "serial", "scanned", "approved")

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from processor.language.messages import printable
 from processor.model import InputError, UsageError
+from processor.plain_text import printable
 from processor.store.output_checks import check_folder
 from processor.validation import cell_runner
 from processor.validation import matrix as matrices

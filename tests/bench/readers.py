@@ -2,12 +2,15 @@
 
     python -m tests.bench.readers --speed [--points 10000000] [--formats e57,las] --output bench-readers.json
     python -m tests.bench.readers --mutations 2000 [--formats e57,las] --output bench-mutations.json
+    python -m tests.bench.readers --corpus FOLDER [--suffix .h5] --output bench-corpus.json
 
 ``--speed``: seconds to float64 coordinates and intensities, each in a process of its own with everything imported and
 compiled, in turns, the least of three rounds or more, beside processor seconds (on a busy machine look at these); and
 by how much the memory of the process and its helper rises at most (proportional set size) beside 24 bytes a point.
 ``--mutations``: damaged files of each format, always the same ones, each read in a watched process with 2 GB and 10 s;
 exits 1 where one of them crashes, hangs, takes memory, raises anything but a plain error, or comes out empty.
+``--corpus``: the same for all files of a folder, as of the HDF Group's own tests (``apt-get source hdf5``): none of
+those is a scene, so that all are to be refused.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ import sys
 import tempfile
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -274,12 +278,12 @@ def speed(count, formats):
     return found
 
 
-def mutations(count, formats, keep):
-    """Print and return what became of damaged files."""
+def watched(runs):
+    """Print and return what became of files: ``runs`` are names and functions that read the files of each."""
     found = {}
-    for name in formats:
+    for name, run in runs.items():
         began = time.monotonic()
-        counts, faults, slowest = watched_reading.run(name, count, keep, print)
+        counts, faults, slowest = run()
         found[name] = {"counts": dict(counts), "faults": faults, "slowest_s": slowest}
         said = ", ".join(f"{what} {n}" for what, n in sorted(counts.items()))
         print(f"{name:<6} {said}; slowest {slowest:.1f} s; {time.monotonic() - began:.0f} s in all", flush=True)
@@ -294,6 +298,8 @@ def main():
     parser.add_argument("--points", type=int, default=10_000_000)
     parser.add_argument("--mutations", type=int, default=0)
     parser.add_argument("--formats", default="")
+    parser.add_argument("--corpus", type=Path)
+    parser.add_argument("--suffix", default=".h5")
     parser.add_argument("--keep", type=Path, help="folder for the files that made trouble")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--memory", action="store_true", help=argparse.SUPPRESS)
@@ -305,15 +311,24 @@ def main():
     found = {}
     if arguments.speed:
         found["speed"] = speed(arguments.points, asked or list(FORMATS))
+    keep = arguments.keep
+    if keep:
+        keep.mkdir(parents=True, exist_ok=True)
     if arguments.mutations:
-        if arguments.keep:
-            arguments.keep.mkdir(parents=True, exist_ok=True)
-        found["mutations"] = mutations(arguments.mutations, asked or list(good_files()), arguments.keep)
+        names = asked or list(good_files())
+        found["mutations"] = watched(
+            {name: partial(watched_reading.run, name, arguments.mutations, keep, print) for name in names}
+        )
+    if arguments.corpus:
+        corpus = partial(watched_reading.run_corpus, arguments.corpus, arguments.suffix, keep, print)
+        found["corpus"] = watched({arguments.suffix: corpus})
     if arguments.output:
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         arguments.output.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     slow = not all(one["passed"] for one in found.get("speed", {}).values())
-    sys.exit(bool(slow or any(one["faults"] for one in found.get("mutations", {}).values())))
+    sys.exit(
+        bool(slow or any(one["faults"] for what in ("mutations", "corpus") for one in found.get(what, {}).values()))
+    )
 
 
 if __name__ == "__main__":

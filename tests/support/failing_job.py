@@ -1,5 +1,7 @@
 """A job's process that fails as the file ``plant`` in its input says, and is done in no time where it says nothing.
 
+With a file ``real`` in the input, and for scenes, it is that of the processor.
+
 As ``failing_job.py batch ...`` it is the command line of processor, whose jobs are done so.
 """
 
@@ -35,6 +37,8 @@ def plant(source):
     what = path.read_text("utf-8").strip() if path.is_file() else ""
     if what == "segfault":
         os.kill(os.getpid(), signal.SIGSEGV)
+    elif what == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
     elif what == "hang":
         time.sleep(3600)
     elif what == "deaf":  # holds the interpreter, so that no thread of it does anything
@@ -75,7 +79,7 @@ def main():
     child.guard(int(sys.argv[1]))
     source = Path(sys.argv[4])
     plant(source)
-    if (source / "real").exists():
+    if source.suffix == ".h5" or (source / "real").exists():
         sys.argv[:] = sys.argv[2:]
         from processor.__main__ import main as processor
 

@@ -122,6 +122,7 @@ REASONS = (
     reason("batch.stopped"),
     reason("batch.timeout", limit=3.5),
     reason("batch.memory", limit=200),
+    reason("batch.killed"),
     reason("batch.crashed", signal="SIGSEGV", number=11),
     reason("batch.crashed-unnamed", number=70),
     reason("batch.no-results", exit_code=9),

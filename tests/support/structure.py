@@ -135,7 +135,7 @@ def layer_groups():
 
 STEPS = ("defects", "deviation", "inspection", "preassembly", "space_frame", "stitching")
 LAYERS = (
-    ("version",),
+    ("version", "plain_text"),
     ("model",),
     ("record_checks",),
     ("progress", "language", "jobs", "unit_ratio", "user_methods"),
@@ -156,7 +156,8 @@ LAYERS = (
     ("__main__",),
 )
 FOR_STEPS = (
-    "version", "model", "progress", "unit_ratio", "geometry", "scene_cloud", "adjustment", "components", "limits"
+    "version", "plain_text", "model", "progress", "unit_ratio", "geometry", "scene_cloud", "adjustment", "components",
+    "limits",
 )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.support.damaged_files import damaged
+from tests.support.damaged_files import damaged, good_files
 
 MEMORY_BYTES = 2 << 30
 HANG_S = 10.0
@@ -56,26 +56,46 @@ class Watched:
 
 
 def run(format_, count, keep=None, say=lambda _: None):
-    """Read ``count`` damaged files of a format: how many came to what, and the faults, each with its number."""
+    """Read ``count`` damaged files of a format: how many came to what, and the faults, each with its number.
+
+    Files that are read with fewer points than before the damage count as "fewer", and are kept and said as faults are.
+    """
+    files = ((f"{format_} {number}", *damaged(format_, number)) for number in range(count))
+    return _read_all(files, keep, say, dict(good_files()[format_]))
+
+
+def run_corpus(folder, suffix, keep=None, say=lambda _: None):
+    """Read all files below a folder whose names end in a suffix, as :func:`run` does."""
+    files = sorted(path for path in folder.rglob(f"*{suffix}") if path.is_file())
+    return _read_all(((str(path.relative_to(folder)), path.name, path.read_bytes()) for path in files), keep, say)
+
+
+def _read_all(files, keep, say, whole=None):
     found, faults, slowest = Counter(), [], 0.0
     watched = Watched()
     with tempfile.TemporaryDirectory() as folder:
-        for number in range(count):
-            name, content = damaged(format_, number)
+        points = {}
+        for name, content in (whole or {}).items():
+            (Path(folder) / name).write_bytes(content)
+            points[name] = int(watched.read(Path(folder) / name)[1])
+        for label, name, content in files:
             path = Path(folder) / name
             path.write_bytes(content)
             began = time.monotonic()
             what, said = watched.read(path)
             slowest = max(slowest, time.monotonic() - began)
-            found[what] += 1
             for sign in ("crashed", "took more than", "was killed"):
                 if sign in said:
                     found[f"library {sign}"] += 1
-            if what in FAULTS:
-                faults.append((number, what, said))
-                say(f"{format_} {number}: {what} {said[:300]}")
+            if what == "read" and int(said) < points.get(name, 0):
+                what, said = "fewer", f"{said} of {points[name]} points"
+            found[what] += 1
+            if what in (*FAULTS, "fewer"):
+                if what in FAULTS:
+                    faults.append((label, what, said))
+                say(f"{label}: {what} {said[:300]}")
                 if keep is not None:
-                    (keep / f"{format_}-{number}-{name}").write_bytes(content)
+                    (keep / f"{label.replace('/', '-').replace(' ', '-')}-{name}").write_bytes(content)
             path.unlink()
     watched.close()
     return found, faults, slowest
@@ -94,7 +114,7 @@ def _attempt(path):
         return "traceback", repr(error)
     if not scene.scans or not all(len(scan.points) for scan in scene.scans):
         return "empty", ""
-    return "read", ""
+    return "read", str(sum(len(scan.points) for scan in scene.scans))
 
 
 def _mapped(key):

@@ -1,5 +1,6 @@
 """Batches: what is found, that a bad input stops nothing, a killed batch goes on, and nothing is half written."""
 
+import contextlib
 import csv
 import fcntl
 import html.parser
@@ -230,6 +231,16 @@ def test_every_way_to_fail_is_recorded_with_its_reason(tmp_path):
     assert attempts(tmp_path / "out") == before | {"hang": 2}
     run(tmp_path / "root", "-o", tmp_path / "out", *limits, "--retry", code=1)
     assert attempts(tmp_path / "out") == {**dict.fromkeys(PLANTS, 2), "hang": 3, "good": 1, "talk": 1}
+
+
+def test_a_job_that_something_else_killed_is_tried_again(tmp_path):
+    folder(tmp_path / "root/a", "killed")
+    for count in (1, 2):
+        run(tmp_path / "root", "-o", tmp_path / "out", code=1)
+        assert said(tmp_path / "out")["a"]["reason"].startswith("was killed by another process")
+        assert attempts(tmp_path / "out") == {"a": count}
+    (tmp_path / "root/a/plant").write_text("")
+    run(tmp_path / "root", "-o", tmp_path / "out")
 
 
 @pytest.fixture(scope="module")
@@ -655,15 +666,15 @@ def free_port():
         return probe.getsockname()[1]
 
 
-@pytest.fixture
-def cluster(tmp_path):
+@contextlib.contextmanager
+def cluster_of(tmp_path, protocol, env):
     """A Dask scheduler and two workers on this machine: the address, and the three processes."""
     pytest.importorskip("distributed")
-    address, log = f"tcp://127.0.0.1:{free_port()}", (tmp_path / "cluster.log").open("w")
-    plain = {"stdout": log, "stderr": log, "cwd": tmp_path, "env": ENV}
+    address, log = f"{protocol}://127.0.0.1:{free_port()}", (tmp_path / "cluster.log").open("w")
+    plain = {"stdout": log, "stderr": log, "cwd": tmp_path, "env": env}
     dask = (sys.executable, "-m", "dask")
     own = ("--host", "127.0.0.1", "--no-dashboard")
-    scheduler = [*dask, "scheduler", *own, "--port", address.rpartition(":")[2]]
+    scheduler = [*dask, "scheduler", *own, "--protocol", protocol, "--port", address.rpartition(":")[2]]
     worker = [*dask, "worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(tmp_path)]
     processes = [subprocess.Popen(one, **plain) for one in (scheduler, worker, worker)]
     try:
@@ -674,6 +685,12 @@ def cluster(tmp_path):
             process.kill()
             process.wait()
         log.close()
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    with cluster_of(tmp_path, "tcp", ENV) as one:
+        yield one
 
 
 def test_a_cluster_that_loses_a_worker_gives_the_same_summary(tmp_path, cluster):
@@ -709,6 +726,33 @@ def test_a_cluster_that_is_lost_is_said_and_the_next_run_goes_on(tmp_path, clust
     kept = finished(out)
     run(tmp_path / "root", "-o", out, "--jobs", 6)
     assert {name: attempts(out)[name] for name in kept} == dict.fromkeys(kept, 1)
+
+
+def test_a_cluster_with_tls_as_the_page_describes_takes_only_those_with_the_key(tmp_path):
+    """The certificate and the configuration of docs/batch-and-nightly.md, in another folder."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    page = (ROOT / "docs/batch-and-nightly.md").read_text("utf-8").replace("/etc/dask", str(tmp_path))
+    made = next(line for line in page.splitlines() if line.startswith("openssl "))
+    subprocess.run(shlex.split(made), check=True, capture_output=True)
+    (tmp_path / "tls.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
+    folder(tmp_path / "root/a")
+    folder(tmp_path / "root/b")
+    env = {**ENV, "DASK_CONFIG": str(tmp_path / "tls.yaml")}
+    with cluster_of(tmp_path, "tls", env) as (address, _):
+        batch_ = command(tmp_path / "root", "-o", tmp_path / "out", "--cluster", address)
+        done = subprocess.run(batch_, capture_output=True, text=True, env=env, check=False)
+        assert done.returncode == 0, done.stderr
+        assert finished(tmp_path / "out") == {"a", "b"}
+        for other, why in (
+            (address, "expected a certificate and a key"),
+            (address.replace("tls", "tcp"), "that answers"),
+        ):
+            batch_ = command(tmp_path / "root", "-o", tmp_path / "other", "--cluster", other)
+            done = subprocess.run(batch_, capture_output=True, text=True, env=ENV, check=False)
+            assert done.returncode == 2, done.stderr
+            assert why in done.stderr
+            assert "Traceback" not in done.stderr
 
 
 def test_a_cluster_that_does_not_answer_is_said(tmp_path, monkeypatch):

@@ -66,12 +66,26 @@ def test_all_bodies_once(fake, tmp_path):
     assert np.ptp(vertices, axis=0).tolist() == [3000.0, 1000.0, 1000.0]
     assert faces.tolist()[4:] == (np.array(faces[:4]) + 4).tolist()
     assert os.listdir(path.parent) == ["whole.STEP"], "nothing is written into the input"
+
+
+def test_meshes_that_have_changed_in_the_cache_are_made_again(fake, tmp_path):
+    path, calls = fake()
+    vertices = cad.read(path, "m")[0]
     (made,) = (tmp_path / "cache/steel-scan-check/cad").iterdir()
-    (made / "import.json").write_text("{")
-    with pytest.raises(InputError, match="was damaged and has been removed"):
-        cad.read(path, "m")
-    cad.read(path, "m")
-    assert calls() == ["--default-units m"] * 2
+    mesh, known = made / "body-1.ply", made / "sha256"
+    changes = (
+        lambda: (made / "import.json").write_text("{"),
+        lambda: mesh.write_text(mesh.read_text().replace("3000", "3900")),  # a mesh as whole as the other
+        lambda: mesh.rename(made / "body-2.ply"),
+        lambda: known.write_text("0" * 64),
+        known.unlink,
+    )
+    for count, change in enumerate(changes, 2):
+        change()
+        for _ in range(2):
+            np.testing.assert_array_equal(cad.read(path, "m")[0], vertices)
+        assert len(calls()) == count
+    assert [one.name for one in made.parent.iterdir()] == [made.name]
 
 
 def test_the_unit_of_a_file_that_states_none(fake):

@@ -13,6 +13,7 @@ import re
 import numpy as np
 import pytest
 
+import designgen.__main__
 from processor import record_checks
 from processor.cli import main
 from processor.evaluation.evaluate import ErrorReport
@@ -22,6 +23,7 @@ from processor.report import table as report_table
 from processor.scan_folder import cad, folder
 from processor.store import store
 from tests.support import step_results
+from tests.support.impossible_texts import impossible_texts
 
 POINTS = np.random.default_rng(3).uniform(0.0, 3.0, (60, 3)).round(3)
 FILES = {
@@ -95,12 +97,13 @@ def mutated(text, rng):
     return text
 
 
+@pytest.mark.parametrize("count", [500, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FILES)
-def test_five_hundred_damaged_files(tmp_path, name):
+def test_damaged_files(tmp_path, name, count):
     place, rng = write(tmp_path), random.Random(name)
     assert folder.read_input(place).frame is not None
     refused, said = 0, ""
-    for _ in range(500):
+    for _ in range(count):
         text = mutated(FILES[name], rng)
         (place / name).write_bytes(text.encode("utf-8", "surrogatepass"))
         try:
@@ -112,7 +115,28 @@ def test_five_hundred_damaged_files(tmp_path, name):
             continue
         assert str(place) in said, (text[:500], said[:500])
         assert len(said) < 6_100, (text[:500], said[:200])
-    assert refused > 150  # the others are harmless: a name, a coordinate
+    assert refused > 0.3 * count  # the others are harmless: a name, a coordinate
+
+
+TEXTS = {name: case for name, *case in impossible_texts(FILES)}
+
+
+def test_there_are_a_hundred_impossible_texts():
+    assert len(TEXTS) >= 100
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_an_impossible_text_is_refused_with_its_place(tmp_path, name):
+    file, text, named = TEXTS[name]
+    write(tmp_path)
+    (tmp_path / file).write_text(text)
+    with pytest.raises((InputError, UsageError)) as caught:
+        folder.read_input(tmp_path)
+    said = str(caught.value)
+    assert said.startswith((f"{tmp_path / file}: ", f"{tmp_path}: scans."))  # a scan's record is of the whole folder
+    # Tables are named by their lines; a cell of megabytes ends the reading of the table.
+    assert any(one and one in said for one in named) or re.search(r"(line|row) \d|field limit", said), said
+    assert len(said) < 1_500
 
 
 # --- the cache of meshes ---------------------------------------------------------------------------------------------
@@ -169,6 +193,22 @@ def test_names_are_harmless_in_pages_tables_and_terminals(tmp_path, capsys):
         if str(path).endswith(".html"):
             assert "<script>alert" not in text
             assert "alert(1)" in text  # as text
+
+
+@pytest.mark.parametrize(
+    "arguments", [("make", "{0}", "-o", "x.h5"), ("scan", "{0}", "-o", "x.h5"), ("import", "{0}", "-o", "x")]
+)
+def test_names_are_harmless_in_errors_of_designgen(tmp_path, monkeypatch, capsys, arguments):
+    name = tmp_path / "a\x1b[2Jb\u202ec.toml"
+    name.write_text("x = ")
+    monkeypatch.setattr("sys.argv", ["designgen", *(one.format(name) for one in arguments)])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        designgen.__main__.main()
+    said = capsys.readouterr().err
+    assert end.value.code in (2, 3)
+    assert "a\N{REPLACEMENT CHARACTER}[2Jb\N{REPLACEMENT CHARACTER}c" in said
+    assert all(line.isprintable() for line in said.splitlines())
 
 
 def test_names_are_harmless_in_tables_of_scans():
