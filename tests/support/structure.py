@@ -138,7 +138,7 @@ LAYERS = (
     ("version",),
     ("model",),
     ("record_checks",),
-    ("progress", "language", "jobs", "unit_ratio", "user_methods"),
+    ("progress", "diagnostics", "language", "jobs", "unit_ratio", "user_methods"),
     ("geometry",),
     ("scene_cloud",),
     ("adjustment",),
@@ -155,7 +155,17 @@ LAYERS = (
     ("cli",),
     ("__main__",),
 )
-FOR_STEPS = ("version", "model", "progress", "unit_ratio", "geometry", "scene_cloud", "adjustment", "limits")
+FOR_STEPS = (
+    "version",
+    "model",
+    "progress",
+    "diagnostics",
+    "unit_ratio",
+    "geometry",
+    "scene_cloud",
+    "adjustment",
+    "limits",
+)
 
 
 def wrong_arrows():
