@@ -1,4 +1,4 @@
-"""Many scenes from one recipe: a file for every combination of seed and varied values, and an index of all files.
+"""Many scenes from one recipe: a file for each seed and varied values, an index of all files, and a card of the set.
 
 The bytes of a scene depend only on its recipe, its parameters, its seed and the versions of the software. A scene in
 the folder that was made from the same is therefore kept, and the folder is the same whether one process, several, a
@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from designgen import __version__, recipe_files
+from designgen import __version__, card, recipe_files
 from processor.jobs import process, runner
 from processor.jobs.child import Loss, Lost
 from processor.jobs.software import check_same, versions
@@ -31,11 +31,14 @@ from processor.model import InputError, UsageError
 from processor.plain_text import printable
 
 INDEX = "index.csv"
+# Columns of the index by their numbers in the card.
+NUMBERS = {"surface": "points_surface", "mixed": "points_mixed", "outlier": "points_outlier", "defects": "defects"}
 MOST_SCENES = 99_999  # in one folder: file names number them by five digits
 MOST_SEED = 2**63
 SOFTWARE = ("h5py", "numba", "numpy", "scipy")  # packages that a scene's bytes depend on; CAD solids are no part of it
 SCENE_FILE = re.compile(r".+-\d{5}-seed\d+\.h5")
-LEFTOVER = re.compile(rf"\.({SCENE_FILE.pattern}|{re.escape(INDEX)})\.\d+-[0-9a-f]{{8}}\.tmp")
+OF_SET = (INDEX, card.CARD_JSON, card.CARD_PAGE)
+LEFTOVER = re.compile(rf"\.({SCENE_FILE.pattern}|{'|'.join(map(re.escape, OF_SET))})\.\d+-[0-9a-f]{{8}}\.tmp")
 LOSSES = {
     Loss.DIED: "the process that made it died twice (out of memory?); run again, with fewer jobs at a time",
     Loss.STOPPED: "stopped",
@@ -85,6 +88,7 @@ class Content:
     points: int
     scene_hash: str
     sha256: str
+    numbers: card.Numbers
 
 
 @dataclass(frozen=True)
@@ -253,7 +257,10 @@ def _content(path: Path, digest: str | None = None) -> Content:
 
     scene = store.read_scene(path)
     points = sum(len(scan.points) for scan in scene.scans)
-    return Content(len(scene.scans), points, store.scene_hash(scene), digest or _sha256(path))
+    truth = store.read_truth(path)
+    assert truth is not None  # every scene is written with it
+    numbers = card.numbers_of(truth)
+    return Content(len(scene.scans), points, store.scene_hash(scene), digest or _sha256(path), numbers)
 
 
 def _sha256(path: Path) -> str:
@@ -268,9 +275,14 @@ def _sha256(path: Path) -> str:
 
 
 def make_many(
-    folder: Path, jobs: Sequence[Job], keys: Sequence[str], processes: int = 1, cluster: str | None = None
+    folder: Path,
+    jobs: Sequence[Job],
+    recipe: recipe_files.Recipe,
+    varied: Mapping[str, Sequence[str]],
+    processes: int = 1,
+    cluster: str | None = None,
 ) -> dict[str, Any]:
-    """Do all jobs and write the index with the varied ``keys``; returns a summary that JSON can hold.
+    """Do all jobs of a recipe and write index and card, with the ``varied`` values; returns a summary for JSON.
 
     Progress and warnings go to standard error. For the main thread. SIGTERM and SIGINT end the program (SystemExit).
     Raises UsageError if the folder is a file or another run is at work in it, or if the cluster does not answer;
@@ -286,7 +298,8 @@ def make_many(
         ):
             indexed = _read_index(folder / INDEX)
             # There is no index until all is done: an older one would list scenes that are being replaced.
-            (folder / INDEX).unlink(missing_ok=True)
+            for name in OF_SET:
+                (folder / name).unlink(missing_ok=True)
             _remove_leftovers(folder)
             _report_strangers(folder, jobs)
             jobs = [replace(job, indexed=indexed.get(job.file)) for job in jobs]
@@ -297,7 +310,10 @@ def make_many(
                 process.POOL.close()
                 _remove_leftovers(folder)
             outcomes = _present(folder, outcomes)
-            _write_index(folder / INDEX, jobs, keys, outcomes)
+            index = _index(jobs, list(varied), outcomes)
+            made = _card(folder, jobs, recipe, varied, outcomes, index)
+            for name, text in zip(OF_SET, (index, card.as_json(made), card.as_markdown(made)), strict=True):
+                _write(folder / name, text)
     except runner.StoppedError as stop:
         raise SystemExit(stop.exit_code) from None
     return _summary(folder, jobs, outcomes)
@@ -383,24 +399,53 @@ def _read_index(path: Path) -> dict[str, Content]:
     try:
         for row in csv.DictReader(io.StringIO(path.read_text("utf-8"), newline="")):
             with suppress(KeyError, TypeError, ValueError):  # of a failed scene, or edited
-                content = Content(int(row["scans"]), int(row["points"]), row["scene_hash"], row["sha256"])
+                numbers = card.Numbers(**{name: int(row[column]) for name, column in NUMBERS.items()})
+                content = Content(int(row["scans"]), int(row["points"]), row["scene_hash"], row["sha256"], numbers)
                 contents[row["file"]] = content
     except (OSError, UnicodeDecodeError, csv.Error):
         return {}
     return contents
 
 
-def _write_index(path: Path, jobs: Sequence[Job], keys: Sequence[str], outcomes: dict[str, Outcome]) -> None:
-    from processor.store.atomic_file import replacing
-
+def _index(jobs: Sequence[Job], keys: Sequence[str], outcomes: Mapping[str, Outcome]) -> str:
     text = io.StringIO(newline="")
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["file", "recipe", "seed", *keys, "points", "scans", "scene_hash", "sha256", "status", "reason"])
+    columns = ["points", "scans", *NUMBERS.values(), "scene_hash", "sha256"]
+    table.writerow(["file", "recipe", "seed", "split", *keys, *columns, "status", "reason"])
     for job in jobs:
         outcome = outcomes[job.file]
         content = outcome.content
-        cells = [content.points, content.scans, content.scene_hash, content.sha256] if content else [""] * 4
+        cells: list[Any] = [""] * len(columns)
+        if content:
+            numbers = [getattr(content.numbers, name) for name in NUMBERS]
+            cells = [content.points, content.scans, *numbers, content.scene_hash, content.sha256]
         status = "done" if content else "failed"
-        table.writerow([job.file, job.recipe, job.seed, *job.varied, *cells, status, outcome.reason])
+        split = card.split_of(job.seed)
+        table.writerow([job.file, job.recipe, job.seed, split, *job.varied, *cells, status, outcome.reason])
+    return text.getvalue()
+
+
+def _card(
+    folder: Path,
+    jobs: Sequence[Job],
+    recipe: recipe_files.Recipe,
+    varied: Mapping[str, Sequence[str]],
+    outcomes: Mapping[str, Outcome],
+    index: str,
+) -> dict[str, Any]:
+    from processor.store import store
+
+    contents = [(job, content) for job in jobs if (content := outcomes[job.file].content)]
+    entries = [card.Entry(job.seed, content.scans, content.points, content.numbers) for job, content in contents]
+    truth = store.read_truth(folder / contents[0][0].file) if contents else None
+    labels = card.labels_of(truth) if truth else []
+    digest = hashlib.sha256(index.encode()).hexdigest()
+    failed = len(jobs) - len(contents)
+    return card.of_set(jobs[0].recipe, recipe, varied, jobs[0].software, entries, failed, labels, digest)
+
+
+def _write(path: Path, text: str) -> None:
+    from processor.store.atomic_file import replacing
+
     with replacing(path) as temporary:
-        temporary.write_text(text.getvalue(), "utf-8")
+        temporary.write_text(text, "utf-8")

@@ -83,7 +83,8 @@ def make(
 ) -> None:
     """Make the scene of RECIPE (a name or a TOML file) with its truth.
 
-    With --count or --vary, make several scenes in a folder with an index.csv. A second run keeps complete scenes.
+    With --count or --vary, make several scenes in a folder with index.csv and a card of the set (card.md, card.json).
+    A second run keeps complete scenes.
     Exit codes: 0 done, 1 some scenes failed (reasons are in the index), 2 all failed or wrong usage, 3 bad input.
     """
     from designgen import batch, recipe_files
@@ -95,7 +96,7 @@ def make(
     if many:
         varied = batch.parse_varied(vary)
         planned = batch.plan(output, name, loaded, varied, seed, count or 1)
-        report = batch.make_many(output, planned, list(varied), jobs or 1, cluster)
+        report = batch.make_many(output, planned, loaded, varied, jobs or 1, cluster)
         for failure in report["failed"]:
             _print_line(f"{failure['file']}: failed: {failure['reason']}", err=True)
         text = "{index}: {done} of {scenes} scene(s), {made} made now".format(**report)

@@ -77,6 +77,7 @@ MEANINGS = {
     "paper.huber_mm": "limit of Huber's function; 0 = from the spacing",
     "deviation.paper.voxel_mm": "side of the density-adaptive voxels",
     "deviation.paper.voxel_points": "points a voxel",
+    "deviation.paper.voxel_growth": "factor by which a voxel with fewer points grows",
     "deviation.paper.normal_diameter_mm": "diameter of the sphere of a normal",
     "deviation.paper.projection_diameter_mm": "diameter of the cylinder",
     "deviation.paper.max_depth_mm": "half length of the cylinder",

@@ -871,13 +871,27 @@ class Metric:
 
 
 @dataclass(frozen=True)
+class Diagnostics(Checked):
+    """Numbers that the parts of a step found on the way, one a row; NaN where there is none.
+
+    ``place`` is where, such as the end of a part; a unit stands at the end of a quantity, else it is a number or share.
+    """
+
+    stage: tuple[str, ...] = names("k")
+    place: tuple[str, ...] = names("k", means=LONG)
+    quantity: tuple[str, ...] = names("k")
+    value: Floats = column("k")
+
+
+@dataclass(frozen=True)
 class StepRun:
-    """One step as it was run: the parameters as JSON text, and the step's own Result record."""
+    """One step as it was run: the parameters as JSON text, the step's own Result record, and diagnostics, if any."""
 
     step: str
     method: str
     params: str = dataclasses.field(metadata={"means": LONG})
     result: Any
+    diagnostics: Diagnostics | None = newer()
 
     @property
     def verdict(self) -> Verdict:

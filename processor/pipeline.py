@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from processor import user_methods
+from processor import diagnostics, user_methods
 from processor.model import InputError, Scan, Scene, Status, StepRun, UsageError, did_you_mean, reason
 from processor.progress import stage
 from processor.store.json_values import json_ready
@@ -50,6 +50,15 @@ class Job:
 
 
 @dataclass(frozen=True)
+class StepCloud:
+    """A cloud of a stage of a step, by the step's method."""
+
+    step: str
+    method: str
+    cloud: diagnostics.KeptCloud
+
+
+@dataclass(frozen=True)
 class Execution:
     """What was run on which scene, and everything that made the result."""
 
@@ -57,6 +66,7 @@ class Execution:
     runs: tuple[StepRun, ...]  # the result of each step first, then other methods for comparison
     provenance: dict[str, Any]
     stored: Path | None = None  # the scene's file, where its points are still in it
+    clouds: tuple[StepCloud, ...] = ()  # of the steps' stages, where they were asked for
 
     def by_step(self) -> list[tuple[StepRun, list[StepRun]]]:
         """Pair the first run of each step, its result, with the runs of other methods for comparison."""
@@ -304,6 +314,7 @@ def execute(
         runs: list[StepRun] = []
         answers: dict[str, Any] = {}
         kept: dict[str, dict[str, Any]] = {}
+        clouds: list[StepCloud] = []
 
         def hashed() -> str:
             return store.scene_hash(scene, None if points is None else points.pieces)
@@ -323,9 +334,13 @@ def execute(
                 needs["answer_given"] = answers[job.step]
             if getattr(job.module, "KEEPS", False):
                 needs["kept"] = kept.setdefault(job.step, {})
-            runs.append(_run(path, scene, job, {**given, **needs}, log))
+            with diagnostics.taken() as notes:
+                done = _run(path, scene, job, {**given, **needs}, log)
+            runs.append(dataclasses.replace(done, diagnostics=notes.table()))
+            clouds += [StepCloud(job.step, job.method, cloud) for cloud in notes.clouds]
             answers.setdefault(job.step, runs[-1].result)
-        return _execution(path, scene, runs, digest or hashed(), piecewise)
+        whole = _execution(path, scene, runs, digest or hashed(), piecewise)
+        return dataclasses.replace(whole, clouds=tuple(clouds))
 
 
 def _execution(path: Path, scene: Scene, runs: Sequence[StepRun], digest: str, piecewise: bool) -> Execution:

@@ -48,7 +48,12 @@ def test_packages_share_only_what_they_may(name):
 
 def test_only_evaluation_reads_the_truth():
     readers = {module_name(path) for path in SOURCES if "read_truth" in path.read_text("utf-8")}
-    assert not {name for name in readers if not within({name}, "processor.evaluation.evaluate", "processor.store")}
+    allowed = (
+        "processor.evaluation.evaluate",
+        "processor.store",
+        "designgen.batch",
+    )  # designgen made it, and counts it
+    assert not {name for name in readers if not within({name}, *allowed)}
     assert "processor.evaluation.evaluate" in readers
 
 

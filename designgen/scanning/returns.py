@@ -136,8 +136,12 @@ def scan_station(
     )
     with ThreadPoolExecutor(_threads()) as pool:  # the kernels release the interpreter's lock
         # One strip at least: it gives the columns of an empty scan their types.
-        strips = caster.view.occupied() or [0]
+        strips = [number for number in caster.view.occupied() if caster.in_view(number)] or [0]
         returns = join(list(pool.map(caster.strip, strips)))
+    if not params.turns:
+        azimuth = 2.0 * np.pi * returns.column.astype(np.float64) / grid.columns
+        elevation = grid.lowest + grid.step * returns.row.astype(np.float64)
+        returns = rows_of(returns, params.in_view(azimuth, elevation))
     measured = np.linalg.norm(returns.points, axis=1)
     factor = (measured * (1.0 + 1e-6 * scale) + offset) / measured
     turned = np.array([[1.0, 0.0, tilt[1]], [0.0, 1.0, -tilt[0]], [-tilt[1], tilt[0], 1.0]])
@@ -183,6 +187,14 @@ class _StationCaster:
     keep_hits: bool
     margin: edge_footprints.Margin
     least: float  # lower bound of the range to any surface, mm
+
+    def in_view(self, number: int) -> bool:
+        """Whether any column of a strip is in the scanner's field of view."""
+        if self.params.turns:
+            return True
+        columns = self.view.strips[number].first + np.arange(STRIP)
+        middle = np.full(STRIP, np.radians(self.params.elevation_deg))
+        return bool(self.params.in_view(2.0 * np.pi * columns / self.grid.columns, middle).any())
 
     def strip(self, number: int) -> Returns:
         """Return the returns of one strip of columns."""

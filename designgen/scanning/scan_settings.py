@@ -31,6 +31,8 @@ KEYS_BY_KIND = {
     "member_reach_mm": ("space-frame",),
     "distance_mm": ("arch-bridge", "assembly", "structure"),
     "height_mm": ("space-frame", "structure"),
+    "field_of_view_deg": ("structure",),
+    "elevation_deg": ("structure",),
     "registered": ("structure",),
     "repeated": ("structure",),
     "scans_at_first": ("structure",),
@@ -38,7 +40,8 @@ KEYS_BY_KIND = {
     "origin_mm": ("space-frame", "structure"),
 }
 # Keys that a type of structure does not use: a stadium is scanned from inside.
-UNUSED_KEYS_BY_TYPE = {"stadium-roof": ("distance_mm",)}
+WINDOW_KEYS = ("field_of_view_deg", "elevation_deg")  # a truss bridge alone is scanned through a window
+UNUSED_KEYS_BY_TYPE = {"stadium-roof": ("distance_mm", *WINDOW_KEYS), "plate-row": WINDOW_KEYS}
 
 
 def scan_settings_of(recipe: Mapping[str, Any]) -> Scanning:
@@ -69,6 +72,8 @@ def _check_used(recipe: Mapping[str, Any], params: type) -> None:
     if kind == "structure" and isinstance(section, Mapping) and section.get("type") in UNUSED_KEYS_BY_TYPE:
         kind = section["type"]
         unused.update(UNUSED_KEYS_BY_TYPE[kind])
+    if "model" in recipe:
+        unused.update(WINDOW_KEYS)
     for key in recipe.get("scan", {}):
         if key in unused:
             there = ", ".join(f.name for f in dataclasses.fields(params) if f.name not in unused)

@@ -18,7 +18,7 @@ import numpy as np
 
 from designgen.checks import expect, expect_all
 from designgen.recipe_files import packaged
-from processor.model import Floats, UsageError
+from processor.model import Bools, Floats, UsageError
 
 MODE = "rays"
 SIGNAL_RANGE_MM = 10_000.0  # range at which the signal is 1
@@ -97,6 +97,8 @@ class Params:
     stations: tuple[int, ...] = (2, 2)
     distance_mm: float = 5_000.0  # of the stations from a part's surface
     height_mm: float = 1_600.0  # of the scanner above the ground
+    field_of_view_deg: float = 360.0  # truss bridges: width and height of a window about the x axis; 360 = all round
+    elevation_deg: float = 0.0  # of the middle of the window
     clutter: int = 0  # number of objects that are no part of the structure
     registration_mm: float = 0.0  # standard deviation of a station's registered position along each axis
     registration_mrad: float = 0.0  # and of its attitude about each axis
@@ -118,11 +120,35 @@ class Params:
             (all(n >= 1 for n in self.stations), "stations", list(self.stations), "one number or two, from 1"),
             (len(self.stations) in (1, 2), "stations", list(self.stations), "one number or two"),
             (len(self.origin_mm) == 3, "origin_mm", list(self.origin_mm), "three numbers"),
+            (
+                10.0 <= self.field_of_view_deg <= 120.0 or self.turns,
+                "field_of_view_deg",
+                self.field_of_view_deg,
+                "10 to 120, or 360",
+            ),
+            (abs(self.elevation_deg) <= 60.0, "elevation_deg", self.elevation_deg, "-60 to 60"),
             (self.scans_at_first >= 1, "scans_at_first", self.scans_at_first, "1 or more"),
             *((getattr(self, key) >= 0, key, getattr(self, key), "0 or more") for key in nonnegative),
             (self.repeated <= count, "repeated", self.repeated, f"no more than the {count} stations"),
             (posed, "merged", True, "false with registered = false: a cloud needs poses"),
         )
+
+    @property
+    def turns(self) -> bool:
+        """Whether the scanner turns all round."""
+        return self.field_of_view_deg == 360.0
+
+    def in_view(self, azimuth: Floats, elevation: Floats) -> Bools:
+        """Mark directions (n,) in the scanner's frame, rad, that it sees."""
+        half = 0.5 * np.radians(self.field_of_view_deg)
+        beside = np.abs((azimuth + np.pi) % (2.0 * np.pi) - np.pi)
+        seen: Bools = (beside <= half) & (np.abs(elevation - np.radians(self.elevation_deg)) <= half)
+        return seen if not self.turns else np.ones(np.shape(azimuth), bool)
+
+    def sees(self, points: Floats) -> Bools:
+        """Mark points (n, 3) in the scanner's frame that lie in its field of view."""
+        x, y, z = points.T
+        return self.in_view(np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)))
 
     def signal(self, cosine: Floats, R: Floats) -> Floats:
         """Return the signal (n,) of a whole beam by the cosine of the angle of incidence and the range, mm."""

@@ -37,6 +37,7 @@ from processor.model import (
     UsageError,
 )
 
+NEXT_WINDOW_MM = 9_000.0  # from one scan of a station to the next, of a scanner that does not turn
 TRUTH_STEP_MM = 250.0
 Components = tuple[box_and_tube.Component, ...]
 PartPatches = list[tuple[int, Patch]]  # the row of the component of each face
@@ -75,7 +76,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         if of_defects is not None:
             surveyed = _labelled(surveyed, of_defects)
         scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
-        picks = _picks(recipe, scans, station_truth, seed)
+        corners = np.vstack([box_and_tube.mesh_of((one,))[0] for one in components if one.name != "ground"])
+        picks = _picks(recipe, scans, station_truth, params, corners + origin, seed)
         if not params.registered:
             scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
             stations = None
@@ -122,14 +124,22 @@ def _labelled(surveyed: survey.Survey, of_defects: OfDefects) -> survey.Survey:
     return dataclasses.replace(surveyed, labels=tuple(labels))
 
 
-def _picks(recipe: Mapping[str, Any], scans: Sequence[Scan], truth: StationTruth, seed: int) -> Picks | None:
+def _picks(
+    recipe: Mapping[str, Any],
+    scans: Sequence[Scan],
+    truth: StationTruth,
+    scanning: scanner.Params,
+    corners: Floats,
+    seed: int,
+) -> Picks | None:
     if "picks" not in recipe:
         return None
     T_project_scan = dict(zip(truth.ids, truth.T_project_station, strict=True))
     if any(scan.name not in T_project_scan for scan in scans):
         raise UsageError("picks: points are picked in scans of one station each; set scan.merged = false")
     params = filled(picking.Params, recipe, "picks")
-    return picking.pick(scans, [T_project_scan[scan.name] for scan in scans], params, seed)[0]
+    poses = [T_project_scan[scan.name] for scan in scans]
+    return picking.pick(scans, poses, params, seed, corners, scanning.sees)[0]
 
 
 def built_faces(kind: str, components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
@@ -231,6 +241,9 @@ def _places(kind: str, patches: PartPatches, params: scanner.Params, seed: int) 
         scans = params.scans_at_first if i < params.repeated else 1
         for k in range(scans):
             heading = generator(seed, f"heading {station} {k}").uniform(0.0, 2.0 * np.pi)
+            if not params.turns:  # its window is on the bridge, and moves along it from scan to scan
+                aim = np.array([12_000.0 * (i // 2) + 3_000.0 + NEXT_WINDOW_MM * k, 0.0]) - at[:2]
+                heading = float(np.arctan2(aim[1], aim[0])) + 0.02 * (heading / np.pi - 1.0)
             poses[station if scans == 1 else f"{station}-{k + 1}"] = survey.levelled_pose(at, heading)
     return poses
 

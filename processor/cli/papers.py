@@ -16,12 +16,21 @@ from processor.jobs.exit_codes import DONE, IN_PART
 @click.option("--only", callback=split_names, metavar="000,001", help="the papers of these numbers  [default: all]")
 @click.option("--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="seeds of every data set")
 @click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True, help="data sets at a time")
+@click.option("--keep-steps", is_flag=True, help="keep clouds and numbers of the methods' stages, in OUT/steps")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @click.option("--json", "as_json", is_flag=True, help="print papers.json instead of one line")
 @debug_option
 @click.pass_context
 def papers(
-    context: click.Context, /, output: Path, only: tuple[str, ...], seeds: int, jobs: int, lang: str, as_json: bool
+    context: click.Context,
+    /,
+    output: Path,
+    only: tuple[str, ...],
+    seeds: int,
+    jobs: int,
+    keep_steps: bool,
+    lang: str,
+    as_json: bool,
 ) -> None:
     """Repeat the tables and figures of the source papers by their methods, beside ours.
 
@@ -29,6 +38,6 @@ def papers(
     """
     from processor.papers import command
 
-    found = command.run(output, only, seeds, jobs, lang)
+    found = command.run(output, only, seeds, jobs, lang, keep_steps)
     click.echo(json.dumps(found.content, ensure_ascii=False) if as_json else str(found.line))
     context.exit(IN_PART if found.failed else DONE)

@@ -42,6 +42,7 @@ from processor.results.file_names import RESULTS_JSON
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), help="end the run after so long")
 @click.option("--memory-mb", type=click.IntRange(min=64), help="end the run if it takes more")
+@click.option("--keep-steps", is_flag=True, help="clouds of the stages of the papers' methods as PLY in OUT/steps")
 @click.option("--so-far", type=click.Path(path_type=Path), hidden=True)
 @form_options
 @fail_on_option
@@ -53,6 +54,7 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
 
     A run that a limit ends leaves OUT as it was, and the steps that were done in OUT.part; it exits with 3.
     """
+    from processor import diagnostics
     from processor.api import runs
     from processor.scan_folder.files import missing
 
@@ -69,18 +71,19 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
         from processor.cli.limited_run import limited_run
 
         context.exit(limited_run(input_, output, *limits, _arguments({**options, "fail_on": fail_on})))
-    results = runs.run(
-        input_,
-        output,
-        options["steps"],
-        options["methods"],
-        options["params"],
-        options["units"],
-        options["seed"],
-        lang=options["lang"],
-        log=log_line if shown.quiet else print_error_line,
-        so_far=options["so_far"],
-    )
+    with diagnostics.with_clouds(options["keep_steps"]):
+        results = runs.run(
+            input_,
+            output,
+            options["steps"],
+            options["methods"],
+            options["params"],
+            options["units"],
+            options["seed"],
+            lang=options["lang"],
+            log=log_line if shown.quiet else print_error_line,
+            so_far=options["so_far"],
+        )
     if further:
         runs.write(results, output, options["lang"], further)
     show_results(context, output, results, shown, fail_on)

@@ -18,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from processor import scene_cloud
+from processor import diagnostics, scene_cloud
 from processor.defects import defect_grids
 from processor.defects.defect_grids import MOST_PLACES
 from processor.defects.params import Paper, Params
@@ -27,7 +27,7 @@ from processor.defects.surface_charts import of_mesh
 from processor.defects.to_result import table
 from processor.geometry import icp, mesh_distance, pfh, rigid
 from processor.geometry.neighbors import surface_spacing, voxel_means
-from processor.model import NORMAL_95, Floats, Ints, Scene, Status, StructureDesign, reason
+from processor.model import NORMAL_95, Bools, Floats, Ints, Scene, Status, StructureDesign, reason
 
 VOXEL_SPACINGS = 1.5
 RADIUS_VOXELS = 2.5  # radius of the neighbourhood that density is counted in
@@ -69,7 +69,9 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     radius = paper.cluster_radius_mm or RADIUS_VOXELS * size
     label = density_clusters(points, radius, paper.cluster_points)
     counts = np.bincount(label[label >= 0], minlength=1)
-    points = points[(label >= 0) & (counts[np.maximum(label, 0)] >= paper.smallest_cluster_share * counts.max())]
+    clustered = (label >= 0) & (counts[np.maximum(label, 0)] >= paper.smallest_cluster_share * counts.max())
+    _say_clusters(points, clustered, len(counts), radius, origin)
+    points = points[clustered]
     if len(points) < paper.feature_points:
         return Result(status=Status.FAILED, method=params.method, reasons=(reason("defects.paper-too-few-points"),))
     design = mesh_distance.sampled(vertices, scene.structure.faces, size)
@@ -78,11 +80,16 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     rms, paired_share = np.inf, 0.0
     for gate in ICP_VOXELS:
         fit = icp.point_to_point(points, design.points, T, max_distance_mm=gate * size, max_iterations=ICP_ITERATIONS)
+        with diagnostics.at(f"pairs within {gate * size:.1f} mm"):
+            diagnostics.note(
+                "iterative closest point", rounds=fit.iterations, rms_mm=fit.rms, paired_share=fit.paired_share
+            )
         if np.isfinite(fit.rms):
             T, rms, paired_share = fit.T_target_source, fit.rms, fit.paired_share
     if not np.isfinite(rms):
         return Result(status=Status.FAILED, method=params.method, reasons=(reason("defects.paper-not-placed"),))
-    deviations = _deviations(rigid.apply(T, points), vertices, scene.structure, radius, params)
+    with diagnostics.placed(rigid.transform(np.eye(3), origin), "design"):
+        deviations = _deviations(rigid.apply(T, points), vertices, scene.structure, radius, params)
     rows = sorted(_rows(deviations, size, paper), key=lambda row: -abs(row["volume_mm3"]))
     order = np.array([row.pop("label") for row in rows], np.int64)
     row_of = np.append(np.argsort(order), NOISE).astype(np.int32)  # by label; the last: of no defect
@@ -111,6 +118,15 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     )
 
 
+def _say_clusters(points: Floats, clustered: Bools, clusters: int, radius: float, origin: Floats) -> None:
+    diagnostics.note(
+        "density clusters", radius_mm=radius, points=len(points), clusters=clusters, kept=int(clustered.sum())
+    )
+    with diagnostics.placed(rigid.transform(np.eye(3), origin), "project"):
+        diagnostics.keep("density clusters", points[clustered])
+        diagnostics.keep("noise", points[~clustered])
+
+
 def _deviations(points: Floats, vertices: Floats, design: StructureDesign, radius: float, params: Params) -> Deviations:
     """Measure distances of points (n, 3), and cluster those beyond the threshold."""
     surface = of_mesh(vertices, design.faces, 1000.0, design.bodies)
@@ -123,6 +139,10 @@ def _deviations(points: Floats, vertices: Floats, design: StructureDesign, radiu
     beyond = np.abs(distance) > threshold
     label = np.full(len(points), NOISE, np.int64)
     label[beyond] = density_clusters(points[beyond], DEFECT_RADII * radius, DEFECT_POINTS)
+    diagnostics.note(
+        "defect points", threshold_mm=threshold, beyond=int(beyond.sum()), clusters=int(label.max(initial=NOISE)) + 1
+    )
+    diagnostics.keep("defect points", lambda: points[label >= 0])
     return Deviations(
         points=points,
         distance=distance,
@@ -267,6 +287,7 @@ def _first_pose(
 
     best = np.eye(4)
     least = error(best)
+    tried = 0
     for _ in range(paper.trials):
         rows = rng.choice(len(source), 3, replace=False)
         pick = similar[rows, rng.integers(similar.shape[1], size=3)]
@@ -275,7 +296,10 @@ def _first_pose(
         if np.abs(sides).max() > LENGTH_VOXELS * size:
             continue
         T = rigid.fit(a, b)
+        tried += 1
         candidate = error(T)
         if candidate < least:
             best, least = T, candidate
+    diagnostics.note("descriptors", source=len(source), target=len(target), radius_mm=radius)
+    diagnostics.note("sample consensus", trials=paper.trials, fitted=tried, huber_mm2=least, huber_limit_mm=limit)
     return best

@@ -10,17 +10,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor import diagnostics
 from processor.adjustment.groups import group_means
 from processor.deviation import cloud, result_fields
 from processor.deviation import measure as deviation_measure
 from processor.deviation.cloud import ScanCloud
-from processor.deviation.params import Params
+from processor.deviation.params import Paper, Params
 from processor.deviation.result import ErrorSource, Result
 from processor.geometry import icp, m3c2, mesh_distance, principal, rigid
 from processor.geometry.neighbors import thinned
 from processor.geometry.principal import AMBIGUOUS, CoarsePose
 from processor.geometry.surface_registration import Registration
-from processor.model import Floats, Scene, Status, reason
+from processor.model import Floats, Ints, Scene, Status, StructureDesign, reason
 
 MOST_ICP_POINTS = 60_000
 COARSE_POINTS, COARSE_ITERATIONS = 3_000, 30
@@ -30,11 +31,19 @@ NAN = float("nan")
 def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, params: Params) -> Result:
     """Deviations of a scan from a design with vertices (v, 3) less ``origin`` (3,), as in the paper."""
     assert scene.structure is not None
+    with diagnostics.placed(np.eye(4), "project"):
+        return _measured(scene.structure, scan, vertices, origin, params)
+
+
+def _measured(design_of: StructureDesign, scan: ScanCloud, vertices: Floats, origin: Floats, params: Params) -> Result:
     preset = params.paper
-    design = mesh_distance.sampled(vertices, scene.structure.faces, scan.spacing_mm)
-    group = cloud.adaptive_voxels(design.points, preset.voxel_mm, preset.voxel_points)
+    design = mesh_distance.sampled(vertices, design_of.faces, scan.spacing_mm)
+    group = voxels(design.points, preset)
     core = group_means(design.points, group)
     towards = group_means(design.normals, group)
+    diagnostics.note("outliers", read=scan.read, kept=scan.kept)
+    diagnostics.keep("outliers", scan.removed + scan.origin)
+    _say_voxels("design voxels", design.points, core)
     T, error, ambiguity = _registered(scan, core, origin, params)
     grid = m3c2.grid(design.points, preset.projection_diameter_mm)
     normals = m3c2.oriented(m3c2.normals(grid, core, preset.normal_diameter_mm).normals, towards)
@@ -86,20 +95,35 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
 def _registered(scan: ScanCloud, core: Floats, origin: Floats, params: Params) -> tuple[Floats, float, float]:
     """Pose T (4, 4) of the scan in the design's local frame, registration error in mm, and ambiguity."""
     preset = params.paper
-    reduced = group_means(scan.points, cloud.adaptive_voxels(scan.points, preset.voxel_mm, preset.voxel_points))
+    reduced = group_means(scan.points, voxels(scan.points, preset))
+    _say_voxels("scan voxels", scan.points, reduced)
+    diagnostics.keep("scan voxels", reduced + scan.origin)
     target, source = thinned(core, MOST_ICP_POINTS), thinned(reduced, MOST_ICP_POINTS)
     if params.register in ("none", "fine"):
         T, ambiguity = rigid.transform(np.eye(3), scan.origin - origin), NAN
     else:
         pose = coarse(source, target)
         T, ambiguity = pose.T_target_source, pose.ambiguity
+        diagnostics.note("principal axes", rms_mm=pose.rms_mm, rival_by_best=pose.ambiguity)
     error = 0.0
     if params.register != "none":
-        T = icp.point_to_point(source, target, T).T_target_source
+        fine = icp.point_to_point(source, target, T)
+        T = fine.T_target_source
+        diagnostics.note("iterative closest point", rounds=fine.iterations, rms_mm=fine.rms)
         error = clone_error(rigid.apply(T, source))
+        diagnostics.note("clone", rms_mm=error)
     if np.isfinite(params.registration_error_mm):
         error = params.registration_error_mm
     return T, error, ambiguity
+
+
+def voxels(points: Floats, preset: Paper) -> Ints:
+    """Return the voxel (n,) of each of points (n, 3) by the paper's density-adaptive down-sampling."""
+    return cloud.adaptive_voxels(points, preset.voxel_mm, preset.voxel_points, preset.voxel_growth)
+
+
+def _say_voxels(stage: str, points: Floats, means: Floats) -> None:
+    diagnostics.note(stage, points=len(points), voxels=len(means), rate=len(means) / max(len(points), 1))
 
 
 def coarse(source: Floats, target: Floats) -> CoarsePose:

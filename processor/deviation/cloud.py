@@ -109,8 +109,8 @@ def _sources(scene: Scene) -> tuple[Ints, tuple[str, ...]]:
     return np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans]), tuple(scan.name for scan in scans)
 
 
-def adaptive_voxels(points: Floats, size_mm: float, least: int) -> Ints:
-    """Group (n,) of each point (n, 3): its voxel of ``size_mm``, doubled in size until it holds ``least`` points.
+def adaptive_voxels(points: Floats, size_mm: float, least: int, growth: float) -> Ints:
+    """Group (n,) of each point (n, 3): its voxel of ``size_mm``, ``growth`` times as wide until it holds ``least``.
 
     Density-adaptive down-sampling of paper 002, section 2.2; points that never fill a voxel are one last group.
     """
@@ -126,7 +126,7 @@ def adaptive_voxels(points: Floats, size_mm: float, least: int) -> Ints:
         group[left[done]] = new[number[done]]
         groups += int(full.sum())
         left = left[~done]
-        size_mm *= 2.0
+        size_mm *= growth
     return group
 
 

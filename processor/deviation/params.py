@@ -15,10 +15,15 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Paper:
-    """The source paper's numbers (002): voxels of 2 mm with 5 points, scales in mm; it states no depth."""
+    """The source paper's numbers (002): voxels of 2 mm with 5 points, scales in mm; it states no depth.
+
+    It does not say by how much voxels grow, either: by a factor of two they end at 14 % of the points, as many hold far
+    more than 5; twice the volume is near the paper's 20 %, which is one in 5.
+    """
 
     voxel_mm: float = 2.0
     voxel_points: int = 5
+    voxel_growth: float = 1.26
     normal_diameter_mm: float = 110.541
     projection_diameter_mm: float = 55.270
     max_depth_mm: float = 100.0
@@ -56,6 +61,7 @@ class Params:
             ("registration_error_mm", not self.registration_error_mm < 0.0, "0 or more"),
             ("paper.voxel_mm", 0.0 < paper.voxel_mm < 1e6, "above 0 and below 1e6"),
             ("paper.voxel_points", paper.voxel_points >= 1, "1 or more"),
+            ("paper.voxel_growth", 1.01 <= paper.voxel_growth <= 16.0, "1.01 to 16"),
             ("paper.normal_diameter_mm", 0.0 < paper.normal_diameter_mm < 1e6, "above 0 and below 1e6"),
             ("paper.projection_diameter_mm", 0.0 < paper.projection_diameter_mm < 1e6, "above 0 and below 1e6"),
             ("paper.max_depth_mm", 0.0 < paper.max_depth_mm < 1e6, "above 0 and below 1e6"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +20,11 @@ NAN = float("nan")
 WRONG_DEPTHS = "depths off by more than a tenth and 2 LOD95"
 NEAR_MM = 30.0
 OPPOSITE = -0.9  # cosine between the normals of two sides of a plate
+# Sizes of true defects that detection is counted by, mm: depth, and diameter of a disc of the same area.
+DEPTHS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+DIAMETERS = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+FOUND_BY_DEPTH = {f"found of depth {low:g} to {high:g} mm": (low, high) for low, high in pairwise(DEPTHS)}
+FOUND_BY_AREA = {f"found of diameter {low:g} to {high:g} mm": (low, high) for low, high in pairwise(DIAMETERS)}
 ALARM_SDS = 3.0  # standard deviations of the number of false alarms that the limit allows
 
 
@@ -70,6 +77,8 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         bodies = None  # components that are not named by the design have no true name
     rows = matched(result.defects, truth.defects, named=bodies is not None)
     metrics = _missed(truth.defects, rows, limited)
+    metrics += _found_by_size(np.abs(truth.defects.depth_max_mm), rows >= 0, FOUND_BY_DEPTH)
+    metrics += _found_by_size(2.0 * np.sqrt(truth.defects.area_mm2 / np.pi), rows >= 0, FOUND_BY_AREA)
     behind = _other_sides(result.defects, truth.defects, rows) if bodies is not None else 0
     false = len(result.defects) - int((rows >= 0).sum()) - behind
     expected = result.examined_mm2 / 1e8
@@ -97,6 +106,20 @@ def _missed(truth: DefectTruth, rows: Ints, limited: bool) -> list[Metric]:
         Metric("defects", f"missed: {kind}", float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=limit)
         for kind in dict.fromkeys(truth.classes)
     ]
+
+
+def _found_by_size(
+    size: Floats, found: npt.NDArray[np.bool_], bounds: Mapping[str, tuple[float, float]]
+) -> list[Metric]:
+    """Return the share of the true defects of each size (t,), mm, that were found, and their number."""
+    metrics = []
+    for quantity, (low, high) in bounds.items():
+        inside = (size >= low) & (size < high)
+        if inside.any():
+            share = 100.0 * float(found[inside].mean())
+            metrics.append(Metric("defects", quantity, share, Statistic.SHARE, unit="%", better=Better.HIGH))
+            metrics.append(Metric("defects", quantity, float(inside.sum()), Statistic.NUMBER))
+    return metrics
 
 
 def _other_sides(defects: Defects, truth: DefectTruth, rows: Ints) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor import diagnostics
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 
@@ -120,6 +121,7 @@ def coarse_alignment(
     if len(rows) < SAMPLE:
         return best
     points, paired = source[rows], target[match]
+    scores = np.linalg.norm(target_histograms[match] - source_histograms[rows], axis=1)
     for _ in range(iterations):
         pick = rng.choice(len(points), SAMPLE, replace=False)
         a, b = points[pick], paired[pick]
@@ -130,6 +132,9 @@ def coarse_alignment(
         count = int((np.linalg.norm(rigid.apply(T, points) - paired, axis=1) <= tolerance_mm).sum())
         if count > best_count and (prior is None or prior.allows(T, source)):
             best, best_count = T, count
+    diagnostics.note(
+        "histograms", pairs=len(rows), score_median=float(np.median(scores)), trials=iterations, agreeing=best_count
+    )
     return best if best is None else _refitted(best, points, paired, source, tolerance_mm, prior)
 
 

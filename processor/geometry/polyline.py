@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor import diagnostics
 from processor.model import Floats
 
 PAIRS_AT_ONCE = 500_000
@@ -52,6 +53,7 @@ def ransac_line(
             best = inliers
             share = min(float(inliers.mean()), 1.0 - 1e-12)
             needed = math.log(1.0 - probability) / math.log(1.0 - share**2)
+    diagnostics.note("line consensus", trials=tried, inliers=0 if best is None else int(best.sum()))
     return None if best is None else fit_line(points[best])
 
 

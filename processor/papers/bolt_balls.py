@@ -6,18 +6,21 @@ one point of the total station misses the ball and lies on what is behind it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from processor import diagnostics
+from processor.geometry import rigid
 from processor.geometry.neighbors import nearest_crops
 from processor.geometry.sphere import algebraic, ransac
 from processor.language.messages import Text, text
-from processor.model import Floats, FrameDesign, Reason, reason
-from processor.papers.charts import Chart
+from processor.model import Floats, FrameDesign, Ints, Reason, reason
 from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule
-from processor.scene_cloud import merged
+from processor.papers.rows import Row, Rule, median
+from processor.report.charts.line_chart import Chart
+from processor.scene_cloud import MergedCloud, merged
 from processor.space_frame import step
 from processor.space_frame.params import Params
 from processor.store import store
@@ -31,17 +34,34 @@ NAN = float("nan")
 STATION_SD_MM = 2.0  # of a coordinate of the total station without reflector
 FOUR = 4
 BLUNDER_ROW, BLUNDER_M = 97, (5.0, 15.0)  # the paper's ball 98; distance to what is behind the ball
+BLUNDER_MM = 1000.0  # an error of a radius that is one
+ROOF, ROOF_BALLS, ROOF_SPACING_MM = "1040 balls", 1040.0, 6.0
+LOWEST_MM = 5.0  # error of a lowest point beyond which it is of no use for a ceiling
 LOWER = -0.2  # greatest height of a point that is sighted from below, in radii
 
 # Tables 2 and 3: radii of the eight balls that are printed, m; the true radius is 0.045.
 RANSAC_RADII_M = (0.0473, 0.0469, 0.0449, 0.0462, 0.0436, 0.0475, 0.0464, 0.0450)
 STATION_RADII_M = (0.0480, 0.0492, 0.0441, 0.0456, 0.0474, 5.8790, 0.0523, 0.0490)
 TRUE_RADIUS_M = 0.045
+PRINTED = (1, 2, 3, 4, 97, 98, 99, 100)  # numbers of these balls
+# Their centres, m.
+RANSAC_CENTRES_M = (
+    (12.2826, 11.3622, 3.07601), (12.4765, 9.6414, 3.04382), (11.6625, 9.0698, 3.19912), (9.8151, 11.9422, 2.92174),
+    (10.1226, 14.9541, 3.16862), (9.89898, 15.6271, 3.20319), (10.8444, 14.4996, 3.21283), (10.9091, 12.6175, 3.08354),
+)  # fmt: skip
+STATION_CENTRES_M = (
+    (12.2901, 11.3583, 3.0700), (12.4731, 9.6490, 3.0418), (11.6672, 9.0700, 3.2000), (9.8200, 11.9475, 2.9272),
+    (10.1298, 14.9571, 3.1613), (9.8913, 15.6212, 3.2082), (10.8412, 14.4915, 3.2198), (10.9012, 12.6112, 3.0888),
+)  # fmt: skip
 
 
 def data_sets(seed: int) -> list[DataSet]:
-    """Return the data sets of one seed."""
-    return [DataSet(PAPER, BALLS, "balls-100", (), seed)]
+    """Return the data sets of one seed: the balls of tables 2 and 3, and as many balls as in figure 4.
+
+    These are scanned near the nodes alone, at a lower density than the paper's 12.2 million points.
+    """
+    near = ("frame.nodes_x=26", "frame.nodes_y=40", f"scan.spacing_mm={ROOF_SPACING_MM}")
+    return [DataSet(PAPER, BALLS, "balls-100", (), seed), DataSet(PAPER, ROOF, "balls-100", near, seed)]
 
 
 def measure(path: Path, data_set: DataSet) -> Measured:
@@ -52,6 +72,8 @@ def measure(path: Path, data_set: DataSet) -> Measured:
     params = Params()
     cloud = merged(scene, with_scanner=False)
     crops = nearest_crops(cloud.points, design.centres - cloud.origin, design.radii + params.crop_margin_mm)
+    if data_set.name == ROOF:
+        return Measured(data_set, _of_roof(cloud, crops, design, params, data_set.seed))
     found = {method: np.full((len(design.radii), 4), np.nan) for method in METHODS}
     found[STATION] = _by_total_station(design, np.random.default_rng([data_set.seed, 1]))
     trials, used = [], []
@@ -65,6 +87,12 @@ def measure(path: Path, data_set: DataSet) -> Measured:
             found["ransac"][i] = (*(consensus.sphere.centre + design.centres[i]), consensus.sphere.radius)
             trials.append(consensus.trials)
             used.append(float(consensus.inliers.mean()))
+            with (
+                diagnostics.at(f"ball {design.ids[i]}"),
+                diagnostics.placed(rigid.transform(np.eye(3), design.centres[i]), "project"),
+            ):
+                diagnostics.note("consensus", trials=trials[-1], points=len(rows), inliers_share=used[-1])
+                diagnostics.keep("consensus", crop[consensus.inliers])
     found["ray"] = _by_ray(step.run(scene, Params(seed=data_set.seed)), design)
     figures = {"trials, median": float(np.median(trials)), "trials, most": float(max(trials))}
     figures["points used, share"] = float(np.median(used))
@@ -73,8 +101,30 @@ def measure(path: Path, data_set: DataSet) -> Measured:
         errors = spheres[:, 3] - design.radii
         series[method] = np.abs(errors).tolist()
         figures |= _of_errors(method, errors, _lowest(spheres) - (design.centres[:, 2] - design.radii))
+    apart = np.linalg.norm(found["ransac"][:, :3] - found[STATION][:, :3], axis=1)
+    figures["centres apart"] = float(np.nanmedian(apart))
+    figures["centres apart, blunder"] = float(apart[_wrong(len(apart))])
+    for ball in PRINTED:
+        for method in ("ransac", STATION):
+            if ball <= len(design.radii):
+                figures[f"{method}: ball {ball}"] = abs(float(found[method][ball - 1, 3] - design.radii[ball - 1]))
     figures["blunder, m"] = float(found[STATION][_wrong(len(crops)), 3]) / 1000.0
     return Measured(data_set, figures, series)
+
+
+def _of_roof(
+    cloud: MergedCloud, crops: Sequence[Ints], design: FrameDesign, params: Params, seed: int
+) -> dict[str, float]:
+    """Return how many balls of a roof get a lowest point by RANSAC within LOWEST_MM of the true one, and the errors."""
+    errors = np.full(len(crops), np.nan)
+    for i, rows in enumerate(crops):
+        crop = cloud.points[rows] + (cloud.origin - design.centres[i])
+        generator = np.random.default_rng([seed, 2, i])
+        consensus = ransac(crop, generator, params.tau_mm, params.probability, params.max_iterations)
+        if consensus is not None:
+            sphere = consensus.sphere
+            errors[i] = abs(float(sphere.centre[2] - sphere.radius + design.radii[i]))
+    return {"balls": float((errors <= LOWEST_MM).sum()), "lowest point, median": float(np.nanmedian(errors))}
 
 
 def _by_total_station(design: FrameDesign, rng: np.random.Generator) -> Floats:
@@ -115,7 +165,7 @@ def _of_errors(method: str, radius: Floats, lowest: Floats) -> dict[str, float]:
     size = np.abs(radius[np.isfinite(radius)])
     low = np.abs(lowest[np.isfinite(lowest)])
     return {
-        f"{method}: radius, mean": float(np.mean(size[size < 1000.0])),
+        f"{method}: radius, mean": float(np.mean(size[size < BLUNDER_MM])),
         f"{method}: radius, median": float(np.median(size)),
         f"{method}: radius, largest": float(size.max()),
         f"{method}: lowest point, median": float(np.median(low)),
@@ -128,13 +178,13 @@ def rows(found: Found) -> list[Row]:
     """Return the rows of tables 2 and 3 and of figures 2 and 4, then ours."""
     printed = 1000.0 * np.abs(np.array(RANSAC_RADII_M) - TRUE_RADIUS_M)
     surveyed = 1000.0 * np.abs(np.array(STATION_RADII_M) - TRUE_RADIUS_M)
-    usual = surveyed[surveyed < 1000.0]
+    usual = surveyed[surveyed < BLUNDER_MM]
     blunder = max(STATION_RADII_M)
     crops, four = reason("papers.balls-raw-crops"), reason("papers.balls-four-points", sd=STATION_SD_MM)
     table_2, table_3 = text("table {number}", number="2"), text("table {number}", number="3")
     figure_2, figure_4 = text("figure {number}", number="2"), text("figure {number}", number="4")
     mean, largest = text("radius error, mean"), text("radius error, largest")
-    better, lowest = text("radius error smaller than by the other method"), text("lowest point, error, median")
+    better = text("radius error smaller than by the other method")
     over = {name: found.values(BALLS, name) for name in _names(found)}
 
     def compared(figure: str, than: str) -> tuple[float, ...]:
@@ -161,10 +211,37 @@ def rows(found: Found) -> list[Row]:
             reason("papers.balls-order-crops"), "",
         ),
         _row(
-            figure_4, "ransac", text("balls with a lowest point"), 1040.0, (), Rule.NONE,
-            reason("papers.balls-weekend"), "",
+            figure_4, "ransac", text("balls with a lowest point"), ROOF_BALLS, found.values(ROOF, "balls"), Rule.NEAR,
+            reason("papers.balls-roof", error=LOWEST_MM, spacing=ROOF_SPACING_MM), "", ROOF,
+        ),
+        _row(
+            figure_4, "ransac", text("lowest point, error, median"), NAN, found.values(ROOF, "lowest point, median"),
+            Rule.AT_MOST, reason("papers.beside"), "mm", ROOF,
         ),
     ]  # fmt: skip
+    made += _by_ball(table_2, table_3, over)
+    between = 1000.0 * np.linalg.norm(np.array(RANSAC_CENTRES_M) - np.array(STATION_CENTRES_M), axis=1)
+    made += [
+        _row(
+            table_3, f"ransac, {STATION}", text("distance of the centres of both methods, median"),
+            float(np.median(between)), over.get("centres apart"), Rule.NEAR,
+            reason("papers.balls-centres", sd=STATION_SD_MM),
+        ),
+        _row(
+            table_3, f"ransac, {STATION}", text("distance of the centres of the ball with one wrong point"),
+            float(between[np.argmax(STATION_RADII_M)]), over.get("centres apart, blunder"), Rule.AT_MOST,
+            reason("papers.balls-blunder-centre"),
+        ),
+    ]  # fmt: skip
+    return [*made, *_beside(over)]
+
+
+def _beside(over: dict[str, tuple[float, ...]]) -> list[Row]:
+    """Rows of numbers that the paper does not state: other methods, lowest points, trials."""
+    figure_2, figure_4 = text("figure {number}", number="2"), text("figure {number}", number="4")
+    mean, largest = text("radius error, mean"), text("radius error, largest")
+    lowest = text("lowest point, error, median")
+    made: list[Row] = []
     own = reason("papers.beside")
     for method in METHODS:
         made += [
@@ -181,16 +258,29 @@ def rows(found: Found) -> list[Row]:
     return made
 
 
+def _by_ball(table_2: Text, table_3: Text, over: dict[str, tuple[float, ...]]) -> list[Row]:
+    """Rows of the balls that are printed in tables 2 and 3; the ball of the blunder has a row of its own."""
+    made = []
+    for place, method, radii in ((table_2, "ransac", RANSAC_RADII_M), (table_3, STATION, STATION_RADII_M)):
+        why = reason("papers.balls-single", mean=median(over.get(f"{method}: radius, mean", ())))
+        for ball, radius in zip(PRINTED, radii, strict=True):
+            error = 1000.0 * abs(radius - TRUE_RADIUS_M)
+            if error < BLUNDER_MM:
+                quantity, values = text("radius error of ball {ball}", ball=ball), over.get(f"{method}: ball {ball}")
+                made.append(_row(place, method, quantity, error, values, Rule.AT_MOST, why))
+    return made
+
+
 def _names(found: Found) -> set[str]:
     return {name for one in found.of(BALLS) for name in one.figures}
 
 
 def _row(
     place: Text, method: str, quantity: Text, published: float, values: tuple[float, ...] | None, rule: Rule,
-    why: Reason, unit: str = "mm",
+    why: Reason, unit: str = "mm", data: str = BALLS,
 ) -> Row:  # fmt: skip
     return Row(
-        paper=PAPER, place=place, data=BALLS, method=method, quantity=quantity, unit=unit, published=float(published),
+        paper=PAPER, place=place, data=data, method=method, quantity=quantity, unit=unit, published=float(published),
         values=values or (), rule=rule, reason=why,
     )  # fmt: skip
 

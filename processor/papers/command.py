@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -26,7 +27,8 @@ from processor.report import write_results
 from processor.store.replaced_folder import replacing_folder, write_text
 
 FORMAT, FORMAT_VERSION = "processor-papers", "1.0"
-JSON, PAGE = "papers.json", "papers.html"
+MATRICES = ("T1", "T2")  # of paper 002
+JSON, PAGE, STEPS = "papers.json", "papers.html", "steps"
 
 
 @dataclass(frozen=True)
@@ -39,19 +41,30 @@ class Comparison:
     failed: int  # data sets
 
 
-def run(out: Path, only: Sequence[str], seeds: int, jobs: int, lang: str = "en") -> Comparison:
+def run(
+    out: Path, only: Sequence[str], seeds: int, jobs: int, lang: str = "en", keep_steps: bool = False
+) -> Comparison:
     """Measure the papers named, or all, and write papers.json and papers.html into the folder ``out``.
 
+    With ``keep_steps`` its folder ``steps`` has what the stages of the papers' methods found in each data set.
     Raises UsageError for an unknown paper or a folder that holds anything but earlier results.
     """
     if unknown := [number for number in only if number not in PAPERS]:
         raise UsageError(f"--only: no paper {unknown[0]!r}; there are {', '.join(PAPERS)}")
-    write_results.check_output(out, None, JSON, (JSON, PAGE))
+    write_results.check_output(out, None, JSON, (JSON, PAGE, STEPS))
     papers = [number for number in PAPERS if not only or number in only]
     wanted = [one for number in papers for seed in range(seeds) for one in data_sets.module_of(number).data_sets(seed)]
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".papers-", dir=out.absolute().parent) as scratch:
-        measured = _measured(wanted, jobs, scratch)
+        steps = Path(scratch, STEPS)
+        measured = _measured(wanted, jobs, scratch, str(steps) if keep_steps else "")
+        return _written(out, papers, measured, seeds, lang, steps)
+
+
+def _written(
+    out: Path, papers: Sequence[str], measured: Sequence[Measured], seeds: int, lang: str, steps: Path
+) -> Comparison:
+    """Make the rows and charts of papers of what was measured, and write them; ``steps`` is moved there if it is."""
     by_paper = {}
     for number in papers:
         module = data_sets.module_of(number)
@@ -71,12 +84,14 @@ def run(out: Path, only: Sequence[str], seeds: int, jobs: int, lang: str = "en")
     with replacing_folder(out) as making:
         write_text(making / JSON, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
         write_text(making / PAGE, page.html(by_paper, line, lang))
+        if steps.exists():
+            shutil.move(steps, making / STEPS)
     return Comparison(line, rows, content, sum(bool(one.failed) for one in measured))
 
 
-def _measured(wanted: Sequence[DataSet], jobs: int, scratch: str) -> list[Measured]:
+def _measured(wanted: Sequence[DataSet], jobs: int, scratch: str, steps: str) -> list[Measured]:
     """Measure data sets, ``jobs`` at a time, with a progress bar if standard error is a terminal."""
-    do: Callable[..., Measured] = partial(data_sets.make_and_measure, scratch=scratch)
+    do: Callable[..., Measured] = partial(data_sets.make_and_measure, scratch=scratch, steps=steps)
     found = []
     with (
         runner.executor(None, jobs, lambda line: print(line, file=sys.stderr)) as executor,
@@ -102,4 +117,5 @@ def _of_data_set(one: Measured) -> dict[str, Any]:
         "seed": one.data_set.seed,
         "seconds": round(one.seconds, 1),
         "failed": one.failed,
+        "matrices": {name: one.series[name] for name in MATRICES if name in one.series},
     }

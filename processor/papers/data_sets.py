@@ -10,9 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from processor.jobs import process
+from processor import diagnostics
+from processor.jobs import making, process
 from processor.jobs.child import Lost
 from processor.jobs.process import Cause
+from processor.writers import step_clouds
 
 PAPERS = {
     "000": "preassembly",
@@ -34,6 +36,12 @@ class DataSet:
     recipe: str
     settings: tuple[str, ...]
     seed: int
+
+    @property
+    def folder(self) -> str:
+        """Name of a folder of its own."""
+        plain = "".join(c if c.isalnum() else "-" for c in self.name)
+        return f"{self.paper}-{plain}-seed{self.seed}"
 
 
 @dataclass(frozen=True)
@@ -71,26 +79,38 @@ def module_of(paper: str) -> Any:
     return importlib.import_module(f"processor.papers.{PAPERS[paper]}")
 
 
-def measured(job: tuple[DataSet, str]) -> Measured:
-    """Measure a data set whose scene is the file named. Runs in a child process."""
-    data_set, scene = job
-    found: Measured = module_of(data_set.paper).measure(Path(scene), data_set)
+def measured(job: tuple[DataSet, str, str]) -> Measured:
+    """Measure a data set whose scene is the file named; runs in a child process.
+
+    What the stages of the methods find is written into the third, a new folder, where it is named.
+    """
+    data_set, scene, steps = job
+    with diagnostics.with_clouds(bool(steps)), diagnostics.taken() as notes:
+        found: Measured = module_of(data_set.paper).measure(Path(scene), data_set)
+    if steps:
+        run = step_clouds.OfRun(PAPERS[data_set.paper], f"paper {data_set.paper}", notes.clouds, notes.table())
+        step_clouds.write(Path(steps), [run])
     return found
 
 
-def make_and_measure(data_set: DataSet, stopped: Callable[[], bool] = process.never, *, scratch: str) -> Measured:
-    """Make the scene of a data set and measure it, in child processes; the scene is deleted afterwards."""
+def make_and_measure(
+    data_set: DataSet, stopped: Callable[[], bool] = process.never, *, scratch: str, steps: str = ""
+) -> Measured:
+    """Make the scene of a data set and measure it, in child processes; the scene is deleted afterwards.
+
+    What the stages of the methods find is kept in a folder of its own in the folder ``steps``, where that is named.
+    """
     started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="set-", dir=scratch, ignore_cleanup_errors=True) as made:
         scene = Path(made) / "scene.h5"
-        words = ["designgen", "make", data_set.recipe, "-o", str(scene), "--seed", str(data_set.seed)]
-        words += [word for setting in data_set.settings for word in ("--set", setting)]
+        words = making.words(data_set.recipe, scene, data_set.seed, data_set.settings)
         ended = process.run(
             (*process.GUARDED, "0", *words), env=process.environment(1), timeout_s=TIMEOUT_S, stopped=stopped
         )
         if ended.cause is not Cause.EXIT or ended.code != 0:
             return Measured(data_set, failed=f"designgen make: {ended.last_line[:TAIL] or ended.cause.value}")
-        found = process.in_process(measured, (data_set, str(scene)), stopped)
+        kept = str(Path(steps, data_set.folder)) if steps else ""
+        found = process.in_process(measured, (data_set, str(scene), kept), stopped)
     if isinstance(found, Lost):
         return Measured(data_set, failed=found.error[:TAIL] or found.loss.value)
     return Measured(data_set, found.figures, found.series, found.failed, time.monotonic() - started)

@@ -6,22 +6,24 @@ from pathlib import Path
 
 import numpy as np
 
+from processor import diagnostics
 from processor.defects import step
 from processor.defects.params import Params
 from processor.defects.result import Result
 from processor.evaluation import evaluate
 from processor.language.messages import Text, text
 from processor.model import Reason, Scene, StepRun, reason
-from processor.papers.charts import Chart
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Row, Rule
 from processor.pipeline import Execution
+from processor.report.charts.line_chart import Chart
 from processor.store import store
 
 PAPER = "004"
 PLATES = "12 plates"
 METHODS = ("paper", "default")
 NAN = float("nan")
+STAGES = ("density clusters", "descriptors", "sample consensus", "iterative closest point", "defect points")
 
 
 def data_sets(seed: int) -> list[DataSet]:
@@ -35,13 +37,19 @@ def measure(path: Path, data_set: DataSet) -> Measured:
     figures: dict[str, float] = {}
     series: dict[str, list[float]] = {}
     for method in METHODS:
-        result = step.run(scene, Params(method=method, seed=data_set.seed), {})
+        with diagnostics.taken() as notes:
+            result = step.run(scene, Params(method=method, seed=data_set.seed), {})
+        diagnostics.say_again(notes)
+        figures |= _of_stages(notes)
         figures |= _figures(method, result, path, scene)
         curves = [curve for curve in result.defects.deflection if len(curve.along)]
         if curves:
             longest = max(curves, key=lambda curve: float(np.ptp(curve.along)))
             series[f"{method}: along"] = (longest.along - longest.along.min()).tolist()
             series[f"{method}: deflection"] = longest.displacement.tolist()
+            deepest = np.abs(result.defects.depth_max[[len(one.along) > 0 for one in result.defects.deflection]])
+            reached = np.array([float(np.ptp(one.displacement)) for one in curves])
+            figures[f"{method}: deflection by depth"] = float(np.median(reached / np.maximum(deepest, 1e-9)))
     return Measured(data_set, figures, series)
 
 
@@ -61,6 +69,11 @@ def _figures(method: str, result: Result, path: Path, scene: Scene) -> dict[str,
     }
 
 
+def _of_stages(notes: diagnostics.Notes) -> dict[str, float]:
+    """Return what the stages of the paper's method say; of several rounds of registration the last."""
+    return {f"{stage}: {quantity}": value for stage, _, quantity, value in notes.rows if stage in STAGES}
+
+
 def _stated(result: Result, code: str, value: str) -> float:
     """Return a value that a remark of the result states; NaN without the remark."""
     return next((float(one.values[value]) for one in result.reasons if one.code == code), NAN)
@@ -78,6 +91,17 @@ def rows(found: Found) -> list[Row]:
     ):
         made.append(_row(place, "paper", quantity, found.values(PLATES, f"paper: {figure}"), none, unit))
     section = text("section {number}", number="1.3")
+    for place, quantity, figure, unit in (
+        (text("figure {number}", number="2"), text("places of the scan with a descriptor"), "descriptors: source", ""),
+        (text("figure {number}", number="2"), text("radius of a descriptor"), "descriptors: radius_mm", "mm"),
+        (section, text("poses compared by Huber's function"), "sample consensus: fitted", ""),
+        (section, text("sum of Huber's function, equation 5"), "sample consensus: huber_mm2", "mm2"),
+        (section, text("rounds of registration, last gate"), "iterative closest point: rounds", ""),
+        (section, text("points beyond the threshold"), "defect points: beyond", ""),
+        (text("section {number}", number="1.4"), text("range of a deflection curve by depth of the defect, median"),
+         "paper: deflection by depth", ""),
+    ):  # fmt: skip
+        made.append(_row(place, "paper", quantity, found.values(PLATES, figure), none, unit))
     for method in METHODS:
         for quantity, figure, unit in (
             (text("defects not found"), "missed", ""),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,13 +17,13 @@ from processor.adjustment.groups import group_means
 from processor.deviation import baseline, cloud, step
 from processor.deviation.params import Params
 from processor.deviation.result import Result
-from processor.geometry import mesh_distance, rigid
+from processor.geometry import icp, mesh_distance, principal, rigid
 from processor.geometry.neighbors import thinned
 from processor.language.messages import Text, text
 from processor.model import Floats, Reason, reason
-from processor.papers.charts import Chart
 from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule
+from processor.papers.rows import Row, Rule, median
+from processor.report.charts.line_chart import Chart
 from processor.store import store
 
 PAPER = "002"
@@ -35,6 +36,9 @@ CHANGE_MM = {"sag_mm": 8.0, "lean_mm": 4.0, "ripple_mm": 3.0}  # such that few d
 NAN = float("nan")
 RANGE_MM, WITHIN_10_SHARE, UNCHANGED_SHARE, LOD95_MM = (-18.986, 20.714), 98.0, 45.79, 3.6
 RATE, ERROR_MM, POINTS_A_CYLINDER, TURN_DEG = 20.0, 10.0, 20.0, 180.0
+SPACING_MM, BEYOND_SHARE, CASES = 32.0, 2.0, 8.0
+RANGE_WITH_LOD_MM = (-22.586, 24.314)
+ROUGHNESS_TIMES = 20.0  # the least normal scale, in roughnesses
 
 
 def data_sets(seed: int) -> list[DataSet]:
@@ -54,21 +58,24 @@ def measure(path: Path, data_set: DataSet) -> Measured:
     params = Params(method="paper", register="fine", seed=data_set.seed)
     vertices, origin = scene_cloud.local_design(scene.structure)
     scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio)
-    group = cloud.adaptive_voxels(scan.points, params.paper.voxel_mm, params.paper.voxel_points)
+    group = baseline.voxels(scan.points, params.paper)
     source = thinned(group_means(scan.points, group) + (scan.origin - origin), baseline.MOST_ICP_POINTS)
     design = mesh_distance.sampled(vertices, scene.structure.faces, scan.spacing_mm).points
-    reduced = group_means(design, cloud.adaptive_voxels(design, params.paper.voxel_mm, params.paper.voxel_points))
+    reduced = group_means(design, baseline.voxels(design, params.paper))
     target = thinned(reduced, baseline.MOST_ICP_POINTS)
     rng = np.random.default_rng([data_set.seed, 3])
-    turns = [_turns(source, target, _attitude(rng)) for _ in range(ATTITUDES)] if data_set.name == ROOF else []
+    attitudes = [_attitude(rng) for _ in range(ATTITUDES)] if data_set.name == ROOF else []
+    turns = [_turns(source, target, attitude) for attitude in attitudes]
     classic, mirrored, decided = (np.array([turn[k] for turn in turns]) for k in range(3))
     figures = {
         "spacing": scan.spacing_mm,
         "outliers, %": 100.0 * (1.0 - scan.kept / scan.read),
         "sampling rate, %": 100.0 * float(group.max() + 1) / len(scan.points),
     }
+    series: dict[str, list[Any]] = {}
     if turns:
-        figures |= {
+        of_matrices, series = _matrices(source, target, attitudes[0])
+        figures |= of_matrices | {
             "classic, wrong": float(((classic > WRONG_DEG) | (mirrored > 0.0)).sum()),
             "classic, mirror images": float(mirrored.sum()),
             "classic, largest turn": float(classic[mirrored == 0.0].max(initial=0.0)),
@@ -77,7 +84,9 @@ def measure(path: Path, data_set: DataSet) -> Measured:
     paper = step.run(scene, params)
     ours = step.run(scene, replace(params, method="default", register="none"))
     figures |= _figures("paper", paper) | _figures("default", ours)
-    return Measured(data_set, figures, {"deviations": _histogram(paper), **_map(ours)})
+    figures["normal scale by roughness"] = paper.normal_diameter / max(paper.sigma, 1e-9)
+    series |= {"deviations": _histogram(paper)} | _map("paper", paper) | _map("default", ours)
+    return Measured(data_set, figures, series)
 
 
 def _attitude(rng: np.random.Generator) -> Floats:
@@ -96,6 +105,20 @@ def _turns(source: Floats, target: Floats, attitude: Floats) -> tuple[float, flo
     mirrored = float(np.linalg.det(R) < 0.0)
     pose = baseline.coarse(turned, target).T_target_source
     return _angle(R @ attitude[:3, :3]), mirrored, _angle(pose[:3, :3] @ attitude[:3, :3])
+
+
+def _matrices(source: Floats, target: Floats, attitude: Floats) -> tuple[dict[str, float], dict[str, list[Any]]]:
+    """Return T1 of the principal axes and T2 of iterative closest point from an attitude, and what each leaves."""
+    turned = rigid.apply(attitude, source)
+    cases = principal.possible_turns(principal.of_points(target).variances, principal.of_points(turned).variances)
+    T1 = baseline.coarse(turned, target).T_target_source
+    T2 = icp.point_to_point(rigid.apply(T1, turned), target, np.eye(4)).T_target_source
+    middle = source.mean(axis=0)
+    left = {}
+    for name, T in (("T1", T1 @ attitude), ("T2", T2 @ T1 @ attitude)):
+        left[f"{name}: turn, mrad"] = 1000.0 * float(np.radians(_angle(T[:3, :3])))
+        left[f"{name}: shift, mm"] = float(np.linalg.norm(rigid.apply(T, middle[None])[0] - middle))
+    return left | {"cases": float(len(cases))}, {"T1": T1.tolist(), "T2": T2.tolist()}
 
 
 def _axes(points: Floats) -> Floats:
@@ -121,7 +144,10 @@ def _figures(method: str, result: Result) -> dict[str, float]:
     return found | {
         f"{method}: least": float(distance.min()),
         f"{method}: greatest": float(distance.max()),
+        f"{method}: least with lod95": float(distance.min() - np.median(lod95)),
+        f"{method}: greatest with lod95": float(distance.max() + np.median(lod95)),
         f"{method}: within 10 mm, %": 100.0 * float(np.mean(np.abs(distance) <= 10.0)),
+        f"{method}: beyond 10 mm, %": 100.0 * float(np.mean(np.abs(distance) > 10.0)),
         f"{method}: unchanged, %": 100.0 * float(np.mean(np.abs(distance) <= lod95)),
         f"{method}: lod95": float(np.median(lod95)),
     }
@@ -135,7 +161,7 @@ def _histogram(result: Result) -> list[float]:
     return shares
 
 
-def _map(result: Result) -> dict[str, list[float]]:
+def _map(method: str, result: Result) -> dict[str, list[float]]:
     """Plan, m, of core points beyond their level of detection and within it, as in figure 8."""
     core = result.core
     known = np.flatnonzero(np.isfinite(core.lod95))
@@ -143,7 +169,7 @@ def _map(result: Result) -> dict[str, list[float]]:
     beyond = np.abs(core.distance[shown]) > core.lod95[shown]
     plan = core.points[shown, :2] / 1000.0
     return {
-        f"{name} {axis}": plan[rows, k].tolist()
+        f"{method}: {name} {axis}": plan[rows, k].tolist()
         for name, rows in (("changed", beyond), ("unchanged", ~beyond))
         for k, axis in enumerate("xy")
     }
@@ -168,9 +194,23 @@ def rows(found: Found) -> list[Row]:
             reason("papers.roof-decision", attitudes=ATTITUDES), "",
         ),
         _row(
-            section, ROOF, "paper", text("matrices T1 and T2"), NAN, (), Rule.NONE, reason("papers.roof-matrices"), "",
+            section, ROOF, "paper", text("poses that are compared"), CASES, found.values(ROOF, "cases"), Rule.NEAR,
+            reason("papers.roof-cases"), "",
+        ),
+        _row(
+            section, ROOF, "", text("spacing of the scan"), SPACING_MM, found.values(ROOF, "spacing"), Rule.NEAR,
+            reason("papers.roof-spacing"), "mm",
         ),
     ]  # fmt: skip
+    matrices = reason("papers.roof-matrices")
+    for name in ("T1", "T2"):
+        for quantity, figure, unit in (
+            (text("turn that {matrix} leaves", matrix=name), f"{name}: turn, mrad", "mrad"),
+            (text("shift that {matrix} leaves", matrix=name), f"{name}: shift, mm", "mm"),
+        ):
+            made.append(
+                _row(section, ROOF, "paper", quantity, NAN, found.values(ROOF, figure), Rule.AT_MOST, matrices, unit)
+            )
     for data in (ROOF, DENSE):
         made += _of_density(found, data, section, figure_7, figure_8)
     return made
@@ -181,6 +221,7 @@ def _of_density(found: Found, data: str, section: Text, figure_7: Text, figure_8
     # 20 points in a cylinder of 55.27 mm need a density of 8300 points a square metre
     few, built = reason("papers.roof-few-points"), reason("papers.roof-built", **CHANGE_MM)
     depth = reason("papers.roof-depth", depth=Params().paper.max_depth_mm)
+    low, high = RANGE_WITH_LOD_MM
     listed: list[tuple[Text, Text, float, str, Rule, Reason, str]] = [
         (section, text("sampling rate of the voxels"), RATE, "sampling rate, %", Rule.NEAR,
          reason("papers.roof-rate"), "%"),
@@ -189,12 +230,23 @@ def _of_density(found: Found, data: str, section: Text, figure_7: Text, figure_8
         (section, text("points in a cylinder"), POINTS_A_CYLINDER, "paper: points a cylinder", Rule.NEAR, few, ""),
         (figure_7, text("least deviation"), RANGE_MM[0], "paper: least", Rule.NEAR, depth, "mm"),
         (figure_7, text("greatest deviation"), RANGE_MM[1], "paper: greatest", Rule.NEAR, depth, "mm"),
+        (figure_7, text("least deviation less LOD95"), low, "paper: least with lod95", Rule.NEAR, depth, "mm"),
+        (figure_7, text("greatest deviation with LOD95"), high, "paper: greatest with lod95", Rule.NEAR, depth, "mm"),
+        (figure_7, text("deviations beyond 10 mm"), BEYOND_SHARE, "paper: beyond 10 mm, %", Rule.NEAR, built, "%"),
         (figure_7, text("deviations within 10 mm"), WITHIN_10_SHARE, "paper: within 10 mm, %", Rule.NEAR, built, "%"),
         (figure_8, text("share without change"), UNCHANGED_SHARE, "paper: unchanged, %", Rule.NEAR, built, "%"),
         (figure_8, text("LOD95, median"), LOD95_MM, "paper: lod95", Rule.AT_MOST, few, "mm"),
         (figure_7, text("core points with a level of detection"), NAN, "paper: measured, %", Rule.NEAR, few, "%"),
     ]  # fmt: skip
+    wide = found.values(data, "normal scale by roughness")
+    holds = tuple(float(value >= ROUGHNESS_TIMES) if np.isfinite(value) else NAN for value in wide)
     made = [
+        _row(
+            section, data, "paper", text("normal scale of 20 roughnesses or more"), 1.0, holds, Rule.HOLDS,
+            reason("papers.roof-roughness", times=median(wide)), "",
+        )
+    ]  # fmt: skip
+    made += [
         _row(place, data, "paper", quantity, number, found.values(data, figure), rule, why, unit)
         for place, quantity, number, figure, rule, why, unit in listed
     ]
@@ -219,7 +271,10 @@ def _row(
 
 
 def charts(found: Found) -> list[Chart]:
-    """Return figures 7 and 8 in kind, of the first seed: the distribution of the deviations, and the map by ours."""
+    """Return figures 7 and 8 in kind, of the first seed: the distribution of the deviations, and maps of two colours.
+
+    The paper's method has few levels of detection at the paper's density: its map is of the denser roof.
+    """
     made = []
     lines = tuple((data, found.series(data, "deviations")) for data in (ROOF, DENSE))
     lines = tuple(line for line in lines if line[1])
@@ -227,11 +282,13 @@ def charts(found: Found) -> list[Chart]:
     places = tuple(np.linspace(-24.5, 24.5, 50).tolist())
     if lines:
         made.append(Chart(title=title, x=text("deviation, mm"), y=text("share, %"), lines=lines, places=places))
-    parts = [
-        (name, found.series(ROOF, f"{name} x"), found.series(ROOF, f"{name} y")) for name in ("unchanged", "changed")
-    ]
-    if any(x for _, x, _ in parts):
-        title = text("figure {number} of paper {paper}", number="8", paper=PAPER)
-        points, plan = tuple((name, y) for name, _, y in parts), tuple(x for _, x, _ in parts)
-        made.append(Chart(title=title, x=text("x, m"), y=text("y, m"), lines=points, plan=plan))
+    for method, data in (("paper", DENSE), ("default", ROOF)):
+        parts = [
+            (name, found.series(data, f"{method}: {name} x"), found.series(data, f"{method}: {name} y"))
+            for name in ("unchanged", "changed")
+        ]
+        if any(x for _, x, _ in parts):
+            title = text("figure {number} of paper {paper}, {data}", number="8", paper=PAPER, data=f"{data} ({method})")
+            points, plan = tuple((name, y) for name, _, y in parts), tuple(x for _, x, _ in parts)
+            made.append(Chart(title=title, x=text("x, m"), y=text("y, m"), lines=points, plan=plan))
     return made

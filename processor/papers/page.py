@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from processor.language.messages import NO_NUMBER, Text, text
-from processor.papers import charts as drawing
-from processor.papers.charts import Chart
 from processor.papers.data_sets import Measured
 from processor.papers.rows import DECADE, TOLERANCE, Outcome, Row
 from processor.report import templates
+from processor.report.charts import line_chart as drawing
+from processor.report.charts.line_chart import Chart
 
 RULE = text(
     "An error is reproduced where the median over the seeds is at most the published one, a quantity where it is near "

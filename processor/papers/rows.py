@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,6 +113,12 @@ class Row:
             "reproduced": None if self.outcome is None else str(self.outcome),
             "reason": {"code": self.reason.code, "values": dict(self.reason.values), "text": english.text(self.reason)},
         }
+
+
+def median(values: Iterable[float]) -> float:
+    """Return the median of what is known among values, for a reason; 0 of nothing, as then its row is not made."""
+    known = [value for value in values if math.isfinite(value)]
+    return float(np.median(known)) if known else 0.0
 
 
 def _finite(value: float) -> float | None:

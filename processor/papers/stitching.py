@@ -1,4 +1,8 @@
-"""Paper 003: nine scans from six stations chained by three picked points per pair, with six and seven parameters."""
+"""Paper 003: nine scans from six stations chained by three picked points per pair, with six and seven parameters.
+
+The scanner sees a window of 40 deg, as the paper's, and the points are corners of the structure. Each pair that has
+three in common is used, not the consecutive ones alone.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from processor import diagnostics, scene_cloud
 from processor.evaluation import evaluate
 from processor.language.messages import Text, text
-from processor.model import Reason, Scene, StepRun, reason
-from processor.papers.charts import Chart
+from processor.model import Floats, Reason, Scene, StepRun, reason
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Row, Rule
 from processor.pipeline import Execution
+from processor.report.charts.line_chart import Chart
 from processor.stitching import step
 from processor.stitching.params import Params
 from processor.stitching.result import Result
@@ -24,11 +29,13 @@ BRIDGE = "truss bridge"
 SCANS, STATIONS, POINTS = 9.0, 6.0, 3.0
 SIX, SEVEN, OURS = "three-point, six", "three-point, seven", "automatic"
 NAN = float("nan")
+APART_MM = 1000.0  # scanners nearer than this are on one station
+MOST_SHOWN = 8000  # points on the chart of the merged cloud
 
 
 def data_sets(seed: int) -> list[DataSet]:
     """Return the data set of one seed."""
-    return [DataSet(PAPER, BRIDGE, "truss-bridge-picks", (), seed)]
+    return [DataSet(PAPER, BRIDGE, "truss-bridge-chain", (), seed)]
 
 
 def measure(path: Path, data_set: DataSet) -> Measured:
@@ -39,10 +46,26 @@ def measure(path: Path, data_set: DataSet) -> Measured:
     if scene.picks is not None:
         pairs = set(zip(scene.picks.scan_a, scene.picks.scan_b, strict=True))
         figures["points per pair"] = len(scene.picks.scan_a) / len(pairs)
-    figures |= _figures(SIX, step.run(scene, params), path, scene)
-    figures |= _figures(SEVEN, step.run(scene, replace(params, scale="free")), path, scene)
+    for method, used in ((SIX, params), (SEVEN, replace(params, scale="free"))):
+        with diagnostics.at(method):
+            result = step.run(scene, used)
+            figures |= _figures(method, result, path, scene)
+        if method == SIX:
+            figures["stations"] = float(_stations(result))
+            cloud = scene_cloud.merged(scene_cloud.stitched(scene, result), with_scanner=False)
+            figures["merged points"] = float(len(cloud.points))
+            shown = cloud.points[:: max(1, len(cloud.points) // MOST_SHOWN)] / 1000.0
     figures |= _figures(OURS, step.run(replace(scene, picks=None), Params(seed=data_set.seed)), path, scene)
-    return Measured(data_set, figures)
+    return Measured(data_set, figures, {"x": shown[:, 0].tolist(), "y": shown[:, 1].tolist()})
+
+
+def _stations(result: Result) -> int:
+    """Return the number of places that the placed scans were made from."""
+    found: list[Floats] = []
+    for at in result.scans.position[result.scans.placed]:
+        if all(np.linalg.norm(at - other) > APART_MM for other in found):
+            found.append(at)
+    return len(found)
 
 
 def _figures(method: str, result: Result, path: Path, scene: Scene) -> dict[str, float]:
@@ -79,8 +102,11 @@ def rows(found: Found) -> list[Row]:
         ):
             values = found.values(BRIDGE, f"{method}: {figure}")
             made.append(_row(section, method, quantity, NAN, values, Rule.AT_MOST, none, unit))
-    view = reason("papers.stitch-field-of-view")
-    made.append(_row(text("figure {number}", number="3"), "", text("stations"), STATIONS, (), Rule.NONE, view))
+    view, figure_8 = reason("papers.stitch-field-of-view"), text("figure {number}", number="8")
+    stations = found.values(BRIDGE, "stations")
+    made.append(_row(text("figure {number}", number="3"), SIX, text("stations"), STATIONS, stations, Rule.NEAR, view))
+    merged = found.values(BRIDGE, "merged points")
+    made.append(_row(figure_8, SIX, text("points of the merged cloud"), NAN, merged, Rule.NEAR, none))
     return made
 
 
@@ -95,5 +121,9 @@ def _row(
 
 
 def charts(found: Found) -> list[Chart]:
-    """Return no charts: the paper's figures are pictures of clouds."""
-    return []
+    """Return figure 8 in kind: the merged cloud in plan, in the frame of the first scan, of the first seed."""
+    x, y = found.series(BRIDGE, "x"), found.series(BRIDGE, "y")
+    if not x:
+        return []
+    title = text("figure {number} of paper {paper}", number="8", paper=PAPER)
+    return [Chart(title=title, x=text("x, m"), y=text("y, m"), lines=((SIX, y),), plan=(x,))]

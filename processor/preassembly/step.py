@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from processor import diagnostics
 from processor.adjustment import thermal
 from processor.model import ArchDesign, InputError, Scan, Scene, UsageError, reason
 from processor.preassembly import assemble
@@ -58,10 +59,13 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
         raise InputError(f"{scene.name}: method {params.method} takes one scan per part, {several[0]} has several")
     kept = {} if kept is None else kept
     if "parts" not in kept:
-        kept["parts"] = methods.extract([of_part[0] for of_part in scans], design, params)
+        with diagnostics.taken() as kept["notes"]:
+            kept["parts"] = methods.extract([of_part[0] for of_part in scans], design, params)
         kept["scanned again"] = bootstrap_bands.repeat_scans(kept["parts"], design, params)
+    diagnostics.say_again(kept["notes"])
     result = methods.assemble(kept["parts"], design, params)
-    result = bootstrap_bands.with_bands(result, kept["scanned again"], design, params)
+    with diagnostics.silent():
+        result = bootstrap_bands.with_bands(result, kept["scanned again"], design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != thermal.REFERENCE_C:
         remark = reason("preassemble.temperature-not-corrected", temperature=scene.temperature_C)
         result = replace(result, reasons=(*result.reasons, remark))

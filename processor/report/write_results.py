@@ -13,14 +13,15 @@ from processor.report import all_figures, all_tables, headline, page, pdf, workb
 from processor.report import table as report_table
 from processor.report.step_report import step_report
 from processor.report.style import default_settings
-from processor.results.file_names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
+from processor.results.file_names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON, STEPS
 from processor.results.to_json import results_json
 from processor.store import store
 from processor.store.output_checks import check_folder
 from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
+from processor.writers import step_clouds
 
 # The record of a batch's job is replaced with its results: without it, the batch does the job again.
-OWN_NAMES = (RESULTS_JSON, RESULTS_H5, REPORT_PAGE, FIGURES, JOB_RECORD)
+OWN_NAMES = (RESULTS_JSON, RESULTS_H5, REPORT_PAGE, FIGURES, JOB_RECORD, STEPS)
 OWN_ENDINGS = (".csv", ".dxf", ".pdf", ".xlsx")
 FURTHER = ("pdf", "xlsx")  # forms of the report that are written on request
 
@@ -68,8 +69,22 @@ def write_results(
             for name, (_, png) in of_step.items():
                 write_bytes(making / FIGURES / name, png)
         write_text(making / REPORT_PAGE, page.html(execution, report, drawn, lang))
+        if execution.clouds:
+            step_clouds.write(making / STEPS, _of_stages(execution))
         if "pdf" in further:
             with default_settings():
                 write_bytes(making / pdf.NAME, pdf.document(execution, drawn))
         if "xlsx" in further:
             write_bytes(making / workbook.NAME, workbook.workbook(execution, report))
+
+
+def _of_stages(execution: Execution) -> list[step_clouds.OfRun]:
+    return [
+        step_clouds.OfRun(
+            run.step,
+            run.method,
+            [one.cloud for one in execution.clouds if (one.step, one.method) == (run.step, run.method)],
+            run.diagnostics,
+        )
+        for run in execution.runs
+    ]

@@ -8,14 +8,16 @@ points that span a plane fix the frame of either method's result and correct its
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from processor import diagnostics
 from processor.adjustment.scanner_class import VIEW_MM
 from processor.model import Floats, InputError, Reason, Scan, Scene, UsageError, reason
 from processor.stitching import automatic, three_point, to_result, verdicts
+from processor.stitching.fine.pair_checks import Pair
 from processor.stitching.params import METHODS, Params
 from processor.stitching.result import Result
 from processor.stitching.three_point import PairFit, Picked
@@ -116,6 +118,7 @@ def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Par
             shortages[a, b] = error.shortage
     pooled = three_point.pooled(list(fits.values())) if fits else []
     pairs = [three_point.as_pair(a, b, fit) for (a, b), fit in zip(fits, pooled, strict=True)]
+    _say_pairs(names, fits, pooled, pairs, picked)
     pair_reasons = [_of_pair(fit, params) for fit in pooled]
     unused = [
         reason("stitch.pair-not-used", a=names[a], b=names[b], shortage=shortage)
@@ -147,6 +150,28 @@ def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Par
         point_mm=float(np.median([fit.sd_mm for fit in pooled])) if pooled else float("nan"),
         reasons=(*unused, *misclosed, *of_pairs),
     )
+
+
+def _say_pairs(
+    names: Sequence[str],
+    keys: Iterable[tuple[int, int]],
+    fits: Sequence[PairFit],
+    pairs: Sequence[Pair],
+    picked: Picked,
+) -> None:
+    """Say what the picks of each pair gave, for diagnostics."""
+    for (a, b), fit, pair in zip(keys, fits, pairs, strict=True):
+        with diagnostics.at(f"{names[a]}, {names[b]}"):
+            diagnostics.note(
+                "three points",
+                points=len(fit.residuals),
+                rms_mm=pair.residual,
+                pick_sd_mm=fit.sd_mm,
+                scale_ppm=1e6 * (fit.scale - 1.0),
+            )
+            for name, points in zip((names[a], names[b]), picked[a, b], strict=True):
+                with diagnostics.placed(np.eye(4), f"scan {name}"):
+                    diagnostics.keep(f"picks in {name}", points)
 
 
 def _of_pair(fit: PairFit, params: Params) -> tuple[Reason, ...]:

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from processor.jobs import process, runner
+from processor.jobs import making, process, runner
 from processor.jobs.child import Lost
 from processor.jobs.exit_codes import WITH_RESULTS
 from processor.jobs.process import Cause, Ended
@@ -90,9 +90,7 @@ def _scene(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) ->
         recipe = folder / f"{recipe}.{'py' if foreign else 'toml'}"
         recipe.write_text(spec["recipe_text"], "utf-8")
     scene = folder / ("scene" if foreign else "scene.h5")
-    words = (str(recipe), str(scene)) if foreign else ("designgen", "make", str(recipe), "-o", str(scene))
-    settings = [word for setting in spec["settings"] for word in ("--set", setting)]
-    made = command(*words, "--seed", str(spec["seed"]), *settings)
+    made = command(*making.words(recipe, scene, spec["seed"], spec["settings"], foreign))
     if made.cause is not Cause.EXIT or made.code != 0:
         raise _FailedError(_reason(spec["recipe"] if foreign else "designgen make", made))
     return scene

@@ -268,6 +268,15 @@ class History:
             )
         ]
 
+    def settings(self, first: str, last: str) -> dict[str, tuple[str, tuple[str, ...]]]:
+        """Return the recipe and the settings ``key=value`` of each case of the nights from ``first`` to ``last``."""
+        return {
+            case: (recipe, tuple(json.loads(settings)))
+            for case, recipe, settings in self.db.execute(
+                "SELECT DISTINCT case_, recipe, settings FROM cells WHERE night BETWEEN ? AND ?", [first, last]
+            )
+        }
+
     def missed(self, night: str) -> dict[str, list[CheckValue]]:
         """Return the figures of a night that are beyond their limits, by cell."""
         beyond: dict[str, list[CheckValue]] = {}

@@ -1,8 +1,8 @@
 """One night: the cells of a matrix are run, written to the history, compared with earlier nights, and reported.
 
-OUT holds ``cells/NIGHT/KEY/results.json`` of every cell (of the last nights), ``history.sqlite``, ``nights.html``, and
-for every night ``nights/NIGHT/`` with summary.json, junit.xml, certificate.json, certificate.html and line.txt. Those
-of the last night are in OUT as well.
+OUT holds ``cells/NIGHT/KEY/results.json`` of every cell (of the last nights), ``history.sqlite``, ``nights.html``,
+``curves.html`` and ``curves.json``, and for every night ``nights/NIGHT/`` with summary.json, junit.xml,
+certificate.json, certificate.html and line.txt. Those of the last night are in OUT as well.
 
 A cell is first moved whole into its folder, then written to the history in one transaction. If the program ends in
 between, the next run takes it from its folder.
@@ -23,7 +23,7 @@ from processor.jobs.runner import locked
 from processor.model import UsageError
 from processor.results.file_names import RESULTS_JSON
 from processor.store.atomic_file import replacing
-from processor.validation import certificate, change_detection, coverage, junit, software_identity, summary
+from processor.validation import certificate, change_detection, coverage, curves, junit, software_identity, summary
 from processor.validation.cell_runner import Runner
 from processor.validation.cells import Cell, Outcome
 from processor.validation.history import History
@@ -146,6 +146,9 @@ def _report(
         _write(out / name, data)
     changed = [(change.name, change.kind, summary.change_object(change)) for change in detected.changes]
     history.end(night, changed, report.line, _now())
+    drawn = curves.of_history(rows, same, history.settings(nights[-SEEN_NIGHTS:][0].night, night))
+    _write(out / "curves.json", _json(curves.as_object(drawn, night)).encode())
+    _write(out / "curves.html", curves.html(drawn, night, lang).encode())
     page = summary.nights_html(report, [each for each in history.nights() if each.night <= night], rows, lang)
     _write(out / "nights.html", page.encode())
     return report

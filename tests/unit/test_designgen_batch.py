@@ -34,7 +34,9 @@ from processor.model import UsageError
 from processor.store import store
 
 MAKE = (sys.executable, "-m", "designgen", "make", "frame-small", "--set", "scan.spacing_mm=60")
-COLUMNS = ["file", "recipe", "seed", "points", "scans", "scene_hash", "sha256", "status", "reason"]
+COUNTS = ["points", "scans", "points_surface", "points_mixed", "points_outlier", "defects"]
+COLUMNS = ["file", "recipe", "seed", "split", *COUNTS, "scene_hash", "sha256", "status", "reason"]
+OF_SET = ["card.json", "card.md"]
 SCENES_OF_KILLED_RUNS = 16
 MARK = "STARTED_FOR"
 
@@ -100,16 +102,18 @@ def copied(folder, to):
 
 def test_index_says_what_is_in_the_files(made):
     assert scenes(made) == [f"frame-small-0000{i}-seed{6 + i}.h5" for i in (1, 2, 3)]
-    assert sorted(os.listdir(made)) == [*scenes(made), "index.csv"]
+    assert sorted(os.listdir(made)) == [*OF_SET, *scenes(made), "index.csv"]
     found = rows(made)
     assert list(found[0]) == COLUMNS
     for row, name, seed in zip(found, scenes(made), ("7", "8", "9"), strict=True):
         path = made / name
         with h5py.File(path) as file:  # the bytes and the counts, read without the code under test
             counts = [len(scan["part"]) for scan in file["truth/labels"].values()]
+            sources = [np.bincount(scan["source"], minlength=3) for scan in file["truth/labels"].values()]
         assert row["file"] == name
         assert (row["recipe"], row["seed"], row["status"], row["reason"]) == ("frame-small", seed, "done", "")
         assert (int(row["scans"]), int(row["points"])) == (len(counts), sum(counts))
+        assert [int(row[f"points_{name}"]) for name in ("surface", "mixed", "outlier")] == np.sum(sources, 0).tolist()
         assert row["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
         assert row["scene_hash"] == store.scene_hash(store.read_scene(path))
     assert len({row["scene_hash"] for row in found}) == 3
@@ -129,7 +133,7 @@ def test_every_combination_in_the_order_given(tmp_path):
     varied = ("--vary", "scan.spacing_mm=80, 60", "--vary", "frame.radii_mm=[45.0, 50.0],[60.0]")
     run("-o", tmp_path / "set", *varied, command=command)
     found = rows(tmp_path / "set")
-    assert list(found[0]) == [*COLUMNS[:3], "scan.spacing_mm", "frame.radii_mm", *COLUMNS[3:]]
+    assert list(found[0]) == [*COLUMNS[:4], "scan.spacing_mm", "frame.radii_mm", *COLUMNS[4:]]
     pairs = [(row["scan.spacing_mm"], row["frame.radii_mm"]) for row in found]
     assert pairs == [("80", "[45.0, 50.0]"), ("80", "[60.0]"), ("60", "[45.0, 50.0]"), ("60", "[60.0]")]
     for row, radii in zip(found, [{45.0, 50.0}, {60.0}] * 2, strict=True):

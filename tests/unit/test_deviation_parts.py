@@ -162,7 +162,7 @@ def test_adaptive_voxels_hold_their_points():
     rng = np.random.default_rng(10)
     dense, sparse = rng.uniform(0.0, 10.0, (5000, 3)), rng.uniform(0.0, 1000.0, (300, 3))
     points = np.vstack([dense, sparse])
-    group = deviation_cloud.adaptive_voxels(points, 2.0, 5)
+    group = deviation_cloud.adaptive_voxels(points, 2.0, 5, 2.0)
     count = np.bincount(group)
     assert (count[:-1] >= 5).all()
     assert count.sum() == len(points)

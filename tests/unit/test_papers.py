@@ -11,15 +11,15 @@ from processor.cli.main import commands
 from processor.language.messages import text
 from processor.model import UsageError, reason
 from processor.papers import bolt_balls, command, data_sets, preassembly
-from processor.papers import charts as drawing
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Outcome, Row, Rule
+from processor.report.charts import line_chart as drawing
 
 TINY = {
     "000": ("arch-s1", ("scan.spacing_mm=25.0", "scan.sigma_mm=0.001", "scan.net=true")),
     "001": ("balls-100", ("frame.nodes_x=3", "frame.nodes_y=3", "scan.spacing_mm=5.0")),
     "002": ("stadium-roof", ("structure.trusses=4", "structure.bays=1", "scan.spacing_mm=120.0")),
-    "003": ("truss-bridge-picks", ("structure.bays=3", "scan.step_mrad=12.0")),
+    "003": ("truss-bridge-chain", ("structure.bays=6", "scan.step_mrad=6.0")),
     "004": ("plates-defects", ('structure.components=["none", "dent"]', "scan.step_mrad=3.0")),
 }
 
@@ -134,7 +134,7 @@ def test_the_command_writes_one_page_and_one_file(tmp_path, monkeypatch):
     for _ in range(2):  # the second replaces the first
         done = CliRunner().invoke(commands, words, standalone_mode=False)
         assert done.return_value == 1  # a data set failed
-        assert "2 of 7 published numbers" in done.output
+        assert "2 of 24 published numbers" in done.output
     assert sorted(path.name for path in out.iterdir()) == [command.PAGE, command.JSON] == ["papers.html", "papers.json"]
     content = json.loads((out / command.JSON).read_text("utf-8"))
     assert (content["format"], content["seeds"]) == ("processor-papers", 2)
@@ -143,7 +143,7 @@ def test_the_command_writes_one_page_and_one_file(tmp_path, monkeypatch):
     assert mean["values"] == [1.0, None]
     assert mean["reason"]["text"]
     assert content["rows"][1]["reproduced"] == "no"
-    assert [one["failed"] for one in content["data_sets"]] == ["", "designgen make: out of paper"]
+    assert [one["failed"] for one in content["data_sets"]] == [*[""] * 2, *["designgen make: out of paper"] * 2]
     page = (out / command.PAGE).read_text("utf-8")
     assert "来源论文逐表对照" in page
     assert "data:image/png;base64," in page

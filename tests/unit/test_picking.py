@@ -60,14 +60,45 @@ def test_the_noise_is_as_asked_for_and_of_the_seed():
 @pytest.mark.parametrize(
     ("params", "said"),
     [
-        (picking.Params(points=2), "points from 3"),
-        (picking.Params(sigma_mm=-1.0), "sigma_mm"),
-        (picking.Params(apart_mm=1e5), "no 3 points 100000 mm from one another"),
+        ({"points": 2}, "picks.points: expected 3 or more"),
+        ({"sigma_mm": -1.0}, "picks.sigma_mm"),
+        ({"at": "towers"}, "picks.at: expected points or corners"),
+        ({"apart_mm": 1e5}, "no 3 points in common with the others that lie 100000 mm from one another"),
     ],
 )
 def test_picks_that_cannot_be_made_are_refused(params, said):
     with pytest.raises(UsageError, match=said):
-        picking.pick(*scans_of(), params, 0)
+        picking.pick(*scans_of(), picking.Params(**params), 0)
+
+
+def test_corners_are_picked_where_the_first_scan_saw_them_and_the_second_may():
+    scans, T = scans_of(points=2000)
+    hall = rigid.apply(T[0], scans[0].points + scans[0].origin)
+    unseen = np.array([0.0, 0.0, 9000.0])
+    corners = np.vstack([hall[:40] + 30.0, hall[40:80] + unseen])
+    params = picking.Params(points=3, sigma_mm=0.0, apart_mm=100.0, at="corners")
+    picks, places = picking.pick(scans, T, params, 4, corners, lambda points: points[:, 0] > 0.0)
+    off = np.linalg.norm(places[:, None] - corners[:40], axis=2).min(axis=1)
+    assert off.max() < 1e-2
+    assert (picks.in_b[:, 0] > 0.0).all()
+    with pytest.raises(UsageError, match="no 3 corners in common"):
+        picking.pick(scans, T, params, 4, corners, lambda points: points[:, 0] > 1e9)
+
+
+def test_a_scanner_with_a_window_sees_nothing_beside_it():
+    recipe = recipe_files.overridden(
+        recipe_files.load("truss-bridge-chain")[1], ["scan.step_mrad=15.0", "picks.sigma_mm=0"]
+    )
+    scene, truth = make("t", recipe, 2)
+    assert len(scene.scans) == 9
+    assert len({tuple(np.round(T[:3, 3])) for T in truth.stations.T_project_station}) == 6
+    whole, _ = make("t", recipe_files.overridden(recipe, ["scan.field_of_view_deg=360.0"]), 2)
+    for scan, all_round in zip(scene.scans, whole.scans, strict=True):
+        x, y, z = scan.points.T
+        azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
+        assert np.abs(azimuth).max() <= 20.01
+        assert np.abs(elevation - 12.0).max() <= 20.01
+        assert 100 < len(scan.points) < 0.5 * len(all_round.points)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor import diagnostics
 from processor.geometry import principal, rigid
 from processor.geometry.neighbors import without_outliers
 from processor.geometry.polyline import Line, crossing, fit_line, ransac_line
@@ -79,21 +80,34 @@ def reduced_boxes(
         across, along = (2, 1) if edge in ("top", "bottom") else (1, 2)
         depth = high[across] - cut[:, across] if edge in ("top", "left") else cut[:, across] - low[across]
         q = cut[:, along] - middle[along]
-        strip = depth < edge_box(depth[np.abs(q) < params.box_range * extent[along]], params)
+        reach = edge_box(depth[np.abs(q) < params.box_range * extent[along]], params)
+        strip = depth < reach
         nearest = []
         for k1, k2 in pairwise(k):
             inside = np.flatnonzero(strip & (q > k1 * extent[along]) & (q < k2 * extent[along]))
             if len(inside) == 0:
                 return None
             nearest.append(cut[inside[np.argmin(to_P[inside])]])
-        line = ransac_line(
-            np.array(nearest), params.line_threshold * spacing_mm, params.line_probability, params.line_iterations, rng
-        )
+        with diagnostics.at(edge):
+            diagnostics.note("strip", L_edge_mm=reach, points=int(strip.sum()))
+            diagnostics.keep("strip", lambda strip=strip: cut[strip])  # type: ignore[misc]
+            diagnostics.keep("nearest points", np.array(nearest))
+            line = ransac_line(
+                np.array(nearest),
+                params.line_threshold * spacing_mm,
+                params.line_probability,
+                params.line_iterations,
+                rng,
+            )
         if line is None:
             return None
         lines.append(line)
     d_t = params.distance_threshold * spacing_mm
     edges = [_on_line(cut, line, d_t) for line in lines]
+    for edge, points in zip(EDGES, edges, strict=True):
+        with diagnostics.at(edge):
+            diagnostics.note("edge points", points=len(points), distance_threshold_mm=d_t)
+            diagnostics.keep("edge points", points)
     if min(len(edge) for edge in edges) < 2:
         return None
     bottom, right, top, left = (fit_line(edge) for edge in edges)
@@ -161,7 +175,12 @@ def slice_edges(
         picked = side[distance == nearest[in_slice[side]]]
         radius, reach = (k * max(1.0, thickness) * spacing_mm for k in (params.filter_radius, params.direction_radius))
         across = params.direction_offset * max(1.0, thickness) * spacing_mm
-        sides.append(points[picked[_runs_along(level[picked], radius, reach, across, params)]])
+        kept = points[picked[_runs_along(level[picked], radius, reach, across, params)]]
+        with diagnostics.at("left" if left else "right"):
+            width = thickness * spacing_mm
+            diagnostics.note("slices", thickness_mm=width, slices=len(nearest), picked=len(picked), kept=len(kept))
+            diagnostics.keep("slices", kept)
+        sides.append(kept)
     return sides[0], sides[1]
 
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.geometry import icp, pfh
+from processor import diagnostics
+from processor.geometry import icp, pfh, rigid
 from processor.geometry.neighbors import voxel_means
 from processor.geometry.polyline import Polyline
 from processor.model import Floats, Reason, reason
@@ -48,6 +49,11 @@ def by_lines(
         max_iterations=params.icp_iterations,
         tolerance=params.icp_tolerance,
     )
+    share = fine.paired_share
+    diagnostics.note("iterative closest point", rounds=fine.iterations, rms_mm=fine.rms, paired_share=share)
+    with diagnostics.placed(np.eye(4), "bridge"):
+        diagnostics.keep("fused target", target)
+        diagnostics.keep("fused source", lambda: rigid.apply(fine.T_target_source, source))
     return Alignment(fine.T_target_source, reasons)
 
 
@@ -57,6 +63,7 @@ def _coarse(
     """Return the coarse pose, and why it is not the one from histograms."""
     thin_source = voxel_means(source, params.pfh_voxel_mm)
     thin_target = voxel_means(target, params.pfh_voxel_mm)
+    diagnostics.note("fused features", source_points=len(source), target_points=len(target))
     if min(len(thin_source), len(thin_target)) < 4:
         return start, (reason("preassemble.few-feature-points"),)
     histograms = [

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from processor import diagnostics
 from processor.geometry import rigid
 from processor.geometry.neighbors import surface_spacing
 from processor.geometry.polyline import Polyline
@@ -98,15 +100,17 @@ def features_of(scan: Scan, index: int, pose: attitude.Attitude, design: ArchDes
             ends.append(None)
             continue
         rng = generator(params, f"{part.name} {outward}")
-        edges, missing = _joint_end(points, pose, design.joint_points[joint], outward, spacing, params, rng)
+        with _in_scan(scan), diagnostics.at(f"{part.name} at {design.joint_names[joint]}"):
+            edges, missing = _joint_end(points, pose, design.joint_points[joint], outward, spacing, params, rng)
         ends.append(edges)
         if missing is not None:
             reasons.append(reason("preassemble.at", place=design.joint_names[joint], reasons=(missing,)))
     slices = params.slices
-    lines, checked = (
-        edge_features.slice_edges(points, pose.T_principal, spacing, thickness, slices)
-        for thickness in (slices.thickness, slices.check_thickness)
-    )
+    with _in_scan(scan), diagnostics.at(part.name):
+        lines, checked = (
+            edge_features.slice_edges(points, pose.T_principal, spacing, thickness, slices)
+            for thickness in (slices.thickness, slices.check_thickness)
+        )
     bottom = assembly_errors.BottomEdges(
         *checked, Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right)
     )
@@ -119,6 +123,10 @@ def features_of(scan: Scan, index: int, pose: attitude.Attitude, design: ArchDes
         edges=bottom,
         reasons=tuple(reasons),
     )
+
+
+def _in_scan(scan: Scan) -> AbstractContextManager[None]:
+    return diagnostics.placed(rigid.transform(np.eye(3), scan.origin), f"scan {scan.name}")
 
 
 def place(parts: list[PartFeatures], design: ArchDesign, params: Params) -> Assembly:
@@ -161,7 +169,10 @@ def _joint_end(
     corners = design_points[:4]
     size = np.array([np.linalg.norm(corners[0] - corners[1]), np.linalg.norm(corners[3] - corners[0])])
     cut = edge_features.cut_joint_end(points, T_joint_scan, outward, size, params.boxes)
-    edges = edge_features.reduced_boxes(cut, outward, spacing, params.boxes, rng)
+    with diagnostics.placed(rigid.invert(T_joint_scan)):
+        diagnostics.note("cut end", points=len(cut))
+        diagnostics.keep("cut end", cut)
+        edges = edge_features.reduced_boxes(cut, outward, spacing, params.boxes, rng)
     if edges is None:
         return None, reason("preassemble.no-joint-edges")
     edges = edges.moved(rigid.invert(T_joint_scan))
@@ -176,10 +187,12 @@ def _chain(
     parts: list[PartFeatures], design: ArchDesign, params: Params
 ) -> tuple[list[Floats], list[tuple[Reason, ...]]]:
     """Chain the parts from the first: T_bridge_scan of each (NaN where the chain is broken), and remarks on each."""
-    poses = [_place_first(parts[0], design, params)]
+    with diagnostics.at(parts[0].name):
+        poses = [_place_first(parts[0], design, params)]
     reasons: list[tuple[Reason, ...]] = [()]
     for before, part in pairwise(parts):
-        alignment = _place_next(before, poses[-1], part, params)
+        with diagnostics.at(part.name):
+            alignment = _place_next(before, poses[-1], part, params)
         poses.append(alignment.T_bridge_scan)
         reasons.append(alignment.reasons)
     return poses, reasons

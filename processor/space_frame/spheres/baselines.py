@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor import diagnostics
+from processor.geometry import rigid
 from processor.geometry.neighbors import nearest_crops
 from processor.geometry.sphere import Sphere, algebraic, ransac
 from processor.model import Bools, Floats, FrameDesign, Ints, Reason, Tolerance, reason
@@ -37,10 +39,11 @@ def fit_nodes(cloud: MergedCloud, design: FrameDesign, params: Params, limits: T
     """Fit a sphere to the crop about every node of a design in the cloud's frame, by one of the paper's methods."""
     nodes = design.centres - cloud.origin
     crops = nearest_crops(cloud.points, nodes, design.radii + params.crop_margin_mm)
-    rows = [
-        _fit_node(int(design.ids[i]), nodes[i], float(design.radii[i]), cloud.points[crop], params, limits)
-        for i, crop in enumerate(crops)
-    ]
+    with diagnostics.placed(rigid.transform(np.eye(3), cloud.origin), "project"):
+        rows = [
+            _fit_node(int(design.ids[i]), nodes[i], float(design.radii[i]), cloud.points[crop], params, limits)
+            for i, crop in enumerate(crops)
+        ]
     return as_result(rows, cloud.origin, params, (reason("spheres.formal-covariances"),))
 
 
@@ -73,7 +76,11 @@ def _fit_node(id_: int, node: Floats, nominal: float, crop: Floats, params: Para
         rng = generator(params, f"ransac {id_}")
         consensus = ransac(crop - node, rng, params.tau_mm, params.probability, params.max_iterations)
         sphere = None if consensus is None else consensus.sphere
-        on = on if consensus is None else consensus.inliers
+        if consensus is not None:
+            on = consensus.inliers
+            with diagnostics.at(f"ball {id_}"):
+                diagnostics.note("consensus", trials=consensus.trials, points=len(on), inliers_share=float(on.mean()))
+                diagnostics.keep("consensus", crop[on])
     if sphere is None:
         return missing(id_, nominal, len(crop), reason("spheres.no-sphere"))
     reach = nominal + params.crop_margin_mm
