@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from processor.model import ArchDesign, ArchTruth, DesignPart, Scan, Scene, Truth
@@ -98,8 +100,9 @@ def key_points(s):
     return np.vstack([corners, middles])
 
 
+@cache
 def design():
-    """The bridge's design."""
+    """The bridge's design; not to be changed."""
     parts = []
     for i, name in enumerate(NAMES):
         s = np.linspace(CUTS[i] * ARC, CUTS[i + 1] * ARC, 101)

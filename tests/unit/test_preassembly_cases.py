@@ -1,6 +1,7 @@
 """Difficult parts and scans: square, half missing, steep, cluttered, unmarked, cut, in two scans, of other plates."""
 
 import dataclasses
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -27,8 +28,9 @@ SMALL = arch_bridge.Params(
 RIB = 2
 
 
+@cache
 def bridge(params=SMALL):
-    """The parts of a bridge and its design."""
+    """The parts of a bridge and its design; not to be changed."""
     parts = arch_bridge.build(params)
     return parts, design_of(parts)
 
@@ -41,6 +43,13 @@ def design_of(parts):
         tuple(part.name for part in parts[1:]),
         np.array([part.key_points(part.s1) for part in parts[:-1]]),
     )
+
+
+def shapes_of(design, kept={}):  # noqa: B006  # designs hold arrays, so they are no keys
+    """The sampled surfaces of a design's parts, which take as long as finding a scan's pose: made once a design."""
+    if id(design) not in kept:
+        kept[id(design)] = attitude.Shapes(design)  # holds the design, whose number is not given again
+    return kept[id(design)]
 
 
 def cloud(part, seed=0, spacing_mm=14.0, sigma_mm=1.0):
@@ -57,7 +66,7 @@ def scanned(points, seed=1, name="scan", component=""):
 
 def measured(design, index, *scans):
     systematic = SystematicParams()
-    return measure.estimate([measure.fit(scans, index, attitude.Shapes(design), 1.0, systematic)], systematic)[0]
+    return measure.estimate([measure.fit(scans, index, shapes_of(design), 1.0, systematic)], systematic)[0]
 
 
 def pulls(design, index, part, found, T):
@@ -192,7 +201,7 @@ def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_
         far = np.linalg.norm(points - place, axis=1)
         up = part.point(np.array([s]), np.array([u]), np.array([1.0])) - part.point(np.array([s]), np.array([u]), [0.0])
         points = points + np.where(far < 700.0, 14.0, 0.0)[:, None] * up
-    assert identity.identify(points, np.eye(4), 1, attitude.Shapes(design)) == identity.Identity()
+    assert identity.identify(points, np.eye(4), 1, shapes_of(design)) == identity.Identity()
 
 
 @pytest.mark.parametrize(
@@ -214,7 +223,7 @@ def test_neighbours_swapped_are_named(asked, came, said):
 
 
 def placed(design, index, points):
-    return measure._place(scanned(points)[0], index, attitude.Shapes(design), 1.0)
+    return measure._place(scanned(points)[0], index, shapes_of(design), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +246,7 @@ def test_what_lies_on_a_part_of_another_size_by_half_is_not_taken_for_it(on_foot
     stated = attitude.Attitude(np.eye(4), np.eye(4), "ok")
     monkeypatch.setattr(attitude, "find", lambda *_: stated)
     monkeypatch.setattr(assignment, "rather", lambda *_: None)
-    found = measure._place(scan, 0, attitude.Shapes(design), 1.0)
+    found = measure._place(scan, 0, shapes_of(design), 1.0)
     assert 0.5 < found.registration.used_share < 0.7
     if strays:
         assert codes(found.doubts) == ["preassemble.sides-not-covered", "preassemble.right-part"]
@@ -261,7 +270,7 @@ def test_another_part_is_not_taken_for_a_foot(clutter, index):
 
 def test_how_much_of_a_part_its_points_lie_on():
     parts, design = bridge()
-    shape = attitude.sample_surface(design.parts[RIB])
+    shape = shapes_of(design)[RIB]
     points = cloud(parts[RIB], spacing_mm=30.0)
     along = points @ shape.axes[:, 0]
     half = along < 0.5 * (along.min() + along.max())
@@ -272,7 +281,7 @@ def test_how_much_of_a_part_its_points_lie_on():
 
 def test_a_rival_farther_along_is_not_called_a_turn():
     _, design = bridge()
-    surface = attitude.sample_surface(design.parts[1])
+    surface = shapes_of(design)[1]
     along = rigid.transform(np.eye(3), 240.0 * surface.axes[:, 0])
     rival = attitude._rival_reason(np.eye(4), along, surface)
     assert (rival.code, rival.values) == ("preassemble.rival-shift", {"shift": pytest.approx(240.0)})
@@ -286,7 +295,7 @@ def test_half_a_part_is_found_however_it_lies_in_its_file(upper, seed):
     points = cloud(part, spacing_mm=14.0)
     down = (points - own.centre) @ own.axes[:, 1] * np.sign(-own.axes[2, 1])
     scan, T = scanned(points[down < 60.0 if upper else down > -60.0], 100 + seed)
-    found = attitude.find(scan.points, design.parts[1])
+    found = attitude.find(scan.points, design.parts[1], shapes_of(design)[1])
     assert found.status in ("ok", "ambiguous")
     turns = [rigid.rotation_angle((one @ rigid.invert(T))[:3, :3]) for one in (found.T_surface, found.T_rival)]
     assert turns[0] < 0.01 or (found.status == "ambiguous" and turns[1] < 0.01)
