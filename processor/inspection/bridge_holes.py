@@ -45,11 +45,11 @@ def _by_joint(
         return
     middle = np.array([np.nanmean(design.joint_points[j], axis=0) for j in at]) - origin
     nearest = [int(np.argmin(np.linalg.norm(middle - hole.middle, axis=1))) for hole in found]
-    whole = np.mean([hole.middle for hole in found], axis=0) if len(at) > 1 else cloud.points.mean(axis=0)
     first = 1
     for k in range(len(at)):
         own = [hole for hole, joint in zip(found, nearest, strict=True) if joint == k]
-        along = middle[k] - whole
+        p1, p2, p3, p4 = design.joint_points[at[k], :4]
+        along = np.cross(p4 - p2, p3 - p1)  # square to the section, from the left part to the right
         for group in holes.groups(own, [along / np.linalg.norm(along)]):
             yield from holes.measured(cloud, group, first)
             first += len(group.holes)

@@ -1,12 +1,15 @@
 """Girders with bolt holes: scanned surfaces against their CadQuery solids, meshes, and where holes were drilled."""
 
+from types import SimpleNamespace
+
 import cadquery as cq
 import numpy as np
 import pytest
 
 from designgen.designs import assembly, bolting, girder
 from designgen.scenes import make as scenes
-from processor.model import UsageError
+from processor.inspection import bridge_holes
+from processor.model import Status, UsageError
 
 SIZES = assembly.Params(
     type="row", section="i", parts=2, length_mm=1400.0, width_mm=420.0, height_mm=600.0, flange_mm=20.0, web_mm=12.0
@@ -68,20 +71,22 @@ QUIET = {
 }
 
 
-def made(seed, scan, mode="surface", hole_mm=1.0):
+def made(seed, scan, mode="surface", hole_mm=1.0, bolts=True):
     recipe = {
         "kind": "assembly",
         "assembly": {
             "type": "row", "section": "i", "parts": 2, "length_mm": 1400.0, "width_mm": 420.0, "height_mm": 600.0,
             "flange_mm": 20.0, "web_mm": 12.0,
         },
-        "bolts": {},
+        **({"bolts": {}} if bolts else {}),
         "asbuilt": {"hole_mm": hole_mm},
         "scan": {"mode": mode, **scan},
     }  # fmt: skip
     if mode == "rays":
         recipe["scanner"] = {"noise_mm": 0.0}
     scene, truth = scenes.make("bolted", recipe, seed)
+    if not bolts:
+        return scene, truth, {}
     noted = {
         (what, where): value
         for what, where, value in zip(truth.as_built.what, truth.as_built.where, truth.as_built.value, strict=True)
@@ -114,3 +119,50 @@ def test_holes_that_do_not_fit_are_refused(changes):
 def test_only_rows_of_i_girders_have_bolts():
     with pytest.raises(UsageError, match="bolts"):
         assembly.build(assembly.Params(type="node"), BOLTS)
+
+
+# --- the holes of a girder as the processor measures them
+
+
+def without_motion(places, shifts):
+    """Shifts (n, 2) less the best-fit motion of the group (Kabsch)."""
+    a = places + shifts - (places + shifts).mean(axis=0)
+    b = places - places.mean(axis=0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    return a @ u @ np.diag([1.0, np.linalg.det(u @ vt)]) @ vt - b
+
+
+def test_holes_of_girders_are_measured_where_they_were_drilled():
+    scene, truth, shifts = made(seed=7, scan={"spacing_mm": 4.0, "sigma_mm": 0.3})
+    names = tuple(part.name for part in scene.arch.parts)
+    table = SimpleNamespace(name=names, status=(Status.OK,) * 2, scans=names, T_bridge_scan=truth.arch.T_bridge_scan)
+    found = bridge_holes.of_parts(scene, SimpleNamespace(components=table, method="adjustment"))
+    held = []
+    for part in assembly.build(SIZES, BOLTS).parts:
+        bores = part.girder.bores
+        web = [k for k, bore in enumerate(bores) if abs(bore.end[0] - bore.start[0]) > 1e-6]
+        places = np.array([bores[k].middle for k in web])[:, [0, 2]]
+        true = without_motion(places, shifts[part.name][web][:, [0, 2]])
+        centred = places - places.mean(axis=0)
+        by_id = {one.id: one for one in found[part.name]}
+        assert sum(id_.endswith("diameter") for id_ in by_id) == HOLES
+        assert sum(id_.endswith("along") for id_ in by_id) == len(web)  # two holes of a flange have a pitch alone
+        for k in range(1, HOLES + 1):
+            if f"hole-{k}-along" not in by_id:
+                continue
+            one, other = by_id[f"hole-{k}-along"], by_id[f"hole-{k}-across"]
+            # Along is that of the girder; across may look either way.
+            sign = 1.0 if np.isclose(centred, [one.nominal, other.nominal], atol=0.01).all(axis=1).any() else -1.0
+            row = int(np.argmin(np.linalg.norm(centred - [one.nominal, sign * other.nominal], axis=1)))
+            np.testing.assert_allclose(centred[row], [one.nominal, sign * other.nominal], atol=0.01)
+            held.append(one.low <= true[row, 0] <= one.high)
+            assert abs(one.deviation - true[row, 0]) < 2.3 * one.ci95  # 4.5 standard deviations
+            assert one.ci95 < 0.25  # some 35 points of 0.3 mm a bore
+        pitches = [one for id_, one in by_id.items() if id_.startswith("pitch")]
+        assert len(pitches) == 2 + 10  # of each flange one; of two by four in the web ten
+    assert np.mean(held) > 0.7  # of 16
+
+
+def test_a_bridge_without_holes_has_none():
+    scene, _, _ = made(seed=7, scan={"spacing_mm": 100.0}, bolts=False)
+    assert bridge_holes.of_parts(scene, None) == {}
