@@ -28,7 +28,7 @@ from processor.jobs import process, runner
 from processor.jobs.child import Loss, Lost
 from processor.jobs.software import check_same, versions
 from processor.model import InputError, UsageError
-from processor.plain_text import printable
+from processor.plain_text import printable, spreadsheet_text
 
 INDEX = "index.csv"
 MOST_SCENES = 99_999  # in one folder: file names number them by five digits
@@ -401,6 +401,6 @@ def _write_index(path: Path, jobs: Sequence[Job], keys: Sequence[str], outcomes:
         content = outcome.content
         cells = [content.points, content.scans, content.scene_hash, content.sha256] if content else [""] * 4
         status = "done" if content else "failed"
-        table.writerow([job.file, job.recipe, job.seed, *job.varied, *cells, status, outcome.reason])
+        table.writerow([job.file, job.recipe, job.seed, *job.varied, *cells, status, spreadsheet_text(outcome.reason)])
     with replacing(path) as temporary:
         temporary.write_text(text.getvalue(), "utf-8")
