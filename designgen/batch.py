@@ -28,7 +28,7 @@ from processor.jobs import process, runner
 from processor.jobs.child import Loss, Lost
 from processor.jobs.software import check_same, versions
 from processor.model import InputError, UsageError
-from processor.plain_text import printable
+from processor.plain_text import printable, spreadsheet_text
 
 INDEX = "index.csv"
 # Columns of the index by their numbers in the card.
@@ -421,7 +421,9 @@ def _index(jobs: Sequence[Job], keys: Sequence[str], outcomes: Mapping[str, Outc
             cells = [content.points, content.scans, *numbers, content.scene_hash, content.sha256]
         status = "done" if content else "failed"
         split = card.split_of(job.seed)
-        table.writerow([job.file, job.recipe, job.seed, split, *job.varied, *cells, status, outcome.reason])
+        table.writerow(
+            [job.file, job.recipe, job.seed, split, *job.varied, *cells, status, spreadsheet_text(outcome.reason)]
+        )
     return text.getvalue()
 
 

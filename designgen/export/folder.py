@@ -20,6 +20,7 @@ from processor.model import (
     UsageError,
     per_point_fields,
 )
+from processor.plain_text import spreadsheet_text
 from processor.store import store
 from processor.store.new_folder import check_new, new_folder
 from processor.writers import project
@@ -150,7 +151,7 @@ def _write_picks(path: Path, picks: Picks, names: Mapping[str, str], scale: floa
         rows.writerow(PICK_COLUMNS)
         for a, b, point, *at in zip(picks.scan_a, picks.scan_b, picks.points, picks.in_a, picks.in_b, strict=True):
             if a in names and b in names:
-                rows.writerow([names[a], names[b], point, *(np.concatenate(at) * scale).tolist()])
+                rows.writerow([names[a], names[b], spreadsheet_text(point), *(np.concatenate(at) * scale).tolist()])
 
 
 def _of_file(scans: Sequence[Scan]) -> list[str]:

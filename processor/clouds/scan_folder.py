@@ -12,8 +12,8 @@ import numpy as np
 from processor.clouds import exported_clouds
 from processor.clouds.earlier_run import Run
 from processor.clouds.poses import Placed
-from processor.language.messages import spreadsheet_text
 from processor.model import Control, Floats, Picks, Scan, Stations, Tolerance
+from processor.plain_text import spreadsheet_text
 from processor.scan_folder import picks as picks_table
 from processor.scan_folder.control_points import COLUMNS
 from processor.scan_folder.files import CONTROL, PICKS, PROJECT, STATIONS

@@ -24,7 +24,6 @@ from functools import cache
 from typing import Any
 
 from processor.model import Reason, Word
-from processor.plain_text import printable
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -55,15 +54,6 @@ class Text:
 def text(template: str, /, **values: Any) -> Text:
     """Return a :class:`Text`."""
     return Text(template, values)
-
-
-FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute
-
-
-def spreadsheet_text(characters: str) -> str:
-    """Return a text without control characters; an apostrophe before it where a spreadsheet would execute it."""
-    harmless = printable(characters)
-    return "'" + harmless if harmless.startswith(FORMULA) else harmless
 
 
 def label(english: str) -> Text:

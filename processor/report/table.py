@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from processor.language.messages import Message, Text, label, messages, spreadsheet_text, text
+from processor.language.messages import Message, Text, label, messages, text
 from processor.model import Checked, Reason, StepRun
-from processor.plain_text import printable
+from processor.plain_text import printable, spreadsheet_text
 
 NAN = float("nan")
 

@@ -20,6 +20,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.model import InputError, UsageError
 from processor.report import all_tables
 from processor.report import table as report_table
+from processor.report.stitching.tables import poses_csv
 from processor.scan_folder import cad, folder
 from processor.store import store
 from tests.support import step_results
@@ -213,8 +214,12 @@ def test_names_are_harmless_in_errors_of_designgen(tmp_path, monkeypatch, capsys
 
 def test_names_are_harmless_in_tables_of_scans():
     names = ("=HYPERLINK(1)", "+1+2", "@a", "-x", "\t=y", "S6", "S7", "S8", "S9")
-    run = step_results.execution(("stitch", "automatic", "{}", step_results.stitching(names)), names=names)
+    result = step_results.stitching(names)
+    scans = dataclasses.replace(result.scans, from_frame=names, to_frame=names[::-1])
+    result = dataclasses.replace(result, scans=scans)
+    run = step_results.execution(("stitch", "automatic", "{}", result), names=names)
     tables = {table.file: report_table.csv_text(table) for table in all_tables.tables_of_run(run, ErrorReport())}
+    tables["poses.csv"] = poses_csv(result).decode()
     cells = [cell for text in tables.values() for row in csv.reader(io.StringIO(text)) for cell in row]
     assert "'=HYPERLINK(1)" in cells
     assert not [cell for cell in cells if re.match(r"[=@\t]|[+-](?![\d.])|\+\d\+", cell)]

@@ -176,5 +176,7 @@ def poses_csv(result: Result) -> bytes:
     scans = result.scans
     for i, name in enumerate(scans.name):
         matrix = [repr(float(x)) if np.isfinite(x) else "" for x in scans.T_project_scan[i].ravel()]
-        writer.writerow([csv_cell(name), scans.status[i], *matrix, scans.from_frame[i], scans.to_frame[i]])
+        writer.writerow(
+            [csv_cell(name), scans.status[i], *matrix, csv_cell(scans.from_frame[i]), csv_cell(scans.to_frame[i])]
+        )
     return out.getvalue().encode("utf-8")
