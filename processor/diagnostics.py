@@ -1,8 +1,8 @@
-"""What the parts of a step find on the way: numbers, and clouds on request.
+"""Diagnostics of the stages of a step: numbers, and clouds on request.
 
-An algorithm says by :func:`note` and :func:`keep` what it has found, by :func:`at` where, and by :func:`placed` in
-which frame. Who runs it takes what was said by :func:`taken`; without a taker, and on other threads, nothing is kept.
-Nothing that is said changes a result.
+An algorithm records numbers by :func:`note` and points by :func:`keep`; :func:`at` names the place and :func:`placed`
+the frame. The caller collects them by :func:`recording`; outside of it, and on other threads, nothing is recorded.
+Diagnostics never change a result.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class KeptCloud:
 
 @dataclass
 class Notes:
-    """What was said: (stage, place, quantity, value), and clouds."""
+    """The record: rows of (stage, place, quantity, value), and clouds."""
 
     rows: list[tuple[str, str, str, float]] = field(default_factory=list)
     clouds: list[KeptCloud] = field(default_factory=list)
@@ -52,7 +52,7 @@ _clouds_wanted: ContextVar[bool] = ContextVar("clouds_wanted", default=False)
 
 @contextmanager
 def with_clouds(wanted: bool = True) -> Iterator[None]:
-    """Keep clouds too, in whatever is run within the block."""
+    """Record clouds, too, within the block."""
     before = _clouds_wanted.set(wanted)
     try:
         yield
@@ -61,8 +61,8 @@ def with_clouds(wanted: bool = True) -> Iterator[None]:
 
 
 @contextmanager
-def taken() -> Iterator[Notes]:
-    """Give what is said within the block."""
+def recording() -> Iterator[Notes]:
+    """Record the diagnostics of the block and yield the record."""
     notes = Notes()
     before = _notes.set(notes)
     try:
@@ -73,7 +73,7 @@ def taken() -> Iterator[Notes]:
 
 @contextmanager
 def at(place: str) -> Iterator[None]:
-    """Say that what is said within the block is of a place; places within places are joined."""
+    """Name the place of the diagnostics of the block; names of nested blocks are joined."""
     before = _places.set((*_places.get(), place))
     try:
         yield
@@ -83,7 +83,7 @@ def at(place: str) -> Iterator[None]:
 
 @contextmanager
 def placed(T: Floats, frame: str = "") -> Iterator[None]:
-    """Say that points kept within the block are to be moved by T (4, 4) to a frame, named by the outermost block."""
+    """Move points that the block keeps by T (4, 4) to a frame, which the outermost block names."""
     outer, T_outer = _frame.get()
     before = _frame.set((frame, T) if not outer else (outer, T_outer @ T))
     try:
@@ -93,8 +93,8 @@ def placed(T: Floats, frame: str = "") -> Iterator[None]:
 
 
 @contextmanager
-def silent() -> Iterator[None]:
-    """Keep nothing that is said within the block: a repetition of what was said before."""
+def paused() -> Iterator[None]:
+    """Record nothing within the block: it repeats what was recorded before."""
     before = _notes.set(None)
     try:
         yield
@@ -103,7 +103,7 @@ def silent() -> Iterator[None]:
 
 
 def note(stage: str, **values: float) -> None:
-    """Say numbers that a stage has found; their names are the quantities, with a unit at the end."""
+    """Record numbers of a stage; their names are the quantities, with a unit at the end."""
     notes = _notes.get()
     if notes is not None:
         place = ", ".join(_places.get())
@@ -111,7 +111,7 @@ def note(stage: str, **values: float) -> None:
 
 
 def keep(stage: str, points: Floats | Callable[[], Floats]) -> None:
-    """Say the points (n, 3) of a stage, mm; they are copied, or made, only where clouds are wanted."""
+    """Record the points (n, 3) of a stage, mm; they are copied, or computed, only where clouds are wanted."""
     notes = _notes.get()
     if notes is not None and _clouds_wanted.get():
         frame, T = _frame.get()
@@ -119,8 +119,8 @@ def keep(stage: str, points: Floats | Callable[[], Floats]) -> None:
         notes.clouds.append(KeptCloud(stage, ", ".join(_places.get()), frame, given @ T[:3, :3].T + T[:3, 3]))
 
 
-def say_again(notes: Notes) -> None:
-    """Say what was said before, by an algorithm whose result is used again."""
+def replay(notes: Notes) -> None:
+    """Record again what an algorithm recorded before whose result is used again."""
     current = _notes.get()
     if current is not None:
         current.rows += notes.rows

@@ -334,7 +334,7 @@ def execute(
                 needs["answer_given"] = answers[job.step]
             if getattr(job.module, "KEEPS", False):
                 needs["kept"] = kept.setdefault(job.step, {})
-            with diagnostics.taken() as notes:
+            with diagnostics.recording() as notes:
                 done = _run(path, scene, job, {**given, **needs}, log)
             runs.append(dataclasses.replace(done, diagnostics=notes.table()))
             clouds += [StepCloud(job.step, job.method, cloud) for cloud in notes.clouds]

@@ -85,7 +85,7 @@ def measured(job: tuple[DataSet, str, str]) -> Measured:
     What the stages of the methods find is written into the third, a new folder, where it is named.
     """
     data_set, scene, steps = job
-    with diagnostics.with_clouds(bool(steps)), diagnostics.taken() as notes:
+    with diagnostics.with_clouds(bool(steps)), diagnostics.recording() as notes:
         found: Measured = module_of(data_set.paper).measure(Path(scene), data_set)
     if steps:
         run = step_clouds.OfRun(PAPERS[data_set.paper], f"paper {data_set.paper}", notes.clouds, notes.table())

@@ -37,9 +37,9 @@ def measure(path: Path, data_set: DataSet) -> Measured:
     figures: dict[str, float] = {}
     series: dict[str, list[float]] = {}
     for method in METHODS:
-        with diagnostics.taken() as notes:
+        with diagnostics.recording() as notes:
             result = step.run(scene, Params(method=method, seed=data_set.seed), {})
-        diagnostics.say_again(notes)
+        diagnostics.replay(notes)
         figures |= _of_stages(notes)
         figures |= _figures(method, result, path, scene)
         curves = [curve for curve in result.defects.deflection if len(curve.along)]

@@ -59,12 +59,12 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
         raise InputError(f"{scene.name}: method {params.method} takes one scan per part, {several[0]} has several")
     kept = {} if kept is None else kept
     if "parts" not in kept:
-        with diagnostics.taken() as kept["notes"]:
+        with diagnostics.recording() as kept["notes"]:
             kept["parts"] = methods.extract([of_part[0] for of_part in scans], design, params)
         kept["scanned again"] = bootstrap_bands.repeat_scans(kept["parts"], design, params)
-    diagnostics.say_again(kept["notes"])
+    diagnostics.replay(kept["notes"])
     result = methods.assemble(kept["parts"], design, params)
-    with diagnostics.silent():
+    with diagnostics.paused():
         result = bootstrap_bands.with_bands(result, kept["scanned again"], design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != thermal.REFERENCE_C:
         remark = reason("preassemble.temperature-not-corrected", temperature=scene.temperature_C)

@@ -23,10 +23,10 @@ def turned(angle, shift):
 
 def test_only_a_taker_hears_and_nobody_hears_other_threads():
     diagnostics.note("a", x=1.0)
-    with diagnostics.taken() as notes:
+    with diagnostics.recording() as notes:
         with diagnostics.at("joint"), diagnostics.at("top"):
             diagnostics.note("a", x=2.0, y=np.inf)
-            with diagnostics.silent():
+            with diagnostics.paused():
                 diagnostics.note("a", x=3.0)
         thread = Thread(target=lambda: diagnostics.note("a", x=4.0))
         thread.start()
@@ -44,7 +44,7 @@ def test_clouds_are_in_the_outermost_frame():
     points = np.random.default_rng(1).normal(size=(7, 3))
     inner, outer = turned(0.3, [1.0, 2.0, 3.0]), turned(-1.1, [10.0, 0.0, -5.0])
     frames = diagnostics.placed(outer, "bridge"), diagnostics.placed(inner)
-    with diagnostics.with_clouds(), diagnostics.taken() as notes, frames[0], frames[1]:
+    with diagnostics.with_clouds(), diagnostics.recording() as notes, frames[0], frames[1]:
         diagnostics.keep("cloud", points)
     (kept,) = notes.clouds
     assert kept.frame == "bridge"
