@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 JOBS ?= 2
+# Modules stay compiled, also where the environment says otherwise: tests and demo start many processes.
+export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: demo test lint docs bench paper nightly weekend clean system
 
