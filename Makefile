@@ -7,6 +7,8 @@ JOBS ?= 2
 # What make test installs: newest (the newest versions that pyproject.toml allows), locked (those of .ci/locked.txt,
 # checked by their hashes) or lowest (the oldest that pyproject.toml allows). For a new $(VENV): make clean before another.
 DEPENDENCIES ?= newest
+# Modules stay compiled, also where the environment says otherwise: tests and demo start many processes.
+export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: demo test test-lowest lint docs bench paper nightly weekend lock audit clean system
 
