@@ -118,6 +118,14 @@ def test_a_long_bite_out_of_an_edge_is_edge_loss():
     assert np.linalg.norm(centre[0] - [3507.0, 273.0, 470.0]) < 40.0
 
 
+@pytest.mark.parametrize(("seed", "deep"), [(11, 24.0), (12, 24.0), (13, 34.0)])
+def test_a_bite_no_deeper_than_the_cells_at_the_border_is_edge_loss(seed, deep):
+    """Away from the border no cell is empty; along it there is steel at either end."""
+    kinds, centre = run(cloud_of(BOXES, seed, cut=((3495.0, 310.0 - deep, 400.0), (3520.0, 320.0, 500.0))))
+    assert kinds == ["edge-loss"]
+    assert np.linalg.norm(centre[0] - [3507.0, 310.0 - deep / 2, 450.0]) < 30.0
+
+
 def test_edges_that_a_filter_removed_are_not_missing():
     cut = ((1095.0, 296.0, 30.0), (1120.0, 320.0, 720.0))
     assert run(cloud_of(BOXES, 9, cut=cut))[0] == []

@@ -4,6 +4,9 @@ An empty place on a face may be missing, or in the shadow of something from all 
 shade it if the place can be seen along every direction along which its seen surroundings can. Something that is not of
 the design may: a place counts as missing only where both sides of the plate are empty, which a shadow of one station
 does not do. The number of points to be expected follows from the density around.
+
+Cells at a border of their face are no evidence by themselves, as filters of mixed points remove edges. They are
+compared with other cells at the same border: a bite has steel beside it along the border at either end.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ LEAST_COS = 0.2  # of incidence, as of points that are used
 LOST_SHARE = 0.05  # of a seen place's directions, that one beside it may lack: 1 of 400 that both sides lie in shade
 RING_CELLS = 3  # about an empty region: its surroundings
 FEWEST_RING = 4  # cells of the surroundings
+ENDS = 2  # of a bite along a border
+BORDER_SHARE = 0.25  # of a cell at a border that lies on the face: on less, hardly a point is expected
 MOST_RING, MOST_CORE = 24, 60  # cells whose lines of sight are compared
 EXPOSED_SHARE = 0.5  # of the surroundings, from which a place can be seen as well
 LOW_QUANTILE = 0.25  # of the densities around: what is counted on
@@ -38,11 +43,15 @@ FEWEST_PAIRS = 30  # of cells side by side, to estimate the scatter of numbers o
 
 @dataclass(frozen=True)
 class _Hole:
-    """An empty place on one side of a plate: its cells, those away from borders, and the points expected on these."""
+    """An empty place on one side of a plate: its cells, those that are examined, and the points expected on these.
+
+    ``bitten``: cells at a border are among them, with steel along the border at either end.
+    """
 
     chart: int
     cells: Ints
     core: Ints
+    bitten: bool
     expected: float
     counted: float
     spread: float  # variance of a number of points by that of a Poisson distribution
@@ -56,7 +65,7 @@ def holes(field: Field, surface: DesignSurface, points: Floats, alarms_per_mm2: 
     for chart in np.flatnonzero(surface.charts.kind == PLANE):
         for cells, ring in _empty_regions(field, surface, count, int(chart)):
             hole = _hole(field, surface, count, int(chart), cells, ring)
-            if hole is None or not _is_beyond(surface, hole, ring, points):
+            if hole is None or not (hole.bitten or _is_beyond(surface, hole, ring, points)):
                 continue
             other = other_side.cells_opposite(surface, hole.core)
             if (other < 0).all() or not _is_exposed(surface, hole.core, ring):
@@ -108,8 +117,6 @@ def _empty_regions(field: Field, surface: DesignSurface, count: Floats, chart: i
             continue
         wide = tuple(slice(max(part.start - RING_CELLS, 0), part.stop + RING_CELLS) for part in box)
         mask = label[wide] == k
-        if not (mask & (inner[wide] > 0.0)).any():
-            continue
         if mask.sum() > on.sum():  # less of the face was seen than is empty here
             continue
         about = ndimage.binary_dilation(mask, EIGHT_NEIGHBOURS, RING_CELLS) & on[wide] & ~mask
@@ -128,21 +135,51 @@ def _placed(mask: Bools, box: tuple[slice, ...], shape: tuple[int, ...]) -> Bool
 def _hole(field: Field, surface: DesignSurface, count: Floats, chart: int, cells: Ints, ring: Ints) -> _Hole | None:
     """Return an empty place with the points expected there; None for a strip along a border of its face."""
     core = cells[field.inner[cells] > 0.0]
-    grid = np.stack(np.divmod(core - surface.charts.first[chart], surface.charts.shape[chart, 1]), axis=1)
-    sides = np.ptp(grid, axis=0) + 1
-    width = len(core) / sides.max()
-    if width < DEEP_CELLS and sides.max() >= SLIM * width:
-        return None
-    density = float(np.quantile(count[ring] / surface.share[ring], LOW_QUANTILE))
-    expected = density * float(surface.share[core].sum())
+    at_border, beside = _at_border(field, surface, chart, cells)
+    if not len(at_border):
+        if not len(core):
+            return None
+        grid = np.stack(np.divmod(core - surface.charts.first[chart], surface.charts.shape[chart, 1]), axis=1)
+        sides = np.ptp(grid, axis=0) + 1
+        width = len(core) / sides.max()
+        if width < DEEP_CELLS and sides.max() >= SLIM * width:
+            return None
+    examined, expected = np.concatenate([core, at_border]), 0.0
+    for part, around in ((core, ring), (at_border, beside)):
+        if len(part):
+            density = float(np.quantile(count[around] / surface.share[around], LOW_QUANTILE))
+            expected += density * float(surface.share[part].sum())
     return _Hole(
         chart=chart,
         cells=cells,
-        core=core,
+        core=examined,
+        bitten=len(at_border) > 0,
         expected=expected,
-        counted=float(count[core].sum()),
+        counted=float(count[examined].sum()),
         spread=_spread(field, surface, count, chart),
     )
+
+
+def _at_border(field: Field, surface: DesignSurface, chart: int, cells: Ints) -> tuple[Ints, Ints]:
+    """Return those of a place's ``cells`` (n,) at a border of its face, and the cells along that border about them.
+
+    None where the border does not go on at both ends: at a corner, or where the cloud ends.
+    """
+    none = np.empty(0, np.int64)
+    first, shape = int(surface.charts.first[chart]), surface.charts.shape[chart]
+    i, j = np.divmod(cells - first, shape[1])
+    start = np.maximum([i.min() - RING_CELLS, j.min() - RING_CELLS], 0)
+    stop = np.minimum([i.max() + RING_CELLS + 1, j.max() + RING_CELLS + 1], shape)
+    rows = first + np.arange(start[0], stop[0])[:, None] * shape[1] + np.arange(start[1], stop[1])
+    border = (surface.share[rows] > BORDER_SHARE) & (field.inner[rows] == 0.0)
+    mask = np.isin(rows, cells)
+    at = np.argwhere(mask & border)
+    if not len(at) or np.ptp(at, axis=0).min() >= DEEP_CELLS:  # of several borders
+        return none, none
+    about = ndimage.binary_dilation(mask & border, EIGHT_NEIGHBOURS, RING_CELLS) & border & ~mask
+    if ndimage.label(about, EIGHT_NEIGHBOURS)[1] != ENDS or about.sum() < FEWEST_RING:
+        return none, none
+    return rows[mask & border], rows[about]
 
 
 def _spread(field: Field, surface: DesignSurface, count: Floats, chart: int) -> float:
