@@ -15,7 +15,9 @@ from OCP.gp import gp_Pnt, gp_Trsf
 from OCP.GProp import GProp_GProps
 from OCP.TopAbs import TopAbs_FACE, TopAbs_SHELL, TopAbs_SOLID
 from OCP.TopExp import TopExp_Explorer
+from OCP.TopLoc import TopLoc_Location
 from OCP.TopoDS import TopoDS_Compound
+from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from designgen.cad import brep_faces, tessellation
 from designgen.cad.bodies import Body, finest_mm, is_closed
@@ -46,13 +48,48 @@ def parts(shape: Any, *kinds: Any) -> Iterator[Any]:
         explorer.Next()
 
 
+class Meshed:
+    """Shapes that have their final mesh: parts placed several times in a file share it, and are meshed once."""
+
+    def __init__(self) -> None:
+        self._shapes, self._faces = TopTools_IndexedMapOfShape(), TopTools_IndexedMapOfShape()
+        self._deviations: dict[int, float] = {}  # mm, by the number of the shape
+        self._owner: dict[int, int] = {}  # shape, by the number of the face
+
+    def deviation(self, shape: Any) -> float | None:
+        """Return the deviation (mm) of the mesh of a shape wherever it is placed; None without a mesh."""
+        return self._deviations.get(int(self._shapes.FindIndex(_unplaced(shape))))
+
+    def add(self, shape: Any, deviation: float) -> None:
+        """Keep that a shape was meshed just now; others that share faces with it have lost the meshes of these."""
+        number = int(self._shapes.Add(_unplaced(shape)))
+        self._deviations[number] = deviation
+        for face in parts(shape, TopAbs_FACE):
+            at = int(self._faces.Add(_unplaced(face)))
+            before = self._owner.get(at, number)
+            self._owner[at] = number
+            if before != number:
+                self._deviations.pop(before, None)
+
+
+def _unplaced(shape: Any) -> Any:
+    return shape.Located(TopLoc_Location())
+
+
 def body_of(
-    path: str, name: str, shape: Any, scale: float, *, solid: bool, face_name: Callable[[Any], str] | None = None
+    path: str,
+    name: str,
+    shape: Any,
+    scale: float,
+    *,
+    solid: bool,
+    face_name: Callable[[Any], str] | None = None,
+    meshed: Meshed | None = None,
 ) -> Body | str:
     """Return a shape, whose unit is ``scale`` mm, as a body, or the problem with it.
 
     With ``face_name``, which names a face or returns "", the body has the forms of its faces, and edges are
-    meshed finer.
+    meshed finer. A shape that ``meshed`` knows keeps its mesh.
     """
     box = Bnd_Box()
     BRepBndLib.Add_s(shape, box, False)
@@ -71,7 +108,10 @@ def body_of(
             return tessellation.mesh_edges_finer(shape, mm, brep_faces.is_meshed_finer, large=size > LARGE_MM)
         return tessellation.mesh_faces(shape, mm / scale, large=size > LARGE_MM)
 
-    deviation = finest_mm(path, name, size, MOST_TRIANGLES, mesh)
+    before = None if meshed is None else meshed.deviation(shape)
+    deviation = finest_mm(path, name, size, MOST_TRIANGLES, mesh) if before is None else before
+    if meshed is not None and before is None:
+        meshed.add(shape, deviation)
     volumes, areas = GProp_GProps(), GProp_GProps()
     BRepGProp.VolumeProperties_s(shape, volumes)
     BRepGProp.SurfaceProperties_s(shape, areas)

@@ -25,7 +25,7 @@ from OCP.TopLoc import TopLoc_Location
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from designgen.cad.bodies import NO_UNIT, UNITS_MM, Body, CadFile, unit_name
-from designgen.cad.shapes import body_of, parts, pieces
+from designgen.cad.shapes import Meshed, body_of, parts, pieces
 from processor.model import InputError, UsageError
 
 # What Open CASCADE, and with it CadQuery and FreeCAD, writes for a product that has no name.
@@ -69,10 +69,11 @@ def parse(path: str, content: bytes, units: str, default_units: str, *, exact: b
     bodies = []
     if reader.NbShapes():
         stem = re.sub(r"\.\w+$", "", os.path.basename(path))
-        face_names = _FaceNames(reader, entities) if exact else None
+        face_names, meshed = _FaceNames(reader, entities) if exact else None, Meshed()
         for number, (shape, solid) in enumerate(pieces(reader.OneShape())):
             name = names.of(shape) or f"{stem}-{number + 1}"
-            body = body_of(path, name, shape, scale, solid=solid, face_name=face_names.of if face_names else None)
+            name_of = face_names.of if face_names else None
+            body = body_of(path, name, shape, scale, solid=solid, face_name=name_of, meshed=meshed)
             if isinstance(body, Body):
                 bodies.append(body)
             else:

@@ -200,8 +200,7 @@ def _inferred(
     surface = registered.surface
     gone: list[Region] = []
     if registered.observed.stations.unnamed:
-        hidden = surface_charts.hidden(surface)
-        gone = missing_bodies.of_bodies(registered.observed, field, surface, hidden, alarms_per_mm2)
+        gone = missing_bodies.of_bodies(registered.observed, field, surface, surface.hidden, alarms_per_mm2)
     points = _sample(scene, registered.T_design_project)
     known = {cell for region in missing + gone for cell in region.cells.tolist()}
     cut = holes.holes(field, surface, points, alarms_per_mm2)

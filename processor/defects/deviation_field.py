@@ -9,7 +9,6 @@ import numpy as np
 from scipy import ndimage
 
 from processor.adjustment import opposite_sides
-from processor.defects import surface_charts
 from processor.defects.alignment import Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
@@ -122,7 +121,7 @@ def _amid(seen: Floats, inner: Floats, charts: Charts, chart: int) -> Bools:
 
 def inner_cells(surface: DesignSurface, edge_mm: float) -> Floats:
     """Return 1 for cells (cells,) away from where their face can no longer be seen, and 0 for others."""
-    inner, exposed = np.zeros(len(surface.share)), surface.covered & ~surface_charts.hidden(surface)
+    inner, exposed = np.zeros(len(surface.share)), surface.covered & ~surface.hidden
     for chart in range(len(surface.charts.kind)):
         rows = surface.charts.cells(chart)
         inner[rows] = _inner(exposed[rows], surface.charts, chart, edge_mm)

@@ -90,6 +90,11 @@ class DesignSurface:
         """The facets in a grid, by which lines of sight are followed."""
         return mesh_distance.facet_grid(self.vertices, self.faces, self.normals, GRID_SHARE * self.size_mm)
 
+    @cached_property
+    def hidden(self) -> Bools:
+        """The samples (cells, samples) of cells that another body of the design touches or holds: none can be seen."""
+        return _hidden(self)
+
     @property
     def area_mm2(self) -> float:
         """Area of all cells, mm2."""
@@ -136,8 +141,8 @@ def gridded(surface: DesignSurface, cell_mm: float) -> DesignSurface:
     )
 
 
-def hidden(surface: DesignSurface) -> Bools:
-    """Mark the samples (cells, samples) of cells that another body of the design touches or holds: none can be seen."""
+def _hidden(surface: DesignSurface) -> Bools:
+    """Mark the samples (cells, samples) of cells that another body of the design touches or holds."""
     charts, marked = surface.charts, np.zeros_like(surface.covered)
     along = np.repeat(charts.axes[:, 0], charts.shape.prod(axis=1), axis=0)
     across = np.cross(surface.outward, along)

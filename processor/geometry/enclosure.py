@@ -8,6 +8,8 @@ surface is not closed are left out.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from scipy.sparse import coo_array
@@ -20,6 +22,7 @@ from processor.model import Bools, Floats, Ints
 OUTSIDE_MM = 0.5  # above the surface: closer bodies are in contact
 JITTER_MM = np.array([1.3e-4, 2.1e-4, 1.7e-4])  # so that no ray meets an edge between two facets
 LEAST_RANGE = 2_000  # places per task of a thread
+PARTS = 16  # of the room about all bodies along each axis, by which the bodies about a place are found
 
 
 def enclosed(points: Floats, normals: Floats, grid: FacetGrid, body: Ints) -> Bools:
@@ -31,8 +34,44 @@ def enclosed(points: Floats, normals: Floats, grid: FacetGrid, body: Ints) -> Bo
     inside = np.zeros(len(places), np.bool_)
     axis = int(np.argmin(grid.shape))
     about = _boxes(grid.corners, body)
-    over_ranges(lambda a, b: _inside(grid, body, about, places, axis, inside, a, b), len(places), least=LEAST_RANGE)
+    room = _room(about)
+    over_ranges(
+        lambda a, b: _inside(grid, body, about, room, places, axis, inside, a, b), len(places), least=LEAST_RANGE
+    )
     return inside
+
+
+class _Room(NamedTuple):
+    """Bodies by equal parts of the room about all of them.
+
+    Those whose boxes reach into part k are ``body[start[k] : start[k + 1]]``. ``low`` (3,) is the room's corner,
+    ``size`` (3,) that of a part, mm.
+    """
+
+    low: Floats
+    size: Floats
+    start: Ints
+    body: Ints
+
+
+def _room(about: Floats) -> _Room:
+    """Sort bodies with boxes (b, 2, 3) into the parts of the room about them; those without a box are in none."""
+    known = np.flatnonzero(np.isfinite(about).all(axis=(1, 2)))
+    if not len(known):
+        return _Room(np.zeros(3), np.ones(3), np.zeros(PARTS**3 + 1, np.int64), np.empty(0, np.int64))
+    low, high = about[known, 0].min(axis=0), about[known, 1].max(axis=0)
+    size = np.maximum((high - low) / PARTS, 1e-6)
+    first = np.clip(np.floor((about[known, 0] - low) / size).astype(np.int64), 0, PARTS - 1)
+    last = np.clip(np.floor((about[known, 1] - low) / size).astype(np.int64), 0, PARTS - 1)
+    parts, bodies = [], []
+    for k, (a, b) in enumerate(zip(first, last, strict=True)):
+        i, j, m = np.meshgrid(*(np.arange(a[d], b[d] + 1) for d in range(3)), indexing="ij")
+        parts.append(((i * PARTS + j) * PARTS + m).ravel())
+        bodies.append(np.full(parts[-1].size, known[k]))
+    part, body = np.concatenate(parts), np.concatenate(bodies)
+    order = np.argsort(part, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(part, minlength=PARTS**3))])
+    return _Room(low, size, start, body[order])
 
 
 def boxes(vertices: Floats, faces: Ints, body: Ints) -> tuple[Floats, Floats]:
@@ -69,7 +108,7 @@ def closed_bodies(faces: Ints) -> Ints:
 
 
 @njit(cache=True, nogil=True)
-def _inside(grid, body, about, places, axis, inside, first, last):  # type: ignore[no-untyped-def]
+def _inside(grid, body, about, room, places, axis, inside, first, last):  # type: ignore[no-untyped-def]
     """Mark places first to last - 1 from which a ray along an axis leaves more bodies than it enters.
 
     Bodies with a place in the box ``about`` (b, 2, 3) them count alone, and the ray ends where their boxes do.
@@ -80,8 +119,16 @@ def _inside(grid, body, about, places, axis, inside, first, last):  # type: igno
     held = np.full(len(about), -1, np.int64)  # row of the place that was in the box of each body last
     for row in range(first, last):
         p = places[row]
-        end, within = -np.inf, True
-        for b in range(len(about)):
+        end, within, part = -np.inf, True, 0
+        for k in range(3):
+            at = np.floor((p[k] - room.low[k]) / room.size[k])
+            if not -1.0 <= at <= PARTS:  # a little beyond, by rounding, is in the outermost part
+                within = False
+            part = part * PARTS + int(min(max(at, 0.0), PARTS - 1.0))
+        if not within:
+            continue
+        for i in range(room.start[part], room.start[part + 1]):
+            b = room.body[i]
             low_b, high_b = about[b, 0], about[b, 1]
             if not (low_b[axis] <= p[axis] <= high_b[axis] and low_b[u] <= p[u] <= high_b[u]):
                 continue

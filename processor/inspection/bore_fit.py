@@ -21,6 +21,7 @@ TUKEY = 4.5  # robust standard deviations beyond which a point has no weight
 LATERAL = 0.2  # variance across the ray as a share of that along it: encoders and footprint
 # Of a ray into the wall, as a cosine: at less the footprint lies on more of the wall than is seen as one surface.
 LEAST_SLOPE = 0.35
+UNNAMED_SHARE = 0.5  # of the class of one view, in the radii of bores that several unnamed views see
 ROUNDS = 30
 SETTLED_MM = 1e-4
 NO_PRIOR_MM = 1e4
@@ -76,6 +77,8 @@ def fit(bores: list[BorePoints], radius: Floats, reach: Floats, sources: int) ->
     departure[rows[known]] = solved[known]
     of_rows, of_known = (3 * at[:, None] + np.arange(3) for at in (rows[known], np.flatnonzero(known)))
     covariance[np.ix_(of_rows.ravel(), of_rows.ravel())] = of_solved[np.ix_(of_known.ravel(), of_known.ravel())]
+    if not np.isfinite(ray).all():  # offsets of ranges widen or narrow all bores alike, and nothing shows it
+        covariance[2::3, 2::3] += (UNNAMED_SHARE * scanner_class.VIEW_MM) ** 2
     points[rows] = count
     return Fitted(departure, covariance, points)
 

@@ -119,17 +119,20 @@ def measured(body: Body) -> tuple[list[Characteristic], dict[str, float]]:
 def body_axes(body: Body) -> list[Axis]:
     """Return the axes of a body, longest first: square to each other, with an outermost face on either side."""
     axes: list[Axis] = []
-    for k, face in enumerate(body.faces):
-        others = [j for j, other in enumerate(body.faces) if other.normal @ face.normal < -PARALLEL]
-        first = next((i for i, axis in enumerate(axes) if abs(axis.direction @ face.normal) > PARALLEL), None)
-        if not others or first is not None:
+    if not body.faces:
+        return axes
+    normals = np.array([face.normal for face in body.faces])
+    middles = np.array([face.corners.mean(axis=0) for face in body.faces])
+    for normal in normals:
+        looks = normals @ normal
+        others = looks < -PARALLEL
+        if not others.any() or any(abs(axis.direction @ normal) > PARALLEL for axis in axes):
             continue
-        looks = [body.faces[j].normal @ face.normal for j in range(len(body.faces))]
-        at = [float(one.corners.mean(axis=0) @ face.normal) for one in body.faces]
-        front = max((j for j in range(len(looks)) if looks[j] > PARALLEL), key=lambda j: at[j])
-        back = min(others, key=lambda j: at[j])
+        at = middles @ normal
+        front = int(np.argmax(np.where(looks > PARALLEL, at, -np.inf)))
+        back = int(np.argmin(np.where(others, at, np.inf)))
         if at[front] > at[back]:
-            axes.append(Axis(body.faces[k].normal, (back, front), at[front] - at[back]))
+            axes.append(Axis(normal, (back, front), float(at[front] - at[back])))
     square: list[Axis] = []
     for axis in sorted(axes, key=lambda one: -one.size):
         if all(abs(axis.direction @ other.direction) < SQUARE for other in square):

@@ -24,6 +24,7 @@ import trimesh
 
 from designgen import recipe_files
 from designgen.cad import files as cad_files
+from designgen.cad import shapes, step
 from designgen.designs import arch_bridge, arch_part
 from designgen.export import step_files
 from processor.model import InputError, UsageError
@@ -439,3 +440,43 @@ def test_a_step_file_that_cannot_be_written_leaves_the_old_one(box, monkeypatch)
         step_files.write_step(box, {"b": cq.Solid.makeBox(1.0, 1.0, 1.0)})
     assert box.read_bytes() == before
     assert [one.name for one in box.parent.iterdir()] == [box.name]
+
+
+def test_a_part_placed_often_is_meshed_once_and_lies_where_it_was_placed(tmp_path, monkeypatch):
+    plate = cq.Workplane().box(400.0, 300.0, 12.0).faces(">Z").workplane().pushPoints([(-90, 40), (60, -80)]).hole(26.0)
+    solid = plate.findSolid().Solids()[0]
+    whole, places = cq.Assembly(name="array"), [(1000.0 * k, 50.0 * k, -7.0 * k) for k in range(6)]
+    for k, place in enumerate(places):
+        location = cq.Location(cq.Vector(*place), cq.Vector(1, 2, 3), 25.0 * k)
+        whole.add(solid, name=f"plate {k + 1}", loc=location)
+    whole.add(cq.Workplane().sphere(50.0).val(), name="ball", loc=cq.Location(cq.Vector(0, 0, 900)))
+    path = tmp_path / "array.step"
+    whole.export(str(path))
+    meshings = []
+    monkeypatch.setattr(
+        shapes.tessellation, "_mesh", lambda *a, of=shapes.tessellation._mesh: (meshings.append(1), of(*a))
+    )
+    read = step.parse(str(path), path.read_bytes(), "", "mm", exact=True)
+    assert len(meshings) <= 2 * 2 * 3  # two shapes, edges and faces, in at most three refinements
+    assert [body.name for body in read.bodies] == [*(f"plate {k + 1}" for k in range(6)), "ball"]
+    for body, place in zip(read.bodies, places, strict=False):
+        assert body.closed
+        assert body.volume_mm3 == pytest.approx(400 * 300 * 12 - 2 * np.pi * 13**2 * 12, rel=1e-9)
+        np.testing.assert_allclose(body.vertices.mean(axis=0), np.array(place), atol=40.0)
+        corners = body.vertices[body.faces]
+        volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
+        assert volume == pytest.approx(body.volume_mm3, rel=1e-5)
+
+
+def test_a_shape_that_shares_a_face_with_a_later_one_is_meshed_again():
+    """Two solids of a compound that share a face: meshing the second takes the mesh of the face from the first."""
+    whole = cq.Workplane().box(100, 100, 10).val().split(cq.Face.makePlane(300, 300, (0, 0, 0), (1, 0, 0)))
+    first, second = whole.Solids()
+    meshed = shapes.Meshed()
+    meshed.add(first.wrapped, 0.05)
+    assert meshed.deviation(first.moved(cq.Location(cq.Vector(5, 0, 0))).wrapped) == 0.05
+    meshed.add(second.wrapped, 0.05)
+    shared = any(a.isSame(b) for a in first.Faces() for b in second.Faces())
+    assert shared
+    assert meshed.deviation(first.wrapped) is None
+    assert meshed.deviation(second.wrapped) == 0.05

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,11 @@ import trimesh
 from processor.components import bridge_parts, frame_members
 from processor.defects import step as defects
 from processor.deviation import step as deviation
-from processor.model import ArchDesign, DesignPart, FrameDesign, Scan, Scene, Status, UsageError
+from processor.model import ArchDesign, DesignPart, FrameDesign, Scan, Scene, Status, StepRun, UsageError
+from processor.pipeline import result_classes
+from processor.results import to_json
+from processor.store import store
+from processor.store.json_values import json_ready
 
 SIZE = np.array([2000.0, 600.0, 400.0])
 JOINT = np.array([[0, 300, 0], [0, -300, 0], [0, -300, 400], [0, 300, 400],
@@ -150,3 +155,14 @@ def test_balls_and_tubes_lie_where_they_were_measured():
     # The ball is open where the member's sleeve hides it.
     own = corners[made.bodies.of_facet == 0].mean(axis=1) - moved[0]
     assert np.linalg.norm(own - 60.0 * axis, axis=1).min() > 40.0
+
+
+def test_results_of_parts_are_stored_and_written(compared, tmp_path):
+    runs = [StepRun(step, "default", "{}", made) for step, made in zip(("deviation", "defects"), compared, strict=True)]
+    store.write_results(tmp_path / "results.h5", runs, {})
+    for run, back in zip(runs, store.read_results(tmp_path / "results.h5", result_classes()), strict=True):
+        assert back.result.parts.name == ("left", "right")
+        written = json.loads(json.dumps(json_ready(to_json.step_json(back))))["parts"]
+        assert [part["name"] for part in written] == ["left", "right"]
+        assert all(part["status"] == "ok" for part in written)
+        np.testing.assert_array_equal(back.result.parts.covariance, run.result.parts.covariance)

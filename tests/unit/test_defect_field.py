@@ -61,7 +61,7 @@ def test_what_a_body_hides_is_the_area_of_the_contact(turn):
     bodies = [trimesh.creation.box(bounds=np.array(bounds, float)) for bounds in (web, rib)]
     mesh = trimesh.util.concatenate(bodies).apply_transform(R)
     surface = surface_charts.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64), 20.0)
-    hidden = surface_charts.hidden(surface) & surface.covered
+    hidden = surface.hidden & surface.covered
     up = surface.outward @ R[:3, :3] @ [0.0, -1.0, 0.0] > 0.5
     foot = surface.outward @ R[:3, :3] @ [0.0, 1.0, 0.0] > 0.5
     sample_mm2 = (20.0 / surface_charts.PER_SIDE) ** 2

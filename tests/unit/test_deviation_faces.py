@@ -96,6 +96,25 @@ def test_what_is_within_another_body_or_in_contact_with_it_is_enclosed():
     assert (enclosure.closed_bodies(opened)[11:] >= 0).all()
 
 
+def test_enclosed_by_any_of_many_bodies():
+    """Boxes of any size and place, some within others: what lies in one is computed from their corners."""
+    rng = np.random.default_rng(11)
+    low = rng.uniform(-2000.0, 2000.0, (150, 3))
+    high = low + rng.uniform(5.0, 1500.0, (150, 3)) * rng.choice([1.0, 1.0, 1.0, 0.02], (150, 3))
+    meshes = [trimesh.creation.box(bounds=np.array(corners)) for corners in zip(low, high, strict=True)]
+    mesh = trimesh.util.concatenate(meshes)
+    surface = mesh_distance.of_design(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 50.0)
+    points, facet = trimesh.sample.sample_surface(mesh, 20_000, seed=1)
+    normals = mesh.face_normals[facet]
+    place = points + enclosure.OUTSIDE_MM * normals
+    gap = np.maximum(low[None] - place[:, None], place[:, None] - high[None]).max(axis=2)  # negative within a box
+    sure = np.abs(gap).min(axis=1) > 0.01
+    inside = enclosure.enclosed(points, normals, grid, enclosure.closed_bodies(surface.faces))
+    assert 0.1 < inside[sure].mean() < 0.9
+    np.testing.assert_array_equal(inside[sure], (gap.min(axis=1) < 0.0)[sure])
+
+
 @pytest.mark.parametrize("offset", [0.0, 0.3])
 def test_stations_that_differ_widen_the_level_of_detection(offset):
     """Five stations see both of a box's large faces from one side; the truth is that of a box as designed."""

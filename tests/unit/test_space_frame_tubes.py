@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from processor.space_frame.members import tube_fits
 from processor.space_frame.members.cylinder_fit import Errors
@@ -163,6 +164,23 @@ def test_cones_sleeves_and_balls_do_not_bend_the_axis():
         assert np.abs(errors / said).max() < 4.5
         assert fine.lengths[0] == pytest.approx(LENGTH, abs=40.0)
         assert np.abs((A + 0.5 * LENGTH * U - fine.points[0]) @ U) < 20.0
+
+
+def test_the_covariance_of_a_bow_is_that_of_its_errors():
+    size = []
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 3])
+        bow = rng.normal(0.0, 1.2, 2)  # as the prior has it: a share of 0.001 of half the length
+        cloud, station = scan(rng, 0.7, bow=bow)
+        _, fine = fitted(cloud, station)
+        side = fine.side[0]
+        axes = np.stack([side, np.cross(fine.directions[0], side)])
+        true = axes @ (np.array(bow) @ np.stack(frame_clouds.across(U)))
+        error = fine.bow[0] - true
+        size.append(error @ np.linalg.solve(fine.bow_covariance[0], error))
+    # A sum of squares of 80 standard normal values; beyond these limits once in 1000 cases.
+    low, high = chi2.ppf([0.0005, 0.9995], 80)
+    assert low < np.sum(size) < high
 
 
 @pytest.mark.parametrize("bow", [(2.7, 0.0), (-1.5, 2.0)])
