@@ -20,6 +20,7 @@ from processor.evaluation import evaluate
 from processor.evaluation import preassembly as against_truth
 from processor.language.messages import Text, text
 from processor.model import Floats, Reason, Scene, StepRun, reason
+from processor.papers import parameters
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Row, Rule
 from processor.pipeline import Execution
@@ -151,9 +152,9 @@ class _Of:
 
 
 def rows(found: Found) -> list[Row]:
-    """Return the rows of tables 2 to 7 and figures 18 to 21, then ours."""
+    """Return the rows of tables 1 to 7 and figures 18 to 21, then ours."""
     numbers = published()
-    made = []
+    made = parameters.rows(PAPER, found.seeds)
     for bridge in range(len(BRIDGES)):
         made += _of_bridge(found, bridge, numbers)
     for side in SIDES:
