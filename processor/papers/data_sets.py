@@ -61,6 +61,11 @@ class Found:
     def __init__(self, measured: Sequence[Measured]) -> None:
         self.measured = sorted(measured, key=lambda one: (one.data_set.name, one.data_set.seed))
 
+    @property
+    def seeds(self) -> int:
+        """Number of seeds of which anything was measured."""
+        return len({one.data_set.seed for one in self.measured if not one.failed})
+
     def values(self, data: str, figure: str) -> tuple[float, ...]:
         """Return a figure of a data set over its seeds; NaN where a seed has none."""
         return tuple(one.figures.get(figure, float("nan")) for one in self.of(data))

@@ -14,7 +14,7 @@ from processor.evaluation import evaluate
 from processor.language.messages import Text, text
 from processor.model import Reason, Scene, StepRun, reason
 from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule
+from processor.papers.rows import Row, Rule, median
 from processor.pipeline import Execution
 from processor.report.charts.line_chart import Chart
 from processor.store import store
@@ -91,6 +91,8 @@ def rows(found: Found) -> list[Row]:
     ):
         made.append(_row(place, "paper", quantity, found.values(PLATES, f"paper: {figure}"), none, unit))
     section = text("section {number}", number="1.3")
+    fitted, trials = (median(found.values(PLATES, f"sample consensus: {name}")) for name in ("fitted", "trials"))
+    alike = reason("papers.defects-alike", fitted=fitted, trials=trials)
     for place, quantity, figure, unit in (
         (text("figure {number}", number="2"), text("places of the scan with a descriptor"), "descriptors: source", ""),
         (text("figure {number}", number="2"), text("radius of a descriptor"), "descriptors: radius_mm", "mm"),
@@ -98,11 +100,14 @@ def rows(found: Found) -> list[Row]:
         (section, text("sum of Huber's function, equation 5"), "sample consensus: huber_mm2", "mm2"),
         (section, text("rounds of registration, last gate"), "iterative closest point: rounds", ""),
         (section, text("points beyond the threshold"), "defect points: beyond", ""),
-        (text("section {number}", number="1.4"), text("range of a deflection curve by depth of the defect, median"),
-         "paper: deflection by depth", ""),
-    ):  # fmt: skip
-        made.append(_row(place, "paper", quantity, found.values(PLATES, figure), none, unit))
+    ):
+        why = alike if figure.startswith("sample consensus") else none
+        made.append(_row(place, "paper", quantity, found.values(PLATES, figure), why, unit))
+    section_4 = text("section {number}", number="1.4")
     for method in METHODS:
+        curve = text("range of a deflection curve by depth of the defect, median")
+        values = found.values(PLATES, f"{method}: deflection by depth")
+        made.append(_row(section_4, method, curve, values, none if method == "paper" else beside, ""))
         for quantity, figure, unit in (
             (text("defects not found"), "missed", ""),
             (text("false alarms"), "false alarms", ""),

@@ -21,6 +21,7 @@ from processor.geometry import icp, mesh_distance, principal, rigid
 from processor.geometry.neighbors import thinned
 from processor.language.messages import Text, text
 from processor.model import Floats, Reason, reason
+from processor.papers import parameters
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Row, Rule, median
 from processor.report.charts.line_chart import Chart
@@ -184,6 +185,7 @@ def rows(found: Found) -> list[Row]:
     counts = [*found.values(ROOF, "classic, wrong"), NAN]
     signs = reason("papers.roof-signs", wrong=float(np.nanmax([0.0, *counts])), attitudes=ATTITUDES)
     made = [
+        *parameters.rows(PAPER, found.seeds),
         _row(section, ROOF, "PCA", text("classic PCA fails in some attitudes"), 1.0, wrong, Rule.HOLDS, signs, ""),
         _row(
             section, ROOF, "PCA", text("largest turn by classic PCA"), TURN_DEG,

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from processor.cli.main import commands
 from processor.language.messages import text
 from processor.model import UsageError, reason
-from processor.papers import bolt_balls, command, data_sets, preassembly
+from processor.papers import bolt_balls, command, data_sets, parameters, preassembly
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Outcome, Row, Rule
 from processor.report.charts import line_chart as drawing
@@ -87,6 +87,17 @@ def test_the_papers_tables_keep_the_papers_statement():
         assert np.abs(between).max() < preassembly.PUBLISHED_DIFFERENCE_MM
         left, before = preassembly.beyond_rigid(between)
         assert left > 0.9 * before
+
+
+def test_stated_parameters_stand_beside_those_that_are_used():
+    found = {str(one.quantity): one for number in ("000", "002") for one in parameters.rows(number, 2)}
+    assert [name for name, one in found.items() if one.outcome is not Outcome.YES] == [
+        "thickness of a slice, in spacings"
+    ]
+    # numbers of the papers' texts and of table 1
+    stated = {"boxes per edge": 10.0, "neighbours K of the outlier removal": 20.0, "normal scale": 110.541}
+    assert {name: found[name].published for name in stated} == stated
+    assert {one.outcome for one in parameters.rows("000", 0)} == {Outcome.NOT_MADE}
 
 
 def test_four_points_with_one_behind_the_ball_make_a_sphere_of_metres():
