@@ -66,6 +66,7 @@ ELSEWHERE = {
     "processor run my-truss -o results --steps stitch --method three-point": "tests/unit/test_stitching_picks.py",
     "processor export results -o assembled --what assembled --format e57": "tests/unit/test_export.py",
     "processor batch /scans -o /results --cluster tcp://10.0.0.1:8786": "tests/unit/test_batch.py",
+    "processor batch /scans -o /results --cluster tls://10.0.0.1:8786": "tests/unit/test_batch.py",
     "processor validate mine.toml -o nights --jobs 2": "tests/unit/test_validation_running.py",
     "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": "tests/unit/test_validation_running.py",
     "processor validate -o nights --accept": "tests/unit/test_validation.py",
@@ -120,7 +121,7 @@ def test_there_are_commands():
 
 
 def targets():
-    return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE))
+    return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE))
 
 
 @pytest.mark.parametrize(("page", "line"), COMMANDS)
