@@ -173,6 +173,7 @@ def sniff(path: Path) -> Layout:
         cells = _cells(stripped, separator, comma)
         names = tuple(_cells(header, *_separator(header))) if header else ()
         if stripped and not comment and len(cells) >= 3 and _is_row(cells, names):
+            _check_passed_over(path, lines[:number], len(cells))
             whole = lines[number:-1] if len(head) == SNIFFED else lines[number:]
             rows = [row.strip() for row in whole[:SAMPLED] if row.strip()] or [stripped]
             # A first row of whole numbers does not show the decimal sign.
@@ -195,6 +196,19 @@ def sniff(path: Path) -> Layout:
         if lines
         else f"{path}: expected rows of numbers, found none"
     )
+
+
+def _check_passed_over(path: Path, lines: Sequence[str], width: int) -> None:
+    """Raise InputError for a line before the first row that has its columns, half of them numbers: a damaged row."""
+    for number, line in enumerate(lines, 1):
+        stripped = line.strip()
+        cells = _cells(stripped, _separator(stripped)[0], True)
+        if stripped.startswith(COMMENTS) or len(cells) != width or 2 * sum(map(_is_number, cells)) < width:
+            continue
+        raise InputError(
+            f"{path}: line {number}: expected {width} numbers or the names of the columns, found {stripped[:60]!r}; "
+            "correct it, or begin a remark with #"
+        )
 
 
 def _separator(line: str) -> tuple[str | None, bool]:

@@ -96,6 +96,9 @@ CASES = {
                               "line 14: expected 4 columns"),
     "PLY rows run together": ("a.ply", ASCII_PLY + b"1 2 3\n1 2 3 1 2 3\n1 2 3\n", "expected 3 columns"),
     "PCD rows run together": ("a.pcd", pcd_header("ascii") + b"1 2 3 1\n1 2 3 1 2\n1 2 3 1\n", "expected 4 columns"),
+    "first row of a table damaged": ("a.csv", "x;y;z;i\n3,1;0.5,3;-7,6;7\n" + "3,1;5,3;-7,6;7\n" * 9,
+                                     "line 2: expected 4 numbers"),
+    "first row damaged": ("a.xyz", "1.5 2..5 3.5\n" + "1.5 2.5 3.5\n" * 9, "line 1: expected 3 numbers or the names"),
     "two units": ("a.csv", "x_mm,y_m,z_m\n1,2,3\n", "different units"),
 }  # fmt: skip
 
@@ -106,10 +109,10 @@ def test_bad_files(tmp_path, case):
     path = put(tmp_path / name, content)
     why = why.replace("10{12}", "1" + "0" * 12).replace("10{9}", "1" + "0" * 9)
     why = why.replace("10{15}", "1" + "0" * 15)
-    began = time.monotonic()
+    began = time.process_time()  # other work on the machine does not count
     with pytest.raises(InputError, match=why) as caught:
         readers.read(path)
-    assert time.monotonic() - began < 5.0
+    assert time.process_time() - began < 5.0
     assert str(caught.value).startswith(str(path))
     assert path.exists()
 
