@@ -291,6 +291,17 @@ class Soak:
             if whole.get(name) != found.get(name):
                 self.faults.append(f"pass {self.passes}: {name}: other bytes than undisturbed")
         self.faults += [f"pass {self.passes}: {name} is left over" for name in left_over(out)]
+        mine, theirs = (_ends(files.get("summary.json", b"{}")) for files in (found, whole))
+        self.faults += [
+            f"pass {self.passes}: {name}: {mine.get(name)}, undisturbed {theirs.get(name)}"
+            for name in sorted(mine.keys() | theirs.keys())
+            if mine.get(name) != theirs.get(name)
+        ]
+
+
+def _ends(summary):
+    """Status and reason of each input of a summary."""
+    return {one["input"]: (one["status"], one.get("reason")) for one in json.loads(summary).get("inputs", ())}
 
 
 def _is_whole(out, whole):
