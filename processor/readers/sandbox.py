@@ -133,7 +133,7 @@ def _death(path: Path, helper: _Helper, error: BaseException) -> InputError:
     if code in (-signal.SIGPROF, -signal.SIGALRM) or isinstance(error, TimeoutError):
         reason = f"reading took more than {limit_s(path):.0f} s, far more than a file of its size needs"
     elif code == -signal.SIGKILL:
-        reason = "reading was killed, most likely for lack of memory"
+        return InputError(f"{path}: reading was killed, most likely for lack of memory; free some and run again")
     else:
         reason = (
             f"the library that reads it crashed ({signal.Signals(-code).name if code < 0 else f'exit code {code}'})"
