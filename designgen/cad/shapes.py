@@ -76,6 +76,12 @@ def _unplaced(shape: Any) -> Any:
     return shape.Located(TopLoc_Location())
 
 
+def _scaled(shape: Any, scale: float) -> Any:
+    scaling = gp_Trsf()
+    scaling.SetScale(gp_Pnt(0.0, 0.0, 0.0), scale)
+    return BRepBuilderAPI_Transform(shape, scaling, True).Shape()
+
+
 def body_of(
     path: str,
     name: str,
@@ -99,9 +105,7 @@ def body_of(
         return f"{name!r} has a face without bounds and is left out"
     size, exact = scale * float(np.sqrt(box.SquareExtent())), face_name is not None
     if exact and scale != 1.0:  # the numbers of forms are in mm
-        scaling = gp_Trsf()
-        scaling.SetScale(gp_Pnt(0.0, 0.0, 0.0), scale)
-        shape, scale = BRepBuilderAPI_Transform(shape, scaling, True).Shape(), 1.0
+        shape, scale = _scaled(shape, scale), 1.0
 
     def mesh(mm: float) -> int:
         if exact:

@@ -30,14 +30,14 @@ KEYS_BY_KIND = {
     "net": ("arch-bridge",),
     "member_reach_mm": ("space-frame",),
     "distance_mm": ("arch-bridge", "assembly", "structure"),
-    "height_mm": ("space-frame", "structure"),
+    "height_mm": ("space-frame", "structure", "room"),
     "field_of_view_deg": ("structure",),
     "elevation_deg": ("structure",),
-    "registered": ("structure",),
+    "registered": ("structure", "room"),
     "repeated": ("structure",),
     "scans_at_first": ("structure",),
-    "merged": ("space-frame", "structure"),
-    "origin_mm": ("space-frame", "structure"),
+    "merged": ("space-frame", "structure", "room"),
+    "origin_mm": ("space-frame", "structure", "room"),
 }
 # Keys that a type of structure does not use: a stadium is scanned from inside.
 WINDOW_KEYS = ("field_of_view_deg", "elevation_deg")  # a truss bridge alone is scanned through a window

@@ -14,6 +14,7 @@ from processor.model import (
     Checked,
     Floats,
     Ints,
+    Labels,
     Reason,
     Rows,
     Status,
@@ -56,6 +57,7 @@ class CorePoints(Rows):
     n2: Ints = column("k", dtype=np.int64)
     std1: Floats = column("k", unit="mm")
     std2: Floats = column("k", unit="mm")
+    body: Labels = column("k", dtype=np.int32, newer=True)  # row of the result's bodies, -1 = of none
 
     @property
     def distances(self) -> Distances:
@@ -148,6 +150,7 @@ class Result(Checked):
     core: CorePoints = dataclasses.field(default_factory=CorePoints, metadata={"json": ""})
     limits: JudgedLimits | None = newer()
     parts: PartFits | None = newer()  # of a bridge; then the fields of one registration are empty
+    bodies: tuple[str, ...] = names("b", json="", newer=True)  # of the design, by name
 
     @property
     def overall(self) -> Verdict:

@@ -73,4 +73,5 @@ def _of_structure(scene: Scene, params: Params, stitched: Any) -> Result:
         first = reason("deviation.scans-unplaced", scans=", ".join(scan.unplaced))
         status = Status.WEAK if result.status is Status.OK else result.status
         result = replace(result, status=status, reasons=(first, *result.reasons))
-    return replace(result, limits=verdicts.judge(scene, result, vertices, origin))
+    result = verdicts.with_bodies(result, scene.structure, vertices, origin)
+    return replace(result, limits=verdicts.judge(scene, result))

@@ -73,7 +73,7 @@ def write_results(
             step_clouds.write(making / STEPS, _of_stages(execution))
         if "pdf" in further:
             with default_settings():
-                write_bytes(making / pdf.NAME, pdf.document(execution, drawn))
+                write_bytes(making / pdf.NAME, pdf.document(execution, drawn, lang))
         if "xlsx" in further:
             write_bytes(making / workbook.NAME, workbook.workbook(execution, report))
 
