@@ -350,10 +350,11 @@ def _with_targets(scene: Scene, log: Callable[[str], None] = lambda _: None) -> 
     if scene.target_search is None or scene.targets is not None:
         return scene
     from processor.targets import find
+    from processor.targets.summary import summary
 
     with stage("searching for targets"):
         scene = find.with_targets(scene)
-    log(str(find.summary(scene)))
+    log(str(summary(scene)))
     return scene
 
 

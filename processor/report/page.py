@@ -18,7 +18,7 @@ from processor.report import all_tables, characteristics, headline, page_script,
 from processor.report.step_report import step_report
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table, headings, numeric, shown
-from processor.targets import find
+from processor.targets.summary import summary
 
 GOOD = "ok"
 LONG_CELL = 24  # characters
@@ -71,7 +71,7 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Captio
         banner=_banner(execution),
         about=_about(scene),
         clipped=None if scene.clips is None else headline.clipped(scene.clips),
-        targets=None if scene.targets is None else find.summary(scene),
+        targets=None if scene.targets is None else summary(scene),
         lang=lang,
         live=page_script.embedded({"words": messages(lang).of_scripts(script), "steps": messages(lang).rendered(live)}),
         script=script,

@@ -296,8 +296,8 @@ def _sampling_sd(d: Floats, other: Floats, spacing: float, width: float) -> floa
         return spacing
 
     def misplaced(periods: Floats) -> Floats:
-        most: Floats = periods / np.pi * np.exp(-2.0 * (np.pi * width / np.sqrt(2.0) / periods) ** 2) / np.sqrt(2.0)
-        return most
+        alias: Floats = periods / np.pi * np.exp(-2.0 * (np.pi * width / np.sqrt(2.0) / periods) ** 2) / np.sqrt(2.0)
+        return alias
 
     count = float(near.sum())
     periods = spacing * np.linspace(*PERIODS)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from processor.geometry import rigid
-from processor.language.messages import Text, text
 from processor.model import Control, Floats, Ints, Scan, Scene, TargetKind, Targets
 from processor.space_frame.result import Balls
 from processor.targets import checkerboard, naming, spheres
@@ -61,25 +60,6 @@ def _of_sphere(balls: Balls, row: int, scan: int, station: int, origin: Floats) 
         sd=float(np.sqrt(np.linalg.eigvalsh(balls.covariance[row, :3, :3])[-1])), points=int(balls.points[row]),
         fit=float("nan"),
     )  # fmt: skip
-
-
-def summary(scene: Scene) -> Text:
-    """Say how many targets were found in the scans, and how many of them have names."""
-    table = Targets() if scene.targets is None else scene.targets
-    counts = [
-        text(template, count=table.kind.count(kind))
-        for kind, template in (
-            (TargetKind.CHECKERBOARD, "{count} {count:?checkerboard|checkerboards}"),
-            (TargetKind.SPHERE, "{count} {count:?sphere|spheres}"),
-        )
-        if kind in table.kind
-    ]
-    return text(
-        "targets in {scans} {scans:?scan|scans}: {counts}; {named} of them are control points",
-        scans=len(scene.scans),
-        counts=counts or text("none"),
-        named=sum(bool(name) for name in table.name),
-    )
 
 
 def _views(scene: Scene, scan: Scan) -> Iterator[tuple[int, Floats, Floats, Floats | None]]:

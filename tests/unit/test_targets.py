@@ -13,6 +13,7 @@ from processor.report.stitching import targets as report
 from processor.scan_folder import folder
 from processor.store import store
 from processor.targets import checkerboard, find, naming
+from processor.targets.summary import summary
 from tests.support.target_clouds import board
 
 SIDE = 150.0
@@ -150,8 +151,8 @@ def test_found_targets_become_sightings_of_control_points():
     assert found.control.seen[0] == pytest.approx(centre, abs=0.6)
     assert (found.control.point.tolist(), found.control.scan.tolist()) == ([0], [0])
     assert found.control.seen_sd[0] >= find.LEAST_SD_MM
-    assert str(find.summary(found)) == "targets in 1 scan: 1 checkerboard; 1 of them are control points"
-    assert "棋盘格" in messages("zh").text(find.summary(found))
+    assert str(summary(found)) == "targets in 1 scan: 1 checkerboard; 1 of them are control points"
+    assert "棋盘格" in messages("zh").text(summary(found))
     assert find.with_targets(found) is found
     rows = report.files(found)["targets.csv"].decode("utf-8").splitlines()
     assert rows[1].startswith("S1,,checkerboard,K1,")
