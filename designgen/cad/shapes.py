@@ -82,6 +82,17 @@ def _scaled(shape: Any, scale: float) -> Any:
     return BRepBuilderAPI_Transform(shape, scaling, True).Shape()
 
 
+def _mesh(path: str, name: str, shape: Any, scale: float, size: float, exact: bool) -> float:
+    """Mesh a shape of a ``size`` in mm as finely as is wanted; return the deviation of the mesh, mm."""
+
+    def mesh(mm: float) -> int:
+        if exact:
+            return tessellation.mesh_edges_finer(shape, mm, brep_faces.is_meshed_finer, large=size > LARGE_MM)
+        return tessellation.mesh_faces(shape, mm / scale, large=size > LARGE_MM)
+
+    return finest_mm(path, name, size, MOST_TRIANGLES, mesh)
+
+
 def body_of(
     path: str,
     name: str,
@@ -107,15 +118,11 @@ def body_of(
     if exact and scale != 1.0:  # the numbers of forms are in mm
         shape, scale = _scaled(shape, scale), 1.0
 
-    def mesh(mm: float) -> int:
-        if exact:
-            return tessellation.mesh_edges_finer(shape, mm, brep_faces.is_meshed_finer, large=size > LARGE_MM)
-        return tessellation.mesh_faces(shape, mm / scale, large=size > LARGE_MM)
-
-    before = None if meshed is None else meshed.deviation(shape)
-    deviation = finest_mm(path, name, size, MOST_TRIANGLES, mesh) if before is None else before
-    if meshed is not None and before is None:
-        meshed.add(shape, deviation)
+    deviation = None if meshed is None else meshed.deviation(shape)
+    if deviation is None:
+        deviation = _mesh(path, name, shape, scale, size, exact)
+        if meshed is not None:
+            meshed.add(shape, deviation)
     volumes, areas = GProp_GProps(), GProp_GProps()
     BRepGProp.VolumeProperties_s(shape, volumes)
     BRepGProp.SurfaceProperties_s(shape, areas)

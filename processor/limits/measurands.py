@@ -81,10 +81,11 @@ def _of_holes_and_members() -> Iterator[Limit]:
         key = f"part_{quantity.replace('-', '_')}_mm"
         yield Limit(key, what, low=-math.inf, high=math.inf, measure=f"part {quantity}")
     yield Limit(
-        "part_pass_through",
+        "part_pass_through_ratio",
         "share of a group's holes that a gauge pin passes, 1 mm thinner than the hole, less 1",
         unit="1",
         low=-1.0,
+        high=0.0,
         measure="part pass-through",
     )
 
