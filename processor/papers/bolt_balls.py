@@ -262,7 +262,9 @@ def _by_ball(table_2: Text, table_3: Text, over: dict[str, tuple[float, ...]]) -
     """Rows of the balls that are printed in tables 2 and 3; the ball of the blunder has a row of its own."""
     made = []
     for place, method, radii in ((table_2, "ransac", RANSAC_RADII_M), (table_3, STATION, STATION_RADII_M)):
-        why = reason("papers.balls-single", mean=median(over.get(f"{method}: radius, mean", ())))
+        usual = median(over.get(f"{method}: radius, median", ()))
+        code = "papers.balls-single" if method == "ransac" else "papers.balls-single-four"
+        why = reason(code, median=usual)
         for ball, radius in zip(PRINTED, radii, strict=True):
             error = 1000.0 * abs(radius - TRUE_RADIUS_M)
             if error < BLUNDER_MM:

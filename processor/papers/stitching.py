@@ -14,7 +14,7 @@ import numpy as np
 from processor import diagnostics, scene_cloud
 from processor.evaluation import evaluate
 from processor.language.messages import Text, text
-from processor.model import Floats, Reason, Scene, StepRun, reason
+from processor.model import Floats, Reason, Scene, Status, StepRun, reason
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Row, Rule
 from processor.pipeline import Execution
@@ -78,6 +78,7 @@ def _figures(method: str, result: Result, path: Path, scene: Scene) -> dict[str,
         f"{method}: placed": float(placed.sum()),
         f"{method}: position, rms": errors.get("station positions after datum fit, rms", NAN),
         f"{method}: position, largest": errors.get("station positions after datum fit, max", NAN),
+        f"{method}: ambiguous": float(sum(status is Status.AMBIGUOUS for status in result.scans.status)),
         f"{method}: scale, ppm": float(scales.max(initial=0.0)),
     }
 
@@ -102,6 +103,9 @@ def rows(found: Found) -> list[Row]:
         ):
             values = found.values(BRIDGE, f"{method}: {figure}")
             made.append(_row(section, method, quantity, NAN, values, Rule.AT_MOST, none, unit))
+    ambiguous = found.values(BRIDGE, f"{OURS}: ambiguous")
+    why = reason("papers.stitch-ambiguous")
+    made.append(_row(section, OURS, text("scans called ambiguous"), NAN, ambiguous, Rule.AT_MOST, why))
     view, figure_8 = reason("papers.stitch-field-of-view"), text("figure {number}", number="8")
     stations = found.values(BRIDGE, "stations")
     made.append(_row(text("figure {number}", number="3"), SIX, text("stations"), STATIONS, stations, Rule.NEAR, view))
