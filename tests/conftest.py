@@ -1,7 +1,8 @@
-"""Kernels are compiled once for all workers: who comes second waits for the first, and loads what it has compiled."""
+"""What all tests share: kernels compiled once for all workers, and no search for garbage in what stays."""
 
 import contextlib
 import fcntl
+import gc
 import hashlib
 import os
 import tempfile
@@ -31,6 +32,7 @@ def _alone(path: Path):
 
 
 def _compile_once(self: Dispatcher, signature: object) -> object:
+    """Compile a kernel, or load what another worker has compiled meanwhile."""
     cache = self._cache
     if signature in self.overloads or not isinstance(cache, FunctionCache):
         return _compile(self, signature)
@@ -41,3 +43,10 @@ def _compile_once(self: Dispatcher, signature: object) -> object:
 
 
 Dispatcher.compile = _compile_once
+
+
+def pytest_collection_finish():
+    """Leave out of further collections what is loaded now and stays: libraries of half a million objects."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 10, 10)

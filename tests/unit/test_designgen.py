@@ -5,6 +5,7 @@ import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import cadquery as cq
 import numpy as np
@@ -14,7 +15,7 @@ from click.testing import CliRunner
 from scipy.integrate import quad
 
 import designgen
-from designgen import batch, curves, recipe_files
+from designgen import __main__, batch, curves, recipe_files
 from designgen.cli import commands
 from designgen.designs import arch_bridge, arch_mesh, arch_part, arch_ring, bolt_ball, space_frame
 from designgen.export import folder as export_folder
@@ -248,15 +249,19 @@ def test_an_exported_folder_holds_design_and_truth(tmp_path):
         export_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=True)
 
 
-def test_the_command_line(tmp_path):
+def test_the_command_line(tmp_path, monkeypatch, capsys):
     def run(*arguments):
-        command = [sys.executable, "-m", "designgen", *map(str, arguments)]
-        return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+        monkeypatch.setattr(sys, "argv", ["designgen", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            __main__.main()
+        return SimpleNamespace(returncode=end.value.code or 0, stdout=capsys.readouterr().out)
 
     listed = run("list").stdout
     assert all(name in listed for name in ("arch-d1", "balls-100", "bolt_ball"))
     scene = tmp_path / "s.h5"
-    done = run("make", "balls-100", "-o", scene, "--seed", 4, "--set", "scan.spacing_mm=20", "--json")
+    words = ["make", "balls-100", "-o", scene, "--seed", "4", "--set", "scan.spacing_mm=20", "--json"]
+    command = [sys.executable, "-m", "designgen", *words]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["seed"] == 4
     assert store.read_provenance(scene)["parameters"]["scan"]["spacing_mm"] == 20
