@@ -554,6 +554,42 @@ class Control(Checked):
     seen_sd: Floats = column("m", means=DEVIATION)  # of each coordinate as seen
 
 
+class TargetKind(Word):
+    """What a target is."""
+
+    CHECKERBOARD = "checkerboard"
+    SPHERE = "sphere"
+
+
+@dataclass(frozen=True)
+class TargetSearch(Checked):
+    """Targets that scans are searched for, mm: NaN = not for this kind.
+
+    ``checkerboard_mm`` is the side of a square of two by two fields, two of them dark, across from one another.
+    """
+
+    checkerboard_mm: float = described(float("nan"), means=Meaning(above=0.0, most=LARGEST_MM))
+    sphere_radius_mm: float = described(float("nan"), means=Meaning(above=0.0, most=LARGEST_MM))
+
+
+@dataclass(frozen=True)
+class Targets(Rows):
+    """Targets as found in scans: ``places`` (t, 3) in the frame of scan ``scan`` (t,), a row of Scene.scans; mm.
+
+    ``name`` is that of the control point, "" where none is there. ``sd`` is of each coordinate, ``station`` as in
+    :class:`Control`. ``fit`` is the share of the intensities' variance that the pattern explains; NaN for spheres.
+    """
+
+    name: tuple[str, ...] = names("t")
+    kind: tuple[TargetKind, ...] = words("t", TargetKind)
+    scan: Ints = column("t", dtype=np.int64, means=Meaning(rows_of="/scans"))
+    station: Ints = column("t", dtype=np.int64, means=Meaning(rows_of="/stations.ids", lowest_row=-1))
+    places: Floats = column("t", 3, means=PLACE)
+    sd: Floats = column("t", means=DEVIATION)
+    points: Ints = column("t", dtype=np.int64, means=Meaning(least=0))
+    fit: Floats = column("t", means=Meaning(most=1.0))
+
+
 @dataclass(frozen=True)
 class Picks(Checked):
     """Common points that were picked in two scans each, in these scans' frames (mm)."""
@@ -579,6 +615,25 @@ class Clips(Checked):
     inside: Ints = column("c", dtype=np.int64, means=Meaning(least=0))
     read: int = described(0, means=Meaning(least=0))  # points of all scans
     kept: int = described(0, means=Meaning(least=0))
+
+
+@dataclass(frozen=True)
+class Ceiling(Checked):
+    """A ceiling that hangs from a space frame, in the project's frame, mm: a ``level``, or a surface of triangles.
+
+    Nothing is to be nearer above it than ``clearance_mm``, no hanger longer than ``longest_mm`` (NaN = any length).
+    """
+
+    level: float = described(float("nan"), means=Meaning(least=-LARGEST_MM, most=LARGEST_MM))
+    vertices: Floats = column("v", 3, means=PLACE)
+    faces: Ints = column("f", 3, dtype=np.int64, means=Meaning(rows_of="vertices"))
+    clearance_mm: float = described(0.0, means=Meaning(finite=True, least=0.0, most=LARGEST_MM))
+    longest_mm: float = described(float("nan"), means=Meaning(above=0.0, most=LARGEST_MM))
+
+    def contradictions(self) -> Iterable[str]:
+        """Yield that there is neither a level nor a surface, or both."""
+        if bool(np.isnan(self.level)) == (not len(self.faces)):
+            yield "/level: expected a level or faces, found neither or both"
 
 
 @dataclass(frozen=True)
@@ -610,6 +665,11 @@ class Scene(Checked):
     picks: Picks | None = newer()
     title_block: TitleBlock | None = newer(hashed=False)
     clips: Clips | None = newer()
+    ceiling: Ceiling | None = newer()
+    target_search: TargetSearch | None = newer()
+    targets: Targets | None = newer(hashed=False)  # those of Scene.control are hashed
+    # days of the scans by their files, YYYY-MM-DD, in order; no step reads them
+    scanned: tuple[str, ...] = names("days", newer=True, hashed=False)
 
     def contradictions(self) -> Iterable[str]:
         """Yield scans of one name, and parts that the design does not have."""
@@ -768,6 +828,15 @@ class PoseTruth(Checked):
 
 
 @dataclass(frozen=True)
+class TargetTruth(Checked):
+    """Targets as placed, in the project's frame: centres of patterns and of spheres."""
+
+    ids: tuple[str, ...] = names("k")
+    kinds: tuple[str, ...] = names("k")
+    positions: Floats = column("k", 3)
+
+
+@dataclass(frozen=True)
 class Truth(Checked):
     """What the generator knows and no step may see."""
 
@@ -781,6 +850,7 @@ class Truth(Checked):
     stations: StationTruth | None = None
     as_built: AsBuilt | None = None
     pose: PoseTruth | None = newer()  # without it the scans are in the design's frame
+    targets: TargetTruth | None = newer()
 
 
 # --- checks ---------------------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from typing import Any
 from processor import user_methods
 from processor.model import InputError, Scan, Scene, Status, StepRun, UsageError, did_you_mean, reason
 from processor.progress import stage
+from processor.store import epoch
 from processor.store.json_values import json_ready
 from processor.version import __version__
 
@@ -190,7 +191,7 @@ def prepare(
     piecewise = is_large(path)
     scene = read(path, units, piecewise)
     jobs = jobs_for(scene, wanted, methods, params, seed)
-    if piecewise and not streams(jobs):
+    if piecewise and not (streams(jobs) and scene.target_search is None):
         return read(path, units), jobs, False
     return scene, jobs, piecewise
 
@@ -308,7 +309,8 @@ def execute(
         def hashed() -> str:
             return store.scene_hash(scene, None if points is None else points.pieces)
 
-        digest = hashed() if so_far is not None else ""
+        digest = hashed()
+        scene = _with_targets(scene, log)
         for job in jobs:
             if so_far is not None:
                 so_far(_execution(path, scene, runs, digest, piecewise))
@@ -325,7 +327,20 @@ def execute(
                 needs["kept"] = kept.setdefault(job.step, {})
             runs.append(_run(path, scene, job, {**given, **needs}, log))
             answers.setdefault(job.step, runs[-1].result)
-        return _execution(path, scene, runs, digest or hashed(), piecewise)
+        return _execution(path, scene, runs, digest, piecewise)
+
+
+def _with_targets(scene: Scene, log: Callable[[str], None] = lambda _: None) -> Scene:
+    """Return the scene with the targets that it is searched for; its hash is that of what was read."""
+    if scene.target_search is None or scene.targets is not None:
+        return scene
+    from processor.targets import find
+    from processor.targets.summary import summary
+
+    with stage("searching for targets"):
+        scene = find.with_targets(scene)
+    log(str(summary(scene)))
+    return scene
 
 
 def _execution(path: Path, scene: Scene, runs: Sequence[StepRun], digest: str, piecewise: bool) -> Execution:
@@ -336,6 +351,7 @@ def _execution(path: Path, scene: Scene, runs: Sequence[StepRun], digest: str, p
         "seed": parameters[0]["seed"] if parameters else 0,
         "software": software(),
         "parameters": parameters,
+        "epoch": epoch.facts(scene),
     }
     return Execution(scene, tuple(runs), provenance, path if piecewise else None)
 
@@ -417,7 +433,8 @@ def read_execution(results: Path, path: Path, units: str | None) -> Execution:
     with points_of(path) if piecewise else nullcontext() as points:
         digest = store.scene_hash(scene, None if points is None else points.pieces)
     check_same_input(results, provenance, path, digest)
-    return Execution(scene, runs, provenance, path if piecewise else None)
+    provenance["epoch"] = epoch.facts(scene)  # the title block may have changed
+    return Execution(scene if piecewise else _with_targets(scene), runs, provenance, path if piecewise else None)
 
 
 def find_input(results: Path) -> Path:

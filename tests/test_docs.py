@@ -68,6 +68,7 @@ ELSEWHERE = {
     "processor batch /scans -o /results --cluster tcp://10.0.0.1:8786": "tests/unit/test_batch.py",
     "processor validate mine.toml -o nights --jobs 2": "tests/unit/test_validation_running.py",
     "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": "tests/unit/test_validation_running.py",
+    "processor history runs -o history": "tests/unit/test_epochs.py",
     "processor validate -o nights --accept": "tests/unit/test_validation.py",
     "processor papers -o papers": "make weekend",
     "processor run my-frame -o results --steps spheres --method ray,my_module:my_method": (

@@ -238,7 +238,7 @@ class _StationCaster:
             shape=shape[met],
             t=t,
             range=t,
-            signal=self.params.signal(cosine, t),
+            signal=self.surfaces.albedo[shape[met]] * self.params.signal(cosine, t),
             cosine=cosine,
             ray=ray[met],
             source=np.full(len(t), SURFACE, np.uint8),
@@ -283,7 +283,8 @@ class _StationCaster:
         )
         hit = np.isfinite(t)
         ranges, t, cosine = np.where(hit, t, np.inf), np.where(hit, t, 1.0), np.where(hit, cosine, 0.0)
-        energy = np.where(hit, share * self.params.signal(cosine, t), 0.0)
+        albedo = self.surfaces.albedo[np.maximum(subs, 0)]
+        energy = np.where(hit, share * albedo * self.params.signal(cosine, t), 0.0)
         if self.scanner.behaviour == "pulse":
             energy = strongest_echo(ranges, energy, self.scanner.separation_mm)
         back = np.where(energy > 0.0, share, 0.0).sum(axis=1) > LEAST_SHARE
@@ -313,9 +314,12 @@ class _StationCaster:
         measured = echoes.range + sigma * rng.standard_normal(n)
         measured = np.where(stray, low + where * (echoes.range - low), measured)
         surface = self.surfaces.label[echoes.shape]
+        bright = echoes.signal
+        if self.scanner.intensity_noise > 0.0:
+            bright = bright * np.maximum(1.0 + self.scanner.intensity_noise * rng.standard_normal(n), 0.0)
         returns = Returns(
             points=self.grid.directions(echoes.row, echoes.column) * measured[:, None],
-            intensity=echoes.signal.astype(np.float32),
+            intensity=bright.astype(np.float32),
             row=echoes.row,
             column=echoes.column,
             part=np.where(stray, -1, self.surfaces.part[echoes.shape]).astype(np.int32),

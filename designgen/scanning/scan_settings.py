@@ -30,12 +30,12 @@ KEYS_BY_KIND = {
     "net": ("arch-bridge",),
     "member_reach_mm": ("space-frame",),
     "distance_mm": ("arch-bridge", "structure"),
-    "height_mm": ("space-frame", "structure"),
-    "registered": ("structure",),
+    "height_mm": ("space-frame", "structure", "room"),
+    "registered": ("structure", "room"),
     "repeated": ("structure",),
     "scans_at_first": ("structure",),
-    "merged": ("space-frame", "structure"),
-    "origin_mm": ("space-frame", "structure"),
+    "merged": ("space-frame", "structure", "room"),
+    "origin_mm": ("space-frame", "structure", "room"),
 }
 # Keys that a type of structure does not use: a stadium is scanned from inside.
 UNUSED_KEYS_BY_TYPE = {"stadium-roof": ("distance_mm",)}

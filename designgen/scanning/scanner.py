@@ -45,6 +45,7 @@ class Scanner:
     max_range_mm: float = 80_000.0
     threshold: float = 0.0005
     flying_share: float = 0.0002
+    intensity_noise: float = 0.0  # relative standard deviation of the intensity
     offset_mm: float = 0.5
     scale_ppm: float = 5.0
     tilt_urad: float = 15.0

@@ -41,6 +41,7 @@ class Surfaces:
     label: Labels  # (m,) row of surface_names
     part: Labels  # (m,) row of part_names, -1 = none
     patch: Labels  # (m,) row of patches, -1 = none or a plane one, whose net is exact
+    albedo: Floats  # (m,) reflectance as a multiple of the scan's
     corner_pq: Floats  # (m, 3, 2) parameters of the corners of a patch's triangles
     cuts: Floats  # (c, 4)
     cut_start: Ints  # (m + 1,)
@@ -74,11 +75,20 @@ class Builder:
     _cuts: list[Floats] = field(default_factory=list)
     _pieces: list[tuple[int, Floats, float]] = field(default_factory=list)
     _labels: list[str] = field(default_factory=list)
+    _albedo: list[float] = field(default_factory=list)
     _nets: list[tuple[Patch | Trimmed, int, Hashable]] = field(default_factory=list)
 
-    def sphere(self, part: int, name: str, centre: Floats, radius: float, cuts: Sequence[tuple[Floats, float]]) -> None:
+    def sphere(
+        self,
+        part: int,
+        name: str,
+        centre: Floats,
+        radius: float,
+        cuts: Sequence[tuple[Floats, float]],
+        albedo: float = 1.0,
+    ) -> None:
         """Add a sphere without the caps beyond planes, each given by unit normal and distance from the centre."""
-        self._add(SPHERE, part, self._name(name), [*centre, radius], [(centre, radius)])
+        self._add(SPHERE, part, self._name(name), [*centre, radius], [(centre, radius)], albedo)
         self._cuts[-1] = np.array([[*normal, distance] for normal, distance in cuts]).reshape(-1, 4)
 
     def cone(
@@ -111,14 +121,14 @@ class Builder:
         """Add a disc or plane ring."""
         self._add(DISC, part, self._name(name), [*centre, *normal, outer, inner], [(centre, outer)])
 
-    def polygon(self, part: int, name: str, corners: Floats) -> None:
-        """Add a convex plane polygon with corners (n, 3)."""
+    def polygon(self, part: int, name: str, corners: Floats, albedo: float = 1.0) -> None:
+        """Add a convex plane polygon with corners (n, 3) that reflects ``albedo`` times as much as the scan states."""
         surface = self._name(name)
         for i in range(1, len(corners) - 1):
             triangle = corners[[0, i, i + 1]]
             middle = triangle.mean(axis=0)
             reach = float(np.linalg.norm(triangle - middle, axis=1).max())
-            self._add(TRIANGLE, part, surface, triangle.ravel().tolist(), [(middle, reach)])
+            self._add(TRIANGLE, part, surface, triangle.ravel().tolist(), [(middle, reach)], albedo)
 
     def patch(self, part: int, patch: Patch | Trimmed, smooth: Hashable = None) -> None:
         """Add a patch. Patches of the same part and ``smooth`` are pieces of one smooth surface; None: of one name."""
@@ -129,8 +139,15 @@ class Builder:
         return len(self._labels) - 1
 
     def _add(
-        self, kind: int, part: int, surface: int, numbers: Sequence[float], pieces: Sequence[tuple[Floats, float]]
+        self,
+        kind: int,
+        part: int,
+        surface: int,
+        numbers: Sequence[float],
+        pieces: Sequence[tuple[Floats, float]],
+        albedo: float = 1.0,
     ) -> None:
+        self._albedo.append(albedo)
         row = np.zeros(NUMBERS)
         row[: len(numbers)] = numbers
         self._pieces += [(len(self._kind), centre, radius) for centre, radius in pieces]
@@ -154,6 +171,7 @@ class Builder:
                 "label": np.array([names[self._labels[row]] for row in self._surface], np.int32),
                 "part": np.array(self._part, np.int32),
                 "patch": np.full(count, -1, np.int32),
+                "albedo": np.array(self._albedo, np.float64),
                 "corner_pq": np.zeros((count, 3, 2)),
                 "piece_shape": np.array([shape for shape, _, _ in self._pieces], np.int32),
                 "piece_centre": np.array([centre for _, centre, _ in self._pieces]).reshape(-1, 3),
@@ -194,6 +212,7 @@ def _net_shapes(patch: Patch | Trimmed, number: int, part: int, surface: int, la
         "label": np.full(count, label, np.int32),
         "part": np.full(count, part, np.int32),
         "patch": np.full(count, -1 if flat else number, np.int32),
+        "albedo": np.ones(count),
         "corner_pq": pq,
         "piece_shape": np.arange(first, first + count, dtype=np.int32),
         "piece_centre": centre,

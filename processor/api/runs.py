@@ -124,11 +124,31 @@ def run(
     InputError : the input cannot be used, or the output cannot be written.
     UsageError : a name or parameter is unknown.
     """
+    results = compute(input_, output, steps, method, params, units, seed, log=log, so_far=so_far)
+    return write(results, None if output is None else Path(output), lang)
+
+
+def compute(
+    input_: str | Path | Scene,
+    output: str | Path | None = None,
+    steps: Names = None,
+    method: Names = None,
+    params: str | Path | Mapping[str, Any] | None = None,
+    units: str | None = None,
+    seed: int | None = 0,
+    *,
+    log: Callable[[str], None] = lambda _: None,
+    so_far: str | Path | None = None,
+) -> Results:
+    """Process an input as :func:`run` does, without writing the results; ``output`` is tried before the work."""
     wanted, methods, parameters = _names(steps), _names(method), _parameters(params)
     out = None if output is None else Path(output)
     if isinstance(input_, Scene):
         meaning.check(input_, f"scene {input_.name[:LONGEST_NAME]!r}")
-        return _run_scene(input_, out, pipeline.jobs_for(input_, wanted, methods, parameters, seed), lang, log)
+        jobs = pipeline.jobs_for(input_, wanted, methods, parameters, seed)
+        if out is not None:
+            write_results.check_output(out, None)
+        return Results(pipeline.execute(Path(input_.name), input_, jobs, log))
     path = files.existing(Path(input_))
     if out is not None:
         write_results.check_output(out, path)
@@ -143,7 +163,7 @@ def run(
     execution = pipeline.execute(path, scene, jobs, log, piecewise, keep)
     results = Results(execution, evaluate.evaluate(path, execution))
     fingerprint.check_unchanged(path.resolve(), before, place)
-    return write(results, out, lang)
+    return results
 
 
 def _log_reading(path: Path, scene: Scene, log: Callable[[str], None], chosen: Sequence[pipeline.Job]) -> None:
@@ -160,18 +180,6 @@ def _keep(folder: Path, jobs: Sequence[pipeline.Job], execution: Execution) -> N
     folder.mkdir(parents=True, exist_ok=True)
     planned = [f"{job.step} ({job.params.method})" for job in jobs]
     store.write_results(folder / RESULTS_H5, execution.runs, {**execution.provenance, "planned": planned})
-
-
-def _run_scene(
-    scene: Scene,
-    out: Path | None,
-    jobs: Sequence[pipeline.Job],
-    lang: str,
-    log: Callable[[str], None],
-) -> Results:
-    if out is not None:
-        write_results.check_output(out, None)
-    return write(Results(pipeline.execute(Path(scene.name), scene, jobs, log)), out, lang)
 
 
 def write(results: Results, out: Path | None, lang: str = "en", further: Sequence[str] = ()) -> Results:

@@ -69,7 +69,7 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
         from processor.cli.limited_run import limited_run
 
         context.exit(limited_run(input_, output, *limits, _arguments({**options, "fail_on": fail_on})))
-    results = runs.run(
+    results = runs.compute(
         input_,
         output,
         options["steps"],
@@ -77,12 +77,10 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
         options["params"],
         options["units"],
         options["seed"],
-        lang=options["lang"],
         log=log_line if shown.quiet else print_error_line,
         so_far=options["so_far"],
     )
-    if further:
-        runs.write(results, output, options["lang"], further)
+    runs.write(results, output, options["lang"], further)
     show_results(context, output, results, shown, fail_on)
 
 

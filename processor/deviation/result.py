@@ -14,6 +14,7 @@ from processor.model import (
     Checked,
     Floats,
     Ints,
+    Labels,
     Reason,
     Rows,
     Status,
@@ -21,6 +22,7 @@ from processor.model import (
     Word,
     column,
     described,
+    names,
     newer,
     optional,
     reasons,
@@ -54,6 +56,7 @@ class CorePoints(Rows):
     n2: Ints = column("k", dtype=np.int64)
     std1: Floats = column("k", unit="mm")
     std2: Floats = column("k", unit="mm")
+    body: Labels = column("k", dtype=np.int32, newer=True)  # row of the result's bodies, -1 = of none
 
     @property
     def distances(self) -> Distances:
@@ -122,6 +125,7 @@ class Result(Checked):
     )
     core: CorePoints = dataclasses.field(default_factory=CorePoints, metadata={"json": ""})
     limits: JudgedLimits | None = newer()
+    bodies: tuple[str, ...] = names("b", json="", newer=True)  # of the design, by name
 
     @property
     def overall(self) -> Verdict:

@@ -50,4 +50,5 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
         first = reason("deviation.scans-unplaced", scans=", ".join(scan.unplaced))
         status = Status.WEAK if result.status is Status.OK else result.status
         result = replace(result, status=status, reasons=(first, *result.reasons))
-    return replace(result, limits=verdicts.judge(scene, result, vertices, origin))
+    result = verdicts.with_bodies(result, scene.structure, vertices, origin)
+    return replace(result, limits=verdicts.judge(scene, result))

@@ -10,6 +10,7 @@ within with their whole intervals, at most those that are not wholly beyond.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import ndtri
@@ -24,18 +25,15 @@ from processor.model import NORMAL_95, WORST_FIRST, Floats, Ints, Limit, Scene, 
 WHOLE = "surface"
 
 
-def judge(scene: Scene, result: Result, vertices: Floats, origin: Floats) -> JudgedLimits | None:
-    """Compare the deviations of a result with the limits of a scene; None where none is given.
-
-    ``vertices`` (v, 3) are those of the design less ``origin`` (3,).
-    """
+def judge(scene: Scene, result: Result) -> JudgedLimits | None:
+    """Compare the deviations of a result, with its bodies, with the limits of a scene; None where none is given."""
     tolerance = standards.default_for(scene.tolerance)
     if scene.structure is None or not any(limit.measure == measures.DEVIATION for limit in tolerance.limits):
         return None
     unsure = result.status in (Status.FAILED, Status.AMBIGUOUS)
     unsure |= result.registration_error_from is ErrorSource.UNKNOWN
     rows: list[Comparison] = []
-    for name, of_it in _components(result, scene.structure, vertices, origin).items():
+    for name, of_it in _components(result).items():
         shares = judging.limits_for(tolerance, measures.DEVIATION_SHARE, name)
         core = result.core
         values, half = core.distance[of_it], core.lod95[of_it]
@@ -48,16 +46,25 @@ def judge(scene: Scene, result: Result, vertices: Floats, origin: Floats) -> Jud
     return judging.judged(rows, tolerance)
 
 
-def _components(result: Result, design: StructureDesign, vertices: Floats, origin: Floats) -> Mapping[str, Bools]:
-    """Mark the core points (k,) of each named body of the design, of the whole surface without any."""
-    count = len(result.core)
-    if design.bodies is None or not count:
-        return {WHOLE: np.ones(count, bool)}
+def with_bodies(result: Result, design: StructureDesign, vertices: Floats, origin: Floats) -> Result:
+    """Return the result with the body of each core point; as it is for a design without bodies.
+
+    ``vertices`` (v, 3) are those of the design less ``origin`` (3,).
+    """
+    if design.bodies is None or not len(result.core):
+        return result
     surface = mesh_distance.of_design(vertices, design.faces)
     facet, _, _ = surface.distances(result.core.points + (result.origin - origin), np.inf)
     of_facet = design.bodies.of_facet[mesh_distance.double_areas(vertices, design.faces)[1] > mesh_distance.LEAST_AREA]
     body: Ints = np.where(facet >= 0, of_facet[np.maximum(facet, 0)], -1)
-    return {name: body == row for row, name in enumerate(design.bodies.names)}
+    return replace(result, bodies=design.bodies.names, core=replace(result.core, body=body.astype(np.int32)))
+
+
+def _components(result: Result) -> Mapping[str, Bools]:
+    """Mark the core points (k,) of each named body of the design, of the whole surface without any."""
+    if not result.bodies:
+        return {WHOLE: np.ones(len(result.core), bool)}
+    return {name: result.core.body == row for row, name in enumerate(result.bodies)}
 
 
 def _share(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool) -> Measured:

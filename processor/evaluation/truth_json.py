@@ -24,6 +24,7 @@ from processor.model import (
     RecordError,
     StationTruth,
     StructureTruth,
+    TargetTruth,
     Truth,
 )
 
@@ -36,6 +37,7 @@ RECORDS: dict[str, type[Any]] = {
     "stations": StationTruth,
     "as_built": AsBuilt,
     "pose": PoseTruth,
+    "targets": TargetTruth,
 }
 NUMBERS = ("spacing_mm", "sigma_mm")
 KNOWN = {"format", "about", *NUMBERS, *RECORDS}

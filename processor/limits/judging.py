@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
@@ -131,6 +132,15 @@ def judged(comparisons: Iterable[Comparison], tolerance: Tolerance) -> JudgedLim
         source=tuple(row.limit.source for row in rows),
         verified=np.array([row.limit.verified for row in rows], np.bool_),
     )
+
+
+def joined(first: JudgedLimits, second: JudgedLimits) -> JudgedLimits:
+    """Return the rows of both."""
+    columns: dict[str, Any] = {}
+    for one in fields(JudgedLimits):
+        a, b = getattr(first, one.name), getattr(second, one.name)
+        columns[one.name] = (*a, *b) if isinstance(a, tuple) else np.concatenate([a, b])
+    return JudgedLimits(**columns)
 
 
 def clause_of(limit: Limit, tolerance: Tolerance) -> str:

@@ -16,6 +16,7 @@ SUPPORT_CENTRE, SUPPORT_HEIGHT, ADJACENT = "support_centre", "support_height", "
 MULTI_POINT, DEFLECTION = "multi_point_support_height", "deflection"
 DEVIATION, DEVIATION_SHARE = "deviation", "deviation_share"
 DEFECT_DEPTH, DEFECT_AREA = "defect_depth", "defect_area"
+CEILING = "ceiling"
 CLOSURE, CONTROL_POINT, SCAN_POSITION = "closure", "control_point", "scan_position"
 
 MEASURES = {

@@ -7,6 +7,7 @@ the scanner's grid, if the scan has both.
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import re
 import struct
 from collections.abc import Sequence
@@ -32,6 +33,7 @@ CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 LONGEST_NAME = 100
 GRID = ("rowIndex", "columnIndex")
 COLOURS = ("colorRed", "colorGreen", "colorBlue")
+GPS_BEGIN, LATEST_S = datetime.datetime(1980, 1, 6, tzinfo=datetime.timezone.utc), 1e10
 MOST_LINES = 2**31 - 1  # rows or columns of a grid: they are stored as int32
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
@@ -149,7 +151,22 @@ def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> 
         grid=(cells[0], cells[1]) if cells else None,
         single=_is_single(header, axes[0]),
     )
-    return dataclasses.replace(scan, colour=colour) if len(colour) else scan
+    return dataclasses.replace(scan, colour=colour if len(colour) else scan.colour, scanned=_day(file, header))
+
+
+def _day(file: Any, header: Any) -> str:
+    """Return the day (UTC) that a scan was begun, else that of the file, as far as the file states one.
+
+    Times are seconds since the begin of GPS time; the leap seconds since then do not count for a day.
+    """
+    root = file.image_file.root()
+    for node, name in ((header.node, "acquisitionStart"), (root, "creationDateTime")):
+        if not node.isDefined(name) or not node[name].isDefined("dateTimeValue"):
+            continue
+        seconds = float(node[name]["dateTimeValue"].value())
+        if 0.0 < seconds < LATEST_S:
+            return (GPS_BEGIN + datetime.timedelta(seconds=seconds)).date().isoformat()
+    return ""
 
 
 def _read_points(

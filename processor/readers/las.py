@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import struct
 from pathlib import Path
@@ -48,6 +49,7 @@ def read(path: Path) -> list[RawScan]:
         fits_degrees = bool((np.abs([header.mins, header.maxs])[:, :2] <= [180.0, 90.0]).all())
         unit = _unit(path, [*header.vlrs, *(header.evlrs or [])], fits_degrees)
         declared = int(header.point_count)
+        day = "" if header.creation_date is None else header.creation_date.isoformat()
         if not np.isfinite([header.scales, header.offsets]).all() or not np.all(header.scales):
             raise InputError(
                 f"{path}: expected finite scales and offsets, and scales other than 0, found {header.scales} and "
@@ -74,7 +76,7 @@ def read(path: Path) -> list[RawScan]:
     scan = build_scan(
         path, scan_name(path), points, unit=unit, intensity=intensity, station=station if station.any() else ()
     )
-    return [coloured(scan, colour)]
+    return [dataclasses.replace(coloured(scan, colour), scanned=day)]
 
 
 def _check_header(path: Path) -> None:

@@ -33,6 +33,7 @@ class RawScan(Checked):
     grid_row: Labels = column("n", dtype=np.int32)  # as stored; see scan_folder.scanner_grid
     grid_column: Labels = column("n", dtype=np.int32)
     colour: Codes = column("n", 3, dtype=np.uint8)  # red, green, blue
+    scanned: str = ""  # day of the scan by the file, YYYY-MM-DD; "" = not given
     step: float = 0.0  # resolution of the coordinates in the file's number type; 0 = unlimited
 
 

@@ -162,7 +162,7 @@ def _scans(answer: dict[str, Any], descriptor: int) -> list[RawScan]:
             key: np.frombuffer(shared, dtype, math.prod(shape), offset).reshape(shape) if 0 not in shape else ()
             for key, (offset, shape, dtype) in scan["arrays"].items()
         }
-        scans.append(RawScan(scan["name"], unit=scan["unit"], step=scan["step"], **arrays))
+        scans.append(RawScan(scan["name"], unit=scan["unit"], step=scan["step"], scanned=scan["scanned"], **arrays))
     return scans
 
 
@@ -313,5 +313,7 @@ def _answer(path: Path, module: str, shared: _Shared) -> dict[str, Any]:
         for key in ARRAYS:
             array = getattr(scan, key)
             arrays[key] = (shared.place(array), array.shape, array.dtype.str)
-        records.append({"name": scan.name, "unit": scan.unit, "step": scan.step, "arrays": arrays})
+        records.append(
+            {"name": scan.name, "unit": scan.unit, "step": scan.step, "scanned": scan.scanned, "arrays": arrays}
+        )
     return {"scans": records}

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 
-from processor.language.messages import Text, messages, text
+from processor.language.messages import Message, Text, messages, text
 from processor.limits.judging import JudgedLimits
-from processor.model import Clips, StepRun, Verdict
+from processor.model import Clips, StepRun
 from processor.pipeline import Execution
+from processor.report import verdict_counts
 from processor.report.step_report import step_report
-
-VERDICTS = {
-    Verdict.FAIL: "{count} fail",
-    Verdict.INDETERMINATE: "{count} indeterminate",
-    Verdict.PASS: "{count} pass",
-}  # the worst first
 
 
 def clipped(clips: Clips) -> Text:
@@ -44,11 +37,9 @@ def of_step(run: StepRun) -> Text:
     return text("{step}: {head}; {verdicts}", step=report_of.title, head=head, verdicts=of_limits(limits))
 
 
-def of_limits(limits: JudgedLimits) -> Text:
+def of_limits(limits: JudgedLimits) -> Message:
     """Return how many comparisons with limits have which verdict."""
-    counts = Counter(limits.verdict)
-    verdicts = [text(template, count=counts[word]) for word, template in VERDICTS.items() if counts[word]]
-    return text("of {count} {count:?limit|limits} {verdicts}", count=len(limits), verdicts=verdicts)
+    return verdict_counts.told(verdict_counts.LIMITS, limits.of, limits.verdict)
 
 
 def unverified(execution: Execution) -> list[str]:

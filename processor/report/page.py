@@ -18,6 +18,7 @@ from processor.report import all_tables, characteristics, headline, page_script,
 from processor.report.step_report import step_report
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table, headings, numeric, shown
+from processor.targets.summary import summary
 
 GOOD = "ok"
 LONG_CELL = 24  # characters
@@ -70,6 +71,7 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Captio
         banner=_banner(execution),
         about=_about(scene),
         clipped=None if scene.clips is None else headline.clipped(scene.clips),
+        targets=None if scene.targets is None else summary(scene),
         lang=lang,
         live=page_script.embedded({"words": messages(lang).of_scripts(script), "steps": messages(lang).rendered(live)}),
         script=script,
@@ -188,7 +190,7 @@ def _sections(
         section["live"] = section["step"] in live
         section["figures"] = _pictures(section["step"], figures.get(section["step"], {}), section["live"])
     if report.metrics:
-        table = _table(all_tables.checks_table(report), lang)
+        table = written_table(all_tables.checks_table(report), lang)
         empty: dict[str, Any] = {"message": "", "lead": [], "further": [], "figures": [], "live": False, "step": ""}
         sections.append({**empty, "title": text("Truth"), "tables": [table]})
     return sections
@@ -209,9 +211,9 @@ def _section(
     return {
         "title": report_of.title,
         "message": _message(run, lang),
-        "lead": [_table(table, lang) for table in lead],
-        "tables": [_table(table, lang) for table in tables if table.file not in LEAD and not table.folded],
-        "further": [_table(table, lang) for table in further],
+        "lead": [written_table(table, lang) for table in lead],
+        "tables": [written_table(table, lang) for table in tables if table.file not in LEAD and not table.folded],
+        "further": [written_table(table, lang) for table in further],
         "further_titles": list(dict.fromkeys(messages(lang).text(table.title) for table in further)),
         "step": run.step,
     }
@@ -251,7 +253,8 @@ def heading(name: str, lang: str) -> str:
     return catalogue.texts.get(f"heading|{name}", catalogue.text(label(name)))
 
 
-def _table(table: Table, lang: str) -> dict[str, Any]:
+def written_table(table: Table, lang: str) -> dict[str, Any]:
+    """Return what the macro ``put`` shows of a table, in a language."""
     note: Any = table.note
     if len(table.rows) > MOST_ROWS:
         note = text(

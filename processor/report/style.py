@@ -64,9 +64,42 @@ def pdf(pages: Iterable[Figure]) -> bytes:
     return out.getvalue()
 
 
+LATIN = "DejaVu Sans"  # comes with Matplotlib
+# Fonts with Chinese characters, as systems have them; the first that is there is used.
+CHINESE = (
+    "Noto Sans CJK SC", "Noto Sans SC", "Source Han Sans SC", "Source Han Sans CN", "Noto Sans CJK JP",
+    "WenQuanYi Micro Hei", "WenQuanYi Zen Hei", "Droid Sans Fallback", "Microsoft YaHei", "SimHei", "SimSun",
+    "PingFang SC", "Heiti SC", "Arial Unicode MS",
+)  # fmt: skip
+
+
 @cache
 def _font() -> FT2Font:
-    return font_manager.get_font(font_manager.findfont("DejaVu Sans"))
+    return font_manager.get_font(font_manager.findfont(LATIN))
+
+
+@cache
+def chinese_font() -> str:
+    """Return the name of a font of this system with Chinese characters; "" where there is none."""
+    there = {font.name for font in font_manager.fontManager.ttflist}
+    return next((name for name in CHINESE if name in there), "")
+
+
+def families() -> list[str]:
+    """Return the families of text: that of Matplotlib, then one with Chinese characters if there is one."""
+    return [LATIN, *filter(None, [chinese_font()])]
+
+
+@cache
+def _has(character: str) -> bool:
+    code = ord(character)
+    if _font().get_char_index(code):
+        return True
+    return bool(chinese_font()) and bool(
+        font_manager.get_font(
+            font_manager.findfont(font_manager.FontProperties(family=[chinese_font()]))
+        ).get_char_index(code)
+    )
 
 
 def write_beside(axes: Axes, rows: Sequence[tuple[str, str | None]], line: float, size: float) -> None:
@@ -95,8 +128,8 @@ def printable_name(name: str, row: int) -> str:
 
 
 def drawable(text: str) -> str:
-    """Return a text with question marks for what Matplotlib's font lacks."""
-    return "".join(c if c.isprintable() and _font().get_char_index(ord(c)) else "?" for c in text)
+    """Return a text with question marks for what the fonts of :func:`families` lack."""
+    return "".join(c if c.isprintable() and _has(c) else "?" for c in text)
 
 
 def colour_limit(values: Floats) -> float:

@@ -70,6 +70,6 @@ def write_results(
         write_text(making / REPORT_PAGE, page.html(execution, report, drawn, lang))
         if "pdf" in further:
             with default_settings():
-                write_bytes(making / document.NAME, document.document(execution, drawn))
+                write_bytes(making / document.NAME, document.document(execution, drawn, lang))
         if "xlsx" in further:
             write_bytes(making / workbook.NAME, workbook.workbook(execution, report))

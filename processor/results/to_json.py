@@ -25,6 +25,7 @@ def results_json(execution: Execution, report: ErrorReport, headline: str = "") 
         "input_sha256": made["input_sha256"],
         "units": {"read_as": execution.scene.units, "reason": execution.scene.units_reason, "written_as": "mm"},
         **_clips(execution.scene),
+        **({"scanned": made["epoch"]["scanned"]} if made.get("epoch", {}).get("scanned") else {}),
         "seed": made["seed"],
         "software": made["software"],
         "parameters": made["parameters"],

@@ -102,11 +102,13 @@ def control_points(
     units: Sequence[str],
     stations: Stations | None,
     unit: str,
+    searched: bool = False,
 ) -> Control | None:
     """Combine known and seen positions of targets; None without any.
 
     ``units`` are those of the scans' coordinates, ``unit`` is that of known ones. Raises InputError for a target that
-    is seen but not known, or given twice, for an unknown scan or station, and if no target is seen at all.
+    is seen but not known, or given twice, for an unknown scan or station, and if no target is seen at all, unless the
+    scans are ``searched`` for them.
     """
     if not measured:
         return None
@@ -116,8 +118,11 @@ def control_points(
         if row[target.name] != i:
             raise InputError(f"{target.where}: control point {target.name!r} has coordinates already; give them once")
     seen = [target for target in measured if target.scan]
-    if not seen:
-        raise InputError(f"{known[0].where}: no control point was measured in a scan; give 'scan' and 'seen' for one")
+    if not seen and not searched:
+        raise InputError(
+            f"{known[0].where}: no control point was measured in a scan; give 'scan' and 'seen' for one, or [targets] "
+            "to search the scans for them"
+        )
     views: list[tuple[int, int, int]] = []  # rows of the point, of the scan and of the station
     for target in seen:
         if target.name not in row:
@@ -128,7 +133,7 @@ def control_points(
         if view in views:
             raise InputError(f"{target.where}: {target.name!r} is seen in {target.scan!r} twice; give one place")
         views.append(view)
-    point, scan, station = np.array(views).T
+    point, scan, station = np.array(views, np.int64).reshape(-1, 3).T
     return Control(
         tuple(target.name for target in known),
         positions=np.array([target.position for target in known]) * MM_PER_UNIT[unit],
@@ -136,7 +141,9 @@ def control_points(
         point=point,
         scan=scan,
         station=station,
-        seen=np.array([target.position * MM_PER_UNIT[units[s]] for target, s in zip(seen, scan, strict=True)]),
+        seen=np.array([target.position * MM_PER_UNIT[units[s]] for target, s in zip(seen, scan, strict=True)]).reshape(
+            -1, 3
+        ),
         seen_sd=np.array([target.sd_mm for target in seen]),
     )
 

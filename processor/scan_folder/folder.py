@@ -48,6 +48,8 @@ from processor.scan_folder.files import (
 from processor.scan_folder.guess import Guess
 from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
+from processor.scan_folder.project_tables.ceiling import read_ceiling
+from processor.scan_folder.project_tables.targets import read_search
 from processor.scan_folder.shapes import files as surface_files
 from processor.scan_folder.text_files import read_text
 from processor.scan_folder.title_block import read_title_block
@@ -61,7 +63,7 @@ else:
 
 KEYS = (
     "name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control", "report",
-    "clip",
+    "clip", "ceiling", "targets",
 )  # fmt: skip
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FLOAT_STEP_MM = 1.0
@@ -150,7 +152,10 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
             design = read_design(folder, project.design, unit)
         meaning.check(design, str(project.design))  # before scans are compared with it
     check_components(str(folder / PROJECT), project.tolerance, _component_names(design))
-    scene = _scene(project, design, option, _read_stations(folder, project.units or option or "m"), keep)
+    unit = project.units or option or "m"
+    scene = _scene(project, design, option, _read_stations(folder, unit), keep)
+    ceiling = read_ceiling(folder, project.table, unit, project.design_units or unit)
+    scene = dataclasses.replace(scene, ceiling=ceiling) if ceiling is not None else scene
     if scene.structure is not None and project.design is not None and project.design.suffix.lower() in MESH_SUFFIXES:
         named = project.design_units or project.units
         source = f"given in {PROJECT}" if named else "given by --units" if option else "not given, so metres"
@@ -162,7 +167,7 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     files |= dict.fromkeys(
         ("arch", "frame", "structure"), str(project.design.relative_to(folder) if project.design else PROJECT)
     )
-    files |= dict.fromkeys(("tolerance", "temperature_C", "name"), PROJECT)
+    files |= dict.fromkeys(("tolerance", "temperature_C", "name", "ceiling", "target_search"), PROJECT)
     return meaning.check(scene, str(folder), {field: str(folder / file) for field, file in files.items()})
 
 
@@ -301,6 +306,7 @@ def _scene(
     parts = {part.name for part in arch.parts} if arch else set()
     scans: list[Scan] = []
     scan_units: list[str] = []
+    days: set[str] = set()
     reasons: dict[str, str] = {}
     clipper = Clipper(read_boxes(project.table, MM_PER_UNIT[project.units or option or "m"]), project.table.where)
     for entry in tracked(project.entries):
@@ -310,6 +316,7 @@ def _scene(
             )
         for raw in _read_raws(entry, scans):
             unit, reason = _unit(raw, entry.path, project, option)
+            days |= {raw.scanned} - {""}
             reasons.setdefault(unit, reason)
             scan = clipper.clip(_scan(raw, entry, unit, parts, stations))
             if any(scan.name == other.name for other in scans):
@@ -318,6 +325,8 @@ def _scene(
             scans.append(keep(scan))
             scan_units.append(unit)
     where = stations or _stations(scans)
+    search = read_search(project.table)
+    unit = project.units or option or "m"
     return Scene(
         project.name,
         kind,
@@ -330,9 +339,11 @@ def _scene(
         units_reason="; ".join([*dict.fromkeys(reasons.values()), *_said(project)]),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
-        control=control_points(project.control, scans, scan_units, where, project.units or option or "m"),
+        control=control_points(project.control, scans, scan_units, where, unit, search is not None),
+        target_search=search,
         title_block=project.title_block,
         clips=clipper.record(),
+        scanned=tuple(sorted(days)),
     )
 
 

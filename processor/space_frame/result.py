@@ -133,6 +133,22 @@ class Tubes(Rows):
 
 
 @dataclass(frozen=True)
+class Hangers(Rows):
+    """Vertical hangers from the lowest point ``top`` of each sphere down to ``bottom`` on the ceiling, mm.
+
+    NaN where a sphere was not found or no ceiling is below it. Above the ceiling a length is positive. ``verdict``: of
+    clearance and greatest length.
+    """
+
+    ids: Ints = column("k", dtype=np.int64, json="id")
+    top: Floats = column("k", 3, unit="mm")
+    bottom: Floats = column("k", 3, unit="mm")
+    length: Floats = column("k", unit="mm")
+    ci95: Floats = column("k", unit="mm")
+    verdict: tuple[Verdict, ...] = words("k", Verdict)
+
+
+@dataclass(frozen=True)
 class StationCorrections(Rows):
     """Corrections of the stations: ``T`` (s, 4, 4) map places as registered to corrected places."""
 
@@ -185,6 +201,7 @@ class Result(Checked):
     datum: tuple[Reason, ...] = described((), reasons="", optional=True)  # what fixes all stations together
     control: ControlDeviations = dataclasses.field(default_factory=ControlDeviations, metadata={"optional": True})
     limits: JudgedLimits | None = newer()  # of supports and deflections; those of nodes are in ``balls``
+    hangers: Hangers | None = newer()
 
     @property
     def has_bounds(self) -> bool:

@@ -356,6 +356,16 @@ def scene_hash(scene: Scene, pieces: Pieces | None = None) -> str:
     return digest.hexdigest()
 
 
+def design_hash(scene: Scene) -> str:
+    """Return the SHA-256 (hex) of a scene's design alone; "" of a scene without one."""
+    designs = (scene.arch, scene.frame, scene.structure)
+    digest = hashlib.sha256()
+    for design in designs:
+        if design is not None:
+            _feed(digest, "design", design, None)
+    return digest.hexdigest() if any(design is not None for design in designs) else ""
+
+
 def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int = 0) -> None:
     if isinstance(value, np.ndarray):
         little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
+import json
 import math
+import re
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.special import ndtri
 
+from processor.cli.main import commands
 from processor.defects.result import DefectClass, Defects, Windows
 from processor.defects.result import Result as DefectsResult
 from processor.defects.verdicts import depths_and_areas
 from processor.deviation import verdicts as of_surface
 from processor.deviation.result import CorePoints, ErrorSource
 from processor.deviation.result import Result as DeviationResult
+from processor.jobs import exit_codes
+from processor.language.messages import messages
 from processor.limits import judging, measures, standards
 from processor.limits.judging import Measured
 from processor.model import (
@@ -31,7 +41,7 @@ from processor.model import (
     did_you_mean,
     reason,
 )
-from processor.report import headline, limit_table
+from processor.report import headline, limit_table, verdict_counts
 from processor.scan_folder import folder, tolerance
 from processor.space_frame import supports
 from processor.space_frame.result import Balls, Evidence, Flag
@@ -40,7 +50,9 @@ from processor.stitching.result import Closures, Scans
 from processor.stitching.result import Result as StitchResult
 from processor.store import store
 from processor.writers import project
+from tests.support.pages import latin
 
+ROOT = Path(__file__).resolve().parents[2]
 WORST = ("fail", "indeterminate", "pass")
 PASS, FAIL, OPEN = Verdict.PASS, Verdict.FAIL, Verdict.INDETERMINATE
 SQUARE = np.array([[0.0, 0, 0], [1000, 0, 0], [1000, 1000, 0], [0, 1000, 0]])
@@ -382,7 +394,10 @@ def test_the_page_and_the_table_have_the_worst_first_and_name_what_is_not_verifi
     unsure = dataclasses.replace(limits, verified=np.zeros(len(limits), bool))
     (table,) = limit_table.limit_table(unsure, "x-limits")
     assert "Not verified: the limits from GB 50205-2020 11.3.6 were not" in str(table.note)
-    assert str(headline.of_limits(limits)) == f"of {len(limits)} limits 1 fail, {len(limits) - 1} pass"
+    failing = limits.of[limits.verdict.index(Verdict.FAIL)]
+    assert (
+        str(headline.of_limits(limits)) == f"1 of {len(limits)} limits is not kept: {failing}; {len(limits) - 1} pass"
+    )
     assert limit_table.limit_table(None, "x") == []
 
 
@@ -472,3 +487,57 @@ def test_a_component_that_the_design_has_not_is_named(tmp_path):
 def test_names_are_suggested_by_their_letters():
     assert did_you_mean("preasemble", ["preassemble", "spheres"]) == " (did you mean 'preassemble'?)"
     assert did_you_mean("xyz", ["preassemble", "spheres"]) == ""
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "said"),
+    [
+        (("pass",) * 4, "all 4 joints pass"),
+        (("pass",), "the joint passes"),
+        (("pass", "pass", "fail", "pass"), "1 of 4 joints fails: J3; 3 pass"),
+        (("fail", "indeterminate", "fail", "none"), "2 of 4 joints fail: J1, J3; 1 indeterminate"),
+        (("pass", "indeterminate"), "1 of 2 joints is indeterminate: J2; 1 passes"),
+        (("fail",) * 5, "5 of 5 joints fail: J1, J2, J3, and 2 more"),
+        (("none",), "none has a verdict"),
+    ],
+)
+def test_joints_are_counted_in_words(verdicts, said):
+    names = [f"J{i + 1}" for i in range(len(verdicts))]
+    found = verdict_counts.told(verdict_counts.JOINTS, names, [Verdict(one) for one in verdicts])
+    assert str(found) == said
+    assert not latin([messages("zh").text(found)])
+
+
+def test_a_frame_with_supports_through_the_command_line(tmp_path):
+    """Supports of a frame are held against the rows of JGJ 7; one that was designed 30 mm higher fails."""
+    place = tmp_path / "frame"
+    shutil.copytree(ROOT / "fixtures/scan-folder", place)
+    design = json.loads((place / "design.json").read_text("utf-8"))
+    lowest = min(node["centre"][2] for node in design["nodes"])
+    supports_ = [node for node in design["nodes"] if node["centre"][2] == lowest][:3]
+    for node in supports_:
+        node["support"] = "perimeter"
+    supports_[1]["centre"][2] += 30.0
+    (place / "design.json").write_text(json.dumps(design))
+    project_ = place / "project.toml"
+    project_.write_text(project_.read_text("utf-8") + '\n[tolerance]\nstandard = "JGJ 7-2010"\n', "utf-8")
+    out = tmp_path / "out"
+    done = CliRunner().invoke(commands, ["run", str(place), "-o", str(out), "--fail-on", "fail"], standalone_mode=False)
+    assert done.return_value == exit_codes.VERDICT or done.exit_code == exit_codes.VERDICT, done.output
+    name = str(supports_[1]["id"])
+    record = json.loads((out / "results.json").read_text("utf-8"))
+    assert record["verdict"] == "fail"
+    assert re.search(r"\d+ of \d+ limits (is|are) not kept: ", record["headline"])
+    assert record["headline"] in done.output.splitlines()
+    rows = list(csv.DictReader(io.StringIO((out / "characteristics.csv").read_text("utf-8"))))
+    found = {(row["quantity"], row["verdict"]) for row in rows if "JGJ 7-2010" in row["limit_from"]}
+    heights = [row for row in rows if row["verdict"] == "fail" and "height" in row["quantity"]]
+    assert heights
+    assert all(name in row["id"].split(" - ") for row in heights)
+    assert all(abs(float(row["deviation"]) - 30.0) < 2.0 for row in heights)
+    assert {quantity for quantity, _ in found} >= {
+        limit.what for limit in standards.load("JGJ 7-2010").limits if limit.measure in SUPPORT_ROWS
+    }
+
+
+SUPPORT_ROWS = (measures.SUPPORT_CENTRE, measures.SUPPORT_HEIGHT, measures.ADJACENT)

@@ -8,10 +8,12 @@ import zlib
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import messages
 from processor.model import TitleBlock
-from processor.report import all_tables, document, workbook
+from processor.report import all_tables, document, style, workbook
 from processor.report.style import default_settings
 from tests.support.bridge_results import of_bridge
 from tests.support.report_pages import drawn
@@ -67,3 +69,72 @@ def test_a_workbook_holds_the_tables_as_numbers_and_text():
                     seen.add(value)
     assert seen == {FORMULAS[0], FORMULAS[3]}
     assert book.properties.created.year == 1980
+
+
+STAND_IN = "Last Resort High-Efficiency"  # comes with Matplotlib and has a glyph for every character
+
+
+@pytest.fixture
+def a_chinese_font(monkeypatch):
+    for module in (style, document):
+        monkeypatch.setattr(module, "chinese_font", lambda: STAND_IN)
+    style._has.cache_clear()
+    yield
+    style._has.cache_clear()
+
+
+def front(execution, lang):
+    return next(iter(document._front(execution, messages(lang))))
+
+
+def texts_of(page):
+    return [one.get_text() for one in page.texts]
+
+
+def test_the_document_is_chinese_where_there_is_a_font(a_chinese_font):
+    execution = signed()
+    seen = texts_of(front(execution, "zh"))
+    assert any("桥 Meyer" in one for one in seen)
+    assert any(one.startswith("批准：") or one.startswith("批准") for one in seen)
+    assert not any("?" in one for one in seen)
+    with default_settings():
+        data = document.document(execution, {}, "zh")
+    assert b"LastResort" in data
+    assert data != written(execution)
+
+
+def test_without_a_font_it_is_english_with_question_marks(monkeypatch):
+    for module in (style, document):
+        monkeypatch.setattr(module, "chinese_font", lambda: "")
+    style._has.cache_clear()
+    execution = signed()
+    with default_settings():
+        assert document.document(execution, {}, "zh") == document.document(execution, {}, "en")
+    assert any("? Meyer" in one for one in texts_of(front(execution, "en")))
+    style._has.cache_clear()
+
+
+def test_the_logo_stands_on_the_first_page_in_its_proportions():
+    execution = signed()
+    assert front(execution, "en").axes == []
+    out = io.BytesIO()
+    Image.new("RGB", (300, 60), "navy").save(out, "PNG")
+    block = dataclasses.replace(execution.scene.title_block, logo=np.frombuffer(out.getvalue(), np.uint8))
+    page = front(dataclasses.replace(execution, scene=dataclasses.replace(execution.scene, title_block=block)), "en")
+    (axes,) = page.axes
+    box = axes.get_position()
+    assert box.width * document.A4[0] / (box.height * document.A4[1]) == pytest.approx(5.0)
+    assert box.x1 == pytest.approx(document.RIGHT)
+
+
+@pytest.mark.parametrize(
+    ("text", "lines"),
+    [
+        ("one two three", ["one two", "three"]),
+        ("一二三四五六", ["一二三四", "五六"]),
+        ("ab 一二三 cd", ["ab 一二", "三 cd"]),
+        ("", []),
+    ],
+)
+def test_lines_are_broken_at_spaces_and_between_chinese_characters(text, lines):
+    assert document.lines_of(text, 8) == lines

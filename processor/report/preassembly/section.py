@@ -11,6 +11,7 @@ from processor.language.messages import Message, Text, text
 from processor.model import Floats, Status, Verdict, worst
 from processor.preassembly.result import Adjustment, MeanMax, Result
 from processor.preassembly.verdicts.joints import ComparedLimits
+from processor.report import verdict_counts
 from processor.report.preassembly import characteristics, figures, live_data, tables
 from processor.report.step_report import StepReport
 
@@ -41,9 +42,8 @@ def _summary(result: Result) -> tuple[Message, Message]:
     if result.adjustment is None:
         body.append(text("Joints: {verdicts}.", verdicts=verdicts or text("none")))
     if result.adjustment is not None:
-        head = text(
-            "of {joints} joints {verdicts}; assembly {head}", joints=len(result.joints), verdicts=verdicts, head=head
-        )
+        told = verdict_counts.told(verdict_counts.JOINTS, result.joints.name, result.joints.verdict)
+        head = text("{verdicts}; assembly {head}", verdicts=told, head=head)
         chain = [limits for limits in result.adjustment.chain if len(limits.limits)]
         body += [text("Whole chain: {verdict}.", verdict=limits.verdict) for limits in chain]
         if not result.verified:

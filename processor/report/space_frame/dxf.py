@@ -1,7 +1,9 @@
 """Nodes, axes and movements of a frame as a drawing (DXF, release 2010) in millimetres, in the input's own frame.
 
 Layers: NODES has a circle of each ball's radius and a point at its centre, AXES a line a tube, MOVEMENTS a line from
-each node's nominal place to where it was found (true to scale), IDS the ids. No text from outside is in it.
+each node's nominal place to where it was found (true to scale), IDS the ids, LOWEST a point at each ball's lowest
+place. With a ceiling HANGERS has a line from there to the ceiling and its length, CLASHES a circle about each hanger
+that fails. No text from outside is in it.
 """
 
 from __future__ import annotations
@@ -12,13 +14,15 @@ from typing import Any
 
 import numpy as np
 
+from processor.model import Verdict
 from processor.report.space_frame.node_places import nominal_places
-from processor.space_frame.result import Result
+from processor.space_frame.result import Hangers, Result
 
 MILLIMETRES = 4  # of $INSUNITS
 METRIC = 1  # of $MEASUREMENT
-LAYERS = {"NODES": 5, "AXES": 8, "MOVEMENTS": 30, "IDS": 7}  # with the colours of AutoCAD's index
-TEXT_HEIGHT_MM = 50.0
+# With the colours of AutoCAD's index.
+LAYERS = {"NODES": 5, "AXES": 8, "MOVEMENTS": 30, "IDS": 7, "LOWEST": 3, "HANGERS": 4, "CLASHES": 1}
+TEXT_HEIGHT_MM, CLASH_RADIUS_MM = 50.0, 150.0
 
 
 def drawing(result: Result) -> bytes:
@@ -60,13 +64,29 @@ def _draw(space: Any, result: Result) -> None:
         text.set_placement((centre[0] + aside, centre[1] + aside, centre[2]))
         if np.isfinite(nominal[i]).all():
             space.add_line(nominal[i].tolist(), centre, dxfattribs={"layer": "MOVEMENTS"})
+        if np.isfinite(balls.lowest[i]).all():
+            space.add_point(balls.lowest[i].tolist(), dxfattribs={"layer": "LOWEST"})
     for start, end in zip(result.tubes.start.tolist(), result.tubes.end.tolist(), strict=True):
         space.add_line(start, end, dxfattribs={"layer": "AXES"})
+    if result.hangers is not None:
+        _draw_hangers(space, result.hangers)
+
+
+def _draw_hangers(space: Any, hangers: Hangers) -> None:
+    on_hangers, on_clashes = {"layer": "HANGERS"}, {"layer": "CLASHES"}
+    for i in np.flatnonzero(np.isfinite(hangers.length)).tolist():
+        top, bottom = hangers.top[i].tolist(), hangers.bottom[i].tolist()
+        space.add_line(top, bottom, dxfattribs=on_hangers)
+        text = space.add_text(f"{hangers.length[i]:.0f}", height=TEXT_HEIGHT_MM, dxfattribs=on_hangers)
+        text.set_placement((bottom[0], bottom[1] - 1.5 * TEXT_HEIGHT_MM, bottom[2]))
+        if hangers.verdict[i] is Verdict.FAIL:
+            space.add_circle(top, CLASH_RADIUS_MM, dxfattribs=on_clashes)
 
 
 def _extent(result: Result) -> tuple[list[float], list[float]]:
     """Corners of all places, so that a viewer opens on the frame and not on the origin."""
-    places = np.vstack([result.balls.centres, result.tubes.start, result.tubes.end])
+    ends = [] if result.hangers is None else [result.hangers.bottom]
+    places = np.vstack([result.balls.centres, result.tubes.start, result.tubes.end, *ends])
     places = places[np.isfinite(places).all(axis=1)]
     if not len(places):
         return [0.0] * 3, [0.0] * 3

@@ -18,7 +18,7 @@ from processor.adjustment.finite_median import finite_median
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import Floats, Scene, StepRun
-from processor.report.space_frame import close_ups
+from processor.report.space_frame import ceiling, close_ups
 from processor.report.space_frame.node_places import designed_places, nominal_places
 from processor.report.style import (
     COLOURS,
@@ -48,6 +48,7 @@ def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Pat
             figures[RADIUS_ERRORS] = _radius_errors(runs, report)
         if first.has_bounds:
             figures[BALL_ERRORS] = _ball_errors(runs[0], report)
+    figures |= ceiling.draw(first)
     if first.has_bounds:
         figures |= close_ups.draw(scene, first, stored)
     return figures

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from processor.language.messages import Message, text
 from processor.model import Status, StepRun
 from processor.pipeline import Execution
-from processor.report.space_frame import close_ups, dxf, figures, live_data, tables
+from processor.report.space_frame import ceiling, close_ups, dxf, figures, live_data, tables
 from processor.report.step_report import StepReport
+from processor.report.stitching import targets
 from processor.space_frame.result import Flag, Result
 
 
@@ -28,7 +29,11 @@ def _summary(result: Result) -> tuple[Message, Message | str]:
 
 
 def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
-    files = {"nodes.dxf": dxf.drawing(run.result)} if len(run.result.tubes) else {}
+    hangers = run.result.hangers
+    files = {"nodes.dxf": dxf.drawing(run.result)} if len(run.result.tubes) or hangers is not None else {}
+    if hangers is not None:
+        files[ceiling.STAKE_OUT] = ceiling.stake_out(run.result)
+    files |= targets.files(execution.scene)
     if run.result.has_bounds:
         pages = close_ups.document(execution.scene, run.result, execution.stored)
         files |= {close_ups.DOCUMENT: pages} if pages else {}

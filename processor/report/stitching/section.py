@@ -9,7 +9,7 @@ from processor.language.messages import Message, text
 from processor.model import Status, StepRun
 from processor.pipeline import Execution
 from processor.report.step_report import StepReport
-from processor.report.stitching import figures, live_data, tables
+from processor.report.stitching import figures, live_data, tables, targets
 from processor.stitching.result import Result
 
 
@@ -30,8 +30,8 @@ def _summary(result: Result) -> tuple[Message, Message]:
     return head, text("Flagged: {flags}. {pairs}", flags=flags, pairs=pairs) if flags else pairs
 
 
-def _files(_: Execution, run: StepRun) -> dict[str, bytes]:
-    return {"stitch.csv": tables.poses_csv(run.result)}
+def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
+    return {"stitch.csv": tables.poses_csv(run.result), **targets.files(execution.scene)}
 
 
 def _why(result: Result) -> Iterator[Message]:

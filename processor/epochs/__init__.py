@@ -1,0 +1,1 @@
+"""Several runs of one structure over time: what changed beyond its interval."""

@@ -1,0 +1,94 @@
+"""Runs of one structure compared: each component over the epochs, and what their errors have in common."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from processor.epochs import change
+from processor.epochs.change import Component, Finding
+from processor.epochs.epoch import Epoch
+from processor.epochs.series import Series
+from processor.model import InputError, Reason, reason
+from processor.pipeline import package_of, step_modules
+
+NOT_COMPARED = ("stitch",)  # of scanners' places, which are others each time
+
+
+@dataclass(frozen=True, kw_only=True)
+class History:
+    """The epochs in the order of their days, the components, and what is common to the epochs."""
+
+    name: str
+    epochs: tuple[Epoch, ...]
+    components: tuple[Component, ...]
+    remarks: tuple[Reason, ...]
+
+    def count(self, finding: Finding) -> int:
+        """Return how many components have this finding."""
+        return sum(component.finding is finding for component in self.components)
+
+
+def compare(epochs: Sequence[Epoch]) -> History:
+    """Compare epochs, in the order of their days. Raises InputError where no component is in two of them."""
+    components: list[Component] = []
+    remarks = list(_common(epochs))
+    others = np.array([epoch.facts.get("design") != epochs[0].facts.get("design") for epoch in epochs], np.bool_)
+    for step in step_modules():
+        results = [epoch.result(step) for epoch in epochs]
+        if step in NOT_COMPARED or sum(result is not None for result in results) < 2:
+            continue
+        module = _module(step)
+        found = [_doubted(one, others) if module.BY_DESIGN else one for one in module.series(results)]
+        components += _components(step, found)
+        remarks += module.remarks(results)
+    if not components:
+        raise InputError(
+            f"{epochs[0].folder} and {epochs[-1].folder}: no step has results of one component in two runs; "
+            "expected runs of one structure"
+        )
+    return History(
+        name=str(epochs[-1].facts.get("name", "")), epochs=tuple(epochs), components=tuple(components),
+        remarks=tuple(remarks),
+    )  # fmt: skip
+
+
+def _module(step: str) -> ModuleType:
+    return importlib.import_module(f"processor.epochs.{package_of(step)}")
+
+
+def _doubted(series: Series, others: Any) -> Series:
+    """Doubt the values of epochs of another design."""
+    return replace(series, doubtful=series.doubtful | others) if others.any() else series
+
+
+def _components(step: str, found: Sequence[Series]) -> Iterator[Component]:
+    by_name: dict[str, list[Series]] = {}
+    for one in found:
+        by_name.setdefault(one.component, []).append(one)
+    for name, of_it in by_name.items():
+        yield change.of_component(step, name, of_it)
+
+
+def _common(epochs: Sequence[Epoch]) -> Iterator[Reason]:
+    """Say what design, scanner and temperature of the epochs have in common."""
+    designs = {epoch.facts.get("design", "") for epoch in epochs}
+    if len(designs) > 1:
+        yield reason("epochs.other-design")
+    elif designs != {""}:
+        yield reason("epochs.same-design")
+    scanners = {(epoch.facts.get("scanner", ""), epoch.facts.get("serial", "")) for epoch in epochs}
+    if any(not serial for _, serial in scanners):
+        yield reason("epochs.scanner-unknown")
+    else:
+        yield reason("epochs.same-scanner" if len(scanners) == 1 else "epochs.other-scanners")
+    warm = [float(epoch.facts.get("temperature_C", np.nan)) for epoch in epochs]
+    if np.isnan(warm).any():
+        yield reason("epochs.temperature-unknown")
+    elif max(warm) - min(warm) > 0.0:
+        yield reason("epochs.temperatures-differ", kelvin=max(warm) - min(warm))

@@ -1,0 +1,78 @@
+"""A comparison of epochs for the terminal, at most 15 lines, and its headline."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from processor.epochs.change import Component, Finding
+from processor.epochs.compare import History
+from processor.language.messages import Message, text
+from processor.report.epochs.tables import day, ordered
+
+MOST_LINES, FEWEST_CHANGES = 15, 3
+
+
+def headline(history: History) -> Message:
+    """Say how many epochs there are, and how many components changed."""
+    return text(
+        "{name}: {epochs} epochs, {first} to {last}: {counts}",
+        name=history.name,
+        epochs=len(history.epochs),
+        first=day(history, 0),
+        last=day(history, -1),
+        counts=counts(history),
+    )
+
+
+def counts(history: History) -> list[Message]:
+    """Return how many components have which finding; the changed ones always."""
+    total = len(history.components)
+    said: list[Message] = [
+        text(
+            "{changed} of {total} {total:?component|components} changed beyond the interval",
+            changed=history.count(Finding.CHANGED),
+            total=total,
+        )
+    ]
+    for finding, template in ((Finding.DOUBTFUL, "{count} doubtful"), (Finding.UNKNOWN, "{count} not known")):
+        if count := history.count(finding):
+            said.append(text(template, count=count))
+    return said
+
+
+def lines(history: History, page: str) -> list[Message]:
+    """Return the headline, what changed, what the epochs have in common, and where the page is."""
+    changed = list(_changed(history))
+    room = MOST_LINES - 2
+    remarks: list[Message] = [text("note: {remark}", remark=remark) for remark in history.remarks]
+    remarks = remarks[: room - min(len(changed), FEWEST_CHANGES)]
+    left = room - len(remarks)
+    if len(changed) > left:
+        more = text("... and {count} more; --verbose prints the tables", count=len(changed) - left + 1)
+        changed = [*changed[: left - 1], more]
+    return [headline(history), *changed, *remarks, text("report: {page}", page=page)]
+
+
+def _changed(history: History) -> Iterator[Message]:
+    for one in ordered(history):
+        if one.finding in (Finding.CHANGED, Finding.DOUBTFUL) and one.leading is not None:
+            yield _line(history, one)
+
+
+def _line(history: History, one: Component) -> Message:
+    assert one.leading is not None
+    leading = one.leading
+    return text(
+        "{finding}: {component}, {quantity}: {first:.2f} to {last:.2f} {unit}, by {change:+.2f} ± {ci95:.2f} {unit}, "
+        "since {day} ({step})",
+        finding=one.finding,
+        component=one.name,
+        quantity=leading.series.quantity,
+        first=float(leading.series.value[leading.first]),
+        last=float(leading.series.value[leading.last]),
+        unit=leading.series.unit,
+        change=leading.value,
+        ci95=leading.ci95,
+        day=day(history, one.since),
+        step=one.step,
+    )

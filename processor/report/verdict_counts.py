@@ -1,0 +1,45 @@
+"""How many joints or limits have which verdict, in words: "all 4 joints pass", "1 of 4 joints fails: J3"."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from processor.language.messages import Message, label, text
+from processor.model import Verdict
+
+MOST_NAMED = 3
+JOINTS = {
+    Verdict.PASS: "all {count} joints pass",
+    Verdict.FAIL: "{part} of {count} {count:?joint|joints} {part:?fails|fail}: {named}",
+    Verdict.INDETERMINATE: "{part} of {count} {count:?joint|joints} {part:?is|are} indeterminate: {named}",
+}
+LIMITS = {
+    Verdict.PASS: "all {count} limits are kept",
+    Verdict.FAIL: "{part} of {count} {count:?limit|limits} {part:?is|are} not kept: {named}",
+    Verdict.INDETERMINATE: "{part} of {count} {count:?limit|limits} {part:?is|are} indeterminate: {named}",
+}
+SINGLE = {JOINTS[Verdict.PASS]: "the joint passes", LIMITS[Verdict.PASS]: "the limit is kept"}
+FURTHER = {Verdict.INDETERMINATE: "{part} indeterminate", Verdict.PASS: "{part} {part:?passes|pass}"}
+
+
+def told(phrases: Mapping[Verdict, str], names: Sequence[str], verdicts: Sequence[Verdict]) -> Message:
+    """Say how many of things with ``names`` have which verdict, and name the first of the worst.
+
+    ``phrases`` are JOINTS or LIMITS. Things without a verdict are not counted among those that pass.
+    """
+    count = len(verdicts)
+    rows = {one: [i for i, verdict in enumerate(verdicts) if verdict is one] for one in phrases}
+    if count and len(rows[Verdict.PASS]) == count:
+        return text(SINGLE[phrases[Verdict.PASS]] if count == 1 else phrases[Verdict.PASS], count=count)
+    said: list[Message] = []
+    for verdict in (Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS):
+        if not rows[verdict]:
+            continue
+        if said or verdict is Verdict.PASS:
+            said.append(text(FURTHER[verdict], part=len(rows[verdict])))
+            continue
+        named: list[Message] = [label(one) for one in dict.fromkeys(names[i] for i in rows[verdict])]
+        if len(named) > MOST_NAMED:
+            named = [*named[:MOST_NAMED], text("and {count} more", count=len(named) - MOST_NAMED)]
+        said.append(text(phrases[verdict], part=len(rows[verdict]), count=count, named=named))
+    return text("{verdicts:;}", verdicts=said or [text("none has a verdict")])

@@ -1,0 +1,1 @@
+"""Single tables of project.toml."""

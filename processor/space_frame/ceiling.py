@@ -1,0 +1,144 @@
+"""The ceiling below a space frame: the length of a hanger from each ball's lowest point, and what is too near to it.
+
+Hangers are vertical. A length is the height of the ball's lowest point above the ceiling; where the ceiling slopes, the
+place of the ball counts in its interval as well. Balls and tubes are held against the clearance of the project, hangers
+also against their greatest length. The use is that of paper 001, section 4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from processor.limits import judging, measures, standards
+from processor.limits.judging import Comparison, JudgedLimits, Measured
+from processor.model import NORMAL_95, Ceiling, Floats, Limit, Scene, Verdict, worst
+from processor.space_frame import plumb_line
+from processor.space_frame.plumb_line import Plan
+from processor.space_frame.result import Balls, Evidence, Flag, Hangers, Result, Tubes
+
+PLACES_OF_A_TUBE = 41
+SOURCE = "project.toml"
+
+
+def with_hangers(result: Result, scene: Scene) -> Result:
+    """Return the result with hangers and verdicts on them; as it is for a scene without a ceiling."""
+    ceiling = scene.ceiling
+    if ceiling is None:
+        return result
+    surface = _Surface.of(ceiling)
+    balls = result.balls
+    length, sd, bottom = _lengths(balls, surface)
+    limits = _limits(ceiling)
+    of_ball = [
+        [judging.compare(limit, _measured(balls, i, float(length[i]), float(sd[i]))) for limit in limits]
+        if math.isfinite(length[i])
+        else []  # it was not found, or no ceiling is below it
+        for i in range(len(balls))
+    ]
+    hangers = Hangers(
+        ids=balls.ids,
+        top=balls.lowest,
+        bottom=bottom,
+        length=length,
+        ci95=NORMAL_95 * sd,
+        verdict=tuple(worst(row.verdict for row in rows) for rows in of_ball),
+    )
+    rows = [*(row for rows in of_ball for row in rows), *_of_tubes(result.tubes, surface, limits[0])]
+    judged = judging.judged(rows, standards.default_for(scene.tolerance))
+    return replace(result, hangers=hangers, limits=_joined(result.limits, judged))
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """A ceiling, level or as a mesh seen from above."""
+
+    level: float
+    plan: Plan | None
+
+    @classmethod
+    def of(cls, ceiling: Ceiling) -> _Surface:
+        return cls(ceiling.level, plumb_line.plan(ceiling.vertices, ceiling.faces) if len(ceiling.faces) else None)
+
+    def heights(self, places: Floats) -> tuple[Floats, Floats]:
+        """Height (n,) and slopes (n, 2) at places (n, 2); NaN where there is no ceiling."""
+        if self.plan is not None:
+            return self.plan.heights(places)
+        unknown = ~np.isfinite(places)
+        height, slope = np.full(len(places), self.level), np.zeros((len(places), 2))
+        height[unknown.any(axis=1)], slope[unknown.any(axis=1)] = np.nan, np.nan
+        return height, slope
+
+
+def _limits(ceiling: Ceiling) -> list[Limit]:
+    clearance = Limit(
+        "ceiling_clearance_mm", "height above the ceiling", low=ceiling.clearance_mm, high=math.inf,
+        measure=measures.CEILING, source=SOURCE, verified=True,
+    )  # fmt: skip
+    if math.isnan(ceiling.longest_mm):
+        return [clearance]
+    longest = Limit(
+        "hanger_length_mm", "length of a hanger", low=-math.inf, high=ceiling.longest_mm, measure=measures.CEILING,
+        source=SOURCE, verified=True,
+    )  # fmt: skip
+    return [clearance, longest]
+
+
+def _measured(balls: Balls, row: int, length: float, sd: float) -> Measured:
+    doubtful = balls.flag[row] is not Flag.OK or balls.evidence[row] is Evidence.AXES
+    return Measured.within(f"ball {int(balls.ids[row])}", length, NORMAL_95 * sd, doubtful=doubtful)
+
+
+def _lengths(balls: Balls, surface: _Surface) -> tuple[Floats, Floats, Floats]:
+    """Length (k,) of each hanger, its standard deviation (k,), and its lower end (k, 3).
+
+    The lowest point is at the centre in plan and a radius below it, so a length depends on the centre's x and y by the
+    slopes there, and on height and radius as the lowest point does.
+    """
+    height, slope = surface.heights(balls.lowest[:, :2])
+    slope = np.nan_to_num(slope)
+    covariance = balls.covariance
+    across = np.einsum("ki,kij,kj->k", slope, covariance[:, :2, :2], slope)
+    along = np.einsum("ki,ki->k", slope, covariance[:, :2, 2] - covariance[:, :2, 3])
+    variance = balls.lowest_sd**2 + across - 2.0 * along
+    bottom = np.column_stack([balls.lowest[:, :2], height])
+    return balls.lowest[:, 2] - height, np.sqrt(np.maximum(variance, 0.0)), bottom
+
+
+def _of_tubes(tubes: Tubes, surface: _Surface, clearance: Limit) -> list[Comparison]:
+    """Compare the lowest line of each tube with the clearance, where it is nearest to the ceiling."""
+    share = np.linspace(0.0, 1.0, PLACES_OF_A_TUBE)[:, None]
+    rows = []
+    for k in range(len(tubes)):
+        axis = tubes.start[k] + share * (tubes.end[k] - tubes.start[k])
+        along = tubes.end[k] - tubes.start[k]
+        along = along / np.linalg.norm(along)
+        down = np.array([0.0, 0.0, -1.0]) + along[2] * along  # across the axis
+        size = float(np.linalg.norm(down))
+        line = axis + tubes.radii[k] * down / size if size > 0.0 else axis
+        height, _ = surface.heights(line[:, :2])
+        above = line[:, 2] - height
+        if not np.isfinite(above).any():
+            continue
+        nearest = int(np.nanargmin(above))
+        at = float(share[nearest, 0])
+        of_axis = (1.0 - at) * tubes.start_ci95[k, 2] + at * tubes.end_ci95[k, 2]
+        half = float(np.hypot(of_axis, tubes.radius_ci95[k])) + float(np.nan_to_num(tubes.bow[k]))
+        name = f"tube {k}, balls {int(tubes.a[k])} and {int(tubes.b[k])}"
+        rows.append(judging.compare(clearance, Measured.within(name, float(above[nearest]), half)))
+    return rows
+
+
+def _joined(first: JudgedLimits | None, second: JudgedLimits | None) -> JudgedLimits | None:
+    """Return the rows of both."""
+    if first is None or second is None:
+        return second if first is None else first
+    return judging.joined(first, second)
+
+
+def clashes(hangers: Hangers) -> Sequence[int]:
+    """Return the rows of the hangers that fail."""
+    return [row for row, verdict in enumerate(hangers.verdict) if verdict is Verdict.FAIL]

@@ -1,0 +1,127 @@
+"""Targets of a scene: found in its scans, named by the known coordinates, and put among its control points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Control, Floats, Ints, Scan, Scene, TargetKind, Targets
+from processor.space_frame.result import Balls
+from processor.targets import checkerboard, naming, spheres
+from processor.targets.checkerboard import Checkerboard
+
+LEAST_SD_MM = 0.05  # of a target's place: what a fit does not see, as the sheet's flatness
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """A target in a scan, in the scan's frame; ``station`` as in Control."""
+
+    kind: TargetKind
+    scan: int
+    station: int
+    place: Floats
+    sd: float
+    points: int
+    fit: float
+
+
+def with_targets(scene: Scene) -> Scene:
+    """Return the scene with the targets that it is searched for; as it is where it asks for none, or has some."""
+    search = scene.target_search
+    if search is None or scene.targets is not None:
+        return scene
+    found: list[_Found] = []
+    for row, scan in enumerate(scene.scans):
+        for station, points, bright, scanner in _views(scene, scan):
+            if not np.isnan(search.checkerboard_mm):
+                for one in checkerboard.find(points, bright, search.checkerboard_mm):
+                    found.append(_of_board(one, row, station, scan.origin))
+            if not np.isnan(search.sphere_radius_mm):
+                balls = spheres.find(points, scanner, search.sphere_radius_mm)
+                found += [_of_sphere(balls, k, row, station, scan.origin) for k in spheres.sure(balls)]
+    names = _names(scene, found)
+    return replace(scene, targets=_table(scene, found, names), control=_with_sightings(scene.control, found, names))
+
+
+def _of_board(one: Checkerboard, scan: int, station: int, origin: Floats) -> _Found:
+    return _Found(
+        kind=TargetKind.CHECKERBOARD, scan=scan, station=station, place=one.centre + origin, sd=one.sd,
+        points=one.points, fit=one.fit,
+    )  # fmt: skip
+
+
+def _of_sphere(balls: Balls, row: int, scan: int, station: int, origin: Floats) -> _Found:
+    return _Found(
+        kind=TargetKind.SPHERE, scan=scan, station=station, place=balls.centres[row] + origin,
+        sd=float(np.sqrt(np.linalg.eigvalsh(balls.covariance[row, :3, :3])[-1])), points=int(balls.points[row]),
+        fit=float("nan"),
+    )  # fmt: skip
+
+
+def _views(scene: Scene, scan: Scan) -> Iterator[tuple[int, Floats, Floats, Floats | None]]:
+    """Yield station, points, intensities and the scanner's place, the latter less the scan's origin, of each view."""
+    bright = scan.intensity if len(scan.intensity) else np.zeros(len(scan.points))
+    if scan.position.size or not len(scan.point_station) or scene.stations is None:
+        yield -1, scan.points, bright, scan.position - scan.origin if scan.position.size else None
+        return
+    back = rigid.invert(scan.pose)
+    for station in np.unique(scan.point_station).tolist():
+        rows = scan.point_station == station
+        at = None if station < 0 else rigid.apply(back, scene.stations.positions[station]) - scan.origin
+        yield station, scan.points[rows], bright[rows], at
+
+
+def _names(scene: Scene, found: list[_Found]) -> Ints:
+    """Return the row (t,) of the control point that each target is, -1 = none."""
+    rows = np.full(len(found), -1, np.int64)
+    if scene.control is None:
+        return rows
+    for key in dict.fromkeys((one.scan, one.station) for one in found):
+        of_view = [i for i, one in enumerate(found) if (one.scan, one.station) == key]
+        places = np.array([found[i].place for i in of_view])
+        scan = scene.scans[key[0]]
+        named = np.full(len(of_view), -1, np.int64)
+        if scan.T_project_scan.size or key[1] >= 0:
+            named = naming.by_pose(rigid.apply(scan.pose, places), scene.control.positions)
+        if (named < 0).all():
+            named = naming.by_pattern(places, scene.control.positions)
+        rows[of_view] = named
+    return rows
+
+
+def _table(scene: Scene, found: list[_Found], names: Ints) -> Targets:
+    ids = () if scene.control is None else scene.control.ids
+    return Targets(
+        name=tuple(ids[row] if row >= 0 else "" for row in names.tolist()),
+        kind=tuple(one.kind for one in found),
+        scan=np.array([one.scan for one in found], np.int64),
+        station=np.array([one.station for one in found], np.int64),
+        places=np.array([one.place for one in found]).reshape(-1, 3),
+        sd=np.array([max(one.sd, LEAST_SD_MM) for one in found]),
+        points=np.array([one.points for one in found], np.int64),
+        fit=np.array([one.fit for one in found]),
+    )
+
+
+def _with_sightings(control: Control | None, found: list[_Found], names: Ints) -> Control | None:
+    """Add the named targets to the sightings; one that the project states already stays as stated."""
+    if control is None:
+        return None
+    stated = set(zip(control.point.tolist(), control.scan.tolist(), control.station.tolist(), strict=True))
+    new = [
+        (row, one)
+        for row, one in zip(names.tolist(), found, strict=True)
+        if row >= 0 and (row, one.scan, one.station) not in stated
+    ]
+    return replace(
+        control,
+        point=np.concatenate([control.point, np.array([row for row, _ in new], np.int64)]),
+        scan=np.concatenate([control.scan, np.array([one.scan for _, one in new], np.int64)]),
+        station=np.concatenate([control.station, np.array([one.station for _, one in new], np.int64)]),
+        seen=np.concatenate([control.seen, np.array([one.place for _, one in new]).reshape(-1, 3)]),
+        seen_sd=np.concatenate([control.seen_sd, np.array([max(one.sd, LEAST_SD_MM) for _, one in new])]),
+    )

@@ -1,0 +1,89 @@
+"""Names of targets: which control point each target of a scan is, by its place or by the distances between targets.
+
+In a scan with a pose a target is the control point nearest to it. In one without, the rigid motion is sought that
+brings most targets to control points: three targets that have the distances of three control points propose one, and a
+motion holds if it places three targets or more, and no other motion that names them otherwise places as many.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from processor.geometry import rigid
+from processor.model import Floats, Ints
+
+NEAR_MM = 100.0  # of a posed target from its control point
+SAME_MM = 10.0  # of a distance, and of a target moved to its control point
+LEAST = 3
+MOST = 40  # targets of a scan that motions are proposed from
+SPREAD_MM = 300.0  # least height of a triangle that proposes a motion
+
+
+def by_pose(places: Floats, known: Floats) -> Ints:
+    """Return the control point (k,) of each place (k, 3), both in the project's frame; -1 = none, or not unique."""
+    return _mutual(places, known, NEAR_MM)
+
+
+def by_pattern(places: Floats, known: Floats) -> Ints:
+    """Return the control point (k,) of each place (k, 3) in a frame of its own; -1 = none, or not unique."""
+    best = np.full(len(places), -1, np.int64)
+    if len(places) < LEAST or len(known) < LEAST:
+        return best
+    fits: list[tuple[int, float, Ints]] = []
+    apart = np.linalg.norm(known[:, None] - known[None], axis=2)
+    for triple in combinations(range(min(len(places), MOST)), 3):
+        some = places[list(triple)]
+        if _height(some) < SPREAD_MM:
+            continue
+        for named in _alike(some, apart):
+            T = rigid.fit(some, known[named])
+            moved = rigid.apply(T, places)
+            if np.abs(moved[list(triple)] - known[named]).max() > SAME_MM:
+                continue
+            rows = _mutual(moved, known, SAME_MM)
+            off = float(np.linalg.norm(moved[rows >= 0] - known[rows[rows >= 0]], axis=1).sum())
+            fits.append((int((rows >= 0).sum()), -off, rows))
+        if fits and max(count for count, _, _ in fits) == len(places):
+            break  # all are named
+    if not fits:
+        return best
+    fits.sort(key=lambda fit: fit[:2])
+    count, _, rows = fits[-1]
+    rival = any(fit[0] == count and _contradict(fit[2], rows) for fit in fits)
+    return best if count < LEAST or rival else rows
+
+
+def _contradict(a: Ints, b: Ints) -> bool:
+    return bool((a != b).any())
+
+
+def _height(triangle: Floats) -> float:
+    """Return the least height of a triangle (3, 3)."""
+    u, v = triangle[1] - triangle[0], triangle[2] - triangle[0]
+    longest = max(np.linalg.norm(u), np.linalg.norm(v), np.linalg.norm(u - v))
+    return float(np.linalg.norm(np.cross(u, v)) / max(longest, 1e-12))
+
+
+def _alike(some: Floats, apart: Floats) -> list[list[int]]:
+    """Return the triples of control points, ``apart`` (m, m), that have the distances of three places (3, 3)."""
+    a, b, c = (float(np.linalg.norm(some[i] - some[j])) for i, j in ((0, 1), (0, 2), (1, 2)))
+    found = []
+    for i, j in zip(*np.nonzero(np.abs(apart - a) < SAME_MM), strict=True):
+        fits = (np.abs(apart[i] - b) < SAME_MM) & (np.abs(apart[j] - c) < SAME_MM)
+        found += [[int(i), int(j), int(k)] for k in np.flatnonzero(fits)]
+    return found
+
+
+def _mutual(places: Floats, known: Floats, reach: float) -> Ints:
+    """Return for each place (k,) the control point that is nearest to it and that it is nearest to, within a reach."""
+    rows = np.full(len(places), -1, np.int64)
+    if not len(places) or not len(known):
+        return rows
+    away, nearest = cKDTree(known).query(places)
+    _, back = cKDTree(places).query(known)
+    mutual = (back[nearest] == np.arange(len(places))) & (away <= reach)
+    rows[mutual] = nearest[mutual]
+    return rows
