@@ -85,8 +85,10 @@ def _common(epochs: Sequence[Epoch]) -> Iterator[Reason]:
     scanners = {(epoch.facts.get("scanner", ""), epoch.facts.get("serial", "")) for epoch in epochs}
     if any(not serial for _, serial in scanners):
         yield reason("epochs.scanner-unknown")
+    elif len(scanners) == 1:
+        yield reason("epochs.same-scanner")
     else:
-        yield reason("epochs.same-scanner" if len(scanners) == 1 else "epochs.other-scanners")
+        yield reason("epochs.other-scanners")
     warm = [float(epoch.facts.get("temperature_C", np.nan)) for epoch in epochs]
     if np.isnan(warm).any():
         yield reason("epochs.temperature-unknown")

@@ -132,7 +132,7 @@ def surface(values, lod95=1.0, status=Status.OK, source=ErrorSource.GIVEN):
 
 def judged(design, result, tolerance):
     scene = Scene("s", "structure", structure=design, tolerance=tolerance)
-    found = of_surface.judge(scene, result, np.asarray(design.vertices), np.zeros(3))
+    found = of_surface.judge(scene, of_surface.with_bodies(result, design, np.asarray(design.vertices), np.zeros(3)))
     return None if found is None else dict(zip(found.of, found.verdict, strict=True))
 
 

@@ -10,6 +10,7 @@ import pytest
 import processor
 from processor import pipeline
 from processor.batch import record
+from processor.epochs.change import Finding
 from processor.language.messages import CODES, Text, catalogue, messages, text
 from processor.model import VOCABULARIES, Status, reason
 from processor.papers import rows
@@ -81,7 +82,7 @@ def test_every_text_of_the_sources_is_translated_with_the_same_values(code):
 def test_words_of_a_catalogue_are_of_a_vocabulary(code):
     assert pipeline.step_modules()
     assert (
-        len({record.JobStatus, changes.ChangeKind, coverage.Holds, rows.Outcome}) == 4
+        len({record.JobStatus, changes.ChangeKind, coverage.Holds, rows.Outcome, Finding}) == 5
     )  # vocabularies are known once they are imported
     for key in messages(code).words:
         name, _, word = key.rpartition(".")
