@@ -263,8 +263,8 @@ def _by_ball(table_2: Text, table_3: Text, over: dict[str, tuple[float, ...]]) -
     made = []
     for place, method, radii in ((table_2, "ransac", RANSAC_RADII_M), (table_3, STATION, STATION_RADII_M)):
         usual = median(over.get(f"{method}: radius, median", ()))
-        code = "papers.balls-single" if method == "ransac" else "papers.balls-single-four"
-        why = reason(code, median=usual)
+        single, four = reason("papers.balls-single", median=usual), reason("papers.balls-single-four", median=usual)
+        why = single if method == "ransac" else four
         for ball, radius in zip(PRINTED, radii, strict=True):
             error = 1000.0 * abs(radius - TRUE_RADIUS_M)
             if error < BLUNDER_MM:

@@ -40,6 +40,7 @@ ALIKE = 0.3  # difference of two fields of one colour, over the step
 BEYOND = (0.56, 0.8)  # strip beyond a side, in sides from the centre's lines
 GOES_ON = 0.4  # step beyond a side, in steps of the pattern
 LEAST_BESIDE = 4  # points of half a side
+SHARP = 1.05  # times the least width: a step whose blur is not seen
 PERIODS = (0.4, 2.5, 85)  # of the scanner's lines across a step, in spacings: from, to, number
 BY_CHANCE = 7.0  # times 1 / n: squared resultant length of n angles at random, exceeded once in a thousand
 FILLED = 0.5  # share of the cells of a field that have points, at least
@@ -289,7 +290,8 @@ def _sampling_sd(d: Floats, other: Floats, spacing: float, width: float) -> floa
     Where the lines of the scanner's grid run along the step, all rows sample it at the same places, and what lies
     between two of them is not seen. A step blurred by a Gaussian of sd s, sampled at a period p, is misplaced by up to
     p / pi exp(-2 pi^2 s^2 / p^2), by the first alias of its spectrum. The resultant length of the distances as angles
-    at the period is 1 for such a grid; where it is 0 the misplacements of the rows average out.
+    at the period is 1 for such a grid; where it is 0 the misplacements of the rows average out. A width at its least
+    shows that the blur is not seen: the step may be sharp, anywhere between two rows.
     """
     near = (np.abs(d) < 4.0 * spacing) & (np.abs(other) > spacing)
     if not near.any():
@@ -302,7 +304,8 @@ def _sampling_sd(d: Floats, other: Floats, spacing: float, width: float) -> floa
     count = float(near.sum())
     periods = spacing * np.linspace(*PERIODS)
     aligned = np.abs(np.exp(2j * np.pi * d[near, None] / periods).mean(axis=0)) ** 2
-    common = float((np.maximum(aligned - BY_CHANCE / count, 0.0) * misplaced(periods) ** 2).max())
+    of_rows = periods / np.sqrt(12.0) if width < SHARP * LEAST_WIDTH * spacing else misplaced(periods)
+    common = float((np.maximum(aligned - BY_CHANCE / count, 0.0) * of_rows**2).max())
     rows = max(np.sqrt(count), 1.0)
     return float(np.sqrt(common + misplaced(np.array([spacing]))[0] ** 2 / rows))
 

@@ -30,7 +30,7 @@ ERRORS = (Statistic.RMS, Statistic.MEDIAN, Statistic.MEAN)  # the first that a q
 LENGTHS_AND_ANGLES = ("mm", "mrad")
 
 
-class Shown(Word):
+class CurveKind(Word):
     """What a curve shows."""
 
     ERROR = "error"
@@ -65,7 +65,7 @@ class Curve:
     ``key`` is the setting that differs, or the size of defects; ``others`` are the settings that are common.
     """
 
-    shown: Shown
+    shown: CurveKind
     origin: str
     recipe: str
     axis: Axis
@@ -133,15 +133,15 @@ def _against_settings(rows: Iterable[Row], cases: Mapping[str, tuple[str, tuple[
     for of, by_statistic in sorted(found.items(), key=lambda item: item[0]):
         statistic = next((str(one) for one in ERRORS if str(one) in by_statistic), "")
         if statistic and next(iter(by_statistic[statistic].values()))[0].unit in LENGTHS_AND_ANGLES:
-            made += _curve(Shown.ERROR, of, statistic, by_statistic[statistic])
+            made += _curve(CurveKind.ERROR, of, statistic, by_statistic[statistic])
         if Statistic.COVERAGE in by_statistic:
             numbers = by_statistic.get(Statistic.NUMBER, {})
-            made += _curve(Shown.COVERAGE, of, Statistic.COVERAGE, by_statistic[Statistic.COVERAGE], numbers)
+            made += _curve(CurveKind.COVERAGE, of, Statistic.COVERAGE, by_statistic[Statistic.COVERAGE], numbers)
     return made
 
 
 def _curve(
-    shown: Shown,
+    shown: CurveKind,
     of: _Of,
     statistic: str,
     rows: Mapping[float, list[Row]],
@@ -199,7 +199,7 @@ def _detection(rows: Sequence[Row], cases: Mapping[str, tuple[str, tuple[str, ..
                 places, values, scenes, items = zip(*points, strict=True)
                 made.append(
                     Curve(
-                        shown=Shown.DETECTION, axis=axis, statistic=str(Statistic.SHARE), unit="%",
+                        shown=CurveKind.DETECTION, axis=axis, statistic=str(Statistic.SHARE), unit="%",
                         places=places, values=values, scenes=scenes, items=items, **asdict(of),
                     )
                 )  # fmt: skip
@@ -221,7 +221,7 @@ def charts(curves: Sequence[Curve]) -> list[Chart]:
     """Return a chart of the curves of one recipe, step and setting, and one a size of the detection of all recipes."""
     groups: dict[tuple[Any, ...], list[Curve]] = defaultdict(list)
     for curve in curves:
-        of_all = curve.shown is Shown.DETECTION
+        of_all = curve.shown is CurveKind.DETECTION
         apart = ("", ()) if of_all else (curve.recipe, curve.others)
         groups[curve.shown, curve.step, apart, curve.key, curve.unit].append(curve)
     return [
@@ -233,11 +233,11 @@ def _chart(curves: Sequence[Curve]) -> Chart:
     first = curves[0]
     values = [value for curve in curves for value in curve.values if value > 0.0]
     places = [place for curve in curves for place in curve.places if place > 0.0]
-    wide = first.shown is Shown.ERROR and values != [] and max(values) > DECADE * min(values)
+    wide = first.shown is CurveKind.ERROR and values != [] and max(values) > DECADE * min(values)
     names = [_name(curve) for curve in curves]
     return Chart(
         title=_title(first),
-        x=text("{key}, mm", key=first.axis) if first.shown is Shown.DETECTION else text("{key}", key=first.key),
+        x=text("{key}, mm", key=first.axis) if first.shown is CurveKind.DETECTION else text("{key}", key=first.key),
         y=text("{shown}, {unit}", shown=first.shown, unit=first.unit),
         lines=tuple((name, list(curve.values)) for name, curve in zip(names, curves, strict=True)),
         over=tuple(list(curve.places) for curve in curves),
@@ -245,22 +245,22 @@ def _chart(curves: Sequence[Curve]) -> Chart:
         logarithmic_x=bool(places)
         and min(p for c in curves for p in c.places) > 0.0
         and max(places) > 4.0 * min(places),
-        level=NOMINAL if first.shown is Shown.COVERAGE else math.nan,
+        level=NOMINAL if first.shown is CurveKind.COVERAGE else math.nan,
     )
 
 
 def _name(curve: Curve) -> str:
-    if curve.shown is Shown.DETECTION:
+    if curve.shown is CurveKind.DETECTION:
         return f"{curve.recipe} ({curve.method}), {sum(curve.items)}"
     return (
         f"{curve.quantity}, {curve.statistic} ({curve.method})"
-        if curve.shown is Shown.ERROR
+        if curve.shown is CurveKind.ERROR
         else (f"{curve.quantity} ({curve.method})")
     )
 
 
 def _title(curve: Curve) -> Text:
-    if curve.shown is Shown.DETECTION:
+    if curve.shown is CurveKind.DETECTION:
         return text("defects found by {key}: scenes and method, number of true defects", key=curve.axis)
     return text(
         "{step}, {recipe}: {shown} against {axis}",

@@ -14,7 +14,7 @@ from processor.epochs.change import Finding
 from processor.language.messages import CODES, Text, catalogue, messages, text
 from processor.model import VOCABULARIES, Status, reason
 from processor.papers import rows
-from processor.validation import change_detection, coverage
+from processor.validation import change_detection, coverage, curves
 
 SOURCES = Path(processor.__file__).parent
 OTHERS = [code for code in CODES if code != "en"]
@@ -82,7 +82,8 @@ def test_every_text_of_the_sources_is_translated_with_the_same_values(code):
 def test_words_of_a_catalogue_are_of_a_vocabulary(code):
     assert pipeline.step_modules()
     assert (
-        len({record.JobStatus, change_detection.ChangeKind, coverage.Holds, rows.Outcome, Finding}) == 5
+        len({record.JobStatus, change_detection.ChangeKind, coverage.Holds, curves.CurveKind, rows.Outcome, Finding})
+        == 6
     )  # vocabularies are known once they are imported
     for key in messages(code).words:
         name, _, word = key.rpartition(".")

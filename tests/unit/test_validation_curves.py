@@ -5,7 +5,7 @@ import json
 import pytest
 
 from processor.validation import curves, night
-from processor.validation.curves import Axis, Shown
+from processor.validation.curves import Axis, CurveKind
 from processor.validation.history import Row
 from tests.support import validation_nights
 
@@ -30,7 +30,7 @@ def test_an_error_against_noise_is_the_median_over_the_scenes_of_the_last_night(
     # The same scene of the night before is replaced; a night of other software is left out.
     old = [row("c1", seed, "centres", "rms", 99.0, night=day) for seed, day in ((0, "2026-11-19"), (7, "2020-01-01"))]
     (found,) = curves.of_history([*old, *rows], {NIGHT, "2026-11-19"}, cases)
-    assert (found.shown, found.axis, found.key, found.others) == (Shown.ERROR, Axis.NOISE, NOISE, (f"{SPACING}=5",))
+    assert (found.shown, found.axis, found.key, found.others) == (CurveKind.ERROR, Axis.NOISE, NOISE, (f"{SPACING}=5",))
     assert found.places == (1.0, 2.0, 4.0)
     assert found.values == pytest.approx((1.1, 2.2, 4.4))
     assert found.scenes == (3, 3, 3)
@@ -54,7 +54,7 @@ def test_coverage_is_that_of_all_errors_together():
                 row(case, seed, "centres", "number", number, ""),
             ]
     (found,) = curves.of_history(rows, {NIGHT}, cases)
-    assert (found.shown, found.axis) == (Shown.COVERAGE, Axis.DENSITY)
+    assert (found.shown, found.axis) == (CurveKind.COVERAGE, Axis.DENSITY)
     assert found.values == pytest.approx((55.0, 92.5))
     assert found.items == (100, 80)
 
