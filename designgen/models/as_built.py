@@ -18,11 +18,11 @@ from designgen.asbuilt.imperfections import Ledger
 from designgen.checks import expect_all
 from designgen.designs.patch import Displacement, Surface
 from designgen.models.model import Model, ModelBody
+from designgen.models.station_placement import spread
 from designgen.models.subdivision import Spacing, subdivided
 from designgen.randomness import generator
 from designgen.recipe_params import filled
 from designgen.scanning import triangle_tree
-from designgen.scanning.station_placement import spread
 from processor.model import AsBuilt, BodyTruth, Bools, DefectTruth, Floats, StructureTruth, UsageError
 
 TRUTH_POINTS, LEAST_TRUTH_POINTS = 20_000, 60  # of the whole model, by area; of a body, at least

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from designgen.designs import arch_bridge, arch_part
-from designgen.models import as_built, loading
+from designgen.models import as_built, loading, station_placement
 from designgen.models.model import Model, ModelBody
 from designgen.recipe_files import Recipe, overridden
 from designgen.recipe_params import filled
 from designgen.scanning import scanner as scanner_module
-from designgen.scanning import station_placement, survey
+from designgen.scanning import survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder, Surfaces
 from designgen.scenes import MADE_IN_MM

@@ -16,9 +16,9 @@ from OCP.gp import gp_Pnt
 
 import designgen
 from designgen import __main__, recipe_files
-from designgen.models import as_built, loading
+from designgen.models import as_built, loading, station_placement
 from designgen.models.model import of_mesh, unique
-from designgen.scanning import returns, scanner, station_placement, surfaces, survey
+from designgen.scanning import returns, scanner, surfaces, survey
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import make
 from designgen.scenes.model import recipe_of

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from processor import diagnostics
 from processor.evaluation import preassembly as preassembly_evaluation
 from processor.geometry import icp, rigid
 from processor.geometry.polyline import Polyline
@@ -357,7 +358,7 @@ def test_a_temperature_that_is_not_corrected_is_said(bridge, monkeypatch):
     scene, _ = bridge
     monkeypatch.setattr(methods, "assemble", lambda *_: preassembly_step.Result("ok", "corner"))
     params = preassembly_step.Params(method="corner")
-    kept = {"parts": [], "scanned again": []}
+    kept = {"parts": [], "notes": diagnostics.Notes(), "scanned again": []}
     result = preassembly_step.run(dataclasses.replace(scene, temperature_C=31.5), params, kept)
     assert result.reasons == (reason("preassemble.temperature-not-corrected", temperature=31.5),)
 

@@ -248,9 +248,10 @@ def test_a_drawing_read_back(T):
         (kind, layer): len(space.query(f'{kind}[layer=="{layer}"]'))
         for kind, layer in (
             ("CIRCLE", "NODES"), ("POINT", "NODES"), ("LINE", "AXES"), ("LINE", "MOVEMENTS"), ("TEXT", "IDS"),
+            ("POINT", "LOWEST"),
         )
     }  # fmt: skip
-    assert list(count.values()) == [4, 4, 2, 3, 4]
+    assert list(count.values()) == [4, 4, 2, 3, 4, 4]
     assert len(space) == sum(count.values())
     assert {text.dxf.text for text in space.query("TEXT")} == {"10", "11", "13", "14"}
     assert sorted(round(c.dxf.radius, 6) for c in space.query("CIRCLE")) == [45.0, 45.1, 50.0, 60.2]

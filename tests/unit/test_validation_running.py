@@ -11,6 +11,7 @@ from processor.jobs import runner
 from processor.model import UsageError
 from processor.validation import cell_runner
 from processor.validation.cells import Case, Cell, Outcome
+from processor.writers import toml
 from tests.support import validation_nights
 
 CELL = Cell(Case("frame", "frame-small", "", False, (), ("spheres",), ()), 1, True)
@@ -61,7 +62,7 @@ def test_parameters_are_written_as_toml():
     tomllib = pytest.importorskip("tomllib")
 
     table = {"spheres": {"radius_mm": 50.0, "catalogue": 'a "b"', "deep": {"list": [1.0, 2.0], "on": True}}}
-    assert tomllib.loads(cell_runner._toml(table)) == table
+    assert tomllib.loads(toml.document(table)) == table
 
 
 def test_stopping_ends_what_is_under_way(tmp_path):

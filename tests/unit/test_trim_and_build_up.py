@@ -52,7 +52,7 @@ def test_a_joint_that_fits_is_left_alone():
     assert not found.cut.any()
     assert not found.build_up.any()
     assert codes(found) == ["nothing-to-do", "all-limits"]
-    assert messages("en").sentences(found.reasons) == "Nothing to do. All limits hold with 100%."
+    assert messages("en").sentences(found.reasons) == "Nothing to do. All limits are kept with a probability of 100%."
 
 
 @pytest.mark.parametrize("root", [0.0, 4.0])
@@ -65,8 +65,8 @@ def test_an_overlap_is_cut_by_itself_and_the_root_gap(root):
     assert not found.build_up.any()
     assert (found.probability, found.probability_as_is) == (1.0, 0.0)
     assert messages("en").sentences(found.reasons) == (
-        f"Cut the right part's end by {3.0 + root:.1f} mm all round. Done to 0 mm (one sd), all limits then hold "
-        "with 100% (groove gap 100%), as it is with 0%."
+        f"Cut the right part's end by {3.0 + root:.1f} mm all round. Done to 0 mm (one sd), all limits are then kept "
+        "with a probability of 100% (groove gap 100%), as it is with 0%."
     )
 
 
