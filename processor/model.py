@@ -825,7 +825,7 @@ class PoseTruth(Checked):
     """Where the design lies in a scene whose scans are in another frame than the design.
 
     ``covariance``, turn about the design frame's axes and shift: of the motion that errors of the scan's stations look
-    like, which no method can tell from a movement of the whole.
+    like, which no method can distinguish from a movement of the whole.
     """
 
     T_design_project: Floats = column(4, 4)

@@ -106,7 +106,7 @@ def body_of(
     """Return a shape, whose unit is ``scale`` mm, as a body, or the problem with it.
 
     With ``face_name``, which names a face or returns "", the body has the forms of its faces, and edges are
-    meshed finer. A shape that ``meshed`` knows keeps its mesh.
+    meshed finer. A shape that is in ``meshed`` keeps its mesh.
     """
     box = Bnd_Box()
     BRepBndLib.Add_s(shape, box, False)

@@ -159,7 +159,7 @@ def _processed(job: Job, input_sha256: str, identity: str, batch_ended: Callable
         ended = _run(job, identity, new_results, batch_ended)
         if ended.cause is Cause.STOPPED:
             return _failure_to_retry(job, STOPPED)
-        if ended.cause is Cause.SIGNAL and ended.code == signal.SIGKILL:  # it says nothing of the input
+        if ended.cause is Cause.SIGNAL and ended.code == signal.SIGKILL:  # no fault of the input
             return _failure_to_retry(job, KILLED)
         status, why, limits, results = _assessed(job, ended, new_results)
         if why is not None and any(sign in ended.last_line for sign in OUTPUT_GONE):

@@ -1,4 +1,4 @@
-"""Changes of values between epochs, with their 95 % intervals, and what they say of a component.
+"""Changes of values between epochs, with their 95 % intervals, and whether a component changed.
 
 The errors of two epochs are taken as independent: the half-width of a change is the root of the sum of both squares.
 Errors that both have in common cancel in the change, so that the interval is then too wide, never too narrow. A
@@ -20,7 +20,7 @@ from processor.model import NORMAL_95, Word
 
 
 class Finding(Word):
-    """What epochs say of a component."""
+    """Whether a component changed between epochs."""
 
     CHANGED = "changed"
     DOUBTFUL = "doubtful"  # it would have changed, but a value of it may be wrong beyond its interval

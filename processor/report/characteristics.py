@@ -89,7 +89,7 @@ def _bound(value: float) -> float:
     return value if math.isfinite(value) else NAN
 
 
-def told(found: Iterable[Characteristic]) -> Message:
+def summary(found: Iterable[Characteristic]) -> Message:
     """Say how many characteristics have which verdict, and name the first of the worst."""
     ordered = sorted(found, key=lambda one: ORDER.get(one.verdict, len(ORDER)))
     if not ordered:

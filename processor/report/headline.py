@@ -39,7 +39,7 @@ def of_step(run: StepRun) -> Text:
 
 def of_limits(limits: JudgedLimits) -> Message:
     """Return how many comparisons with limits have which verdict."""
-    return verdict_counts.told(verdict_counts.LIMITS, limits.of, limits.verdict)
+    return verdict_counts.summary(verdict_counts.LIMITS, limits.of, limits.verdict)
 
 
 def unverified(execution: Execution) -> list[str]:

@@ -110,7 +110,7 @@ def _banner(execution: Execution) -> dict[str, Any]:
     """Return the verdict on everything, in a word, and what it rests on."""
     runs = [run for run, _ in execution.by_step()]
     verdict = worst(run.verdict for run in runs)
-    told = characteristics.told(one for run in runs for one in characteristics.of_run(execution.scene, run))
+    told = characteristics.summary(one for run in runs for one in characteristics.of_run(execution.scene, run))
     sentences, tone = [told], TONES[verdict]
     if verdict is not Verdict.NONE and headline.unverified(execution):
         tone = tone if verdict is Verdict.FAIL else "open"

@@ -89,7 +89,7 @@ def _front(execution: Execution, say: Messages) -> Iterator[Figure]:
     lines += [
         Line(word, 18, "bold", COLOURS.get(verdict, "black")),
         Line(""),
-        *_wrapped(say.text(characteristics.told(held))),
+        *_wrapped(say.text(characteristics.summary(held))),
     ]
     if verdict is not Verdict.NONE and headline.unverified(execution):
         lines += _wrapped(say.text(text("Provisional: not all limits were checked against the standard's text.")))

@@ -22,8 +22,8 @@ SINGLE = {JOINTS[Verdict.PASS]: "the joint passes", LIMITS[Verdict.PASS]: "the l
 FURTHER = {Verdict.INDETERMINATE: "{part} indeterminate", Verdict.PASS: "{part} {part:?passes|pass}"}
 
 
-def told(phrases: Mapping[Verdict, str], names: Sequence[str], verdicts: Sequence[Verdict]) -> Message:
-    """Say how many of things with ``names`` have which verdict, and name the first of the worst.
+def summary(phrases: Mapping[Verdict, str], names: Sequence[str], verdicts: Sequence[Verdict]) -> Message:
+    """Return how many of the things with ``names`` have which verdict, and the names of the worst.
 
     ``phrases`` are JOINTS or LIMITS. Things without a verdict are not counted among those that pass.
     """
@@ -31,15 +31,15 @@ def told(phrases: Mapping[Verdict, str], names: Sequence[str], verdicts: Sequenc
     rows = {one: [i for i, verdict in enumerate(verdicts) if verdict is one] for one in phrases}
     if count and len(rows[Verdict.PASS]) == count:
         return text(SINGLE[phrases[Verdict.PASS]] if count == 1 else phrases[Verdict.PASS], count=count)
-    said: list[Message] = []
+    counted: list[Message] = []
     for verdict in (Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS):
         if not rows[verdict]:
             continue
-        if said or verdict is Verdict.PASS:
-            said.append(text(FURTHER[verdict], part=len(rows[verdict])))
+        if counted or verdict is Verdict.PASS:
+            counted.append(text(FURTHER[verdict], part=len(rows[verdict])))
             continue
         named: list[Message] = [label(one) for one in dict.fromkeys(names[i] for i in rows[verdict])]
         if len(named) > MOST_NAMED:
             named = [*named[:MOST_NAMED], text("and {count} more", count=len(named) - MOST_NAMED)]
-        said.append(text(phrases[verdict], part=len(rows[verdict]), count=count, named=named))
-    return text("{verdicts:;}", verdicts=said or [text("none has a verdict")])
+        counted.append(text(phrases[verdict], part=len(rows[verdict]), count=count, named=named))
+    return text("{verdicts:;}", verdicts=counted or [text("none has a verdict")])

@@ -12,7 +12,7 @@ REPORT, FILES = "[report] scanned", "scan files"  # where the day is from
 
 
 def facts(scene: Scene) -> dict[str, Any]:
-    """Return what later runs of the same structure are told apart by; what is not known is left out.
+    """Return what distinguishes runs of the same structure; what is not known is left out.
 
     ``scanned`` is the day as the project's title block has it, else the first day that the scan files state, and
     ``scanned_from`` says which. ``design`` is the hash of the design's geometry.

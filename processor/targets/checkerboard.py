@@ -4,8 +4,8 @@ Candidates are cells of space whose intensities scatter far more than is usual i
 plane are drawn as an image, and the pattern is sought in it at all places and turns by normalised correlation. The
 centre is then fitted to the intensities of the points themselves: with distances d1 and d2 from the two lines where the
 fields meet, the intensity is a + b erf(d1 / w) erf(d2 / w), w the width over which the footprint mixes two fields. What
-is no target is told by the share of the variance that the pattern explains, by fields that differ, and by a pattern
-that goes on beyond its border.
+is no target is recognised by the share of the variance that the pattern explains, by fields that differ, and by a
+pattern that goes on beyond its border.
 """
 
 from __future__ import annotations

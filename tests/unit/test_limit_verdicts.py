@@ -504,7 +504,7 @@ def test_names_are_suggested_by_their_letters():
 )
 def test_joints_are_counted_in_words(verdicts, said):
     names = [f"J{i + 1}" for i in range(len(verdicts))]
-    found = verdict_counts.told(verdict_counts.JOINTS, names, [Verdict(one) for one in verdicts])
+    found = verdict_counts.summary(verdict_counts.JOINTS, names, [Verdict(one) for one in verdicts])
     assert str(found) == said
     assert not latin([messages("zh").text(found)])
 

@@ -42,7 +42,7 @@ def _summary(result: Result) -> tuple[Message, Message]:
     if result.adjustment is None:
         body.append(text("Joints: {verdicts}.", verdicts=verdicts or text("none")))
     if result.adjustment is not None:
-        told = verdict_counts.told(verdict_counts.JOINTS, result.joints.name, result.joints.verdict)
+        told = verdict_counts.summary(verdict_counts.JOINTS, result.joints.name, result.joints.verdict)
         head = text("{verdicts}; assembly {head}", verdicts=told, head=head)
         chain = [limits for limits in result.adjustment.chain if len(limits.limits)]
         body += [text("Whole chain: {verdict}.", verdict=limits.verdict) for limits in chain]
