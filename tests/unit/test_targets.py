@@ -212,7 +212,7 @@ def test_known_coordinates_alone_are_enough_where_scans_are_searched(tmp_path):
     assert len(scene.control.point) == 0
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_room_with_targets_and_decoys(seed):
     """Every target with points enough is found and named, nothing else is, and places are within 0.3 mm and 4 sd."""
     settings = {"scan.step_mrad": 4.0, "room.spheres": 0, "room.checkerboard_mm": 300.0, "room.decoys": 8}
