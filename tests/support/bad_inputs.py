@@ -10,9 +10,8 @@ from tests.support.impossible_scenes import impossible_scenes
 from tests.support.scan_bytes import ply_header
 from tests.support.store_scenes import a_scene
 
-# What a process does instead of its work: see failing_job. One waits for the limit of time. None fills the memory by a
-# process of its own: where the system kills that one, the job ends in another way.
-PLANTS = ("segfault", "memory", "panic", "exit 3", "segfault", "memory", "panic", "hang", "segfault")
+# What a process does instead of its work: see failing_job. One waits for the limit of time.
+PLANTS = ("segfault", "memory", "panic", "exit 3", "segfault", "memory elsewhere", "panic", "hang", "segfault")
 
 
 def sphere(place, number):
