@@ -63,7 +63,7 @@ weekend: $(VENV)/.test paper
 	$(BIN)/python -m tests.bench.soak --minutes 60 --output $(OUT)/nightly-soak.json
 
 # The versions of .ci/locked.txt and .ci/lowest.txt again; rm .ci/locked.txt first for the newest ones.
-UV = $(BIN)/uv pip compile --quiet --no-emit-index-url --no-strip-extras --custom-compile-command "make lock" --python-version 3.10
+UV = $(BIN)/uv pip compile --quiet --no-strip-extras --custom-compile-command "make lock" --python-version 3.10
 WITH = --extra designgen --extra test pyproject.toml .ci/build.in
 lock: | $(BIN)/python
 	$(BIN)/python -m pip install --quiet uv

@@ -8,13 +8,16 @@ Diagnostics never change a result.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
 from processor.model import Diagnostics, Floats
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -51,55 +54,45 @@ _clouds_wanted: ContextVar[bool] = ContextVar("clouds_wanted", default=False)
 
 
 @contextmanager
-def with_clouds(wanted: bool = True) -> Iterator[None]:
-    """Record clouds, too, within the block."""
-    before = _clouds_wanted.set(wanted)
+def _set(variable: ContextVar[T], value: T) -> Iterator[None]:
+    before = variable.set(value)
     try:
         yield
     finally:
-        _clouds_wanted.reset(before)
+        variable.reset(before)
+
+
+def with_clouds(wanted: bool = True) -> AbstractContextManager[None]:
+    """Record clouds, too, within the block."""
+    return _set(_clouds_wanted, wanted)
 
 
 @contextmanager
 def recording() -> Iterator[Notes]:
     """Record the diagnostics of the block and yield the record."""
     notes = Notes()
-    before = _notes.set(notes)
-    try:
+    with _set(_notes, notes):
         yield notes
-    finally:
-        _notes.reset(before)
 
 
 @contextmanager
 def at(place: str) -> Iterator[None]:
     """Name the place of the diagnostics of the block; names of nested blocks are joined."""
-    before = _places.set((*_places.get(), place))
-    try:
+    with _set(_places, (*_places.get(), place)):
         yield
-    finally:
-        _places.reset(before)
 
 
 @contextmanager
-def placed(T: Floats, frame: str = "") -> Iterator[None]:
-    """Move points that the block keeps by T (4, 4) to a frame, which the outermost block names."""
+def placed(T_frame: Floats, frame: str = "") -> Iterator[None]:
+    """Move points that the block keeps by a pose (4, 4) to a frame, which the outermost block names."""
     outer, T_outer = _frame.get()
-    before = _frame.set((frame, T) if not outer else (outer, T_outer @ T))
-    try:
+    with _set(_frame, (outer, T_outer @ T_frame) if outer else (frame, T_frame)):
         yield
-    finally:
-        _frame.reset(before)
 
 
-@contextmanager
-def paused() -> Iterator[None]:
+def paused() -> AbstractContextManager[None]:
     """Record nothing within the block: it repeats what was recorded before."""
-    before = _notes.set(None)
-    try:
-        yield
-    finally:
-        _notes.reset(before)
+    return _set(_notes, None)
 
 
 def note(stage: str, **values: float) -> None:

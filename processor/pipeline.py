@@ -316,11 +316,7 @@ def execute(
         answers: dict[str, Any] = {}
         kept: dict[str, dict[str, Any]] = {}
         clouds: list[StepCloud] = []
-
-        def hashed() -> str:
-            return store.scene_hash(scene, None if points is None else points.pieces)
-
-        digest = hashed()
+        digest = store.scene_hash(scene, None if points is None else points.pieces)
         scene = _with_targets(scene, log)
         for job in jobs:
             if so_far is not None:

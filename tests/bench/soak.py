@@ -6,7 +6,7 @@
 until the time is over: the batch, its job or both are killed, the batch is stopped by SIGTERM, another process takes
 the memory of its control group until the system kills one of them, and the disk of the results is filled. It is run
 again until it is complete, its files are compared with those of the undisturbed one, and it begins anew. Memory and
-disk need root: without, these two are left out, and that is said.
+disk need root: without, these two are left out, and the output names them.
 
 Exits 1 where a file differs or lacks, something is left over, a process outlives its batch, or the memory of a batch's
 process varies by more than 20 MB.

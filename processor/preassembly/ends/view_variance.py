@@ -1,4 +1,4 @@
-"""What viewpoints disagree by, where nothing is said of them: by the two sides of plates.
+"""Variance between the unnamed views of a merged cloud, from the two sides of plates.
 
 A cloud merged from several stations has errors of range, place and turn of each station in it, and each face is seen
 from some of them only. On one face they look like form. But the two sides of a plate are never seen from one place, and
