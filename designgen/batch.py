@@ -288,6 +288,8 @@ def make_many(
     Raises UsageError if the folder is a file or another run is at work in it, or if the cluster does not answer;
     InputError if the cluster is lost on the way or the folder cannot be written.
     """
+    from processor.store.atomic_file import replace_text
+
     _make_folder(folder)
     busy = f"{folder}: another designgen is making scenes here; wait for it or stop it"
     try:
@@ -313,7 +315,7 @@ def make_many(
             index = _index(jobs, list(varied), outcomes)
             made = _card(folder, jobs, recipe, varied, outcomes, index)
             for name, text in zip(OF_SET, (index, card.as_json(made), card.as_markdown(made)), strict=True):
-                _write(folder / name, text)
+                replace_text(folder / name, text)
     except runner.StoppedError as stop:
         raise SystemExit(stop.exit_code) from None
     return _summary(folder, jobs, outcomes)
@@ -444,10 +446,3 @@ def _card(
     digest = hashlib.sha256(index.encode()).hexdigest()
     failed = len(jobs) - len(contents)
     return card.of_set(jobs[0].recipe, recipe, varied, jobs[0].software, entries, failed, labels, digest)
-
-
-def _write(path: Path, text: str) -> None:
-    from processor.store.atomic_file import replacing
-
-    with replacing(path) as temporary:
-        temporary.write_text(text, "utf-8")
