@@ -2,7 +2,7 @@
 
 Two forms of the test serve two kinds of adjustment. :func:`strongest` tests the misfits of one adjustment for an error
 in some directions: a common shift of all sightings of a point, of a single one, or a motion of all that a scan saw. By
-chance, the part of the squares that such an error explains is chi-square distributed with as many freedoms.
+chance, the part of the squares that such an error explains is chi-square distributed with as many degrees of freedom.
 :func:`leave_out` predicts each sighting from an adjustment without it, where an adjustment is one linear step.
 """
 
@@ -72,9 +72,9 @@ class _Tested:
     size_mm: float
 
 
-def beyond_chance(square: float, freedoms: int) -> bool:
+def beyond_chance(square: float, dof: int) -> bool:
     """Whether all misfits together are larger than their covariances explain."""
-    return freedoms > 0 and square > float(chdtri(freedoms, BY_CHANCE))
+    return dof > 0 and square > float(chdtri(dof, BY_CHANCE))
 
 
 def strongest(fit: Misfits, point: Ints, scan: Ints) -> Suspicion | None:

@@ -18,14 +18,14 @@ BY_CHANCE = 1e-3  # probability that noise as modelled makes any test of one res
 PREDICTIVE = 2.0
 
 
-def tail(square: Floats | float, freedom: float, noise_freedom: float) -> Floats:
+def tail(square: Floats | float, dof: float, noise_dof: float) -> Floats:
     """Probability of a weighted sum of squares of at least ``square``; 1 without degrees of freedom.
 
     ``noise_freedom`` is that of the estimated noise.
     """
-    if freedom <= 0 or noise_freedom <= 0:
+    if dof <= 0 or noise_dof <= 0:
         return np.ones_like(square, dtype=np.float64)
-    probability: Floats = np.asarray(fdtrc(freedom, noise_freedom, np.asarray(square) / freedom), np.float64)
+    probability: Floats = np.asarray(fdtrc(dof, noise_dof, np.asarray(square) / dof), np.float64)
     return probability
 
 

@@ -32,7 +32,7 @@ LEAST_SHARE = 1e-4  # a hypothesis of less weight is left out of the average
 class Means(NamedTuple):
     """Means (c,) of departures over patches at ``place`` (c, 2), mm, their variances by noise, and the trend (c, k).
 
-    ``freedom`` is that of the noise's estimate. Coefficients of the trend are expected within ``trend_sd`` of
+    The noise is known by ``dof`` degrees of freedom. Coefficients of the trend are expected within ``trend_sd`` of
     ``trend_mean`` (k,): patches may not determine all of them.
     """
 
@@ -40,7 +40,7 @@ class Means(NamedTuple):
     value: Floats
     variance: Floats
     trend: Floats
-    freedom: float = np.inf
+    dof: float = np.inf
     trend_mean: Floats | float = 0.0
     trend_sd: float = np.inf
 
@@ -124,7 +124,7 @@ def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tu
     both = -inverse @ by_trend.T
     covariance = np.block([[inverse, both], [both.T, of_process]])
     process = products[wanted, value] - by_trend @ coefficients
-    beyond = float(global_test.tail(float(rest), count - columns, means.freedom))
+    beyond = float(global_test.tail(float(rest), count - columns, means.dof))
     return np.concatenate([coefficients, process]), covariance, log, beyond
 
 

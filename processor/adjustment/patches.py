@@ -1,13 +1,12 @@
-"""Means of residuals over patches, and Student's factor for variances of few degrees of freedom."""
+"""Means of residuals over patches."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
-from processor.model import NORMAL_95, Floats, Ints
+from processor.model import Floats, Ints
 
 
 class Patches(NamedTuple):
@@ -20,12 +19,6 @@ class Patches(NamedTuple):
     number: Floats
     centre: Floats
     noise: float
-
-
-def widening(freedom: Floats | float) -> Floats:
-    """Factors of variances such that 1.96 standard deviations cover what Student's t does with this ``freedom``."""
-    factor: Floats = (stdtrit(np.maximum(freedom, 1.0), 0.975) / NORMAL_95) ** 2
-    return factor
 
 
 def patches(place: Floats, residual: Floats, size_mm: float) -> Patches:

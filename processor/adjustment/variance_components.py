@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import stdtrit
 
-from processor.model import NORMAL_95, Floats, Ints
+from processor.model import Floats, Ints
+from processor.robust_statistics import student_factor
 
 LEAST_POINTS = 25  # of a station in a cell
 
@@ -45,7 +45,7 @@ def between_stations(residual: Floats, station: Ints, cell: Ints) -> float:
     surplus = (scatter - (count - 1))[several]
     weight = (total - square / np.where(total > 0.0, total, 1.0))[several]
     # The variance comes from few stations: widen it so that 1.96 standard deviations cover what Student's t covers.
-    widening = (float(stdtrit(len(np.unique(station[enough[group]])) - 1, 0.975)) / NORMAL_95) ** 2
+    widening = float(student_factor(len(np.unique(station[enough[group]])) - 1)) ** 2
     return widening * max(float(np.mean(surplus / weight)), 0.0)
 
 
@@ -67,17 +67,17 @@ def lack_of_fit_variance(fits: Sequence[tuple[Floats, Ints]], coefficients: int)
     Each fit is its residuals (n,) and their cells (n,), with so many ``coefficients``.
     """
     between = within = 0.0
-    freedom, points, inside = 0, 0, 0
+    dof, points, inside = 0, 0, 0
     for residual, cell in fits:
         number = np.bincount(cell)
         used = number > 0
         mean = np.bincount(cell, residual)[used] / number[used]
         between += float((number[used] * mean**2).sum())
         within += float(((residual - (np.bincount(cell, residual) / np.maximum(number, 1))[cell]) ** 2).sum())
-        freedom += int(used.sum()) - coefficients
+        dof += int(used.sum()) - coefficients
         points += len(residual)
         inside += len(residual) - int(used.sum())
-    if freedom <= 0 or inside <= 0:
+    if dof <= 0 or inside <= 0:
         return 0.0
     noise = within / inside
-    return max((between - freedom * noise) / points, 0.0)
+    return max((between - dof * noise) / points, 0.0)

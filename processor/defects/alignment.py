@@ -19,6 +19,7 @@ from processor.defects.observations import Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
 from processor.model import Bools, Floats, Ints
+from processor.robust_statistics import robust_sd
 
 BLOCK_MM = 80.0
 BLOCK_RAD = 0.25  # of a block around a tube: within it, a movement of the tube is nearly one deviation
@@ -229,8 +230,8 @@ def _blocks(pairs: Pairs, surface: DesignSurface) -> StationBlocks:
     weight = pairs.count[used].astype(float)
     count = np.bincount(index, weight)
     mean = np.bincount(index, weight * pairs.mean[used]) / count
-    freedom = np.maximum(np.bincount(index, np.maximum(weight - 1.0, 0.0)), 1.0)
-    square = np.bincount(index, pairs.square[used]) / freedom
+    dof = np.maximum(np.bincount(index, np.maximum(weight - 1.0, 0.0)), 1.0)
+    square = np.bincount(index, pairs.square[used]) / dof
     _, of_block = np.unique(block[used], return_inverse=True)
     of_block = of_block.reshape(-1)
     total = np.bincount(of_block, weight)
@@ -326,7 +327,7 @@ def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Float
     """
     x = np.zeros(6)
     prior = np.diag(1.0 / WHOLE_PRIOR**2)
-    scale = max(1.4826 * float(np.median(np.abs(deviation))), FLOOR_MM)
+    scale = robust_sd(deviation, FLOOR_MM)
     weight = np.ones(len(deviation))
     _, of_component = np.unique(component, return_inverse=True)
     of_component = of_component.reshape(-1)
@@ -337,7 +338,7 @@ def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Float
         step = np.linalg.solve(A, J.T @ (weight * deviation) / scale**2) - x
         x = x + step
         residual = deviation - J @ x
-        scale = max(1.4826 * float(np.median(np.abs(residual))), FLOOR_MM)
+        scale = robust_sd(residual, FLOOR_MM)
         if np.abs(J @ step).max() < 1e-4:
             break
     residual = deviation - J @ x

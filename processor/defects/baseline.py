@@ -28,6 +28,7 @@ from processor.defects.to_result import table
 from processor.geometry import icp, mesh_distance, pfh, rigid
 from processor.geometry.neighbors import surface_spacing, voxel_means
 from processor.model import NORMAL_95, Bools, Floats, Ints, Scene, Status, StructureDesign, reason
+from processor.robust_statistics import robust_sd_about_median
 
 VOXEL_SPACINGS = 1.5
 RADIUS_VOXELS = 2.5  # radius of the neighbourhood that density is counted in
@@ -134,7 +135,7 @@ def _deviations(points: Floats, vertices: Floats, design: StructureDesign, radiu
     facet, distance = mesh_distance.nearest_visible(grid, points, np.zeros((1, 3)), np.full(len(points), -1, np.int64))
     near = facet >= 0
     points, facet, distance = points[near], facet[near], distance[near]
-    sigma = 1.4826 * float(np.median(np.abs(distance - np.median(distance)))) if len(distance) else 0.0
+    sigma = robust_sd_about_median(distance)
     threshold = params.paper.defect_mm or max(ROBUST_TIMES * sigma, 1e-6)
     beyond = np.abs(distance) > threshold
     label = np.full(len(points), NOISE, np.int64)

@@ -163,12 +163,12 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     alarms_per_mm2 = params.false_alarms / (1e6 * params.per_m2)
     aligned, field, shapes = _fitted_shapes(registered, error_mm, params)
     candidates = {fit.component: [s for s in fit.fitted.shapes if s.kind != "bump"] for fit in shapes}
-    residuals = field.less(component_shapes.values(surface, shapes, candidates))
+    residuals = field.minus(component_shapes.values(surface, shapes, candidates))
     levels = scan_statistic.levels_of(residuals, surface, alarms_per_mm2, params.systematic_mm)
     significant = component_shapes.significant(shapes, surface, field, aligned, levels, alarms_per_mm2)
     chosen = {number: [judged.shape for judged in of_one] for number, of_one in significant.items()}
     shape_values = component_shapes.values(surface, shapes, chosen)
-    residuals = field.less(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
+    residuals = field.minus(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
     finding = scan_statistic.search(residuals, surface, levels)
     expected = expected_points.expected(scene, registered.T_design_project, pairs, surface, observed.stations)
     missing = regions.missing(field, expected, surface, alarms_per_mm2)

@@ -46,7 +46,7 @@ class Field:
         variance = self.stations[cells][self.count[cells] > 0]
         return float(np.sqrt(variance.mean() + self.views**2)) if len(variance) else self.views
 
-    def less(self, shape: Floats) -> Field:
+    def minus(self, shape: Floats) -> Field:
         """Return the field less a shape (cells,)."""
         return dataclasses.replace(self, deviation=self.deviation - shape)
 
@@ -66,16 +66,16 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     count = np.bincount(pairs.cell, pairs.count, cells)
     divisor = np.maximum(count, 1.0)
     mean = np.bincount(pairs.cell, pairs.count * (pairs.mean - correction), cells) / divisor
-    freedom = np.bincount(pairs.cell, np.maximum(pairs.count - 1, 0), cells).astype(np.float64)
+    dof = np.bincount(pairs.cell, np.maximum(pairs.count - 1, 0), cells).astype(np.float64)
     square = np.bincount(pairs.cell, pairs.square, cells).astype(np.float64)
     charts = surface.charts
     noise = np.zeros(cells)
-    overall = float(square.sum() / max(freedom.sum(), 1.0))
+    overall = float(square.sum() / max(dof.sum(), 1.0))
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
-        pooled_square, pooled_freedom = (_pooled(charts.image(x, chart), charts, chart) for x in (square, freedom))
-        known = pooled_freedom * POOLED_CELLS**2 > FEWEST_FREE
-        noise[rows] = np.where(known, pooled_square / np.maximum(pooled_freedom, 1e-9), overall).ravel()
+        pooled_square, pooled_dof = (_pooled(charts.image(x, chart), charts, chart) for x in (square, dof))
+        known = pooled_dof * POOLED_CELLS**2 > FEWEST_FREE
+        noise[rows] = np.where(known, pooled_square / np.maximum(pooled_dof, 1e-9), overall).ravel()
     noise = np.sqrt(np.maximum(noise, 1e-6))
     stray, mixed = (np.bincount(pairs.cell, x, cells) for x in (pairs.stray, pairs.mixed))
     variance, seen = noise**2 / divisor, inner * ((count + stray - mixed >= FEWEST_POINTS) & (count > 0))

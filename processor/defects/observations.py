@@ -12,6 +12,7 @@ from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import FacetGrid
 from processor.model import Bools, Floats, InputError, Ints, Scan, Scene
+from processor.robust_statistics import MAD_TO_SD
 
 CHUNK = 500_000
 BEHIND_MM = 4.0  # a face, from which on a beam must have passed through it as designed
@@ -233,7 +234,7 @@ def pairs(
         pure = deviation[start:end][~mixed[start:end]]
         if len(pure) >= FEWEST_POINTS:
             middle = np.median(pure)
-            gate = max(LEAST_GATE_MM, GATE_SDS * 1.4826 * np.median(np.abs(pure - middle)))
+            gate = max(LEAST_GATE_MM, GATE_SDS * MAD_TO_SD * np.median(np.abs(pure - middle)))
         for i in range(start, end):
             if i == start or station[i] != station[i - 1]:
                 at += 1

@@ -18,6 +18,7 @@ from scipy.special import ndtr, ndtri
 from processor.defects.deviation_field import Field
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
 from processor.model import Bools, Floats
+from processor.robust_statistics import robust_sd_about_median
 
 SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of windows, in cells
 COVERED = 0.5  # share of a window that must have been seen
@@ -125,8 +126,7 @@ def _windows(field: Field, charts: Charts, used: list[int], side: int) -> tuple[
 
 def _surplus(z: Floats, sd: Floats, views_mm: float) -> float:
     """Return the variance of means by their formal standard deviations (n,), less 1 and that of unnamed views."""
-    scatter = 1.4826 * float(np.median(np.abs(z - np.median(z))))
-    return max(scatter**2 - 1.0 - (views_mm / float(np.median(sd))) ** 2, 0.0)
+    return max(robust_sd_about_median(z) ** 2 - 1.0 - (views_mm / float(np.median(sd))) ** 2, 0.0)
 
 
 def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> Finding:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from processor.adjustment.finite_median import finite_median
 from processor.defects import classification, defect_grids, measures
 from processor.defects.alignment import Alignment
 from processor.defects.classification import Classification
@@ -26,6 +25,7 @@ from processor.defects.scan_statistic import Levels
 from processor.defects.shape_models import RIGID, Frame
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Status, reason
+from processor.robust_statistics import finite_median
 
 CHANCE_MM2 = 1e8  # the area that false alarms are counted on
 CURVE_STRIPS = 40

@@ -13,13 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from scipy.special import stdtrit
 
 from processor.geometry.linalg_small import eigen
-from processor.geometry.m3c2 import FEWEST_FOR_LOD, HALF_DIAGONAL, LEAST_RANGE, Z95
+from processor.geometry.m3c2 import FEWEST_FOR_LOD, HALF_DIAGONAL, LEAST_RANGE
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
 from processor.model import Floats, Ints
+from processor.robust_statistics import student_factor
 
 DETERMINED = 0.05  # least eigenvalue of the mean of n n' for which the translation along its vector is estimated
 
@@ -93,7 +93,7 @@ def movement(
         free=np.empty(k, np.int64),
     )  # fmt: skip
     over_ranges(lambda a, b: _movement(feet.cells, measured, wanted, a, b, moved), k, least=LEAST_RANGE)
-    table = stdtrit(np.arange(1.0, 401.0), 0.975) / Z95
+    table = student_factor(np.arange(1.0, 401.0))
     factor = np.where(moved.free > 0, table[np.clip(moved.free, 1, 400) - 1], np.nan)
     return Movement(
         moved.along, moved.number, np.sqrt(moved.variance) * factor, moved.vector, moved.number - moved.free

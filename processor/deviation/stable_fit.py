@@ -21,6 +21,7 @@ from processor.geometry import rigid
 from processor.geometry.m3c2 import Z95
 from processor.geometry.mesh_distance import Samples
 from processor.model import Floats, Ints
+from processor.robust_statistics import TUKEY, biweight
 
 BLOCKS_ALONG = 40.0  # blocks along the extent of the structure
 BLOCK_DIAMETERS = 3.0  # least side of a block
@@ -28,7 +29,6 @@ LEVELS = 3  # sizes of blocks, each twice the last: a movement that grows gradua
 LEAST_STRENGTH = 0.005  # share of a block's points along a direction, below which its curvature would count as a face
 TRIALS, BLOCKS_A_TRIAL, REFINED = 400, 3, 6
 ITERATIONS, CONVERGED_MM = 30, 1e-6
-TUKEY = 4.685  # standard deviations at which the weight is 0: 95 % efficient for normal errors
 AGREES = 2.5  # standard deviations within which a block agrees with a motion
 MOST_CONDITION = 1e10
 FEWEST_CLUSTERS = 12  # for a sandwich with six unknowns
@@ -129,7 +129,7 @@ def fits(
     stable, small = _reweighted(levels, stable), _reweighted(levels[:1], stable)
     share = float(blocks.area[_worst(blocks, stable[None], limit)[0] <= 1.0].sum() / blocks.area.sum())
     worst, scale = _largest(levels, stable), levels[0].sd
-    weight = _tukey(worst)
+    weight = biweight((worst) / TUKEY)
     z = np.abs(blocks.value - blocks.design @ stable) / scale
     slope = np.where(z < worst, weight, _tukey_slope(z))
     return Fits(
@@ -248,7 +248,7 @@ def _reweighted(levels: list[_Level], motion: Floats) -> Floats:
     """Refine a motion (6,): blocks lose weight if they, or the larger blocks they are in, do not agree with it."""
     blocks, sd = levels[0].blocks, levels[0].sd
     for _ in range(ITERATIONS):
-        last, motion = motion, _solved(blocks, _tukey(_largest(levels, motion)) / sd**2)
+        last, motion = motion, _solved(blocks, biweight((_largest(levels, motion)) / TUKEY) / sd**2)
         if np.abs(motion - last).max() < CONVERGED_MM:
             break
     return motion
@@ -269,11 +269,6 @@ def _scaled(blocks: _Blocks, motion: Floats, sd: Floats, limit: Floats) -> Float
     z = (blocks.value - blocks.design @ motion) / sd
     near = _worst(blocks, motion[None], limit)[0] <= 1.0
     return sd * (max(1.0, float(np.sqrt(np.median(z[near] ** 2) / CHI2_MEDIAN))) if near.any() else 1.0)
-
-
-def _tukey(z: Floats) -> Floats:
-    weight: Floats = np.clip(1.0 - (z / TUKEY) ** 2, 0.0, 1.0) ** 2
-    return weight
 
 
 def _tukey_slope(z: Floats) -> Floats:

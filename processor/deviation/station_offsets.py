@@ -10,14 +10,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
-from scipy.special import stdtrit
 
 from processor.adjustment.groups import pieces
 from processor.adjustment.opposite_sides import SURE
 from processor.deviation.local_translation import Movement
-from processor.geometry.m3c2 import Z95
 from processor.geometry.mesh_distance import Samples
 from processor.model import Floats, Ints
+from processor.robust_statistics import student_factor
 
 CELL_DIAMETERS = 3.0  # side of a piece of a face
 LEAST_POINTS = 10  # of a station on a piece
@@ -51,7 +50,7 @@ def shared_sd(
     total = np.bincount(of_core[at[rows]], minlength=len(cell))
     share = np.bincount(key[:, 0], number**2, len(cell)) / np.maximum(total, 1) ** 2
     variance = _between(key[:, 0], mean, noise / number, number >= LEAST_POINTS)
-    widening = float(stdtrit(len(np.unique(station)) - 1, 0.975)) / Z95
+    widening = float(student_factor(len(np.unique(station)) - 1))
     shared[known] = widening * np.sqrt(variance * share[cell])
     return shared
 

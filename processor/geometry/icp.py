@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
 from processor.model import Floats, Ints
+from processor.robust_statistics import robust_sd
 
 MOST_WEIGHT = 100.0  # of a point on a face that few points lie on
 
@@ -141,7 +142,7 @@ def point_to_plane(
             rms = float(np.sqrt(np.mean(r**2)))
             # On a clean scan the median is close to zero. The few points of an end face, far off while the part still
             # slides along its length, would then lose all their weight: the gate sets a lower bound of the scale.
-            scale = max(1.4826 * float(np.median(np.abs(r))), gate / 12.0)
+            scale = robust_sd(r, gate / 12.0)
             weight = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(r), 1e-12))
             if axes is not None:
                 weight *= balance(facing(n, axes))

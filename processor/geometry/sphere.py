@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.model import Bools, Floats, Ints
+from processor.robust_statistics import TUKEY, biweight, robust_sd
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,6 @@ def ransac(
 # --- Robust geometric fit
 
 
-TUKEY = 4.685  # in scales: 95 % efficiency under normal noise
 WINDOW = 4.0  # in scales: residuals within it determine the scale
 STEEPEST = 0.3  # cosine of incidence below which the beam is split at the limb, and errors of angles dominate
 ITERATIONS = 100
@@ -313,7 +313,7 @@ def _linearised(points: Floats, state: Floats, scanner: Floats | None) -> tuple[
 
 def _step(residual: Floats, J: Floats, scale: float) -> Floats | None:
     """Gauss-Newton step (p,) with Tukey's weights; None where the points do not determine a sphere."""
-    w = (1.0 - (residual / (TUKEY * scale)) ** 2) ** 2
+    w = biweight(residual / (TUKEY * scale))
     N = (J * w[:, None]).T @ J
     if np.linalg.cond(N) > 1e12:
         return None
@@ -322,10 +322,10 @@ def _step(residual: Floats, J: Floats, scale: float) -> Floats | None:
 
 
 def _scale(residual: Floats, scale: float) -> float:
-    """Scale by the residuals within 4 scales: 1.4826 median |residual|."""
+    """Scale by the residuals within 4 scales."""
     size = np.abs(residual)
     near = size[size <= WINDOW * scale]
-    return 1.4826 * float(np.median(near)) if len(near) else scale
+    return robust_sd(near) if len(near) else scale
 
 
 def _sandwich(J: Floats, u: Floats, scale: float) -> Floats:

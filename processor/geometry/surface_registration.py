@@ -18,6 +18,7 @@ from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
 from processor.geometry.neighbors import thinned, voxel_means
 from processor.geometry.principal import CoarsePose, PrincipalAxes
 from processor.model import NORMAL_95, Bools, Floats, Ints, Word
+from processor.robust_statistics import biweight, robust_sd
 
 # --- Fine registration
 
@@ -101,9 +102,9 @@ def _iterate(
         middle = placed[used].mean(axis=0)
         J = np.hstack([np.cross(placed[used] - middle, n), n])
         axis = icp.facing(n, axes)
-        spread = np.array([_spread(r[axis == k]) for k in range(3)])
-        sigma = _spread(r)
-        weight = np.clip(1.0 - (r / (CUT * spread[axis])) ** 2, 0.0, 1.0) ** 2  # Tukey's
+        spread = np.array([robust_sd(r[axis == k], FLOOR_MM) for k in range(3)])
+        sigma = robust_sd(r, FLOOR_MM)
+        weight = biweight(r / (CUT * spread[axis]))
         weight = weight * icp.balance(axis) if even else weight
         normal = J.T @ (J * weight[:, None])
         if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)) + 1e-300)) > 1e10:
@@ -125,10 +126,6 @@ def _iterate(
             break
         face = face if move < SMALL_MM else None
     return SurfaceFit(T, covariance, sigma, share, weak), form
-
-
-def _spread(residual: Floats) -> float:
-    return max(1.4826 * float(np.median(np.abs(residual))), FLOOR_MM) if len(residual) else FLOOR_MM
 
 
 def cells(place: Floats, axis: Ints, normal: Floats) -> Ints:

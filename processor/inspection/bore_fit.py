@@ -12,12 +12,13 @@ import numpy as np
 
 from processor.adjustment import scanner_class
 from processor.model import Bools, Floats, Ints
+from processor.robust_statistics import biweight, robust_sd
 
 # Points nearer to a rim than a footprint's radius may lie on the face as well.
 RIM_MM, RIM_SHARE = 2.5, 0.25  # at most this share of the depth
 STEP_MM, GATE_MM = 1.0, 1.5  # of the search for a hole's place, and reach of its circle
 FEWEST, FEWEST_SECTORS, SECTORS = 12, 4, 8  # points of a hole, and sectors of its circle that they lie in
-TUKEY = 4.5  # robust standard deviations beyond which a point has no weight
+ZERO_WEIGHT = 4.5  # robust standard deviations beyond which a point has no weight
 LATERAL = 0.2  # variance across the ray as a share of that along it: encoders and footprint
 # Of a ray into the wall, as a cosine: at less the footprint lies on more of the wall than is seen as one surface.
 LEAST_SLOPE = 0.35
@@ -132,8 +133,8 @@ def _adjusted(
         precision = 1.0 / (np.where(known, slope**2, 1.0) + LATERAL)
         scaled = residual * np.sqrt(precision)
         near = np.abs(residual) < GATE_MM
-        sigma = max(1.4826 * float(np.median(np.abs(scaled[near]))) if near.any() else FLOOR_MM, FLOOR_MM)
-        weight = np.maximum(1.0 - (scaled / (TUKEY * sigma)) ** 2, 0.0) ** 2
+        sigma = robust_sd(scaled[near], FLOOR_MM)
+        weight = biweight(scaled / (ZERO_WEIGHT * sigma))
         weight[(np.abs(residual) > 3.0 * GATE_MM) | (known & (slope < LEAST_SLOPE))] = 0.0
         weighted = jacobian * (weight * precision)[:, None]
         inverse = np.linalg.inv(jacobian.T @ weighted / sigma**2 + np.diag(1.0 / prior**2))

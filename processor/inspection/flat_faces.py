@@ -22,6 +22,7 @@ from processor.geometry import mesh_distance
 from processor.inspection import design_holes
 from processor.inspection.design_holes import Hole
 from processor.model import Floats, Ints, StructureDesign
+from processor.robust_statistics import robust_sd
 
 NORMALS, OFFSETS_MM = 1e-3, 0.5  # by which facets of one flat face may differ
 PIECE_DIAMETERS = 3.0  # side of a piece, in diameters of the core points' circles
@@ -223,16 +224,15 @@ def fit(basis: Floats, pieces: Pieces, along: Floats) -> Fit | None:
     """
     used, form = np.ones(len(basis), bool), 0.0
     for _ in range(ROUNDS):
-        kept, freedom = used, int(used.sum()) - basis.shape[1]
-        if freedom < 1 or np.linalg.cond(basis[kept]) > MOST_CONDITION:
+        kept, dof = used, int(used.sum()) - basis.shape[1]
+        if dof < 1 or np.linalg.cond(basis[kept]) > MOST_CONDITION:
             return None
         root = 1.0 / np.sqrt(pieces.noise[kept] + form)
         solve = np.linalg.pinv(basis[kept] * root[:, None]) * root
         mean = solve @ pieces.value[kept]
         rest = pieces.value - basis @ mean
-        form = max(float((rest[kept] ** 2).sum()) / freedom - float(pieces.noise[kept].mean()), 0.0)
-        spread = 1.4826 * float(np.median(np.abs(rest[kept])))
-        used = np.abs(rest) <= CLIP * np.maximum(spread, np.sqrt(pieces.noise))
+        form = max(float((rest[kept] ** 2).sum()) / dof - float(pieces.noise[kept].mean()), 0.0)
+        used = np.abs(rest) <= CLIP * np.maximum(robust_sd(rest[kept]), np.sqrt(pieces.noise))
         if (used == kept).all():
             break
     covariance = pieces.covariance(along, form)[np.ix_(kept, kept)]

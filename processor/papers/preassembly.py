@@ -214,7 +214,7 @@ def _of_bridge(found: Found, bridge: int, numbers: dict[str, Any]) -> list[Row]:
 def _orders(found: Found, name: str, why: Reason) -> list[Row]:
     """Rows of the paper's statements on the order of the methods."""
 
-    def less(method: str, than: str, figure: str) -> tuple[float, ...]:
+    def minus(method: str, than: str, figure: str) -> tuple[float, ...]:
         pairs = zip(found.values(name, f"{method}: {figure}"), found.values(name, f"{than}: {figure}"), strict=True)
         return tuple(float(one < other) if np.isfinite([one, other]).all() else NAN for one, other in pairs)
 
@@ -228,13 +228,13 @@ def _orders(found: Found, name: str, why: Reason) -> list[Row]:
     return (
         [
             _Of(place, name, f"{one}, {other}", "").row(
-                statement, 1.0, less(one, other, "splicing, mean"), Rule.HOLDS, corners if other == "corner" else why
+                statement, 1.0, minus(one, other, "splicing, mean"), Rule.HOLDS, corners if other == "corner" else why
             )
             for one, other in (("line", "corner"), ("line", "design-aided"), ("design-aided", "corner"))
         ]
         + [
             _Of(table_3, name, f"{one}, {other}", "").row(
-                of_line, 1.0, less(one, other, "linear, mean"), Rule.HOLDS, because
+                of_line, 1.0, minus(one, other, "linear, mean"), Rule.HOLDS, because
             )
             for one, other, because in (("design-aided", "line", why), ("line", "corner", attitude))
         ]
@@ -268,10 +268,10 @@ def _of_side(found: Found, side: str, numbers: dict[str, Any]) -> list[Row]:
                 of.row(quantity, numbers["figure_18"][k][i], values, Rule.NEAR, reason("papers.bridge-real-parts"))
             )
     pairs = zip(found.values(side, "design-aided: linear, mean"), found.values(side, "line: linear, mean"), strict=True)
-    less = tuple(float(aided < line) if np.isfinite([aided, line]).all() else NAN for aided, line in pairs)
+    minus = tuple(float(aided < line) if np.isfinite([aided, line]).all() else NAN for aided, line in pairs)
     of = _Of(text("figure {number}", number="18"), side, "design-aided, line", "")
     statement = text("linear error smaller than by the other method")
-    made.append(of.row(statement, 1.0, less, Rule.HOLDS, reason("papers.bridge-real-parts")))
+    made.append(of.row(statement, 1.0, minus, Rule.HOLDS, reason("papers.bridge-real-parts")))
     between = np.array(numbers[f"table_{table + 2}"]) - np.array(numbers[f"table_{table}"])
     left, before = beyond_rigid(between)
     why = reason("papers.bridge-picked-anew", rms=before, left=left)
@@ -292,12 +292,12 @@ def beyond_rigid(between: Floats) -> tuple[float, float]:
     left = np.array([1.0, -1.0, -1.0, 1.0, 0.0, -1.0, 0.0, 1.0])
     up = np.array([-1.0, -1.0, 1.0, 1.0, -1.0, 0.0, 1.0, 0.0])
     one = np.ones(8)
-    square, freedoms = 0.0, 0
+    square, dof = 0.0, 0
     for column, values in enumerate(between.T):
         A = np.stack([(one, left, up), (one, up), (one, left)][column % 3], axis=1)
         square += float(((values - A @ np.linalg.lstsq(A, values, rcond=None)[0]) ** 2).sum())
-        freedoms += 8 - A.shape[1]
-    return float(np.sqrt(square / freedoms)), float(np.sqrt(np.mean(between**2)))
+        dof += 8 - A.shape[1]
+    return float(np.sqrt(square / dof)), float(np.sqrt(np.mean(between**2)))
 
 
 # --- charts -------------------------------------------------------------------------------------------------------

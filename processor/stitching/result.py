@@ -97,7 +97,7 @@ class Closures(Rows):
     loop: tuple[tuple[str, ...], ...] = name_lists("l")  # names of the scans; the first again at the end
     mm: Floats = column("l", unit="mm")
     mrad: Floats = column("l", unit="mrad")
-    ratio: Floats = column("l")  # chi-square by the pairs' covariances over its 6 freedoms
+    ratio: Floats = column("l")  # chi-square by the pairs' covariances over its 6 degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class ControlPoints(Checked):
     """How control points fix the frame of the scans."""
 
     holds: bool = False  # whether the project's frame is theirs; False: too few, it is the reference scan's
-    redundancy: int = 0  # freedoms
+    redundancy: int = 0  # degrees of freedom
     ratio: float = NAN  # chi-square of the misfits over the redundancy; expected: 1
     loosened: float = 1.0  # factor that the standard deviations of control points were multiplied by
     sightings: ControlSightings = dataclasses.field(default_factory=ControlSightings)

@@ -144,7 +144,7 @@ def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Par
         used=[True] * len(pairs),
         pair_reasons=pair_reasons,
         scale=np.array([fit.scale for fit in pooled]),
-        scale_sd=np.array([three_point.widened(fit.scale_sd, fit.scaled_freedoms) for fit in pooled]),
+        scale_sd=np.array([three_point.widened(fit.scale_sd, fit.scaled_dof) for fit in pooled]),
         pose_scale_sd=adjusted.scale_sd,
         unplaced=_unplaced(names, shortages, {row for pair in fits for row in pair}),
         point_mm=float(np.median([fit.sd_mm for fit in pooled])) if pooled else float("nan"),
@@ -176,7 +176,7 @@ def _say_pairs(
 
 def _of_pair(fit: PairFit, params: Params) -> tuple[Reason, ...]:
     """Return the likely cause of the pair's scale, or of the scatter of its picks."""
-    cause = three_point.cause_of_scale(fit.scale, fit.scale_sd, params.scale_limit_ppm, fit.scaled_freedoms)
+    cause = three_point.cause_of_scale(fit.scale, fit.scale_sd, params.scale_limit_ppm, fit.scaled_dof)
     if cause is None and fit.is_outlier:
         cause = reason("stitch.picks-scatter", sd_mm=fit.sd_mm)
     return () if cause is None else (cause,)

@@ -16,6 +16,7 @@ from scipy.special import fdtri, stdtrit
 from processor.adjustment import data_snooping
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Picks, Reason, Scan, reason
+from processor.robust_statistics import student_factor
 from processor.stitching import pose_covariance
 from processor.stitching.common_points import LEAST_HEIGHT, LEAST_POINTS, units_slip
 from processor.stitching.fine.pair_checks import Pair
@@ -40,7 +41,7 @@ class PairFit:
     """Pose of a pair of scans by its picks: T_a_b with the scale where it is free, scale of b in a, and residuals.
 
     ``covariance`` (6, 6): rotation along a's axes about the origin of b, and shift; with a free scale (7, 7), its
-    logarithm last. ``freedoms`` are those that ``sd_mm`` is known by; ``scaled_sd_mm`` and ``scaled_freedoms`` are the
+    logarithm last. ``dof`` degrees of freedom are those of ``sd_mm``; ``scaled_sd_mm`` and ``scaled_dof`` are the
     same for the difference of both scans' picks with a free scale.
     """
 
@@ -50,9 +51,9 @@ class PairFit:
     residuals: Floats  # (n, 3) a less transformed b, mm
     sd_mm: float  # of a picked coordinate of one scan
     covariance: Floats
-    freedoms: int
+    dof: int
     scaled_sd_mm: float
-    scaled_freedoms: int
+    scaled_dof: int
     is_outlier: bool = False  # its picks scatter more than those of the other pairs, beyond chance
 
 
@@ -74,8 +75,8 @@ def by_pair(picks: Picks | None, scans: Sequence[Scan]) -> Picked:
 def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
     """Fit a pair's picked points (n, 3) of each scan by least squares; raises TooFewError.
 
-    The standard deviation of a pick follows from the redundancy: with three points three freedoms for six parameters,
-    two for seven. The scale is the least-squares one of the rotated points.
+    The standard deviation of a pick follows from the redundancy: three points have three degrees of freedom with six
+    parameters, two with seven. The scale is the least-squares one of the rotated points.
     """
     n = len(points_a)
     if n < LEAST_POINTS:
@@ -90,9 +91,9 @@ def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
     scale = float((a * rotated).sum() / (rotated**2).sum())
     used = scale if scale_free else 1.0
     residuals = a - used * rotated
-    freedoms = 3 * n - 6 - scale_free
+    dof = 3 * n - 6 - scale_free
     # Of a difference, which contains the errors of both scans' picks.
-    difference_sd = max(float(np.sqrt((residuals**2).sum() / freedoms)), LEAST_SD_MM)
+    difference_sd = max(float(np.sqrt((residuals**2).sum() / dof)), LEAST_SD_MM)
     # The scale's standard deviation follows from the residuals of seven parameters, which do not contain its deviation.
     scaled_sd = max(float(np.sqrt(((a - scale * rotated) ** 2).sum() / (3 * n - 7))), LEAST_SD_MM)
     J = rigid.motion(used * rotated)
@@ -104,67 +105,67 @@ def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
     covariance = pose_covariance.about(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
     return PairFit(
         T_a_b=T, scale=scale, scale_sd=scaled_sd / float(np.sqrt((rotated**2).sum())), residuals=residuals,
-        sd_mm=difference_sd / np.sqrt(2.0), covariance=covariance, freedoms=freedoms,
-        scaled_sd_mm=scaled_sd, scaled_freedoms=3 * n - 7,
+        sd_mm=difference_sd / np.sqrt(2.0), covariance=covariance, dof=dof,
+        scaled_sd_mm=scaled_sd, scaled_dof=3 * n - 7,
     )  # fmt: skip
 
 
 def pooled(fits: list[PairFit]) -> list[PairFit]:
     """Give all pairs the standard deviation of a pick that is pooled over them.
 
-    Three points leave a pair two or three freedoms: weights by its own standard deviation would be random. A pair that
-    scatters beyond chance (F test) keeps its own. Covariances are scaled such that 1.96 standard deviations contain
-    95 %: with few freedoms (Student's t) they are larger than those of the pooled standard deviation.
+    Three points leave a pair two or three degrees of freedom: weights by its own standard deviation would be random. A
+    pair that scatters beyond chance (F test) keeps its own. Covariances are scaled such that 1.96 standard deviations
+    contain 95 %: with few degrees of freedom (Student's t) they are larger than those of the pooled standard deviation.
     """
     used = list(fits)
     while True:
-        freedoms = sum(fit.freedoms for fit in used)
-        sd = float(np.sqrt(sum(fit.freedoms * fit.sd_mm**2 for fit in used) / freedoms))
-        rest = [max(freedoms - fit.freedoms, 1) for fit in used]
-        others = [(freedoms * sd**2 - fit.freedoms * fit.sd_mm**2) / n for fit, n in zip(used, rest, strict=True)]
+        dof = sum(fit.dof for fit in used)
+        sd = float(np.sqrt(sum(fit.dof * fit.sd_mm**2 for fit in used) / dof))
+        rest = [max(dof - fit.dof, 1) for fit in used]
+        others = [(dof * sd**2 - fit.dof * fit.sd_mm**2) / n for fit, n in zip(used, rest, strict=True)]
         beyond = [
-            fit.sd_mm**2 / max(variance, 1e-300) / fdtri(fit.freedoms, n, 1.0 - BY_CHANCE / len(fits))
+            fit.sd_mm**2 / max(variance, 1e-300) / fdtri(fit.dof, n, 1.0 - BY_CHANCE / len(fits))
             for fit, variance, n in zip(used, others, rest, strict=True)
         ]
         if len(used) < 3 or max(beyond) <= 1.0:
             break
         del used[int(np.argmax(beyond))]
-    scaled_freedoms = sum(fit.scaled_freedoms for fit in used)
-    scaled_sd = float(np.sqrt(sum(fit.scaled_freedoms * fit.scaled_sd_mm**2 for fit in used) / scaled_freedoms))
+    scaled_dof = sum(fit.scaled_dof for fit in used)
+    scaled_sd = float(np.sqrt(sum(fit.scaled_dof * fit.scaled_sd_mm**2 for fit in used) / scaled_dof))
     inliers = {id(fit) for fit in used}
     return [
-        _with_sd(fit, sd, freedoms, scaled_sd, scaled_freedoms)
+        _with_sd(fit, sd, dof, scaled_sd, scaled_dof)
         if id(fit) in inliers
-        else replace(_with_sd(fit, fit.sd_mm, fit.freedoms, fit.scaled_sd_mm, fit.scaled_freedoms), is_outlier=True)
+        else replace(_with_sd(fit, fit.sd_mm, fit.dof, fit.scaled_sd_mm, fit.scaled_dof), is_outlier=True)
         for fit in fits
     ]
 
 
-def _with_sd(fit: PairFit, sd: float, freedoms: int, scaled_sd: float, scaled_freedoms: int) -> PairFit:
-    """Scale the covariances of a pair to standard deviations that are known by so many freedoms."""
-    factor = sd / fit.sd_mm * float(stdtrit(freedoms, 0.975)) / NORMAL_95
+def _with_sd(fit: PairFit, sd: float, dof: int, scaled_sd: float, scaled_dof: int) -> PairFit:
+    """Scale the covariances of a pair to standard deviations that are known by so many degrees of freedom."""
+    factor = sd / fit.sd_mm * float(student_factor(dof))
     return replace(
         fit, sd_mm=sd, covariance=fit.covariance * factor**2, scale_sd=scaled_sd / fit.scaled_sd_mm * fit.scale_sd,
-        scaled_sd_mm=scaled_sd, scaled_freedoms=scaled_freedoms,
+        scaled_sd_mm=scaled_sd, scaled_dof=scaled_dof,
     )  # fmt: skip
 
 
-def cause_of_scale(scale: float, sd: float, limit_ppm: float, freedoms: float = np.inf) -> Reason | None:
-    """Return the likely cause of a scale other than 1, or None; ``freedoms`` are those that ``sd`` is known by."""
+def cause_of_scale(scale: float, sd: float, limit_ppm: float, dof: float = np.inf) -> Reason | None:
+    """Return the likely cause of a scale other than 1, or None; ``dof`` degrees of freedom are those of ``sd``."""
     off = 1e6 * abs(scale - 1.0)
     slip = units_slip(scale)
     if slip:
         return reason("stitch.scale-of-units", scale=scale, units=slip)
-    if off <= float(stdtrit(freedoms, 1.0 - 0.5 * SCALE_BY_CHANCE)) * 1e6 * sd:
+    if off <= float(stdtrit(dof, 1.0 - 0.5 * SCALE_BY_CHANCE)) * 1e6 * sd:
         return None
     if off > limit_ppm:
         return reason("stitch.scale-by-blunder", scale=scale)
-    return reason("stitch.scale", ppm=1e6 * (scale - 1.0), ci95_ppm=1e6 * NORMAL_95 * widened(sd, freedoms))
+    return reason("stitch.scale", ppm=1e6 * (scale - 1.0), ci95_ppm=1e6 * NORMAL_95 * widened(sd, dof))
 
 
-def widened(sd: float, freedoms: float) -> float:
-    """Scale a standard deviation known by a few freedoms such that 1.96 of it contain 95 % (Student's t)."""
-    return float(stdtrit(freedoms, 0.975)) / NORMAL_95 * sd
+def widened(sd: float, dof: float) -> float:
+    """Scale a standard deviation known by a few degrees of freedom such that 1.96 of it contain 95 % (Student's t)."""
+    return float(student_factor(dof)) * sd
 
 
 def as_pair(a: int, b: int, fit: PairFit) -> Pair:
@@ -227,8 +228,8 @@ def adjust(pairs: list[Pair], count: int, reference: int) -> Adjusted:
 def _factor(pairs: list[Pair], T: Floats, unknowns: int) -> float:
     """Return the factor of standard deviations that explains the misclosures of adjusted pairs; 1 if chance does."""
     square = sum(float(r @ W @ r) for _, r, W in (_equation(pair, T) for pair in pairs))
-    freedoms = sum(len(pair.covariance) for pair in pairs) - unknowns
-    return float(np.sqrt(square / freedoms)) if data_snooping.beyond_chance(square, freedoms) else 1.0
+    dof = sum(len(pair.covariance) for pair in pairs) - unknowns
+    return float(np.sqrt(square / dof)) if data_snooping.beyond_chance(square, dof) else 1.0
 
 
 def _chained(pairs: list[Pair], count: int, reference: int) -> Floats:

@@ -19,10 +19,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from processor.adjustment.finite_median import finite_median
 from processor.language.messages import NO_NUMBER, text
 from processor.model import Statistic
 from processor.report import templates
+from processor.robust_statistics import finite_median
 from processor.validation.cells import Case, Origin
 from processor.validation.coverage import Coverage
 from processor.validation.history import Row

@@ -41,7 +41,7 @@ from processor.validation.loss import Loss, loss
 ALARM_RATE = 0.005  # of a night, for worse and for better each
 SAME = 1e-6  # relative: what another library's rounding may move
 LEAST_PAIRS = 3
-LEAST_FREEDOM = 5  # of the scatter from seed to seed
+LEAST_DOF = 5  # of the scatter from seed to seed
 LEAST_NIGHTS, MOST_NIGHTS = 5, 120
 GRID = 64  # steps of normal scores in 1
 LEAST_SPREAD = 1e-9  # of differences: rounding remains where they agree to the last bit
@@ -268,9 +268,9 @@ def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Loss) 
     margin = measure.margin + measure.margin_share * float(np.sqrt(np.mean([before**2 for *_, before in pairs])))
     spread = max(float(np.std(means, ddof=1)), LEAST_SPREAD)
     scales = [(spread, count - 1)]
-    seeds, freedom = _between_seeds(figure, measure)
-    if freedom >= LEAST_FREEDOM and math.sqrt(2.0) * seeds > spread:
-        scales.append((math.sqrt(2.0) * seeds, freedom))
+    seeds, dof = _between_seeds(figure, measure)
+    if dof >= LEAST_DOF and math.sqrt(2.0) * seeds > spread:
+        scales.append((math.sqrt(2.0) * seeds, dof))
     mean, root = float(np.mean(means)), math.sqrt(count)
     worse, better = (
         min(1.0, 2.0 * min(float(stats.t.sf((sign * mean - margin) * root / scale, dof)) for scale, dof in scales))
@@ -286,13 +286,13 @@ def _between_seeds(figure: _Series, measure: Loss) -> tuple[float, int]:
         of_case[case].append(measure.of(row.value))
     for case, earlier in figure.earlier.items():
         of_case[case] += [measure.of(value) for night in earlier.values() for value in night]
-    squares, freedom = 0.0, 0
+    squares, dof = 0.0, 0
     for values in of_case.values():
         levels = np.array([level for level in values if math.isfinite(level)])
         if len(levels) > 1:
             squares += float(np.sum((levels - levels.mean()) ** 2))
-            freedom += len(levels) - 1
-    return (math.sqrt(squares / freedom), freedom) if freedom else (math.nan, 0)
+            dof += len(levels) - 1
+    return (math.sqrt(squares / dof), dof) if dof else (math.nan, 0)
 
 
 # --- on the seeds of the night --------------------------------------------------------------------------------------

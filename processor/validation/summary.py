@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from processor.adjustment.finite_median import finite_median
 from processor.language.messages import NO_NUMBER, Text, label, text
 from processor.model import Statistic
 from processor.report import templates
 from processor.report.all_tables import figure_name
+from processor.robust_statistics import finite_median
 from processor.validation import change_detection
 from processor.validation import coverage as intervals
 from processor.validation.cells import CheckValue, Origin

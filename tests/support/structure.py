@@ -138,7 +138,7 @@ LAYERS = (
     ("version", "plain_text"),
     ("model",),
     ("record_checks",),
-    ("progress", "diagnostics", "language", "jobs", "unit_ratio", "user_methods"),
+    ("progress", "diagnostics", "language", "jobs", "robust_statistics", "unit_ratio", "user_methods"),
     ("geometry",),
     ("scene_cloud",),
     ("adjustment",),
@@ -158,8 +158,8 @@ LAYERS = (
     ("__main__",),
 )
 FOR_STEPS = (
-    "version", "plain_text", "model", "progress", "diagnostics", "unit_ratio", "geometry", "scene_cloud", "adjustment",
-    "components", "limits",
+    "version", "plain_text", "model", "progress", "diagnostics", "robust_statistics", "unit_ratio", "geometry",
+    "scene_cloud", "adjustment", "components", "limits",
 )  # fmt: skip
 
 

@@ -113,7 +113,7 @@ def test_what_views_differ_by_is_no_defect_and_a_dent_is():
         assert scan_statistic.search(named, surface, levels).sign.any()
         off = np.linalg.norm(surface.centres[:, 1:] - [200.0, 300.0], axis=1)
         on = (off < 100.0) & (surface.outward[:, 0] > 0.5) & (surface.centres[:, 0] < 20.0)
-        dented = unnamed.less(np.where(on, 10.0 * np.cos(0.5 * np.pi * np.minimum(off / 100.0, 1.0)), 0.0))
+        dented = unnamed.minus(np.where(on, 10.0 * np.cos(0.5 * np.pi * np.minimum(off / 100.0, 1.0)), 0.0))
         assert scan_statistic.search(dented, surface, levels).sign[on & (off < 60.0)].all()
 
 

@@ -98,17 +98,17 @@ def cloud_of(planes, position=True):
 def test_the_noise_follows_incidence_and_range(across, along):
     """Variances a + b R^2 across the face and along the ray; every seventh piece is rough."""
     rng = np.random.default_rng(1)
-    n, freedoms = 900, 40.0
+    n, dof = 900, 40.0
     mean, normal = (rng.normal(size=(n, 3)) for _ in range(2))
     R = rng.uniform(3e3, 4e4, n)
     mean *= (R / np.linalg.norm(mean, axis=1))[:, None]
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     c2, r2 = np.einsum("ni,ni->n", mean, normal) ** 2 / R**2, (R / 1e4) ** 2
     true = across[0] + across[1] * r2 + (along[0] + along[1] * r2) * c2
-    scatter = true * rng.chisquare(freedoms, n) / freedoms
+    scatter = true * rng.chisquare(dof, n) / dof
     scatter[::7] += 9.0
-    variance = np.column_stack([scatter * freedoms / (freedoms + 3.0), np.full((n, 2), 1e4)])
-    planes = Planes(np.full(n, freedoms + 3.0), mean, normal, variance, np.tile(np.eye(3), (n, 1, 1)))
+    variance = np.column_stack([scatter * dof / (dof + 3.0), np.full((n, 2), 1e4)])
+    planes = Planes(np.full(n, dof + 3.0), mean, normal, variance, np.tile(np.eye(3), (n, 1, 1)))
     found = noise_model.variances(cloud_of(planes))
     steep = c2 > 0.04  # the least variance at grazing incidence is a bound
     assert np.abs(np.log(found / true)[steep]).max() < 0.25

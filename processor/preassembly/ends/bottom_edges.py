@@ -26,6 +26,7 @@ from processor.model import Bools, Floats, Ints
 from processor.preassembly.assembly_errors import INTERVAL_MM
 from processor.preassembly.ends import plate_sides
 from processor.preassembly.ends.outer_faces import ALONG, RegisteredPart
+from processor.robust_statistics import robust_sd
 
 REACH_MM = 200.0  # across each face
 LEAST_POINTS = 30
@@ -250,14 +251,14 @@ def _at_edge(face: _FacePoints, count: int, stations: int) -> _AtEdge:
         solution[fitted] = np.einsum("nij,nj->ni", inverse, right[fitted])
         rest = face.residual - np.einsum("ni,ni->n", basis, solution[face.interval])
         known = np.isin(face.interval, fitted)
-        spread = 1.4826 * float(np.median(np.abs(rest[known & used]))) if (known & used).any() else 0.0
+        sd = robust_sd(rest[known & used])
         value, variance = np.full(count, np.nan), np.full(count, np.nan)
-        value[fitted], variance[fitted] = solution[fitted, 0], spread**2 * inverse[:, 0, 0] + FLOOR_MM**2
+        value[fitted], variance[fitted] = solution[fitted, 0], sd**2 * inverse[:, 0, 0] + FLOOR_MM**2
         group = interval * stations + face.station[used]
         of_station = np.stack([np.bincount(group, B[:, i], count * stations) for i in range(3)], axis=1)
         of_station = of_station.reshape(count, stations, 3)[fitted]
         by_station[:], by_station[fitted] = 0.0, np.einsum("ni,nsi->ns", inverse[:, 0], of_station)
-        now = known & (np.abs(rest) < 4.5 * max(spread, FLOOR_MM))
+        now = known & (np.abs(rest) < 4.5 * max(sd, FLOOR_MM))
         if (now == used).all():
             break
         used = now

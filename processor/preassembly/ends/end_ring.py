@@ -23,6 +23,7 @@ from scipy.special import ndtr
 
 from processor.model import Bools, Floats, Ints
 from processor.preassembly.ends import plate_sides
+from processor.robust_statistics import robust_sd_about_median
 
 REACH = 4.0  # standard deviations from ring and walls
 LEAST_REACH_MM = 3.0
@@ -113,9 +114,8 @@ def _start(x: Floats, e: Floats, thickness: Floats, basis: Floats, sigma: float)
         coefficients = np.asarray(np.linalg.lstsq(basis[used], x[used], rcond=None)[0], np.float64)
         residual = x - basis @ coefficients
         # About the median: points of walls pull inward only.
-        deviation = np.abs(residual[used] - np.median(residual[used]))
-        spread = max(1.4826 * float(np.median(deviation)), FLOOR_MM)
-        now = inside & (np.abs(residual) < 3.5 * spread + 0.01)
+        sd = max(robust_sd_about_median(residual[used]), FLOOR_MM)
+        now = inside & (np.abs(residual) < 3.5 * sd + 0.01)
         if (now == used).all():
             break
         used = now

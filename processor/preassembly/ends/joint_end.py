@@ -41,6 +41,7 @@ from processor.preassembly.ends.outer_faces import (
 )
 from processor.preassembly.ends.section import EndFace, PlateFace
 from processor.preassembly.ends.view_variance import Thickness, Variances
+from processor.robust_statistics import robust_sd
 
 # Sizes of bending terms, the finest for scans without noise, and their prior weights: ends are cut by a plane.
 BENDS_MM = (0.0, 0.02, *SIZES_MM[1:])
@@ -182,7 +183,7 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
         plates=tuple(face.plate for face in faces) if (part.station == part.station[0]).all() else (),
         sides=sides,
         thickness=thickness,
-        ring_noise=float(np.median(np.abs(on_ring.residual)) * 1.4826) ** 2,
+        ring_noise=robust_sd(on_ring.residual) ** 2,
     )
 
 

@@ -21,6 +21,7 @@ from processor.preassembly.ends import plate_sides, view_variance
 from processor.preassembly.ends.joint_frame import EndPlace, end_place
 from processor.preassembly.ends.section import EndFace
 from processor.preassembly.ends.view_variance import Thickness
+from processor.robust_statistics import robust_sd_about_median
 
 FACE = 8  # coefficients of a face
 PLAIN = [0, 1, 4]  # of these terms: those of a face too narrow to have a shape across
@@ -135,7 +136,7 @@ def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] |
     """Fit the outer faces to the points of the joint's zone, ``local`` (n, 3) in its frame; or the reason why not."""
     faces = _on_faces(part, local, place)
     centred = [sheets.out - np.median(sheets.out) for sheets in faces if len(sheets.out)]
-    margin = 3.0 * _noise(np.concatenate(centred or [np.empty(0)])) + 2.0
+    margin = 3.0 * robust_sd_about_median(np.concatenate(centred or [np.empty(0)])) + 2.0
     fits = []
     for of_design, (rows, out, cell, behind, behind_out, single_layer) in zip(place.section.faces, faces, strict=True):
         across, half = of_design.across, of_design.half
@@ -185,10 +186,8 @@ def _with_waves(coefficients: Floats, used: UsedPoints, at: Floats, face: EndFac
     terms = PLAIN if face.narrow else list(range(FACE))
     trend = basis(found.centre[:, 0], found.centre[:, 1] / half)[:, terms]
     noise = max(found.noise, FLOOR_MM**2)
-    freedom = len(used.residual) - len(found.mean)
-    means = kriging.Means(
-        found.centre, found.mean, noise / found.number, trend, freedom, -coefficients[terms], REACH_MM
-    )
+    dof = len(used.residual) - len(found.mean)
+    means = kriging.Means(found.centre, found.mean, noise / found.number, trend, dof, -coefficients[terms], REACH_MM)
     nodes = np.stack([np.zeros(len(NODES)), half * np.array(NODES)], axis=1)
     hypotheses = kriging.by_hypotheses(means, nodes)
     if face.narrow:
@@ -251,12 +250,6 @@ def _inner_side(local: Floats, depth: Floats, place: EndPlace, across: int) -> B
     return inner
 
 
-def _noise(residual: Floats) -> float:
-    """Return the standard deviation by the median absolute deviation; 0 of no residuals."""
-    middle = np.median(residual) if len(residual) else 0.0
-    return float(1.4826 * np.median(np.abs(residual - middle))) if len(residual) else 0.0
-
-
 def least_squares(basis: Floats, value: Floats, least: int = LEAST_POINTS) -> tuple[Floats, Floats, Bools]:
     """Coefficients (k,), residuals of the inliers, and a mark of these; empty for too few points.
 
@@ -271,7 +264,7 @@ def least_squares(basis: Floats, value: Floats, least: int = LEAST_POINTS) -> tu
         rows = np.vstack([basis[used], expected]), np.append(value[used], np.zeros(len(expected)))
         coefficients = np.asarray(np.linalg.lstsq(*rows, rcond=None)[0], np.float64)
         residual = value - basis @ coefficients
-        now = np.abs(residual) < 4.5 * max(_noise(residual[used]), FLOOR_MM)
+        now = np.abs(residual) < 4.5 * max(robust_sd_about_median(residual[used]), FLOOR_MM)
         if (now == used).all():
             break
         used = now

@@ -23,6 +23,7 @@ from scipy.special import chdtri
 from processor.adjustment import global_test, patches
 from processor.adjustment.scanner_class import VIEW_MM
 from processor.model import Bools, Floats, Ints
+from processor.robust_statistics import robust_sd, student_factor
 
 TERMS = 3  # of a plate's thickness: its mean, its changes along and across
 ALIKE_MM = 2.0  # plates that differ by less are of one nominal thickness: rolling and viewpoints differ by less
@@ -86,7 +87,7 @@ def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickn
         difference += sense * mean
         variance += noise / np.maximum(number, 1)
         enough &= number >= FEWEST_OF_PATCH
-        sides.append(float((1.4826 * np.median(np.abs(rest))) ** 2) if len(rest) else 0.0)
+        sides.append(robust_sd(rest) ** 2)
     if enough.sum() < 2 * TERMS:
         return None
     total = np.bincount(patch, minlength=count)
@@ -115,12 +116,12 @@ def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Varia
     # The mean of a group takes its share of the noise out of the differences.
     differences = len(plates) - len(count)
     by_noise = float(noise[:, 0].mean()) * differences
-    freedom = int(_freedom(count).sum())
+    dof = int(_dof(count).sum())
     squares = float((level**2).sum())
-    evident = freedom > 0 and squares > float(chdtri(differences, RISK)) * float(noise[:, 0].mean())
-    between = _variance(squares, by_noise, freedom)
+    evident = dof > 0 and squares > float(chdtri(differences, RISK)) * float(noise[:, 0].mean())
+    between = _variance(squares, by_noise, dof)
     if evident:
-        between = max(between, _with_class(between, squares, by_noise, freedom))
+        between = max(between, _with_class(between, squares, by_noise, dof))
     of_points = np.maximum(np.mean([one.sides for one in plates], axis=0), FLOOR_MM**2)
     outer = of_points[0] / of_points.mean()
     return Variances(
@@ -128,7 +129,7 @@ def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Varia
         ring=between * (max(float(np.mean(rings)), FLOOR_MM**2) / of_points.mean() if len(rings) else outer),
         along=_variance(float((value[:, 1] ** 2).sum()), float(noise[:, 1].sum()), len(plates)),
         across=_variance(float((value[:, 2] ** 2).sum()), float(noise[:, 2].sum()), len(plates)),
-        known=freedom > 0,
+        known=dof > 0,
         evident=evident,
     )
 
@@ -146,19 +147,19 @@ def tails(ends: Sequence[Sequence[Thickness]]) -> Floats:
     for number in np.unique(of_end):
         own, others = of_end == number, of_end != number
         count = np.bincount(group[others], minlength=int(group.max()) + 1)
-        freedom = int(_freedom(count).sum())
+        dof = int(_dof(count).sum())
         own &= count[group] > 0
-        if not own.any() or freedom < 1:
+        if not own.any() or dof < 1:
             continue
         mean = np.bincount(group[others], value[others], len(count)) / np.maximum(count, 1)
         by_noise = np.bincount(group[others], noise[others], len(count)) / np.maximum(count, 1)
         squares = float(((value - mean[group])[others] ** 2).sum())
-        between = max(squares - float((by_noise * (count - 1))[count > 0].sum()), 0.0) / freedom
+        between = max(squares - float((by_noise * (count - 1))[count > 0].sum()), 0.0) / dof
         share = 1.0 / count[group[own]]
         variance = noise[own] + by_noise[group[own]] * share + between * (1.0 + np.minimum(OF_PAIR * share, 1.0))
         independent = own.sum() / OF_PAIR
         mean_square = float(np.mean((value[own] - mean[group[own]]) ** 2 / variance))
-        found[number] = global_test.tail(mean_square * independent, independent, freedom / OF_PAIR)
+        found[number] = global_test.tail(mean_square * independent, independent, dof / OF_PAIR)
     return found
 
 
@@ -170,28 +171,28 @@ def _alike(level: Floats) -> Ints:
     return group
 
 
-def _freedom(count: Ints) -> Ints:
+def _dof(count: Ints) -> Ints:
     """Plates (g,) of groups of ``count`` (g,) less those that a group's mean takes: two, as opposite plates are one."""
     free: Ints = np.maximum(count - OF_PAIR, 0)
     return free
 
 
-def _with_class(between: float, squares: float, by_noise: float, freedom: int) -> float:
+def _with_class(between: float, squares: float, by_noise: float, dof: int) -> float:
     """Variance on one side of a plate by the plates and by the scanner's class together.
 
     A few stations may by chance agree better than they are right. The class counts for OF_CLASS observations, up to the
     95 % confidence limit of what the plates show: a network may be better than its class.
     """
-    pairs = freedom / OF_PAIR
+    pairs = dof / OF_PAIR
     both = (between * pairs + VIEW_MM**2 * OF_CLASS) / (pairs + OF_CLASS)
-    return min(both, _estimate(squares, by_noise, freedom) * pairs / float(chdtri(pairs, 0.95)))
+    return min(both, _estimate(squares, by_noise, dof) * pairs / float(chdtri(pairs, 0.95)))
 
 
-def _variance(squares: float, by_noise: float, freedom: int) -> float:
+def _variance(squares: float, by_noise: float, dof: int) -> float:
     """Variance on one side of a plate, widened for the number of differences it comes from."""
-    return float(patches.widening(freedom / OF_PAIR)) * _estimate(squares, by_noise, freedom) if freedom >= 1 else 0.0
+    return float(student_factor(dof / OF_PAIR)) ** 2 * _estimate(squares, by_noise, dof) if dof >= 1 else 0.0
 
 
-def _estimate(squares: float, by_noise: float, freedom: int) -> float:
+def _estimate(squares: float, by_noise: float, dof: int) -> float:
     """Variance on one side of a plate by the sum of squares of differences of its two sides."""
-    return max(squares - by_noise, 0.0) / (2.0 * freedom)
+    return max(squares - by_noise, 0.0) / (2.0 * dof)

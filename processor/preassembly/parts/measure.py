@@ -25,6 +25,7 @@ from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import assignment, attitude, contradictions, identity, systematic_errors
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.part_in_chain import Member
+from processor.robust_statistics import MAD_TO_SD
 
 CELL_MM = 40.0  # points of a cell are looked up one after the other
 SLICES, LEAST_OF_TYPICAL = (
@@ -414,7 +415,7 @@ def _misfit(registration: surface_registration.SurfaceFit) -> tuple[Reason, ...]
     if not (share > surface_registration.LEAST_SHARE and np.isfinite(registration.covariance).all()):
         return (reason("preassemble.few-points-near", share=share),)
     if not surface_registration.fits(registration):
-        distance = registration.sigma_mm / 1.4826
+        distance = registration.sigma_mm / MAD_TO_SD
         return (reason("preassemble.misfit", share=1.0 - share, distance=distance),)
     return ()
 

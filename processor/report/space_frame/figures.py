@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from scipy.spatial import cKDTree
 
-from processor.adjustment.finite_median import finite_median
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import Floats, Scene, StepRun
@@ -31,6 +30,7 @@ from processor.report.style import (
     png,
     rounded,
 )
+from processor.robust_statistics import finite_median
 from processor.space_frame.result import LOCATED_FLAGS, Flag, Result
 
 MOST_LABELS = 30

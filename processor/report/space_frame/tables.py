@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from processor.adjustment.finite_median import finite_median
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import NORMAL_95, Floats, Status, StepRun, Verdict
 from processor.report.space_frame import ceiling
 from processor.report.table import NAN, Table
+from processor.robust_statistics import finite_median
 from processor.space_frame.result import Balls, Evidence, Flag, Result
 from processor.space_frame.spheres.baselines import SAME
 

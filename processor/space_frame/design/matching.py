@@ -30,6 +30,7 @@ from processor.model import (
     reason,
     reasons,
 )
+from processor.robust_statistics import TUKEY, biweight
 from processor.space_frame.design import constellation
 
 TOLERANCE_MM = 60.0  # largest deviation of a node from its nominal place
@@ -42,7 +43,6 @@ INDEPENDENT = 20  # nodes at most whose distances count as independent: those of
 DECISIVE = 7.0  # log odds, 1000 to 1
 NEAR = 19  # nodes about one that may be a bay's length off
 UPRIGHT_COS = 0.996  # 5 degrees
-TUKEY = 4.685
 MEDIAN_OF_3 = 1.538  # of the length of a normal vector in space, per sd
 RADIUS_ODDS = 4.0  # lost at most by a sphere of another size
 RADIUS_SD_MM = 1.0  # of spheres against the catalogue, beside the measurement's
@@ -247,7 +247,7 @@ def robust_fit(source: Floats, target: Floats) -> tuple[Floats, Floats]:
     for _ in range(20):
         off = np.linalg.norm(rigid.apply(T, source) - target, axis=1)
         scale = max(float(np.median(off)) / MEDIAN_OF_3, 1e-6)
-        weight = np.clip(1.0 - (off / (2.0 * TUKEY * scale)) ** 2, 0.0, 1.0) ** 2
+        weight = biweight(off / (2.0 * TUKEY * scale))
         before, T = T, _weighted_fit(source, target, weight)
         if np.abs(rigid.apply(T, source[:1]) - rigid.apply(before, source[:1])).max() < 1e-6 * scale:
             break

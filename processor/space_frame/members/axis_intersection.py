@@ -11,7 +11,7 @@ from numba import njit
 
 from processor.model import Floats, Ints
 
-PRIOR_FREEDOM = 6.0  # degrees of freedom of the whole frame's scatter in that about one node
+PRIOR_DOF = 6.0  # degrees of freedom of the whole frame's scatter in that about one node
 CUT_SIGMAS = 4.5  # an axis that misses the others by more is not of this node
 
 
@@ -74,8 +74,8 @@ def intersect_axes(ends: AxisEnds, starts: Floats, floor_mm: float, rounds: int 
     # Twice from the start: an axis that was left out before the eccentricity was known may come back.
     for _ in range(2):
         used, e2 = _agreeing(ends, e2, k, floor_mm, rounds)
-    x, cov, chi2, freedom = _intersect(ends, used, e2, k)
-    scale = (PRIOR_FREEDOM + chi2) / (PRIOR_FREEDOM + np.maximum(freedom, 0.0))
+    x, cov, chi2, dof = _intersect(ends, used, e2, k)
+    scale = (PRIOR_DOF + chi2) / (PRIOR_DOF + np.maximum(dof, 0.0))
     count = np.bincount(ends.node[used], minlength=k)
     square = np.bincount(ends.node[used], (_miss(ends, x)[used] ** 2).sum(axis=1), k)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -192,8 +192,8 @@ def _intersect(
     cov[regular] = np.linalg.inv(normal[regular])
     x: Floats = np.einsum("kij,kj->ki", cov, right)
     add_squares(ends.node, _miss(ends, x), W, chi2)
-    freedom = 2.0 * np.bincount(ends.node[used > 0.0], minlength=k).astype(np.float64) - 3.0
-    return x, cov, chi2, freedom
+    dof = 2.0 * np.bincount(ends.node[used > 0.0], minlength=k).astype(np.float64) - 3.0
+    return x, cov, chi2, dof
 
 
 @njit(cache=True, nogil=True)
@@ -228,16 +228,16 @@ def _estimate_eccentricity2(ends: AxisEnds, used: npt.NDArray[np.bool_], k: int,
     low, high = floor_mm**2, 100.0
 
     def excess(e2: float) -> float:
-        _, _, chi2, freedom = _intersect(ends, used, e2, k)
-        redundant = freedom >= 3.0
+        _, _, chi2, dof = _intersect(ends, used, e2, k)
+        redundant = dof >= 3.0
         if not redundant.any():
             return -1.0
-        chi2, freedom = chi2[redundant], freedom[redundant]
+        chi2, dof = chi2[redundant], dof[redundant]
         # Trimmed: a false node must not change the variance of all others.
-        order = np.argsort(chi2 / freedom, kind="stable")
+        order = np.argsort(chi2 / dof, kind="stable")
         cut = len(order) // 10
         rows = order[cut : len(order) - cut]
-        return float(chi2[rows].sum() / freedom[rows].sum() - 1.0)
+        return float(chi2[rows].sum() / dof[rows].sum() - 1.0)
 
     if excess(low) <= 0.0:
         return low

@@ -20,6 +20,7 @@ from numba import njit
 
 from processor.geometry.linalg_small import DEFINITE, factorise, substitute
 from processor.model import Floats, Ints
+from processor.robust_statistics import MAD_TO_SD
 
 NP = 7  # a, b, c, d, r, e, f; mm
 GRAZING_COS = 0.2  # of incidence by the model: rays that graze more are often mixed pixels
@@ -218,7 +219,7 @@ def element(A, a, k):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def spread_of(values, n):  # type: ignore[no-untyped-def]
     """Estimate the standard deviation of normal values by their median absolute size."""
-    return 1.4826 * np.median(np.abs(values[:n]))
+    return MAD_TO_SD * np.median(np.abs(values[:n]))
 
 
 @njit(cache=True, nogil=True)

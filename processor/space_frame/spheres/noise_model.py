@@ -12,12 +12,12 @@ import numpy as np
 from scipy.optimize import nnls
 
 from processor.model import Floats
+from processor.robust_statistics import MAD_TO_SD
 
 LEAST_POINTS = 60
 CELL_POINTS = 20
 NEAREST_MM, RATIO = 1000.0, 1.4  # of the bins of the range
 COSINES = np.array([0.15, 0.22, 0.3, 0.4, 0.55, 0.7, 0.85, 1.0 + 1e-9])
-MAD = 1.482602218505602
 LEAST_MM = 0.02
 LIMB_STEP, LIMB_POINTS = 0.05, 40
 LIMB = np.arange(0.15, 0.451, LIMB_STEP)
@@ -44,7 +44,7 @@ def noise_model(
     e, c, L = np.abs(errors[on]), cosines[on], ranges[on]
     if len(e) < LEAST_POINTS:
         return start, 10.0
-    whole = float(MAD * np.median(e))
+    whole = float(MAD_TO_SD * np.median(e))
     band = np.floor(np.log(np.maximum(L, NEAREST_MM) / NEAREST_MM) / np.log(RATIO)).astype(np.int64)
     # 16 bits: sorted in one pass
     cell = (band * len(COSINES) + np.searchsorted(COSINES, c, side="right")).astype(np.int16)
@@ -54,7 +54,7 @@ def noise_model(
     for members in np.split(order, edges):
         if len(members) < CELL_POINTS:
             continue
-        scale = MAD * float(np.median(e[members]))
+        scale = MAD_TO_SD * float(np.median(e[members]))
         cos, far = float(np.median(c[members])), float(np.median(L[members]))
         rows.append([1.0, far * far / cos, (1.0 - cos * cos) / (cos * cos)])
         variances.append(max(scale, LEAST_MM) ** 2)
@@ -90,7 +90,7 @@ def limb_cosine(errors: Floats, cosines: Floats, ranges: Floats, weights: Floats
         if len(here) < LIMB_POINTS:
             continue
         middle = abs(float(np.median(here)))
-        spread = MAD * float(np.median(np.abs(here)))
+        spread = MAD_TO_SD * float(np.median(np.abs(here)))
         if middle > max(0.1, 3.0 * 1.2533 / np.sqrt(len(here))) * spread:
             limb = high + LIMB_STEP
     return max(least, min(limb, 0.5))

@@ -29,8 +29,8 @@ from processor.geometry.sphere import (
     visible_fraction,
 )
 from processor.model import Floats, Ints
+from processor.robust_statistics import MAD_TO_SD, robust_sd
 
-MAD = 1.4826
 LEAST_POINTS = 40  # on a ball; with fewer, balls occur anywhere by chance
 STEP = 1.5  # between scales
 FINEST = 20  # neighbours of a point within the smallest scale
@@ -359,7 +359,7 @@ def _accepted(cloud: Cloud, start: Sphere, least_points: int, radius_mm: float |
         close = off < BAND * start.radius
         if np.count_nonzero(close) < least // 2 or _facing(points[near], close, start) < ROUGHLY_FACING:
             return None
-        scale = 2.0 * MAD * float(np.median(off[close]))
+        scale = 2.0 * MAD_TO_SD * float(np.median(off[close]))
         fit = robust_fit(points[near], start, scale, radius_mm, None if scanner is None else scanner[near])
         if fit is None or not _stands_out(points[near], fit, least):
             return None
@@ -405,7 +405,7 @@ def _denser(points: Floats, ball: Sphere, times: float, scale: float | None = No
     off = ball.residuals(points)
     if scale is None:
         close = np.abs(off[np.abs(off) < BAND * ball.radius])
-        scale = MAD * float(np.median(close)) if len(close) else 0.0
+        scale = robust_sd(close)
     width = 3.0 * scale
     at = np.count_nonzero(np.abs(off) <= width)
     outside = np.count_nonzero((off > width) & (off <= 3.0 * width))

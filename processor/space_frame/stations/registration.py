@@ -20,6 +20,7 @@ import numpy as np
 
 from processor.geometry.linalg_small import product
 from processor.model import Bools, Floats, Ints, Reason, reason
+from processor.robust_statistics import TUKEY, robust_sd
 from processor.space_frame.result import StationMotion
 from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
@@ -30,7 +31,7 @@ from processor.space_frame.stations.records import Stations, StationStatus, Tube
 MOST_STATIONS = 10  # of those that see a tube: the others are far away and have few points on it
 ROUNDS = 3
 STEEPEST = 0.3  # least cosine of incidence: below it the beam is split at the limb
-FIRST_CUT_MM, CUT = 15.0, 4.685  # Tukey's biweight: of the first round, then in scales
+FIRST_CUT_MM = 15.0  # of Tukey's biweight in the first round
 BOW_SHARE = 0.6e-3  # of a tube's length: prior sd of its bow; uniform up to L/1000 has this one
 SCATTER = 0.661  # mean of psi squared over that of the weights, of the biweight under normal noise
 FIXED = 1e12  # information on an unknown that a tube does not have
@@ -120,14 +121,14 @@ def _estimated(
     places = posterior.places
     count, tubes = len(places), len(axes.half)
     x, weight, floor = np.zeros(kernels.STATION * count), np.ones(len(layout.tube)), 0.0
-    scale, doubt, C = np.full(count, FIRST_CUT_MM / CUT), None, np.empty((0, 0))
+    scale, doubt, C = np.full(count, FIRST_CUT_MM / TUKEY), None, np.empty((0, 0))
     by_station, bounds = _by_station(layout.station, layout.start, count)
     for turn in range(ROUNDS):
         T, offset = corrections(x, places), x[6 :: kernels.STATION]
         seen = kernels.residuals(points, layout, T, offset, places, axes, STEEPEST)
         if turn:
             scale = _scales(seen, by_station, bounds, scale, tubes)
-        equations = normals.Equations(*kernels.observations(seen, layout, scale, CUT), weight, floor)
+        equations = normals.Equations(*kernels.observations(seen, layout, scale, TUKEY), weight, floor)
         geometry = normals.Geometry(axes, places, _prior(axes))
         last = turn == ROUNDS - 1
         if turn and control is not None:  # after the tubes have aligned the stations with each other
@@ -216,7 +217,7 @@ def _scales(seen: Floats, by_station: Ints, bounds: Ints, before: Floats, tubes:
         size = residual[bounds[s] : bounds[s + 1]]
         size = size[np.isfinite(size)]
         if len(size) >= LEAST_POINTS:
-            scale[s] = max(1.4826 * absorbed * float(np.median(size)), SMALLEST_MM)
+            scale[s] = max(absorbed * robust_sd(size), SMALLEST_MM)
     return scale
 
 

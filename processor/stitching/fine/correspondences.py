@@ -25,7 +25,7 @@ MOST_NORMALS = 1500
 LEAST_POINTS = 6.0  # of a scan on a piece
 FLAT_SIGMAS, SLACK_SIGMAS = 1.6, 0.5  # scatter of a merged piece: by the noise across it, and beside that
 MOST_SCANS = 4096
-PRIOR_FREEDOMS = 20.0  # with which a piece's points are taken to scatter as the noise model states
+PRIOR_DOF = 20.0  # with which a piece's points are taken to scatter as the noise model states
 
 
 @dataclass(frozen=True)
@@ -206,9 +206,9 @@ def _excess(weighted: Floats, count: Floats, piece: Ints, pieces: int) -> Floats
     as the rest, such pieces would have too much weight, and the poses too small a covariance.
     """
     planes = extraction.planes_of(weighted)
-    freedoms = np.bincount(piece, count - 3.0, pieces)
+    dof = np.bincount(piece, count - 3.0, pieces)
     square = np.bincount(piece, planes.variance[:, 0] * planes.count, pieces)
-    excess: Floats = np.maximum((square + PRIOR_FREEDOMS) / (freedoms + PRIOR_FREEDOMS), 1.0)
+    excess: Floats = np.maximum((square + PRIOR_DOF) / (dof + PRIOR_DOF), 1.0)
     return excess
 
 

@@ -42,9 +42,10 @@ def factors(blocks: Blocks, solution: Solution, reference: int) -> Floats:
     """Return the ratio (k,) of the standard deviations by regions to those of the adjustment; 1 if it may be chance.
 
     The mean square of the motions without a region each, by the growth of their covariance, is chi-square by its
-    freedoms. A region that a pose rests on may be large: by the covariance alone it would count as a contradiction.
+    degrees of freedom. A region that a pose rests on may be large: by the covariance alone it would count as a
+    contradiction.
     """
-    k, freedoms = len(solution.T), REGIONS - 1
+    k, dof = len(solution.T), REGIONS - 1
     factor = np.ones(k)
     if blocks.pieces < REGIONS * LEAST_PIECES:
         return factor
@@ -59,7 +60,7 @@ def factors(blocks: Blocks, solution: Solution, reference: int) -> Floats:
         square += _squares(step - rest, covariance - whole, whole)
     for s in range(k):
         ratio = square[s] / (6.0 * REGIONS)
-        factor[s] = np.sqrt(ratio) if ratio > chdtri(freedoms, BY_CHANCE) / freedoms else 1.0
+        factor[s] = np.sqrt(ratio) if ratio > chdtri(dof, BY_CHANCE) / dof else 1.0
     return factor
 
 

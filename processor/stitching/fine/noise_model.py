@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 from processor.model import Floats
 from processor.stitching.planes.scan_planes import Cloud
 
-LEAST_FREEDOMS = 10.0  # of a piece
+LEAST_DOF = 10.0  # of a piece
 FEWEST_PIECES = 10
 RANGE_MM = 1e4  # unit of ranges in the model
 LEAST_SHARE = 0.05**2  # least variance across a face seen at grazing incidence, of that of the range
@@ -25,14 +25,14 @@ HUBER = 1.5
 
 def variances(cloud: Cloud) -> Floats:
     """Return the variance (m,), mm^2, of a point of each cell across its face."""
-    freedoms = cloud.planes.count - 3.0
-    keep = freedoms >= LEAST_FREEDOMS
-    v = cloud.planes.variance[keep, 0] * cloud.planes.count[keep] / freedoms[keep]
+    dof = cloud.planes.count - 3.0
+    keep = dof >= LEAST_DOF
+    v = cloud.planes.variance[keep, 0] * cloud.planes.count[keep] / dof[keep]
     if len(v) < FEWEST_PIECES or not cloud.has_position:
         one = max(float(np.median(v)) if len(v) else cloud.sigma_mm**2, LEAST_MM2)
         return np.full(len(cloud.mean), one)
     terms = _terms(cloud.planes.mean[keep], cloud.planes.normal[keep])
-    share = _fitted(terms, v, freedoms[keep])
+    share = _fitted(terms, v, dof[keep])
     model: Floats = _terms(cloud.mean, cloud.normal) @ share
     return np.maximum(model, LEAST_MM2)
 
@@ -48,14 +48,14 @@ def _terms(points: Floats, normals: Floats) -> Floats:
     return np.stack([np.ones(len(R)), r2, c2, c2 * r2], axis=1)
 
 
-def _fitted(terms: Floats, v: Floats, freedoms: Floats) -> Floats:
+def _fitted(terms: Floats, v: Floats, dof: Floats) -> Floats:
     """Fit shares (4,), none negative, of the terms to variances v (n,) of pieces.
 
     Relative misfits are weighted by Huber's function, since pieces that are not quite planar scatter by more than the
     noise; the median then sets the size.
     """
     v = np.maximum(v, 1e-12)
-    sd = np.sqrt(2.0 / freedoms + PIECES_SD**2)
+    sd = np.sqrt(2.0 / dof + PIECES_SD**2)
     model: Floats = np.full(len(v), float(np.median(v)))
     weight = np.ones(len(v))
     share = np.zeros(terms.shape[1])

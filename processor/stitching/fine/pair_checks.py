@@ -38,7 +38,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Loop:
-    """Scans around a loop (the first again at the end), its misclosure, and chi2 of this by its 6 or 7 freedoms."""
+    """Scans around a loop (the first again at the end), and chi2 of its misclosure by its 6 or 7 degrees of freedom."""
 
     rows: tuple[int, ...]
     mm: float
