@@ -10,11 +10,11 @@ from processor.language.messages import label, messages, text
 def environment(folder: str, lang: str) -> jinja2.Environment:
     """Return the environment of the templates in a folder of this package, for a language of CODES.
 
-    Templates name their texts by ``text`` and ``label``; filter ``say`` writes a message, and all else as it is.
+    They extend base.html of the reports. They name their texts by ``text`` and ``label``; filter ``say`` writes a
+    message, and all else as it is.
     """
-    made = jinja2.Environment(
-        loader=jinja2.PackageLoader("processor", folder), autoescape=True, undefined=jinja2.StrictUndefined
-    )
+    folders = [jinja2.PackageLoader("processor", name) for name in dict.fromkeys((folder, "report"))]
+    made = jinja2.Environment(loader=jinja2.ChoiceLoader(folders), autoescape=True, undefined=jinja2.StrictUndefined)
     made.filters["say"] = messages(lang).text
     made.globals |= {"text": text, "label": label}
     return made
