@@ -165,11 +165,22 @@ def _merged(run: Run, aside: Path) -> _Content:
 
 def _assembled(run: Run, aside: Path) -> _Content:
     placed = poses.in_bridge(run)
-    stems = project.stems([replace(one.scan, name=one.component) for one in placed.scans])
+    stems = project.stems(
+        [replace(one.scan, name=name) for one, name in zip(placed.scans, _numbered(placed), strict=True)]
+    )
     clouds = {
         f"{SCANS}/{stem}": exported_clouds.part_cloud(run, one) for stem, one in zip(stems, placed.scans, strict=True)
     }
     return _Content(clouds, placed.scans, placed.remarks, "frame of the bridge")
+
+
+def _numbered(placed: poses.Poses) -> list[str]:
+    """Return the component of each scan, with a number from a component's second scan on."""
+    names, seen = list[str](), dict[str, int]()
+    for one in placed.scans:
+        seen[one.component] = seen.get(one.component, 0) + 1
+        names.append(one.component if seen[one.component] == 1 else f"{one.component}-{seen[one.component]}")
+    return names
 
 
 def _deviation(run: Run, aside: Path) -> _Content:

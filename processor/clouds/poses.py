@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -103,7 +102,7 @@ def _stitched(run: Run, what: str) -> Poses:
 
 
 def in_bridge(run: Run) -> Poses:
-    """Return the reference scan of each part in the bridge's frame, at the reference temperature.
+    """Return the scans of each part in the bridge's frame, at the reference temperature.
 
     Raises UsageError where step preassemble was not run, InputError where it placed no part.
     """
@@ -112,24 +111,18 @@ def in_bridge(run: Run) -> Poses:
     scale = 1.0 / thermal.expansion(scene.temperature_C) if result.method == "adjustment" else 1.0
     placed, remarks = [], []
     for row, name in enumerate(table.name):
-        T, status = table.T_bridge_scan[row], table.status[row]
-        numbers = [i for i, scan in enumerate(scene.scans) if scan.component == name]
-        if status == Status.FAILED or not np.isfinite(T).all() or not numbers:
+        status, poses = table.status[row], table.poses_of_scans(row)
+        of_part = [(number, scan) for number, scan in enumerate(scene.scans) if scan.component == name]
+        used = [(number, scan) for number, scan in of_part if scan.name in poses]
+        if status == Status.FAILED or not used:
             remarks.append(reason("export.part-not-placed", part=name))
             continue
         if status != Status.OK:
             remarks.append(reason("export.part-doubtful", part=name, status=status))
-        number = _reference([scene.scans[i].name for i in numbers], numbers, table.scans[row])
-        placed.append(Placed(number, scene.scans[number], T, scale, component=name))
-        others = tuple(scene.scans[i].name for i in numbers if i != number)
+        placed += [Placed(number, scan, poses[scan.name], scale, component=name) for number, scan in used]
+        others = tuple(scan.name for _, scan in of_part if scan.name not in poses)
         if others:
             remarks.append(reason("export.further-scans", part=name, scans=others))
     if not placed:
         raise InputError(f"{run.name}: step preassemble placed no part, so there is nothing to export as assembled")
     return Poses(tuple(placed), tuple(remarks))
-
-
-def _reference(names: Sequence[str], numbers: Sequence[int], used: str) -> int:
-    """Return the number of the first of the scans that were ``used``, whose names are joined by commas."""
-    fitting = [k for k, name in enumerate(names) if used == name or used.startswith(f"{name}, ")]
-    return numbers[max(fitting, key=lambda k: len(names[k]), default=0)]

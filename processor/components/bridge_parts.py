@@ -1,4 +1,4 @@
-"""The parts of a bridge as structures of their own, each with its scans where step preassemble registered them.
+"""The parts of a bridge as structures of their own, each with its scans where step preassemble has placed them.
 
 A part is compared with its own design, wherever the assembly has it: a part that was moved or turned has no defect by
 that, and ends that touch in the assembly were scanned apart.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,6 +44,13 @@ class PartScene:
     reasons: tuple[Reason, ...] = ()
 
 
+class _Placed(NamedTuple):
+    """A scan that step preassemble used: p_bridge = T_bridge_scan (shrink p_scan)."""
+
+    scan: Scan
+    T_bridge_scan: Floats
+
+
 def of_bridge(scene: Scene, assembled: Any, step: str) -> Iterator[PartScene]:
     """Yield the parts of a bridge by the result of step preassemble.
 
@@ -55,52 +62,57 @@ def of_bridge(scene: Scene, assembled: Any, step: str) -> Iterator[PartScene]:
         raise UsageError(f"{step}: the parts of a bridge are placed by step preassemble; add it to --steps")
     rows = {name: row for row, name in enumerate(assembled.components.name)}
     for part in scene.arch.parts:
-        scans = [scan for scan in scene.scans if scan.component == part.name and len(scan.points)]
         row = rows.get(part.name, -1)
+        scans = [scan for scan in scene.scans if scan.component == part.name and len(scan.points)]
+        poses = assembled.components.poses_of_scans(row) if row >= 0 else {}
+        placed = [_Placed(scan, poses[scan.name]) for scan in scans if scan.name in poses]
+        status = assembled.components.status[row] if row >= 0 else Status.FAILED
         if part.source != MESH:
             yield PartScene(part.name, None, Status.FAILED, (reason("parts.no-surface"),))
-        elif not scans or row < 0 or assembled.components.status[row] is Status.FAILED:
+        elif status is Status.FAILED or not placed:
             yield PartScene(part.name, None, Status.FAILED, (reason("parts.not-registered"),))
         else:
-            status = assembled.components.status[row]
-            doubt = (reason("parts.pose-ambiguous"),) if status is Status.AMBIGUOUS else ()
-            used, T = assembled.components.scans[row], assembled.components.T_bridge_scan[row]
+            ambiguous = status is Status.AMBIGUOUS
+            doubts = (reason("parts.pose-ambiguous"),) if ambiguous else ()
+            unused = tuple(scan.name for scan in scans if scan.name not in poses)
+            remarks = (reason("parts.scans-not-used", scans=unused),) if unused else ()
             # The papers' methods take lengths as they were scanned.
             shrink = 1.0 / thermal.expansion(scene.temperature_C) if assembled.method == ADJUSTED else 1.0
-            placed = _placed(scene, part, scans, used, T, shrink)
-            yield PartScene(part.name, placed, Status.AMBIGUOUS if doubt else Status.OK, doubt)
+            structure = _structure(scene, part, placed, shrink)
+            yield PartScene(part.name, structure, Status.AMBIGUOUS if ambiguous else Status.OK, (*doubts, *remarks))
 
 
-def _placed(
-    scene: Scene, part: DesignPart, scans: list[Scan], used: str, T_bridge_scan: Floats, shrink: float
-) -> Scene:
-    """Return a part as a structure, its scans in the bridge's frame; T_bridge_scan is of the first one ``used``.
+def _structure(scene: Scene, part: DesignPart, placed: list[_Placed], shrink: float) -> Scene:
+    """Return a part as a structure with its ``placed`` scans.
 
-    ``shrink`` brings lengths at another temperature to the design's.
+    ``shrink`` brings lengths at another temperature to the design's. Stations are those of each scan: registered by
+    itself, it has moved them by an error of its own.
     """
-    first = next((scan for scan in scans if used == scan.name or used.startswith(f"{scan.name}, ")), scans[0])
-    T_bridge_project = T_bridge_scan @ rigid.invert(first.pose)
-    number = np.unique(np.concatenate([scan.point_station for scan in scans]))
-    number = number[number >= 0]
-    placed = []
-    for scan in scans:
-        at = scan.position
-        placed.append(
+    scans, stations, before = [], [], 0
+    for one in placed:
+        number = np.unique(one.scan.point_station).astype(np.int64)
+        number = number[number >= 0]
+        if scene.stations is not None and len(number):
+            stations.append(_stations(scene.stations, number, one, shrink, again=before > 0))
+        known = one.scan.point_station >= 0
+        scans.append(
             replace(
-                scan,
-                points=scan.points * shrink,
-                position=scan.origin + shrink * (at - scan.origin) if at.size else at,
-                point_station=np.where(scan.point_station < 0, -1, np.searchsorted(number, scan.point_station)),
-                T_project_scan=T_bridge_project @ scan.pose,
+                one.scan,
+                points=one.scan.points * shrink,
+                origin=one.scan.origin * shrink,
+                position=one.scan.position * shrink,
+                point_station=np.where(known, before + np.searchsorted(number, one.scan.point_station), -1),
+                T_project_scan=one.T_bridge_scan,
                 component="",
             )
         )
+        before += len(number)
     bodies = DesignBodies(names=(part.name,), of_facet=np.zeros(len(part.faces), np.int64))
     return Scene(
         scene.name,
         "structure",
-        tuple(placed),
-        stations=_stations(scene, number, rigid.apply(first.pose, first.origin), shrink, T_bridge_project),
+        tuple(scans),
+        stations=_joined(stations),
         temperature_C=scene.temperature_C,
         units=scene.units,
         units_reason=scene.units_reason,
@@ -109,16 +121,30 @@ def _placed(
     )
 
 
-def _stations(scene: Scene, number: Ints, about: Floats, shrink: float, T_bridge_project: Floats) -> Stations | None:
-    """Return the stations that saw a part, in the bridge's frame, nearer to a place (3,) by a factor."""
-    known = scene.stations
-    if known is None or not len(number):
-        return None
-    nearer = known.T_project_station[number].copy() if len(known.T_project_station) else known.T_project_station
-    if len(nearer):
-        nearer[:, :3, 3] = about + shrink * (nearer[:, :3, 3] - about)
+def _stations(known: Stations, number: Ints, placed: _Placed, shrink: float, again: bool) -> Stations:
+    """Return the stations ``number`` (k,) where a scan has them, in the bridge's frame.
+
+    ``again`` marks stations of a further scan: their ids have its name, so that they differ from those of the first.
+    """
+    T_scan_project, T_bridge_scan = rigid.invert(placed.scan.pose), placed.T_bridge_scan
+    T = known.T_project_station[number] if len(known.T_project_station) else known.T_project_station
+    if len(T):
+        T = T_scan_project @ T
+        T[:, :3, 3] *= shrink
+        T = T_bridge_scan @ T
     return Stations(
-        ids=tuple(known.ids[k] for k in number),
-        positions=rigid.apply(T_bridge_project, about + shrink * (known.positions[number] - about)),
-        T_project_station=T_bridge_project @ nearer if len(nearer) else nearer,
+        ids=tuple(f"{known.ids[k]}, {placed.scan.name}" if again else known.ids[k] for k in number),
+        positions=rigid.apply(T_bridge_scan, shrink * rigid.apply(T_scan_project, known.positions[number])),
+        T_project_station=T,
+    )
+
+
+def _joined(stations: list[Stations]) -> Stations | None:
+    """Return the stations of all scans of a part; None without any."""
+    if not stations:
+        return None
+    return Stations(
+        ids=tuple(id_ for one in stations for id_ in one.ids),
+        positions=np.concatenate([one.positions for one in stations]),
+        T_project_station=np.concatenate([one.T_project_station for one in stations]),
     )

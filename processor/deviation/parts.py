@@ -64,8 +64,9 @@ def part_result(part: PartScene, method: str, one: Callable[[Scene], Result]) ->
     if part.scene is None:
         return Result(status=Status.FAILED, method=method, reasons=part.reasons)
     found = one(part.scene)
+    found = replace(found, reasons=(*part.reasons, *found.reasons))
     if part.status is Status.AMBIGUOUS and found.status is not Status.FAILED:
-        return replace(found, status=Status.AMBIGUOUS, reasons=(*part.reasons, *found.reasons))
+        return replace(found, status=Status.AMBIGUOUS)
     return found
 
 

@@ -64,12 +64,21 @@ class AtJoints(Rows):
 
 
 @dataclass(frozen=True)
+class ScanPoses(Rows):
+    """The scans that were used of one component, each with its pose as assembled."""
+
+    name: tuple[str, ...] = names("s")
+    T_bridge_scan: Floats = column("s", 4, 4)
+
+
+@dataclass(frozen=True)
 class Components(Rows):
     """The components in assembly order. Axis of length 2: start and end of a component. NaN = not known.
 
     ``scans`` names those used; poses and key points P1..P8 are in the frame of the first. The paper's methods state no
     covariance. A component that is left or right part of several joints has no start and end; then ``at_joints`` has
-    the key points of all components by joint.
+    the key points of all components by joint. Where several scans of a component were used, ``scan_poses`` has the pose
+    of each scan of every component.
     """
 
     name: tuple[str, ...] = names("c")
@@ -83,6 +92,18 @@ class Components(Rows):
     at_joints: tuple[AtJoints, ...] = dataclasses.field(
         default=(), metadata={"json": "joints", "by": "joint", "newer": True}
     )
+    scan_poses: tuple[ScanPoses, ...] = dataclasses.field(
+        default=(), metadata={"json": "scan_poses", "by": "name", "newer": True}
+    )
+
+    def poses_of_scans(self, row: int) -> dict[str, Floats]:
+        """Return T_bridge_scan (4, 4) of each scan of a component by name; empty for one that has no pose."""
+        if not np.isfinite(self.T_bridge_scan[row]).all():
+            return {}
+        if self.scan_poses:
+            poses = self.scan_poses[row]
+            return dict(zip(poses.name, poses.T_bridge_scan, strict=True))
+        return {self.scans[row]: self.T_bridge_scan[row]}
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from processor.preassembly.result import (
     Residuals,
     Result,
     Rivals,
+    ScanPoses,
     TradeOff,
     overall_status,
 )
@@ -88,6 +89,12 @@ def to_result(assembly: Assembly) -> Result:
         key_points_scan=_starts_and_ends(_on_steel(placement.key_points_scan, ends, placement.steel), branched),
         key_points_sd=_starts_and_ends(_on_steel(placement.key_points_sd, ends, placement.steel), branched),
         at_joints=_at_joints(assembly, ends) if any(branched) else (),
+        scan_poses=tuple(
+            ScanPoses(name=tuple(scan.name for scan in part.scans), T_bridge_scan=poses)
+            for part, poses in zip(parts, placement.T_bridge_scans, strict=True)
+        )
+        if any(len(part.scans) > 1 for part in parts)
+        else (),
     )
     joints, splicing = _joints(assembly)
     return Result(

@@ -70,12 +70,13 @@ def stitched(scans, poses, statuses=None, *, scale="fixed"):
     return Results(execution(scene, "stitch", result, {"scale": scale}))
 
 
-def assembled(scans, poses, temperature_C=float("nan"), status=Status.OK, used=None):
+def assembled(scans, poses, temperature_C=float("nan"), status=Status.OK, used=None, scan_poses=()):
     """Return the results of a run that assembled parts foot1, foot2, ... of one scan each by these poses (c, 4, 4)."""
     names, c = tuple(dict.fromkeys(scan.component for scan in scans)), len(poses)
     table = Components(
         name=names, status=[status] * c, reasons=((),) * c, scans=used or names, T_bridge_scan=np.array(poses),
         covariance=np.zeros((c, 6, 6)), key_points_scan=np.zeros((c, 2, 8, 3)), key_points_sd=np.zeros((c, 2, 8, 3)),
+        scan_poses=scan_poses,
     )  # fmt: skip
     result = Assembly(status=status, method="adjustment", components=table)
     scene = Scene("bridge", "arch-bridge", tuple(scans), temperature_C=temperature_C)

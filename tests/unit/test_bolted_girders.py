@@ -10,6 +10,7 @@ from designgen.designs import assembly, bolting, girder
 from designgen.scenes import make as scenes
 from processor.inspection import bridge_holes
 from processor.model import Status, UsageError
+from processor.preassembly.result import Components
 
 SIZES = assembly.Params(
     type="row", section="i", parts=2, length_mm=1400.0, width_mm=420.0, height_mm=600.0, flange_mm=20.0, web_mm=12.0
@@ -135,7 +136,10 @@ def without_motion(places, shifts):
 def test_holes_of_girders_are_measured_where_they_were_drilled():
     scene, truth, shifts = made(seed=7, scan={"spacing_mm": 4.0, "sigma_mm": 0.3})
     names = tuple(part.name for part in scene.arch.parts)
-    table = SimpleNamespace(name=names, status=(Status.OK,) * 2, scans=names, T_bridge_scan=truth.arch.T_bridge_scan)
+    table = Components(
+        name=names, status=(Status.OK,) * 2, reasons=((),) * 2, scans=names, T_bridge_scan=truth.arch.T_bridge_scan,
+        covariance=np.zeros((2, 6, 6)), key_points_scan=np.zeros((2, 2, 8, 3)), key_points_sd=np.zeros((2, 2, 8, 3)),
+    )  # fmt: skip
     found = bridge_holes.of_parts(scene, SimpleNamespace(components=table, method="adjustment"))
     held = []
     for part in assembly.build(SIZES, BOLTS).parts:

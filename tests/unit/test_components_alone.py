@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from types import SimpleNamespace
 
@@ -9,11 +10,13 @@ import numpy as np
 import pytest
 import trimesh
 
+from processor import scene_cloud
 from processor.components import bridge_parts, frame_members
 from processor.defects import step as defects
 from processor.deviation import step as deviation
-from processor.model import ArchDesign, DesignPart, FrameDesign, Scan, Scene, Status, StepRun, UsageError
+from processor.model import ArchDesign, DesignPart, FrameDesign, Scan, Scene, Stations, Status, StepRun, UsageError
 from processor.pipeline import result_classes
+from processor.preassembly.result import Components, ScanPoses
 from processor.results import to_json
 from processor.store import store
 from processor.store.json_values import json_ready
@@ -46,6 +49,15 @@ def scanned(part, rng, dent):
     return points + 0.5 * rng.normal(size=points.shape)
 
 
+def components(names, poses):
+    """Components of one scan each, of the same name."""
+    c = len(names)
+    return Components(
+        name=names, status=(Status.OK,) * c, reasons=((),) * c, scans=names, T_bridge_scan=np.array(poses),
+        covariance=np.zeros((c, 6, 6)), key_points_scan=np.zeros((c, 2, 8, 3)), key_points_sd=np.zeros((c, 2, 8, 3)),
+    )  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def bridge():
     """Two boxes; the right one is dented, and lies 25 mm off in the assembly. Each is in a scan frame of its own."""
@@ -60,9 +72,7 @@ def bridge():
         back[:3, 3] += [2.0, -1.5 - off, 1.0]
         poses.append(back)
     scene = Scene("two", "arch-bridge", tuple(scans), arch=made)
-    table = SimpleNamespace(
-        name=("left", "right"), status=(Status.OK,) * 2, scans=("left", "right"), T_bridge_scan=np.array(poses)
-    )
+    table = components(("left", "right"), poses)
     return scene, SimpleNamespace(components=table, method="adjustment")
 
 
@@ -96,7 +106,7 @@ def test_the_dent_is_found_on_its_part_and_nothing_else(compared):
 
 def test_a_part_that_was_not_registered_fails_alone(bridge):
     scene, assembled = bridge
-    table = SimpleNamespace(**{**vars(assembled.components), "status": (Status.FAILED, Status.OK)})
+    table = dataclasses.replace(assembled.components, status=(Status.FAILED, Status.OK))
     broken = SimpleNamespace(components=table, method="adjustment")
     found = deviation.run(scene, deviation.Params(), {"preassemble": broken})
     assert found.status is Status.PARTIAL
@@ -121,6 +131,53 @@ def test_warm_steel_is_compared_at_the_reference_temperature(bridge):
     )  # fmt: skip
     for cold, part in zip(scene.scans, bridge_parts.of_bridge(warm, assembled, "deviation"), strict=True):
         np.testing.assert_allclose(part.scene.scans[0].points, cold.points, atol=1e-6)
+
+
+def test_every_scan_of_a_part_lies_where_preassembly_placed_it():
+    """Warm steel, three scans with frames and far origins of their own, of which one was not used."""
+    rng, made, grown = np.random.default_rng(8), design(), 1.0 + 12e-6 * 30.0
+    on_part = [scanned(made.parts[0], rng, 0.0) for _ in range(3)]
+    scans, poses = [], []
+    for k, points in enumerate(on_part):
+        T = trimesh.transformations.rotation_matrix(0.4 + k, [0.3, k, 0.7], [1e6, 2e3 * k, -5e5])
+        in_scan = grown * (points @ T[:3, :3].T + T[:3, 3])
+        seen = grown * (T[:3, :3] @ [-900.0, 4e3, 1.5e3] + T[:3, 3])  # a scanner beside the part
+        origin = np.round(in_scan.mean(axis=0))
+        scans.append(Scan(f"s{k}", in_scan - origin, origin=origin, position=seen, component="left"))
+        poses.append(np.linalg.inv(T))
+    scene = Scene("warm", "arch-bridge", tuple(scans), arch=made, temperature_C=50.0)
+    used = ScanPoses(name=("s2", "s0"), T_bridge_scan=np.array([poses[2], poses[0]]))
+    table = dataclasses.replace(components(("left",), poses[2:]), scans=("s2, s0",), scan_poses=(used,))
+    assembled = SimpleNamespace(components=table, method="adjustment")
+    part = next(bridge_parts.of_bridge(scene, assembled, "deviation"))
+    assert [scan.name for scan in part.scene.scans] == ["s0", "s2"]
+    assert [(one.code, one.values["scans"]) for one in part.reasons] == [("parts.scans-not-used", ("s1",))]
+    cloud = scene_cloud.merged(part.scene, with_scanner=True)
+    np.testing.assert_allclose(cloud.points + cloud.origin, np.vstack([on_part[0], on_part[2]]), atol=1e-5)
+    np.testing.assert_allclose(cloud.scanner + cloud.origin, np.tile([-900.0, 4e3, 1.5e3], (len(cloud.points), 1)),
+                               atol=1e-5)  # fmt: skip
+
+
+def test_stations_of_two_scans_of_a_part_lie_where_each_scan_was_placed():
+    made, places = design(), np.array([[-900.0, 4e3, 1.5e3], [-900.0, -4e3, 1.5e3]])
+    stations = Stations(ids=("S1", "S2"), positions=places)
+    points = scanned(made.parts[0], np.random.default_rng(9), 0.0)
+    seen = np.arange(len(points)) % 2
+    lifts = np.eye(4)[None].repeat(2, axis=0)
+    lifts[:, 2, 3] = [3.0, 5.0]  # preassembly lifts either scan by another amount
+    scans = [Scan(f"s{k}", points, point_station=seen, component="left") for k in range(2)]
+    scene = Scene("two", "arch-bridge", tuple(scans), arch=made, stations=stations)
+    table = dataclasses.replace(
+        components(("left",), lifts[:1]), scans=("s0, s1",), scan_poses=(ScanPoses(("s0", "s1"), lifts),)
+    )
+    part = next(bridge_parts.of_bridge(scene, SimpleNamespace(components=table, method="adjustment"), "defects"))
+    assert part.scene.stations.ids == ("S1", "S2", "S1, s1", "S2, s1")
+    np.testing.assert_allclose(
+        part.scene.stations.positions, np.vstack([places + lifts[0, :3, 3], places + lifts[1, :3, 3]]), atol=1e-9
+    )
+    cloud = scene_cloud.merged(part.scene, with_scanner=True)
+    lift = np.repeat([3.0, 5.0], len(points))[:, None] * [0, 0, 1.0]
+    np.testing.assert_allclose(cloud.scanner + cloud.origin, np.tile(places[seen], (2, 1)) + lift, atol=1e-9)
 
 
 def test_balls_and_tubes_lie_where_they_were_measured():

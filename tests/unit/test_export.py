@@ -26,6 +26,7 @@ from processor.clouds import cleaning, slabs, thinning
 from processor.clouds import export as clouds_export
 from processor.clouds.points import InMemory, Spool
 from processor.model import InputError, Scene, Stations, Status, UsageError
+from processor.preassembly.result import ScanPoses
 from processor.scan_folder import folder
 from processor.store import store
 from processor.writers.cloud import Block, Cloud
@@ -202,15 +203,17 @@ def test_stations_of_a_merged_cloud(tmp_path):
     assert [remark.code for remark in done.remarks] == ["export.stations-lost"]
 
 
-def test_of_several_scans_of_a_part_the_one_with_the_pose_is_assembled(tmp_path):
-    names = ("foot1", "foot1, again")
+def test_of_several_scans_of_a_part_those_that_were_used_are_assembled(tmp_path):
+    names = ("foot1", "foot1, again", "foot1, moved")
     scans = [swept(name, i, component="foot1") for i, name in enumerate(names)]
-    results = exported_runs.assembled(scans, [pose(5)], used=("foot1, again, foot1",))
+    used = ScanPoses(("foot1, again", "foot1"), np.array([pose(5), pose(6)]))
+    results = exported_runs.assembled(scans, [pose(5)], used=("foot1, again, foot1",), scan_poses=(used,))
     done = processor.export(results, tmp_path / "a", what="assembled", format="ply")
-    np.testing.assert_allclose(
-        cloud_of(tmp_path / "a/scans/foot1.ply"), scans[1].points @ pose(5)[:3, :3].T + pose(5)[:3, 3], atol=1e-6
-    )
-    assert [(r.code, r.values["scans"]) for r in done.remarks] == [("export.further-scans", ("foot1",))]
+    for file, k, T in (("foot1.ply", 0, pose(6)), ("foot1-2.ply", 1, pose(5))):
+        np.testing.assert_allclose(
+            cloud_of(tmp_path / "a/scans" / file), scans[k].points @ T[:3, :3].T + T[:3, 3], atol=1e-6
+        )
+    assert [(r.code, r.values["scans"]) for r in done.remarks] == [("export.further-scans", ("foot1, moved",))]
 
 
 # --- a run of the program, and its folder of results

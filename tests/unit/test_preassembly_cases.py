@@ -336,6 +336,10 @@ def test_two_scans_of_one_part_make_one(monkeypatch):
     assert {scan.name for scan in both.scans} == {"left", "right"}
     assert both.status == "ok"
     assert_right(both, design, RIB, part, T if both.scans[0].name == "left" else _back(2))
+    (further,) = both.T_further_scans
+    true = _back(2) if both.scans[0].name == "left" else T
+    at = rigid.apply(rigid.invert(true), part.key_points(part.s0))
+    assert np.abs(rigid.apply(further, at) - rigid.apply(true, at)).max() < 3.0
     alone = measured(design, RIB, one)
     assert alone.status == "weak"
     assert reason("preassemble.few-points-on-face", face="right") in nested(alone.reasons)

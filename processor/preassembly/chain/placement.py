@@ -18,12 +18,14 @@ from processor.preassembly.parts.measure import MeasuredPart
 class Placement:
     """Poses T_bridge_scan (c, 4, 4) with covariance (c, 6, 6), rival poses, key points, and gaps (j, 8, 3).
 
+    ``T_bridge_scans`` (s, 4, 4) are the poses of all s scans of each part, the first one's first.
     Key points (e, 8, 3) are of the e ends of each part. Poses and key points are of the scan's frame with its origin,
     lengths of poses at the reference temperature and of key points as scanned; mm, NaN = unknown. ``steel`` (j, 8)
     marks the key points that lie on steel.
     """
 
     T_bridge_scan: Floats
+    T_bridge_scans: tuple[Floats, ...]
     covariance: Floats
     T_rival_scan: Floats
     key_points_scan: tuple[Floats, ...]
@@ -39,8 +41,16 @@ def place(
 
     ``steel`` (j, 8) marks the key points of the joints that lie on steel.
     """
-    poses = np.array([T @ part.T_bridge_scan for T, part in zip(adjusted.motions, parts, strict=True)])
-    T_bridge_scan = _with_origins(parts, poses)
+    T_bridge_scans = tuple(
+        np.array(
+            [
+                rigid.with_origin(T @ pose, scan.origin * part.shrink)
+                for pose, scan in zip((part.T_bridge_scan, *part.T_further_scans), part.scans, strict=True)
+            ]
+        )
+        for T, part in zip(adjusted.motions, parts, strict=True)
+    )
+    T_bridge_scan = np.array([poses[0] for poses in T_bridge_scans])
     key_points, key_points_sd = _key_points(parts, design, frames)
     ends = [
         [rigid.apply(T, end * part.shrink) for end in ends]
@@ -50,19 +60,13 @@ def place(
     gaps = [ends[right.part][right.end] - ends[left.part][left.end] for left, right in topology.sides_of(design.joined)]
     return Placement(
         T_bridge_scan=T_bridge_scan,
+        T_bridge_scans=T_bridge_scans,
         covariance=_covariances(parts, adjusted, T_bridge_scan),
-        T_rival_scan=_with_origins(parts, [part.T_rival for part in parts]),
+        T_rival_scan=np.array([rigid.with_origin(part.T_rival, part.scans[0].origin * part.shrink) for part in parts]),
         key_points_scan=key_points,
         key_points_sd=key_points_sd,
         gaps=np.array(gaps).reshape(-1, 8, 3),
         steel=steel,
-    )
-
-
-def _with_origins(parts: Sequence[MeasuredPart], poses: Sequence[Floats] | Floats) -> Floats:
-    """Poses (c, 4, 4) of scans whose origins were taken off, as poses of the scans' own frames."""
-    return np.array(
-        [rigid.with_origin(T, part.scans[0].origin * part.shrink) for T, part in zip(poses, parts, strict=True)]
     )
 
 

@@ -46,7 +46,7 @@ class MeasuredPart:
     scans: tuple[Scan, ...]  # those used; poses and key points are in the frame of the first
     status: Status  # ok | ambiguous | weak | failed
     reasons: tuple[Reason, ...]
-    T_bridge_scan: Floats
+    T_bridge_scan: Floats  # of the first scan
     member: Member
     shrink: float  # lengths at the reference temperature by lengths as scanned
     T_rival: Floats  # (4, 4) of an ambiguous part: the other pose that fits as well; NaN of others
@@ -54,6 +54,7 @@ class MeasuredPart:
     residuals: Floats  # (r,) from the design's surface, outward
     identities: tuple[ScanParts, ...] = ()  # of its scans
     outer: OuterEnd | None = None  # of the first and the last part of a row
+    T_further_scans: tuple[Floats, ...] = ()
 
     @property
     def of_others(self) -> tuple[Reason, ...]:
@@ -151,7 +152,6 @@ def fit(
     status = Status.WEAK if first.registration.weak or doubtful else Status.OK
     status = Status.AMBIGUOUS if first.attitude.status == Status.AMBIGUOUS else status
     resemblance = _resemblance(first.points, index, shapes) if status != Status.OK else ()
-    residual_points, residuals = _residuals(registered.points, shape.mesh)
     outer = _outer_end(registered, part, joints) if len(part.bottom_edge_left) else None
     open_end = None in joints and len(part.bottom_edge_left) > 0
     unseen = (reason("preassemble.outer-end-not-seen"),) if open_end and outer is None else ()
@@ -164,10 +164,10 @@ def fit(
         member=Member((None,) * len(joints), edges, part.vertices.mean(axis=0), registered.pose),
         shrink=shrink,
         T_rival=first.attitude.T_rival,
-        residual_points=residual_points,
-        residuals=residuals,
+        **_residuals(registered.points, shape.mesh),
         identities=_identities(placed, part),
         outer=outer,
+        T_further_scans=tuple(scan.registration.T_design_scan for scan in used[1:]),
     )
     several = len(np.unique(registered.station)) > 1
     names = tuple("" if joint is None else design.joint_names[joint] for joint in joints)
@@ -445,12 +445,12 @@ def _covered(points: Floats, T: Floats, shape: attitude.Surface) -> float:
     return float((counts > LEAST_OF_TYPICAL * np.median(counts[counts > 0.0])).mean()) if counts.any() else 0.0
 
 
-def _residuals(points: Floats, surface: MeshSurface) -> tuple[Floats, Floats]:
-    """Thinned points (r, 3) and their distances (r,) from the design's surface."""
+def _residuals(points: Floats, surface: MeshSurface) -> dict[str, Floats]:
+    """Thinned points (r, 3) and their distances (r,) from the design's surface, as fields of MeasuredPart."""
     points = thinned(points, RESIDUALS)
     face, distance, beyond = surface.distances(points, 60.0)
     near = on_face(face, beyond)
-    return points[near], distance[near]
+    return {"residual_points": points[near], "residuals": distance[near]}
 
 
 def _resemblance(points: Floats, index: int, shapes: attitude.Shapes) -> tuple[Reason, ...]:
