@@ -16,11 +16,12 @@ from designgen.export import step_files
 from processor.api import runs
 from processor.cli import main
 from processor.geometry.polyline import Polyline
-from processor.model import ArchDesign
+from processor.model import ArchDesign, DesignBodies
+from processor.scan_folder import cad, guess
 from processor.scan_folder import folder as scan_folder
-from processor.scan_folder import guess
-from processor.scan_folder.shapes import arch_bridge
-from processor.scan_folder.shapes.body import welded
+from processor.scan_folder.shapes import arch_bridge, guess_design
+from processor.scan_folder.shapes.body import stacked, welded
+from processor.scan_folder.units import MM_PER_UNIT
 from tests.support import bridge_parts
 from tests.support.scan_folders import write_ply
 
@@ -344,6 +345,36 @@ def test_a_unit_that_nothing_states_is_not_sure(tmp_path, unit, size_mm):
     output = init(tmp_path)
     assert f"? units of the design: taken as {unit}" in output
     assert json.loads((tmp_path / "design.json").read_text("utf-8"))["unsure"][0].startswith("? units of the design")
+
+
+@pytest.mark.parametrize("one_file", [True, False])
+def test_bodies_of_cad_files_without_a_unit_have_the_guessed_one(tmp_path, monkeypatch, one_file):
+    """The bridge in numbers of metres; facets are those of a file in the unit that is asked for."""
+    meshes, joints = bridge_parts.bridge()
+    made = dict(zip(bridge_parts.names(5), meshes, strict=True))
+    asked = []
+
+    def read_design(path, unit):
+        asked.append(unit)
+        parts = made if path.stem == "bridge" else {path.stem: made[path.stem]}
+        bodies = [
+            welded(name, vertices / 1000.0 * MM_PER_UNIT[unit], faces) for name, (vertices, faces) in parts.items()
+        ]
+        body = stacked("all", bodies)
+        of_facet = np.repeat(np.arange(len(bodies)), [len(one.faces) for one in bodies])
+        names = DesignBodies(names=tuple(parts), of_facet=of_facet)
+        return cad.CadDesign(body.vertices, body.faces, names, unit_stated=False)
+
+    monkeypatch.setattr(cad, "read_design", read_design)
+    (tmp_path / "design").mkdir()
+    paths = [tmp_path / f"design/{name}.step" for name in (["bridge"] if one_file else made)]
+    for path in paths:
+        path.write_text("ISO-10303-21;")
+    guessed = guess_design.guess(tmp_path, paths, [])
+    assert asked[-1] == "m"
+    assert guessed.doubts[0].startswith("units of the design: taken as m")
+    assert guessed.units == ("mm" if one_file else "m")  # of one file each part's mesh is written, in mm
+    assert np.abs(guessed.design.joint_points - joints).max() < CORNER_MM
 
 
 def test_inches_are_asked_for(tmp_path):

@@ -120,26 +120,6 @@ def welded(name: str, vertices: Floats, faces: Ints) -> Body | None:
     return Body(name, points[used], renumbered.reshape(-1, 3).astype(np.int64))
 
 
-def pieces(body: Body) -> list[Body]:
-    """Return the connected pieces of a body, in the order of their first facets."""
-    count = len(body.vertices)
-    rows = body.faces[:, [0, 1]].reshape(-1), body.faces[:, [1, 2]].reshape(-1)
-    graph = sparse.coo_matrix((np.ones(len(rows[0]), np.int8), rows), (count, count))
-    number, label = sparse.csgraph.connected_components(graph, directed=False)
-    if number == 1:
-        return [body]
-    of_facet = label[body.faces[:, 0]]
-    _, first = np.unique(of_facet, return_index=True)
-    result = []
-    order = np.argsort(of_facet, kind="stable")
-    groups = np.split(order, np.cumsum(np.bincount(of_facet, minlength=number))[:-1])
-    for piece in of_facet[np.sort(first)]:
-        faces = body.faces[groups[piece]]
-        used, renumbered = np.unique(faces, return_inverse=True)
-        result.append(Body(body.name, body.vertices[used], renumbered.reshape(-1, 3).astype(np.int64)))
-    return result
-
-
 def stacked(name: str, bodies: Sequence[Body]) -> Body:
     """Return one mesh of several bodies, which share no vertices."""
     counts = np.cumsum([0, *(len(body.vertices) for body in bodies)]).tolist()

@@ -60,6 +60,8 @@ def guess(
     names = _names(folder, chosen)
     # Scans are of a whole frame, but of single parts of a bridge.
     units = _unit(surfaces, scans, given_unit, as_whole=True)
+    before = units.unit or "mm"
+    surfaces = _in_unit(folder, surfaces, given_unit or "mm", before)
     bodies = _bodies(folder, surfaces, units.unit or "mm").bodies
     if not bodies:
         return GuessedDesign(doubts=(*doubts, "no surface has an area"), files=names)
@@ -76,7 +78,20 @@ def guess(
     doubts += _unit_doubts(units)
     if not units.unit:
         return GuessedDesign(doubts=tuple(doubts), files=names)
+    surfaces = _in_unit(folder, surfaces, before, units.unit)
     return _bridge(_bodies(folder, surfaces, units.unit), names, tuple(doubts), _json_unit(surfaces, units))
+
+
+def _in_unit(
+    folder: Path, surfaces: Sequence[surface_files.Surface], before: str, unit: str
+) -> list[surface_files.Surface]:
+    """Return surfaces with the facets of ``unit``: CAD files without one were read as if in the unit ``before``."""
+    return [
+        surface_files.read(folder, surface.path, unit)
+        if surface.bodies is not None and not surface.unit and unit != before
+        else surface
+        for surface in surfaces
+    ]
 
 
 def _unit(
@@ -143,7 +158,7 @@ def _named_as_parts(bodies: Sequence[Body]) -> bool:
 def _bodies(folder: Path, surfaces: Sequence[surface_files.Surface], units: str) -> _Parts:
     """Return the parts in mm: a part per file, or of one file per part a body."""
     bodies, mesh_of = list[Body](), dict[str, str]()
-    scales = [1.0 if surface.bodies is not None else MM_PER_UNIT[units] for surface in surfaces]
+    scales = [1.0 if surface.unit else MM_PER_UNIT[units] for surface in surfaces]
     if len(surfaces) > 1:
         for surface, scale in zip(surfaces, scales, strict=True):
             body = welded(surface.path.stem, surface.vertices * scale, surface.faces)

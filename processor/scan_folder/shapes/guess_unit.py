@@ -25,13 +25,13 @@ class DesignUnit:
     sure: bool
 
 
-def guess(surfaces: Sequence[Floats], scans: Sequence[tuple[float, str]], single: bool) -> DesignUnit:
-    """Guess the unit of vertices (v, 3) of each part, or of the whole if ``single``.
+def guess(surfaces: Sequence[Floats], scans: Sequence[tuple[float, str]], as_whole: bool) -> DesignUnit:
+    """Guess the unit of vertices (v, 3) of each part, or of the whole if ``as_whole``.
 
     ``scans`` are the radius of each scan and the unit that its format states, "" for none.
     """
     whole = np.concatenate(surfaces)
-    sizes = np.array([radius(whole)] if single else [radius(part) for part in surfaces])
+    sizes = np.array([radius(whole)] if as_whole else [radius(part) for part in surfaces])
     stated = [size * MM_PER_UNIT[unit] for size, unit in scans if unit and size > 0.0]
     if stated:
         misfit = {
@@ -48,4 +48,7 @@ def guess(surfaces: Sequence[Floats], scans: Sequence[tuple[float, str]], single
     if len(likely) != 1 and "mm" not in likely:
         return DesignUnit("", f"an extent of {extent:.4g} would be {which}", False)
     unit = "mm" if "mm" in likely else likely[0]
-    return DesignUnit(unit, f"no file states it; an extent of {extent:.4g} is that of a structure in {unit}", False)
+    others = "".join(f", and in {u}" for u in possible if u != unit)
+    return DesignUnit(
+        unit, f"no file states it; an extent of {extent:.4g} is that of a structure in {unit}{others}", False
+    )

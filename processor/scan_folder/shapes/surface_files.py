@@ -14,6 +14,7 @@ from processor.scan_folder import cad
 from processor.scan_folder.checked_table import existing_file_in
 from processor.scan_folder.files import SCANS, belongs
 from processor.scan_folder.meshes import CAD_SUFFIXES, MESH_SUFFIXES, read_mesh
+from processor.scan_folder.units import MM_PER_UNIT
 
 MADE = "design-parts"  # folder of the meshes that `processor init` writes
 DEPTH = 2  # of folders below the scan folder
@@ -77,11 +78,16 @@ def one_a_stem(files: Sequence[Path]) -> tuple[list[Path], list[str]]:
 
 
 def read(folder: Path, path: Path, unit: str) -> Surface:
-    """Read a file of surfaces; ``unit`` is that of a CAD file that states none. Raises InputError."""
+    """Read a file of surfaces. Raises InputError.
+
+    Curved faces of a CAD file that states no unit become facets as fine as they need be if it is in ``unit``.
+    """
     existing_file_in(folder, str(path.relative_to(folder)), str(folder))
     if path.suffix.lower() in CAD_SUFFIXES:
         design = cad.read_design(path, unit)
-        return Surface(path, design.vertices, design.faces, design.bodies, "mm" if design.unit_stated else "")
+        if design.unit_stated:
+            return Surface(path, design.vertices, design.faces, design.bodies, "mm")
+        return Surface(path, design.vertices / MM_PER_UNIT[unit], design.faces, design.bodies, "")
     vertices, faces = read_mesh(path)
     if len(faces) < 4:
         raise InputError(f"{path}: expected a mesh of a body, found {len(faces)} faces")
