@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from processor.geometry.same_places import same_places
 from processor.model import Floats, Ints
 
 FEWEST_CORNERS = 8  # of a polygon that is a circle
@@ -76,7 +77,7 @@ def _through(circles: list[Circle]) -> Iterator[Hole]:
 def _circles(vertices: Floats, faces: Ints, normals: Floats, plane: Ints) -> Iterator[Circle]:
     """Yield the circles that bound flat faces from within."""
     used, where = np.unique(faces, return_inverse=True)
-    place = np.unique(np.rint(vertices[used] / SAME_PLACE_MM), axis=0, return_inverse=True)[1].reshape(-1)
+    place = same_places(vertices[used], SAME_PLACE_MM)
     corner = place[where.reshape(faces.shape)]
     spot = np.empty((int(place.max()) + 1, 3))
     spot[place] = vertices[used]

@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from processor import scene_cloud
 from processor.adjustment import groups, scanner_class
 from processor.geometry import mesh_distance
+from processor.geometry.same_places import same_places
 from processor.inspection import design_holes
 from processor.inspection.design_holes import Hole
 from processor.model import Floats, Ints, StructureDesign
@@ -176,7 +177,7 @@ def _bodies(design: StructureDesign, vertices: Floats) -> tuple[tuple[str, ...],
     """Return the names of bodies, and the body (f,) of each facet; without names they are what hangs together."""
     if design.bodies is not None:
         return design.bodies.names, design.bodies.of_facet
-    place = np.unique(np.rint(vertices / SAME_PLACE_MM), axis=0, return_inverse=True)[1].reshape(-1)[design.faces]
+    place = same_places(vertices, SAME_PLACE_MM)[design.faces]
     a, b = place[:, [0, 1]].ravel(), place[:, [1, 2]].ravel()
     links = coo_array((np.ones(len(a), np.int8), (a, b)), (int(place.max()) + 1,) * 2)
     body = connected_components(links, directed=False)[1][place[:, 0]]

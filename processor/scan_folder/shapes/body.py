@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from processor.geometry.same_places import same_places
 from processor.model import Floats, Ints
 
 WELD_MM = 1e-4  # vertices nearer to each other are one: far below any edge and far above rounding
@@ -105,9 +106,8 @@ class Body:
 
 def welded(name: str, vertices: Floats, faces: Ints) -> Body | None:
     """Return a body without repeated vertices and without facets of no area; None if nothing is left."""
-    grid = np.round(vertices / WELD_MM)
-    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    points, triangles = vertices[first], inverse.reshape(-1)[faces]
+    _, first, place = np.unique(same_places(vertices, WELD_MM), return_index=True, return_inverse=True)
+    points, triangles = vertices[first], place.reshape(-1)[faces]
     a, b, c = triangles.T
     triangles = triangles[(a != b) & (b != c) & (c != a)]
     corners = points[triangles]
