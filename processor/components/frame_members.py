@@ -18,6 +18,7 @@ from processor.model import (
     FrameDesign,
     InputError,
     Ints,
+    Scan,
     Scene,
     Stations,
     StructureDesign,
@@ -60,10 +61,14 @@ def _corrected(scene: Scene, found: Any) -> Scene:
     T_of = dict(zip(found.stations.names, found.stations.T, strict=True))
     if not T_of:
         return scene
-    scans = tuple(
-        replace(scan, T_project_scan=T_of[scan.name] @ scan.pose) if scan.name in T_of else scan for scan in scene.scans
-    )
     stations = scene.stations
+    of_row = {} if stations is None else {row: T_of[id_] for row, id_ in enumerate(stations.ids) if id_ in T_of}
+    scans = tuple(
+        replace(scan, T_project_scan=T_of[scan.name] @ scan.pose)
+        if scan.name in T_of
+        else replace(scan, points=_points_corrected(scan, of_row))
+        for scan in scene.scans
+    )
     if stations is not None and all(id_ in T_of for id_ in stations.ids):
         moved = np.stack([T_of[id_] for id_ in stations.ids])
         stations = Stations(
@@ -74,6 +79,18 @@ def _corrected(scene: Scene, found: Any) -> Scene:
             else stations.T_project_station,
         )
     return replace(scene, scans=scans, stations=stations)
+
+
+def _points_corrected(scan: Scan, of_row: dict[int, Floats]) -> Floats:
+    """Return the points (n, 3) of a merged scan where the corrected poses of their stations, by row, have them."""
+    points: Floats = scan.points.copy()
+    for row, T in of_row.items():
+        seen = scan.point_station == row
+        if seen.any():
+            M = rigid.invert(scan.pose) @ T @ scan.pose
+            # Of large coordinates the difference alone is added: they would cost the points digits.
+            points[seen] += scan.points[seen] @ (M[:3, :3] - np.eye(3)).T + (rigid.apply(M, scan.origin) - scan.origin)
+    return points
 
 
 def _balls(design: FrameDesign, found: Any) -> dict[str, Mesh]:
