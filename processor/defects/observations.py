@@ -123,9 +123,11 @@ def _of_scan(
         station = np.where(known[of_point], of_point, -1)
         facet[rows], deviation[rows] = mesh_distance.nearest_visible(grid, points[rows], scanners, station)
     near = np.flatnonzero(facet >= 0)
+    places, outward = _sighted(surface, facet[near], points[near], scanners[station_of[near]], known[station_of[near]])
     arm = scanners[station_of[near]] - points[near]
-    cosine = np.einsum("ni,ni->n", arm, surface.normals[facet[near]]) / np.linalg.norm(arm, axis=1)
-    on = near[~known[station_of[near]] | (cosine > LEAST_COS)]
+    cosine = np.einsum("ni,ni->n", arm, outward) / np.linalg.norm(arm, axis=1)
+    used = ~known[station_of[near]] | (cosine > LEAST_COS)
+    on, places = near[used], places[used]
     mixed = _at_outline(surface, facet[on], points[on], scanners[station_of[on]])
     mixed |= _passed_by(surface, grid, facet[on], points[on], deviation[on], scanners[station_of[on]])
     mixed &= known[station_of[on]]
@@ -137,7 +139,35 @@ def _of_scan(
             of_face = surface.normals[facet[on[rows]]], deviation[on[rows]], chart[rows]
             every = points[station_of == k], every_chart[station_of == k]
             mixed[rows] |= mixed_pixels.beside(points[on[rows]], positions[k], *of_face, every)
-    return chart, layout(surface.charts, chart, points[on]), station_of[on], deviation[on], mixed
+    return chart, layout(surface.charts, chart, places), station_of[on], deviation[on], mixed
+
+
+def _sighted(
+    surface: DesignSurface, facet: Ints, points: Floats, scanners: Floats, known: Bools
+) -> tuple[Floats, Floats]:
+    """Return places (n, 3) of points (n, 3) on their faces, and the outward normals (n, 3) there.
+
+    On a round face the place is where the line of sight from the scanner (n, 3) meets it, as noise along the line moves
+    a point around the face: by the nearest place, what is too far would gather near the outline, where the face ends
+    for the scanner, and what is too near would gather away from it. ``known`` (n,) marks scanners with a position.
+    """
+    charts, chart = surface.charts, surface.chart_of[facet]
+    places, outward = points.copy(), surface.normals[facet]
+    rows = np.flatnonzero((charts.kind[chart] == CYLINDER) & known)
+    axis, radius = charts.axes[chart[rows], 0], charts.radius[chart[rows]]
+    arm, sight = points[rows] - charts.origin[chart[rows]], points[rows] - scanners[rows]
+    arm, sight = (x - np.einsum("ni,ni->n", x, axis)[:, None] * axis for x in (arm, sight))
+    # The line of sight arm + t sight meets the circle about the axis where a t^2 + 2 b t + c = 0.
+    a, b = np.einsum("ni,ni->n", sight, sight), np.einsum("ni,ni->n", arm, sight)
+    inside = b**2 - a * (np.einsum("ni,ni->n", arm, arm) - radius**2)
+    meets = (inside > 0.0) & (a > 0.0)
+    rows, arm, sight, axis, a, b, inside = (x[meets] for x in (rows, arm, sight, axis, a, b, inside))
+    way = np.where(np.einsum("ni,ni->n", arm, outward[rows]) > 0.0, 1.0, -1.0)  # a hole is seen on its far side
+    t = (-b - way * np.sqrt(inside)) / a
+    places[rows] += t[:, None] * (points[rows] - scanners[rows])
+    out = arm + t[:, None] * sight
+    outward[rows] = way[:, None] * out / np.linalg.norm(out, axis=1)[:, None]
+    return places, outward
 
 
 def _at_outline(surface: DesignSurface, facet: Ints, points: Floats, scanners: Floats) -> Bools:
