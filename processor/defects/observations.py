@@ -19,6 +19,7 @@ LEAST_COS = 0.2  # of incidence: points at a more oblique one are mostly of beam
 GATE_SDS = 4.0  # robust standard deviations from the median of a cell, beyond which a point is stray
 LEAST_GATE_MM = 1.0
 FEWEST_POINTS = 4  # of a cell, for its median to identify stray points
+FEWEST_OF_FACE = 40  # points of a station on a face, for their own robust standard deviation
 
 
 @dataclass(frozen=True)
@@ -238,14 +239,72 @@ def paired(observed: Observed, surface: DesignSurface) -> Pairs:
     """Sum up the points by cell and station."""
     cell = cells_of(observed, surface)
     order = np.argsort(cell * len(observed.stations.names) + observed.station, kind="stable")
-    return Pairs(*pairs(cell[order], observed.station[order], observed.deviation[order], observed.mixed[order]))
+    cell, station, chart = cell[order], observed.station[order], observed.chart[order]
+    deviation, mixed = observed.deviation[order], observed.mixed[order]
+    sd = _robust_sd(off_median(cell, deviation, mixed), station, chart)
+    return Pairs(*pairs(cell, station, deviation, mixed, sd))
+
+
+def _robust_sd(off: Floats, station: Ints, chart: Ints) -> Floats:
+    """Return the robust standard deviation (n,) of the points of each point's station on its face, mm.
+
+    ``off`` (n,) are distances from the medians of cells, NaN where a cell has too few points. The points of one cell
+    alone show it badly: of four, the nearest three may agree by chance.
+    """
+    known = np.flatnonzero(np.isfinite(off))
+    of_face, of_station = (
+        medians(off[known], group[known], int(group.max(initial=0)) + 1, FEWEST_OF_FACE)
+        for group in (station * (int(chart.max(initial=0)) + 1) + chart, station)
+    )
+    own = of_face[station * (int(chart.max(initial=0)) + 1) + chart]
+    sd: Floats = 1.4826 * np.where(np.isfinite(own), own, np.nan_to_num(of_station[station]))
+    return sd
+
+
+def medians(values: Floats, group: Ints, groups: int, fewest: int) -> Floats:
+    """Return the median (groups,) of the values (n,) of each group; NaN for a group of fewer than ``fewest``."""
+    order = np.lexsort([values, group])
+    count = np.bincount(group, minlength=groups)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    enough = np.flatnonzero(count >= fewest)
+    median = np.full(groups, np.nan)
+    low, high = (values[order[first[enough] + (count[enough] - k) // 2]] for k in (1, 0))
+    median[enough] = 0.5 * (low + high)
+    return median
+
+
+@njit(cache=True, nogil=True)
+def off_median(cell: Ints, deviation: Floats, mixed: Bools) -> Floats:
+    """Return the distances (n,) from the median of the pure points of a cell, of points sorted by cell.
+
+    NaN for mixed points and in a cell of fewer than FEWEST_POINTS. The median is of the points themselves: the distance
+    is that from the expected value after multiplication by (n / (n - 1))^(1/2).
+    """
+    off = np.full(len(cell), np.nan)
+    start = 0
+    while start < len(cell):
+        end = start
+        while end < len(cell) and cell[end] == cell[start]:
+            end += 1
+        pure = deviation[start:end][~mixed[start:end]]
+        n = len(pure)
+        if n >= FEWEST_POINTS:
+            middle = np.median(pure)
+            for i in range(start, end):
+                if not mixed[i]:
+                    off[i] = abs(deviation[i] - middle) * np.sqrt(n / (n - 1.0))
+        start = end
+    return off
 
 
 @njit(cache=True, nogil=True)
 def pairs(
-    cell: Ints, station: Ints, deviation: Floats, mixed: Bools
+    cell: Ints, station: Ints, deviation: Floats, mixed: Bools, sd: Floats
 ) -> tuple[Ints, Ints, Ints, Ints, Floats, Floats, Ints]:
-    """Return the columns of :class:`Pairs` of points sorted by cell and station (Welford's algorithm)."""
+    """Return the columns of :class:`Pairs` of points sorted by cell and station (Welford's algorithm).
+
+    ``sd`` (n,) is the robust standard deviation of a point: what is within GATE_SDS of it is not stray.
+    """
     n = len(cell)
     total = 0
     for i in range(n):
@@ -269,7 +328,7 @@ def pairs(
                 at += 1
                 cells[at], stations[at] = cell[i], station[i]
             value = deviation[i]
-            if mixed[i] or abs(value - middle) > gate:
+            if mixed[i] or abs(value - middle) > max(gate, GATE_SDS * sd[i]):
                 stray[at] += 1
                 beside[at] += mixed[i]
                 continue

@@ -51,3 +51,16 @@ def test_cells_at_the_outline_of_a_tube_do_not_deviate_by_noise(hollow):
         weight += int(pairs.count[oblique].sum())
     assert weight > 1500
     assert abs(top / weight) < 4.0 * 0.5 * NOISE / np.sqrt(weight)  # half of the noise is along the normal there
+
+
+def test_points_of_a_noisy_station_are_not_stray():
+    """Of four points in a cell the nearest three often agree by chance, which makes the fourth no stray one."""
+    box = trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], [2000.0, 20.0, 1000.0]]))
+    surface = surface_charts.of_mesh(np.array(box.vertices), np.array(box.faces, np.int64), 40.0)
+    ray = rays_through((0.0, 0.0), (2000.0, 1000.0), 20.0)
+    away = -SCANNER[1] / ray[:, 1]
+    scene = scan_of(ray, away, np.random.default_rng(5))
+    pairs = observations.paired(observations.observe(scene, np.eye(4), surface, 60.0), surface)
+    assert (pairs.stray - pairs.mixed).sum() < 0.002 * len(away)  # beyond 4 sd of their cell, which is known by four
+    sd = np.sqrt(pairs.square.sum() / (pairs.count - 1.0).clip(0.0).sum())
+    assert sd == pytest.approx(NOISE, rel=4.0 / np.sqrt(2.0 * len(away)))
