@@ -64,7 +64,7 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
     rays = rays_to(points, stations.positions[pairs.station])
     correction = alignment.corrections(points, outward, rays, pairs.station)
-    count = np.bincount(pairs.cell, pairs.count, cells)
+    count = np.bincount(pairs.cell, pairs.count, cells).astype(np.float64)
     divisor = np.maximum(count, 1.0)
     mean = np.bincount(pairs.cell, pairs.count * (pairs.mean - correction), cells) / divisor
     noise, freedom = _noise(pairs, surface, count)
@@ -101,15 +101,17 @@ def _noise(pairs: Pairs, surface: DesignSurface, count: Floats) -> tuple[Floats,
     """
     charts, chart = surface.charts, chart_of_cells(surface)[pairs.cell]
     stations = int(pairs.station.max(initial=0)) + 1
-    variance, freedom = np.ones(len(pairs.cell)), np.zeros(len(pairs.cell))
     free = np.maximum(pairs.count - 1, 0).astype(np.float64)
+    overall = float(pairs.square.sum() / max(free.sum(), 1.0))  # of a station that hardly shows its own
+    variance, freedom = np.full(len(free), overall), np.full(len(free), LOCAL_FREE)
     for station in range(stations):
         rows = pairs.station == station
         square_of, free_of = (
             np.bincount(chart[rows], x[rows], len(charts.kind)).astype(np.float64) for x in (pairs.square, free)
         )
-        known = moderated_variances.moderated(square_of, free_of)
-        variance[rows], freedom[rows] = (x[chart[rows]] for x in known)
+        if free_of.sum() > LOCAL_FREE:
+            known = moderated_variances.moderated(square_of, free_of)
+            variance[rows], freedom[rows] = (x[chart[rows]] for x in known)
     cells, part = len(surface.share), pairs.count * variance
     total, observed, expected, local = (
         np.bincount(pairs.cell, x, cells).astype(np.float64) for x in (part, pairs.square, free * variance, free)
@@ -123,10 +125,8 @@ def _noise(pairs: Pairs, surface: DesignSurface, count: Floats) -> tuple[Floats,
         weight = frees * POOLED_CELLS**2
         factor[charts.cells(k)] = ((LOCAL_FREE + weight * ratio) / (LOCAL_FREE + weight)).ravel()
     # Of a cell without points it is the noise of its face.
-    of_face = np.bincount(chart, part, len(charts.kind)) / np.maximum(
-        np.bincount(chart, pairs.count, len(charts.kind)), 1.0
-    )
-    of_face = np.where(of_face > 0.0, of_face, part.sum() / max(float(pairs.count.sum()), 1.0))
+    sums, numbers = (np.bincount(chart, x, len(charts.kind)) for x in (part, pairs.count))
+    of_face = np.where(numbers > 0.0, sums / np.maximum(numbers, 1.0), overall)
     mean = np.where(count > 0.0, total / np.maximum(count, 1.0), of_face[chart_of_cells(surface)])
     noise = np.sqrt(np.maximum(mean * factor, 1e-6))
     return noise, total**2 / np.maximum(spread, 1e-12)
