@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import ndtr, ndtri
+from scipy.special import chdtrc, ndtr, ndtri
 
 from processor.defects import shape_models
 from processor.defects.alignment import Alignment, chart_of_cells
@@ -27,6 +27,7 @@ LEAST_Z = 4.5  # of a shape: what stations have in common is known from few of t
 FEWEST_SEEN = 6  # cells of a face, whose mean movement is compared with that of others
 FACE_GAIN = 1.1  # from which on another face than the front shows a movement
 FLUSH_COS, FLUSH_MM = 0.9998, 1.0  # faces in one plane
+LEAST_CHANCE = 1e-200  # below which the number of factors makes no difference
 LARGE_SHARE = 0.9  # of the largest face's area, from which a face may be the front
 
 
@@ -116,12 +117,14 @@ def significant(
 ) -> dict[int, list[SignificantShape]]:
     """Return the shapes, by component, that are significant at the given rate of false alarms.
 
-    The largest value of a shape has three errors: noise, the common error of means of large places, and the pose of
-    the whole in the design's frame.
+    The value of a shape at a place has three errors: noise, the common error of means of large places, and the pose of
+    the whole in the design's frame. Its significance is that of the place where it is most significant, of all places
+    that the shape's factors may bring out (Scheffe 1953); its interval is that where it is largest, which may be a
+    corner that was not seen.
     """
     chosen: dict[int, list[SignificantShape]] = {}
     for fit in shapes:
-        candidates = [(k, s) for k, s in enumerate(fit.fitted.shapes) if s.kind != "bump"]
+        candidates = [shape for shape in fit.fitted.shapes if shape.kind != "bump"]
         if not candidates:
             continue
         front = front_of(surface, fit.component, field)
@@ -131,26 +134,32 @@ def significant(
         # Noise of blocks; the common error of larger places is added below.
         size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
         inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
-        for k, shape in candidates:
+        for shape in candidates:
             rows = cells_of_shape(surface, field, fit, shape)
             points, outward = with_corners(surface, rows)
             registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
             value = shape.values(fit.frame, points, outward)
+            noise = shape.sd(fit.frame, points, outward) * inflation
+            sd = np.sqrt(noise**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration**2)
             top = int(np.argmax(np.abs(value)))
-            formal = abs(value[top]) / max(np.sqrt(max(fit.fitted.gain[k], 1e-9)), 1e-9) * inflation
-            sd = float(np.sqrt(formal**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration[top] ** 2))
-            z = abs(float(value[top])) / sd
+            z = deviate_of_one(float((np.abs(value) / sd).max()), len(shape.factors))
             if z > threshold:
                 judged = SignificantShape(
                     shape=shape,
                     peak=float(value[top]),
-                    ci95=NORMAL_95 * sd,
+                    ci95=NORMAL_95 * float(sd[top]),
                     z=z,
                     chance=2.0 * float(ndtr(-z)) * len(shape_models.BASES) / area,
                     margin=fit.fitted.margin / inflation**2,
                 )
                 chosen.setdefault(fit.component, []).append(judged)
     return chosen
+
+
+def deviate_of_one(z: float, factors: int) -> float:
+    """Return the deviate of one factor that is as improbable as the largest, ``z``, of all sums of several factors."""
+    chance = float(chdtrc(factors, z**2))
+    return float(-ndtri(0.5 * chance)) if chance > LEAST_CHANCE else z
 
 
 def cells_of_shape(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from processor.adjustment import opposite_sides
+from processor.adjustment import moderated_variances, opposite_sides
 from processor.defects.alignment import Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
@@ -16,7 +16,7 @@ from processor.model import Bools, Floats, Ints
 
 POOLED_CELLS = 9  # side of the square over which noise is pooled
 ABOUT_CELLS, SEEN_SHARE = 3, 0.5  # side of the square about a cell, and the least share of it that was seen
-FEWEST_FREE = 20.0  # degrees of freedom below which the noise of all points is used
+LOCAL_FREE = 20.0  # degrees of freedom by which the noise about a cell is taken to be that of its face
 PIECE_CELLS = 6.0  # side of a piece of a face, whose mean is compared with that of the other side
 
 
@@ -28,7 +28,7 @@ class Field:
     ``inner`` are cells away from their face's border, ``seen`` those of them with enough points, and about them as
     well. ``stations`` is the variance by errors of the stations' movements, which neighbouring cells have in common; 0
     in cells without points. ``views`` is the standard deviation of what the points of one view have in common, where
-    views are not named, mm.
+    views are not named, mm. ``freedom`` (cells,) is of the variance; without it the variance is known.
     """
 
     deviation: Floats
@@ -40,6 +40,7 @@ class Field:
     seen: Floats  # 0 or 1
     stations: Floats
     views: float = 0.0
+    dof: Floats = dataclasses.field(default_factory=lambda: np.empty(0))
 
     def stations_sd(self, cells: Ints) -> float:
         """Return the standard deviation that cells have in common by errors of stations' movements or of views, mm."""
@@ -63,21 +64,12 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
     rays = rays_to(points, stations.positions[pairs.station])
     correction = alignment.corrections(points, outward, rays, pairs.station)
-    count = np.bincount(pairs.cell, pairs.count, cells)
+    count = np.bincount(pairs.cell, pairs.count, cells).astype(np.float64)
     divisor = np.maximum(count, 1.0)
     mean = np.bincount(pairs.cell, pairs.count * (pairs.mean - correction), cells) / divisor
-    dof = np.bincount(pairs.cell, np.maximum(pairs.count - 1, 0), cells).astype(np.float64)
-    square = np.bincount(pairs.cell, pairs.square, cells).astype(np.float64)
-    charts = surface.charts
-    noise = np.zeros(cells)
-    overall = float(square.sum() / max(dof.sum(), 1.0))
-    for chart in range(len(charts.kind)):
-        rows = charts.cells(chart)
-        pooled_square, pooled_dof = (_pooled(charts.image(x, chart), charts, chart) for x in (square, dof))
-        known = pooled_dof * POOLED_CELLS**2 > FEWEST_FREE
-        noise[rows] = np.where(known, pooled_square / np.maximum(pooled_dof, 1e-9), overall).ravel()
-    noise = np.sqrt(np.maximum(noise, 1e-6))
+    noise, dof = _noise(pairs, surface, count)
     stray, mixed = (np.bincount(pairs.cell, x, cells) for x in (pairs.stray, pairs.mixed))
+    charts = surface.charts
     variance, seen = noise**2 / divisor, inner * ((count + stray - mixed >= FEWEST_POINTS) & (count > 0))
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
@@ -96,7 +88,48 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
         seen=seen,
         stations=station_variance(pairs, surface, stations, alignment),
         views=views,
+        dof=dof,
     )
+
+
+def _noise(pairs: Pairs, surface: DesignSurface, count: Floats) -> tuple[Floats, Floats]:
+    """Return the standard deviation (cells,) of one point in each cell, mm, and the degrees of freedom of its square.
+
+    Noise differs between stations, by range and incidence: where a near one sees most of a face, and a far one alone a
+    cell of it, the noise of the face's points is not that of the cell's. Each station has a variance on each face. What
+    the scatter about a cell differs from these is a factor on them.
+    """
+    charts, chart = surface.charts, chart_of_cells(surface)[pairs.cell]
+    stations = int(pairs.station.max(initial=0)) + 1
+    free = np.maximum(pairs.count - 1, 0).astype(np.float64)
+    overall = float(pairs.square.sum() / max(free.sum(), 1.0))  # of a station that hardly shows its own
+    variance, dof = np.full(len(free), overall), np.full(len(free), LOCAL_FREE)
+    for station in range(stations):
+        rows = pairs.station == station
+        square_of, free_of = (
+            np.bincount(chart[rows], x[rows], len(charts.kind)).astype(np.float64) for x in (pairs.square, free)
+        )
+        if free_of.sum() > LOCAL_FREE:
+            known = moderated_variances.moderated(square_of, free_of)
+            variance[rows], dof[rows] = (x[chart[rows]] for x in known)
+    cells, part = len(surface.share), pairs.count * variance
+    total, observed, expected, local = (
+        np.bincount(pairs.cell, x, cells).astype(np.float64) for x in (part, pairs.square, free * variance, free)
+    )
+    # Satterthwaite's degrees of freedom of a sum of variances.
+    spread = np.bincount(pairs.cell, part**2 / np.maximum(dof, 1.0), cells)
+    factor = np.ones(cells)
+    for k in range(len(charts.kind)):
+        squares, wanted, frees = (_pooled(charts.image(x, k), charts, k) for x in (observed, expected, local))
+        ratio = squares / np.maximum(wanted, 1e-12)
+        weight = frees * POOLED_CELLS**2
+        factor[charts.cells(k)] = ((LOCAL_FREE + weight * ratio) / (LOCAL_FREE + weight)).ravel()
+    # Of a cell without points it is the noise of its face.
+    sums, numbers = (np.bincount(chart, x, len(charts.kind)) for x in (part, pairs.count))
+    of_face = np.where(numbers > 0.0, sums / np.maximum(numbers, 1.0), overall)
+    mean = np.where(count > 0.0, total / np.maximum(count, 1.0), of_face[chart_of_cells(surface)])
+    noise = np.sqrt(np.maximum(mean * factor, 1e-6))
+    return noise, total**2 / np.maximum(spread, 1e-12)
 
 
 def component_of_cells(surface: DesignSurface) -> Ints:

@@ -20,6 +20,7 @@ LEAST_COS = 0.2  # of incidence: points at a more oblique one are mostly of beam
 GATE_SDS = 4.0  # robust standard deviations from the median of a cell, beyond which a point is stray
 LEAST_GATE_MM = 1.0
 FEWEST_POINTS = 4  # of a cell, for its median to identify stray points
+FEWEST_OF_FACE = 40  # points of a station on a face, for their own robust standard deviation
 
 
 @dataclass(frozen=True)
@@ -124,9 +125,11 @@ def _of_scan(
         station = np.where(known[of_point], of_point, -1)
         facet[rows], deviation[rows] = mesh_distance.nearest_visible(grid, points[rows], scanners, station)
     near = np.flatnonzero(facet >= 0)
+    places, outward = _sighted(surface, facet[near], points[near], scanners[station_of[near]], known[station_of[near]])
     arm = scanners[station_of[near]] - points[near]
-    cosine = np.einsum("ni,ni->n", arm, surface.normals[facet[near]]) / np.linalg.norm(arm, axis=1)
-    on = near[~known[station_of[near]] | (cosine > LEAST_COS)]
+    cosine = np.einsum("ni,ni->n", arm, outward) / np.linalg.norm(arm, axis=1)
+    used = ~known[station_of[near]] | (cosine > LEAST_COS)
+    on, places = near[used], places[used]
     mixed = _at_outline(surface, facet[on], points[on], scanners[station_of[on]])
     mixed |= _passed_by(surface, grid, facet[on], points[on], deviation[on], scanners[station_of[on]])
     mixed &= known[station_of[on]]
@@ -138,7 +141,35 @@ def _of_scan(
             of_face = surface.normals[facet[on[rows]]], deviation[on[rows]], chart[rows]
             every = points[station_of == k], every_chart[station_of == k]
             mixed[rows] |= mixed_pixels.beside(points[on[rows]], positions[k], *of_face, every)
-    return chart, layout(surface.charts, chart, points[on]), station_of[on], deviation[on], mixed
+    return chart, layout(surface.charts, chart, places), station_of[on], deviation[on], mixed
+
+
+def _sighted(
+    surface: DesignSurface, facet: Ints, points: Floats, scanners: Floats, known: Bools
+) -> tuple[Floats, Floats]:
+    """Return places (n, 3) of points (n, 3) on their faces, and the outward normals (n, 3) there.
+
+    On a round face the place is where the line of sight from the scanner (n, 3) meets it, as noise along the line moves
+    a point around the face: by the nearest place, what is too far would gather near the outline, where the face ends
+    for the scanner, and what is too near would gather away from it. ``known`` (n,) marks scanners with a position.
+    """
+    charts, chart = surface.charts, surface.chart_of[facet]
+    places, outward = points.copy(), surface.normals[facet]
+    rows = np.flatnonzero((charts.kind[chart] == CYLINDER) & known)
+    axis, radius = charts.axes[chart[rows], 0], charts.radius[chart[rows]]
+    arm, sight = points[rows] - charts.origin[chart[rows]], points[rows] - scanners[rows]
+    arm, sight = (x - np.einsum("ni,ni->n", x, axis)[:, None] * axis for x in (arm, sight))
+    # The line of sight arm + t sight meets the circle about the axis where a t^2 + 2 b t + c = 0.
+    a, b = np.einsum("ni,ni->n", sight, sight), np.einsum("ni,ni->n", arm, sight)
+    inside = b**2 - a * (np.einsum("ni,ni->n", arm, arm) - radius**2)
+    meets = (inside > 0.0) & (a > 0.0)
+    rows, arm, sight, axis, a, b, inside = (x[meets] for x in (rows, arm, sight, axis, a, b, inside))
+    way = np.where(np.einsum("ni,ni->n", arm, outward[rows]) > 0.0, 1.0, -1.0)  # a hole is seen on its far side
+    t = (-b - way * np.sqrt(inside)) / a
+    places[rows] += t[:, None] * (points[rows] - scanners[rows])
+    out = arm + t[:, None] * sight
+    outward[rows] = way[:, None] * out / np.linalg.norm(out, axis=1)[:, None]
+    return places, outward
 
 
 def _at_outline(surface: DesignSurface, facet: Ints, points: Floats, scanners: Floats) -> Bools:
@@ -209,14 +240,72 @@ def paired(observed: Observed, surface: DesignSurface) -> Pairs:
     """Sum up the points by cell and station."""
     cell = cells_of(observed, surface)
     order = np.argsort(cell * len(observed.stations.names) + observed.station, kind="stable")
-    return Pairs(*pairs(cell[order], observed.station[order], observed.deviation[order], observed.mixed[order]))
+    cell, station, chart = cell[order], observed.station[order], observed.chart[order]
+    deviation, mixed = observed.deviation[order], observed.mixed[order]
+    sd = _robust_sd(off_median(cell, deviation, mixed), station, chart)
+    return Pairs(*pairs(cell, station, deviation, mixed, sd))
+
+
+def _robust_sd(off: Floats, station: Ints, chart: Ints) -> Floats:
+    """Return the robust standard deviation (n,) of the points of each point's station on its face, mm.
+
+    ``off`` (n,) are distances from the medians of cells, NaN where a cell has too few points. The points of one cell
+    alone show it badly: of four, the nearest three may agree by chance.
+    """
+    known = np.flatnonzero(np.isfinite(off))
+    of_face, of_station = (
+        medians(off[known], group[known], int(group.max(initial=0)) + 1, FEWEST_OF_FACE)
+        for group in (station * (int(chart.max(initial=0)) + 1) + chart, station)
+    )
+    own = of_face[station * (int(chart.max(initial=0)) + 1) + chart]
+    sd: Floats = 1.4826 * np.where(np.isfinite(own), own, np.nan_to_num(of_station[station]))
+    return sd
+
+
+def medians(values: Floats, group: Ints, groups: int, fewest: int) -> Floats:
+    """Return the median (groups,) of the values (n,) of each group; NaN for a group of fewer than ``fewest``."""
+    order = np.lexsort([values, group])
+    count = np.bincount(group, minlength=groups)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    enough = np.flatnonzero(count >= fewest)
+    median = np.full(groups, np.nan)
+    low, high = (values[order[first[enough] + (count[enough] - k) // 2]] for k in (1, 0))
+    median[enough] = 0.5 * (low + high)
+    return median
+
+
+@njit(cache=True, nogil=True)
+def off_median(cell: Ints, deviation: Floats, mixed: Bools) -> Floats:
+    """Return the distances (n,) from the median of the pure points of a cell, of points sorted by cell.
+
+    NaN for mixed points and in a cell of fewer than FEWEST_POINTS. The median is of the points themselves: the distance
+    is that from the expected value after multiplication by (n / (n - 1))^(1/2).
+    """
+    off = np.full(len(cell), np.nan)
+    start = 0
+    while start < len(cell):
+        end = start
+        while end < len(cell) and cell[end] == cell[start]:
+            end += 1
+        pure = deviation[start:end][~mixed[start:end]]
+        n = len(pure)
+        if n >= FEWEST_POINTS:
+            middle = np.median(pure)
+            for i in range(start, end):
+                if not mixed[i]:
+                    off[i] = abs(deviation[i] - middle) * np.sqrt(n / (n - 1.0))
+        start = end
+    return off
 
 
 @njit(cache=True, nogil=True)
 def pairs(
-    cell: Ints, station: Ints, deviation: Floats, mixed: Bools
+    cell: Ints, station: Ints, deviation: Floats, mixed: Bools, sd: Floats
 ) -> tuple[Ints, Ints, Ints, Ints, Floats, Floats, Ints]:
-    """Return the columns of :class:`Pairs` of points sorted by cell and station (Welford's algorithm)."""
+    """Return the columns of :class:`Pairs` of points sorted by cell and station (Welford's algorithm).
+
+    ``sd`` (n,) is the robust standard deviation of a point: what is within GATE_SDS of it is not stray.
+    """
     n = len(cell)
     total = 0
     for i in range(n):
@@ -240,7 +329,7 @@ def pairs(
                 at += 1
                 cells[at], stations[at] = cell[i], station[i]
             value = deviation[i]
-            if mixed[i] or abs(value - middle) > gate:
+            if mixed[i] or abs(value - middle) > max(gate, GATE_SDS * sd[i]):
                 stray[at] += 1
                 beside[at] += mixed[i]
                 continue

@@ -3,17 +3,19 @@
 Square windows of many sizes are moved over each face in steps of a quarter of their side. The weighted mean of a window
 is compared with its standard deviation. The threshold of a size follows from the number of windows of that size on the
 surface by Bonferroni's bound, so that all sizes together keep the rate of false alarms. Noise that is correlated
-between points shows in the scatter of the windows' means, and raises the thresholds.
+between points shows in the scatter of the windows' means, and raises the thresholds. A variance that few points show is
+widened to Student's t at the threshold.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr, ndtri, stdtrit
 
 from processor.defects.deviation_field import Field
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
@@ -97,7 +99,7 @@ def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float, syste
 
 def search(field: Field, surface: DesignSurface, levels: Levels) -> Finding:
     """Search from small windows to large; cells of a region do not count in larger windows."""
-    charts = surface.charts
+    charts, field = surface.charts, _widened(field, levels)
     count = len(surface.share)
     finding = Finding(np.zeros(count, np.int8), np.zeros(count), np.full(count, np.inf))
     for chart in _used(field, charts):
@@ -107,6 +109,15 @@ def search(field: Field, surface: DesignSurface, levels: Levels) -> Finding:
         finding.z[rows] = of_chart.z.ravel()
         finding.chance[rows] = of_chart.chance.ravel()
     return finding
+
+
+def _widened(field: Field, levels: Levels) -> Field:
+    """Return the field with the variances by which a cell exceeds its threshold as often as Student's t does."""
+    if not len(field.dof):
+        return field
+    threshold = float(levels.threshold[0])
+    student = -stdtrit(np.maximum(field.dof, 1.0), ndtr(-threshold))
+    return dataclasses.replace(field, variance=field.variance * (student / threshold) ** 2)
 
 
 def _used(field: Field, charts: Charts) -> list[int]:

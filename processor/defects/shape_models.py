@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -50,17 +50,26 @@ At = tuple[float, ...]  # parameters of a shape other than its factors
 
 @dataclass(frozen=True)
 class Shape:
-    """One shape: its kind, its parameters and its factors (k,)."""
+    """One shape: its kind, its parameters, its factors (k,) and their covariance (k, k) by the noise of blocks."""
 
     kind: str
     at: At
     factors: Floats
+    covariance: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
     def values(self, frame: Frame, points: Floats, outward: Floats) -> Floats:
         """Return the shape's deviations (n,) at points (n, 3) with unit normals (n, 3), mm."""
-        columns = BASES[self.kind](frame.local(points), outward @ frame.axes.T, frame.half, self.at)
-        deviations: Floats = columns @ self.factors
+        deviations: Floats = self._columns(frame, points, outward) @ self.factors
         return deviations
+
+    def sd(self, frame: Frame, points: Floats, outward: Floats) -> Floats:
+        """Return the standard deviation (n,) of the shape's deviations there by the noise of blocks, mm."""
+        columns = self._columns(frame, points, outward)
+        deviations: Floats = np.sqrt(np.einsum("ni,ij,nj->n", columns, self.covariance, columns))
+        return deviations
+
+    def _columns(self, frame: Frame, points: Floats, outward: Floats) -> Floats:
+        return BASES[self.kind](frame.local(points), outward @ frame.axes.T, frame.half, self.at)
 
 
 @dataclass(frozen=True)
@@ -109,11 +118,14 @@ class Observations:
         """Return the factors (k,) of columns (n, k) by weighted least squares."""
         if not columns.shape[1]:
             return np.empty(0)
-        weight = self.blocks.weight
-        A = columns.T @ (weight[:, None] * columns)
-        ridge = WEAK * np.trace(A) / len(A) + 1e-12
-        factors: Floats = np.linalg.solve(A + ridge * np.eye(len(A)), columns.T @ (weight * self.blocks.mean))
+        top = columns.T @ (self.blocks.weight * self.blocks.mean)
+        factors: Floats = np.linalg.solve(self._normal_matrix(columns), top)
         return factors
+
+    def _normal_matrix(self, columns: Floats) -> Floats:
+        A: Floats = columns.T @ (self.blocks.weight[:, None] * columns)
+        ridge = WEAK * np.trace(A) / len(A) + 1e-12
+        return A + ridge * np.eye(len(A))
 
     def residual(self, columns: Floats) -> tuple[Floats, float]:
         """Return the residuals (n,) of the fit of columns (n, k), and their chi-square."""
@@ -122,12 +134,15 @@ class Observations:
 
     def shapes(self, chosen: list[tuple[str, At]]) -> tuple[Shape, ...]:
         """Return shapes fitted together."""
-        factors = self.factors(self.columns(chosen))
+        if not chosen:
+            return ()
+        columns = self.columns(chosen)
+        factors, covariance = self.factors(columns), np.linalg.inv(self._normal_matrix(columns))
         shapes, start = [], 0
         for kind, at in chosen:
-            width = BASES[kind](self.p[:1], self.n[:1], self.frame.half, at).shape[1]
-            shapes.append(Shape(kind, at, factors[start : start + width]))
-            start += width
+            own = slice(start, start + BASES[kind](self.p[:1], self.n[:1], self.frame.half, at).shape[1])
+            shapes.append(Shape(kind, at, factors[own], covariance[own, own]))
+            start = own.stop
         return tuple(shapes)
 
     def weighted(self, weight: Floats) -> Observations:

@@ -1,5 +1,7 @@
 """Which cells of a design are examined, and what is taken of the errors of views that are not named."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -136,3 +138,35 @@ def test_the_pose_of_unnamed_views_has_the_covariance_of_the_class():
     np.testing.assert_allclose(np.diag(added)[:3], (0.2 / arm) ** 2, rtol=0.06)
     np.testing.assert_allclose(np.diag(added)[3:], 0.08, rtol=0.06)
     assert unnamed.pose_covariance()[3, 3] > scanner_class.SHIFT_MM**2
+
+
+def test_a_cell_that_a_far_station_sees_alone_has_its_noise():
+    """A near station sees most of each face with little noise, a far one a few cells of it alone, with much."""
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
+    rng, cells = np.random.default_rng(3), np.flatnonzero(surface.share > 0.5)
+    alone = rng.random(len(cells)) < 0.05
+    sd, count = np.where(alone, 1.2, 0.3), np.where(alone, 5, 20)
+    square = sd**2 * rng.chisquare(count - 1.0)
+    none, station = np.zeros(len(cells), np.int64), alone.astype(np.int64)
+    pairs = Pairs(cells, station, count, none, rng.normal(0.0, sd / np.sqrt(count)), square, none)
+    stations = Stations(("near", "far"), np.vstack([SCANNER, 3.0 * SCANNER]))
+    still, inner = alignment.none(surface, 2, 0.0), deviation_field.inner_cells(surface, EDGE)
+    field = deviation_field.of_pairs(pairs, surface, stations, still, inner)
+    for of_station in (alone, ~alone):
+        z = (field.deviation / np.sqrt(field.variance))[cells[of_station]]
+        assert np.sqrt((z**2).mean()) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * len(z)))
+    assert (field.dof[cells] > 100.0).all()
+
+
+def test_few_degrees_of_freedom_need_larger_deviations():
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
+    known = dataclasses.replace(field_of(surface, pairs_of(surface, 1)), dof=np.empty(0))
+    levels = scan_statistic.levels_of(known, surface, 1e-8, 0.0)
+    up = np.flatnonzero((known.seen > 0) & (surface.outward[:, 2] > 0.5))
+    deviation = known.deviation.copy()
+    deviation[up[len(up) // 2]] = 1.15 * levels.threshold[0] * levels.inflation[0] * np.sqrt(known.variance[up[0]])
+    found = {}
+    for dof in (30.0, 1e6):
+        field = dataclasses.replace(known, deviation=deviation, dof=np.full(len(deviation), dof))
+        found[dof] = bool(scan_statistic.search(field, surface, levels).sign.any())
+    assert found == {30.0: False, 1e6: True}

@@ -7,7 +7,7 @@ import trimesh
 from scipy.stats import poisson
 
 import designgen
-from processor.defects import detect, shape_models, step, surface_charts
+from processor.defects import component_shapes, detect, shape_models, step, surface_charts
 from processor.defects.component_shapes import ComponentShape, SignificantShape
 from processor.defects.movement import moved_bodies
 from processor.model import DesignBodies, Scene
@@ -134,3 +134,21 @@ def test_bodies_of_one_name_and_without_a_name_are_numbered_and_counted():
     assert (named.shared, named.unnamed) == (2, 1)
     said = [one.code for one in detect._of_names(named)]
     assert said == ["defects.names-shared", "defects.names-missing"]
+
+
+def test_a_movement_is_as_uncertain_at_an_unseen_corner_as_it_scatters_there():
+    """Of a beam of which a third was seen, the fitted movement of the far end is turned by the noise of that third."""
+    frame = shape_models.Frame(np.zeros(3), np.eye(3), np.array([1500.0, 150.0, 6.0]), 150.0)
+    rng, sigma = np.random.default_rng(4), 0.2
+    places = np.stack([rng.uniform(-1500.0, -500.0, 80), rng.uniform(-150.0, 150.0, 80), np.full(80, 6.0)], axis=1)
+    up, weight = np.tile([0.0, 0.0, 1.0], (80, 1)), np.full(80, sigma**-2)
+    corners, z, beyond = np.array([[1500.0, 150.0, 6.0], [-1000.0, 0.0, 6.0]]), [], 0
+    for _ in range(400):
+        blocks = shape_models.Blocks(places, up, rng.normal(0.0, sigma, 80), weight, 50.0)
+        seen = shape_models.Observations(blocks, frame, places, up)
+        (shape,) = seen.shapes([(shape_models.RIGID, ())])
+        z.append(shape.values(frame, corners, up[:2]) / shape.sd(frame, corners, up[:2]))
+        everywhere = np.abs(shape.values(frame, places, up)) / shape.sd(frame, places, up)
+        beyond += component_shapes.deviate_of_one(float(everywhere.max()), len(shape.factors)) > 1.96
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(z), axis=0)), 1.0, atol=4.0 / np.sqrt(800.0))
+    assert beyond < 0.05 * 400 + 3.0 * np.sqrt(0.05 * 400)  # a bound, for the three factors that are seen of six

@@ -1,0 +1,49 @@
+"""Variances of small groups: what is known of them by all groups, on groups whose law is given."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from processor.adjustment import moderated_variances
+
+LAW, COMMON = 12.0, 0.5
+
+
+def groups(seed, law=LAW, count=400):
+    """True variances of groups by a scaled inverse chi-square law, their sums of squares and degrees of freedom."""
+    rng = np.random.default_rng(seed)
+    dof = rng.integers(1, 30, count).astype(float)
+    true = COMMON * law / rng.chisquare(law, count) if np.isfinite(law) else np.full(count, COMMON)
+    return rng, true, true * rng.chisquare(dof), dof
+
+
+def test_means_by_their_moderated_deviation_follow_students_law():
+    beyond, number = 0, 0
+    for seed in range(20):
+        rng, true, square, dof = groups(seed)
+        found = moderated_variances.moderated(square, dof)
+        t = rng.normal(0.0, np.sqrt(true)) / np.sqrt(found.variance)
+        beyond += int((2.0 * stats.t.sf(np.abs(t), found.dof) < 0.01).sum())
+        number += len(t)
+    assert beyond == pytest.approx(0.01 * number, abs=4.0 * np.sqrt(0.01 * number))
+
+
+def test_moderated_variances_are_nearer_to_the_true_ones():
+    _, true, square, dof = groups(1)
+    found = moderated_variances.moderated(square, dof)
+    few = dof < 6.0
+    off, before = (np.abs(np.log(x[few] / true[few])).mean() for x in (found.variance, square / dof))
+    assert off < 0.7 * before
+
+
+def test_groups_of_one_variance_have_it():
+    _, _, square, dof = groups(2, law=np.inf)
+    found = moderated_variances.moderated(square, dof)
+    np.testing.assert_allclose(found.variance, COMMON, rtol=0.2)
+    assert found.dof.min() > 50.0
+
+
+def test_groups_without_points_have_the_common_variance():
+    found = moderated_variances.moderated(np.array([0.0, 20.0]), np.array([0.0, 40.0]))
+    assert found.variance[0] == pytest.approx(0.5)
+    assert found.dof[0] == moderated_variances.ASSUMED_FREE
