@@ -259,6 +259,12 @@ def test_surfaces_that_no_two_epochs_saw_are_unknown():
     assert third.finding is Finding.WITHIN  # the second says nothing, and does not take the third with it
 
 
+def test_the_other_side_of_a_thin_plate_is_another_place():
+    first, below = surface(np.zeros(20)), surface(np.full(20, 9.0), shift=-9.0)
+    turned = dataclasses.replace(below, core=dataclasses.replace(below.core, normals=-below.core.normals))
+    assert {one.finding for one in findings(deviation, first, turned).values()} == {Finding.UNKNOWN}
+
+
 def box(shift, sides, n=200, seed=4, lod95=0.4):
     """A body of 2 x 0.2 x 0.4 m moved by ``shift``, of which the faces ``sides`` (axis, sign) are seen."""
     rng = np.random.default_rng(seed)
