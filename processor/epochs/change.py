@@ -1,10 +1,12 @@
 """Changes of values between epochs, with their 95 % intervals, and whether a component changed.
 
 The errors of two epochs are taken as independent: the half-width of a change is the root of the sum of both squares.
-Errors that both have in common cancel in the change, so that the interval is then too wide, never too narrow. A
-component has many values, of which one in twenty leaves its interval by chance: a component is called changed where a
-change exceeds its interval widened for the number of changes that were looked at (Bonferroni), so that of all
-components that did not change 5 % at most are called so.
+Of errors that the intervals of both hold and that are the same at both, the change is free, and its interval is too
+wide. Errors that no interval holds are not in that of the change either: the expansion of steel by another temperature,
+scale and offset of another scanner; the remarks of a comparison name them. A component has many values, of which one in
+twenty leaves its interval by chance: a component is called changed where a change exceeds its interval widened for the
+number of changes that were looked at (Bonferroni), so that of all components that did not change 5 % at most are called
+so, as far as the intervals hold all errors.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from processor.epochs.series import Series
+from processor.epochs.series import Kind, Series
 from processor.model import NORMAL_95, Word
 
 
@@ -66,15 +68,17 @@ class Component:
 
     step: str
     name: str
+    kind: Kind
     finding: Finding
     changes: tuple[Change, ...]
     leading: Change | None  # None where nothing is known
     since: int | None  # row of the first epoch at which it had changed
+    follows: tuple[str, ...] = ()  # balls that changed, and whose places alone changed it
 
 
 def of_component(step: str, name: str, found: Sequence[Series]) -> Component:
     """Compare the values of one component over the epochs."""
-    looked_at = sum(series.chosen_from * len(_later(series)) for series in found)
+    looked_at = sum(max(len(_rows(series)) - 1, 0) for series in found if _has_intervals(series))
     changes = [change for series in found for change in _changes(series, looked_at)]
     sure = [change for change in changes if change.surely and not change.doubtful]
     doubtful = [change for change in changes if change.surely and change.doubtful]
@@ -85,28 +89,35 @@ def of_component(step: str, name: str, found: Sequence[Series]) -> Component:
     return Component(
         step=step,
         name=name,
+        kind=found[0].kind,
         finding=finding,
         changes=tuple(changes),
-        leading=_leading(sure or doubtful or known),
+        leading=leading(sure or doubtful or known),
         since=min((change.last for change in sure or doubtful), default=None),
     )
 
 
-def _leading(changes: Sequence[Change]) -> Change | None:
+def leading(changes: Sequence[Change]) -> Change | None:
     """Return the strongest change up to the last epoch that has one."""
     last = max((change.last for change in changes), default=0)
     return max((change for change in changes if change.last == last), key=lambda one: one.strength, default=None)
 
 
-def _later(series: Series) -> list[int]:
-    """Return the rows of the epochs with a value and an interval, but for the first of them."""
-    rows: list[int] = np.flatnonzero(np.isfinite(series.value) & np.isfinite(series.ci95)).tolist()
-    return rows[1:]
+def _rows(series: Series) -> list[int]:
+    """Return the epochs that are compared: those with a value and an interval; if fewer than two, with a value."""
+    value = np.isfinite(series.value)
+    with_interval = value & np.isfinite(series.ci95)
+    rows: list[int] = np.flatnonzero(with_interval if with_interval.sum() > 1 else value).tolist()
+    return rows
+
+
+def _has_intervals(series: Series) -> bool:
+    return bool(np.isfinite(series.ci95[_rows(series)]).sum() > 1)
 
 
 def _changes(series: Series, looked_at: int) -> Iterable[Change]:
-    rows = np.flatnonzero(np.isfinite(series.value)).tolist()
-    factor = float(ndtri(1.0 - 0.025 / max(looked_at, 1))) / NORMAL_95
+    rows = _rows(series)
+    factor = float(ndtri(1.0 - 0.025 / (max(looked_at, 1) * series.chosen_from))) / NORMAL_95
     alone = float(ndtri(1.0 - 0.025 / series.chosen_from)) / NORMAL_95
     for row in rows[1:]:
         half = float(np.hypot(series.ci95[rows[0]], series.ci95[row]))

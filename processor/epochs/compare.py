@@ -13,10 +13,11 @@ import numpy as np
 from processor.epochs import change
 from processor.epochs.change import Component, Finding
 from processor.epochs.epoch import Epoch
-from processor.epochs.series import Series
+from processor.epochs.series import Kind, Series
 from processor.model import InputError, Reason, reason
 from processor.pipeline import package_of, step_modules
 
+BEYOND = (Finding.CHANGED, Finding.DOUBTFUL)
 NOT_COMPARED = ("stitch",)  # of scanners' places, which are others each time
 
 
@@ -30,8 +31,12 @@ class History:
     remarks: tuple[Reason, ...]
 
     def count(self, finding: Finding) -> int:
-        """Return how many components have this finding."""
-        return sum(component.finding is finding for component in self.components)
+        """Return how many components have this finding; one that follows others does not count."""
+        return sum(component.finding is finding and not component.follows for component in self.components)
+
+    def of_kind(self, kind: Kind) -> list[Component]:
+        """Return the components of a kind."""
+        return [component for component in self.components if component.kind is kind]
 
 
 def compare(epochs: Sequence[Epoch]) -> History:
@@ -53,7 +58,7 @@ def compare(epochs: Sequence[Epoch]) -> History:
             "expected runs of one structure"
         )
     return History(
-        name=str(epochs[-1].facts.get("name", "")), epochs=tuple(epochs), components=tuple(components),
+        name=str(epochs[-1].facts.get("name", "")), epochs=tuple(epochs), components=_followed(components),
         remarks=tuple(remarks),
     )  # fmt: skip
 
@@ -73,6 +78,24 @@ def _components(step: str, found: Sequence[Series]) -> Iterator[Component]:
         by_name.setdefault(one.component, []).append(one)
     for name, of_it in by_name.items():
         yield change.of_component(step, name, of_it)
+
+
+def _followed(components: Sequence[Component]) -> tuple[Component, ...]:
+    """Say of components that changed by the places of balls alone which balls these are: it is one movement.
+
+    Where something else changed too, that is the component's leading change.
+    """
+    moved = {one.name for one in components if one.kind is Kind.BALL and one.finding in BEYOND}
+    return tuple(_following(one, moved) if one.finding in BEYOND else one for one in components)
+
+
+def _following(component: Component, moved: set[str]) -> Component:
+    sure = [one for one in component.changes if one.surely]
+    own = [one for one in sure if not moved.intersection(one.series.between)]
+    if own:
+        return replace(component, leading=change.leading([one for one in own if not one.doubtful] or own))
+    balls = (ball for one in sure for ball in one.series.between if ball in moved)
+    return replace(component, follows=tuple(dict.fromkeys(balls)))
 
 
 def _common(epochs: Sequence[Epoch]) -> Iterator[Reason]:

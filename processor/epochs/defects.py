@@ -1,8 +1,9 @@
 """Epochs of step ``defects``: the depth of each defect.
 
 Defects of two epochs are one defect if they are of one component and the centre of either lies within the extent of the
-other. At an epoch that did not find a defect but saw its place its depth is zero, with the least depth that is found
-there for half-width; at one that did not see the place it is not known.
+other; of several the nearest. At an epoch that did not find a defect but saw its place its depth is zero, with the
+least depth that is found there for half-width; at one that did not see the place it is not known. The zero is doubtful
+where another defect of that epoch covers the place: what was one defect may be two pieces at another epoch.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.defects.result import Defects, Result
-from processor.epochs.series import Series
+from processor.epochs.series import Kind, Series
 from processor.language.messages import text
-from processor.model import Floats, Reason, Status, reason
+from processor.model import Floats, Reason, reason
 
 BY_DESIGN = True
 Found = list[tuple[int, int]]  # epoch and row of one defect
@@ -28,14 +29,22 @@ def series(results: Sequence[Result | None]) -> Iterator[Series]:
         newest = results[e]
         assert newest is not None
         table = newest.defects
-        values = [_depth(result, dict(same).get(k), table, row) for k, result in enumerate(results)]
+        found = dict(same)
+        values = [_depth(result, found.get(k), table, row) for k, result in enumerate(results)]
         value, half, doubt = np.array(values).T
+        covered = np.array([k not in found and _is_covered(results, k, (e, row)) for k in range(len(results))])
         x, y, z = table.centre[row].tolist()
         quantity = text(
-            "{defect_class} at {x:.0f}, {y:.0f}, {z:.0f}, depth", defect_class=table.defect_class[row], x=x, y=y, z=z
-        )
+            "{defect_class} at {x:.0f}, {y:.0f}, {z:.0f}, depth inward",
+            defect_class=table.defect_class[row], x=x, y=y, z=z,
+        )  # fmt: skip
         yield Series(
-            component=table.component[row] or "surface", quantity=quantity, value=value, ci95=half, doubtful=doubt > 0.0
+            component=table.component[row] or "surface",
+            kind=Kind.WITH_DEFECTS,
+            quantity=quantity,
+            value=value,
+            ci95=half,
+            doubtful=(doubt > 0.0) | covered,
         )
 
 
@@ -49,14 +58,29 @@ def _same_defects(results: Sequence[Result | None]) -> list[Found]:
     """Group the defects of all epochs that are one; each group has one an epoch at most."""
     groups: list[Found] = []
     for e, result in enumerate(results):
-        for row in range(0 if result is None else len(result.defects)):
-            assert result is not None
-            group = next((one for one in groups if _is_same(results, one[-1], (e, row))), None)
-            if group is None:
-                groups.append([(e, row)])
-            else:
-                group.append((e, row))
+        new = [(e, row) for row in range(0 if result is None else len(result.defects))]
+        pairs = [
+            (_apart(results, group[-1], one), k, row)
+            for k, group in enumerate(groups)
+            for row, one in enumerate(new)
+            if _is_same(results, group[-1], one)
+        ]
+        known, placed = set(), set()
+        for _, k, row in sorted(pairs):
+            if k not in known and row not in placed:
+                known.add(k)
+                placed.add(row)
+                groups[k].append(new[row])
+        groups += [[one] for row, one in enumerate(new) if row not in placed]
     return groups
+
+
+def _apart(results: Sequence[Result | None], one: tuple[int, int], other: tuple[int, int]) -> float:
+    """Distance of the centres of two defects, each an epoch and a row."""
+    a, b = results[one[0]], results[other[0]]
+    assert a is not None
+    assert b is not None
+    return float(np.linalg.norm(b.defects.centre[other[1]] - a.defects.centre[one[1]]))
 
 
 def _is_same(results: Sequence[Result | None], earlier: tuple[int, int], later: tuple[int, int]) -> bool:
@@ -70,6 +94,12 @@ def _is_same(results: Sequence[Result | None], earlier: tuple[int, int], later: 
     return _covers(a.defects, i, between) or _covers(b.defects, j, -between)
 
 
+def _is_covered(results: Sequence[Result | None], e: int, one: tuple[int, int]) -> bool:
+    """Whether any defect of an epoch is at the place of a defect of another."""
+    result = results[e]
+    return result is not None and any(_is_same(results, one, (e, row)) for row in range(len(result.defects)))
+
+
 def _covers(defects: Defects, row: int, away: Floats) -> bool:
     """Whether a place so far ``away`` from a defect's centre lies within its extent, and as near to its face."""
     along = np.abs(defects.axes[row] @ away)
@@ -79,7 +109,7 @@ def _covers(defects: Defects, row: int, away: Floats) -> bool:
 
 def _depth(result: Result | None, row: int | None, like: Defects, at: int) -> tuple[float, float, float]:
     """Return depth and half-width of a defect in an epoch, ``row`` None if it did not find it, and 1 for doubtful."""
-    if result is None or result.status is Status.FAILED:
+    if result is None:
         return np.nan, np.nan, 0.0
     if row is not None:
         defects = result.defects

@@ -1,8 +1,12 @@
-"""Epochs of step ``deviation``: how far the surface of each component moved, on average and where it moved most.
+"""Epochs of step ``deviation``: how far the surface of each component moved: on average, as a body, and at most.
 
-The mean of a component has an interval as if the errors of all its core points were the same, which no correlation can
-exceed. Core points are the same ones at two epochs where the design's surface was sampled alike; the one that changed
-most by its levels of detection stands for all, its interval widened for their number.
+All is over the places that the epochs have in common, as another part of the same surface has another mean: core points
+nearer than half their spacing, on the same side. The movement of a body is that part of its deviations that a rigid
+motion explains, at its middle; opposite faces cancel in the mean, and not in the movement. Intervals are as if the
+errors of all core points were the same, with the worst signs, which no correlation can exceed.
+
+The core point that changed most, by its levels of detection, stands for all, its interval widened for their number. It
+is found only where the epochs have the same core points, as the design's surface was sampled alike.
 """
 
 from __future__ import annotations
@@ -15,49 +19,86 @@ from scipy.spatial import cKDTree
 
 from processor.deviation.result import ErrorSource, Result
 from processor.deviation.verdicts import WHOLE
-from processor.epochs.series import Series
+from processor.epochs.series import Kind, Series, strongest
 from processor.language.messages import text
 from processor.model import Bools, Floats, Ints, Reason, Status, reason
 
 BY_DESIGN = True
+NAN = float("nan")
 SAME_MM = 0.01  # core points of one place
+LEAST_DETERMINED = 0.1  # singular value by the greatest, below which a direction of a rigid motion is not determined
+DETERMINED_SHARE = 0.99  # of an axis, within the directions that are
 
 
 @dataclass(frozen=True)
 class _Core:
-    """Core points of a component at one epoch: places (r, 3), distances (r,) and levels of detection (r,)."""
+    """Core points of a component at one epoch: places and normals (r, 3), distances (r,), levels of detection (r,)."""
 
     places: Floats
+    normals: Floats
     distance: Floats
     lod95: Floats
 
     @classmethod
     def of(cls, result: Result | None, rows: Ints | None) -> _Core:
         if result is None or rows is None:
-            return cls(np.empty((0, 3)), np.empty(0), np.empty(0))
+            return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
         core = result.core
-        return cls(core.points[rows] + result.origin, core.distance[rows], core.lod95[rows])
+        return cls(core.points[rows] + result.origin, core.normals[rows], core.distance[rows], core.lod95[rows])
+
+    @property
+    def spacing(self) -> float:
+        """Median distance of a core point from its nearest; 0 of one alone."""
+        return float(np.median(cKDTree(self.places).query(self.places, 2)[0][:, 1])) if len(self.places) > 1 else 0.0
+
+    def sided(self, reach: float) -> Floats:
+        """Places with normals as further coordinates (r, 6), such that what faces away is farther than ``reach``."""
+        return np.hstack([self.places, reach * self.normals])
+
+    def at(self, rows: Ints) -> tuple[Floats, Floats]:
+        """Return distances and levels of detection (c,) of core points by their rows (c,)."""
+        return self.distance[rows], self.lod95[rows]
 
 
 def series(results: Sequence[Result | None]) -> Iterator[Series]:
-    """Yield the mean deviation of each component, and that of its core point that changed most."""
-    doubtful = np.array([one is not None and _unsure(one) for one in results], np.bool_)
-    for name in dict.fromkeys(name for one in results if one is not None for name in one.bodies or (WHOLE,)):
-        marked = [None if one is None else _of_body(one, name) for one in results]
-        pairs = [_mean(one, rows) for one, rows in zip(results, marked, strict=True)]
-        value, half = np.array(pairs).T
-        yield Series(component=name, quantity=text("mean deviation"), value=value, ci95=half, doubtful=doubtful)
-        yield from _strongest(name, results, marked, doubtful)
+    """Yield the mean deviation of each component, the movement of each body, and the core point that changed most."""
+    doubtful = np.array([one is not None and _is_unsure(one) for one in results], np.bool_)
+    with_bodies = all(one is None or len(one.bodies) for one in results)
+    for name in _names(results):
+        cores = _cores(results, name)
+        common = _in_common(cores, 0.5 * max(core.spacing for core in cores))
+        values = [core.at(rows) for core, rows in zip(cores, common, strict=True)]
+        value, half = np.array([(np.mean(d), np.mean(lod95)) if len(d) else (NAN, NAN) for d, lod95 in values]).T
+        yield Series(
+            component=name, kind=Kind.SURFACE, quantity=text("mean deviation"), value=value, ci95=half,
+            doubtful=doubtful,
+        )  # fmt: skip
+        if with_bodies:
+            yield from _movement(name, cores, common, doubtful)
+        yield from _strongest(name, cores, doubtful)
 
 
 def remarks(results: Sequence[Result | None]) -> Iterator[Reason]:
-    """Say what deviations of two epochs have in common."""
-    if sum(result is not None for result in results) > 1:
-        yield reason("epochs.registered-to-design")
+    """Say what deviations of two epochs have in common, and whether their core points are the same."""
+    if sum(result is not None for result in results) < 2:
+        return
+    yield reason("epochs.registered-to-design")
+    compared = [cores for cores in (_cores(results, name) for name in _names(results)) if _with_points(cores) > 1]
+    elsewhere = [cores for cores in compared if _known(_in_common(cores, SAME_MM)) < 2]
+    if elsewhere:
+        yield reason("epochs.core-points-elsewhere", count=len(elsewhere), total=len(compared))
 
 
-def _unsure(result: Result) -> bool:
-    return result.status in (Status.FAILED, Status.AMBIGUOUS) or result.registration_error_from is ErrorSource.UNKNOWN
+def _names(results: Sequence[Result | None]) -> list[str]:
+    return list(dict.fromkeys(name for one in results if one is not None for name in one.bodies or (WHOLE,)))
+
+
+def _cores(results: Sequence[Result | None], name: str) -> list[_Core]:
+    return [_Core.of(result, None if result is None else _of_body(result, name)) for result in results]
+
+
+def _is_unsure(result: Result) -> bool:
+    return result.status is Status.AMBIGUOUS or result.registration_error_from is ErrorSource.UNKNOWN
 
 
 def _of_body(result: Result, name: str) -> Ints:
@@ -71,43 +112,83 @@ def _of_body(result: Result, name: str) -> Ints:
     return np.flatnonzero(known)
 
 
-def _mean(result: Result | None, rows: Ints | None) -> tuple[float, float]:
-    if result is None or rows is None or not len(rows):
-        return np.nan, np.nan
-    return float(result.core.distance[rows].mean()), float(result.core.lod95[rows].mean())
+def _with_points(cores: Sequence[_Core]) -> int:
+    return sum(len(core.places) > 0 for core in cores)
 
 
-def _strongest(
-    name: str, results: Sequence[Result | None], marked: Sequence[Ints | None], doubtful: Bools
-) -> Iterator[Series]:
-    """Yield the deviation at the core point that changed most of those that all epochs with the component have."""
-    known = [e for e, rows in enumerate(marked) if rows is not None and len(rows)]
+def _known(rows: Sequence[Ints]) -> int:
+    return sum(len(one) > 0 for one in rows)
+
+
+def _in_common(cores: Sequence[_Core], reach: float) -> list[Ints]:
+    """Return the rows (c,) of the core points, epoch by epoch, at the places that the epochs have in common.
+
+    Places are core points of the first epoch with the component, and those of the others are the nearest within
+    ``reach``. The epochs that have most of them are taken first; one that shares none with all of these has no rows.
+    """
+    rows = [np.empty(0, np.int64) for _ in cores]
+    known = [e for e, core in enumerate(cores) if len(core.places)]
+    if not known:
+        return rows
+    first = cores[known[0]].sided(reach)
+    nearest = {e: cKDTree(cores[e].sided(reach)).query(first, distance_upper_bound=reach) for e in known}
+    places, taken = np.arange(len(first)), []
+    for e in sorted(known, key=lambda e: -int(np.isfinite(nearest[e][0]).sum())):
+        shared = places[np.isfinite(nearest[e][0][places])]
+        if len(shared):
+            places = shared
+            taken.append(e)
+    for e in taken:
+        rows[e] = nearest[e][1][places]
+    return rows
+
+
+def _movement(name: str, cores: Sequence[_Core], common: Sequence[Ints], doubtful: Bools) -> Iterator[Series]:
+    """Yield the movement of a body from its design along x, y and z, as far as its surface seen determines them."""
+    first = next((e for e, rows in enumerate(common) if len(rows)), None)
+    if first is None:
+        return
+    core, rows = cores[first], common[first]
+    solve, determined = _rigid_motion(core.places[rows], core.normals[rows])
+    values, half = np.full((2, len(cores), 3), np.nan)
+    for e, (one, own) in enumerate(zip(cores, common, strict=True)):
+        if len(own):
+            distance, lod95 = one.at(own)
+            values[e], half[e] = solve @ distance, np.abs(solve) @ lod95
+    for axis in np.flatnonzero(determined).tolist():
+        yield Series(
+            component=name, kind=Kind.SURFACE, quantity=text("movement {axis}", axis="xyz"[axis]),
+            value=values[:, axis], ci95=half[:, axis], doubtful=doubtful,
+        )  # fmt: skip
+
+
+def _rigid_motion(places: Floats, normals: Floats) -> tuple[Floats, Bools]:
+    """Return the matrix (3, c) from distances along normals to the shift of the middle, and its axes determined (3,).
+
+    A place p with normal n moves along it by n t + (p x n) w. Directions that the normals do not determine are taken
+    out by their singular values; lengths are in units of the body's size, so that turns compare with shifts.
+    """
+    arm = places - places.mean(axis=0)
+    size = max(float(np.linalg.norm(arm, axis=1).max()), 1e-9)
+    A = np.hstack([normals, np.cross(arm, normals) / size])
+    inverse = np.linalg.pinv(A, rcond=LEAST_DETERMINED)
+    return inverse[:3], np.diag(inverse @ A)[:3] > DETERMINED_SHARE
+
+
+def _strongest(name: str, cores: Sequence[_Core], doubtful: Bools) -> Iterator[Series]:
+    """Yield the deviation at the core point that changed most of those that the epochs have in common."""
+    common = _in_common(cores, SAME_MM)
+    known = [e for e, rows in enumerate(common) if len(rows)]
     if len(known) < 2:
         return
-    cores = [_Core.of(result, rows) for result, rows in zip(results, marked, strict=True)]
-    first = cores[known[0]]
-    common = np.arange(len(first.places))
-    matched: dict[int, Ints] = {}
+    n = len(common[known[0]])
+    distance, lod95 = np.full((2, len(cores), n), np.nan)
     for e in known:
-        away, matched[e] = cKDTree(cores[e].places).query(first.places, distance_upper_bound=SAME_MM)
-        common = common[np.isfinite(away[common])]
-    if not len(common):
-        return
-    distance, lod95 = np.full((2, len(results), len(common)), np.nan)
-    for e in known:
-        rows = matched[e][common]
-        distance[e], lod95[e] = cores[e].distance[rows], cores[e].lod95[rows]
-    ratio = _ratios(distance[known], lod95[known])
-    k = int(ratio.argmax())
-    x, y, z = first.places[common[k]].tolist()
+        distance[e], lod95[e] = cores[e].at(common[e])
+    k = strongest(distance[known], lod95[known])
+    x, y, z = cores[known[0]].places[common[known[0]][k]].tolist()
     quantity = text("deviation at {x:.0f}, {y:.0f}, {z:.0f}", x=x, y=y, z=z)
     yield Series(
-        component=name, quantity=quantity, value=distance[:, k], ci95=lod95[:, k], doubtful=doubtful,
-        chosen_from=len(common),
+        component=name, kind=Kind.SURFACE, quantity=quantity, value=distance[:, k], ci95=lod95[:, k],
+        doubtful=doubtful, chosen_from=n,
     )  # fmt: skip
-
-
-def _ratios(distance: Floats, lod95: Floats) -> Floats:
-    """Return the greatest change (k,) from the first epoch, by its half-width, of values (e, k)."""
-    ratios: Floats = (np.abs(distance[1:] - distance[0]) / np.hypot(lod95[1:], lod95[0])).max(axis=0)
-    return ratios

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,11 +80,9 @@ def _day(folder: Path, name: str, facts: Mapping[str, Any]) -> tuple[datetime.da
     stated = str(facts.get("scanned", ""))
     for text, source in ((stated, str(facts.get("scanned_from", ""))), (name, FOLDER)):
         found = DAY.findall(text)
-        if found:
-            try:
-                return datetime.date(*map(int, found[-1])), source
-            except ValueError:
-                pass
+        for digits in reversed(found):  # the last that is a day: a number of eight digits may follow it
+            with suppress(ValueError):
+                return datetime.date(*map(int, digits)), source
         if text and source != FOLDER:
             raise InputError(
                 f"{folder / RESULTS_H5}: expected a day such as 2026-11-20 as 'scanned' of [report], found {text!r}; "

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from processor.epochs.series import Series
+from processor.epochs.series import Kind, Series
 from processor.language.messages import text
 from processor.model import KEY_POINTS, Floats, Reason, Status, reason
 from processor.preassembly.result import Result
@@ -28,13 +28,18 @@ def series(results: Sequence[Result | None]) -> Iterator[Series]:
             for axis, name in enumerate(AXES):
                 quantity = text("gap {point} {axis}", point=point, axis=name)
                 yield Series(
-                    component=joint, quantity=quantity, value=gaps[:, k, axis], ci95=half[:, k, axis], doubtful=doubtful
-                )
+                    component=joint, kind=Kind.JOINT, quantity=quantity, value=gaps[:, k, axis],
+                    ci95=half[:, k, axis], doubtful=doubtful,
+                )  # fmt: skip
     spans = [None if result is None else result.adjustment for result in results]
     value = np.array([np.nan if one is None else one.span_departure for one in spans])
     if np.isfinite(value).any():
         ci95 = np.array([np.nan if one is None else one.span_ci95 for one in spans])
-        yield Series(component=SPAN, quantity=text("departure from the design"), value=value, ci95=ci95)
+        doubtful = np.array([result is not None and _any_doubtful(result) for result in results], np.bool_)
+        yield Series(
+            component=SPAN, kind=Kind.SPAN, quantity=text("departure from the design"), value=value, ci95=ci95,
+            doubtful=doubtful,
+        )  # fmt: skip
 
 
 def remarks(results: Sequence[Result | None]) -> Iterator[Reason]:
@@ -52,6 +57,11 @@ def _of_row(result: Result | None, row: int | None, column: str) -> Floats:
         return np.full((8, 3), np.nan)
     values: Floats = getattr(result.joints, column)[row]
     return values
+
+
+def _any_doubtful(result: Result) -> bool:
+    """Whether any part of the bridge is weak or has a rival pose: the span is over all of them."""
+    return any(status is not Status.OK for status in result.components.status)
 
 
 def _doubtful(result: Result | None, row: int | None) -> bool:

@@ -7,7 +7,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from processor.language.messages import Message
-from processor.model import Bools, Floats
+from processor.model import Bools, Floats, Word
+
+
+class Kind(Word):
+    """What a component is; components are counted by it."""
+
+    JOINT = "joint"
+    SPAN = "span"
+    BALL = "ball"
+    SURFACE = "surface"
+    WITH_DEFECTS = "body with defects"
+    PART = "part"
+    MEMBER = "member"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,17 +28,25 @@ class Series:
 
     ``ci95`` (e,) are half-widths of 95 % intervals, NaN where a method states none. ``doubtful`` (e,) are values that
     may be wrong beyond their interval; empty: none is. ``chosen_from`` is the number of values that this one was chosen
-    from as the one that changed most; its interval is widened for that number.
+    from as the one that changed most; its interval is widened for that number. ``between`` are the balls whose places
+    give the value.
     """
 
     component: str
+    kind: Kind
     quantity: str | Message
     value: Floats
     ci95: Floats
     unit: str = "mm"
     doubtful: Bools = field(default_factory=lambda: np.empty(0, np.bool_))
     chosen_from: int = 1
+    between: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.doubtful):
             object.__setattr__(self, "doubtful", np.zeros(len(self.value), np.bool_))
+
+
+def strongest(value: Floats, ci95: Floats) -> int:
+    """Return which of k values (e, k) at epochs changed most from the first epoch, by its half-width (e, k)."""
+    return int((np.abs(value[1:] - value[0]) / np.hypot(ci95[1:], ci95[0])).max(axis=0).argmax())

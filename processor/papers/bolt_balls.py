@@ -18,7 +18,7 @@ from processor.geometry.sphere import algebraic, ransac
 from processor.language.messages import Text, text
 from processor.model import Floats, FrameDesign, Ints, Reason, reason
 from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule, median
+from processor.papers.rows import Row, Rule, is_smaller, median
 from processor.report.charts.line_chart import Chart
 from processor.scene_cloud import MergedCloud, merged
 from processor.space_frame import step
@@ -188,8 +188,7 @@ def rows(found: Found) -> list[Row]:
     over = {name: found.values(BALLS, name) for name in _names(found)}
 
     def compared(figure: str, than: str) -> tuple[float, ...]:
-        pairs = zip(over.get(f"ransac: {figure}", ()), over.get(f"{than}: {figure}", ()), strict=True)
-        return tuple(float(ours < other) for ours, other in pairs)
+        return is_smaller(over.get(f"ransac: {figure}", ()), over.get(f"{than}: {figure}", ()))
 
     made = [
         _row(table_2, "ransac", mean, printed.mean(), over.get("ransac: radius, mean"), Rule.AT_MOST, crops),

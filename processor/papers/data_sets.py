@@ -8,11 +8,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from processor import diagnostics
 from processor.jobs import making, process
-from processor.jobs.child import Lost
+from processor.jobs.child import Loss, Lost
 from processor.jobs.process import Cause
 from processor.writers import step_clouds
 
@@ -23,8 +23,8 @@ PAPERS = {
     "003": "stitching",
     "004": "defects",
 }
-TIMEOUT_S = 1800.0
-TAIL = 300  # characters of an error message
+MAKING_S, MEASURING_S = 1800.0, 7200.0  # longest times of a data set
+MOST_SAID = 300  # characters of an error message
 
 
 @dataclass(frozen=True)
@@ -84,17 +84,22 @@ def module_of(paper: str) -> Any:
     return importlib.import_module(f"processor.papers.{PAPERS[paper]}")
 
 
-def measured(job: tuple[DataSet, str, str]) -> Measured:
-    """Measure a data set whose scene is the file named; runs in a child process.
+class Job(NamedTuple):
+    """A data set to measure: the file of its scene, and a new folder for what the stages of the methods find."""
 
-    What the stages of the methods find is written into the third, a new folder, where it is named.
-    """
-    data_set, scene, steps = job
-    with diagnostics.with_clouds(bool(steps)), diagnostics.recording() as notes:
-        found: Measured = module_of(data_set.paper).measure(Path(scene), data_set)
-    if steps:
+    data_set: DataSet
+    scene: str
+    steps: str  # "" = not kept
+
+
+def measured(job: Job) -> Measured:
+    """Measure a data set; runs in a child process."""
+    data_set = job.data_set
+    with diagnostics.with_clouds(bool(job.steps)), diagnostics.recording() as notes:
+        found: Measured = module_of(data_set.paper).measure(Path(job.scene), data_set)
+    if job.steps:
         run = step_clouds.OfRun(PAPERS[data_set.paper], f"paper {data_set.paper}", notes.clouds, notes.table())
-        step_clouds.write(Path(steps), [run])
+        step_clouds.write(Path(job.steps), [run])
     return found
 
 
@@ -103,19 +108,24 @@ def make_and_measure(
 ) -> Measured:
     """Make the scene of a data set and measure it, in child processes; the scene is deleted afterwards.
 
-    What the stages of the methods find is kept in a folder of its own in the folder ``steps``, where that is named.
+    What the stages of the methods find is kept in a folder of its own in the folder ``steps``, if that is not empty.
+    Either child process is ended at its limit of time.
     """
     started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="set-", dir=scratch, ignore_cleanup_errors=True) as made:
         scene = Path(made) / "scene.h5"
         words = making.words(data_set.recipe, scene, data_set.seed, data_set.settings)
         ended = process.run(
-            (*process.GUARDED, "0", *words), env=process.environment(1), timeout_s=TIMEOUT_S, stopped=stopped
+            (*process.GUARDED, "0", *words), env=process.environment(1), timeout_s=MAKING_S, stopped=stopped
         )
         if ended.cause is not Cause.EXIT or ended.code != 0:
-            return Measured(data_set, failed=f"designgen make: {ended.last_line[:TAIL] or ended.cause.value}")
+            return Measured(data_set, failed=f"designgen make: {ended.last_line[:MOST_SAID] or ended.cause.value}")
         kept = str(Path(steps, data_set.folder)) if steps else ""
-        found = process.in_process(measured, (data_set, str(scene), kept), stopped)
+        end = time.monotonic() + MEASURING_S
+        job = Job(data_set, str(scene), kept)
+        found = process.in_process(measured, job, lambda: stopped() or time.monotonic() > end)
     if isinstance(found, Lost):
-        return Measured(data_set, failed=found.error[:TAIL] or found.loss.value)
+        late = found.loss is Loss.STOPPED and not stopped()
+        why = f"measuring took longer than {MEASURING_S:.0f} s" if late else found.error[:MOST_SAID] or found.loss.value
+        return Measured(data_set, failed=why)
     return Measured(data_set, found.figures, found.series, found.failed, time.monotonic() - started)

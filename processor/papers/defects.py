@@ -70,7 +70,7 @@ def _figures(method: str, result: Result, path: Path, scene: Scene) -> dict[str,
 
 
 def _of_stages(notes: diagnostics.Notes) -> dict[str, float]:
-    """Return what the stages of the paper's method say; of several rounds of registration the last."""
+    """Return the figures that the stages of the paper's method note; of several rounds of registration the last."""
     return {f"{stage}: {quantity}": value for stage, _, quantity, value in notes.rows if stage in STAGES}
 
 

@@ -23,7 +23,7 @@ from processor.language.messages import Text, text
 from processor.model import Floats, Reason, Scene, Statistic, StepRun, reason
 from processor.papers import parameters
 from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule
+from processor.papers.rows import Row, Rule, is_smaller
 from processor.pipeline import Execution
 from processor.preassembly import step
 from processor.preassembly.baselines import methods as paper_methods
@@ -214,9 +214,8 @@ def _of_bridge(found: Found, bridge: int, numbers: dict[str, Any]) -> list[Row]:
 def _orders(found: Found, name: str, why: Reason) -> list[Row]:
     """Rows of the paper's statements on the order of the methods."""
 
-    def minus(method: str, than: str, figure: str) -> tuple[float, ...]:
-        pairs = zip(found.values(name, f"{method}: {figure}"), found.values(name, f"{than}: {figure}"), strict=True)
-        return tuple(float(one < other) if np.isfinite([one, other]).all() else NAN for one, other in pairs)
+    def smaller(method: str, than: str, figure: str) -> tuple[float, ...]:
+        return is_smaller(found.values(name, f"{method}: {figure}"), found.values(name, f"{than}: {figure}"))
 
     place, statement = text("table {number}", number="2"), text("splicing error smaller than by the other method")
     table_3, of_line = text("table {number}", number="3"), text("linear error smaller than by the other method")
@@ -228,13 +227,17 @@ def _orders(found: Found, name: str, why: Reason) -> list[Row]:
     return (
         [
             _Of(place, name, f"{one}, {other}", "").row(
-                statement, 1.0, minus(one, other, "splicing, mean"), Rule.HOLDS, corners if other == "corner" else why
+                statement,
+                1.0,
+                smaller(one, other, "splicing, mean"),
+                Rule.HOLDS,
+                corners if other == "corner" else why,
             )
             for one, other in (("line", "corner"), ("line", "design-aided"), ("design-aided", "corner"))
         ]
         + [
             _Of(table_3, name, f"{one}, {other}", "").row(
-                of_line, 1.0, minus(one, other, "linear, mean"), Rule.HOLDS, because
+                of_line, 1.0, smaller(one, other, "linear, mean"), Rule.HOLDS, because
             )
             for one, other, because in (("design-aided", "line", why), ("line", "corner", attitude))
         ]
@@ -267,11 +270,10 @@ def _of_side(found: Found, side: str, numbers: dict[str, Any]) -> list[Row]:
             made.append(
                 of.row(quantity, numbers["figure_18"][k][i], values, Rule.NEAR, reason("papers.bridge-real-parts"))
             )
-    pairs = zip(found.values(side, "design-aided: linear, mean"), found.values(side, "line: linear, mean"), strict=True)
-    minus = tuple(float(aided < line) if np.isfinite([aided, line]).all() else NAN for aided, line in pairs)
+    smaller = is_smaller(found.values(side, "design-aided: linear, mean"), found.values(side, "line: linear, mean"))
     of = _Of(text("figure {number}", number="18"), side, "design-aided, line", "")
     statement = text("linear error smaller than by the other method")
-    made.append(of.row(statement, 1.0, minus, Rule.HOLDS, reason("papers.bridge-real-parts")))
+    made.append(of.row(statement, 1.0, smaller, Rule.HOLDS, reason("papers.bridge-real-parts")))
     between = np.array(numbers[f"table_{table + 2}"]) - np.array(numbers[f"table_{table}"])
     left, before = beyond_rigid(between)
     why = reason("papers.bridge-picked-anew", rms=before, left=left)

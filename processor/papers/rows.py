@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,6 @@ class Rule(Word):
     NEAR = "near"  # a quantity: within TOLERANCE of the published one
     MAGNITUDE = "magnitude"  # a blunder: of the same order of magnitude
     HOLDS = "holds"  # a statement: it holds in every seed
-    NONE = "none"  # cannot be made from our data
 
 
 class Outcome(Word):
@@ -32,7 +31,7 @@ class Outcome(Word):
 
     YES = "yes"
     NO = "no"
-    NOT_MADE = "not made"  # cannot be made from our data, or a data set failed
+    NOT_MADE = "not made"  # nothing was measured for it, as where a data set failed
 
 
 @dataclass(frozen=True)
@@ -75,8 +74,6 @@ class Row:
     @property
     def outcome(self) -> Outcome | None:
         """Whether the number is reproduced; None in a row of ours without a published number."""
-        if self.rule is Rule.NONE:
-            return Outcome.NOT_MADE
         if math.isnan(self.published):
             return None
         if not self._known():
@@ -111,15 +108,30 @@ class Row:
             "values": [_finite(value) for value in self.values],
             "rule": str(self.rule),
             "reproduced": None if self.outcome is None else str(self.outcome),
-            "reason": {"code": self.reason.code, "values": dict(self.reason.values), "text": english.text(self.reason)},
+            "reason": {
+                "code": self.reason.code,
+                "values": {name: _finite(value) for name, value in self.reason.values.items()},
+                "text": english.text(self.reason),
+            },
         }
 
 
 def median(values: Iterable[float]) -> float:
-    """Return the median of what is known among values, for a reason; 0 of nothing, as then its row is not made."""
+    """Return the median of what is known among values, for a reason; NaN of nothing."""
     known = [value for value in values if math.isfinite(value)]
-    return float(np.median(known)) if known else 0.0
+    return float(np.median(known)) if known else math.nan
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def holds(values: Iterable[float], condition: Callable[[float], bool]) -> tuple[float, ...]:
+    """Return 1 for each value that meets a condition, 0 for each that does not, NaN where there is none."""
+    return tuple(float(condition(value)) if math.isfinite(value) else math.nan for value in values)
+
+
+def is_smaller(values: Iterable[float], others: Iterable[float]) -> tuple[float, ...]:
+    """Return 1 for each value that is smaller than the other of its seed, 0 if it is not, NaN where either is none."""
+    return holds((value - other for value, other in zip(values, others, strict=True)), lambda off: off < 0.0)
+
+
+def _finite(value: Any) -> Any:
+    """Return a value for JSON, which has no number that is not finite."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -2,17 +2,20 @@
 
 import json
 import math
+import time
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from processor.cli.main import commands
-from processor.language.messages import text
+from processor.jobs import process
+from processor.jobs.process import Cause
+from processor.language.messages import NO_NUMBER, text
 from processor.model import UsageError, reason
 from processor.papers import bolt_balls, command, data_sets, parameters, preassembly
 from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Outcome, Row, Rule
+from processor.papers.rows import Outcome, Row, Rule, holds, is_smaller
 from processor.report.charts import line_chart as drawing
 
 TINY = {
@@ -55,7 +58,7 @@ def row(published, values, rule):
         (Rule.NEAR, 1.0, (math.nan,), Outcome.NOT_MADE, math.nan),
         (Rule.AT_MOST, math.nan, (3.0, 1.0), None, 3.0),
         (Rule.AT_MOST, math.nan, (), None, math.nan),
-        (Rule.NONE, math.nan, (), Outcome.NOT_MADE, math.nan),
+        (Rule.HOLDS, 1.0, (math.nan, math.nan), Outcome.NOT_MADE, math.nan),
     ],
 )
 def test_what_counts_as_reproduced(rule, published, values, outcome, worst):
@@ -63,6 +66,51 @@ def test_what_counts_as_reproduced(rule, published, values, outcome, worst):
     assert made.outcome == outcome
     np.testing.assert_equal(made.worst, worst)
     assert json.dumps(made.as_object(), allow_nan=False)
+
+
+def test_a_comparison_of_methods_needs_both():
+    assert is_smaller((1.0, 2.0), (2.0, 1.0)) == (1.0, 0.0)
+    np.testing.assert_equal(is_smaller((math.nan, 1.0), (1.0, math.nan)), (math.nan, math.nan))
+    np.testing.assert_equal(holds((3.0, math.nan), lambda value: value > 2.0), (1.0, math.nan))
+
+
+def test_a_seed_that_failed_does_not_refute_a_statement():
+    figures = {"ransac: radius, median": 1.0, "total station: radius, median": 2.0}
+    first, second = (bolt_balls.data_sets(seed)[0] for seed in range(2))
+    found = bolt_balls.rows(Found([Measured(first, figures), Measured(second, failed="out of paper")]))
+    (statement,) = [one for one in found if one.rule is Rule.HOLDS and "total station" in one.method]
+    np.testing.assert_equal(statement.values, (1.0, math.nan))
+    assert statement.outcome is Outcome.YES
+
+
+def test_where_a_data_set_failed_no_statement_is_made_and_no_median_is_stated():
+    for number in ("000", "001", "002", "004"):
+        module = data_sets.module_of(number)
+        failed = Found([Measured(one, failed="out of paper") for one in module.data_sets(0)])
+        found = module.rows(failed)
+        assert not [str(one.quantity) for one in found if one.outcome in (Outcome.YES, Outcome.NO)]
+        for one in found:
+            said = one.as_object()
+            assert json.dumps(said, allow_nan=False)
+            if "median" in one.reason.values or "times" in one.reason.values:
+                assert NO_NUMBER in said["reason"]["text"]
+
+
+def hanging_job(job):
+    time.sleep(60.0)
+
+
+def test_measuring_ends_at_its_limit(tmp_path, monkeypatch):
+    ended = process.Ended(Cause.EXIT, 0, "", 1.0, 1.0, 1.0)
+    monkeypatch.setattr(process, "run", lambda *_, **__: ended)
+    monkeypatch.setattr(data_sets, "measured", hanging_job)
+    monkeypatch.setattr(data_sets, "MEASURING_S", 0.5)
+    made = data_sets.make_and_measure(DataSet("001", "100 balls", "balls-100", (), 0), scratch=str(tmp_path))
+    assert made.failed == "measuring took longer than 0 s"
+    stopped = data_sets.make_and_measure(
+        DataSet("001", "100 balls", "balls-100", (), 0), lambda: True, scratch=str(tmp_path)
+    )
+    assert "longer" not in stopped.failed
 
 
 def test_differences_of_two_methods_by_motions_are_told_from_others():

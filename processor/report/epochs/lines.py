@@ -6,10 +6,20 @@ from collections.abc import Iterator
 
 from processor.epochs.change import Component, Finding
 from processor.epochs.compare import History
+from processor.epochs.series import Kind
 from processor.language.messages import Message, text
 from processor.report.epochs.tables import day, ordered
 
 MOST_LINES, FEWEST_CHANGES = 15, 3
+COUNTED = {
+    Kind.JOINT: "{changed} of {total} {total:?joint|joints}",
+    Kind.SPAN: "{changed} of {total} {total:?span|spans}",
+    Kind.BALL: "{changed} of {total} {total:?ball|balls}",
+    Kind.SURFACE: "{changed} of {total} {total:?surface|surfaces}",
+    Kind.WITH_DEFECTS: "{changed} of {total} {total:?body with defects|bodies with defects}",
+    Kind.PART: "{changed} of {total} {total:?part|parts}",
+    Kind.MEMBER: "{changed} of {total} {total:?member|members}",
+}
 
 
 def headline(history: History) -> Message:
@@ -25,15 +35,18 @@ def headline(history: History) -> Message:
 
 
 def counts(history: History) -> list[Message]:
-    """Return how many components have which finding; the changed ones always."""
-    total = len(history.components)
-    said: list[Message] = [
-        text(
-            "{changed} of {total} {total:?component|components} changed beyond the interval",
-            changed=history.count(Finding.CHANGED),
-            total=total,
-        )
-    ]
+    """Return how many components of each kind changed, and how many have another finding.
+
+    Members whose length changed by their balls are counted by themselves: it is the balls' movement once more.
+    """
+    changed = []
+    for kind, template in COUNTED.items():
+        if own := history.of_kind(kind):
+            number = sum(one.finding is Finding.CHANGED and not one.follows for one in own)
+            changed.append(text(template, changed=number, total=len(own)))
+    said: list[Message] = [text("{changed} changed beyond the interval", changed=changed)]
+    if count := sum(bool(one.follows) for one in history.components):
+        said.append(text("{count} more {count:?member|members} by {count:?its|their} balls", count=count))
     for finding, template in ((Finding.DOUBTFUL, "{count} doubtful"), (Finding.UNKNOWN, "{count} not known")):
         if count := history.count(finding):
             said.append(text(template, count=count))
@@ -55,7 +68,7 @@ def lines(history: History, page: str) -> list[Message]:
 
 def _changed(history: History) -> Iterator[Message]:
     for one in ordered(history):
-        if one.finding in (Finding.CHANGED, Finding.DOUBTFUL) and one.leading is not None:
+        if one.finding in (Finding.CHANGED, Finding.DOUBTFUL) and not one.follows and one.leading is not None:
             yield _line(history, one)
 
 

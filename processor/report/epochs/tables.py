@@ -10,13 +10,21 @@ from processor.epochs.compare import History
 from processor.language.messages import Message, label, text
 from processor.report.table import NAN, Table
 
-ORDER = (Finding.CHANGED, Finding.DOUBTFUL, Finding.WITHIN, Finding.UNKNOWN)
+CHANGED = (Finding.CHANGED, Finding.DOUBTFUL)
+ORDER: tuple[Finding | None, ...] = (*CHANGED, None, Finding.WITHIN, Finding.UNKNOWN)  # None: what follows others
 COMPONENTS, EPOCHS, CHANGES = "history", "epochs", "changes"
 
 
 def ordered(history: History) -> list[Component]:
-    """Return the components, those that changed first, by the strength of their changes."""
-    return sorted(history.components, key=lambda one: (ORDER.index(one.finding), -_strength(one)))
+    """Return the components, those that changed first, by the strength of their changes.
+
+    What follows others stands after all that changed by itself.
+    """
+    return sorted(history.components, key=lambda one: (_rank(one), -_strength(one)))
+
+
+def _rank(component: Component) -> int:
+    return len(CHANGED) if component.follows else ORDER.index(component.finding)
 
 
 def _strength(component: Component) -> float:
@@ -43,7 +51,7 @@ def _components(history: History) -> Table:
             one.name, one.finding, "" if one.leading is None else one.leading.series.quantity,
             *(NAN if one.leading is None else float(one.leading.series.value[e]) for e in epochs),
             *_of_change(one.leading), "" if one.leading is None else one.leading.series.unit, day(history, one.since),
-            one.step,
+            one.step, ", ".join(one.follows),
         )
         for one in ordered(history)
     )  # fmt: skip
@@ -51,10 +59,11 @@ def _components(history: History) -> Table:
         "A row a component: of its values the one that changed most, by its interval, at the last epoch. Change is "
         "from its first value to its last, ci95 the half-width of the 95 % interval, of both epochs together. Changed: "
         "the change exceeds its interval widened for the number of changes of the component ({changes} in all); of "
-        "components that did not change 5 % at most are called so. Since: the first day at which it had changed.",
+        "components that did not change 5 % at most are called so. Since: the first day at which it had changed. "
+        "Follows: the balls that moved and, with their places, changed the length of a member.",
         changes=sum(len(one.changes) for one in history.components),
     )
-    columns = ("component", "finding", "quantity", *names, "change", "ci95", "unit", "since", "step")
+    columns = ("component", "finding", "quantity", *names, "change", "ci95", "unit", "since", "step", "follows")
     return Table(text("Components over the epochs"), columns, rows, COMPONENTS, note)
 
 

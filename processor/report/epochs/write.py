@@ -62,6 +62,8 @@ def _component(history: History, one: Component) -> dict[str, Any]:
     return {
         "name": one.name,
         "step": one.step,
+        "kind": one.kind,
+        "follows": list(one.follows),
         "finding": one.finding,
         "since": tables.day(history, one.since) or None,
         "values": [
