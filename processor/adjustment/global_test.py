@@ -21,7 +21,7 @@ PREDICTIVE = 2.0
 def tail(square: Floats | float, dof: float, noise_dof: float) -> Floats:
     """Probability of a weighted sum of squares of at least ``square``; 1 without degrees of freedom.
 
-    ``noise_freedom`` is that of the estimated noise.
+    ``noise_dof`` is that of the estimated noise.
     """
     if dof <= 0 or noise_dof <= 0:
         return np.ones_like(square, dtype=np.float64)

@@ -25,20 +25,20 @@ class Moderated(NamedTuple):
     """Variances (g,) of groups, and the degrees of freedom (g,) by which they are known."""
 
     variance: Floats
-    freedom: Floats
+    dof: Floats
 
 
-def moderated(square: Floats, freedom: Floats) -> Moderated:
+def moderated(square: Floats, dof: Floats) -> Moderated:
     """Moderate the variances of groups by their sums of squares (g,) and degrees of freedom (g,), which may be 0."""
-    used = (freedom >= FEWEST_FREE) & (square > 0.0)
-    common, of_law = float(square.sum() / max(freedom.sum(), 1.0)), ASSUMED_FREE
+    used = (dof >= FEWEST_FREE) & (square > 0.0)
+    common, of_law = float(square.sum() / max(dof.sum(), 1.0)), ASSUMED_FREE
     if used.sum() >= FEWEST_GROUPS:
-        half = 0.5 * freedom[used]
-        e = np.log(square[used] / freedom[used]) - digamma(half) + np.log(half)
+        half = 0.5 * dof[used]
+        e = np.log(square[used] / dof[used]) - digamma(half) + np.log(half)
         surplus = float(np.var(e, ddof=1) - polygamma(1, half).mean())
         of_law = min(2.0 * _inverse_trigamma(surplus), MOST_FREE) if surplus > 0.0 else MOST_FREE
         common = float(np.exp(e.mean() + digamma(0.5 * of_law) - np.log(0.5 * of_law)))
-    total = of_law + freedom
+    total = of_law + dof
     return Moderated((of_law * common + square) / total, total)
 
 

@@ -20,6 +20,11 @@ SHIFT_MM = 0.2
 OFFSET_MM = 0.2
 
 
+def scale_variance(length: float) -> float:
+    """Return the variance of a length by the scale of the scanner, mm^2."""
+    return (SCALE * length) ** 2
+
+
 def pose_covariance(points: Floats) -> Floats:
     """Covariance (6, 6) of a rotation about the frame's origin and a translation that views of points (n, 3) share.
 

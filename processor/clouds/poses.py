@@ -8,6 +8,7 @@ import numpy as np
 
 from processor.adjustment import thermal
 from processor.clouds.earlier_run import Run
+from processor.components import bridge_parts
 from processor.geometry import rigid
 from processor.model import Floats, InputError, Reason, Scan, Status, UsageError, reason
 from processor.scene_cloud import UNPLACED
@@ -108,7 +109,7 @@ def in_bridge(run: Run) -> Poses:
     """
     result = run.step("preassemble", "assembled")
     scene, table = run.scene, result.components
-    scale = 1.0 / thermal.expansion(scene.temperature_C) if result.method == "adjustment" else 1.0
+    scale = 1.0 / thermal.expansion(scene.temperature_C) if result.method == bridge_parts.ADJUSTED else 1.0
     placed, remarks = [], []
     for row, name in enumerate(table.name):
         status, poses = table.status[row], table.poses_of_scans(row)

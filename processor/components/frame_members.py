@@ -139,10 +139,9 @@ def _tubes(design: FrameDesign, found: Any) -> dict[str, Mesh]:
 
 def _tube(start: Floats, axis: Floats, length: float, radius: float) -> Mesh:
     """Return the open mesh of a tube's outer surface, facets outward."""
-    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    side = side / np.linalg.norm(side)
+    side, third = rigid.axes_across(axis)
     turn = 2.0 * np.pi * np.arange(AROUND) / AROUND
-    ring = radius * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(axis, side))
+    ring = radius * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * third)
     rows = max(2, 1 + int(np.ceil(length / (4.0 * radius))))  # facets that are not slivers
     along = np.linspace(0.0, length, rows)
     vertices = (start + along[:, None] * axis)[:, None] + ring[None]

@@ -28,7 +28,7 @@ class Field:
     ``inner`` are cells away from their face's border, ``seen`` those of them with enough points, and about them as
     well. ``stations`` is the variance by errors of the stations' movements, which neighbouring cells have in common; 0
     in cells without points. ``views`` is the standard deviation of what the points of one view have in common, where
-    views are not named, mm. ``freedom`` (cells,) is of the variance; without it the variance is known.
+    views are not named, mm. ``dof`` (cells,) is of the variance; without it the variance is known.
     """
 
     deviation: Floats

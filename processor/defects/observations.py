@@ -258,7 +258,7 @@ def _robust_sd(off: Floats, station: Ints, chart: Ints) -> Floats:
         for group in (station * (int(chart.max(initial=0)) + 1) + chart, station)
     )
     own = of_face[station * (int(chart.max(initial=0)) + 1) + chart]
-    sd: Floats = 1.4826 * np.where(np.isfinite(own), own, np.nan_to_num(of_station[station]))
+    sd: Floats = MAD_TO_SD * np.where(np.isfinite(own), own, np.nan_to_num(of_station[station]))
     return sd
 
 

@@ -16,7 +16,7 @@ from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from processor.geometry import enclosure, mesh_distance
+from processor.geometry import circle, enclosure, mesh_distance
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
 from processor.model import Bools, DesignBodies, Floats, Ints
 
@@ -258,10 +258,12 @@ def _cylinder(corners: Floats, normals: Floats) -> tuple[Floats, Floats, float] 
     points = corners.reshape(-1, 3)
     middle = points.mean(axis=0)
     flat = (points - middle) @ axes[:, 1:]
-    solved = np.linalg.lstsq(np.column_stack([2.0 * flat, np.ones(len(flat))]), (flat**2).sum(axis=1), rcond=None)[0]
-    radius = float(np.sqrt(max(solved[2] + solved[:2] @ solved[:2], 0.0)))
-    off = np.abs(np.linalg.norm(flat - solved[:2], axis=1) - radius).max()
-    return (middle + axes[:, 1:] @ solved[:2], axis, radius) if off < ROUND_SHARE * radius else None
+    fitted = circle.algebraic(flat)
+    if fitted is None:
+        return None
+    centre, radius = fitted
+    off = np.abs(np.linalg.norm(flat - centre, axis=1) - radius).max()
+    return (middle + axes[:, 1:] @ centre, axis, radius) if off < ROUND_SHARE * radius else None
 
 
 def _charts(vertices: Floats, faces: Ints, normals: Floats, chart_of: Ints, component: Ints) -> Charts:

@@ -1,4 +1,4 @@
-"""Rigid motions as 4x4 matrices: ``T_a_b`` maps coordinates in frame b to frame a."""
+"""Rigid motions as 4x4 matrices, ``T_a_b`` maps coordinates in frame b to frame a, and directions across another."""
 
 from __future__ import annotations
 
@@ -101,3 +101,20 @@ def fit(source: Floats, target: Floats) -> Floats:
     proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])
     R = Vt.T @ proper @ U.T
     return transform(R, centre_target - R @ centre_source)
+
+
+def axes_across(direction: Floats) -> Floats:
+    """Return two unit vectors, rows (..., 2, 3), square to unit directions (..., 3) and to each other."""
+    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(direction, first)], axis=-2)
+
+
+def looks_forwards(direction: Floats) -> bool:
+    """Whether the largest component of a direction (3,) is positive."""
+    return bool(direction[np.argmax(np.abs(direction))] > 0.0)
+
+
+def forwards(direction: Floats) -> Floats:
+    """Return a direction (3,) or its opposite, the one whose largest component is positive."""
+    return direction if looks_forwards(direction) else -direction

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from processor.geometry import rigid
 from processor.model import Floats, Ints
 
 
@@ -53,9 +54,7 @@ def fitted(points: Floats, row: Ints, column: Ints) -> Rays | None:
         return None
     angles = np.arcsin(np.clip((mean @ axis)[occupied], -1.0, 1.0))  # scanners step by equal angles
     heights = np.sin(np.interp(np.arange(rows), np.flatnonzero(occupied), angles, left=np.nan, right=np.nan))
-    e1 = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    e1 /= np.linalg.norm(e1)
-    e2 = np.cross(axis, e1)
+    e1, e2 = rigid.axes_across(axis)
     x, y = np.bincount(c, u @ e1, columns), np.bincount(c, u @ e2, columns)
     turn = np.where(np.bincount(c, minlength=columns) > 0, np.arctan2(y, x), np.nan)
     return Rays(np.stack([e1, e2, axis], axis=1), heights, turn)

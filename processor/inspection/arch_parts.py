@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.adjustment import extremes, scanner_class
+from processor.adjustment import scanner_class
 from processor.geometry.polyline import Polyline
 from processor.inspection import characteristic, part_geometry
 from processor.inspection.characteristic import Characteristic
@@ -51,10 +51,8 @@ def inspect(
         _part(part, design_ends(design, i), shapes[part.name], states[part.name], tolerance, others.get(part.name, ()))
         for i, part in enumerate(design.parts)
     )
-    failed = [component.status is Status.FAILED for component in components]
-    status = Status.FAILED if all(failed) else Status.PARTIAL if any(failed) else Status.OK
     remarks = () if tolerance is not None else (reason("inspect.no-limits"),)
-    return Result(status=status, method=method, reasons=remarks, components=components)
+    return Result.of_components(components, method, remarks)
 
 
 def design_ends(design: ArchDesign, part: int) -> Floats:
@@ -80,9 +78,15 @@ def _part(
 ) -> InspectedComponent:
     if status is Status.FAILED:
         return InspectedComponent(name=part.name, status=status, reasons=(reason("inspect.not-registered"),))
+    doubtful = status is Status.AMBIGUOUS
+    remarks = (reason("inspect.ambiguous"),) if doubtful else ()
     if np.isnan(design).all():
-        return InspectedComponent(name=part.name, reasons=(reason("inspect.branch"),))
-    remarks = (reason("inspect.ambiguous"),) if status is Status.AMBIGUOUS else ()
+        sizes = {"length": _length(part, design)}
+        return InspectedComponent(
+            name=part.name,
+            reasons=(reason("inspect.branch"), *remarks),
+            characteristics=characteristic.table(others, tolerance, part.name, sizes, doubtful),
+        )
     axis, departures = _axis(part, shape)
     found = [*_sections(design, shape), *_lengths(part, design, shape), *departures, *others]
     width, height = part_geometry.section_sizes(design)
@@ -91,7 +95,7 @@ def _part(
         name=part.name,
         status=status,
         reasons=remarks,
-        characteristics=characteristic.table(found, tolerance, part.name, sizes, status is Status.AMBIGUOUS),
+        characteristics=characteristic.table(found, tolerance, part.name, sizes, doubtful),
         axis=axis,
     )
 
@@ -147,13 +151,8 @@ def _of_ends(values: Sequence[Value], design: Floats, shape: Any, needed: Sequen
             yield characteristic.absent(value.id, value.quantity, nominal, why)
         else:
             deviation = float(value.of(as_built)) - nominal
-            variance = covariance[row, row] + by_scale(nominal)
+            variance = covariance[row, row] + scanner_class.scale_variance(nominal)
             yield characteristic.normal(value.id, value.quantity, nominal, deviation, variance)
-
-
-def by_scale(length: float) -> float:
-    """Return the variance of a length by the scale of the scanner, mm^2."""
-    return (scanner_class.SCALE * length) ** 2
 
 
 def _foot_length(part: DesignPart, design: Floats, shape: Any, joint: int) -> tuple[float, float, float]:
@@ -169,7 +168,7 @@ def _foot_length(part: DesignPart, design: Floats, shape: Any, joint: int) -> tu
     departure = shape.ends[joint, 4] - design[joint, 4]
     rows = slice(24 * joint + 12, 24 * joint + 15)
     variance = float(along @ shape.ends_covariance[rows, rows] @ along) + shape.outer_variance
-    return nominal, float(departure @ along) + shape.outer, variance + by_scale(nominal)
+    return nominal, float(departure @ along) + shape.outer, variance + scanner_class.scale_variance(nominal)
 
 
 def _axis(part: DesignPart, shape: Any) -> tuple[AxisDepartures, list[Characteristic]]:
@@ -179,10 +178,11 @@ def _axis(part: DesignPart, shape: Any) -> tuple[AxisDepartures, list[Characteri
     off, so that a turn of the part is none.
     """
     left, right = (np.flatnonzero(np.array(shape.edge) == side) for side in ("left", "right"))
-    count = min(len(left), len(right))
-    known = np.flatnonzero(np.isfinite(shape.departure[left[:count]] + shape.departure[right[:count]]).all(axis=1))
+    _, *same = np.intersect1d(shape.chainage[left], shape.chainage[right], return_indices=True)
+    left, right = left[same[0]], right[same[1]]
+    known = np.flatnonzero(np.isfinite(shape.departure[left] + shape.departure[right]).all(axis=1))
     kinds = (Quantity.SWEEP, Quantity.CAMBER)
-    if len(known) < 3 or known[-1] - known[0] < LEAST_REACH * count:
+    if len(known) < 3 or known[-1] - known[0] < LEAST_REACH * len(left):
         why = reason("inspect.edges-not-seen")
         return AxisDepartures(), [characteristic.absent(str(kind), kind, 0.0, why) for kind in kinds]
     chainage = shape.chainage[left[known]]
@@ -194,20 +194,10 @@ def _axis(part: DesignPart, shape: Any) -> tuple[AxisDepartures, list[Characteri
         departure = mean @ shape.departure[both, a]
         covariance = mean @ shape.departure_covariance[a][np.ix_(both, both)] @ mean.T
         columns += [departure, NORMAL_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))]
-        found.append(_greatest(kind, departure, covariance))
+        found.append(characteristic.greatest(kind, departure, covariance))
     return AxisDepartures(
         chainage=chainage, sideways=columns[0], sideways_ci95=columns[1], up=columns[2], up_ci95=columns[3]
     ), [*found, _middle_width(part, shape, left[known], right[known])]
-
-
-def _greatest(kind: Quantity, departure: Floats, covariance: Floats) -> Characteristic:
-    """Return the greatest departure, with its sign, and the interval of its size."""
-    sign = np.where(departure < 0.0, -1.0, 1.0)
-    inner = slice(1, -1)  # the first and the last are 0 by definition
-    of_sizes = covariance * np.outer(sign, sign)
-    size, low, high = extremes.of_correlated(np.abs(departure)[inner], of_sizes[inner, inner], folded=True)
-    at = 1 + int(np.argmax(np.abs(departure)[inner]))
-    return Characteristic(str(kind), kind, 0.0, deviation=sign[at] * size, low=low, high=high, size=True)
 
 
 def _middle_width(part: DesignPart, shape: Any, left: Ints, right: Ints) -> Characteristic:

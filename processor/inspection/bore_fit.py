@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from processor.adjustment import scanner_class
 from processor.model import Bools, Floats, Ints
@@ -78,7 +79,7 @@ def fit(bores: list[BorePoints], radius: Floats, reach: Floats, sources: int) ->
     departure[rows[known]] = solved[known]
     of_rows, of_known = (3 * at[:, None] + np.arange(3) for at in (rows[known], np.flatnonzero(known)))
     covariance[np.ix_(of_rows.ravel(), of_rows.ravel())] = of_solved[np.ix_(of_known.ravel(), of_known.ravel())]
-    if not np.isfinite(ray).all():  # offsets of ranges widen or narrow all bores alike, and nothing shows it
+    if not np.isfinite(ray).all():  # offsets of ranges widen or narrow all bores alike: unknown rays do not show them
         covariance[2::3, 2::3] += (UNNAMED_SHARE * scanner_class.VIEW_MM) ** 2
     points[rows] = count
     return Fitted(departure, covariance, points)
@@ -104,8 +105,8 @@ def _adjusted(
 ) -> tuple[Floats, Floats, Floats, Ints]:
     """Return departures (h, 3), their covariance (3h, 3h), and weight and sector (n,) of each point.
 
-    Unknowns are the holes' departures, then offset and shift across the axis of each source. Without known rays one
-    offset and shift of the class of scanners stand for all.
+    Unknowns are the holes' departures, then offset and shift across the axis of each source, the class of scanners as
+    their prior. Points without a known ray do not depend on an offset: :func:`fit` adds it to the radii.
     """
     holes, state = len(radius), np.concatenate([start.ravel(), np.zeros(3 * sources)])
     prior = np.concatenate(
@@ -116,29 +117,27 @@ def _adjusted(
     )
     known: Bools = np.asarray(np.isfinite(ray).all(axis=1))
     ray = np.where(known[:, None], ray, 0.0)
-    row = np.arange(len(places))
+    at = 3 * holes + 3 * source
+    columns = np.column_stack([3 * hole, 3 * hole + 1, 3 * hole + 2, at, at + 1, at + 2])
+    starts = 6 * np.arange(len(places) + 1)
     weight, sigma, unit = np.ones(len(places)), 1.0, np.zeros((len(places), 2))
     inverse = np.eye(len(state))
     for _ in range(ROUNDS):
         off = places - state[: 3 * holes].reshape(-1, 3)[hole, :2]
         unit, residual = _hit(off, ray, radius[hole] + state[3 * hole + 2])
         slope = np.einsum("ni,ni->n", ray, unit)
-        jacobian = np.zeros((len(places), len(state)))
-        jacobian[row[:, None], 3 * hole[:, None] + [0, 1]] = unit
-        jacobian[row, 3 * hole + 2] = 1.0
-        at = 3 * holes + 3 * source
-        jacobian[row, at] = slope
-        jacobian[row[:, None], at[:, None] + [1, 2]] = unit
-        residual = residual - jacobian[:, 3 * holes :] @ state[3 * holes :]
+        entries = np.column_stack([unit, np.ones(len(unit)), slope, unit])
+        jacobian = csr_array((entries.ravel(), columns.ravel(), starts), (len(places), len(state)))
+        residual = residual - np.einsum("ni,ni->n", entries[:, 3:], state[columns[:, 3:]])
         precision = 1.0 / (np.where(known, slope**2, 1.0) + LATERAL)
         scaled = residual * np.sqrt(precision)
         near = np.abs(residual) < GATE_MM
         sigma = robust_sd(scaled[near], FLOOR_MM)
         weight = biweight(scaled / (ZERO_WEIGHT * sigma))
         weight[(np.abs(residual) > 3.0 * GATE_MM) | (known & (slope < LEAST_SLOPE))] = 0.0
-        weighted = jacobian * (weight * precision)[:, None]
-        inverse = np.linalg.inv(jacobian.T @ weighted / sigma**2 + np.diag(1.0 / prior**2))
-        gradient = weighted.T @ residual / sigma**2
+        weighted = jacobian.multiply((weight * precision / sigma**2)[:, None]).tocsr()
+        inverse = np.linalg.inv((jacobian.T @ weighted).toarray() + np.diag(1.0 / prior**2))
+        gradient = weighted.T @ residual
         gradient[3 * holes :] -= state[3 * holes :] / prior[3 * holes :] ** 2
         step = inverse @ gradient
         state = state + step

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.adjustment import extremes
 from processor.inspection.result import Characteristics, Quantity
 from processor.limits import judging, standards
 from processor.limits.judging import Comparison, Measured
-from processor.model import NORMAL_95, Reason, Tolerance, Verdict
+from processor.model import NORMAL_95, Floats, Reason, Tolerance, Verdict
 
 NAN = float("nan")
 Sizes = Mapping[str, float]
@@ -21,7 +22,8 @@ Sizes = Mapping[str, float]
 class Characteristic:
     """A deviation from ``nominal`` with its 95 % interval ``low`` to ``high``, in ``unit``; NaN = not measured.
 
-    A greatest departure is stated with its sign, and its interval is that of its ``size``.
+    A greatest departure is stated with its sign, and its interval is that of its ``size``. ``doubtful``: it may be
+    wrong altogether, beyond its interval. ``why`` it was not measured, or what the value lacks.
     """
 
     id: str
@@ -33,6 +35,7 @@ class Characteristic:
     size: bool = False
     unit: str = "mm"
     why: tuple[Reason, ...] = ()
+    doubtful: bool = False
 
     @property
     def ci95(self) -> float:
@@ -45,6 +48,19 @@ def normal(id_: str, quantity: Quantity, nominal: float, deviation: float, varia
     """Return a characteristic whose error is normally distributed with a variance in mm^2."""
     half = NORMAL_95 * math.sqrt(max(variance, 0.0)) if math.isfinite(variance) else NAN
     return Characteristic(id_, quantity, nominal, deviation=deviation, low=deviation - half, high=deviation + half)
+
+
+def greatest(quantity: Quantity, departure: Floats, covariance: Floats) -> Characteristic:
+    """Return the greatest of departures (n,) with its sign, and the interval of its size by their covariance (n, n).
+
+    The first and the last are 0 by definition.
+    """
+    inner = slice(1, -1)
+    sign = np.where(departure < 0.0, -1.0, 1.0)
+    of_sizes = covariance * np.outer(sign, sign)
+    size, low, high = extremes.of_correlated(np.abs(departure)[inner], of_sizes[inner, inner], folded=True)
+    at = 1 + int(np.argmax(np.abs(departure)[inner]))
+    return Characteristic(str(quantity), quantity, 0.0, deviation=sign[at] * size, low=low, high=high, size=True)
 
 
 def absent(id_: str, quantity: Quantity, nominal: float, *why: Reason) -> Characteristic:
@@ -96,6 +112,6 @@ def _compared(
     fitting = [limit for limit in limits if standards.applies(limit, own.get(limit.of, NAN))]
     if not fitting:
         return None
-    unknown = doubtful or not all(map(math.isfinite, (one.low, one.high)))
+    unknown = doubtful or one.doubtful or not all(map(math.isfinite, (one.low, one.high)))
     measured = Measured(one.id, one.deviation, one.low, one.high, sizes_mm=own, doubtful=unknown, unsigned=one.size)
     return judging.compare(fitting[-1], measured)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from processor.geometry import circle, rigid
 from processor.geometry.same_places import same_places
 from processor.model import Floats, Ints
 
@@ -57,21 +58,21 @@ def _through(circles: list[Circle]) -> Iterator[Hole]:
     centre = np.array([circle.centre for circle in circles])
     normal = np.array([circle.normal for circle in circles])
     radius = np.array([circle.radius for circle in circles])
-    for i, circle in enumerate(circles):
-        off = centre - circle.centre
-        depth = -off @ circle.normal  # the other face lies behind this one
-        beside = np.linalg.norm(off + depth[:, None] * circle.normal, axis=1)
+    for i, one in enumerate(circles):
+        off = centre - one.centre
+        depth = -off @ one.normal  # the other face lies behind this one
+        beside = np.linalg.norm(off + depth[:, None] * one.normal, axis=1)
         fits = (
-            (normal @ circle.normal < -PARALLEL)
+            (normal @ one.normal < -PARALLEL)
             & (beside < SAME_MM)
-            & (np.abs(radius - circle.radius) < SAME_MM)
+            & (np.abs(radius - one.radius) < SAME_MM)
             & (depth > SAME_MM)
-            & (depth < 2.0 * MOST_DEPTH * circle.radius)
+            & (depth < 2.0 * MOST_DEPTH * one.radius)
         )
         if fits.any():
             j = int(np.flatnonzero(fits)[np.argmin(depth[fits])])
             if i < j:  # each pair once
-                yield Hole(0.5 * (centre[i] + centre[j]), circle.normal, circle.radius, float(depth[j]))
+                yield Hole(0.5 * (centre[i] + centre[j]), one.normal, one.radius, float(depth[j]))
 
 
 def _circles(vertices: Floats, faces: Ints, normals: Floats, plane: Ints) -> Iterator[Circle]:
@@ -101,31 +102,24 @@ def _circles(vertices: Floats, faces: Ints, normals: Floats, plane: Ints) -> Ite
             continue
         at = border[rows]
         normal = normals[at[0] // 3]
-        circle = _fitted(spot[np.concatenate([a[at], b[at]])], normal)
-        if circle is None:
+        one = _fitted(spot[np.concatenate([a[at], b[at]])], normal)
+        if one is None:
             continue
         # Facets of a face outside of the circle have their third corner there; those of a disc have it on the circle.
-        if (np.linalg.norm(spot[third[at]] - circle.centre, axis=1) > circle.radius + SAME_MM).all():
-            yield circle
+        if (np.linalg.norm(spot[third[at]] - one.centre, axis=1) > one.radius + SAME_MM).all():
+            yield one
 
 
 def _fitted(points: Floats, normal: Floats) -> Circle | None:
-    """Fit a circle across ``normal`` to points (k, 3); None where they are none of a hole's size."""
-    across = plane_axes(normal)
+    """Fit a circle across ``normal`` to points (k, 3); None where they do not lie on a circle of a hole's size."""
+    plane = rigid.axes_across(normal)
     middle = points.mean(axis=0)
-    flat = (points - middle) @ across.T
-    solution = np.linalg.lstsq(
-        np.column_stack([2.0 * flat, np.ones(len(flat))]), np.einsum("ki,ki->k", flat, flat), rcond=None
-    )[0]
-    radius = float(np.sqrt(max(solution[2] + solution[:2] @ solution[:2], 0.0)))
-    off = np.abs(np.linalg.norm(flat - solution[:2], axis=1) - radius)
+    flat = (points - middle) @ plane.T
+    found = circle.algebraic(flat)
+    if found is None:
+        return None
+    centre, radius = found
+    off = np.abs(np.linalg.norm(flat - centre, axis=1) - radius)
     if not LEAST_RADIUS_MM <= radius <= MOST_RADIUS_MM or off.max() > max(ROUND_MM, ROUND_SHARE * radius):
         return None
-    return Circle(middle + solution[:2] @ across, normal, radius)
-
-
-def plane_axes(normal: Floats) -> Floats:
-    """Return two unit vectors, the rows (2, 3), square to a unit ``normal`` and to each other."""
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first)])
+    return Circle(middle + centre @ plane, normal, radius)

@@ -33,9 +33,9 @@ SAME_PLACE_MM = 1e-3
 # Share of the shared variance that the halves of a face have against each other, if they are FAR_MM apart or more: a
 # smaller face is seen from the same places all over.
 HALVES, FAR_MM = 0.5, 2000.0
-CLIP = 4.5  # robust standard deviations beyond which a piece is none of the face's plane
+CLIP = 4.5  # robust standard deviations from the fitted shape beyond which a piece is left out
 ROUNDS = 5
-LEAST_SIDE = 0.5  # side of the smallest face that tells a body's size, in least widths of one that is measured
+LEAST_SIDE = 0.5  # side of the smallest face that a body's size is taken from, in least widths of a measured face
 MOST_CONDITION = 1e6
 
 
@@ -174,7 +174,7 @@ def _members(group: Ints, count: int = 0) -> list[Ints]:
 
 
 def _bodies(design: StructureDesign, vertices: Floats) -> tuple[tuple[str, ...], Ints]:
-    """Return the names of bodies, and the body (f,) of each facet; without names they are what hangs together."""
+    """Return the names of bodies, and the body (f,) of each facet; without names they are the connected pieces."""
     if design.bodies is not None:
         return design.bodies.names, design.bodies.of_facet
     place = same_places(vertices, SAME_PLACE_MM)[design.faces]
@@ -221,7 +221,7 @@ def fit(basis: Floats, pieces: Pieces, along: Floats) -> Fit | None:
     """Fit a shape with ``basis`` (m, p) to pieces; None where they do not determine it.
 
     Pieces far off the shape (dents, other steel) have no weight. What the shape does not follow is a variance of the
-    pieces (method of moments).
+    pieces: the mean square of the residuals less the part by noise (Cochran 1954, Biometrics 10, 101-129).
     """
     used, form = np.ones(len(basis), bool), 0.0
     for _ in range(ROUNDS):

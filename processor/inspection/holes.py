@@ -6,27 +6,30 @@ fit: where the body was moved to or turned is no part of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from processor import scene_cloud
+from processor.adjustment import scanner_class, thermal
 from processor.geometry import rigid
 from processor.inspection import bore_fit, characteristic
 from processor.inspection.bore_fit import BorePoints, Fitted
 from processor.inspection.characteristic import Characteristic
-from processor.inspection.design_holes import Hole, plane_axes
+from processor.inspection.design_holes import Hole
 from processor.inspection.result import Quantity
-from processor.model import Floats, Ints, Scene, reason
+from processor.model import Floats, Ints, Scan, Scene, reason
 
 REACH_MM, PITCH_SHARE = 25.0, 0.4  # of a hole from its designed place, and at most this share of the way to the next
-RING_MM = 15.0  # around a hole, of the face that tells the height of its plate
+RING_MM = 15.0  # width of the ring of the face around a hole whose points give the height of its plate
 FEWEST_LEVEL = 20
-UNDER_MM = 1.0  # of a gauge pin below the nominal diameter of a hole, as steel is checked for high-strength bolts
+UNDER_MM = 1.0  # of a gauge pin below a hole's nominal diameter: a convention, see part_pass_through_ratio of limits
 SEED, DRAWS = 21, 2000  # of the errors, for the share of holes that a pin passes
-PARALLEL, SAME_PLATE_MM, ROW_MM = 0.9999, 1.0, 1.0
+PARALLEL, SAME_PLATE_MM = 0.9999, 1.0
+ROW_MM = 1.0  # across a row, from one hole to the next of it
+FEWEST_PLACED = 3  # holes of a group whose best fit is taken off
 
 
 class Cloud(NamedTuple):
@@ -55,15 +58,25 @@ def cloud_of(scene: Scene, T: Floats, stitched: Any, origin: Floats) -> Cloud:
     cloud = scene_cloud.merged(placed, with_scanner=True)
     # The large offsets are subtracted from each other first: added to the points, either would cost them digits.
     points = cloud.points @ T[:3, :3].T + (T[:3, :3] @ cloud.origin + T[:3, 3] - origin)
-    count = [len(scan.points) for scan in placed.scans]
-    source = np.repeat(np.arange(len(count)), count)
+    source = _views(placed.scans)
+    sources = int(source.max(initial=0)) + 1
     if cloud.scanner is None:
-        return Cloud(points, np.full(points.shape, np.nan), source, max(len(count), 1), cKDTree(points))
+        return Cloud(points, np.full(points.shape, np.nan), source, sources, cKDTree(points))
     ray = points - rigid.apply(T, cloud.scanner + cloud.origin) + origin
-    if len(placed.scans) == 1 and len(placed.scans[0].point_station):
-        source = placed.scans[0].point_station.astype(np.int64)
     length = np.linalg.norm(ray, axis=1, keepdims=True)
-    return Cloud(points, ray / np.maximum(length, 1e-9), source, int(source.max()) + 1, cKDTree(points))
+    return Cloud(points, ray / np.maximum(length, 1e-9), source, sources, cKDTree(points))
+
+
+def _views(scans: Sequence[Scan]) -> Ints:
+    """Return the number (n,) of the view of each point: a scan, or a station of it; points of no station are one."""
+    numbers, count = [np.empty(0, np.int64)], 0
+    for scan in scans:
+        number = np.zeros(len(scan.points), np.int64)
+        if len(scan.point_station) and not scan.position.size:
+            number = np.unique(scan.point_station, return_inverse=True)[1].reshape(-1).astype(np.int64)
+        numbers.append(count + number)
+        count += int(number.max(initial=-1)) + 1
+    return np.concatenate(numbers)
 
 
 def groups(holes: list[Hole], axes: list[Floats]) -> Iterator[Group]:
@@ -81,7 +94,7 @@ def groups(holes: list[Hole], axes: list[Floats]) -> Iterator[Group]:
         left = [hole for hole in left if all(hole is not one for one in same)]
         across = _group_axes(first.axis, axes)
         places = np.array([across @ hole.middle for hole in same])
-        order = np.lexsort((places[:, 0], np.round(places[:, 1] / ROW_MM)))
+        order = np.lexsort((places[:, 0], _rows(places[:, 1])))
         yield Group(tuple(same[k] for k in order), across)
 
 
@@ -91,23 +104,40 @@ def _group_axes(normal: Floats, axes: list[Floats]) -> Floats:
         flat = axis - (axis @ normal) * normal
         if np.linalg.norm(flat) > 0.9:
             first = flat / np.linalg.norm(flat)
-            return np.stack([first, _forwards(np.cross(normal, first))])
-    return np.array([_forwards(axis) for axis in plane_axes(normal)])
+            return np.stack([first, rigid.forwards(np.cross(normal, first))])
+    return np.array([rigid.forwards(axis) for axis in rigid.axes_across(normal)])
 
 
-def _forwards(direction: Floats) -> Floats:
-    """Let a direction look the way of its largest component, so that its sense does not depend on the mesh."""
-    return direction if direction[np.argmax(np.abs(direction))] > 0.0 else -direction
+def _rows(across: Floats) -> Ints:
+    """Return the row (h,) of each hole by coordinates (h,) across the rows: wider gaps of them divide two rows."""
+    order = np.argsort(across, kind="stable")
+    row = np.zeros(len(across), np.int64)
+    row[order[1:]] = np.cumsum(np.diff(across[order]) > ROW_MM)
+    return row
 
 
-def measured(cloud: Cloud, group: Group, first: int) -> list[Characteristic]:
-    """Return the characteristics of a group whose holes are numbered from ``first``."""
+def measured(cloud: Cloud, group: Group, first: int, temperature_C: float = float("nan")) -> list[Characteristic]:
+    """Return the characteristics of a group whose holes are numbered from ``first``.
+
+    Lengths are those at the reference temperature, if that of the steel is known.
+    """
     places = np.array([group.axes @ hole.middle for hole in group.holes])
     between = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(len(places), np.inf))
     reach = np.minimum(REACH_MM, PITCH_SHARE * between.min(axis=1))
     bores = [_bore(cloud, group, hole) for hole in group.holes]
     radius = np.array([hole.radius for hole in group.holes])
-    return list(_characteristics(places, radius, bore_fit.fit(bores, radius, reach, cloud.sources), first))
+    fitted = _referred(bore_fit.fit(bores, radius, reach, cloud.sources), places, radius, temperature_C)
+    return list(_characteristics(places, radius, fitted, first))
+
+
+def _referred(fitted: Fitted, places: Floats, radius: Floats, temperature_C: float) -> Fitted:
+    """Bring holes to the reference temperature, and add the error of the scanner's scale to their covariance."""
+    size = np.column_stack([places - places.mean(axis=0), radius])
+    expansion, by_scale = thermal.expansion(temperature_C), scanner_class.SCALE * size.ravel()
+    return fitted._replace(
+        departure=(size + fitted.departure) / expansion - size,
+        covariance=fitted.covariance / expansion**2 + np.outer(by_scale, by_scale),
+    )
 
 
 def _bore(cloud: Cloud, group: Group, hole: Hole) -> BorePoints:
@@ -138,10 +168,10 @@ def _level(height: Floats, beyond: Floats, hole: Hole) -> float:
 def _characteristics(places: Floats, radius: Floats, fitted: Fitted, first: int) -> Iterator[Characteristic]:
     known = np.flatnonzero(np.isfinite(fitted.departure).all(axis=1))
     why = reason("inspect.hole-not-seen")
-    if len(known) > 2:
-        departure, covariance = _within(places, fitted, known)
-        yield from _places(places, (departure, covariance), known, first)
-        yield _passing(radius[known], fitted, (departure, covariance), known, (first, first + len(places) - 1))
+    if len(places) >= FEWEST_PLACED:
+        within = _within(places, fitted, known) if len(known) >= FEWEST_PLACED else None
+        yield from _places(places, within, known, first)
+        yield _passing(radius[known], fitted, within, known, (first, first + len(places) - 1))
     for a, b in _neighbours(places):
         id_, nominal = f"pitch-{first + a}-{first + b}", float(np.linalg.norm(places[b] - places[a]))
         if a in known and b in known:
@@ -181,32 +211,36 @@ def _within(places: Floats, fitted: Fitted, known: Ints) -> tuple[Floats, Floats
     )
 
 
-def _places(places: Floats, within: tuple[Floats, Floats], known: Ints, first: int) -> Iterator[Characteristic]:
-    """Yield the places of holes within their group, along and across."""
+def _places(places: Floats, within: tuple[Floats, Floats] | None, known: Ints, first: int) -> Iterator[Characteristic]:
+    """Yield the places of holes within their group, along and across; None: too few holes of it were seen."""
     middle = places.mean(axis=0)
-    departure, variance = within[0], np.diag(within[1])
     at = {int(k): i for i, k in enumerate(known)}
     for k in range(len(places)):
         for a, name in enumerate(("along", "across")):
             id_, nominal = f"hole-{first + k}-{name}", float(places[k, a] - middle[a])
-            if k in at:
+            if within is not None and k in at:
                 row = 2 * at[k] + a
-                yield characteristic.normal(
-                    id_, Quantity.HOLE_POSITION, nominal, float(departure[row]), float(variance[row])
-                )
+                deviation, variance = float(within[0][row]), float(within[1][row, row])
+                yield characteristic.normal(id_, Quantity.HOLE_POSITION, nominal, deviation, variance)
             else:
-                yield characteristic.absent(id_, Quantity.HOLE_POSITION, nominal, reason("inspect.hole-not-seen"))
+                why = reason("inspect.few-holes-seen" if k in at else "inspect.hole-not-seen")
+                yield characteristic.absent(id_, Quantity.HOLE_POSITION, nominal, why)
 
 
 def _passing(
-    radius: Floats, fitted: Fitted, within: tuple[Floats, Floats], known: Ints, numbers: tuple[int, int]
+    radius: Floats, fitted: Fitted, within: tuple[Floats, Floats] | None, known: Ints, numbers: tuple[int, int]
 ) -> Characteristic:
     """Return the share of a group's holes that a gauge pin passes together with a splice plate drilled as designed.
 
     The pin is thinner than the nominal hole by UNDER_MM. It passes a hole of radius r, off the plate's hole of radius R
-    by e, if e <= r + R - d for the pin's diameter d. The share is the mean of the holes' probabilities, its interval
-    that of draws of all errors together.
+    by e, if e <= r + R - d for the pin's diameter d: r + R - e is the width that both leave open. The share is the mean
+    of the probabilities of the holes seen, its interval that of draws of all errors together. It is of the whole group:
+    of the holes not seen none passes at its lower end, and all do at its upper end.
     """
+    id_, holes = f"holes-{numbers[0]}-{numbers[1]}-pass-through", numbers[1] - numbers[0] + 1
+    if within is None:
+        why = (reason("inspect.few-holes-seen"),)
+        return Characteristic(id_, Quantity.PASS_THROUGH, 1.0, unit="1", why=why)
     mean, covariance = np.concatenate([within[0], fitted.departure[known, 2]]), within[1]
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -215,22 +249,24 @@ def _passing(
     off = np.hypot(drawn[:, 0 : 2 * count : 2], drawn[:, 1 : 2 * count : 2])
     pin = 2.0 * radius - UNDER_MM
     passed = (off <= 2.0 * radius - pin + drawn[:, 2 * count :]).mean(axis=1)
-    low, high = np.quantile(passed, [0.025, 0.975]) - 1.0
+    low, high = np.quantile(passed, [0.025, 0.975]) * count
+    unseen = holes - count
     return Characteristic(
-        f"holes-{numbers[0]}-{numbers[1]}-pass-through",
+        id_,
         Quantity.PASS_THROUGH,
         1.0,
         deviation=float(passed.mean()) - 1.0,
-        low=float(low),
-        high=float(high),
+        low=float(low) / holes - 1.0,
+        high=float(high + unseen) / holes - 1.0,
         unit="1",
+        why=(reason("inspect.holes-unseen", unseen=unseen, holes=holes),) if unseen else (),
     )
 
 
 def _neighbours(places: Floats) -> Iterator[tuple[int, int]]:
     """Yield the pairs of holes that are next to each other in a row along or across."""
     for a in range(2):
-        line = np.round(places[:, 1 - a] / ROW_MM)
+        line = _rows(places[:, 1 - a])
         for value in np.unique(line):
             rows = np.flatnonzero(line == value)
             rows = rows[np.argsort(places[rows, a], kind="stable")]

@@ -8,17 +8,19 @@ the tube. None depends on where the member lies.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from processor.adjustment import scanner_class, thermal
+from processor.components.frame_members import SEEN
 from processor.inspection import characteristic
 from processor.inspection.characteristic import Characteristic
 from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.model import NORMAL_95, FrameDesign, Scene, Status, reason
 
-LOCATED = ("ball", "fused")  # what the centre of a sphere that was seen is estimated from
+CERTAIN = "ok"  # flag of a sphere that nothing contradicts
 
 
 def inspect(scene: Scene, found: Any, method: str) -> Result:
@@ -34,7 +36,7 @@ def inspect(scene: Scene, found: Any, method: str) -> Result:
     remarks = () if scene.tolerance is not None else (reason("inspect.no-limits"),)
     if doubtful:
         remarks = (reason("inspect.pose-ambiguous"), *remarks)
-    return Result(status=Status.OK, method=method, reasons=remarks, components=components)
+    return Result.of_components(components, method, remarks)
 
 
 def name_of(design: FrameDesign, member: int) -> str:
@@ -74,14 +76,19 @@ def _length(
     nominal = float(np.linalg.norm(b - a))
     at = [ball.get(node, -1) for node in nodes]
     balls = found.balls
-    if min(at) < 0 or any(str(balls.evidence[k]) not in LOCATED or not balls.placed[k] for k in at):
+    if min(at) < 0 or any(str(balls.evidence[k]) not in SEEN or not balls.placed[k] for k in at):
         return characteristic.absent("length", Quantity.LENGTH, nominal, reason("inspect.node-not-seen"))
     off = balls.centres[at[1]] - balls.centres[at[0]]
     actual = float(np.linalg.norm(off))
     along = off / actual
-    variance = float(sum(along @ balls.covariance[k][:3, :3] @ along for k in at)) + (scanner_class.SCALE * actual) ** 2
+    of_balls = float(sum(along @ balls.covariance[k][:3, :3] @ along for k in at))
     deviation = actual / thermal.expansion(scene.temperature_C) - nominal
-    return characteristic.normal("length", Quantity.LENGTH, nominal, deviation, variance)
+    length = characteristic.normal(
+        "length", Quantity.LENGTH, nominal, deviation, of_balls + scanner_class.scale_variance(actual)
+    )
+    flagged = [k for k in at if str(balls.flag[k]) != CERTAIN]
+    why = tuple(reason("inspect.node-flagged", node=int(balls.ids[k]), flag=balls.flag[k]) for k in flagged)
+    return replace(length, doubtful=bool(flagged), why=why)
 
 
 def _of_tube(diameter: float, found: Any, row: int | None) -> Iterator[Characteristic]:

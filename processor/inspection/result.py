@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +19,7 @@ from processor.model import (
     column,
     described,
     names,
+    reason,
     reasons,
     words,
     worst,
@@ -109,6 +111,17 @@ class Result(Checked):
     method: str = described()
     reasons: tuple[Reason, ...] = reasons()
     components: tuple[InspectedComponent, ...] = described(())
+
+    @classmethod
+    def of_components(
+        cls, components: Sequence[InspectedComponent], method: str, remarks: Sequence[Reason] = ()
+    ) -> Result:
+        """Return the result with the status that follows from those of the components."""
+        failed = [component.status is Status.FAILED for component in components]
+        status = Status.PARTIAL if any(failed) else Status.OK
+        if failed and all(failed):
+            status, remarks = Status.FAILED, (reason("inspect.none-seen"), *remarks)
+        return cls(status=status, method=method, reasons=tuple(remarks), components=tuple(components))
 
     @property
     def overall(self) -> Verdict:

@@ -14,14 +14,15 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from processor import scene_cloud
-from processor.adjustment import extremes, scanner_class
+from processor.adjustment import extremes, scanner_class, thermal
+from processor.geometry import rigid
 from processor.inspection import characteristic, flat_faces, holes
 from processor.inspection.characteristic import Characteristic
 from processor.inspection.flat_faces import Body, Fit, Pieces
 from processor.inspection.holes import Cloud
 from processor.inspection.part_geometry import off_the_chord
 from processor.inspection.result import InspectedComponent, Quantity, Result
-from processor.model import Floats, Scene, Status, Tolerance, reason
+from processor.model import Floats, Scene, Status, reason
 
 PARALLEL, SQUARE = 0.9999, 0.02  # cosines between normals of opposite faces, and of different axes
 SLENDER = 4.0  # length by height and width from which a body is a member with an axis
@@ -68,47 +69,51 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     if any(body.holes for body in found):
         T = deviation.T_design_scan if deviation.T_design_scan.size else np.eye(4)
         cloud = holes.cloud_of(scene, T, stitched, scene_cloud.local_design(scene.structure)[1])
+    doubtful = deviation.status is Status.AMBIGUOUS
     components = tuple(
-        component for body in found if (component := _component(body, scene.tolerance, cloud)) is not None
+        component for body in found if (component := _component(body, scene, cloud, doubtful)) is not None
     )
     remarks = () if scene.tolerance is not None else (reason("inspect.no-limits"),)
     if not components:
         remarks = (reason("inspect.no-flat-bodies"), *remarks)
-    if deviation.status is Status.AMBIGUOUS:
+    if doubtful:
         remarks = (reason("inspect.pose-ambiguous"), *remarks)
-    return Result(status=Status.OK, method=method, reasons=remarks, components=components)
+    return Result.of_components(components, method, remarks)
 
 
-def _component(body: Body, tolerance: Tolerance | None, cloud: Cloud | None) -> InspectedComponent | None:
-    found, sizes = measured(body)
+def _component(body: Body, scene: Scene, cloud: Cloud | None, doubtful: bool) -> InspectedComponent | None:
+    found, sizes = measured(body, scene.temperature_C)
     if cloud is not None:
-        found = [*found, *_holes(body, cloud)]
+        found = [*found, *_holes(body, cloud, scene.temperature_C)]
     if not found:
         return None
     if all(np.isnan(one.deviation) for one in found):
         return InspectedComponent(name=body.name, status=Status.FAILED, reasons=(reason("inspect.body-not-seen"),))
     return InspectedComponent(
-        name=body.name, characteristics=characteristic.table(found, tolerance, body.name, sizes, doubtful=False)
+        name=body.name, characteristics=characteristic.table(found, scene.tolerance, body.name, sizes, doubtful)
     )
 
 
-def _holes(body: Body, cloud: Cloud) -> Iterator[Characteristic]:
+def _holes(body: Body, cloud: Cloud, temperature_C: float) -> Iterator[Characteristic]:
     """Yield the characteristics of a body's holes, numbered over the whole body."""
     first = 1
     for group in holes.groups(list(body.holes), [axis.direction for axis in body_axes(body)]):
-        yield from holes.measured(cloud, group, first)
+        yield from holes.measured(cloud, group, first, temperature_C)
         first += len(group.holes)
 
 
-def measured(body: Body) -> tuple[list[Characteristic], dict[str, float]]:
-    """Return the characteristics of a body and its sizes as designed; none of a body without flat sides."""
+def measured(body: Body, temperature_C: float = float("nan")) -> tuple[list[Characteristic], dict[str, float]]:
+    """Return the characteristics of a body and its sizes as designed; none of a body without flat sides.
+
+    Sizes are those at the reference temperature, if that of the steel is known.
+    """
     axes = body_axes(body)
     if len(axes) < 2:
         return [], {}
     names = axis_names(axes)
     middle = np.mean([face.corners.mean(axis=0) for face in body.faces], axis=0)
     sides = {row: _side(body, row, axes, middle) for axis in axes for row in axis.faces}
-    found = [*_sizes(axes, names, sides), *_squareness(axes, names, sides)]
+    found = [*_sizes(axes, names, sides, temperature_C), *_squareness(axes, names, sides)]
     if len(axes) == 3 and axes[0].size > SLENDER * axes[1].size:
         found += [*_twist(axes, names, sides), *_bows(axes, sides)]
     else:
@@ -142,7 +147,7 @@ def body_axes(body: Body) -> list[Axis]:
 
 def _forwards(axis: Axis) -> Axis:
     """Let an axis look the way of its largest component, so that its sense does not depend on the order of faces."""
-    if axis.direction[np.argmax(np.abs(axis.direction))] > 0.0:
+    if rigid.looks_forwards(axis.direction):
         return axis
     return Axis(-axis.direction, (axis.faces[1], axis.faces[0]), axis.size)
 
@@ -186,16 +191,20 @@ def _term(side: Side, k: int) -> tuple[float, float]:
     return float(side.fit.mean[k]), float(side.fit.covariance[k, k])
 
 
-def _sizes(axes: list[Axis], names: list[Quantity], sides: dict[int, Side | None]) -> Iterator[Characteristic]:
+def _sizes(
+    axes: list[Axis], names: list[Quantity], sides: dict[int, Side | None], temperature_C: float
+) -> Iterator[Characteristic]:
     """Yield the distances of opposite faces at the body's middle."""
+    expansion = thermal.expansion(temperature_C)
     for axis, name in zip(axes, names, strict=True):
         pair = [sides[row] for row in axis.faces]
         if pair[0] is None or pair[1] is None:
             yield characteristic.absent(str(name), name, axis.size, reason("inspect.face-not-seen"))
             continue
         (back, of_back), (front, of_front) = (_term(side, 0) for side in pair if side is not None)
-        by_scale = (scanner_class.SCALE * axis.size) ** 2
-        yield characteristic.normal(str(name), name, axis.size, back + front, of_back + of_front + by_scale)
+        deviation = (axis.size + back + front) / expansion - axis.size
+        variance = of_back + of_front + scanner_class.scale_variance(axis.size)
+        yield characteristic.normal(str(name), name, axis.size, deviation, variance)
 
 
 def _turn(axes: list[Axis], k: int, sides: dict[int, Side | None]) -> tuple[float, float]:
@@ -270,14 +279,7 @@ def _bows(axes: list[Axis], sides: dict[int, Side | None]) -> Iterator[Character
         if curve is None:
             yield characteristic.absent(str(quantity), quantity, 0.0, reason("inspect.face-not-seen"))
             continue
-        departure, covariance = curve
-        sign = np.where(departure < 0.0, -1.0, 1.0)
-        inner = slice(1, -1)
-        size, low, high = extremes.of_correlated(
-            np.abs(departure)[inner], (covariance * np.outer(sign, sign))[inner, inner], folded=True
-        )
-        at = 1 + int(np.argmax(np.abs(departure)[inner]))
-        yield Characteristic(str(quantity), quantity, 0.0, deviation=sign[at] * size, low=low, high=high, size=True)
+        yield characteristic.greatest(quantity, *curve)
 
 
 def _axis_curve(sides: list[tuple[Side, float]]) -> tuple[Floats, Floats] | None:
@@ -308,7 +310,9 @@ def _flatness(axes: list[Axis], names: list[Quantity], sides: dict[int, Side | N
     """Yield the flatness of faces: the greatest less the least departure from their plane, noise taken out.
 
     The plane is fitted to all of a face. The extremes of noisy values are too far apart: departures are shrunk by their
-    variance against their noise (empirical Bayes), and what their noise still adds is taken off (parametric bootstrap).
+    variance against their noise (empirical Bayes: Efron and Morris 1973, Journal of the American Statistical
+    Association 68), and what their noise still adds is taken off (bias by the parametric bootstrap: Efron and
+    Tibshirani 1993, An Introduction to the Bootstrap, chapters 6 and 10).
     The interval is a simultaneous band over all pieces.
     """
     for axis, name in zip(axes, names, strict=True):

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 import processor
 from processor import pipeline
 from processor.evaluation import inspection as evaluation
-from processor.inspection import arch_parts, part_geometry
+from processor.inspection import arch_parts, characteristic, part_geometry
+from processor.inspection.result import Quantity
 from processor.limits import standards
 from processor.model import ArchDesign, DesignPart, Scene, Status, UsageError, Verdict
 from tests.support import arch_clouds
@@ -222,3 +223,11 @@ def test_parts_as_designed_are_inspected_from_their_scans():
     assert set(found) == {
         "lengths", "widths and heights", "diagonals", "twists", "sweeps and cambers", "squareness of end faces",
     }  # fmt: skip
+
+
+def test_a_branch_keeps_the_characteristics_of_its_holes():
+    hole = characteristic.normal("hole-1-diameter", Quantity.HOLE_DIAMETER, 24.0, 0.3, 0.01)
+    part, nowhere = bridge().parts[1], np.full((2, 8, 3), np.nan)
+    found = arch_parts._part(part, nowhere, shape(), Status.OK, None, [hole])
+    assert [one.code for one in found.reasons] == ["inspect.branch"]
+    assert by_id(found.characteristics, "hole-1-diameter").deviation == pytest.approx(0.3)

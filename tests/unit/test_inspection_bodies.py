@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -170,3 +172,44 @@ def test_what_cannot_be_inspected_is_said():
     result = inspection_step.run(scene, inspection_step.Params(), {"deviation": failed})
     assert (result.status, result.reasons[0].code) == (Status.FAILED, "inspect.failed")
     assert inspection_step.run(scene, inspection_step.Params()).reasons[0].code == "inspect.no-deviation"
+
+
+def test_verdicts_are_indeterminate_where_another_attitude_fits_as_well(runs):
+    scene, *_ = runs[0]
+    named = dataclasses.replace(scene, tolerance=standards.load("GB 50205-2020"))
+    measured = deviation_step.run(named, deviation_step.Params(register="none"))
+    ambiguous = dataclasses.replace(measured, status=Status.AMBIGUOUS)
+    for status, given in ((False, measured), (True, ambiguous)):
+        result = inspection_step.run(named, inspection_step.Params(), {"deviation": given})
+        verdicts = set(result.components[0].characteristics.verdict) - {Verdict.NONE}
+        assert (verdicts == {Verdict.INDETERMINATE}) is status
+    assert result.status is Status.OK
+
+
+def test_sizes_of_a_warm_body_are_those_at_the_reference_temperature():
+    """A box as designed, 40 K warmer than its design: 12e-6 a kelvin longer (EN 1993-1-1)."""
+    longer = 12e-6 * 40.0 * SIZE
+    scene = beam_clouds.beam(Built(longer=longer[0], wider=longer[1]), 6, sigma=0.2, registration=0.0, count=40_000)
+    warm = by_id(inspected(dataclasses.replace(scene, temperature_C=60.0)))
+    plain = by_id(inspected(scene))
+    for name, size in (("length", longer[0]), ("width", longer[1])):
+        assert plain[name][0] - warm[name][0] == pytest.approx(size, rel=2e-3)
+        assert abs(warm[name][0]) <= warm[name][1]
+
+
+def test_the_step_is_partial_if_a_body_was_not_seen_and_failed_if_none_was(runs):
+    scene, *_ = runs[0]
+    mesh = scene.structure
+    two = StructureDesign(
+        "two",
+        np.concatenate([mesh.vertices, mesh.vertices + np.array([0.0, 0.0, 9000.0])]),
+        np.concatenate([mesh.faces, mesh.faces + len(mesh.vertices)]),
+    )
+    for seen, status in ((True, Status.PARTIAL), (False, Status.FAILED)):
+        both = dataclasses.replace(scene, structure=two)
+        measured = deviation_step.run(both, deviation_step.Params(register="none"))
+        if not seen:
+            core = dataclasses.replace(measured.core, distance=np.full(len(measured.core), np.nan))
+            measured = dataclasses.replace(measured, core=core)
+        result = inspection_step.run(both, inspection_step.Params(), {"deviation": measured})
+        assert result.status is status

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import cadquery as cq
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from scipy.stats import binom
 
 from processor.inspection import bore_fit, design_holes, flat_faces, holes
 from processor.inspection.bore_fit import BorePoints
-from processor.model import StructureDesign
+from processor.model import Scan, StructureDesign
 
 RADIUS, DEPTH = 12.0, 16.0
 PITCH = np.array([80.0, 70.0])
@@ -220,3 +222,100 @@ def test_bodies_of_a_design_have_their_holes():
     )  # fmt: skip
     (body,) = flat_faces.bodies(design, seen, 60.0)
     assert len(body.holes) == len(GRID)
+
+
+# --- what was not seen, rows, temperature, scale, views -------------------------------------------------------------
+
+
+def drilled(seen, sd=0.05, places=GRID, temperature_C=float("nan"), departure=0.0):
+    """Characteristics of holes at ``places``, of which the rows ``seen`` were found with errors of ``sd``."""
+    count = len(places)
+    off = np.full((count, 3), np.nan)
+    off[seen] = departure
+    covariance = np.full((3 * count, 3 * count), np.nan)
+    rows = (3 * np.array(seen, np.int64)[:, None] + np.arange(3)).ravel()
+    covariance[np.ix_(rows, rows)] = sd**2 * np.eye(len(rows))
+    radius = np.full(count, RADIUS)
+    fitted = holes._referred(bore_fit.Fitted(off, covariance, np.zeros(count, np.int64)), places, radius, temperature_C)
+    return {one.id: one for one in holes._characteristics(places, radius, fitted, 1)}
+
+
+def test_holes_not_seen_may_pass_or_not():
+    """Of six holes three were seen, all of them as designed: between three and six pass."""
+    some = drilled([0, 1, 2])["holes-1-6-pass-through"]
+    assert (1.0 + some.low, 1.0 + some.high) == pytest.approx((0.5, 1.0))
+    assert some.low <= some.deviation <= some.high
+    assert [one.code for one in some.why] == ["inspect.holes-unseen"]
+    whole = drilled(list(range(6)))["holes-1-6-pass-through"]
+    assert (whole.low, whole.high, whole.why) == (0.0, 0.0, ())
+
+
+def test_places_of_a_group_of_which_two_holes_were_seen_are_absent_with_a_reason():
+    found = drilled([1, 4])
+    assert np.isnan([found["hole-2-along"].deviation, found["holes-1-6-pass-through"].deviation]).all()
+    assert [one.code for one in found["hole-2-along"].why] == ["inspect.few-holes-seen"]
+    assert [one.code for one in found["hole-1-along"].why] == ["inspect.hole-not-seen"]
+    assert [one.code for one in found["holes-1-6-pass-through"].why] == ["inspect.few-holes-seen"]
+    assert np.isfinite(found["hole-2-diameter"].deviation)
+    assert "hole-1-along" not in drilled([0, 1], places=GRID[:2])  # of two holes none has a place in the group
+
+
+def test_rows_do_not_depend_on_the_last_digit_of_a_coordinate():
+    """Three holes in a row whose coordinate lies between two whole numbers, up to rounding."""
+    across = np.array([12.5 + 1e-9, 12.5 - 1e-9, 12.5 + 1e-9, 82.5])
+    middle = np.column_stack([[140.0, 70.0, 0.0, 0.0], across, np.zeros(4)])
+    made = [design_holes.Hole(place, np.array([0.0, 0.0, 1.0]), RADIUS, DEPTH) for place in middle]
+    (group,) = holes.groups(made, [np.array([1.0, 0.0, 0.0])])
+    assert [hole.middle[0] for hole in group.holes] == [0.0, 70.0, 140.0, 0.0]
+    pitches = {
+        id_
+        for id_ in drilled([0, 1, 2, 3], places=np.array([hole.middle[:2] for hole in group.holes]))
+        if "pitch" in id_
+    }
+    assert pitches == {"pitch-1-2", "pitch-2-3", "pitch-1-4"}
+
+
+def test_lengths_of_warm_steel_are_those_at_the_reference_temperature():
+    """30 K warmer, steel is longer by 12e-6 a kelvin (EN 1993-1-1): a plate drilled as designed has no deviation."""
+    larger = 12e-6 * 30.0 * np.column_stack([GRID - GRID.mean(axis=0), np.full(len(GRID), RADIUS)])
+    every = list(range(len(GRID)))
+    for one in drilled(every, departure=larger, temperature_C=50.0).values():
+        assert one.deviation == pytest.approx(0.0, abs=1e-4)
+    assert drilled(every, departure=larger)["pitch-1-2"].deviation == pytest.approx(12e-6 * 30.0 * PITCH[0])
+
+
+def test_places_and_pitches_have_the_scale_of_the_scanner():
+    places = 50.0 * GRID
+    found = drilled(list(range(6)), sd=0.0, places=places)
+    assert found["pitch-1-2"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)
+    assert found["hole-1-along"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)
+
+
+def test_each_station_of_each_scan_is_a_view_and_points_of_no_station_are_one():
+    points = np.zeros((4, 3))
+    scans = (
+        Scan("a", points, point_station=[0, 1, 0, -1]),
+        Scan("b", points, point_station=[1, 1, 0, 0]),
+        Scan("c", points, position=np.zeros(3), point_station=[0, 0, 1, 1]),
+    )
+    view = holes._views(scans)
+    apart = [view[[0, 2]], view[[1]], view[[3]], view[4:6], view[6:8], view[8:]]
+    assert all(len(set(one.tolist())) == 1 for one in apart)
+    assert len({int(one[0]) for one in apart}) == len(apart)
+    assert sorted(set(view.tolist())) == list(range(len(apart)))
+
+
+def test_the_adjustment_of_many_holes_needs_no_matrix_of_all_points():
+    rng = np.random.default_rng(2)
+    count, points = 100, 1000
+    turn = rng.uniform(0.0, 2.0 * np.pi, count * points)
+    places = RADIUS * np.column_stack([np.cos(turn), np.sin(turn)]) + rng.normal(0.0, 0.3, (count * points, 2))
+    hole, source = np.repeat(np.arange(count), points), rng.integers(0, 3, count * points)
+    tracemalloc.start()
+    solved, *_ = bore_fit._adjusted(
+        places, np.full(places.shape, np.nan), source, hole, np.full(count, RADIUS), np.zeros((count, 3)), 3
+    )
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.abs(solved).max() < 0.2
+    assert most < 8 * len(places) * 3 * (count + 3)  # bytes of a number for each point and unknown

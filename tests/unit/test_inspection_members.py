@@ -10,8 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from processor.inspection import members, step
+from processor.language.messages import messages
 from processor.limits import standards
 from processor.model import NORMAL_95, FrameDesign, Scene, Status, Tolerance, UsageError, Verdict
+from processor.space_frame.result import Flag
 from tests.support import ball_results
 
 DESIGN = FrameDesign(
@@ -111,3 +113,28 @@ def test_deviation_of_a_frame_needs_spheres():
 
     with pytest.raises(UsageError, match="spheres"):
         deviation.run(Scene("frame", "space-frame", frame=DESIGN), deviation.Params(), {})
+
+
+@pytest.mark.parametrize(
+    ("flag", "verdict"),
+    [("ok", Verdict.PASS), ("low-confidence", Verdict.INDETERMINATE), ("wrong-size", Verdict.INDETERMINATE)],
+)
+def test_a_length_to_a_flagged_sphere_has_no_sure_verdict(flag, verdict):
+    tolerance = standards.override(Tolerance(), {"part_length_mm": np.array([-99.0, 99.0])}, "project.toml")
+    found = ball_results.whole()
+    flags = (Flag(flag), Flag.OK, *found.balls.flag[2:])
+    found = dataclasses.replace(found, balls=dataclasses.replace(found.balls, flag=flags))
+    length = by_id(inspected(found=found, tolerance=tolerance)["10-11"], "length")
+    assert length.verdict is verdict
+    assert [one.code for one in length.reasons] == ([] if flag == "ok" else ["inspect.node-flagged"])
+    assert str(messages("zh").text(length.reasons)) != str(messages("en").text(length.reasons)) or flag == "ok"
+
+
+def test_the_step_is_partial_if_a_member_was_not_seen_and_failed_if_none_was():
+    found = ball_results.whole()
+    scene = Scene("frame", "space-frame", frame=DESIGN)
+    assert members.inspect(scene, found, "default").status is Status.PARTIAL  # node 12 was not found
+    hidden = dataclasses.replace(found.balls, evidence=("axes",) * len(found.balls))
+    nowhere = dataclasses.replace(found.tubes, a=np.full(len(found.tubes), -1))
+    result = members.inspect(scene, dataclasses.replace(found, balls=hidden, tubes=nowhere), "default")
+    assert (result.status, result.reasons[0].code) == (Status.FAILED, "inspect.none-seen")

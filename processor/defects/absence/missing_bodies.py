@@ -17,7 +17,7 @@ from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, cells_of
 from processor.defects.regions import EMPTY_SHARE, Region, chernoff
 from processor.defects.surface_charts import PLANE, DesignSurface
-from processor.geometry import enclosure, mesh_distance
+from processor.geometry import enclosure, mesh_distance, rigid
 from processor.model import Bools, Floats, Ints
 
 STEP_MM = 2.0  # between places by which contacts are measured
@@ -102,10 +102,7 @@ def _well_inside(points: Floats, normals: Floats, grid: mesh_distance.FacetGrid,
     inside = np.zeros(len(points), np.bool_)
     if not len(points):
         return inside
-    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    along = np.cross(normals, helper)
-    along /= np.linalg.norm(along, axis=1)[:, None]
-    across = np.cross(normals, along)
+    along, across = rigid.axes_across(normals).transpose(1, 0, 2)
     for way in (1.0, -1.0):
         all_within = np.ones(len(points), np.bool_)
         for a, b in ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from processor.geometry import circle
 from processor.model import Floats, Ints
 from processor.scan_folder.shapes.body import Body
 
@@ -114,19 +115,16 @@ def _fitted(edges: Floats, ways: Floats) -> tuple[Floats, float] | None:
     x = np.linalg.svd(way[None])[2][1:]
     middle = edges.mean(axis=(0, 1))
     flat = (edges.reshape(-1, 3) - middle) @ x.T
-    unknown, _, rank, _ = np.linalg.lstsq(
-        np.column_stack([2.0 * flat, np.ones(len(flat))]), (flat**2).sum(axis=1), rcond=None
-    )
-    square = unknown[2] + unknown[:2] @ unknown[:2]
-    if rank < 3 or square <= 0.0:
+    fitted = circle.algebraic(flat)
+    if fitted is None:
         return None
-    radius = float(np.sqrt(square))
-    off = flat - unknown[:2]
+    centre, radius = fitted
+    off = flat - centre
     if np.sqrt(((np.linalg.norm(off, axis=1) - radius) ** 2).mean()) > ROUND * radius:
         return None
     angles = np.sort(np.arctan2(off[:, 1], off[:, 0]))
     if 2.0 * np.pi - np.diff(angles, append=angles[0] + 2.0 * np.pi).max() < LEAST_TURN:
         return None
     along = (edges.reshape(-1, 3) - middle) @ way
-    on_axis = middle + unknown[:2] @ x
+    on_axis = middle + centre @ x
     return np.stack([on_axis + along.min() * way, on_axis + along.max() * way]), radius

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from processor.geometry import rigid
 from processor.geometry.linalg_small import product
 from processor.model import Bools, Floats, Ints, Reason, reason
 from processor.robust_statistics import TUKEY, robust_sd
@@ -174,10 +175,8 @@ def _axes(points: Floats, start: Ints, at: Floats, along: Floats, radii: Floats)
 
 def _across(along: Floats) -> tuple[Floats, Floats]:
     """Two unit vectors (m, 3) each across directions (m, 3)."""
-    least = np.eye(3)[np.argmin(np.abs(along), axis=1)]
-    e1 = np.cross(along, least)
-    e1 /= np.linalg.norm(e1, axis=1)[:, None]
-    return e1, np.cross(along, e1)
+    e1, e2 = rigid.axes_across(along).transpose(1, 0, 2)
+    return np.ascontiguousarray(e1), np.ascontiguousarray(e2)
 
 
 def _moved(axes: kernels.Axes, unknown: Floats) -> kernels.Axes:
