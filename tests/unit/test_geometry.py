@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from processor.geometry import icp, neighbors, principal, rigid
 from processor.geometry.polyline import Line, Polyline, crossing, fit_line, ransac_line
@@ -104,6 +105,20 @@ def test_point_to_plane_brings_a_box_home():
     found = icp.point_to_plane(source, points, normals, np.eye(4), gates_mm=(200.0, 50.0, 10.0))
     moved = rigid.apply(found.T_target_source @ rigid.invert(T_true), np.array([[3000.0, 900.0, 500.0]]))
     assert np.linalg.norm(moved - [3000.0, 900.0, 500.0]) < 0.2
+
+
+def test_partners_of_points_that_move_are_those_of_a_plain_search():
+    rng = np.random.default_rng(6)
+    tree = cKDTree(rng.uniform(0.0, 1000.0, (3000, 3)))
+    points = rng.uniform(-100.0, 1100.0, (2000, 3))
+    partners = icp._Partners(tree, len(points))
+    for step, reach in ((0.0, 90.0), (300.0, 90.0), (20.0, 90.0), (3.0, 90.0), (0.3, 60.0), (0.0, 60.0), (3.0, 200.0)):
+        points = points + rng.normal(0.0, step, points.shape)
+        index, near = partners.of(points, reach)
+        distance, expected = tree.query(points, distance_upper_bound=reach)
+        np.testing.assert_array_equal(near, np.isfinite(distance))
+        np.testing.assert_array_equal(index[near], expected[near])
+        assert 0 < near.sum() < len(points)
 
 
 def test_spacing_of_a_grid_and_of_random_points():
