@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import h5py
@@ -35,9 +35,15 @@ def begin(path: str, dataset: Any) -> Any:
 
 def seal(dataset: Any, array: np.typing.NDArray[Any]) -> None:
     """Give a dataset the checksum of the array that was written to it."""
+    seal_parts(dataset, [array])
+
+
+def seal_parts(dataset: Any, parts: Iterable[np.typing.NDArray[Any]]) -> None:
+    """Give a dataset the checksum of the parts that are written to it."""
     digest = begin(dataset.name, dataset)
-    same = np.ascontiguousarray(array, dataset.dtype)
-    digest.update(same.data if same.size else b"")
+    for part in parts:
+        same = np.ascontiguousarray(part, dataset.dtype)
+        digest.update(same.data if same.size else b"")
     _write(dataset, digest)
 
 

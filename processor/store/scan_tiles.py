@@ -26,13 +26,11 @@ NEWER = {
 
 def write_scan(group: Any, scan: Scan) -> Ints:
     """Write a scan into a group; returns the row (n,) of ``scan.points`` at each position of the file."""
-    tiled = tiles.arrange(scan.points)
-    sorted_columns = {
-        name: getattr(scan, name)[tiled.order]
-        for name in per_point_fields(Scan)
-        if name != "points" and getattr(scan, name).size
+    others = {
+        name: getattr(scan, name) for name in per_point_fields(Scan) if name != "points" and getattr(scan, name).size
     }
-    codec.write_record(group, dataclasses.replace(scan, **sorted_columns), skip={"points"})
+    tiled = tiles.arrange(scan.points, others)
+    codec.write_record(group, dataclasses.replace(scan, **tiled.others), skip={"points"})
     points = group.create_group("points")
     for axis, column in zip(AXES, tiled.columns, strict=True):
         codec.write_array(points, axis, column)

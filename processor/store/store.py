@@ -26,6 +26,7 @@ import processor.store.checksums as checksums
 import processor.store.codec as codec
 import processor.store.file_structure_checks as file_structure_checks
 import processor.store.scan_tiles as scan_tiles
+from processor import large_arrays
 from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth, per_point_fields
 from processor.store.atomic_file import replacing
 from processor.store.codec import DecodeError
@@ -103,7 +104,8 @@ def _check(path: Path, scene: Scene) -> None:
     if len(set(names)) != len(names):
         raise InputError(f"{path}: expected scans of different names, found {', '.join(sorted(names))}; rename one")
     for scan in scene.scans:
-        bad = int(np.count_nonzero(~np.isfinite(scan.points).all(axis=1)))
+        blocks = large_arrays.blocks(len(scan.points))
+        bad = sum(int(np.count_nonzero(~np.isfinite(scan.points[rows]).all(axis=1))) for rows in blocks)
         if bad or not np.isfinite(scan.origin).all():
             culprit = f"{bad} points" if bad else "an origin"
             raise InputError(f"{path}: scan {scan.name!r} has {culprit} with coordinates that are not finite")
