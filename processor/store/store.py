@@ -176,6 +176,8 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
         raise InputError(f"{path}: {error}") from error
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
+    except large_arrays.NoRoomError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except DAMAGE as error:
         wanted = " or ".join(FORMATS[kind] for kind in kinds)
         raise InputError(
@@ -371,9 +373,11 @@ def design_hash(scene: Scene) -> str:
 
 def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int = 0) -> None:
     if isinstance(value, np.ndarray):
-        little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
-        digest.update(f"{name}:{little.dtype.str}{value.shape};".encode())
-        digest.update(little.data if little.size else b"")
+        kind = value.dtype.newbyteorder("<")
+        digest.update(f"{name}:{kind.str}{value.shape};".encode())
+        for rows in large_arrays.blocks(len(value)) if value.ndim else ((),):
+            part = np.ascontiguousarray(value[rows], kind)
+            digest.update(part.data if part.size else b"")
     elif dataclasses.is_dataclass(value):
         digest.update(f"{name}:{type(value).__name__}(".encode())
         for field in dataclasses.fields(value):

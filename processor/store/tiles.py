@@ -161,9 +161,9 @@ def problems(grid: Grid, cell: Ints, start: Ints, count: Ints, n: int) -> list[s
     return faults
 
 
-def misplaced(grid: Grid, cell: Ints, count: Ints, columns: tuple[Column, Column, Column]) -> int:
-    """Count the points that lie outside their tile of the index."""
-    return int((grid.cells(columns) != np.repeat(cell, count, axis=0)).any(axis=1).sum())
+def misplaced(grid: Grid, cell: Ints, columns: tuple[Column, Column, Column]) -> int:
+    """Count the points that lie outside their tile, whose cell (n, 3) the index gives."""
+    return int((grid.cells(columns) != cell).any(axis=1).sum())
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,10 @@ def blocks(monkeypatch):
     monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
 
 
+def full_disk(*_):
+    raise OSError(28, "No space left on device")
+
+
 def in_memory(path, tmp_path, units=None):
     """The bytes of the scene file of an input that is read whole."""
     out = tmp_path / "whole.h5"
@@ -217,10 +221,7 @@ def test_a_disk_too_small_for_the_points_is_said(tmp_path, blocks, monkeypatch):
     np.savetxt(tmp_path / "a.xyz", np.random.default_rng(0).uniform(size=(100, 3)))
     formats.write_ptx(tmp_path / "b.ptx", stations_apart(np.zeros(3)).scans[0], None)
 
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.posix_fallocate", full)
+    monkeypatch.setattr("os.posix_fallocate", full_disk)
     for name in ("a.xyz", "b.ptx"):
         with pytest.raises(InputError, match=f"{name}: cannot be read \\(the disk of .* has no room for its points"):
             conversion.convert(tmp_path / name, tmp_path / "s.h5")
@@ -301,3 +302,17 @@ def test_memory_does_not_grow_with_the_points(tmp_path):
         )
         peak.append(int(done.stdout))
     assert peak[1] < peak[0] + 330, peak
+
+
+def test_a_scene_read_into_files_is_the_same(tmp_path, monkeypatch):
+    scene = merged(FAR)
+    store.write_scene(tmp_path / "s.h5", scene, None, {})
+    whole = store.scene_hash(store.read_scene(tmp_path / "s.h5"))
+    monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
+    monkeypatch.setattr(large_arrays, "BLOCK_ROWS", BLOCK)
+    monkeypatch.setattr("processor.store.checksums.PART_ITEMS", 100)
+    with large_arrays.in_files(tmp_path):
+        assert store.scene_hash(store.read_scene(tmp_path / "s.h5")) == whole
+    monkeypatch.setattr("os.posix_fallocate", full_disk)
+    with large_arrays.in_files(tmp_path), pytest.raises(InputError, match=r"cannot be read \(the disk of"):
+        store.read_scene(tmp_path / "s.h5")
