@@ -21,6 +21,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from processor import large_arrays
+
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 # Labels and grid numbers come by the ten million: they are kept small. Coordinates never are.
@@ -360,7 +362,7 @@ class Scan(Checked):
     def contradictions(self) -> Iterable[str]:
         """Yield that a few points claim a grid that fills the memory."""
         if len(self.grid_row) and len(self.grid_column):
-            rows, columns = int(self.grid_row.max()) + 1, int(self.grid_column.max()) + 1
+            rows, columns = (int(large_arrays.extremes(n)[1]) + 1 for n in (self.grid_row, self.grid_column))
             most = LARGEST_GRID + GRID_CELLS_PER_POINT * len(self.grid_row)
             if rows * columns > most:
                 yield f"/grid_row: expected a grid of at most {most} cells for its points, found {rows} x {columns}"

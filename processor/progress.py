@@ -16,6 +16,7 @@ PATIENCE_S = 2.0
 REFRESH_S = 0.25
 COUNTED = "{desc}: {n_fmt} of {total_fmt} |{bar}| {elapsed}, {remaining} left"
 UNCOUNTED = "{desc}: {elapsed}"
+IN_PARTS = "{desc}: {percentage:3.0f} % |{bar}| {elapsed}, {remaining} left"
 
 
 @dataclass
@@ -23,6 +24,7 @@ class _Stage:
     title: str
     done: int = 0
     total: int = 0
+    share: float = 0.0  # of the item after those done
 
 
 _stages: list[_Stage] = []
@@ -53,8 +55,14 @@ def tracked(items: Sequence[Item]) -> Iterator[Item]:
     current.done, current.total = 0, len(items)
     for item in items:
         yield item
-        current.done += 1
+        current.done, current.share = current.done + 1, 0.0
     current.total = 0
+
+
+def show_share(share: float) -> None:
+    """Show how much of the current item of :func:`tracked` is done, from 0 to 1."""
+    if _stages:
+        _stages[-1].share = min(share, 1.0)
 
 
 def _show(current: _Stage, ended: threading.Event) -> None:
@@ -66,6 +74,6 @@ def _show(current: _Stage, ended: threading.Event) -> None:
         while not ended.wait(REFRESH_S):
             if bar.total != current.total:
                 bar.reset(current.total)
-                bar.bar_format = COUNTED if current.total else UNCOUNTED
-            bar.n = current.done
+            bar.bar_format = UNCOUNTED if not current.total else IN_PARTS if current.share else COUNTED
+            bar.n = current.done + current.share
             bar.refresh()

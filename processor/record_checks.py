@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from processor import large_arrays
 from processor.model import LARGEST_MM, Checked, InputError, Meaning, Word
 
 POSE_TOLERANCE = 1e-3  # of R^T R - I
@@ -123,6 +124,8 @@ def _shown(value: object) -> str:
 
 
 def _of_numbers(values: Array, meaning: Meaning, record: Any, root: Any) -> Iterator[str]:
+    if meaning is UNDECLARED or _in_range(values, meaning, record, root):
+        return
     real = values.dtype.kind == "f"
     if meaning.finite and real:
         yield from _first(values, ~np.isfinite(values), "expected finite numbers")
@@ -148,6 +151,17 @@ def _of_numbers(values: Array, meaning: Meaning, record: Any, root: Any) -> Iter
         first = np.zeros(len(values), bool)
         first[np.unique(values, return_index=True)[1]] = True
         yield from _first(values, ~first, "expected each once")
+
+
+def _in_range(values: Array, meaning: Meaning, record: Any, root: Any) -> bool:
+    """Whether no number of many is impossible, found block by block; False where that is not known."""
+    if not values.ndim or len(values) <= large_arrays.BLOCK_ROWS or meaning.among or meaning.unlike or meaning.unique:
+        return False
+    low, high = meaning.least, meaning.most
+    if meaning.rows_of:
+        low, high = meaning.lowest_row, len(_referred(meaning.rows_of, record, root)) - 1
+    least, most = large_arrays.extremes(values)
+    return bool(np.isfinite([least, most]).all()) and low <= least <= most <= high and least > meaning.above
 
 
 def _interval(low: float, high: float, rows_of: str) -> str:

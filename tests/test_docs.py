@@ -36,6 +36,7 @@ RUN = (
     "processor run my-frame -o results --lang zh",
     "processor run my-frame -o results --params mine.toml",
     "processor run my-frame -o results --method ray,ransac",
+    "processor convert my-frame -o my-frame.h5",
     "processor check results",
     "processor verify results",
     "processor report results",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from processor import pipeline, record_checks
+from processor import large_arrays, pipeline, record_checks
 from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
@@ -19,7 +20,7 @@ from processor.progress import stage
 from processor.report import headline, write_results
 from processor.results.file_names import RESULTS_H5
 from processor.scan_folder import files, fingerprint
-from processor.store import store
+from processor.store import output_checks, store
 
 Names = str | Sequence[str] | None
 
@@ -140,7 +141,10 @@ def compute(
     log: Callable[[str], None] = lambda _: None,
     so_far: str | Path | None = None,
 ) -> Results:
-    """Process an input as :func:`run` does, without writing the results; ``output`` is tried before the work."""
+    """Process an input as :func:`run` does, without writing the results; ``output`` is tried before the work.
+
+    Points beyond 128 MB lie in files without a name beside the output, without one in the folder for temporary files.
+    """
     wanted, methods, parameters = _names(steps), _names(method), _parameters(params)
     out = None if output is None else Path(output)
     if isinstance(input_, Scene):
@@ -156,11 +160,12 @@ def compute(
         pipeline.plan(wanted, methods, parameters, seed)  # wrong names are reported before a long reading
     place = out.resolve() if out else None
     before = fingerprint.signature(path.resolve(), place)
-    with stage(f"reading {path.name}"):
-        scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
-    _log_reading(path, scene, log, () if wanted else jobs)
-    keep = None if so_far is None else partial(_keep, Path(so_far), jobs)
-    execution = pipeline.execute(path, scene, jobs, log, piecewise, keep)
+    with large_arrays.in_files(Path(tempfile.gettempdir()) if out is None else output_checks.existing_parent(out)):
+        with stage(f"reading {path.name}"):
+            scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
+        _log_reading(path, scene, log, () if wanted else jobs)
+        keep = None if so_far is None else partial(_keep, Path(so_far), jobs)
+        execution = pipeline.execute(path, scene, jobs, log, piecewise, keep)
     results = Results(execution, evaluate.evaluate(path, execution))
     fingerprint.check_unchanged(path.resolve(), before, place)
     return results

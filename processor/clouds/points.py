@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from processor import large_arrays
 from processor.model import Scan, Scene, per_point_fields
 from processor.writers.cloud import BLOCK
 
@@ -107,3 +108,4 @@ def blocks(points: Points, scan: int) -> Iterator[dict[str, Any]]:
     present = {name: column for name, column in columns.items() if len(column)}
     for start in range(0, len(columns["points"]), BLOCK):
         yield {name: column[start : start + BLOCK] for name, column in present.items()}
+        large_arrays.release()

@@ -50,12 +50,20 @@ def evaluate(path: Path, execution: Execution) -> ErrorReport:
 
     Raises InputError for a truth that cannot be read, or is that of another scene.
     """
+    truth = truth_of(path, labels=execution.stored is None)
+    source = folder.truth_file(path) or path / truth_json.NAME
+    return ErrorReport() if truth is None else against(truth, execution, str(source))
+
+
+def truth_of(path: Path, labels: bool = True) -> Truth | None:
+    """Return the truth of the input at ``path``, with or without the labels of its points; None where it holds none.
+
+    Raises InputError for a truth that cannot be read.
+    """
     source = folder.truth_file(path)
-    if source is None:
-        truth = truth_json.read(path) if path.is_dir() else None
-    else:
-        truth = store.read_truth(source, labels=execution.stored is None)
-    return ErrorReport() if truth is None else against(truth, execution, str(source or path / truth_json.NAME))
+    if source is not None:
+        return store.read_truth(source, labels=labels)
+    return truth_json.read(path) if path.is_dir() else None
 
 
 def against(truth: Truth, execution: Execution, source: str) -> ErrorReport:

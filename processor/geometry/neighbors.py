@@ -1,4 +1,4 @@
-"""Nearest neighbours in a cloud: its spacing, its outliers, distances to another cloud, crops, even samples of it."""
+"""Nearest neighbours in a cloud: spacing, outliers, distances to another cloud, crops, even samples, equal places."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
@@ -8,6 +8,8 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.geometry import point_grid
@@ -233,3 +235,15 @@ def _nearest(cells, places, own, order, first, last, k, mean, farthest):  # type
         farthest[row] = np.sqrt(best[k - 1])
         if np.isfinite(farthest[row]):
             guess = max(1.2 * (farthest[row] - away), 0.05 * size)
+
+
+def same_places(points: Floats, within_mm: float) -> Ints:
+    """Return the number (n,), from 0, of the place of each point (n, 3); points no farther apart have the same one."""
+    distinct, place = np.unique(points, axis=0, return_inverse=True)
+    place = place.reshape(-1).astype(np.int64)
+    pairs = cKDTree(distinct).query_pairs(within_mm, output_type="ndarray") if len(distinct) else np.empty((0, 2))
+    if not len(pairs):
+        return place
+    links = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(distinct),) * 2)
+    label: Ints = connected_components(links, directed=False)[1].astype(np.int64)
+    return label[place]

@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from processor.geometry import circle, rigid
-from processor.geometry.same_places import same_places
+from processor.geometry.neighbors import same_places
 from processor.model import Floats, Ints
 
 FEWEST_CORNERS = 8  # of a polygon that is a circle

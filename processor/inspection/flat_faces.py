@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from processor import scene_cloud
 from processor.adjustment import groups, scanner_class
 from processor.geometry import mesh_distance
-from processor.geometry.same_places import same_places
+from processor.geometry.neighbors import same_places
 from processor.inspection import design_holes
 from processor.inspection.design_holes import Hole
 from processor.model import Floats, Ints, StructureDesign

@@ -48,6 +48,9 @@ class Rows:
         self, file: BinaryIO, separator: str | None = None, commas: bool = False, comments: bool = False
     ) -> None:
         self._file = file
+        start = file.tell()
+        self.size = file.seek(0, os.SEEK_END)  # of the file, bytes
+        file.seek(start)
         self._separator = ord(separator) if separator else 0
         self._commas, self._comments = commas, comments
         self._text = np.empty(0, np.uint8)
@@ -80,15 +83,16 @@ class Rows:
             pair = self._text[end : end + 2].tobytes() == b"\r\n"
             self._at = min(end + 1 + pair, len(self._text))
 
+    def bytes_read(self) -> int:
+        """Return how many bytes of the file were read."""
+        return self._file.tell()
+
     def likely_left(self) -> int:
         """Estimate the number of rows to the end of the file from the lines in memory, with a margin of 5 %."""
         if not self._fill():
             return 0
         lines, size = int(count_ends(self._text, self._at, len(self._text))) + 1, len(self._text) - self._at
-        place = self._file.tell()
-        beyond = self._file.seek(0, os.SEEK_END) - place
-        self._file.seek(place)
-        return lines + int(1.05 * beyond * lines / size)
+        return lines + int(1.05 * (self.size - self._file.tell()) * lines / size)
 
     def pieces(self, columns: Sequence[int], most: int = 2**62, width: int = 0) -> Iterator[Floats]:
         """Yield the numbers (n, k) of some columns of the next rows, at most ``most`` of them, piece by piece.

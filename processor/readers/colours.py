@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from processor import large_arrays
 from processor.model import Codes
 from processor.readers.columns import first_named
 from processor.readers.raw_scan import RawScan
@@ -31,16 +32,20 @@ def of_columns(columns: Sequence[Any]) -> Codes:
     none = np.empty((0, 3), np.uint8)
     if not columns or not len(columns[0]):
         return none
-    most = max(float(column.max()) for column in columns)
-    least = min(float(column.min()) for column in columns)
+    bounds = [large_arrays.extremes(column) for column in columns]
+    least, most = min(low for low, _ in bounds), max(high for _, high in bounds)
     if not (least >= 0.0 and 0.0 < most < (MOST + 1) * STEP):
         return none
-    if any(np.asarray(column).dtype.kind == "f" and (column != np.rint(column)).any() for column in columns):
-        return none
-    if most > MOST:
-        # Of c in 8 bits some programs write 256 c, others 257 c.
-        columns = [np.asarray(column, np.float32) // STEP for column in columns]
-    return scaled(columns, 0.0, float(MOST))
+    colour = large_arrays.allocate(len(columns[0]), 3, dtype=np.uint8)
+    for rows in large_arrays.blocks(len(colour)):
+        parts = [np.asarray(column[rows]) for column in columns]
+        if any(part.dtype.kind == "f" and (part != np.rint(part)).any() for part in parts):
+            return none
+        if most > MOST:
+            # Of c in 8 bits some programs write 256 c, others 257 c.
+            parts = [np.asarray(part, np.float32) // STEP for part in parts]
+        colour[rows] = scaled(parts, 0.0, float(MOST))
+    return colour
 
 
 def coloured(scan: RawScan, columns: Sequence[Any]) -> RawScan:

@@ -8,6 +8,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+import processor.readers.pieces as progress_of
 from processor.model import Floats
 
 INTENSITY_NAMES = r"(scalar_)?(intensity|reflectance|reflectivity|amplitude)|i"
@@ -58,5 +59,6 @@ def fill_columns(columns: Sequence[Floats], pieces: Iterable[Any]) -> None:
         for values, part in zip(columns[1:], parts[3:], strict=True):
             values[rows] = part
         filled += len(parts[0])
+        progress_of.read(len(parts[0]), filled, count)
     if filled != count:
         raise ValueError(f"expected {count} points as declared, found {filled}")

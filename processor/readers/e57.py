@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import processor.readers.pieces as pieces
+from processor.large_arrays import allocate
 from processor.model import Codes, Floats, InputError, Labels
-from processor.readers.allocation import allocate
 from processor.readers.colours import scaled
 from processor.readers.file_checks import errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
@@ -209,6 +210,7 @@ def _read_points(
                 break
             lines[part] = numbers
         count = part.stop
+        pieces.read(rows, read, declared)
     if read != declared:
         raise InputError(
             f"{path}: expected {declared} points in scan {name!r} as declared, found {read}; copy it again"

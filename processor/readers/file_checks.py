@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from processor.large_arrays import NoRoomError
 from processor.model import InputError
 
 
@@ -18,7 +19,7 @@ def errors_name_the_file(path: Path, kind: str) -> Iterator[None]:
     """
     try:
         yield
-    except (InputError, KeyboardInterrupt, SystemExit, GeneratorExit):
+    except (InputError, NoRoomError, KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except BaseException as error:
         message = (str(error).strip().splitlines() or [""])[0][:200] or type(error).__name__

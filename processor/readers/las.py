@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+import processor.readers.pieces as pieces
+from processor.large_arrays import allocate
 from processor.model import InputError
-from processor.readers.allocation import allocate
 from processor.readers.colours import coloured
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
@@ -43,7 +44,7 @@ def read(path: Path) -> list[RawScan]:
     import laspy
 
     _check_header(path)
-    count = 0
+    count, named = 0, False
     with errors_name_the_file(path, "LAS"), laspy.open(str(path)) as file:
         header = file.header
         fits_degrees = bool((np.abs([header.mins, header.maxs])[:, :2] <= [180.0, 90.0]).all())
@@ -56,7 +57,7 @@ def read(path: Path) -> list[RawScan]:
                 f"{header.offsets}; export it again"
             )
         points, intensity = allocate(declared, 3), allocate(declared)
-        station = np.empty(declared, np.uint16)
+        station = allocate(declared, dtype=np.uint16)
         colours = COLOURS if set(COLOURS) <= set(header.point_format.dimension_names) else ()
         colour = [allocate(declared, dtype=np.uint16) for _ in colours]
         for piece in file.chunk_iterator(PIECE):
@@ -70,12 +71,12 @@ def read(path: Path) -> list[RawScan]:
             for name, column in zip(colours, colour, strict=True):
                 column[rows] = piece[name]
             count += len(piece)
+            pieces.read(len(piece), count, declared)
+            named = named or bool(station[rows].any())
     if count != declared:
         raise InputError(f"{path}: expected {declared} points as declared, found {count}; copy it again")
     # 0 in all points: the stations are unknown.
-    scan = build_scan(
-        path, scan_name(path), points, unit=unit, intensity=intensity, station=station if station.any() else ()
-    )
+    scan = build_scan(path, scan_name(path), points, unit=unit, intensity=intensity, station=station if named else ())
     return [dataclasses.replace(coloured(scan, colour), scanned=day)]
 
 

@@ -16,8 +16,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from processor import large_arrays
+from processor.large_arrays import allocate
 from processor.model import Floats, InputError
-from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
 from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, columns_of_records, fill_columns, first_named
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
@@ -144,7 +145,7 @@ def _unpacked(file: BinaryIO, header: Header, fields: Sequence[int]) -> Iterator
 def _without_nan(columns: Sequence[Floats]) -> int:
     """Move the rows without NaN coordinates to the front, in their order, and return their number."""
     returns, count = 0, len(columns[0])
-    if count and not np.isnan(columns[0].min()):
+    if count and not np.isnan(large_arrays.extremes(columns[0])[0]):
         return count
     for start in range(0, count, PIECE):
         rows = slice(start, min(start + PIECE, count))
@@ -154,4 +155,5 @@ def _without_nan(columns: Sequence[Floats]) -> int:
             for column in columns:
                 column[returns : returns + added] = column[rows][valid]
         returns += added
+        large_arrays.release()
     return returns

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from processor.large_arrays import allocate
 from processor.model import InputError
-from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
 from processor.readers.colours import coloured
 from processor.readers.colours import named as colours_named

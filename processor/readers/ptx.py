@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
+import processor.readers.pieces as pieces
+from processor.large_arrays import allocate
 from processor.model import Codes, Floats, InputError, Labels
-from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
 from processor.readers.file_checks import check_declared_points, check_last_row, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
@@ -77,6 +78,7 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
         for piece in rows.pieces(tuple(range(width if wide else 3)), cells, width if wide else 0):
             count = copy_returns(piece, read, lines, count, points, (intensity, colour), (row, column))
             read += len(piece)
+            pieces.read(len(piece), rows.bytes_read(), rows.size)
     if read != cells:
         raise InputError(f"{path}: expected {cells} cells in scan {number}, found {read}; copy or export it again")
     if not count:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from processor import large_arrays
 from processor.model import Checked, Codes, Floats, InputError, Ints, Labels, column, optional
 from processor.readers.encoding import file_name_as_text
 
@@ -62,7 +63,7 @@ def build_scan(
     """
     if not len(points):
         raise InputError(f"{path}: scan {name!r} holds no points; export it again")
-    low, high = float(points.min()), float(points.max())  # NaN where there is one
+    low, high = large_arrays.extremes(points)
     if not (np.isfinite(low) and np.isfinite(high)):
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         raise InputError(
@@ -73,20 +74,21 @@ def build_scan(
     origin = np.zeros(3)
     if farthest > FAR:
         # The median of a sample: a single point may be an outlier.
-        sample = points[:: max(1, len(points) // 1000)]
+        sample = large_arrays.every(points, max(1, len(points) // 1000))
         origin = np.floor(np.sort(sample, axis=0)[len(sample) // 2] / ORIGIN_STEP) * ORIGIN_STEP
-        points -= origin
+        for rows in large_arrays.blocks(len(points)):
+            points[rows] -= origin
     with np.errstate(over="ignore"):
         step = float(np.spacing(np.float32(farthest))) if single else 0.0
     return RawScan(
         name,
         points,
         origin,
-        intensity=np.asarray(intensity, np.float64),
+        intensity=large_arrays.contiguous(intensity, np.float64),
         position=np.asarray(position, np.float64),
         T_project_scan=np.asarray(T_project_scan, np.float64),
         unit=unit,
-        station=np.asarray(station, np.int64),
+        station=large_arrays.contiguous(station, np.int64),
         grid_row=grid[0] if grid else np.empty(0, np.int32),
         grid_column=grid[1] if grid else np.empty(0, np.int32),
         step=step,
@@ -98,5 +100,6 @@ def scaled_in_place(raw: RawScan, factor: float) -> Floats:
     points: Floats = raw.points
     points.flags.writeable = True
     if factor != 1.0:
-        points *= factor
+        for rows in large_arrays.blocks(len(points)):
+            points[rows] *= factor
     return points

@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,10 +30,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import processor.readers.pieces as pieces
+from processor import large_arrays, progress
 from processor.jobs.child import end_with_parent
 from processor.jobs.process import end, isolated, start
 from processor.model import InputError
-from processor.readers.allocation import allocate_with
 from processor.readers.raw_scan import RawScan
 
 SLACK_BYTES = 1 << 30
@@ -41,6 +43,8 @@ PATIENCE = 4.0  # ratio of elapsed to processor time: the machine may be busy
 START_S = 120.0
 ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station", "grid_row", "grid_column", "colour")
 SMALL = 1 << 16
+BYTES_A_BYTE = 6.0  # of arrays per byte of a compressed file
+SHOWN_S = 0.5  # between two messages of how much is read
 START = "from processor.readers import sandbox; sandbox.serve()"
 
 
@@ -75,12 +79,15 @@ def read(path: Path, module: str) -> list[RawScan]:
     with _lock:
         helper = _running()
         try:
-            _send(
-                helper.channel, {"module": module, "path": os.fsencode(path.absolute()).hex(), "limit_s": limit_s(path)}
-            )
+            folder = large_arrays.folder_for(int(BYTES_A_BYTE * path.stat().st_size))
+            places = {"path": _hex(path), "folder": "" if folder is None else _hex(folder)}
+            _send(helper.channel, {"module": module, "limit_s": limit_s(path), **places})
             # The process ends itself in time; this timeout is for one that is stopped or cannot be ended.
             helper.channel.settimeout(PATIENCE * limit_s(path) + 30.0)
             answer, descriptor = _receive(helper.channel)
+            while "share" in answer:
+                progress.show_share(answer["share"])
+                answer, descriptor = _receive(helper.channel)
         except (OSError, EOFError) as error:
             raise _death(path, helper, error) from None
         except BaseException:
@@ -88,7 +95,15 @@ def read(path: Path, module: str) -> list[RawScan]:
             raise
     if "error" in answer:
         raise InputError(f"{path}{answer['error']}" if answer["about_file"] else answer["error"])
-    return _scans(answer, descriptor)
+    return _scans(answer, descriptor, folder is not None)
+
+
+def _hex(path: Path) -> str:
+    return os.fsencode(path.absolute()).hex()
+
+
+def _path(text: str) -> Path:
+    return Path(os.fsdecode(bytes.fromhex(text)))
 
 
 def _running() -> _Helper:
@@ -150,10 +165,10 @@ def close() -> None:
         helper.end()
 
 
-def _scans(answer: dict[str, Any], descriptor: int) -> list[RawScan]:
+def _scans(answer: dict[str, Any], descriptor: int, in_file: bool) -> list[RawScan]:
     try:
         length = os.fstat(descriptor).st_size
-        shared = mmap.mmap(descriptor, length) if length else b""
+        shared = (large_arrays.mapped if in_file else mmap.mmap)(descriptor, length) if length else b""
     finally:
         os.close(descriptor)
     scans = []
@@ -197,16 +212,34 @@ def _receive_some(channel: socket.socket, most: int) -> bytes:
     return data
 
 
+@dataclass
+class _Sender:
+    """Sends how much of a file is read, now and then."""
+
+    channel: socket.socket
+    last: float = 0.0
+
+    def __call__(self, share: float) -> None:
+        """Send a share, from 0 to 1."""
+        now = time.monotonic()
+        if now > self.last + SHOWN_S:
+            self.last = now
+            _send(self.channel, {"share": share})
+
+
 # --- the other process ---------------------------------------------------------------------------------------------
 
 
 class _Shared:
-    """Shared memory for arrays, which the other process maps by one descriptor."""
+    """Shared memory for arrays, or a file of a folder, which the other process maps by one descriptor."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path | None) -> None:
         self.end = 0
+        self.folder = folder
         self.blocks: list[tuple[int, int, int]] = []  # address, bytes, offset
-        if hasattr(os, "memfd_create"):
+        if folder is not None:
+            self.descriptor = large_arrays.new_file(folder)
+        elif hasattr(os, "memfd_create"):
             self.descriptor = os.memfd_create("scan")
         else:
             with tempfile.TemporaryFile() as file:
@@ -220,8 +253,12 @@ class _Shared:
         _allow(size)
         offset = self.end
         self.end += -(-size // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
-        os.ftruncate(self.descriptor, self.end)
-        array: npt.NDArray[Any] = np.frombuffer(mmap.mmap(self.descriptor, size, offset=offset), dtype).reshape(shape)
+        self._extend()
+        if self.folder is None:
+            memory = mmap.mmap(self.descriptor, size, offset=offset)
+        else:
+            memory = large_arrays.mapped(self.descriptor, size, offset)
+        array: npt.NDArray[Any] = np.frombuffer(memory, dtype).reshape(shape)
         self.blocks.append((_address(array), size, offset))
         return array
 
@@ -233,12 +270,18 @@ class _Shared:
                 return offset + address - first
         offset = self.end
         self.end += -(-array.nbytes // 16) * 16
-        os.ftruncate(self.descriptor, self.end)
+        self._extend()
         view = memoryview(array).cast("B") if array.size else b""
         done = 0
         while done < array.nbytes:
             done += os.pwrite(self.descriptor, view[done : done + (1 << 26)], offset + done)
         return offset
+
+    def _extend(self) -> None:
+        if self.folder is None:
+            os.ftruncate(self.descriptor, self.end)
+        else:
+            large_arrays.reserve(self.descriptor, self.end, self.folder)
 
 
 def _address(array: Any) -> int:
@@ -282,18 +325,19 @@ def serve() -> None:
             request, _ = _receive(channel)
         except (EOFError, OSError):
             return
-        shared = _Shared()
-        allocate_with(shared.new)
+        shared = _Shared(_path(request["folder"]) if request["folder"] else None)
+        large_arrays.allocate_with(shared.new)
+        pieces.show_with(_Sender(channel))
         _limit_memory(SLACK_BYTES)
         signal.setitimer(signal.ITIMER_PROF, request["limit_s"])
         signal.setitimer(signal.ITIMER_REAL, PATIENCE * request["limit_s"])
-        answer = _answer(Path(os.fsdecode(bytes.fromhex(request["path"]))), request["module"], shared)
+        answer = _answer(_path(request["path"]), request["module"], shared)
         for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
             signal.setitimer(timer, 0.0)
         _send(channel, answer, shared.descriptor)
         os.close(shared.descriptor)
         del shared
-        allocate_with(np.empty)
+        large_arrays.allocate_with(None)
 
 
 def _answer(path: Path, module: str, shared: _Shared) -> dict[str, Any]:

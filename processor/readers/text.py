@@ -16,8 +16,10 @@ from typing import BinaryIO
 
 import numpy as np
 
+import processor.readers.pieces as pieces
+from processor import large_arrays
+from processor.large_arrays import allocate
 from processor.model import Floats, InputError
-from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
 from processor.readers.colours import coloured
 from processor.readers.colours import named as colours_named
@@ -113,6 +115,7 @@ def _filled(rows: Rows, wanted: Sequence[int], declared: int, width: int) -> tup
         points[count : count + len(piece)] = piece[:, :3]
         others[count : count + len(piece)] = piece[:, 3:]
         count += len(piece)
+        pieces.read(len(piece), rows.bytes_read(), rows.size)
     if count < declared:
         raise ValueError(f"expected {declared} points as declared, found {count}")
     return points[:count], others[:count]
@@ -120,7 +123,8 @@ def _filled(rows: Rows, wanted: Sequence[int], declared: int, width: int) -> tup
 
 def _grown(column: Floats, room: int) -> Floats:
     larger = allocate(room, column.shape[1])
-    larger[: len(column)] = column
+    for part in large_arrays.blocks(len(column)):
+        larger[part] = column[part]
     return larger
 
 
@@ -128,8 +132,8 @@ def numbers(path: Path, layout: Layout) -> Floats:
     """Return all columns (n, k) of a table. Raises InputError for a cell that is not a number."""
     with errors_name_the_file(path, "text"), _opened(path, layout) as file:
         rows = _rows(file, layout)
-        pieces = [piece.copy() for piece in rows.pieces(range(layout.columns), width=layout.width)]
-    return np.concatenate(pieces) if pieces else np.empty((0, layout.columns))
+        copies = [piece.copy() for piece in rows.pieces(range(layout.columns), width=layout.width)]
+    return np.concatenate(copies) if copies else np.empty((0, layout.columns))
 
 
 def _rows(file: BinaryIO, layout: Layout) -> Rows:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from processor import large_arrays
 from processor.model import Bools, Clips, Floats, InputError, Scan, per_point_fields
 from processor.scan_folder.checked_table import Table
 
 KEYS = ("box", "keep", "scan")
 FEWEST_POINTS = 4
-AT_ONCE = 1_000_000  # points whose places are computed at a time
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,8 @@ class Clipper:
         self.inside = self.inside or [0] * len(self.boxes)
         self.names.append(scan.name)
         kept = np.ones(len(scan.points), bool)
-        for start in range(0, len(kept), AT_ONCE):
-            kept[start : start + AT_ONCE] = self._kept(scan, slice(start, start + AT_ONCE))
+        for rows in large_arrays.blocks(len(kept)):
+            kept[rows] = self._kept(scan, rows)
         self.read += len(kept)
         self.kept += int(kept.sum())
         if kept.all():
@@ -73,8 +74,10 @@ class Clipper:
                 f"expected {FEWEST_POINTS} or more; correct the boxes (the project's frame and units), limit them to "
                 "other scans by 'scan', or leave this file out by [[scan]]"
             )
-        columns = {
-            name: getattr(scan, name)[kept] for name in per_point_fields(Scan) if len(getattr(scan, name)) == len(kept)
+        columns: dict[str, Any] = {
+            name: large_arrays.chosen(getattr(scan, name), kept)
+            for name in per_point_fields(Scan)
+            if len(getattr(scan, name)) == len(kept)
         }
         return dataclasses.replace(scan, **columns)
 

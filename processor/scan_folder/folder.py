@@ -10,13 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from processor import readers, record_checks, store
+from processor import large_arrays, readers, record_checks, store
 from processor.model import (
     KINDS,
     ArchDesign,
     Floats,
     FrameDesign,
     InputError,
+    Ints,
+    Labels,
     Scan,
     Scene,
     Stations,
@@ -394,12 +396,14 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
     if pose.size:
         pose[:3, 3] *= scale
     position = raw.position if entry.position is None else entry.position
-    station = raw.station - 1 if stations is not None else raw.station[:0]
-    if stations is not None and len(station) and not -1 <= station.min() <= station.max() < len(stations.ids):
-        raise InputError(
-            f"{entry.path}: its points name stations {raw.station.min()} to {raw.station.max()}, "
-            f"but {STATIONS} has {len(stations.ids)}, counted from 1"
-        )
+    station = raw.station if stations is not None else raw.station[:0]
+    if stations is not None and len(station):
+        least, most = map(int, large_arrays.extremes(raw.station))
+        if not 0 <= least <= most <= len(stations.ids):
+            raise InputError(
+                f"{entry.path}: its points name stations {least} to {most}, "
+                f"but {STATIONS} has {len(stations.ids)}, counted from 1"
+            )
     scanner = position if position.size else np.zeros(3)
     origin = raw.origin * scale
     row, column = scanner_grid.of_scanner(raw.points, raw.grid_row, raw.grid_column, scanner - raw.origin)
@@ -408,7 +412,7 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
         scaled_in_place(raw, scale),
         origin,
         intensity=raw.intensity,
-        point_station=station.astype(np.int32),
+        point_station=_from_0(station),
         grid_row=row,
         grid_column=column,
         component=entry.component or (raw.name if raw.name in parts else ""),
@@ -418,6 +422,14 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
         sigma_mm=entry.sigma_mm,
         colour=raw.colour,
     )
+
+
+def _from_0(station: Ints) -> Labels:
+    """Return stations (n,) counted from 1, 0 = unknown, as rows of the scene's stations."""
+    rows = large_arrays.allocate(len(station), dtype=np.int32)
+    for part in large_arrays.blocks(len(station)):
+        rows[part] = station[part] - 1
+    return rows
 
 
 def _stations(scans: list[Scan]) -> Stations | None:

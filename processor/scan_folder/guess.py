@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from processor import readers
+from processor import large_arrays, readers
 from processor.geometry import mesh_distance, principal
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints
 from processor.readers import RawScan
@@ -226,7 +226,7 @@ def _sample(raws: Sequence[RawScan]) -> Floats:
     share = max(1, sum(len(raw.points) for raw in raws) // SAMPLE)
     pieces = []
     for raw in raws:
-        points = raw.points[::share] + (raw.origin - raws[0].origin)
+        points = large_arrays.every(raw.points, share) + (raw.origin - raws[0].origin)
         if raw.T_project_scan.size and len(raws) > 1:
             T = raw.T_project_scan
             points = (points + raws[0].origin) @ T[:3, :3].T + T[:3, 3]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from processor import large_arrays
 from processor.geometry import scanner_rays
 from processor.model import Floats, Labels
 
@@ -26,25 +27,36 @@ def of_scanner(points: Floats, row: Labels, column: Labels, scanner: Floats) -> 
     if not len(row):
         return NO_GRID
     if not _fits(row, column):
-        row, column = row - row.min(), column - column.min()  # a part of a larger grid
+        row, column = _from_least(row), _from_least(column)  # a part of a larger grid
         if not _fits(row, column):
             return NO_GRID
-    rows, columns = int(row.max()) + 1, int(column.max()) + 1
+    rows, columns = _lines(row), _lines(column)
     if _is_swept(points, row, column, scanner) and not _has_duplicates(row, column, rows, columns):
         return row, column
     return NO_GRID
 
 
 def _fits(row: Labels, column: Labels) -> bool:
-    return (int(row.max()) + 1) * (int(column.max()) + 1) <= CELLS + CELLS_PER_POINT * len(row)
+    return _lines(row) * _lines(column) <= CELLS + CELLS_PER_POINT * len(row)
+
+
+def _lines(numbers: Labels) -> int:
+    return int(large_arrays.extremes(numbers)[1]) + 1
+
+
+def _from_least(numbers: Labels) -> Labels:
+    least, shifted = int(large_arrays.extremes(numbers)[0]), large_arrays.allocate(len(numbers), dtype=np.int32)
+    for rows in large_arrays.blocks(len(numbers)):
+        shifted[rows] = numbers[rows] - least
+    return shifted
 
 
 def _is_swept(points: Floats, row: Labels, column: Labels, scanner: Floats) -> bool:
     """Whether the rays of rows and columns lead to the points."""
     count = len(points)
     sample = np.arange(count) if count <= SAMPLE else np.random.default_rng(0).integers(0, count, SAMPLE)
-    r, c = row[sample].astype(np.int64), column[sample].astype(np.int64)
-    local = points[sample] - scanner
+    r, c = (large_arrays.taken(numbers, sample).astype(np.int64) for numbers in (row, column))
+    local = large_arrays.taken(points, sample) - scanner
     rays = scanner_rays.fitted(local, r, c)
     if rays is None:
         return False
@@ -53,10 +65,14 @@ def _is_swept(points: Floats, row: Labels, column: Labels, scanner: Floats) -> b
     return bool(difference < RAY_TOLERANCE * np.linalg.norm(u - u.mean(axis=0), axis=1).mean())
 
 
-@njit(cache=True, nogil=True)
 def _has_duplicates(row: Labels, column: Labels, rows: int, columns: int) -> bool:
     """Whether two points are in one cell; one bit a cell."""
     seen = np.zeros((rows * columns >> 3) + 1, np.uint8)
+    return any(_seen_before(row[part], column[part], rows, seen) for part in large_arrays.blocks(len(row)))
+
+
+@njit(cache=True, nogil=True)
+def _seen_before(row, column, rows, seen):  # type: ignore[no-untyped-def]
     for i in range(len(row)):
         cell = np.int64(column[i]) * rows + row[i]
         bit = np.uint8(1 << (cell & 7))

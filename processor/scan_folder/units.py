@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor import unit_ratio
+from processor import large_arrays, unit_ratio
 from processor.model import Floats, InputError, UsageError
 
 MM_PER_UNIT = {
@@ -49,6 +49,7 @@ SAMPLE = 100_000  # points
 # In metres no scan of a structure is larger, and none has points farther apart.
 LARGEST_M, WIDEST_SPACING_M = 2000.0, 0.5
 FEWEST_FOR_SPACING, SPACING_POINTS = 1000, 2000
+RANK_MARGIN = 0.01  # of all points: a sample of SAMPLE points misses a rank by far less
 
 
 def known_unit(text: str) -> str:
@@ -71,7 +72,7 @@ def not_metres(points: Floats) -> str:
     As metres the scan would be larger than any structure, or its points too far apart to show one. Points nearer to
     each other than half a millimetre in a scan below 2 m are not told from metres.
     """
-    sample = points[:: max(1, len(points) // SAMPLE)]
+    sample = large_arrays.every(points, max(1, len(points) // SAMPLE))
     if not len(sample):
         return ""
     low, high = np.quantile(sample, [STRAY, 1.0 - STRAY], axis=0)
@@ -86,14 +87,40 @@ def not_metres(points: Floats) -> str:
 
 def _spacing(points: Floats, axis: int) -> float:
     """Median distance of points (n, 3) from the nearest other one, in a slab of SAMPLE points across an axis."""
-    along = points[:, axis]
     first = max((len(points) - SAMPLE) // 2, 0)
     last = min(first + SAMPLE, len(points)) - 1
-    low, high = np.partition(along, (first, last))[[first, last]]
-    slab = points[(along >= low) & (along <= high)]
+    low, high = _ordered(points, axis, (first, last))
+    parts = []
+    for rows in large_arrays.blocks(len(points)):
+        along = points[rows, axis]
+        parts.append(points[rows][(along >= low) & (along <= high)])
+    slab = np.concatenate(parts)
     chosen = slab[:: max(1, len(slab) // SPACING_POINTS)]
     distance, _ = cKDTree(slab).query(chosen, k=2)
     return float(np.median(distance[:, 1]))
+
+
+def _ordered(points: Floats, axis: int, ranks: tuple[int, int]) -> tuple[float, float]:
+    """Return the coordinates along an axis of points (n, 3) that have two ranks by size.
+
+    Of many points those between bounds are sorted that a sample gives; all of them where the sample misses a rank.
+    """
+    along = points[:, axis]
+    low, high = -np.inf, np.inf
+    if len(points) > large_arrays.BLOCK_ROWS:
+        sample = np.sort(large_arrays.every(along, len(points) // SAMPLE))
+        share = np.array(ranks) / len(points) + [-RANK_MARGIN, RANK_MARGIN]
+        low, high = sample[np.clip((share * len(sample)).astype(np.int64), 0, len(sample) - 1)]
+    below, parts = 0, []
+    for rows in large_arrays.blocks(len(points)):
+        part = along[rows]
+        below += int(np.count_nonzero(part < low))
+        parts.append(part[(part >= low) & (part <= high)])
+    between = np.concatenate(parts)
+    first, last = ranks[0] - below, ranks[1] - below
+    if first < 0 or last >= len(between):
+        between, first, last = np.array(along), *ranks
+    return float(np.partition(between, first)[first]), float(np.partition(between, last)[last])
 
 
 def check_extent(what: str, points: Floats, unit: str, reason: str, advice: str, stray: float = 0.0) -> None:
@@ -102,7 +129,7 @@ def check_extent(what: str, points: Floats, unit: str, reason: str, advice: str,
     Their position on the map does not matter. ``what`` names file and object, ``reason`` the source of the unit;
     ``stray`` is the share of points at either end of an axis that do not count.
     """
-    sample = points[:: max(1, len(points) // SAMPLE)]
+    sample = large_arrays.every(points, max(1, len(points) // SAMPLE))
     if not len(sample):
         return
     low, high = np.quantile(sample, [stray, 1.0 - stray], axis=0) if stray else (points.min(axis=0), points.max(axis=0))
@@ -129,7 +156,7 @@ def check_ratio(
     size = radius(nominal) if len(nominal) else 0.0
     if not size > 0.0:
         return
-    sample = points[:: max(1, len(points) // SAMPLE)]
+    sample = large_arrays.every(points, max(1, len(points) // SAMPLE))
     centre = np.quantile(sample, [STRAY, 1.0 - STRAY], axis=0).mean(axis=0)
     ratio = float(np.quantile(np.linalg.norm(sample - centre, axis=1), 0.99)) / size
     factor = unit_ratio.nearest_factor(ratio, ratios, RATIO_TOLERANCE)

@@ -11,11 +11,14 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import h5py
 import numpy as np
+
+from processor import large_arrays
 
 ATTRIBUTE = "sha256"
 PART_ITEMS = 1 << 20
@@ -35,9 +38,15 @@ def begin(path: str, dataset: Any) -> Any:
 
 def seal(dataset: Any, array: np.typing.NDArray[Any]) -> None:
     """Give a dataset the checksum of the array that was written to it."""
+    seal_parts(dataset, [array])
+
+
+def seal_parts(dataset: Any, parts: Iterable[np.typing.NDArray[Any]]) -> None:
+    """Give a dataset the checksum of the parts that are written to it."""
     digest = begin(dataset.name, dataset)
-    same = np.ascontiguousarray(array, dataset.dtype)
-    digest.update(same.data if same.size else b"")
+    for part in parts:
+        same = np.ascontiguousarray(part, dataset.dtype)
+        digest.update(same.data if same.size else b"")
     _write(dataset, digest)
 
 
@@ -130,21 +139,35 @@ def whole(dataset: Any) -> np.typing.NDArray[Any]:
     """Read a dataset as an array of its type, without a check."""
     array = np.empty(dataset.shape, dataset.dtype)
     if array.size:
-        try:
+        with _damage(dataset):
             dataset.id.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
-        except (OSError, RuntimeError) as error:
-            raise ChecksumError(f"{dataset.name}: is damaged ({error}); make or copy the file again") from error
     return array
 
 
+@contextmanager
+def _damage(dataset: Any) -> Iterator[None]:
+    """Raise ChecksumError for data that HDF5 finds damaged."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise ChecksumError(f"{dataset.name}: is damaged ({error}); make or copy the file again") from error
+
+
 def read(dataset: Any) -> np.typing.NDArray[Any]:
-    """Read a dataset, with a check where it has a checksum. Raises ChecksumError."""
-    array, known = whole(dataset), _stored(dataset.id)
-    if known is not None:
-        digest = begin(dataset.name, dataset)
+    """Read a dataset, with a check where it has a checksum; one in chunks part by part. Raises ChecksumError."""
+    known, digest = _stored(dataset.id), begin(dataset.name, dataset)
+    if dataset.chunks is None:
+        array = whole(dataset)
         digest.update(array.data if array.size else b"")
-        if digest.hexdigest() != known:
-            raise ChecksumError(f"{dataset.name}: {DAMAGED}")
+    else:
+        array = large_arrays.allocate(*dataset.shape, dtype=dataset.dtype)
+        rows = max(1, PART_ITEMS // max(1, math.prod(dataset.shape[1:])))
+        for part in large_arrays.blocks(len(array), rows):
+            with _damage(dataset):
+                dataset.read_direct(array, part, part)
+            digest.update(array[part].data)
+    if known is not None and digest.hexdigest() != known:
+        raise ChecksumError(f"{dataset.name}: {DAMAGED}")
     return array
 
 

@@ -12,7 +12,7 @@ import json
 import math
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, TypeVar
 
@@ -20,6 +20,7 @@ import h5py
 import numpy as np
 
 import processor.store.checksums as checksums
+from processor import large_arrays
 from processor.model import VOCABULARIES, Reason, RecordError, Word
 
 CHUNK_ROWS = 65_536
@@ -61,9 +62,23 @@ def _create(group: Any, name: str, data: Any, **options: Any) -> None:
 
     It is closed so that its place in the file is independent of Python's garbage collection.
     """
-    dataset = group.create_dataset(name, data=data, **options)
-    checksums.seal(dataset, np.asarray(data))
+    array = np.asarray(data)
+    if "chunks" not in options or len(array) <= options["chunks"][0]:
+        dataset = group.create_dataset(name, data=data, **options)
+        checksums.seal(dataset, array)
+    else:
+        dataset = group.create_dataset(name, array.shape, array.dtype, **options)
+        checksums.seal_parts(dataset, _written(dataset, array, options["chunks"][0]))
     dataset.id.close()
+
+
+def _written(dataset: Any, array: np.typing.NDArray[Any], rows: int) -> Iterator[np.typing.NDArray[Any]]:
+    """Write an array chunk by chunk, and yield what was written."""
+    for start in range(0, len(array), rows):
+        part = np.ascontiguousarray(array[start : start + rows])
+        dataset[start : start + rows] = part
+        yield part
+        large_arrays.release_after(part.nbytes)
 
 
 def write_text(group: Any, name: str, text: str) -> None:

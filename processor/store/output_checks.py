@@ -11,10 +11,15 @@ from processor.model import InputError
 
 def check_folder(out: Path) -> None:
     """Raise InputError where a folder cannot be made; nothing is left of the trial, no parent is made."""
+    _try(out, existing_parent(out))
+
+
+def existing_parent(out: Path) -> Path:
+    """Return the nearest folder above a path that is there."""
     place = out.absolute().parent
     while not place.exists() and place != place.parent:
         place = place.parent
-    _try(out, place)
+    return place
 
 
 def check_file(path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 import processor.store.codec as codec
 import processor.store.tiles as tiles
+from processor import large_arrays
 from processor.model import Floats, Ints, Labels, Scan, per_point_fields
 from processor.store.codec import DecodeError
 
@@ -26,13 +27,11 @@ NEWER = {
 
 def write_scan(group: Any, scan: Scan) -> Ints:
     """Write a scan into a group; returns the row (n,) of ``scan.points`` at each position of the file."""
-    tiled = tiles.arrange(scan.points)
-    sorted_columns = {
-        name: getattr(scan, name)[tiled.order]
-        for name in per_point_fields(Scan)
-        if name != "points" and getattr(scan, name).size
+    others = {
+        name: getattr(scan, name) for name in per_point_fields(Scan) if name != "points" and getattr(scan, name).size
     }
-    codec.write_record(group, dataclasses.replace(scan, **sorted_columns), skip={"points"})
+    tiled = tiles.arrange(scan.points, others)
+    codec.write_record(group, dataclasses.replace(scan, **tiled.others), skip={"points"})
     points = group.create_group("points")
     for axis, column in zip(AXES, tiled.columns, strict=True):
         codec.write_array(points, axis, column)
@@ -48,17 +47,18 @@ def write_scan(group: Any, scan: Scan) -> Ints:
 def read_scan(group: Any) -> Scan:
     """Read a scan. Raises DecodeError also for points that are not finite or lie outside their tile."""
     stored = _read_tiles(group)
-    grid = stored.grid
-    data = tuple(
-        codec.read_array(group["points"], axis, column.dtype, 1)
-        for axis, column in zip(AXES, stored.columns, strict=True)
-    )
-    if not all(np.isfinite(column).all() for column in data):
-        raise DecodeError([f"{group.name}/points: holds coordinates that are not finite"])
-    wrong = tiles.misplaced(grid, stored.cell, stored.counts, (data[0], data[1], data[2]))
+    points = large_arrays.allocate(int(stored.counts.sum()), 3)
+    ends, wrong = np.cumsum(stored.counts), 0
+    for rows in large_arrays.blocks(len(points)):
+        x, y, z = (column[rows] for column in stored.columns)
+        if not all(np.isfinite(column).all() for column in (x, y, z)):
+            raise DecodeError([f"{group.name}/points: holds coordinates that are not finite"])
+        tile = np.searchsorted(ends, np.arange(rows.start, rows.stop), side="right")
+        wrong += tiles.misplaced(stored.grid, stored.cell[tile], (x, y, z))
+        points[rows] = stored.grid.millimetres((x, y, z))
     if wrong:
         raise DecodeError([f"{group.name}/points: {wrong} points lie outside their tile of the index"])
-    scan = codec.read_record(group, Scan, given={"points": grid.millimetres((data[0], data[1], data[2]))})
+    scan = codec.read_record(group, Scan, given={"points": points})
     if not np.isfinite(scan.origin).all():
         raise DecodeError([f"{group.name}/origin: is not finite"])
     return scan

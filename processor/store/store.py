@@ -26,6 +26,7 @@ import processor.store.checksums as checksums
 import processor.store.codec as codec
 import processor.store.file_structure_checks as file_structure_checks
 import processor.store.scan_tiles as scan_tiles
+from processor import large_arrays
 from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth, per_point_fields
 from processor.store.atomic_file import replacing
 from processor.store.codec import DecodeError
@@ -103,7 +104,8 @@ def _check(path: Path, scene: Scene) -> None:
     if len(set(names)) != len(names):
         raise InputError(f"{path}: expected scans of different names, found {', '.join(sorted(names))}; rename one")
     for scan in scene.scans:
-        bad = int(np.count_nonzero(~np.isfinite(scan.points).all(axis=1)))
+        blocks = large_arrays.blocks(len(scan.points))
+        bad = sum(int(np.count_nonzero(~np.isfinite(scan.points[rows]).all(axis=1))) for rows in blocks)
         if bad or not np.isfinite(scan.origin).all():
             culprit = f"{bad} points" if bad else "an origin"
             raise InputError(f"{path}: scan {scan.name!r} has {culprit} with coordinates that are not finite")
@@ -174,6 +176,8 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
         raise InputError(f"{path}: {error}") from error
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
+    except large_arrays.NoRoomError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except DAMAGE as error:
         wanted = " or ".join(FORMATS[kind] for kind in kinds)
         raise InputError(
@@ -369,9 +373,11 @@ def design_hash(scene: Scene) -> str:
 
 def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int = 0) -> None:
     if isinstance(value, np.ndarray):
-        little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
-        digest.update(f"{name}:{little.dtype.str}{value.shape};".encode())
-        digest.update(little.data if little.size else b"")
+        kind = value.dtype.newbyteorder("<")
+        digest.update(f"{name}:{kind.str}{value.shape};".encode())
+        for rows in large_arrays.blocks(len(value)) if value.ndim else ((),):
+            part = np.ascontiguousarray(value[rows], kind)
+            digest.update(part.data if part.size else b"")
     elif dataclasses.is_dataclass(value):
         digest.update(f"{name}:{type(value).__name__}(".encode())
         for field in dataclasses.fields(value):

@@ -7,11 +7,15 @@ back and are arranged again keep their order.
 
 from __future__ import annotations
 
+import types
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from processor import large_arrays
 from processor.model import Floats, Ints
 
 POINTS_PER_TILE = 16_384
@@ -20,6 +24,7 @@ STEPS_PER_MM = (10_000.0, 1_000.0)
 INT32_REACH = 2**31 - 16
 
 Column = npt.NDArray[np.generic]
+Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -60,48 +65,87 @@ class Tiles:
     count: Ints  # (t,)
     columns: tuple[Column, Column, Column]
     order: Ints  # (n,) row of the given points at each position
+    others: dict[str, Any]  # further columns
 
 
-def arrange(points: Floats) -> Tiles:
-    """Arrange finite points (n, 3) in mm in tiles of about POINTS_PER_TILE points, stable within a tile."""
+def arrange(points: Floats, others: Mapping[str, Array] = types.MappingProxyType({})) -> Tiles:
+    """Arrange finite points (n, 3) in mm in tiles of about POINTS_PER_TILE points, stable within a tile.
+
+    ``others`` are further columns (n, ...), arranged alike. Memory holds a block of points at a time, where they lie
+    in files (:mod:`processor.large_arrays`).
+    """
     if not len(points):
         grid = Grid(STEPS_PER_MM[0], np.zeros(3), np.zeros(3), 1.0)
         none = np.empty(0, np.int32)
         empty = np.empty(0, np.int64)
         cell = np.empty((0, 3), np.int64)
-        return Tiles(grid, cell=cell, start=empty, count=empty, columns=(none, none, none), order=empty)
-    columns, steps, offset = _stored(points)
-    lower = np.array([float(column.min()) for column in columns])
-    extent = max(float(column.max()) - low for column, low in zip(columns, lower, strict=True))
-    # A cell size of whole steps makes cell numbers of integers exact. For float64 the size is slightly enlarged, so
-    # that the last point lies inside the grid.
+        return Tiles(
+            grid, cell=cell, start=empty, count=empty, columns=(none, none, none), order=empty, others=dict(others)
+        )
+    scale = _scale(points)
     levels = _levels(len(points))
-    finest = float(np.ceil((extent + 1.0) / 2**levels))
-    if columns[0].dtype != np.int32:
-        finest = (extent or 1.0) / 2.0**levels * (1.0 + 1e-9)
-    cells = Grid(steps, offset, lower, finest).cells(columns)
-    shift = levels - _level(cells, len(points), levels)
-    cells >>= shift
-    key = (cells[:, 0] << 2 * levels) | (cells[:, 1] << levels) | cells[:, 2]
-    del cells
-    occupied = np.zeros(2 ** (3 * levels), bool)
-    occupied[key] = True
-    keys = np.flatnonzero(occupied)
-    rank = np.empty(2 ** (3 * levels), np.int32)
-    rank[keys] = np.arange(len(keys), dtype=np.int32)
-    # numpy sorts 16-bit numbers by radix sort, which is several times faster.
-    tile = rank[key].astype(np.uint16 if len(keys) < 2**16 else np.uint32)
-    order = np.argsort(tile, kind="stable")
-    count = np.bincount(tile, minlength=len(keys)).astype(np.int64)
-    mask = 2**levels - 1
+    grid = _finest(points, scale, levels)
+    finest = np.zeros(2 ** (3 * levels), np.int32)
+    for rows in large_arrays.blocks(len(points)):
+        np.add.at(finest, _numbers(grid.cells(scale.columns(points[rows])), levels), 1)
+    level, counts = _level(finest.reshape((2**levels,) * 3), len(points), levels)
+    shift = levels - level
+    keys = np.flatnonzero(counts)
+    count = counts.reshape(-1)[keys].astype(np.int64)
+    start = np.cumsum(count) - count
+    columns, sorted_others, order = _in_tiles(points, others, scale, grid, (keys, start, level, shift))
+    mask = 2**level - 1
     return Tiles(
-        grid=Grid(steps, offset, lower, finest * 2**shift),
-        cell=np.stack([keys >> 2 * levels, (keys >> levels) & mask, keys & mask], axis=1).astype(np.int64),
-        start=np.cumsum(count) - count,
+        grid=Grid(scale.steps_per_mm, scale.offset, grid.lower, grid.edge * 2**shift),
+        cell=np.stack([keys >> 2 * level, (keys >> level) & mask, keys & mask], axis=1).astype(np.int64),
+        start=start,
         count=count,
-        columns=(columns[0][order], columns[1][order], columns[2][order]),
-        order=order.astype(np.int64),
+        columns=columns,
+        order=order,
+        others=sorted_others,
     )
+
+
+def _in_tiles(
+    points: Floats, others: Mapping[str, Array], scale: _Scale, grid: Grid, tiles: tuple[Ints, Ints, int, int]
+) -> tuple[tuple[Column, Column, Column], dict[str, Array], Ints]:
+    """Return the columns of points and of what else there is of each, and the rows they are from, by their tiles.
+
+    A counting sort, block by block: of each tile (numbers of cells of a level, first rows) the next row is known.
+    """
+    keys, start, level, shift = tiles
+    n, dtype = len(points), np.int32 if scale.steps_per_mm > 1.0 else np.float64
+    x, y, z = (large_arrays.allocate(n, dtype=dtype) for _ in range(3))
+    order = large_arrays.allocate(n, dtype=np.int64)
+    found = {name: large_arrays.allocate(n, *a.shape[1:], dtype=a.dtype.type) for name, a in others.items()}
+    rank = np.empty(2 ** (3 * level), np.int32)
+    rank[keys] = np.arange(len(keys), dtype=np.int32)
+    after = start.copy()
+    # numpy sorts 16-bit numbers by radix sort, which is several times faster.
+    kind = np.uint16 if len(keys) < 2**16 else np.uint32
+    for rows in large_arrays.blocks(n):
+        stored = scale.columns(points[rows])
+        cells = grid.cells(stored) >> shift
+        tile = rank[_numbers(cells, level)].astype(kind)
+        sort = np.argsort(tile, kind="stable")
+        tile = tile[sort].astype(np.int64)
+        first = np.flatnonzero(np.diff(tile, prepend=-1))
+        length = np.diff(first, append=len(tile))
+        place = after[tile] + (np.arange(len(tile)) - np.repeat(first, length))
+        after[tile[first]] += length
+        order[place] = rows.start + sort
+        for column, values in zip((x, y, z), stored, strict=True):
+            column[place] = values[sort]
+        for name, column in found.items():
+            column[place] = others[name][rows][sort]
+            large_arrays.release()
+    return (x, y, z), found, order
+
+
+def _numbers(cells: Ints, level: int) -> Ints:
+    """Return one number for each of cells (n, 3) of a level, in lexicographic order."""
+    numbers: Ints = (cells[:, 0] << 2 * level) | (cells[:, 1] << level) | cells[:, 2]
+    return numbers
 
 
 def problems(grid: Grid, cell: Ints, start: Ints, count: Ints, n: int) -> list[str]:
@@ -117,21 +161,51 @@ def problems(grid: Grid, cell: Ints, start: Ints, count: Ints, n: int) -> list[s
     return faults
 
 
-def misplaced(grid: Grid, cell: Ints, count: Ints, columns: tuple[Column, Column, Column]) -> int:
-    """Count the points that lie outside their tile of the index."""
-    return int((grid.cells(columns) != np.repeat(cell, count, axis=0)).any(axis=1).sum())
+def misplaced(grid: Grid, cell: Ints, columns: tuple[Column, Column, Column]) -> int:
+    """Count the points that lie outside their tile, whose cell (n, 3) the index gives."""
+    return int((grid.cells(columns) != cell).any(axis=1).sum())
 
 
-def _stored(points: Floats) -> tuple[tuple[Column, Column, Column], float, Floats]:
-    low, high = points.min(axis=0), points.max(axis=0)
+@dataclass(frozen=True)
+class _Scale:
+    """How points are stored: in whole steps, less an offset, or as float64 mm (1 step per mm)."""
+
+    steps_per_mm: float
+    offset: Floats
+
+    def columns(self, points: Floats) -> tuple[Column, Column, Column]:
+        """Return the stored columns of points (n, 3) in mm."""
+        if self.steps_per_mm == 1.0:
+            x, y, z = (np.ascontiguousarray(points[:, i]) for i in range(3))
+            return x, y, z
+        x, y, z = ((np.rint(points[:, i] * self.steps_per_mm) - self.offset[i]).astype(np.int32) for i in range(3))
+        return x, y, z
+
+
+def _scale(points: Floats) -> _Scale:
+    corners = [(points[rows].min(axis=0), points[rows].max(axis=0)) for rows in large_arrays.blocks(len(points))]
+    low, high = np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)
     for steps in STEPS_PER_MM:
         first, last = np.rint(low * steps), np.rint(high * steps)
         if (last - first).max() < 2 * INT32_REACH and max(np.abs(first).max(), np.abs(last).max()) < 2.0**52:
-            offset = np.floor((first + last) / 2.0)
-            x, y, z = ((np.rint(points[:, i] * steps) - offset[i]).astype(np.int32) for i in range(3))
-            return (x, y, z), steps, offset
-    x, y, z = (np.ascontiguousarray(points[:, i]) for i in range(3))
-    return (x, y, z), 1.0, np.zeros(3)
+            return _Scale(steps, np.floor((first + last) / 2.0))
+    return _Scale(1.0, np.zeros(3))
+
+
+def _finest(points: Floats, scale: _Scale, levels: int) -> Grid:
+    """Return the finest grid of points."""
+    corners = []
+    for rows in large_arrays.blocks(len(points)):
+        columns = scale.columns(points[rows])
+        corners.append([[float(column.min()), float(column.max())] for column in columns])
+    lower, upper = np.min(corners, axis=0)[:, 0], np.max(corners, axis=0)[:, 1]
+    extent = float((upper - lower).max())
+    # A cell size of whole steps makes cell numbers of integers exact. For float64 the size is slightly enlarged, so
+    # that the last point lies inside the grid.
+    edge = float(np.ceil((extent + 1.0) / 2**levels))
+    if scale.steps_per_mm == 1.0:
+        edge = (extent or 1.0) / 2.0**levels * (1.0 + 1e-9)
+    return Grid(scale.steps_per_mm, scale.offset, lower, edge)
 
 
 def _levels(n: int) -> int:
@@ -139,17 +213,17 @@ def _levels(n: int) -> int:
     return int(np.clip(np.ceil(np.log2(n / POINTS_PER_TILE)) + 2, 0, MOST_LEVELS))
 
 
-def _level(cells: Ints, n: int, levels: int) -> int:
-    """Return the level whose occupied cells have, on average, a number of points nearest to POINTS_PER_TILE."""
-    side = 2**levels
-    occupied: npt.NDArray[np.bool_] = np.zeros((side, side, side), bool)
-    occupied[cells[:, 0], cells[:, 1], cells[:, 2]] = True
-    best, least = 0, np.inf
+def _level(counts: Array, n: int, levels: int) -> tuple[int, Array]:
+    """Return the level whose occupied cells have a number of points nearest to POINTS_PER_TILE on average, and theirs.
+
+    ``counts`` are those of the cells of the finest level.
+    """
+    best, chosen, least = 0, counts, np.inf
     for level in range(levels, -1, -1):
-        distance = abs(np.log(n / np.count_nonzero(occupied) / POINTS_PER_TILE))
+        distance = abs(np.log(n / np.count_nonzero(counts) / POINTS_PER_TILE))
         if distance < least:
-            best, least = level, distance
-        side = max(side // 2, 1)
+            best, chosen, least = level, counts, distance
         if level:
-            occupied = np.asarray(occupied.reshape(side, 2, side, 2, side, 2).any(axis=(1, 3, 5)))
-    return best
+            side = len(counts) // 2
+            counts = counts.reshape(side, 2, side, 2, side, 2).sum(axis=(1, 3, 5), dtype=np.int64)
+    return best, chosen

@@ -135,7 +135,7 @@ def layer_groups():
 
 STEPS = ("defects", "deviation", "inspection", "preassembly", "space_frame", "stitching")
 LAYERS = (
-    ("version", "plain_text"),
+    ("version", "plain_text", "large_arrays"),
     ("model",),
     ("record_checks",),
     ("progress", "diagnostics", "language", "jobs", "robust_statistics", "unit_ratio", "user_methods"),
@@ -158,8 +158,8 @@ LAYERS = (
     ("__main__",),
 )
 FOR_STEPS = (
-    "version", "plain_text", "model", "progress", "diagnostics", "robust_statistics", "unit_ratio", "geometry",
-    "scene_cloud", "adjustment", "components", "limits",
+    "version", "plain_text", "large_arrays", "model", "progress", "diagnostics", "robust_statistics", "unit_ratio",
+    "geometry", "scene_cloud", "adjustment", "components", "limits",
 )  # fmt: skip
 
 

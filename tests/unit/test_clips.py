@@ -93,7 +93,7 @@ def test_many_points_are_clipped_in_pieces_alike(monkeypatch):
     box = Box("p", np.zeros(3), np.full(3, 4.0), False)
     whole = Clipper([box])
     wanted = whole.clip(scan)
-    monkeypatch.setattr("processor.scan_folder.clips.AT_ONCE", 7)
+    monkeypatch.setattr("processor.large_arrays.BLOCK_ROWS", 7)
     pieces = Clipper([box])
     np.testing.assert_array_equal(pieces.clip(scan).points, wanted.points)
     assert pieces.record().inside.tolist() == whole.record().inside.tolist()

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from processor.geometry.same_places import same_places
+from processor.geometry.neighbors import same_places
 from processor.model import Floats, Ints
 
 WELD_MM = 1e-4  # vertices nearer to each other are one: far below any edge and far above rounding

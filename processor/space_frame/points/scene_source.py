@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numba import njit
 
+from processor import large_arrays
 from processor.geometry import rigid
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Labels, Scan, Scene
@@ -41,6 +42,7 @@ class InScans:
         points, station = self.scans[scan].points, self.scans[scan].point_station
         for start in range(0, len(points), size):
             yield points[start : start + size], station[start : start + size]
+            large_arrays.release()
 
 
 @dataclass(frozen=True)
