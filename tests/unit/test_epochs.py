@@ -501,7 +501,23 @@ def test_a_member_that_changed_by_its_balls_is_not_counted_again(tmp_path, diame
     else:
         assert found.follows == ()
         assert "1 of 5 balls, 1 of 1 member changed" in said[0]
-        assert any("10-11, diameter" in line for line in said)
+        assert any("member 10-11, diameter" in line for line in said)
+
+
+def test_the_page_has_what_changed_before_the_picture_and_all_else_behind(tmp_path):
+    parts = [
+        (inspected(5000.0), inspected(5000.0, name="flange")),
+        (inspected(5009.0), inspected(5000.1, name="flange")),
+    ]
+    for month, (web, flange) in enumerate(parts, start=1):
+        both = dataclasses.replace(web, components=(*flange.components, *web.components))
+        stored(tmp_path, f"2026-0{month}-01", {"inspect": both})
+    write.write(tmp_path / "out", compare.compare(epoch.read(tmp_path)))
+    page = (tmp_path / "out/report.html").read_text("utf-8")
+    page = page[page.index("<body") :]
+    assert page.index(">web<") < page.index("data:image/png") < page.index(">flange<")
+    names = [line.split(",")[0] for line in (tmp_path / "out/history.csv").read_text("utf-8").splitlines()]
+    assert names == ["component", "web", "flange"]
 
 
 def called(*arguments):
@@ -514,7 +530,9 @@ def test_the_command_says_what_changed_and_writes_the_folder(site, tmp_path):
     assert done.exception is None, done.output
     first, second, *_ = done.output.splitlines()
     assert first.endswith("3 epochs, 2026-03-01 to 2026-11-20: 1 of 1 part changed beyond the interval")
-    assert second == ("changed: web, length: 5000.00 to 5004.00 mm, by +4.00 ± 0.28 mm, since 2026-11-20 (inspect)")
+    assert second == (
+        "changed: part web, length: 5000.00 to 5004.00 mm, by +4.00 ± 0.28 mm, since 2026-11-20 (inspect)"
+    )
     assert len(done.output.splitlines()) <= lines.MOST_LINES
     record = json.loads((out / "history.json").read_text("utf-8"))
     assert record["components"][0]["values"][0]["value"] == [5000.0, 5000.1, 5004.0]

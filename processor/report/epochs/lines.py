@@ -11,6 +11,7 @@ from processor.language.messages import Message, text
 from processor.report.epochs.tables import day, ordered
 
 MOST_LINES, FEWEST_CHANGES = 15, 3
+WITH_KIND = (Kind.JOINT, Kind.BALL, Kind.PART, Kind.MEMBER)  # names that alone do not say what they are of
 COUNTED = {
     Kind.JOINT: "{changed} of {total} {total:?joint|joints}",
     Kind.SPAN: "{changed} of {total} {total:?span|spans}",
@@ -79,7 +80,7 @@ def _line(history: History, one: Component) -> Message:
         "{finding}: {component}, {quantity}: {first:.2f} to {last:.2f} {unit}, by {change:+.2f} ± {ci95:.2f} {unit}, "
         "since {day} ({step})",
         finding=one.finding,
-        component=one.name,
+        component=text("{kind} {name}", kind=one.kind, name=one.name) if one.kind in WITH_KIND else one.name,
         quantity=leading.series.quantity,
         first=float(leading.series.value[leading.first]),
         last=float(leading.series.value[leading.last]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from processor.epochs.change import Change, Component, Finding
@@ -39,6 +40,18 @@ def tables(history: History) -> list[Table]:
 def day(history: History, row: int | None) -> str:
     """Write the day of an epoch; "" for none."""
     return "" if row is None else history.epochs[row].day.isoformat()
+
+
+def of_page(history: History) -> tuple[list[Table], list[Table]]:
+    """Return the tables of the page: what changed, if anything did, and below the figure all else and the epochs."""
+    whole = _components(history)
+    shown = ordered(history)
+    beyond = sum(_rank(one) < len(CHANGED) for one in shown)
+    if not 0 < beyond < len(shown):
+        return [whole], [_epochs(history)]
+    first = replace(whole, title=text("Components that changed, or may have"), rows=whole.rows[:beyond])
+    others = replace(whole, title=text("Other components"), rows=whole.rows[beyond:], note="")
+    return [first], [others, _epochs(history)]
 
 
 def _components(history: History) -> Table:

@@ -107,7 +107,7 @@ def write(out: Path, history: History, lang: str = "en") -> dict[str, Any]:
 
 
 def _page(history: History, drawn: tuple[Message, bytes] | None, lang: str) -> str:
-    of_page = [table for table in tables.tables(history) if table.on_page]
+    first, others = tables.of_page(history)
     figure = None if drawn is None else {"caption": drawn[0], "data": base64.b64encode(drawn[1]).decode("ascii")}
     written: str = (
         templates.environment("report", lang)
@@ -124,8 +124,8 @@ def _page(history: History, drawn: tuple[Message, bytes] | None, lang: str) -> s
             ),
             remarks=history.remarks,
             figure=None if figure is None else {**figure, "twin": False},
-            components=page.written_table(of_page[0], lang),
-            others=[page.written_table(table, lang) for table in of_page[1:]],
+            first=[page.written_table(table, lang) for table in first],
+            others=[page.written_table(table, lang) for table in others],
             running_head=title_block.css_string(history.name),
             running_foot=title_block.css_string(f"processor {pipeline.software().get('processor', '')}"),
         )
