@@ -578,7 +578,8 @@ class TargetSearch(Checked):
 class Targets(Rows):
     """Targets as found in scans: ``places`` (t, 3) in the frame of scan ``scan`` (t,), a row of Scene.scans; mm.
 
-    ``name`` is that of the control point, "" where none is there. ``sd`` is of each coordinate, ``station`` as in
+    ``name`` is that of the control point, "" where none is there. ``sd`` is of each coordinate, with the error that all
+    ranges of a view share by the class of scanners, along the direction where it is largest; ``station`` as in
     :class:`Control`. ``fit`` is the share of the intensities' variance that the pattern explains; NaN for spheres.
     """
 
@@ -670,6 +671,7 @@ class Scene(Checked):
     ceiling: Ceiling | None = newer()
     target_search: TargetSearch | None = newer()
     targets: Targets | None = newer(hashed=False)  # those of Scene.control are hashed
+    target_remarks: tuple[Reason, ...] = reasons(newer=True, hashed=False)  # on the search for targets
     # days of the scans by their files, YYYY-MM-DD, in order; no step reads them
     scanned: tuple[str, ...] = names("days", newer=True, hashed=False)
 

@@ -21,9 +21,11 @@ from scipy.spatial import cKDTree
 from scipy.special import erf
 
 from processor.model import Bools, Floats, Ints
+from processor.progress import tracked
 
 CELL_SHARE = 0.4  # edge of a cell of the search, in sides of the target
 CONTRAST = 0.25  # scatter of the intensities of a cell over their mean, above which it is looked at
+MOST_SEEDS = 5000  # places of a view that are looked at, those of most contrast
 LEAST_POINTS, LEAST_OF_A_FIELD = 80, 12  # on a target, and on each of its fields
 NEAR = 1.0  # radius about a candidate, in sides, whose points make the image
 CENTRES = 0.45  # a centre is sought within this distance of the candidate
@@ -42,7 +44,8 @@ GOES_ON = 0.4  # step beyond a side, in steps of the pattern
 LEAST_BESIDE = 4  # points of half a side
 SHARP = 1.05  # times the least width: a step whose blur is not seen
 PERIODS = (0.4, 2.5, 85)  # of the scanner's lines across a step, in spacings: from, to, number
-BY_CHANCE = 7.0  # times 1 / n: squared resultant length of n angles at random, exceeded once in a thousand
+# Rayleigh test: the squared mean resultant length of n angles at random exceeds K / n with probability exp(-K).
+BY_CHANCE = float(np.log(1000.0))
 FILLED = 0.5  # share of the cells of a field that have points, at least
 
 
@@ -73,17 +76,29 @@ class _Plane:
 
 
 def find(points: Floats, intensity: Floats, side_mm: float) -> list[Checkerboard]:
+    """Return the targets of :func:`search` alone."""
+    return search(points, intensity, side_mm)[0]
+
+
+def search(points: Floats, intensity: Floats, side_mm: float) -> tuple[list[Checkerboard], int]:
     """Find targets whose square of four fields has sides of ``side_mm``, among points (n, 3), by intensity (n,).
 
-    The order is that of the points' own coordinates; it does not depend on the order of the points.
+    Points without an intensity (NaN) are left out. The order is that of the points' own coordinates; it does not depend
+    on the order of the points. Also returns the number of places with contrast that were not looked at, beyond
+    MOST_SEEDS: those of least contrast.
     """
-    if len(points) < LEAST_POINTS or len(intensity) != len(points):
-        return []
+    if len(intensity) != len(points):
+        return [], 0
+    bright = np.isfinite(intensity)
+    points, intensity = points[bright], intensity[bright]
+    if len(points) < LEAST_POINTS:
+        return [], 0
     order = np.lexsort(points.T)
     points, intensity = points[order], intensity[order]
     tree = cKDTree(points)
     found: list[Checkerboard] = []
-    for seed in _seeds(points, intensity, side_mm):
+    seeds = list(_seeds(points, intensity, side_mm))
+    for seed in tracked(seeds[:MOST_SEEDS]):
         if any(np.linalg.norm(seed - one.centre) < 0.7 * side_mm for one in found):
             continue
         plane = _plane(points, tree, seed, side_mm)
@@ -94,11 +109,11 @@ def find(points: Floats, intensity: Floats, side_mm: float) -> list[Checkerboard
         one = None if one is None else _again(points, intensity, tree, one, side_mm)
         if one is not None and all(np.linalg.norm(one.centre - other.centre) > 0.5 * side_mm for other in found):
             found.append(one)
-    return sorted(found, key=lambda one: tuple(one.centre))
+    return sorted(found, key=lambda one: tuple(one.centre)), max(len(seeds) - MOST_SEEDS, 0)
 
 
 def _again(points: Floats, intensity: Floats, tree: cKDTree, found: Checkerboard, side: float) -> Checkerboard | None:
-    """Return a target that was found, fitted to the points about its own centre; None where it is none after all."""
+    """Return a target that was found, fitted to the points about its own centre; None if these show no target."""
     plane = _plane(points, tree, found.centre, side)
     start = None if plane is None else _start(plane, intensity[plane.rows], side)
     return None if plane is None or start is None else _fitted(plane, intensity[plane.rows], start, side)
@@ -273,7 +288,7 @@ def _has_fields(u: Floats, v: Floats, bright: Floats, reach: float, spacing: flo
     return bool(max(abs(first[0] - first[1]), abs(second[0] - second[1])) <= ALIKE * step)
 
 
-def _goes_on(u: Floats, v: Floats, intensity: Floats, step: float, side: float) -> bool:
+def _goes_on(u: Floats, v: Floats, intensity: Floats, half_step: float, side: float) -> bool:
     """Whether the pattern goes on beyond two or more of its sides: as a step like its own, of either sign."""
     strip = []
     for across, along in ((u, v), (-u, v), (v, u), (-v, u)):
@@ -281,17 +296,18 @@ def _goes_on(u: Floats, v: Floats, intensity: Floats, step: float, side: float) 
         halves = [intensity[beside & (sign * along > 0.1 * side)] for sign in (1.0, -1.0)]
         if min(map(len, halves)) >= LEAST_BESIDE:
             strip.append(abs(float(halves[0].mean() - halves[1].mean())))
-    return sum(one > GOES_ON * 2.0 * step for one in strip) >= 2
+    return sum(one > GOES_ON * 2.0 * half_step for one in strip) >= 2
 
 
 def _sampling_sd(d: Floats, other: Floats, spacing: float, width: float) -> float:
     """Return the sd of a line's place by the sampling of the step across it; distances ``d`` (m,) from the line.
 
     Where the lines of the scanner's grid run along the step, all rows sample it at the same places, and what lies
-    between two of them is not seen. A step blurred by a Gaussian of sd s, sampled at a period p, is misplaced by up to
-    p / pi exp(-2 pi^2 s^2 / p^2), by the first alias of its spectrum. The resultant length of the distances as angles
-    at the period is 1 for such a grid; where it is 0 the misplacements of the rows average out. A width at its least
-    shows that the blur is not seen: the step may be sharp, anywhere between two rows.
+    between two of them is not seen. The place of a step is the sum of its samples times their period p. By Poisson's
+    summation formula that of a step at x, blurred by a Gaussian of sd s, is off by the sum over k of p / (pi k)
+    exp(-2 pi^2 k^2 s^2 / p^2) sin(2 pi k x / p), of which the first term counts. The resultant length of the distances
+    as angles at the period is 1 for such a grid; where it is 0 the misplacements of the rows average out. A width at
+    its least shows that the blur is not seen: the step may be sharp, anywhere between two rows.
     """
     near = (np.abs(d) < 4.0 * spacing) & (np.abs(other) > spacing)
     if not near.any():
@@ -313,7 +329,8 @@ def _sampling_sd(d: Floats, other: Floats, spacing: float, width: float) -> floa
 def _placed(plane: _Plane, off: Floats, fit: Any, sampling: Floats, explained: float) -> Checkerboard | None:
     """Return the target in space; its covariance is that of fit and sampling in the plane, and of the plane across it.
 
-    ``sampling`` (2,) are standard deviations across the two lines.
+    ``sampling`` (2,) are standard deviations across the two lines. Errors that all points of a view share are not
+    contained, nor is a difference of the ranges to dark and to bright fields.
     """
     J, residual, found = fit.jac, fit.fun, fit.x[:3]
     variance = float(residual @ residual) / max(len(residual) - J.shape[1], 1)

@@ -7,13 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from processor.adjustment import scanner_class
 from processor.geometry import rigid
-from processor.model import Control, Floats, Ints, Scan, Scene, TargetKind, Targets
+from processor.model import Control, Floats, Ints, Reason, Scan, Scene, TargetKind, Targets, reason
 from processor.space_frame.result import Balls
 from processor.targets import checkerboard, naming, spheres
 from processor.targets.checkerboard import Checkerboard
 
 LEAST_SD_MM = 0.05  # of a target's place: what a fit does not see, as the sheet's flatness
+# Of the ranges of a view: it moves all of its targets along their rays, and no fit of one target shows it.
+VIEW_MM = scanner_class.VIEW_MM
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,16 +38,29 @@ def with_targets(scene: Scene) -> Scene:
     if search is None or scene.targets is not None:
         return scene
     found: list[_Found] = []
+    remarks: list[Reason] = []
     for row, scan in enumerate(scene.scans):
+        if not np.isnan(search.checkerboard_mm) and not np.isfinite(scan.intensity).any():
+            remarks.append(reason("targets.no-intensities", scan=scan.name))
         for station, points, bright, scanner in _views(scene, scan):
             if not np.isnan(search.checkerboard_mm):
-                for one in checkerboard.find(points, bright, search.checkerboard_mm):
-                    found.append(_of_board(one, row, station, scan.origin))
+                boards, left_out = checkerboard.search(points, bright, search.checkerboard_mm)
+                found += [_of_board(one, row, station, scan.origin) for one in boards]
+                if left_out:
+                    looked_at = checkerboard.MOST_SEEDS
+                    remarks.append(reason("targets.most-places", scan=scan.name, places=looked_at, left=left_out))
             if not np.isnan(search.sphere_radius_mm):
-                balls = spheres.find(points, scanner, search.sphere_radius_mm)
+                balls, stopped = spheres.find(points, scanner, search.sphere_radius_mm)
                 found += [_of_sphere(balls, k, row, station, scan.origin) for k in spheres.sure(balls)]
-    names = _names(scene, found)
-    return replace(scene, targets=_table(scene, found, names), control=_with_sightings(scene.control, found, names))
+                if stopped:
+                    remarks.append(reason("targets.most-spheres", scan=scan.name, spheres=len(balls)))
+    names = _names(scene, found, remarks)
+    return replace(
+        scene,
+        targets=_table(scene, found, names),
+        target_remarks=tuple(remarks),
+        control=_with_sightings(scene.control, found, names),
+    )
 
 
 def _of_board(one: Checkerboard, scan: int, station: int, origin: Floats) -> _Found:
@@ -64,7 +80,7 @@ def _of_sphere(balls: Balls, row: int, scan: int, station: int, origin: Floats) 
 
 def _views(scene: Scene, scan: Scan) -> Iterator[tuple[int, Floats, Floats, Floats | None]]:
     """Yield station, points, intensities and the scanner's place, the latter less the scan's origin, of each view."""
-    bright = scan.intensity if len(scan.intensity) else np.zeros(len(scan.points))
+    bright = scan.intensity if len(scan.intensity) else np.full(len(scan.points), np.nan)
     if scan.position.size or not len(scan.point_station) or scene.stations is None:
         yield -1, scan.points, bright, scan.position - scan.origin if scan.position.size else None
         return
@@ -75,8 +91,11 @@ def _views(scene: Scene, scan: Scan) -> Iterator[tuple[int, Floats, Floats, Floa
         yield station, scan.points[rows], bright[rows], at
 
 
-def _names(scene: Scene, found: list[_Found]) -> Ints:
-    """Return the row (t,) of the control point that each target is, -1 = none."""
+def _names(scene: Scene, found: list[_Found], remarks: list[Reason]) -> Ints:
+    """Return the row (t,) of the control point that each target is, -1 = none.
+
+    A remark on targets that contradict the others is added to ``remarks``.
+    """
     rows = np.full(len(found), -1, np.int64)
     if scene.control is None:
         return rows
@@ -84,11 +103,16 @@ def _names(scene: Scene, found: list[_Found]) -> Ints:
         of_view = [i for i, one in enumerate(found) if (one.scan, one.station) == key]
         places = np.array([found[i].place for i in of_view])
         scan = scene.scans[key[0]]
-        named = np.full(len(of_view), -1, np.int64)
+        named, near = np.full(len(of_view), -1, np.int64), 0
         if scan.T_project_scan.size or key[1] >= 0:
-            named = naming.by_pose(rigid.apply(scan.pose, places), scene.control.positions)
+            posed = rigid.apply(scan.pose, places)
+            near = int((naming.nearest(posed, scene.control.positions) >= 0).sum())
+            named = naming.by_pose(posed, scene.control.positions)
         if (named < 0).all():
             named = naming.by_pattern(places, scene.control.positions)
+        contradict = near - int((named >= 0).sum())
+        if contradict > 0:
+            remarks.append(reason("targets.contradict", scan=scan.name, targets=contradict, mm=naming.NEAR_MM))
         rows[of_view] = named
     return rows
 
@@ -101,7 +125,7 @@ def _table(scene: Scene, found: list[_Found], names: Ints) -> Targets:
         scan=np.array([one.scan for one in found], np.int64),
         station=np.array([one.station for one in found], np.int64),
         places=np.array([one.place for one in found]).reshape(-1, 3),
-        sd=np.array([max(one.sd, LEAST_SD_MM) for one in found]),
+        sd=np.array([float(np.hypot(max(one.sd, LEAST_SD_MM), VIEW_MM)) for one in found]),
         points=np.array([one.points for one in found], np.int64),
         fit=np.array([one.fit for one in found]),
     )

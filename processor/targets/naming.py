@@ -1,12 +1,15 @@
 """Names of targets: which control point each target of a scan is, by its place or by the distances between targets.
 
-In a scan with a pose a target is the control point nearest to it. In one without, the rigid motion is sought that
-brings most targets to control points: three targets that have the distances of three control points propose one, and a
-motion holds if it places three targets or more, and no other motion that names them otherwise places as many.
+In a scan with a pose a target is the control point nearest to it, if one rigid motion brings those that are named to
+their control points: three targets or more; of two the distance has to agree. In a scan without a pose the rigid motion
+is sought that brings most targets to control points: three targets that have the distances of three control points
+propose one, and a motion holds if it places three targets or more, and no other motion that names them otherwise places
+as many.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import combinations
 
 import numpy as np
@@ -21,24 +24,54 @@ LEAST = 3
 MOST = 40  # targets of a scan that motions are proposed from
 SPREAD_MM = 300.0  # least height of a triangle that proposes a motion
 
+Proposal = tuple[tuple[int, ...], list[list[int]]]  # three places, and the control points that they may be
+
+
+def nearest(places: Floats, known: Floats) -> Ints:
+    """Return the control point (k,) near each place (k, 3), both in the project's frame; -1 = none, or not unique."""
+    return _mutual(places, known, NEAR_MM)
+
 
 def by_pose(places: Floats, known: Floats) -> Ints:
-    """Return the control point (k,) of each place (k, 3), both in the project's frame; -1 = none, or not unique."""
-    return _mutual(places, known, NEAR_MM)
+    """Return the control point (k,) of each place (k, 3), both in the project's frame; -1 = none.
+
+    Those near a control point, but not where the others put it, have none either.
+    """
+    rows = nearest(places, known)
+    near = np.flatnonzero(rows >= 0)
+    triples = combinations(near[:MOST].tolist(), 3)
+    named = _of_common_motion(places, known, ((one, [rows[list(one)].tolist()]) for one in triples))
+    if named is not None:
+        return named
+    # Too few for a motion, or nearly on a line: the distances between them have to agree.
+    of_places, of_known = (
+        np.linalg.norm(one[:, None] - one[None], axis=2) for one in (places[near], known[rows[near]])
+    )
+    rows[near[(np.abs(of_places - of_known) > SAME_MM).any(axis=1)]] = -1
+    return rows
 
 
 def by_pattern(places: Floats, known: Floats) -> Ints:
     """Return the control point (k,) of each place (k, 3) in a frame of its own; -1 = none, or not unique."""
-    best = np.full(len(places), -1, np.int64)
-    if len(places) < LEAST or len(known) < LEAST:
-        return best
-    fits: list[tuple[int, float, Ints]] = []
     apart = np.linalg.norm(known[:, None] - known[None], axis=2)
-    for triple in combinations(range(min(len(places), MOST)), 3):
+    triples = combinations(range(min(len(places), MOST)), 3)
+    named = _of_common_motion(places, known, ((one, _alike(places[list(one)], apart)) for one in triples))
+    return np.full(len(places), -1, np.int64) if named is None else named
+
+
+def _of_common_motion(places: Floats, known: Floats, proposals: Iterable[Proposal]) -> Ints | None:
+    """Return the control points (k,) by the motion that brings most places to them; None if no triple proposes one.
+
+    All are -1 if fewer than LEAST fit, or if another motion that names them otherwise fits as many.
+    """
+    fits: list[tuple[int, float, Ints]] = []
+    proposed = False
+    for triple, names in proposals:
         some = places[list(triple)]
         if _height(some) < SPREAD_MM:
             continue
-        for named in _alike(some, apart):
+        for named in names:
+            proposed = True
             T = rigid.fit(some, known[named])
             moved = rigid.apply(T, places)
             if np.abs(moved[list(triple)] - known[named]).max() > SAME_MM:
@@ -49,15 +82,11 @@ def by_pattern(places: Floats, known: Floats) -> Ints:
         if fits and max(count for count, _, _ in fits) == len(places):
             break  # all are named
     if not fits:
-        return best
+        return np.full(len(places), -1, np.int64) if proposed else None
     fits.sort(key=lambda fit: fit[:2])
     count, _, rows = fits[-1]
-    rival = any(fit[0] == count and _contradict(fit[2], rows) for fit in fits)
-    return best if count < LEAST or rival else rows
-
-
-def _contradict(a: Ints, b: Ints) -> bool:
-    return bool((a != b).any())
+    rival = any(fit[0] == count and (fit[2] != rows).any() for fit in fits)
+    return np.full(len(places), -1, np.int64) if count < LEAST or rival else rows
 
 
 def _height(triangle: Floats) -> float:

@@ -10,14 +10,18 @@ from processor.space_frame.params import Params
 from processor.space_frame.result import Balls, Flag
 from processor.space_frame.spheres import search_without_design
 
-MOST = 30
+MOST = 30  # spheres of a view
 
 
-def find(points: Floats, scanner: Floats | None, radius_mm: float) -> Balls:
-    """Return the spheres without a flag among points (n, 3); ``scanner`` (3,) is where they were seen from."""
+def find(points: Floats, scanner: Floats | None, radius_mm: float) -> tuple[Balls, bool]:
+    """Return the spheres among points (n, 3), flagged ones too, and whether the search stopped at MOST of them.
+
+    ``scanner`` (3,) is where the points were seen from, None if not known.
+    """
     seen_from = None if scanner is None else np.broadcast_to(scanner, points.shape)
     params = Params(radius_mm=radius_mm, max_balls=MOST)
-    return search_without_design.search(MergedCloud(points, np.zeros(3), seen_from), params).balls
+    balls = search_without_design.search(MergedCloud(points, np.zeros(3), seen_from), params).balls
+    return balls, len(balls) >= MOST
 
 
 def sure(balls: Balls) -> list[int]:

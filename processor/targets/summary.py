@@ -7,7 +7,7 @@ from processor.model import Scene, TargetKind, Targets
 
 
 def summary(scene: Scene) -> Text:
-    """Say how many targets were found in the scans, and how many of them have names."""
+    """Say how many targets were found in the scans, how many of them have names, and what was not searched."""
     table = Targets() if scene.targets is None else scene.targets
     counts = [
         text(template, count=table.kind.count(kind))
@@ -17,9 +17,11 @@ def summary(scene: Scene) -> Text:
         )
         if kind in table.kind
     ]
-    return text(
+    found = text(
         "targets in {scans} {scans:?scan|scans}: {counts}; {named} of them are control points",
         scans=len(scene.scans),
         counts=counts or text("none"),
         named=sum(bool(name) for name in table.name),
     )
+    remarks = scene.target_remarks
+    return text("{found}. {remarks:.}", found=found, remarks=remarks) if remarks else found

@@ -12,7 +12,7 @@ from processor.model import Control, InputError, Scan, Scene, Stations, TargetSe
 from processor.report.stitching import targets as report
 from processor.scan_folder import folder
 from processor.store import store
-from processor.targets import checkerboard, find, naming
+from processor.targets import checkerboard, find, naming, spheres
 from processor.targets.summary import summary
 from tests.support.target_clouds import board
 
@@ -237,3 +237,84 @@ def test_a_room_with_targets_and_decoys(seed):
 def _points_on(label, number):
     rows = [i for i, name in enumerate(label.surface_names) if name.startswith(f"checkerboard {number + 1} ")]
     return int(np.isin(label.surface, rows).sum())
+
+
+# --- what is not found, and is said ---------------------------------------------------------------------------------
+
+
+def test_points_without_intensity_cost_no_target():
+    points, intensity, centre = board(np.random.default_rng(7), side=SIDE)
+    on_it = np.flatnonzero(np.linalg.norm(points - centre, axis=1) < 40.0)
+    intensity[on_it[::25]] = np.nan
+    (one,) = checkerboard.find(points, intensity, SIDE)
+    assert np.linalg.norm(one.centre - centre) < 0.6
+
+
+def test_a_scan_without_intensities_is_said_not_to_be_searched():
+    scene, _ = scene_of_board()
+    blank = dataclasses.replace(scene.scans[0], intensity=np.empty(0))
+    found = find.with_targets(dataclasses.replace(scene, scans=(blank,)))
+    assert [one.code for one in found.target_remarks] == ["targets.no-intensities"]
+    assert "S1 has no intensities" in str(summary(found))
+    assert "强度" in messages("zh").text(summary(found))
+    assert find.with_targets(scene).target_remarks == ()
+
+
+def test_places_and_spheres_that_were_not_searched_are_said(monkeypatch):
+    scene, _ = scene_of_board()
+    monkeypatch.setattr(checkerboard, "MOST_SEEDS", 2)
+    found = find.with_targets(scene)
+    (remark,) = found.target_remarks
+    assert (remark.code, remark.values["places"]) == ("targets.most-places", 2)
+    monkeypatch.setattr(spheres, "MOST", 1)
+    rng = np.random.default_rng(3)
+    unit = rng.standard_normal((2, 900, 3))
+    unit /= np.linalg.norm(unit, axis=2)[..., None]
+    ball = (100.0 * unit + np.array([[[3000.0, 0.0, 0.0]], [[0.0, 3000.0, 0.0]]])).reshape(-1, 3)
+    scan = Scan("S1", ball + rng.normal(0.0, 0.3, ball.shape))
+    found = find.with_targets(Scene("x", "structure", (scan,), target_search=TargetSearch(sphere_radius_mm=100.0)))
+    assert [one.code for one in found.target_remarks] == ["targets.most-spheres"]
+    assert len(found.targets) == 1
+
+
+def test_the_interval_of_a_target_has_what_all_ranges_of_a_view_share():
+    """The class of scanners: 0.5 mm, one standard deviation, for the ranges of one view."""
+    scene, _ = scene_of_board()
+    found = find.with_targets(scene)
+    assert found.targets.sd[0] == pytest.approx(np.hypot(0.5, found.control.seen_sd[0]))
+
+
+def spread_targets(seed=4, count=6):
+    return np.random.default_rng(seed).uniform(0.0, 12_000.0, (count, 3))
+
+
+def test_a_shifted_target_of_a_posed_scan_has_no_name():
+    known = spread_targets()
+    seen = known + np.array([30.0, -20.0, 10.0])  # of an approximate pose
+    seen[2, 2] += 40.0
+    assert naming.by_pose(seen, known).tolist() == [0, 1, -1, 3, 4, 5]
+
+
+def test_two_targets_of_a_posed_scan_have_names_if_their_distance_agrees():
+    known = spread_targets()
+    seen = known[[1, 3]] + 20.0
+    assert naming.by_pose(seen, known).tolist() == [1, 3]
+    seen[1] += 30.0 * (known[3] - known[1]) / np.linalg.norm(known[3] - known[1])
+    assert naming.by_pose(seen, known).tolist() == [-1, -1]
+    line = np.array([[0.0, 0, 0], [4000.0, 0, 0], [9000.0, 0, 0]])
+    assert naming.by_pose(line + 3.0, line).tolist() == [0, 1, 2]
+
+
+def test_targets_that_contradict_each_other_are_said():
+    known = spread_targets()
+    seen = known.copy()
+    seen[2, 2] += 40.0
+    control = Control(tuple(f"K{i}" for i in range(6)), positions=known, sd=np.full(6, 0.5))
+    found = [
+        find._Found(kind="sphere", scan=0, station=-1, place=place, sd=0.1, points=100, fit=np.nan) for place in seen
+    ]
+    scan = Scan("S1", np.zeros((1, 3)), T_project_scan=np.eye(4))
+    remarks: list = []
+    names = find._names(Scene("x", "structure", (scan,), control=control), found, remarks)
+    assert names.tolist() == [0, 1, -1, 3, 4, 5]
+    assert [(one.code, one.values["targets"]) for one in remarks] == [("targets.contradict", 1)]
