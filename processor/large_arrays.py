@@ -31,7 +31,8 @@ class NoRoomError(OSError):
 
 
 BLOCK_ROWS = 1 << 18
-MEMORY_BYTES = 1 << 27  # of arrays in memory, about 4 million points
+MEMORY_BYTES = 1 << 26  # of arrays in memory, about 2 million points
+LEAST_BYTES = 1 << 16  # of an array in a file
 TOUCHED_BYTES = 1 << 25  # written one after the other before their pages are given back
 
 
@@ -72,9 +73,12 @@ def folder_for(size: int) -> Path | None:
 
 def _new(shape: tuple[int, ...], dtype: type) -> Array:
     size = np.dtype(dtype).itemsize * math.prod(shape)
-    folder = folder_for(size) if size else None
-    if folder is None:
-        return np.empty(shape, dtype)
+    folder = folder_for(size) if size >= LEAST_BYTES else None
+    return np.empty(shape, dtype) if folder is None else _in_file(folder, shape, dtype)
+
+
+def _in_file(folder: Path, shape: tuple[int, ...], dtype: type) -> Array:
+    size = np.dtype(dtype).itemsize * math.prod(shape)
     descriptor = new_file(folder)
     try:
         reserve(descriptor, size, folder)
@@ -182,6 +186,16 @@ def taken(array: Array, rows: npt.NDArray[np.int64]) -> Array:
         start, stop = np.searchsorted(rows, (part.start, part.stop), sorter=order)
         found[order[start:stop]] = array[rows[order[start:stop]]]
     return found
+
+
+def put_aside(array: Array) -> Array:
+    """Return an array, or a copy of it in a file where arrays of its size are allocated there."""
+    folder = folder_for(array.nbytes) if array.nbytes >= LEAST_BYTES else None
+    if folder is None:
+        return array
+    aside = _in_file(folder, array.shape, array.dtype.type)
+    aside[:] = array
+    return aside
 
 
 def chosen(array: Array, kept: npt.NDArray[np.bool_]) -> Array:

@@ -110,6 +110,7 @@ def read(
     ``piecewise`` leaves the points of a scene file where they are, for steps that take them piece by piece. Scans of
     other files go through ``keep``, see :func:`processor.scan_folder.folder.read_input`.
     """
+    from processor import readers
     from processor.scan_folder import folder
     from processor.store import store
 
@@ -119,6 +120,8 @@ def read(
         scene = store.read_scene(path, not piecewise)
     else:
         scene = folder.read_input(path, units, keep)
+        if sum(len(scan.points) for scan in scene.scans) > PIECEWISE_POINTS:
+            readers.sandbox.close()  # its process takes memory that the steps need
     for name in (path.name, scene.name, *(scan.name for scan in scene.scans)):
         try:
             name.encode("utf-8")

@@ -143,7 +143,7 @@ def compute(
 ) -> Results:
     """Process an input as :func:`run` does, without writing the results; ``output`` is tried before the work.
 
-    Points beyond 128 MB lie in files without a name beside the output, without one in the folder for temporary files.
+    Points beyond 64 MB lie in files without a name beside the output, without one in the folder for temporary files.
     """
     wanted, methods, parameters = _names(steps), _names(method), _parameters(params)
     out = None if output is None else Path(output)

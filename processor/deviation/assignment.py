@@ -19,6 +19,7 @@ from numba import njit
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import SHARP_COS, CurvedFacets, FacetGrid, square_to
 from processor.geometry.parallel import over_ranges
+from processor.large_arrays import put_aside
 from processor.model import Floats, Ints
 
 LEAST_RANGE = 5_000  # points per task of a thread
@@ -33,17 +34,49 @@ class OnSurface:
     """Points of a scan on the design: foot (n, 3), signed distance (n,) and facet (n,); mm, outward > 0.
 
     Off the design's faces the distance is NaN and the facet -1. ``clearance`` (n,) is the distance of the foot from the
-    nearest face of another direction that could be mistaken for its own, and from half way to an opposed face.
+    nearest face of another direction that could be mistaken for its own, and from half way to an opposed face. ``flat``
+    (n,) is the distance from the facet itself, without the height of the curved surface over it.
     """
 
     feet: Floats
     distance: Floats
     facet: Ints
     clearance: Floats
+    flat: Floats
 
     def of(self, rows: Ints) -> OnSurface:
         """Return the points of some rows alone."""
-        return OnSurface(self.feet[rows], self.distance[rows], self.facet[rows], self.clearance[rows])
+        return OnSurface(
+            self.feet[rows], self.distance[rows], self.facet[rows], self.clearance[rows], flat=self.flat[rows]
+        )
+
+
+@dataclass(frozen=True)
+class Aside:
+    """What cannot be computed quickly of points on the design, where it takes least: rows (m,) of a block of them."""
+
+    rows: Ints
+    facet: Ints
+    clearance: Floats
+    flat: Floats
+
+    @classmethod
+    def put(cls, rows: Ints, seen: OnSurface) -> Aside:
+        """Put aside the rows (m,) of a block whose points are ``seen``."""
+        return cls(
+            put_aside(rows.astype(np.int32)), put_aside(seen.facet[rows].astype(np.int32)),
+            put_aside(seen.clearance[rows]), put_aside(seen.flat[rows]),
+        )  # fmt: skip
+
+    def seen(self, points: Floats, curved: CurvedFacets) -> OnSurface:
+        """Return what is known of the points (m, 3) that were put aside."""
+        facet, flat = self.facet.astype(np.int64), np.array(self.flat)
+        return _on_surface(points, facet, flat, np.array(self.clearance), curved)
+
+
+def _on_surface(points: Floats, facet: Ints, flat: Floats, clearance: Floats, curved: CurvedFacets) -> OnSurface:
+    feet = points - flat[:, None] * curved.surface.normals[facet]
+    return OnSurface(feet, flat - curved.heights(feet, facet), facet, clearance, flat=flat)
 
 
 def assigned(points: Floats, scanner: Floats | None, curved: CurvedFacets, grid: FacetGrid) -> OnSurface:
@@ -54,13 +87,13 @@ def assigned(points: Floats, scanner: Floats | None, curved: CurvedFacets, grid:
     over_ranges(lambda a, b: _nearest(grid, points, scanner, facet, a, b), len(points), least=LEAST_RANGE)
     facet, distance, beyond = surface.distances(points, grid.reach, facet)
     used = mesh_distance.on_face(facet, beyond)
-    facet, distance = np.where(used, facet, -1), np.where(used, distance, np.nan)
-    feet = points - distance[:, None] * surface.normals[facet]
+    facet, flat = np.where(used, facet, -1), np.where(used, distance, np.nan)
     clearance = np.full(len(points), np.nan)
+    seen = _on_surface(points, facet, flat, clearance, curved)
     seen_from = np.empty((0, 3)) if scanner is None else np.ascontiguousarray(scanner)
-    measured = _Feet(feet, facet, seen_from)
+    measured = _Feet(seen.feet, facet, seen_from)
     over_ranges(lambda a, b: _clear(grid, surface.part_of, measured, clearance, a, b), len(points), least=LEAST_RANGE)
-    return OnSurface(feet, distance - curved.heights(feet, facet), facet, clearance)
+    return seen
 
 
 def clear(seen: OnSurface, scatter: Floats) -> npt.NDArray[np.bool_]:

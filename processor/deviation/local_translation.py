@@ -58,6 +58,15 @@ class _Places(NamedTuple):
     order: Ints
 
 
+class _Sums(NamedTuple):
+    """Over the feet about each place: their number (k,), and the sums of s s (k,), n n' (k, 3, 3) and n s (k, 3)."""
+
+    number: Ints
+    square: Floats
+    nn: Floats
+    ns: Floats
+
+
 class _Moved(NamedTuple):
     """What the kernel fills; ``free`` (k,) are degrees of freedom, ``variance`` (k,) that of one point."""
 
@@ -68,41 +77,58 @@ class _Moved(NamedTuple):
     free: Ints
 
 
-def movement(
-    feet: PointGrid,
-    distance: Floats,
-    normals: Floats,
-    places: Floats,
-    directions: Floats,
-    *,
-    diameter_mm: float,
-    least_cos: float,
-) -> Movement:
-    """Movement of a surface at places (k, 3) on it, along unit normals ``directions`` (k, 3).
+class Translations:
+    """Movement of a surface at places (k, 3) on it, along unit normals ``directions`` (k, 3), from feet block by block.
 
-    ``feet`` are points on the surface, with the signed ``distance`` (n,) of what was measured there and the unit
-    ``normals`` (n, 3), both in the grid's order. Feet are used within half ``diameter_mm`` of a place, where the cosine
-    between the surface's normal and the place's is at least ``least_cos``.
+    Feet are used within half ``diameter_mm`` of a place, where the cosine between the surface's normal and the place's
+    is at least ``least_cos``.
     """
-    places, directions = np.ascontiguousarray(places), np.ascontiguousarray(directions)
-    k = len(places)
-    measured = _Feet(distance, normals, 0.5 * float(diameter_mm), float(least_cos))
-    wanted = _Places(places, directions, feet.beside(places))
-    moved = _Moved(
-        along=np.empty(k), variance=np.empty(k), vector=np.empty((k, 3)), number=np.empty(k, np.int64),
-        free=np.empty(k, np.int64),
-    )  # fmt: skip
-    over_ranges(lambda a, b: _movement(feet.cells, measured, wanted, a, b, moved), k, least=LEAST_RANGE)
-    table = student_factor(np.arange(1.0, 401.0))
-    factor = np.where(moved.free > 0, table[np.clip(moved.free, 1, 400) - 1], np.nan)
-    return Movement(
-        moved.along, moved.number, np.sqrt(moved.variance) * factor, moved.vector, moved.number - moved.free
-    )
+
+    def __init__(self, places: Floats, directions: Floats, diameter_mm: float, least_cos: float) -> None:
+        self._places, self._directions = np.ascontiguousarray(places), np.ascontiguousarray(directions)
+        self.diameter, self._least_cos = float(diameter_mm), float(least_cos)
+        k = len(places)
+        self._sums = _Sums(np.zeros(k, np.int64), np.zeros(k), np.zeros((k, 3, 3)), np.zeros((k, 3)))
+
+    def add(self, feet: PointGrid, distance: Floats, normals: Floats) -> None:
+        """Add points on the surface with the signed ``distance`` (n,) of what was measured there.
+
+        Distances and the unit ``normals`` (n, 3) of the surface are in the grid's order.
+        """
+        measured = _Feet(distance, normals, 0.5 * self.diameter, self._least_cos)
+        wanted = _Places(self._places, self._directions, feet.beside(self._places))
+        over_ranges(
+            lambda a, b: _add(feet.cells, measured, wanted, a, b, self._sums), len(self._places), least=LEAST_RANGE
+        )
+
+    def movement(self) -> Movement:
+        """Return the movement by all feet that were added."""
+        k = len(self._places)
+        moved = _Moved(
+            along=np.full(k, np.nan), variance=np.full(k, np.nan), vector=np.full((k, 3), np.nan),
+            number=self._sums.number.copy(), free=np.zeros(k, np.int64),
+        )  # fmt: skip
+        over_ranges(lambda a, b: _movement(self._sums, self._directions, a, b, moved), k, least=LEAST_RANGE)
+        table = student_factor(np.arange(1.0, 401.0))
+        factor = np.where(moved.free > 0, table[np.clip(moved.free, 1, 400) - 1], np.nan)
+        return Movement(
+            moved.along, moved.number, np.sqrt(moved.variance) * factor, moved.vector, moved.number - moved.free
+        )
 
 
 @njit(cache=True, nogil=True)
-def _movement(cells, feet, wanted, first, last, moved):  # type: ignore[no-untyped-def]
-    """Fit the movement at places order[first] to order[last - 1]."""
+def _movement(sums, directions, first, last, moved):  # type: ignore[no-untyped-def]
+    """Fit the movement at places first to last - 1."""
+    A, g = np.empty((3, 3)), np.empty(3)
+    for row in range(first, last):
+        if sums.number[row] >= FEWEST_FOR_LOD:
+            A[:, :], g[:] = sums.nn[row], sums.ns[row]
+            _solve(A, g, sums.square[row], sums.number[row], directions[row], row, moved)
+
+
+@njit(cache=True, nogil=True)
+def _add(cells, feet, wanted, first, last, sums):  # type: ignore[no-untyped-def]
+    """Add the feet about places order[first] to order[last - 1] to their sums."""
     places, directions, order = wanted.places, wanted.directions, wanted.order
     distance, normals, radius, least_cos = feet.distance, feet.normals, feet.radius, feet.least_cos
     size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
@@ -114,8 +140,6 @@ def _movement(cells, feet, wanted, first, last, moved):  # type: ignore[no-untyp
         row = order[at]
         x, y, z = places[row, 0], places[row, 1], places[row, 2]
         a, b, c = directions[row, 0], directions[row, 1], directions[row, 2]
-        moved.along[row], moved.variance[row], moved.vector[row, :] = np.nan, np.nan, np.nan
-        moved.number[row], moved.free[row] = 0, 0
         if not np.isfinite(a + b + c + x + y + z) or len(points) == 0:
             continue
         i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, extent, extent, extent)
@@ -155,9 +179,10 @@ def _movement(cells, feet, wanted, first, last, moved):  # type: ignore[no-untyp
                                 g[0] += e * s
                                 g[1] += m * s
                                 g[2] += o * s
-        moved.number[row] = n
-        if n >= FEWEST_FOR_LOD:
-            _solve(A, g, square, n, directions[row], row, moved)
+        sums.number[row] += n
+        sums.square[row] += square
+        sums.nn[row] += A
+        sums.ns[row] += g
 
 
 @njit(cache=True, nogil=True)

@@ -115,7 +115,7 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
     core = mesh_distance.sampled(surface.vertices, surface.faces, core_spacing)
     depth = params.max_depth_mm or _depth(cloud.points, surface)
-    moved, share, shared = surface_movement.movement(cloud, core, curved, diameter, depth)
+    moved, share, shared = surface_movement.movement([cloud], core, curved, diameter, depth)
     views = 0.0
     if scan.unnamed_views:
         # Each scanned point counts at ``overlap`` core points.

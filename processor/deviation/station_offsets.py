@@ -7,6 +7,9 @@ points of few stations is then no better than the number of stations allows.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
@@ -15,6 +18,7 @@ from processor.adjustment.groups import pieces
 from processor.adjustment.opposite_sides import SURE
 from processor.deviation.local_translation import Movement
 from processor.geometry.mesh_distance import Samples
+from processor.large_arrays import put_aside, release
 from processor.model import Floats, Ints
 from processor.robust_statistics import student_factor
 
@@ -23,34 +27,50 @@ LEAST_POINTS = 10  # of a station on a piece
 SAME_FACE = 0.9  # least cosine between the normals of a point and of its core point
 
 
-def shared_sd(
-    core: Samples, moved: Movement, feet: Floats, facing: Floats, distance: Floats, station: Ints, diameter_mm: float
-) -> Floats:
+class OnFaces(NamedTuple):
+    """Points whose ``feet`` (n, 3) lie on faces with normals ``facing`` (n, 3): ``distance`` (n,), ``station`` (n,)."""
+
+    feet: Floats
+    facing: Floats
+    distance: Floats
+    station: Ints
+
+
+def shared_sd(core: Samples, moved: Movement, points: Callable[[], Iterable[OnFaces]], diameter_mm: float) -> Floats:
     """Return the standard deviation (k,) of the error that stations cause in the movements at core points, mm.
 
-    The points at ``feet`` (n, 3) on faces with normals ``facing`` (n, 3) have a ``distance`` (n,) and a ``station``
-    (n,). It is 0 where no piece was seen from two stations, and where these do not differ by more than chance.
+    ``points`` passes over the points that were measured. It is 0 where no piece was seen from two stations, and where
+    these do not differ by more than chance.
     """
     shared = np.zeros(len(core.points))
     known = np.flatnonzero(np.isfinite(moved.along))
-    if not len(known) or len(np.unique(station)) < 2:
+    stations = set[int]().union(*(np.unique(part.station).tolist() for part in points()))
+    if not len(known) or len(stations) < 2:
         return shared
-    at = known[cKDTree(core.points[known]).query(feet, workers=-1)[1]]
-    rows = np.flatnonzero(np.einsum("ni,ni->n", facing, core.normals[at]) > SAME_FACE)
+    tree = cKDTree(core.points[known])
     cell = pieces(core.points[known], core.normals[known], CELL_DIAMETERS * diameter_mm)
     of_core = np.full(len(core.points), -1, np.int64)
     of_core[known] = cell
-    left = distance[rows] - moved.along[at[rows]]
-    key, group, number = np.unique(
-        np.stack([of_core[at[rows]], station[rows]], axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    group = group.reshape(-1)
-    mean = np.bincount(group, left) / number
-    noise = np.bincount(group, (left - mean[group]) ** 2) / np.maximum(number - 1, 1)
-    total = np.bincount(of_core[at[rows]], minlength=len(cell))
-    share = np.bincount(key[:, 0], number**2, len(cell)) / np.maximum(total, 1) ** 2
-    variance = _between(key[:, 0], mean, noise / number, number >= LEAST_POINTS)
-    widening = float(student_factor(len(np.unique(station)) - 1))
+    cells, most = int(cell.max()) + 1, max(stations) + 1
+    number, total = np.zeros(cells * most, np.int64), np.zeros(cells * most)
+    asides = []
+    for part in points():
+        at = known[tree.query(part.feet, workers=-1)[1]] if len(part.feet) else known[:0]
+        rows = np.flatnonzero(np.einsum("ni,ni->n", part.facing, core.normals[at]) > SAME_FACE)
+        key, left = of_core[at[rows]] * most + part.station[rows], part.distance[rows] - moved.along[at[rows]]
+        number += np.bincount(key, minlength=len(number))
+        total += np.bincount(key, left, len(number))
+        asides.append((put_aside(key.astype(np.int32)), put_aside(left)))
+    mean, square = total / np.maximum(number, 1), np.zeros(len(number))
+    for key, left in asides:
+        square += np.bincount(key, (left - mean[key]) ** 2, len(number))
+        release()
+    seen = np.flatnonzero(number)
+    of_cell, count = seen // most, number[seen]
+    noise = square[seen] / np.maximum(count - 1, 1)
+    share = np.bincount(of_cell, count**2, cells) / np.maximum(np.bincount(of_cell, count, cells), 1) ** 2
+    variance = _between(of_cell, mean[seen], noise / count, count >= LEAST_POINTS)
+    widening = float(student_factor(len(stations) - 1))
     shared[known] = widening * np.sqrt(variance * share[cell])
     return shared
 

@@ -61,6 +61,7 @@ def pdf(pages: Iterable[Figure]) -> bytes:
     with PdfPages(out, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as document:
         for page in pages:
             document.savefig(page, dpi=110)
+            page.clear()  # a figure is part of a circle: its points would stay until the next garbage collection
     return out.getvalue()
 
 

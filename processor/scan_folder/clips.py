@@ -59,6 +59,8 @@ class Clipper:
 
     def clip(self, scan: Scan) -> Scan:
         """Return a scan without what is clipped. Raises InputError where too little of it is left."""
+        if not self.boxes:
+            return scan
         self.inside = self.inside or [0] * len(self.boxes)
         self.names.append(scan.name)
         kept = np.ones(len(scan.points), bool)

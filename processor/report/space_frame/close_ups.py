@@ -31,6 +31,7 @@ ROUND_MM = 60.0  # shown about the ball
 SLICE_MM = 8.0  # on either side of the plane through the centre
 SLACK_MM = 0.1  # of a box, beyond what is shown
 MOST_POINTS = 20_000  # of a panel; more are not visible
+MOST_KEPT = 10 * MOST_POINTS  # of a ball, of which a panel shows a slice and the rest
 LEAST_RADIUS_MM = 30.0
 VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of each
 
@@ -89,7 +90,7 @@ def _drawn(scene: Scene, result: Result, stored: Path | None, most: int) -> Iter
     with points_of(stored) if stored is not None else nullcontext() as points:
         crops = crops_about(scene, centres[shown], np.array(reach), points)
     for k, i in enumerate(shown):
-        yield i, _ball(result, i, centres[i], nominal[i] - centres[i], crops[k], reach[k])
+        yield i, _ball(result, i, centres[i], nominal[i] - centres[i], crops.pop(0), reach[k])
 
 
 def crops_about(scene: Scene, centres: Floats, reach: Floats, stored: StoredPoints | None = None) -> list[Floats]:
@@ -118,11 +119,16 @@ def _boxes(scene: Scene, centre: Floats, far: float) -> list[tuple[Floats, Float
 def _within(source: SceneSource, centres: Floats, reach: Floats) -> list[Floats]:
     middles = centres - source.origin
     pieces: list[list[Floats]] = [[] for _ in reach]
+    step, kept = [1] * len(pieces), [0] * len(pieces)
     for chunk in source.chunks():
         for k, (middle, far) in enumerate(zip(middles, reach, strict=True)):
             # By one axis first: most of a roof is far away.
             near = chunk.points[np.abs(chunk.points[:, 0] - middle[0]) <= far] - middle
-            pieces[k].append(near[np.einsum("ij,ij->i", near, near) <= far**2])
+            pieces[k].append(near[np.einsum("ij,ij->i", near, near) <= far**2][:: step[k]])
+            kept[k] += len(pieces[k][-1])
+            if kept[k] > MOST_KEPT:
+                pieces[k] = [np.vstack(pieces[k])[::2].copy()]
+                step[k], kept[k] = 2 * step[k], len(pieces[k][0])
     return [np.vstack(parts) if parts else np.empty((0, 3)) for parts in pieces]
 
 
