@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from processor import scene_cloud
-from processor.geometry import neighbors
+from processor.deviation import large_cloud
+from processor.deviation.large_cloud import LargeCloud
+from processor.geometry import neighbors, rigid
 from processor.model import Floats, InputError, Ints, Scene
 
-MOST_POINTS = 3_000_000  # of a scan; more are thinned evenly
+MOST_POINTS = 3_000_000  # of a scan that are held at once; of more an even sample is held
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,8 @@ class ScanCloud:
 
     The points ``removed`` (m, 3) as outliers have the scanners ``removed_scanner`` (m, 3). ``source`` (n + m,) is the
     row in ``sources`` of the scan that a point is from, or of the station if the scene is one scan. Scans that
-    stitching did not place are not in it: ``unplaced`` names them.
+    stitching did not place are not in it: ``unplaced`` names them. Of a scan too large for memory the points are a
+    sample, and ``large`` has all of them.
     """
 
     points: Floats
@@ -35,6 +38,7 @@ class ScanCloud:
     sources: tuple[str, ...]
     unposed: int = 0  # scans without a pose
     unplaced: tuple[str, ...] = ()
+    large: LargeCloud | None = None
 
     @property
     def unnamed_views(self) -> bool:
@@ -45,6 +49,7 @@ class ScanCloud:
         """Return the points of some sources alone."""
         used = np.isin(self.source, sources)
         rows, out = np.flatnonzero(used[: len(self.points)]), np.flatnonzero(used[len(self.points) :])
+        large = None if self.large is None else self.large.of(sources)
         return replace(
             self,
             points=self.points[rows],
@@ -52,22 +57,59 @@ class ScanCloud:
             removed=self.removed[out],
             removed_scanner=None if self.removed_scanner is None else self.removed_scanner[out],
             source=self.source[used],
-            kept=len(rows),
+            kept=len(rows) if large is None else large.kept,
+            large=large,
         )
 
 
-def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) -> ScanCloud:
+def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None, most: int = 0) -> ScanCloud:
     """Merge the scans of a scene, with the poses that stitching found, and remove outliers as paper 002 does.
 
-    Raises InputError for too few points.
+    Of ``most`` points or fewer, if that is not 0, every k-th is left. Raises InputError for too few points.
     """
     whole, scene = scene, scene_cloud.stitched(scene, stitched)
-    unposed = sum(not scan.T_project_scan.size for scan in scene.scans)
+    count = sum(len(scan.points) for scan in scene.scans)
+    if count < scene_cloud.FEWEST_POINTS:
+        raise InputError(f"{scene.name}: expected a scan of {scene_cloud.FEWEST_POINTS} points or more, got {count}")
+    cloud = (
+        _sample(scene, neighbours, ratio) if count > MOST_POINTS and not most else _held(scene, neighbours, ratio, most)
+    )
+    return replace(
+        cloud,
+        unposed=sum(not scan.T_project_scan.size for scan in scene.scans),
+        unplaced=tuple(scan.name for scan in whole.scans if all(scan.name != used.name for used in scene.scans)),
+    )
+
+
+def _sample(scene: Scene, neighbours: int, ratio: float) -> ScanCloud:
+    """Sort the scans of a scene into a large cloud, and return a sample of it."""
+    origin = rigid.apply(scene.scans[0].pose, scene.scans[0].origin)
+    names = _source_names(scene)
+    large = large_cloud.of_scene(scene, origin, len(names) > len(scene.scans), neighbours, ratio)
+    if not large.spacing_mm > 0.0:
+        raise InputError(f"{scene.name}: most points of the scan lie at the same place; export it again")
+    kept = large.kept
+    step = -(-kept // MOST_POINTS)
+    points, scanner, source = large.thinned(True, step)
+    removed, removed_scanner, removed_source = large.thinned(False, step)
+    return ScanCloud(
+        points=points,
+        origin=origin,
+        scanner=scanner,
+        removed=removed,
+        removed_scanner=removed_scanner,
+        spacing_mm=large.spacing_mm * np.sqrt(kept / len(points)),
+        read=len(large.points),
+        kept=kept,
+        source=np.concatenate([source, removed_source]),
+        sources=names,
+        large=large,
+    )
+
+
+def _held(scene: Scene, neighbours: int, ratio: float, most: int) -> ScanCloud:
+    """Merge the scans of a scene in memory; of ``most`` points or fewer, if that is not 0, every k-th is left."""
     cloud = scene_cloud.merged(scene, with_scanner=True)
-    if len(cloud.points) < scene_cloud.FEWEST_POINTS:
-        raise InputError(
-            f"{scene.name}: expected a scan of {scene_cloud.FEWEST_POINTS} points or more, got {len(cloud.points)}"
-        )
     grid = neighbors.of_spacing(cloud.points)
     spacing = neighbors.spacing(grid)
     if not spacing > 0.0:
@@ -75,11 +117,11 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     inlier = np.ones(grid.count, bool)
     if ratio > 0.0:
         inlier = neighbors.statistical_inliers(grid, neighbours, ratio)
-    step = max(1, -(-int(inlier.sum()) // MOST_POINTS))
+    step = max(1, -(-int(inlier.sum()) // most)) if most else 1
     rows, out = np.flatnonzero(inlier)[::step], np.flatnonzero(~inlier)[::step]
     kept = int(inlier.sum())
 
-    source, sources = _sources(scene)
+    source, names = _sources(scene), _source_names(scene)
 
     def scanner(at: Ints) -> Floats | None:
         return None if cloud.scanner is None else cloud.scanner[grid.order[at]]
@@ -94,19 +136,25 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
         read=grid.count,
         kept=kept,
         source=source[grid.order[np.concatenate([rows, out])]],
-        sources=sources,
-        unposed=unposed,
-        unplaced=tuple(scan.name for scan in whole.scans if all(scan.name != used.name for used in scene.scans)),
+        sources=names,
     )
 
 
-def _sources(scene: Scene) -> tuple[Ints, tuple[str, ...]]:
-    """Return the scan (n,) of each point in the order of the scans, or its station in a single one, and their names."""
+def _source_names(scene: Scene) -> tuple[str, ...]:
+    """Return the names of the scans, or of the stations of a single one, with "-" for unknown."""
+    scans = scene.scans
+    if len(scans) == 1 and len(scans[0].point_station) and scene.stations is not None:
+        return (*scene.stations.ids, "-")
+    return tuple(scan.name for scan in scans)
+
+
+def _sources(scene: Scene) -> Ints:
+    """Return the scan (n,) of each point in the order of the scans, or its station in a single one."""
     scans = scene.scans
     if len(scans) == 1 and len(scans[0].point_station) and scene.stations is not None:
         station = scans[0].point_station.astype(np.int64)
-        return np.where(station < 0, len(scene.stations.ids), station), (*scene.stations.ids, "-")
-    return np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans]), tuple(scan.name for scan in scans)
+        return np.where(station < 0, len(scene.stations.ids), station)
+    return np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans])
 
 
 def adaptive_voxels(points: Floats, size_mm: float, least: int, growth: float) -> Ints:

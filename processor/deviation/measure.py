@@ -98,24 +98,16 @@ def _doubted(result: Result, placement: Placement) -> Result:
 def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, most: int = 0) -> Measured:
     """Measure movements of a scan placed by T (4, 4); of ``most`` points of it, if that is not 0."""
     step = max(1, -(-len(scan.points) // most)) if most else 1
-    points = scan.points[::step] if most else np.concatenate([scan.points, scan.removed])
-    scanner = scan.scanner
-    if scanner is not None and scan.removed_scanner is not None:
-        scanner = scanner[::step] if most else np.concatenate([scanner, scan.removed_scanner])
-    cloud = Cloud(
-        rigid.apply(T, points),
-        None if scanner is None else rigid.apply(T, scanner),
-        np.arange(len(points)) >= len(scan.points),
-        scan.source[: len(scan.points) : step] if most else scan.source,
-    )
+    few = _cloud(scan, T, step, with_removed=not most)
     surface = curved.surface
     spacing = scan.spacing_mm * np.sqrt(step)
     diameter = params.projection_diameter_mm or m3c2.rounded(m3c2.diameter_for(POINTS_A_CORE, spacing))
     area = mesh_distance.area(surface.vertices, surface.faces)
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
     core = mesh_distance.sampled(surface.vertices, surface.faces, core_spacing)
-    depth = params.max_depth_mm or _depth(cloud.points, surface)
-    moved, share, shared = surface_movement.movement([cloud], core, curved, diameter, depth)
+    depth = params.max_depth_mm or _depth(few.points, surface)
+    clouds = [few] if most or scan.large is None else scan.large.placed(T)
+    moved, share, shared = surface_movement.movement(clouds, core, curved, diameter, depth)
     views = 0.0
     if scan.unnamed_views:
         # Each scanned point counts at ``overlap`` core points.
@@ -126,6 +118,20 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
         core=core, moved=moved, shared=np.hypot(shared, views), views=views, diameter=diameter, spacing=core_spacing,
         depth=depth, on_surface=share,
     )  # fmt: skip
+
+
+def _cloud(scan: ScanCloud, T: Floats, step: int, with_removed: bool) -> Cloud:
+    """Return every k-th point of a scan placed by T (4, 4), and what was removed as outliers, or not."""
+    points = np.concatenate([scan.points, scan.removed]) if with_removed else scan.points[::step]
+    scanner = scan.scanner
+    if scanner is not None and scan.removed_scanner is not None:
+        scanner = np.concatenate([scanner, scan.removed_scanner]) if with_removed else scanner[::step]
+    return Cloud(
+        rigid.apply(T, points),
+        None if scanner is None else rigid.apply(T, scanner),
+        np.arange(len(points)) >= len(scan.points),
+        scan.source if with_removed else scan.source[: len(scan.points) : step],
+    )
 
 
 def _fits(measured: Measured, params: Params) -> Fits:
@@ -239,7 +245,7 @@ def _result(
         stable_fit_share=fits.stable.share,
         stable_fit_limit=fits.limit_mm,
         ambiguity=placed.ambiguity,
-        spacing=scan.spacing_mm,
+        spacing=scan.spacing_mm if scan.large is None else scan.large.spacing_mm,
         sigma=float(np.median(known)) if len(known) else float("nan"),
         points_read=scan.read,
         points_kept=scan.kept,

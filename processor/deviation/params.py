@@ -37,6 +37,7 @@ class Params:
     seed: int = 0
     register: str = "auto"  # none: the frame as it is; fine: from where it is; coarse: from anywhere; auto: see README
     fit: str = "stable"  # a scan that is registered is fitted to: the largest part that agrees (stable); all: best fit
+    most_points: int = 0  # of more every k-th is used; 0 = all are used
     neighbours: int = 20  # K of the outlier removal
     outlier_ratio: float = 1.0  # n: standard deviations of the mean distance to K neighbours; 0 = no removal
     projection_diameter_mm: float = 0.0
@@ -53,6 +54,7 @@ class Params:
             raise UsageError(f"deviation.fit: expected one of {', '.join(FIT)}, got {self.fit!r}")
         paper = self.paper
         for name, sound, expected in (
+            ("most_points", self.most_points >= 0, "0 or more"),
             ("neighbours", self.neighbours >= 1, "1 or more"),
             ("outlier_ratio", 0.0 <= self.outlier_ratio < 1e6, "0 or more and below 1e6"),
             ("projection_diameter_mm", 0.0 <= self.projection_diameter_mm < 1e6, "0 or more and below 1e6"),

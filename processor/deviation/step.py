@@ -65,7 +65,7 @@ def _of_structure(scene: Scene, params: Params, stitched: Any) -> Result:
             "processor compare holds one scan against another"
         )
     vertices, origin = scene_cloud.local_design(scene.structure)
-    scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio, stitched)
+    scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio, stitched, params.most_points)
     method = baseline.measure if params.method == "paper" else measure.measure
     result = method(scene, scan, vertices, origin, params)
     result = replace(result, reasons=(*result.reasons, *scene_cloud.design_faults(scene.structure)))

@@ -43,12 +43,19 @@ def spacing(grid: PointGrid, rows: Ints | None = None) -> float:
     k neighbours within r cover pi r^2 = k d^2, on regular grids and random samples alike. The median is taken over
     ``rows`` of the grid, without them over an even sample of it.
     """
-    k = min(SPACING_NEIGHBOURS, grid.count - 1)
-    if k < 1:
-        return float("nan")
     rows = np.arange(0, grid.count, max(1, grid.count // SPACING_SAMPLE)) if rows is None else rows
-    farthest = _distances(grid, grid.cells.points[rows], rows, k)[1]
-    return float(np.median(farthest) * np.sqrt(np.pi / k))
+    return spacing_of(*farthest_distances(grid, rows))
+
+
+def farthest_distances(grid: PointGrid, rows: Ints) -> tuple[Floats, int]:
+    """Distance (m,) of ``rows`` of a grid to the k-th neighbour, and k; 0 where there is none."""
+    k = min(SPACING_NEIGHBOURS, grid.count - 1)
+    return (_distances(grid, grid.cells.points[rows], rows, k)[1] if k > 0 else np.empty(0)), k
+
+
+def spacing_of(farthest: Floats, k: int) -> float:
+    """Spacing by the distances (m,) of points to the k-th neighbour; NaN without any."""
+    return float(np.median(farthest) * np.sqrt(np.pi / k)) if len(farthest) else float("nan")
 
 
 def surface_spacing(points: Floats) -> float:

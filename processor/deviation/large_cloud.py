@@ -1,0 +1,252 @@
+"""A scan of more points than are held at once: sorted into slabs in files, with its outliers marked slab by slab.
+
+Neighbours of a slab's points are searched for in it and in what lies within ``HALO`` spacings of it, so outliers are
+those of the whole cloud. Within a slab the points are in the order of a grid, so every k-th is an even sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from processor.deviation.surface_movement import Cloud
+from processor.geometry import neighbors, rigid
+from processor.large_arrays import allocate, blocks, extremes, release, taken
+from processor.model import Bools, Floats, Ints, Labels, Scan, Scene
+
+SLAB_POINTS = 1_000_000
+BINS = 1 << 16  # across the longest axis, of which slabs consist
+HALO = 20.0  # spacings about a slab: 20 neighbours of a point on a surface lie within three
+SPACING_SAMPLE = 20_000
+SAMPLE = 60_000  # points of a slab by which its spacing is estimated
+
+
+class _Part(NamedTuple):
+    """Points (n, 3), the sources (n,) and the scanners (n,) they are from, as rows."""
+
+    points: Floats
+    source: Labels
+    scanner: Labels
+
+
+@dataclass(frozen=True)
+class LargeCloud:
+    """Points (n, 3) in files, mm, slab by slab; their sources, the rows (n,) of ``scanners`` (s, 3), and inliers (n,).
+
+    ``scanners`` is None where any is unknown. ``used`` are the sources that are left, of all at first.
+    """
+
+    points: Floats
+    source: Labels
+    scanner: Labels
+    inlier: Bools
+    scanners: Floats | None
+    spacing_mm: float
+    used: Ints
+
+    def of(self, sources: Ints) -> LargeCloud:
+        """Return the points of some sources alone."""
+        return replace(self, used=sources)
+
+    @property
+    def kept(self) -> int:
+        """Number of points that are no outliers."""
+        return sum(int((self.inlier[rows] & self._is_used(rows)).sum()) for rows in blocks(len(self.points)))
+
+    def _is_used(self, rows: slice) -> Bools:
+        return np.isin(self.source[rows], self.used)
+
+    def thinned(self, inliers: bool, step: int) -> tuple[Floats, Floats | None, Ints]:
+        """Return every k-th of the inliers, or of the others: points, scanners and sources."""
+        chosen, count = [np.empty(0, np.int64)], 0
+        for block in blocks(len(self.points), SLAB_POINTS):
+            rows = np.flatnonzero(self.inlier[block] == inliers)
+            chosen.append(block.start + rows[-count % step :: step])
+            count += len(rows)
+        rows = np.concatenate(chosen)
+        scanner = None if self.scanners is None else self.scanners[taken(self.scanner, rows)]
+        return taken(self.points, rows), scanner, taken(self.source, rows).astype(np.int64)
+
+    def placed(self, T: Floats) -> Placed:
+        """Return the points placed by T (4, 4), for passes over them."""
+        return Placed(self, T)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The points of a large cloud placed by T (4, 4): clouds of a slab's size, the same in every pass."""
+
+    cloud: LargeCloud
+    T: Floats
+
+    def __iter__(self) -> Iterator[Cloud]:
+        """Pass over all points that are used."""
+        large = self.cloud
+        scanners = None if large.scanners is None else rigid.apply(self.T, large.scanners)
+        for block in blocks(len(large.points), SLAB_POINTS):
+            rows = np.flatnonzero(np.isin(large.source[block], large.used))
+            if len(rows):
+                yield Cloud(
+                    rigid.apply(self.T, large.points[block][rows]),
+                    None if scanners is None else scanners[large.scanner[block][rows]],
+                    ~large.inlier[block][rows],
+                    large.source[block][rows].astype(np.int64),
+                )
+
+
+def of_scene(scene: Scene, origin: Floats, by_station: bool, neighbours: int, ratio: float) -> LargeCloud:
+    """Sort the scans of a scene, less ``origin`` (3,), into slabs, and mark outliers as paper 002 does.
+
+    Sources are the stations of a single scan (``by_station``, those unknown last), else the scans.
+    """
+    scanners, first = _scanners(scene, origin)
+    parts = _Parts(scene.scans, origin, by_station, len(scene.stations.ids) if scene.stations else 0, first)
+    slabs = _Slabs.of(parts)
+    n = int(slabs.ends[-1])
+    points, source, scanner = allocate(n, 3), allocate(n, dtype=np.int32), allocate(n, dtype=np.int32)
+    place = slabs.ends - np.diff(slabs.ends, prepend=0)
+    for part in parts:
+        slab = slabs.of_points(part.points)
+        order = np.argsort(slab, kind="stable")
+        count = np.bincount(slab, minlength=len(place))
+        rows = np.repeat(place - (np.cumsum(count) - count), count) + np.arange(len(slab))
+        points[rows], source[rows], scanner[rows] = (column[order] for column in part)
+        place += count
+        release()
+    inlier, spacing = _inliers(slabs, _Part(points, source, scanner), neighbours, ratio)
+    used = np.arange(parts.stations + 1 if by_station else len(scene.scans))
+    return LargeCloud(points, source, scanner, inlier, scanners=scanners, spacing_mm=spacing, used=used)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Passes over the points of scans in the project's frame less ``origin``, in blocks.
+
+    ``first`` is the row of the first station among the scanners, of which those of scans with a position come before.
+    """
+
+    scans: tuple[Scan, ...]
+    origin: Floats
+    by_station: bool
+    stations: int
+    first: int
+
+    def __iter__(self) -> Iterator[_Part]:
+        """Pass over all points."""
+        own = 0
+        for number, scan in enumerate(self.scans):
+            T = scan.pose
+            # Large offsets are subtracted from each other first: added to the points, either would cost them digits.
+            shift = T[:3, :3] @ scan.origin + (T[:3, 3] - self.origin)
+            for rows in blocks(len(scan.points)):
+                points = (scan.points[rows] @ T[:3, :3].T if scan.T_project_scan.size else scan.points[rows]) + shift
+                station = scan.point_station[rows]
+                source = np.full(len(points), number, np.int32)
+                if self.by_station:
+                    source = np.where(station < 0, self.stations, station).astype(np.int32)
+                seen_from = np.full(len(points), own, np.int32) if scan.position.size else self.first + station
+                yield _Part(points, source, seen_from if len(seen_from) else np.zeros(len(points), np.int32))
+            own += bool(scan.position.size)
+
+
+def _scanners(scene: Scene, origin: Floats) -> tuple[Floats | None, int]:
+    """Return positions (s, 3) of scanners, those of scans first, and the number of these; None where one is unknown."""
+    own, known = [np.empty((0, 3))], True
+    for scan in scene.scans:
+        if scan.position.size:
+            T = scan.pose
+            shift = T[:3, :3] @ scan.origin + (T[:3, 3] - origin)
+            own.append((T[:3, :3] @ (scan.position - scan.origin) + shift)[None])
+        else:
+            named = scene.stations is not None and len(scan.point_station) > 0
+            known = known and named and extremes(scan.point_station)[0] >= 0
+    stations = np.empty((0, 3)) if scene.stations is None else scene.stations.positions - origin
+    return np.concatenate([*own, stations]) if known else None, len(own) - 1
+
+
+@dataclass(frozen=True)
+class _Slabs:
+    """Slabs of about SLAB_POINTS points across an axis, in bins from ``low``; the row after the last of each (s,)."""
+
+    axis: int
+    low: float
+    width: float  # of a bin
+    slab_of_bin: Ints
+    ends: Ints
+
+    @classmethod
+    def of(cls, parts: _Parts) -> _Slabs:
+        """Return the slabs of points."""
+        corners = [(part.points.min(axis=0), part.points.max(axis=0)) for part in parts]
+        low, high = np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)
+        axis = int(np.argmax(high - low))
+        width = max(float(high[axis] - low[axis]) / BINS, 1e-9)
+        one = cls(axis, float(low[axis]), width, np.arange(BINS), ends=np.empty(0, np.int64))
+        filled = np.zeros(BINS, np.int64)
+        for part in parts:
+            filled += np.bincount(one.of_points(part.points), minlength=BINS)
+        slab_of_bin, slab, total = np.empty(BINS, np.int64), 0, 0
+        for number, count in enumerate(filled.tolist()):
+            if total and total + count > SLAB_POINTS:
+                slab, total = slab + 1, 0
+            slab_of_bin[number], total = slab, total + count
+        ends = np.cumsum(np.bincount(slab_of_bin, filled).astype(np.int64))
+        return replace(one, slab_of_bin=slab_of_bin, ends=ends)
+
+    def of_points(self, points: Floats) -> Ints:
+        """Return the slab (n,) of points (n, 3)."""
+        number = ((points[:, self.axis] - self.low) / self.width).astype(np.int64)
+        return self.slab_of_bin[np.clip(number, 0, BINS - 1)]
+
+    def bounds(self, slab: int) -> tuple[float, float]:
+        """Return where a slab begins and ends along the axis."""
+        bins = np.flatnonzero(self.slab_of_bin == slab)
+        return self.low + self.width * float(bins[0]), self.low + self.width * float(bins[-1] + 1)
+
+
+def _inliers(slabs: _Slabs, part: _Part, neighbours: int, ratio: float) -> tuple[Bools, float]:
+    """Mark (n,) the points that outlier removal keeps, put each slab in the order of a grid, and return the spacing."""
+    n = len(part.points)
+    distance, farthest, total, k = allocate(n), list[Floats](), 0.0, 1
+    for slab in range(len(slabs.ends)):
+        rows = slice(int(slabs.ends[slab - 1]) if slab else 0, int(slabs.ends[slab]))
+        if rows.start == rows.stop:
+            continue
+        grid = neighbors.of_spacing(_with_halo(slabs, part.points, slab, rows))
+        own = np.flatnonzero(grid.order < rows.stop - rows.start)
+        order = grid.order[own]
+        for column in part:
+            column[rows] = column[rows][order]
+        if ratio > 0.0:
+            distance[rows] = neighbors.mean_distances(grid, neighbours)[own]
+            total += float(distance[rows].sum())
+        sample, k = neighbors.farthest_distances(grid, own[:: max(1, n // SPACING_SAMPLE)])
+        farthest.append(sample)
+        release()
+    inlier = allocate(n, dtype=np.bool_)
+    mean = total / n
+    square = sum(float(((distance[rows] - mean) ** 2).sum()) for rows in blocks(n)) if ratio > 0.0 else 0.0
+    limit = mean + ratio * float(np.sqrt(square / n))
+    for rows in blocks(n):
+        inlier[rows] = distance[rows] <= limit if ratio > 0.0 else True
+    return inlier, neighbors.spacing_of(np.concatenate(farthest), k)
+
+
+def _with_halo(slabs: _Slabs, points: Floats, slab: int, rows: slice) -> Floats:
+    """Return the points of a slab, and after them those about it."""
+    own = points[rows]
+    step = max(1, len(own) // SAMPLE)
+    few = neighbors.spacing(neighbors.of_spacing(own[::step]))
+    reach = HALO * few / np.sqrt(step) if few > 0.0 else 0.0
+    low, high = slabs.bounds(slab)
+    beside = [own]
+    for other in range(len(slabs.ends)):
+        start, stop = slabs.bounds(other)
+        if other != slab and start <= high + reach and stop >= low - reach:
+            part = points[slice(int(slabs.ends[other - 1]) if other else 0, int(slabs.ends[other]))]
+            along = part[:, slabs.axis]
+            beside.append(part[(along >= low - reach) & (along <= high + reach)])
+    return np.concatenate(beside)
