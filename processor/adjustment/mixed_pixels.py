@@ -3,14 +3,16 @@
 A beam has a width of some millimetres. At the outline of a body it meets the body and what is behind, and a phase
 scanner states a mean of the two ranges (mixed pixel, Hebert and Krotkov 1992). Such points lie in the air or, where the
 body behind is near, a little before its surface. They are recognised by their neighbours in direction: one of them is
-of another face, and lies before that of the point by more than any slope of steel would bring it; or it is of the same
-face, and lies so far before the point itself: on top of a bulge all neighbours lie before the face, but none does that.
+of another face, and lies before that of the point; or it is of the same face or of none, and lies so far before the
+point itself that no slope of steel would bring it there: on top of a bulge all neighbours lie before the face, but none
+does that. Steel of another face needs no slope: where a face is seen at a glance, an edge far before it lies within the
+slope of a dent.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
@@ -20,12 +22,16 @@ from processor.geometry.parallel import over_ranges
 from processor.model import Bools, Floats, Ints
 
 WINDOW_STEPS = 1.6  # of the scanner, within which a point is a neighbour: those of a square grid and its diagonals
-HALF_BEAM_MM = 4.0  # of scanners up to 20 m away, by which the window is wider
+# Half of a beam, by which the window is wider. Beams are 3.5 to 6 mm wide at exit and diverge by 0.3 to 0.5 mrad.
+HALF_EXIT_MM, HALF_DIVERGENCE = 2.4, 2e-4
 NEAREST_SHARE = 0.05  # of the points, which are so near that their window is not taken in full
 STEP_NEIGHBOUR, STEP_SAMPLE = 4, 2_000  # of a point of a square grid, the first four lie one step away
 HIGHER_MM = 3.0  # before the face, from which a neighbour is something else
 SLOPE = 0.25  # height by the distance along the face, up to which a neighbour may be of the same steel: dents have less
 LEAST_RANGE = 5_000  # points per task of a thread
+
+
+T = TypeVar("T", float, Floats)
 
 
 class _Others(NamedTuple):
@@ -57,7 +63,7 @@ def beside(
     if not (len(points) and step > 0.0):
         return marked
     nearest = float(np.quantile(np.linalg.norm(points - scanner, axis=1), NEAREST_SHARE))
-    key, columns = _keys(directions, WINDOW_STEPS * step + HALF_BEAM_MM / nearest)
+    key, columns = _keys(directions, WINDOW_STEPS * step + half_beam(nearest) / nearest)
     order = np.argsort(key, kind="stable")
     others = _Others(np.ascontiguousarray(everything[order]), faces[order], key[order], columns, step)
     points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
@@ -67,6 +73,11 @@ def beside(
 
     over_ranges(kernel, len(points), least=LEAST_RANGE)
     return marked
+
+
+def half_beam(away: T) -> T:
+    """Return half the width of a beam, mm, at distances from its scanner, mm."""
+    return HALF_EXIT_MM + HALF_DIVERGENCE * away
 
 
 def _directions(points: Floats, scanner: Floats) -> Floats:
@@ -109,7 +120,7 @@ def _mark(points, normals, height, face, scanner, others, marked, first, last): 
         x, y, z = points[i, 0] - scanner[0], points[i, 1] - scanner[1], points[i, 2] - scanner[2]
         far = np.sqrt(x * x + y * y + z * z)
         x, y, z = x / far, y / far, z / far
-        window = WINDOW_STEPS * others.step + HALF_BEAM_MM / far
+        window = WINDOW_STEPS * others.step + HALF_EXIT_MM / far + HALF_DIVERGENCE
         row = min(int(np.arccos(z) / np.pi * rows), rows - 1)
         turn = np.arctan2(y, x) / (2.0 * np.pi) + 0.5
         for r in range(max(row - 1, 0), min(row + 2, rows)):
@@ -122,14 +133,15 @@ def _mark(points, normals, height, face, scanner, others, marked, first, last): 
                 k = np.searchsorted(key, wanted)
                 while k < len(key) and key[k] == wanted:
                     level = 0.0 if others.face[k] == face[i] else height[i]
-                    if _stands_before(points[i], normals[i], level, scanner, others.points[k], x, y, z, window):
+                    slope = SLOPE if others.face[k] == face[i] or others.face[k] < 0 else 0.0
+                    if _stands_before(points[i], normals[i], level, slope, scanner, others.points[k], x, y, z, window):
                         marked[i] = True
                         break
                     k += 1
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _stands_before(point, normal, height, scanner, other, x, y, z, window):  # type: ignore[no-untyped-def]
+def _stands_before(point, normal, height, slope, scanner, other, x, y, z, window):  # type: ignore[no-untyped-def]
     """Return whether another point is a neighbour of a direction (x, y, z), too high above one ``height`` below it."""
     a, b, c = other[0] - scanner[0], other[1] - scanner[1], other[2] - scanner[2]
     far = np.sqrt(a * a + b * b + c * c)
@@ -141,4 +153,4 @@ def _stands_before(point, normal, height, scanner, other, x, y, z, window):  # t
     if rise + height < HIGHER_MM:
         return False
     across = np.sqrt(max(dx * dx + dy * dy + dz * dz - rise * rise, 0.0))
-    return rise + height > HIGHER_MM + SLOPE * across
+    return rise + height > HIGHER_MM + slope * across

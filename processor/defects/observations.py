@@ -133,13 +133,12 @@ def _of_scan(
     mixed = _at_outline(surface, facet[on], points[on], scanners[station_of[on]])
     mixed |= _passed_by(surface, grid, facet[on], points[on], deviation[on], scanners[station_of[on]])
     mixed &= known[station_of[on]]
-    every_chart = np.where(facet >= 0, surface.chart_of[facet], -1)
-    chart = every_chart[on]
+    smooth, chart = np.where(facet >= 0, surface.part_of[facet], -1), surface.chart_of[facet[on]]
     for k in np.unique(station_of[on]):
         if known[k]:
             rows = station_of[on] == k
-            of_face = surface.normals[facet[on[rows]]], deviation[on[rows]], chart[rows]
-            every = points[station_of == k], every_chart[station_of == k]
+            of_face = surface.normals[facet[on[rows]]], deviation[on[rows]], smooth[on[rows]]
+            every = points[station_of == k], smooth[station_of == k]
             mixed[rows] |= mixed_pixels.beside(points[on[rows]], positions[k], *of_face, every)
     return chart, layout(surface.charts, chart, places), station_of[on], deviation[on], mixed
 
@@ -182,11 +181,12 @@ def _at_outline(surface: DesignSurface, facet: Ints, points: Floats, scanners: F
     rows = np.flatnonzero(charts.kind[chart] == CYLINDER)
     chart = chart[rows]
     axis, arm = charts.axes[chart, 0], points[rows] - charts.origin[chart]
-    across = np.cross(scanners[rows] - points[rows], axis)
+    sight = scanners[rows] - points[rows]
+    across = np.cross(sight, axis)
     across /= np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None]
     off = np.abs(np.einsum("ni,ni->n", arm, across))
     is_convex = np.einsum("ni,ni->n", arm, surface.normals[facet[rows]]) > 0.0
-    marked[rows] = is_convex & (off > charts.radius[chart] - mixed_pixels.HALF_BEAM_MM)
+    marked[rows] = is_convex & (off > charts.radius[chart] - mixed_pixels.half_beam(np.linalg.norm(sight, axis=1)))
     return marked
 
 

@@ -124,8 +124,8 @@ class Observations:
 
     def _normal_matrix(self, columns: Floats) -> Floats:
         A: Floats = columns.T @ (self.blocks.weight[:, None] * columns)
-        ridge = float(WEAK * np.trace(A) / len(A) + 1e-12)
-        return np.asarray(A + ridge * np.eye(len(A)), np.float64)
+        A += (WEAK * np.trace(A) / len(A) + 1e-12) * np.eye(len(A))
+        return A
 
     def residual(self, columns: Floats) -> tuple[Floats, float]:
         """Return the residuals (n,) of the fit of columns (n, k), and their chi-square."""
@@ -137,7 +137,8 @@ class Observations:
         if not chosen:
             return ()
         columns = self.columns(chosen)
-        factors, covariance = self.factors(columns), np.asarray(np.linalg.inv(self._normal_matrix(columns)), np.float64)
+        factors = self.factors(columns)
+        covariance: Floats = np.asarray(np.linalg.inv(self._normal_matrix(columns)), np.float64)
         shapes, start = [], 0
         for kind, at in chosen:
             own = slice(start, start + BASES[kind](self.p[:1], self.n[:1], self.frame.half, at).shape[1])

@@ -72,6 +72,7 @@ class DesignSurface:
     faces: Ints
     normals: Floats
     chart_of: Ints  # (f,)
+    part_of: Ints  # (f,) the smooth face, of which a chart may be a piece
     component_of: Ints  # (f,)
     charts: Charts
     covered: Bools  # (cells, samples)
@@ -113,6 +114,7 @@ def of_mesh(vertices: Floats, faces: Ints, cell_mm: float, bodies: DesignBodies 
         faces=faces,
         normals=normals,
         chart_of=chart_of,
+        part_of=mesh.part_of,
         component_of=component,
         charts=_charts(vertices, faces, normals, chart_of, component),
         covered=np.empty((0, PER_SIDE**2), np.bool_),

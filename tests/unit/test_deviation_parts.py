@@ -217,9 +217,9 @@ def test_a_movement_along_the_normal_is_what_moved_wherever_points_look():
     grid = m3c2.grid(feet, 150.0)
     place = np.array([[80.0, 0.0, 0.0], [80.0 * np.cos(0.5), 80.0 * np.sin(0.5), 10.0], [900.0, 0.0, 0.0]])
     look = np.array([[1.0, 0.0, 0.0], [np.cos(0.5), np.sin(0.5), 0.0], [1.0, 0.0, 0.0]])
-    found = moving.movement(
-        grid, distance[grid.order], normals[grid.order], place, look, diameter_mm=150.0, least_cos=0.5
-    )
+    translations = moving.Translations(place, look, diameter_mm=150.0, least_cos=0.5)
+    translations.add(grid, distance[grid.order], normals[grid.order])
+    found = translations.movement()
     error = found.along[:2] - look[:2] @ moved
     bound = 1.96 * found.sd[:2] / np.sqrt(found.count[:2])
     assert (np.abs(error) < 2.0 * bound).all()
@@ -240,8 +240,8 @@ def test_its_interval_holds_for_few_points_too():
         feet = np.column_stack([rng.uniform(-1.0, 1.0, (6, 2)), np.zeros(6)])
         distance = rng.normal(0.0, 1.0, 6)
         grid = m3c2.grid(feet, 4.0)
-        found = moving.movement(
-            grid, distance[grid.order], np.tile(UP, (6, 1)), np.zeros((1, 3)), UP[None], diameter_mm=4.0, least_cos=0.5
-        )
+        translations = moving.Translations(np.zeros((1, 3)), UP[None], diameter_mm=4.0, least_cos=0.5)
+        translations.add(grid, distance[grid.order], np.tile(UP, (6, 1)))
+        found = translations.movement()
         held += abs(found.along[0]) <= 1.96 * found.sd[0] / np.sqrt(6.0)
     assert 0.92 <= held / 400 <= 0.98

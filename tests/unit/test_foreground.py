@@ -6,7 +6,7 @@ import pytest
 from processor.adjustment import mixed_pixels
 from processor.defects import observations, surface_charts
 
-SCANNER, STEP, WALL, POST = np.array([0.0, -5000.0, 0.0]), 1.7e-3, 0.0, -300.0
+SCANNER, STEP, WALL, POST = np.array([0.0, -5000.0, 0.0]), 1.6e-3, 0.0, -300.0
 HALF = 50.0  # of the post, mm
 
 
@@ -36,7 +36,7 @@ def test_points_beside_a_post_are_marked_and_no_others():
     off = np.abs(points[wall, 0]) - shadow
     step_mm = 5000.0 * STEP
     assert found[off < step_mm].all()
-    assert not found[off > mixed_pixels.WINDOW_STEPS * step_mm + mixed_pixels.HALF_BEAM_MM + step_mm].any()
+    assert not found[off > mixed_pixels.WINDOW_STEPS * step_mm + mixed_pixels.half_beam(5000.0) + step_mm].any()
 
 
 def test_without_the_post_nothing_is_marked_whatever_the_noise_of_a_point_itself():
@@ -83,3 +83,21 @@ def test_a_beam_past_the_edge_of_a_plate_is_no_dent_of_its_far_side():
         surface, grid, np.full(2, front), through, np.full(2, -10.0), np.repeat(scanner, 2, axis=0)
     )
     assert passed.tolist() == [False, True]
+
+
+def test_an_edge_far_before_a_wall_seen_at_a_glance_is_no_slope():
+    """A rail stands 80 mm before the wall: of its neighbours on the wall, the rail lies within the slope of a dent."""
+    scanner, step = np.array([-20_000.0, -4_600.0, 0.0]), 1.0e-3
+    turn, rise = (x.ravel() for x in np.meshgrid(np.arange(0.15, 0.45, step), np.arange(-10, 11) * step))
+    ray = np.stack([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)], axis=1)
+    on_wall = scanner + ray * (-scanner[1] / ray[:, 1])[:, None]
+    on_rail = scanner + ray * ((-80.0 - scanner[1]) / ray[:, 1])[:, None]
+    is_rail = (np.abs(on_rail[:, 0]) < 30.0)[:, None]
+    points, wall = np.where(is_rail, on_rail, on_wall), ~is_rail[:, 0]
+    normals, face = np.tile([0.0, -1.0, 0.0], (wall.sum(), 1)), np.zeros(wall.sum(), np.int64)
+    faces = np.where(wall, 0, 1)
+    found = mixed_pixels.beside(points[wall], scanner, normals, -points[wall, 1], face, (points, faces))
+    turned = np.arctan2(ray[:, 1], ray[:, 0])
+    beside = np.abs(turned[wall] - turned[~wall].min() + step) < 0.3 * step  # past the rail's far end
+    assert beside.sum() == 21
+    assert found[beside].all()

@@ -164,7 +164,7 @@ def _fit_of(k: int, crops: CropsWithRays, weights: Floats, fits: Fits, priors: P
     held = by_points[:3] @ J[:, :3]
     moved = np.linalg.pinv(held, rcond=1e-3) @ by_points[:3]
     gain = covariance @ (by_points + prior @ np.vstack([moved, np.zeros(len(cells))]))
-    return _Fit(cells.astype(np.int64), counts, means, noise, J, gain)
+    return _Fit(cells=cells.astype(np.int64), counts=counts, means=means, noise=noise, J=J, gain=gain)
 
 
 def _residuals(fit: _Fit, place: Floats) -> BallResiduals:
