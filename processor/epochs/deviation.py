@@ -1,7 +1,7 @@
 """Epochs of step ``deviation``: how far the surface of each component moved: on average, as a body, and at most.
 
 All is over the places that the epochs have in common, as another part of the same surface has another mean: core points
-nearer than half their spacing, on the same side. The movement of a body is that part of its deviations that a rigid
+nearer than their spacing, on the same side. The movement of a body is that part of its deviations that a rigid
 motion explains, at its middle; opposite faces cancel in the mean, and not in the movement. Intervals are as if the
 errors of all core points were the same, with the worst signs, which no correlation can exceed.
 
@@ -66,7 +66,7 @@ def series(results: Sequence[Result | None]) -> Iterator[Series]:
     with_bodies = all(one is None or len(one.bodies) for one in results)
     for name in _names(results):
         cores = _cores(results, name)
-        common = _in_common(cores, 0.5 * max(core.spacing for core in cores))
+        common = _in_common(cores, _reach(cores))
         values = [core.at(rows) for core, rows in zip(cores, common, strict=True)]
         value, half = np.array([(np.mean(d), np.mean(lod95)) if len(d) else (NAN, NAN) for d, lod95 in values]).T
         yield Series(
@@ -83,10 +83,10 @@ def remarks(results: Sequence[Result | None]) -> Iterator[Reason]:
     if sum(result is not None for result in results) < 2:
         return
     yield reason("epochs.registered-to-design")
-    compared = [cores for cores in (_cores(results, name) for name in _names(results)) if _with_points(cores) > 1]
-    elsewhere = [cores for cores in compared if _known(_in_common(cores, SAME_MM)) < 2]
+    compared = [_cores(results, name) for name in _names(results)]
+    elsewhere = sum(_epochs(_sampled_alike(cores)) < _epochs(cores) for cores in compared)
     if elsewhere:
-        yield reason("epochs.core-points-elsewhere", count=len(elsewhere), total=len(compared))
+        yield reason("epochs.core-points-elsewhere", count=elsewhere, total=len(compared))
 
 
 def _names(results: Sequence[Result | None]) -> list[str]:
@@ -112,12 +112,35 @@ def _of_body(result: Result, name: str) -> Ints:
     return np.flatnonzero(known)
 
 
-def _with_points(cores: Sequence[_Core]) -> int:
+def _epochs(cores: Sequence[_Core]) -> int:
+    """Count the epochs that have core points."""
     return sum(len(core.places) > 0 for core in cores)
 
 
-def _known(rows: Sequence[Ints]) -> int:
-    return sum(len(one) > 0 for one in rows)
+def _reach(cores: Sequence[_Core]) -> float:
+    """Distance within which core points of two epochs are of one place: the spacing of the epoch that has fewest."""
+    return max(core.spacing for core in cores)
+
+
+def _sampled_alike(cores: Sequence[_Core]) -> list[_Core]:
+    """Return the epochs' core points, without any where they are not those of the first epoch with the component.
+
+    Of two samplings of one surface some points coincide by chance: most of the places in common have to.
+    """
+    first = next((core for core in cores if len(core.places)), None)
+    if first is None:
+        return list(cores)
+    reach = _reach(cores)
+    alike = [2 * _matched(core, first, SAME_MM) >= _matched(core, first, reach) for core in cores]
+    return [core if same else _Core.of(None, None) for core, same in zip(cores, alike, strict=True)]
+
+
+def _matched(core: _Core, first: _Core, reach: float) -> int:
+    """Count the core points of the first epoch that have one of another within ``reach``."""
+    if not len(core.places):
+        return 0
+    away, _ = cKDTree(core.sided(reach)).query(first.sided(reach), distance_upper_bound=reach)
+    return int(np.isfinite(away).sum())
 
 
 def _in_common(cores: Sequence[_Core], reach: float) -> list[Ints]:
@@ -177,6 +200,7 @@ def _rigid_motion(places: Floats, normals: Floats) -> tuple[Floats, Bools]:
 
 def _strongest(name: str, cores: Sequence[_Core], doubtful: Bools) -> Iterator[Series]:
     """Yield the deviation at the core point that changed most of those that the epochs have in common."""
+    cores = _sampled_alike(cores)
     common = _in_common(cores, SAME_MM)
     known = [e for e, rows in enumerate(common) if len(rows)]
     if len(known) < 2:

@@ -188,7 +188,7 @@ def rows(found: Found) -> list[Row]:
     over = {name: found.values(BALLS, name) for name in _names(found)}
 
     def compared(figure: str, than: str) -> tuple[float, ...]:
-        return is_smaller(over.get(f"ransac: {figure}", ()), over.get(f"{than}: {figure}", ()))
+        return is_smaller(found.values(BALLS, f"ransac: {figure}"), found.values(BALLS, f"{than}: {figure}"))
 
     made = [
         _row(table_2, "ransac", mean, printed.mean(), over.get("ransac: radius, mean"), Rule.AT_MOST, crops),

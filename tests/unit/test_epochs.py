@@ -241,6 +241,20 @@ def test_another_spacing_of_core_points_is_said():
     assert codes(deviation, first, later) == ["epochs.registered-to-design", "epochs.core-points-elsewhere"]
 
 
+def test_core_points_that_coincide_by_chance_do_not_stand_for_all():
+    """A third epoch of another spacing has a few core points of the first: they must not be all that is compared."""
+    later = np.zeros(20)
+    later[3] = 4.0
+    third = surface(np.zeros(20), shift=9.0)
+    points = np.array(third.core.points)
+    points[5, 2] = 0.0
+    third = dataclasses.replace(third, core=dataclasses.replace(third.core, points=points))
+    found = findings(deviation, surface(np.zeros(20)), surface(later), third)["left"]
+    assert "deviation at 150, 0, 0" in {str(one.series.quantity) for one in found.changes if one.surely}
+    (said,) = [one for one in deviation.remarks([surface(np.zeros(20)), third]) if "elsewhere" in one.code]
+    assert said.values == {"count": 2, "total": 2}
+
+
 def test_the_mean_is_over_what_both_epochs_saw():
     """An unchanged surface, of which the second epoch saw the half that lies deeper: means of all would differ."""
     distance = np.where(np.arange(20) % 10 < 5, 5.0, 0.0)
