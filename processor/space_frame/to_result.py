@@ -14,6 +14,7 @@ from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.design.matching import Matching
 from processor.space_frame.design.movement import Movement, size_of, verdict_of
 from processor.space_frame.extract import Extracted, Options, extract
+from processor.space_frame.members import station_errors
 from processor.space_frame.members.records import Members
 from processor.space_frame.params import Params
 from processor.space_frame.points.scene_source import PointReader, SceneSource, of_scene
@@ -30,7 +31,6 @@ from processor.space_frame.result import (
     Tubes,
 )
 from processor.space_frame.spheres import baselines
-from processor.space_frame.spheres.records import ViewErrors
 from processor.space_frame.spheres.view_errors import of_tubes
 from processor.space_frame.stations.records import Stations
 from processor.space_frame.stations.sightings import control_of
@@ -102,7 +102,7 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
         balls=balls,
         movement_reference=reference,
         matching=pose,
-        tubes=_tubes(extracted.members, balls.ids, source.origin, extracted.spheres.views),
+        tubes=_tubes(extracted, balls.ids, source.origin),
         stations=StationCorrections() if stations is None else _corrections(stations, source),
         datum=() if stations is None else stations.datum,
         control=ControlDeviations() if stations is None else _control(stations),
@@ -177,10 +177,16 @@ def _with_movements(balls: Balls, movements: Movement, limit: float, matched: bo
     )
 
 
-def _tubes(members: Members, ids: Ints, origin: Floats, views: ViewErrors | None) -> Tubes:
-    """Convert members; errors of unnamed ``views`` are part of the intervals."""
+def _tubes(extracted: Extracted, ids: Ints, origin: Floats) -> Tubes:
+    """Convert members; errors of unnamed views and of stations are part of the intervals."""
+    members, views, stations = extracted.members, extracted.spheres.views, extracted.stations
     half = 0.5 * members.lengths[:, None] * members.directions
     common = np.zeros((len(half), 3, 3)) if views is None else of_tubes(views, members)
+    at_start, at_end, of_radius = common[:, :2, :2], common[:, :2, :2], common[:, 2, 2]
+    if stations is not None and np.isfinite(stations.covariance).all():
+        at_start = at_start + station_errors.of_axes(members, stations, -0.5 * members.lengths)
+        at_end = at_end + station_errors.of_axes(members, stations, 0.5 * members.lengths)
+        of_radius = of_radius + station_errors.of_radii(members, stations)
     return Tubes(
         a=np.where(members.node_a >= 0, ids[members.node_a], -1),
         b=np.where(members.node_b >= 0, ids[members.node_b], -1),
@@ -188,9 +194,9 @@ def _tubes(members: Members, ids: Ints, origin: Floats, views: ViewErrors | None
         end=members.points + half + origin,
         radii=members.radii,
         bow=np.hypot(*members.bow.T),
-        radius_ci95=NORMAL_95 * np.sqrt(members.covariance[:, 4, 4] + common[:, 2, 2]),
-        start_ci95=_across(members, -0.5 * members.lengths, common[:, :2, :2]),
-        end_ci95=_across(members, 0.5 * members.lengths, common[:, :2, :2]),
+        radius_ci95=NORMAL_95 * np.sqrt(members.covariance[:, 4, 4] + of_radius),
+        start_ci95=_across(members, -0.5 * members.lengths, at_start),
+        end_ci95=_across(members, 0.5 * members.lengths, at_end),
         bow_ci95=NORMAL_95 * _bow_sd(members),
     )
 

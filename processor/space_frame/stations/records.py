@@ -57,6 +57,7 @@ class Stations(Checked):
     range_offset: Floats = column("s")  # of a station's ranges less the mean of all, mm
     range_offset_sd: float = float("nan")  # of all stations, as scanned
     shared_offset_sd: float = 0.0  # of an error common to all ranges, by an offset or a wide beam; in no covariance
+    shared_offset: float = 0.0  # that the tubes show, mm; it is subtracted from no range
     observations: Ints = column("s", dtype=np.int64)  # tubes that a station has in common with others
     reasons: tuple[tuple[Reason, ...], ...] = reasons("s")  # why a station's correction is weak
     range_sd: Floats = column("s")  # scale of the residuals along the ray, mm

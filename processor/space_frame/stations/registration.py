@@ -258,6 +258,7 @@ def _result(estimate: _Estimate, posterior: Posterior) -> Stations:
         range_offset=x[6 :: kernels.STATION],
         range_offset_sd=offset_mm,
         shared_offset_sd=abs(shared) if beam else spread,
+        shared_offset=0.0 if beam else shared,
         observations=estimate.seen_by,
         reasons=tuple(map(_weak, weak)),
         range_sd=estimate.scale,

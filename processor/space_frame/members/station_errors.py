@@ -1,0 +1,51 @@
+"""Errors of registered stations in the axes and radii of tubes, which the fit of a tube by itself does not contain.
+
+Of the points that a station sees of a tube, the share is taken to fall with the square of its distance, and around the
+tube with the cosine of incidence.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.model import Floats
+from processor.space_frame.members.records import Members
+from processor.space_frame.stations.records import Stations
+
+SECTORS = 36  # around a tube
+
+
+def of_axes(members: Members, stations: Stations, along: Floats) -> Floats:
+    """Covariances (m, 2, 2), along side and other, of the axes at ``along`` (m,) from the middles of tubes; mm^2.
+
+    They include the motion and the offset of ranges that all stations have in common.
+    """
+    places = members.points + along[:, None] * members.directions
+    nearness = 1.0 / np.maximum(np.sum((places[:, None] - stations.places) ** 2, axis=2), 1e-300)
+    share = nearness / nearness.sum(axis=1, keepdims=True)
+    covariance = stations.effect(places, share) + stations.shared_offset_at(places)
+    basis = np.stack([members.side, members.other], axis=2)
+    return np.asarray(np.swapaxes(basis, 1, 2) @ covariance @ basis, np.float64)
+
+
+def of_radii(members: Members, stations: Stations) -> Floats:
+    """Variances (m,) of the radii by the offset that all ranges have in common, mm^2.
+
+    An offset d moves a point by d times the cosine of incidence. The offset that the tubes show is not subtracted from
+    the ranges, as a wide beam looks like it: it counts as a standard deviation.
+    """
+    turn = 2.0 * np.pi * np.arange(SECTORS) / SECTORS
+    across = np.column_stack([np.cos(turn), np.sin(turn)])
+    normals = across[:, :1] * members.side[:, None] + across[:, 1:] * members.other[:, None]  # (m, sectors, 3)
+    ray = stations.places - members.points[:, None]
+    squared = np.maximum(np.sum(ray**2, axis=2), 1e-300)
+    cosine = np.maximum(np.einsum("mni,msi->mns", normals, ray / np.sqrt(squared)[:, :, None]), 0.0)
+    weight = cosine / squared[:, None]  # (m, sectors, s)
+    points = weight.sum(axis=2)
+    moved = np.sum(weight * cosine, axis=2) / np.where(points > 0.0, points, 1.0)
+    J = np.column_stack([across, np.ones(SECTORS)])
+    normal = np.einsum("mn,ni,nj->mij", points, J, J)
+    right = np.einsum("mn,ni,mn->mi", points, J, moved)
+    by_unit = np.einsum("mij,mj->mi", np.linalg.pinv(normal, rcond=1e-6, hermitian=True), right)[:, 2]
+    variance: Floats = (stations.shared_offset_sd**2 + stations.shared_offset**2) * by_unit**2
+    return variance
