@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from designgen.models.model import Model
 from designgen.scanning.scan_settings import Scanning, scan_settings_of
-from designgen.scenes import arch_bridge, assembly, model, room, space_frame, structure
+from designgen.scenes import arch_bridge, assembly, model, space_frame, structure, target_room
 from processor.model import Scene, Truth, UsageError
 
 Maker = Callable[[str, Mapping[str, Any], Scanning, int], tuple[Scene, Truth]]
@@ -20,7 +20,7 @@ MAKERS: dict[str, tuple[str, Maker]] = {
     "structure": ("structure", structure.make),
     "ring": ("ring", arch_bridge.make_ring),
     "assembly": ("assembly", assembly.make),
-    "room": ("room", room.make),
+    "room": ("room", target_room.make),
 }
 EXTRA = {"structure": {"picks"}, "assembly": {"bolts"}}  # sections of one kind only
 

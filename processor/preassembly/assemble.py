@@ -14,7 +14,7 @@ from processor.adjustment import thermal
 from processor.limits import standards
 from processor.model import ArchDesign, Bools, Floats, Scan, Scene, Tolerance
 from processor.preassembly import to_result, topology
-from processor.preassembly.chain import adjustment, bottom_edge_departures, loop_closure, placement, span_and_closure
+from processor.preassembly.chain import adjustment, assembled_parts, linear_error, loop_closure, span_and_closure
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
@@ -44,7 +44,7 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
     parts = measure.assigned(measure.estimate(fitted, params.systematic))
     curve = _adjust(parts, design, frames, params.adjust.weight)
     adjusted = curve[params.adjust.weight]
-    placed = placement.place(parts, adjusted, design, frames, _on_steel(shapes, design))
+    placed = assembled_parts.place(parts, adjusted, design, frames, _on_steel(shapes, design))
     figures = span_and_closure.measure(parts, adjusted, design, frames)
     assembly = Assembly(
         design=design,
@@ -55,7 +55,7 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         adjusted=adjusted,
         trade_off={weight: curve[weight] for weight in TRADE_OFF},
         placement=placed,
-        edges=bottom_edge_departures.along_bridge(parts, adjusted, design),
+        edges=linear_error.along_bridge(parts, adjusted, design),
         figures=figures,
         loops=loop_closure.measure([part.member for part in parts], design, frames),
         joints=_judge_joints(parts, placed.gaps, adjusted, design, frames, limits, params.trim),

@@ -13,8 +13,8 @@ from processor.model import NORMAL_95, ArchDesign, Bools, Floats, Reason, Tolera
 from processor.preassembly import topology
 from processor.preassembly.assembly_errors import mean_max, splicing_error
 from processor.preassembly.chain.adjustment import Adjusted
-from processor.preassembly.chain.bottom_edge_departures import EdgeErrors
-from processor.preassembly.chain.placement import Placement
+from processor.preassembly.chain.assembled_parts import Placement
+from processor.preassembly.chain.linear_error import EdgeErrors
 from processor.preassembly.chain.span_and_closure import Figures, mean_max_ci95
 from processor.preassembly.params import Params, SystematicParams
 from processor.preassembly.parts import part_covariance, systematic_errors

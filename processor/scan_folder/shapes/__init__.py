@@ -1,0 +1,1 @@
+"""Designs recognised from surfaces: bodies, faces, balls, tubes, sections and joints, and their unit."""
