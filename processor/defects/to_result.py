@@ -250,18 +250,36 @@ def _place_defects(search: Search) -> Iterator[Defect]:
             found.append((group[0], Defect(values=values, component=component, cells=cells, field=search.residuals)))
     in_wave: set[int] = set()
     waving = [
-        k for k, (region, defect) in enumerate(found) if region.sign and _may_wave(search.surface, region, defect)
+        k for k, (region, defect) in enumerate(found) if region.sign and _is_pushed(search.surface, region, defect)
     ]
     for rows in waves.waves([_lobe(search.surface, *found[k]) for k in waving]):
         lobes = [waving[row] for row in rows]
         in_wave.update(lobes)
         yield _wave([found[k][1] for k in lobes])
+    behind = _other_sides(search.surface, found)
     for k, (_, defect) in enumerate(found):
-        if k not in in_wave:
+        if k not in in_wave and k not in behind:
             yield defect
 
 
-def _may_wave(surface: DesignSurface, region: Region, defect: Defect) -> bool:
+def _other_sides(surface: DesignSurface, found: list[tuple[Region, Defect]]) -> set[int]:
+    """Return the places of ``found`` that are the other side of a larger one: a plate that was pushed to one side."""
+    pushed = [k for k, (region, defect) in enumerate(found) if _is_pushed(surface, region, defect)]
+    pushed.sort(key=lambda k: -len(found[k][0].cells))
+    behind: set[int] = set()
+    for row, k in enumerate(pushed):
+        region = found[k][0]
+        for larger in pushed[:row]:
+            front, plate = found[larger][0], found[larger][1].component
+            against = front.sign == -region.sign and plate == found[k][1].component and larger not in behind
+            if against and other_side.is_behind(surface, region.cells, front.cells):
+                behind.add(k)
+                break
+    return behind
+
+
+def _is_pushed(surface: DesignSurface, region: Region, defect: Defect) -> bool:
+    """Return whether steel of a flat face was pushed to one side, and not taken away."""
     kinds = (DefectClass.DENT, DefectClass.BULGE, DefectClass.BEND, DefectClass.UNKNOWN)
     flat = bool(surface.charts.kind[region.chart] == PLANE)
     return flat and region.sign != 0 and defect.values["defect_class"] in kinds

@@ -114,6 +114,32 @@ def test_what_chance_brings_is_called_doubtful():
     assert "no defects found and" in str(section.REPORT.summary(result)[0])
 
 
+def from_behind(scene, inward, count, seed):
+    """The scene with a scan of the plates' backs, which ``inward`` (x, z) moves as it does the fronts."""
+    rng, station = np.random.default_rng(seed), np.array([0.5 * count * (SIDE + GAP), 4000.0, 600.0])
+    n = int((SIDE / 4.0) ** 2)
+    parts = []
+    for i in range(count):
+        x, z = i * (SIDE + GAP) + rng.uniform(0.0, SIDE, n), rng.uniform(0.0, SIDE, n)
+        parts.append(np.stack([x, THICK + inward(x, z), z], axis=1))
+    ray = np.vstack(parts) - station
+    away = np.linalg.norm(ray, axis=1)[:, None]
+    points = station + ray * (1.0 + rng.normal(0.0, 0.4, away.shape) / away)
+    scan = Scan("S3", points, position=station, T_project_scan=np.eye(4))
+    return dataclasses.replace(scene, scans=(*scene.scans, scan))
+
+
+@pytest.mark.parametrize("depth", [4.0, -4.0])
+def test_a_plate_dented_through_is_one_defect_though_both_sides_show_it(depth):
+    pushed, pit = bump(depth, 90.0, (250.0, 300.0)), bump(3.0, 40.0, (1250.0, 350.0))
+    scene = scene_of(3, lambda x, z: pushed(x, z) + pit(x, z))
+    result = defects_step.run(from_behind(scene, pushed, 3, 9), defects_step.Params())
+    assert sorted(name for _, name in found(result)) == ["component-1", "component-2"]
+    kind, _ = next(row for row in found(result) if row[1] == "component-1")
+    assert kind in ("dent", "bulge")
+    assert abs(result.defects.depth_max[result.defects.component.index("component-1")]) == pytest.approx(4.0, rel=0.1)
+
+
 def test_a_dent_a_bulge_and_a_pit_are_measured():
     dent, bulge, pit = (
         bump(3.0, 90.0, (250.0, 300.0)),

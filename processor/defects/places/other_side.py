@@ -1,8 +1,12 @@
-"""The other side of a plate: a dent moves it as well, where a pit takes material from one side alone."""
+"""The other side of a plate: a dent moves it as well, where a pit takes material from one side alone.
+
+A plate that is dented shows it on both sides where both were seen: that is one defect, not a dent and a bulge.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from processor.defects.deviation_field import Field
 from processor.defects.observations import cells_at
@@ -13,6 +17,7 @@ from processor.model import Floats, Ints
 PLATE_MM = 80.0  # largest thickness of a plate, whose other side is compared
 OPPOSITE_COS = -0.95  # of the normals of the two sides of a plate
 LEAST_SHARE = 0.5  # of a place's cells, whose other side was seen
+BORDER_CELLS = 1.6  # about a place, which are too shallow to be significant one by one
 FORM_SHARE = 0.25  # of the depth, by which the two sides of a dent may differ in form (one standard deviation)
 MOST_EVIDENCE = 20.0  # of the logarithm of a ratio of likelihoods
 
@@ -34,6 +39,14 @@ def stayed(field: Field, surface: DesignSurface, cells: Ints) -> float:
     variance = noise + common + (FORM_SHARE * depth) ** 2
     evidence = np.clip(0.5 * ((moved - depth) ** 2 - moved**2) / variance, -MOST_EVIDENCE, MOST_EVIDENCE)
     return float(1.0 / (1.0 + np.exp(-evidence)))
+
+
+def is_behind(surface: DesignSurface, cells: Ints, place: Ints) -> bool:
+    """Return whether most of ``cells`` (n,) have a ``place`` (m,), or its border, on the other side of their plate."""
+    other = cells_opposite(surface, cells)
+    away = cKDTree(surface.centres[place]).query(surface.centres[other[other >= 0]])[0]
+    near = away < BORDER_CELLS * surface.charts.cell_mm
+    return bool(near.sum() >= LEAST_SHARE * len(cells))
 
 
 def cells_opposite(surface: DesignSurface, cells: Ints) -> Ints:
