@@ -56,7 +56,7 @@ def test_every_recipe_makes_a_scene_that_goes_through_the_store(name, tmp_path):
     recipe = recipe_files.load(name)[1]
     if recipe.get("frame", {}).get("nodes_x", 0) > 10:
         recipe["frame"] |= {"nodes_x": 5, "nodes_y": 6, "shape": "flat"}
-    coarse = {"rays": "scan.step_mrad=30", "surface": "scan.spacing_mm=120"}[recipe["scan"]["mode"]]
+    coarse = {"rays": "scan.step_mrad=45", "surface": "scan.spacing_mm=160"}[recipe["scan"]["mode"]]
     if recipe.get("picks", {}).get("at") == "corners":  # three of a pair must be seen in both scans
         coarse = "scan.step_mrad=6"
     recipe = recipe_files.overridden(recipe, [coarse])

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.geometry.distinct_rows import distinct
 from processor.model import Floats, Ints
 
 
 def pieces(points: Floats, normals: Floats, side: float) -> Ints:
     """Return the piece (k,) of a face that each place (k, 3) is on, by its cell and the direction of its normal."""
     place = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
-    cells: Ints = np.unique(np.hstack([place, np.rint(normals).astype(np.int64)]), axis=0, return_inverse=True)[1]
-    return cells.reshape(-1)
+    return distinct(np.hstack([place, np.rint(normals).astype(np.int64)])).number
 
 
 def group_means(values: Floats, group: Ints) -> Floats:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from processor.geometry.distinct_rows import distinct
 from processor.model import Floats, Ints
 from processor.robust_statistics import student_factor
 
@@ -25,15 +26,14 @@ def between_stations(residual: Floats, station: Ints, cell: Ints) -> float:
 
     The estimate is multiplied by (t / 1.96)^2, with Student's t for the number of stations.
     """
-    key, group = np.unique(np.stack([cell, station], axis=1), axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    number = np.bincount(group)
+    groups = distinct(np.stack([cell, station], axis=1))
+    group, number = groups.number, groups.count
     mean = np.bincount(group, residual) / number
     within = residual - mean[group]
     enough = number >= LEAST_POINTS
     noise = np.bincount(group, within**2) / np.maximum(number - 1, 1)
     w = np.where(enough, number / np.maximum(noise, 1e-12), 0.0)
-    cell_of_group = key[:, 0]
+    cell_of_group = groups.rows[:, 0]
     total, square = np.bincount(cell_of_group, w), np.bincount(cell_of_group, w**2)
     count = np.bincount(cell_of_group, enough)
     several = count >= 2

@@ -14,6 +14,7 @@ from processor.defects.alignment import Alignment, chart_of_cells
 from processor.defects.deviation_field import Field, component_of_cells
 from processor.defects.scan_statistic import Levels
 from processor.defects.surface_charts import DesignSurface
+from processor.geometry.distinct_rows import distinct
 from processor.model import NORMAL_95, Floats, Ints
 
 BLOCKS_ALONG, BLOCKS_ACROSS = 36, 16  # of a component's largest face, at least
@@ -225,8 +226,7 @@ def _blocks_of(field: Field, surface: DesignSurface, cells: Ints, side: int) -> 
     charts = surface.charts
     chart = chart_of_cells(surface)[cells]
     u, v = np.divmod(cells - charts.first[chart], charts.shape[chart, 1])
-    _, index = np.unique(np.stack([chart, u // side, v // side], axis=1), axis=0, return_inverse=True)
-    index = index.reshape(-1)
+    index = distinct(np.stack([chart, u // side, v // side], axis=1)).number
     w = 1.0 / field.variance[cells]
     total = np.bincount(index, w)
     mean = np.bincount(index, w * field.deviation[cells]) / total

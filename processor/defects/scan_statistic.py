@@ -180,14 +180,15 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> F
 def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, finding: Finding) -> None:
     """Search lines of cells in LINE_TURNS directions, for what is narrower than a window and long; add to a finding."""
     top, weight = _images(field, charts, chart, finding.sign != 0)
-    seen = (weight > 0.0).astype(float)
+    margin = max(LINE_CELLS)
+    padded = np.pad(np.stack([top, weight, weight > 0.0]), ((0, 0), (margin, margin), (margin, margin)))
     systematic = float(np.hypot(levels.systematic_mm, field.views))
     for length in LINE_CELLS:
         if length > max(top.shape):
             continue
         for turn in range(LINE_TURNS):
             offsets = _line(length, np.pi * turn / LINE_TURNS)
-            sum_top, sum_weight, number = (sum(_shifted(x, i, j) for i, j in offsets) for x in (top, weight, seen))
+            sum_top, sum_weight, number = _along(padded, margin, offsets)
             with np.errstate(invalid="ignore", divide="ignore"):
                 sd = np.hypot(levels.line_inflation / np.sqrt(sum_weight), systematic)
                 z = np.where(number >= COVERED * length, sum_top / sum_weight / sd, 0.0)
@@ -230,15 +231,13 @@ def _line(length: int, angle: float) -> list[tuple[int, int]]:
     return [(int(i), int(j)) for i, j in steps]
 
 
-def _shifted(image: Floats, i: int, j: int) -> Floats:
-    """Return the image whose cell (a, b) is the given one's (a + i, b + j); 0 beyond its border."""
-    shifted = np.zeros_like(image)
-    n, m = image.shape
-    if abs(i) < n and abs(j) < m:
-        shifted[max(0, -i) : n - max(0, i), max(0, -j) : m - max(0, j)] = image[
-            max(0, i) : n - max(0, -i), max(0, j) : m - max(0, -j)
-        ]
-    return shifted
+def _along(padded: Floats, margin: int, offsets: list[tuple[int, int]]) -> Floats:
+    """Sum images (k, n, m), ``padded`` by a margin, over the cells at ``offsets`` from each of their cells."""
+    rows, columns = (length - 2 * margin for length in padded.shape[1:])
+    total = np.zeros((len(padded), rows, columns))
+    for i, j in offsets:
+        total += padded[:, margin + i : margin + i + rows, margin + j : margin + j + columns]
+    return total
 
 
 def _whole_pieces(cells: Bools, windows: Bools) -> Bools:

@@ -17,6 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from processor.geometry import circle, enclosure, mesh_distance
+from processor.geometry.distinct_rows import distinct
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
 from processor.model import Bools, DesignBodies, Floats, Ints
 
@@ -188,8 +189,8 @@ def _welded(vertices: Floats, faces: Ints, body: Ints | None) -> tuple[Floats, I
     key = np.round(vertices[corners] / WELD_MM).astype(np.int64)
     if body is not None:
         key = np.hstack([key, np.repeat(body, 3)[:, None]])
-    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    return vertices[corners[first]], inverse.reshape(faces.shape)
+    places = distinct(key)
+    return vertices[corners[places.first]], places.number.reshape(faces.shape)
 
 
 def with_components(vertices: Floats, faces: Ints, bodies: DesignBodies | None = None) -> tuple[MeshSurface, Ints]:

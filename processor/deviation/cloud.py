@@ -11,6 +11,7 @@ from processor import scene_cloud
 from processor.deviation import large_cloud
 from processor.deviation.large_cloud import LargeCloud
 from processor.geometry import neighbors, rigid
+from processor.geometry.distinct_rows import distinct
 from processor.model import Floats, InputError, Ints, Scene
 
 MOST_POINTS = 3_000_000  # of a scan that are held at once; of more an even sample is held
@@ -181,11 +182,5 @@ def adaptive_voxels(points: Floats, size_mm: float, least: int, growth: float) -
 def _voxels(points: Floats, size: float) -> tuple[Ints, Ints]:
     """Return the number (n,) of each point's voxel, and points (v,) in each."""
     cell = np.floor(points / size).astype(np.int64)
-    extent = cell.max(axis=0) + 1
-    key = cell[:, 0].astype(np.float64) * extent[1] * extent[2] + cell[:, 1] * extent[2] + cell[:, 2]
-    if float(extent[0]) * float(extent[1]) * float(extent[2]) < 2.0**62:
-        key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-        _, number, count = np.unique(key, return_inverse=True, return_counts=True)
-    else:
-        _, number, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    return number.reshape(-1), count
+    voxels = distinct(cell)
+    return voxels.number, voxels.count

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from processor.adjustment.opposite_sides import CHI2_MEDIAN
 from processor.deviation.local_translation import Movement
 from processor.geometry import rigid
+from processor.geometry.distinct_rows import distinct
 from processor.geometry.m3c2 import Z95
 from processor.geometry.mesh_distance import Samples
 from processor.model import Floats, Ints
@@ -156,9 +157,8 @@ def _blocks(
     middle, extent = points.mean(axis=0), np.ptp(points, axis=0)
     arm = max(0.5 * float(np.linalg.norm(extent)), 1e-6)
     side = times * max(BLOCK_DIAMETERS * diameter, float(extent.max()) / BLOCKS_ALONG)
-    _, first, block = np.unique(_cells(points, side), axis=0, return_index=True, return_inverse=True)
-    block = block.reshape(-1)
-    count = np.bincount(block)
+    found = distinct(_cells(points, side))
+    first, block, count = found.first, found.number, found.count
     centre = np.stack([np.bincount(block, points[:, i]) for i in range(3)], axis=1) / count[:, None]
     J = np.hstack([np.cross(points - middle, normals) / arm, normals])
     weight = 1.0 / np.maximum(error, 1e-6) ** 2
@@ -300,8 +300,7 @@ def _fit(
     square = np.outer(bias + np.zeros(6), bias + np.zeros(6))
     covariance, error, side = np.full((6, 6), np.nan), -1.0, 1.0
     while True:
-        cell = np.unique(_cells(blocks.centre[blocks.block[used]] / blocks.side, side), axis=0, return_inverse=True)[1]
-        cell = cell.reshape(-1)
+        cell = distinct(_cells(blocks.centre[blocks.block[used]] / blocks.side, side)).number
         number = int(cell.max()) + 1 if len(cell) else 0
         if number < FEWEST_CLUSTERS:
             break

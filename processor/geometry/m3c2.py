@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from processor.geometry import neighbors, point_grid
+from processor.geometry.distinct_rows import distinct
 from processor.geometry.linalg_small import eigen
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
@@ -290,8 +291,8 @@ def share(marked: Bools, places: Floats, cell: float) -> Share:
     if not len(marked):
         return Share(float("nan"), float("nan"), float("nan"))
     p = float(marked.mean())
-    number = np.unique(np.floor((places - places.min(axis=0)) / cell).astype(np.int64), axis=0, return_inverse=True)[1]
-    sums = np.bincount(number.reshape(-1), marked - p)
+    number = distinct(np.floor((places - places.min(axis=0)) / cell).astype(np.int64)).number
+    sums = np.bincount(number, marked - p)
     cells = len(sums)
     variance = float(sums @ sums) / len(marked) ** 2 * cells / max(cells - 1, 1)
     count = min(max(p * (1.0 - p) / variance, 1.0), float(len(marked))) if variance > 0.0 else float(cells)

@@ -12,6 +12,7 @@ from processor.geometry import rigid
 from processor.model import Floats, Ints
 
 SAMPLE = 3  # pairs that determine a pose
+BEFORE = np.roll(np.arange(SAMPLE), 1)
 
 
 def normals(points: Floats, radius_mm: float) -> Floats:
@@ -125,7 +126,7 @@ def coarse_alignment(
     for _ in range(iterations):
         pick = rng.choice(len(points), SAMPLE, replace=False)
         a, b = points[pick], paired[pick]
-        sides = np.linalg.norm(a - np.roll(a, 1, axis=0), axis=1) - np.linalg.norm(b - np.roll(b, 1, axis=0), axis=1)
+        sides = np.linalg.norm(a - a[BEFORE], axis=1) - np.linalg.norm(b - b[BEFORE], axis=1)
         if np.abs(sides).max() > tolerance_mm:
             continue
         T = rigid.fit(a, b)

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_distance, neighbors, rigid
+from processor.geometry.distinct_rows import distinct
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
 from processor.model import Bools, Floats, Ints
 
@@ -77,11 +78,10 @@ def _groups(points: Floats) -> tuple[Ints, Ints]:
     """Return the group (n,) of each point, -1 in a voxel of few points, and the voxel (groups, 3) of each group."""
     size = GROUP_SPACINGS * max(neighbors.surface_spacing(points), 1e-6)
     voxel = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
-    corner, group, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
-    full = count >= FEWEST_POINTS
+    groups = distinct(voxel)
+    full = groups.count >= FEWEST_POINTS
     number = np.where(full, np.cumsum(full) - 1, -1)
-    return number[group], corner[full]
+    return number[groups.number], groups.rows[full]
 
 
 def _distances(points: Floats, scanner: Floats | None, grid: FacetGrid, T: Floats) -> Floats:

@@ -13,6 +13,7 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import h5py
@@ -21,6 +22,7 @@ import numpy as np
 from processor import large_arrays
 
 ATTRIBUTE = "sha256"
+NAME = ATTRIBUTE.encode()
 PART_ITEMS = 1 << 20
 # Columns found whole by this process. Steps read a column several times; later passes rely on the chunks' checksums.
 _WHOLE: set[tuple[object, ...]] = set()
@@ -36,27 +38,38 @@ def begin(path: str, dataset: Any) -> Any:
     return hashlib.sha256(f"{path}:{dataset.dtype.str}{tuple(dataset.shape)};".encode())
 
 
-def seal(dataset: Any, array: np.typing.NDArray[Any]) -> None:
-    """Give a dataset the checksum of the array that was written to it."""
-    seal_parts(dataset, [array])
+def seal(dataset: Any, path: str, array: np.typing.NDArray[Any]) -> str:
+    """Give a dataset, one of h5py's low-level interface, the checksum of the array that was written to it."""
+    return seal_parts(dataset, path, array, [array])
 
 
-def seal_parts(dataset: Any, parts: Iterable[np.typing.NDArray[Any]]) -> None:
-    """Give a dataset the checksum of the parts that are written to it."""
-    digest = begin(dataset.name, dataset)
+def seal_parts(dataset: Any, path: str, array: np.typing.NDArray[Any], parts: Iterable[np.typing.NDArray[Any]]) -> str:
+    """Give a dataset the checksum of the parts of an array that are written to it; returns the checksum."""
+    digest = begin(path, array)
     for part in parts:
-        same = np.ascontiguousarray(part, dataset.dtype)
-        digest.update(same.data if same.size else b"")
-    _write(dataset, digest)
+        digest.update(np.ascontiguousarray(part).data if part.size else b"")
+    return _write(dataset, digest)
 
 
-def seal_root(file: Any) -> None:
-    """Give the root group the checksum of all that was written."""
-    _write(file, _of_all(file, {path: text or "" for path, text in _all_stored(file.id)}))
+def seal_root(file: Any, known: Mapping[str, str]) -> None:
+    """Give the root group the checksum of all that was written: datasets by their paths, with their checksums."""
+    _write(file.id, _of_all(file, known))
 
 
-def _write(item: Any, digest: Any) -> None:
-    item.attrs.create(ATTRIBUTE, digest.hexdigest().encode(), dtype=h5py.string_dtype("ascii", 64))
+def _write(item: Any, digest: Any) -> str:
+    text: str = digest.hexdigest()
+    stored, in_memory, scalar = _of_text()
+    attribute = h5py.h5a.create(item, NAME, stored, scalar)
+    attribute.write(np.array(text.encode(), "S64"), in_memory)
+    attribute.close()
+    return text
+
+
+@cache
+def _of_text() -> tuple[Any, Any, Any]:
+    """Return the types of a checksum in a file and in memory, and its extent."""
+    dtype = h5py.string_dtype("ascii", 64)
+    return h5py.h5t.py_create(dtype, logical=True), h5py.h5t.py_create(dtype), h5py.h5s.create(h5py.h5s.SCALAR)
 
 
 def _of_all(file: Any, known: Mapping[str, str]) -> Any:
@@ -73,13 +86,15 @@ def _of_all(file: Any, known: Mapping[str, str]) -> Any:
 
 def _stored(item: Any) -> str | None:
     """Return the checksum that a dataset or group, one of h5py's low-level interface, carries; None without one."""
-    if not h5py.h5a.exists(item, ATTRIBUTE.encode()):
+    if not h5py.h5a.exists(item, NAME):
         return None
-    attribute = h5py.h5a.open(item, ATTRIBUTE.encode())
-    if attribute.dtype.kind != "S" or attribute.get_space().get_simple_extent_type() != h5py.h5s.SCALAR:
+    attribute = h5py.h5a.open(item, NAME)
+    kind = attribute.get_type()  # made a NumPy type by h5py, it takes longer than all the rest
+    fixed = isinstance(kind, h5py.h5t.TypeStringID) and not kind.is_variable_str()
+    if not fixed or attribute.get_space().get_simple_extent_type() != h5py.h5s.SCALAR:
         return None
-    value = np.empty((), attribute.dtype)
-    attribute.read(value)
+    value = np.empty((), f"S{kind.get_size()}")
+    attribute.read(value, kind)
     return bytes(value[()]).decode("ascii", "replace")
 
 

@@ -90,6 +90,9 @@ def _group(group: Any, place: str, faults: list[str], seen: set[int]) -> int:
 def _attributes(item: Any, where: str, faults: list[str]) -> None:
     for number in range(h5py.h5a.get_num_attrs(item)):
         attribute = h5py.h5a.open(item, index=number)
+        kind = attribute.get_type()
+        if isinstance(kind, h5py.h5t.TypeStringID) and not kind.is_variable_str():
+            continue
         if not _plain(attribute.dtype):
             name = attribute.name.decode("utf-8", "surrogateescape")
             faults.append(f"{where}@{name}: type {attribute.dtype} is not accepted")

@@ -72,9 +72,9 @@ def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterat
         header = {"format": FORMATS[kind], "format_version": version, "units": "mm", "history": json.dumps(history)}
         for name, text in header.items():
             file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
-        codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
-        yield file
-        checksums.seal_root(file)
+        with codec.sealing(file):
+            codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
+            yield file
         if small:
             file.flush()
             temporary.write_bytes(file.id.get_file_image())

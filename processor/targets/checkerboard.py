@@ -10,18 +10,22 @@ pattern that goes on beyond its border.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.optimize import least_squares
-from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 from scipy.special import erf
 
 from processor.model import Bools, Floats, Ints
 from processor.progress import tracked
+
+Spectrum = npt.NDArray[np.complex128]
 
 CELL_SHARE = 0.4  # edge of a cell of the search, in sides of the target
 CONTRAST = 0.25  # scatter of the intensities of a cell over their mean, above which it is looked at
@@ -184,35 +188,69 @@ def _start(plane: _Plane, intensity: Floats, side: float) -> Floats | None:
     there = (count > 0).astype(np.float64)
     image = np.where(count > 0, total / np.maximum(count, 1), 0.0)
     image = np.where(count > 0, image - image[count > 0].mean(), 0.0)
-    half = int(0.5 * side * np.sqrt(2.0) / cell) + 1
-    grid = np.arange(-half, half + 1) * cell
-    x, y = np.meshgrid(grid, grid, indexing="ij")
+    where = np.indices(image.shape).reshape(2, -1).T * cell + 0.5 * cell - reach
+    close = (np.linalg.norm(where, axis=1) <= CENTRES * side).reshape(image.shape)
+    patterns = _patterns(side, width)
+    fields = {"there": there, "image": image, "square": image**2}
+    spectra = {name: rfftn(values, patterns[0].extent) for name, values in fields.items()}
     best, found = LIKELY, None
-    for turn in np.arange(TURNS) * (0.5 * np.pi / TURNS):
-        u, v = np.cos(turn) * x + np.sin(turn) * y, -np.sin(turn) * x + np.cos(turn) * y
-        window = ((np.abs(u) <= WITHIN * side) & (np.abs(v) <= WITHIN * side)).astype(np.float64)
-        score = _correlation(image, there, np.sign(u) * np.sign(v) * window, window)
-        where = np.indices(score.shape).reshape(2, -1).T * cell + 0.5 * cell - reach
-        score = np.where((np.linalg.norm(where, axis=1) <= CENTRES * side).reshape(score.shape), np.abs(score), 0.0)
+    for pattern in patterns:
+        score = np.where(close, np.abs(_correlation(spectra, pattern, width)), 0.0)
         k = int(score.argmax())
         if score.ravel()[k] > best:
-            best, found = float(score.ravel()[k]), np.array([*where[k], turn])
+            best, found = float(score.ravel()[k]), np.array([*where[k], pattern.turn])
     return found
 
 
-def _correlation(image: Floats, there: Floats, pattern: Floats, window: Floats) -> Floats:
-    """Normalised correlation of an image that is 0 where it is not ``there`` with a pattern about each of its cells."""
+@dataclass(frozen=True)
+class _Pattern:
+    """The pattern at a turn: transforms, padded to ``extent``, of it, its window, and its magnitude."""
 
-    def slid(values: Floats, weights: Floats) -> Floats:
-        summed: Floats = fftconvolve(values, weights[::-1, ::-1], mode="same")
+    turn: float
+    cells: int  # along a side of its image
+    window: float  # number of cells
+    extent: tuple[int, int]
+    of_pattern: Spectrum
+    of_window: Spectrum
+    of_size: Spectrum
+
+
+@lru_cache(maxsize=4)
+def _patterns(side: float, width: int) -> tuple[_Pattern, ...]:
+    """Return the pattern at all turns, for images of ``width`` cells along a side."""
+    cell = side / IMAGE_CELLS
+    half = int(0.5 * side * np.sqrt(2.0) / cell) + 1
+    grid = np.arange(-half, half + 1) * cell
+    x, y = np.meshgrid(grid, grid, indexing="ij")
+    extent = (next_fast_len(width + len(grid) - 1, True),) * 2  # real
+    patterns = []
+    for turn in np.arange(TURNS) * (0.5 * np.pi / TURNS):
+        u, v = np.cos(turn) * x + np.sin(turn) * y, -np.sin(turn) * x + np.cos(turn) * y
+        window = ((np.abs(u) <= WITHIN * side) & (np.abs(v) <= WITHIN * side)).astype(np.float64)
+        pattern = np.sign(u) * np.sign(v) * window
+        transforms = [rfftn(one[::-1, ::-1], extent) for one in (pattern, window, np.abs(pattern))]
+        patterns.append(_Pattern(float(turn), len(grid), float(window.sum()), extent, *transforms))
+    return tuple(patterns)
+
+
+def _correlation(spectra: Mapping[str, Spectrum], pattern: _Pattern, width: int) -> Floats:
+    """Normalised correlation (width, width) of an image with a pattern about each of its cells.
+
+    ``spectra`` are of where the image is ``there``, of the ``image``, 0 where it is not, and of its ``square``.
+    """
+    first = (pattern.cells - 1) // 2
+    middle = slice(first, first + width)
+
+    def slid(name: str, weights: Spectrum) -> Floats:
+        summed: Floats = irfftn(spectra[name] * weights, pattern.extent)[middle, middle]
         return summed
 
-    n = np.maximum(slid(there, window), 0.0)
-    mean = slid(image, window) / np.maximum(n, 1.0)
-    covariance = slid(image, pattern) - mean * slid(there, pattern)
-    spread = np.maximum(slid(image**2, window) - n * mean**2, 0.0)
-    size = np.sqrt(spread * np.maximum(slid(there, np.abs(pattern)), 1.0))
-    full = n > FILLED * window.sum()
+    n = np.maximum(slid("there", pattern.of_window), 0.0)
+    mean = slid("image", pattern.of_window) / np.maximum(n, 1.0)
+    covariance = slid("image", pattern.of_pattern) - mean * slid("there", pattern.of_pattern)
+    spread = np.maximum(slid("square", pattern.of_window) - n * mean**2, 0.0)
+    size = np.sqrt(spread * np.maximum(slid("there", pattern.of_size), 1.0))
+    full = n > FILLED * pattern.window
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(full & (size > 0.0), covariance / size, 0.0)
 

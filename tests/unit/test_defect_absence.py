@@ -50,12 +50,16 @@ def seen(points, normals, boxes, station):
     """Whether a station sees points (n, 3): steep enough, and no box before them (slabs)."""
     ray = station - points
     visible = np.einsum("ni,ni->n", ray, normals) > 0.15 * np.linalg.norm(ray, axis=1)
-    start = points + 0.1 * normals
+    rows = np.flatnonzero(visible)
+    # Axis by axis: sums over rows of three are slow.
+    start, ray = (points[rows] + 0.1 * normals[rows]).T.copy(), ray[rows].T.copy()
     with np.errstate(divide="ignore"):
         for low, high in np.array(boxes):
-            a, b = (low - start) / ray, (high - start) / ray
-            enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
-            visible &= ~((enter < leave) & (leave > 0.0) & (enter < 1.0))
+            enter, leave = np.full(len(rows), -np.inf), np.full(len(rows), np.inf)
+            for k in range(3):
+                a, b = (low[k] - start[k]) / ray[k], (high[k] - start[k]) / ray[k]
+                enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
+            visible[rows] &= ~((enter < leave) & (leave > 0.0) & (enter < 1.0))
     return visible
 
 

@@ -53,7 +53,7 @@ def test_clouds_are_in_the_outermost_frame():
 
 # --- the paper's methods of preassembly ---
 
-PARAMS = {"preassemble": {"repetitions": 0}}
+PARAMS = {"preassemble": {"repetitions": 0, "match": {"pfh_iterations": 300}}}  # poses need not be good
 METHODS = "line,design-aided"
 
 

@@ -113,7 +113,12 @@ def test_a_station_that_may_have_moved_is_worth_less():
 
 @pytest.mark.parametrize(
     ("radius", "count", "visible", "sigma", "several"),
-    [(45.0, 200, 0.25, 2.0, 1), (45.0, 60, 0.25, 2.0, 3), (150.0, 30, 0.1, 1.0, 1), (45.0, 30, 0.25, 2.0, 1)],
+    [
+        (45.0, 60, 0.25, 2.0, 3),
+        (150.0, 30, 0.1, 1.0, 1),
+        pytest.param(45.0, 200, 0.25, 2.0, 1, marks=pytest.mark.slow),
+        pytest.param(45.0, 30, 0.25, 2.0, 1, marks=pytest.mark.slow),
+    ],
 )
 def test_errors_keep_to_the_bound_and_intervals_hold(radius, count, visible, sigma, several):
     draws = 600

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from dataclasses import dataclass
 
@@ -27,6 +28,7 @@ from processor.model import (
 )
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Balls
+from processor.store import checksums, codec
 from tests.support.store_scenes import a_scene, surface_points
 
 HALF_STEP = 0.5e-4 * (1.0 + 1e-6)  # mm: points are kept to 0.0001 mm
@@ -330,3 +332,27 @@ def test_results_of_the_old_format_are_refused_with_what_to_do(tmp_path):
         InputError, match=r"expected format_version 2\.0 or 2\.1 or 2\.2, found 1\.3; run processor run again"
     ):
         store.read_results(path, {})
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        np.arange(6.0).reshape(2, 3),
+        np.float64(2.5),
+        np.empty(0, np.int64),
+        np.arange(3, dtype=np.uint8),
+        np.array([b"a", b"bc"], h5py.string_dtype("utf-8", 2)),
+        np.array(b"abc", h5py.string_dtype("utf-8", 3)),
+    ],
+)
+def test_a_dataset_has_the_bytes_that_h5py_gives_it(tmp_path, data):
+    paths = tmp_path / "own.h5", tmp_path / "theirs.h5"
+    with h5py.File(paths[0], "w", libver="earliest") as file:
+        codec._create(file.create_group("group"), "x", data)
+        checksum = file["group/x"].attrs[checksums.ATTRIBUTE]
+    with h5py.File(paths[1], "w", libver="earliest") as file:
+        dataset = file.create_group("group").create_dataset("x", data=data)
+        stated = f"/group/x:{dataset.dtype.str}{dataset.shape};".encode()
+        assert checksum == hashlib.sha256(stated + np.asarray(data).tobytes()).hexdigest().encode()
+        dataset.attrs.create(checksums.ATTRIBUTE, checksum, dtype=h5py.string_dtype("ascii", 64))
+    assert paths[0].read_bytes() == paths[1].read_bytes()

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from processor.geometry import scanner_rays
+from processor.geometry.distinct_rows import distinct
 from processor.model import Floats, Ints, Scan
 from processor.stitching.planes import borders, extraction, hashing
 from processor.stitching.planes.extraction import Planes
@@ -112,8 +113,7 @@ def _merged(cells: Ints, sums: Floats, piece: Ints, level: Ints) -> tuple[Floats
     on = np.flatnonzero((piece >= 0) & (sums[:, 9] > 0.0))
     down = np.maximum(level[piece[on]] - KEPT_BELOW, 0)
     key = extraction.packed(cells[on] >> down[:, None])
-    _, inverse = np.unique(np.stack([key, piece[on]], axis=1), axis=0, return_inverse=True)
-    inverse = inverse.ravel()
+    inverse = distinct(np.stack([key, piece[on]], axis=1)).number
     count = int(inverse.max()) + 1 if len(inverse) else 0
     piece_of_merged = np.zeros(count, np.int64)
     piece_of_merged[inverse] = piece[on]

@@ -1,0 +1,51 @@
+"""Distinct rows of integers: cells that points lie in, pairs of numbers; in a fraction of the time of np.unique."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.model import Ints
+
+DENSE = 8  # times the rows: numbers of this range are counted, others are sorted
+
+
+@dataclass(frozen=True)
+class Distinct:
+    """Rows (k, m), sorted from the first column on; where each comes ``first`` (k,), and how often: ``count`` (k,).
+
+    ``number`` (n,) is that of each of the rows given.
+    """
+
+    rows: Ints
+    first: Ints
+    number: Ints
+    count: Ints
+
+
+def distinct(rows: Ints) -> Distinct:
+    """Find the distinct ones of rows (n, m)."""
+    if not len(rows):
+        none = np.empty(0, np.int64)
+        return Distinct(rows, none, none, none)
+    low, high = rows.min(axis=0), rows.max(axis=0)
+    key, span = np.zeros(len(rows), np.int64), 1
+    for column, least, most in zip(rows.T, low.tolist(), high.tolist(), strict=True):
+        span *= most - least + 1
+        if span >= 2**62:  # a key for each row would not fit
+            _, first, number, count = np.unique(
+                rows, axis=0, return_index=True, return_inverse=True, return_counts=True
+            )
+            return Distinct(rows[first], first, number.reshape(-1), count)
+        key = key * (most - least + 1) + (column - least)
+    if span > DENSE * len(rows):
+        _, first, number, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+        return Distinct(rows[first], first, number, count)
+    every = np.bincount(key, minlength=span)
+    there = every > 0
+    number = (np.cumsum(there) - 1)[key]
+    count = every[there]
+    first = np.empty(len(count), np.int64)
+    first[number[::-1]] = np.arange(len(rows) - 1, -1, -1)
+    return Distinct(rows[first], first, number, count)
