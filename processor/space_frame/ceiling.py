@@ -1,7 +1,8 @@
 """The ceiling below a space frame: the length of a hanger from each ball's lowest point, and what is too near to it.
 
 Hangers are vertical. A length is the height of the ball's lowest point above the ceiling; where the ceiling slopes, the
-place of the ball counts in its interval as well. Balls and tubes are held against the clearance of the project, hangers
+place of ball or tube counts in its interval as well. A tube is measured by its own points: a flag of a ball at its end
+does not make it doubtful. Balls and tubes are held against the clearance of the project, hangers
 also against their greatest length. The use is that of paper 001, section 4.
 """
 
@@ -119,17 +120,26 @@ def _of_tubes(tubes: Tubes, surface: _Surface, clearance: Limit) -> list[Compari
         down = np.array([0.0, 0.0, -1.0]) + along[2] * along  # across the axis
         size = float(np.linalg.norm(down))
         line = axis + tubes.radii[k] * down / size if size > 0.0 else axis
-        height, _ = surface.heights(line[:, :2])
+        height, slopes = surface.heights(line[:, :2])
         above = line[:, 2] - height
         if not np.isfinite(above).any():
             continue
         nearest = int(np.nanargmin(above))
         at = float(share[nearest, 0])
-        of_axis = (1.0 - at) * tubes.start_ci95[k, 2] + at * tubes.end_ci95[k, 2]
-        half = float(np.hypot(of_axis, tubes.radius_ci95[k])) + float(np.nan_to_num(tubes.bow[k]))
-        name = f"tube {k}, balls {int(tubes.a[k])} and {int(tubes.b[k])}"
+        # Along x, y and z; how the errors of the axes are correlated is not known, so they may add up.
+        of_axis = (1.0 - at) * tubes.start_ci95[k] + at * tubes.end_ci95[k]
+        of_height = of_axis[2] + np.abs(slopes[nearest]) @ of_axis[:2]
+        half = float(np.hypot(of_height, tubes.radius_ci95[k])) + float(np.nan_to_num(tubes.bow[k]))
+        name = _name(k, int(tubes.a[k]), int(tubes.b[k]))
         rows.append(judging.compare(clearance, Measured.within(name, float(above[nearest]), half)))
     return rows
+
+
+def _name(tube: int, a: int, b: int) -> str:
+    """Name a tube by its row and the balls at its ends; -1 = none there."""
+    if min(a, b) >= 0:
+        return f"tube {tube}, balls {a} and {b}"
+    return f"tube {tube}, ball {max(a, b)} and a free end" if max(a, b) >= 0 else f"tube {tube}, no balls"
 
 
 def _joined(first: JudgedLimits | None, second: JudgedLimits | None) -> JudgedLimits | None:

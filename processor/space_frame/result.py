@@ -201,7 +201,7 @@ class Result(Checked):
     stations: StationCorrections = dataclasses.field(default_factory=StationCorrections, metadata={"optional": True})
     datum: tuple[Reason, ...] = described((), reasons="", optional=True)  # what fixes all stations together
     control: ControlDeviations = dataclasses.field(default_factory=ControlDeviations, metadata={"optional": True})
-    limits: JudgedLimits | None = newer()  # of supports and deflections; those of nodes are in ``balls``
+    limits: JudgedLimits | None = newer()  # all but those of movements of nodes, which are in ``balls``
     hangers: Hangers | None = newer()
 
     @property
@@ -211,5 +211,5 @@ class Result(Checked):
 
     @property
     def overall(self) -> Verdict:
-        """The worst verdict on the nodes' movements, supports and deflections."""
+        """The worst verdict on the nodes' movements, supports, deflections, hangers and tubes."""
         return worst((*self.balls.verdict, *(() if self.limits is None else self.limits.verdict)))

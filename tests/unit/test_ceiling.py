@@ -134,6 +134,28 @@ def test_the_lowest_line_of_a_tube_is_held_against_the_ceiling(degrees):
     assert str(found.limits.verdict[row]) == ("pass" if degrees > 45.0 else "fail")
 
 
+def tube_above(slopes, a=10, b=11):
+    """A level tube of radius 40 mm in 500 mm height, its axis known to 2, 3 and 0.4 mm along x, y and z."""
+    tubes = Tubes(
+        a=[a], b=[b], start=[[0.0, 0, 500]], end=[[2000.0, 0, 500]], radii=[40.0], bow=[0.0], radius_ci95=[0.3],
+        start_ci95=[[2.0, 3.0, 0.4]], end_ci95=[[2.0, 3.0, 0.4]],
+    )  # fmt: skip
+    return with_hangers(dataclasses.replace(whole(), tubes=tubes), scene(**slope(*slopes, 300.0), clearance_mm=10.0))
+
+
+def test_the_interval_of_a_tube_over_a_slope_contains_its_place():
+    found = tube_above((0.1, -0.2))
+    row = found.limits.of.index("tube 0, balls 10 and 11")
+    assert found.limits.ci95[row] == pytest.approx(np.hypot(0.4 + 0.1 * 2.0 + 0.2 * 3.0, 0.3))
+    level = tube_above((0.0, 0.0))
+    assert level.limits.ci95[row] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("a", "b", "name"), [(-1, 5, "tube 0, ball 5 and a free end"), (-1, -1, "tube 0, no balls")])
+def test_a_tube_with_a_free_end_is_named_without_a_ball_there(a, b, name):
+    assert name in tube_above((0.0, 0.0), a, b).limits.of
+
+
 # --- files ---------------------------------------------------------------------------------------------------------
 
 
@@ -210,7 +232,8 @@ def test_a_surface_is_read_in_the_units_of_the_project(tmp_path):
         ("clearance_mm = 20", "'level', a height, or 'surface'"),
         ('level = 1.0\nsurface = "x.ply"', "found level and surface"),
         ("level = 1.0\nclearance_mm = -1", "'clearance_mm' of 0 or more"),
-        ("level = 1.0\nclearance_mm = 50\nlongest_mm = 40", "'longest_mm' above it"),
+        ("level = 1.0\nclearance_mm = 50\nhanger_longest_mm = 40", "'hanger_longest_mm' above it"),
+        ("level = 1.0\nlongest_mm = 40", "did you mean 'hanger_longest_mm'"),
         ('surface = "../x.ply"', "leads out of the folder"),
         ('surface = "none.ply"', "there is no file"),
         ("level = 1.0\nlevle = 2", "unknown key 'levle'"),

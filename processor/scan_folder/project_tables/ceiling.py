@@ -10,7 +10,7 @@ from processor.scan_folder.design import read_surface
 from processor.scan_folder.units import MM_PER_UNIT
 
 NAN = float("nan")
-KEYS = ("level", "surface", "clearance_mm", "longest_mm")
+KEYS = ("level", "surface", "clearance_mm", "hanger_longest_mm")
 
 
 def read_ceiling(folder: Path, project: Table, unit: str, surface_unit: str) -> Ceiling | None:
@@ -29,11 +29,11 @@ def read_ceiling(folder: Path, project: Table, unit: str, surface_unit: str) -> 
             f"{table.where}: expected 'level', a height, or 'surface', a mesh or CAD file, found "
             f"{' and '.join(given) or 'neither'}; give one of them"
         )
-    clearance, longest = table.number("clearance_mm", 0.0), table.number("longest_mm", NAN)
+    clearance, longest = table.number("clearance_mm", 0.0), table.number("hanger_longest_mm", NAN)
     if clearance < 0.0 or longest <= clearance:
         raise InputError(
-            f"{table.where}: expected 'clearance_mm' of 0 or more and 'longest_mm' above it, found {clearance:g} and "
-            f"{longest:g}; correct them"
+            f"{table.where}: expected 'clearance_mm' of 0 or more and 'hanger_longest_mm' above it, found "
+            f"{clearance:g} and {longest:g}; correct them"
         )
     if given == ["level"]:
         level = table.number("level") * MM_PER_UNIT[unit]
