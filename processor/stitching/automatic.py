@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from processor.geometry import parallel, rigid
-from processor.model import Floats, Ints, Scan
+from processor.model import Control, Floats, Ints, Scan
 from processor.stitching import three_point
 from processor.stitching.coarse import network, pairwise
 from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
 from processor.stitching.fine import (
     bundle_adjustment,
     contradictions,
+    control_points,
     correspondences,
     edge_constraints,
     jackknife,
@@ -50,20 +51,25 @@ class RegisteredScans:
     elsewhere: list[bool]  # whether the best candidate pose of each pair is not the adjusted one
     contradictions: list[Contradiction]  # of each scan's pose
     refuted: Floats  # (k,), see network.refuted
-    links: list[tuple[int, int]]  # pairs of scans that overlap, not contradicted by free space
+    # pairs of scans that overlap, not contradicted by free space, and those whose relative pose is by control points
+    links: list[tuple[int, int]]
     groups: Ints  # (k,), see network.groups
 
 
-def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: Picked) -> RegisteredScans:
+def stitch(
+    scans: Sequence[Scan], params: Params, reference: int, picked: Picked, control: Control | None = None
+) -> RegisteredScans:
     """Register two or more scans in the frame of scan ``reference``, a row of ``scans``.
 
     Candidate poses of all pairs are scored by matching patches and free space, the scans are placed by these one after
     another, and all poses are adjusted on shared planar pieces and ends of faces. The pose by picked points is one of
-    the candidates of its pair. Scans that overlap with no other one have a pose of NaN.
+    the candidates of its pair; that by control points, of scans that each saw enough of them, is the only one: what
+    repeats itself is decided by them. Scans that overlap with no other one have a pose of NaN.
     """
     clouds = parallel.each(lambda scan: scan_planes.extract(scan, params.cell_mm), scans)
     patches = _sample_patches(clouds)
-    candidates = _find_candidates(patches, params, picked)
+    known = control_points.poses_of_scans(control, [cloud.origin for cloud in clouds])
+    candidates = _find_candidates(patches, params, picked, known)
     coarse = network.place(patches, candidates, reference)
     cells = correspondences.gather(clouds)
     solution, blocks = _adjust(clouds, cells, coarse.T, reference)
@@ -82,8 +88,12 @@ def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: Picked
             _is_elsewhere(candidates[pair.a, pair.b], scores[pair.a, pair.b], patches[pair.b]) for pair in pairs
         ],
         contradictions=contradictions.of_scans(cells, solution, GATES[0] * cells.size_mm),
-        refuted=network.refuted(scores, len(scans), reference),
-        links=network.links(scores),
+        refuted=np.where(
+            [s in known and reference in known for s in range(len(scans))],
+            0.0,
+            network.refuted(scores, len(scans), reference),
+        ),
+        links=sorted({*network.links(scores), *itertools.combinations(sorted(known), 2)}),
         groups=network.groups(candidates, len(scans)),
     )
 
@@ -93,12 +103,18 @@ def _sample_patches(clouds: list[Cloud]) -> list[ScanPatches]:
     return parallel.each(lambda cloud: pairwise.prepare(cloud, side), clouds)
 
 
-def _find_candidates(patches: list[ScanPatches], params: Params, picked: Picked) -> network.Pairs:
-    """Return the candidate poses of all pairs (a < b), the best first."""
+def _find_candidates(
+    patches: list[ScanPatches], params: Params, picked: Picked, known: Mapping[int, Floats]
+) -> network.Pairs:
+    """Return the candidate poses of all pairs (a < b), the best first; of two scans of ``known`` poses that alone."""
     most_tilt_rad = 2e-3 * params.levelled_mrad if params.levelled_mrad else np.inf
 
     def candidates(key: tuple[int, int]) -> list[ScoredPose]:
         a, b = patches[key[0]], patches[key[1]]
+        if key[0] in known and key[1] in known and len(a.patches.weight) and len(b.patches.weight):
+            T = rigid.invert(known[key[0]]) @ known[key[1]]
+            refined = pairwise.refine(a, b, T)[0]
+            return [pairwise.score_pose(a, b, refined if pairwise.same(refined, T, a.side_mm, b) else T)]
         poses = pairwise.candidate_poses(a, b, most_tilt_rad)
         if key in picked and len(a.patches.weight) and len(b.patches.weight):
             poses += _pose_by_picks(a, b, *picked[key][:2])

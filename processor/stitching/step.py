@@ -68,13 +68,14 @@ def run(scene: Scene, params: Params) -> Result:
             )
         network = _by_picks(scene.scans, picked, reference, params)
     else:
-        network = _automatic(scene.scans, picked, reference, params)
+        network = _automatic(scene, picked, reference, params)
     result = to_result.result(scene.scans, to_result.controlled(network, scene), reference, params)
     return replace(result, limits=verdicts.judge(scene, result))
 
 
-def _automatic(scans: Sequence[Scan], picked: Picked, reference: int, params: Params) -> Network:
-    registered = automatic.stitch(scans, params, reference, picked)
+def _automatic(scene: Scene, picked: Picked, reference: int, params: Params) -> Network:
+    scans = scene.scans
+    registered = automatic.stitch(scans, params, reference, picked, scene.control)
     solution, coarse = registered.solution, registered.coarse
     gross = [pair.is_gross for pair in registered.pairs]
     noise = float(np.median([cloud.sigma_mm for cloud in registered.clouds]))

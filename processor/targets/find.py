@@ -31,6 +31,11 @@ class _Found:
     points: int
     fit: float
 
+    @property
+    def with_view_sd(self) -> float:
+        """Standard deviation of the place, with the error that all ranges of its view share."""
+        return float(np.hypot(max(self.sd, LEAST_SD_MM), VIEW_MM))
+
 
 def with_targets(scene: Scene) -> Scene:
     """Return the scene with the targets that it is searched for; as it is where it asks for none, or has some."""
@@ -125,7 +130,7 @@ def _table(scene: Scene, found: list[_Found], names: Ints) -> Targets:
         scan=np.array([one.scan for one in found], np.int64),
         station=np.array([one.station for one in found], np.int64),
         places=np.array([one.place for one in found]).reshape(-1, 3),
-        sd=np.array([float(np.hypot(max(one.sd, LEAST_SD_MM), VIEW_MM)) for one in found]),
+        sd=np.array([one.with_view_sd for one in found]),
         points=np.array([one.points for one in found], np.int64),
         fit=np.array([one.fit for one in found]),
     )
@@ -147,5 +152,5 @@ def _with_sightings(control: Control | None, found: list[_Found], names: Ints) -
         scan=np.concatenate([control.scan, np.array([one.scan for _, one in new], np.int64)]),
         station=np.concatenate([control.station, np.array([one.station for _, one in new], np.int64)]),
         seen=np.concatenate([control.seen, np.array([one.place for _, one in new]).reshape(-1, 3)]),
-        seen_sd=np.concatenate([control.seen_sd, np.array([max(one.sd, LEAST_SD_MM) for _, one in new])]),
+        seen_sd=np.concatenate([control.seen_sd, np.array([one.with_view_sd for _, one in new])]),
     )

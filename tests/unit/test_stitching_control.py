@@ -381,3 +381,23 @@ def test_a_folder_with_control_points_says_what_they_hold(tmp_path):
     assert "T_GLCS_SOCS(S2)" in page
     assert "T_GLCS_PRCS" in page
     assert "T_PRCS_SOCS" not in page
+
+
+def test_scans_that_saw_enough_control_points_have_a_pose_by_these():
+    rng = np.random.default_rng(5)
+    known = rng.uniform(0.0, 20_000.0, (6, 3)) + np.array([5e5, 4.2e6, 0.0])
+    T = [SITE @ pose([3000.0 * s, 500.0, 0.0], 70.0 * s, 1.0) for s in range(3)]
+    rows = [(p, s) for s, count in enumerate((6, 4, 2)) for p in range(count)]
+    seen = np.array([rigid.apply(rigid.invert(T[s]), known[p]) for p, s in rows])
+    point, scan = np.array(rows).T
+    control = Control(
+        tuple("ABCDEF"), known, np.full(6, 0.5), point, scan, np.full(len(rows), -1), seen, np.ones(len(rows))
+    )
+    found = control_points.poses_of_scans(control, [np.zeros(3)] * 3)
+    assert sorted(found) == [0, 1]  # two points are too few
+    relative = rigid.invert(found[0]) @ found[1]
+    np.testing.assert_allclose(relative, rigid.invert(T[0]) @ T[1], atol=1e-5)
+    wrong = seen.copy()
+    wrong[7] += [0.0, 300.0, 0.0]
+    assert sorted(control_points.poses_of_scans(dataclasses.replace(control, seen=wrong), [np.zeros(3)] * 3)) == [0]
+    assert control_points.poses_of_scans(None, []) == {}

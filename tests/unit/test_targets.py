@@ -11,6 +11,7 @@ from processor.language.messages import messages
 from processor.model import Control, InputError, Scan, Scene, Stations, TargetSearch
 from processor.report.stitching import targets as report
 from processor.scan_folder import folder
+from processor.stitching import step as stitching_step
 from processor.store import store
 from processor.targets import checkerboard, find, naming, spheres
 from processor.targets.summary import summary
@@ -281,7 +282,10 @@ def test_the_interval_of_a_target_has_what_all_ranges_of_a_view_share():
     """The class of scanners: 0.5 mm, one standard deviation, for the ranges of one view."""
     scene, _ = scene_of_board()
     found = find.with_targets(scene)
-    assert found.targets.sd[0] == pytest.approx(np.hypot(0.5, found.control.seen_sd[0]))
+    points, intensity = scene.scans[0].points, scene.scans[0].intensity
+    (one,) = checkerboard.find(points, intensity, SIDE)
+    assert found.targets.sd[0] == pytest.approx(np.hypot(0.5, max(one.sd, find.LEAST_SD_MM)))
+    assert found.control.seen_sd[0] == found.targets.sd[0]
 
 
 def spread_targets(seed=4, count=6):
@@ -318,3 +322,25 @@ def test_targets_that_contradict_each_other_are_said():
     names = find._names(Scene("x", "structure", (scan,), control=control), found, remarks)
     assert names.tolist() == [0, 1, -1, 3, 4, 5]
     assert [(one.code, one.values["targets"]) for one in remarks] == [("targets.contradict", 1)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_scans_of_a_room_are_placed_by_their_targets(seed):
+    """The walls of a room look alike turned by half a turn: the targets decide, and places are within the intervals.
+
+    Of three coordinates and three angles of two scans at most two are beyond 1.96 sd in 98 of 100 cases, by chance.
+    """
+    settings = {"scan.step_mrad": 4.0, "room.checkerboard_mm": 300.0}
+    scene, truth = designgen.make("room-targets", seed=seed, settings=settings)
+    found = stitching_step.run(find.with_targets(scene), stitching_step.Params())
+    assert [str(one) for one in found.scans.status] == ["ok", "ok"]
+    beyond = 0
+    for T, C, true in zip(
+        found.scans.T_project_scan, found.scans.covariance, truth.stations.T_project_station, strict=True
+    ):
+        at = true[:3, 3]
+        J = np.vstack([np.eye(6)[:3], rigid.motion(at[None])[0]])
+        off = np.concatenate([rigid.vector_from_rotation(T[:3, :3] @ true[:3, :3].T), T[:3, 3] - at])
+        beyond += int((np.abs(off) > 1.96 * np.sqrt(np.diag(J @ C @ J.T))).sum())
+    assert beyond <= 2

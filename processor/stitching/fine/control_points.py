@@ -22,6 +22,8 @@ from processor.stitching.result import ControlPoints, ControlSightings
 
 CLEAR = 10.0  # least distance from a line in standard deviations; nearer points do not determine the rotation about it
 LEAST_SD_MM = 1e-3  # of a sighting; the covariance would be singular without
+# Of the sightings of a scan that give it a pose: greatest misfit, and least extent across their longest one.
+GROSS_MM, LEAST_SPREAD_MM = 50.0, 300.0
 ROUNDS, STILL = 12, 1e-10
 MOST = 1000  # sightings; the equations are dense
 LOOSENED = 30  # rounds at most
@@ -150,6 +152,25 @@ def adjust(
             holds=True, redundancy=fit.free, ratio=fit.chi2 / fit.free, loosened=factor, sightings=sightings
         ),
     )  # fmt: skip
+
+
+def poses_of_scans(control: Control | None, origins: Sequence[Floats]) -> dict[int, Floats]:
+    """Return the pose (4, 4) of each scan whose own sightings determine it, of coordinates less the scan's origin (3,).
+
+    All are in one frame, that of the control points less their middle. A scan whose sightings fit a rigid motion worse
+    than GROSS_MM has none: one of them is wrong, or their unit.
+    """
+    if control is None or not len(control.scan):
+        return {}
+    poses, middle = {}, control.positions.mean(axis=0)
+    for s in np.unique(control.scan).tolist():
+        rows = control.scan == s
+        seen, known = control.seen[rows] - origins[s], control.positions[control.point[rows]] - middle
+        if control_points.determine_motion(known, common_points.LEAST_HEIGHT, LEAST_SPREAD_MM):
+            T = rigid.fit(seen, known)
+            if np.linalg.norm(rigid.apply(T, seen) - known, axis=1).max() <= GROSS_MM:
+                poses[s] = T
+    return poses
 
 
 def fitted(sightings: Sightings, T: Floats, prior: Floats, factor: float = 1.0) -> Fit:
