@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.geometry.distinct_rows import distinct
+from processor.distinct_rows import distinct
 from processor.model import Floats, Ints
 
 

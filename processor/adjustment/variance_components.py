@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from processor.geometry.distinct_rows import distinct
+from processor.distinct_rows import distinct
 from processor.model import Floats, Ints
 from processor.robust_statistics import student_factor
 

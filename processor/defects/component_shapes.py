@@ -14,7 +14,7 @@ from processor.defects.alignment import Alignment, chart_of_cells
 from processor.defects.deviation_field import Field, component_of_cells
 from processor.defects.scan_statistic import Levels
 from processor.defects.surface_charts import DesignSurface
-from processor.geometry.distinct_rows import distinct
+from processor.distinct_rows import distinct
 from processor.model import NORMAL_95, Floats, Ints
 
 BLOCKS_ALONG, BLOCKS_ACROSS = 36, 16  # of a component's largest face, at least

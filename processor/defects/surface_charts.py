@@ -16,8 +16,8 @@ from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from processor.distinct_rows import distinct
 from processor.geometry import circle, enclosure, mesh_distance
-from processor.geometry.distinct_rows import distinct
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
 from processor.model import Bools, DesignBodies, Floats, Ints
 

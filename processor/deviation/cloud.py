@@ -10,8 +10,8 @@ import numpy as np
 from processor import scene_cloud
 from processor.deviation import large_cloud
 from processor.deviation.large_cloud import LargeCloud
+from processor.distinct_rows import distinct
 from processor.geometry import neighbors, rigid
-from processor.geometry.distinct_rows import distinct
 from processor.model import Floats, InputError, Ints, Scene
 
 MOST_POINTS = 3_000_000  # of a scan that are held at once; of more an even sample is held

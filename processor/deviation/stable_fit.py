@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 
 from processor.adjustment.opposite_sides import CHI2_MEDIAN
 from processor.deviation.local_translation import Movement
+from processor.distinct_rows import distinct
 from processor.geometry import rigid
-from processor.geometry.distinct_rows import distinct
 from processor.geometry.m3c2 import Z95
 from processor.geometry.mesh_distance import Samples
 from processor.model import Floats, Ints

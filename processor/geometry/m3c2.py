@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from processor.distinct_rows import distinct
 from processor.geometry import neighbors, point_grid
-from processor.geometry.distinct_rows import distinct
 from processor.geometry.linalg_small import eigen
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within

@@ -20,8 +20,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processor.distinct_rows import distinct
 from processor.geometry import mesh_distance, neighbors, rigid
-from processor.geometry.distinct_rows import distinct
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
 from processor.model import Bools, Floats, Ints
 

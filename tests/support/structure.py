@@ -138,7 +138,7 @@ LAYERS = (
     ("version", "plain_text", "large_arrays"),
     ("model",),
     ("record_checks",),
-    ("progress", "diagnostics", "language", "jobs", "robust_statistics", "unit_ratio", "user_methods"),
+    ("progress", "diagnostics", "language", "jobs", "robust_statistics", "distinct_rows", "unit_ratio", "user_methods"),
     ("geometry",),
     ("scene_cloud",),
     ("adjustment",),
@@ -158,8 +158,8 @@ LAYERS = (
     ("__main__",),
 )
 FOR_STEPS = (
-    "version", "plain_text", "large_arrays", "model", "progress", "diagnostics", "robust_statistics", "unit_ratio",
-    "geometry", "scene_cloud", "adjustment", "components", "limits",
+    "version", "plain_text", "large_arrays", "model", "progress", "diagnostics", "robust_statistics", "distinct_rows",
+    "unit_ratio", "geometry", "scene_cloud", "adjustment", "components", "limits",
 )  # fmt: skip
 
 

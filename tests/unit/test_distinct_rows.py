@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.geometry.distinct_rows import distinct
+from processor.distinct_rows import distinct
 
 
 @pytest.mark.parametrize("span", [3, 40, 10**6, 2**40])

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from processor.distinct_rows import distinct
 from processor.geometry import scanner_rays
-from processor.geometry.distinct_rows import distinct
 from processor.model import Floats, Ints, Scan
 from processor.stitching.planes import borders, extraction, hashing
 from processor.stitching.planes.extraction import Planes
