@@ -83,7 +83,8 @@ def test_a_part_as_built_is_laid_on_its_design():
 
 
 # Corner is held to its bands over bridges, below: its errors along one bridge are a single rotation.
-@pytest.mark.parametrize("method", ["design-aided", pytest.param("line", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["design-aided", "line"])
+@pytest.mark.slow
 def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
     """All deviations of this bridge are errors of the method: its parts are exactly as designed."""
     result = banded(*bridge, method)

@@ -324,7 +324,7 @@ def mutations(content, rng, count):
         yield bytes(data)
 
 
-@pytest.mark.parametrize("each", [5, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("each", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_damaged_files_end_in_a_result_or_an_input_error(tmp_path, capfd, each):
     """A process a file, two at a time."""
     shapes = {"a": cq.Workplane().box(30, 20, 10).edges("|Z").fillet(2).faces(">Z").hole(4).val()}

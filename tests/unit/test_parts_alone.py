@@ -31,7 +31,9 @@ def test_a_row_of_balls_has_members_between_them():
         designgen.make("bolt-ball", settings={"frame.layers": 2})
 
 
-@pytest.mark.parametrize(("recipe", "expected"), [("arch-foot", []), ("arch-rib", ["dent"])])
+@pytest.mark.parametrize(
+    ("recipe", "expected"), [("arch-foot", []), pytest.param("arch-rib", ["dent"], marks=pytest.mark.slow)]
+)
 def test_a_part_of_an_arch_alone(recipe, expected):
     """A foot has no place on one side of a step near its base: nothing may be taken for a movement there."""
     scene, truth = designgen.make(recipe, settings={"scan.step_mrad": 3.0})

@@ -28,7 +28,9 @@ def found_in(seed, **settings):
     return checkerboard.find(points, intensity, SIDE), centre
 
 
-@pytest.mark.parametrize(("step", "median_mm", "most_mm"), [(0.3e-3, 0.1, 0.3), (0.6e-3, 0.3, 0.6)])
+@pytest.mark.parametrize(
+    ("step", "median_mm", "most_mm"), [(0.3e-3, 0.1, 0.3), pytest.param(0.6e-3, 0.3, 0.6, marks=pytest.mark.slow)]
+)
 def test_centres_at_ten_metres(step, median_mm, most_mm):
     """Footprints drawn ray by ray, apart from the model that is fitted; median and most of twenty boards."""
     errors = []
@@ -213,7 +215,8 @@ def test_known_coordinates_alone_are_enough_where_scans_are_searched(tmp_path):
     assert len(scene.control.point) == 0
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.slow
 def test_a_room_with_targets_and_decoys(seed):
     """Every target with points enough is found and named, nothing else is, and places are within 0.3 mm and 4 sd."""
     settings = {"scan.step_mrad": 4.0, "room.spheres": 0, "room.checkerboard_mm": 300.0, "room.decoys": 8}
