@@ -15,6 +15,7 @@ from processor.geometry import neighbors, rigid
 from processor.model import Floats, InputError, Ints, Scene
 
 MOST_POINTS = 3_000_000  # of a scan that are held at once; of more an even sample is held
+SAMPLE_POINTS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,16 @@ class ScanCloud:
     unposed: int = 0  # scans without a pose
     unplaced: tuple[str, ...] = ()
     large: LargeCloud | None = None
+
+    @property
+    def resolved_mm(self) -> float:
+        """Spacing of the points by which core points are chosen: of a large cloud that of MOST_POINTS of them.
+
+        More core points than these tell apart are not placed, so all other points make each of them more certain.
+        """
+        if self.large is None:
+            return self.spacing_mm
+        return self.large.spacing_mm * max(1.0, float(np.sqrt(self.kept / MOST_POINTS)))
 
     @property
     def unnamed_views(self) -> bool:
@@ -90,7 +101,7 @@ def _sample(scene: Scene, neighbours: int, ratio: float) -> ScanCloud:
     if not large.spacing_mm > 0.0:
         raise InputError(f"{scene.name}: most points of the scan lie at the same place; export it again")
     kept = large.kept
-    step = -(-kept // MOST_POINTS)
+    step = -(-kept // SAMPLE_POINTS)
     points, scanner, source = large.thinned(True, step)
     removed, removed_scanner, removed_source = large.thinned(False, step)
     return ScanCloud(

@@ -1,7 +1,8 @@
 """A scan of more points than are held at once: sorted into slabs in files, with its outliers marked slab by slab.
 
-Neighbours of a slab's points are searched for in it and in what lies within ``HALO`` spacings of it, so outliers are
-those of the whole cloud. Within a slab the points are in the order of a grid, so every k-th is an even sample.
+Neighbours of a slab's points are searched for in it and in what lies within ``HALO`` spacings of it. Outliers are those
+of the whole cloud, but for the distances of points that are alone, which are overstated. Within a slab the points are
+in the order of a grid, so every k-th is an even sample.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from processor.geometry import neighbors, rigid
 from processor.large_arrays import allocate, blocks, extremes, release, taken
 from processor.model import Bools, Floats, Ints, Labels, Scan, Scene
 
-SLAB_POINTS = 1_000_000
+SLAB_POINTS = 500_000
+PASS_POINTS = 250_000  # in memory at once where no neighbours are searched for
 BINS = 1 << 16  # across the longest axis, of which slabs consist
 HALO = 20.0  # spacings about a slab: 20 neighbours of a point on a surface lie within three
 SPACING_SAMPLE = 20_000
@@ -77,7 +79,7 @@ class LargeCloud:
 
 @dataclass(frozen=True)
 class Placed:
-    """The points of a large cloud placed by T (4, 4): clouds of a slab's size, the same in every pass."""
+    """The points of a large cloud placed by T (4, 4): clouds of PASS_POINTS, the same in every pass."""
 
     cloud: LargeCloud
     T: Floats
@@ -86,7 +88,7 @@ class Placed:
         """Pass over all points that are used."""
         large = self.cloud
         scanners = None if large.scanners is None else rigid.apply(self.T, large.scanners)
-        for block in blocks(len(large.points), SLAB_POINTS):
+        for block in blocks(len(large.points), PASS_POINTS):
             rows = np.flatnonzero(np.isin(large.source[block], large.used))
             if len(rows):
                 yield Cloud(

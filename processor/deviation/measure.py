@@ -100,7 +100,7 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
     step = max(1, -(-len(scan.points) // most)) if most else 1
     few = _cloud(scan, T, step, with_removed=not most)
     surface = curved.surface
-    spacing = scan.spacing_mm * np.sqrt(step)
+    spacing = scan.spacing_mm * np.sqrt(step) if most else scan.resolved_mm
     diameter = params.projection_diameter_mm or m3c2.rounded(m3c2.diameter_for(POINTS_A_CORE, spacing))
     area = mesh_distance.area(surface.vertices, surface.faces)
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))

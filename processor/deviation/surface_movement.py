@@ -48,7 +48,7 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _Passes:
     """Core points of a design, what movements at them are fitted with, and the ``clouds`` of a scan, in every pass.
 
     ``asides`` are the points of each cloud near the surface.
@@ -105,7 +105,7 @@ def movement(
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, depth_mm)
     within = enclosure.enclosed(core.points, core.normals, grid, enclosure.closed_bodies(surface.faces))
     core = replace(core, normals=np.where(within[:, None], np.nan, core.normals))
-    fit = _Fit(clouds, core, curved, grid, diameter=diameter_mm, depth=depth_mm)
+    fit = _Passes(clouds, core, curved, grid, diameter=diameter_mm, depth=depth_mm)
     first, on_surface = _first(fit)
     known = np.flatnonzero(np.isfinite(first.along))
     if not len(known):
@@ -121,7 +121,7 @@ def movement(
     return last, on_surface, shared
 
 
-def _first(fit: _Fit) -> tuple[Movement, float]:
+def _first(fit: _Passes) -> tuple[Movement, float]:
     """Assign all points, put those near the surface aside, and fit movements to them; also the share that is near."""
     first, near, points = fit.sums(), 0, 0
     for cloud in fit.clouds:
@@ -135,7 +135,7 @@ def _first(fit: _Fit) -> tuple[Movement, float]:
     return first.movement(), near / points
 
 
-def _second(fit: _Fit, known: Ints, raw: Floats) -> tuple[list[Ints], Movement, Movement]:
+def _second(fit: _Passes, known: Ints, raw: Floats) -> tuple[list[Ints], Movement, Movement]:
     """Fit movements to points whose face is decided, for the scatter ``raw`` (k,) about core points.
 
     Returns the ``known`` core point next to each point near the surface, and the fits for all faces about a core point
@@ -153,7 +153,7 @@ def _second(fit: _Fit, known: Ints, raw: Floats) -> tuple[list[Ints], Movement, 
     return nearest, about.movement(), moved.movement()
 
 
-def _last(fit: _Fit, shifts: _Shifts, scatter: Floats) -> tuple[list[Aside], Movement]:
+def _last(fit: _Passes, shifts: _Shifts, scatter: Floats) -> tuple[list[Aside], Movement]:
     """Fit movements to points by the faces below their places before the movement; returns the points used, too."""
     used, last = list[Aside](), fit.sums()
     for (cloud, _), at in zip(fit.near(), shifts.nearest, strict=True):
@@ -168,13 +168,13 @@ def _last(fit: _Fit, shifts: _Shifts, scatter: Floats) -> tuple[list[Aside], Mov
     return used, last.movement()
 
 
-def _distance(fit: _Fit, before: OnSurface, shift: Floats) -> Floats:
+def _distance(fit: _Passes, before: OnSurface, shift: Floats) -> Floats:
     """Return the movement found, and what is left of it, along the facet's normal."""
     distance: Floats = before.distance + np.einsum("ni,ni->n", fit.curved.surface.normals[before.facet], shift)
     return distance
 
 
-def _used(fit: _Fit, shifts: _Shifts, used: Sequence[Aside]) -> Iterator[OnFaces]:
+def _used(fit: _Passes, shifts: _Shifts, used: Sequence[Aside]) -> Iterator[OnFaces]:
     """Pass over the points of the last fit."""
     for cloud, near, at, aside in zip(fit.clouds, fit.asides, shifts.nearest, used, strict=True):
         points, shift = cloud.of(near.rows[aside.rows]), shifts.vector[at[aside.rows]]

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.geometry.parallel import over_ranges
-from processor.model import Bools, Floats, Ints
+from processor.model import Bools, Floats, Ints, Labels
 
 LEAST_AREA = 1e-9  # mm2, twice that of a facet; smaller ones are left out
 
@@ -313,7 +313,7 @@ class FacetGrid(NamedTuple):
     size: float  # edge of a voxel
     shape: Ints  # (3,)
     start: Ints  # (voxels + 1,) of each voxel's facets
-    facet: Ints
+    facet: Labels
     corners: Floats  # (f, 3, 3)
     normals: Floats
     reach: float
@@ -332,10 +332,11 @@ def facet_grid(vertices: Floats, faces: Ints, normals: Floats, reach: float) -> 
     while _entries(longest, width, size, reach) > MOST_ENTRIES:
         size *= 1.2
     shape = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
-    none = np.empty(0, np.int64)
-    count = _facets_of_voxels(corners, normals, low, size, shape, reach, none, none)
-    start = np.concatenate([[0], np.cumsum(count)])
-    facet = np.empty(start[-1], np.int64)
+    # Of a large design these arrays are the largest there are.
+    start = np.zeros(int(np.prod(shape)) + 1, np.int64)
+    none = np.empty(0, np.int64), np.empty(0, np.int32)
+    np.cumsum(_facets_of_voxels(corners, normals, low, size, shape, reach, *none), out=start[1:])
+    facet = np.empty(start[-1], np.int32)
     _facets_of_voxels(corners, normals, low, size, shape, reach, start, facet)
     return FacetGrid(
         low=low, size=size, shape=shape, start=start, facet=facet, corners=corners, normals=normals, reach=float(reach)
@@ -468,14 +469,14 @@ def _touching(grid: FacetGrid, points: Floats, within: float) -> tuple[Ints, Int
 
 @njit(cache=True, nogil=True)
 def _facets_of_voxels(
-    corners: Floats, normals: Floats, low: Floats, size: float, shape: Ints, reach: float, start: Ints, out: Ints
-) -> Ints:
+    corners: Floats, normals: Floats, low: Floats, size: float, shape: Ints, reach: float, start: Ints, out: Labels
+) -> Labels:
     """Count the facets of each voxel (voxels,); write them to ``out`` where ``start`` (voxels + 1,) is given.
 
     A facet belongs to the voxels of its bounding box that its plane comes within ``reach`` of. The box of a long thin
     facet askew is mostly empty: such a facet is halved until boxes are not, and the voxels are those of its pieces.
     """
-    count = np.zeros(shape[0] * shape[1] * shape[2], np.int64)
+    count = np.zeros(shape[0] * shape[1] * shape[2], np.int32)
     last = np.full(len(count), -1, np.int32)  # facet that a voxel had last, so that pieces of one count once
     stack = np.empty((PIECES, 3, 3))
     lo, hi = np.empty(3, np.int64), np.empty(3, np.int64)
