@@ -36,6 +36,7 @@ def blocks(monkeypatch):
     """All arrays lie in files, and are passed over in blocks of few rows."""
     monkeypatch.setattr(large_arrays, "BLOCK_ROWS", BLOCK)
     monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
+    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
 
 
 def full_disk(*_):
@@ -58,6 +59,7 @@ def converted(path, tmp_path, units=None):
 def test_blocks_give_the_bytes_of_a_whole_reading(path, tmp_path, monkeypatch):
     expected = in_memory(path, tmp_path)
     monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
+    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
     for size in (1, 7, 199, 200, 201):
         monkeypatch.setattr(large_arrays, "BLOCK_ROWS", size)
         assert converted(path, tmp_path) == expected
@@ -73,6 +75,7 @@ def test_stations_grids_intensities_and_origins_are_those_of_a_whole_reading(for
     (out / "truth.h5").unlink(missing_ok=True)
     expected = in_memory(out, tmp_path)
     monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
+    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
     monkeypatch.setattr(large_arrays, "BLOCK_ROWS", BLOCK)
     assert converted(out, tmp_path) == expected
     back = store.read_scene(tmp_path / "blocks.h5")
@@ -136,6 +139,7 @@ def test_a_scene_without_a_unit_is_judged_by_blocks_as_by_the_whole(tmp_path, mo
     expected = in_memory(tmp_path / "a.xyz", tmp_path)
     monkeypatch.setattr("processor.scan_folder.units.SAMPLE", 500)
     monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
+    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
     monkeypatch.setattr(large_arrays, "BLOCK_ROWS", BLOCK)
     assert converted(tmp_path / "a.xyz", tmp_path)
     assert store.read_scene(tmp_path / "blocks.h5").units == "mm"
@@ -309,6 +313,7 @@ def test_a_scene_read_into_files_is_the_same(tmp_path, monkeypatch):
     store.write_scene(tmp_path / "s.h5", scene, None, {})
     whole = store.scene_hash(store.read_scene(tmp_path / "s.h5"))
     monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
+    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
     monkeypatch.setattr(large_arrays, "BLOCK_ROWS", BLOCK)
     monkeypatch.setattr("processor.store.checksums.PART_ITEMS", 100)
     with large_arrays.in_files(tmp_path):
