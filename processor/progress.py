@@ -75,5 +75,5 @@ def _show(current: _Stage, ended: threading.Event) -> None:
             if bar.total != current.total:
                 bar.reset(current.total)
             bar.bar_format = UNCOUNTED if not current.total else IN_PARTS if current.share else COUNTED
-            bar.n = current.done + current.share
+            bar.n = current.done + current.share if current.share else current.done
             bar.refresh()

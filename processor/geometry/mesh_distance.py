@@ -463,7 +463,7 @@ def _touching(grid: FacetGrid, points: Floats, within: float) -> tuple[Ints, Int
         for at in range(grid.start[voxel], grid.start[voxel + 1]):
             if square_to(grid.corners[grid.facet[at]], p) < within * within:
                 rows.append(row)
-                facets.append(grid.facet[at])
+                facets.append(np.int64(grid.facet[at]))
     return np.array(rows), np.array(facets)
 
 
