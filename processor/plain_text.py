@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
-NUMBER = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?([eE][-+]?[0-9]+)?")
 FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute
 
 
@@ -14,9 +11,6 @@ def printable(characters: str) -> str:
 
 
 def spreadsheet_text(characters: str) -> str:
-    """Return a text without control characters; an apostrophe before it where a spreadsheet would execute it.
-
-    A number such as -0.25 is executed by none, and stays one for the instruments and programs that read the table.
-    """
+    """Return a text without control characters; an apostrophe before it where a spreadsheet would execute it."""
     harmless = printable(characters)
-    return "'" + harmless if harmless.startswith(FORMULA) and not NUMBER.fullmatch(harmless) else harmless
+    return "'" + harmless if harmless.startswith(FORMULA) else harmless

@@ -178,8 +178,17 @@ def test_the_drawing_has_lowest_points_hangers_and_clashes():
 def test_points_to_stake_out_are_those_of_balls_without_a_flag():
     rows = list(csv.DictReader(io.StringIO(ceiling_report.stake_out(clashing()).decode("utf-8"))))
     assert [row["name"] for row in rows] == ["L10", "C10", "L14", "C14"]
-    assert rows[0] == {"name": "L10", "x_m": "0.0030", "y_m": "0.0040", "z_m": "5.9549", "code": "LOWEST"}
-    assert rows[1]["z_m"] == "5.9000"
+    assert rows[0] == {"name": "L10", "x_m": "0.003", "y_m": "0.004", "z_m": "5.9549", "code": "LOWEST"}
+    assert rows[1]["z_m"] == "5.9"
+
+
+def test_negative_coordinates_to_stake_out_are_numbers():
+    found = clashing()
+    west = dataclasses.replace(
+        found, hangers=dataclasses.replace(found.hangers, top=found.hangers.top - [1234.5, 0.0, 0.0])
+    )
+    rows = list(csv.DictReader(io.StringIO(ceiling_report.stake_out(west).decode("utf-8"))))
+    assert float(rows[0]["x_m"]) == pytest.approx(0.003 - 1.2345, abs=6e-5)
 
 
 def test_table_and_plan():

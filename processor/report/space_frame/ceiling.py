@@ -54,7 +54,7 @@ def stake_out(result: Result) -> bytes:
     for i, ball in enumerate(hangers.ids.tolist()):
         if result.balls.flag[i] is Flag.OK and np.isfinite(hangers.length[i]):
             for letter, place, code in (("L", hangers.top[i], LOWEST), ("C", hangers.bottom[i], CEILING)):
-                rows.append((f"{letter}{ball}", *(f"{value / 1000.0:.4f}" for value in place.tolist()), code))
+                rows.append((f"{letter}{ball}", *np.round(place / 1000.0, 4).tolist(), code))
     return csv_of_rows(COLUMNS, rows).encode("utf-8")
 
 
