@@ -35,14 +35,12 @@ def merged(scene: Scene, with_scanner: bool) -> MergedCloud:
     points, scanners = [np.empty((0, 3))], [np.empty((0, 3))]
     known = with_scanner
     for scan in scene.scans:
-        T = scan.pose
-        # Large offsets are subtracted from each other first: added to the points, either would cost them digits.
-        shift = T[:3, :3] @ scan.origin + (T[:3, 3] - origin)
-        points.append((scan.points @ T[:3, :3].T if scan.T_project_scan.size else scan.points) + shift)
+        T = rigid.between_origins(scan.pose, scan.origin, origin)
+        points.append(rigid.apply(T, scan.points) if scan.T_project_scan.size else scan.points + T[:3, 3])
         if not known:
             continue
         if scan.position.size:
-            at = T[:3, :3] @ (scan.position - scan.origin) + shift
+            at = T[:3, :3] @ (scan.position - scan.origin) + T[:3, 3]
             scanners.append(np.broadcast_to(at, (len(scan.points), 3)))
         elif scene.stations is not None and len(scan.point_station) and scan.point_station.min() >= 0:
             scanners.append(scene.stations.positions[scan.point_station] - origin)

@@ -1,11 +1,13 @@
-"""Pieces of faces, and means over groups."""
+"""Pieces of faces, numbers of groups, and means over groups."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from processor.distinct_rows import distinct
-from processor.model import Floats, Ints
+from processor.model import Floats, Ints, Labels
 
 
 def pieces(points: Floats, normals: Floats, side: float) -> Ints:
@@ -19,3 +21,13 @@ def group_means(values: Floats, group: Ints) -> Floats:
     count = np.bincount(group)
     total: Floats = np.stack([np.bincount(group, values[:, k]) for k in range(values.shape[1])], axis=1)
     return total / count[:, None]
+
+
+def joined_numbers(by_part: Sequence[Ints | Labels]) -> Ints:
+    """Return the numbers (n,), from 0, of groups in the joined points of several parts; no group is of two parts."""
+    numbers, before = [np.empty(0, np.int64)], 0
+    for group in by_part:
+        number = np.unique(group, return_inverse=True)[1].reshape(-1).astype(np.int64)
+        numbers.append(number + before)
+        before += int(number.max(initial=-1)) + 1
+    return np.concatenate(numbers)

@@ -36,8 +36,7 @@ class Placed:
 
     def to_local(self, T: Floats, origin: Floats) -> Floats:
         """Return the map (4, 4) by T (4, 4) of scaled points less the scan's origin to points less ``origin`` (3,)."""
-        # Large offsets are subtracted from each other first: added to the points, either would cost them digits.
-        return rigid.transform(T[:3, :3], T[:3, :3] @ (self.scale * self.scan.origin) + (T[:3, 3] - origin))
+        return rigid.between_origins(T, self.scale * self.scan.origin, origin)
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,8 @@ def _noise(pairs: Pairs, surface: DesignSurface, count: Floats) -> tuple[Floats,
     cell of it, the noise of the face's points is not that of the cell's. Each station has a variance on each face. What
     the scatter about a cell differs from these is a factor on them.
     """
-    charts, chart = surface.charts, chart_of_cells(surface)[pairs.cell]
+    charts, of_cell = surface.charts, chart_of_cells(surface)
+    chart = of_cell[pairs.cell]
     stations = int(pairs.station.max(initial=0)) + 1
     free = np.maximum(pairs.count - 1, 0).astype(np.float64)
     overall = float(pairs.square.sum() / max(free.sum(), 1.0))  # of a station that hardly shows its own
@@ -127,7 +128,7 @@ def _noise(pairs: Pairs, surface: DesignSurface, count: Floats) -> tuple[Floats,
     # Of a cell without points it is the noise of its face.
     sums, numbers = (np.bincount(chart, x, len(charts.kind)) for x in (part, pairs.count))
     of_face = np.where(numbers > 0.0, sums / np.maximum(numbers, 1.0), overall)
-    mean = np.where(count > 0.0, total / np.maximum(count, 1.0), of_face[chart_of_cells(surface)])
+    mean = np.where(count > 0.0, total / np.maximum(count, 1.0), of_face[of_cell])
     noise = np.sqrt(np.maximum(mean * factor, 1e-6))
     return noise, total**2 / np.maximum(spread, 1e-12)
 

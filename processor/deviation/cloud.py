@@ -46,7 +46,7 @@ class ScanCloud:
     def resolved_mm(self) -> float:
         """Spacing of the points by which core points are chosen: of a large cloud that of MOST_POINTS of them.
 
-        More core points than these tell apart are not placed, so all other points make each of them more certain.
+        No more core points are placed than these distinguish, so all other points make each of them more certain.
         """
         if self.large is None:
             return self.spacing_mm

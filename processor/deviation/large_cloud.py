@@ -140,11 +140,10 @@ class _Parts:
         """Pass over all points."""
         own = 0
         for number, scan in enumerate(self.scans):
-            T = scan.pose
-            # Large offsets are subtracted from each other first: added to the points, either would cost them digits.
-            shift = T[:3, :3] @ scan.origin + (T[:3, 3] - self.origin)
+            T = rigid.between_origins(scan.pose, scan.origin, self.origin)
             for rows in blocks(len(scan.points)):
-                points = (scan.points[rows] @ T[:3, :3].T if scan.T_project_scan.size else scan.points[rows]) + shift
+                points = scan.points[rows]
+                points = rigid.apply(T, points) if scan.T_project_scan.size else points + T[:3, 3]
                 station = scan.point_station[rows]
                 source = np.full(len(points), number, np.int32)
                 if self.by_station:
@@ -159,9 +158,8 @@ def _scanners(scene: Scene, origin: Floats) -> tuple[Floats | None, int]:
     own, known = [np.empty((0, 3))], True
     for scan in scene.scans:
         if scan.position.size:
-            T = scan.pose
-            shift = T[:3, :3] @ scan.origin + (T[:3, 3] - origin)
-            own.append((T[:3, :3] @ (scan.position - scan.origin) + shift)[None])
+            T = rigid.between_origins(scan.pose, scan.origin, origin)
+            own.append((T[:3, :3] @ (scan.position - scan.origin) + T[:3, 3])[None])
         else:
             named = scene.stations is not None and len(scan.point_station) > 0
             known = known and named and extremes(scan.point_station)[0] >= 0
@@ -203,6 +201,10 @@ class _Slabs:
         number = ((points[:, self.axis] - self.low) / self.width).astype(np.int64)
         return self.slab_of_bin[np.clip(number, 0, BINS - 1)]
 
+    def rows(self, slab: int) -> slice:
+        """Return the rows of a slab."""
+        return slice(int(self.ends[slab - 1]) if slab else 0, int(self.ends[slab]))
+
     def bounds(self, slab: int) -> tuple[float, float]:
         """Return where a slab begins and ends along the axis."""
         bins = np.flatnonzero(self.slab_of_bin == slab)
@@ -214,10 +216,10 @@ def _inliers(slabs: _Slabs, part: _Part, neighbours: int, ratio: float) -> tuple
     n = len(part.points)
     distance, farthest, total, k = allocate(n), list[Floats](), 0.0, 1
     for slab in range(len(slabs.ends)):
-        rows = slice(int(slabs.ends[slab - 1]) if slab else 0, int(slabs.ends[slab]))
+        rows = slabs.rows(slab)
         if rows.start == rows.stop:
             continue
-        grid = neighbors.of_spacing(_with_halo(slabs, part.points, slab, rows))
+        grid = neighbors.of_spacing(_with_halo(slabs, part.points, slab))
         own = np.flatnonzero(grid.order < rows.stop - rows.start)
         order = grid.order[own]
         for column in part:
@@ -237,9 +239,9 @@ def _inliers(slabs: _Slabs, part: _Part, neighbours: int, ratio: float) -> tuple
     return inlier, neighbors.spacing_of(np.concatenate(farthest), k)
 
 
-def _with_halo(slabs: _Slabs, points: Floats, slab: int, rows: slice) -> Floats:
+def _with_halo(slabs: _Slabs, points: Floats, slab: int) -> Floats:
     """Return the points of a slab, and after them those about it."""
-    own = points[rows]
+    own = points[slabs.rows(slab)]
     step = max(1, len(own) // SAMPLE)
     few = neighbors.spacing(neighbors.of_spacing(own[::step]))
     reach = HALO * few / np.sqrt(step) if few > 0.0 else 0.0
@@ -248,7 +250,7 @@ def _with_halo(slabs: _Slabs, points: Floats, slab: int, rows: slice) -> Floats:
     for other in range(len(slabs.ends)):
         start, stop = slabs.bounds(other)
         if other != slab and start <= high + reach and stop >= low - reach:
-            part = points[slice(int(slabs.ends[other - 1]) if other else 0, int(slabs.ends[other]))]
+            part = points[slabs.rows(other)]
             along = part[:, slabs.axis]
             beside.append(part[(along >= low - reach) & (along <= high + reach)])
     return np.concatenate(beside)

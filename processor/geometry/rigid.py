@@ -32,6 +32,15 @@ def with_origin(T: Floats, origin: Floats) -> Floats:
     return transform(T[:3, :3], T[:3, 3] - T[:3, :3] @ origin)
 
 
+def between_origins(T: Floats, source: Floats, target: Floats) -> Floats:
+    """T (4, 4) for coordinates less an origin ``source`` (3,), to such less an origin ``target`` (3,).
+
+    Large offsets are subtracted from each other first: added to the points, either would cost them digits.
+    """
+    R = T[:3, :3]
+    return transform(R, R @ source + (T[:3, 3] - target))
+
+
 def rotation_angle(R: Floats) -> float:
     """Angle of a rotation (3, 3) in rad, accurate near 0 and near pi."""
     sine = 0.5 * np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])

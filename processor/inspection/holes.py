@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from processor import scene_cloud
 from processor.adjustment import scanner_class, thermal
+from processor.adjustment.groups import joined_numbers
 from processor.geometry import rigid
 from processor.inspection import bore_fit, characteristic
 from processor.inspection.bore_fit import BorePoints, Fitted
@@ -56,8 +57,7 @@ def cloud_of(scene: Scene, T: Floats, stitched: Any, origin: Floats) -> Cloud:
     """Return all points of a scene in the design's frame less ``origin``, by a pose (4, 4) of the scans as merged."""
     placed = scene_cloud.stitched(scene, stitched)
     cloud = scene_cloud.merged(placed, with_scanner=True)
-    # The large offsets are subtracted from each other first: added to the points, either would cost them digits.
-    points = cloud.points @ T[:3, :3].T + (T[:3, :3] @ cloud.origin + T[:3, 3] - origin)
+    points = rigid.apply(rigid.between_origins(T, cloud.origin, origin), cloud.points)
     source = _views(placed.scans)
     sources = int(source.max(initial=0)) + 1
     if cloud.scanner is None:
@@ -69,14 +69,14 @@ def cloud_of(scene: Scene, T: Floats, stitched: Any, origin: Floats) -> Cloud:
 
 def _views(scans: Sequence[Scan]) -> Ints:
     """Return the number (n,) of the view of each point: a scan, or a station of it; points of no station are one."""
-    numbers, count = [np.empty(0, np.int64)], 0
-    for scan in scans:
-        number = np.zeros(len(scan.points), np.int64)
-        if len(scan.point_station) and not scan.position.size:
-            number = np.unique(scan.point_station, return_inverse=True)[1].reshape(-1).astype(np.int64)
-        numbers.append(count + number)
-        count += int(number.max(initial=-1)) + 1
-    return np.concatenate(numbers)
+    return joined_numbers(
+        [
+            scan.point_station
+            if len(scan.point_station) and not scan.position.size
+            else np.zeros(len(scan.points), np.int64)
+            for scan in scans
+        ]
+    )
 
 
 def groups(holes: list[Hole], axes: list[Floats]) -> Iterator[Group]:

@@ -243,7 +243,7 @@ def _points_on(label, number):
     return int(np.isin(label.surface, rows).sum())
 
 
-# --- what is not found, and is said ---------------------------------------------------------------------------------
+# --- what is not found, with a remark ---------------------------------------------------------------------------------
 
 
 def test_points_without_intensity_cost_no_target():

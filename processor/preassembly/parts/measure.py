@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import variance_components
+from processor.adjustment.groups import joined_numbers
 from processor.geometry import box_girder, icp, rigid, surface_registration
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.geometry.neighbors import by_cell, thinned
@@ -274,7 +275,7 @@ def _reasons(
 def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Sequence[Floats]) -> RegisteredPart:
     """Join the points of the scans used, on the design; ``joints`` are the key points (8, 3) of the part's joints."""
     points = np.vstack([rigid.apply(scan.registration.T_design_scan, scan.points) for scan in used])
-    station = _station_numbers([scan.station for scan in used])
+    station = joined_numbers([scan.station for scan in used])
     return RegisteredPart(
         points=points,
         station=station,
@@ -341,16 +342,6 @@ def _between_stations(points: Floats, station: Ints, shape: attitude.Surface) ->
     facing = icp.facing(normals, shape.axes)
     cell = surface_registration.cells(points[near] @ shape.axes, facing, normals @ shape.axes)
     return variance_components.between_stations(residual[near], station[near], cell)
-
-
-def _station_numbers(by_scan: Sequence[Ints]) -> Ints:
-    """Return station numbers (n,) for the joined points of all scans, unique over the scans."""
-    numbers, before = [], 0
-    for station in by_scan:
-        number = np.unique(station, return_inverse=True)[1].reshape(-1).astype(np.int64)
-        numbers.append(number + before)
-        before += int(number.max(initial=-1)) + 1
-    return np.concatenate(numbers)
 
 
 def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _PlacedScan:

@@ -76,9 +76,7 @@ def live_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
 def _in_project(scan: Scan, T: Floats, origin: Floats) -> Floats:
     """Return points (n, 3) of a scan, at most MOST_SEARCHED, in the project's frame less ``origin``."""
     points = scan.points[:: max(1, -(-len(scan.points) // MOST_SEARCHED))]
-    shift = T[:3, :3] @ scan.origin + (T[:3, 3] - origin)
-    transformed: Floats = points[np.isfinite(points).all(axis=1)] @ T[:3, :3].T + shift
-    return transformed
+    return rigid.apply(rigid.between_origins(T, scan.origin, origin), points[np.isfinite(points).all(axis=1)])
 
 
 def _distances(points: Floats, tree: cKDTree, other_trees: Sequence[cKDTree], scanner: Floats) -> Floats:

@@ -68,10 +68,8 @@ class SceneSource:
     def chunks(self) -> Iterator[Chunk]:
         """Pass over all points."""
         for number, (scan, scanner) in enumerate(zip(self.scans, self.scanner_of, strict=True)):
-            T = scan.pose
-            R = T[:3, :3]
-            # offset less offset first: adding either to the points would lose digits
-            shift = R @ scan.origin + (T[:3, 3] - self.origin)
+            T = rigid.between_origins(scan.pose, scan.origin, self.origin)
+            R, shift = T[:3, :3], T[:3, 3]
             identity = np.array_equal(R, np.eye(3)) and not shift.any()
             for points, named in self.points.read(number, self.chunk_size):
                 known = scanner == UNKNOWN_STATION and len(named) > 0 and len(self.scanners) > 0
