@@ -135,15 +135,14 @@ def test_edges_that_a_filter_removed_are_not_missing():
     assert run(cloud_of(BOXES, 9, cut=cut))[0] == []
 
 
-@pytest.mark.parametrize(("sides", "kinds"), [(1, {"pit"}), (2, {"bulge", "dent"})])
+@pytest.mark.parametrize(("sides", "kinds"), [(1, ["pit"]), (2, ["bulge"])])
 @pytest.mark.parametrize("radius", [28.0, 55.0])
 def test_a_pit_is_on_one_side_of_a_plate_and_a_dent_on_both_whatever_their_size(sides, kinds, radius):
     """By their size alone, 56 and 110 mm on 14 mm of steel, the small one is a pit and the large one a dent.
 
-    A plate that was pushed is one defect, a dent of one side or a bulge of the other.
+    A plate that was pushed is one defect: here a bulge of the side of which more was seen.
     """
-    (kind,) = run(cloud_of(BOXES, 10, press=(radius, sides)))[0]
-    assert kind in kinds
+    assert run(cloud_of(BOXES, 10, press=(radius, sides)))[0] == kinds
 
 
 def test_a_corner_in_the_shadow_of_something_is_not_missing():
