@@ -138,12 +138,16 @@ def significant(
         for shape in candidates:
             rows = cells_of_shape(surface, field, fit, shape)
             points, outward = with_corners(surface, rows)
-            registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
-            value = shape.values(fit.frame, points, outward)
+            registration = field.stations_sd(rows)
+            value = own = shape.values(fit.frame, points, outward)
+            if alignment.fitted or shape.kind == shape_models.RIGID:
+                registration = np.hypot(alignment.sd(points, outward), registration)
+            else:  # the error of a pose that was not fitted to the design may be large: it moves, it does not deform
+                own = value - _rigid_part(fit, shape).values(fit.frame, points, outward)
             noise = shape.sd(fit.frame, points, outward) * inflation
             sd = np.sqrt(noise**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration**2)
             top = int(np.argmax(np.abs(value)))
-            z = deviate_of_one(float((np.abs(value) / sd).max()), len(shape.factors))
+            z = deviate_of_one(float((np.abs(own) / sd).max()), len(shape.factors))
             if z > threshold:
                 judged = SignificantShape(
                     shape=shape,
@@ -155,6 +159,30 @@ def significant(
                 )
                 chosen.setdefault(fit.component, []).append(judged)
     return chosen
+
+
+def _rigid_part(fit: ComponentShape, shape: shape_models.Shape) -> shape_models.Shape:
+    """Return the rigid motion of the component that is nearest to a shape where blocks were seen."""
+    value = shape.values(fit.frame, fit.blocks.points, fit.blocks.outward)
+    return shape_models.rigid_motion(dataclasses.replace(fit.blocks, mean=value), fit.frame, [])
+
+
+def unproven_motions(
+    shapes: list[ComponentShape], significant: dict[int, list[SignificantShape]]
+) -> dict[int, list[shape_models.Shape]]:
+    """Return the rigid motion, by component, of those that fit one which is not significant.
+
+    It may be an error of the registration. A search that does not leave it out finds the whole component in place of
+    what deviates from the rest of it.
+    """
+    motions: dict[int, list[shape_models.Shape]] = {}
+    for fit in shapes:
+        proven = [judged.shape for judged in significant.get(fit.component, ())]
+        kinds = [shape.kind for shape in proven]
+        if shape_models.RIGID not in kinds and any(shape.kind == shape_models.RIGID for shape in fit.fitted.shapes):
+            blocks = dataclasses.replace(fit.blocks, weight=fit.fitted.weight)
+            motions[fit.component] = [shape_models.rigid_motion(blocks, fit.frame, proven)]
+    return motions
 
 
 def deviate_of_one(z: float, factors: int) -> float:
@@ -200,6 +228,7 @@ def front_of(surface: DesignSurface, component: int, field: Field) -> Ints:
         int(k)
         for k in candidates
         if charts.kind[k] == charts.kind[main]
+        and charts.way[k] == charts.way[main]
         and charts.axes[k, 2] @ out > FLUSH_COS
         and abs((charts.origin[k] - at) @ out) < FLUSH_MM
     ]

@@ -168,6 +168,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     significant = component_shapes.significant(shapes, surface, field, aligned, levels, alarms_per_mm2)
     chosen = {number: [judged.shape for judged in of_one] for number, of_one in significant.items()}
     shape_values = component_shapes.values(surface, shapes, chosen)
+    shape_values += component_shapes.values(surface, shapes, component_shapes.unproven_motions(shapes, significant))
     residuals = field.minus(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
     finding = scan_statistic.search(residuals, surface, levels)
     expected = expected_points.expected(scene, registered.T_design_project, pairs, surface, observed.stations)

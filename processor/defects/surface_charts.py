@@ -37,15 +37,17 @@ PER_SIDE = 4  # samples of a cell along each axis, for the share that its face c
 class Charts:
     """Maps of faces to planes: u, v of a point are along rows 0 and 1 of ``axes`` from ``origin``.
 
-    On a cylinder u runs along its axis, v around it, and ``origin`` lies on the axis. The cells of a chart, a grid of
-    ``shape``, are rows ``first`` onward of all cells, u slowest.
+    On a cylinder u runs along its axis, v around it, and ``origin`` lies on the axis; ``way`` is -1 where its steel lies
+    outside (bores, undersides of curved plates). The cells of a chart, a grid of ``shape``, are rows ``first`` onward of
+    all cells, u slowest.
     """
 
     kind: Ints  # (c,)
     component: Ints
     origin: Floats  # (c, 3)
-    axes: Floats  # (c, 3, 3) rows u, v, outward normal (of a cylinder: where v = 0)
+    axes: Floats  # (c, 3, 3) rows u, v, outward normal (of a cylinder: away from its axis, where v = 0)
     radius: Floats
+    way: Floats  # (c,) of the outward normal of a cylinder: 1 away from its axis, -1 towards it; of a plane 1
     low: Floats  # (c, 2) of u, v at the corner of the first cell
     shape: Ints  # (c, 2)
     first: Ints
@@ -273,7 +275,8 @@ def _charts(vertices: Floats, faces: Ints, normals: Floats, chart_of: Ints, comp
     """Return the charts without cells."""
     count = int(chart_of.max(initial=-1)) + 1
     kind, component_of = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    origin, axes, radius = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.full(count, np.inf)
+    origin, axes = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    radius, way = np.full(count, np.inf), np.ones(count)
     order = np.argsort(chart_of, kind="stable")
     for chart, rows in enumerate(np.split(order, np.flatnonzero(np.diff(chart_of[order])) + 1)):
         corners = vertices[faces[rows]]
@@ -287,6 +290,8 @@ def _charts(vertices: Floats, faces: Ints, normals: Floats, chart_of: Ints, comp
             origin[chart], along, radius[chart] = cylinder
             side = normals[rows[0]] - (normals[rows[0]] @ along) * along
             out = side / np.linalg.norm(side)
+            away = np.einsum("ni,ni->n", corners.mean(axis=1) - origin[chart], normals[rows])
+            way[chart] = 1.0 if size @ away > 0.0 else -1.0
         else:
             origin[chart] = corners.reshape(-1, 3).mean(axis=0)
             out = normal / np.linalg.norm(normal)
@@ -298,6 +303,7 @@ def _charts(vertices: Floats, faces: Ints, normals: Floats, chart_of: Ints, comp
         origin=origin,
         axes=axes,
         radius=np.where(kind == PLANE, 1.0, radius),
+        way=way,
         low=np.zeros((count, 2)),
         shape=np.ones((count, 2), np.int64),
         first=np.zeros(count, np.int64),
@@ -353,8 +359,9 @@ def _cell_places(charts: Charts) -> tuple[Floats, Floats]:
         axes = charts.axes[chart]
         if charts.kind[chart] == CYLINDER:
             turn = v / charts.radius[chart]
-            out = np.outer(np.sin(turn), axes[1]) + np.outer(np.cos(turn), axes[2])
-            centres.append(charts.origin[chart] + np.outer(u, axes[0]) + charts.radius[chart] * out)
+            away = np.outer(np.sin(turn), axes[1]) + np.outer(np.cos(turn), axes[2])
+            centres.append(charts.origin[chart] + np.outer(u, axes[0]) + charts.radius[chart] * away)
+            out = charts.way[chart] * away
         else:
             out = np.broadcast_to(axes[2], (len(u), 3))
             centres.append(charts.origin[chart] + np.outer(u, axes[0]) + np.outer(v, axes[1]))
