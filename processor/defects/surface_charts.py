@@ -37,9 +37,9 @@ PER_SIDE = 4  # samples of a cell along each axis, for the share that its face c
 class Charts:
     """Maps of faces to planes: u, v of a point are along rows 0 and 1 of ``axes`` from ``origin``.
 
-    On a cylinder u runs along its axis, v around it, and ``origin`` lies on the axis; ``way`` is -1 where its steel lies
-    outside (bores, undersides of curved plates). The cells of a chart, a grid of ``shape``, are rows ``first`` onward of
-    all cells, u slowest.
+    On a cylinder u runs along its axis, v around it, and ``origin`` lies on the axis; ``way`` is -1 where the steel is
+    outside of it (bores, undersides of curved plates). The cells of a chart, a grid of ``shape``, are rows ``first``
+    onward of all cells, u slowest.
     """
 
     kind: Ints  # (c,)

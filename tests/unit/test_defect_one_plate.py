@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processor.defects import step as defects_step
-from tests.unit.test_defect_search import SIDE, bump, scene_of
+from tests.support.plate_rows import SIDE, bump, scene_of
 
 DENT = bump(4.0, 90.0, (0.5 * SIDE, 0.5 * SIDE))
 
