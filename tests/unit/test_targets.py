@@ -107,7 +107,8 @@ DECOYS = {
 
 @pytest.mark.parametrize("name", DECOYS)
 def test_what_looks_alike_is_no_target(name):
-    assert checkerboard.find(*painted(DECOYS[name]), SIDE) == []
+    half = 280.0 if name == "chess" else 400.0  # its crossings are tried one by one: there are fifty of them
+    assert checkerboard.find(*painted(DECOYS[name], half=half), SIDE) == []
 
 
 def test_the_same_wall_with_a_target():
