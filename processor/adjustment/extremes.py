@@ -70,7 +70,7 @@ def _errors(covariance: Floats, count: int, seed: int) -> Floats:
     return errors
 
 
-@lru_cache(maxsize=4)  # every quantity of a part has as many values: drawing them again takes half of the time
+@lru_cache(maxsize=4)  # every quantity of a part has as many values: drawing them again takes a third of the time
 def _standard_normal(count: int, n: int, seed: int) -> Floats:
     drawn: Floats = np.random.default_rng(seed).standard_normal((count, n))
     drawn.flags.writeable = False
