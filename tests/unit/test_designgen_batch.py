@@ -69,7 +69,7 @@ def run_by_itself(*arguments, code=0, command=MAKE):
 def processes_stay():
     """Processes that make scenes stay for the runs of other tests: each takes a second to load what it needs."""
     close = processes.POOL.close
-    with mock.patch.object(processes.POOL, "close", lambda: None):
+    with mock.patch.object(processes.POOL, "close"):
         yield
     close()
 
