@@ -19,7 +19,8 @@ from processor.cli import help_text, main
 from processor.evaluation.evaluate import evaluate
 from processor.language.messages import label
 from processor.limits import standards
-from processor.model import FrameDesign, FrameTruth, InputError, Scan, Scene, Truth, UsageError, Verdict
+from processor.model import FrameDesign, FrameTruth, InputError, Scan, Scene, Status, Truth, UsageError, Verdict
+from processor.preassembly.parts import attitude
 from processor.report import terminal, write_results
 from processor.space_frame.result import Result as FrameResult
 from processor.store import store
@@ -99,10 +100,11 @@ def test_one_scan_file_to_results(sphere_run):
     assert store.problems(folder / "out" / "results.h5") == []
 
 
-def test_the_same_bytes_in_give_the_same_bytes_out(sphere_run, tmp_path):
+def test_the_same_bytes_in_give_the_same_bytes_out(called, sphere_run, tmp_path):
+    """In another process, another folder and with a relative path."""
     folder, _ = sphere_run
     (tmp_path / "target.xyz").write_bytes((folder / "target.xyz").read_bytes())
-    assert processor("run", "target.xyz", "-o", "again", "--steps", "spheres", cwd=tmp_path).returncode == 0
+    assert called("run", "target.xyz", "-o", "again", "--steps", "spheres", cwd=tmp_path).returncode == 0
     for made in sorted((folder / "out").iterdir()):
         assert made.read_bytes() == (tmp_path / "again" / made.name).read_bytes(), made.name
     assert str(tmp_path) not in (tmp_path / "again" / "results.json").read_text("utf-8")
@@ -402,8 +404,13 @@ def test_names_from_outside_are_shown_as_text(frame, tmp_path):
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
 
 
-def test_a_bridge_through_the_pipeline(tmp_path):
+def test_a_bridge_through_the_pipeline(tmp_path, monkeypatch):
     scene, truth = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=2)
+    # The search for attitudes takes most of the time; tests/unit/test_diagnostics.py has it in a run of such a bridge.
+    known = dict(zip(truth.arch.names, truth.arch.T_bridge_scan, strict=True))
+    monkeypatch.setattr(
+        attitude, "find", lambda _, part: attitude.Attitude(known[part.name], known[part.name], Status.OK)
+    )
     store.write_scene(tmp_path / "b.h5", scene, truth, {})
     without_bands = {"preassemble": {"repetitions": 0}}
     found, report = run_in_process(tmp_path / "b.h5", tmp_path / "out", ("design-aided", "corner"), without_bands)
