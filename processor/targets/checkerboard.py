@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -291,13 +291,29 @@ def _inside(at: Floats, centre_turn: Floats, reach: float) -> Bools:
     return inside
 
 
+def _model(at: Floats, x: Floats) -> Floats:
+    """Return the pattern's intensities (m,) at (m, 2) for centre, turn, mean, half step and width ``x`` (6,)."""
+    u, v = _lines(at, x)
+    return np.asarray(x[3] + x[4] * erf(u / x[5]) * erf(v / x[5]))
+
+
+def _slopes(at: Floats, x: Floats) -> Floats:
+    """Return the derivatives (m, 6) of the model: finite differences take the time of six more models."""
+    u, v = _lines(at, x)
+    c, s, half, width = np.cos(x[2]), np.sin(x[2]), x[4], x[5]
+    along_u, along_v = erf(u / width), erf(v / width)
+    slope = 2.0 / (np.sqrt(np.pi) * width)
+    by_u = half * slope * np.exp(-((u / width) ** 2)) * along_v
+    by_v = half * slope * np.exp(-((v / width) ** 2)) * along_u
+    of_pose = (s * by_v - c * by_u, -s * by_u - c * by_v, v * by_u - u * by_v)
+    return np.stack([*of_pose, np.ones(len(at)), along_u * along_v, -(u * by_u + v * by_v) / width], axis=1)
+
+
 def _least_squares(at: Floats, bright: Floats, start: Floats, spacing: float, side: float) -> Any:
     """Fit centre, turn, mean, half step and width of the pattern to the intensities ``bright`` (m,) at (m, 2)."""
 
     def residuals(x: Floats) -> Floats:
-        u, v = _lines(at, x)
-        found: Floats = x[3] + x[4] * erf(u / x[5]) * erf(v / x[5]) - bright
-        return found
+        return _model(at, x) - bright
 
     u, v = _lines(at, start)
     step = float(np.mean(np.sign(u * v) * (bright - bright.mean())))
@@ -306,7 +322,8 @@ def _least_squares(at: Floats, bright: Floats, start: Floats, spacing: float, si
     low = np.array([*(start[:2] - 0.2 * side), start[2] - 0.3, -np.inf, -np.inf, least])
     high = np.array([*(start[:2] + 0.2 * side), start[2] + 0.3, np.inf, np.inf, 0.2 * side])
     scale = np.array([spacing, spacing, 0.05, abs(step) + 1e-12, abs(step) + 1e-12, spacing])
-    return least_squares(residuals, np.clip(begin, low, high), bounds=(low, high), x_scale=scale, xtol=1e-10)
+    begin = np.clip(begin, low, high)
+    return least_squares(residuals, begin, partial(_slopes, at), bounds=(low, high), x_scale=scale, xtol=1e-10)
 
 
 def _has_fields(u: Floats, v: Floats, bright: Floats, reach: float, spacing: float) -> bool:

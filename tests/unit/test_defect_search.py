@@ -24,6 +24,7 @@ from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
 from processor.report.defects import figures, section
 from processor.results.fields_to_json import as_object
 from processor.store.json_values import json_ready
+from tests.support.at_design import AT_DESIGN
 
 SIDE, THICK, GAP = 600.0, 12.0, 300.0
 BOX_FACES = np.array(
@@ -85,6 +86,11 @@ def bump(depth, radius, at):
     return lambda x, z: depth * np.maximum(1.0 - ((x - at[0]) ** 2 + (z - at[1]) ** 2) / radius**2, 0.0) ** 2
 
 
+def run(scene, **params):
+    """The defects of a scene that lies at its design, see :mod:`tests.support.at_design`."""
+    return defects_step.run(scene, defects_step.Params(**params), AT_DESIGN)
+
+
 def found(result):
     return list(zip(result.defects.defect_class, result.defects.component, strict=True))
 
@@ -104,7 +110,7 @@ def test_an_undamaged_structure_has_no_defect(seed):
 
 def test_what_chance_brings_is_called_doubtful():
     """Asked for 5000 false alarms on 100 m2 there are some on 1 m2, at most as many, and none passes for sure."""
-    result = defects_step.run(scene_of(3, flat), defects_step.Params(false_alarms=5000.0))
+    result = run(scene_of(3, flat), false_alarms=5000.0)
     allowed = 5000.0 * result.examined_mm2 / 1e8
     assert 0 < len(result.defects) < allowed
     assert result.defects.doubtful.all()
@@ -133,7 +139,7 @@ def from_behind(scene, inward, count, seed):
 def test_a_plate_dented_through_is_one_defect_though_both_sides_show_it(depth):
     pushed, pit = bump(depth, 90.0, (250.0, 300.0)), bump(3.0, 40.0, (1250.0, 350.0))
     scene = scene_of(3, lambda x, z: pushed(x, z) + pit(x, z))
-    result = defects_step.run(from_behind(scene, pushed, 3, 9), defects_step.Params())
+    result = run(from_behind(scene, pushed, 3, 9))
     assert sorted(name for _, name in found(result)) == ["component-1", "component-2"]
     kind, _ = next(row for row in found(result) if row[1] == "component-1")
     assert kind in ("dent", "bulge")
@@ -147,7 +153,7 @@ def test_a_dent_a_bulge_and_a_pit_are_measured():
         bump(4.0, 16.0, (2100.0, 200.0)),
     )
     scene = scene_of(3, lambda x, z: dent(x, z) + bulge(x, z) + pit(x, z), spacing=3.0)
-    result = defects_step.run(scene, defects_step.Params())
+    result = run(scene)
     assert sorted(found(result)) == [("bulge", "component-2"), ("dent", "component-1"), ("pit", "component-3")]
     assert not result.defects.doubtful.any()
     for kind, depth, radius, at in (("dent", 3.0, 90.0, (250.0, 300.0)), ("bulge", -2.0, 80.0, (1250.0, 350.0)),
@@ -175,7 +181,7 @@ def test_missing_corners_edges_and_holes_are_named():
         hole = np.hypot(x - 2100.0, z - 300.0) < 50.0
         return corner | edge | hole
 
-    result = defects_step.run(scene_of(3, flat, missing), defects_step.Params())
+    result = run(scene_of(3, flat, missing))
     assert sorted(found(result)) == [
         ("edge-loss", "component-2"), ("missing-part", "component-1"), ("missing-part", "component-3"),
     ]  # fmt: skip
@@ -197,7 +203,7 @@ def test_a_hole_seen_from_both_sides_is_one_missing_part_without_a_picture():
     half_turn[:3, 3] = [3 * (SIDE + GAP) - GAP, THICK, 0.0]
     behind = scene_of(3, flat, lambda x, z: missing(3 * (SIDE + GAP) - GAP - x, z), seed=2)
     backs = (dataclasses.replace(s, name=f"{s.name} behind", T_project_scan=half_turn) for s in behind.scans)
-    result = defects_step.run(dataclasses.replace(scene, scans=(*scene.scans, *backs)), defects_step.Params())
+    result = run(dataclasses.replace(scene, scans=(*scene.scans, *backs)))
     assert found(result) == [("missing-part", "component-1")]
     assert result.pictures[0].deviation.size == 0
     drawn = figures.draw(result)
@@ -209,7 +215,7 @@ def test_what_something_hides_is_not_missing():
     """A ball in the way of both stations: no point of the surface in its shadow."""
     clutter = (1200.0, -250.0, 300.0, 90.0)
     scene = scene_of(3, flat, clutter=clutter)
-    result = defects_step.run(scene, defects_step.Params())
+    result = run(scene)
     assert found(result) == []
     assert result.expected_mm2 < 3 * SIDE**2 - 8_000.0
     # The same points gone without anything in the way are.
@@ -230,9 +236,7 @@ def test_what_something_hides_is_not_missing():
 )
 def test_shapes_of_whole_components(kind, inward, depth):
     """On the second of five plates; the others tell where the whole is."""
-    result = defects_step.run(
-        scene_of(5, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)), defects_step.Params()
-    )
+    result = run(scene_of(5, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)))
     assert found(result) == [(kind, "component-2")]
     assert abs(result.defects.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
     curve = result.defects.deflection[0]
@@ -249,16 +253,16 @@ def test_stations_that_are_off_are_no_defect():
     for scan, off in zip(scene.scans, (0.5, -0.5), strict=True):
         ray = scan.points - scan.position
         scans.append(dataclasses.replace(scan, points=scan.points + off * ray / np.linalg.norm(ray, axis=1)[:, None]))
-    result = defects_step.run(dataclasses.replace(scene, scans=tuple(scans)), defects_step.Params())
+    result = run(dataclasses.replace(scene, scans=tuple(scans)))
     assert found(result) == []
 
 
 def test_the_last_movement_is_added_once(monkeypatch):
     """The whole is 1.5 mm off; an alignment that never settles gives the same pose as one that does."""
     scene = scene_of(4, lambda x, z: np.full(len(x), 1.5))
-    settled = defects_step.run(scene, defects_step.Params())
+    settled = run(scene)
     monkeypatch.setattr(detect, "AGAIN_MM", 0.0)
-    again = defects_step.run(scene, defects_step.Params())
+    again = run(scene)
     assert settled.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
     np.testing.assert_allclose(again.T_design_project[1], settled.T_design_project[1], atol=0.01)  # plates fix y
     assert again.covariance.shape == (6, 6)
@@ -284,12 +288,16 @@ def test_no_defect_is_sure_where_another_attitude_fits_as_well():
     assert "no defects found and" in str(section.REPORT.summary(result)[0])
 
 
-def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
-    dent = bump(3.0, 90.0, (250.0, 300.0))
-    scene = scene_of(3, dent)
-    first = defects_step.run(scene, defects_step.Params())
+@pytest.fixture(scope="module")
+def dented():
+    scene = scene_of(3, bump(3.0, 90.0, (250.0, 300.0)))
+    return scene, run(scene)
+
+
+def test_the_order_of_points_and_the_place_in_the_world_do_not_matter(dented):
+    scene, first = dented
     mixed = [dataclasses.replace(s, points=np.random.default_rng(5).permutation(s.points)) for s in scene.scans]
-    again = defects_step.run(dataclasses.replace(scene, scans=tuple(mixed)), defects_step.Params())
+    again = run(dataclasses.replace(scene, scans=tuple(mixed)))
     assert found(again) == found(first)
     np.testing.assert_allclose(again.defects.depth_max, first.defects.depth_max, atol=1e-6)
     np.testing.assert_allclose(again.defects.centre, first.defects.centre, atol=1e-6)
@@ -318,9 +326,8 @@ def test_the_papers_chain_finds_a_dent_and_is_seeded():
     np.testing.assert_array_equal(again.defects.depth_max, result.defects.depth_max)
 
 
-def test_what_is_written():
-    result = defects_step.run(scene_of(3, bump(3.0, 90.0, (250.0, 300.0))), defects_step.Params())
-    written = json_ready(as_object(result))
+def test_what_is_written(dented):
+    written = json_ready(as_object(dented[1]))
     (one,) = written["defects"]
     keys = {"id", "class", "confidence", "component", "centre", "area_mm2", "depth_max", "depth_ci95", "volume_mm3"}
     assert keys <= set(one)
@@ -408,7 +415,7 @@ def test_what_stations_leave_undetermined_is_in_their_covariance():
 
 def test_facets_are_the_nearest_that_a_scanner_can_see():
     vertices, faces = box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0))
-    normals = trimesh.Trimesh(vertices, faces, process=False).face_normals
+    normals = np.array(trimesh.Trimesh(vertices, faces, process=False).face_normals)  # writeable, as the step has them
     rng = np.random.default_rng(3)
     points = rng.uniform([-30.0, -30.0, -30.0], [330.0, 42.0, 230.0], (2000, 3))
     grid = mesh_distance.facet_grid(vertices, faces, normals, 60.0)
@@ -551,7 +558,7 @@ def plates_on_a_wall(gone, gap=0.0):
         "wall", "structure", (Scan("S1", points, position=station, T_project_scan=np.eye(4)),),
         structure=StructureDesign("wall", vertices, faces),
     )  # fmt: skip
-    return defects_step.run(scene, defects_step.Params(align=False, registration_error_mm=0.01))
+    return run(scene, align=False, registration_error_mm=0.01)
 
 
 @pytest.mark.parametrize("gap", [-0.1, 0.0, 0.1])
@@ -609,7 +616,7 @@ def girder_with_brackets(gone):
 
 def test_a_part_that_is_gone_is_missing_where_scanners_see_through_it():
     params = defects_step.Params(align=False, registration_error_mm=0.01)
-    whole = defects_step.run(girder_with_brackets(gone=False), params)
+    whole = defects_step.run(girder_with_brackets(gone=False), params, AT_DESIGN)
     assert found(whole) == []
     result = defects_step.run(girder_with_brackets(gone=True), params)
     assert result.defects.defect_class == ("missing-part",)

@@ -325,7 +325,10 @@ def test_two_scans_of_one_part_make_one(monkeypatch):
 
     def placed_once(scan, *rest):
         if scan.name not in placed:
-            placed[scan.name] = place(scan, *rest)
+            with monkeypatch.context() as patch:
+                if scan.name == "right":  # which part half a scan is of is searched for on its mirror image
+                    patch.setattr(assignment, "rather", lambda *_: None)
+                placed[scan.name] = place(scan, *rest)
         return placed[scan.name]
 
     monkeypatch.setattr(measure, "_place", placed_once)

@@ -452,13 +452,13 @@ def test_grazing_rays_stay_near_their_net():
     builder.patch(0, Patch("wavy", at, knots, knots))
     T = standing(0.0, 0.0, 6.0)
     returns = scanning_returns.scan_station(
-        builder.to_surfaces(), T, QUIET, scanner.Params(step_mrad=0.1), 0, "S1", keep_hits=True
+        builder.to_surfaces(), T, QUIET, scanner.Params(step_mrad=0.16), 0, "S1", keep_hits=True
     ).returns
     assert asked[0] < 1.0 + 4.0 / 11.0 + 1e-3
     x, y, z = in_scene(T, returns.hits).T
     p, q = x / 3000.0 + 0.5, (y - 2000.0) / 3000.0
     np.testing.assert_allclose(z, 3.0 * np.sin(9.0 * p) + 3.0 * np.cos(9.0 * q), atol=1e-5)
-    assert len(x) > 50_000
+    assert len(x) > 20_000
 
 
 def test_what_is_too_near_hides_what_is_behind_it():

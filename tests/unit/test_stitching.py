@@ -38,6 +38,14 @@ def room():
     return T, scans, stitching_step.run(Scene("room", "structure", scans), stitching_step.Params())
 
 
+@pytest.fixture(scope="module")
+def three():
+    """The least that closes a loop: of four scans there are twice as many pairs to search."""
+    T, scans = four()
+    scans = scans[:3]
+    return T[:3], scans, stitching_step.run(Scene("room", "structure", scans), stitching_step.Params())
+
+
 def test_four_scans_of_a_room_are_registered(room):
     T, _, result = room
     assert result.status == "ok"
@@ -66,8 +74,8 @@ def test_covariance_is_that_of_a_left_perturbation_in_the_project_frame(room):
     assert not scans.covariance[0].any()
 
 
-def test_result_is_independent_of_the_frames_of_the_scans(room):
-    T, scans, first = room
+def test_result_is_independent_of_the_frames_of_the_scans(three):
+    T, scans, first = three
     rng = np.random.default_rng(5)
     turned, back = [], []
     for scan in scans:
@@ -88,8 +96,8 @@ def test_result_is_independent_of_the_frames_of_the_scans(room):
     assert turn.max() < 0.05
 
 
-def test_result_is_independent_of_the_order_of_points(room):
-    _, scans, first = room
+def test_result_is_independent_of_the_order_of_points(three):
+    _, scans, first = three
     rng = np.random.default_rng(1)
     mixed = []
     for scan in scans:
@@ -141,7 +149,7 @@ def test_scans_of_different_places_are_never_called_ok():
 @pytest.mark.parametrize("reference", [pytest.param("S1", marks=pytest.mark.slow), "X"])
 def test_a_scan_of_another_place_is_named_first(reference):
     """Also where it is the reference: the others agree with each other."""
-    _, scans = four(step_mrad=20.0)
+    scans = four(step_mrad=20.0)[1][:3]
     room = (np.array([-2000.0, -9000.0, 0.0]), np.array([2500.0, 8000.0, 5200.0]))
     things = ((np.array([-2000.0, 3000.0, 0.0]), np.array([-500.0, 4000.0, 2600.0])),)
     other = stitch_clouds.scan(
@@ -155,17 +163,17 @@ def test_a_scan_of_another_place_is_named_first(reference):
 
 def test_scans_without_a_grid_are_registered():
     T, scans = four(grid=False)
-    result = stitching_step.run(Scene("room", "structure", scans), stitching_step.Params(reference="S2"))
+    result = stitching_step.run(Scene("room", "structure", scans[:3]), stitching_step.Params(reference="S2"))
     assert result.reference == "S2"
     base = np.linalg.inv(T[1])
-    for pose, true in zip(result.scans.T_project_scan, T, strict=True):
+    for pose, true in zip(result.scans.T_project_scan, T[:3], strict=True):
         np.testing.assert_allclose(pose[:3, 3], (base @ true)[:3, 3], atol=0.3)
 
 
 def test_a_given_pose_of_the_reference_defines_the_project_frame():
     T, scans = four(step_mrad=20.0)
     given = stitch_clouds.pose([5e5, 4e6, 300.0], 33.0)
-    scans = (dataclasses.replace(scans[0], T_project_scan=given), *scans[1:])
+    scans = (dataclasses.replace(scans[0], T_project_scan=given), *scans[1:3])
     scene = Scene("room", "structure", scans)
     assert stitching_step.applies(scene)
     result = stitching_step.run(scene, stitching_step.Params())
@@ -222,9 +230,9 @@ def test_intervals_cover_over_seeds():
     assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.5
 
 
-def test_a_run_writes_all_reports(room, tmp_path):
+def test_a_run_writes_all_reports(three, tmp_path):
     """results.json as specified, poses that are read back exactly, both figures, all tables."""
-    _, scans, result = room
+    _, scans, result = three
     path = tmp_path / "room.h5"
     store.write_scene(path, Scene("room", "structure", scans, units="mm", units_reason="made so"), None, {})
     scene = pipeline.read(path, None)
@@ -232,7 +240,7 @@ def test_a_run_writes_all_reports(room, tmp_path):
     write_results.write_results(tmp_path / "out", execution, ErrorReport())
     written = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["stitch"]
     assert written["reference"] == "S1"
-    assert [row["status"] for row in written["scans"]] == ["ok"] * 4
+    assert [row["status"] for row in written["scans"]] == ["ok"] * 3
     assert set(written["pairs"][0]) >= {"a", "b", "overlap", "residual", "used"}
     assert set(written["closures"][0]) >= {"loop", "mm", "mrad"}
     assert np.array(written["scans"][1]["covariance"]).shape == (6, 6)

@@ -76,7 +76,7 @@ def test_a_range_error_that_no_ray_shows_is_stated_by_the_class():
     """In a frame whose origin is not the scanner the rays are not known; the other scans' range errors are seen."""
     _, scans = four(3, step_mrad=20.0, grid=False)
     lost = dataclasses.replace(scans[1], points=scans[1].points + np.array([0.0, 0.0, 1e4]))
-    scene = Scene("room", "structure", (scans[0], lost, *scans[2:]))
+    scene = Scene("room", "structure", (scans[0], lost, scans[2]))
     result = stitching_step.run(scene, stitching_step.Params())
     stated = [why for why in result.reasons if why.code == "stitch.ranges-by-class"]
     assert [why.values for why in stated] == [{"scans": ("S2",), "sd_mm": 0.5}]
