@@ -19,12 +19,13 @@ from scipy.sparse.csgraph import connected_components
 from processor.distinct_rows import distinct
 from processor.geometry import circle, enclosure, mesh_distance
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
+from processor.geometry.neighbors import same_places
 from processor.model import Bools, DesignBodies, Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
 PIECE_COS = np.cos(np.radians(15.0))
 ROUND_SHARE = 0.02  # of the radius, the largest distance of a vertex from its cylinder
-WELD_MM = 0.01
+WELD_MM = 0.01  # vertices nearer to each other are one
 TOUCH_MM = 0.5
 MOST_BODIES = 12  # of a component
 MOST_SIDES = 60  # edges tried for the direction of a face
@@ -188,7 +189,7 @@ def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:
 def _welded(vertices: Floats, faces: Ints, body: Ints | None) -> tuple[Floats, Ints]:
     """Merge vertices at the same place, but not those of different bodies (f,)."""
     corners = faces.ravel()
-    key = np.round(vertices[corners] / WELD_MM).astype(np.int64)
+    key = same_places(vertices, WELD_MM)[corners, None]
     if body is not None:
         key = np.hstack([key, np.repeat(body, 3)[:, None]])
     places = distinct(key)

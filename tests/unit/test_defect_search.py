@@ -394,6 +394,16 @@ def test_cells_cover_what_a_design_has():
     )
 
 
+def test_vertices_at_one_place_are_one_wherever_the_place_is():
+    """Two triangles of a plate with corners that differ by rounding, on either side of half a hundredth millimetre."""
+    step = surface_charts.WELD_MM
+    at = np.array([0.5 * step - 1e-9, 300.5 * step - 1e-9, 0.0])
+    square = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [100.0, 50.0, 0.0], [0.0, 50.0, 0.0]]) + at
+    vertices = np.vstack([square[[0, 1, 2]], square[[0, 2, 3]] + 2e-9])
+    plate = surface_charts.of_mesh(vertices, np.array([[0, 1, 2], [3, 4, 5]]), 10.0)
+    assert len(plate.vertices) == 4
+
+
 def test_bodies_that_touch_are_one_component():
     web, flange = box((0.0, 0.0, 0.0), (500.0, 10.0, 300.0)), box((0.0, -60.0, 300.0), (500.0, 70.0, 316.0))
     alone = box((900.0, 0.0, 0.0), (1100.0, 10.0, 300.0))
