@@ -18,7 +18,7 @@ from processor import tiles
 from processor.deviation import assignment, station_offsets
 from processor.deviation.assignment import Aside, OnSurface
 from processor.deviation.local_translation import Movement, PartSums, Translations
-from processor.deviation.station_offsets import OnFaces
+from processor.deviation.station_offsets import OnFaces, OnPieces, Pieces
 from processor.geometry import enclosure, m3c2, mesh_distance
 from processor.geometry.mesh_distance import CurvedFacets, FacetGrid, Samples
 from processor.large_arrays import put_aside, release
@@ -142,9 +142,12 @@ def movement(
     sd = np.where(np.isfinite(moved.sd), np.maximum(moved.sd, noise), np.nan)
     scatter = np.where((about.rank > 1) & np.isfinite(sd), sd, raw)
     shifts = _Shifts(np.nan_to_num(about.vector), nearest)
-    used, last = _last(passes, shifts, scatter)
-    shared = station_offsets.shared_sd(core, last, lambda: _used(passes, shifts, used), diameter_mm)
-    return last, on_surface, shared
+    used, last, stations = _last(passes, shifts, scatter)
+
+    def on_pieces(pieces: Pieces) -> Iterator[OnPieces]:
+        return tiles.mapped(_on_pieces_of, _used(passes, shifts, used), passes.fit, Shared(pieces))
+
+    return last, on_surface, station_offsets.shared_sd(core, last, stations, on_pieces, diameter_mm)
 
 
 def _first(passes: _Passes) -> tuple[Movement, float]:
@@ -191,17 +194,21 @@ def _second_of(near: _Near, fit: _Fit, around: _Around) -> tuple[Ints, PartSums,
     return at.astype(np.int32), about, moved
 
 
-def _last(passes: _Passes, shifts: _Shifts, scatter: Floats) -> tuple[list[Aside], Movement]:
-    """Fit movements to points by the faces below their places before the movement; returns the points used, too."""
-    used, last = list[Aside](), passes.fit.value.sums()
+def _last(passes: _Passes, shifts: _Shifts, scatter: Floats) -> tuple[list[Aside], Movement, set[int]]:
+    """Fit movements to points by the faces below their places before the movement.
+
+    Returns the points used and their stations, too.
+    """
+    used, last, stations = list[Aside](), passes.fit.value.sums(), set[int]()
     near = (one._replace(nearest=at) for one, at in zip(passes.near(), shifts.nearest, strict=True))
-    for aside, part in tiles.mapped(_last_of, near, passes.fit, Shared(shifts.vector), Shared(scatter)):
+    for aside, part, seen_from in tiles.mapped(_last_of, near, passes.fit, Shared(shifts.vector), Shared(scatter)):
         used.append(aside.put())
         last.add_part(part)
-    return used, last.movement()
+        stations |= seen_from
+    return used, last.movement(), stations
 
 
-def _last_of(near: _Near, fit: _Fit, vector: Floats, scatter: Floats) -> tuple[Aside, PartSums]:
+def _last_of(near: _Near, fit: _Fit, vector: Floats, scatter: Floats) -> tuple[Aside, PartSums, set[int]]:
     """Return what :func:`_last` needs of the points of a cloud."""
     cloud, at = near.points, near.nearest
     about = scatter[at]
@@ -210,7 +217,8 @@ def _last_of(near: _Near, fit: _Fit, vector: Floats, scatter: Floats) -> tuple[A
     clear = assignment.clear(before, about) & (left <= fit.depth) & (~cloud.doubtful | (left <= RETURNS * about))
     rows = np.flatnonzero(clear)
     aside, before = Aside.of(rows, before), before.of(rows)
-    return aside, fit.part(fit.sums(), before, _distance(fit.curved, before, vector[at[rows]]))
+    part = fit.part(fit.sums(), before, _distance(fit.curved, before, vector[at[rows]]))
+    return aside, part, set(np.unique(cloud.station[rows]).tolist())
 
 
 def _distance(curved: CurvedFacets, before: OnSurface, shift: Floats) -> Floats:
@@ -219,12 +227,26 @@ def _distance(curved: CurvedFacets, before: OnSurface, shift: Floats) -> Floats:
     return distance
 
 
-def _used(passes: _Passes, shifts: _Shifts, used: Sequence[Aside]) -> Iterator[OnFaces]:
+class _Used(NamedTuple):
+    """Points (n,) of the last fit before the movement, their stations, movements (n, 3), and what was put aside."""
+
+    points: Floats
+    station: Ints
+    shift: Floats
+    aside: Aside
+
+
+def _used(passes: _Passes, shifts: _Shifts, used: Sequence[Aside]) -> Iterator[_Used]:
     """Pass over the points of the last fit."""
-    curved = passes.fit.value.curved
     for cloud, near, at, aside in zip(passes.clouds, passes.asides, shifts.nearest, used, strict=True):
         points, shift = cloud.of(near.rows[aside.rows]), shifts.vector[at[aside.rows]]
-        before = aside.seen(points.points - shift, curved)
-        facing = curved.surface.normals[before.facet]
-        yield OnFaces(before.feet, facing, _distance(curved, before, shift), points.station)
+        yield _Used(points.points - shift, points.station, shift, aside)
         release()
+
+
+def _on_pieces_of(used: _Used, fit: _Fit, pieces: Pieces) -> OnPieces:
+    """Return what :func:`station_offsets.shared_sd` needs of points of the last fit."""
+    before = used.aside.seen(used.points, fit.curved)
+    facing = fit.curved.surface.normals[before.facet]
+    distance = _distance(fit.curved, before, used.shift)
+    return station_offsets.on_pieces(OnFaces(before.feet, facing, distance, used.station), pieces)

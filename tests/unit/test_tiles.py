@@ -8,14 +8,21 @@ import pytest
 
 import processor
 from processor import tiles
+from processor.api import runs
+from processor.cli.main import commands
+from processor.compare import core_tiles
+from processor.compare.compare import Request, compare
 from processor.deviation import cloud, large_cloud
-from processor.jobs import tile_cluster
-from processor.model import InputError, UsageError
+from processor.geometry import m3c2, point_grid
+from processor.jobs import runner, tile_cluster
+from processor.model import InputError, Scan, Scene, Stations, UsageError
+from processor.space_frame.spheres import node_tiles
 from processor.store import store
 from processor.tiles import Shared
-from tests.support import tile_functions
+from tests.support import frame_clouds, tile_functions
 from tests.support.bracket_scenes import scene_of
 from tests.support.dask_cluster import cluster_in, dask_cluster  # noqa: F401
+from tests.support.m3c2_clouds import wavy
 
 TILES = [np.full(3, float(k)) for k in range(7)]
 
@@ -100,21 +107,119 @@ def small(monkeypatch):
     """Scans of a few thousand points are large, and their slabs small."""
     monkeypatch.setattr(cloud, "MOST_POINTS", 5_000)
     monkeypatch.setattr(cloud, "SAMPLE_POINTS", 4_000)
-    monkeypatch.setattr(large_cloud, "SLAB_POINTS", 3_000)
-    monkeypatch.setattr(large_cloud, "PASS_POINTS", 3_000)
+    monkeypatch.setattr(large_cloud, "SLAB_POINTS", 2_000)
+    monkeypatch.setattr(large_cloud, "PASS_POINTS", 2_000)
 
 
-def test_a_deviation_has_the_same_bytes_as_here(dask_cluster, small, tmp_path, monkeypatch):  # noqa: F811
+@pytest.fixture
+def used(monkeypatch):
+    """The names of the functions whose tiles a cluster computes."""
+    names, results = set(), tile_cluster._ClusterWorkers.results
+
+    def noted(self, function, *rest):
+        names.add(function.__name__)
+        return results(self, function, *rest)
+
+    monkeypatch.setattr(tile_cluster._ClusterWorkers, "results", noted)
+    return names
+
+
+def stored(scene, path, step, cluster):
+    """The bytes of results.h5, without the report."""
+    execution = runs.compute(scene, steps=step, cluster=cluster).execution
+    store.write_results(path, execution.runs, execution.provenance)
+    return path.read_bytes()
+
+
+def test_a_deviation_has_the_same_bytes_as_here(dask_cluster, small, used, tmp_path):  # noqa: F811
+    scene = scene_of(scans=2, count=8_000)
+    here, there = (stored(scene, tmp_path / "a.h5", "deviation", one) for one in (None, dask_cluster.address))
+    assert used == {"_near", "_first_of", "_second_of", "_last_of", "_on_pieces_of"}
+    assert here == there
+
+
+def test_spheres_have_the_same_bytes_as_here(dask_cluster, used, tmp_path, monkeypatch):  # noqa: F811
+    points, station = frame_clouds.scanned(frame_clouds.grid(3, 2), np.random.default_rng(1))
+    scan = Scan("s", points, point_station=station)
+    stations = Stations(("A", "B", "C", "D"), frame_clouds.STATIONS)
+    scene = Scene("frame", "space-frame", (scan,), stations=stations, units="mm")
+    found = []
+    for nodes, cluster in ((200, None), (3, None), (3, dask_cluster.address)):
+        monkeypatch.setattr(node_tiles, "NODES", nodes)
+        found.append(stored(scene, tmp_path / "a.h5", "spheres", cluster))
+    assert used == {"_chosen", "_fitted"}
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.slow
+def test_a_run_writes_the_same_files_as_here(dask_cluster, small, tmp_path):  # noqa: F811
     store.write_scene(tmp_path / "bracket.h5", scene_of(scans=2), None, {})
-    used = []
-    results = tile_cluster._ClusterWorkers.results
-    monkeypatch.setattr(
-        tile_cluster._ClusterWorkers,
-        "results",
-        lambda self, function, *rest: used.append(function.__name__) or results(self, function, *rest),
-    )
     for out, cluster in (("here", None), ("there", dask_cluster.address)):
         processor.run(tmp_path / "bracket.h5", tmp_path / out, steps="deviation", cluster=cluster)
-    assert {"_near", "_first_of", "_second_of", "_last_of"} <= set(used)
     for name in ("results.h5", "results.json", "deviation.csv"):
-        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes(), name
+
+
+def test_core_points_in_tiles_are_measured_as_at_once(monkeypatch):
+    """Upright and level surfaces, places far away, and places and normals that are unknown."""
+    monkeypatch.setattr(core_tiles, "CORE_POINTS", 300)
+    first, second = (np.vstack([one, one[:, [2, 0, 1]]]) for one in (wavy(4000, 1), wavy(4000, 2, 5.0)))
+    core = np.vstack([first[::4], [[1e6, 0.0, 0.0], [np.nan, 0.0, 0.0]]])
+    grids = m3c2.grid(first, 60.0), m3c2.grid(second, 60.0)
+    normals, tiled = m3c2.normals(grids[0], core, 90.0), core_tiles.normals(grids[0], core, 90.0)
+    lengths = core_tiles.Lengths(60.0, 40.0, 0.5)
+    whole = m3c2.distances(*grids, core, normals.normals, **lengths._asdict())
+    parts = core_tiles.distances(*grids, core, normals.normals, lengths)
+    assert np.isfinite(whole.lod95).sum() > 1500
+    for one, other in ((normals, tiled), (whole, parts)):
+        for name, values in vars(one).items():
+            np.testing.assert_array_equal(getattr(other, name), values)
+
+
+def test_a_part_of_a_grid_holds_the_points_about_a_box():
+    points = np.random.default_rng(1).uniform(-50.0, 50.0, (5000, 3))
+    grid = point_grid.of_points(points, 4.0)
+    low, high = np.array([-20.0, 5.0, -60.0]), np.array([0.0, 30.0, 0.0])
+    part = point_grid.within(grid, low, high)
+    inside = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    assert set(inside) <= set(part.order)
+    assert part.count < 0.5 * grid.count
+    np.testing.assert_array_equal(points[part.order], part.cells.points)
+    assert point_grid.within(grid, low + 500.0, high + 500.0).count == 0
+
+
+def test_a_comparison_has_the_same_bytes_as_here(dask_cluster, used, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(core_tiles, "CORE_POINTS", 1000)
+    for name, points in (("a.xyz", wavy(3000, 1)), ("b.xyz", wavy(3000, 2, 5.0))):
+        np.savetxt(tmp_path / name, points)
+    request, found = Request(tmp_path / "a.xyz", tmp_path / "b.xyz"), []
+    for address in (None, dask_cluster.address):
+        with tile_cluster.on_cluster(address, said):
+            found.append(compare(request))
+    assert used == {"_normals", "_distances"}
+    for name in ("distance", "lod95", "n1", "n2", "std1", "std2"):
+        here, there = (getattr(one.distances, name) for one in found)
+        assert here.tobytes() == there.tobytes()
+    assert found[0].normals.tobytes() == found[1].normals.tobytes()
+
+
+@pytest.mark.parametrize("command", [("run", "a.xyz", "--steps", "spheres"), ("compare", "a.xyz", "b.xyz")])
+def test_commands_take_a_cluster(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "CONNECT_S", 0.2)
+    for name in ("a.xyz", "b.xyz"):
+        np.savetxt(tmp_path / name, wavy(100, 1))
+    arguments = [str(tmp_path / one) if one.endswith(".xyz") else one for one in command]
+    with pytest.raises(UsageError, match="expected the address of a Dask scheduler that answers"):
+        commands([*arguments, "-o", str(tmp_path / "out"), "--cluster", "tcp://127.0.0.1:1"], standalone_mode=False)
+
+
+@pytest.mark.slow
+def test_a_comparison_writes_the_same_files_as_here(dask_cluster, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(core_tiles, "CORE_POINTS", 1000)
+    for name, points in (("a.xyz", wavy(3000, 1)), ("b.xyz", wavy(3000, 2, 5.0))):
+        np.savetxt(tmp_path / name, points)
+    for out, further in (("here", []), ("there", ["--cluster", dask_cluster.address])):
+        arguments = ["compare", tmp_path / "a.xyz", tmp_path / "b.xyz", "-o", tmp_path / out, *further]
+        commands([str(one) for one in arguments], standalone_mode=False)
+    for path in (tmp_path / "here").iterdir():
+        assert path.read_bytes() == (tmp_path / "there" / path.name).read_bytes(), path.name

@@ -1,0 +1,89 @@
+"""Normals and M3C2 distances at many core points: tiles of core points with the points of the clouds about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from processor import tiles
+from processor.geometry import m3c2, point_grid
+from processor.geometry.m3c2 import CloudNormals, Distances
+from processor.geometry.point_grid import PointGrid
+from processor.model import Floats, Ints
+from processor.tiles import Shared
+
+CORE_POINTS = 50_000  # of a tile
+ROUNDING = 1.0 + 1e-9
+
+
+class Lengths(NamedTuple):
+    """The cylinder of a core point, and the registration error."""
+
+    projection_diameter_mm: float
+    max_depth_mm: float
+    registration_error_mm: float
+
+
+class _Tile(NamedTuple):
+    """Core points (m, 3), their normals (m, 3) where these are known, and clouds about them."""
+
+    core: Floats
+    normals: Floats
+    clouds: tuple[PointGrid, ...]
+
+
+def normals(reference: PointGrid, core: Floats, diameter_mm: float) -> CloudNormals:
+    """Fit normals at core points (k, 3) as :func:`processor.geometry.m3c2.normals` does."""
+    rows = _rows(reference, core)
+    parts = tiles.mapped(_normals, _tiles(rows, core, core, (reference,), 0.5 * diameter_mm), Shared(diameter_mm))
+    found = CloudNormals(np.empty((len(core), 3)), np.empty(len(core)), np.empty(len(core), np.int64))
+    for at, part in zip(rows, parts, strict=True):
+        found.normals[at], found.roughness[at], found.count[at] = part.normals, part.roughness, part.count
+    return found
+
+
+def _normals(tile: _Tile, diameter_mm: float) -> CloudNormals:
+    return m3c2.normals(tile.clouds[0], tile.core, diameter_mm)
+
+
+def distances(reference: PointGrid, compared: PointGrid, core: Floats, normals: Floats, lengths: Lengths) -> Distances:
+    """Measure at core points (k, 3) with unit normals (k, 3) as :func:`processor.geometry.m3c2.distances` does."""
+    rows = _rows(reference, core)
+    reach = float(np.hypot(0.5 * lengths.projection_diameter_mm, lengths.max_depth_mm))
+    parts = tiles.mapped(_distances, _tiles(rows, core, normals, (reference, compared), reach), Shared(lengths))
+    columns = {name: np.empty(len(core)) for name in ("distance", "lod95", "std1", "std2")}
+    counts = {name: np.empty(len(core), np.int64) for name in ("n1", "n2")}
+    for at, part in zip(rows, parts, strict=True):
+        for name, column in (*columns.items(), *counts.items()):
+            column[at] = getattr(part, name)
+    return Distances(**columns, **counts)
+
+
+def _distances(tile: _Tile, lengths: Lengths) -> Distances:
+    return m3c2.distances(*tile.clouds, tile.core, tile.normals, **lengths._asdict())
+
+
+def _rows(reference: PointGrid, core: Floats) -> list[Ints]:
+    """Return the rows of the core points of each tile."""
+    if len(core) <= CORE_POINTS:
+        return [np.arange(len(core))]
+    order = reference.beside(core)
+    return [order[part] for part in tiles.ranges(len(core), CORE_POINTS)]
+
+
+def _tiles(
+    rows: Sequence[Ints], core: Floats, normals: Floats, clouds: tuple[PointGrid, ...], reach: float
+) -> Iterator[_Tile] | list[_Tile]:
+    """Cut clouds about the core points of each tile; all of them for a single one."""
+    if len(rows) == 1:
+        return [_Tile(core, normals, clouds)]
+    return (_tile(core[at], normals[at], clouds, reach) for at in rows)
+
+
+def _tile(core: Floats, normals: Floats, clouds: tuple[PointGrid, ...], reach: float) -> _Tile:
+    known = core[np.isfinite(core).all(axis=1)]
+    low, high = (known.min(axis=0), known.max(axis=0)) if len(known) else (np.zeros(3), np.zeros(3))
+    off = reach * ROUNDING
+    return _Tile(core, normals, tuple(point_grid.within(cloud, low - off, high + off) for cloud in clouds))
