@@ -174,9 +174,9 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
         turned = _fitted_normals(reference, first, core, origin, used.normal_diameter_mm)
         normals = turned.normals
         source = reason("compare.normals-of-planes-upright") if turned.upright else reason("compare.normals-of-planes")
-    clouds_sorted = (_sorted(cloud, used.projection_diameter_mm) for cloud in (first, second))
-    lengths = Lengths(used.projection_diameter_mm, used.max_depth_mm, request.registration_error)
-    distances = core_tiles.distances(*clouds_sorted, core, normals, lengths)
+    diameter = used.projection_diameter_mm
+    lengths = Lengths(diameter, used.max_depth_mm, request.registration_error)
+    distances = core_tiles.distances(_sorted(first, diameter), _sorted(second, diameter), core, normals, lengths)
     summary = m3c2.summary(distances, core, normals, used.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
     if not np.isfinite(distances.distance).any():
         why = diagnosis.no_distance(first.cells.points, second.cells.points, core, summary.without_normal, used)

@@ -53,16 +53,25 @@ def distances(reference: PointGrid, compared: PointGrid, core: Floats, normals: 
     rows = _rows(reference, core)
     reach = float(np.hypot(0.5 * lengths.projection_diameter_mm, lengths.max_depth_mm))
     parts = tiles.mapped(_distances, _tiles(rows, core, normals, (reference, compared), reach), Shared(lengths))
-    columns = {name: np.empty(len(core)) for name in ("distance", "lod95", "std1", "std2")}
-    counts = {name: np.empty(len(core), np.int64) for name in ("n1", "n2")}
+    columns = [np.empty(len(core)) for _ in range(4)]
+    counts = [np.empty(len(core), np.int64) for _ in range(2)]
     for at, part in zip(rows, parts, strict=True):
-        for name, column in (*columns.items(), *counts.items()):
-            column[at] = getattr(part, name)
-    return Distances(**columns, **counts)
+        columns[0][at], columns[1][at], columns[2][at], columns[3][at] = part.distance, part.lod95, part.std1, part.std2
+        counts[0][at], counts[1][at] = part.n1, part.n2
+    return Distances(columns[0], columns[1], counts[0], counts[1], std1=columns[2], std2=columns[3])
 
 
 def _distances(tile: _Tile, lengths: Lengths) -> Distances:
-    return m3c2.distances(*tile.clouds, tile.core, tile.normals, **lengths._asdict())
+    reference, compared = tile.clouds
+    return m3c2.distances(
+        reference,
+        compared,
+        tile.core,
+        tile.normals,
+        projection_diameter_mm=lengths.projection_diameter_mm,
+        max_depth_mm=lengths.max_depth_mm,
+        registration_error_mm=lengths.registration_error_mm,
+    )
 
 
 def _rows(reference: PointGrid, core: Floats) -> list[Ints]:

@@ -110,13 +110,16 @@ class Translations:
 
     def part(self) -> PartSums:
         """Return the sums over the feet that were added."""
-        places = np.flatnonzero(self._sums.number)
-        return PartSums(places, Sums(*(column[places] for column in self._sums)))
+        sums = self._sums
+        places = np.flatnonzero(sums.number)
+        return PartSums(places, Sums(sums.number[places], sums.square[places], sums.nn[places], sums.ns[places]))
 
     def add_part(self, part: PartSums) -> None:
         """Add the sums over some feet, which another object has of the same places."""
-        for column, of_part in zip(self._sums, part.sums, strict=True):
-            column[part.places] += of_part
+        self._sums.number[part.places] += part.sums.number
+        self._sums.square[part.places] += part.sums.square
+        self._sums.nn[part.places] += part.sums.nn
+        self._sums.ns[part.places] += part.sums.ns
 
     def movement(self) -> Movement:
         """Return the movement by all feet that were added."""

@@ -100,9 +100,12 @@ def fit_final(
         )
     )  # fmt: skip
     residuals = zip(*(part.residuals for part in parts), strict=True)
-    columns = zip(*(part[:-1] for part in parts), strict=True)
     return Finished(
-        *(np.concatenate(column) for column in columns), Residuals(*(np.concatenate(column) for column in residuals))
+        states=np.concatenate([part.states for part in parts]),
+        covariances=np.concatenate([part.covariances for part in parts]),
+        bounds=np.concatenate([part.bounds for part in parts]),
+        numbers=np.concatenate([part.numbers for part in parts]),
+        residuals=Residuals(*(np.concatenate(column) for column in residuals)),
     )
 
 
@@ -118,13 +121,21 @@ def _nodes(count: int) -> list[slice]:
 def _crops(crops: CropsWithRays, nodes: slice) -> CropsWithRays:
     start = crops.start[nodes.start : nodes.stop + 1]
     rows = slice(start[0], start[-1])
-    return CropsWithRays(start - start[0], *(column[rows] for column in crops[1:]))
+    return CropsWithRays(
+        start - start[0], crops.points[rows], crops.rays[rows], crops.ranges[rows], crops.station[rows]
+    )
 
 
 def _masks(masks: Masks, nodes: slice) -> Masks:
     start = masks.start[nodes.start : nodes.stop + 1]
     rows = slice(start[0], start[-1])
-    return Masks(start - start[0], *(column[rows] for column in masks[1:5]), masks.hole, masks.least_cosine)
+    return masks._replace(
+        start=start - start[0],
+        axis_points=masks.axis_points[rows],
+        axes=masks.axes[rows],
+        keep_off=masks.keep_off[rows],
+        tube_off=masks.tube_off[rows],
+    )
 
 
 def _sizes(sizes: Sizes, nodes: slice) -> Sizes:
