@@ -22,7 +22,7 @@ from processor.deviation.station_offsets import OnFaces, OnPieces, Pieces
 from processor.geometry import enclosure, m3c2, mesh_distance
 from processor.geometry.mesh_distance import CurvedFacets, FacetGrid, Samples
 from processor.large_arrays import put_aside, release
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 from processor.tiles import Shared
 
 LEAST_COS = 0.5  # between the normals at a core point and below a scanned point
@@ -83,19 +83,19 @@ class _Passes:
     fit: Shared[_Fit]
     asides: list[Aside] = field(default_factory=list)
 
-    def near(self) -> Iterator[_Near]:
+    def near(self) -> Iterator[tuple[Cloud, Aside]]:
         """Pass over the points near the surface, cloud by cloud."""
         for cloud, aside in zip(self.clouds, self.asides, strict=True):
-            yield _Near(cloud.of(aside.rows), aside)
+            yield cloud.of(aside.rows), aside
             release()
 
 
 class _Near(NamedTuple):
-    """Points of a cloud near the surface, what was put aside of them, and the core point next to each, if known."""
+    """Points (n, 3) near the surface, which of them may be outliers, and what was put aside."""
 
-    points: Cloud
+    points: Floats
+    doubtful: Bools
     aside: Aside
-    nearest: Ints = np.empty(0, np.int32)
 
 
 class _Around(NamedTuple):
@@ -104,13 +104,6 @@ class _Around(NamedTuple):
     known: Ints
     tree: cKDTree
     scatter: Floats
-
-
-class _Shifts(NamedTuple):
-    """Movements (k, 3) at core points, and the core point next to each point near the surface, cloud by cloud."""
-
-    vector: Floats
-    nearest: list[Ints]
 
 
 def movement(
@@ -141,11 +134,11 @@ def movement(
     nearest, about, moved = _second(passes, _Around(known, cKDTree(core.points[known]), raw))
     sd = np.where(np.isfinite(moved.sd), np.maximum(moved.sd, noise), np.nan)
     scatter = np.where((about.rank > 1) & np.isfinite(sd), sd, raw)
-    shifts = _Shifts(np.nan_to_num(about.vector), nearest)
-    used, last, stations = _last(passes, shifts, scatter)
+    vector = Shared(np.nan_to_num(about.vector))
+    used, last, stations = _last(passes, vector, nearest, Shared(scatter))
 
     def on_pieces(pieces: Pieces) -> Iterator[OnPieces]:
-        return tiles.mapped(_on_pieces_of, _used(passes, shifts, used), passes.fit, Shared(pieces))
+        return tiles.mapped(_on_pieces_of, _used(passes, nearest, used), passes.fit, vector, Shared(pieces))
 
     return last, on_surface, station_offsets.shared_sd(core, last, stations, on_pieces, diameter_mm)
 
@@ -177,7 +170,8 @@ def _second(passes: _Passes, around: _Around) -> tuple[list[Ints], Movement, Mov
     and for its own.
     """
     nearest, about, moved = list[Ints](), passes.fit.value.about(), passes.fit.value.sums()
-    for at, *parts in tiles.mapped(_second_of, passes.near(), passes.fit, Shared(around)):
+    near = (_Near(cloud.points, cloud.doubtful, aside) for cloud, aside in passes.near())
+    for at, *parts in tiles.mapped(_second_of, near, passes.fit, Shared(around)):
         nearest.append(put_aside(at))
         for sums, part in zip((about, moved), parts, strict=True):
             sums.add_part(part)
@@ -186,31 +180,33 @@ def _second(passes: _Passes, around: _Around) -> tuple[list[Ints], Movement, Mov
 
 def _second_of(near: _Near, fit: _Fit, around: _Around) -> tuple[Ints, PartSums, PartSums]:
     """Return what :func:`_second` needs of the points of a cloud."""
-    seen = near.aside.seen(near.points.points, fit.curved)
+    seen = near.aside.seen(near.points, fit.curved)
     at = around.known[around.tree.query(seen.feet, workers=-1)[1]] if len(seen.feet) else around.known[:0]
-    rows = np.flatnonzero(assignment.clear(seen, around.scatter[at]) & ~near.points.doubtful)
+    rows = np.flatnonzero(assignment.clear(seen, around.scatter[at]) & ~near.doubtful)
     clear = seen.of(rows)
     about, moved = (fit.part(sums, clear, clear.distance) for sums in (fit.about(), fit.sums()))
     return at.astype(np.int32), about, moved
 
 
-def _last(passes: _Passes, shifts: _Shifts, scatter: Floats) -> tuple[list[Aside], Movement, set[int]]:
+def _last(
+    passes: _Passes, vector: Shared[Floats], nearest: Sequence[Ints], scatter: Shared[Floats]
+) -> tuple[list[Aside], Movement, set[int]]:
     """Fit movements to points by the faces below their places before the movement.
 
     Returns the points used and their stations, too.
     """
     used, last, stations = list[Aside](), passes.fit.value.sums(), set[int]()
-    near = (one._replace(nearest=at) for one, at in zip(passes.near(), shifts.nearest, strict=True))
-    for aside, part, seen_from in tiles.mapped(_last_of, near, passes.fit, Shared(shifts.vector), Shared(scatter)):
+    near = ((cloud, at) for (cloud, _), at in zip(passes.near(), nearest, strict=True))
+    for aside, part, seen_from in tiles.mapped(_last_of, near, passes.fit, vector, scatter):
         used.append(aside.put())
         last.add_part(part)
         stations |= seen_from
     return used, last.movement(), stations
 
 
-def _last_of(near: _Near, fit: _Fit, vector: Floats, scatter: Floats) -> tuple[Aside, PartSums, set[int]]:
+def _last_of(near: tuple[Cloud, Ints], fit: _Fit, vector: Floats, scatter: Floats) -> tuple[Aside, PartSums, set[int]]:
     """Return what :func:`_last` needs of the points of a cloud."""
-    cloud, at = near.points, near.nearest
+    cloud, at = near
     about = scatter[at]
     before = assignment.assigned(cloud.points - vector[at], cloud.scanner, fit.curved, fit.grid)
     left = np.abs(before.distance)
@@ -228,25 +224,25 @@ def _distance(curved: CurvedFacets, before: OnSurface, shift: Floats) -> Floats:
 
 
 class _Used(NamedTuple):
-    """Points (n,) of the last fit before the movement, their stations, movements (n, 3), and what was put aside."""
+    """Points (n, 3) of the last fit, their stations, the core points next to them, and what was put aside."""
 
     points: Floats
     station: Ints
-    shift: Floats
+    nearest: Ints
     aside: Aside
 
 
-def _used(passes: _Passes, shifts: _Shifts, used: Sequence[Aside]) -> Iterator[_Used]:
+def _used(passes: _Passes, nearest: Sequence[Ints], used: Sequence[Aside]) -> Iterator[_Used]:
     """Pass over the points of the last fit."""
-    for cloud, near, at, aside in zip(passes.clouds, passes.asides, shifts.nearest, used, strict=True):
-        points, shift = cloud.of(near.rows[aside.rows]), shifts.vector[at[aside.rows]]
-        yield _Used(points.points - shift, points.station, shift, aside)
+    for cloud, near, at, aside in zip(passes.clouds, passes.asides, nearest, used, strict=True):
+        rows = near.rows[aside.rows]
+        yield _Used(cloud.points[rows], cloud.station[rows], at[aside.rows], aside)
         release()
 
 
-def _on_pieces_of(used: _Used, fit: _Fit, pieces: Pieces) -> OnPieces:
+def _on_pieces_of(used: _Used, fit: _Fit, vector: Floats, pieces: Pieces) -> OnPieces:
     """Return what :func:`station_offsets.shared_sd` needs of points of the last fit."""
-    before = used.aside.seen(used.points, fit.curved)
-    facing = fit.curved.surface.normals[before.facet]
-    distance = _distance(fit.curved, before, used.shift)
+    shift = vector[used.nearest]
+    before = used.aside.seen(used.points - shift, fit.curved)
+    facing, distance = fit.curved.surface.normals[before.facet], _distance(fit.curved, before, shift)
     return station_offsets.on_pieces(OnFaces(before.feet, facing, distance, used.station), pieces)
