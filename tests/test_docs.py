@@ -71,6 +71,8 @@ ELSEWHERE = {
     "processor export results -o assembled --what assembled --format e57": "tests/unit/test_export.py",
     "processor batch /scans -o /results --cluster tcp://10.0.0.1:8786": "tests/unit/test_batch.py",
     "processor batch /scans -o /results --cluster tls://10.0.0.1:8786": "tests/unit/test_batch.py",
+    "processor run my-hall -o results --steps deviation --cluster tcp://10.0.0.1:8786": "tests/unit/test_tiles.py",
+    "processor compare before.laz after.laz -o change --cluster tcp://10.0.0.1:8786": "tests/unit/test_tiles.py",
     "processor validate mine.toml -o nights --jobs 2": "tests/unit/test_validation_running.py",
     "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": "tests/unit/test_validation_running.py",
     "processor history runs -o history": "tests/unit/test_epochs.py",

@@ -14,6 +14,7 @@ from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
 from processor.evaluation.evaluate import ErrorReport
+from processor.jobs import tile_cluster
 from processor.model import LONGEST_NAME, Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
@@ -99,7 +100,7 @@ def run(
     *,
     lang: str = "en",
     log: Callable[[str], None] = lambda _: None,
-    so_far: str | Path | None = None,
+    cluster: str | None = None,
 ) -> Results:
     """Process an input as ``processor run`` does.
 
@@ -114,7 +115,8 @@ def run(
     seed : of all randomness; None = that of the parameters.
     lang : language of report.html, "en" or "zh".
     log : receives a line of progress at a time.
-    so_far : folder whose results.h5 holds the steps that are done, while others run; None = they are not kept.
+    cluster : address of the scheduler of a Dask cluster, whose workers compute the tiles of large clouds, e.g.
+        "tcp://10.0.0.1:8786"; the results are the same. None = all is computed here.
 
     Returns
     -------
@@ -123,9 +125,9 @@ def run(
     Raises
     ------
     InputError : the input cannot be used, or the output cannot be written.
-    UsageError : a name or parameter is unknown.
+    UsageError : a name or parameter is unknown, no scheduler answers, or its workers have other software.
     """
-    results = compute(input_, output, steps, method, params, units, seed, log=log, so_far=so_far)
+    results = compute(input_, output, steps, method, params, units, seed, log=log, cluster=cluster)
     return write(results, None if output is None else Path(output), lang)
 
 
@@ -140,10 +142,12 @@ def compute(
     *,
     log: Callable[[str], None] = lambda _: None,
     so_far: str | Path | None = None,
+    cluster: str | None = None,
 ) -> Results:
     """Process an input as :func:`run` does, without writing the results; ``output`` is tried before the work.
 
     Points beyond 64 MB lie in files without a name beside the output, without one in the folder for temporary files.
+    The results.h5 in the folder ``so_far`` holds the steps that are done, while others run.
     """
     wanted, methods, parameters = _names(steps), _names(method), _parameters(params)
     out = None if output is None else Path(output)
@@ -152,7 +156,8 @@ def compute(
         jobs = pipeline.jobs_for(input_, wanted, methods, parameters, seed)
         if out is not None:
             write_results.check_output(out, None)
-        return Results(pipeline.execute(Path(input_.name), input_, jobs, log))
+        with tile_cluster.on_cluster(cluster, log):
+            return Results(pipeline.execute(Path(input_.name), input_, jobs, log))
     path = files.existing(Path(input_))
     if out is not None:
         write_results.check_output(out, path)
@@ -160,7 +165,8 @@ def compute(
         pipeline.plan(wanted, methods, parameters, seed)  # wrong names are reported before a long reading
     place = out.resolve() if out else None
     before = fingerprint.signature(path.resolve(), place)
-    with large_arrays.in_files(Path(tempfile.gettempdir()) if out is None else output_checks.existing_parent(out)):
+    folder = Path(tempfile.gettempdir()) if out is None else output_checks.existing_parent(out)
+    with tile_cluster.on_cluster(cluster, log), large_arrays.in_files(folder):
         with stage(f"reading {path.name}"):
             scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
         _log_reading(path, scene, log, () if wanted else jobs)

@@ -76,6 +76,13 @@ def debug_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return log_file(debug(command))
 
 
+def cluster_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --cluster, whose workers compute the tiles of one scene."""
+    return click.option(
+        "--cluster", metavar="ADDRESS", help="Dask scheduler whose workers share the work, e.g. tcp://10.0.0.1:8786"
+    )(command)
+
+
 def check_jobs(jobs: int | None, cluster: str | None) -> None:
     """Raise UsageError where both --jobs and --cluster are given."""
     if jobs is not None and cluster is not None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from processor.cli.common import LANGUAGES, debug_option, print_error_line
+from processor.cli.common import LANGUAGES, cluster_option, debug_option, print_error_line
 
 LENGTH = click.FloatRange(min=0.0, min_open=True)
 FILE = click.Path(path_type=Path)
@@ -46,6 +46,7 @@ class _Diameters(click.Command):
 @click.option(
     "--units", metavar="U[/V][,U[/V]]", help="unit of all files, or of each; V: unit of heights, e.g. m/us-ft,m"
 )
+@cluster_option
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @click.option("--json", "as_json", is_flag=True, help="print compare.json")
 @debug_option
@@ -56,6 +57,7 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
     clouds' density.
     """
     from processor.compare import compare as comparing
+    from processor.jobs import tile_cluster
     from processor.language.messages import messages
     from processor.plain_text import printable
     from processor.report import comparison
@@ -65,8 +67,10 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
         if not path.exists():
             raise missing(path)
     comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
+    address = options.pop("cluster")
     given = {name: value for name, value in options.items() if value is not None}
-    result = comparing.compare(comparing.Request(reference, compared, **given), print_error_line)
+    with tile_cluster.on_cluster(address, print_error_line):
+        result = comparing.compare(comparing.Request(reference, compared, **given), print_error_line)
     record = comparison.write(output, result, lang)
     if as_json:
         click.echo(json.dumps(record, ensure_ascii=False))

@@ -12,6 +12,7 @@ from processor.cli.common import (
     LANGUAGES,
     UNITS,
     Shown,
+    cluster_option,
     debug_option,
     fail_on_option,
     form_options,
@@ -42,6 +43,7 @@ from processor.results.file_names import RESULTS_JSON
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), help="end the run after so long")
 @click.option("--memory-mb", type=click.IntRange(min=64), help="end the run if it takes more")
+@cluster_option
 @click.option("--keep-steps", is_flag=True, help="clouds of the stages of the papers' methods as PLY in OUT/steps")
 @click.option("--so-far", type=click.Path(path_type=Path), hidden=True)
 @form_options
@@ -82,6 +84,7 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
             options["seed"],
             log=log_line if shown.quiet else print_error_line,
             so_far=options["so_far"],
+            cluster=options["cluster"],
         )
     runs.write(results, output, options["lang"], further)
     show_results(context, output, results, shown, fail_on)

@@ -11,8 +11,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor import readers, store
-from processor.compare import diagnosis, units
+from processor.compare import core_tiles, diagnosis, units
 from processor.compare import normals_file as scan_folder_normals
+from processor.compare.core_tiles import Lengths
 from processor.geometry import m3c2, neighbors, normal_orientation
 from processor.geometry.m3c2 import CloudNormals, Distances, Scales, Summary
 from processor.geometry.normal_orientation import Turned
@@ -173,15 +174,9 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
         turned = _fitted_normals(reference, first, core, origin, used.normal_diameter_mm)
         normals = turned.normals
         source = reason("compare.normals-of-planes-upright") if turned.upright else reason("compare.normals-of-planes")
-    distances = m3c2.distances(
-        _sorted(first, used.projection_diameter_mm),
-        _sorted(second, used.projection_diameter_mm),
-        core,
-        normals,
-        projection_diameter_mm=used.projection_diameter_mm,
-        max_depth_mm=used.max_depth_mm,
-        registration_error_mm=request.registration_error,
-    )
+    diameter = used.projection_diameter_mm
+    lengths = Lengths(diameter, used.max_depth_mm, request.registration_error)
+    distances = core_tiles.distances(_sorted(first, diameter), _sorted(second, diameter), core, normals, lengths)
     summary = m3c2.summary(distances, core, normals, used.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
     if not np.isfinite(distances.distance).any():
         why = diagnosis.no_distance(first.cells.points, second.cells.points, core, summary.without_normal, used)
@@ -227,7 +222,7 @@ def _read_clouds(request: Request) -> dict[str, _Cloud]:
 
 def _fitted_normals(reference: _Cloud, grid: PointGrid, core: Floats, origin: Floats, diameter: float) -> Turned:
     """Return oriented normals (k, 3) of planes fitted to the reference, whose points are in ``grid``."""
-    fitted = m3c2.normals(_sorted(grid, diameter), core, diameter)
+    fitted = core_tiles.normals(_sorted(grid, diameter), core, diameter)
     scanner = _seen_from(reference, core, fitted, diameter, origin)
     return normal_orientation.turned(fitted, core, diameter, scanner)
 

@@ -61,11 +61,14 @@ class Aside:
     flat: Floats
 
     @classmethod
-    def put(cls, rows: Ints, seen: OnSurface) -> Aside:
-        """Put aside the rows (m,) of a block whose points are ``seen``."""
-        return cls(
-            put_aside(rows.astype(np.int32)), put_aside(seen.facet[rows].astype(np.int32)),
-            put_aside(seen.clearance[rows]), put_aside(seen.flat[rows]),
+    def of(cls, rows: Ints, seen: OnSurface) -> Aside:
+        """Return the rows (m,) of a block whose points are ``seen``, in memory."""
+        return cls(rows.astype(np.int32), seen.facet[rows].astype(np.int32), seen.clearance[rows], seen.flat[rows])
+
+    def put(self) -> Aside:
+        """Put them aside."""
+        return Aside(
+            put_aside(self.rows), put_aside(self.facet), put_aside(self.clearance), put_aside(self.flat)
         )  # fmt: skip
 
     def seen(self, points: Floats, curved: CurvedFacets) -> OnSurface:

@@ -7,12 +7,13 @@ in the order of a grid, so every k-th is an even sample.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from processor import tiles
 from processor.deviation.surface_movement import Cloud
 from processor.geometry import neighbors, rigid
 from processor.large_arrays import allocate, blocks, extremes, release, taken
@@ -211,24 +212,50 @@ class _Slabs:
         return self.low + self.width * float(bins[0]), self.low + self.width * float(bins[-1] + 1)
 
 
+class _Slab(NamedTuple):
+    """A slab's points and then those about it (n, 3), how many are its own, and which of these show the spacing."""
+
+    points: Floats
+    own: int
+    step: int
+    neighbours: int  # for the distance of outlier removal; 0: none is wanted
+
+
+class _Near(NamedTuple):
+    """Of a slab: its points' order (m,) in a grid, distances (m,) to neighbours, and the farthest (s,) of k."""
+
+    order: Ints
+    distance: Floats
+    farthest: Floats
+    k: int
+
+
+def _near(slab: _Slab) -> _Near:
+    """Search for the neighbours of a slab's points."""
+    grid = neighbors.of_spacing(slab.points)
+    own = np.flatnonzero(grid.order < slab.own)
+    distance = neighbors.mean_distances(grid, slab.neighbours)[own] if slab.neighbours else np.zeros(len(own))
+    farthest, k = neighbors.farthest_distances(grid, own[:: slab.step])
+    return _Near(grid.order[own], distance, farthest, k)
+
+
 def _inliers(slabs: _Slabs, part: _Part, neighbours: int, ratio: float) -> tuple[Bools, float]:
     """Mark (n,) the points that outlier removal keeps, put each slab in the order of a grid, and return the spacing."""
     n = len(part.points)
-    distance, farthest, total, k = allocate(n), list[Floats](), 0.0, 1
-    for slab in range(len(slabs.ends)):
+    distance, order = allocate(n), allocate(n, dtype=np.int32)
+    farthest, total, k = list[Floats](), 0.0, 1
+    filled = [slab for slab in range(len(slabs.ends)) if len(part.points[slabs.rows(slab)])]
+    found = tiles.mapped(_near, _slabs(slabs, part.points, filled, neighbours if ratio > 0.0 else 0))
+    for slab, near in zip(filled, found, strict=True):
         rows = slabs.rows(slab)
-        if rows.start == rows.stop:
-            continue
-        grid = neighbors.of_spacing(_with_halo(slabs, part.points, slab))
-        own = np.flatnonzero(grid.order < rows.stop - rows.start)
-        order = grid.order[own]
+        order[rows], distance[rows], k = near.order, near.distance, near.k
+        total += float(near.distance.sum())
+        farthest.append(near.farthest)
+        release()
+    for slab in filled:  # not before all slabs were searched: those about a slab are parts of it
+        rows = slabs.rows(slab)
         for column in part:
-            column[rows] = column[rows][order]
-        if ratio > 0.0:
-            distance[rows] = neighbors.mean_distances(grid, neighbours)[own]
-            total += float(distance[rows].sum())
-        sample, k = neighbors.farthest_distances(grid, own[:: max(1, n // SPACING_SAMPLE)])
-        farthest.append(sample)
+            column[rows] = column[rows][order[rows]]
         release()
     inlier = allocate(n, dtype=np.bool_)
     mean = total / n
@@ -237,6 +264,14 @@ def _inliers(slabs: _Slabs, part: _Part, neighbours: int, ratio: float) -> tuple
     for rows in blocks(n):
         inlier[rows] = distance[rows] <= limit if ratio > 0.0 else True
     return inlier, neighbors.spacing_of(np.concatenate(farthest), k)
+
+
+def _slabs(slabs: _Slabs, points: Floats, numbers: Sequence[int], neighbours: int) -> Iterator[_Slab]:
+    """Pass over slabs with the points about them."""
+    step = max(1, len(points) // SPACING_SAMPLE)
+    for slab in numbers:
+        rows = slabs.rows(slab)
+        yield _Slab(_with_halo(slabs, points, slab), rows.stop - rows.start, step, neighbours)
 
 
 def _with_halo(slabs: _Slabs, points: Floats, slab: int) -> Floats:

@@ -58,13 +58,20 @@ class _Places(NamedTuple):
     order: Ints
 
 
-class _Sums(NamedTuple):
+class Sums(NamedTuple):
     """Over the feet about each place: their number (k,), and the sums of s s (k,), n n' (k, 3, 3) and n s (k, 3)."""
 
     number: Ints
     square: Floats
     nn: Floats
     ns: Floats
+
+
+class PartSums(NamedTuple):
+    """Sums over some feet, at the places (p,) about which there are any."""
+
+    places: Ints
+    sums: Sums
 
 
 class _Moved(NamedTuple):
@@ -88,7 +95,7 @@ class Translations:
         self._places, self._directions = np.ascontiguousarray(places), np.ascontiguousarray(directions)
         self.diameter, self._least_cos = float(diameter_mm), float(least_cos)
         k = len(places)
-        self._sums = _Sums(np.zeros(k, np.int64), np.zeros(k), np.zeros((k, 3, 3)), np.zeros((k, 3)))
+        self._sums = Sums(np.zeros(k, np.int64), np.zeros(k), np.zeros((k, 3, 3)), np.zeros((k, 3)))
 
     def add(self, feet: PointGrid, distance: Floats, normals: Floats) -> None:
         """Add points on the surface with the signed ``distance`` (n,) of what was measured there.
@@ -100,6 +107,19 @@ class Translations:
         over_ranges(
             lambda a, b: _add(feet.cells, measured, wanted, a, b, self._sums), len(self._places), least=LEAST_RANGE
         )
+
+    def part(self) -> PartSums:
+        """Return the sums over the feet that were added."""
+        sums = self._sums
+        places = np.flatnonzero(sums.number)
+        return PartSums(places, Sums(sums.number[places], sums.square[places], sums.nn[places], sums.ns[places]))
+
+    def add_part(self, part: PartSums) -> None:
+        """Add the sums over some feet, which another object has of the same places."""
+        self._sums.number[part.places] += part.sums.number
+        self._sums.square[part.places] += part.sums.square
+        self._sums.nn[part.places] += part.sums.nn
+        self._sums.ns[part.places] += part.sums.ns
 
     def movement(self) -> Movement:
         """Return the movement by all feet that were added."""

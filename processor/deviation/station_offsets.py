@@ -7,7 +7,7 @@ points of few stations is then no better than the number of stations allows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -36,31 +36,66 @@ class OnFaces(NamedTuple):
     station: Ints
 
 
-def shared_sd(core: Samples, moved: Movement, points: Callable[[], Iterable[OnFaces]], diameter_mm: float) -> Floats:
+class Pieces(NamedTuple):
+    """Pieces of faces: the ``known`` core points (m,), a tree of them, and of each core point (k,) its piece, or -1.
+
+    ``normals`` (k, 3) are those of the core points, ``along`` (k,) their movements.
+    """
+
+    known: Ints
+    tree: cKDTree
+    of_core: Ints
+    normals: Floats
+    along: Floats
+
+
+class OnPieces(NamedTuple):
+    """Points (n,) on pieces: the piece, the station, and the distance less the movement of the core point."""
+
+    piece: Ints
+    station: Ints
+    left: Floats
+
+
+def on_pieces(points: OnFaces, pieces: Pieces) -> OnPieces:
+    """Assign points to the pieces of their core points."""
+    at = pieces.known[pieces.tree.query(points.feet, workers=-1)[1]] if len(points.feet) else pieces.known[:0]
+    rows = np.flatnonzero(np.einsum("ni,ni->n", points.facing, pieces.normals[at]) > SAME_FACE)
+    at = at[rows]
+    return OnPieces(
+        pieces.of_core[at].astype(np.int32),
+        points.station[rows].astype(np.int32),
+        points.distance[rows] - pieces.along[at],
+    )
+
+
+def shared_sd(
+    core: Samples,
+    moved: Movement,
+    stations: Collection[int],
+    points: Callable[[Pieces], Iterable[OnPieces]],
+    diameter_mm: float,
+) -> Floats:
     """Return the standard deviation (k,) of the error that stations cause in the movements at core points, mm.
 
-    ``points`` passes over the points that were measured. It is 0 where no piece was seen from two stations, and where
-    these do not differ by more than chance.
+    ``points`` passes over the points that were measured, from ``stations``. It is 0 where no piece was seen from two
+    stations, and where these do not differ by more than chance.
     """
     shared = np.zeros(len(core.points))
     known = np.flatnonzero(np.isfinite(moved.along))
-    stations = set[int]().union(*(np.unique(part.station).tolist() for part in points()))
     if not len(known) or len(stations) < 2:
         return shared
-    tree = cKDTree(core.points[known])
     cell = pieces(core.points[known], core.normals[known], CELL_DIAMETERS * diameter_mm)
     of_core = np.full(len(core.points), -1, np.int64)
     of_core[known] = cell
     cells, most = int(cell.max()) + 1, max(stations) + 1
     number, total = np.zeros(cells * most, np.int64), np.zeros(cells * most)
     asides = []
-    for part in points():
-        at = known[tree.query(part.feet, workers=-1)[1]] if len(part.feet) else known[:0]
-        rows = np.flatnonzero(np.einsum("ni,ni->n", part.facing, core.normals[at]) > SAME_FACE)
-        key, left = of_core[at[rows]] * most + part.station[rows], part.distance[rows] - moved.along[at[rows]]
+    for part in points(Pieces(known, cKDTree(core.points[known]), of_core, core.normals, moved.along)):
+        key = part.piece.astype(np.int64) * most + part.station
         number += np.bincount(key, minlength=len(number))
-        total += np.bincount(key, left, len(number))
-        asides.append((put_aside(key.astype(np.int32)), put_aside(left)))
+        total += np.bincount(key, part.left, len(number))
+        asides.append((put_aside(key.astype(np.int32)), put_aside(part.left)))
     mean, square = total / np.maximum(number, 1), np.zeros(len(number))
     for key, left in asides:
         square += np.bincount(key, (left - mean[key]) ** 2, len(number))

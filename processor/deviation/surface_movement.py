@@ -14,14 +14,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from processor import tiles
 from processor.deviation import assignment, station_offsets
 from processor.deviation.assignment import Aside, OnSurface
-from processor.deviation.local_translation import Movement, Translations
-from processor.deviation.station_offsets import OnFaces
+from processor.deviation.local_translation import Movement, PartSums, Translations
+from processor.deviation.station_offsets import OnFaces, OnPieces, Pieces
 from processor.geometry import enclosure, m3c2, mesh_distance
 from processor.geometry.mesh_distance import CurvedFacets, FacetGrid, Samples
 from processor.large_arrays import put_aside, release
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
+from processor.tiles import Shared
 
 LEAST_COS = 0.5  # between the normals at a core point and below a scanned point
 NOISE_SHARE = 0.75  # quantile of the core points' standard deviations that is the noise: noise across edges is larger
@@ -48,43 +50,60 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class _Passes:
-    """Core points of a design, what movements at them are fitted with, and the ``clouds`` of a scan, in every pass.
+class _Fit:
+    """Core points of a design, and what movements at them are fitted with."""
 
-    ``asides`` are the points of each cloud near the surface.
-    """
-
-    clouds: Iterable[Cloud]
     core: Samples
     curved: CurvedFacets
     grid: FacetGrid
     diameter: float
     depth: float
-    asides: list[Aside] = field(default_factory=list)
 
     def sums(self, times: float = 1.0, least_cos: float = LEAST_COS) -> Translations:
         """Begin the sums of a fit to the points within half of some diameters of the core points."""
         return Translations(self.core.points, self.core.normals, times * self.diameter, least_cos)
 
-    def add(self, sums: Translations, seen: OnSurface, distance: Floats) -> None:
-        """Add points on the surface with their distances (n,) to a fit."""
+    def about(self) -> Translations:
+        """Begin the sums of a fit to the points of all faces about the core points."""
+        return self.sums(ABOUT, -1.0 - 1e-9)
+
+    def part(self, sums: Translations, seen: OnSurface, distance: Floats) -> PartSums:
+        """Return sums over points on the surface with their distances (n,)."""
         if len(distance):
             feet = m3c2.grid(seen.feet, sums.diameter)
             sums.add(feet, distance[feet.order], self.curved.surface.normals[seen.facet[feet.order]])
+        return sums.part()
 
-    def near(self) -> Iterator[tuple[Cloud, OnSurface]]:
-        """Pass over the points near the surface, and what is known of them, cloud by cloud."""
+
+@dataclass(frozen=True)
+class _Passes:
+    """The ``clouds`` of a scan, the same in every pass, and the points of each near the surface, put aside."""
+
+    clouds: Iterable[Cloud]
+    fit: Shared[_Fit]
+    asides: list[Aside] = field(default_factory=list)
+
+    def near(self) -> Iterator[tuple[Cloud, Aside]]:
+        """Pass over the points near the surface, cloud by cloud."""
         for cloud, aside in zip(self.clouds, self.asides, strict=True):
-            points = cloud.of(aside.rows)
-            yield points, aside.seen(points.points, self.curved)
+            yield cloud.of(aside.rows), aside
             release()
 
 
-class _Shifts(NamedTuple):
-    """Movements (k, 3) at core points, and the core point next to each point near the surface, cloud by cloud."""
+class _Near(NamedTuple):
+    """Points (n, 3) near the surface, which of them may be outliers, and what was put aside."""
 
-    vector: Floats
-    nearest: list[Ints]
+    points: Floats
+    doubtful: Bools
+    aside: Aside
+
+
+class _Around(NamedTuple):
+    """The ``known`` core points (m,), a tree of them, and the scatter (k,) about all core points."""
+
+    known: Ints
+    tree: cKDTree
+    scatter: Floats
 
 
 def movement(
@@ -105,80 +124,125 @@ def movement(
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, depth_mm)
     within = enclosure.enclosed(core.points, core.normals, grid, enclosure.closed_bodies(surface.faces))
     core = replace(core, normals=np.where(within[:, None], np.nan, core.normals))
-    fit = _Passes(clouds, core, curved, grid, diameter=diameter_mm, depth=depth_mm)
-    first, on_surface = _first(fit)
+    passes = _Passes(clouds, Shared(_Fit(core, curved, grid, diameter=diameter_mm, depth=depth_mm)))
+    first, on_surface = _first(passes)
     known = np.flatnonzero(np.isfinite(first.along))
     if not len(known):
         return first, on_surface, np.zeros(len(core.points))
     noise = float(np.quantile(first.sd[known], NOISE_SHARE))
     raw = np.maximum(np.hypot(first.along, first.sd), noise)
-    nearest, about, moved = _second(fit, known, raw)
+    nearest, about, moved = _second(passes, _Around(known, cKDTree(core.points[known]), raw))
     sd = np.where(np.isfinite(moved.sd), np.maximum(moved.sd, noise), np.nan)
     scatter = np.where((about.rank > 1) & np.isfinite(sd), sd, raw)
-    shifts = _Shifts(np.nan_to_num(about.vector), nearest)
-    used, last = _last(fit, shifts, scatter)
-    shared = station_offsets.shared_sd(core, last, lambda: _used(fit, shifts, used), diameter_mm)
-    return last, on_surface, shared
+    vector = Shared(np.nan_to_num(about.vector))
+    used, last, stations = _last(passes, vector, nearest, Shared(scatter))
+
+    def on_pieces(pieces: Pieces) -> Iterator[OnPieces]:
+        return tiles.mapped(_on_pieces_of, _used(passes, nearest, used), passes.fit, vector, Shared(pieces))
+
+    return last, on_surface, station_offsets.shared_sd(core, last, stations, on_pieces, diameter_mm)
 
 
-def _first(fit: _Passes) -> tuple[Movement, float]:
+def _first(passes: _Passes) -> tuple[Movement, float]:
     """Assign all points, put those near the surface aside, and fit movements to them; also the share that is near."""
-    first, near, points = fit.sums(), 0, 0
-    for cloud in fit.clouds:
-        seen = assignment.assigned(cloud.points, cloud.scanner, fit.curved, fit.grid)
-        close = np.abs(seen.distance) <= fit.depth
-        near, points = near + int((close & ~cloud.doubtful).sum()), points + int((~cloud.doubtful).sum())
-        fit.asides.append(Aside.put(np.flatnonzero(close), seen))
-        sure = np.flatnonzero(close & ~cloud.doubtful)
-        fit.add(first, seen.of(sure), seen.distance[sure])
+    first, near, points = passes.fit.value.sums(), 0, 0
+    for aside, part, sure, count in tiles.mapped(_first_of, passes.clouds, passes.fit):
+        passes.asides.append(aside.put())
+        first.add_part(part)
+        near, points = near + sure, points + count
         release()
     return first.movement(), near / points
 
 
-def _second(fit: _Passes, known: Ints, raw: Floats) -> tuple[list[Ints], Movement, Movement]:
-    """Fit movements to points whose face is decided, for the scatter ``raw`` (k,) about core points.
+def _first_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, PartSums, int, int]:
+    """Return what :func:`_first` needs of a cloud: its points near the surface, sums, and numbers of sure points."""
+    seen = assignment.assigned(cloud.points, cloud.scanner, fit.curved, fit.grid)
+    close = np.abs(seen.distance) <= fit.depth
+    sure = np.flatnonzero(close & ~cloud.doubtful)
+    part = fit.part(fit.sums(), seen.of(sure), seen.distance[sure])
+    return Aside.of(np.flatnonzero(close), seen), part, len(sure), int((~cloud.doubtful).sum())
 
-    Returns the ``known`` core point next to each point near the surface, and the fits for all faces about a core point
+
+def _second(passes: _Passes, around: _Around) -> tuple[list[Ints], Movement, Movement]:
+    """Fit movements to points whose face is decided, for the scatter about core points.
+
+    Returns the known core point next to each point near the surface, and the fits for all faces about a core point
     and for its own.
     """
-    tree = cKDTree(fit.core.points[known])
-    nearest, about, moved = list[Ints](), fit.sums(ABOUT, -1.0 - 1e-9), fit.sums()
-    for cloud, seen in fit.near():
-        at = known[tree.query(seen.feet, workers=-1)[1]] if len(seen.feet) else known[:0]
-        nearest.append(put_aside(at.astype(np.int32)))
-        rows = np.flatnonzero(assignment.clear(seen, raw[at]) & ~cloud.doubtful)
-        clear = seen.of(rows)
-        fit.add(about, clear, clear.distance)
-        fit.add(moved, clear, clear.distance)
+    nearest, about, moved = list[Ints](), passes.fit.value.about(), passes.fit.value.sums()
+    near = (_Near(cloud.points, cloud.doubtful, aside) for cloud, aside in passes.near())
+    for at, *parts in tiles.mapped(_second_of, near, passes.fit, Shared(around)):
+        nearest.append(put_aside(at))
+        for sums, part in zip((about, moved), parts, strict=True):
+            sums.add_part(part)
     return nearest, about.movement(), moved.movement()
 
 
-def _last(fit: _Passes, shifts: _Shifts, scatter: Floats) -> tuple[list[Aside], Movement]:
-    """Fit movements to points by the faces below their places before the movement; returns the points used, too."""
-    used, last = list[Aside](), fit.sums()
-    for (cloud, _), at in zip(fit.near(), shifts.nearest, strict=True):
-        about = scatter[at]
-        before = assignment.assigned(cloud.points - shifts.vector[at], cloud.scanner, fit.curved, fit.grid)
-        left = np.abs(before.distance)
-        clear = assignment.clear(before, about) & (left <= fit.depth) & (~cloud.doubtful | (left <= RETURNS * about))
-        rows = np.flatnonzero(clear)
-        used.append(Aside.put(rows, before))
-        before = before.of(rows)
-        fit.add(last, before, _distance(fit, before, shifts.vector[at[rows]]))
-    return used, last.movement()
+def _second_of(near: _Near, fit: _Fit, around: _Around) -> tuple[Ints, PartSums, PartSums]:
+    """Return what :func:`_second` needs of the points of a cloud."""
+    seen = near.aside.seen(near.points, fit.curved)
+    at = around.known[around.tree.query(seen.feet, workers=-1)[1]] if len(seen.feet) else around.known[:0]
+    rows = np.flatnonzero(assignment.clear(seen, around.scatter[at]) & ~near.doubtful)
+    clear = seen.of(rows)
+    about, moved = (fit.part(sums, clear, clear.distance) for sums in (fit.about(), fit.sums()))
+    return at.astype(np.int32), about, moved
 
 
-def _distance(fit: _Passes, before: OnSurface, shift: Floats) -> Floats:
+def _last(
+    passes: _Passes, vector: Shared[Floats], nearest: Sequence[Ints], scatter: Shared[Floats]
+) -> tuple[list[Aside], Movement, set[int]]:
+    """Fit movements to points by the faces below their places before the movement.
+
+    Returns the points used and their stations, too.
+    """
+    used, last, stations = list[Aside](), passes.fit.value.sums(), set[int]()
+    near = ((cloud, at) for (cloud, _), at in zip(passes.near(), nearest, strict=True))
+    for aside, part, seen_from in tiles.mapped(_last_of, near, passes.fit, vector, scatter):
+        used.append(aside.put())
+        last.add_part(part)
+        stations |= seen_from
+    return used, last.movement(), stations
+
+
+def _last_of(near: tuple[Cloud, Ints], fit: _Fit, vector: Floats, scatter: Floats) -> tuple[Aside, PartSums, set[int]]:
+    """Return what :func:`_last` needs of the points of a cloud."""
+    cloud, at = near
+    about = scatter[at]
+    before = assignment.assigned(cloud.points - vector[at], cloud.scanner, fit.curved, fit.grid)
+    left = np.abs(before.distance)
+    clear = assignment.clear(before, about) & (left <= fit.depth) & (~cloud.doubtful | (left <= RETURNS * about))
+    rows = np.flatnonzero(clear)
+    aside, before = Aside.of(rows, before), before.of(rows)
+    part = fit.part(fit.sums(), before, _distance(fit.curved, before, vector[at[rows]]))
+    return aside, part, set(np.unique(cloud.station[rows]).tolist())
+
+
+def _distance(curved: CurvedFacets, before: OnSurface, shift: Floats) -> Floats:
     """Return the movement found, and what is left of it, along the facet's normal."""
-    distance: Floats = before.distance + np.einsum("ni,ni->n", fit.curved.surface.normals[before.facet], shift)
+    distance: Floats = before.distance + np.einsum("ni,ni->n", curved.surface.normals[before.facet], shift)
     return distance
 
 
-def _used(fit: _Passes, shifts: _Shifts, used: Sequence[Aside]) -> Iterator[OnFaces]:
+class _Used(NamedTuple):
+    """Points (n, 3) of the last fit, their stations, the core points next to them, and what was put aside."""
+
+    points: Floats
+    station: Ints
+    nearest: Ints
+    aside: Aside
+
+
+def _used(passes: _Passes, nearest: Sequence[Ints], used: Sequence[Aside]) -> Iterator[_Used]:
     """Pass over the points of the last fit."""
-    for cloud, near, at, aside in zip(fit.clouds, fit.asides, shifts.nearest, used, strict=True):
-        points, shift = cloud.of(near.rows[aside.rows]), shifts.vector[at[aside.rows]]
-        before = aside.seen(points.points - shift, fit.curved)
-        facing = fit.curved.surface.normals[before.facet]
-        yield OnFaces(before.feet, facing, _distance(fit, before, shift), points.station)
+    for cloud, near, at, aside in zip(passes.clouds, passes.asides, nearest, used, strict=True):
+        rows = near.rows[aside.rows]
+        yield _Used(cloud.points[rows], cloud.station[rows], at[aside.rows], aside)
         release()
+
+
+def _on_pieces_of(used: _Used, fit: _Fit, vector: Floats, pieces: Pieces) -> OnPieces:
+    """Return what :func:`station_offsets.shared_sd` needs of points of the last fit."""
+    shift = vector[used.nearest]
+    before = used.aside.seen(used.points - shift, fit.curved)
+    facing, distance = fit.curved.surface.normals[before.facet], _distance(fit.curved, before, shift)
+    return station_offsets.on_pieces(OnFaces(before.feet, facing, distance, used.station), pieces)

@@ -87,11 +87,42 @@ def of_points(points: Floats, cell: float) -> PointGrid:
     starts += first[:, None]
     order = order.astype(np.int64)
     over_ranges(lambda a, b: _sort_cells(rows, order, starts, a, b), len(first), least=64)
-    slots = 1 << max(4, int(2 * len(first)).bit_length())
-    keys, blocks = np.full(slots, EMPTY, np.int64), np.full(slots, EMPTY, np.int64)
-    _fill(keys, blocks, np.ascontiguousarray(block_key[first]))
+    keys, blocks = _table(block_key[first])
     reach = ((points.max(axis=0) - lower) / size).astype(np.int64) // SIDE + 1
     return PointGrid(Cells(rows, keys, blocks, starts, lower, size, reach), order)
+
+
+def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
+    """Return the blocks that a box from ``low`` (3,) to ``high`` (3,) meets, with the same cells.
+
+    Searches that do not leave the box find the same points in the same order as in the whole grid.
+    """
+    cells = grid.cells
+    filled = np.flatnonzero(cells.keys != EMPTY)
+    filled = filled[np.argsort(cells.blocks[filled])]
+    key = cells.keys[filled]
+    block = np.stack([key >> 2 * FIELD, key >> FIELD & ((1 << FIELD) - 1), key & ((1 << FIELD) - 1)], axis=1)
+    edge = SIDE * cells.size
+    # A block more on each side, for the rounding.
+    first, last = (np.floor((corner - cells.lower) / edge) for corner in (low, high))
+    kept = np.flatnonzero(((block >= first - 1.0) & (block <= last + 1.0)).all(axis=1))
+    starts = cells.starts[kept]
+    count = starts[:, -1] - starts[:, 0]
+    begin = np.cumsum(count) - count
+    rows = np.repeat(starts[:, 0] - begin, count) + np.arange(int(count.sum()))
+    keys, blocks = _table(key[kept])
+    table = cells._replace(
+        points=cells.points[rows], keys=keys, blocks=blocks, starts=starts + (begin - starts[:, 0])[:, None]
+    )
+    return PointGrid(table, grid.order[rows])
+
+
+def _table(block_keys: Ints) -> tuple[Ints, Ints]:
+    """Return the hash table of blocks with ``block_keys`` (b,): keys (slots,) and rows (slots,)."""
+    slots = 1 << max(4, int(2 * len(block_keys)).bit_length())
+    keys, blocks = np.full(slots, EMPTY, np.int64), np.full(slots, EMPTY, np.int64)
+    _fill(keys, blocks, np.ascontiguousarray(block_keys))
+    return keys, blocks
 
 
 def _keys(cell: Ints) -> Ints:

@@ -137,7 +137,7 @@ STEPS = ("defects", "deviation", "inspection", "preassembly", "space_frame", "st
 LAYERS = (
     ("version", "plain_text", "large_arrays"),
     ("model",),
-    ("record_checks",),
+    ("record_checks", "tiles"),
     ("progress", "diagnostics", "language", "jobs", "robust_statistics", "distinct_rows", "unit_ratio", "user_methods"),
     ("geometry",),
     ("scene_cloud",),
@@ -159,7 +159,7 @@ LAYERS = (
 )
 FOR_STEPS = (
     "version", "plain_text", "large_arrays", "model", "progress", "diagnostics", "robust_statistics", "distinct_rows",
-    "unit_ratio", "geometry", "scene_cloud", "adjustment", "components", "limits",
+    "unit_ratio", "tiles", "geometry", "scene_cloud", "adjustment", "components", "limits",
 )  # fmt: skip
 
 

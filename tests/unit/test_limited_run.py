@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-import processor
 from processor import pipeline
+from processor.api import runs
 from processor.cli import limited_run
 from processor.jobs.process import Cause, Ended
 from processor.store import store
@@ -33,7 +33,7 @@ def ended(cause, code=0, last_line=""):
 
 def test_what_is_done_is_kept_before_each_step(tmp_path, site):
     part = tmp_path / "out.part"
-    processor.run(site, steps="deviation", method="default,paper", so_far=part)
+    runs.compute(site, steps="deviation", method="default,paper", so_far=part)
     (first,), provenance = pipeline.read_runs(part / "results.h5")
     assert first.step == "deviation"
     assert provenance["planned"] == ["deviation (default)", "deviation (paper)"]
@@ -45,7 +45,7 @@ def test_what_is_done_is_kept_before_each_step(tmp_path, site):
 
 def test_what_is_kept_does_not_change_the_results(tmp_path, site):
     for out, so_far in (("a", None), ("b", tmp_path / "part")):
-        processor.run(site, tmp_path / out, steps="deviation", so_far=so_far)
+        runs.write(runs.compute(site, steps="deviation", so_far=so_far), tmp_path / out)
     assert (tmp_path / "a" / "results.h5").read_bytes() == (tmp_path / "b" / "results.h5").read_bytes()
 
 

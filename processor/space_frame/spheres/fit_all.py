@@ -16,8 +16,7 @@ from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.points.sphere_crops import Crops, gather
-from processor.space_frame.spheres import assessment, noise_model, sleeve_radii
-from processor.space_frame.spheres.final_fit import fit_final
+from processor.space_frame.spheres import assessment, node_tiles, noise_model, sleeve_radii
 from processor.space_frame.spheres.gauss_newton import CUT_SD, LEAST_COSINE
 from processor.space_frame.spheres.rays import with_rays
 from processor.space_frame.spheres.records import (
@@ -32,7 +31,6 @@ from processor.space_frame.spheres.records import (
     Spheres,
     StochasticModel,
 )
-from processor.space_frame.spheres.size_selection import choose
 from processor.space_frame.spheres.sleeve_radii import AXIS_MM, FLAT_MM, MemberEnds
 from processor.space_frame.spheres.station_scatter import shift_sd
 from processor.space_frame.spheres.view_errors import view_errors
@@ -245,16 +243,15 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
         centre_weight=problem.centre_weight,
     )
     undecided = np.ones(len(problem.nominal), bool) if before is None else ~before.final_size
-    choice = choose(
-        problem.crops, masks, model, sizes, 2.5 * sigma + 1.0, params.first_reach_mm, undecided, params.threads
-    )
+    reaches = (2.5 * sigma + 1.0, params.first_reach_mm)
+    choice = node_tiles.choose(problem.crops, masks, model, sizes, reaches, undecided, params.threads)
     if before is not None:
         earlier = SizeChoice(before.states, before.sizes, before.energy, before.second, before.second_energy)
         for new, old in zip(choice, earlier, strict=True):
             new[~undecided] = old[~undecided]
     keep_nominal(choice, problem.nominal)
     priors = Priors(problem.centre_weight, choice.sizes, np.full(len(choice.sizes), size_weight))
-    final = fit_final(
+    final = node_tiles.fit_final(
         problem.crops, masks, model, setting.model_points, priors, choice.states, CUT_SD * sigma, params.threads
     )
     fits = Fits(

@@ -1,0 +1,142 @@
+"""Size selection and final fit of many spheres: tiles of nodes, each with the points about them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from processor import tiles
+from processor.model import Bools, Floats
+from processor.space_frame.spheres import final_fit, size_selection
+from processor.space_frame.spheres.records import (
+    CropsWithRays,
+    Finished,
+    Masks,
+    Priors,
+    Residuals,
+    SizeChoice,
+    Sizes,
+    StochasticModel,
+)
+
+NODES = 200  # of a tile
+
+
+class _ToChoose(NamedTuple):
+    """Arguments of :func:`size_selection.choose` for some nodes."""
+
+    crops: CropsWithRays
+    masks: Masks
+    model: StochasticModel
+    sizes: Sizes
+    vote_half_width: float
+    first_reach_mm: float
+    wanted: Bools
+    threads: int
+
+
+class _ToFit(NamedTuple):
+    """Arguments of :func:`final_fit.fit_final` for some nodes."""
+
+    crops: CropsWithRays
+    masks: Masks
+    model: StochasticModel
+    model_points: float
+    priors: Priors
+    states: Floats
+    first_reach_mm: float
+    threads: int
+
+
+def choose(
+    crops: CropsWithRays,
+    masks: Masks,
+    model: StochasticModel,
+    sizes: Sizes,
+    reaches: tuple[float, float],
+    wanted: Bools,
+    threads: int = 0,
+) -> SizeChoice:
+    """Choose the size of each node's sphere; ``reaches`` are ``vote_half_width`` and ``first_reach_mm``, mm.
+
+    See :func:`processor.space_frame.spheres.size_selection.choose`.
+    """
+    parts = tiles.mapped(
+        _chosen,
+        [
+            _ToChoose(_crops(crops, at), _masks(masks, at), model, _sizes(sizes, at), *reaches, wanted[at], threads)
+            for at in _nodes(len(wanted))
+        ],
+    )
+    return SizeChoice(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _chosen(tile: _ToChoose) -> SizeChoice:
+    return size_selection.choose(*tile)
+
+
+def fit_final(
+    crops: CropsWithRays,
+    masks: Masks,
+    model: StochasticModel,
+    model_points: float,
+    priors: Priors,
+    states: Floats,
+    first_reach_mm: float,
+    threads: int = 0,
+) -> Finished:
+    """Fit every node whose state (k, 4) is finite; see :func:`processor.space_frame.spheres.final_fit.fit_final`."""
+    parts = list(
+        tiles.mapped(
+            _fitted,
+            [
+                _ToFit(
+                    _crops(crops, at), _masks(masks, at), model, model_points,
+                    Priors(*(column[at] for column in priors)), states[at], first_reach_mm, threads,
+                )
+                for at in _nodes(len(states))
+            ],
+        )
+    )  # fmt: skip
+    residuals = zip(*(part.residuals for part in parts), strict=True)
+    return Finished(
+        states=np.concatenate([part.states for part in parts]),
+        covariances=np.concatenate([part.covariances for part in parts]),
+        bounds=np.concatenate([part.bounds for part in parts]),
+        numbers=np.concatenate([part.numbers for part in parts]),
+        residuals=Residuals(*(np.concatenate(column) for column in residuals)),
+    )
+
+
+def _fitted(tile: _ToFit) -> Finished:
+    return final_fit.fit_final(*tile)
+
+
+def _nodes(count: int) -> list[slice]:
+    """Return the nodes of each tile; one of none where there are none."""
+    return tiles.ranges(count, NODES) or [slice(0, 0)]
+
+
+def _crops(crops: CropsWithRays, nodes: slice) -> CropsWithRays:
+    start = crops.start[nodes.start : nodes.stop + 1]
+    rows = slice(start[0], start[-1])
+    return CropsWithRays(
+        start - start[0], crops.points[rows], crops.rays[rows], crops.ranges[rows], crops.station[rows]
+    )
+
+
+def _masks(masks: Masks, nodes: slice) -> Masks:
+    start = masks.start[nodes.start : nodes.stop + 1]
+    rows = slice(start[0], start[-1])
+    return masks._replace(
+        start=start - start[0],
+        axis_points=masks.axis_points[rows],
+        axes=masks.axes[rows],
+        keep_off=masks.keep_off[rows],
+        tube_off=masks.tube_off[rows],
+    )
+
+
+def _sizes(sizes: Sizes, nodes: slice) -> Sizes:
+    return sizes._replace(nominal=sizes.nominal[nodes], centre_weight=sizes.centre_weight[nodes])
