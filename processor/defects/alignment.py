@@ -26,8 +26,8 @@ BLOCK_RAD = 0.25  # of a block around a tube: within it, a movement of the tube 
 # Largest and least standard deviations of a station's error: rotation (rad), translation (mm), range offset (mm).
 PRIOR = np.array([2e-4] * 3 + [3.0] * 3 + [2.0])
 LEAST_PRIOR = np.array([1e-6] * 3 + [0.02] * 3 + [0.02])
-# Of the class of scanners, whose error of a view is a translation and a range offset, with the degrees of freedom that a
-# factor of two in it comes to: two or three stations hardly show their own standard deviations.
+# Of the class of scanners, whose error of a view is a translation and a range offset, with the degrees of freedom that
+# an uncertainty by a factor of two amounts to: two or three stations hardly show their own standard deviations.
 CLASS = np.array([0.0] * 3 + [np.sqrt(0.5) * scanner_class.VIEW_MM] * 4)
 CLASS_FREE = np.array([0.0] * 3 + [4.0] * 4)
 GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of parameters with one variance component each
@@ -281,8 +281,9 @@ def station_movements(blocks: StationBlocks, J: Floats, stations: int) -> tuple[
     """Return the movements (k, 7) by which stations agree, with Cauchy's weights, and their covariance (7k, 7k).
 
     The deviation of a block is free. The movements' standard deviations are variance components of maximum likelihood
-    (expectation maximisation, Dempster et al. 1977), from PRIOR down, moderated by CLASS. Where stations do not show one at all, as a
-    single station does not, nothing is moved: an error that stations share is stated by the parameters.
+    (expectation maximisation, Dempster et al. 1977), from PRIOR down, moderated by CLASS. Where stations do not show
+    one at all, as a single station does not, nothing is moved: an error that stations share is stated by the
+    parameters.
     """
     _, block = np.unique(blocks.block, return_inverse=True)
     block = block.reshape(-1)

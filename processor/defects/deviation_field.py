@@ -27,8 +27,9 @@ class Field:
     ``stray`` counts points that do not agree with the others of the cell, or whose beams may have hit something else.
     ``inner`` are cells away from their face's border, ``seen`` those of them with enough points, and about them as
     well. ``stations`` is the variance by errors of the stations' movements, which neighbouring cells have in common; 0
-    in cells without points, ``stations_free`` that of deviations from the best fit of the whole. ``views`` is the standard deviation of what the points of one view have in common, where
-    views are not named, mm. ``dof`` (cells,) is of the variance; without it the variance is known.
+    in cells without points. ``stations_free`` is that of deviations from the best fit of the whole. ``views`` is the
+    standard deviation of what the points of one view have in common, where views are not named, mm. ``dof`` (cells,)
+    is of the variance; without it the variance is known.
     """
 
     deviation: Floats
