@@ -339,7 +339,8 @@ def test_stations_that_agree_are_not_moved_by_what_hardly_shows():
         blocks, J, _ = two_sides(seed, 0.0)
         x, covariance = alignment.station_movements(blocks, J, 4)
         shifts.append(np.abs(x[:, 3:6]).max())
-        assert np.sqrt(np.diag(covariance).reshape(4, 7)[:, 3:6].max()) < 0.1
+        # Less than the class of scanners has, as four stations agree; shifts along the plates hardly show.
+        assert np.sqrt(np.diag(covariance).reshape(4, 7)[:, 3:6].max()) < alignment.CLASS[3]
     assert max(shifts) < 0.1  # with a prior of 3 mm for every station, up to 0.7 mm
 
 
