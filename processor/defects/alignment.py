@@ -26,6 +26,10 @@ BLOCK_RAD = 0.25  # of a block around a tube: within it, a movement of the tube 
 # Largest and least standard deviations of a station's error: rotation (rad), translation (mm), range offset (mm).
 PRIOR = np.array([2e-4] * 3 + [3.0] * 3 + [2.0])
 LEAST_PRIOR = np.array([1e-6] * 3 + [0.02] * 3 + [0.02])
+# Of the class of scanners, whose error of a view is a translation and a range offset, with the degrees of freedom that
+# an uncertainty by a factor of two amounts to: two or three stations hardly show their own standard deviations.
+CLASS = np.array([0.0] * 3 + [np.sqrt(0.5) * scanner_class.VIEW_MM] * 4)
+CLASS_FREE = np.array([0.0] * 3 + [4.0] * 4)
 GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of parameters with one variance component each
 WHOLE_PRIOR = np.array([5e-3] * 3 + [50.0] * 3)
 FLOOR_MM = 0.15  # standard deviation of a block's mean: beams, encoders and the roughness of the steel
@@ -42,7 +46,8 @@ class Alignment:
 
     ``movements`` (k, 7) are of the stations, ``whole`` (6,) of everything; ``covariance`` (6, 6) is that of the whole
     if the stations' movements were known, ``station_covariance`` (7k, 7k) that of these. The whole moves by
-    ``response`` (6, 7k) times an error of the stations' movements.
+    ``response`` (6, 7k) times an error of the stations' movements, or would by ``free_response`` if it were fitted to
+    all that was seen.
     """
 
     centre: Floats
@@ -52,6 +57,7 @@ class Alignment:
     fitted: bool
     station_covariance: Floats
     response: Floats
+    free_response: Floats
 
     def corrections(self, points: Floats, outward: Floats, rays: Floats, station: Ints) -> Floats:
         """Return the corrections (n,) to subtract from deviations at points (n, 3) along unit rays (n, 3), mm."""
@@ -99,6 +105,7 @@ def none(surface: DesignSurface, stations: int, error_mm: float) -> Alignment:
         fitted=False,
         station_covariance=np.zeros((7 * stations, 7 * stations)),
         response=np.zeros((6, 7 * stations)),
+        free_response=np.zeros((6, 7 * stations)),
     )
 
 
@@ -122,27 +129,46 @@ def align(
     enough = len(np.unique(component[used])) >= FEWEST_COMPONENTS
     compared = used if enough else np.ones_like(used)
     movements, station_covariance = station_movements(_of_rows(blocks, compared), J[compared], len(stations.names))
-    start = replace(start, movements=movements, station_covariance=station_covariance)
+    free = _response(_free_gain(J[:, :6], blocks.variance), J, blocks.station, len(stations.names))
+    start = replace(start, movements=movements, station_covariance=station_covariance, free_response=free)
     residual = blocks.mean - np.einsum("nk,nk->n", J, movements[blocks.station])
     if not enough:
         return start
     whole, covariance, gain = _whole(residual[used], J[used, :6], component[used])
     if stations.unnamed:
         covariance = covariance + scanner_class.pose_covariance(points[used] - start.centre)
-    response = np.zeros((6, station_covariance.shape[0]))
-    for k in range(len(stations.names)):
-        rows = np.flatnonzero(blocks.station[used] == k)
-        response[:, 7 * k : 7 * k + 7] = -gain[:, rows] @ J[used][rows]
+    response = _response(gain, J[used], blocks.station[used], len(stations.names))
     return replace(start, whole=whole, covariance=covariance, fitted=True, response=response)
 
 
-def station_variance(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment) -> Floats:
-    """Return the variance (cells,) of the cells' deviations by errors of the stations' movements, mm2."""
+def _response(gain: Floats, J: Floats, station: Ints, stations: int) -> Floats:
+    """Return the movement (6, 7k) of a whole with a gain (6, n) by errors of the stations' movements."""
+    response = np.zeros((6, 7 * stations))
+    for k in range(stations):
+        rows = np.flatnonzero(station == k)
+        response[:, 7 * k : 7 * k + 7] = -gain[:, rows] @ J[rows]
+    return response
+
+
+def _free_gain(J: Floats, variance: Floats) -> Floats:
+    """Return the gain (6, n) of a whole that deviations (n,) with derivative J (n, 6) are fitted by."""
+    weighted = J.T / variance
+    gain: Floats = np.linalg.solve(weighted @ J + np.diag(1.0 / WHOLE_PRIOR**2), weighted)
+    return gain
+
+
+def station_variance(
+    pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, free: bool = False
+) -> Floats:
+    """Return the variance (cells,) of the cells' deviations by errors of the stations' movements, mm2.
+
+    If ``free``, the deviations are those from the best fit of the whole.
+    """
     points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
     rays = rays_to(points, stations.positions[pairs.station])
     J = _derivative(points - alignment.centre, outward, rays)
     total = np.maximum(np.bincount(pairs.cell, pairs.count, len(surface.share)), 1.0)
-    C, R = alignment.station_covariance, alignment.response
+    C, R = alignment.station_covariance, alignment.free_response if free else alignment.response
     return quadratic_forms(
         pairs.cell, pairs.station, pairs.count / total[pairs.cell], J, C, C @ R.T, R @ C @ R.T, total
     )
@@ -255,8 +281,9 @@ def station_movements(blocks: StationBlocks, J: Floats, stations: int) -> tuple[
     """Return the movements (k, 7) by which stations agree, with Cauchy's weights, and their covariance (7k, 7k).
 
     The deviation of a block is free. The movements' standard deviations are variance components of maximum likelihood
-    (expectation maximisation, Dempster et al. 1977), from PRIOR down. Where stations do not show one at all, as a
-    single station does not, nothing is moved: an error that stations share is stated by the parameters.
+    (expectation maximisation, Dempster et al. 1977), from PRIOR down, moderated by CLASS. Where stations do not show
+    one at all, as a single station does not, nothing is moved: an error that stations share is stated by the
+    parameters.
     """
     _, block = np.unique(blocks.block, return_inverse=True)
     block = block.reshape(-1)
@@ -282,7 +309,9 @@ def station_movements(blocks: StationBlocks, J: Floats, stations: int) -> tuple[
         for group in GROUPS:
             known = 1.0 - np.diag(covariance).reshape(stations, 7)[:, group] / prior[group] ** 2
             undetermined = iteration == 0 and known.sum() < 1.0
-            size = 0.0 if undetermined else float(np.sqrt(expected[seen][:, group].mean()))
+            free = CLASS_FREE[group][0]
+            square = free * CLASS[group][0] ** 2 + float(expected[seen][:, group].sum())
+            size = 0.0 if undetermined else float(np.sqrt(square / (free + expected[seen][:, group].size)))
             prior[group] = max(size, LEAST_PRIOR[group][0])
         if iteration >= ROUNDS - 1 and np.abs(prior / before - 1.0).max() < SETTLED:
             break

@@ -139,12 +139,11 @@ def significant(
             rows = cells_of_shape(surface, field, fit, shape)
             points, outward = with_corners(surface, rows)
             value = own = shape.values(fit.frame, points, outward)
-            registration = alignment.sd(points, outward)
+            registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
             if shape.kind != shape_models.RIGID and not alignment.fitted:
                 # The error of a pose that was not fitted to the design may be large: it moves, it does not deform.
                 own = value - _rigid_part(fit, shape).values(fit.frame, points, outward)
-                registration = np.zeros_like(value)
-            registration = np.hypot(registration, field.stations_sd(rows))
+                registration = np.full_like(value, field.stations_sd(rows, free=True))
             noise = shape.sd(fit.frame, points, outward) * inflation
             sd = np.sqrt(noise**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration**2)
             top = int(np.argmax(np.abs(value)))

@@ -28,7 +28,7 @@ from processor.defects.absence import holes, missing_bodies
 from processor.defects.alignment import Alignment
 from processor.defects.component_shapes import ComponentShape
 from processor.defects.deviation_field import Field
-from processor.defects.movement import moved_bodies
+from processor.defects.movement import face_offsets, moved_bodies
 from processor.defects.observations import Observed, Pairs
 from processor.defects.params import Params
 from processor.defects.regions import Region
@@ -169,6 +169,8 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     chosen = {number: [judged.shape for judged in of_one] for number, of_one in significant.items()}
     shape_values = component_shapes.values(surface, shapes, chosen)
     shape_values += component_shapes.values(surface, shapes, component_shapes.unproven_motions(shapes, significant))
+    if not aligned.fitted:
+        shape_values += face_offsets.unproven(field.minus(shape_values), surface)
     residuals = field.minus(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
     finding = scan_statistic.search(residuals, surface, levels)
     expected = expected_points.expected(scene, registered.T_design_project, pairs, surface, observed.stations)

@@ -27,8 +27,9 @@ class Field:
     ``stray`` counts points that do not agree with the others of the cell, or whose beams may have hit something else.
     ``inner`` are cells away from their face's border, ``seen`` those of them with enough points, and about them as
     well. ``stations`` is the variance by errors of the stations' movements, which neighbouring cells have in common; 0
-    in cells without points. ``views`` is the standard deviation of what the points of one view have in common, where
-    views are not named, mm. ``dof`` (cells,) is of the variance; without it the variance is known.
+    in cells without points. ``stations_free`` is that of deviations from the best fit of the whole. ``views`` is the
+    standard deviation of what the points of one view have in common, where views are not named, mm. ``dof`` (cells,)
+    is of the variance; without it the variance is known.
     """
 
     deviation: Floats
@@ -39,12 +40,16 @@ class Field:
     inner: Floats  # 0 or 1
     seen: Floats  # 0 or 1
     stations: Floats
+    stations_free: Floats
     views: float = 0.0
     dof: Floats = dataclasses.field(default_factory=lambda: np.empty(0))
 
-    def stations_sd(self, cells: Ints) -> float:
-        """Return the standard deviation that cells have in common by errors of stations' movements or of views, mm."""
-        variance = self.stations[cells][self.count[cells] > 0]
+    def stations_sd(self, cells: Ints, free: bool = False) -> float:
+        """Return the standard deviation that cells have in common by errors of stations' movements or of views, mm.
+
+        If ``free``, of deviations from the best fit of the whole.
+        """
+        variance = (self.stations_free if free else self.stations)[cells][self.count[cells] > 0]
         return float(np.sqrt(variance.mean() + self.views**2)) if len(variance) else self.views
 
     def minus(self, shape: Floats) -> Field:
@@ -78,6 +83,7 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     if stations.unnamed:
         used, side = np.flatnonzero(seen * count), PIECE_CELLS * charts.cell_mm
         views = opposite_sides.view_sd(surface.centres[used], surface.outward[used], mean[used], variance[used], side)
+    of_stations = station_variance(pairs, surface, stations, alignment)
     return Field(
         deviation=mean,
         variance=variance,
@@ -86,7 +92,8 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
         noise=noise,
         inner=inner,
         seen=seen,
-        stations=station_variance(pairs, surface, stations, alignment),
+        stations=of_stations,
+        stations_free=of_stations if alignment.fitted else station_variance(pairs, surface, stations, alignment, True),
         views=views,
         dof=dof,
     )

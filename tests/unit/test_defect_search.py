@@ -303,7 +303,7 @@ def test_false_alarms_are_no_more_than_asked_for():
         noise = np.random.default_rng(seed).normal(0.0, 0.1, len(seen))
         ones = np.ones(len(seen), np.int64)
         field = deviation_field.Field(
-            noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen, 0 * ones
+            noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen, 0 * ones, 0 * ones
         )
         levels = scan_statistic.levels_of(field, plate, 1e-8, 0.0)
         sign = scan_statistic.search(field, plate, levels).sign
@@ -339,7 +339,8 @@ def test_stations_that_agree_are_not_moved_by_what_hardly_shows():
         blocks, J, _ = two_sides(seed, 0.0)
         x, covariance = alignment.station_movements(blocks, J, 4)
         shifts.append(np.abs(x[:, 3:6]).max())
-        assert np.sqrt(np.diag(covariance).reshape(4, 7)[:, 3:6].max()) < 0.1
+        # Less than the class of scanners has, as four stations agree; shifts along the plates hardly show.
+        assert np.sqrt(np.diag(covariance).reshape(4, 7)[:, 3:6].max()) < alignment.CLASS[3]
     assert max(shifts) < 0.1  # with a prior of 3 mm for every station, up to 0.7 mm
 
 

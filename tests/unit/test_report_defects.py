@@ -74,7 +74,9 @@ def plates():
     found = surface_charts.of_mesh(np.vstack([corners, strip]), np.vstack([faces, faces + 4]), 10.0)
     ones = np.ones(len(found.share))
     value = 1e-3 * found.centres[:, 0]
-    return found, Field(value, ones, ones.astype(np.int64), 0 * ones.astype(np.int64), ones, ones, ones, 0 * ones)
+    return found, Field(
+        value, ones, ones.astype(np.int64), 0 * ones.astype(np.int64), ones, ones, ones, 0 * ones, 0 * ones
+    )
 
 
 def test_all_places_are_drawn_where_there_are_few(plates):
