@@ -1,0 +1,29 @@
+"""Offsets of whole faces, of designs of few components, that an error of the stations which saw them may be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.defects.deviation_field import Field
+from processor.defects.surface_charts import DesignSurface
+from processor.model import Floats
+
+LEAST_Z = 4.5  # standard deviations, from which on an offset is the face's
+FEWEST_CELLS = 6
+
+
+def unproven(field: Field, surface: DesignSurface) -> Floats:
+    """Return the median deviation of each face, for all of its cells (cells,), where it is not significant; else 0.
+
+    A face that one station saw alone deviates by that station's error. A search that does not leave it out finds the
+    whole face in place of what deviates from the rest of it.
+    """
+    offsets = np.zeros(len(surface.share))
+    for chart in range(len(surface.charts.kind)):
+        rows = surface.charts.cells(chart)
+        seen = np.flatnonzero(field.seen[rows] > 0.0) + rows.start
+        if len(seen) >= FEWEST_CELLS:
+            median = float(np.median(field.deviation[seen]))
+            if abs(median) < LEAST_Z * field.stations_sd(seen):
+                offsets[rows] = median
+    return offsets
