@@ -32,7 +32,9 @@ def inspect(scene: Scene, found: Any, method: str) -> Result:
     pairs = zip(found.tubes.a.tolist(), found.tubes.b.tolist(), strict=True)
     tube = {frozenset(pair): m for m, pair in enumerate(pairs) if -1 not in pair}
     doubtful = found.matching is not None and found.matching.status is Status.AMBIGUOUS
-    components = tuple(_member(scene, design, m, found, ball, tube, doubtful) for m in range(len(design.member_a)))
+    row = {int(id_): k for k, id_ in enumerate(design.ids)}
+    rows = [(row[a], row[b]) for a, b in zip(design.member_a.tolist(), design.member_b.tolist(), strict=True)]
+    components = tuple(_member(scene, design, m, ends, found, ball, tube, doubtful) for m, ends in enumerate(rows))
     remarks = () if scene.tolerance is not None else (reason("inspect.no-limits"),)
     if doubtful:
         remarks = (reason("inspect.pose-ambiguous"), *remarks)
@@ -48,13 +50,14 @@ def _member(
     scene: Scene,
     design: FrameDesign,
     member: int,
+    rows: tuple[int, int],  # of its nodes in the design
     found: Any,
     ball: dict[int, int],
     tube: dict[frozenset[int], int],
     doubtful: bool,
 ) -> InspectedComponent:
     nodes = int(design.member_a[member]), int(design.member_b[member])
-    length = _length(scene, design, nodes, found, ball)
+    length = _length(scene, design, nodes, rows, found, ball)
     row = tube.get(frozenset(nodes))
     own = list(_of_tube(float(design.tube_diameters[member]), found, row))
     sizes = {"length": length.nominal, "diameter": float(design.tube_diameters[member])}
@@ -68,11 +71,13 @@ def _member(
 
 
 def _length(
-    scene: Scene, design: FrameDesign, nodes: tuple[int, int], found: Any, ball: dict[int, int]
+    scene: Scene, design: FrameDesign, nodes: tuple[int, int], rows: tuple[int, int], found: Any, ball: dict[int, int]
 ) -> Characteristic:
-    """Distance of the centres of a member's nodes, at the reference temperature if the steel's is known."""
-    row = {int(id_): k for k, id_ in enumerate(design.ids)}
-    a, b = (design.centres[row[node]] for node in nodes)
+    """Distance of the centres of a member's nodes, at the reference temperature if the steel's is known.
+
+    ``rows`` are those of the nodes in the design.
+    """
+    a, b = (design.centres[row] for row in rows)
     nominal = float(np.linalg.norm(b - a))
     at = [ball.get(node, -1) for node in nodes]
     balls = found.balls

@@ -70,9 +70,9 @@ def _create(group: Any, name: str, data: Any, **options: Any) -> None:
     if not options:
         # As h5py makes it, in a third of the time: a frame's results have a hundred thousand.
         array = np.asarray(array, order="C")
-        kind = _kind(array.dtype.str, array.dtype.metadata is not None)
+        kind, in_memory = _kinds(array.dtype.str, array.dtype.metadata is not None)
         made = h5py.h5d.create(group.id, name.encode(), kind, _space(array.shape), dcpl=_plain())
-        made.write(h5py.h5s.ALL, h5py.h5s.ALL, array)
+        made.write(h5py.h5s.ALL, h5py.h5s.ALL, array, in_memory)
         checksum = checksums.seal(made, path, array)
     elif len(array) <= options["chunks"][0]:
         made = group.create_dataset(name, data=data, **options).id
@@ -88,10 +88,11 @@ def _create(group: Any, name: str, data: Any, **options: Any) -> None:
 
 
 @lru_cache(1_024)
-def _kind(dtype: str, is_text: bool) -> Any:
-    """Return the type in a file of arrays of a NumPy type, or of text of its length."""
+def _kinds(dtype: str, is_text: bool) -> tuple[Any, Any]:
+    """Return the types in a file and in memory of arrays of a NumPy type, or of text of its length."""
     given = np.dtype(dtype)
-    return h5py.h5t.py_create(h5py.string_dtype("utf-8", given.itemsize) if is_text else given, logical=True)
+    given = h5py.string_dtype("utf-8", given.itemsize) if is_text else given
+    return h5py.h5t.py_create(given, logical=True), h5py.h5t.py_create(given)
 
 
 @lru_cache(1_024)
@@ -177,6 +178,7 @@ def _encoded(text: str) -> bytes:
     return text.encode("utf-8", "replace")
 
 
+@lru_cache(1_024)
 def _text_type(length: int) -> Any:
     return h5py.string_dtype("utf-8", max(1, length))
 

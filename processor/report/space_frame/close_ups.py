@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -33,6 +34,12 @@ SLACK_MM = 0.1  # of a box, beyond what is shown
 MOST_POINTS = 20_000  # of a panel; more are not visible
 MOST_KEPT = 10 * MOST_POINTS  # of a ball, of which a panel shows a slice and the rest
 LEAST_RADIUS_MM = 30.0
+CELL_MM, MOST_CELLS = 10.0, 1_000_000  # of the x axis, by which points near any ball are chosen
+# In inches: the figure, and its panels with a heading of one line (left, bottom, width, height).
+SIZE_IN = (12.4, 5.3)
+VIEWS_IN = ((0.72, 0.72, 4.03, 4.03), (5.57, 0.72, 4.03, 4.03))
+NUMBERS_IN = (9.73, 0.43, 2.63, 4.59)
+HEADING_IN, EDGE_IN = 0.19, 0.04  # a line of the heading, and the margin of heading and legend
 VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of each
 
 
@@ -118,18 +125,41 @@ def _boxes(scene: Scene, centre: Floats, far: float) -> list[tuple[Floats, Float
 
 def _within(source: SceneSource, centres: Floats, reach: Floats) -> list[Floats]:
     middles = centres - source.origin
+    by_cell = _NearInX(middles[:, 0], reach)
     pieces: list[list[Floats]] = [[] for _ in reach]
     step, kept = [1] * len(pieces), [0] * len(pieces)
     for chunk in source.chunks():
+        # By one axis first, for all centres at once: most of a roof is far away.
+        some = np.compress(by_cell.holds(chunk.points[:, 0]), chunk.points, axis=0)
         for k, (middle, far) in enumerate(zip(middles, reach, strict=True)):
-            # By one axis first: most of a roof is far away.
-            near = chunk.points[np.abs(chunk.points[:, 0] - middle[0]) <= far] - middle
+            near = np.compress(np.abs(some[:, 0] - middle[0]) <= far, some, axis=0) - middle
             pieces[k].append(near[np.einsum("ij,ij->i", near, near) <= far**2][:: step[k]])
             kept[k] += len(pieces[k][-1])
             if kept[k] > MOST_KEPT:
                 pieces[k] = [np.vstack(pieces[k])[::2].copy()]
                 step[k], kept[k] = 2 * step[k], len(pieces[k][0])
     return [np.vstack(parts) if parts else np.empty((0, 3)) for parts in pieces]
+
+
+class _NearInX:
+    """Cells of the x axis that hold the ranges ``far`` (k,) about centres (k,)."""
+
+    def __init__(self, middle: Floats, far: Floats) -> None:
+        self.low = float((middle - far).min())
+        self.width = max(CELL_MM, float((middle + far).max() - self.low) / MOST_CELLS)
+        first, last = self._cells(middle - far), self._cells(middle + far)
+        self.near = np.zeros(last.max() + 3, np.bool_)  # the first and the last are for all that is beyond
+        for start, end in zip(first.tolist(), last.tolist(), strict=True):
+            self.near[max(start - 1, 1) : end + 2] = True  # with a cell on either side, for rounding
+
+    def _cells(self, x: Floats) -> npt.NDArray[np.int64]:
+        return np.floor((x - self.low) / self.width).astype(np.int64) + 1
+
+    def holds(self, x: Floats) -> npt.NDArray[np.bool_]:
+        """Whether places (n,) may be within a range of a centre; those within one are."""
+        cells = (x - self.low) * (1.0 / self.width) + 1.0
+        near: npt.NDArray[np.bool_] = self.near[np.clip(cells, 0.0, len(self.near) - 1.0).astype(np.int32)]
+        return near
 
 
 def _radius(result: Result, i: int) -> float:
@@ -139,8 +169,10 @@ def _radius(result: Result, i: int) -> float:
 
 def _ball(result: Result, i: int, middle: Floats, nominal: Floats, points: Floats, reach: float) -> Figure:
     """Draw a ball about ``middle`` (3,), its numbers beside it; ``nominal`` (3,) is less it."""
-    balls, figure = result.balls, Figure(figsize=(12.4, 5.3), layout="constrained")
-    *views, beside = figure.subplots(1, 3, width_ratios=[4.6, 4.6, 3.0])
+    balls, figure = result.balls, Figure(figsize=SIZE_IN)
+    heading = f"Ball {int(balls.ids[i])}: {balls.flag[i]}. {messages('en').sentences(balls.reasons[i])}"
+    lines = textwrap.wrap(heading, 130)[:3]
+    *views, beside = _panels(figure, HEADING_IN * (len(lines) - 1))
     for axes, (name, across) in zip(views, VIEWS, strict=True):
         _points(axes, points, across)
         _members(axes, result, i, middle, across, reach)
@@ -154,8 +186,7 @@ def _ball(result: Result, i: int, middle: Floats, nominal: Floats, points: Float
         )  # fmt: skip
         axes.set_aspect("equal")
         axes.grid(alpha=0.3)
-    heading = f"Ball {int(balls.ids[i])}: {balls.flag[i]}. {messages('en').sentences(balls.reasons[i])}"
-    figure.suptitle("\n".join(textwrap.wrap(heading, 130)[:3]), fontsize=11)
+    figure.suptitle("\n".join(lines), fontsize=11, y=1.0 - EDGE_IN / SIZE_IN[1])
     write_beside(beside, _numbers(balls, i, nominal), LINE, 8.0)
     handles = [
         Line2D([], [], marker=".", linestyle="", color="black", label=f"points within {SLICE_MM:g} mm of the plane"),
@@ -164,8 +195,26 @@ def _ball(result: Result, i: int, middle: Floats, nominal: Floats, points: Float
         Line2D([], [], color=COLOURS[1], linestyle="--", marker="+", label="nominal"),
         Line2D([], [], color=COLOURS[2], linestyle="-.", label="axes of members"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8)
+    below = (0.5, EDGE_IN / SIZE_IN[1])
+    figure.legend(handles=handles, loc="lower center", bbox_to_anchor=below, borderaxespad=0.0, ncols=5, fontsize=8)
     return figure
+
+
+def _panels(figure: Figure, lowered_in: float) -> list[Axes]:
+    """Add the panels of both views and that of the numbers, their upper edges lowered from those of a short heading.
+
+    All balls have the same; a layout found for each takes as long as drawing it.
+    """
+    width, height = SIZE_IN
+    made = []
+    for left, bottom, wide, high in (*VIEWS_IN, NUMBERS_IN):
+        less = lowered_in if wide == high else 0.0  # views stay squares
+        made.append(
+            figure.add_axes((
+                (left + 0.5 * less) / width, bottom / height, (wide - less) / width, (high - lowered_in) / height
+            ))
+        )  # fmt: skip
+    return made
 
 
 def _numbers(balls: Balls, i: int, nominal: Floats) -> list[tuple[str, str | None]]:
