@@ -30,11 +30,12 @@ def as_object(record: Checked) -> dict[str, Any]:
 
 def as_rows(table: Rows) -> list[dict[str, Any]]:
     """Write a table as a list of its rows; a column without values is left out."""
-    rows: list[dict[str, Any]] = [{} for _ in range(len(table))]
+    count = len(table)
+    rows: list[dict[str, Any]] = [{} for _ in range(count)]
     for field in dataclasses.fields(table):  # type: ignore[arg-type]
         column = getattr(table, field.name)
         if len(column):
-            for i in _present(table, field.metadata):
+            for i in _present(table, field.metadata) if "where" in field.metadata else range(count):
                 _put_field(rows[i], field, column[i])
     return rows
 
@@ -75,9 +76,7 @@ def _absent(value: Any, metadata: Mapping[str, Any]) -> bool:
 
 
 def _present(table: Rows, metadata: Mapping[str, Any]) -> list[int]:
-    """Return the rows that have a value in a column: all, or those where column ``where`` is finite."""
-    if "where" not in metadata:
-        return list(range(len(table)))
+    """Return the rows that have a value in a column: those where column ``where`` is finite."""
     present = getattr(table, metadata["where"])
     return np.flatnonzero(np.isfinite(present.reshape(len(present), -1)).all(axis=1)).tolist() if len(present) else []
 
