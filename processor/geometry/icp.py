@@ -1,20 +1,28 @@
 """Iterative closest point, to points and to planes."""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
+from processor.geometry.linalg_small import product
 from processor.geometry.polyline import Polyline
 from processor.model import Bools, Floats, Ints
-from processor.robust_statistics import robust_sd
+from processor.robust_statistics import MAD_TO_SD
 
 MOST_WEIGHT = 100.0  # of a point on a face that few points lie on
+LEAF = 8  # samples in a box that holds no other boxes
+STACK = 64  # more than twice the levels of boxes about 2^31 samples
 SURE_MM = 1e-6  # a sample counts as nearer than any other by more than errors of rounding
+HUBER = 1.345  # standard deviations from which a point's weight falls: 95 % efficient for normal errors
+RANK = 6.0 * float(np.finfo(np.float64).eps)  # least singular value over the greatest of a motion that pairs determine
 
 
 @dataclass(frozen=True)
@@ -107,87 +115,153 @@ def _iterated(
 
 def point_to_plane(
     source: Floats,
-    target: Floats,
+    boxes: SampleBoxes,
     normals: Floats,
     start: Floats,
     *,
     gates_mm: tuple[float, ...],
-    tree: cKDTree | None = None,
     axes: Floats | None = None,
     max_iterations: int = 15,
 ) -> Alignment:
-    """Align source (n, 3) to a surface given by samples target (m, 3) with unit normals (m, 3).
+    """Align source (n, 3) to a surface given by ``boxes`` about its samples, with their unit normals (m, 3).
 
     Gauss-Newton on the distances along the normals, Huber-weighted by their median. Pairs beyond the gate are left
-    out; the gates are used in turn, from wide to narrow. The rms is that of the last gate's pairs. ``tree`` is of the
-    target, if there is one already. With ``axes`` (3, 3, columns), faces along each axis have the same weight in sum:
-    see :func:`balance`.
+    out; the gates are used in turn, from wide to narrow. The rms is that of the last gate's pairs. With ``axes``
+    (3, 3, columns), faces along each axis have the same weight in sum: see :func:`balance`.
     """
-    partners = _Partners(cKDTree(target) if tree is None else tree, len(source))
-    T, rms, share, iterations = start, np.inf, 0.0, 0
+    known = nothing_known(len(source))
+    source, axes = np.ascontiguousarray(source), np.ascontiguousarray(np.empty((3, 0)) if axes is None else axes)
+    T, rms, share, iterations = start.copy(), np.inf, 0.0, 0
     for gate in gates_mm:
-        for _ in range(max_iterations):
-            iterations += 1
-            placed = rigid.apply(T, source)
-            # The nearest sample may lie a sample spacing away along the surface; the gate limits the normal distance.
-            index, near = partners.of(placed, 3.0 * gate)
-            p, at = placed.compress(near, axis=0), index[near]
-            n = normals.take(at, axis=0)  # with compress, in a quarter of the time of an index
-            r = np.einsum("ni,ni->n", p - target.take(at, axis=0), n)
-            keep = np.abs(r) <= gate
-            p, n, r = p.compress(keep, axis=0), n.compress(keep, axis=0), r[keep]
-            share = len(r) / len(source)
-            if len(r) < 6:
-                return Alignment(T, np.inf, share, iterations)
-            rms = float(np.sqrt(np.mean(r**2)))
-            # On a clean scan the median is close to zero. The few points of an end face, far off while the part still
-            # slides along its length, would then lose all their weight: the gate sets a lower bound of the scale.
-            scale = robust_sd(r, gate / 12.0)
-            weight = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(r), 1e-12))
-            if axes is not None:
-                weight *= balance(facing(n, axes))
-            centre = p.mean(axis=0)
-            J = np.hstack([np.cross(p - centre, n), n])
-            step = np.linalg.lstsq(J.T @ (weight[:, None] * J), -J.T @ (weight * r), rcond=None)[0]
-            R = rigid.rotation_from_vector(step[:3])
-            T = rigid.transform(R, centre + step[3:] - R @ centre) @ T
-            reach = float(np.linalg.norm(p - centre, axis=1).max())
-            if np.linalg.norm(step[:3]) * reach + np.linalg.norm(step[3:]) < 1e-3 * gate:
-                break
+        rms, share, more = _aligned(boxes, normals, source, T, float(gate), axes, max_iterations, known)
+        iterations += more
+        if rms == np.inf:
+            break
     return Alignment(T, rms, share, iterations)
 
 
-class _Partners:
-    """The nearest samples of a tree to points that move a little at a time, searched for only where they may be others.
+@njit(cache=True, nogil=True)
+def _aligned(boxes, normals, source, T, gate, axes, most, known):  # type: ignore[no-untyped-def]
+    """Align with one gate by at most ``most`` iterations from T (4, 4), which becomes the pose reached.
 
-    A search also finds the second nearest sample. While a point has moved by less than half of what that one is
-    farther away, the nearest one stays (triangle inequality).
+    Return the rms of the pairs before the last step, infinite where too few are left, their share, and iterations.
     """
+    count = len(source)
+    placed, near = np.empty((count, 3)), np.empty(count, np.bool_)
+    p, n, r = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    rms = np.inf
+    for iteration in range(1, most + 1):
+        for row in range(count):
+            for i in range(3):
+                x, y, z = source[row, 0], source[row, 1], source[row, 2]
+                placed[row, i] = T[i, 0] * x + T[i, 1] * y + T[i, 2] * z + T[i, 3]
+        # The nearest sample may lie a sample spacing away along the surface; the gate limits the normal distance.
+        find_partners(boxes, placed, 3.0 * gate, known, near)
+        pairs = _pairs(boxes, normals, placed, known.first, near, gate, p, n, r)
+        if pairs < 6:
+            return np.inf, pairs / count, iteration
+        residual = r[:pairs]
+        rms = np.sqrt(np.mean(residual**2))
+        # On a clean scan the median is close to zero. The few points of an end face, far off while the part still
+        # slides along its length, would then lose all their weight: the gate sets a lower bound of the scale.
+        scale = max(MAD_TO_SD * np.median(np.abs(residual)), gate / 12.0)
+        moved = _step(p[:pairs], n[:pairs], residual, HUBER * scale, axes, T)
+        if moved < 1e-3 * gate:
+            break
+    return rms, pairs / count, iteration
 
-    def __init__(self, tree: cKDTree, count: int) -> None:
-        self._tree, self._samples = tree, np.asarray(tree.data)
-        self._index = np.full(count, tree.n)  # of the nearest sample; the tree's number of samples for none
-        self._other = np.full(count, -np.inf)  # least distance of any other sample from where the point was
-        self._searched = np.zeros((count, 3))  # where the point was
 
-    def of(self, placed: Floats, reach: float) -> tuple[Ints, Bools]:
-        """Return the nearest sample (n,) of each of the points (n, 3), and whether it lies within ``reach``."""
-        known = self._index < self._tree.n
-        nearest = self._samples.take(self._index, axis=0, mode="clip")
-        distance = np.where(known, _lengths(placed - nearest), np.inf)
-        other = self._other - _lengths(placed - self._searched) - SURE_MM
-        again = np.flatnonzero((other <= distance) & (np.minimum(other, distance) < reach))
-        if len(again):
-            found, index = self._tree.query(placed[again], k=2, distance_upper_bound=reach)
-            self._index[again], self._searched[again] = index[:, 0], placed[again]
-            self._other[again] = np.minimum(found[:, 1], reach)
-            distance[again] = found[:, 0]
-        return self._index, distance < reach
+@njit(cache=True, nogil=True)
+def _pairs(boxes, normals, placed, nearest, near, gate, p, n, r):  # type: ignore[no-untyped-def]
+    """Write the points, normals and distances of pairs within the gate to the start of p, n and r; return how many."""
+    pairs = 0
+    for row in range(len(placed)):
+        if near[row]:
+            at = boxes.row[nearest[row]]
+            off = 0.0
+            for i in range(3):
+                off += (placed[row, i] - boxes.samples[nearest[row], i]) * normals[at, i]
+            if abs(off) <= gate:
+                for i in range(3):
+                    p[pairs, i], n[pairs, i] = placed[row, i], normals[at, i]
+                r[pairs] = off
+                pairs += 1
+    return pairs
 
 
-def _lengths(vectors: Floats) -> Floats:
-    length: Floats = np.sqrt(np.einsum("ni,ni->n", vectors, vectors))
-    return length
+@njit(cache=True, nogil=True)
+def _step(p, n, r, huber, axes, T):  # type: ignore[no-untyped-def]
+    """Move T (4, 4) by one weighted least-squares step of pairs (k,); return by how much it moves the points, mm."""
+    share, group = _balance(n, axes)
+    centre = np.array([p[:, 0].mean(), p[:, 1].mean(), p[:, 2].mean()])
+    normal, right, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
+    reach = 0.0
+    for k in range(len(r)):
+        weight = min(1.0, huber / max(abs(r[k]), 1e-12)) * share[group[k]]
+        x, y, z = p[k, 0] - centre[0], p[k, 1] - centre[1], p[k, 2] - centre[2]
+        reach = max(reach, x * x + y * y + z * z)
+        row[0] = y * n[k, 2] - z * n[k, 1]
+        row[1] = z * n[k, 0] - x * n[k, 2]
+        row[2] = x * n[k, 1] - y * n[k, 0]
+        row[3], row[4], row[5] = n[k, 0], n[k, 1], n[k, 2]
+        for i in range(6):
+            right[i] -= weight * r[k] * row[i]
+            for j in range(i + 1):
+                normal[i, j] += weight * row[i] * row[j]
+    for i in range(6):
+        for j in range(i):
+            normal[j, i] = normal[i, j]
+    step = _solution(normal, right)
+    motion = _turn(step[0], step[1], step[2])
+    for i in range(3):
+        motion[i, 3] = centre[i] + step[3 + i]
+        for j in range(3):
+            motion[i, 3] -= motion[i, j] * centre[j]
+    T[:, :] = product(motion, T)
+    return np.sqrt(np.sum(step[:3] ** 2)) * np.sqrt(reach) + np.sqrt(np.sum(step[3:] ** 2))
+
+
+@njit(cache=True, nogil=True)
+def _balance(n, axes):  # type: ignore[no-untyped-def]
+    """Return weights (3,) of groups and the group (k,) of each normal (k, 3), see :func:`balance`; 1 without axes."""
+    group, number = np.zeros(len(n), np.int64), np.zeros(3)
+    if axes.shape[1] == 0:
+        return np.ones(3), group
+    for k in range(len(n)):
+        most = -1.0
+        for i in range(3):
+            along = abs(n[k, 0] * axes[0, i] + n[k, 1] * axes[1, i] + n[k, 2] * axes[2, i])
+            if along > most:
+                most, group[k] = along, i
+        number[group[k]] += 1.0
+    return np.minimum(len(n) / (3.0 * np.maximum(number, 1.0)), MOST_WEIGHT), group
+
+
+@njit(cache=True, nogil=True)
+def _solution(normal, right):  # type: ignore[no-untyped-def]
+    """Return the shortest solution (6,) of normal equations: motions that the pairs do not determine are not made."""
+    values, vectors = np.linalg.eigh(normal)
+    solution = np.zeros(6)
+    for k in range(6):
+        if abs(values[k]) > RANK * np.abs(values).max():
+            along = 0.0
+            for i in range(6):
+                along += vectors[i, k] * right[i]
+            for i in range(6):
+                solution[i] += along / values[k] * vectors[i, k]
+    return solution
+
+
+@njit(cache=True, nogil=True)
+def _turn(a, b, c):  # type: ignore[no-untyped-def]
+    """Return the motion (4, 4) that turns about the origin by a vector, rad (Rodrigues)."""
+    T = np.eye(4)
+    angle = np.sqrt(a * a + b * b + c * c)
+    if angle == 0.0:
+        return T
+    K = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]]) / angle
+    T[:3, :3] += np.sin(angle) * K + (1.0 - np.cos(angle)) * product(K, K)
+    return T
 
 
 def facing(normals: Floats, axes: Floats) -> Ints:
@@ -205,3 +279,153 @@ def balance(group: Ints) -> Floats:
     number = np.maximum(np.bincount(group, minlength=3), 1)
     weight: Floats = np.minimum(len(group) / (3.0 * number), MOST_WEIGHT)[group]
     return weight
+
+
+# --- Nearest samples of a surface to points that move a little at a time
+#
+# A tree's search starts without a bound, and far from a surface, where many samples are about as near, it visits many
+# of them. Here the samples found before, which stay near, are the bound from the start.
+
+
+class SampleBoxes(NamedTuple):
+    """Samples (n, 3) in the order of a tree, and the boxes about them; ``row`` (n,) numbers them in the tree's data.
+
+    Box i holds the boxes 2i and 2i + 1, box 1 all; the last half of the boxes ``low`` and ``high`` (2k, 3) holds LEAF
+    samples each, in their order. A box without samples has infinite limits.
+    """
+
+    samples: Floats
+    row: Ints
+    low: Floats
+    high: Floats
+
+
+class Known(NamedTuple):
+    """What is known of the two nearest samples of points (n,): numbers -1 where none was found.
+
+    ``other`` (n,) is the least distance of any sample but the ``first`` from where the point was ``searched`` (n, 3).
+    """
+
+    first: Ints
+    second: Ints
+    other: Floats
+    searched: Floats
+
+
+def boxes_of(tree: cKDTree) -> SampleBoxes:
+    """Put boxes about the samples of a tree, neighbours in the tree's order."""
+    row = np.asarray(tree.indices, np.int64)
+    samples = np.asarray(tree.data)[row]
+    leaves = 1 << max(int(np.ceil(np.log2(max(len(row) / LEAF, 1.0)))), 0)
+    low, high = np.full((2 * leaves, 3), np.inf), np.full((2 * leaves, 3), -np.inf)
+    starts = np.arange(0, len(row), LEAF)
+    low[leaves : leaves + len(starts)] = np.minimum.reduceat(samples, starts)
+    high[leaves : leaves + len(starts)] = np.maximum.reduceat(samples, starts)
+    while leaves > 1:
+        half = leaves // 2
+        low[half:leaves] = low[leaves : 2 * leaves].reshape(half, 2, 3).min(axis=1)
+        high[half:leaves] = high[leaves : 2 * leaves].reshape(half, 2, 3).max(axis=1)
+        leaves = half
+    return SampleBoxes(samples, row, low, high)
+
+
+def nothing_known(count: int) -> Known:
+    """Return what is known of ``count`` points before any search."""
+    none = np.full(count, -1, np.int64)
+    return Known(none, none.copy(), np.full(count, -np.inf), np.zeros((count, 3)))
+
+
+def partners(boxes: SampleBoxes, placed: Floats, reach: float, known: Known) -> tuple[Ints, Bools]:
+    """Return the nearest sample (n,), by its order in boxes, of points (n, 3), and whether it lies within ``reach``.
+
+    A search also finds the second nearest sample. While a point has moved by less than half of what that one is
+    farther away, the nearest one stays (triangle inequality). ``known`` is brought up to date.
+    """
+    near = np.zeros(len(placed), np.bool_)
+    find_partners(boxes, np.ascontiguousarray(placed), reach, known, near)
+    return known.first, near
+
+
+@njit(cache=True, nogil=True)
+def find_partners(boxes, placed, reach, known, near):  # type: ignore[no-untyped-def]
+    """Bring the partners of points up to date, see :func:`partners`."""
+    stack, away = np.empty(STACK, np.int64), np.empty(STACK)
+    samples, (first, second, other, searched) = boxes.samples, known
+    last = -1  # neighbours among the points often have the same partner
+    for row in range(len(placed)):
+        x, y, z = placed[row, 0], placed[row, 1], placed[row, 2]
+        distance = np.inf
+        if first[row] >= 0:
+            distance = np.sqrt(_square(samples, first[row], x, y, z))
+        left = other[row] - np.sqrt(_square(searched, row, x, y, z)) - SURE_MM
+        if left <= distance and min(left, distance) < reach:
+            guess = first[row] if first[row] >= 0 else last
+            one, two, best, bound = _search(boxes, x, y, z, reach, guess, second[row], stack, away)
+            first[row], second[row], other[row] = one, two, np.sqrt(bound)
+            searched[row, 0], searched[row, 1], searched[row, 2] = x, y, z
+            distance = np.sqrt(best) if one >= 0 else np.inf
+        near[row] = distance < reach
+        last = first[row]
+
+
+@njit(cache=True, nogil=True)
+def _search(boxes, x, y, z, reach, guess, other_guess, stack, away):  # type: ignore[no-untyped-def]
+    """Find the two samples nearest to (x, y, z) within ``reach``, and the squares of their distances.
+
+    The guesses are the bounds to begin with. The number is -1 and the square that of ``reach`` where there is none.
+    """
+    one, two, best, bound = -1, -1, reach * reach, reach * reach
+    samples, low, high = boxes.samples, boxes.low, boxes.high
+    if guess >= 0:
+        square = _square(samples, guess, x, y, z)
+        if square < best:
+            one, best = guess, square
+    if other_guess >= 0 and other_guess != guess:
+        square = _square(samples, other_guess, x, y, z)
+        if square < best:
+            one, two, best, bound = other_guess, one, square, best
+        elif square < bound:
+            two, bound = other_guess, square
+    leaves, count = len(low) // 2, len(samples)
+    stack[0], away[0], depth = 1, 0.0, 1
+    while depth:
+        depth -= 1
+        box = stack[depth]
+        if away[depth] >= bound:
+            continue
+        while box < leaves:
+            left, right = _from_box(low, high, 2 * box, x, y, z), _from_box(low, high, 2 * box + 1, x, y, z)
+            box *= 2
+            if right < left:
+                box += 1
+                left, right = right, left
+            if right < bound:
+                stack[depth], away[depth] = box ^ 1, right
+                depth += 1
+            if left >= bound:
+                break
+        if box < leaves or _from_box(low, high, box, x, y, z) >= bound:
+            continue
+        for at in range((box - leaves) * LEAF, min((box - leaves + 1) * LEAF, count)):
+            square = _square(samples, at, x, y, z)
+            if square < bound and at != one and at != two:
+                if square < best:
+                    one, two, best, bound = at, one, square, best
+                else:
+                    two, bound = at, square
+    return one, two, best, bound
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _square(points, row, x, y, z):  # type: ignore[no-untyped-def]
+    a, b, c = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+    return a * a + b * b + c * c
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _from_box(low, high, box, x, y, z):  # type: ignore[no-untyped-def]
+    """Return the square of the distance of (x, y, z) from a box, infinite for one without samples."""
+    a = max(low[box, 0] - x, x - high[box, 0], 0.0)
+    b = max(low[box, 1] - y, y - high[box, 1], 0.0)
+    c = max(low[box, 2] - z, z - high[box, 2], 0.0)
+    return a * a + b * b + c * c

@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import icp, neighbors, principal, rigid
 from processor.geometry.polyline import Line, Polyline, crossing, fit_line, ransac_line
+from processor.robust_statistics import robust_sd
 
 
 def test_fit_recovers_a_quarter_turn_worked_by_hand():
@@ -102,22 +103,74 @@ def test_point_to_plane_brings_a_box_home():
     normals[np.arange(len(points)), axis] = side
     T_true = rigid.transform(rigid.rotation_from_vector(np.array([0.01, 0.02, -0.01])), np.array([40.0, -30.0, 20.0]))
     source = rigid.apply(rigid.invert(T_true), points[::7]) + rng.normal(0.0, 0.5, (len(points[::7]), 3))
-    found = icp.point_to_plane(source, points, normals, np.eye(4), gates_mm=(200.0, 50.0, 10.0))
+    boxes = icp.boxes_of(cKDTree(points))
+    found = icp.point_to_plane(source, boxes, normals, np.eye(4), gates_mm=(200.0, 50.0, 10.0))
     moved = rigid.apply(found.T_target_source @ rigid.invert(T_true), np.array([[3000.0, 900.0, 500.0]]))
     assert np.linalg.norm(moved - [3000.0, 900.0, 500.0]) < 0.2
 
 
-def test_partners_of_points_that_move_are_those_of_a_plain_search():
+def point_to_plane_by_arrays(source, points, normals, start, gates_mm, axes):
+    """Return the pose of icp.point_to_plane, by a plain search for all points and whole arrays."""
+    tree, T = cKDTree(points), start
+    for gate in gates_mm:
+        for _ in range(15):
+            placed = rigid.apply(T, source)
+            distance, index = tree.query(placed, distance_upper_bound=3.0 * gate)
+            p, at = placed[np.isfinite(distance)], index[np.isfinite(distance)]
+            r = np.einsum("ni,ni->n", p - points[at], normals[at])
+            keep = np.abs(r) <= gate
+            p, n, r = p[keep], normals[at][keep], r[keep]
+            weight = np.minimum(1.0, 1.345 * robust_sd(r, gate / 12.0) / np.maximum(np.abs(r), 1e-12))
+            weight *= 1.0 if axes is None else icp.balance(icp.facing(n, axes))
+            centre = p.mean(axis=0)
+            J = np.hstack([np.cross(p - centre, n), n])
+            step = np.linalg.lstsq(J.T @ (weight[:, None] * J), -J.T @ (weight * r), rcond=None)[0]
+            R = rigid.rotation_from_vector(step[:3])
+            T = rigid.transform(R, centre + step[3:] - R @ centre) @ T
+            reach = np.linalg.norm(p - centre, axis=1).max()
+            if np.linalg.norm(step[:3]) * reach + np.linalg.norm(step[3:]) < 1e-3 * gate:
+                break
+    return T
+
+
+@pytest.mark.parametrize("turn", [0.02, 0.3])
+@pytest.mark.parametrize("sides", [1, 3])
+def test_point_to_plane_by_its_kernel_is_that_by_arrays(turn, sides):
+    rng = np.random.default_rng(8)
+    points, normals = rng.uniform(-1.0, 1.0, (4000, 3)) * [3000.0, 900.0, 500.0], np.zeros((4000, 3))
+    axis = 2 - rng.integers(0, sides, len(points))  # of one side alone, three motions are not determined
+    points[np.arange(len(points)), axis] = np.array([3000.0, 900.0, 500.0])[axis]
+    normals[np.arange(len(points)), axis] = 1.0
+    T = rigid.transform(rigid.rotation_from_vector(np.array([turn, -0.02, 0.01])), np.array([60.0, -30.0, 20.0]))
+    source = rigid.apply(T, points[::7]) + rng.normal(0.0, 0.5, (len(points[::7]), 3))
+    boxes, gates = icp.boxes_of(cKDTree(points)), (400.0, 150.0, 12.0)
+    for axes in (None, rigid.rotation_from_vector(np.array([0.02, 0.01, 0.0]))):
+        found = icp.point_to_plane(source, boxes, normals, np.eye(4), gates_mm=gates, axes=axes).T_target_source
+        expected = point_to_plane_by_arrays(source, points, normals, np.eye(4), gates, axes)
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7)
+
+
+def test_point_to_plane_without_pairs_leaves_the_pose():
+    points, normals = np.eye(3)[[0, 1, 2, 0, 1, 2, 0]] * 10.0, np.eye(3)[[2, 2, 2, 2, 2, 2, 2]]
+    boxes = icp.boxes_of(cKDTree(points))
+    found = icp.point_to_plane(points + 1e4, boxes, normals, np.eye(4), gates_mm=(50.0, 10.0))
+    assert (found.rms, found.paired_share, found.iterations) == (np.inf, 0.0, 1)
+    np.testing.assert_array_equal(found.T_target_source, np.eye(4))
+
+
+@pytest.mark.parametrize("count", [3, 40, 3000])
+def test_partners_of_points_that_move_are_those_of_a_plain_search(count):
     rng = np.random.default_rng(6)
-    tree = cKDTree(rng.uniform(0.0, 1000.0, (3000, 3)))
+    tree = cKDTree(rng.uniform(0.0, 1000.0, (count, 3)))
+    boxes = icp.boxes_of(tree)
     points = rng.uniform(-100.0, 1100.0, (2000, 3))
-    partners = icp._Partners(tree, len(points))
+    known = icp.nothing_known(len(points))
     for step, reach in ((0.0, 90.0), (300.0, 90.0), (20.0, 90.0), (3.0, 90.0), (0.3, 60.0), (0.0, 60.0), (3.0, 200.0)):
         points = points + rng.normal(0.0, step, points.shape)
-        index, near = partners.of(points, reach)
+        nearest, near = icp.partners(boxes, points, reach, known)
         distance, expected = tree.query(points, distance_upper_bound=reach)
         np.testing.assert_array_equal(near, np.isfinite(distance))
-        np.testing.assert_array_equal(index[near], expected[near])
+        np.testing.assert_array_equal(boxes.row[nearest[near]], expected[near])
         assert 0 < near.sum() < len(points)
 
 

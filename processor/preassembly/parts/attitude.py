@@ -66,6 +66,7 @@ class Surface:
     points: Floats
     normals: Floats
     tree: cKDTree
+    boxes: icp.SampleBoxes
     mesh: MeshSurface
     centre: Floats  # (3,) of its area
     axes: Floats  # (3, 3) principal axes as columns
@@ -112,10 +113,12 @@ def sample_surface(part: DesignPart) -> Surface:
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
     mesh = mesh_distance.of_mesh(part.vertices, part.faces)
     axes = principal.of_mesh(part.vertices, part.faces)
+    tree = cKDTree(points, balanced_tree=False)
     return Surface(
         points=points,
         normals=normals,
-        tree=cKDTree(points, balanced_tree=False),
+        tree=tree,
+        boxes=icp.boxes_of(tree),
         mesh=mesh,
         centre=axes.centre,
         axes=axes.axes,
@@ -257,11 +260,10 @@ def _of_pieces(seeds: Floats, few: Floats, surface: Surface, part: DesignPart) -
     def iterate(T: Floats) -> _Candidate:
         fitted = icp.point_to_plane(
             quick,
-            surface.points,
+            surface.boxes,
             surface.normals,
             T,
             gates_mm=COARSE_GATES_MM[:1],
-            tree=surface.tree,
             axes=surface.axes,
             max_iterations=PIECE_ITERATIONS,
         ).T_target_source
@@ -334,7 +336,7 @@ def _align(points: Floats, surface: Surface, gates_mm: tuple[float, ...], candid
     T = candidate.T
     for seeds, gates in ((thinned(points, WIDE_POINTS), gates_mm[:-1]), (points, gates_mm[-1:])):
         T = icp.point_to_plane(
-            seeds, surface.points, surface.normals, T, gates_mm=gates, tree=surface.tree, axes=surface.axes
+            seeds, surface.boxes, surface.normals, T, gates_mm=gates, axes=surface.axes
         ).T_target_source
     return _Candidate(T, candidate.start, _misfit(points, surface, T))
 
