@@ -25,6 +25,7 @@ CELLS_OF_POINTS = 2.0  # edge of a cell, in spacings
 LEAST_RANGE = 512  # places per task of a thread
 GROWTH = 1.5  # factor of the search radius where too few points were found
 CROP_CHUNK = 1 << 20
+MOST_EMPTY = 4  # voxels for each point, up to which the empty ones are counted, too
 
 
 def of_spacing(points: Floats) -> PointGrid:
@@ -158,10 +159,14 @@ def by_cell(points: Floats, size_mm: float) -> Ints:
 
 def voxel_means(points: Floats, size_mm: float, least: int = 1) -> Floats:
     """Mean (k, 3) of the points in each occupied voxel that holds at least ``least`` points, in voxel order."""
-    cell = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64)
-    _, inverse, count = np.unique(_cell_keys(cell), return_inverse=True, return_counts=True)
-    total = np.stack([np.bincount(inverse, points[:, i], len(count)) for i in range(3)], axis=1)
-    return (total / count[:, None])[count >= least]
+    key = _cell_keys(np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64))
+    if int(key.max()) > MOST_EMPTY * len(key):  # numbers of the occupied voxels alone: these take a sort
+        key = np.unique(key, return_inverse=True)[1]
+    count = np.bincount(key)
+    full = np.flatnonzero(count >= max(least, 1))
+    total = np.stack([np.bincount(key, points[:, i])[full] for i in range(3)], axis=1)
+    means: Floats = total / count[full, None]
+    return means
 
 
 def _cell_keys(cell: Ints) -> Ints:

@@ -210,6 +210,14 @@ def test_voxel_means_by_hand():
     np.testing.assert_allclose(means, [[0.5, 0, 0], [10.5, 1.0, 0]])
 
 
+def test_voxel_means_do_not_depend_on_how_many_voxels_are_empty():
+    points = np.random.default_rng(7).uniform(0.0, 100.0, (500, 3))
+    near = neighbors.voxel_means(points, 10.0)  # 1000 voxels for 500 points
+    far = neighbors.voxel_means(np.vstack([points, np.full((1, 3), 1e5)]), 10.0)  # 10^12 voxels
+    np.testing.assert_array_equal(far[:-1], near)
+    np.testing.assert_array_equal(far[-1], [1e5, 1e5, 1e5])
+
+
 def test_the_order_by_cells_does_not_depend_on_that_of_the_file():
     rng = np.random.default_rng(0)
     points = rng.uniform(0.0, 300.0, (2_000, 3)).round(0)  # some coordinates are equal

@@ -366,7 +366,7 @@ def test_unequal_plates_meet_at_their_outer_faces():
     assert np.abs(result.joints.gaps).max() < 0.5
     assert (np.abs(result.joints.gaps) < 1.5 * result.joints.gap_ci95 + 0.02).all()
     twice = Scene("b", "arch-bridge", (*scans, dataclasses.replace(scans[1], name="again")), arch=design)
-    with pytest.raises(InputError, match=r"takes one scan a part, rib1 has several"):
+    with pytest.raises(InputError, match=r"takes one scan per part, rib1 has several"):
         preassembly_step.run(twice, preassembly_step.Params(method="line"))
 
 
