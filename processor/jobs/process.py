@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import pickle
@@ -315,6 +316,7 @@ def _answered(process: subprocess.Popen[bytes], message: bytes, stopped: Callabl
 
 
 POOL = Pool()
+atexit.register(POOL.close)
 
 
 def in_process(function: Callable[[Any], R], job: Any, stopped: Callable[[], bool] = never) -> R | Lost:
