@@ -46,8 +46,8 @@ class Alignment:
 
     ``movements`` (k, 7) are of the stations, ``whole`` (6,) of everything; ``covariance`` (6, 6) is that of the whole
     if the stations' movements were known, ``station_covariance`` (7k, 7k) that of these. The whole moves by
-    ``response`` (6, 7k) times an error of the stations' movements, or would by ``free_response`` if it were fitted to
-    all that was seen.
+    ``response`` (6, 7k) times an error of the stations' movements. Where it is not fitted, it would by
+    ``free_response`` if it were fitted to all that was seen.
     """
 
     centre: Floats
@@ -129,11 +129,11 @@ def align(
     enough = len(np.unique(component[used])) >= FEWEST_COMPONENTS
     compared = used if enough else np.ones_like(used)
     movements, station_covariance = station_movements(_of_rows(blocks, compared), J[compared], len(stations.names))
-    free = _response(_free_gain(J[:, :6], blocks.variance), J, blocks.station, len(stations.names))
-    start = replace(start, movements=movements, station_covariance=station_covariance, free_response=free)
-    residual = blocks.mean - np.einsum("nk,nk->n", J, movements[blocks.station])
+    start = replace(start, movements=movements, station_covariance=station_covariance)
     if not enough:
-        return start
+        free = _free_gain(J[:, :6], blocks.variance)
+        return replace(start, free_response=_response(free, J, blocks.station, len(stations.names)))
+    residual = blocks.mean - np.einsum("nk,nk->n", J, movements[blocks.station])
     whole, covariance, gain = _whole(residual[used], J[used, :6], component[used])
     if stations.unnamed:
         covariance = covariance + scanner_class.pose_covariance(points[used] - start.centre)

@@ -164,7 +164,7 @@ def significant(
 def _rigid_part(fit: ComponentShape, shape: shape_models.Shape) -> shape_models.Shape:
     """Return the rigid motion of the component that is nearest to a shape where blocks were seen."""
     value = shape.values(fit.frame, fit.blocks.points, fit.blocks.outward)
-    return shape_models.rigid_motion(dataclasses.replace(fit.blocks, mean=value), fit.frame, [])
+    return shape_models.rigid_motion(dataclasses.replace(fit.blocks, mean=value), fit.frame)
 
 
 def unproven_motions(
@@ -180,8 +180,11 @@ def unproven_motions(
         proven = [judged.shape for judged in significant.get(fit.component, ())]
         kinds = [shape.kind for shape in proven]
         if shape_models.RIGID not in kinds and any(shape.kind == shape_models.RIGID for shape in fit.fitted.shapes):
-            blocks = dataclasses.replace(fit.blocks, weight=fit.fitted.weight)
-            motions[fit.component] = [shape_models.rigid_motion(blocks, fit.frame, proven)]
+            rest = fit.blocks.mean.copy()
+            for shape in proven:
+                rest -= shape.values(fit.frame, fit.blocks.points, fit.blocks.outward)
+            blocks = dataclasses.replace(fit.blocks, mean=rest, weight=fit.fitted.weight)
+            motions[fit.component] = [shape_models.rigid_motion(blocks, fit.frame)]
     return motions
 
 

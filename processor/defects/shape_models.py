@@ -305,12 +305,8 @@ def refitted(fitted: Fitted, fine: Blocks, frame: Frame) -> Fitted:
     return dataclasses.replace(fitted, shapes=seen.shapes(chosen), gain=tuple(gains))
 
 
-def rigid_motion(blocks: Blocks, frame: Frame, others: list[Shape]) -> Shape:
-    """Return the rigid motion that fits what ``others`` leave of the blocks' deviations."""
-    rest = blocks.mean.copy()
-    for shape in others:
-        rest -= shape.values(frame, blocks.points, blocks.outward)
-    blocks = dataclasses.replace(blocks, mean=rest)
+def rigid_motion(blocks: Blocks, frame: Frame) -> Shape:
+    """Return the rigid motion that fits the blocks' deviations."""
     seen = Observations(blocks, frame, frame.local(blocks.points), blocks.outward @ frame.axes.T)
     return seen.shapes([(RIGID, ())])[0]
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.geometry.linalg_small import product
 from processor.geometry.polyline import Polyline
-from processor.model import Bools, Floats, Ints
+from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
 
 MOST_WEIGHT = 100.0  # of a point on a face that few points lie on
@@ -335,20 +335,13 @@ def nothing_known(count: int) -> Known:
     return Known(none, none.copy(), np.full(count, -np.inf), np.zeros((count, 3)))
 
 
-def partners(boxes: SampleBoxes, placed: Floats, reach: float, known: Known) -> tuple[Ints, Bools]:
-    """Return the nearest sample (n,), by its order in boxes, of points (n, 3), and whether it lies within ``reach``.
-
-    A search also finds the second nearest sample. While a point has moved by less than half of what that one is
-    farther away, the nearest one stays (triangle inequality). ``known`` is brought up to date.
-    """
-    near = np.zeros(len(placed), np.bool_)
-    find_partners(boxes, np.ascontiguousarray(placed), reach, known, near)
-    return known.first, near
-
-
 @njit(cache=True, nogil=True)
 def find_partners(boxes, placed, reach, known, near):  # type: ignore[no-untyped-def]
-    """Bring the partners of points up to date, see :func:`partners`."""
+    """Bring the nearest samples of points (n, 3) up to date in ``known``; ``near`` (n,) are those within ``reach``.
+
+    A search also finds the second nearest sample. While a point has moved by less than half of what that one is
+    farther away, the nearest one stays (triangle inequality).
+    """
     stack, away = np.empty(STACK, np.int64), np.empty(STACK)
     samples, (first, second, other, searched) = boxes.samples, known
     last = -1  # neighbours among the points often have the same partner

@@ -28,13 +28,13 @@ R = TypeVar("R")
 
 
 @contextmanager
-def on_cluster(address: str | None, say: Callable[[str], None]) -> Iterator[None]:
+def on_cluster(address: str | None, log: Callable[[str], None]) -> Iterator[None]:
     """Compute tiles on the Dask cluster whose scheduler has the address, as long as the context lasts; None: here.
 
     Raises UsageError where no scheduler answers, as :func:`processor.jobs.runner.executor` does, and for workers with
     other software.
     """
-    with runner.executor(address, 1, say) as where:
+    with runner.executor(address, 1, log) as where:
         if isinstance(where, runner.Local):
             yield
             return

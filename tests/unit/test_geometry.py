@@ -164,13 +164,13 @@ def test_partners_of_points_that_move_are_those_of_a_plain_search(count):
     tree = cKDTree(rng.uniform(0.0, 1000.0, (count, 3)))
     boxes = icp.boxes_of(tree)
     points = rng.uniform(-100.0, 1100.0, (2000, 3))
-    known = icp.nothing_known(len(points))
+    known, near = icp.nothing_known(len(points)), np.empty(len(points), np.bool_)
     for step, reach in ((0.0, 90.0), (300.0, 90.0), (20.0, 90.0), (3.0, 90.0), (0.3, 60.0), (0.0, 60.0), (3.0, 200.0)):
         points = points + rng.normal(0.0, step, points.shape)
-        nearest, near = icp.partners(boxes, points, reach, known)
+        icp.find_partners(boxes, points, reach, known, near)
         distance, expected = tree.query(points, distance_upper_bound=reach)
         np.testing.assert_array_equal(near, np.isfinite(distance))
-        np.testing.assert_array_equal(boxes.row[nearest[near]], expected[near])
+        np.testing.assert_array_equal(boxes.row[known.first[near]], expected[near])
         assert 0 < near.sum() < len(points)
 
 

@@ -27,8 +27,8 @@ from tests.support.m3c2_clouds import wavy
 TILES = [np.full(3, float(k)) for k in range(7)]
 
 
-def said(_):
-    """Nobody reads what is said here."""
+def no_log(_):
+    """Drop a line of progress."""
 
 
 def test_tiles_are_computed_here_in_order():
@@ -51,7 +51,7 @@ def test_ranges_cover_all_rows():
 
 def test_tiles_on_a_cluster_come_in_order_from_its_workers(dask_cluster):  # noqa: F811
     factor = Shared(np.array([2.0]))
-    with tile_cluster.on_cluster(dask_cluster.address, said):
+    with tile_cluster.on_cluster(dask_cluster.address, no_log):
         for _ in range(2):
             found = list(tiles.mapped(tile_functions.scaled, iter(TILES), factor))
             assert [int(part[0]) for part, _, _ in found] == [0, 2, 4, 6, 8, 10, 12]
@@ -62,7 +62,7 @@ def test_tiles_on_a_cluster_come_in_order_from_its_workers(dask_cluster):  # noq
 
 
 def test_errors_of_tiles_are_raised(dask_cluster):  # noqa: F811
-    with tile_cluster.on_cluster(dask_cluster.address, said):
+    with tile_cluster.on_cluster(dask_cluster.address, no_log):
         with pytest.raises(InputError, match="tile 0: refused"):
             list(tiles.mapped(tile_functions.refused, TILES))
         with pytest.raises(InputError, match="a worker has too little memory for a tile"):
@@ -73,12 +73,12 @@ def test_a_worker_with_other_software_is_named(dask_cluster, monkeypatch):  # no
     other = {**tile_cluster.software(), "numpy": "1.0"}
     monkeypatch.setattr(tile_cluster, "software", lambda: other)
     message = rf"--cluster {dask_cluster.address}: tcp://.*: a worker has other software: numpy .*, not 1.0"
-    with pytest.raises(UsageError, match=message), tile_cluster.on_cluster(dask_cluster.address, said):
+    with pytest.raises(UsageError, match=message), tile_cluster.on_cluster(dask_cluster.address, no_log):
         pass
     monkeypatch.setattr(tile_cluster, "_check_workers", lambda _: None)  # as of a worker that joins later
     with (
         pytest.raises(InputError, match=r"a worker has other software: numpy .*, not 1.0"),
-        tile_cluster.on_cluster(dask_cluster.address, said),
+        tile_cluster.on_cluster(dask_cluster.address, no_log),
     ):
         list(tiles.mapped(np.sum, TILES))
 
@@ -90,7 +90,7 @@ def test_a_worker_that_ends_costs_its_tile_alone(tmp_path):
         cluster.add_worker("b")
         attempts = tmp_path / "attempts"
         attempts.mkdir()
-        with tile_cluster.on_cluster(cluster.address, said):
+        with tile_cluster.on_cluster(cluster.address, no_log):
             found = list(tiles.mapped(tile_functions.ends_its_worker, TILES, Shared(str(attempts))))
         np.testing.assert_array_equal(found, np.sqrt(TILES))
         again = {k for k, n in Counter(one.name.split("-")[0] for one in attempts.iterdir()).items() if n > 1}
@@ -194,7 +194,7 @@ def test_a_comparison_has_the_same_bytes_as_here(dask_cluster, used, tmp_path, m
         np.savetxt(tmp_path / name, points)
     request, found = Request(tmp_path / "a.xyz", tmp_path / "b.xyz"), []
     for address in (None, dask_cluster.address):
-        with tile_cluster.on_cluster(address, said):
+        with tile_cluster.on_cluster(address, no_log):
             found.append(compare(request))
     assert used == {"_normals", "_distances"}
     for name in ("distance", "lod95", "n1", "n2", "std1", "std2"):

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.defects.component_shapes import FEWEST_SEEN, LEAST_Z
 from processor.defects.deviation_field import Field
 from processor.defects.surface_charts import DesignSurface
 from processor.model import Floats
-
-LEAST_Z = 4.5  # standard deviations, from which on an offset is the face's
-FEWEST_CELLS = 6
 
 
 def unproven(field: Field, surface: DesignSurface) -> Floats:
@@ -22,7 +20,7 @@ def unproven(field: Field, surface: DesignSurface) -> Floats:
     for chart in range(len(surface.charts.kind)):
         rows = surface.charts.cells(chart)
         seen = np.flatnonzero(field.seen[rows] > 0.0) + rows.start
-        if len(seen) >= FEWEST_CELLS:
+        if len(seen) >= FEWEST_SEEN:
             median = float(np.median(field.deviation[seen]))
             if abs(median) < LEAST_Z * field.stations_sd(seen):
                 offsets[rows] = median
