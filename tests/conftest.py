@@ -1,5 +1,6 @@
-"""What all tests share: kernels compiled once for all workers, and no search for garbage in what stays."""
+"""What all tests share: kernels compiled once for all workers, blank pictures, no search for garbage in what stays."""
 
+import base64
 import contextlib
 import fcntl
 import gc
@@ -8,9 +9,13 @@ import os
 import tempfile
 from pathlib import Path
 
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numba.core.caching import FunctionCache
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
+
+PIXEL = b"iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
 
 _compile = Dispatcher.compile
 _held: set[Path] = set()  # locks of this process: a kernel that calls itself asks for its own
@@ -50,3 +55,12 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 10, 10)
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch):
+    """Write every picture as one white pixel: for tests of all else on a page, as drawing takes most of the time."""
+    pixel = base64.b64decode(
+        "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
+    )
+    monkeypatch.setattr(FigureCanvasAgg, "print_png", lambda _, out, **__: out.write(pixel))

@@ -26,6 +26,8 @@ from processor.space_frame.result import Result as FrameResult
 from processor.store import store
 from tests.support import arch_clouds
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 ROOT = Path(__file__).resolve().parents[1]
 
 

@@ -25,6 +25,8 @@ from processor.scan_folder import folder
 from processor.scan_folder.folder import read_input
 from tests.support import batches, cad_in_process
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = {"processor": processor, "designgen": designgen}

@@ -176,6 +176,7 @@ EVEN_CELLS = 200.0  # voxels along the scan's extent, for points of even density
 NEAR_MM = 100.0  # of the design's surface
 NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
 FINE_POINTS = 30_000
+RIVAL_POINTS = 8_000  # enough to tell attitudes apart: the fit of the one that is chosen uses FINE_POINTS
 LEAST_SHIFT_MM = 2.0  # thinner plates are not told apart by the side of their surface
 FACE_COS, MOST_AREA, FACE_ROUNDS = 0.9, 0.5, 5  # faces about along an axis, their least share of the area
 PROMISING = 3.0  # ratio of two poses' errors after the coarse registration, below which the fine one decides
@@ -305,7 +306,7 @@ def _surely_turned(
     refined = _refined(even(points), design, float(np.linalg.norm(np.ptp(design.points, axis=0))))
     turns = _turns(axes, surface)
     (error, _), *others = [refined(turn @ given.T_design_scan) for turn in turns]
-    few = thinned(points, FINE_POINTS)
+    few = thinned(points, RIVAL_POINTS)
     fits, turned_back = [], []
     for turn, (rms, T) in zip(turns[1:], others, strict=True):
         if rms <= PROMISING * error:
@@ -315,7 +316,8 @@ def _surely_turned(
     choice = pose_choice.choose(points, surface, poses, scanner)
     if choice.best >= len(fits) or any(rival >= len(fits) for rival in choice.rivals):
         return []
-    return [fits[choice.best], *(fits[rival] for rival in choice.rivals)]
+    best = fine(thinned(points, FINE_POINTS), surface, axes.axes, fits[choice.best].T_design_scan)
+    return [best, *(fits[rival] for rival in choice.rivals)]
 
 
 def _samples(surface: MeshSurface) -> Samples:

@@ -15,6 +15,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import font_manager
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ft2font import FT2Font
@@ -33,6 +34,7 @@ DECADES_APART = 20.0  # ratio between methods above which the axis is logarithmi
 LEAST_SHOWN_MM = 1e-3
 BEHIND_TEXT = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 LONGEST_LABEL = 24
+DPI = 110
 
 CaptionedPngs = dict[str, tuple[str | Message, bytes]]  # file name -> (caption, PNG)
 
@@ -48,8 +50,9 @@ def default_settings() -> Iterator[None]:
 
 def png(figure: Figure) -> bytes:
     """Write a figure as PNG, without a date."""
+    figure.set_dpi(DPI)
     out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
+    FigureCanvasAgg(figure).print_png(out, metadata={"Software": None})  # savefig draws a figure with a layout twice
     return out.getvalue()
 
 
@@ -60,7 +63,7 @@ def pdf(pages: Iterable[Figure]) -> bytes:
     out = io.BytesIO()
     with PdfPages(out, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as document:
         for page in pages:
-            document.savefig(page, dpi=110)
+            document.savefig(page, dpi=DPI)
             page.clear()  # a figure is part of a circle: its points would stay until the next garbage collection
     return out.getvalue()
 

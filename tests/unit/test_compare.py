@@ -21,6 +21,8 @@ from processor.report.deviation.core_points_csv import COLUMNS
 from processor.store import store
 from tests.support.m3c2_clouds import brute, wavy
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 UTM = np.array([512_345.25, 5_412_678.5, 231.0])  # metres
 
 

@@ -24,6 +24,8 @@ from processor.writers.cloud import of_scans
 from tests.support.exported_scenes import exported, merged, on_grid, stations_apart
 from tests.support.scan_bytes import las_bytes, put
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"
 FORMATS = sorted((FIXTURES / "formats").iterdir())
 PLACE = FIXTURES / "scan-folder"

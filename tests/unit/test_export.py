@@ -35,6 +35,8 @@ from tests.support.e57_fields import e57_field
 from tests.support.exported_runs import MAP, pose, swept
 from tests.support.meshes import bracket
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 RNG = np.random.default_rng(8)
 LAS_MM = 0.05 + 1e-4  # half a step of LAS
 TEXT_MM = 0.5e-4 + 1e-6

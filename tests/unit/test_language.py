@@ -23,6 +23,8 @@ from tests.support.bridge_results import LIMITS, SECTION, of_bridge, with_band
 from tests.support.metrics import metric
 from tests.support.pages import Visible, latin
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 CODES = [code for code in messages_.CODES if code != "en"]
 
 

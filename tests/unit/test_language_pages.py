@@ -35,6 +35,8 @@ from tests.support.pages import (
     two_nights,
 )
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 # --- steps ----------------------------------------------------------------------------------------------------------
 
 

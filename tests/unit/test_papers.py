@@ -18,6 +18,8 @@ from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Outcome, Row, Rule, holds, is_smaller
 from processor.report.charts import line_chart as drawing
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 TINY = {
     "000": ("arch-s1", ("scan.spacing_mm=25.0", "scan.sigma_mm=0.001", "scan.net=true")),
     "001": ("balls-100", ("frame.nodes_x=3", "frame.nodes_y=3", "scan.spacing_mm=5.0")),

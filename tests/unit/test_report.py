@@ -185,6 +185,7 @@ def test_long_tables_are_cut_on_the_terminal_and_say_so():
     assert lines[-1] == "  ... and 40 more in long.csv"
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_gaps_stand_as_in_the_source_paper():
     found = TablesOfPage(render(of_bridge(), ErrorReport())).tables["Splicing error, method design-aided (mm)"]
     assert found[0] == ["", "J1: foot1 & rib1", "J2: rib1 & foot2"]
@@ -193,6 +194,7 @@ def test_gaps_stand_as_in_the_source_paper():
     assert len(found) == 10
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_joint_without_an_answer_is_not_a_perfect_one():
     found = TablesOfPage(render(of_bridge(), ErrorReport())).tables["Joints, method design-aided (mm)"]
     assert found[1] == ["J1", "foot1", "rib1", "4.600", "8.200", "P8, z", "indeterminate"]
@@ -252,6 +254,7 @@ def test_a_run_without_any_answer_is_drawn_too():
     )
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_page_escapes_names_and_loads_nothing():
     bad = "<script>alert(1)</script>"
     scene = dataclasses.replace(arch_scene((bad, "rib1", "foot2")), name=bad, units_reason=bad)
@@ -268,6 +271,7 @@ def test_the_page_escapes_names_and_loads_nothing():
     assert not any(word in text for word in ("@import", "url(", "http://", "https://"))
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_page_says_first_what_came_out():
     execution, report = of_frame()
     text = render(execution, report)
@@ -293,6 +297,7 @@ def contents(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_earlier_results_are_replaced_as_a_whole(tmp_path):
     out = tmp_path / "deep" / "out"
     write_results.write_results(out, *of_frame())
@@ -304,6 +309,7 @@ def test_earlier_results_are_replaced_as_a_whole(tmp_path):
     assert [p.name for p in out.parent.iterdir()] == ["out"]
 
 
+@pytest.mark.usefixtures("blank_pictures")
 @pytest.mark.parametrize("where", ["page", "move"])
 def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
     out = tmp_path / "out"

@@ -51,6 +51,7 @@ def number(text):
 # --- tables --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_what_to_do_holds_the_numbers_of_results_json():
     execution = of_bridge()
     step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
@@ -207,6 +208,7 @@ def test_span_closure_budget_and_trade_off_as_tables():
     assert low < value < high
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_methods_without_intervals_have_none_of_these():
     runs = (StepRun("preassemble", "line", "{}", assembled("line")),)
     execution = Execution(arch_scene(), runs, PROVENANCE)

@@ -285,6 +285,7 @@ def test_starting_the_program_loads_no_drawing_library():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
     execution, report = of_frame()
     write_results.write_results(tmp_path / "out", execution, report)

@@ -13,6 +13,8 @@ from tests.support.bridge_results import of_bridge
 from tests.support.browser import opened, picture, read_over
 from tests.support.report_pages import BAD, rendered
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 
 def cells_below(shown, title):
     """Cells of the table below a heading, row by row."""

@@ -15,6 +15,8 @@ from processor.results import to_json
 from tests.support.bridge_results import of_bridge
 from tests.support.report_pages import BAD, Page, rendered
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 
 def test_the_page_carries_what_its_script_draws():
     execution = of_bridge()

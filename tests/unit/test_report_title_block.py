@@ -22,6 +22,8 @@ from tests.support.bridge_results import of_bridge
 from tests.support.browser import opened
 from tests.support.report_pages import BAD, Page, rendered
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 FULL = """
 [report]
 weather = "dry, 4 C"
