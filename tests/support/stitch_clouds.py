@@ -37,7 +37,7 @@ def ranges(origin, rays, room, things):
     return nearest
 
 
-def scan(name, T, seed, *, step_mrad=12.0, sigma_mm=2.0, room=ROOM, things=THINGS, grid=True):
+def scan(name, T, seed, *, step_mrad=17.0, sigma_mm=2.0, room=ROOM, things=THINGS, grid=True):
     """A panoramic scan in its scanner's frame, in rows and columns."""
     rng = np.random.default_rng(seed)
     columns = int(2.0 * np.pi / (1e-3 * step_mrad))

@@ -52,7 +52,7 @@ def test_four_scans_of_a_room_are_registered(room):
     assert result.frame == "PRCS"
     assert set(result.scans.status) == {"ok"}
     shift, turn = errors(result, T)
-    # With 78 thousand points of 2 mm in a scan the walls alone determine a pose to a few hundredths of a millimetre.
+    # With 52 thousand points of 2 mm in a scan the walls alone determine a pose to a few hundredths of a millimetre.
     assert np.abs(shift).max() < 0.2
     assert turn.max() < 0.05
     assert result.pairs.used.all()
