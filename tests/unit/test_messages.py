@@ -1,6 +1,7 @@
 """The catalogues of messages: complete in every language, and nothing in them that no program uses."""
 
 import ast
+import functools
 import re
 import string
 from pathlib import Path
@@ -20,26 +21,30 @@ SOURCES = Path(processor.__file__).parent
 OTHERS = [code for code in CODES if code != "en"]
 
 
+@functools.cache
+def all_calls():
+    """Every call in the sources, with its file."""
+    return [
+        (path.name, node)
+        for path in sorted(SOURCES.rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Call)
+    ]
+
+
 def calls(*names):
     """The first arguments of calls of the functions of these names, with the keywords given: constant texts."""
-    for path in sorted(SOURCES.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if not isinstance(node, ast.Call) or not node.args:
-                continue
-            if getattr(node.func, "id", "") in names and isinstance(node.args[0], ast.Constant):
-                yield path.name, node.args[0].value, {word.arg for word in node.keywords}
+    for file, node in all_calls():
+        if node.args and getattr(node.func, "id", "") in names and isinstance(node.args[0], ast.Constant):
+            yield file, node.args[0].value, {word.arg for word in node.keywords}
 
 
 def headings():
     """The headings of records' fields, which are looked up as texts."""
-    for path in sorted(SOURCES.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Call):
-                yield from (
-                    word.value.value
-                    for word in node.keywords
-                    if word.arg == "heading" and isinstance(word.value, ast.Constant)
-                )
+    for _, node in all_calls():
+        yield from (
+            word.value.value for word in node.keywords if word.arg == "heading" and isinstance(word.value, ast.Constant)
+        )
 
 
 def in_templates():
