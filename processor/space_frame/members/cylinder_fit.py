@@ -403,7 +403,7 @@ def _thinned(gathered, m, most):  # type: ignore[no-untyped-def]
     """Places and stations of every k-th point of line ``m``, with k so that no more than ``most`` are left."""
     rows = slice(m * gathered.room, m * gathered.room + gathered.counts[m])
     k = max(1, (gathered.counts[m] + most - 1) // most)
-    return gathered.places[rows][::k], gathered.stations[rows][::k]
+    return gathered.places[rows][::k].copy(), gathered.stations[rows][::k].copy()  # as slices they compile all anew
 
 
 @njit(cache=True, nogil=True)

@@ -218,5 +218,6 @@ def tubes(
     """
     count = len(layout.of_tube) - 1
     unknowns, scores = np.zeros((count, TUBE)), np.zeros((len(layout.station), 3))
-    over_ranges(partial(_tubes, equations, layout, geometry, x, off, unknowns, scores), count, threads, LEAST)
+    kernel = partial(_tubes, equations, layout, geometry, np.ascontiguousarray(x), off, unknowns, scores)
+    over_ranges(kernel, count, threads, LEAST)
     return unknowns, scores

@@ -155,7 +155,7 @@ def residuals(
     by their station's T (s, 4, 4) before, and ranges reduced by its offset (s,).
     """
     seen = np.zeros((len(points), 5))
-    kernel = partial(_residuals, points, layout, T, offset, scanners, axes, steepest, seen)
+    kernel = partial(_residuals, points, layout, T, np.ascontiguousarray(offset), scanners, axes, steepest, seen)
     over_ranges(kernel, len(layout.tube), threads, LEAST)
     return seen
 

@@ -223,8 +223,8 @@ def _linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: F
     along = np.einsum("bi,bij,bj->b", n, Hss[:, 3:6, 3:6], n)
     tilt = planes.axes[:, :, 1:] @ inverse[:, :2, :2] @ planes.axes[:, :, 1:].transpose(0, 2, 1)
     coupling = _Coupling(
-        piece=blocks.piece, columns=columns, Hsp=Hsp, inverse=inverse, gp=gp, normal=planes.normal, tilt=tilt,
-        along=along,
+        piece=np.ascontiguousarray(blocks.piece), columns=columns, Hsp=Hsp, inverse=inverse, gp=gp,
+        normal=planes.normal, tilt=tilt, along=along,
     )  # fmt: skip
     eliminate(coupling, N, g, spurious)
     # Misfit: the mean distance of a block from the plane; its variance is reduced by the block's leverage on the plane.
