@@ -13,15 +13,18 @@ from processor.version import __version__
 
 if TYPE_CHECKING:
     from processor.api.arrays import CorePoints, Pose, SphereFit, fit_sphere, m3c2, register
+    from processor.api.conversion import Converted, convert
     from processor.api.runs import Results, check, export, read, run
 
 __all__ = [
+    "Converted",
     "CorePoints",
     "Pose",
     "Results",
     "SphereFit",
     "__version__",
     "check",
+    "convert",
     "export",
     "fit_sphere",
     "m3c2",
@@ -31,7 +34,11 @@ __all__ = [
 ]
 _RUNS = ("Results", "check", "export", "read", "run")
 _ARRAYS = ("CorePoints", "Pose", "SphereFit", "fit_sphere", "m3c2", "register")
-_HOMES = dict.fromkeys(_RUNS, "processor.api.runs") | dict.fromkeys(_ARRAYS, "processor.api.arrays")
+_HOMES = {
+    **dict.fromkeys(_RUNS, "processor.api.runs"),
+    **dict.fromkeys(_ARRAYS, "processor.api.arrays"),
+    **dict.fromkeys(("Converted", "convert"), "processor.api.conversion"),
+}
 
 
 def __getattr__(name: str) -> Any:

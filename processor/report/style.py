@@ -52,7 +52,8 @@ def png(figure: Figure) -> bytes:
     """Write a figure as PNG, without a date."""
     figure.set_dpi(DPI)
     out = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(out, metadata={"Software": None})  # savefig draws a figure with a layout twice
+    # Figure.savefig draws a figure with a layout twice.
+    FigureCanvasAgg(figure).print_png(out, metadata={"Software": None})  # type: ignore[no-untyped-call]
     return out.getvalue()
 
 

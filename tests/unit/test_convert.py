@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import processor
 from designgen.export import folder as export_folder
 from designgen.export import formats
 from processor import large_arrays
@@ -53,7 +54,7 @@ def in_memory(path, tmp_path, units=None):
 
 
 def converted(path, tmp_path, units=None):
-    conversion.convert(path, tmp_path / "blocks.h5", units)
+    processor.convert(path, tmp_path / "blocks.h5", units)
     return (tmp_path / "blocks.h5").read_bytes()
 
 
@@ -98,7 +99,7 @@ def test_colours_of_several_scans_in_one_e57(tmp_path, blocks):
         for name in ("a", "b")
     ]
     e57.write(tmp_path / "two.e57", of_scans(scans), spherical=False)
-    conversion.convert(tmp_path / "two.e57", tmp_path / "two.h5")
+    processor.convert(tmp_path / "two.e57", tmp_path / "two.h5")
     back = store.read_scene(tmp_path / "two.h5")
     assert [scan.name for scan in back.scans] == ["a", "b"]
     for ours, theirs in zip(scans, back.scans, strict=True):
@@ -111,7 +112,7 @@ def test_whole_numbers_of_las_are_kept(tmp_path, blocks):
     rng = np.random.default_rng(1)
     whole = rng.integers(-400_000, 400_000, (500, 3))
     content = las_bytes(whole, scale=0.0001, offset=(431.0, -77.5, 3.0))
-    conversion.convert(put(tmp_path / "a.las", content), tmp_path / "a.h5")
+    processor.convert(put(tmp_path / "a.las", content), tmp_path / "a.h5")
     (scan,) = store.read_scene(tmp_path / "a.h5").scans
     metres = (scan.points + scan.origin) / 1000.0 - [431.0, -77.5, 3.0]
     back = np.rint(metres / 0.0001).astype(int)
@@ -161,7 +162,7 @@ def test_the_truth_comes_along_with_its_labels_in_the_order_of_the_points(tmp_pa
     # Of a scan that is clipped the labels do not fit.
     toml = tmp_path / "out/project.toml"
     toml.write_text(toml.read_text() + "\n[[clip]]\nbox = [[-1e5, -1e5, -1e5], [0, 1e5, 1e5]]\n")
-    conversion.convert(tmp_path / "out", tmp_path / "s.h5")
+    processor.convert(tmp_path / "out", tmp_path / "s.h5")
     assert store.read_truth(tmp_path / "s.h5").labels == ()
 
 
@@ -170,7 +171,7 @@ def test_clips_come_along(tmp_path, blocks):
     toml = out / "project.toml"
     toml.write_text(toml.read_text() + "\n[[clip]]\nbox = [[-1e5, -1e5, -1e5], [0, 1e5, 1e5]]\n")
     read = folder.read_input(out)
-    conversion.convert(out, tmp_path / "s.h5")
+    processor.convert(out, tmp_path / "s.h5")
     back = store.read_scene(tmp_path / "s.h5")
     assert len(back.scans[0].points) == len(read.scans[0].points) < 500
     assert back.clips.kept == read.clips.kept
@@ -203,7 +204,7 @@ def test_exit_codes(tmp_path):
 def test_the_output_is_tried_before_the_work_and_stays_whole(tmp_path, monkeypatch):
     np.savetxt(tmp_path / "a.xyz", np.random.default_rng(0).uniform(size=(100, 3)))
     out = tmp_path / "s.h5"
-    conversion.convert(tmp_path / "a.xyz", out)
+    processor.convert(tmp_path / "a.xyz", out)
     before = out.read_bytes()
 
     def full(*_, **__):
@@ -211,15 +212,15 @@ def test_the_output_is_tried_before_the_work_and_stays_whole(tmp_path, monkeypat
 
     monkeypatch.setattr("processor.store.scan_tiles.write_scan", full)
     with pytest.raises(InputError, match="cannot be written"):
-        conversion.convert(tmp_path / "a.xyz", out)
+        processor.convert(tmp_path / "a.xyz", out)
     assert out.read_bytes() == before
     monkeypatch.setattr("processor.pipeline.read", lambda *_: pytest.fail("read before the output was tried"))
     with pytest.raises(InputError, match="cannot be written"):
-        conversion.convert(tmp_path / "a.xyz", tmp_path / "none/s.h5")
+        processor.convert(tmp_path / "a.xyz", tmp_path / "none/s.h5")
     with pytest.raises(UsageError, match="expected a scene file"):
-        conversion.convert(tmp_path / "a.xyz", tmp_path / "s.laz")
+        processor.convert(tmp_path / "a.xyz", tmp_path / "s.laz")
     with pytest.raises(UsageError, match="where the truth of the input lies"):
-        conversion.convert(tmp_path, tmp_path / "truth.h5")
+        processor.convert(tmp_path, tmp_path / "truth.h5")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.xyz", "s.h5"]
 
 
@@ -230,7 +231,7 @@ def test_a_disk_too_small_for_the_points_is_said(tmp_path, blocks, monkeypatch):
     monkeypatch.setattr("os.posix_fallocate", full_disk)
     for name in ("a.xyz", "b.ptx"):
         with pytest.raises(InputError, match=f"{name}: cannot be read \\(the disk of .* has no room for its points"):
-            conversion.convert(tmp_path / name, tmp_path / "s.h5")
+            processor.convert(tmp_path / name, tmp_path / "s.h5")
 
 
 def test_arrays_in_files_leave_no_file(tmp_path, blocks):
@@ -261,7 +262,7 @@ def test_passes_by_blocks_are_those_of_numpy(blocks):
 def test_a_scene_from_a_folder_runs_as_the_folder(tmp_path):
     """The same balls, but for coordinates rounded to 0.0001 mm."""
     place, out = PLACE, tmp_path / "frame.h5"
-    conversion.convert(place, out)
+    processor.convert(place, out)
     results = {}
     for name, input_ in (("folder", place), ("scene", out)):
         arguments = ["run", str(input_), "-o", str(tmp_path / name), "-q"]
