@@ -157,7 +157,8 @@ def described(default: Any = dataclasses.MISSING, **shown: Any) -> Any:
     the key stands for the names in ``keys``, which the items of an array (of a column: of its rows) are for. ``axes``:
     names along several axes, written as nested objects. ``by``: the column of a nested table by which its rows are
     named in an object. ``sentence``: the key of the English text of reasons. ``optional``: not written where it is
-    empty. ``where``: a column is written in rows where the column of this name is finite.
+    empty. ``where``: a column is written in rows where the column of this name is finite. ``joined``: HDF5 holds the
+    records of a tuple as one table.
     """
     return dataclasses.field(default=default, metadata=shown)
 

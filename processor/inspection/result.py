@@ -110,7 +110,7 @@ class Result(Checked):
     status: Status = described(words=Status)
     method: str = described()
     reasons: tuple[Reason, ...] = reasons()
-    components: tuple[InspectedComponent, ...] = described(())
+    components: tuple[InspectedComponent, ...] = described((), joined=True)
 
     @classmethod
     def of_components(

@@ -1,8 +1,8 @@
 """Records to HDF5 groups and back, by walking the fields of their dataclasses.
 
 A field is a dataset of the same name (arrays, numbers, text, lists of text) or a group (a record; a tuple of records
-with members 0000, 0001, ...). A field that is None is left out. Text has a fixed length in UTF-8, so no dataset refers
-to a heap, and sizes are known before data are read.
+with members 0000, 0001, ..., or as one table where the field is declared as ``joined``). A field that is None is left
+out. Text has a fixed length in UTF-8, so no dataset refers to a heap, and sizes are known before data are read.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 import processor.store.checksums as checksums
 from processor import large_arrays
 from processor.model import VOCABULARIES, Reason, RecordError, Word
+from processor.store import joined_records
 
 CHUNK_ROWS = 65_536
 PLAIN_ITEMS = 1_024  # arrays up to this size are stored plainly
@@ -220,6 +221,8 @@ def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type
         _create(group, name, np.int64(value))
     elif isinstance(value, float):
         _create(group, name, np.float64(value))
+    elif metadata.get("joined") and value:
+        write_record(group.create_group(name), joined_records.joined(value))
     elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
         members = group.create_group(name)
         for i, item in enumerate(value):
@@ -309,6 +312,8 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
             return ()
         raise DecodeError([f"{where}: expected a group, found a dataset"])
     if typing.get_origin(kind) is tuple:
+        if metadata.get("joined") and "0000" not in item:
+            return _read_joined(item, typing.get_args(kind)[0])
         return _read_members(item, typing.get_args(kind)[0], hooks)
     return _read_member(item, kind, hooks)
 
@@ -325,6 +330,14 @@ def _read_json(group: Any, name: str, decode: Callable[[Any], Any]) -> tuple[Any
 def _read_member(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> Any:
     hook = hooks.get(kind)
     return hook(group) if hook else read_record(group, kind, hooks)
+
+
+def _read_joined(group: Any, kind: Any) -> tuple[Any, ...]:
+    """Read a table of records; files of before version 2.3 of results hold a group for each instead."""
+    try:
+        return joined_records.split(read_record(group, joined_records.table_of(kind)), kind)
+    except RecordError as error:
+        raise DecodeError([f"{group.name}: {error}"]) from None
 
 
 def numbered_groups(group: Any) -> list[Any]:

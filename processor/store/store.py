@@ -34,14 +34,15 @@ from processor.store.codec import DecodeError
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
 FORMAT_VERSION = "1.4"  # of scenes and truths
 READABLE = ("1.2", "1.3", FORMAT_VERSION)  # fields added since may be absent
-RESULTS_VERSION = "2.2"
-RESULTS_READABLE = ("2.0", "2.1", RESULTS_VERSION)
+RESULTS_VERSION = "2.3"
+RESULTS_READABLE = ("2.0", "2.1", "2.2", RESULTS_VERSION)
 WITHOUT_CHECKSUMS = ("1.2", "1.3", "2.0")
 RESULTS_HISTORY = [
     "1.0 to 1.3: one flat record a step",
     "2.0: nested tables; words and reasons with codes",
     "2.1: checksums",
     "2.2: diagnostics of a step",
+    "2.3: the components of an inspection as tables",
 ]
 HISTORY = [
     "1.0: first",
