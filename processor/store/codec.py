@@ -22,9 +22,9 @@ import h5py
 import numpy as np
 
 import processor.store.checksums as checksums
+import processor.store.joined_records as joined_records
 from processor import large_arrays
 from processor.model import VOCABULARIES, Reason, RecordError, Word
-from processor.store import joined_records
 
 CHUNK_ROWS = 65_536
 PLAIN_ITEMS = 1_024  # arrays up to this size are stored plainly
