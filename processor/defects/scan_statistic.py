@@ -10,6 +10,7 @@ widened to Student's t at the threshold.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.special import ndtr, ndtri, stdtrit
 
 from processor.defects.deviation_field import Field
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
-from processor.model import Bools, Floats
+from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd_about_median
 
 SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of windows, in cells
@@ -180,6 +181,7 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> F
 def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, finding: Finding) -> None:
     """Search lines of cells in LINE_TURNS directions, for what is narrower than a window and long; add to a finding."""
     top, weight = _images(field, charts, chart, finding.sign != 0)
+    score = top / np.sqrt(np.maximum(weight, 1e-30))
     margin = max(LINE_CELLS)
     padded = np.pad(np.stack([top, weight, weight > 0.0]), ((0, 0), (margin, margin), (margin, margin)))
     systematic = float(np.hypot(levels.systematic_mm, field.views))
@@ -194,15 +196,28 @@ def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, find
                 z = np.where(number >= COVERED * length, sum_top / sum_weight / sd, 0.0)
             for direction in (-1, 1):
                 for i, j in np.argwhere(direction * z > levels.line_threshold):
-                    score = direction * z[i, j]
-                    chance = 2.0 * ndtr(-score) * levels.line_per_mm2
-                    for di, dj in offsets:
-                        a, b = i + di, j + dj
-                        inside = 0 <= a < top.shape[0] and 0 <= b < top.shape[1] and weight[a, b] > 0.0
-                        if inside and direction * top[a, b] > LINE_GROWTH * np.sqrt(weight[a, b]):
-                            finding.sign[a, b] = direction
-                            finding.z[a, b] = max(finding.z[a, b], score)
-                            finding.chance[a, b] = min(finding.chance[a, b], chance)
+                    a, b = _long_runs(direction * score, [(i + di, j + dj) for di, dj in offsets]).T
+                    strongest = direction * z[i, j]
+                    finding.sign[a, b] = direction
+                    finding.z[a, b] = np.maximum(finding.z[a, b], strongest)
+                    chance = 2.0 * ndtr(-strongest) * levels.line_per_mm2
+                    finding.chance[a, b] = np.minimum(finding.chance[a, b], chance)
+
+
+def _long_runs(score: Floats, line: Sequence[tuple[int, int]]) -> Ints:
+    """Return the cells (n, 2) of a line whose ``score`` (rows, columns) deviates, without runs far below the longest.
+
+    A line that crosses a region has deviating cells beyond it by chance, which are no regions of their own.
+    """
+    cells = np.array(line)
+    inside = ((cells >= 0) & (cells < score.shape)).all(axis=1)
+    deviate = np.zeros(len(cells), np.bool_)
+    deviate[inside] = score[tuple(cells[inside].T)] > LINE_GROWTH
+    run, count = ndimage.label(deviate)
+    sizes = np.bincount(run, minlength=count + 1)
+    sizes[0] = 0
+    long: Ints = cells[deviate & (sizes[run] >= PIECE_SHARE * sizes.max())]
+    return long
 
 
 def _line_inflation(field: Field, charts: Charts, used: list[int]) -> float:

@@ -170,3 +170,19 @@ def test_few_degrees_of_freedom_need_larger_deviations():
         field = dataclasses.replace(known, deviation=deviation, dof=np.full(len(deviation), dof))
         found[dof] = bool(scan_statistic.search(field, surface, levels).sign.any())
     assert found == {30.0: False, 1e6: True}
+
+
+def test_a_cell_beyond_the_end_of_a_line_is_no_region():
+    """A ridge of one cell's width, and a cell in line with it that deviates as one in fifteen does by chance."""
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
+    field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
+    levels = scan_statistic.levels_of(field, surface, 1e-8, 0.0)
+    up = (field.seen > 0) & (surface.outward[:, 2] > 0.5)
+    row = np.flatnonzero(up & (np.abs(surface.centres[:, 1] - surface.centres[up, 1][0] - 300.0) < 1.0))
+    row = row[np.argsort(surface.centres[row, 0])]
+    ridge, beyond = row[10:18], row[23]
+    deviation = np.zeros(len(surface.share))
+    deviation[ridge] = 3.5 * np.sqrt(field.variance[ridge])
+    deviation[beyond] = 1.5 * np.sqrt(field.variance[beyond])
+    found = scan_statistic.search(dataclasses.replace(field, deviation=deviation), surface, levels).sign
+    assert set(np.flatnonzero(found)) == set(ridge)
