@@ -178,6 +178,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     missing += _inferred(scene, registered, field, missing, alarms_per_mm2)
     deviating = regions.of_finding(finding, surface)
     near_mm = max(UNITE_CELLS * surface.charts.cell_mm, UNITE_MM)
+    united = regions.united(missing + deviating, surface, near_mm)
     return to_result.Search(
         surface=surface,
         field=field,
@@ -186,7 +187,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
         levels=levels,
         shapes=shapes,
         significant=significant,
-        places=regions.united(missing + deviating, surface, near_mm),
+        places=[group for group in united if regions.is_significant(group[0], residuals, levels)],
         expected=expected,
         shape_values=shape_values,
         points=measures.points_by_cell(observed, surface, aligned),

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from processor.defects.classification import CRACK_RATIO
 from processor.defects.deviation_field import Field
-from processor.defects.scan_statistic import Finding
+from processor.defects.scan_statistic import Finding, Levels
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
 from processor.model import Floats, Ints
 
@@ -119,6 +119,20 @@ def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> lis
             groups.append([region])
             trees.append(cKDTree(places))
     return _lines_united([_joined(group) for group in groups], surface)
+
+
+def is_significant(region: Region, field: Field, levels: Levels) -> bool:
+    """Whether the mean of a region's cells is significant by itself; what is missing always is.
+
+    Cells that are left of a line or a window may be few: the rest was of another region, or lay all about.
+    """
+    if region.sign == 0:
+        return True
+    weight = field.seen[region.cells] / field.variance[region.cells]
+    total = max(float(weight.sum()), 1e-30)
+    size = max(0, int(np.searchsorted(levels.sides, np.sqrt(len(region.cells)), side="right")) - 1)
+    sd = float(np.hypot(levels.inflation[size] / np.sqrt(total), levels.systematic_mm))
+    return abs(float(weight @ field.deviation[region.cells])) / total > levels.threshold[size] * sd
 
 
 def unrolled(surface: DesignSurface, region: Region) -> Floats:

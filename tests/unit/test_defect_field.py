@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from processor.adjustment import scanner_class
-from processor.defects import alignment, deviation_field, scan_statistic, surface_charts
+from processor.defects import alignment, deviation_field, regions, scan_statistic, surface_charts
 from processor.defects.observations import Pairs, Stations
 
 EDGE, SIGMA, POINTS = 8.0, 0.5, 12
@@ -186,3 +186,18 @@ def test_a_cell_beyond_the_end_of_a_line_is_no_region():
     deviation[beyond] = 1.5 * np.sqrt(field.variance[beyond])
     found = scan_statistic.search(dataclasses.replace(field, deviation=deviation), surface, levels).sign
     assert set(np.flatnonzero(found)) == set(ridge)
+
+
+def test_a_region_is_significant_by_its_own_cells():
+    """Nine cells of 1.7 standard deviations are 5.1 together, four are 3.4; what is missing needs no deviation."""
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
+    field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
+    levels = dataclasses.replace(
+        scan_statistic.levels_of(field, surface, 1e-8, 0.0), threshold=np.full(len(scan_statistic.SIDES), 5.0)
+    )
+    cells = np.flatnonzero((field.seen > 0) & (surface.outward[:, 2] > 0.5))[:9]
+    deviating = dataclasses.replace(field, deviation=np.sqrt(field.variance) * 1.7 * levels.inflation.max())
+    chart = int(np.searchsorted(surface.charts.first, cells[0], side="right")) - 1
+    for number, sign, expected in ((9, 1, True), (4, 1, False), (4, 0, True)):
+        region = regions.Region(chart, cells[:number], sign, 9.0, 0.0)
+        assert regions.is_significant(region, deviating, levels) is expected
