@@ -132,7 +132,7 @@ def is_significant(region: Region, field: Field, levels: Levels) -> bool:
     total = max(float(weight.sum()), 1e-30)
     size = max(0, int(np.searchsorted(levels.sides, np.sqrt(len(region.cells)), side="right")) - 1)
     sd = float(np.hypot(levels.inflation[size] / np.sqrt(total), levels.systematic_mm))
-    return abs(float(weight @ field.deviation[region.cells])) / total > levels.threshold[size] * sd
+    return abs(float(weight @ field.deviation[region.cells])) / total > float(levels.threshold[size]) * sd
 
 
 def unrolled(surface: DesignSurface, region: Region) -> Floats:
