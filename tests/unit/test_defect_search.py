@@ -162,7 +162,7 @@ def test_what_something_hides_is_not_missing():
     assert result.expected_mm2 < 3 * SIDE**2 - 8_000.0
     # The same points gone without anything in the way are.
     kept = [dataclasses.replace(s, points=s.points[s.points[:, 1] > -100.0]) for s in scene.scans]
-    gone = defects_step.run(dataclasses.replace(scene, scans=tuple(kept)), defects_step.Params())
+    gone = run(dataclasses.replace(scene, scans=tuple(kept)))
     assert set(found(gone)) == {("missing-part", "component-2")}
 
 

@@ -320,18 +320,19 @@ def test_a_scan_of_one_end_only_says_so():
 
 
 def test_two_scans_of_one_part_make_one(monkeypatch):
-    """One scan shows the left side, the other the right: each constrains the part, only both show whole ends."""
+    """One scan shows the left side, the other the right: each constrains the part, only both show whole ends.
+
+    Which part half a scan is of is searched for in test_assignment.
+    """
     place, placed = measure._place, {}  # the left scan is asked for twice
 
     def placed_once(scan, *rest):
         if scan.name not in placed:
-            with monkeypatch.context() as patch:
-                if scan.name == "right":  # which part half a scan is of is searched for on its mirror image
-                    patch.setattr(assignment, "rather", lambda *_: None)
-                placed[scan.name] = place(scan, *rest)
+            placed[scan.name] = place(scan, *rest)
         return placed[scan.name]
 
     monkeypatch.setattr(measure, "_place", placed_once)
+    monkeypatch.setattr(assignment, "rather", lambda *_: None)
     parts, design = bridge()
     part = parts[RIB]
     points = cloud(part, spacing_mm=24.0)
