@@ -28,7 +28,7 @@ def extracted(scene, truth):
 @pytest.fixture(scope="module")
 def bridge():
     """A bridge and the features of its parts."""
-    scene, truth = arch_clouds.bridge(spacing_mm=25.0, sigma_mm=1.0, seed=3)
+    scene, truth = arch_clouds.bridge(spacing_mm=35.0, sigma_mm=1.0, seed=3)
     return scene.arch, extracted(scene, truth)
 
 

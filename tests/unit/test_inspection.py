@@ -26,7 +26,7 @@ SECTION = np.array(
 ALONG = np.array([L, 0.0, 0.0])
 DESIGN = np.array([SECTION, SECTION + ALONG])
 RIB = DESIGN + ALONG  # as the middle one of three parts
-CHAINAGE = np.arange(100.0, L, 200.0)
+CHAINAGE = np.arange(100.0, L, 400.0)
 
 
 def by_id(found, id_):
