@@ -14,7 +14,7 @@ from processor.space_frame import step as spheres_step
 
 
 def test_one_ball_alone():
-    scene, truth = designgen.make("bolt-ball")
+    scene, truth = designgen.make("bolt-ball", settings={"scan.step_mrad": 1.0})
     (centre,), (radius,) = truth.frame.centres, truth.frame.radii
     positions = np.array([scan.T_project_scan[:3, 3] for scan in scene.scans])
     assert np.ptp(positions[:, :2], axis=0).max() > 1000.0, "stations below it stand apart"
