@@ -114,43 +114,53 @@ def _keys(directions: Floats, window: float) -> tuple[Ints, Ints]:
 @njit(cache=True, nogil=True)
 def _mark(points, normals, height, face, scanner, others, marked, first, last):  # type: ignore[no-untyped-def]
     """Mark points first to last - 1 of which a neighbour within the window stands before the face."""
-    key, columns = others.key, others.columns
+    columns = others.columns
     rows = len(columns) - 1
     for i in range(first, last):
         x, y, z = points[i, 0] - scanner[0], points[i, 1] - scanner[1], points[i, 2] - scanner[2]
         far = np.sqrt(x * x + y * y + z * z)
         x, y, z = x / far, y / far, z / far
         window = WINDOW_STEPS * others.step + HALF_EXIT_MM / far + HALF_DIVERGENCE
+        ray, of_face = (x, y, z, window), (height[i], face[i])
         row = min(int(np.arccos(z) / np.pi * rows), rows - 1)
         turn = np.arctan2(y, x) / (2.0 * np.pi) + 0.5
         for r in range(max(row - 1, 0), min(row + 2, rows)):
-            wide = columns[r + 1] - columns[r]
-            middle = min(int(turn * wide), wide - 1)
-            for c in range(middle - 1, middle + 2):
-                if marked[i] or (wide < 3 and not 0 <= c < wide):
-                    continue
-                wanted = columns[r] + c % wide
-                k = np.searchsorted(key, wanted)
-                while k < len(key) and key[k] == wanted:
-                    level = 0.0 if others.face[k] == face[i] else height[i]
-                    slope = SLOPE if others.face[k] == face[i] or others.face[k] < 0 else 0.0
-                    if _stands_before(points[i], normals[i], level, slope, scanner, others.points[k], x, y, z, window):
-                        marked[i] = True
-                        break
-                    k += 1
+            start, end = columns[r], columns[r + 1] - 1
+            at = start + min(int(turn * (end + 1 - start)), end - start)
+            # The bins about one follow each other, but that a row's last and first ones are side by side.
+            low, high = max(at - 1, start), min(at + 1, end)
+            found = _any_before(points[i], normals[i], of_face, scanner, ray, others, low, high)
+            if not found and at == start:
+                found = _any_before(points[i], normals[i], of_face, scanner, ray, others, end, end)
+            if not found and at == end:
+                found = _any_before(points[i], normals[i], of_face, scanner, ray, others, start, start)
+            if found:
+                marked[i] = True
+                break
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _stands_before(point, normal, height, slope, scanner, other, x, y, z, window):  # type: ignore[no-untyped-def]
-    """Return whether another point is a neighbour of a direction (x, y, z), too high above one ``height`` below it."""
-    a, b, c = other[0] - scanner[0], other[1] - scanner[1], other[2] - scanner[2]
-    far = np.sqrt(a * a + b * b + c * c)
-    cosine = (a * x + b * y + c * z) / far
-    if 1.0 - cosine > 0.5 * window * window:
-        return False
-    dx, dy, dz = other[0] - point[0], other[1] - point[1], other[2] - point[2]
-    rise = dx * normal[0] + dy * normal[1] + dz * normal[2]
-    if rise + height < HIGHER_MM:
-        return False
-    across = np.sqrt(max(dx * dx + dy * dy + dz * dz - rise * rise, 0.0))
-    return rise + height > HIGHER_MM + slope * across
+@njit(cache=True, nogil=True)
+def _any_before(point, normal, of_face, scanner, ray, others, low, high):  # type: ignore[no-untyped-def]
+    """Return whether any of the points in bins low to high is a neighbour that stands before a point's face.
+
+    ``of_face`` is how far the point lies above its face, and the face's number; ``ray`` its direction, and the window.
+    """
+    (height, face), (x, y, z, window) = of_face, ray
+    for k in range(np.searchsorted(others.key, low), len(others.key)):
+        if others.key[k] > high:
+            break
+        other, of_other = others.points[k], others.face[k]
+        dx, dy, dz = other[0] - point[0], other[1] - point[1], other[2] - point[2]
+        rise = dx * normal[0] + dy * normal[1] + dz * normal[2]
+        above = rise + (0.0 if of_other == face else height)
+        if above < HIGHER_MM:  # most neighbours: without any root
+            continue
+        a, b, c = other[0] - scanner[0], other[1] - scanner[1], other[2] - scanner[2]
+        cosine = (a * x + b * y + c * z) / np.sqrt(a * a + b * b + c * c)
+        if 1.0 - cosine > 0.5 * window * window:
+            continue
+        across = np.sqrt(max(dx * dx + dy * dy + dz * dz - rise * rise, 0.0))
+        slope = SLOPE if of_other == face or of_other < 0 else 0.0
+        if above > HIGHER_MM + slope * across:
+            return True
+    return False

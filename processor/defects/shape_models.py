@@ -188,8 +188,9 @@ def _twist(p: Floats, n: Floats, half: Floats, at: At) -> Floats:
 def _wave(p: Floats, n: Floats, half: Floats, at: At) -> Floats:
     axis, length, fading = int(at[0]), at[1], at[2]  # zero at ``fading`` to either side; 0 = does not fade
     phase = 2.0 * np.pi * p[:, axis] / length
-    across = np.clip(p[:, 1 - axis] / fading, -1.0, 1.0) if fading else np.zeros(len(p))
-    amplitude = np.cos(0.5 * np.pi * across) ** 2 * n[:, 2]
+    amplitude = n[:, 2]
+    if fading:
+        amplitude = np.cos(0.5 * np.pi * np.clip(p[:, 1 - axis] / fading, -1.0, 1.0)) ** 2 * amplitude
     return np.stack([amplitude * np.sin(phase), amplitude * np.cos(phase)], axis=1)
 
 

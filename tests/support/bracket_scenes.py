@@ -7,7 +7,7 @@ from processor.geometry import rigid
 from processor.model import Scan, Scene, Stations, StructureDesign
 from tests.support.meshes import bracket
 
-COUNT = 20_000
+COUNT = 12_000
 
 
 def scene_of(seed=1, scans=1, stations=False, outliers=200, count=COUNT):

@@ -32,7 +32,9 @@ def scanned(part, seed=1, spacing_mm=30.0):
     return rigid.apply(arch_clouds.random_pose(rng), points)
 
 
-@pytest.mark.parametrize(("came", "asked", "found"), [(2, 1, 2), (1, 2, 1), (3, 0, 1), (0, 2, 0)])
+@pytest.mark.parametrize(
+    ("came", "asked", "found"), [(2, 1, 2), pytest.param(1, 2, 1, marks=pytest.mark.slow), (3, 0, 1), (0, 2, 0)]
+)
 def test_a_scan_of_another_size_is_of_the_part_that_has_it(shapes, came, asked, found):
     """Ribs 1 and 3, and the feet, differ by their marks alone: any of them stands for both."""
     assert assignment.rather(scanned(came), asked, shapes) == found

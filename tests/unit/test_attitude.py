@@ -18,7 +18,7 @@ def structure(*brackets):
     return trimesh.util.concatenate([trimesh.creation.box(GIRDER), *brackets])
 
 
-def placed(design, built, seed, count=60_000, noise=1.0):
+def placed(design, built, seed, count=15_000, noise=1.0):
     """Pose of a scan relative to the true one, and whether it is ambiguous."""
     rng = np.random.default_rng(seed)
     points = np.asarray(trimesh.sample.sample_surface(built, count, seed=seed)[0])
@@ -29,7 +29,7 @@ def placed(design, built, seed, count=60_000, noise=1.0):
     return found.T @ rigid.invert(T), found.ambiguous
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_a_bracket_distinguishes_the_attitudes_of_a_box(seed):
     # By half a turn about the length the brackets come to lie on themselves but for their thickness.
     design = structure(bracket(-1500.0, 1.0), bracket(-1500.0, -1.0), bracket(700.0, 1.0), bracket(700.0, -1.0))
@@ -68,7 +68,7 @@ def test_the_side_of_a_plate_that_was_scanned_lies_on_its_own_side(thickness):
 
 def test_a_scan_the_wrong_way_round_in_the_design_s_frame_is_turned():
     design = structure(*(bracket(x, y) for x in (-2400.0, -1200.0, 300.0) for y in (1.0, -1.0)))
-    points = np.asarray(trimesh.sample.sample_surface(design, 60_000, seed=2)[0])
+    points = np.asarray(trimesh.sample.sample_surface(design, 15_000, seed=2)[0])
     points += np.random.default_rng(2).normal(0.0, 1.0, points.shape)
     surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
     turned = rigid.apply(rigid.transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)), points)
@@ -87,12 +87,12 @@ def test_what_nothing_distinguishes_is_ambiguous():
 
 def test_a_contradiction_as_large_as_the_evidence_is_no_choice():
     design = structure(bracket(-1500.0, 1.0), bracket(900.0, 1.0))
-    points = np.asarray(trimesh.sample.sample_surface(structure(bracket(-1500.0, 1.0)), 60_000, seed=1)[0])
+    points = np.asarray(trimesh.sample.sample_surface(structure(bracket(-1500.0, 1.0)), 15_000, seed=1)[0])
     surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
     turned = rigid.transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     assert pose_choice.choose(points, surface, [np.eye(4), turned]) == pose_choice.Choice(best=0, rivals=())
     both = structure(bracket(-1500.0, 1.0), bracket(1500.0, -1.0))  # one where each of the attitudes has one
-    points = np.asarray(trimesh.sample.sample_surface(both, 60_000, seed=1)[0])
+    points = np.asarray(trimesh.sample.sample_surface(both, 15_000, seed=1)[0])
     assert len(pose_choice.choose(points, surface, [np.eye(4), turned]).rivals) == 1
 
 

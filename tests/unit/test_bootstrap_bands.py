@@ -13,16 +13,14 @@ from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import bootstrap_bands, methods
 from processor.preassembly.params import PAPER_METHODS
 from processor.preassembly.parts import attitude
-from tests.support import arch_clouds
+from tests.support import arch_clouds, known_attitudes
 
 
 def extracted(scene, truth):
     """Features of a bridge's parts, with the attitudes that the search would find."""
     parts = []
     for i, (scan, part, T) in enumerate(zip(scene.scans, scene.arch.parts, truth.arch.T_bridge_scan, strict=True)):
-        hypotheses = attitude.principal_hypotheses(scan.points, part)
-        turns = [rigid.rotation_angle(one[:3, :3] @ T[:3, :3].T) for one in hypotheses]
-        found = attitude.Attitude(hypotheses[int(np.argmin(turns))], T, "ok", "")
+        found = known_attitudes.attitude_of(scan.points, part, T)
         parts.append(methods.features_of(scan, i, found, scene.arch, preassembly_step.Params()))
     return parts
 
@@ -30,7 +28,7 @@ def extracted(scene, truth):
 @pytest.fixture(scope="module")
 def bridge():
     """A bridge and the features of its parts."""
-    scene, truth = arch_clouds.bridge(spacing_mm=25.0, sigma_mm=1.0, seed=3)
+    scene, truth = arch_clouds.bridge(spacing_mm=35.0, sigma_mm=1.0, seed=3)
     return scene.arch, extracted(scene, truth)
 
 

@@ -13,16 +13,15 @@ BOX_FACES = np.array(
     [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4],
      [2, 3, 7], [2, 7, 6], [1, 2, 6], [1, 6, 5], [0, 4, 7], [0, 7, 3]]
 )  # fmt: skip
-# A web with five ribs on either side; the last is a box that stands on the floor by itself.
-WEB = ((0.0, -150.0, 0.0), (4000.0, 150.0, 800.0))
-RIBS = [((x, y, 60.0), (x + 14.0, y + 160.0, 700.0)) for x in (400.0, 1100.0, 2000.0, 2700.0, 3500.0)
-        for y in (-310.0, 150.0)]  # fmt: skip
-BOXES = [WEB, *RIBS, ((300.0, 700.0, 0.0), (800.0, 900.0, 500.0))]
+# A web with two ribs on either side; the last is a box that stands on the floor by itself.
+WEB = ((0.0, -150.0, 0.0), (1700.0, 150.0, 800.0))
+RIBS = [((x, y, 60.0), (x + 14.0, y + 160.0, 700.0)) for x in (400.0, 1200.0) for y in (-310.0, 150.0)]
+BOXES = [WEB, *RIBS, ((0.0, 700.0, 0.0), (400.0, 900.0, 500.0))]
 STATIONS = np.array(
-    [[-2500.0, -3000, 2500], [6500, -2800, 2600], [2000, -3500, -800], [-2400, 3000, 2400], [6400, 3100, -700],
-     [1900, 3600, 2700]]
+    [[-2500.0, -3000, 2500], [4200, -2800, 2600], [850, -3500, -800], [-2400, 3000, 2400], [4100, 3100, -700],
+     [-300, 3600, 2700]]
 )  # fmt: skip
-NOTCH = ((1000.0, 230.0, 620.0), (1200.0, 320.0, 710.0))  # the outer corner of a rib
+NOTCH = ((300.0, 230.0, 620.0), (500.0, 320.0, 710.0))  # the outer corner of a rib
 SPACING = 9.0
 
 
@@ -66,7 +65,7 @@ def seen(points, normals, boxes, station):
 
 def pressed(points, radius, sides):
     """Points with a rib's far side pressed in by 4 mm within ``radius``, or both of its ``sides``."""
-    (near, y, z), (far, *_) = RIBS[9]
+    (near, y, z), (far, *_) = RIBS[3]
     share = np.exp(-((np.hypot(points[:, 1] - y - 85.0, points[:, 2] - z - 320.0) / radius) ** 8))
     on = points[:, 0] == far
     if sides == 2:
@@ -110,30 +109,30 @@ def test_nothing_is_missing_from_steel_as_designed(seed, earlier):
 
 def test_a_rib_that_is_gone_and_a_corner_are_missing():
     """The rib by points on the web where it should stand, the corner by the steel around it on both sides."""
-    kinds, centre = run(cloud_of([box for box in BOXES if box != RIBS[4]], 3, cut=NOTCH))
+    kinds, centre = run(cloud_of([box for box in BOXES if box != RIBS[2]], 3, cut=NOTCH))
     assert kinds == ["missing-part", "missing-part"]
-    expected = np.array([np.mean(RIBS[4], axis=0), [1107.0, 270.0, 660.0]])
+    expected = np.array([np.mean(RIBS[2], axis=0), [407.0, 270.0, 660.0]])
     for place in expected:
         assert np.linalg.norm(centre - place, axis=1).min() < 40.0
 
 
 def test_a_long_bite_out_of_an_edge_is_edge_loss():
     """Four times as long as deep, and more without the cells at the border; a strip that a filter removes is none."""
-    kinds, centre = run(cloud_of(BOXES, 8, cut=((3495.0, 235.0, 300.0), (3520.0, 320.0, 640.0))))
+    kinds, centre = run(cloud_of(BOXES, 8, cut=((1195.0, 235.0, 300.0), (1220.0, 320.0, 640.0))))
     assert kinds == ["edge-loss"]
-    assert np.linalg.norm(centre[0] - [3507.0, 273.0, 470.0]) < 40.0
+    assert np.linalg.norm(centre[0] - [1207.0, 273.0, 470.0]) < 40.0
 
 
-@pytest.mark.parametrize(("seed", "deep"), [(11, 24.0), (12, 24.0), (13, 34.0)])
+@pytest.mark.parametrize(("seed", "deep"), [(11, 24.0), pytest.param(12, 24.0, marks=pytest.mark.slow), (13, 34.0)])
 def test_a_bite_no_deeper_than_the_cells_at_the_border_is_edge_loss(seed, deep):
     """Away from the border no cell is empty; along it there is steel at either end."""
-    kinds, centre = run(cloud_of(BOXES, seed, cut=((3495.0, 310.0 - deep, 400.0), (3520.0, 320.0, 500.0))))
+    kinds, centre = run(cloud_of(BOXES, seed, cut=((1195.0, 310.0 - deep, 400.0), (1220.0, 320.0, 500.0))))
     assert kinds == ["edge-loss"]
-    assert np.linalg.norm(centre[0] - [3507.0, 310.0 - deep / 2, 450.0]) < 30.0
+    assert np.linalg.norm(centre[0] - [1207.0, 310.0 - deep / 2, 450.0]) < 30.0
 
 
 def test_edges_that_a_filter_removed_are_not_missing():
-    cut = ((1095.0, 296.0, 30.0), (1120.0, 320.0, 720.0))
+    cut = ((395.0, 296.0, 30.0), (420.0, 320.0, 720.0))
     assert run(cloud_of(BOXES, 9, cut=cut))[0] == []
 
 
@@ -149,7 +148,7 @@ def test_a_pit_is_on_one_side_of_a_plate_and_a_dent_on_both_whatever_their_size(
 
 def test_a_corner_in_the_shadow_of_something_is_not_missing():
     """A board before one side of the corner: the other side is seen."""
-    shade = ((1220.0, 230.0, 560.0), (1225.0, 400.0, 800.0))
+    shade = ((520.0, 230.0, 560.0), (525.0, 400.0, 800.0))
     scene = cloud_of(BOXES, 4, shades=[shade])
     scan = scene.scans[0]
     off = ((scan.points > np.array(shade[0]) - 3.0) & (scan.points < np.array(shade[1]) + 3.0)).all(axis=1)
@@ -163,7 +162,7 @@ def test_a_body_that_no_station_sees_is_not_missing():
 
 
 def test_where_the_cloud_was_cropped_nothing_is_missing():
-    assert run(cloud_of(BOXES, 6, cut=((3400.0, -1e4, -1e4), (1e4, 1e4, 1e4))))[0] == []
+    assert run(cloud_of(BOXES, 6, cut=((1100.0, -1e4, -1e4), (1e4, 1e4, 1e4))))[0] == []
     assert run(cloud_of(BOXES, 7, cut=((-1e4, -1e4, 560.0), (1e4, 1e4, 1e4))))[0] == []
 
 

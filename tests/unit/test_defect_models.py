@@ -13,7 +13,7 @@ from processor.defects.movement import moved_bodies
 from processor.model import DesignBodies, Scene
 from processor.scan_folder import cad
 
-COARSE = {"scan.step_mrad": 2.5}
+FINE, COARSE = {"scan.step_mrad": 2.5}, {"scan.step_mrad": 3.5}
 DENT = {"asbuilt.beam.dent_at_mm": [800.0, -75.0, 2115.0], "asbuilt.beam.dent_radius_mm": 70.0}
 
 
@@ -49,7 +49,8 @@ def portal(gap):
 
 
 def scanned(gap, seed, built=None):
-    return designgen.scan(portal(gap), stations=5, seed=seed, settings={**COARSE, **(built or {})})
+    settings = {**FINE, **built} if built else COARSE
+    return designgen.scan(portal(gap), stations=5, seed=seed, settings=settings)
 
 
 def found(scene: Scene):

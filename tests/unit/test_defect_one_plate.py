@@ -7,23 +7,28 @@ import pytest
 
 from processor.defects import step as defects_step
 from processor.model import Scan
+from tests.support.at_design import AT_DESIGN
 from tests.support.plate_rows import SIDE, THICK, bump, scene_of
 
 DENT = bump(4.0, 90.0, (0.5 * SIDE, 0.5 * SIDE))
 
 
-def found(inward, *more):
+def found(inward, *more, earlier=AT_DESIGN):
     """Depth and interval of each class, for scans of the front and ``more`` scans."""
-    scene = scene_of(1, inward)
-    defects = defects_step.run(dataclasses.replace(scene, scans=(*scene.scans, *more)), defects_step.Params()).defects
+    scene = scene_of(1, inward, spacing=5.0)
+    scene = dataclasses.replace(scene, scans=(*scene.scans, *more))
+    defects = defects_step.run(scene, defects_step.Params(), earlier).defects
     kinds = [str(kind) for kind in defects.defect_class]
     return dict(zip(kinds, zip(defects.depth_max, defects.depth_ci95, strict=True), strict=True))
 
 
-@pytest.mark.parametrize("off_mm", [0.15, 0.5])
-def test_a_dent_is_found_where_the_whole_plate_is_off(off_mm):
-    """A registration within its error of 1 mm moves the plate by more than the noise of its mean."""
-    of_class = found(lambda x, z: DENT(x, z) + off_mm)
+@pytest.mark.parametrize(("off_mm", "earlier"), [(0.15, AT_DESIGN), (0.5, {})])
+def test_a_dent_is_found_where_the_whole_plate_is_off(off_mm, earlier):
+    """A registration within its error of 1 mm moves the plate by more than the noise of its mean.
+
+    Of the second plate the step itself finds that it lies at the design.
+    """
+    of_class = found(lambda x, z: DENT(x, z) + off_mm, earlier=earlier)
     assert list(of_class) == ["dent"]
     depth, ci95 = of_class["dent"]
     assert abs(depth - 4.0) < min(ci95, 0.2)
@@ -47,7 +52,7 @@ def test_a_plate_that_is_off_within_the_error_of_its_pose_has_no_defect():
 def test_the_back_that_one_station_saw_alone_may_be_off(inward):
     """Its ranges are 0.6 mm too long, within what a view of a scanner may be off; the back is as designed."""
     rng, station = np.random.default_rng(7), np.array([0.4 * SIDE, 4000.0, 500.0])
-    x, z = rng.uniform(0.0, SIDE, (2, 20_000))
+    x, z = rng.uniform(0.0, SIDE, (2, 14_000))
     ray = np.stack([x, np.full(len(x), THICK), z], axis=1) - station
     away = np.linalg.norm(ray, axis=1)[:, None]
     points = station + ray * (1.0 + (0.6 + rng.normal(0.0, 0.4, away.shape)) / away)

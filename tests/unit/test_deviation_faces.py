@@ -1,5 +1,7 @@
 """Faces of points near edges and on thin plates: a plate as designed has no deviation, whatever is known of it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,6 +11,8 @@ from processor.deviation import step as deviation_step
 from processor.geometry import enclosure, mesh_distance
 from processor.model import Scan, Scene, StructureDesign
 from tests.support.plate_clouds import SIGMA, STATIONS, plate
+
+AS_IT_LIES = deviation_step.Params(register="none")  # as by default, but for the search for other attitudes
 
 
 def from_edge(core, thickness):
@@ -22,8 +26,10 @@ def from_edge(core, thickness):
 @pytest.mark.parametrize("positions", [False, True])
 @pytest.mark.parametrize("sides", [1, 2])
 def test_a_plate_as_designed_deviates_nowhere(thickness, positions, sides):
+    """Of one of the plates the step itself finds that no other attitude fits better."""
     scene = plate(thickness, 3, STATIONS[:sides], positions)
-    core = deviation_step.run(scene, deviation_step.Params()).core
+    params = deviation_step.Params() if (thickness, positions, sides) == (5.0, True, 2) else AS_IT_LIES
+    core = deviation_step.run(scene, params).core
     known = np.isfinite(core.lod95)
     edge = from_edge(core, thickness)
     assert 0.02 < core.distances.significant[known].mean() < 0.07
@@ -41,10 +47,10 @@ def test_a_plate_as_designed_deviates_nowhere(thickness, positions, sides):
 
 def test_a_plate_thinner_than_its_noise_has_no_answer_without_positions():
     scene = plate(1.0, 4, STATIONS, positions=False)
-    core = deviation_step.run(scene, deviation_step.Params()).core
+    core = deviation_step.run(scene, AS_IT_LIES).core
     assert np.isfinite(core.lod95).mean() < 0.01
     scene = plate(1.0, 4, STATIONS, positions=True)
-    core = deviation_step.run(scene, deviation_step.Params()).core
+    core = deviation_step.run(scene, AS_IT_LIES).core
     known = np.isfinite(core.lod95)
     assert known.mean() > 0.9
     assert core.distances.significant[known].mean() < 0.07
@@ -131,7 +137,7 @@ def test_stations_that_differ_widen_the_level_of_detection(offset):
         scans.append(Scan(f"s{k}", np.asarray(points)[some] + off[:, None] * normals[some]))
     design = StructureDesign("box", np.asarray(mesh.vertices), np.asarray(mesh.faces))
     scene = Scene("box", "structure", tuple(scans), structure=design, units="mm")
-    core = deviation_step.run(scene, deviation_step.Params(registration_error_mm=0.0)).core
+    core = deviation_step.run(scene, dataclasses.replace(AS_IT_LIES, registration_error_mm=0.0)).core
     known = np.isfinite(core.lod95)
     shared = core.std1[known] / np.sqrt(core.n1[known])
     if offset == 0.0:

@@ -92,7 +92,7 @@ def test_all_points_count_where_none_are_to_be_left_out(small, monkeypatch):
     one, four = (deviation_step.run(each, params) for each in (few, scene))
     assert four.core.n1.sum() / one.core.n1.sum() == pytest.approx(4.0, rel=0.05)
     assert np.nanmedian(four.core.lod95 / one.core.lod95) == pytest.approx(0.5, rel=0.1)
-    thinned = deviation_step.run(scene, dataclasses.replace(params, most_points=5_000))
+    thinned = deviation_step.run(scene, dataclasses.replace(params, most_points=COUNT // 4))
     assert thinned.core.n1.sum() / one.core.n1.sum() == pytest.approx(1.0, rel=0.05)
 
 

@@ -50,7 +50,7 @@ def field(points):
     return np.column_stack([0.0 * x, 4.0 + 0.0 * x, -6.0 * (1.0 - x**2)])
 
 
-def scene_of(seed, move=field, T_design_scan=None, origin=0.0, count=60_000):
+def scene_of(seed, move=field, T_design_scan=None, origin=0.0, count=15_000):
     mesh = bracket()
     rng = np.random.default_rng(seed)
     points = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
@@ -73,7 +73,7 @@ def metrics(scene, result, truth):
 
 
 def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_bad_frame():
-    scene, truth = scene_of(1, origin=FAR)
+    scene, truth = scene_of(1, origin=FAR, count=60_000)
     result = deviation_step.run(scene, deviation_step.Params())
     assert (result.status, result.registration) == ("ok", "as given")
     np.testing.assert_array_equal(result.T_design_scan, np.eye(4))
@@ -149,8 +149,8 @@ def test_a_scan_in_another_frame_is_registered_whatever_its_order():
 
 @pytest.mark.parametrize("seed", [4, 5])
 def test_an_undamaged_structure_is_a_twentieth_beyond_where_the_frame_is_sure(seed):
-    scene, _ = scene_of(seed, lambda p: 0.0 * p)
-    result = deviation_step.run(scene, deviation_step.Params(registration_error_mm=0.0))
+    scene, _ = scene_of(seed, lambda p: 0.0 * p, count=60_000)
+    result = deviation_step.run(scene, deviation_step.Params(register="none", registration_error_mm=0.0))
     assert 0.035 < result.significant_share < 0.065
     cautious = deviation_step.run(scene, deviation_step.Params())
     assert cautious.registration_error > 0.0
@@ -222,7 +222,7 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
     assert result.status == "weak"
     assert codes(result)[0] == "deviation.scans-elsewhere"
     assert result.reasons[0].values["scans"] == ", ".join(f"scan-{k}" for k in range(wrong))
-    assert result.reasons[0].values["points"] == pytest.approx(20_000 * wrong, rel=0.01)
+    assert result.reasons[0].values["points"] == pytest.approx(5_000 * wrong, rel=0.01)
     assert result.registration == ("coarse" if elsewhere else "as given")
     assert result.significant_share < 0.07
     assert np.isfinite(result.core.lod95).mean() > 0.9
@@ -382,7 +382,7 @@ def test_a_pose_that_is_another_of_those_that_fit_is_not_held_against_the_truth(
 
 def test_the_least_and_the_greatest_have_their_intervals(tmp_path):
     scene, _ = scene_of(14, count=20_000)
-    result = deviation_step.run(scene, deviation_step.Params())
+    result = deviation_step.run(scene, deviation_step.Params(register="none"))
     written = fields_to_json.as_object(result)
     known = np.isfinite(result.core.lod95)
     for end, row in (("min", np.argmin(result.core.distance[known])), ("max", np.argmax(result.core.distance[known]))):

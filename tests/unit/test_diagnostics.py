@@ -1,7 +1,6 @@
 """What the stages of the papers' methods find: numbers in results.h5, clouds on request; neither changes a result."""
 
 import csv
-import hashlib
 from pathlib import Path
 from threading import Thread
 from unittest import mock
@@ -18,7 +17,7 @@ from processor.model import Status
 from processor.preassembly.parts import attitude
 from processor.report import write_results
 from processor.store import store
-from tests.support import arch_clouds
+from tests.support import arch_clouds, known_attitudes
 
 
 def turned(angle, shift):
@@ -64,23 +63,11 @@ METHODS = "line,design-aided"
 
 @pytest.fixture(scope="module")
 def bridge():
-    return arch_clouds.bridge(spacing_mm=20.0, sigma_mm=0.5, seed=3)[0]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def attitudes():
-    """The attitude of each part is searched once: that search does not use the module under test."""
-    found, find = {}, attitude.find
-
-    def once(points, part):
-        key = part.name, hashlib.sha256(points.tobytes()).digest()
-        if key not in found:
-            found[key] = find(points, part)
-        return found[key]
-
+    """A bridge whose parts' attitudes are known: the search for them does not use the module under test."""
     assert "diagnostics" not in Path(attitude.__file__).read_text("utf-8")
-    with mock.patch.object(attitude, "find", once):
-        yield
+    scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=0.5, seed=3)
+    with mock.patch.object(attitude, "find", known_attitudes.find_by(truth)):
+        yield scene
 
 
 @pytest.fixture(scope="module")

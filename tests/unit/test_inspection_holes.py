@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from functools import cache
 
 import cadquery as cq
 import numpy as np
@@ -103,10 +104,14 @@ def bore_cloud(rng, departure, radius=0.0, sigma=0.35, spacing=2.0, mixed=0.0, k
     return points, np.concatenate(ray), np.concatenate(source)
 
 
+@cache
+def group():
+    return next(holes.groups(holes_of(plate(GRID).val()), [np.array([1.0, 0.0, 0.0])]))
+
+
 def measured(points, ray, source):
     cloud = holes.Cloud(points, ray, source, 3, cKDTree(points))
-    group = next(holes.groups(holes_of(plate(GRID).val()), [np.array([1.0, 0.0, 0.0])]))
-    return {one.id: one for one in holes.measured(cloud, group, 1)}
+    return {one.id: one for one in holes.measured(cloud, group(), 1)}
 
 
 def without_motion(departure):

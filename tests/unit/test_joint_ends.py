@@ -1,6 +1,7 @@
 """Ends of a straight box with displaced corners, by points made with numpy, against closed forms."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,7 +26,9 @@ def box(b, low, high):
     return vertices, np.array([face for q in quads for face in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))])
 
 
+@cache
 def design():
+    """The mesh of the box and its joint; not to be changed."""
     outer, faces = box(B, 0.0, H)
     inner, same = box(B - T, T, H - T)
     ring = [(4 + k, 4 + (k + 1) % 4, 12 + (k + 1) % 4, 12 + k) for k in range(4)]
@@ -34,6 +37,12 @@ def design():
     middles = [0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0))]
     joint = np.vstack([corners, middles])
     return mesh_distance.of_mesh(np.vstack([outer, inner]), np.vstack([faces, same + 8, np.array(ends)])), joint
+
+
+@cache
+def outer_faces():
+    surface, joint = design()
+    return ends_faces.outer_faces(surface, [joint])
 
 
 def cloud(rng, spacing, shares=(1.0, 1.0, 1.0, 1.0), inner=1.0):
@@ -67,7 +76,7 @@ def built(points, corners):
 
 def fitted(points, rng, sigma=1.0):
     surface, joint = design()
-    outer = ends_faces.outer_faces(surface, [joint])
+    outer = outer_faces()
     noisy = points + sigma * rng.standard_normal(points.shape)
     place = end_place(joint, 1.0)
     assert np.allclose(place.T_bridge_joint[:3, :3], np.eye(3))

@@ -7,12 +7,12 @@ from processor.adjustment import scanner_class
 from processor.preassembly.ends import view_variance
 
 
-def plate(rng, apart, thick=24.0, waves=0.0, off=None):
+def plate(rng, apart, thick=24.0, waves=0.0, off=None, count=3_000):
     """Points on both sides of a plate of 500 by 900 mm; each side is ``off``, or by a draw of ``apart`` mm."""
     heights, places, inner = [], [], []
     off = apart * rng.standard_normal(2) if off is None else off
     for side, level in ((False, off[0]), (True, off[1] - thick)):
-        at = rng.uniform((-500.0, -450.0), (0.0, 450.0), (3_000, 2))
+        at = rng.uniform((-500.0, -450.0), (0.0, 450.0), (count, 2))
         shape = waves * np.sin(2.0 * np.pi * at[:, 0] / 700.0)
         heights.append(level + shape + rng.standard_normal(len(at)))
         places.append(at)
@@ -32,7 +32,7 @@ def test_waves_of_a_plate_do_not_change_its_thickness():
 def pair(rng, apart, thick=24.0):
     """Two opposite plates of an end, seen from the same two sides: shifts of views point outward on one alone."""
     off = apart * rng.standard_normal(2)
-    return [plate(rng, apart, thick, off=off), plate(rng, apart, thick, off=-off[::-1])]
+    return [plate(rng, apart, thick, off=one, count=1_500) for one in (off, -off[::-1])]
 
 
 # Of 12 pairs of opposite plates less 3 means of equal thickness 9 are left. By Student's t they are widened by
