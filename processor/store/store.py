@@ -288,13 +288,17 @@ def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRu
 def read_provenance(path: Path) -> dict[str, Any]:
     """Read how a file was made: the JSON object given to the writer."""
     with opened(path, list(FORMATS)) as file:
-        try:
-            provenance = json.loads(codec.read_text(file, "provenance"))
-        except json.JSONDecodeError:
-            provenance = None
-        if not isinstance(provenance, dict):
-            raise DecodeError(["/provenance: expected a JSON object"])
-        return provenance
+        return _provenance(file)
+
+
+def _provenance(file: Any) -> dict[str, Any]:
+    try:
+        provenance = json.loads(codec.read_text(file, "provenance"))
+    except json.JSONDecodeError:
+        provenance = None
+    if not isinstance(provenance, dict):
+        raise DecodeError(["/provenance: expected a JSON object"])
+    return provenance
 
 
 def problems(path: Path) -> list[str]:
@@ -309,15 +313,15 @@ def problems(path: Path) -> list[str]:
             return cause.problems if isinstance(cause, DecodeError) else [str(error).removeprefix(f"{path}: ")]
         return []
 
-    def read_kind(path: Path) -> None:
+    def read_header(path: Path) -> None:
         nonlocal kind
         with opened(path, list(FORMATS)) as file:
             kind = _attribute(file, "format")
+            _provenance(file)
 
-    faults = attempt(read_kind)
-    if faults:
+    faults = attempt(read_header)
+    if not kind:  # nothing of it can be read
         return faults
-    faults = attempt(read_provenance)
     if kind == FORMATS["scene"]:
         faults += attempt(read_scene)
     if kind != FORMATS["results"]:
