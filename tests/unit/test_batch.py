@@ -15,7 +15,6 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import termios
 import time
 import urllib.parse
@@ -30,6 +29,7 @@ from processor.cli import main as cli_main
 from processor.jobs import runner
 from processor.model import InputError, UsageError
 from processor.scan_folder import fingerprint
+from tests.support import dask_forks
 from tests.support.batches import ENV, FAILING, REAL, ROOT, folder, run, run_one
 
 SPHERES = ("--steps", "spheres", "--method", "least-squares", "--seed", "3")
@@ -669,21 +669,18 @@ def free_port():
 def cluster_of(tmp_path, protocol, env, workers):
     """A Dask scheduler and workers on this machine: the address, and the processes, that of the scheduler first."""
     pytest.importorskip("distributed")
-    address, log = f"{protocol}://127.0.0.1:{free_port()}", (tmp_path / "cluster.log").open("w")
-    plain = {"stdout": log, "stderr": log, "cwd": tmp_path, "env": env}
-    dask = (sys.executable, "-m", "dask")
+    address, path = f"{protocol}://127.0.0.1:{free_port()}", tmp_path / "cluster.log"
     own = ("--host", "127.0.0.1", "--no-dashboard")
-    scheduler = [*dask, "scheduler", *own, "--protocol", protocol, "--port", address.rpartition(":")[2]]
-    worker = [*dask, "worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(tmp_path)]
-    processes = [subprocess.Popen(one, **plain) for one in (scheduler, *[worker] * workers)]
+    worker = ("worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(tmp_path))
+    with path.open("w") as log:
+        forks = dask_forks.Forks(log, tmp_path, env)
     try:
-        until(lambda: (tmp_path / "cluster.log").read_text().count("Registered to") >= workers)
+        scheduler = forks.start("scheduler", *own, "--protocol", protocol, "--port", address.rpartition(":")[2])
+        processes = [scheduler, *(forks.start(*worker) for _ in range(workers))]
+        until(lambda: path.read_text().count("Registered to") >= workers)
         yield address, processes
     finally:
-        for process in reversed(processes):
-            process.kill()
-            process.wait()
-        log.close()
+        forks.end()
 
 
 @pytest.fixture
