@@ -56,8 +56,6 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
 
     A run that a limit ends leaves OUT as it was, and the steps that were done in OUT.part; it exits with 3.
     """
-    from processor import diagnostics
-    from processor.api import runs
     from processor.scan_folder.files import missing
 
     shown = Shown(options["as_json"], options["verbose"], options["quiet"])
@@ -73,6 +71,10 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
         from processor.cli.limited_run import limited_run
 
         context.exit(limited_run(input_, output, *limits, _arguments({**options, "fail_on": fail_on})))
+    # The process that waits for a limited run has no use for these, which are loaded in two seconds.
+    from processor import diagnostics
+    from processor.api import runs
+
     with diagnostics.with_clouds(options["keep_steps"]):
         results = runs.compute(
             input_,
