@@ -212,7 +212,8 @@ def place(tmp_path, monkeypatch):
     cad_in_process.read_here(monkeypatch)
     invoke("designgen make arch-s1 -o s1.h5 --set scan.spacing_mm=100")
     invoke(f"designgen make {fixtures / 'frame-of-four.toml'} -o roof.h5 --set scan.step_mrad=10")
-    plates = '--set scan.step_mrad=6 --set structure.length_mm=500 --set structure.height_mm=500 --set \'structure.components=["none", "none", "dent"]\''
+    plates = "--set scan.step_mrad=6 --set structure.length_mm=500 --set structure.height_mm=500"
+    plates += ' --set \'structure.components=["none", "none", "dent"]\''
     invoke(f"designgen make plates-defects -o plates.h5 {plates}")
     for name in ("my-plates", "my-roof"):
         invoke(f"designgen export plates.h5 -o {name} --format ply")
