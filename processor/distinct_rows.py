@@ -52,7 +52,7 @@ def distinct(rows: Ints) -> Distinct:
 
 
 def distinct_points(points: Floats) -> tuple[Floats, Ints]:
-    """Return the distinct ones of points (n, 3), sorted from the first column on, and the number (n,) of each given."""
+    """Return the distinct ones of points (n, m), sorted from the first column on, and the number (n,) of each given."""
     order = np.lexsort(points.T[::-1])
     ordered = points[order]
     begins = np.ones(len(points), bool)
