@@ -166,6 +166,8 @@ def test_real_files_in_inches(name, tmp_path):
 @pytest.mark.usefixtures("cad_here")
 def test_designs_go_out_as_step_and_keep_their_volumes(tmp_path):
     recipe = recipe_files.load("arch-s1")[1]
+    sizes = {key: value / 4.0 for key, value in recipe["bridge"].items() if key.endswith("_mm")}
+    recipe["bridge"] |= sizes
     files = step_files.write_design(recipe, tmp_path / "design")
     bridge = {k: tuple(v) if isinstance(v, list) else v for k, v in recipe["bridge"].items()}
     parts = arch_bridge.build(arch_bridge.Params(**bridge))
