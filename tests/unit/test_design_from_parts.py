@@ -48,7 +48,7 @@ def joined(*meshes):
 @pytest.mark.parametrize("parts", [2, 5, 7, 11])
 @pytest.mark.parametrize("gap", [0.0, 8.0, 55.0])
 def test_joints_are_those_of_the_closed_form(parts, gap):
-    for seed in range(3):
+    for seed in range(2):
         meshes, joints = bridge_parts.bridge(parts, seed, gap)
         shuffled = np.random.default_rng(seed).permutation(parts)
         one = found([meshes[k] for k in shuffled], [bridge_parts.names(parts)[k] for k in shuffled])
