@@ -11,8 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
-from scipy.optimize import brentq
 
 from processor.model import Floats, UsageError
 
@@ -75,6 +73,8 @@ def ring(radius: float) -> Curve:
 
 
 def _parabola(span: float, rise: float) -> Curve:
+    from scipy.interpolate import CubicHermiteSpline  # loaded in a third of a second, which other scenes spare
+
     k = 4.0 * rise / span**2  # z below the crown = k x^2
 
     def arc(x: Floats) -> Floats:
@@ -109,6 +109,8 @@ def _parabola(span: float, rise: float) -> Curve:
 
 
 def _catenary(span: float, rise: float) -> Curve:
+    from scipy.optimize import brentq
+
     half = 0.5 * span
     # Solve a (cosh(half / a) - 1) = rise for q = half / a; the left side grows with q from 0.
     q = brentq(lambda q: half * (math.cosh(q) - 1.0) / q - rise, 1e-9, 50.0, xtol=1e-15, rtol=1e-15)

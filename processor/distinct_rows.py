@@ -1,4 +1,4 @@
-"""Distinct rows of integers: cells that points lie in, pairs of numbers; in a fraction of the time of np.unique."""
+"""Distinct rows: cells that points lie in, pairs of numbers, points; in a fraction of the time of np.unique."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.model import Ints
+from processor.model import Floats, Ints
 
 DENSE = 8  # times the rows: numbers of this range are counted, others are sorted
 
@@ -49,3 +49,14 @@ def distinct(rows: Ints) -> Distinct:
     first = np.empty(len(count), np.int64)
     first[number[::-1]] = np.arange(len(rows) - 1, -1, -1)
     return Distinct(rows[first], first, number, count)
+
+
+def distinct_points(points: Floats) -> tuple[Floats, Ints]:
+    """Return the distinct ones of points (n, m), sorted from the first column on, and the number (n,) of each given."""
+    order = np.lexsort(points.T[::-1])
+    ordered = points[order]
+    begins = np.ones(len(points), bool)
+    begins[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    number = np.empty(len(points), np.int64)
+    number[order] = np.cumsum(begins) - 1
+    return ordered[begins], number

@@ -207,14 +207,15 @@ def place(tmp_path, monkeypatch):
         write_plane(tmp_path / f"{name}.ply", 4000, number, "ply")
     write_plane(tmp_path / "places.csv", 20, 2, "x y z")
     (tmp_path / "mine.toml").write_text("\n".join(blocks(ROOT / "docs/parameters.md", "toml")))
-    cadquery.exporters.export(cadquery.Workplane().box(200.0, 100.0, 20.0), str(tmp_path / "design.step"))
+    cadquery.exporters.export(cadquery.Workplane().box(50.0, 25.0, 5.0), str(tmp_path / "design.step"))
     monkeypatch.chdir(tmp_path)
     # What starts processes does so in the tests of it; here, jobs of a batch have made-up results at once.
     monkeypatch.setattr(batch, "Settings", functools.partial(batch.Settings, program=batches.FAILING))
     cad_in_process.read_here(monkeypatch)
     invoke("designgen make arch-s1 -o s1.h5 --set scan.spacing_mm=100")
     invoke(f"designgen make {fixtures / 'frame-of-four.toml'} -o roof.h5 --set scan.step_mrad=10")
-    plates = '--set scan.step_mrad=6 --set \'structure.components=["none", "none", "dent"]\''
+    plates = "--set scan.step_mrad=6 --set structure.length_mm=500 --set structure.height_mm=500"
+    plates += ' --set \'structure.components=["none", "none", "dent"]\''
     invoke(f"designgen make plates-defects -o plates.h5 {plates}")
     for name in ("my-plates", "my-roof"):
         invoke(f"designgen export plates.h5 -o {name} --format ply")

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from processor.model import Floats, Ints
 
@@ -139,6 +138,8 @@ def _curve(numbers: Floats) -> Curve:
         return lambda t: rest[0:3] + np.outer(np.cos(t), rest[3:6]) + np.outer(np.sin(t), rest[6:9])
     if kind != CURVE:
         raise ValueError(f"no curve of kind {kind:g}")
+    from scipy.interpolate import BSpline  # loaded in a third of a second, which most files spare
+
     degree, count = int(rest[0]), int(rest[1])
     spline = BSpline(rest[2 : 2 + count], rest[2 + count :].reshape(-1, 4), degree, extrapolate=True)
 

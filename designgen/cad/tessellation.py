@@ -104,7 +104,12 @@ def merged(points: Floats, triangles: Ints) -> tuple[Floats, Ints, npt.NDArray[n
     Triangles of which two corners are one point are left out.
     """
     # Faces have separate vertices along a common edge; 1e-5 mm is far below any edge and far above rounding.
-    _, first, inverse = np.unique(np.round(points, 5), axis=0, return_index=True, return_inverse=True)
-    faces = inverse.reshape(-1)[triangles]
+    rounded = np.round(points, 5)
+    order = np.lexsort(rounded.T[::-1])  # as np.unique sorts rows, in a fraction of its time
+    begins = np.ones(len(points), bool)
+    begins[1:] = (np.diff(rounded[order], axis=0) != 0.0).any(axis=1)
+    first, inverse = order[begins], np.empty(len(points), np.int64)
+    inverse[order] = np.cumsum(begins) - 1
+    faces = inverse[triangles]
     proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     return points[first], faces[proper].astype(np.int64), proper

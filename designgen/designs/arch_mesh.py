@@ -9,7 +9,6 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import brentq
 
 from designgen.designs.arch_part import PAD_HEIGHT_MM, PAD_SIZE_MM, ArchPart, pad_frame
 from processor.model import Floats, Ints
@@ -66,6 +65,8 @@ def _step(part: ArchPart) -> float:
 
 def _under_pad(part: ArchPart, s: float, x: float) -> float:
     """Return the arc length at which the top face is ``x`` along the pad from its middle at ``s``, mm."""
+    from scipy.optimize import brentq
+
     origin, along, _, _ = pad_frame(part)
 
     def error(at: float) -> float:

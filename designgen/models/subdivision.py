@@ -35,8 +35,9 @@ def subdivided(body: ModelBody, spacings: Sequence[Spacing]) -> ModelBody:
     vertices, triangles, pq, face = body.vertices, body.triangles, body.pq, body.face
     for _ in range(MOST_ROUNDS):
         edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        key, which = np.unique(edges, axis=0, return_inverse=True)
-        which = which.reshape(-1, 3)
+        # Pairs as numbers, in the same order: rows take ten times as long to sort.
+        number, which = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True)
+        key, which = np.stack(np.divmod(number, len(vertices)), axis=1), which.reshape(-1, 3)
         split = np.zeros(len(key), bool)
         split[which[_long(vertices[triangles], spacings)]] = True
         if not split.any():

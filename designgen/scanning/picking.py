@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from designgen.checks import expect_all
 from designgen.randomness import generator
@@ -93,6 +92,8 @@ def _into(T: Floats, points: Floats) -> Floats:
 
 def _seen(corners: Floats, points: Floats) -> Floats:
     """Return the corners (k, 3) that a scan of points (n, 3) has points at."""
+    from scipy.spatial import cKDTree
+
     unique = np.unique(np.round(corners, 3), axis=0)
     seen: Floats = unique[cKDTree(points).query(unique)[0] < CORNER_REACH_MM]
     return seen

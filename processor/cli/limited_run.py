@@ -64,12 +64,15 @@ def _why(ended: Ended, timeout_s: float | None, memory_mb: int | None) -> str:
 
 def _what_is_done(part: Path, input_: Path) -> str:
     """Return which steps were done before the end, and where they are."""
-    from processor import pipeline
+    nothing = f"ended before the first step; nothing is kept; {MORE}"
+    if not (part / RESULTS_H5).is_file():
+        return nothing
+    from processor import pipeline  # with all steps, in two seconds
 
     try:
         runs, provenance = pipeline.read_runs(part / RESULTS_H5)
     except InputError:
-        return f"ended before the first step; nothing is kept; {MORE}"
+        return nothing
     done = [f"{run.step} ({run.method})" for run in runs]
     planned = [str(name) for name in provenance.get("planned", ())]
     left = ", ".join(planned[len(done) :])

@@ -24,6 +24,7 @@ from processor.cli.common import (
     split_names,
 )
 from processor.cli.help_text import RunCommand
+from processor.cli.limited_run import limited_run
 from processor.model import UsageError
 from processor.results.file_names import RESULTS_JSON
 
@@ -56,8 +57,6 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
 
     A run that a limit ends leaves OUT as it was, and the steps that were done in OUT.part; it exits with 3.
     """
-    from processor import diagnostics
-    from processor.api import runs
     from processor.scan_folder.files import missing
 
     shown = Shown(options["as_json"], options["verbose"], options["quiet"])
@@ -70,9 +69,10 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
             print_error_line(f"results go to {output}, as -o names no folder")
     limits = options.pop("timeout_s"), options.pop("memory_mb")
     if any(limit is not None for limit in limits):
-        from processor.cli.limited_run import limited_run
-
         context.exit(limited_run(input_, output, *limits, _arguments({**options, "fail_on": fail_on})))
+    from processor import diagnostics
+    from processor.api import runs  # in two seconds, which the process that waits for a limited run spares
+
     with diagnostics.with_clouds(options["keep_steps"]):
         results = runs.compute(
             input_,

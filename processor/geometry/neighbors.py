@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processor.distinct_rows import distinct_points
 from processor.geometry import point_grid
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
@@ -251,8 +252,7 @@ def _nearest(cells, places, own, order, first, last, k, mean, farthest):  # type
 
 def same_places(points: Floats, within_mm: float) -> Ints:
     """Return the number (n,), from 0, of the place of each point (n, 3); points no farther apart have the same one."""
-    distinct, place = np.unique(points, axis=0, return_inverse=True)
-    place = place.reshape(-1).astype(np.int64)
+    distinct, place = distinct_points(points)
     pairs = cKDTree(distinct).query_pairs(within_mm, output_type="ndarray") if len(distinct) else np.empty((0, 2))
     if not len(pairs):
         return place

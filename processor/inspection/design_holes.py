@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from processor.distinct_rows import distinct
 from processor.geometry import circle, rigid
 from processor.geometry.neighbors import same_places
 from processor.model import Floats, Ints
@@ -86,12 +87,12 @@ def _circles(vertices: Floats, faces: Ints, normals: Floats, plane: Ints) -> Ite
     third, group = corner[:, [2, 0, 1]].ravel(), np.repeat(plane, 3)
     # An edge of two facets of one face is within it; one of a single facet is in its border.
     key = np.stack([group, np.minimum(a, b), np.maximum(a, b)], axis=1)
-    _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
-    border = first[count == 1]
+    edges = distinct(key)
+    border = edges.first[edges.count == 1]
     if not len(border):
         return
     ends = np.concatenate([[group[border], a[border]], [group[border], b[border]]], axis=1).T
-    node = np.unique(ends, axis=0, return_inverse=True)[1].reshape(-1)
+    node = distinct(ends).number
     start, end = node[: len(border)], node[len(border) :]
     links = coo_array((np.ones(len(border)), (start, end)), (int(node.max()) + 1,) * 2)
     loop = connected_components(links, directed=False)[1][start]

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from processor import scene_cloud
 from processor.adjustment import groups, scanner_class
+from processor.distinct_rows import distinct_points
 from processor.geometry import mesh_distance
 from processor.geometry.neighbors import same_places
 from processor.inspection import design_holes
@@ -190,8 +191,7 @@ def _planes(corners: Floats, normals: Floats, body: Ints) -> Ints:
     offset = np.einsum("fi,fi->f", normals, corners.mean(axis=1))
     # Shifted, as many designs have planes right between two steps.
     keys = np.column_stack([body, np.rint(normals / NORMALS + 0.137), np.rint(offset / OFFSETS_MM + 0.137)])
-    number: Ints = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
-    return number
+    return distinct_points(keys)[1]
 
 
 def _width(face: FlatFace) -> float:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import processor.readers.pieces as pieces
 from processor.large_arrays import allocate
@@ -279,6 +278,8 @@ def _pose(path: Path, name: str, header: Any) -> Floats:
             raise InputError(
                 f"{path}: the pose of scan {name!r} has a quaternion of length {length:g}, expected 1; export it again"
             )
+        from scipy.spatial.transform import Rotation  # loaded in a quarter of a second, which other formats spare
+
         pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
     if node.isDefined("translation"):
         pose[:3, 3] = [float(node["translation"][key].value()) for key in "xyz"]

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from processor.distinct_rows import distinct_points
 from processor.model import Bools, DesignFaults, Floats, Ints
 
 JOIN_SHARE = 1e-9  # of the mesh's size: vertices nearer to each other are one, as STL repeats them
@@ -54,8 +55,7 @@ def _joined(vertices: Floats, faces: Ints) -> Ints:
     """Return the facets by numbers of distinct vertices."""
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
     grid = np.round(vertices / max(JOIN_SHARE * size, 1e-300))
-    number: Ints = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
-    joined: Ints = number[faces]
+    joined: Ints = distinct_points(grid)[1][faces]
     return joined
 
 

@@ -84,7 +84,7 @@ def _of_all(file: Any, known: Mapping[str, str]) -> Any:
     return digest
 
 
-def _stored(item: Any) -> str | None:
+def stored(item: Any) -> str | None:
     """Return the checksum that a dataset or group, one of h5py's low-level interface, carries; None without one."""
     if not h5py.h5a.exists(item, NAME):
         return None
@@ -96,16 +96,6 @@ def _stored(item: Any) -> str | None:
     value = np.empty((), f"S{kind.get_size()}")
     attribute.read(value, kind)
     return bytes(value[()]).decode("ascii", "replace")
-
-
-def _all_stored(group: Any, place: str = "") -> Iterator[tuple[str, str | None]]:
-    """Yield the paths of all datasets of a low-level group at a place, and their checksums."""
-    for name in group:
-        item, path = h5py.h5o.open(group, name), f"{place}/{name.decode('utf-8', 'surrogateescape')}"
-        if isinstance(item, h5py.h5g.GroupID):
-            yield from _all_stored(item, path)
-        else:
-            yield path, _stored(item)
 
 
 def has_any(file: Any) -> bool:
@@ -123,13 +113,12 @@ def datasets(group: Any) -> Iterator[tuple[str, Any]]:
             yield item.name, item
 
 
-def root_problems(file: Any) -> list[str]:
-    """List what the root group's checksum and those of the datasets contradict; no data are read."""
-    known = dict(_all_stored(file.id))
+def root_problems(file: Any, known: Mapping[str, str | None]) -> list[str]:
+    """List what the root group's checksum and those ``known`` of all datasets contradict; no data are read."""
     missing = [f"{path}: has no checksum, as every dataset of this version has" for path in known if not known[path]]
     if not has_any(file):
         missing.append("/: has no checksum, as every file of this version has")
-    if missing or _stored(file.id) == _of_all(file, {path: text or "" for path, text in known.items()}).hexdigest():
+    if missing or stored(file.id) == _of_all(file, {path: text or "" for path, text in known.items()}).hexdigest():
         return missing
     return [
         "/: is damaged: its attributes, or the names of what it holds, are not those written; make or copy it again"
@@ -170,7 +159,7 @@ def _damage(dataset: Any) -> Iterator[None]:
 
 def read(dataset: Any) -> np.typing.NDArray[Any]:
     """Read a dataset, with a check where it has a checksum; one in chunks part by part. Raises ChecksumError."""
-    known, digest = _stored(dataset.id), begin(dataset.name, dataset)
+    known, digest = stored(dataset.id), begin(dataset.name, dataset)
     if dataset.chunks is None:
         array = whole(dataset)
         digest.update(array.data if array.size else b"")
@@ -199,7 +188,7 @@ class Column:
         self.shape: tuple[int, ...] = dataset.shape
         self.dtype = dataset.dtype
         self.ndim: int = dataset.ndim
-        self._known, self._place = _stored(dataset.id), (object(),) if again else _place(dataset)
+        self._known, self._place = stored(dataset.id), (object(),) if again else _place(dataset)
         self._digest: Any = None
         self._next = 0
         self._all = None if dataset.chunks else read(dataset)

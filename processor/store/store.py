@@ -165,9 +165,12 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
         with file_structure_checks.limited_memory():
             file = h5py.File(path, "r", locking=False)
         with file:
+            known: dict[str, str | None] = {}
             with file_structure_checks.limited_memory():
-                faults = file_structure_checks.problems(file, path)
-            faults = faults or _header_problems(file, kinds)
+                faults = file_structure_checks.problems(
+                    file, path, lambda place, dataset: known.update({place: checksums.stored(dataset)})
+                )
+            faults = faults or _header_problems(file, kinds, known)
             if faults:
                 raise DecodeError(faults)
             yield file
@@ -196,7 +199,7 @@ def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
+def _header_problems(file: Any, kinds: Sequence[str], known: Mapping[str, str | None]) -> list[str]:
     header = {name: _attribute(file, name) for name in ("format", "format_version", "units")}
     wanted = [FORMATS[kind] for kind in kinds]
     if header["format"] not in wanted:
@@ -210,11 +213,11 @@ def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
         faults.append(f"expected format_version {' or '.join(readable)}, found {version}{advice}")
     if header["units"] != "mm":
         faults.append(f"expected units mm, found {header['units'] or 'none'}")
-    return faults or _checksum_problems(file, str(header["format_version"]))
+    return faults or _checksum_problems(file, str(header["format_version"]), known)
 
 
-def _checksum_problems(file: Any, version: str) -> list[str]:
-    return [] if version in WITHOUT_CHECKSUMS and not checksums.has_any(file) else checksums.root_problems(file)
+def _checksum_problems(file: Any, version: str, known: Mapping[str, str | None]) -> list[str]:
+    return [] if version in WITHOUT_CHECKSUMS and not checksums.has_any(file) else checksums.root_problems(file, known)
 
 
 def _attribute(file: Any, name: str) -> str:
@@ -289,13 +292,17 @@ def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRu
 def read_provenance(path: Path) -> dict[str, Any]:
     """Read how a file was made: the JSON object given to the writer."""
     with opened(path, list(FORMATS)) as file:
-        try:
-            provenance = json.loads(codec.read_text(file, "provenance"))
-        except json.JSONDecodeError:
-            provenance = None
-        if not isinstance(provenance, dict):
-            raise DecodeError(["/provenance: expected a JSON object"])
-        return provenance
+        return _provenance(file)
+
+
+def _provenance(file: Any) -> dict[str, Any]:
+    try:
+        provenance = json.loads(codec.read_text(file, "provenance"))
+    except json.JSONDecodeError:
+        provenance = None
+    if not isinstance(provenance, dict):
+        raise DecodeError(["/provenance: expected a JSON object"])
+    return provenance
 
 
 def problems(path: Path) -> list[str]:
@@ -310,15 +317,15 @@ def problems(path: Path) -> list[str]:
             return cause.problems if isinstance(cause, DecodeError) else [str(error).removeprefix(f"{path}: ")]
         return []
 
-    def read_kind(path: Path) -> None:
+    def read_header(path: Path) -> None:
         nonlocal kind
         with opened(path, list(FORMATS)) as file:
             kind = _attribute(file, "format")
+            _provenance(file)
 
-    faults = attempt(read_kind)
-    if faults:
+    faults = attempt(read_header)
+    if not kind:  # nothing of it can be read
         return faults
-    faults = attempt(read_provenance)
     if kind == FORMATS["scene"]:
         faults += attempt(read_scene)
     if kind != FORMATS["results"]:

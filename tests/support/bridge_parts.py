@@ -19,7 +19,7 @@ def soffit(x):
 
 
 def edge(corner, x, inner=False):
-    """Point (3,) at ``x`` on the edge 0..3 (bottom-left, bottom-right, top-right, top-left); inside of the plates."""
+    """Points (..., 3) at ``x`` (...) on the edge 0..3 (bottom-left, bottom-right, top-right, top-left); or inside."""
     half = 430.0 + 210.0 * abs(2.0 * x / SPAN - 1.0) ** 1.5
     high = 980.0 + 350.0 * (2.0 * x / SPAN - 1.0) ** 2
     if corner in (2, 3):
@@ -27,7 +27,7 @@ def edge(corner, x, inner=False):
     low = BOTTOM if inner else 0.0
     up = high - (TOP if inner else 0.0)
     y = (half - (WEB if inner else 0.0)) * (1.0 if corner in (0, 3) else -1.0)
-    return np.array([x, y, soffit(x) + (low if corner < 2 else up)])
+    return np.stack([x, y, soffit(x) + (low if corner < 2 else up)], axis=-1)
 
 
 def cutting_planes(parts, seed):
@@ -60,9 +60,9 @@ def part(start, end, rows=ROWS):
     vertices, faces = [], []
     for inner in (False, True):
         ends = [[crossing(k, *plane, inner) for plane in (start, end)] for k in range(4)]
-        loops = [[edge(k, x, inner) for k, x in enumerate(row)] for row in np.linspace(*np.transpose(ends), rows)]
+        loops = [edge(k, x, inner) for k, x in enumerate(np.linspace(*np.transpose(ends), rows).T)]
         first = 4 * rows * inner
-        vertices += [point for loop in loops for point in loop]
+        vertices.append(np.stack(loops, axis=1).reshape(-1, 3))
         for i in range(rows - 1):
             for k in range(4):
                 a, b = first + 4 * i + k, first + 4 * i + (k + 1) % 4
@@ -72,7 +72,7 @@ def part(start, end, rows=ROWS):
             a, b = 4 * i + k, 4 * i + (k + 1) % 4
             quad = [(a, a + 4 * rows, b), (b, a + 4 * rows, b + 4 * rows)]
             faces += [face[::-1] for face in quad] if turned else quad
-    return np.array(vertices), np.array(faces)
+    return np.concatenate(vertices), np.array(faces)
 
 
 def bridge(parts=5, seed=0, gap=0.0):

@@ -10,6 +10,31 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update")
 
 
+class _Shared:
+    """One browser for the pages of a file of tests; each has a context of its own."""
+
+    def __init__(self):
+        self.playwright = self.browser = None
+
+    def get(self):
+        if self.browser is None:
+            from playwright.sync_api import sync_playwright
+
+            self.playwright = sync_playwright().start()
+            self.browser = self.playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+        return self.browser
+
+    def close(self):
+        if self.browser is not None:
+            self.browser.close()
+        if self.playwright is not None:
+            self.playwright.stop()
+        self.playwright = self.browser = None
+
+
+SHARED = _Shared()  # closed by a fixture of tests/unit/conftest.py when the tests of a file are over
+
+
 @contextmanager
 def opened(path, width=1200, height=900):
     """Yield the page of a file; on leaving, nothing was said on its console and nothing but the file was asked for.
@@ -18,18 +43,16 @@ def opened(path, width=1200, height=900):
     """
     if CHROMIUM is None:
         (pytest.fail if os.environ.get("CI") else pytest.skip)("no Chromium: install Debian's package chromium")
-    from playwright.sync_api import sync_playwright
-
     said, asked = [], []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
-        page = browser.new_page(viewport={"width": width, "height": height})
+    page = SHARED.get().new_page(viewport={"width": width, "height": height})
+    try:
         page.on("console", lambda message: said.append(message.text))
         page.on("pageerror", lambda error: said.append(str(error)))
         page.on("request", lambda request: asked.append(request.url))
         page.goto(path.as_uri())
         yield page
-        browser.close()
+    finally:
+        page.close()
     assert not said, said
     assert [url for url in asked if not url.startswith("data:")] == [path.as_uri()]
 

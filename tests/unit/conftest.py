@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.support import cad_in_process
+from tests.support import browser, cad_in_process
 from tests.support.scan_folders import BOX, arch_design, surface, write_ply, write_xyz
 
 
@@ -24,3 +24,10 @@ def bridge(tmp_path):
 def cad_here(monkeypatch):
     """CAD files are read by this process: see :mod:`tests.support.cad_in_process`."""
     cad_in_process.read_here(monkeypatch)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def browser_of_a_file():
+    """A browser that tests of a file have opened is closed with the last of them."""
+    yield
+    browser.SHARED.close()

@@ -15,7 +15,6 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import termios
 import time
 import urllib.parse
@@ -30,6 +29,7 @@ from processor.cli import main as cli_main
 from processor.jobs import runner
 from processor.model import InputError, UsageError
 from processor.scan_folder import fingerprint
+from tests.support import dask_forks
 from tests.support.batches import ENV, FAILING, REAL, ROOT, folder, run, run_one
 
 SPHERES = ("--steps", "spheres", "--method", "least-squares", "--seed", "3")
@@ -367,16 +367,17 @@ def planted_site(root, count):
     return ("--jobs", 2, "--timeout-s", 2, "--memory-mb", 200)
 
 
-def test_killed_three_times_it_ends_as_if_undisturbed(tmp_path):
-    killed_three_times(tmp_path, planted_site(tmp_path / "root", 30), 30)
+@pytest.mark.parametrize(("count", "kills"), [(20, 1), pytest.param(30, 3, marks=pytest.mark.slow)])
+def test_killed_it_ends_as_if_undisturbed(tmp_path, count, kills):
+    killed(tmp_path, planted_site(tmp_path / "root", count), count, kills)
 
 
-def killed_three_times(tmp_path, limits, count):
+def killed(tmp_path, limits, count, kills=3):
     run(tmp_path / "root", "-o", tmp_path / "whole", *limits, code=1)
     assert [one["status"] for one in said(tmp_path / "whole").values()].count("failed") == 5
     rng, out = random.Random(6), tmp_path / "out"
     known, counts = set(), {}
-    for share in (1, 2, 3):
+    for share in range(1, kills + 1):
         process = started(tmp_path / "root", "-o", out, *limits)
         least = len(known) + rng.randint(3, 8)
         until(lambda least=least, process=process: len(finished(out)) >= least or process.poll() is not None, 300)
@@ -393,7 +394,7 @@ def killed_three_times(tmp_path, limits, count):
     after = attempts(out)
     assert {name: after[name] for name in known} == {name: counts[name] for name in known}
     assert summaries(out) == summaries(tmp_path / "whole")
-    assert sum(after.values()) <= count + 3 * 2, "two at a time: a kill costs two jobs at most"
+    assert sum(after.values()) <= count + kills * 2, "two at a time: a kill costs two jobs at most"
     for place in (out, tmp_path / "whole"):
         assert not [one for one in place.rglob("*") if one.name.startswith(".") and one.name != ".batch"]
         assert sorted(os.listdir(place / ".batch")) == ["failed", "lock"]
@@ -410,7 +411,7 @@ def test_forty_real_folders_killed_three_times(tmp_path):
         np.savetxt(path, 0.05 * unit / np.linalg.norm(unit, axis=1)[:, None] + 1.0, fmt="%.6f")
         (path.parent / "real").touch()
     limits = ("--jobs", 2, "--timeout-s", 60, "--memory-mb", 1500, *SPHERES)
-    killed_three_times(tmp_path, limits, 40)
+    killed(tmp_path, limits, 40)
 
 
 @pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT])
@@ -669,21 +670,18 @@ def free_port():
 def cluster_of(tmp_path, protocol, env, workers):
     """A Dask scheduler and workers on this machine: the address, and the processes, that of the scheduler first."""
     pytest.importorskip("distributed")
-    address, log = f"{protocol}://127.0.0.1:{free_port()}", (tmp_path / "cluster.log").open("w")
-    plain = {"stdout": log, "stderr": log, "cwd": tmp_path, "env": env}
-    dask = (sys.executable, "-m", "dask")
+    address, path = f"{protocol}://127.0.0.1:{free_port()}", tmp_path / "cluster.log"
     own = ("--host", "127.0.0.1", "--no-dashboard")
-    scheduler = [*dask, "scheduler", *own, "--protocol", protocol, "--port", address.rpartition(":")[2]]
-    worker = [*dask, "worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(tmp_path)]
-    processes = [subprocess.Popen(one, **plain) for one in (scheduler, *[worker] * workers)]
+    worker = ("worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(tmp_path))
+    with path.open("w") as log:
+        forks = dask_forks.Forks(log, tmp_path, env)
     try:
-        until(lambda: (tmp_path / "cluster.log").read_text().count("Registered to") >= workers)
+        scheduler = forks.start("scheduler", *own, "--protocol", protocol, "--port", address.rpartition(":")[2])
+        processes = [scheduler, *(forks.start(*worker) for _ in range(workers))]
+        until(lambda: path.read_text().count("Registered to") >= workers)
         yield address, processes
     finally:
-        for process in reversed(processes):
-            process.kill()
-            process.wait()
-        log.close()
+        forks.end()
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ from designgen.cad import shapes, step
 from designgen.designs import arch_bridge, arch_part
 from designgen.export import step_files
 from processor.model import InputError, UsageError
+from tests.support import cad_in_process, commands
 
 ROOT = Path(__file__).resolve().parents[2]
 REAL = ROOT.parent / "shared/data/design"
@@ -143,12 +144,13 @@ def test_bad_files_are_refused(box, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["base_interface_AP203.STEP", "base_interface_AP214.STEP"])
+@pytest.mark.usefixtures("cad_here")
 def test_real_files_in_inches(name, tmp_path):
     path = REAL / name
     if not path.exists():
         pytest.skip("the real data are not here")
-    command = [sys.executable, "-m", "designgen", "import", str(path), "-o", str(tmp_path / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
+    done = commands.here("designgen", "import", path, "-o", tmp_path / "out")
+    assert done.returncode == 0
     assert done.stdout.splitlines()[0].endswith("unit inch (25.4 mm, stated in the file)")
     assert len(done.stdout.splitlines()) == 2
     assert done.stderr == ""
@@ -164,6 +166,8 @@ def test_real_files_in_inches(name, tmp_path):
 @pytest.mark.usefixtures("cad_here")
 def test_designs_go_out_as_step_and_keep_their_volumes(tmp_path):
     recipe = recipe_files.load("arch-s1")[1]
+    sizes = {key: value / 4.0 for key, value in recipe["bridge"].items() if key.endswith("_mm")}
+    recipe["bridge"] |= sizes
     files = step_files.write_design(recipe, tmp_path / "design")
     bridge = {k: tuple(v) if isinstance(v, list) else v for k, v in recipe["bridge"].items()}
     parts = arch_bridge.build(arch_bridge.Params(**bridge))
@@ -384,7 +388,9 @@ def test_what_is_lost_is_said(tmp_path):
     path = tmp_path / "torn.step"
     step_files.write_step(path, shapes)
     text = path.read_text()
-    assert cad_files.read(path).problems == ()
+    with pytest.MonkeyPatch.context() as here:
+        cad_in_process.read_here(here)
+        assert cad_files.read(path).problems == ()
     faces = list(re.finditer(r"#\d+ = ADVANCED_FACE\([^;]*;\n", text))
     assert len(faces) == 12
     path.write_text(text.replace(faces[-1][0], ""))
@@ -421,7 +427,7 @@ def test_a_large_sphere_takes_seconds_and_says_its_deviation(tmp_path):
 def test_georeferenced_designs_lie_where_their_scene_has_them(name, tmp_path):
     origin, recipe = [5.0e8, 4.3e9, 1.0e5], recipe_files.load(name)[1]
     if name == "frame-small":
-        recipe["frame"] |= {"nodes_x": 2, "nodes_y": 2, "layers": 1}
+        recipe["frame"] |= {"nodes_x": 2, "nodes_y": 1, "layers": 1, "radii_mm": [45.0]}
     corners = []
     for section in (recipe["scan"], {**recipe["scan"], "origin_mm": origin}):
         (path,) = step_files.write_design({**recipe, "scan": section}, tmp_path / name)

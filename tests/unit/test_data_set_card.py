@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from designgen import card, recipe_files
 from designgen.cli import commands
 
-DENTS = ("--set", 'structure.components=["none", "dent"]', "--set", "scan.step_mrad=12")
+DENTS = ("--set", 'structure.components=["none", "dent"]', "--set", "scan.step_mrad=12", "--set", "scan.stations=2")
 
 
 def make(folder, recipe, *more):

@@ -48,7 +48,7 @@ def joined(*meshes):
 @pytest.mark.parametrize("parts", [2, 5, 7, 11])
 @pytest.mark.parametrize("gap", [0.0, 8.0, 55.0])
 def test_joints_are_those_of_the_closed_form(parts, gap):
-    for seed in range(3):
+    for seed in range(2):
         meshes, joints = bridge_parts.bridge(parts, seed, gap)
         shuffled = np.random.default_rng(seed).permutation(parts)
         one = found([meshes[k] for k in shuffled], [bridge_parts.names(parts)[k] for k in shuffled])
@@ -59,7 +59,7 @@ def test_joints_are_those_of_the_closed_form(parts, gap):
         for part in one.design.parts:
             for side, edge in enumerate((part.bottom_edge_left, part.bottom_edge_right)):
                 assert (np.diff(edge[:, 0]) > 0.0).all()
-                curve = Polyline.through(np.array([bridge_parts.edge(side, x) for x in edge[:, 0]]))
+                curve = Polyline.through(bridge_parts.edge(side, edge[:, 0]))
                 assert np.abs(curve.vertices - edge).max() < 0.1
 
 
@@ -428,12 +428,12 @@ def test_a_design_that_is_there_is_not_changed(tmp_path):
 
 @pytest.mark.usefixtures("cad_here")
 def test_a_step_file_with_all_parts_of_our_own_bridge(tmp_path):
-    """Seven ribs as solids of one file, whose names are those of the bodies."""
+    """Four ribs as solids of one file, whose names are those of the bodies."""
     curve = make_curve("parabola", 9000.0, 2000.0)
-    cuts = curve.length * np.array([0.0, 0.13, 0.29, 0.42, 0.56, 0.7, 0.86, 1.0])
+    cuts = curve.length * np.array([0.0, 0.29, 0.56, 0.7, 1.0])
     parts = [
         arch_rib.build(f"拱肋{k + 1}", curve, (cuts[k], cuts[k + 1]), 500.0, 600.0, Plates(16.0, 14.0, 12.0))
-        for k in range(7)
+        for k in range(4)
     ]
     tmp_path.joinpath("CAD").mkdir()
     step_files.write_step(tmp_path / "CAD/bridge v3.step", {part.name: solid(part) for part in reversed(parts)})

@@ -95,11 +95,11 @@ def test_solids_keep_to_the_closed_form(parts):
         shell = cq.Shell(solid.Shells()[0].wrapped)
         rng = np.random.default_rng(0)
         for face in arch_part.faces(part, 1e9):
-            for point in face.at(rng.uniform(size=3), rng.uniform(size=3)):
+            for point in face.at(rng.uniform(size=2), rng.uniform(size=2)):
                 if face.name == "outer-top" and np.linalg.norm(point - arch_part.pad_frame(part)[0]) < 150.0:
                     continue  # under the pad
                 assert shell.distance(cq.Vertex.makeVertex(*point)) < 0.02, (part.name, face.name)
-        middles = design.triangles_center[rng.permutation(len(design.faces))[:60]]
+        middles = design.triangles_center[rng.permutation(len(design.faces))[:20]]
         assert max(shell.distance(cq.Vertex.makeVertex(*point)) for point in middles) < 0.02
 
 
@@ -234,7 +234,7 @@ def test_impossible_frames_are_refused_by_key(setting, said):
 
 
 def test_an_exported_folder_holds_design_and_truth(tmp_path):
-    small = ["scan.spacing_mm=40", "frame.nodes_x=3", "frame.nodes_y=3"]
+    small = ["scan.spacing_mm=40", "frame.nodes_x=2", "frame.nodes_y=2"]
     recipe = recipe_files.overridden(recipe_files.load("frame-small")[1], small)
     scene, truth = make("roof", recipe)
     store.write_scene(tmp_path / "s.h5", scene, truth, {"parameters": recipe})

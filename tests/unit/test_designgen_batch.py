@@ -32,13 +32,16 @@ from processor.jobs import runner
 from processor.jobs.child import Loss, Lost
 from processor.model import UsageError
 from processor.store import store
-from tests.support import dying_job
+from tests.support import dask_forks, dying_job
 
-MAKE = (sys.executable, "-m", "designgen", "make", "frame-small", "--set", "scan.spacing_mm=60")
+COMMAND = (sys.executable, "-m", "designgen", "make", "frame-small")
+SMALL = ("scan.spacing_mm=60", "frame.nodes_x=2", "frame.nodes_y=2")
+MAKE = (*COMMAND, *(part for setting in SMALL for part in ("--set", setting)))
+LONG = (*COMMAND, "--set", "scan.spacing_mm=25")  # there is time to kill the run
 COUNTS = ["points", "scans", "points_surface", "points_mixed", "points_outlier", "defects"]
 COLUMNS = ["file", "recipe", "seed", "split", *COUNTS, "scene_hash", "sha256", "status", "reason"]
 OF_SET = ["card.json", "card.md"]
-SCENES_OF_KILLED_RUNS = 12
+SCENES_OF_KILLED_RUNS = 10
 MARK = "STARTED_FOR"
 
 
@@ -139,9 +142,8 @@ def test_two_processes_make_the_same_bytes_and_so_does_a_single_scene(made, tmp_
 
 
 def test_every_combination_in_the_order_given(tmp_path):
-    command = (sys.executable, "-m", "designgen", "make", "frame-small")
     varied = ("--vary", "scan.spacing_mm=80, 60", "--vary", "frame.radii_mm=[45.0, 50.0],[60.0]")
-    run("-o", tmp_path / "set", *varied, command=command)
+    run("-o", tmp_path / "set", *varied, command=COMMAND)
     found = rows(tmp_path / "set")
     assert list(found[0]) == [*COLUMNS[:4], "scan.spacing_mm", "frame.radii_mm", *COLUMNS[4:]]
     pairs = [(row["scan.spacing_mm"], row["frame.radii_mm"]) for row in found]
@@ -201,7 +203,7 @@ def test_other_software_is_made_again(made, tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "__version__", "9.9")
     folder = copied(made, tmp_path / "set")
     name, recipe = recipe_files.load("frame-small")
-    job = batch.plan(folder, name, recipe_files.overridden(recipe, ["scan.spacing_mm=60"]), {}, 7, 1)[0]
+    job = batch.plan(folder, name, recipe_files.overridden(recipe, list(SMALL)), {}, 7, 1)[0]
     outcome = batch.run_job(job)
     assert outcome.made
     assert outcome.replaced == "was made with other software; made again"
@@ -260,12 +262,12 @@ def test_leftovers_are_removed_and_other_files_are_not(made, tmp_path):
 def whole(tmp_path_factory):
     """What runs that are killed must come to in the end."""
     folder = tmp_path_factory.mktemp("whole") / "set"
-    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, "--set", "scan.spacing_mm=25")
+    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, command=LONG)
     return folder
 
 
 def started(folder, *more):
-    command = [*MAKE, "--set", "scan.spacing_mm=25", "-o", folder, "--count", SCENES_OF_KILLED_RUNS, *more]
+    command = [*LONG, "-o", folder, "--count", SCENES_OF_KILLED_RUNS, *more]
     # A shell in the background hands down interrupts that are ignored; here they are to arrive.
     listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     return subprocess.Popen(
@@ -325,10 +327,10 @@ def test_killed_at_random_and_run_again(whole, tmp_path, kills):
         for name in scenes(folder):  # no half file under a final name
             assert (folder / name).read_bytes() == (whole / name).read_bytes()
         assert not (folder / "index.csv").exists()
-        leftover = folder / ".frame-small-00009-seed9.h5.77-01234567.tmp"
+        leftover = folder / ".frame-small-00007-seed7.h5.77-01234567.tmp"
         leftover.write_bytes(b"half")
     kept = times(folder)
-    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, "--set", "scan.spacing_mm=25", "--jobs", 2)
+    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, "--jobs", 2, command=LONG)
     assert digests(folder) == digests(whole)
     assert kept == {name: when for name, when in times(folder).items() if name in kept}
 
@@ -351,7 +353,7 @@ def test_stops_cleanly(whole, tmp_path, sent, code, to_all):
     _, said = process.communicate(timeout=60)
     assert process.returncode == code, said
     assert "Traceback" not in said
-    assert re.search(r"stopped: \d+ of 12 scene\(s\) are done; run again to go on", said)
+    assert re.search(r"stopped: \d+ of 10 scene\(s\) are done; run again to go on", said)
     assert sorted(os.listdir(folder)) == scenes(folder), "neither an index nor temporary files"
     until_gone(folder)
     for name in scenes(folder):
@@ -488,21 +490,18 @@ def free_port():
 def cluster(tmp_path):
     """A Dask scheduler and two workers on this machine: the address, and the three processes."""
     pytest.importorskip("distributed")
-    address, log = f"tcp://127.0.0.1:{free_port()}", (tmp_path / "cluster.log").open("w")
-    plain = {"stdout": log, "stderr": log, "cwd": tmp_path}
-    dask = (sys.executable, "-m", "dask")
+    address, path = f"tcp://127.0.0.1:{free_port()}", tmp_path / "cluster.log"
     own = ("--host", "127.0.0.1", "--no-dashboard")
-    scheduler = [*dask, "scheduler", *own, "--port", address.rpartition(":")[2]]
-    worker = [*dask, "worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(tmp_path)]
-    processes = [subprocess.Popen(command, **plain) for command in (scheduler, worker, worker)]
+    worker = ("worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(tmp_path))
+    with path.open("w") as log:
+        forks = dask_forks.Forks(log, tmp_path, os.environ)
     try:
-        until(lambda: (tmp_path / "cluster.log").read_text().count("Registered to") >= 2)
+        scheduler = forks.start("scheduler", *own, "--port", address.rpartition(":")[2])
+        processes = [scheduler, forks.start(*worker), forks.start(*worker)]
+        until(lambda: path.read_text().count("Registered to") >= 2)
         yield address, processes
     finally:
-        for process in reversed(processes):
-            process.kill()
-            process.wait()
-        log.close()
+        forks.end()
 
 
 def test_a_cluster_that_loses_a_worker_makes_the_same_folder_and_one_that_is_lost_is_said(whole, tmp_path, cluster):
@@ -523,7 +522,7 @@ def test_a_cluster_that_loses_a_worker_makes_the_same_folder_and_one_that_is_los
     assert process.returncode == 3, said
     assert f"--cluster {address}: the connection is lost; run again to go on" in said
     assert "Traceback" not in said
-    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, "--set", "scan.spacing_mm=25")
+    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, command=LONG)
     assert digests(folder) == digests(whole)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.distinct_rows import distinct
+from processor.distinct_rows import distinct, distinct_points
 
 
 @pytest.mark.parametrize("span", [3, 40, 10**6, 2**40])
@@ -21,3 +21,12 @@ def test_of_no_rows():
     found = distinct(np.empty((0, 3), np.int64))
     assert found.rows.shape == (0, 3)
     assert len(found.first) == len(found.number) == len(found.count) == 0
+
+
+@pytest.mark.parametrize("count", [0, 1, 2_000])
+def test_distinct_points_are_those_of_numpy(count):
+    points = np.random.default_rng(count).integers(-4, 4, (count, 3)) / 8.0
+    found = distinct_points(points)
+    expected = np.unique(points, axis=0, return_inverse=True)
+    for own, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(own, theirs.reshape(own.shape))

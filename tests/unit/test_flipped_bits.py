@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import shutil
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from processor import pipeline
 from processor.model import InputError, StepRun
 from processor.store import checksums, store
 from processor.store.streaming import points_of
+from tests.support import commands
 from tests.support.ball_results import whole as ball_results
 from tests.support.bridge_results import adjusted
 from tests.support.flipped_files import flipped, unnoticed
@@ -40,14 +40,19 @@ def scene_file(tmp_path):
 
 
 @pytest.fixture
-def results_file(tmp_path):
-    path = tmp_path / "results.h5"
+def results_file(results_once, tmp_path):
+    return shutil.copy(results_once, tmp_path / "results.h5")
+
+
+@pytest.fixture(scope="module")
+def results_once(tmp_path_factory):
+    path = tmp_path_factory.mktemp("once") / "results.h5"
     found = {"defects": defects(), "stitch": stitching(), "preassemble": adjusted(), "spheres": ball_results()}
     store.write_results(path, [StepRun(step, "m", "{}", result) for step, result in found.items()], {"seed": 1})
     return path
 
 
-@pytest.mark.parametrize("flips", [100, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("flips", [40, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_bits_of_a_scene(scene_file, flips):
     noticed, same, wrong = unnoticed(scene_file, read_scene, flips)
     assert wrong == []
@@ -55,7 +60,7 @@ def test_bits_of_a_scene(scene_file, flips):
     assert noticed > flips / 4  # most bytes of the file are data
 
 
-@pytest.mark.parametrize("flips", [20, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("flips", [12, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_bits_of_results(results_file, flips):
     noticed, same, wrong = unnoticed(results_file, read_results, flips)
     assert wrong == []
@@ -126,8 +131,7 @@ def test_a_file_of_this_version_has_all_its_checksums(scene_file):
 
 
 def verify(*arguments):
-    command = [sys.executable, "-m", "processor", "verify", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return commands.here("processor", "verify", *arguments)
 
 
 def test_verify(tmp_path, scene_file, results_file):

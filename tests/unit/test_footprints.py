@@ -60,7 +60,7 @@ def before_a_wall():
 OUTERMOST = 0.7 * np.cos(np.radians(30.0))  # of the middle to an edge upright: the six stand at 30, 90 degrees, ...
 
 
-@pytest.mark.parametrize("step_mrad", [0.75, 0.4, pytest.param(0.2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step_mrad", [0.75, 0.5, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_mixed_pixels_reach_as_far_from_an_edge_as_the_beam(step_mrad):
     surfaces, device = before_a_wall()
     params = scanner.Params(step_mrad=step_mrad, specular=0.0)

@@ -23,6 +23,7 @@ SMALL = {
     "space_frame": ("rows=2", "columns=2", "stations=2", "step_mrad=8"),
     "steelwork": ("case=plate", "step_mrad=8", "spacing=20"),
 }
+COARSER = {"arch_bridge": ("spacing=200",)}  # where bytes alone are compared
 QUIET = {
     "arch_bridge": ("noise=0", "noise_ppm=0", "range_offset=0", "shift=0", "rotation_urad=0", "drift=0",
                     "incidence_bias=0", "outliers=0", "beam=0", "clutter=0"),
@@ -63,7 +64,8 @@ def test_a_generator_shares_no_code(path):
 @pytest.mark.parametrize("name", SMALL)
 def test_the_same_seed_makes_the_same_bytes(name, tmp_path):
     one, again, other = (
-        contents(make(name, tmp_path / str(i), *SMALL[name], seed=seed)) for i, seed in enumerate((3, 3, 4))
+        contents(make(name, tmp_path / str(i), *SMALL[name], *COARSER.get(name, ()), seed=seed))
+        for i, seed in enumerate((3, 3, 4))
     )
     assert one == again
     assert one.keys() == other.keys()

@@ -12,6 +12,7 @@ from processor.api import runs
 from processor.cli import limited_run
 from processor.jobs.process import Cause, Ended
 from processor.store import store
+from tests.support import commands
 from tests.support.step_results import scene
 
 
@@ -39,7 +40,7 @@ def test_what_is_done_is_kept_before_each_step(tmp_path, site):
     assert provenance["planned"] == ["deviation (default)", "deviation (paper)"]
     said = limited_run._what_is_done(part, site)
     assert said.startswith("done: deviation (default); not done: deviation (paper); ")
-    assert run("report", part, site).returncode in (0, 1)
+    assert commands.here("processor", "report", part, site).returncode in (0, 1)
     assert (part / "report.html").is_file()
 
 

@@ -42,14 +42,14 @@ EMPTY_STEP = (
     "ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION((''),'2;1');\nFILE_NAME('','',(''),(''),'','','');\n"
     "FILE_SCHEMA(('AUTOMOTIVE_DESIGN'));\nENDSEC;\nDATA;\nENDSEC;\nEND-ISO-10303-21;\n"
 )
-SPLINE = [(100, 0), (60, 80), (-70, 60), (-90, -40), (20, -90)]
+SPLINE = [(50, 0), (30, 40), (-35, 30), (-45, -20), (10, -45)]
 SOLIDS = {
     "plane": cq.Workplane().box(300, 200, 100),
     "cylinder": cq.Workplane().circle(80).circle(60).extrude(300),
-    "cone": cq.Workplane(cq.Solid.makeCone(120, 40, 200)),
+    "cone": cq.Workplane(cq.Solid.makeCone(60, 20, 100)),
     "sphere": cq.Workplane().sphere(100),
-    "torus": cq.Workplane(cq.Solid.makeTorus(150, 40)),
-    "extruded spline": cq.Workplane().spline(SPLINE, periodic=True).close().extrude(150),
+    "torus": cq.Workplane(cq.Solid.makeTorus(60, 20)),
+    "extruded spline": cq.Workplane().spline(SPLINE, periodic=True).close().extrude(80),
     "loft": cq.Workplane().rect(200, 150).workplane(offset=120).circle(60).workplane(offset=100).rect(60, 90).loft(),
     "fillets and holes": cq.Workplane().box(300, 200, 60).edges("|Z").fillet(40).faces("<Z").workplane().hole(25),
 }
@@ -67,14 +67,15 @@ def mesh_text(faces, vertices=CORNERS, name="plain"):
 def shapes():
     outline = [(0, 0), (100, 120), (300, 40), (400, 100)]
     spline = cq.Workplane().moveTo(1200, 600).spline([(1200 + x, 600 + y) for x, y in outline[1:]], includeCurrent=True)
-    return {
+    whole = {
         "box": cq.Solid.makeBox(400, 300, 200),
         "cylinder": cq.Solid.makeCylinder(80, 300, cq.Vector(700, 0, 0)),
         "cone": cq.Solid.makeCone(120, 40, 250, cq.Vector(0, 700, 0)),
         "ball": cq.Solid.makeSphere(150, cq.Vector(700, 700, 150), angleDegrees1=-90),
-        "torus": cq.Solid.makeTorus(150, 40, cq.Vector(1400, 0, 40)),
+        "torus": cq.Workplane().center(1400, 0).circle(40).revolve(90, (-150, 0, 0), (-150, 1, 0)).val(),
         "spline": spline.lineTo(1600, 900).lineTo(1200, 900).close().extrude(150).val(),
     }
+    return {name: shape.scale(0.5) for name, shape in whole.items()}
 
 
 def assembly(of):
@@ -157,7 +158,7 @@ def test_labels_name_bodies_and_what_is_as_designed_has_no_defect(seen):
 
 @pytest.mark.parametrize("kind", SOLIDS)
 def test_hits_lie_on_the_surface_of_the_solid(kind):
-    hits = hits_on(loading.load(SOLIDS[kind]))
+    hits = hits_on(loading.load(SOLIDS[kind]), step_mrad=4.0)
     assert len(hits) > 300
     shell = cq.Compound.makeCompound(SOLIDS[kind].val().Shells()).wrapped
     picked = hits[np.random.default_rng(0).choice(len(hits), 300, replace=False)]

@@ -57,7 +57,7 @@ def seen():
     device = dataclasses.replace(QUIET, encoder_urad=20.0)
     T = standing(2500.0, 2800.0, 1600.0)
     surfaces = surfaces_of(frame)
-    params = scanner.Params(step_mrad=1.0)
+    params = scanner.Params(step_mrad=2.0)
     return (
         frame,
         surfaces,
@@ -71,7 +71,7 @@ def test_hits_lie_on_spheres_tubes_and_sleeves(seen):
     hits = in_scene(T, returns.hits)
     ball = named(surfaces, returns, "ball")
     off = np.linalg.norm(hits[ball] - frame.centres[returns.part[ball]], axis=1) - frame.radii[returns.part[ball]]
-    assert ball.sum() > 3_000
+    assert ball.sum() > 1_500
     assert np.abs(off).max() < 1e-6
     # A bowed tube: the distance from its axis, moved by the bow of where it is along the tube, found member by member.
     tube = hits[named(surfaces, returns, "tube")]
@@ -152,25 +152,23 @@ def test_another_caster_sees_the_same():
         )
         owner.append(number // 3)
     grid = raycast.Grid(2e-3, np.radians(-60.0), int(np.radians(150.0) / 2e-3), round(np.pi / 1e-3))
-    row, column = np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing="ij")
-    rays = grid.directions(row.ravel(), column.ravel()) @ T[:3, :3].T
+    # All shapes are in front: rays backward meet nothing.
+    assert min(mesh.bounds[0][1] for mesh in meshes) > 0.0
+    row, column = (x.ravel() for x in np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing="ij"))
+    forward = grid.directions(np.zeros(grid.columns), np.arange(grid.columns)) @ T[:3, :3].T
+    row, column = (x[forward[column, 1] >= 0.0] for x in (row, column))
+    rays = grid.directions(row, column) @ T[:3, :3].T
     answer = scene.cast_rays(open3d.core.Tensor(np.hstack([np.zeros_like(rays), rays]).astype(np.float32)))
     t, number = answer["t_hit"].numpy(), answer["geometry_ids"].numpy().astype(np.int64)
-    theirs = {
-        (r, c): (d, owner[g])
-        for r, c, d, g in zip(row.ravel(), column.ravel(), t, number, strict=True)
-        if np.isfinite(d)
-    }
-    ours = {
-        (r, c): (d, p)
-        for r, c, d, p in zip(found.row, found.column, np.linalg.norm(found.points, axis=1), found.part, strict=True)
-    }
+    met = np.isfinite(t)
+    theirs = row[met] * grid.columns + column[met]
+    ours = found.row.astype(np.int64) * grid.columns + found.column
     assert len(theirs) > 20_000
-    both = ours.keys() & theirs.keys()
+    both, i, j = np.intersect1d(ours, theirs, assume_unique=True, return_indices=True)
     # Facets lie inside of the shapes: rays past a silhouette may see one of the two only.
     assert len(both) > 0.995 * max(len(ours), len(theirs))
-    same = np.array([ours[k][1] == theirs[k][1] for k in both])
-    apart = np.array([abs(ours[k][0] - theirs[k][0]) for k in both])
+    same = found.part[i] == np.array(owner)[number[met][j]]
+    apart = np.abs(np.linalg.norm(found.points[i], axis=1) - t[met][j])
     assert same.mean() > 0.999
     assert np.median(apart[same]) < 0.02
     assert np.quantile(apart[same], 0.99) < 1.0
@@ -241,7 +239,7 @@ def check_noise(device, params, R, error, cosine, classes=5):
     which = np.digitize(np.degrees(np.arccos(cosine)), [20.0, 40.0, 60.0, 75.0][: classes - 1])
     for k in range(classes):
         own = pull[which == k]
-        assert len(own) > 5_000
+        assert len(own) > 2_000
         allowed = 4.0 / np.sqrt(len(own))  # of chance itself
         assert abs(own.mean()) < 0.02 + allowed
         assert own.std() == pytest.approx(1.0, abs=0.03 + allowed)
@@ -255,7 +253,7 @@ def without_systematics(name):
 
 @pytest.mark.parametrize("name", ["phase", "pulse", "long-range"])
 def test_clean_ranges_have_the_specified_noise_at_every_incidence(name):
-    device, params = without_systematics(name), scanner.Params(scanner=name, step_mrad=0.9)
+    device, params = without_systematics(name), scanner.Params(scanner=name, step_mrad=1.6)
     frame = frame_of_balls()
     surfaces, T = surfaces_of(frame, things=9), standing(2500.0, 2800.0, 1600.0)
     returns = scanning_returns.scan_station(surfaces, T, device, params, 1, "S1", keep_hits=True).returns
@@ -291,7 +289,7 @@ def off_axis(start, end, points):
 
 
 def test_noise_on_a_net_follows_the_surface_and_not_its_facets():
-    device, params = without_systematics("phase"), scanner.Params(step_mrad=0.35)
+    device, params = without_systematics("phase"), scanner.Params(step_mrad=1.2)
     start, end, radius = TUBE
     T = standing(0.0, 0.0, 1600.0)
     returns = scanning_returns.scan_station(
@@ -318,21 +316,15 @@ def test_mixed_pixels_on_a_net_lie_where_they_do_on_the_exact_tube():
     for builder in (exact, net):
         corners = np.array([[2500.0, 300.0, 0.0], [2500.0, 300.0, 1790.0], [2500.0, -600.0, 1600.0]])
         builder.polygon(1, "sheet", corners)
-        params = scanner.Params(step_mrad=0.5, specular=0.0)
+        params = scanner.Params(step_mrad=0.6, specular=0.0)
         found.append(scanning_returns.scan_station(builder.to_surfaces(), np.eye(4), device, params, 0, "S1").returns)
-    theirs, ours = (
-        {
-            (r, c): np.linalg.norm(p)
-            for r, c, p, source in zip(one.row, one.column, one.points, one.source, strict=True)
-            if source == scanning_returns.MIXED
-        }
-        for one in found
-    )
-    cells = np.array(sorted(ours.keys() & theirs.keys()))
-    apart = np.array([ours[r, c] - theirs[r, c] for r, c in map(tuple, cells)])
-    R = np.array([theirs[r, c] for r, c in map(tuple, cells)])
+    mixed = [scanning_returns.rows_of(one, one.source == scanning_returns.MIXED) for one in found]
+    rays = [one.row.astype(np.int64) * 100_000 + one.column for one in mixed]
+    both, i, j = np.intersect1d(*rays, assume_unique=True, return_indices=True)
+    R, ours = np.linalg.norm(mixed[0].points[i], axis=1), np.linalg.norm(mixed[1].points[j], axis=1)
+    apart, cells = ours - R, np.column_stack(np.divmod(both, 100_000))
     # Not at the tube's silhouette, where rays meet the exact tube and pass by its net.
-    grid = raycast.Grid(5e-4, np.radians(-60.0), int(np.radians(150.0) / 5e-4), round(2.0 * np.pi / 5e-4))
+    grid = raycast.Grid(6e-4, np.radians(-60.0), int(np.radians(150.0) / 6e-4), round(2.0 * np.pi / 6e-4))
     across = np.cross(start, end) / np.linalg.norm(np.cross(start, end))
     rays = grid.directions(*cells.T)
     on_both = (np.abs(rays @ across) < 0.7 * radius / 3500.0) & (np.abs(rays[:, 1]) < 0.3)
@@ -452,13 +444,13 @@ def test_grazing_rays_stay_near_their_net():
     builder.patch(0, Patch("wavy", at, knots, knots))
     T = standing(0.0, 0.0, 6.0)
     returns = scanning_returns.scan_station(
-        builder.to_surfaces(), T, QUIET, scanner.Params(step_mrad=0.16), 0, "S1", keep_hits=True
+        builder.to_surfaces(), T, QUIET, scanner.Params(step_mrad=0.5), 0, "S1", keep_hits=True
     ).returns
     assert asked[0] < 1.0 + 4.0 / 11.0 + 1e-3
     x, y, z = in_scene(T, returns.hits).T
     p, q = x / 3000.0 + 0.5, (y - 2000.0) / 3000.0
     np.testing.assert_allclose(z, 3.0 * np.sin(9.0 * p) + 3.0 * np.cos(9.0 * q), atol=1e-5)
-    assert len(x) > 20_000
+    assert len(x) > 8_000
 
 
 def test_what_is_too_near_hides_what_is_behind_it():
@@ -507,7 +499,7 @@ def test_what_is_behind_is_not_seen_and_ranges_are_limited():
 def test_weak_signals_are_lost_and_some_returns_stray():
     surfaces = surfaces_of(frame_of_balls())
     T = standing(2500.0, 2800.0, 1600.0)
-    params = scanner.Params(step_mrad=1.5)
+    params = scanner.Params(step_mrad=2.5)
     every = scanning_returns.scan_station(surfaces, T, QUIET, params, 1, "S1").returns
     dim = scanning_returns.scan_station(surfaces, T, dataclasses.replace(QUIET, threshold=0.5), params, 1, "S1").returns
     # Speckle of eight looks multiplies the signal: the share that stays is a gamma law's.
@@ -550,7 +542,7 @@ def test_a_station_is_wrong_by_what_its_truth_says():
 def test_a_station_does_not_depend_on_others_or_on_threads(monkeypatch):
     surfaces = surfaces_of(frame_of_balls())
     poses = {"S1": standing(2500.0, 2800.0, 1600.0), "S2": standing(100.0, 400.0, 1500.0)}
-    device, params = scanner.Scanner(), scanner.Params(step_mrad=3.0, registration_mm=2.0, registration_mrad=0.1)
+    device, params = scanner.Scanner(), scanner.Params(step_mrad=5.0, registration_mm=2.0, registration_mrad=0.1)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     one = survey.survey(surfaces, (), {"S2": poses["S2"]}, device, params, 5)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")

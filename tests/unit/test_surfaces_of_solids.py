@@ -17,7 +17,7 @@ from processor.store import store
 
 TOLERANCE_MM = 0.01
 QUIET = scanner.Scanner(**{**scanner.preset("phase"), "flying_share": 0.0, "threshold": 0.0})
-COUNT = 60  # points of each kind of face: the kernel takes some milliseconds each
+COUNT = 25  # points of each kind of face: the kernel takes some milliseconds each
 
 
 def departures(points, shells):

@@ -3,10 +3,9 @@
 import dataclasses
 import json
 import math
+import multiprocessing
 import runpy
 import sqlite3
-import subprocess
-import sys
 import time
 from contextlib import closing
 from pathlib import Path
@@ -20,7 +19,7 @@ from processor.model import InputError, UsageError
 from processor.validation import cell_runner, cells, certificate, coverage, history, matrix, night, software_identity
 from processor.validation.cells import Outcome
 from processor.validation.history import History
-from tests.support import validation_nights
+from tests.support import commands, validation_nights
 
 ROOT = Path(__file__).resolve().parents[2]
 NIGHT = "2026-11-21"
@@ -284,23 +283,19 @@ def test_a_history_of_an_earlier_version_keeps_its_nights(tmp_path, version):
         assert [(one.line, one.message) for one in opened.nights()] == [("2026-01-01 ok", kept)]
 
 
-KILLED = """
-import sys, time
-from pathlib import Path
-from processor.validation import night
-from tests.support import validation_nights
-from tests.unit import test_validation as t
+FORKS = multiprocessing.get_context("forkserver")  # of a process that has loaded this module once
 
-def slow(cell):
-    time.sleep(0.02)
-    return t.of_cell(cell)
 
-out = Path(sys.argv[1])
-with night.locked_output(out):
-    print("begun", flush=True)
-    night.run(t.killed_matrix(), out, t.NIGHT, validation_nights.runner(slow), made_by=validation_nights.SOFTWARE)
-print("ended", flush=True)
-"""
+def slow_night(out, begun):
+    """A night in a process that is killed."""
+
+    def slow(cell):
+        time.sleep(0.02)
+        return of_cell(cell)
+
+    with night.locked_output(out):
+        begun.send("begun")
+        night.run(killed_matrix(), out, NIGHT, validation_nights.runner(slow), made_by=validation_nights.SOFTWARE)
 
 
 def killed_matrix():
@@ -310,19 +305,18 @@ def killed_matrix():
 def test_a_night_killed_at_any_moment_loses_and_doubles_nothing(tmp_path):
     out = tmp_path / "out"
     counts = []
+    FORKS.set_forkserver_preload([__name__])
     for attempt in range(12):
-        process = subprocess.Popen(
-            [sys.executable, "-c", KILLED, str(out)], stdout=subprocess.PIPE, cwd=ROOT, text=True
-        )
-        assert process.stdout.readline() == "begun\n"
+        here, there = FORKS.Pipe(duplex=False)
+        process = FORKS.Process(target=slow_night, args=(out, there))
+        process.start()
+        assert here.poll(60.0)
         if attempt < 3:
             time.sleep((0.15, 0.33, 0.2)[attempt])
             process.kill()
-        said = process.stdout.read()
-        process.wait()
-        process.stdout.close()
+        process.join()
         counts.append(stored(out, "SELECT COUNT(*) FROM cells")[0][0])
-        if said == "ended\n":
+        if process.exitcode == 0:
             break
     assert counts == sorted(counts)
     assert counts[0] < 60  # it was killed in the middle
@@ -518,13 +512,7 @@ def test_a_real_cell_through_the_command_line(tmp_path):
     (tmp_path / "m.toml").write_text(TINY, "utf-8")
     words = ["validate", str(tmp_path / "m.toml"), "-o", str(tmp_path / "out"), "--night", NIGHT, "--json"]
     words += ["--lang", "zh"]
-    done = subprocess.run(
-        [sys.executable, "-m", "processor", *words, "--jobs", "2"],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        check=False,
-    )
+    done = commands.here("processor", *words, "--jobs", "2")
     assert done.returncode == 1, done.stderr
     assert 'impossible scan.mode="magic" seed 1: failed: designgen make: exit code 2' in done.stderr
     told = json.loads(done.stdout)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from processor.distinct_rows import distinct
 from processor.geometry.neighbors import same_places
 from processor.model import Floats, Ints
 
@@ -60,8 +61,9 @@ class Body:
     def edges(self) -> tuple[Ints, Ints]:
         """Vertices (e, 2) of each edge and the facets (e, 2) on its sides; -1 where there are not exactly two."""
         pairs = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        ends, inverse, count = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
-        order = np.argsort(inverse.reshape(-1), kind="stable")
+        found = distinct(pairs)
+        ends, count = found.rows, found.count
+        order = np.argsort(found.number, kind="stable")
         first = np.cumsum(count) - count
         sides = np.full((len(ends), 2), -1, np.int64)
         two = count == 2
