@@ -2,12 +2,13 @@
 
     python -m tests.bench.cost --output cost.json [--only spheres,stitch/scans,peers] [--quick] [--rounds 2]
 
-Every run is a process of its own, of which the system tells the processor seconds (user and system, its children's
-too) and the largest resident memory. A run takes what the smallest scene of its step takes anyhow - the start of the
-program, the reading, the report -, so that this is measured once a step and subtracted for the exponents: the slopes of
-log seconds, or log MB, over log size by least squares. Libraries of linear algebra get one thread, the program has the
-cores. A run of the smallest size goes before each step, so that compiled code is there. Of several rounds the least
-seconds count. ``--quick`` takes the two smallest sizes only. docs/make_cost.py makes docs/cost.md from the file.
+Every run is a process of its own with all that a user waits for: start, reading, step, report. The system tells its
+processor seconds (user and system, its children's too) and its largest resident memory; tests/bench/cost_run.py tells
+the processor seconds of the step alone, and the exponents are of these: the slope of log seconds over log size by least
+squares. Of memory, what the smallest scene of the step takes is subtracted first. Libraries of linear algebra get one
+thread, the program has the cores. A run of the smallest size goes before each step, so that compiled code is there. Of
+several rounds the least seconds count. ``--quick`` takes the two smallest sizes only. docs/make_cost.py makes
+docs/cost.md from the file.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ from processor.store import store
 from tests.bench import cost_peers, cost_series, m3c2
 from tests.bench.cost_series import Series, Size
 
-LEAST_SHARE = 0.05  # of the smallest scene's seconds, that are counted of a run at least
+LEAST_SHARE = 0.02  # of the smallest scene's MB, that are counted of a run at least
 DONE = (0, 4)  # exit codes: 4 is a missed limit of accuracy, which some of these scenes are too coarse for
 SMALLEST_CLOUD = 2_000
+SECONDS = "seconds.json"  # of each step
 VERSIONS = ("numpy", "scipy", "numba", "h5py", "open3d")
 
 
@@ -45,7 +47,7 @@ def exponent(sizes, values):
 
 
 def beyond(values, base):
-    """What values are beyond those of the smallest scene; never less than a share of these."""
+    """What MB are beyond those of the smallest scene; never less than a share of these."""
     return np.maximum(np.asarray(values, float) - base, LEAST_SHARE * base)
 
 
@@ -95,7 +97,7 @@ def write_clouds(count: int, folder: Path) -> dict[str, Any]:
 
 def run_of(step: str, parameters: str, folder: Path) -> list[str]:
     """The command that is measured."""
-    program = [sys.executable, "-m", "processor"]
+    program = [sys.executable, "-m", "tests.bench.cost_run", str(folder / SECONDS)]
     if step == cost_series.COMPARE:
         return [
             *program,
@@ -136,8 +138,12 @@ def row_of(series: Series, size: Size, rounds: int, warm: bool) -> dict[str, flo
         command = run_of(series.step, size.parameters, folder)
         if not warm:
             measured(command, folder)
-        runs = [measured(command, folder) for _ in range(rounds)]
-        row = {key: min(one[key] for one in runs) for key in ("cpu", "wall")} | {"mb": max(one["mb"] for one in runs)}
+        runs = []
+        for _ in range(rounds):
+            runs.append(measured(command, folder))
+            runs[-1]["step"] = json.loads((folder / SECONDS).read_text("utf-8"))[series.step]
+        row = {key: min(one[key] for one in runs) for key in ("step", "cpu", "wall")}
+        row["mb"] = max(one["mb"] for one in runs)
         return {"size": size_of(series.over, said, size, folder), "points": said["points"], **row}
 
 
@@ -150,14 +156,15 @@ def start_of(step: str, rounds: int) -> dict[str, float]:
 
 def fitted(series: Series, rows: list[dict[str, float]], start: dict[str, float]) -> dict[str, Any]:
     """A series as it is written: rows, exponents, bytes a point of the largest scene."""
-    sizes = [row["size"] for row in rows]
-    memory = beyond([row["mb"] for row in rows], start["mb"])
+    sizes, points = ([row[key] for row in rows] for key in ("size", "points"))
+    mb = [row["mb"] for row in rows]
+    grows = len(set(points)) > 1
     return {
         "step": series.step, "over": series.over, "recipe": series.recipe, "held": series.held,
         "rows": rows,
-        "exponent": exponent(sizes, beyond([row["cpu"] for row in rows], start["cpu"])),
-        "memory exponent": exponent(sizes, memory),
-        "bytes a point": float(memory[-1] * 2.0**20 / rows[-1]["points"]),
+        "exponent": exponent(sizes, [row["step"] for row in rows]),
+        "memory exponent": exponent(sizes, beyond(mb, start["mb"])),
+        "bytes a point": float(np.polyfit(points, mb, 1)[0]) * 2.0**20 if grows else float("nan"),
     }  # fmt: skip
 
 
@@ -171,16 +178,11 @@ def machine() -> dict[str, Any]:
 def show(series: dict[str, Any]) -> None:
     """Print the rows of a series."""
     for row in series["rows"]:
-        print(
-            f"  {row['size']:12,.0f} {series['over']:14s} {row['points']:12,} points  {row['cpu']:7.2f} processor s  "
-            f"{row['wall']:7.2f} s  {row['mb']:6.0f} MB",
-            flush=True,
-        )
-    print(
-        f"  exponent {series['exponent']:.2f}, of memory {series['memory exponent']:.2f}, "
-        f"{series['bytes a point']:.0f} bytes a point",
-        flush=True,
-    )
+        size = f"{row['size']:12,.0f} {series['over']:14s} {row['points']:12,} points"
+        seconds = f"step {row['step']:7.2f}, run {row['cpu']:7.2f} processor s, {row['wall']:7.2f} s"
+        print(f"  {size}  {seconds}, {row['mb']:6.0f} MB")
+    slopes = f"exponent {series['exponent']:.2f}, of memory {series['memory exponent']:.2f}"
+    print(f"  {slopes}, {series['bytes a point']:.0f} bytes a point", flush=True)
 
 
 def main() -> None:
@@ -198,7 +200,11 @@ def main() -> None:
     for series in chosen:
         if series.step not in found["start"]:
             found["start"][series.step] = start_of(series.step, given.rounds)
-            print("{0}: smallest scene {cpu:.2f} s, {mb:.0f} MB".format(series.step, **found["start"][series.step]))
+            print(
+                "{0}: smallest scene {step:.2f} of {cpu:.2f} processor s, {mb:.0f} MB".format(
+                    series.step, **found["start"][series.step]
+                )
+            )
         print(f"{series.name}: {series.recipe}, {series.held}", flush=True)
         sizes = series.sizes[: 2 if given.quick else None]
         warm = any(one["step"] == series.step for one in found["series"])

@@ -51,7 +51,7 @@ def cells(side_mm: float) -> Size:
     return Size((), f"[defects]\ncell_mm = {side_mm}\n")
 
 
-# The smallest scene of each step: what it takes is the start of the program, the reading and the report.
+# The smallest scene of each step: the rest of its run is the start of the program and the report.
 SMALLEST = {
     "spheres": ("bolt-ball", ("scan.step_mrad=2.0",)),
     "preassemble": (
@@ -73,10 +73,10 @@ SERIES = (
     ),
     Series(
         "spheres", BALLS, "frame-1040", "points a ball and balls a station: points grow along",
-        (roof(4, 8, "[1,2]"), roof(8, 8, "[2,2]"), roof(8, 16, "[2,4]"), roof(16, 16, "[4,4]")),
-        ("scan.step_mrad=2.0", "scan.clutter=20"),
+        (roof(8, 8, "[2,2]"), roof(8, 16, "[2,4]"), roof(16, 16, "[4,4]"), roof(16, 32, "[4,8]")),
+        ("scan.step_mrad=2.4", "scan.clutter=20"),
     ),
-    Series("preassemble", POINTS, "arch-s7", "7 parts", varied("scan.spacing_mm", 28.0, 20.0, 14.0, 10.0)),
+    Series("preassemble", POINTS, "arch-s7", "7 parts", varied("scan.spacing_mm", 20.0, 14.0, 10.0, 7.0)),
     Series(
         "preassemble", PARTS, "arch-s7", "the bridge and its points, cut into more parts",
         tuple(Size((f"bridge.parts={parts}",), count=parts) for parts in (4, 8, 16)),

@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 
 from docs import make_cost
-from tests.bench import cost, cost_peers, cost_series
+from tests.bench import cost, cost_peers, cost_run, cost_series
 
 SIZES = (1e5, 2e5, 4e5)
 CONTENT = {
     "machine": {"cores": 2, "python": "3.11.7", "numpy": "2.4.6"},
-    "start": {"spheres": {"size": 2000.0, "points": 2000, "cpu": 3.0, "wall": 3.5, "mb": 250.0}},
+    "start": {"spheres": {"size": 2000.0, "points": 2000, "step": 0.2, "cpu": 3.0, "wall": 3.5, "mb": 250.0}},
     "series": [
         {
             "step": "spheres", "over": "points", "recipe": "frame-1040", "held": "61 balls",
             "rows": [
-                {"size": n, "points": int(n), "cpu": 3.0 + 1e-5 * n, "wall": 5.0, "mb": 250.0 + 1e-4 * n} for n in SIZES
+                {"size": n, "points": n, "step": 1e-5 * n, "cpu": 3.0 + 1e-5 * n, "wall": 5.0, "mb": 250.0 + 1e-4 * n}
+                for n in SIZES
             ],
             "exponent": 1.0, "memory exponent": 1.0, "bytes a point": 104.86,
         }
@@ -49,15 +50,21 @@ def test_exponent_of_one_size_is_no_number():
     assert np.isnan(cost.exponent([1e6, 1e6], [2.0, 3.0]))
 
 
-def test_fitted_series_has_the_start_subtracted():
-    rows = [
-        {"size": n, "points": int(n), "cpu": 3.0 + 1e-5 * n, "wall": 1.0, "mb": 100.0 + 100.0 * n / 2.0**20}
-        for n in SIZES
-    ]
-    found = cost.fitted(cost_series.SERIES[0], rows, {"cpu": 3.0, "mb": 100.0})
+def test_fitted_series_has_the_memory_of_the_smallest_scene_subtracted():
+    rows = [{"size": n, "points": int(n), "step": 1e-5 * n, "mb": 100.0 + 100.0 * n / 2.0**20} for n in SIZES]
+    found = cost.fitted(cost_series.SERIES[0], rows, {"mb": 100.0})
     assert found["exponent"] == pytest.approx(1.0)
     assert found["memory exponent"] == pytest.approx(1.0)
     assert found["bytes a point"] == pytest.approx(100.0)
+
+
+def test_timed_adds_the_processor_seconds_of_every_call():
+    seconds = {}
+    work = cost_run.timed(lambda count: sum(range(count)), "step", seconds)
+    assert work(1_000_000) == 499_999_500_000
+    once = seconds["step"]
+    work(1_000_000)
+    assert 0.0 < once < seconds["step"] < 5.0
 
 
 def test_measured_tells_seconds_and_memory_of_a_process_of_its_own(tmp_path):
@@ -83,7 +90,7 @@ def test_tables_show_sizes_and_exponents():
     assert lines[0] == "Machine: 2 cores, python 3.11.7, numpy 2.4.6."
     row = next(line for line in lines if line.startswith("| spheres |"))
     assert "100 k / 200 k / 400 k" in row
-    assert "4 / 5 / 7" in row
+    assert "1 / 2 / 4 | 4 / 5 / 7" in row
     assert "| 1.00 | 1.00 | 105 |" in row
     assert not any("Outlier" in line for line in lines)
     with_peers = make_cost.tables(make_cost.joined([CONTENT, {**CONTENT, "series": [], "peers": PEERS}]))
