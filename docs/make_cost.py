@@ -67,7 +67,7 @@ def series_row(series: dict[str, Any]) -> str:
     bytes_ = series["bytes a point"]
     cells = (
         series["step"], series["over"], series["held"], *columns, f"{series['exponent']:.2f}",
-        f"{series['memory exponent']:.2f}", figure(bytes_) if bytes_ == bytes_ else "",
+        f"{series['memory exponent']:.2f}", "" if bytes_ is None else figure(bytes_),
     )  # fmt: skip
     return "| " + " | ".join(cells) + " |"
 

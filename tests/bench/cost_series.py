@@ -58,7 +58,7 @@ SMALLEST = {
         "arch-s7",
         ("bridge.parts=2", "bridge.span_mm=12000.0", "bridge.rise_mm=3000.0", "scan.spacing_mm=25"),
     ),
-    "stitch": ("truss-bridge", ("structure.bays=4", "scan.step_mrad=10", "scan.stations=2", "scan.repeated=0")),
+    "stitch": ("truss-bridge", ("scan.step_mrad=10", "scan.stations=3", "scan.repeated=0")),
     "deviation": ("stadium-roof", ("structure.trusses=4", "structure.bays=1", "scan.spacing_mm=120")),
     "defects": ("plates-defects", ('structure.components=["none", "dent"]', "scan.step_mrad=6")),
     COMPARE: ("", ()),
@@ -72,19 +72,19 @@ SERIES = (
         "spheres", POINTS, "frame-1040", "61 balls, 6 stations", varied("scan.step_mrad", 2.4, 1.7, 1.2, 0.85), ROOF
     ),
     Series(
-        "spheres", BALLS, "frame-1040", "points a ball and balls a station: points grow along",
+        "spheres", BALLS, "frame-1040", "balls a station and step of the scans: points grow along",
         (roof(8, 8, "[2,2]"), roof(8, 16, "[2,4]"), roof(16, 16, "[4,4]"), roof(16, 32, "[4,8]")),
         ("scan.step_mrad=2.4", "scan.clutter=20"),
     ),
     Series("preassemble", POINTS, "arch-s7", "7 parts", varied("scan.spacing_mm", 20.0, 14.0, 10.0, 7.0)),
     Series(
-        "preassemble", PARTS, "arch-s7", "the bridge and its points, cut into more parts",
+        "preassemble", PARTS, "arch-s7", "one bridge, cut into more parts",
         tuple(Size((f"bridge.parts={parts}",), count=parts) for parts in (4, 8, 16)),
         ("scan.spacing_mm=14",),
     ),
     Series("stitch", PER_SCAN, "truss-bridge", "9 scans", varied("scan.step_mrad", 7.4, 5.2, 3.7)),
     Series(
-        "stitch", SCANS, "truss-bridge", "points a scan: all points grow along",
+        "stitch", SCANS, "truss-bridge", "step of the scans: points grow along",
         tuple(Size((f"scan.stations={stations}",)) for stations in (3, 6, 12)),
         ("scan.repeated=0", "scan.step_mrad=5.2"),
     ),
@@ -95,7 +95,7 @@ SERIES = (
         (cells(16.0), cells(11.3), cells(8.0), cells(5.7)), (*PLATES, "scan.step_mrad=1.0"),
     ),
     Series(
-        COMPARE, POINTS, "", "points per area; every point of the first cloud is a core point",
+        COMPARE, POINTS, "", "points per area; each point of the first cloud a core point",
         tuple(Size((), count=count) for count in (250_000, 500_000, 1_000_000, 2_000_000)),
     ),
 )  # fmt: skip
