@@ -46,6 +46,7 @@ bench: $(VENV)/.test
 	$(BIN)/processor papers -o $(OUT)/bench-papers --only 001 --seeds 1
 	$(BIN)/python -m tests.bench.generator --whole --output $(OUT)/bench-generator.json
 	$(BIN)/python -m tests.bench.readers --speed --output $(OUT)/bench-readers.json
+	$(BIN)/python -m tests.bench.cost --output $(OUT)/bench-cost.json
 
 paper: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/paper
