@@ -18,7 +18,7 @@ PICTURE = PAGE.with_suffix(".png")
 START, END = "<!-- below: written by docs/make_cost.py -->", "<!-- above: written by docs/make_cost.py -->"
 COLUMNS = 5
 SECONDS, MEMORY = "#1f5fa8", "#c8641b"
-LEAST_SHARE = 0.02  # as the bench has it
+LEAST_SHARE = 0.02  # of the smallest scene's MB, that are counted of a run at least
 
 
 def main(paths: list[str]) -> None:
@@ -38,6 +38,11 @@ def joined(contents: list[dict[str, Any]]) -> dict[str, Any]:
         whole["series"] += content["series"]
         whole["peers"] |= content["peers"]
     return whole
+
+
+def beyond(values: Any, base: float) -> Any:
+    """Return what MB are beyond those of the smallest scene; never less than a share of these."""
+    return np.maximum(np.asarray(values, float) - base, LEAST_SHARE * base)
 
 
 def tables(content: dict[str, Any]) -> list[str]:
@@ -113,7 +118,7 @@ def chart(content: dict[str, Any]) -> Figure:
         for key, colour, slope in (("step", SECONDS, "exponent"), ("mb", MEMORY, "memory exponent")):
             values = np.array([row[key] for row in series["rows"]])
             if key == "mb":
-                values = np.maximum(values - start["mb"], LEAST_SHARE * start["mb"])
+                values = beyond(values, start["mb"])
             name = f"{'s' if key == 'step' else 'MB'} ∝ size^{series[slope]:.2f}"
             axes.loglog(sizes, values, "o" if key == "step" else "s", color=colour, markersize=5)
             line = np.exp(np.log(values).mean() + series[slope] * (np.log(sizes) - np.log(sizes).mean()))

@@ -15,7 +15,9 @@ from numba.core.caching import FunctionCache
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
-PIXEL = b"iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
+PIXEL = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
+)  # as PNG
 
 _compile = Dispatcher.compile
 _held: set[Path] = set()  # locks of this process: a kernel that calls itself asks for its own
@@ -60,7 +62,4 @@ def pytest_collection_finish():
 @pytest.fixture
 def blank_pictures(monkeypatch):
     """Write every picture as one white pixel: for tests of all else on a page, as drawing takes most of the time."""
-    pixel = base64.b64decode(
-        "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
-    )
-    monkeypatch.setattr(FigureCanvasAgg, "print_png", lambda _, out, **__: out.write(pixel))
+    monkeypatch.setattr(FigureCanvasAgg, "print_png", lambda _, out, **__: out.write(PIXEL))

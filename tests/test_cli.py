@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from processor.preassembly.parts import attitude
 from processor.report import terminal, write_results
 from processor.space_frame.result import Result as FrameResult
 from processor.store import store
-from tests.support import arch_clouds
+from tests.support import arch_clouds, commands
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
@@ -43,16 +42,12 @@ def processor(*arguments, cwd=None):
 
 
 @pytest.fixture
-def called(monkeypatch, capsys):
+def called(monkeypatch):
     """``called(*arguments, cwd=ROOT)``: like :func:`processor`, in this process."""
 
     def call(*arguments, cwd=ROOT):
         monkeypatch.chdir(cwd)
-        monkeypatch.setattr(sys, "argv", ["processor", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            __main__.main()
-        out, err = capsys.readouterr()
-        return SimpleNamespace(returncode=end.value.code or 0, stdout=out, stderr=err)
+        return commands.here("processor", *arguments)
 
     return call
 

@@ -10,7 +10,6 @@ widened to Student's t at the threshold.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -195,8 +194,9 @@ def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, find
                 sd = np.hypot(levels.line_inflation / np.sqrt(sum_weight), systematic)
                 z = np.where(number >= COVERED * length, sum_top / sum_weight / sd, 0.0)
             for direction in (-1, 1):
+                towards = direction * score
                 for i, j in np.argwhere(direction * z > levels.line_threshold):
-                    a, b = _long_runs(direction * score, [(i + di, j + dj) for di, dj in offsets]).T
+                    a, b = _long_runs(towards, np.add(offsets, (i, j))).T
                     strongest = direction * z[i, j]
                     finding.sign[a, b] = direction
                     finding.z[a, b] = np.maximum(finding.z[a, b], strongest)
@@ -204,12 +204,11 @@ def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, find
                     finding.chance[a, b] = np.minimum(finding.chance[a, b], chance)
 
 
-def _long_runs(score: Floats, line: Sequence[tuple[int, int]]) -> Ints:
-    """Return the cells (n, 2) of a line whose ``score`` (rows, columns) deviates, without runs far below the longest.
+def _long_runs(score: Floats, cells: Ints) -> Ints:
+    """Return a line's cells (n, 2) whose ``score`` (rows, columns) deviates, without runs far below the longest.
 
     A line that crosses a region has deviating cells beyond it by chance, which are no regions of their own.
     """
-    cells = np.array(line)
     inside = ((cells >= 0) & (cells < score.shape)).all(axis=1)
     deviate = np.zeros(len(cells), np.bool_)
     deviate[inside] = score[tuple(cells[inside].T)] > LINE_GROWTH

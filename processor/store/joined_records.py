@@ -45,15 +45,16 @@ def table_of(kind: Any) -> Any:
 
 def joined(records: Sequence[Any]) -> Any:
     """Return the table of one or more records of one kind."""
-    kind = type(records[0])
+    kind: Any = type(records[0])
     values: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
-        every = [getattr(record, field.name) for record in records]
-        values[field.name] = tuple(every)
+        every = tuple(getattr(record, field.name) for record in records)
         if isinstance(every[0], Rows):
             values[field.name] = _one_after_another(every)
             values[ROWS.format(name=field.name)] = np.array([len(one) for one in every], np.int64)
-    return table_of(typing.cast(typing.Hashable, kind))(**values)
+        else:
+            values[field.name] = every
+    return table_of(kind)(**values)
 
 
 def _one_after_another(tables: Sequence[Any]) -> Any:

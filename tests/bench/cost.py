@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyElement
 
+from docs import make_cost
 from processor.store import store
 from tests.bench import cost_peers, cost_series, m3c2
 from tests.bench.cost_series import Series, Size
 
-LEAST_SHARE = 0.02  # of the smallest scene's MB, that are counted of a run at least
 DONE = (0, 1, 4)  # exit codes: 1 is done in part, 4 a missed limit of accuracy: some of these scenes are very coarse
 SMALLEST_CLOUD = 2_000
 SECONDS = "seconds.json"  # of each step
@@ -44,11 +44,6 @@ def exponent(sizes, values):
     if len(sizes) < 2 or len(set(sizes)) < 2:
         return float("nan")
     return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
-
-
-def beyond(values, base):
-    """What MB are beyond those of the smallest scene; never less than a share of these."""
-    return np.maximum(np.asarray(values, float) - base, LEAST_SHARE * base)
 
 
 # A small process between: the peak of a process counts what that which started it had at that moment.
@@ -163,7 +158,7 @@ def fitted(series: Series, rows: list[dict[str, float]], start: dict[str, float]
         "step": series.step, "over": series.over, "recipe": series.recipe, "held": series.held,
         "rows": rows,
         "exponent": exponent(sizes, [row["step"] for row in rows]),
-        "memory exponent": exponent(sizes, beyond(mb, start["mb"])),
+        "memory exponent": exponent(sizes, make_cost.beyond(mb, start["mb"])),
         "bytes a point": float(np.polyfit(points, mb, 1)[0]) * 2.0**20 if grows else None,
     }  # fmt: skip
 
@@ -196,7 +191,7 @@ def main() -> None:
     given = parser.parse_args()
     only = set(given.only.split(",")) if given.only else set()
     chosen = [one for one in cost_series.SERIES if not only or only & {one.step, one.name}]
-    found: dict[str, Any] = {"machine": machine(), "rounds": given.rounds, "start": {}, "series": [], "peers": []}
+    found: dict[str, Any] = {"machine": machine(), "rounds": given.rounds, "start": {}, "series": [], "peers": {}}
     given.output.parent.mkdir(parents=True, exist_ok=True)
     for series in chosen:
         if series.step not in found["start"]:

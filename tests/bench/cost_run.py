@@ -15,8 +15,7 @@ from typing import Any
 from processor import __main__ as program
 from processor import pipeline
 from processor.compare import compare
-
-COMPARE = "compare"
+from tests.bench.cost_series import COMPARE
 
 
 def processor_seconds() -> float:

@@ -11,8 +11,16 @@ from pathlib import Path
 
 import pytest
 
+from tests.support import dask_forks
+
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 60.0
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 @dataclass
@@ -26,9 +34,7 @@ class DaskCluster:
     workers: dict = field(default_factory=dict)  # by name
 
     def start(self):
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
+        port = free_port()
         self.address = f"tcp://127.0.0.1:{port}"
         self._process("scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
 
@@ -77,6 +83,27 @@ def cluster_in(folder):
         yield cluster
     finally:
         cluster.stop()
+
+
+@contextlib.contextmanager
+def forked(folder, workers=2, protocol="tcp", environment=os.environ):
+    """A scheduler and workers that are soon there: the address, and the processes, that of the scheduler first."""
+    pytest.importorskip("distributed")
+    address, path = f"{protocol}://127.0.0.1:{free_port()}", folder / "cluster.log"
+    own = ("--host", "127.0.0.1", "--no-dashboard")
+    worker = ("worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(folder))
+    with path.open("w") as log:
+        forks = dask_forks.Forks(log, folder, environment)
+    try:
+        scheduler = forks.start("scheduler", *own, "--protocol", protocol, "--port", address.rpartition(":")[2])
+        processes = [scheduler, *(forks.start(*worker) for _ in range(workers))]
+        end = time.monotonic() + PATIENCE_S
+        while path.read_text().count("Registered to") < workers:
+            assert time.monotonic() < end, path.read_text()
+            time.sleep(0.01)
+        yield address, processes
+    finally:
+        forks.end()
 
 
 @pytest.fixture(scope="session")

@@ -3,10 +3,12 @@
 import numpy as np
 import trimesh
 
+from processor.deviation import step as deviation_step
 from processor.model import Scan, Scene, StructureDesign
 
 STATIONS = np.array([[2500.0, 1800.0, 2500.0], [-2200.0, -2600.0, -2400.0]])
 SIGMA = 0.5
+AS_IT_LIES = deviation_step.Params(register="none")  # as by default, but for the search for other attitudes
 
 
 def plate(thickness, seed, stations, positions):

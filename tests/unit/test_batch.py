@@ -1,6 +1,5 @@
 """Batches: what is found, that a bad input stops nothing, a killed batch goes on, and nothing is half written."""
 
-import contextlib
 import csv
 import fcntl
 import html.parser
@@ -12,7 +11,6 @@ import re
 import shlex
 import shutil
 import signal
-import socket
 import struct
 import subprocess
 import termios
@@ -29,7 +27,7 @@ from processor.cli import main as cli_main
 from processor.jobs import runner
 from processor.model import InputError, UsageError
 from processor.scan_folder import fingerprint
-from tests.support import dask_forks
+from tests.support import dask_cluster
 from tests.support.batches import ENV, FAILING, REAL, ROOT, folder, run, run_one
 
 SPHERES = ("--steps", "spheres", "--method", "least-squares", "--seed", "3")
@@ -660,33 +658,9 @@ def test_names_that_are_no_text_are_shown_escaped():
 # --- on a cluster -----------------------------------------------------------------------------------------------------
 
 
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-@contextlib.contextmanager
-def cluster_of(tmp_path, protocol, env, workers):
-    """A Dask scheduler and workers on this machine: the address, and the processes, that of the scheduler first."""
-    pytest.importorskip("distributed")
-    address, path = f"{protocol}://127.0.0.1:{free_port()}", tmp_path / "cluster.log"
-    own = ("--host", "127.0.0.1", "--no-dashboard")
-    worker = ("worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(tmp_path))
-    with path.open("w") as log:
-        forks = dask_forks.Forks(log, tmp_path, env)
-    try:
-        scheduler = forks.start("scheduler", *own, "--protocol", protocol, "--port", address.rpartition(":")[2])
-        processes = [scheduler, *(forks.start(*worker) for _ in range(workers))]
-        until(lambda: path.read_text().count("Registered to") >= workers)
-        yield address, processes
-    finally:
-        forks.end()
-
-
 @pytest.fixture
 def cluster(tmp_path):
-    with cluster_of(tmp_path, "tcp", ENV, 2) as one:
+    with dask_cluster.forked(tmp_path, environment=ENV) as one:
         yield one
 
 
@@ -733,7 +707,7 @@ def test_a_cluster_with_tls_as_the_page_describes_takes_only_those_with_the_key(
     folder(tmp_path / "root/a")
     folder(tmp_path / "root/b")
     env = {**ENV, "DASK_CONFIG": str(tmp_path / "tls.yaml")}
-    with cluster_of(tmp_path, "tls", env, 1) as (address, _):
+    with dask_cluster.forked(tmp_path, 1, "tls", env) as (address, _):
         batch_ = command(tmp_path / "root", "-o", tmp_path / "out", "--cluster", address)
         done = subprocess.run(batch_, capture_output=True, text=True, env=env, check=False)
         assert done.returncode == 0, done.stderr
@@ -749,7 +723,7 @@ def test_a_cluster_that_does_not_answer_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(runner, "CONNECT_S", 1)
     folder(tmp_path / "root/a")
-    address = f"tcp://127.0.0.1:{free_port()}"
+    address = f"tcp://127.0.0.1:{dask_cluster.free_port()}"
     done = run(tmp_path / "root", "-o", tmp_path / "out", "--cluster", address, code=2)
     assert f"--cluster {address}: expected the address of a Dask scheduler that answers" in done.stderr
     assert not (tmp_path / "out").exists(), "nothing was begun"

@@ -12,7 +12,6 @@ import pty
 import random
 import re
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -32,7 +31,7 @@ from processor.jobs import runner
 from processor.jobs.child import Loss, Lost
 from processor.model import UsageError
 from processor.store import store
-from tests.support import dask_forks, dying_job
+from tests.support import dask_cluster, dying_job
 
 COMMAND = (sys.executable, "-m", "designgen", "make", "frame-small")
 SMALL = ("scan.spacing_mm=60", "frame.nodes_x=2", "frame.nodes_y=2")
@@ -480,28 +479,10 @@ def test_two_runs_in_one_folder_are_refused(tmp_path):
 # --- on a cluster -----------------------------------------------------------------------------------------------------
 
 
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 @pytest.fixture
 def cluster(tmp_path):
-    """A Dask scheduler and two workers on this machine: the address, and the three processes."""
-    pytest.importorskip("distributed")
-    address, path = f"tcp://127.0.0.1:{free_port()}", tmp_path / "cluster.log"
-    own = ("--host", "127.0.0.1", "--no-dashboard")
-    worker = ("worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(tmp_path))
-    with path.open("w") as log:
-        forks = dask_forks.Forks(log, tmp_path, os.environ)
-    try:
-        scheduler = forks.start("scheduler", *own, "--port", address.rpartition(":")[2])
-        processes = [scheduler, forks.start(*worker), forks.start(*worker)]
-        until(lambda: path.read_text().count("Registered to") >= 2)
-        yield address, processes
-    finally:
-        forks.end()
+    with dask_cluster.forked(tmp_path) as one:
+        yield one
 
 
 def test_a_cluster_that_loses_a_worker_makes_the_same_folder_and_one_that_is_lost_is_said(whole, tmp_path, cluster):
@@ -530,7 +511,7 @@ def test_a_cluster_that_loses_a_worker_makes_the_same_folder_and_one_that_is_los
 def test_a_cluster_that_does_not_answer_is_said(tmp_path):
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "index.csv").write_text("mine")
-    address = f"tcp://127.0.0.1:{free_port()}"
+    address = f"tcp://127.0.0.1:{dask_cluster.free_port()}"
     done = run("-o", tmp_path / "set", "--count", 2, "--cluster", address, code=2)
     assert f"--cluster {address}: expected the address of a Dask scheduler that answers" in done.stderr
     assert os.listdir(tmp_path / "set") == ["index.csv"], "nothing was begun"

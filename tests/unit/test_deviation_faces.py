@@ -10,9 +10,7 @@ from processor.deviation import assignment
 from processor.deviation import step as deviation_step
 from processor.geometry import enclosure, mesh_distance
 from processor.model import Scan, Scene, StructureDesign
-from tests.support.plate_clouds import SIGMA, STATIONS, plate
-
-AS_IT_LIES = deviation_step.Params(register="none")  # as by default, but for the search for other attitudes
+from tests.support.plate_clouds import AS_IT_LIES, SIGMA, STATIONS, plate
 
 
 def from_edge(core, thickness):

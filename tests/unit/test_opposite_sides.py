@@ -6,9 +6,8 @@ import pytest
 from processor.adjustment import opposite_sides
 from processor.deviation import step as deviation_step
 from processor.model import Scan, Scene
-from tests.support.plate_clouds import STATIONS, plate
+from tests.support.plate_clouds import AS_IT_LIES, STATIONS, plate
 
-AS_IT_LIES = deviation_step.Params(register="none")  # as by default, but for the search for other attitudes
 SPACING, NOISE, SIDE, THICKNESS = 10.0, 0.08, 60.0, 12.0
 
 
