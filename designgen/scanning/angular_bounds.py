@@ -64,7 +64,8 @@ def by_strip(windows, width, strips, side):  # type: ignore[no-untyped-def]
             low = max(0, (windows[w, 1] - side) // width)
             for s in range(low, min(strips - 1, (windows[w, 2] + side) // width) + 1):
                 if fill:
-                    result[place[s]] = windows[w]
+                    for k in range(5):
+                        result[place[s], k] = windows[w, k]
                     place[s] += 1
                 else:
                     start[s + 1] += 1

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from processor.geometry.linalg_small import eigen
+from processor.geometry.linalg_small import assign, assign_rows, eigen
 from processor.geometry.m3c2 import FEWEST_FOR_LOD, HALF_DIAGONAL, LEAST_RANGE
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
@@ -142,7 +142,8 @@ def _movement(sums, directions, first, last, moved):  # type: ignore[no-untyped-
     A, g = np.empty((3, 3)), np.empty(3)
     for row in range(first, last):
         if sums.number[row] >= FEWEST_FOR_LOD:
-            A[:, :], g[:] = sums.nn[row], sums.ns[row]
+            assign_rows(A, sums.nn[row])
+            assign(g, sums.ns[row])
             _solve(A, g, sums.square[row], sums.number[row], directions[row], row, moved)
 
 
@@ -201,8 +202,10 @@ def _add(cells, feet, wanted, first, last, sums):  # type: ignore[no-untyped-def
                                 g[2] += o * s
         sums.number[row] += n
         sums.square[row] += square
-        sums.nn[row] += A
-        sums.ns[row] += g
+        for i in range(3):
+            sums.ns[row, i] += g[i]
+            for j in range(i, 3):
+                sums.nn[row, i, j] += A[i, j]
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
-from processor.geometry.linalg_small import product
+from processor.geometry.linalg_small import assign_rows, product
 from processor.geometry.polyline import Polyline
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
@@ -217,7 +217,7 @@ def _step(p, n, r, huber, axes, T):  # type: ignore[no-untyped-def]
         motion[i, 3] = centre[i] + step[3 + i]
         for j in range(3):
             motion[i, 3] -= motion[i, j] * centre[j]
-    T[:, :] = product(motion, T)
+    assign_rows(T, product(motion, T))
     return np.sqrt(np.sum(step[:3] ** 2)) * np.sqrt(reach) + np.sqrt(np.sum(step[3:] ** 2))
 
 
@@ -260,7 +260,10 @@ def _turn(a, b, c):  # type: ignore[no-untyped-def]
     if angle == 0.0:
         return T
     K = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]]) / angle
-    T[:3, :3] += np.sin(angle) * K + (1.0 - np.cos(angle)) * product(K, K)
+    K2 = product(K, K)
+    for i in range(3):
+        for j in range(3):
+            T[i, j] += np.sin(angle) * K[i, j] + (1.0 - np.cos(angle)) * K2[i, j]
     return T
 
 

@@ -13,6 +13,21 @@ DEFINITE = 1e-12  # least pivot of a positive definite matrix, as a share of its
 SWEEPS = 12
 
 
+@njit(cache=True, nogil=True)
+def assign(target, source):  # type: ignore[no-untyped-def]
+    """Copy the elements of an array (n,) to another: numba takes a second to compile target[:] = source."""
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@njit(cache=True, nogil=True)
+def assign_rows(target, source):  # type: ignore[no-untyped-def]
+    """Copy the elements of an array (n, m) to another; see :func:`assign`."""
+    for i in range(len(source)):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def factorise(A, n, least, L):  # type: ignore[no-untyped-def]
     """Write the lower Cholesky factor of the leading (n, n) block of A to L; only the lower halves are used.

@@ -19,6 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processor.geometry.linalg_small import assign_rows
 from processor.geometry.parallel import over_ranges
 from processor.model import Bools, Floats, Ints, Labels
 
@@ -484,7 +485,7 @@ def _facets_of_voxels(
     for f in range(len(corners)):
         n = normals[f]
         span = half * (abs(n[0]) + abs(n[1]) + abs(n[2])) + reach
-        stack[0] = corners[f]
+        assign_rows(stack[0], corners[f])
         left = 1
         while left:
             left -= 1
@@ -539,7 +540,7 @@ def _halved(stack: Floats, at: int) -> None:
         if square > longest:
             longest, k = square, i
     a, b = k, (k + 1) % 3
-    stack[at + 1] = stack[at]
+    assign_rows(stack[at + 1], stack[at])
     for axis in range(3):
         middle = 0.5 * (stack[at, a, axis] + stack[at, b, axis])
         stack[at, b, axis] = middle

@@ -8,11 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from processor.geometry.linalg_small import assign, assign_rows
 from processor.model import Floats
 from processor.space_frame.members.cylinder_model import (
     ACROSS_MM,
     GRAZING_COS,
     NP,
+    STRAIGHT,
     Observations,
     Shifts,
     Solution,
@@ -25,6 +27,8 @@ from processor.space_frame.members.cylinder_model import (
 )
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM
 from processor.space_frame.points.line_crops import FIELD, HALF
+
+# Numbers of steps and parameters are passed as np.int64: numba compiles a kernel anew for every literal.
 
 BIN_MM = 10.0
 ROUGH_TRIM_MM = 30.0  # off each rough end
@@ -98,14 +102,14 @@ def fit_roughly(gathered, scanners, inner, spans, limits, rough, first, last):  
                 sigma = max(spread_of(sizes, count), LEAST_SIGMA_MM)
                 cut = max(CUT_SIGMAS * sigma, LEAST_CUT_MM)
             weighting = Weighting(ROUGH_COS, cut, sigma, 1.0)
-            count, total, _, good = step(p, h, observations, fixed, 5, weighting, sizes, solution)
+            count, total, _, good = step(p, h, observations, fixed, np.int64(STRAIGHT), weighting, sizes, solution)
             if not good or not least < p[4] < most:
                 good = False
                 break
         if not good:
             continue
         sigma = max(spread_of(sizes, count), LEAST_SIGMA_MM)
-        noise = np.sqrt(total / max(count - 5, 1))
+        noise = np.sqrt(total / max(count - STRAIGHT, 1))
         _score_incidence(p, h, observations, noise, cut, rough.by_incidence[m])
         away = _distances(frame.point, at, bounds, scanners)
         _score_stations(p, h, observations, away, noise, cut, solution.inverse, rough.scatter[m])
@@ -225,7 +229,9 @@ def refine(gathered, scanners, spans, limits, errors, fits, first, last):  # typ
         observations = _localised(places, at, middle, frame, scanners)
         shifts, solution = _unknowns(frame, at, observations, scanners, errors)
         slack = np.sqrt(shifts.sd.max() ** 2 + FINE_MM**2)
-        good, count, assumed, sigma = _improve(p, h, observations, shifts, errors, fits.sigma[m], slack, 2, solution)
+        good, count, assumed, sigma = _improve(
+            p, h, observations, shifts, errors, fits.sigma[m], slack, np.int64(2), solution
+        )
         if not good:
             continue
         # The ends of the cylinder need all points; the rest of the fit runs about its middle.
@@ -238,7 +244,7 @@ def refine(gathered, scanners, spans, limits, errors, fits, first, last):  # typ
         for g in range(len(bounds) - 1):
             for k in range(len(known)):
                 if known_at[k] == at[bounds[g]]:
-                    values[g] = known[k]
+                    assign(values[g], known[k])
         bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
         low, high = extent_of(p, h, observations, values, np.sqrt(sigma**2 + FINE_MM**2), bins, BIN_MM)
         half = 0.5 * (high - low) - TRIM_MM
@@ -246,8 +252,8 @@ def refine(gathered, scanners, spans, limits, errors, fits, first, last):  # typ
             continue
         _centre(frame, observations.points, p, h, 0.5 * (low + high), half)
         shifts, solution = _unknowns(frame, at, observations, scanners, errors)
-        shifts.values[:] = values
-        good, count, assumed, sigma = _improve(p, half, observations, shifts, errors, sigma, 0.0, 4, solution)
+        assign_rows(shifts.values, values)
+        good, count, assumed, sigma = _improve(p, half, observations, shifts, errors, sigma, 0.0, np.int64(4), solution)
         if not good or not limits.least_radius < p[4] < limits.most_radius:
             continue
         _count_around(p, half, observations, CUT_SIGMAS * sigma, fits.around[m])
@@ -277,7 +283,7 @@ def _improve(p, h, observations, shifts, errors, sigma, slack, turns, solution):
         cut = max(CUT_SIGMAS * (np.sqrt(sigma**2 + slack**2) if turn == 0 else sigma), 0.5)
         assumed = sigma
         weighting = Weighting(errors.least_cos, cut, sigma, max(errors.bow_share * h, 1e-3))
-        count, total, change, good = step(p, h, observations, shifts, NP, weighting, sizes, solution)
+        count, total, change, good = step(p, h, observations, shifts, np.int64(NP), weighting, sizes, solution)
         if not good:
             break
         sigma = max(np.sqrt(total / max(count - NP, 1)), LEAST_SIGMA_MM)
@@ -312,7 +318,8 @@ def _centre(frame, points, p, h, middle, half):  # type: ignore[no-untyped-def]
         p[5 + a] *= (half / h) ** 2
     for i in range(3):
         frame.point[i] += middle * frame.direction[i]
-    points[:, 2] -= middle
+    for i in range(len(points)):
+        points[i, 2] -= middle
 
 
 @njit(cache=True, nogil=True)
@@ -339,7 +346,8 @@ def _store_response(response, at, bounds, change, sd, h):  # type: ignore[no-unt
     for g in range(len(bounds) - 1):
         if 0 <= at[bounds[g]] < len(response):
             for i in range(4):
-                response[at[bounds[g]], i] = change[g, i] * scale[i] * sd[g]
+                for a in range(2):
+                    response[at[bounds[g]], i, a] = change[g, i, a] * scale[i] * sd[g]
 
 
 # --- points and rays in the frame of a tube, and their stations ------------------------------------------------------

@@ -23,6 +23,7 @@ from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
 
 NP = 7  # a, b, c, d, r, e, f; mm
+STRAIGHT = 5  # of them without bow
 GRAZING_COS = 0.2  # of incidence by the model: rays that graze more are often mixed pixels
 ACROSS_MM = 0.4  # noise across the ray: angles and footprint of the beam
 
@@ -92,12 +93,15 @@ def residual(p, h, px, py, pz, ux, uy, uz, by_ray, J):  # type: ignore[no-untype
 
 
 @njit(cache=True, nogil=True)
-def solve(A, y, n, x, inverse, want_inverse):  # type: ignore[no-untyped-def]
-    """Cholesky solution x of the leading n by n block; False where it is not positive definite."""
+def solve(A, y, n, x, inverse):  # type: ignore[no-untyped-def]
+    """Cholesky solution x of the leading n by n block, with its ``inverse`` unless that has no rows.
+
+    False where the block is not positive definite.
+    """
     L = np.zeros((n, n))
     if not factorise(A, n, DEFINITE, L):
         return False
-    if want_inverse:
+    if len(inverse):
         for column in range(n):
             for i in range(n):
                 x[i] = 1.0 if i == column else 0.0
@@ -132,7 +136,7 @@ def step(p, h, observations, shifts, free, weighting, sizes, solution):  # type:
             for b in range(a + 1):
                 N[a, b] += A[g, a, b]
     if free == NP:
-        for a in range(5, NP):
+        for a in range(STRAIGHT, NP):
             N[a, a] += (sigma / bow_sd) ** 2
             right[a] -= (sigma / bow_sd) ** 2 * p[a]
     moving = shifts.sd.max() > 0.0
@@ -145,7 +149,7 @@ def step(p, h, observations, shifts, free, weighting, sizes, solution):  # type:
                 right[a] -= e0 * r0 + e1 * r1
                 for b in range(a + 1):
                     N[a, b] -= e0 * element(A[g], b, 0) + e1 * element(A[g], b, 1)
-    if not solve(N, right, free, x, inverse, True):
+    if not solve(N, right, free, x, inverse):
         return n, total, 0.0, False
     if moving:
         for g in range(groups):
@@ -225,7 +229,7 @@ def spread_of(values, n):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def circle_along(P, low, high, reach, p, h):  # type: ignore[no-untyped-def]
     """Start ``p`` from an algebraic circle whose centre runs along a line: linear in (a, b, c, d, and the constant)."""
-    A, y, x, inverse = np.zeros((5, 5)), np.zeros(5), np.zeros(5), np.zeros((5, 5))
+    A, y, x, none = np.zeros((5, 5)), np.zeros(5), np.zeros(5), np.zeros((0, 0))
     J = np.empty(5)
     for turn in range(3):
         A[:], y[:] = 0.0, 0.0
@@ -249,7 +253,7 @@ def circle_along(P, low, high, reach, p, h):  # type: ignore[no-untyped-def]
                 for b in range(a + 1):
                     A[a, b] += J[a] * J[b]
             n += 1
-        if n < 12 or not solve(A, y, 5, x, inverse, False):
+        if n < 12 or not solve(A, y, len(y), x, none):
             return False
         mean2 = x[0] * x[0] + x[1] * x[1] + (x[2] * x[2] + x[3] * x[3]) / 3.0
         r2 = x[4] + mean2

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.geometry.linalg_small import assign
 from processor.geometry.parallel import over_ranges, usable
 from processor.model import Floats, Ints, Labels
 from processor.space_frame.points.hash_sampling import REACH, STEPS_PER_MM, WHOLE, hashed
@@ -244,7 +245,7 @@ def arrange(counts, room, places, stations, most_station, first, last):  # type:
             if starts[s + 1] - starts[s] > 1:
                 # Not .sort(): numba gives it the same symbols as argsort, and kernels cached by two processes collide.
                 run = places[base + starts[s] : base + starts[s + 1]]
-                run[:] = run[np.argsort(run)]
+                assign(run, run[np.argsort(run)])
 
 
 def gather(

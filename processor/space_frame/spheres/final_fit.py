@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from processor.geometry.linalg_small import inverse_of
+from processor.geometry.linalg_small import assign, assign_rows, inverse_of
 from processor.geometry.parallel import over_ranges
 from processor.geometry.sphere import BANDS, SECTORS
 from processor.model import Floats
@@ -142,8 +142,8 @@ def _fit_at(k, crops, masks, model, model_points, priors, state, first_reach_mm,
         for j in range(3):
             chi2 += state[i] * prior.centre_weight[i, j] * state[j]
     _without_bias(observations, surface, local.noise, state, covariance)
-    finished.states[k] = state
-    finished.covariances[k] = covariance
+    assign(finished.states[k], state)
+    assign_rows(finished.covariances[k], covariance)
     for i in range(n):
         finished.residuals.errors[rows[i]] = residuals.errors[i]
         finished.residuals.cosines[rows[i]] = residuals.cosines[i]

@@ -19,6 +19,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry import point_grid
+from processor.geometry.linalg_small import assign
 from processor.geometry.parallel import over_ranges
 from processor.geometry.sphere import (
     RobustFit,
@@ -220,7 +221,7 @@ def _propose(cells, seeds, scale, band, draws, spheres, scores, first, last):  #
                 score += 1.0 - off * off if off < 1.0 else -0.5 if off < 3.0 else 0.0
             if score > scores[s]:
                 scores[s] = score
-                spheres[s] = sphere
+                assign(spheres[s], sphere)
         if scores[s] > 0.0:
             _refine(patch, spheres[s])
             for a in range(3):

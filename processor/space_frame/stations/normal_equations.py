@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from processor.geometry.linalg_small import cholesky, solve
+from processor.geometry.linalg_small import assign, cholesky, solve
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats
 from processor.space_frame.stations.residual_kernels import LEAST, STATION, TUBE, Axes, Layout
@@ -108,7 +108,9 @@ def add_tube(j, equations, layout, geometry, H, g):  # type: ignore[no-untyped-d
     if np.isnan(L[0, 0]):
         return
     S = np.empty((TUBE, width + 1))
-    S[:, :-1], S[:, -1] = K, total
+    for k in range(TUBE):
+        assign(S[k], K[k])
+        S[k, width] = total[k]
     S = solve(L, S)
     for c in range(width):
         for k in range(TUBE):
@@ -174,7 +176,7 @@ def _tubes(equations, layout, geometry, x, off, unknowns, scores, begin, end):  
         if np.isnan(L[0, 0]):
             continue
         a = solve(L, total.reshape(-1, 1))[:, 0]
-        unknowns[j] = a
+        assign(unknowns[j], a)
         for q in range(first, last):
             M, y = with_floor(N[q], b[q], floor)
             G = arm(geometry, j, station[q])

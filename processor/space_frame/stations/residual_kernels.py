@@ -234,8 +234,16 @@ def _effect(points, influence, places, covariance, effects, first, last):  # typ
 def effect(points: Floats, influence: Floats, places: Floats, covariance: Floats, threads: int = 0) -> Floats:
     """Covariance (k, d, d) of estimates near points (k, 3) with derivatives ``influence`` (k, s, d, 3) by stations."""
     effects = np.zeros((len(points), influence.shape[2], influence.shape[2]))
+    points, influence, places, covariance = (_frozen(array) for array in (points, influence, places, covariance))
     over_ranges(partial(_effect, points, influence, places, covariance, effects), len(points), threads, LEAST)
     return effects
+
+
+def _frozen(array: Floats) -> Floats:
+    """Return a view that cannot be written: the kernel is compiled for one kind of array only."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 @njit(cache=True, nogil=True)

@@ -188,7 +188,7 @@ def _matches(small, large, T, patches, weight, bound, gate, like):  # type: igno
         if cosine <= like or abs(off) >= gate:
             continue
         matched[count, 0], matched[count, 1], matched[count, 2] = x, y, z
-        matched[count, 3:6] = m
+        matched[count, 3], matched[count, 4], matched[count, 5] = m[0], m[1], m[2]
         matched[count, 6], matched[count, 7] = off, weight[k]
         count += 1
     return matched[:count]
