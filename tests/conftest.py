@@ -15,6 +15,8 @@ from numba.core.caching import FunctionCache
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
+from processor.jobs import garbage
+
 PIXEL = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
 )  # as PNG
@@ -56,7 +58,7 @@ def pytest_collection_finish():
     """Leave out of further collections what is loaded now and stays: libraries of half a million objects."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(20_000, 10, 10)
+    garbage.search_rarely()
 
 
 @pytest.fixture

@@ -241,7 +241,7 @@ def effect(points: Floats, influence: Floats, places: Floats, covariance: Floats
 
 def _frozen(array: Floats) -> Floats:
     """Return a view that cannot be written: the kernel is compiled for one kind of array only."""
-    view = array.view()
+    view: Floats = array.view()
     view.flags.writeable = False
     return view
 
