@@ -2,7 +2,7 @@
 
 A plane or cylindrical face is mapped to a plane by one chart; any other face is cut into pieces that are nearly flat. A
 component is a body that the design names. In a mesh without names it is a set of bodies that touch, or a single body
-where more than MOST_BODIES touch.
+where more than ``mesh_bodies.MOST_BODIES`` touch.
 """
 
 from __future__ import annotations
@@ -13,21 +13,14 @@ from functools import cached_property
 
 import numpy as np
 from numba import njit
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from processor.distinct_rows import distinct
-from processor.geometry import circle, enclosure, mesh_distance
+from processor.geometry import circle, mesh_bodies, mesh_distance
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
-from processor.geometry.neighbors import same_places
 from processor.model import Bools, DesignBodies, Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
 PIECE_COS = np.cos(np.radians(15.0))
 ROUND_SHARE = 0.02  # of the radius, the largest distance of a vertex from its cylinder
-WELD_MM = 0.01  # vertices nearer to each other are one
-TOUCH_MM = 0.5
-MOST_BODIES = 12  # of a component
 MOST_SIDES = 60  # edges tried for the direction of a face
 PLANE, CYLINDER = 0, 1
 GRID_SHARE = 0.01  # voxel by the design's size
@@ -125,7 +118,7 @@ def of_mesh(vertices: Floats, faces: Ints, cell_mm: float, bodies: DesignBodies 
         share=np.empty(0),
         centres=np.empty((0, 3)),
         outward=np.empty((0, 3)),
-        names=tuple(f"component-{k + 1}" for k in range(count)) if bodies is None else bodies.names,
+        names=tuple(map(mesh_bodies.component_name, range(count))) if bodies is None else bodies.names,
     )
     return gridded(surface, cell_mm)
 
@@ -152,7 +145,7 @@ def _hidden(surface: DesignSurface) -> Bools:
     charts, marked = surface.charts, np.zeros_like(surface.covered)
     along = np.repeat(charts.axes[:, 0], charts.shape.prod(axis=1), axis=0)
     across = np.cross(surface.outward, along)
-    body = enclosure.closed_bodies(surface.faces)
+    body = mesh_bodies.closed_bodies(surface.faces)
     near = np.flatnonzero(_near_bodies(surface, body, 0.5 * charts.cell_mm * (np.abs(along) + np.abs(across))))
     centres, outward, along, across = (x[near] for x in (surface.centres, surface.outward, along, across))
     reach = max(surface.size_mm * GRID_SHARE, charts.cell_mm)
@@ -160,15 +153,15 @@ def _hidden(surface: DesignSurface) -> Bools:
     for sample in range(PER_SIDE**2):
         a, b = (charts.cell_mm * ((k + 0.5) / PER_SIDE - 0.5) for k in divmod(sample, PER_SIDE))
         on = surface.covered[near, sample]
-        marked[near[on], sample] = enclosure.enclosed((centres + a * along + b * across)[on], outward[on], grid, body)
+        marked[near[on], sample] = mesh_bodies.enclosed((centres + a * along + b * across)[on], outward[on], grid, body)
     return marked
 
 
 def _near_bodies(surface: DesignSurface, body: Ints, halves: Floats) -> Bools:
     """Mark cells, with half sides (cells, 3), that reach into the box about a closed body: no other can be hidden."""
-    low, high = enclosure.boxes(surface.vertices, surface.faces, body)
-    middles = surface.centres + enclosure.OUTSIDE_MM * surface.outward
-    first, last = middles - halves - WELD_MM, middles + halves + WELD_MM
+    low, high = mesh_bodies.boxes(surface.vertices, surface.faces, body)
+    middles = surface.centres + mesh_bodies.OUTSIDE_MM * surface.outward
+    first, last = middles - halves - mesh_bodies.WELD_MM, middles + halves + mesh_bodies.WELD_MM
     near = np.zeros(len(middles), np.bool_)
     for chart in range(len(surface.charts.kind)):
         rows = surface.charts.cells(chart)
@@ -186,16 +179,6 @@ def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:
     return np.stack([local[:, 0], np.where(charts.kind[chart] == CYLINDER, around, local[:, 1])], axis=1)
 
 
-def _welded(vertices: Floats, faces: Ints, body: Ints | None) -> tuple[Floats, Ints]:
-    """Merge vertices at the same place, but not those of different bodies (f,)."""
-    corners = faces.ravel()
-    key = same_places(vertices, WELD_MM)[corners, None]
-    if body is not None:
-        key = np.hstack([key, np.repeat(body, 3)[:, None]])
-    places = distinct(key)
-    return vertices[corners[places.first]], places.number.reshape(faces.shape)
-
-
 def with_components(vertices: Floats, faces: Ints, bodies: DesignBodies | None = None) -> tuple[MeshSurface, Ints]:
     """Prepare a mesh for searches; also the component (f,) of each of its facets, numbered as in the defects' names.
 
@@ -207,29 +190,10 @@ def with_components(vertices: Floats, faces: Ints, bodies: DesignBodies | None =
 
 def _joined(vertices: Floats, faces: Ints, bodies: DesignBodies | None) -> tuple[Floats, Ints, Ints]:
     """Return a mesh with one vertex at a place, without facets of no area, and the component (f,) of each facet."""
-    vertices, faces = _welded(vertices, faces, None if bodies is None else bodies.of_facet)
+    vertices, faces = mesh_bodies.welded(vertices, faces, None if bodies is None else bodies.of_facet)
     has_area = mesh_distance.double_areas(vertices, faces)[1] > mesh_distance.LEAST_AREA
     faces = faces[has_area]
-    return vertices, faces, _components(vertices, faces) if bodies is None else bodies.of_facet[has_area]
-
-
-def _components(vertices: Floats, faces: Ints) -> Ints:
-    """Return the component (f,) of each facet, numbered in the order of the mesh."""
-    links = coo_array((np.ones(2 * len(faces), np.int8), (faces[:, :2].ravel(), faces[:, 1:].ravel())),
-                      (len(vertices),) * 2)  # fmt: skip
-    body = connected_components(links, directed=False)[1][faces[:, 0]].astype(np.int64)
-    vertex, facet = mesh_distance.touching(vertices, faces, TOUCH_MM)
-    body_of_vertex = np.full(len(vertices), -1, np.int64)
-    body_of_vertex[faces.ravel()] = np.repeat(body, 3)
-    count = int(body.max(initial=-1)) + 1
-    contacts = coo_array((np.ones(len(vertex), np.int8), (body_of_vertex[vertex], body[facet])), (count, count))
-    group = connected_components(contacts, directed=False)[1].astype(np.int64)
-    many = np.bincount(group) > MOST_BODIES
-    group = np.where(many[group[body]], count + body, group[body])
-    _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[inverse.reshape(-1)]
+    return vertices, faces, mesh_bodies.components(vertices, faces) if bodies is None else bodies.of_facet[has_area]
 
 
 def _pieces(vertices: Floats, faces: Ints, normals: Floats, part: Ints) -> Ints:

@@ -19,7 +19,7 @@ from processor.deviation import assignment, station_offsets
 from processor.deviation.assignment import Aside, OnSurface
 from processor.deviation.local_translation import Movement, PartSums, Translations
 from processor.deviation.station_offsets import OnFaces, OnPieces, Pieces
-from processor.geometry import enclosure, m3c2, mesh_distance
+from processor.geometry import m3c2, mesh_bodies, mesh_distance
 from processor.geometry.mesh_distance import CurvedFacets, FacetGrid, Samples
 from processor.large_arrays import put_aside, release
 from processor.model import Bools, Floats, Ints
@@ -122,7 +122,7 @@ def movement(
     """
     surface = curved.surface
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, depth_mm)
-    within = enclosure.enclosed(core.points, core.normals, grid, enclosure.closed_bodies(surface.faces))
+    within = mesh_bodies.enclosed(core.points, core.normals, grid, mesh_bodies.closed_bodies(surface.faces))
     core = replace(core, normals=np.where(within[:, None], np.nan, core.normals))
     passes = _Passes(clouds, Shared(_Fit(core, curved, grid, diameter=diameter_mm, depth=depth_mm)))
     first, on_surface = _first(passes)

@@ -18,9 +18,8 @@ from scipy.sparse.csgraph import connected_components
 
 from processor import scene_cloud
 from processor.adjustment import groups, scanner_class
-from processor.distinct_rows import distinct_points
-from processor.geometry import mesh_distance
-from processor.geometry.neighbors import same_places
+from processor.distinct_rows import distinct, distinct_points
+from processor.geometry import mesh_bodies, mesh_distance
 from processor.inspection import design_holes
 from processor.inspection.design_holes import Hole
 from processor.model import Floats, Ints, StructureDesign
@@ -175,15 +174,26 @@ def _members(group: Ints, count: int = 0) -> list[Ints]:
 
 
 def _bodies(design: StructureDesign, vertices: Floats) -> tuple[tuple[str, ...], Ints]:
-    """Return the names of bodies, and the body (f,) of each facet; without names they are the connected pieces."""
+    """Return the names of bodies, and the body (f,) of each facet; without names they are the connected pieces.
+
+    A piece without a name has that of its component, as in the defects; if others touch it, with a number.
+    """
     if design.bodies is not None:
         return design.bodies.names, design.bodies.of_facet
-    place = same_places(vertices, SAME_PLACE_MM)[design.faces]
-    a, b = place[:, [0, 1]].ravel(), place[:, [1, 2]].ravel()
-    links = coo_array((np.ones(len(a), np.int8), (a, b)), (int(place.max()) + 1,) * 2)
-    body = connected_components(links, directed=False)[1][place[:, 0]]
-    number: Ints = np.unique(body, return_inverse=True)[1].reshape(-1).astype(np.int64)
-    return tuple(f"body {k + 1}" for k in range(int(number.max()) + 1)), number
+    welded, faces = mesh_bodies.welded(vertices, design.faces, None)
+    a, b = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    links = coo_array((np.ones(len(a), np.int8), (a, b)), (int(faces.max()) + 1,) * 2)
+    piece = connected_components(links, directed=False)[1][faces[:, 0]]
+    component = mesh_bodies.components(welded, faces)
+    places = distinct(np.column_stack([component, piece]))
+    number: Ints = places.number.reshape(-1).astype(np.int64)
+    of_body = component[places.first]
+    names = []
+    for body, whole in enumerate(of_body):
+        alike = np.flatnonzero(of_body == whole)
+        part = f" body {int(np.searchsorted(alike, body)) + 1}" if len(alike) > 1 else ""
+        names.append(mesh_bodies.component_name(int(whole)) + part)
+    return tuple(names), number
 
 
 def _planes(corners: Floats, normals: Floats, body: Ints) -> Ints:

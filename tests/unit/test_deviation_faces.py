@@ -8,7 +8,7 @@ import trimesh
 
 from processor.deviation import assignment
 from processor.deviation import step as deviation_step
-from processor.geometry import enclosure, mesh_distance
+from processor.geometry import mesh_bodies, mesh_distance
 from processor.model import Scan, Scene, StructureDesign
 from tests.support.plate_clouds import AS_IT_LIES, SIGMA, STATIONS, plate
 
@@ -92,12 +92,12 @@ def test_what_is_within_another_body_or_in_contact_with_it_is_enclosed():
     normals = np.array(
         [[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 0, -1], [0, 0, 1], [0, 0, -1], [0, 0, 1], [-1, 0, 0]], float
     )
-    inside = enclosure.enclosed(points, normals, grid, enclosure.closed_bodies(surface.faces))
+    inside = mesh_bodies.enclosed(points, normals, grid, mesh_bodies.closed_bodies(surface.faces))
     # Of the beam below the post; beside it; its side; the post's end; beam and plate in contact; the plate; the cavity.
     np.testing.assert_array_equal(inside, [True, False, False, True, True, True, False, False])
     opened = surface.faces[1:]  # a beam without one facet is no body
-    assert (enclosure.closed_bodies(opened)[:11] < 0).all()
-    assert (enclosure.closed_bodies(opened)[11:] >= 0).all()
+    assert (mesh_bodies.closed_bodies(opened)[:11] < 0).all()
+    assert (mesh_bodies.closed_bodies(opened)[11:] >= 0).all()
 
 
 def test_enclosed_by_any_of_many_bodies():
@@ -111,10 +111,10 @@ def test_enclosed_by_any_of_many_bodies():
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 50.0)
     points, facet = trimesh.sample.sample_surface(mesh, 20_000, seed=1)
     normals = mesh.face_normals[facet]
-    place = points + enclosure.OUTSIDE_MM * normals
+    place = points + mesh_bodies.OUTSIDE_MM * normals
     gap = np.maximum(low[None] - place[:, None], place[:, None] - high[None]).max(axis=2)  # negative within a box
     sure = np.abs(gap).min(axis=1) > 0.01
-    inside = enclosure.enclosed(points, normals, grid, enclosure.closed_bodies(surface.faces))
+    inside = mesh_bodies.enclosed(points, normals, grid, mesh_bodies.closed_bodies(surface.faces))
     assert 0.1 < inside[sure].mean() < 0.9
     np.testing.assert_array_equal(inside[sure], (gap.min(axis=1) < 0.0)[sure])
 

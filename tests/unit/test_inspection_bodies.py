@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 import processor
+from processor.defects import surface_charts
 from processor.deviation import step as deviation_step
 from processor.evaluation import inspection as evaluation
 from processor.geometry import rigid
@@ -123,6 +124,20 @@ def test_the_truth_is_measured_by_the_same_definitions(runs):
         one.quantity: one.value for one in evaluation.check(scene, result, truth) if one.statistic == "coverage"
     }
     assert set(coverage) >= {"lengths", "widths and heights", "sweeps and cambers", "twists"}
+
+
+def test_bodies_of_a_mesh_without_names_are_named_as_the_components_of_defects():
+    apart, touching, upon = (
+        trimesh.creation.box((400.0, 300.0, 200.0), rigid.transform(np.eye(3), np.array([x, 0.0, z])))
+        for x, z in ((5000.0, 0.0), (0.0, 0.0), (100.0, 200.0))
+    )
+    mesh = trimesh.util.concatenate([apart, touching, upon])
+    design = StructureDesign("three.ply", mesh.vertices, mesh.faces)
+    none = np.empty(0)
+    seen = flat_faces.Observed(np.empty((0, 3)), np.empty(0, np.int64), none, none, none, side=50.0)
+    names = [body.name for body in flat_faces.bodies(design, seen, 60.0)]
+    assert names == ["component-1", "component-2 body 1", "component-2 body 2"]
+    assert surface_charts.of_mesh(mesh.vertices, mesh.faces, 50.0).names == ("component-1", "component-2")
 
 
 def flat_plate(wave, noise, seed):

@@ -17,7 +17,7 @@ from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, cells_of
 from processor.defects.regions import EMPTY_SHARE, Region, chernoff
 from processor.defects.surface_charts import PLANE, DesignSurface
-from processor.geometry import enclosure, mesh_distance, rigid
+from processor.geometry import mesh_bodies, mesh_distance, rigid
 from processor.model import Bools, Floats, Ints
 
 STEP_MM = 2.0  # between places by which contacts are measured
@@ -43,7 +43,7 @@ def of_bodies(
     observed: Observed, field: Field, surface: DesignSurface, hidden: Bools, alarms_per_mm2: float
 ) -> list[Region]:
     """Return the faces of bodies that are gone. ``hidden`` (cells, samples) are places that other bodies hide."""
-    body = enclosure.closed_bodies(surface.faces)
+    body = mesh_bodies.closed_bodies(surface.faces)
     contacts = list(_contacts(observed, field, surface, hidden, body))
     present = [contact for contact in contacts if not contact.is_empty]
     if not present:
@@ -70,7 +70,7 @@ def _contacts(
     touched = np.flatnonzero(hidden.any(axis=1) & (charts.kind == PLANE)[chart_of_cells(surface)])
     places, inward, place_mm2 = _places_of(surface, touched)
     found = _points_on(observed, surface, touched)
-    low, high = enclosure.boxes(surface.vertices, surface.faces, body)
+    low, high = mesh_bodies.boxes(surface.vertices, surface.faces, body)
     typical = _density(field, surface) * charts.cell_mm**2
     for one in range(len(low)):
         only = np.where(body == one, 0, -1)
@@ -106,8 +106,8 @@ def _well_inside(points: Floats, normals: Floats, grid: mesh_distance.FacetGrid,
     for way in (1.0, -1.0):
         all_within = np.ones(len(points), np.bool_)
         for a, b in ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
-            place = points + WITHIN_MM * (a * along + b * across) + (way * DEPTH_MM - enclosure.OUTSIDE_MM) * normals
-            all_within &= enclosure.enclosed(place, normals, grid, only)
+            place = points + WITHIN_MM * (a * along + b * across) + (way * DEPTH_MM - mesh_bodies.OUTSIDE_MM) * normals
+            all_within &= mesh_bodies.enclosed(place, normals, grid, only)
         inside |= all_within
     return inside
 

@@ -1,4 +1,4 @@
-"""Places of a design's surface that lie within other solids of it: where parts overlap or are in contact.
+"""The bodies of a design's mesh: components of those that touch, and places of the surface within another body.
 
 A design is often a set of closed bodies that run into each other. What is inside of another body cannot be scanned.
 The winding number of a place is counted along a ray (Jacobson et al. 2013 for its use on sets of bodies); bodies whose
@@ -15,14 +15,58 @@ from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from processor.distinct_rows import distinct
+from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import FacetGrid
+from processor.geometry.neighbors import same_places
 from processor.geometry.parallel import over_ranges
 from processor.model import Bools, Floats, Ints
 
+WELD_MM = 0.01  # vertices nearer to each other are one
+TOUCH_MM = 0.5
+MOST_BODIES = 12  # of a component
 OUTSIDE_MM = 0.5  # above the surface: closer bodies are in contact
 JITTER_MM = np.array([1.3e-4, 2.1e-4, 1.7e-4])  # so that no ray meets an edge between two facets
 LEAST_RANGE = 2_000  # places per task of a thread
 PARTS = 16  # of the room about all bodies along each axis, by which the bodies about a place are found
+
+
+def welded(vertices: Floats, faces: Ints, body: Ints | None) -> tuple[Floats, Ints]:
+    """Return a mesh whose vertices at the same place are one, but not those of different bodies (f,)."""
+    corners = faces.ravel()
+    key = same_places(vertices, WELD_MM)[corners, None]
+    if body is not None:
+        key = np.hstack([key, np.repeat(body, 3)[:, None]])
+    places = distinct(key)
+    return vertices[corners[places.first]], places.number.reshape(faces.shape)
+
+
+def component_name(number: int) -> str:
+    """Return the name of a component of a mesh whose bodies have no names; the first has the number 0."""
+    return f"component-{number + 1}"
+
+
+def components(vertices: Floats, faces: Ints) -> Ints:
+    """Return the component (f,) of each facet of a mesh, numbered in the order of the mesh.
+
+    A component is a set of bodies that touch, or a single body where more than MOST_BODIES touch. ``vertices`` at one
+    place are one, see :func:`welded`.
+    """
+    links = coo_array((np.ones(2 * len(faces), np.int8), (faces[:, :2].ravel(), faces[:, 1:].ravel())),
+                      (len(vertices),) * 2)  # fmt: skip
+    body = connected_components(links, directed=False)[1][faces[:, 0]].astype(np.int64)
+    vertex, facet = mesh_distance.touching(vertices, faces, TOUCH_MM)
+    body_of_vertex = np.full(len(vertices), -1, np.int64)
+    body_of_vertex[faces.ravel()] = np.repeat(body, 3)
+    count = int(body.max(initial=-1)) + 1
+    contacts = coo_array((np.ones(len(vertex), np.int8), (body_of_vertex[vertex], body[facet])), (count, count))
+    group = connected_components(contacts, directed=False)[1].astype(np.int64)
+    many = np.bincount(group) > MOST_BODIES
+    group = np.where(many[group[body]], count + body, group[body])
+    _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[inverse.reshape(-1)]
 
 
 def enclosed(points: Floats, normals: Floats, grid: FacetGrid, body: Ints) -> Bools:
