@@ -172,7 +172,8 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     if not aligned.fitted:
         shape_values += face_offsets.unproven(field.minus(shape_values), surface)
     residuals = field.minus(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
-    finding = scan_statistic.search(residuals, surface, levels)
+    searched = scan_statistic.widened(residuals, levels)
+    finding = scan_statistic.search(searched, surface, levels)
     expected = expected_points.expected(scene, registered.T_design_project, pairs, surface, observed.stations)
     missing = regions.missing(field, expected, surface, alarms_per_mm2)
     missing += _inferred(scene, registered, field, missing, alarms_per_mm2)
@@ -187,7 +188,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
         levels=levels,
         shapes=shapes,
         significant=significant,
-        places=[group for group in united if regions.is_significant(group[0], residuals, levels)],
+        places=[group for group in united if regions.is_significant(group[0], searched, levels)],
         expected=expected,
         shape_values=shape_values,
         points=measures.points_by_cell(observed, surface, aligned),

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from processor.defects import scan_statistic
 from processor.defects.classification import CRACK_RATIO
 from processor.defects.deviation_field import Field
 from processor.defects.scan_statistic import Finding, Levels
@@ -124,14 +125,15 @@ def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> lis
 def is_significant(region: Region, field: Field, levels: Levels) -> bool:
     """Whether the mean of a region's cells is significant by itself; what is missing always is.
 
-    Cells that are left of a line or a window may be few: the rest was of another region, or lay all about.
+    Cells that are left of a line or a window may be few: the rest was of another region, or lay all about. ``field`` is
+    the one that was searched.
     """
     if region.sign == 0:
         return True
     weight = field.seen[region.cells] / field.variance[region.cells]
     total = max(float(weight.sum()), 1e-30)
     size = max(0, int(np.searchsorted(levels.sides, np.sqrt(len(region.cells)), side="right")) - 1)
-    sd = float(np.hypot(levels.inflation[size] / np.sqrt(total), levels.systematic_mm))
+    sd = float(scan_statistic.mean_sd(total, levels.inflation[size], field, levels))
     return abs(float(weight @ field.deviation[region.cells])) / total > float(levels.threshold[size]) * sd
 
 

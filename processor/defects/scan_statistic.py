@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -98,8 +99,11 @@ def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float, syste
 
 
 def search(field: Field, surface: DesignSurface, levels: Levels) -> Finding:
-    """Search from small windows to large; cells of a region do not count in larger windows."""
-    charts, field = surface.charts, _widened(field, levels)
+    """Search from small windows to large; cells of a region do not count in larger windows.
+
+    ``field`` is that of :func:`widened`.
+    """
+    charts = surface.charts
     count = len(surface.share)
     finding = Finding(np.zeros(count, np.int8), np.zeros(count), np.full(count, np.inf))
     for chart in _used(field, charts):
@@ -111,13 +115,21 @@ def search(field: Field, surface: DesignSurface, levels: Levels) -> Finding:
     return finding
 
 
-def _widened(field: Field, levels: Levels) -> Field:
+def widened(field: Field, levels: Levels) -> Field:
     """Return the field with the variances by which a cell exceeds its threshold as often as Student's t does."""
     if not len(field.dof):
         return field
     threshold = float(levels.threshold[0])
     student = -stdtrit(np.maximum(field.dof, 1.0), ndtr(-threshold))
     return dataclasses.replace(field, variance=field.variance * (student / threshold) ** 2)
+
+
+def mean_sd(weight: Any, inflation: float, field: Field, levels: Levels) -> Any:
+    """Return the standard deviation of means of cells, mm: noise, differences of unnamed views, systematic errors.
+
+    ``weight`` are sums of the inverse variances of cells, of which the noise is ``inflation`` times as large.
+    """
+    return np.hypot(inflation / np.sqrt(weight), np.hypot(levels.systematic_mm, field.views))
 
 
 def _used(field: Field, charts: Charts) -> list[int]:
@@ -145,7 +157,6 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> F
     shape = tuple(charts.shape[chart])
     finding = Finding(np.zeros(shape, np.int8), np.zeros(shape), np.full(shape, np.inf))
     sign = finding.sign
-    systematic = float(np.hypot(levels.systematic_mm, field.views))
     for side, inflation, threshold, per_mm2 in zip(
         levels.sides, levels.inflation, levels.threshold, levels.per_mm2, strict=True
     ):
@@ -153,7 +164,7 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> F
             break
         top, weight = _window_sums(field, charts, chart, side, sign != 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            z = np.where(weight > 0.0, top / weight / np.hypot(inflation / np.sqrt(weight), systematic), 0.0)
+            z = np.where(weight > 0.0, top / weight / mean_sd(weight, inflation, field, levels), 0.0)
         if side == LINES_AFTER:
             _search_lines(field, charts, chart, levels, finding)
         if not (np.abs(z) > threshold).any():
@@ -183,7 +194,6 @@ def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, find
     score = top / np.sqrt(np.maximum(weight, 1e-30))
     margin = max(LINE_CELLS)
     padded = np.pad(np.stack([top, weight, weight > 0.0]), ((0, 0), (margin, margin), (margin, margin)))
-    systematic = float(np.hypot(levels.systematic_mm, field.views))
     for length in LINE_CELLS:
         if length > max(top.shape):
             continue
@@ -191,7 +201,7 @@ def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, find
             offsets = _line(length, np.pi * turn / LINE_TURNS)
             sum_top, sum_weight, number = _along(padded, margin, offsets)
             with np.errstate(invalid="ignore", divide="ignore"):
-                sd = np.hypot(levels.line_inflation / np.sqrt(sum_weight), systematic)
+                sd = mean_sd(sum_weight, levels.line_inflation, field, levels)
                 z = np.where(number >= COVERED * length, sum_top / sum_weight / sd, 0.0)
             for direction in (-1, 1):
                 towards = direction * score

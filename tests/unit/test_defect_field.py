@@ -168,6 +168,7 @@ def test_few_degrees_of_freedom_need_larger_deviations():
     found = {}
     for dof in (30.0, 1e6):
         field = dataclasses.replace(known, deviation=deviation, dof=np.full(len(deviation), dof))
+        field = scan_statistic.widened(field, levels)
         found[dof] = bool(scan_statistic.search(field, surface, levels).sign.any())
     assert found == {30.0: False, 1e6: True}
 
@@ -201,3 +202,7 @@ def test_a_region_is_significant_by_its_own_cells():
     for number, sign, expected in ((9, 1, True), (4, 1, False), (4, 0, True)):
         region = regions.Region(chart, cells[:number], sign, 9.0, 0.0)
         assert regions.is_significant(region, deviating, levels) is expected
+    region = regions.Region(chart, cells[:9], 1, 9.0, 0.0)
+    mean_sd = float(np.sqrt(field.variance[cells[:9]].mean() / 9.0)) * levels.inflation.max()
+    differing = dataclasses.replace(deviating, views=mean_sd)  # the deviation is 5.1 / sqrt(2) standard deviations
+    assert not regions.is_significant(region, differing, levels)

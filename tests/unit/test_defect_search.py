@@ -19,7 +19,7 @@ from processor.defects import (
 )
 from processor.defects import step as defects_step
 from processor.defects.measures import thickness_at
-from processor.geometry import mesh_distance, rigid
+from processor.geometry import mesh_bodies, mesh_distance, rigid
 from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
 from processor.report.defects import figures, section
 from processor.results.fields_to_json import as_object
@@ -397,7 +397,7 @@ def test_cells_cover_what_a_design_has():
 
 def test_vertices_at_one_place_are_one_wherever_the_place_is():
     """Two triangles of a plate with corners that differ by rounding, on either side of half a hundredth millimetre."""
-    step = surface_charts.WELD_MM
+    step = mesh_bodies.WELD_MM
     at = np.array([0.5 * step - 1e-9, 300.5 * step - 1e-9, 0.0])
     square = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [100.0, 50.0, 0.0], [0.0, 50.0, 0.0]]) + at
     vertices = np.vstack([square[[0, 1, 2]], square[[0, 2, 3]] + 2e-9])
