@@ -54,7 +54,8 @@ PIECE_MM, LEAST_FACE_MM = 100.0, 1.0
 def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     """Compare the characteristics of parts and bodies with the truth; all figures are for information."""
     if truth.arch is not None and scene.arch is not None:
-        true = {component.name: _of_part(scene.arch, component, truth.arch) for component in result.components}
+        parts = [component for component in result.components if component.name in truth.arch.names]
+        true = {component.name: _of_part(scene.arch, component, truth.arch) for component in parts}
     elif truth.frame is not None and scene.frame is not None:
         true = _of_members(scene, scene.frame, truth)
     elif truth.structure is not None and scene.structure is not None and len(truth.structure.points):

@@ -8,8 +8,7 @@ pose. The scale of the scanner, which no part shows, is added by its class.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,24 +34,58 @@ NAN = float("nan")
 LEAST_REACH = 0.7  # of the edges' length, over which both have to be seen
 
 
+class HoleCharacteristics(NamedTuple):
+    """What was measured of bolt holes, of parts and of joints by their names."""
+
+    parts: Mapping[str, Sequence[Characteristic]]
+    joints: Mapping[str, Sequence[Characteristic]]
+
+
 def inspect(
     design: ArchDesign,
     assembled: Any,
     tolerance: Tolerance | None,
     method: str,
-    others: Mapping[str, Sequence[Characteristic]] = MappingProxyType({}),
+    of_holes: HoleCharacteristics | None = None,
 ) -> Result:
-    """Inspect the parts of a bridge by the result of step ``preassemble``; ``others`` are measured of parts by name."""
+    """Inspect the parts of a bridge, and its bolted joints, by the result of step ``preassemble``."""
+    of_holes = of_holes or HoleCharacteristics({}, {})
     if assembled is None or assembled.adjustment is None or not assembled.adjustment.shapes:
         return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-measured-ends"),))
     shapes = {shape.name: shape for shape in assembled.adjustment.shapes}
     states = dict(zip(assembled.components.name, assembled.components.status, strict=True))
     components = tuple(
-        _part(part, design_ends(design, i), shapes[part.name], states[part.name], tolerance, others.get(part.name, ()))
+        _part(
+            part,
+            design_ends(design, i),
+            shapes[part.name],
+            states[part.name],
+            tolerance,
+            of_holes.parts.get(part.name, ()),
+        )
         for i, part in enumerate(design.parts)
     )
+    components += tuple(_joints(design, of_holes.joints, states, tolerance))
     remarks = () if tolerance is not None else (reason("inspect.no-limits"),)
     return Result.of_components(components, method, remarks)
+
+
+def _joints(
+    design: ArchDesign,
+    found: Mapping[str, Sequence[Characteristic]],
+    states: Mapping[str, Status],
+    tolerance: Tolerance | None,
+) -> Iterator[InspectedComponent]:
+    """Yield the bolted joints; where a part may lie the other way round, its holes may be those of the other end."""
+    for name, left, right in zip(design.joint_names, design.joint_left, design.joint_right, strict=True):
+        if name in found:
+            doubtful = Status.AMBIGUOUS in (states[left], states[right])
+            yield InspectedComponent(
+                name=name,
+                status=Status.AMBIGUOUS if doubtful else Status.OK,
+                reasons=(reason("inspect.ambiguous"),) if doubtful else (),
+                characteristics=characteristic.table(found[name], tolerance, name, {}, doubtful),
+            )
 
 
 def design_ends(design: ArchDesign, part: int) -> Floats:

@@ -2,40 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from processor.components import bridge_parts
 from processor.inspection import flat_faces, holes
+from processor.inspection.bore_fit import Fitted
 from processor.inspection.characteristic import Characteristic
 from processor.inspection.design_holes import Hole
 from processor.model import ArchDesign, Floats, Scene
 
 
-def of_parts(scene: Scene, assembled: Any) -> dict[str, list[Characteristic]]:
-    """Return the characteristics of the holes of each part that has any, numbered over the part from joint to joint."""
+class DrilledGroup(NamedTuple):
+    """The holes of a part through one plate at a joint, from an ``origin`` (3,), as designed and as measured.
+
+    They are numbered from ``first`` over the part.
+    """
+
+    part: str
+    joint: int
+    origin: Floats
+    group: holes.Group
+    fitted: Fitted
+    first: int
+
+
+def of_parts(scene: Scene, assembled: Any) -> list[DrilledGroup]:
+    """Return the groups of holes of all parts, from joint to joint."""
     if scene.arch is None or not any(len(scan.points) for scan in scene.scans):
-        return {}
+        return []
     drilled = {}
     for part in scene.arch.parts:
         origin, found = flat_faces.holes_of(part.vertices, part.faces)
         if found:
             drilled[part.name] = (origin, found)
-    characteristics: dict[str, list[Characteristic]] = {}
+    groups: list[DrilledGroup] = []
     for placed in bridge_parts.of_bridge(scene, assembled, "inspect") if drilled else ():
         if placed.name in drilled and placed.scene is not None:
             origin, found = drilled[placed.name]
             cloud = holes.cloud_of(placed.scene, np.eye(4), None, origin)
-            characteristics[placed.name] = list(_by_joint(scene.arch, placed.name, found, cloud, origin))
-    return characteristics
+            groups += _by_joint(scene.arch, placed.name, found, cloud, origin)
+    return groups
+
+
+def characteristics(drilled: Sequence[DrilledGroup]) -> dict[str, list[Characteristic]]:
+    """Return the characteristics of the holes of each part that has any."""
+    found: dict[str, list[Characteristic]] = defaultdict(list)
+    for one in drilled:
+        found[one.part] += holes.characteristics(one.group, one.fitted, one.first)
+    return dict(found)
 
 
 def _by_joint(
     design: ArchDesign, name: str, found: list[Hole], cloud: holes.Cloud, origin: Floats
-) -> Iterator[Characteristic]:
-    """Yield the characteristics of the holes at each joint of a part, plate by plate."""
+) -> Iterator[DrilledGroup]:
+    """Yield the holes at each joint of a part, plate by plate."""
     at = [
         j
         for j, (left, right) in enumerate(zip(design.joint_left, design.joint_right, strict=True))
@@ -51,5 +75,5 @@ def _by_joint(
         p1, p2, p3, p4 = design.joint_points[at[k], :4]
         along = np.cross(p4 - p2, p3 - p1)  # square to the section, from the left part to the right
         for group in holes.groups(own, [along / np.linalg.norm(along)]):
-            yield from holes.measured(cloud, group, first)
+            yield DrilledGroup(name, at[k], origin, group, holes.fitted(cloud, group), first)
             first += len(group.holes)

@@ -21,7 +21,7 @@ from processor.inspection.bore_fit import BorePoints, Fitted
 from processor.inspection.characteristic import Characteristic
 from processor.inspection.design_holes import Hole
 from processor.inspection.result import Quantity
-from processor.model import Floats, Ints, Scan, Scene, reason
+from processor.model import Bools, Floats, Ints, Scan, Scene, reason
 
 REACH_MM, PITCH_SHARE = 25.0, 0.4  # of a hole from its designed place, and at most this share of the way to the next
 RING_MM = 15.0  # width of the ring of the face around a hole whose points give the height of its plate
@@ -116,18 +116,22 @@ def _rows(across: Floats) -> Ints:
     return row
 
 
-def measured(cloud: Cloud, group: Group, first: int, temperature_C: float = float("nan")) -> list[Characteristic]:
-    """Return the characteristics of a group whose holes are numbered from ``first``.
+def fitted(cloud: Cloud, group: Group, temperature_C: float = float("nan")) -> Fitted:
+    """Return the holes of a group as measured.
 
     Lengths are those at the reference temperature, if that of the steel is known.
     """
-    places = np.array([group.axes @ hole.middle for hole in group.holes])
+    places = _designed(group)
     between = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(len(places), np.inf))
     reach = np.minimum(REACH_MM, PITCH_SHARE * between.min(axis=1))
     bores = [_bore(cloud, group, hole) for hole in group.holes]
     radius = np.array([hole.radius for hole in group.holes])
-    fitted = _referred(bore_fit.fit(bores, radius, reach, cloud.sources), places, radius, temperature_C)
-    return list(_characteristics(places, radius, fitted, first))
+    return _referred(bore_fit.fit(bores, radius, reach, cloud.sources), places, radius, temperature_C)
+
+
+def _designed(group: Group) -> Floats:
+    """Return the designed places (h, 2) along the axes of a group."""
+    return np.array([group.axes @ hole.middle for hole in group.holes])
 
 
 def _referred(fitted: Fitted, places: Floats, radius: Floats, temperature_C: float) -> Fitted:
@@ -165,13 +169,18 @@ def _level(height: Floats, beyond: Floats, hole: Hole) -> float:
     return float(np.mean(found)) if found else 0.0
 
 
+def characteristics(group: Group, fitted: Fitted, first: int) -> Iterator[Characteristic]:
+    """Yield the characteristics of a group whose holes are numbered from ``first``."""
+    yield from _characteristics(_designed(group), np.array([hole.radius for hole in group.holes]), fitted, first)
+
+
 def _characteristics(places: Floats, radius: Floats, fitted: Fitted, first: int) -> Iterator[Characteristic]:
     known = np.flatnonzero(np.isfinite(fitted.departure).all(axis=1))
     why = reason("inspect.hole-not-seen")
     if len(places) >= FEWEST_PLACED:
         within = _within(places, fitted, known) if len(known) >= FEWEST_PLACED else None
         yield from _places(places, within, known, first)
-        yield _passing(radius[known], fitted, within, known, (first, first + len(places) - 1))
+        yield _passing(fitted, within, known, (first, first + len(places) - 1))
     for a, b in _neighbours(places):
         id_, nominal = f"pitch-{first + a}-{first + b}", float(np.linalg.norm(places[b] - places[a]))
         if a in known and b in known:
@@ -228,29 +237,41 @@ def _places(places: Floats, within: tuple[Floats, Floats] | None, known: Ints, f
 
 
 def _passing(
-    radius: Floats, fitted: Fitted, within: tuple[Floats, Floats] | None, known: Ints, numbers: tuple[int, int]
+    fitted: Fitted, within: tuple[Floats, Floats] | None, known: Ints, numbers: tuple[int, int]
 ) -> Characteristic:
-    """Return the share of a group's holes that a gauge pin passes together with a splice plate drilled as designed.
-
-    The pin is thinner than the nominal hole by UNDER_MM. It passes a hole of radius r, off the plate's hole of radius R
-    by e, if e <= r + R - d for the pin's diameter d: r + R - e is the width that both leave open. The share is the mean
-    of the probabilities of the holes seen, its interval that of draws of all errors together. It is of the whole group:
-    of the holes not seen none passes at its lower end, and all do at its upper end.
-    """
-    id_, holes = f"holes-{numbers[0]}-{numbers[1]}-pass-through", numbers[1] - numbers[0] + 1
+    """Return the share of a group's holes that a gauge pin passes together with a splice plate drilled as designed."""
+    id_ = f"holes-{numbers[0]}-{numbers[1]}-pass-through"
     if within is None:
         why = (reason("inspect.few-holes-seen"),)
         return Characteristic(id_, Quantity.PASS_THROUGH, 1.0, unit="1", why=why)
-    mean, covariance = np.concatenate([within[0], fitted.departure[known, 2]]), within[1]
+    return share_of(id_, passes(within[0], fitted.departure[known, 2], within[1]), numbers[1] - numbers[0] + 1)
+
+
+def passes(off: Floats, wider: Floats, covariance: Floats) -> Bools:
+    """Return for draws of the errors (d, n) whether a gauge pin passes a hole together with that of its splice plate.
+
+    Holes are ``off`` those of the plate (2n,) and ``wider`` (n,) than designed, with their covariance (3n, 3n). The pin
+    is thinner than the nominal hole by UNDER_MM. It passes a hole of radius r, off the plate's hole of radius R by e,
+    if e <= r + R - d for the pin's diameter d: r + R - e is the width that both leave open.
+    """
+    mean, count = np.concatenate([off, wider]), len(wider)
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     drawn = mean + np.random.default_rng(SEED).standard_normal((DRAWS, len(mean))) @ root.T
-    count = len(known)
-    off = np.hypot(drawn[:, 0 : 2 * count : 2], drawn[:, 1 : 2 * count : 2])
-    pin = 2.0 * radius - UNDER_MM
-    passed = (off <= 2.0 * radius - pin + drawn[:, 2 * count :]).mean(axis=1)
-    low, high = np.quantile(passed, [0.025, 0.975]) * count
-    unseen = holes - count
+    passed: Bools = (
+        np.hypot(drawn[:, 0 : 2 * count : 2], drawn[:, 1 : 2 * count : 2]) <= UNDER_MM + drawn[:, 2 * count :]
+    )
+    return passed
+
+
+def share_of(id_: str, passed: Bools, holes: int) -> Characteristic:
+    """Return the share of ``holes`` holes that a pin passes, by draws (d, n) of those seen.
+
+    It is the mean of the probabilities of the holes seen, its interval that of draws of all errors together. It is of
+    all holes: of those not seen none passes at its lower end, and all do at its upper end.
+    """
+    unseen = holes - passed.shape[1]
+    low, high = np.quantile(passed.sum(axis=1), [0.025, 0.975])
     return Characteristic(
         id_,
         Quantity.PASS_THROUGH,

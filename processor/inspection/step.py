@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from processor.inspection import arch_parts, bridge_holes, members, structure_bodies
+from processor.inspection import arch_parts, bridge_holes, members, splices, structure_bodies
 from processor.inspection.params import METHODS, Params
 from processor.inspection.result import Result
 from processor.model import InputError, Scene, Status, UsageError, reason
@@ -63,5 +63,8 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
         return structure_bodies.inspect(
             scene, found, (earlier or {}).get("stitch"), params.least_face_mm, params.method
         )
-    drilled = {} if found is None else bridge_holes.of_parts(scene, found)
-    return arch_parts.inspect(scene.arch, found, scene.tolerance, params.method, drilled)
+    drilled = [] if found is None else bridge_holes.of_parts(scene, found)
+    of_holes = arch_parts.HoleCharacteristics(
+        bridge_holes.characteristics(drilled), splices.of_joints(scene.arch, drilled)
+    )
+    return arch_parts.inspect(scene.arch, found, scene.tolerance, params.method, of_holes)

@@ -98,7 +98,7 @@ def _holes(body: Body, cloud: Cloud, temperature_C: float) -> Iterator[Character
     """Yield the characteristics of a body's holes, numbered over the whole body."""
     first = 1
     for group in holes.groups(list(body.holes), [axis.direction for axis in body_axes(body)]):
-        yield from holes.measured(cloud, group, first, temperature_C)
+        yield from holes.characteristics(group, holes.fitted(cloud, group, temperature_C), first)
         first += len(group.holes)
 
 

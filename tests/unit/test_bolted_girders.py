@@ -8,7 +8,7 @@ import pytest
 
 from designgen.designs import assembly, bolting, girder
 from designgen.scenes import make as scenes
-from processor.inspection import bridge_holes
+from processor.inspection import bridge_holes, splices
 from processor.model import Status, UsageError
 from processor.preassembly.result import Components
 
@@ -140,7 +140,8 @@ def test_holes_of_girders_are_measured_where_they_were_drilled():
         name=names, status=(Status.OK,) * 2, reasons=((),) * 2, scans=names, T_bridge_scan=truth.arch.T_bridge_scan,
         covariance=np.zeros((2, 6, 6)), key_points_scan=np.zeros((2, 2, 8, 3)), key_points_sd=np.zeros((2, 2, 8, 3)),
     )  # fmt: skip
-    found = bridge_holes.of_parts(scene, SimpleNamespace(components=table, method="adjustment"))
+    drilled = bridge_holes.of_parts(scene, SimpleNamespace(components=table, method="adjustment"))
+    found = bridge_holes.characteristics(drilled)
     held = []
     for part in assembly.build(SIZES, BOLTS).parts:
         bores = part.girder.bores
@@ -165,8 +166,11 @@ def test_holes_of_girders_are_measured_where_they_were_drilled():
         pitches = [one for id_, one in by_id.items() if id_.startswith("pitch")]
         assert len(pitches) == 2 + 10  # of each flange one; of two by four in the web ten
     assert np.mean(held) > 0.7  # of 16
+    joint = {one.id: one for one in splices.of_joints(scene.arch, drilled)[scene.arch.joint_names[0]]}
+    assert list(joint) == [*(f"plate-{k}-pass-through" for k in (1, 2, 3)), "splice-pass-through"]
+    assert all(one.low <= one.deviation <= one.high and not one.why for one in joint.values())
 
 
 def test_a_bridge_without_holes_has_none():
     scene, _, _ = made(seed=7, scan={"spacing_mm": 100.0}, bolts=False)
-    assert bridge_holes.of_parts(scene, None) == {}
+    assert bridge_holes.of_parts(scene, None) == []

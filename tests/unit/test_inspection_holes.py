@@ -111,7 +111,7 @@ def group():
 
 def measured(points, ray, source):
     cloud = holes.Cloud(points, ray, source, 3, cKDTree(points))
-    return {one.id: one for one in holes.measured(cloud, group(), 1)}
+    return {one.id: one for one in holes.characteristics(group(), holes.fitted(cloud, group()), 1)}
 
 
 def without_motion(departure):
