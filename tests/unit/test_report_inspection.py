@@ -74,8 +74,9 @@ def test_the_table_has_a_row_a_characteristic(execution):
     tables = {table.file: table for table in all_tables.tables_of_run(execution, ErrorReport())}
     rows = list(csv.DictReader(io.StringIO(csv_text(tables["inspect"]))))
     assert [row["characteristic"] for row in rows][-1] == "end-squareness-over-width"
-    assert (rows[0]["component"], float(rows[0]["deviation_mm"]), rows[0]["verdict"]) == ("rib1", 3.5, "pass")
-    assert rows[3]["actual_mm"] == ""
+    assert (rows[0]["component"], float(rows[0]["deviation"]), rows[0]["verdict"]) == ("rib1", 3.5, "pass")
+    assert rows[3]["actual"] == ""
+    assert rows[3]["unit"] == "mm"
     assert rows[3]["remark"] == "not measured at: end"
     assert len(tables["inspect-axes"].rows) == 2
 

@@ -27,10 +27,10 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     result: Result = runs[0].result
     if not result.components:
         return []
-    columns = ("component", "characteristic", "quantity", "nominal_mm", "actual_mm", "deviation_mm", "ci95_mm",
-               "lower_mm", "upper_mm", "verdict", "clause", "remark")  # fmt: skip
+    columns = ("component", "characteristic", "quantity", "nominal", "actual", "deviation", "ci95",
+               "lower", "upper", "unit", "verdict", "clause", "remark")  # fmt: skip
     rows = tuple(row for component in result.components for row in _rows(component))
-    tables = [Table(text("Characteristics of components (mm)"), columns, rows, "inspect", NOTE, on_terminal=False)]
+    tables = [Table(text("Characteristics of components"), columns, rows, "inspect", NOTE, on_terminal=False)]
     if any(len(component.axis) for component in result.components):
         tables.append(_axes(result))
     return tables
@@ -42,7 +42,7 @@ def _rows(component: InspectedComponent) -> Iterator[tuple[Any, ...]]:
         yield (
             component.name, found.id[i], found.quantity[i], float(found.nominal[i]), float(found.actual[i]),
             float(found.deviation[i]), float(found.ci95[i]), float(found.lower[i]), float(found.upper[i]),
-            found.verdict[i], found.clause[i], found.reasons[i],
+            found.unit[i], found.verdict[i], found.clause[i], found.reasons[i],
         )  # fmt: skip
 
 
