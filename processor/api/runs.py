@@ -14,6 +14,7 @@ from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
 from processor.evaluation.evaluate import ErrorReport
+from processor.geometry.parallel import one_blas_thread
 from processor.jobs import tile_cluster
 from processor.model import LONGEST_NAME, Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
@@ -156,7 +157,7 @@ def compute(
         jobs = pipeline.jobs_for(input_, wanted, methods, parameters, seed)
         if out is not None:
             write_results.check_output(out, None)
-        with tile_cluster.on_cluster(cluster, log):
+        with tile_cluster.on_cluster(cluster, log), one_blas_thread():
             return Results(pipeline.execute(Path(input_.name), input_, jobs, log))
     path = files.existing(Path(input_))
     if out is not None:
@@ -166,7 +167,7 @@ def compute(
     place = out.resolve() if out else None
     before = fingerprint.signature(path.resolve(), place)
     folder = Path(tempfile.gettempdir()) if out is None else output_checks.existing_parent(out)
-    with tile_cluster.on_cluster(cluster, log), large_arrays.in_files(folder):
+    with tile_cluster.on_cluster(cluster, log), large_arrays.in_files(folder), one_blas_thread():
         with stage(f"reading {path.name}"):
             scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
         _log_reading(path, scene, log, () if wanted else jobs)

@@ -6,11 +6,15 @@ The result of an item does not depend on other items, so that neither the number
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
 from typing import TypeVar
+
+import scipy.linalg  # noqa: F401 - so that its BLAS is limited, too: one that is loaded later is not
+from threadpoolctl import threadpool_limits
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -20,6 +24,13 @@ PIECES = 32  # ranges; more than threads, since they do not all take the same ti
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="kernels")
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Keep linear algebra to one thread: the last digits of its sums depend on the number of threads."""
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 def usable() -> int:

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import designgen
 import processor
+from processor import pipeline
 from processor.geometry import rigid
 from processor.model import InputError, Scene, Status, UsageError, Verdict
 from tests.support.meshes import bracket
@@ -36,6 +38,24 @@ def test_every_name_of_the_interface_is_there():
 
 def test_both_packages_are_typed():
     assert (Path(processor.__file__).parent / "py.typed").exists()
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_steps_run_with_one_thread_of_linear_algebra(in_memory, monkeypatch):
+    """With more the last digits of results would depend on the machine."""
+    seen = []
+    execute = pipeline.execute
+
+    def observed(*arguments):
+        seen.extend(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+        return execute(*arguments)
+
+    monkeypatch.setattr(pipeline, "execute", observed)
+    with threadpool_limits(2, user_api="blas"):
+        processor.run(
+            processor.read(SCAN_FOLDER) if in_memory else SCAN_FOLDER, steps="spheres", method="least-squares"
+        )
+    assert set(seen) == {1}
 
 
 def test_a_sphere_of_a_target():

@@ -19,6 +19,7 @@ its uncertainty, which few views leave large, as the variance of Student's t doe
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -75,12 +76,14 @@ def correlation(cosine: Floats) -> Floats:
     return product
 
 
+@cache
 def modes() -> Floats:
-    """Factor (200, 16) of the correlation over the cells of normals, the smoothest modes first."""
+    """Factor (200, 16) of the correlation over the cells of normals, the smoothest modes first; not to be written."""
     normal = directions()
     values, vectors = np.linalg.eigh(correlation(normal @ normal.T))
     largest = np.argsort(-values, kind="stable")[:MODES]
     factor: Floats = vectors[:, largest] * np.sqrt(values[largest])
+    factor.flags.writeable = False
     return factor
 
 
@@ -89,11 +92,11 @@ def field_of(balls: list[BallResiduals]) -> ViewField:
     # Equal probability for equal ratios, to the class's error of a view; beyond it less, as of a Cauchy distribution.
     prior = -np.log1p((SD_MM / VIEW_MM) ** 2)
     log_probability = np.tile(prior, (len(LENGTHS_MM), 1))
-    scores = [score for ball in balls if (score := _score(ball)) is not None]
-    if scores:
-        y, H = np.concatenate([y for y, _ in scores]), np.concatenate([H for _, H in scores])
-        row = np.repeat(np.arange(len(scores)), [len(y) for y, _ in scores])
-        places = np.array([ball.place for ball in balls if _score(ball) is not None])
+    known = [(ball.place, score) for ball in balls if (score := _score(ball)) is not None]
+    if known:
+        y, H = np.concatenate([y for _, (y, _) in known]), np.concatenate([H for _, (_, H) in known])
+        row = np.repeat(np.arange(len(known)), [len(y) for _, (y, _) in known])
+        places = np.array([place for place, _ in known])
         distance = np.linalg.norm(places[:, None] - places[None], axis=2)[np.ix_(row, row)]
         product = H @ H.T
         for i, length in enumerate(LENGTHS_MM):
