@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from processor import large_arrays, readers, record_checks, store
+from processor.geometry import rigid
 from processor.model import (
     KINDS,
     ArchDesign,
@@ -397,6 +398,9 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
         pose[:3, 3] *= scale
     position = raw.position if entry.position is None else entry.position
     station = raw.station if stations is not None else raw.station[:0]
+    if stations is not None and not position.size and not station.any():
+        position = _named_position(entry.station or raw.name, stations, pose) / scale
+        station = station[:0] if position.size else station
     if stations is not None and len(station):
         least, most = map(int, large_arrays.extremes(raw.station))
         if not 0 <= least <= most <= len(stations.ids):
@@ -422,6 +426,14 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
         sigma_mm=entry.sigma_mm,
         colour=raw.colour,
     )
+
+
+def _named_position(name: str, stations: Stations, pose: Floats) -> Floats:
+    """Return the position (3,) in mm, in a scan's frame, of the station that has the scan's name; (0,) without one."""
+    if name not in stations.ids:
+        return np.empty(0)
+    position = stations.positions[stations.ids.index(name)]
+    return rigid.apply(rigid.invert(pose), position) if pose.size else position
 
 
 def _from_0(station: Ints) -> Labels:

@@ -73,6 +73,22 @@ def test_all_that_a_project_file_says(bridge):
     assert len(scene.scans) == 2
 
 
+def test_a_scan_named_like_a_station_was_seen_from_there(tmp_path):
+    """Of files a station, stations.json states the scanners' places: in the project's frame, also of a posed scan."""
+    for name in ("S1", "S2", "S3"):
+        write_xyz(tmp_path / f"{name}.xyz", surface(0))
+    stations = {"S1": {"position": [1.0, 2.0, 3.0]}, "east": {"position": [7.0, 22.0, 33.0]}}
+    (tmp_path / "stations.json").write_text(json.dumps(stations))
+    posed = '[[scan]]\nfile = "S2.xyz"\nstation = "east"\npose = [[0,-1,0,10], [1,0,0,20], [0,0,1,30], [0,0,0,1]]\n'
+    files = '[[scan]]\nfile = "S1.xyz"\n[[scan]]\nfile = "S3.xyz"\n'
+    project(tmp_path, 'kind = "structure"\nunits = "m"\n' + files + posed)
+    scans = {scan.name: scan for scan in folder.read_input(tmp_path).scans}
+    assert scans["S1"].position.tolist() == [1000.0, 2000.0, 3000.0]
+    # The pose maps (2, 3, 3) to (10 - 3, 20 + 2, 30 + 3).
+    assert np.allclose(scans["S2"].position, [2000.0, 3000.0, 3000.0], rtol=0, atol=1e-9)
+    assert not scans["S3"].position.size
+
+
 def test_a_chinese_project_file_in_gb18030(bridge):
     (bridge / "project.toml").write_bytes('name = "东桥"\n'.encode("gb18030"))
     assert folder.read_input(bridge).name == "东桥"
