@@ -76,8 +76,8 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
 def _doubted(result: Result, placement: Placement) -> Result:
     """Put first why a result is not sure.
 
-    Either the scan does not lie at the design, or scans were left out, or the registration is less certain than what
-    scanners and single points are wrong by.
+    Either the scan does not lie at the design, or scans were left out, or single points scatter as they do at a wrong
+    pose, or the registration is less certain than what scanners and single points are wrong by.
     """
     status, error = result.status, result.registration_error
     given = result.registration is Registration.AS_GIVEN
@@ -88,6 +88,10 @@ def _doubted(result: Result, placement: Placement) -> Result:
         points = sum(one.points for one in placement.left_out)
         first = reason("deviation.scans-elsewhere", scans=names, points=points, read=result.points_read)
         status = Status.WEAK if status is Status.OK else status
+    elif result.registration is Registration.COARSE and result.sigma >= surface_registration.most_scatter(
+        result.on_surface_share
+    ):
+        first, status = reason("deviation.no-fit", sigma=result.sigma), Status.WEAK if status is Status.OK else status
     elif status is Status.OK and error > max(UNCERTAIN * result.sigma, scanner_class.SHIFT_MM) and not given:
         first, status = reason("deviation.registration-uncertain", sd=error, sigma=result.sigma), Status.WEAK
     else:

@@ -82,7 +82,12 @@ def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> S
 
 def fits(fitted: SurfaceFit) -> bool:
     """Whether the scan is of the design's part: the points that are not clutter lie on its surface."""
-    return fitted.sigma_mm < NO_FIT_MM[fitted.used_share < 1.0 - CLUTTER_SHARE]
+    return fitted.sigma_mm < most_scatter(fitted.used_share)
+
+
+def most_scatter(on_surface: float) -> float:
+    """Return the scatter in mm above which a scan, with such a share on the surface, does not fit its design."""
+    return NO_FIT_MM[on_surface < 1.0 - CLUTTER_SHARE]
 
 
 def _iterate(

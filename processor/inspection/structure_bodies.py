@@ -69,7 +69,8 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     if any(body.holes for body in found):
         T = deviation.T_design_scan if deviation.T_design_scan.size else np.eye(4)
         cloud = holes.cloud_of(scene, T, stitched, scene_cloud.local_design(scene.structure)[1])
-    doubtful = deviation.status is Status.AMBIGUOUS
+    unproven = any(one.code == "deviation.no-fit" for one in deviation.reasons)
+    doubtful = deviation.status is Status.AMBIGUOUS or unproven
     components = tuple(
         component for body in found if (component := _component(body, scene, cloud, doubtful)) is not None
     )
@@ -77,7 +78,8 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     if not components:
         remarks = (reason("inspect.no-flat-bodies"), *remarks)
     if doubtful:
-        remarks = (reason("inspect.pose-ambiguous"), *remarks)
+        why = reason("inspect.pose-unproven") if unproven else reason("inspect.pose-ambiguous")
+        remarks = (why, *remarks)
     return Result.of_components(components, method, remarks)
 
 

@@ -12,6 +12,8 @@ from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline
 from processor.adjustment import scanner_class
+from processor.defects import design_pose
+from processor.defects.params import Params as DefectParams
 from processor.deviation import baseline, mean_uncertainty
 from processor.deviation import step as deviation_step
 from processor.deviation.cloud import ScanCloud
@@ -127,6 +129,19 @@ def test_a_thin_plate_seen_from_one_side_is_not_surely_registered(sigma, monkeyp
     assert codes(result)[0] == "deviation.registration-uncertain"
     thick = plate_clouds.plate(8.0, 1, plate_clouds.STATIONS[:1], positions=False)
     assert deviation_step.run(thick, deviation_step.Params(register="fine")).status == "ok"
+
+
+@pytest.mark.parametrize(("sigma", "proven"), [(3.0, True), (12.0, False)])
+def test_a_pose_about_which_points_scatter_is_not_proven(sigma, proven, monkeypatch):
+    """From any attitude, a pose is one of the design's only if points lie at its surface: within 10 mm (one sd)."""
+    monkeypatch.setattr("tests.unit.test_deviation_step.SIGMA", sigma)
+    scene, _ = scene_of(3, lambda p: 0.0 * p, count=20_000)
+    result = deviation_step.run(scene, deviation_step.Params(register="coarse"))
+    assert 0.6 * sigma < result.sigma < 1.4 * sigma
+    assert (codes(result)[0] == "deviation.no-fit") is not proven
+    assert result.status == ("ok" if proven else "weak")
+    placed = design_pose.pose(scene, {"deviation": result}, DefectParams())
+    assert (placed.doubt is None, placed.status) == ((True, "ok") if proven else (False, "weak"))
 
 
 def test_a_scan_in_another_frame_is_registered_whatever_its_order():
