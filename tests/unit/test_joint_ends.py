@@ -319,3 +319,29 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
     both = J @ stated.motion_with_pose[6:, 6:] @ own.T
     covariance = J @ stated.motion_covariance[6:, 6:] @ J.T + both + both.T + own @ pose @ own.T
     np.testing.assert_allclose(np.std(moved, axis=0), np.sqrt(np.diag(covariance)), rtol=0.2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_outlier_beyond_a_strip_does_not_bend_the_face(seed):
+    """The strip's terms are as without it: it alone determines the bend, so no residual shows that it is wrong."""
+    rng = np.random.default_rng(seed)
+    x, w = rng.uniform(-60.0, 0.0, 200), rng.uniform(-1.0, 1.0, 200)
+    height = 1.5 + 0.5 * rng.standard_normal(200)
+    clean = ends_faces.least_squares(ends_faces.basis(x, w), height)
+    basis = ends_faces.basis(np.append(x, -480.0), np.append(w, 0.7))
+    coefficients, residual, used = ends_faces.least_squares(basis, np.append(height, -70.0))
+    assert not used[-1]
+    assert len(residual) == used.sum() >= 190
+    np.testing.assert_allclose(coefficients, clean[0], atol=1e-9)
+
+
+def test_a_face_seen_as_a_strip_and_one_outlier_keeps_its_corners():
+    """The bottom was seen within 60 mm of the end, but for one point 40 mm off at 480 mm; the end is as designed."""
+    rng = np.random.default_rng(5)
+    points = cloud(rng, 12.0)
+    bottom = (points[:, 2] < T + 1.0) & (points[:, 0] < -0.5)
+    strip = (points[:, 2] == 0.0) & (points[:, 0] > -60.0)
+    points = np.vstack([points[~bottom | strip], [[-480.0, 0.6 * B, -40.0]]])
+    end = fitted(points, rng)
+    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
+    assert (np.abs(end.departure) < 4.0 * np.hypot(sd, 0.05)).all()

@@ -36,6 +36,8 @@ BESIDE_MM = 30.0  # of an edge's width, in which its points are looked for
 REACH_MM = 80.0  # largest departure of an end from the design
 LEAST_POINTS = 60
 LEAST_POINTS_OF_EDGE = 20
+LEAST_REDUNDANCY = 0.5  # of a point in a fit, 1 less its leverage: most of an error then shows in its residual
+ROUNDS = 12  # of a fit, without the points that do not belong to it
 CELLS = (5, 6)  # of a face, along and across, for its outermost layer and its lack of fit
 FLOOR_MM = 0.004  # least standard deviation: of the design's mesh and of rounding
 
@@ -253,18 +255,23 @@ def _inner_side(local: Floats, depth: Floats, place: EndPlace, across: int) -> B
 def least_squares(basis: Floats, value: Floats, least: int = LEAST_POINTS) -> tuple[Floats, Floats, Bools]:
     """Coefficients (k,), residuals of the inliers, and a mark of these; empty for too few points.
 
-    Coefficients that the points do not determine, as of a face seen as one strip, are 0 within REACH_MM.
+    Coefficients that the points do not determine, as of a face seen as one strip, are 0 within REACH_MM. A point that
+    alone determines one has no residual to be tested by, so an outlier there would bend the whole face: points of less
+    redundancy than LEAST_REDUNDANCY (Baarda 1968) are left out.
     """
     used = np.ones(len(value), bool)
     expected = np.eye(basis.shape[1]) / REACH_MM
     coefficients: Floats = np.empty(0, np.float64)
-    for _ in range(6):
+    tested = np.ones(len(value), bool)
+    for _ in range(ROUNDS):
         if used.sum() < least:
             return np.empty(0), np.empty(0), used
         rows = np.vstack([basis[used], expected]), np.append(value[used], np.zeros(len(expected)))
         coefficients = np.asarray(np.linalg.lstsq(*rows, rcond=None)[0], np.float64)
         residual = value - basis @ coefficients
-        now = np.abs(residual) < 4.5 * max(robust_sd_about_median(residual[used]), FLOOR_MM)
+        orthonormal = np.linalg.qr(rows[0])[0][: int(used.sum())]
+        tested[used] = 1.0 - np.einsum("ij,ij->i", orthonormal, orthonormal) > LEAST_REDUNDANCY
+        now = tested & (np.abs(residual) < 4.5 * max(robust_sd_about_median(residual[used]), FLOOR_MM))
         if (now == used).all():
             break
         used = now
