@@ -345,3 +345,17 @@ def test_a_face_seen_as_a_strip_and_one_outlier_keeps_its_corners():
     end = fitted(points, rng)
     sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
     assert (np.abs(end.departure) < 4.0 * np.hypot(sd, 0.05)).all()
+
+
+@pytest.mark.parametrize("thickness", [16.0, 24.0])
+def test_the_inner_side_beyond_a_strip_of_the_outer_face_is_told_from_it(thickness):
+    """The outer side was seen within 100 mm of the end, the inner one beyond; the plate is tilted by 4 mm a metre."""
+    rng = np.random.default_rng(7)
+    x, w = -rng.uniform(0.0, 500.0, 400), rng.uniform(-1.0, 1.0, 400)
+    beyond = x < -100.0
+    out = 1.0 + 0.004 * x + 0.5 * w + 0.5 * rng.standard_normal(400) - thickness * beyond
+    terms = np.stack([np.ones_like(x), x / 500.0, w, w * x / 500.0], axis=1)
+    assert (plate_sides.inner_of_two(out, terms, thickness) == beyond).all()
+    one_side = out + thickness * beyond
+    assert not plate_sides.inner_of_two(one_side, terms, thickness).any()
+    assert not plate_sides.inner_of_two(one_side + 8.0 * (x / 500.0) ** 2, terms, thickness).any()

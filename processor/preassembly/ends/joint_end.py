@@ -159,12 +159,12 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
     if zone.sum() < 5 * LEAST_POINTS:
         return unknown(reason("preassemble.few-points-at-joint"))
     part, local = part.only(zone), local[zone]
-    faces = ends_faces.fit(part, local, place)
+    thickness = _design_thickness(part.surface, place)
+    faces = ends_faces.fit(part, local, place, thickness)
     if isinstance(faces, Reason):
         return unknown(faces)
     residual = np.concatenate([face.used.residual for face in faces])
     sigma = float(np.sqrt(residual @ residual / max(len(residual) - FACE * len(faces), 1)))
-    thickness = _design_thickness(part.surface, place)
     faces, sides = _outer_sides(local, faces, place, thickness, sigma)
     ring, on_ring = _fit_ring(local, part.station, faces, place, thickness, sigma)
     if not len(ring.coefficients):

@@ -134,9 +134,15 @@ def _nearest_face(surface: MeshSurface, place: EndPlace, face: EndFace, facets: 
     return int(surface.part_of[facets[np.argmin(score)]])
 
 
-def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] | Reason:
-    """Fit the outer faces to the points of the joint's zone, ``local`` (n, 3) in its frame; or the reason why not."""
-    faces = _on_faces(part, local, place)
+def fit(part: RegisteredPart, local: Floats, place: EndPlace, thickness: Floats) -> list[FaceFit] | Reason:
+    """Fit the outer faces to the points of the joint's zone, ``local`` (n, 3) in its frame; or the reason why not.
+
+    ``thickness`` (f,) is that of the faces' plates as designed; 0 = unknown.
+    """
+    faces = [
+        _without_inner_side(sheets, local, face, float(of_plate))
+        for sheets, face, of_plate in zip(_on_faces(part, local, place), place.section.faces, thickness, strict=True)
+    ]
     centred = [sheets.out - np.median(sheets.out) for sheets in faces if len(sheets.out)]
     margin = 3.0 * robust_sd_about_median(np.concatenate(centred or [np.empty(0)])) + 2.0
     fits = []
@@ -241,6 +247,24 @@ def _on_faces(part: RegisteredPart, local: Floats, place: EndPlace) -> list[_She
         single_layer = len(rows) - int(layer.sum()) < plate_sides.SECOND_SHARE * len(rows)
         faces.append(_Sheets(rows[layer], out[layer], cell[layer], rows[~layer], out[~layer], single_layer))
     return faces
+
+
+def _without_inner_side(sheets: _Sheets, local: Floats, face: EndFace, thickness: float) -> _Sheets:
+    """Put points of the inner side of a plate, taken for its outer face, behind it."""
+    if not face.plate:
+        return sheets
+    x, w = local[sheets.rows, 0] / ZONE_MM, face.w(local[sheets.rows])
+    inner = plate_sides.inner_of_two(sheets.out, np.stack([np.ones_like(x), x, w, x * w], axis=1), thickness)
+    if not inner.any():
+        return sheets
+    return _Sheets(
+        rows=sheets.rows[~inner],
+        out=sheets.out[~inner],
+        cell=sheets.cell[~inner],
+        behind=np.concatenate([sheets.behind, sheets.rows[inner]]),
+        behind_out=np.concatenate([sheets.behind_out, sheets.out[inner]]),
+        single_layer=False,
+    )
 
 
 def _inner_side(local: Floats, depth: Floats, place: EndPlace, across: int) -> Bools:

@@ -21,6 +21,7 @@ FEWEST_BESIDE = 10  # points of the end face on one side of a layer, which show 
 CLIMBS = 2  # a plate has two sides
 ONE_LAYER_SHARE = 0.7  # of the points above a layer that must lie on one surface, to be a layer themselves
 THINNEST_MM = 6.0
+FEW, STARTS = 500, (0.1, 0.5, 0.9)  # points by which two sides are looked for, and quantiles of heights to begin at
 RING_SHARE = 0.95  # quantile of a ring's points that is taken for this share of the thickness
 
 
@@ -61,6 +62,39 @@ def outer_surface(out: Floats, basis: Floats, cell: Ints) -> Bools:
         level = basis @ coefficients
     layer: Bools = np.abs(out - level) < LAYER_MM
     return layer
+
+
+def inner_of_two(out: Floats, basis: Floats, thickness_mm: float) -> Bools:
+    """Mark points that are on the inner side of a plate ``thickness_mm`` thick, where ``out`` (n,) holds both sides.
+
+    Where the outer side was seen near the end alone and the inner one beyond, a bent surface may run from one to the
+    other. Two surfaces of one shape in ``basis`` (n, k), a thickness apart, are taken if they halve what one leaves.
+    """
+    none = np.zeros(len(out), bool)
+    if len(out) < 2 * FEWEST_OF_CELL or thickness_mm < THINNEST_MM:
+        return none
+    few = np.linspace(0, len(out) - 1, min(len(out), FEW)).astype(np.int64)
+    points, terms = out[few], basis[few]
+    spread = 0.5 * _spread(points - terms @ _least_absolute(terms, points))
+    best: Floats | None = None
+    for start in np.quantile(points, STARTS):
+        level = np.full(len(few), start)
+        for _ in range(3):
+            raised = points + thickness_mm * (points - level < -0.5 * thickness_mm)
+            coefficients = _least_absolute(terms, raised)
+            level = terms @ coefficients
+        left = _spread(raised - level)
+        if left < spread:
+            best, spread = coefficients, left
+    if best is None:
+        return none
+    inner: Bools = out - basis @ best < -0.5 * thickness_mm
+    return inner if min(inner.sum(), (~inner).sum()) >= FEWEST_OF_CELL else none
+
+
+def _spread(residual: Floats) -> float:
+    """Mean absolute residual, of which outliers are no large share."""
+    return float(np.mean(np.minimum(np.abs(residual), LAYER_MM)))
 
 
 def _through_cells(out: Floats, basis: Floats, cell: Ints) -> Floats | None:
