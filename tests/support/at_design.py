@@ -18,6 +18,7 @@ class _Measured:
     registration: Registration = Registration.AS_GIVEN
     registration_error: float = DEFAULT_ERROR_MM
     T_design_scan: Floats = field(default_factory=lambda: np.eye(4))
+    reasons: tuple = ()
 
 
 AT_DESIGN = {"deviation": _Measured()}
