@@ -41,6 +41,14 @@ def welded(vertices: Floats, faces: Ints, body: Ints | None) -> tuple[Floats, In
     return vertices[corners[places.first]], places.number.reshape(faces.shape)
 
 
+def pieces(faces: Ints) -> Ints:
+    """Return the connected piece (f,) of each facet; vertices at one place are one, see :func:`welded`."""
+    count = int(faces.max(initial=-1)) + 1
+    links = coo_array((np.ones(2 * len(faces), np.int8), (faces[:, :2].ravel(), faces[:, 1:].ravel())), (count, count))
+    piece: Ints = connected_components(links, directed=False)[1][faces[:, 0]].astype(np.int64)
+    return piece
+
+
 def component_name(number: int) -> str:
     """Return the name of a component of a mesh whose bodies have no names; the first has the number 0."""
     return f"component-{number + 1}"
@@ -52,9 +60,7 @@ def components(vertices: Floats, faces: Ints) -> Ints:
     A component is a set of bodies that touch, or a single body where more than MOST_BODIES touch. ``vertices`` at one
     place are one, see :func:`welded`.
     """
-    links = coo_array((np.ones(2 * len(faces), np.int8), (faces[:, :2].ravel(), faces[:, 1:].ravel())),
-                      (len(vertices),) * 2)  # fmt: skip
-    body = connected_components(links, directed=False)[1][faces[:, 0]].astype(np.int64)
+    body = pieces(faces)
     vertex, facet = mesh_distance.touching(vertices, faces, TOUCH_MM)
     body_of_vertex = np.full(len(vertices), -1, np.int64)
     body_of_vertex[faces.ravel()] = np.repeat(body, 3)

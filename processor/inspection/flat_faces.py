@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from processor import scene_cloud
 from processor.adjustment import groups, scanner_class
@@ -181,11 +179,8 @@ def _bodies(design: StructureDesign, vertices: Floats) -> tuple[tuple[str, ...],
     if design.bodies is not None:
         return design.bodies.names, design.bodies.of_facet
     welded, faces = mesh_bodies.welded(vertices, design.faces, None)
-    a, b = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
-    links = coo_array((np.ones(len(a), np.int8), (a, b)), (int(faces.max()) + 1,) * 2)
-    piece = connected_components(links, directed=False)[1][faces[:, 0]]
     component = mesh_bodies.components(welded, faces)
-    places = distinct(np.column_stack([component, piece]))
+    places = distinct(np.column_stack([component, mesh_bodies.pieces(faces)]))
     number: Ints = places.number.reshape(-1).astype(np.int64)
     of_body = component[places.first]
     names = []
