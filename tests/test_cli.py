@@ -31,12 +31,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def processor(*arguments, cwd=None):
+    # Linear algebra for another type of processor has other last digits.
+    algebra = {name: value for name, value in os.environ.items() if name.startswith("OPENBLAS_")}
     return subprocess.run(
         [sys.executable, "-m", "processor", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=cwd or ROOT,
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), "LANG": "C.UTF-8", "MPLBACKEND": "Agg"},
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), "LANG": "C.UTF-8", "MPLBACKEND": "Agg", **algebra},
         check=False,
     )
 

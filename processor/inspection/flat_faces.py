@@ -1,9 +1,8 @@
 """Flat faces of a design's bodies, and what was measured on them.
 
 Deviations at the core points of step ``deviation`` are combined in pieces of a face. The errors of a piece are the
-noise of its points and what the points of a view share, as ``deviation`` states both. Of the shared error the level of
-a whole face and its slope from one half to the other are taken as seen from one place each: neither face nor half is
-seen better than one view is right.
+noise of its points and what the points of a view share, as ``deviation`` states both. The shared error varies over a
+long face, along it and across it: a web hides each half of a flange's inner side from the stations that see the other.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ PIECE_DIAMETERS = 3.0  # side of a piece, in diameters of the core points' circl
 FEWEST_POINTS = 3  # of a piece
 FLOOR_MM = 0.004  # least standard deviation: of the design's mesh and of rounding
 SAME_PLACE_MM = 1e-3
-# Share of the shared variance that the halves of a face have against each other, if they are FAR_MM apart or more: a
-# smaller face is seen from the same places all over.
+# Share of the shared variance by which the halves of a face differ, along it, across it and crosswise, if it is as large
+# as FAR_MM: a smaller one is seen from the same places all over.
 HALVES, FAR_MM = 0.5, 2000.0
 CLIP = 4.5  # robust standard deviations from the fitted shape beyond which a piece is left out
 ROUNDS = 5
@@ -59,15 +58,17 @@ class Pieces(NamedTuple):
     noise: Floats
     shared: float
 
-    def covariance(self, along: Floats, form: float = 0.0) -> Floats:
-        """Covariance (m, m) of the values, the halves of a face by the places' coordinates (m,) ``along`` it.
+    def covariance(self, along: Floats, across: Floats, form: float = 0.0) -> Floats:
+        """Covariance (m, m) of the values at coordinates ``along`` and ``across`` the face, (m,) each.
 
         ``form`` is the variance of what the fitted shape does not follow.
         """
-        half = np.where(along > 0.5 * (along.min() + along.max()), 1.0, -1.0)
+        halves = [np.where(x > 0.5 * (x.min() + x.max()), 1.0, -1.0) for x in (along, across)]
         apart = min(float(np.linalg.norm(np.ptp(self.places, axis=0))) / FAR_MM, 1.0)
-        both = np.ones((len(half), len(half))) + HALVES * apart**2 * np.outer(half, half)
-        covariance: Floats = np.diag(self.noise + form) + self.shared**2 * both
+        quarters = np.ones((len(along), len(along)))
+        for half in (*halves, halves[0] * halves[1]):
+            quarters += HALVES * apart**2 * np.outer(half, half)
+        covariance: Floats = np.diag(self.noise + form) + self.shared**2 * quarters
         return covariance
 
 
@@ -222,8 +223,8 @@ def _pieces(seen: Observed, normals: Floats, rows: Ints) -> Pieces:
     )
 
 
-def fit(basis: Floats, pieces: Pieces, along: Floats) -> Fit | None:
-    """Fit a shape with ``basis`` (m, p) to pieces; None where they do not determine it.
+def fit(basis: Floats, pieces: Pieces, along: Floats, across: Floats) -> Fit | None:
+    """Fit a shape with ``basis`` (m, p) to pieces at (m,) along and across a face; None where it is not determined.
 
     Pieces far off the shape (dents, other steel) have no weight. What the shape does not follow is a variance of the
     pieces: the mean square of the residuals less the part by noise (Cochran 1954, Biometrics 10, 101-129).
@@ -241,5 +242,5 @@ def fit(basis: Floats, pieces: Pieces, along: Floats) -> Fit | None:
         used = np.abs(rest) <= CLIP * np.maximum(robust_sd(rest[kept]), np.sqrt(pieces.noise))
         if (used == kept).all():
             break
-    covariance = pieces.covariance(along, form)[np.ix_(kept, kept)]
+    covariance = pieces.covariance(along, across, form)[np.ix_(kept, kept)]
     return Fit(mean, solve @ covariance @ solve.T)

@@ -180,7 +180,7 @@ def _side(body: Body, row: int, axes: list[Axis], middle: Floats) -> Side | None
     terms = [np.ones_like(x), x, y, x * y, x**2 - 1.0 / 3.0]
     for count in (5, 4, 3):
         bowed = count < 5 or len(np.unique(np.round(BOWED * x))) >= BOWED
-        fitted = flat_faces.fit(np.stack(terms[:count], axis=1), pieces, x) if bowed else None
+        fitted = flat_faces.fit(np.stack(terms[:count], axis=1), pieces, x, y) if bowed else None
         if fitted is not None:
             return Side(pieces, x, y, fitted)
     return None
@@ -297,7 +297,7 @@ def _axis_curve(sides: list[tuple[Side, float]]) -> tuple[Floats, Floats] | None
         if not degree:
             continue
         terms = [legvander(side.along, degree), side.across[:, None], (side.along * side.across)[:, None]]
-        fitted = flat_faces.fit(np.hstack(terms), side.pieces, side.along)
+        fitted = flat_faces.fit(np.hstack(terms), side.pieces, side.along, side.across)
         if fitted is not None:
             curve = legvander(PLACES, degree)
             values.append(sense * curve @ fitted.mean[: degree + 1])
