@@ -27,8 +27,8 @@ PIECE_DIAMETERS = 3.0  # side of a piece, in diameters of the core points' circl
 FEWEST_POINTS = 3  # of a piece
 FLOOR_MM = 0.004  # least standard deviation: of the design's mesh and of rounding
 SAME_PLACE_MM = 1e-3
-# Share of the shared variance by which the halves of a face differ, along it, across it and crosswise, if it is as large
-# as FAR_MM: a smaller one is seen from the same places all over.
+# Share of the shared variance by which the halves of a face differ, along it, across it and crosswise, if it is as
+# large as FAR_MM: a smaller one is seen from the same places all over.
 HALVES, FAR_MM = 0.5, 2000.0
 CLIP = 4.5  # robust standard deviations from the fitted shape beyond which a piece is left out
 ROUNDS = 5
