@@ -10,10 +10,11 @@ import numpy.typing as npt
 
 from processor.deviation import measure as deviation_measure
 from processor.geometry import m3c2 as m3c2_distances
-from processor.geometry import mesh_distance, normal_orientation, rigid, surface_registration
+from processor.geometry import mesh_distance, normal_orientation, rigid
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Floats, Reason, Status
+from processor.registration import surface_registration
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import Params
 from processor.space_frame.result import Flag

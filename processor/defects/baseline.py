@@ -25,9 +25,10 @@ from processor.defects.params import Paper, Params
 from processor.defects.result import DefectClass, Result, SurfacePlaces
 from processor.defects.surface_charts import of_mesh
 from processor.defects.to_result import table
-from processor.geometry import icp, mesh_distance, pfh, rigid
+from processor.geometry import mesh_distance, rigid
 from processor.geometry.neighbors import surface_spacing, voxel_means
 from processor.model import NORMAL_95, Bools, Floats, Ints, Scene, Status, StructureDesign, reason
+from processor.registration import icp, pfh
 from processor.robust_statistics import robust_sd_about_median
 
 VOXEL_SPACINGS = 1.5

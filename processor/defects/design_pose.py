@@ -10,9 +10,10 @@ import numpy as np
 
 from processor import scene_cloud
 from processor.defects.params import Params
-from processor.geometry import mesh_distance, rigid, surface_registration
-from processor.geometry.surface_registration import Registration
+from processor.geometry import mesh_distance, rigid
 from processor.model import Floats, Reason, Scene, Status, reason
+from processor.registration import surface_registration
+from processor.registration.surface_registration import Registration
 
 DEFAULT_ERROR_MM = 1.0  # registration error of scans in the design's frame, where none is known
 SAMPLE = 200_000

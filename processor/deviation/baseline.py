@@ -17,11 +17,12 @@ from processor.deviation import measure as deviation_measure
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Paper, Params
 from processor.deviation.result import ErrorSource, Result
-from processor.geometry import icp, m3c2, mesh_distance, principal, rigid
+from processor.geometry import m3c2, mesh_distance, rigid
 from processor.geometry.neighbors import thinned
-from processor.geometry.principal import AMBIGUOUS, CoarsePose
-from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Ints, Scene, Status, StructureDesign, reason
+from processor.registration import icp, principal
+from processor.registration.principal import AMBIGUOUS, CoarsePose
+from processor.registration.surface_registration import Registration
 
 MOST_ICP_POINTS = 60_000
 COARSE_POINTS, COARSE_ITERATIONS = 3_000, 30

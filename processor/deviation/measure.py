@@ -18,12 +18,13 @@ from processor.deviation.result import ErrorSource, Result
 from processor.deviation.stable_fit import Fits
 from processor.deviation.station_offsets import CELL_DIAMETERS
 from processor.deviation.surface_movement import Cloud
-from processor.geometry import m3c2, mesh_distance, rigid, surface_registration
+from processor.geometry import m3c2, mesh_distance, rigid
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
 from processor.geometry.neighbors import thinned
-from processor.geometry.surface_registration import NEAR_MM, Placed, Registration
 from processor.model import Floats, Reason, Scene, Status, reason
+from processor.registration import surface_registration
+from processor.registration.surface_registration import NEAR_MM, Placed, Registration
 
 MOST_CORE = 150_000
 POINTS_A_CORE = 40.0  # scanned points about a core point, fewer on narrow surfaces

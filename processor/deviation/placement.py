@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.deviation.cloud import ScanCloud
-from processor.geometry import mesh_distance, rigid, surface_registration
+from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import thinned
-from processor.geometry.surface_registration import NEAR_MM, NEAR_SHARE, Placed
 from processor.model import Floats, Ints
+from processor.registration import surface_registration
+from processor.registration.surface_registration import NEAR_MM, NEAR_SHARE, Placed
 
 # Points in another frame lie as often from NEAR_MM to twice as far from the design's surface as nearer to it; points of
 # the structure lie nearer. The limit is half way between these shares.

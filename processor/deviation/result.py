@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry.m3c2 import Distances
-from processor.geometry.surface_registration import Registration
 from processor.limits.judging import JudgedLimits
 from processor.model import (
     Checked,
@@ -28,6 +27,7 @@ from processor.model import (
     reasons,
     words,
 )
+from processor.registration.surface_registration import Registration
 
 NAN = float("nan")
 

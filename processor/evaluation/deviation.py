@@ -8,9 +8,10 @@ from scipy.special import chdtri
 
 from processor.deviation.result import Result
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls
-from processor.geometry import principal, rigid
-from processor.geometry.surface_registration import Registration
+from processor.geometry import rigid
 from processor.model import Bools, Floats, Ints, Metric, PoseTruth, Scene, Statistic, Status, StructureTruth, Truth
+from processor.registration import principal
+from processor.registration.surface_registration import Registration
 
 NEIGHBOURS = 24
 REACH_MM = 500.0  # of a core point: a movement is smooth

@@ -17,13 +17,14 @@ from processor.adjustment.groups import group_means
 from processor.deviation import baseline, cloud, step
 from processor.deviation.params import Params
 from processor.deviation.result import Result
-from processor.geometry import icp, mesh_distance, principal, rigid
+from processor.geometry import mesh_distance, rigid
 from processor.geometry.neighbors import thinned
 from processor.language.messages import Text, text
 from processor.model import Floats, Reason, reason
 from processor.papers import parameters
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Row, Rule, holds, median
+from processor.registration import icp, principal
 from processor.report.charts.line_chart import Chart
 from processor.store import store
 

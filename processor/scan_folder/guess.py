@@ -11,9 +11,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from processor import large_arrays, readers
-from processor.geometry import mesh_distance, principal
+from processor.geometry import mesh_distance
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints
 from processor.readers import RawScan
+from processor.registration import principal
 from processor.scan_folder import component_names
 from processor.scan_folder.checked_table import existing_file_in
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from processor.defects.design_pose import DEFAULT_ERROR_MM
-from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Status
+from processor.registration.surface_registration import Registration
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ LAYERS = (
     ("record_checks", "tiles"),
     ("progress", "diagnostics", "language", "jobs", "robust_statistics", "distinct_rows", "unit_ratio", "user_methods"),
     ("geometry",),
-    ("scene_cloud",),
+    ("scene_cloud", "registration"),
     ("adjustment",),
     ("components", "limits", "store"),
     ("readers", "writers"),
@@ -159,7 +159,7 @@ LAYERS = (
 )
 FOR_STEPS = (
     "version", "plain_text", "large_arrays", "model", "progress", "diagnostics", "robust_statistics", "distinct_rows",
-    "unit_ratio", "tiles", "geometry", "scene_cloud", "adjustment", "components", "limits",
+    "unit_ratio", "tiles", "geometry", "registration", "scene_cloud", "adjustment", "components", "limits",
 )  # fmt: skip
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.geometry import mesh_distance, pose_choice, principal, rigid, surface_registration
+from processor.geometry import mesh_distance, rigid
+from processor.registration import pose_choice, principal, surface_registration
 
 GIRDER = (6000.0, 800.0, 1400.0)
 PLATE = (400.0, 140.0, 14.0)  # a bracket, its upper side in the girder's middle

@@ -8,9 +8,10 @@ from scipy.spatial import cKDTree
 from processor.adjustment.groups import group_means
 from processor.deviation import cloud as deviation_cloud
 from processor.deviation import local_translation as moving
-from processor.geometry import m3c2, mesh_distance, neighbors, principal, rigid, surface_registration
+from processor.geometry import m3c2, mesh_distance, neighbors, rigid
 from processor.geometry.m3c2 import Distances
 from processor.model import InputError
+from processor.registration import principal, surface_registration
 from tests.support.m3c2_clouds import wavy
 from tests.support.meshes import bracket
 

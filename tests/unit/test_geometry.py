@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from processor.geometry import icp, neighbors, principal, rigid
+from processor.geometry import neighbors, rigid
 from processor.geometry.polyline import Line, Polyline, crossing, fit_line, ransac_line
+from processor.registration import icp, principal
 from processor.robust_statistics import robust_sd
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.geometry.surface_registration import Motion
 from processor.language import messages as messages_
 from processor.language.messages import messages
 from processor.language.messages import text as message
@@ -16,6 +15,7 @@ from processor.model import Status, reason
 from processor.preassembly.ends.section import PlateFace
 from processor.preassembly.result import Gauge
 from processor.preassembly.verdicts import joint_measures, trim_and_build_up
+from processor.registration.surface_registration import Motion
 from processor.report import all_figures, page, page_script
 from processor.space_frame.design.matching import FrameRelation
 from tests.support.ball_results import of_frame, whole, with_truth

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from processor.geometry import pfh, rigid
+from processor.geometry import rigid
+from processor.registration import pfh
 
 
 def cross(a, b):

@@ -8,7 +8,7 @@ import pytest
 
 from processor import diagnostics
 from processor.evaluation import preassembly as preassembly_evaluation
-from processor.geometry import icp, rigid
+from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
 from processor.model import InputError, Scene, UsageError, Verdict, reason
 from processor.preassembly import assembly_errors
@@ -17,6 +17,7 @@ from processor.preassembly.baselines import edge_features, joint_alignment, meth
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import PAPER_METHODS, BoxParams, MatchParams, SliceParams
 from processor.preassembly.parts import attitude
+from processor.registration import icp
 from tests.support import arch_clouds, known_attitudes
 
 

@@ -12,13 +12,14 @@ from designgen.designs import arch_bridge, arch_mesh
 from designgen.scanning import sampler
 from designgen.scenes.make import make
 from processor.adjustment import scanner_class
-from processor.geometry import principal, rigid
+from processor.geometry import rigid
 from processor.geometry.neighbors import by_cell
 from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene, reason
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import assignment, attitude, identity, measure
+from processor.registration import principal
 from tests.support import arch_clouds
 from tests.support.arch_clouds import random_pose
 

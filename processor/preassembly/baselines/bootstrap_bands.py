@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from processor.geometry import rigid, surface_registration
+from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import by_cell
 from processor.geometry.parallel import each
@@ -25,6 +25,7 @@ from processor.preassembly.baselines.methods import PartFeatures
 from processor.preassembly.params import Params
 from processor.preassembly.parts import attitude
 from processor.preassembly.result import Deviations, Result
+from processor.registration import surface_registration
 
 CELL_MM = 40.0  # a part's form does not change within a cell
 NEAR_MM = 30.0  # largest distance of a part as built from its design

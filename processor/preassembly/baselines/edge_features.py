@@ -14,11 +14,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor import diagnostics
-from processor.geometry import principal, rigid
+from processor.geometry import rigid
 from processor.geometry.neighbors import without_outliers
 from processor.geometry.polyline import Line, crossing, fit_line, ransac_line
 from processor.model import Floats
 from processor.preassembly.params import BoxParams, SliceParams
+from processor.registration import principal
 
 EDGES = ("bottom", "right", "top", "left")
 EDGE_BOX = 1.5  # L_edge in thicknesses (paper 000, section 2.3)

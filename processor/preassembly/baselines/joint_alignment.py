@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor import diagnostics
-from processor.geometry import icp, pfh, rigid
+from processor.geometry import rigid
 from processor.geometry.neighbors import voxel_means
 from processor.geometry.polyline import Polyline
 from processor.model import Floats, Reason, reason
 from processor.preassembly.params import MatchParams
+from processor.registration import icp, pfh
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from processor.robust_statistics import robust_sd
 
 REACH_MM = 200.0  # across each face
 LEAST_POINTS = 30
+LEAST_KEPT = 0.7  # of the points of an interval: on the plane fitted to them
 FLOOR_MM = 0.004
 
 
@@ -232,7 +233,10 @@ def _outer(interval: Ints, out: Floats, inner: Bools) -> Bools:
 
 
 def _at_edge(face: _FacePoints, count: int, stations: int) -> _AtEdge:
-    """Values at the edge of planes in x and w, fitted to the residuals of each of ``count`` intervals."""
+    """Values at the edge of planes in x and w, fitted to the residuals of each of ``count`` intervals.
+
+    An interval of which many points lie off its plane shows something else (a trestle beneath the part), and is NaN.
+    """
     basis = np.stack([np.ones_like(face.x), face.x / INTERVAL_MM, face.w / REACH_MM], axis=1)
     used = np.ones(len(face.x), bool)
     value, variance = np.full(count, np.nan), np.full(count, np.nan)
@@ -262,4 +266,8 @@ def _at_edge(face: _FacePoints, count: int, stations: int) -> _AtEdge:
         if (now == used).all():
             break
         used = now
+    of_face = np.bincount(face.interval[now], minlength=count) >= LEAST_KEPT * np.bincount(
+        face.interval, minlength=count
+    )
+    value[~of_face] = np.nan
     return _AtEdge(value, variance, by_station)

@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from processor.geometry import box_girder, principal, rigid, surface_registration
+from processor.geometry import box_girder, rigid
 from processor.geometry.neighbors import thinned
 from processor.model import ArchDesign, Floats, Reason, reason
 from processor.preassembly.parts import attitude, same_shape
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, TELLING_MM, Shapes, Surface
+from processor.registration import principal, surface_registration
 
 POINTS, NEAR_POINTS = 100_000, 3_000  # of a scan, by which rough poses are compared, and their share near a design
 SAMPLES = 50_000  # of each surface: tens on a mark, also on a part of 100 m2

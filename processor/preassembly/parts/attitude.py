@@ -13,11 +13,12 @@ from itertools import product
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.geometry import icp, mesh_distance, principal, rigid, surface_registration
+from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import thinned, voxel_means
 from processor.geometry.parallel import each
 from processor.model import ArchDesign, DesignPart, Floats, Reason, Status, reason
+from processor.registration import icp, principal, surface_registration
 
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.1 m
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis

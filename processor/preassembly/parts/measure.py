@@ -10,7 +10,7 @@ import numpy as np
 
 from processor.adjustment import variance_components
 from processor.adjustment.groups import joined_numbers
-from processor.geometry import box_girder, icp, rigid, surface_registration
+from processor.geometry import box_girder, rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.geometry.neighbors import by_cell, thinned
 from processor.geometry.polyline import Polyline
@@ -26,6 +26,7 @@ from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import assignment, attitude, contradictions, identity, systematic_errors
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.part_in_chain import Member
+from processor.registration import icp, main_body, surface_registration
 from processor.robust_statistics import MAD_TO_SD
 
 CELL_MM = 40.0  # points of a cell are looked up one after the other
@@ -36,6 +37,7 @@ SLICES, LEAST_OF_TYPICAL = (
 ACROSS = 0.7  # cosine to the part's axis, below which a normal is of the part's sides
 LEAST_COVERED = 0.7
 RIGHT_PART = (reason("preassemble.right-part"),)
+AT_PART_MM = 60.0  # of the design, at which points of the ground may be of the part
 RESIDUALS = 4_000  # points of a part whose distances from the design are kept
 
 
@@ -345,10 +347,25 @@ def _between_stations(points: Floats, station: Ints, shape: attitude.Surface) ->
 
 
 def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _PlacedScan:
-    """Register one scan and check that it is of part ``index``."""
+    """Register one scan, without the ground and what stands about the part, and check that it is of part ``index``."""
     order = by_cell(scan.points, CELL_MM)
     points = scan.points[order] * shrink
     station = scan.point_station[order].astype(np.int64) if len(scan.point_station) else np.zeros(len(points), np.int64)
+    of_part = main_body.of_sizes(points, [shapes[k].sizes for k in range(len(shapes))])
+    if of_part is None:
+        return _identified(scan, points, station, index, shapes)
+    placed = _identified(scan, points[of_part], station[of_part], index, shapes)
+    if placed.rejected:
+        return placed
+    # Where the part lies on the ground, points of its lower edge went with the ground.
+    rest = np.flatnonzero(~of_part)
+    off = shapes[index].mesh.distances(rigid.apply(placed.registration.T_design_scan, points[rest]), AT_PART_MM)
+    of_part[rest] = on_face(off[0], off[2]) & (np.abs(off[1]) < AT_PART_MM)
+    return replace(placed, points=points[of_part], station=station[of_part])
+
+
+def _identified(scan: Scan, points: Floats, station: Ints, index: int, shapes: attitude.Shapes) -> _PlacedScan:
+    """Register the points (n, 3) of a scan, and check that they are of part ``index``."""
     part, every = shapes.design.parts[index], tuple(part.name for part in shapes.design.parts)
     other = assignment.rather(points, index, shapes)
     if other is not None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.geometry import box_girder, mesh_distance, principal, rigid
+from processor.geometry import box_girder, mesh_distance, rigid
 from processor.model import DesignPart, Floats
+from processor.registration import principal
 
 SAMPLES = 1_000  # of the other part's surface
 ALIKE_SHARE = 0.97  # of them near this part's surface: marks are smaller

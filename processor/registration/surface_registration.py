@@ -1,7 +1,7 @@
 """Registration of a scan to the surface of its design: coarse by principal axes, then fine by least squares.
 
-The fine registration needs a pose that is right to a few millimetres; see :mod:`processor.geometry.principal` for the
-search from any pose, and :mod:`processor.geometry.pose_choice` for the choice between the attitudes of a nearly
+The fine registration needs a pose that is right to a few millimetres; see :mod:`processor.registration.principal` for
+the search from any pose, and :mod:`processor.registration.pose_choice` for the choice between the attitudes of a nearly
 symmetric structure. :func:`place` decides which of these a scan needs.
 """
 
@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.geometry import icp, mesh_distance, pose_choice, principal, rigid
+from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
 from processor.geometry.neighbors import thinned, voxel_means
-from processor.geometry.principal import CoarsePose, PrincipalAxes
 from processor.model import NORMAL_95, Bools, Floats, Ints, Word
+from processor.registration import icp, main_body, pose_choice, principal
+from processor.registration.principal import CoarsePose, PrincipalAxes
 from processor.robust_statistics import biweight, robust_sd
 
 # --- Fine registration
@@ -224,8 +225,12 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
 
     A best fit absorbs whatever a structure moved as a whole. A scan that lies at its design already is therefore left
     where it is by ``auto``, and the best fit is only reported. ``scanner`` (n, 3) is the position that each point was
-    measured from, if known: it helps to distinguish attitudes.
+    measured from, if known: it helps to distinguish attitudes. Ground and what stands about the structure is left out.
     """
+    if how in ("auto", "coarse"):
+        of_body = main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
+        if of_body is not None:
+            points, scanner = points[of_body], None if scanner is None else scanner[of_body]
     axes = principal.of_mesh(surface.vertices, surface.faces)
     few = thinned(points, FINE_POINTS)
     near, _ = surface.tree.query(rigid.apply(given, few), distance_upper_bound=NEAR_MM, workers=-1)
