@@ -243,6 +243,22 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
     assert np.isfinite(result.core.lod95).mean() > 0.9
 
 
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_scan_with_more_points_of_the_ground_than_of_the_structure_is_placed_right(elsewhere):
+    scene, _ = scene_of(12, lambda p: 0.0 * p)
+    points, rng = scene.scans[0].points, np.random.default_rng(12)
+    low, high = points.min(axis=0) - 1_000.0, points.max(axis=0) + 1_000.0
+    ground = rng.uniform(low, high, (3 * len(points), 3))
+    ground[:, 2] = low[2] + rng.normal(0.0, 2.0, len(ground))
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, 0.5])), np.array([30_000.0, 0.0, 0.0]))
+    scan = Scan("all", rigid.apply(T if elsewhere else np.eye(4), np.vstack([points, ground])))
+    result = deviation_step.run(dataclasses.replace(scene, scans=(scan,)), deviation_step.Params())
+    assert result.status == "ok"
+    assert result.registration == ("coarse" if elsewhere else "as given")
+    assert result.significant_share < 0.07
+    assert np.isfinite(result.core.lod95).mean() > 0.9
+
+
 def test_a_station_of_a_merged_scan_is_named_too():
     scene, _ = scene_of(15, lambda p: 0.0 * p, count=30_000)
     points = scene.scans[0].points.copy()

@@ -412,6 +412,43 @@ def test_a_floor_beside_a_part_does_not_turn_it_round(seed, index, share):
     assert np.degrees(rigid.rotation_angle(turn)) < 0.1
 
 
+def on_trestles(points, rng, step=12.0):
+    """A part 0.6 m above a floor that reaches 2 m beyond it, on two trestles that touch it and hide its bottom."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    ground = low[2] - 600.0
+    corners = np.array([low[:2] - 2_000.0, high[:2] + 2_000.0])
+    flat = rng.uniform(*corners, (int(np.prod(np.ptp(corners, axis=0)) / step**2), 2))
+    about = [np.column_stack([flat, rng.normal(ground, 1.5, len(flat))])]
+    hidden = np.zeros(len(points), bool)
+    for share in (0.2, 0.8):
+        x = low[0] + share * (high[0] - low[0])
+        above = np.abs(points[:, 0] - x) < 250.0
+        top = points[above, 2].min()
+        hidden |= above & (points[:, 2] < top + 100.0) & (np.abs(points[:, 1]) < 0.5 * SMALL.width_mm - 5.0)
+        for side in (-200.0, 200.0):
+            size = np.array([high[1] - low[1] + 300.0, top - ground])
+            at = rng.uniform([low[1] - 150.0, ground], [high[1] + 150.0, top], (int(np.prod(size) / step**2), 2))
+            about.append(np.column_stack([rng.normal(x + side, 1.0, len(at)), at]))
+    return np.vstack([points[~hidden], *about])
+
+
+def test_a_part_on_trestles_above_a_floor_of_more_points_is_found_right():
+    parts, design = bridge()
+    points = cloud(parts[1])
+    everything = on_trestles(points, np.random.default_rng(4))
+    assert len(everything) > 2.0 * len(points)
+    scan, T = scanned(everything)
+    found = measured(design, 1, scan)
+    assert found.status == "ok"
+    assert_right(found, design, 1, parts[1], T)
+    # Points of the trestles are at the bottom edges, where they hide the part.
+    edges = found.member.edges
+    sd = np.sqrt(np.stack([np.diag(one) for one in edges.covariance], axis=1))
+    known = np.isfinite(edges.departure)
+    assert known.mean() > 0.9
+    assert np.abs(edges.departure / sd)[known].max() < 4.5
+
+
 @pytest.mark.slow
 def test_no_random_pose_is_wrong_and_called_ok():
     parts, design = bridge()
