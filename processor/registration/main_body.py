@@ -40,16 +40,20 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
     largest = np.max(sizes, axis=0) * (1.0 + LARGER)
     side = LARGER_AREA * float(largest[0] * largest[1])
     left = np.ones(len(even), bool)
+    if (principal.sizes(even) <= largest).all():
+        return None
     while left.sum() >= FEWEST and (principal.sizes(even[left]) > largest).any():
         on = _plane(even[left], step, side)
         if on is None:
             break
         left[np.flatnonzero(left)[on]] = False
-    if left.all():
+    if left.sum() < FEWEST:
         return None
     piece = np.zeros(len(even), bool)
     piece[np.flatnonzero(left)[_largest_piece(even[left], step)]] = True
     best = piece if _misfit(even[piece], sizes) <= _misfit(even[left], sizes) else left
+    if best.all():
+        return None
     nearest = cKDTree(even).query(points, distance_upper_bound=2.0 * step, workers=-1)[1]
     found: Bools = np.append(best, False)[nearest]
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from processor import large_arrays, readers
 from processor.geometry import mesh_distance
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints
 from processor.readers import RawScan
-from processor.registration import principal
+from processor.registration import main_body, principal
 from processor.scan_folder import component_names
 from processor.scan_folder.checked_table import existing_file_in
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
@@ -52,7 +52,7 @@ class ScanGuess:
     stem: str = ""
     similar: tuple[str, ...] = ()  # components of the scan's shape
     differences: dict[str, float] = field(default_factory=dict)  # of its extents from each component's, by the longest
-    extents: Floats = field(default_factory=lambda: np.zeros(3))  # in the file's unit, longest first
+    sample: Floats = field(default_factory=lambda: np.empty((0, 3)))  # points (n, 3) in the file's unit
     radius: float = 0.0  # from the middle
 
 
@@ -95,9 +95,10 @@ def guess(folder: Path, design_units: str = "") -> Guess:
         raise InputError(
             f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none"
         )
-    _guess_units(project, _sizes(design))
-    if isinstance(design, ArchDesign):
-        _guess_components(project, design)
+    shapes = _shapes(design) if isinstance(design, ArchDesign) else {}
+    _guess_units(project, _sizes(design), shapes)
+    if shapes:
+        _guess_components(project, shapes)
     elif not design:
         _guess_kind(project)
     if (folder / STATIONS).is_file():
@@ -215,7 +216,7 @@ def _read_scan(folder: Path, path: Path, project: Guess) -> ScanGuess:
         return scan
     scan.units = known_unit(raws[0].unit) if raws[0].unit else ""
     points = _sample(raws)
-    scan.extents = principal.sizes(points)
+    scan.sample = points
     scan.radius = radius(points - points.mean(axis=0))
     if len(raws) > 1:
         scan.reason = f"holds {len(raws)} scans: {', '.join(raw.name for raw in raws[:6])}"
@@ -238,8 +239,28 @@ def _sample(raws: Sequence[RawScan]) -> Floats:
 # --- guesses ----------------------------------------------------------------------------------------------------------
 
 
-def _guess_units(project: Guess, nominal: Sequence[float]) -> None:
-    """Take the unit of the formats; else the one in which the scans have the design's size; else metres."""
+def _shapes(design: ArchDesign) -> dict[str, Floats]:
+    """Return the sizes (3,) of a design's parts along their principal axes, longest first, by their names."""
+    surfaces = {part.name: mesh_distance.spread(part.vertices, part.faces, lambda _: SAMPLE) for part in design.parts}
+    return {name: principal.sizes(surface.points) for name, surface in surfaces.items()}
+
+
+def _differences(scan: ScanGuess, unit: str, shapes: Mapping[str, Floats]) -> dict[str, float]:
+    """Return the largest difference of a scan's extents from each part's, by the part's longest size.
+
+    Ground and what stands about the part is left out.
+    """
+    points = scan.sample * MM_PER_UNIT[unit]
+    of_part = main_body.of_sizes(points, list(shapes.values()))
+    extents = principal.sizes(points if of_part is None else points[of_part])
+    return {name: float(np.abs(extents - shape).max() / shape[0]) for name, shape in shapes.items()}
+
+
+def _guess_units(project: Guess, nominal: Sequence[float], shapes: Mapping[str, Floats]) -> None:
+    """Take the unit of the formats; else the one in which the scans have the design's size; else metres.
+
+    ``nominal`` are the radii of what is designed, ``shapes`` the sizes of an arch's parts.
+    """
     without = [scan for scan in project.scans if not scan.units and not scan.error]
     if project.design and project.kind == "structure" and Path(project.design).suffix.lower() in MESH_SUFFIXES:
         project.design_units = "mm"
@@ -248,6 +269,15 @@ def _guess_units(project: Guess, nominal: Sequence[float]) -> None:
         given = sorted({scan.units for scan in project.scans if scan.units})
         project.units_reason = f"given by the scans' formats: {', '.join(given)}" if given else ""
         return
+    if shapes:
+        of_unit = {
+            unit: float(np.median([min(_differences(scan, unit, shapes).values()) for scan in without]))
+            for unit in UNITS
+        }
+        best = min(UNITS, key=of_unit.__getitem__)
+        if of_unit[best] <= LIKE_SHAPE:
+            project.units, project.units_reason = best, "the scans are as large as the design in it"
+            return
     if nominal:
         sizes = np.array(nominal)
         misfits = {
@@ -275,15 +305,12 @@ def _guess_kind(project: Guess) -> None:
     )
 
 
-def _guess_components(project: Guess, design: ArchDesign) -> None:
+def _guess_components(project: Guess, shapes: Mapping[str, Floats]) -> None:
     """Assign components to scans by name and shape; contradictions and ambiguities are added to ``unsure``."""
-    names = [part.name for part in design.parts]
-    surfaces = {part.name: mesh_distance.spread(part.vertices, part.faces, lambda _: SAMPLE) for part in design.parts}
-    shapes = {name: principal.sizes(surface.points) for name, surface in surfaces.items()}
+    names = list(shapes)
     scans = [scan for scan in project.scans if not scan.error]
     for scan in scans:
-        extents = scan.extents * MM_PER_UNIT[scan.units or project.units or "m"]
-        scan.differences = {name: float(np.abs(extents - shape).max() / shape[0]) for name, shape in shapes.items()}
+        scan.differences = _differences(scan, scan.units or project.units or "m", shapes)
         scan.station = component_names.station(scan.stem)
         _choose(scan, component_names.components(scan.stem, names))
     _assign_similar(scans, names)

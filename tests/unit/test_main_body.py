@@ -56,7 +56,7 @@ def found(rng, *others):
     return taken[: len(of_part)].mean(), taken[len(of_part) :].mean()
 
 
-@pytest.mark.parametrize("others", [(ground,), (ground, crate), (ground, wall), (ground, wall, crate)])
+@pytest.mark.parametrize("others", [(crate,), (ground,), (ground, crate), (ground, wall), (ground, wall, crate)])
 def test_a_part_among_things_that_do_not_touch_it_is_found(others):
     of_part, of_others = found(np.random.default_rng(1), *others)
     assert of_part > 0.999
@@ -94,3 +94,7 @@ def test_stray_points_alone_are_no_reason_to_leave_anything_out():
 def test_of_a_few_points_nothing_is_left_out():
     assert main_body.of_sizes(np.random.default_rng(6).uniform(0.0, 1e5, (50, 3)), [SIZE]) is None
     assert main_body.of_sizes(np.zeros((10, 3)), [SIZE]) is None
+
+
+def test_of_something_far_larger_than_the_part_nothing_is_left_out():
+    assert main_body.of_sizes(1000.0 * part(np.random.default_rng(7)), [SIZE]) is None

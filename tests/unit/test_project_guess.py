@@ -77,7 +77,7 @@ def box_points(size, seed, turn=True, count=20_000):
     side = rng.choice(3, count, p=across / across.sum())
     points[np.arange(count), side] = rng.integers(0, 2, count)
     Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return (points * size) @ (Q if turn else np.eye(3)).T + rng.uniform(-5, 5, 3)
+    return (points * size) @ Q.T + rng.uniform(-5, 5, 3) if turn else points * size
 
 
 def write_scan(path, points):
@@ -168,6 +168,18 @@ def test_the_shape_decides_on_scans_that_are_only_numbered(bridge):
     assert {one.component for one in feet} == {"foot1", "foot2"}
     assert not any(one.sure for one in feet)
     assert all("any of them may be right" in one.reason for one in feet)
+
+
+def test_the_shape_of_a_part_is_measured_without_the_ground_about_it(bridge):
+    rng = np.random.default_rng(1)
+    for i, name in enumerate(("rib2", "rib1"), 1):
+        size = np.array(SIZES[name])
+        ground = rng.uniform([-2.0, -2.0, -0.8], [size[0] + 2.0, size[1] + 2.0, -0.8], (60_000, 3))
+        points = np.vstack([box_points(SIZES[name], i, turn=False), ground + rng.uniform(-0.001, 0.001, ground.shape)])
+        write_scan(bridge / f"scans/Scan_{i:03d}.xyz", points)
+    found = guess.guess(bridge)
+    assert found.units == "m"
+    assert [(one.component, one.sure) for one in found.scans] == [("rib2", True), ("rib1", True)]
 
 
 def test_a_name_is_not_sure_where_the_shape_is_that_of_another(bridge):
