@@ -19,7 +19,8 @@ from processor.geometry.neighbors import thinned, voxel_means
 from processor.model import Bools, Floats
 from processor.registration import principal
 
-VOXELS = 200.0  # along the scan's diagonal
+VOXELS = (200.0, 140.0, 100.0, 70.0)  # along the scan's diagonal, the most that the points allow
+PER_VOXEL = 6  # points of an occupied voxel, on average
 FEWEST = 200  # voxels of a scan that is searched
 LARGER = 0.02  # of the longest size, by which a scan that holds more than its part is larger
 LARGER_AREA = 1.3  # of a plane, by the part's largest side: cells at its rim are partly empty
@@ -33,8 +34,8 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
 
     None if the scan is not larger than the part, or nothing in it is found to be something else.
     """
-    step = float(np.linalg.norm(np.ptp(points, axis=0))) / VOXELS
-    even = voxel_means(points, step, least=2) if step > 0.0 else points
+    step = _voxel_size(points)
+    even = voxel_means(points, step, least=2) if step > 0.0 else points[:0]
     if len(even) < FEWEST:
         return None
     largest = np.max(sizes, axis=0) * (1.0 + LARGER)
@@ -57,6 +58,16 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
     nearest = cKDTree(even).query(points, distance_upper_bound=2.0 * step, workers=-1)[1]
     found: Bools = np.append(best, False)[nearest]
     return found
+
+
+def _voxel_size(points: Floats) -> float:
+    """Return the size of voxels, mm, so large that those of one surface touch; 0 if no such size divides the scan."""
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    for count in VOXELS:
+        step = diagonal / count
+        if step > 0.0 and len(voxel_means(points, step)) * PER_VOXEL <= len(points):
+            return step
+    return 0.0
 
 
 def _misfit(points: Floats, sizes: Sequence[Floats]) -> float:
