@@ -42,12 +42,22 @@ def log_line(line: str, level: int = logging.INFO) -> None:
     LOG.log(level, "%s", printable(line))
 
 
+class _OnTerminal(logging.Handler):
+    """Writes the message of a record on standard error, as it is at that time."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        click.echo(printable(record.getMessage()), err=True)
+
+
 def _log_to(_: click.Context, __: click.Parameter, path: Path | None) -> None:
     """Append to a log file from now on; InputError where it cannot be written."""
     for earlier in LOG.handlers[:]:
         LOG.removeHandler(earlier)
         earlier.close()
     LOG.propagate = False
+    of_input = logging.getLogger("processor.input")
+    if not any(isinstance(one, _OnTerminal) for one in of_input.handlers):
+        of_input.addHandler(_OnTerminal())
     if path is None:
         LOG.addHandler(logging.NullHandler())
         return

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,9 @@ import numpy as np
 
 from processor.model import Floats, InputError, UsageError, did_you_mean
 from processor.scan_folder.units import known_unit
+
+LOG = logging.getLogger("processor.input")
+MOST_NAMED = 6  # unknown keys
 
 
 def existing_file_in(folder: Path, text: str, where: str) -> Path:
@@ -130,3 +134,11 @@ def _kind(value: Any) -> str:
     if isinstance(value, (str, int, float)):
         return repr(value)[:60]
     return {list: "a list", dict: "a table", type(None): "null"}.get(type(value), type(value).__name__)
+
+
+def ignore_unknown(where: str, tables: Sequence[Table], known: Collection[str]) -> None:
+    """Log one line on the keys of tables that are not in ``known``: they are ignored."""
+    unknown = sorted({key for table in tables for key in table.values if key not in known})
+    if unknown:
+        like = did_you_mean(unknown[0], known)
+        LOG.warning("%s: ignored unknown %s%s", where, ", ".join(map(repr, unknown[:MOST_NAMED])), like)

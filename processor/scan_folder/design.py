@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from processor.model import (
     did_you_mean,
 )
 from processor.scan_folder import cad
-from processor.scan_folder.checked_table import Table, existing_file_in
+from processor.scan_folder.checked_table import Table, existing_file_in, ignore_unknown
 from processor.scan_folder.meshes import MESH_SUFFIXES, read_mesh
 from processor.scan_folder.text_files import csv_rows, read_text
 from processor.scan_folder.units import MM_PER_UNIT, known_unit
@@ -60,11 +60,15 @@ def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | Frame
 
 def read_json(path: Path) -> Table:
     """Read a JSON file that holds an object. Raises InputError for any other."""
+    return Table.of(str(path), read_json_value(path))
+
+
+def read_json_value(path: Path) -> Any:
+    """Read a JSON file that holds any value. Raises InputError for a file that is not JSON."""
     try:
-        data = json.loads(_text(path))
+        return json.loads(_text(path))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable JSON: {error}") from None
-    return Table.of(str(path), data)
 
 
 def _text(path: Path) -> str:
@@ -111,8 +115,9 @@ class _Joint(NamedTuple):
 
 def _joints(design: Table, scale: float) -> list[_Joint]:
     joints: list[_Joint] = []
-    for joint in design.tables("joints"):
-        joint.only(("name", "left", "right", "points"))
+    tables = design.tables("joints")
+    ignore_unknown(f"{design.where}: joints", tables, ("name", "left", "right", "points"))
+    for joint in tables:
         points = joint.table("points")
         points.only(KEY_POINTS)
         corners = np.stack([points.array(key, 3) for key in KEY_POINTS]) * scale
@@ -233,8 +238,10 @@ def _frame(design: Table) -> FrameDesign:
     scale = MM_PER_UNIT[design.unit("units")]
     ids, centres, radii = [], [], []
     supports, deflections = [], []
-    for node in design.tables("nodes"):
-        node.only(("id", "centre", "radius", "support", "deflection"))
+    nodes, members = design.tables("nodes"), design.tables("members")
+    ignore_unknown(f"{design.where}: nodes", nodes, ("id", "centre", "radius", "support", "deflection"))
+    ignore_unknown(f"{design.where}: members", members, ("a", "b", "tube_diameter"))
+    for node in nodes:
         ids.append(node.integer("id"))
         supports.append(_support(node))
         deflections.append(node.number("deflection", float("nan"), positive=True) * scale)
@@ -243,8 +250,7 @@ def _frame(design: Table) -> FrameDesign:
     _check_ids(design.where, ids)
     known = set(ids)
     a, b, diameters = [], [], []
-    for member in design.tables("members"):
-        member.only(("a", "b", "tube_diameter"))
+    for member in members:
         ends = (member.integer("a"), member.integer("b"))
         if not known.issuperset(ends) or ends[0] == ends[1]:
             raise InputError(

@@ -36,7 +36,7 @@ from processor.scan_folder import guess, mesh_faults, scanner_grid, units
 from processor.scan_folder.checked_table import Table, existing_file_in
 from processor.scan_folder.clips import FEWEST_POINTS, Clipper, read_boxes
 from processor.scan_folder.control_points import Measured, control_points, read_control
-from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
+from processor.scan_folder.design import is_surface, read_design, read_json_value, read_surface
 from processor.scan_folder.files import (
     CONTROL,
     DESIGNS,
@@ -191,16 +191,33 @@ def _component_names(design: Design | None) -> Sequence[str]:
     return design.bodies.names if isinstance(design, StructureDesign) and design.bodies is not None else ()
 
 
+def _stations_by_name(path: Path) -> dict[str, Table]:
+    """Return the tables of stations.json, a table by names or a list with the names as ``id``."""
+    value = read_json_value(path)
+    if not isinstance(value, list):
+        table = Table.of(str(path), value)
+        named = {name: table.table(name) for name in table.values}
+        for station in named.values():
+            station.only(("position",))
+        return named
+    stations: dict[str, Table] = {}
+    for number, item in enumerate(value, 1):
+        station = Table.of(f"{path}: {number}", item)
+        station.only(("id", "position"))
+        name = station.text("id")
+        if name in stations:
+            raise InputError(f"{station.where}: id {name!r} is given more than once; give each station its own")
+        stations[name] = station
+    return stations
+
+
 def _read_stations(folder: Path, unit: str) -> Stations | None:
     """Read stations.json, if it exists: positions of scanners by name, in the project's frame."""
     path = folder / STATIONS
     if not path.exists():
         return None
     existing_file_in(folder, STATIONS, str(folder))
-    table = read_json(path)
-    stations = {name: table.table(name) for name in table.values}
-    for station in stations.values():
-        station.only(("position",))
+    stations = _stations_by_name(path)
     positions = np.array([station.array("position", 3) for station in stations.values()]).reshape(-1, 3)
     return Stations(tuple(stations), positions * MM_PER_UNIT[unit])
 

@@ -89,6 +89,31 @@ def test_a_scan_named_like_a_station_was_seen_from_there(tmp_path):
     assert not scans["S3"].position.size
 
 
+def test_stations_may_be_a_list_with_ids(tmp_path):
+    write_xyz(tmp_path / "scan.xyz", surface(0))
+    listed = [{"id": "S2", "position": [1.0, 2.0, 3.0]}, {"id": "S1", "position": [4.0, 5.0, 6.0]}]
+    (tmp_path / "stations.json").write_text(json.dumps(listed))
+    stations = folder.read_input(tmp_path, units="m").stations
+    assert stations.ids == ("S2", "S1")
+    assert stations.positions.tolist() == [[1000.0, 2000.0, 3000.0], [4000.0, 5000.0, 6000.0]]
+    for wrong in ([*listed, listed[0]], [{"position": [1.0, 2.0, 3.0]}], [{**listed[0], "pose": 1}]):
+        (tmp_path / "stations.json").write_text(json.dumps(wrong))
+        with pytest.raises(InputError, match=r"stations\.json: \d"):
+            folder.read_input(tmp_path, units="m")
+
+
+def test_unknown_keys_of_nodes_and_members_are_ignored_with_one_line(tmp_path, caplog):
+    write_xyz(tmp_path / "scan.xyz", surface(0))
+    nodes = [{"id": i, "centre": [1000.0 * i, 0, 0], "radius": 60.0, "suport": "perimeter"} for i in range(3)]
+    members = [{"a": 0, "b": 1, "tube_diameter": 60.0, "colour": "red"}]
+    design = {"units": "mm", "kind": "space-frame", "nodes": nodes, "members": members}
+    (tmp_path / "design.json").write_text(json.dumps(design))
+    (tmp_path / "project.toml").write_text('kind = "space-frame"\nunits = "mm"\ndesign = "design.json"\n')
+    assert len(folder.read_input(tmp_path).frame.ids) == 3
+    assert [record.args[1] for record in caplog.records] == ["'suport'", "'colour'"]
+    assert "support" in caplog.records[0].message
+
+
 def test_a_chinese_project_file_in_gb18030(bridge):
     (bridge / "project.toml").write_bytes('name = "东桥"\n'.encode("gb18030"))
     assert folder.read_input(bridge).name == "东桥"
