@@ -338,9 +338,10 @@ def refined(
         f_scale=ROBUST_SDS,
     )
     try:
-        sd = float(np.sqrt(np.linalg.inv(fit.jac.T @ fit.jac)[3, 3]))
+        variance = float(np.linalg.inv(fit.jac.T @ fit.jac)[3, 3])
     except np.linalg.LinAlgError:
         return measured
+    sd = float(np.sqrt(variance)) if variance > 0.0 else np.inf  # by rounding, of a matrix that is nearly singular
     depth = float(fit.x[3])
     plausible = depth * measured.depth > 0.0 and abs(depth) <= 4.0 * abs(measured.depth)
     if not (fit.success and plausible and sd < 0.5 * abs(depth)):
