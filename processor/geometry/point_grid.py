@@ -65,7 +65,10 @@ def of_points(points: Floats, cell: float) -> PointGrid:
     if len(points) == 0:
         none = np.zeros((0, SIDE**3 + 1), np.int64)
         empty = np.full(2, EMPTY, np.int64)
-        cells = Cells(np.zeros((0, 3)), empty, empty.copy(), none, np.zeros(3), 1.0, np.ones(3, np.int64))
+        cells = Cells(
+            points=np.zeros((0, 3)), keys=empty, blocks=empty.copy(), starts=none, lower=np.zeros(3), size=1.0,
+            extent=np.ones(3, np.int64),
+        )  # fmt: skip
         return PointGrid(cells, np.empty(0, np.int64))
     lower = points.min(axis=0)
     extent = float((points.max(axis=0) - lower).max())
@@ -89,7 +92,8 @@ def of_points(points: Floats, cell: float) -> PointGrid:
     over_ranges(lambda a, b: _sort_cells(rows, order, starts, a, b), len(first), least=64)
     keys, blocks = _table(block_key[first])
     reach = ((points.max(axis=0) - lower) / size).astype(np.int64) // SIDE + 1
-    return PointGrid(Cells(rows, keys, blocks, starts, lower, size, reach), order)
+    cells = Cells(points=rows, keys=keys, blocks=blocks, starts=starts, lower=lower, size=size, extent=reach)
+    return PointGrid(cells, order)
 
 
 def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:

@@ -75,5 +75,5 @@ def _by_joint(
         p1, p2, p3, p4 = design.joint_points[at[k], :4]
         along = np.cross(p4 - p2, p3 - p1)  # square to the section, from the left part to the right
         for group in holes.groups(own, [along / np.linalg.norm(along)]):
-            yield DrilledGroup(name, at[k], origin, group, holes.fitted(cloud, group), first)
+            yield DrilledGroup(name, at[k], origin, group, fitted=holes.fitted(cloud, group), first=first)
             first += len(group.holes)

@@ -109,12 +109,16 @@ def long_functions():
 
 
 def positional_records(most=5):
-    """Calls of dataclasses of the project with more than ``most`` positional arguments."""
+    """Calls of dataclasses and named tuples of the project with more than ``most`` positional arguments."""
     records = {
         node.name
         for path in SOURCES
         for node in ast.walk(tree(path))
-        if isinstance(node, ast.ClassDef) and any("dataclass" in ast.dump(one) for one in node.decorator_list)
+        if isinstance(node, ast.ClassDef)
+        and (
+            any("dataclass" in ast.dump(one) for one in node.decorator_list)
+            or any("NamedTuple" in ast.dump(one) for one in node.bases)
+        )
     }
     found = []
     for path in SOURCES:

@@ -195,7 +195,10 @@ def _with_waves(coefficients: Floats, used: UsedPoints, at: Floats, face: EndFac
     trend = basis(found.centre[:, 0], found.centre[:, 1] / half)[:, terms]
     noise = max(found.noise, FLOOR_MM**2)
     dof = len(used.residual) - len(found.mean)
-    means = kriging.Means(found.centre, found.mean, noise / found.number, trend, dof, -coefficients[terms], REACH_MM)
+    means = kriging.Means(
+        place=found.centre, value=found.mean, variance=noise / found.number, trend=trend, dof=dof,
+        trend_mean=-coefficients[terms], trend_sd=REACH_MM,
+    )  # fmt: skip
     nodes = np.stack([np.zeros(len(NODES)), half * np.array(NODES)], axis=1)
     hypotheses = kriging.by_hypotheses(means, nodes)
     if face.narrow:
@@ -245,7 +248,16 @@ def _on_faces(part: RegisteredPart, local: Floats, place: EndPlace) -> list[_She
         cell = (column * CELLS[1] + row).astype(np.int64)
         layer = plate_sides.outer_surface(out, np.stack([np.ones_like(x), x, w, x * w], axis=1), cell)
         single_layer = len(rows) - int(layer.sum()) < plate_sides.SECOND_SHARE * len(rows)
-        faces.append(_Sheets(rows[layer], out[layer], cell[layer], rows[~layer], out[~layer], single_layer))
+        faces.append(
+            _Sheets(
+                rows=rows[layer],
+                out=out[layer],
+                cell=cell[layer],
+                behind=rows[~layer],
+                behind_out=out[~layer],
+                single_layer=single_layer,
+            )
+        )
     return faces
 
 

@@ -146,13 +146,14 @@ def _made(half: Floats, closed: tuple[bool, ...], thickness: Floats) -> Section:
         width = float(half[3 - axis])
         if closed[k]:
             number[k, -1.0] = number[k, 1.0] = len(faces)
-            faces.append(EndFace(name, axis, sense, float(half[axis]), 0.0, width))
+            faces.append(EndFace(name, axis, sense, offset=float(half[axis]), middle=0.0, half=width))
             continue
         for end in (-1.0, 1.0):
             plate = next(j for j, (_, a, s) in enumerate(SIDES) if a == 3 - axis and s == end)
             edge = 0.5 * float(thickness[plate])
             number[k, end] = len(faces)
-            faces.append(EndFace(name, axis, sense, float(half[axis]), end * (width - edge), edge, plate=False))
+            offset, middle = float(half[axis]), end * (width - edge)
+            faces.append(EndFace(name, axis, sense, offset=offset, middle=middle, half=edge, plate=False))
     corners = []
     for u, v in PLACES:
         upright = next(j for j, (_, a, s) in enumerate(SIDES) if a == 1 and s == u)

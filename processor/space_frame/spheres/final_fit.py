@@ -228,7 +228,9 @@ def fill_residuals(observations, surface, noise, unknowns, covariance, residuals
             if inside:
                 stations += 1
             inside = False
-    return ResidualSums(weights, squares, leverages, plain, seen, stations)
+    return ResidualSums(
+        weight=weights, scaled_squares=squares, leverage=leverages, squares=plain, cells=seen, stations=stations
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

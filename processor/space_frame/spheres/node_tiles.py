@@ -65,7 +65,16 @@ def choose(
     parts = tiles.mapped(
         _chosen,
         [
-            _ToChoose(_crops(crops, at), _masks(masks, at), model, _sizes(sizes, at), *reaches, wanted[at], threads)
+            _ToChoose(
+                crops=_crops(crops, at),
+                masks=_masks(masks, at),
+                model=model,
+                sizes=_sizes(sizes, at),
+                vote_half_width=reaches[0],
+                first_reach_mm=reaches[1],
+                wanted=wanted[at],
+                threads=threads,
+            )
             for at in _nodes(len(wanted))
         ],
     )
@@ -92,8 +101,9 @@ def fit_final(
             _fitted,
             [
                 _ToFit(
-                    _crops(crops, at), _masks(masks, at), model, model_points,
-                    Priors(*(column[at] for column in priors)), states[at], first_reach_mm, threads,
+                    crops=_crops(crops, at), masks=_masks(masks, at), model=model, model_points=model_points,
+                    priors=Priors(*(column[at] for column in priors)), states=states[at],
+                    first_reach_mm=first_reach_mm, threads=threads,
                 )
                 for at in _nodes(len(states))
             ],

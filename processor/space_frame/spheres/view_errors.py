@@ -169,7 +169,7 @@ def _fit_of(k: int, crops: CropsWithRays, weights: Floats, fits: Fits, priors: P
 
 def _residuals(fit: _Fit, place: Floats) -> BallResiduals:
     left = np.eye(len(fit.cells)) - fit.J @ fit.gain
-    return BallResiduals(place, fit.cells, fit.means, fit.counts, left, fit.noise)
+    return BallResiduals(place, fit.cells, fit.means, weights=fit.counts, left=left, noise=fit.noise)
 
 
 def _neighbours(rows: list[int], places: Floats) -> list[int]:
