@@ -144,7 +144,11 @@ def words(axis: str, vocabulary: type[Word], **shown: Any) -> Any:
 
 
 def reasons(axis: str = "", **shown: Any) -> Any:
-    """Declare a tuple of reasons; with an axis a tuple of reasons for each row along it."""
+    """Declare a tuple of reasons; with an axis a tuple of reasons for each row along it.
+
+    ``of_text`` turns the text that earlier files hold in their place into reasons. ``hashed_as_text``: the hash of a
+    scene is taken from their English text, as it was when the field held that text.
+    """
     return dataclasses.field(default=(), metadata={"reasons": axis, **shown})
 
 
@@ -649,6 +653,11 @@ class TitleBlock(Checked):
     logo: Codes = column("bytes", dtype=np.uint8, means=Meaning())
 
 
+def _units_as_stated(text: str) -> tuple[Reason, ...]:
+    """Return the source of a unit that a scene file of before version 1.5 states as a text."""
+    return (reason("units.as-stated", text=text),) if text else ()
+
+
 @dataclass(frozen=True)
 class Scene(Checked):
     """What was scanned, and what it was meant to be. Steps read this and nothing else."""
@@ -662,7 +671,7 @@ class Scene(Checked):
     # of the steel while it was scanned
     temperature_C: float = described(float("nan"), means=Meaning(least=-100.0, most=500.0))
     units: str = "mm"  # of the input's coordinates, and why they were read so
-    units_reason: str = described("", means=LONG)
+    units_reason: tuple[Reason, ...] = reasons(of_text=_units_as_stated, hashed_as_text=True)
     structure: StructureDesign | None = None
     tolerance: Tolerance | None = None  # None: nothing was said
     control: Control | None = newer()

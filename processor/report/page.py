@@ -91,7 +91,7 @@ def _about(scene: Scene) -> Text:
         "scans": len(scene.scans),
         "points": points,
         "units": scene.units,
-        "reason": [label(one) for one in scene.units_reason.split("; ")],
+        "reason": scene.units_reason,
     }
     if points:
         return text(

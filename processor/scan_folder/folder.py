@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from processor import large_arrays, readers, record_checks, store
 from processor.geometry import rigid
+from processor.language.messages import messages
 from processor.model import (
     KINDS,
     ArchDesign,
@@ -20,6 +21,7 @@ from processor.model import (
     InputError,
     Ints,
     Labels,
+    Reason,
     Scan,
     Scene,
     Stations,
@@ -27,6 +29,7 @@ from processor.model import (
     TitleBlock,
     Tolerance,
     did_you_mean,
+    reason,
 )
 from processor.progress import tracked
 from processor.readers import RawScan
@@ -72,9 +75,6 @@ KEYS = (
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FLOAT_STEP_MM = 1.0
 NAN = float("nan")
-GUESSED = "guessed from the scans' size"
-GUESSED_DESIGN = "design and components as processor init guesses them, as there is no project.toml"
-UNSURE_DESIGN = "design and components as processor init guesses them, some not sure, as there is no project.toml"
 
 Design = ArchDesign | FrameDesign | StructureDesign
 Keep = Callable[[Scan], Scan]
@@ -311,7 +311,7 @@ def _scene(
     scans: list[Scan] = []
     scan_units: list[str] = []
     days: set[str] = set()
-    reasons: dict[str, str] = {}
+    reasons: dict[str, Reason] = {}  # why a unit was taken, by units
     clipper = Clipper(read_boxes(project.table, MM_PER_UNIT[project.units or option or "m"]), project.table.where)
     for entry in tracked(project.entries):
         if entry.component and parts and entry.component not in parts:
@@ -319,13 +319,13 @@ def _scene(
                 f"{entry.path}: the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}"
             )
         for raw in _read_raws(entry, scans):
-            unit, reason = _unit(raw, entry.path, project, option)
+            unit, why = _unit(raw, entry.path, project, option)
             days |= {raw.scanned} - {""}
-            reasons.setdefault(unit, reason)
+            reasons.setdefault(unit, why)
             scan = clipper.clip(_scan(raw, entry, unit, parts, stations))
             if any(scan.name == other.name for other in scans):
                 raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
-            _check_unit(entry.path, scan, unit, reason, design)
+            _check_unit(entry.path, scan, unit, messages("en").text(why), design)
             scans.append(keep(scan))
             scan_units.append(unit)
     where = stations or _stations(scans)
@@ -340,7 +340,7 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason="; ".join([*dict.fromkeys(reasons.values()), *_said(project)]),
+        units_reason=(*_different(reasons.values()), *_said(project)),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
         control=control_points(project.control, scans, scan_units, where, unit, search is not None),
@@ -351,10 +351,18 @@ def _scene(
     )
 
 
-def _said(project: _Project) -> list[str]:
+def _different(reasons: Iterable[Reason]) -> list[Reason]:
+    """Return each reason once, in their order; reasons have no hash."""
+    different: list[Reason] = []
+    for one in reasons:
+        different += [] if one in different else [one]
+    return different
+
+
+def _said(project: _Project) -> tuple[Reason, ...]:
     if project.guessed is None:
-        return []
-    return [UNSURE_DESIGN if project.guessed.unsure else GUESSED_DESIGN]
+        return ()
+    return (reason("units.design-guessed-unsure") if project.guessed.unsure else reason("units.design-guessed"),)
 
 
 def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
@@ -370,16 +378,16 @@ def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
         yield raw
 
 
-def _unit(raw: RawScan, path: Path, project: _Project, option: str) -> tuple[str, str]:
+def _unit(raw: RawScan, path: Path, project: _Project, option: str) -> tuple[str, Reason]:
     if option:
-        return option, "given by --units"
+        return option, reason("units.by-option")
     if raw.unit:
-        return known_unit(raw.unit), f"given by the {path.suffix.lower()[1:]} file or its format"
+        return known_unit(raw.unit), reason("units.by-format", format=path.suffix.lower()[1:])
     if project.units:
-        return project.units, GUESSED if project.guessed else f"given in {PROJECT}"
+        return project.units, (reason("units.by-size") if project.guessed else reason("units.by-project", file=PROJECT))
     if project.design is None and project.guessed is None and (why := units.not_metres(raw.points)):
         return "mm", why
-    return "m", "taken as metres, as scanners write: neither the format nor the project gives a unit"
+    return "m", reason("units.as-scanners-write")
 
 
 def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Stations | None) -> Scan:
@@ -454,7 +462,7 @@ def _stations(scans: list[Scan]) -> Stations | None:
     return Stations(tuple(positions), np.array(list(positions.values()))) if positions else None
 
 
-def _check_unit(path: Path, scan: Scan, unit: str, reason: str, design: Design | None) -> None:
+def _check_unit(path: Path, scan: Scan, unit: str, source: str, design: Design | None) -> None:
     """Raise InputError if a scan's size shows that its unit is wrong, by itself or beside its design."""
     nominal, ratios = np.empty((0, 3)), units.STRUCTURE_RATIOS
     if isinstance(design, ArchDesign):
@@ -465,5 +473,5 @@ def _check_unit(path: Path, scan: Scan, unit: str, reason: str, design: Design |
     elif design is not None:
         nominal = design.vertices
     what, advice = f"{path}: scan {scan.name!r}", f"give its unit by --units or in {PROJECT}"
-    units.check_ratio(what, scan.points, nominal, ratios, unit, reason, f"{advice}, or correct the design's units")
-    units.check_extent(what, scan.points, unit, reason, advice, units.STRAY)
+    units.check_ratio(what, scan.points, nominal, ratios, unit, source, f"{advice}, or correct the design's units")
+    units.check_extent(what, scan.points, unit, source, advice, units.STRAY)

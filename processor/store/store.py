@@ -27,13 +27,14 @@ import processor.store.codec as codec
 import processor.store.file_structure_checks as file_structure_checks
 import processor.store.scan_tiles as scan_tiles
 from processor import large_arrays
-from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth, per_point_fields
+from processor.language.messages import messages
+from processor.model import InputError, Ints, PointLabels, Reason, Scan, Scene, StepRun, Truth, per_point_fields
 from processor.store.atomic_file import replacing
 from processor.store.codec import DecodeError
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
-FORMAT_VERSION = "1.4"  # of scenes and truths
-READABLE = ("1.2", "1.3", FORMAT_VERSION)  # fields added since may be absent
+FORMAT_VERSION = "1.5"  # of scenes and truths
+READABLE = ("1.2", "1.3", "1.4", FORMAT_VERSION)  # fields added since may be absent
 RESULTS_VERSION = "2.3"
 RESULTS_READABLE = ("2.0", "2.1", "2.2", RESULTS_VERSION)
 WITHOUT_CHECKSUMS = ("1.2", "1.3", "2.0")
@@ -51,6 +52,7 @@ HISTORY = [
     "what a part's mesh is made from",
     "1.3: control points",
     "1.4: checksums",
+    "1.5: how coordinates were read, as reasons with codes",
 ]
 
 # Exceptions of HDF5 and h5py for a damaged file; none of them names the file.
@@ -239,6 +241,8 @@ def read_scene(path: Path, points: bool = True) -> Scene:
     with opened(path, ["scene"]) as file:
         read_scan = scan_tiles.read_scan if points else scan_tiles.read_scan_alone
         scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: read_scan})
+        _check_reasons(scene.units_reason, "/scene/units_reason")
+        _check_reasons(scene.target_remarks, "/scene/target_remarks")
         if points:
             return _possible(scene, "/scene")
         # Steps look stations up by the numbers of the points: their range is known before any step begins.
@@ -247,6 +251,15 @@ def read_scene(path: Path, points: bool = True) -> Scene:
         scans = (dataclasses.replace(s, point_station=e) for s, e in zip(scene.scans, extremes, strict=True))
         _possible(dataclasses.replace(scene, scans=tuple(scans)), "/scene")
         return scene
+
+
+def _check_reasons(reasons: Sequence[Reason], where: str) -> None:
+    """Raise DecodeError for reasons that lack a value of their text, or have one of another kind."""
+    for i, reason in enumerate(reasons):
+        try:
+            messages("en").text(reason)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise DecodeError([f"{where}, row {i}: expected the values of {reason.code!r} ({error!r})"]) from None
 
 
 def _possible(record: Record, where: str) -> Record:
@@ -402,6 +415,8 @@ def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int =
                     digest.update(np.ascontiguousarray(part, kind).data)
                 continue
             item = getattr(value, field.name)
+            if field.metadata.get("hashed_as_text"):
+                item = messages("en").text(item)
             if not newer or (item is not None and not (isinstance(item, np.ndarray) and item.size == 0)):
                 _feed(digest, field.name, item, pieces)
         digest.update(b")")

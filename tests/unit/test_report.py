@@ -257,7 +257,9 @@ def test_a_run_without_any_answer_is_drawn_too():
 @pytest.mark.usefixtures("blank_pictures")
 def test_the_page_escapes_names_and_loads_nothing():
     bad = "<script>alert(1)</script>"
-    scene = dataclasses.replace(arch_scene((bad, "rib1", "foot2")), name=bad, units_reason=bad)
+    scene = dataclasses.replace(
+        arch_scene((bad, "rib1", "foot2")), name=bad, units_reason=(reason("units.as-stated", text=bad),)
+    )
     text = render(
         of_bridge(scene, names=(bad, "rib1", "foot2")), ErrorReport((Metric("s", bad, 1.0, unit=bad, limit=2.0),))
     )
