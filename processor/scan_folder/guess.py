@@ -130,22 +130,22 @@ def _shown_design(
     """Return the design that meshes or CAD files show: of an arch bridge or a frame, else one surface of a whole."""
     scans = [(scan.radius, scan.units) for scan in project.scans if not scan.error]
     found = list[GuessedDesign]()
-    doubts = list[str]()
+    without = list[GuessedDesign]()
     for group in groups:
         try:
             guessed = guess_design.guess(folder, group, scans, design_units)
         except InputError as error:
             project.unsure.append(f"design: {str(error).replace(f'{folder}/', '')}")
             continue
-        found += [guessed] if guessed.design is not None else []
-        doubts += guessed.doubts if guessed.design is None else ()
+        (without if guessed.design is None else found).append(guessed)
     if len(found) == 1:
         _take_design(project, found[0])
         return found[0].design
     paths = [path for group in groups for path in group]
     if len(paths) == 1 and not found:
         project.design, project.design_reason = str(paths[0].relative_to(folder)), "the only candidate"
-        project.unsure += [text for text in doubts if not text.startswith("units of the design")]
+        # The unit of one surface of the whole is that of 'design_units', which has a doubt of its own.
+        project.unsure += [text for one in without for text in one.doubts]
         return _read_design(folder, paths[0], project)
     if not paths:
         project.unsure.append("design: none found, so scans are not compared with one")
@@ -156,7 +156,7 @@ def _shown_design(
         f"design: several files may be it ({named}); name one as 'design', with kind = \"structure\", or write a "
         "design.json"
     )
-    project.unsure += [f"design: {text}" for text in doubts]
+    project.unsure += [f"design: {text}" for one in without for text in one.questions]
     return None
 
 
@@ -166,7 +166,7 @@ def _take_design(project: Guess, guessed: GuessedDesign) -> None:
     project.kind_reason = project.design_reason = guessed.reason
     if guessed.kind_doubt:
         project.unsure.append(f"kind: taken as {project.kind}: {guessed.kind_doubt}")
-    project.unsure += guessed.doubts
+    project.unsure += guessed.questions
 
 
 def _has_kind(path: Path) -> bool:
@@ -443,6 +443,6 @@ def write_design(folder: Path, project: Guess) -> None:
         (folder / name).parent.mkdir(exist_ok=True)
         with replacing(folder / name) as temporary:
             write_mesh(temporary, vertices, faces)
-    questions = [*([project.made.kind_doubt] if project.made.kind_doubt else []), *project.made.doubts]
+    questions = [*([project.made.kind_doubt] if project.made.kind_doubt else []), *project.made.questions]
     with replacing(folder / project.design) as temporary:
         write_json(temporary, guess_design.content(project.made, questions))
