@@ -16,7 +16,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -182,6 +182,17 @@ def newer(hashed: bool = True) -> Any:
     return dataclasses.field(default=None, metadata={"newer": True, "hashed": hashed})
 
 
+class Fault(NamedTuple):
+    """What is impossible in a record: the field within it, and the text to follow its name.
+
+    ``path`` are the names of the fields and the numbers of the records that lead to the field. The text has the row,
+    what was expected and what was found: ", row 3: expected ..., found ...", or without a row ": expected ...".
+    """
+
+    path: tuple[str, ...]
+    text: str
+
+
 class Checked:
     """Checks the declared fields of a frozen dataclass when it is made; holds no data and no behaviour."""
 
@@ -207,8 +218,8 @@ class Checked:
                 array = _checked_array(value, metadata, where, lengths)
                 object.__setattr__(self, field.name, array)
 
-    def contradictions(self) -> Iterable[str]:
-        """Yield what its fields, each possible, contradict: place within the record, expected, found."""
+    def contradictions(self) -> Iterable[Fault]:
+        """Yield what its fields, each possible, contradict."""
         return ()
 
 
@@ -364,13 +375,14 @@ class Scan(Checked):
         """T_project_scan (4, 4); the identity for a scan without a pose."""
         return self.T_project_scan if self.T_project_scan.size else np.eye(4)
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield that a few points claim a grid that fills the memory."""
         if len(self.grid_row) and len(self.grid_column):
             rows, columns = (int(large_arrays.extremes(n)[1]) + 1 for n in (self.grid_row, self.grid_column))
             most = LARGEST_GRID + GRID_CELLS_PER_POINT * len(self.grid_row)
             if rows * columns > most:
-                yield f"/grid_row: expected a grid of at most {most} cells for its points, found {rows} x {columns}"
+                text = f": expected a grid of at most {most} cells for its points, found {rows} x {columns}"
+                yield Fault(("grid_row",), text)
 
 
 @dataclass(frozen=True)
@@ -413,9 +425,9 @@ class ArchDesign(Checked):
     joint_right: tuple[str, ...] = names("j", means=Meaning(among="parts.name"))
     joint_points: Floats = column("j", 8, 3, means=PLACE)
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield parts of one name."""
-        yield from _repeated("/parts", tuple(part.name for part in self.parts))
+        yield from _repeated("parts", tuple(part.name for part in self.parts))
 
     @property
     def joined(self) -> Ints:
@@ -488,11 +500,12 @@ class StructureDesign(Checked):
     bodies: DesignBodies | None = newer()
     faults: DesignFaults | None = newer()
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield that bodies are not given for each facet."""
         given = len(self.faces) if self.bodies is None else len(self.bodies.of_facet)
         if given != len(self.faces):
-            yield f"/bodies/of_facet: expected a row for each of {len(self.faces)} faces, found {given}"
+            text = f": expected a row for each of {len(self.faces)} faces, found {given}"
+            yield Fault(("bodies", "of_facet"), text)
 
 
 @dataclass(frozen=True)
@@ -524,11 +537,12 @@ class Limit(Checked):
     source: str = described("", means=LONG)
     component: str | None = newer()
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield a lower bound above the upper one."""
         for low, high in (("low", "high"), ("low_ratio", "high_ratio"), ("above_mm", "up_to_mm")):
             if getattr(self, low) > getattr(self, high):
-                yield f"/{low}: expected at most {high}, {getattr(self, high):g}, found {getattr(self, low):g}"
+                text = f": expected at most {high}, {getattr(self, high):g}, found {getattr(self, low):g}"
+                yield Fault((low,), text)
 
 
 @dataclass(frozen=True)
@@ -638,10 +652,10 @@ class Ceiling(Checked):
     clearance_mm: float = described(0.0, means=Meaning(finite=True, least=0.0, most=LARGEST_MM))
     longest_mm: float = described(float("nan"), means=Meaning(above=0.0, most=LARGEST_MM))
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield that there is neither a level nor a surface, or both."""
         if bool(np.isnan(self.level)) == (not len(self.faces)):
-            yield "/level: expected a level or faces, found neither or both"
+            yield Fault(("level",), ": expected a level or faces, found neither or both")
 
 
 @dataclass(frozen=True)
@@ -685,19 +699,21 @@ class Scene(Checked):
     # days of the scans by their files, YYYY-MM-DD, in order; no step reads them
     scanned: tuple[str, ...] = names("days", newer=True, hashed=False)
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield scans of one name, and parts that the design does not have."""
-        yield from _repeated("/scans", tuple(scan.name for scan in self.scans))
+        yield from _repeated("scans", tuple(scan.name for scan in self.scans))
         parts = {part.name for part in self.arch.parts} if self.arch else set()
         for i, scan in enumerate(self.scans):
             if parts and scan.component and scan.component not in parts:
-                yield f"/scans/{i:04d}/component: expected a part of the design, found {scan.component!r}"
+                text = f": expected a part of the design, found {scan.component!r}"
+                yield Fault(("scans", f"{i:04d}", "component"), text)
 
 
-def _repeated(where: str, names: tuple[str, ...]) -> Iterator[str]:
+def _repeated(field: str, names: tuple[str, ...]) -> Iterator[Fault]:
     for i, name in enumerate(names):
         if name in names[:i]:
-            yield f"{where}/{i:04d}/name: expected another name for each, found {name!r} a second time"
+            text = f": expected another name for each, found {name!r} a second time"
+            yield Fault((field, f"{i:04d}", "name"), text)
             return
 
 
