@@ -1,6 +1,7 @@
 """The structure of the sources, read with ast: modules, imports, circles, sizes."""
 
 import ast
+import re
 from collections import Counter, defaultdict
 from functools import cache
 from pathlib import Path
@@ -28,7 +29,8 @@ def tree(path):
 def imports(path):
     """Every module that a file imports, those inside functions too; of `from a import b` both a and a.b.
 
-    Imports for type checkers alone do not count, and neither do names in strings.
+    Of `import_module(f"a.{name}.b")` these are all modules whose names fit. Imports for type checkers alone do not
+    count, and neither do other names in strings.
     """
     found = set()
     only_types = {
@@ -45,7 +47,17 @@ def imports(path):
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) == "import_module":
+            found |= modules_named(node.args[0])
     return frozenset(found)
+
+
+def modules_named(name):
+    """The modules of the project that an argument of import_module can name; a field of an f-string is any word."""
+    if not isinstance(name, ast.JoinedStr) or not isinstance(name.values[0], ast.Constant):
+        return set()
+    pattern = "".join(re.escape(one.value) if isinstance(one, ast.Constant) else r"\w+" for one in name.values)
+    return {module for module in MODULES if re.fullmatch(pattern, module)}
 
 
 def within(names, *packages):

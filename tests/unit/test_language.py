@@ -16,7 +16,8 @@ from processor.preassembly.ends.section import PlateFace
 from processor.preassembly.result import Gauge
 from processor.preassembly.verdicts import joint_measures, trim_and_build_up
 from processor.registration.surface_registration import Motion
-from processor.report import all_figures, page, page_script
+from processor.report import all_figures, page
+from processor.report.scripts import page_script
 from processor.scan_folder import units
 from processor.space_frame.design.matching import FrameRelation
 from tests.support.ball_results import of_frame, whole, with_truth
