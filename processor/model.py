@@ -16,6 +16,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -316,13 +317,26 @@ class PlainError(Exception):
     """An error of one message for people; of what came by the megabyte, the message shows the beginning."""
 
     def __init__(self, message: str = "") -> None:
-        short = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][: LONGEST_WORD // 5]}...", message)
-        cut = len(short) - LONGEST_MESSAGE
-        super().__init__(f"{short[:LONGEST_MESSAGE]}... ({cut} characters more)" if cut > 0 else short)
+        super().__init__(_shortened(message))
+
+
+def _shortened(message: str) -> str:
+    short = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][: LONGEST_WORD // 5]}...", message)
+    cut = len(short) - LONGEST_MESSAGE
+    return f"{short[:LONGEST_MESSAGE]}... ({cut} characters more)" if cut > 0 else short
 
 
 class InputError(PlainError):
-    """Input that cannot be used. The message names the file, what was expected, what came and what to do."""
+    """Input that cannot be used. The message names the file, what was expected, what came and what to do.
+
+    ``path`` is the file or folder that the message begins with, None where it begins otherwise; ``problem`` is the
+    message without it.
+    """
+
+    def __init__(self, problem: str = "", *, path: Path | str | None = None) -> None:
+        super().__init__(problem if path is None else f"{path}: {problem}")
+        self.path = None if path is None else Path(path)
+        self.problem = _shortened(problem)
 
 
 WORST_FIRST = (Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS)

@@ -213,13 +213,13 @@ def _read_project(folder: Path) -> _Project:
         try:
             table = Table.of(str(path), tomllib.loads(read_text(path)))
         except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise InputError(f"{path}: not readable TOML: {error}") from None
+            raise InputError(f"not readable TOML: {error}", path=path) from None
     guessed = None if path.exists() else _guess(folder)
     table.only(KEYS)
     kind = table.text("kind", "")
     if kind and kind not in KINDS:
         like = did_you_mean(kind, KINDS)
-        raise InputError(f"{path}: unknown kind {kind!r}{like}; expected one of {', '.join(KINDS)}")
+        raise InputError(f"unknown kind {kind!r}{like}; expected one of {', '.join(KINDS)}", path=path)
     found = next((name for name in DESIGNS if (folder / name).exists()), "")
     named = table.text("design", "") or found
     if not named and guessed is None and not path.exists():
@@ -293,8 +293,9 @@ def _open_scans(folder: Path, files: Sequence[Path]) -> list[Path]:
     if not scans:
         packed = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in readers.ARCHIVES]
         raise InputError(
-            f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none"
-            + (f"; unpack {packed[0]} first" if packed else "")
+            f"expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none"
+            + (f"; unpack {packed[0]} first" if packed else ""),
+            path=folder,
         )
     return scans
 
@@ -316,7 +317,7 @@ def _scene(
     for entry in tracked(project.entries):
         if entry.component and parts and entry.component not in parts:
             raise InputError(
-                f"{entry.path}: the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}"
+                f"the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}", path=entry.path
             )
         for raw in _read_raws(entry, scans):
             unit, why = _unit(raw, entry.path, project, option)
@@ -324,7 +325,7 @@ def _scene(
             reasons.setdefault(unit, why)
             scan = clipper.clip(_scan(raw, entry, unit, parts, stations))
             if any(scan.name == other.name for other in scans):
-                raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
+                raise InputError(f"a second scan named {scan.name!r}; rename one of the files", path=entry.path)
             _check_unit(entry.path, scan, unit, messages("en").text(why), design)
             scans.append(keep(scan))
             scan_units.append(unit)
@@ -370,7 +371,7 @@ def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
     raws = readers.read(entry.path)
     several = len(raws) > 1
     if several and (entry.pose is not None or entry.position is not None):
-        raise InputError(f"{entry.path}: holds {len(raws)} scans, so one 'pose' or 'position' does not fit them")
+        raise InputError(f"holds {len(raws)} scans, so one 'pose' or 'position' does not fit them", path=entry.path)
     for number in range(1, len(raws) + 1):
         raw = raws.pop(0)
         if several and any(raw.name == other.name for other in scans):  # scanners name the first of each file S1
@@ -393,13 +394,14 @@ def _unit(raw: RawScan, path: Path, project: _Project, option: str) -> tuple[str
 def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Stations | None) -> Scan:
     if len(raw.points) < FEWEST_POINTS:
         raise InputError(
-            f"{entry.path}: scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more"
+            f"scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more", path=entry.path
         )
     scale = MM_PER_UNIT[unit]
     if raw.step * scale > FLOAT_STEP_MM:
         raise InputError(
-            f"{entry.path}: the coordinates of scan {raw.name!r} are in 32 bits, which so far from their origin have "
-            f"steps of {raw.step * scale:.3g} mm; export it in double precision, or nearer to its origin"
+            f"the coordinates of scan {raw.name!r} are in 32 bits, which so far from their origin have "
+            f"steps of {raw.step * scale:.3g} mm; export it in double precision, or nearer to its origin",
+            path=entry.path,
         )
     pose = np.array(raw.T_project_scan if entry.pose is None else entry.pose)
     if pose.size:
@@ -413,8 +415,8 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
         least, most = map(int, large_arrays.extremes(raw.station))
         if not 0 <= least <= most <= len(stations.ids):
             raise InputError(
-                f"{entry.path}: its points name stations {least} to {most}, "
-                f"but {STATIONS} has {len(stations.ids)}, counted from 1"
+                f"its points name stations {least} to {most}, but {STATIONS} has {len(stations.ids)}, counted from 1",
+                path=entry.path,
             )
     scanner = position if position.size else np.zeros(3)
     origin = raw.origin * scale

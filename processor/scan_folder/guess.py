@@ -82,7 +82,7 @@ def guess(folder: Path, design_units: str = "") -> Guess:
     without such a folder.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected a scan folder, found {'a file' if folder.exists() else 'nothing'}")
+        raise InputError(f"expected a scan folder, found {'a file' if folder.exists() else 'nothing'}", path=folder)
     project = Guess(str(folder), folder.resolve().name)
     path = _written_design(folder, project)
     groups = [] if path else surface_files.candidates(folder)
@@ -93,7 +93,7 @@ def guess(folder: Path, design_units: str = "") -> Guess:
         project.scans += [_read_scan(folder, file, project) for file in scan_files(folder, [path]) if file in surfaces]
     if not project.scans:
         raise InputError(
-            f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none"
+            f"expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none", path=folder
         )
     _guess_units(project, _sizes(design))
     if isinstance(design, ArchDesign):
@@ -135,7 +135,7 @@ def _shown_design(
         try:
             guessed = guess_design.guess(folder, group, scans, design_units)
         except InputError as error:
-            project.unsure.append(f"design: {str(error).replace(f'{folder}/', '')}")
+            project.unsure.append(f"design: {_within(folder, error)}")
             continue
         (without if guessed.design is None else found).append(guessed)
     if len(found) == 1:
@@ -210,7 +210,7 @@ def _read_scan(folder: Path, path: Path, project: Guess) -> ScanGuess:
         existing_file_in(folder, scan.file, str(folder))
         raws = readers.read(path)
     except InputError as error:
-        scan.error = str(error).replace(f"{folder}/", "")
+        scan.error = _within(folder, error)
         project.unsure.append(f"{scan.file}: cannot be read, so it is written as a comment: {scan.error}")
         return scan
     scan.units = known_unit(raws[0].unit) if raws[0].unit else ""
@@ -220,6 +220,13 @@ def _read_scan(folder: Path, path: Path, project: Guess) -> ScanGuess:
     if len(raws) > 1:
         scan.reason = f"holds {len(raws)} scans: {', '.join(raw.name for raw in raws[:6])}"
     return scan
+
+
+def _within(folder: Path, error: InputError) -> str:
+    """Return the message of an error, with the file named as from the folder that it is in."""
+    if error.path is None or not error.path.is_relative_to(folder):
+        return str(error)
+    return f"{error.path.relative_to(folder)}: {error.problem}"
 
 
 def _sample(raws: Sequence[RawScan]) -> Floats:

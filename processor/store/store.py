@@ -105,24 +105,25 @@ def write_scene(path: Path, scene: Scene, truth: Truth | None, provenance: Mappi
 def _check(path: Path, scene: Scene) -> None:
     names = [scan.name for scan in scene.scans]
     if len(set(names)) != len(names):
-        raise InputError(f"{path}: expected scans of different names, found {', '.join(sorted(names))}; rename one")
+        raise InputError(f"expected scans of different names, found {', '.join(sorted(names))}; rename one", path=path)
     for scan in scene.scans:
         blocks = large_arrays.blocks(len(scan.points))
         bad = sum(int(np.count_nonzero(~np.isfinite(scan.points[rows]).all(axis=1))) for rows in blocks)
         if bad or not np.isfinite(scan.origin).all():
             culprit = f"{bad} points" if bad else "an origin"
-            raise InputError(f"{path}: scan {scan.name!r} has {culprit} with coordinates that are not finite")
+            raise InputError(f"scan {scan.name!r} has {culprit} with coordinates that are not finite", path=path)
 
 
 def _in_order(labels: PointLabels, orders: Mapping[str, Ints], path: Path) -> PointLabels:
     order = orders.get(labels.scan)
     if order is None:
-        raise InputError(f"{path}: the truth has labels of a scan {labels.scan!r}, which is not in the scene")
+        raise InputError(f"the truth has labels of a scan {labels.scan!r}, which is not in the scene", path=path)
     columns = {name: getattr(labels, name) for name in per_point_fields(PointLabels)}
     for name, column in columns.items():
         if len(column) not in (0, len(order)):
             raise InputError(
-                f"{path}: expected {len(order)} labels ({name}) of the points of {labels.scan!r}, found {len(column)}"
+                f"expected {len(order)} labels ({name}) of the points of {labels.scan!r}, found {len(column)}",
+                path=path,
             )
     return dataclasses.replace(labels, **{name: column[order] for name, column in columns.items() if len(column)})
 
@@ -177,18 +178,19 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
                 raise DecodeError(faults)
             yield file
     except DecodeError as error:
-        raise InputError(f"{path}: {_listed(error.problems)}") from error
+        raise InputError(_listed(error.problems), path=path) from error
     except checksums.ChecksumError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(str(error), path=path) from error
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError("no such file", path=path) from None
     except large_arrays.NoRoomError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        raise InputError(f"cannot be read ({error.strerror})", path=path) from error
     except DAMAGE as error:
         wanted = " or ".join(FORMATS[kind] for kind in kinds)
         raise InputError(
-            f"{path}: expected a {wanted} file (HDF5), found one that is damaged, cut off or of another kind "
-            f"({_first_line(error)}); make or copy it again"
+            f"expected a {wanted} file (HDF5), found one that is damaged, cut off or of another kind "
+            f"({_first_line(error)}); make or copy it again",
+            path=path,
         ) from error
 
 
@@ -327,7 +329,7 @@ def problems(path: Path) -> list[str]:
             read(path)
         except InputError as error:
             cause = error.__cause__
-            return cause.problems if isinstance(cause, DecodeError) else [str(error).removeprefix(f"{path}: ")]
+            return cause.problems if isinstance(cause, DecodeError) else [error.problem]
         return []
 
     def read_header(path: Path) -> None:
@@ -363,7 +365,7 @@ def damage(path: Path) -> tuple[bool, list[str]]:
             if checksums.has_any(file):
                 return True, checksums.problems(file)
     except InputError as error:
-        return True, [str(error).removeprefix(f"{path}: ")]
+        return True, [error.problem]
     return False, problems(path)
 
 

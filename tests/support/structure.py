@@ -191,3 +191,72 @@ def wrong_arrows():
             if rank[target] >= rank[room] or (room in STEPS and target not in FOR_STEPS):
                 found.append(f"{name} -> {other}")
     return found
+
+
+CUTS = (
+    "split",
+    "rsplit",
+    "partition",
+    "rpartition",
+    "startswith",
+    "endswith",
+    "removeprefix",
+    "removesuffix",
+    "replace",
+)
+FOR_PEOPLE = {
+    "message",
+    "reason",
+    "reasons",
+    "units_reason",
+    "doubt",
+    "doubts",
+    "problem",
+    "problems",
+    "fault",
+    "faults",
+}
+
+
+def messages_read_again(sources=SOURCES):
+    """Calls that cut, or look into, a text for people: a message, a reason, a doubt, or an error as a text.
+
+    ``split()`` at white space puts a text on one line and reads nothing.
+    """
+    found = []
+    for path in sources:
+        calls = [node for node in ast.walk(tree(path)) if isinstance(node, ast.Call)]
+        names = FOR_PEOPLE | _items_for_people(tree(path))
+        found += [
+            f"{path.name}:{node.lineno} {ast.unparse(node.func)}"
+            for node in calls
+            if isinstance(node.func, ast.Attribute)
+            and node.func.attr in CUTS
+            and not (node.func.attr == "split" and not node.args)
+            and _for_people(node.func.value, names)
+        ]
+    return found
+
+
+def _items_for_people(parsed):
+    """The names of the items of lists of texts for people, in loops over them."""
+    return {
+        node.target.id
+        for node in ast.walk(parsed)
+        if isinstance(node, ast.For | ast.comprehension) and isinstance(node.target, ast.Name)
+        if _for_people(node.iter, FOR_PEOPLE)
+    }
+
+
+def _for_people(node, names):
+    """Whether an expression is a text for people, or a part of one, by the names in it."""
+    if isinstance(node, ast.Subscript):
+        return _for_people(node.value, names)
+    if isinstance(node, ast.Call):
+        name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+        if name == "str" and node.args:
+            return "error" in ast.unparse(node.args[0]) or _for_people(node.args[0], names)
+        if isinstance(node.func, ast.Attribute):  # message.strip().split(...), messages("en").text(...).split(...)
+            return _for_people(node.func.value, names) or ast.unparse(node.func.value).startswith("messages(")
+        return name in names
+    return getattr(node, "id", getattr(node, "attr", "")) in names

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import pickle
 from dataclasses import dataclass
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -30,6 +32,7 @@ from processor.model import (
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Balls
 from processor.store import checksums, codec
+from processor.store.replaced_folder import replacing_folder
 from tests.support.old_files import sealed_again
 from tests.support.store_scenes import a_scene, surface_points
 
@@ -399,3 +402,24 @@ def test_a_dataset_has_the_bytes_that_h5py_gives_it(tmp_path, data):
         assert checksum == hashlib.sha256(stated + np.asarray(data).tobytes()).hexdigest().encode()
         dataset.attrs.create(checksums.ATTRIBUTE, checksum, dtype=h5py.string_dtype("ascii", 64))
     assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_an_error_has_its_path_beside_its_problem_in_another_process_as_well():
+    error = pickle.loads(pickle.dumps(InputError("a: b; c", path=Path("d: e.h5"))))
+    assert (str(error), error.path, error.problem) == ("d: e.h5: a: b; c", Path("d: e.h5"), "a: b; c")
+    bare = pickle.loads(pickle.dumps(InputError("a: b")))
+    assert (str(bare), bare.path, bare.problem) == ("a: b", None, "a: b")
+    assert len(InputError("word " * 10_000, path="f").problem) < 7_000
+
+
+def test_an_error_of_a_file_in_a_folder_that_is_removed_names_its_place(tmp_path):
+    with pytest.raises(InputError) as caught, replacing_folder(tmp_path / "out") as making:
+        raise InputError("cannot be written", path=making / "a" / "b.csv")
+    assert str(caught.value) == f"{tmp_path / 'out' / 'a' / 'b.csv'}: cannot be written"
+
+
+def test_faults_of_a_file_do_not_repeat_its_name(tmp_path):
+    path = tmp_path / "a.h5"
+    path.write_bytes(b"x")
+    assert all(str(path) not in fault for fault in store.store.problems(path))
+    assert store.store.damage(path)[1][0].startswith("expected a processor-scene or")
