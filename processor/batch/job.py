@@ -223,7 +223,9 @@ def _assessed(job: Job, ended: process.Ended, new_results: Path) -> _Assessed:
     """Return the status of a process that ended, the reason, the limits that ended it, and its results."""
     if ended.cause is Cause.TIME:
         return _failure(reason("batch.timeout", limit=job.timeout_s), timeout_s=job.timeout_s)
-    last = _one_line(job, ended.last_line.replace(str(new_results), RESULTS_JSON), 500)
+    error, last = (
+        _one_line(job, line.replace(str(new_results), RESULTS_JSON), 500) for line in (ended.error, ended.last_line)
+    )
     if ended.cause is Cause.MEMORY or "MemoryError" in last or "Unable to allocate" in last:
         return _failure(reason("batch.memory", limit=job.memory_mb), memory_mb=float(job.memory_mb))
     if ended.cause is Cause.SIGNAL:
@@ -239,8 +241,8 @@ def _assessed(job: Job, ended: process.Ended, new_results: Path) -> _Assessed:
             return STATUS[ended.code], None, {}, results
         except (OSError, ValueError, TypeError, KeyError):
             pass
-    elif last.startswith("error: "):
-        return _failure(reason("batch.error", message=last.removeprefix("error: ")))
+    elif error:
+        return _failure(reason("batch.error", message=error))
     if last:
         return _failure(reason("batch.no-results-but", exit_code=ended.code, last=last))
     return _failure(reason("batch.no-results", exit_code=ended.code))

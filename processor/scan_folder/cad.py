@@ -221,4 +221,4 @@ def _run(command: list[str], source: Path, out: Path, unit: str) -> str:
     if (out / RECORD).is_file():
         return ""
     code = -ended.code if ended.cause is process.Cause.SIGNAL else ended.code
-    return ended.last_line.removeprefix("error: ") or f"designgen import ended with exit code {code}"
+    return ended.error or ended.last_line or f"designgen import ended with exit code {code}"
