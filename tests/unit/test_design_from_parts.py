@@ -383,7 +383,7 @@ def test_bodies_of_cad_files_without_a_unit_have_the_guessed_one(tmp_path, monke
         path.write_text("ISO-10303-21;")
     guessed = guess_design.guess(tmp_path, paths, [])
     assert asked[-1] == "m"
-    assert guessed.doubts[0].startswith("units of the design: taken as m")
+    assert guessed.unit_doubt.startswith("units of the design: taken as m")
     assert guessed.units == ("mm" if one_file else "m")  # of one file each part's mesh is written, in mm
     assert np.abs(guessed.design.joint_points - joints).max() < CORNER_MM
 
