@@ -16,7 +16,8 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -144,7 +145,11 @@ def words(axis: str, vocabulary: type[Word], **shown: Any) -> Any:
 
 
 def reasons(axis: str = "", **shown: Any) -> Any:
-    """Declare a tuple of reasons; with an axis a tuple of reasons for each row along it."""
+    """Declare a tuple of reasons; with an axis a tuple of reasons for each row along it.
+
+    ``of_text`` turns the text that earlier files hold in their place into reasons. ``hashed_as_text``: the hash of a
+    scene is taken from their English text, as it was when the field held that text.
+    """
     return dataclasses.field(default=(), metadata={"reasons": axis, **shown})
 
 
@@ -178,6 +183,17 @@ def newer(hashed: bool = True) -> Any:
     return dataclasses.field(default=None, metadata={"newer": True, "hashed": hashed})
 
 
+class Fault(NamedTuple):
+    """What is impossible in a record: the field within it, and the text to follow its name.
+
+    ``path`` are the names of the fields and the numbers of the records that lead to the field. The text has the row,
+    what was expected and what was found: ", row 3: expected ..., found ...", or without a row ": expected ...".
+    """
+
+    path: tuple[str, ...]
+    text: str
+
+
 class Checked:
     """Checks the declared fields of a frozen dataclass when it is made; holds no data and no behaviour."""
 
@@ -203,8 +219,8 @@ class Checked:
                 array = _checked_array(value, metadata, where, lengths)
                 object.__setattr__(self, field.name, array)
 
-    def contradictions(self) -> Iterable[str]:
-        """Yield what its fields, each possible, contradict: place within the record, expected, found."""
+    def contradictions(self) -> Iterable[Fault]:
+        """Yield what its fields, each possible, contradict."""
         return ()
 
 
@@ -301,13 +317,26 @@ class PlainError(Exception):
     """An error of one message for people; of what came by the megabyte, the message shows the beginning."""
 
     def __init__(self, message: str = "") -> None:
-        short = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][: LONGEST_WORD // 5]}...", message)
-        cut = len(short) - LONGEST_MESSAGE
-        super().__init__(f"{short[:LONGEST_MESSAGE]}... ({cut} characters more)" if cut > 0 else short)
+        super().__init__(_shortened(message))
+
+
+def _shortened(message: str) -> str:
+    short = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][: LONGEST_WORD // 5]}...", message)
+    cut = len(short) - LONGEST_MESSAGE
+    return f"{short[:LONGEST_MESSAGE]}... ({cut} characters more)" if cut > 0 else short
 
 
 class InputError(PlainError):
-    """Input that cannot be used. The message names the file, what was expected, what came and what to do."""
+    """Input that cannot be used. The message names the file, what was expected, what came and what to do.
+
+    ``path`` is the file or folder that the message begins with, None where it begins otherwise; ``problem`` is the
+    message without it.
+    """
+
+    def __init__(self, problem: str = "", *, path: Path | str | None = None) -> None:
+        super().__init__(problem if path is None else f"{path}: {problem}")
+        self.path = None if path is None else Path(path)
+        self.problem = _shortened(problem)
 
 
 WORST_FIRST = (Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS)
@@ -360,13 +389,14 @@ class Scan(Checked):
         """T_project_scan (4, 4); the identity for a scan without a pose."""
         return self.T_project_scan if self.T_project_scan.size else np.eye(4)
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield that a few points claim a grid that fills the memory."""
         if len(self.grid_row) and len(self.grid_column):
             rows, columns = (int(large_arrays.extremes(n)[1]) + 1 for n in (self.grid_row, self.grid_column))
             most = LARGEST_GRID + GRID_CELLS_PER_POINT * len(self.grid_row)
             if rows * columns > most:
-                yield f"/grid_row: expected a grid of at most {most} cells for its points, found {rows} x {columns}"
+                text = f": expected a grid of at most {most} cells for its points, found {rows} x {columns}"
+                yield Fault(("grid_row",), text)
 
 
 @dataclass(frozen=True)
@@ -409,9 +439,9 @@ class ArchDesign(Checked):
     joint_right: tuple[str, ...] = names("j", means=Meaning(among="parts.name"))
     joint_points: Floats = column("j", 8, 3, means=PLACE)
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield parts of one name."""
-        yield from _repeated("/parts", tuple(part.name for part in self.parts))
+        yield from _repeated("parts", tuple(part.name for part in self.parts))
 
     @property
     def joined(self) -> Ints:
@@ -484,11 +514,12 @@ class StructureDesign(Checked):
     bodies: DesignBodies | None = newer()
     faults: DesignFaults | None = newer()
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield that bodies are not given for each facet."""
         given = len(self.faces) if self.bodies is None else len(self.bodies.of_facet)
         if given != len(self.faces):
-            yield f"/bodies/of_facet: expected a row for each of {len(self.faces)} faces, found {given}"
+            text = f": expected a row for each of {len(self.faces)} faces, found {given}"
+            yield Fault(("bodies", "of_facet"), text)
 
 
 @dataclass(frozen=True)
@@ -520,11 +551,12 @@ class Limit(Checked):
     source: str = described("", means=LONG)
     component: str | None = newer()
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield a lower bound above the upper one."""
         for low, high in (("low", "high"), ("low_ratio", "high_ratio"), ("above_mm", "up_to_mm")):
             if getattr(self, low) > getattr(self, high):
-                yield f"/{low}: expected at most {high}, {getattr(self, high):g}, found {getattr(self, low):g}"
+                text = f": expected at most {high}, {getattr(self, high):g}, found {getattr(self, low):g}"
+                yield Fault((low,), text)
 
 
 @dataclass(frozen=True)
@@ -634,10 +666,10 @@ class Ceiling(Checked):
     clearance_mm: float = described(0.0, means=Meaning(finite=True, least=0.0, most=LARGEST_MM))
     longest_mm: float = described(float("nan"), means=Meaning(above=0.0, most=LARGEST_MM))
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield that there is neither a level nor a surface, or both."""
         if bool(np.isnan(self.level)) == (not len(self.faces)):
-            yield "/level: expected a level or faces, found neither or both"
+            yield Fault(("level",), ": expected a level or faces, found neither or both")
 
 
 @dataclass(frozen=True)
@@ -647,6 +679,11 @@ class TitleBlock(Checked):
     keys: tuple[str, ...] = names("k")
     values: tuple[str, ...] = names("k")
     logo: Codes = column("bytes", dtype=np.uint8, means=Meaning())
+
+
+def _units_as_stated(text: str) -> tuple[Reason, ...]:
+    """Return the source of a unit that a scene file of before version 1.5 states as a text."""
+    return (reason("units.as-stated", text=text),) if text else ()
 
 
 @dataclass(frozen=True)
@@ -662,7 +699,7 @@ class Scene(Checked):
     # of the steel while it was scanned
     temperature_C: float = described(float("nan"), means=Meaning(least=-100.0, most=500.0))
     units: str = "mm"  # of the input's coordinates, and why they were read so
-    units_reason: str = described("", means=LONG)
+    units_reason: tuple[Reason, ...] = reasons(of_text=_units_as_stated, hashed_as_text=True)
     structure: StructureDesign | None = None
     tolerance: Tolerance | None = None  # None: nothing was said
     control: Control | None = newer()
@@ -676,19 +713,21 @@ class Scene(Checked):
     # days of the scans by their files, YYYY-MM-DD, in order; no step reads them
     scanned: tuple[str, ...] = names("days", newer=True, hashed=False)
 
-    def contradictions(self) -> Iterable[str]:
+    def contradictions(self) -> Iterable[Fault]:
         """Yield scans of one name, and parts that the design does not have."""
-        yield from _repeated("/scans", tuple(scan.name for scan in self.scans))
+        yield from _repeated("scans", tuple(scan.name for scan in self.scans))
         parts = {part.name for part in self.arch.parts} if self.arch else set()
         for i, scan in enumerate(self.scans):
             if parts and scan.component and scan.component not in parts:
-                yield f"/scans/{i:04d}/component: expected a part of the design, found {scan.component!r}"
+                text = f": expected a part of the design, found {scan.component!r}"
+                yield Fault(("scans", f"{i:04d}", "component"), text)
 
 
-def _repeated(where: str, names: tuple[str, ...]) -> Iterator[str]:
+def _repeated(field: str, names: tuple[str, ...]) -> Iterator[Fault]:
     for i, name in enumerate(names):
         if name in names[:i]:
-            yield f"{where}/{i:04d}/name: expected another name for each, found {name!r} a second time"
+            text = f": expected another name for each, found {name!r} a second time"
+            yield Fault((field, f"{i:04d}", "name"), text)
             return
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor import large_arrays
-from processor.model import LARGEST_MM, Checked, InputError, Meaning, Word
+from processor.model import LARGEST_MM, Checked, Fault, InputError, Meaning, Word
 
 POSE_TOLERANCE = 1e-3  # of R^T R - I
 SHOWN = 60  # characters of a value
@@ -25,26 +25,34 @@ Record = TypeVar("Record")
 Array = npt.NDArray[Any]
 
 
-def problems(record: Any, where: str = "", root: Any = None) -> list[str]:
-    """List what is impossible in a record and those within it: place (field or dataset, row), expected, found.
+def problems(record: Any, where: str = "") -> list[str]:
+    """List what is impossible in a record and those within it: place (dataset, row), expected, found.
 
-    Places begin with ``where``; references from the root of all are to ``root``, without it to ``record``.
+    Places begin with ``where``, the group of the record.
+    """
+    return ["/".join((where, *path)) + text for path, text in faults(record)]
+
+
+def faults(record: Any, path: tuple[str, ...] = (), root: Any = None) -> list[Fault]:
+    """List what is impossible in a record and those within it.
+
+    Paths of faults begin with ``path``; references from the root of all are to ``root``, without it to ``record``.
     """
     top = record if root is None else root
-    found: list[str] = []
+    found: list[Fault] = []
     for field in dataclasses.fields(record):
-        value, place = getattr(record, field.name), f"{where}/{field.name}"
+        value, place = getattr(record, field.name), (*path, field.name)
         if dataclasses.is_dataclass(value):
-            found += problems(value, place, top)
+            found += faults(value, place, top)
         elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
             if "reasons" not in field.metadata:
                 for i, item in enumerate(value):
-                    found += problems(item, f"{place}/{i:04d}", top)
+                    found += faults(item, (*place, f"{i:04d}"), top)
         else:
             meaning = field.metadata.get("means", UNDECLARED)
-            found += [f"{place}{fault}" for fault in _faults(field, value, meaning, record, top)]
+            found += [Fault(place, text) for text in _faults(field, value, meaning, record, top)]
     if isinstance(record, Checked) and not found:
-        found += [f"{where}{fault}" for fault in record.contradictions()]
+        found += [Fault((*path, *fault.path), fault.text) for fault in record.contradictions()]
     return found
 
 
@@ -54,13 +62,12 @@ def check(record: Record, source: str, files: Mapping[str, str] | None = None) -
     ``source`` is the input; ``files`` names the file of a field of a scene, as ``{"frame": "design.json"}``.
     Raises InputError that names the file.
     """
-    found = problems(record)
+    found = faults(record)
     if found:
-        by_field = files or {}
-        first = found[0].removeprefix("/").replace("/", ".")
-        place = by_field.get(first.partition(".")[0].partition(",")[0].partition(":")[0], source)
+        first = found[0]
+        place = (files or {}).get(first.path[0], source)
         more = f" (and {len(found) - 1} more of the kind)" if len(found) > 1 else ""
-        raise InputError(f"{place}: {first}{more}; correct the input")
+        raise InputError(f"{place}: {'.'.join(first.path)}{first.text}{more}; correct the input")
     return record
 
 

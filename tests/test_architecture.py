@@ -57,12 +57,35 @@ def test_only_evaluation_reads_the_truth():
     assert "processor.evaluation.evaluate" in readers
 
 
-def test_messages_are_not_parsed_again():
-    """The catalogues are looked up by whole templates; no regular expression stands where texts are made or shown."""
+def test_no_regular_expression_stands_where_texts_are_made_or_shown():
+    """The catalogues are looked up by whole templates."""
     for name in MODULES:
         if within({name}, "processor.language", "processor.report"):
             allowed = {"processor.report.style"}  # numbers in SVG attributes of Matplotlib
             assert "re" not in imports(MODULES[name]) or name in allowed, name
+
+
+def test_messages_are_not_parsed_again():
+    """What a text for people states is data beside it: a code, a field, or ``path`` and ``problem`` of an error."""
+    assert structure.messages_read_again() == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "label = scene.units_reason.split('; ')",
+        "said = [text for text in doubts if not text.startswith('units')]",
+        "rest = str(error).removeprefix(f'{path}: ')",
+        "rest = message.strip().partition(':')[0].rpartition(',')",
+        "rest = messages('en').text(reason).split(';')",
+        "place = problems(record)[0].removeprefix('/')",
+    ],
+)
+def test_a_line_that_reads_a_message_is_found(tmp_path, line):
+    (tmp_path / "a.py").write_text(f"{line}\nwhole = ' '.join(str(error).split())\n", "utf-8")
+    assert structure.messages_read_again([tmp_path / "a.py"])
+    (tmp_path / "b.py").write_text("whole = ' '.join(str(error).split())\n", "utf-8")
+    assert structure.messages_read_again([tmp_path / "b.py"]) == []
 
 
 def test_tests_share_code_through_support():

@@ -88,6 +88,8 @@ def test_one_scan_file_to_results(sphere_run):
     assert (printed["format"], printed["format_version"]) == ("processor-results", "1.0")
     assert printed["input"] == "target.xyz"
     assert printed["units"]["read_as"] == "m"
+    assert [one["code"] for one in printed["units"]["reasons"]] == ["units.as-scanners-write"]
+    assert printed["units"]["reason"] == printed["units"]["reasons"][0]["text"]
     (ball,) = printed["steps"]["spheres"]["balls"]
     np.testing.assert_allclose(ball["centre"], [1000.0, -2000.0, 500.0], atol=0.2)
     assert ball["radius"] == pytest.approx(60.0, abs=0.1)

@@ -12,7 +12,7 @@ from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline, readers
 from processor.model import Scene, StepRun, UsageError
-from processor.report.step_report import step_report
+from processor.report.reports_of_steps import step_report
 from processor.store import store
 from tests.support.metrics import metric
 from tests.support.records import assert_equal

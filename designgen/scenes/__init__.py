@@ -1,3 +1,5 @@
 """Scenes of the kinds of recipes, with their truth."""
 
-MADE_IN_MM = "made in millimetres"  # the reason for the unit of every scene
+from processor.model import reason
+
+MADE_IN_MM = (reason("units.made-in-mm"),)  # why every scene is in mm

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from processor import large_arrays, pipeline
 from processor.evaluation import evaluate
+from processor.language.messages import messages
 from processor.model import Scan, Truth, UsageError, per_point_fields
 from processor.progress import stage
 from processor.scan_folder import files, fingerprint
@@ -62,7 +63,7 @@ def convert(input_: str | Path, output: str | Path, units: str | None = None) ->
         with stage(f"writing {out.name}"):
             store.write_scene(out, scene, _fitting(truth, scene.scans), _provenance(path))
     points = {scan.name: len(scan.points) for scan in scene.scans}
-    return Converted(out, points, scene.units, units_reason=scene.units_reason, with_truth=truth is not None)
+    return Converted(out, points, scene.units, messages("en").text(scene.units_reason), with_truth=truth is not None)
 
 
 def _provenance(path: Path) -> dict[str, object]:

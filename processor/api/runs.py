@@ -16,6 +16,7 @@ from processor.evaluation import evaluate
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.parallel import one_blas_thread
 from processor.jobs import tile_cluster
+from processor.language.messages import messages
 from processor.model import LONGEST_NAME, Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
@@ -180,7 +181,7 @@ def compute(
 
 def _log_reading(path: Path, scene: Scene, log: Callable[[str], None], chosen: Sequence[pipeline.Job]) -> None:
     """Say how an input was read; ``chosen`` are the jobs if the program chose them."""
-    log(f"{path.name}: read as {scene.units} ({scene.units_reason})")
+    log(f"{path.name}: read as {scene.units} ({messages('en').text(scene.units_reason)})")
     if scene.clips is not None:
         log(f"{path.name}: {headline.clipped(scene.clips)}")
     if len(scene.scans) == 2 and [job.step for job in chosen] == ["stitch"]:

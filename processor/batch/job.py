@@ -53,7 +53,8 @@ STATUS = {
 }
 WITH_RESULTS = tuple(STATUS.values())
 # Errors of the output folder, not of an input.
-OUTPUT_GONE = tuple(os.strerror(code) for code in (errno.ENOSPC, errno.EDQUOT, errno.EROFS))
+GONE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+OUTPUT_GONE = tuple(map(os.strerror, GONE))  # in the line that another process ends with
 STOPPED, KILLED = reason("batch.stopped"), reason("batch.killed")
 
 
@@ -116,10 +117,18 @@ def run_job(job: Job, stopped: Callable[[], bool] = process.never) -> Record:
     except OtherSoftwareError as error:
         return _failure_to_retry(job, reason("batch.other-software", difference=error.args[0]))
     except (InputError, OSError) as error:
-        text = str(error)
-        if any(sign in text for sign in OUTPUT_GONE):
-            raise OutputGoneError(text) from error
-        return _failure_to_retry(job, reason("batch.error", message=_one_line(job, text)))
+        if _is_of_output(error):
+            raise OutputGoneError(str(error)) from error
+        return _failure_to_retry(job, reason("batch.error", message=_one_line(job, str(error))))
+
+
+def _is_of_output(error: BaseException | None) -> bool:
+    """Whether an error, or the one that caused it, is that no more can be written."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in GONE:
+            return True
+        error = error.__cause__
+    return False
 
 
 def _failure_to_retry(job: Job, why: Reason) -> Record:
@@ -223,7 +232,9 @@ def _assessed(job: Job, ended: process.Ended, new_results: Path) -> _Assessed:
     """Return the status of a process that ended, the reason, the limits that ended it, and its results."""
     if ended.cause is Cause.TIME:
         return _failure(reason("batch.timeout", limit=job.timeout_s), timeout_s=job.timeout_s)
-    last = _one_line(job, ended.last_line.replace(str(new_results), RESULTS_JSON), 500)
+    error, last = (
+        _one_line(job, line.replace(str(new_results), RESULTS_JSON), 500) for line in (ended.error, ended.last_line)
+    )
     if ended.cause is Cause.MEMORY or "MemoryError" in last or "Unable to allocate" in last:
         return _failure(reason("batch.memory", limit=job.memory_mb), memory_mb=float(job.memory_mb))
     if ended.cause is Cause.SIGNAL:
@@ -239,8 +250,8 @@ def _assessed(job: Job, ended: process.Ended, new_results: Path) -> _Assessed:
             return STATUS[ended.code], None, {}, results
         except (OSError, ValueError, TypeError, KeyError):
             pass
-    elif last.startswith("error: "):
-        return _failure(reason("batch.error", message=last.removeprefix("error: ")))
+    elif error:
+        return _failure(reason("batch.error", message=error))
     if last:
         return _failure(reason("batch.no-results-but", exit_code=ended.code, last=last))
     return _failure(reason("batch.no-results", exit_code=ended.code))

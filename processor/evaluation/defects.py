@@ -17,6 +17,7 @@ DEPTH_SHARE = 0.10
 DEPTH_LODS = 2.0
 CLASS_SHARE = 0.9
 NAN = float("nan")
+FALSE_ALARMS, DEPTH_ERROR = "false alarms", "depth error"
 WRONG_DEPTHS = "depths off by more than a tenth and 2 LOD95"
 NEAR_MM = 30.0
 OPPOSITE = -0.9  # cosine between the normals of two sides of a plate
@@ -84,7 +85,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     expected = result.examined_mm2 / 1e8
     most = np.floor(expected + ALARM_SDS * np.sqrt(expected) + 1.0) if np.isfinite(expected) and limited else NAN
     metrics += [
-        Metric("defects", "false alarms", float(false), Statistic.COUNT, limit=float(most)),
+        Metric("defects", FALSE_ALARMS, float(false), Statistic.COUNT, limit=float(most)),
         Metric("defects", "surface examined", result.examined_mm2 / 1e6, unit="m2", better=Better.HIGH),
     ]
     if bodies is not None:
@@ -98,12 +99,17 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     return metrics
 
 
+def missed_quantity(kind: str) -> str:
+    """Return the quantity of the metric of the missed defects of a true class."""
+    return f"missed: {kind}"
+
+
 def _missed(truth: DefectTruth, rows: Ints, limited: bool) -> list[Metric]:
     """Return the number of missed defects (rows (t,) -1) of each true class."""
     classes = np.array(truth.classes)
     limit = 0.0 if limited else NAN
     return [
-        Metric("defects", f"missed: {kind}", float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=limit)
+        Metric("defects", missed_quantity(kind), float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=limit)
         for kind in dict.fromkeys(truth.classes)
     ]
 
@@ -173,8 +179,8 @@ def _classes_and_depths(defects: Defects, truth: DefectTruth, rows: Ints, limite
     return [
         Metric("defects", "class wrong", 100.0 * wrong, Statistic.SHARE, unit="%", limit=most_wrong),
         Metric("defects", WRONG_DEPTHS, wrong_depths, Statistic.COUNT, limit=0.0 if limited else NAN),
-        Metric("defects", "depth error", float(np.median(size)) if len(size) else NAN, Statistic.MEDIAN, unit="mm"),
-        Metric("defects", "depth error", float(size.max(initial=0.0)), Statistic.MAX, unit="mm"),
+        Metric("defects", DEPTH_ERROR, float(np.median(size)) if len(size) else NAN, Statistic.MEDIAN, unit="mm"),
+        Metric("defects", DEPTH_ERROR, float(size.max(initial=0.0)), Statistic.MAX, unit="mm"),
         Metric("defects", "depths that are bounds alone", float(bound.sum()), Statistic.COUNT),
         *covered("defects", "depths", error[measured], defects.depth_ci95[rows[measured]]),
         *_volumes_and_areas(defects, truth, rows, measured),

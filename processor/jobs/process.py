@@ -37,6 +37,9 @@ J = TypeVar("J")
 R = TypeVar("R")
 
 
+ERROR = "error: "  # begins the line that a program of this project ends with if it fails
+
+
 class Cause(Enum):
     """What ended a process."""
 
@@ -57,6 +60,11 @@ class Ended:
     seconds: float
     peak_mb: float  # private memory of all its processes together, sampled
     max_rss_mb: float  # resident memory of the largest of its processes
+
+    @property
+    def error(self) -> str:
+        """The error of a program of this project, the last line of which is ``error: MESSAGE``; "" without one."""
+        return self.last_line[len(ERROR) :] if self.last_line.startswith(ERROR) else ""
 
 
 def never() -> bool:

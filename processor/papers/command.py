@@ -19,8 +19,9 @@ from processor.jobs import runner
 from processor.jobs.child import Lost
 from processor.language.messages import Text
 from processor.model import UsageError
-from processor.papers import data_sets, page
-from processor.papers.data_sets import PAPERS, DataSet, Found, Measured
+from processor.papers import measuring, page
+from processor.papers.data_sets import DataSet, Found, Measured
+from processor.papers.measuring import PAPERS
 from processor.papers.rows import Row
 from processor.plain_text import printable
 from processor.report import write_results
@@ -53,7 +54,7 @@ def run(
         raise UsageError(f"--only: no paper {unknown[0]!r}; there are {', '.join(PAPERS)}")
     write_results.check_output(out, None, JSON, (JSON, PAGE, STEPS))
     papers = [number for number in PAPERS if not only or number in only]
-    wanted = [one for number in papers for seed in range(seeds) for one in data_sets.module_of(number).data_sets(seed)]
+    wanted = [one for number in papers for seed in range(seeds) for one in measuring.module_of(number).data_sets(seed)]
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".papers-", dir=out.absolute().parent) as scratch:
         steps = Path(scratch, STEPS)
@@ -67,7 +68,7 @@ def _written(
     """Make the rows and charts of papers of what was measured, and write them; ``steps`` is moved there if it is."""
     by_paper = {}
     for number in papers:
-        module = data_sets.module_of(number)
+        module = measuring.module_of(number)
         own = [one for one in measured if one.data_set.paper == number]
         found = Found(own)
         by_paper[number] = (module.rows(found), module.charts(found), own)
@@ -91,7 +92,7 @@ def _written(
 
 def _measured(wanted: Sequence[DataSet], jobs: int, scratch: str, steps: str) -> list[Measured]:
     """Measure data sets, ``jobs`` at a time, with a progress bar if standard error is a terminal."""
-    do: Callable[..., Measured] = partial(data_sets.make_and_measure, scratch=scratch, steps=steps)
+    do: Callable[..., Measured] = partial(measuring.make_and_measure, scratch=scratch, steps=steps)
     found = []
     with (
         runner.executor(None, jobs, lambda line: print(line, file=sys.stderr)) as executor,

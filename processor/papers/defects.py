@@ -9,10 +9,11 @@ import numpy as np
 from processor import diagnostics
 from processor.defects import step
 from processor.defects.params import Params
-from processor.defects.result import Result
+from processor.defects.result import DefectClass, Result
+from processor.evaluation import defects as against_truth
 from processor.evaluation import evaluate
 from processor.language.messages import Text, text
-from processor.model import Reason, Scene, StepRun, reason
+from processor.model import Reason, Scene, Statistic, StepRun, reason
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Row, Rule, median
 from processor.pipeline import Execution
@@ -23,6 +24,7 @@ PAPER = "004"
 PLATES = "12 plates"
 METHODS = ("paper", "default")
 NAN = float("nan")
+MISSED = frozenset(against_truth.missed_quantity(kind) for kind in DefectClass)
 STAGES = ("density clusters", "descriptors", "sample consensus", "iterative closest point", "defect points")
 
 
@@ -55,13 +57,13 @@ def measure(path: Path, data_set: DataSet) -> Measured:
 
 def _figures(method: str, result: Result, path: Path, scene: Scene) -> dict[str, float]:
     report = evaluate.evaluate(path, Execution(scene, (StepRun(step.NAME, method, "{}", result),), {}))
-    values = {metric.name: metric.value for metric in report.metrics}
-    missed = [value for name, value in values.items() if name.startswith("missed: ")]
+    values = {(metric.quantity, metric.statistic): metric.value for metric in report.metrics}
+    missed = [value for (quantity, _), value in values.items() if quantity in MISSED]
     return {
         f"{method}: missed": float(sum(missed)),
         f"{method}: true": float(len(missed)),
-        f"{method}: false alarms": values.get("false alarms", NAN),
-        f"{method}: depth error": values.get("depth error, median", NAN),
+        f"{method}: false alarms": values.get((against_truth.FALSE_ALARMS, Statistic.COUNT), NAN),
+        f"{method}: depth error": values.get((against_truth.DEPTH_ERROR, Statistic.MEDIAN), NAN),
         f"{method}: threshold": result.lod95,
         f"{method}: curves": float(sum(len(curve.along) > 0 for curve in result.defects.deflection)),
         f"{method}: clustered": _stated(result, "defects.paper-clusters", "points"),
@@ -93,15 +95,15 @@ def rows(found: Found) -> list[Row]:
     section = text("section {number}", number="1.3")
     fitted, trials = (median(found.values(PLATES, f"sample consensus: {name}")) for name in ("fitted", "trials"))
     alike = reason("papers.defects-alike", fitted=fitted, trials=trials)
-    for place, quantity, figure, unit in (
-        (text("figure {number}", number="2"), text("places of the scan with a descriptor"), "descriptors: source", ""),
-        (text("figure {number}", number="2"), text("radius of a descriptor"), "descriptors: radius_mm", "mm"),
-        (section, text("poses compared by Huber's function"), "sample consensus: fitted", ""),
-        (section, text("sum of Huber's function, equation 5"), "sample consensus: huber_mm2", "mm2"),
-        (section, text("rounds of registration, last gate"), "iterative closest point: rounds", ""),
-        (section, text("points beyond the threshold"), "defect points: beyond", ""),
+    figure_2 = text("figure {number}", number="2")
+    for place, quantity, figure, unit, why in (
+        (figure_2, text("places of the scan with a descriptor"), "descriptors: source", "", none),
+        (figure_2, text("radius of a descriptor"), "descriptors: radius_mm", "mm", none),
+        (section, text("poses compared by Huber's function"), "sample consensus: fitted", "", alike),
+        (section, text("sum of Huber's function, equation 5"), "sample consensus: huber_mm2", "mm2", alike),
+        (section, text("rounds of registration, last gate"), "iterative closest point: rounds", "", none),
+        (section, text("points beyond the threshold"), "defect points: beyond", "", none),
     ):
-        why = alike if figure.startswith("sample consensus") else none
         made.append(_row(place, "paper", quantity, found.values(PLATES, figure), why, unit))
     section_4 = text("section {number}", number="1.4")
     for method in METHODS:

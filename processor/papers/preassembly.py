@@ -41,7 +41,7 @@ METHODS = ("corner", "line", "design-aided")  # W1, W2, W3
 BRIDGES = ("D1", "D2", "D3")
 SPACING_MM, COARSE_MM = 10.0, 20.0  # the coarse one shows how errors grow with it
 NO_NOISE_MM = 0.001  # a scene states a noise above 0
-SIDES = {"east": "table_4", "west": "table_5"}
+SIDES = {"east": 4, "west": 5}  # the table of each
 CORNERS = 4
 AXES = ("dx", "dy", "dz")
 PUBLISHED_DIFFERENCE_MM = 1.0  # "at most" between line and design-aided, figures 19 to 21
@@ -66,7 +66,7 @@ def data_sets(seed: int) -> list[DataSet]:
             settings = (f"scan.sigma_mm={NO_NOISE_MM}", f"scan.spacing_mm={spacing}", f"scan.net={str(net).lower()}")
             found.append(DataSet(PAPER, name, f"arch-{bridge.lower()}", settings, seed))
     for side, table in SIDES.items():
-        gaps = np.array(published()[table])[:CORNERS].reshape(CORNERS, -1, 3).swapaxes(0, 1).ravel()
+        gaps = np.array(published()[f"table_{table}"])[:CORNERS].reshape(CORNERS, -1, 3).swapaxes(0, 1).ravel()
         listed = ", ".join(f"{gap:.2f}" for gap in gaps)
         opened = (f"asbuilt.gap_table_mm=[{listed}]", "asbuilt.corner_mm=0.0")
         found.append(DataSet(PAPER, side, f"arch-{side}-sampled", opened, seed))
@@ -198,7 +198,7 @@ def _of_bridge(found: Found, bridge: int, numbers: dict[str, Any]) -> list[Row]:
             made.append(
                 _Of(table_2, name, method).row(quantity, NAN, values, Rule.AT_MOST, reason("papers.bridge-true"))
             )
-        made += _orders(found, name, why)
+        made += _orders(found, name, why, net)
         if not _has_ours(name):
             continue
         beside = _Of(table_2, name, "adjustment")
@@ -211,8 +211,8 @@ def _of_bridge(found: Found, bridge: int, numbers: dict[str, Any]) -> list[Row]:
     return made
 
 
-def _orders(found: Found, name: str, why: Reason) -> list[Row]:
-    """Rows of the paper's statements on the order of the methods."""
+def _orders(found: Found, name: str, why: Reason, net: bool) -> list[Row]:
+    """Rows of the paper's statements on the order of the methods; ``net``: the points of the data set are on one."""
 
     def smaller(method: str, than: str, figure: str) -> tuple[float, ...]:
         return is_smaller(found.values(name, f"{method}: {figure}"), found.values(name, f"{than}: {figure}"))
@@ -220,7 +220,7 @@ def _orders(found: Found, name: str, why: Reason) -> list[Row]:
     place, statement = text("table {number}", number="2"), text("splicing error smaller than by the other method")
     table_3, of_line = text("table {number}", number="3"), text("linear error smaller than by the other method")
     attitude = reason("papers.bridge-attitude")
-    corners = reason("papers.bridge-net-corners") if name.endswith("net") else why
+    corners = reason("papers.bridge-net-corners") if net else why
     poses = found.values(name, "line: coarse poses")
     by_histograms, symmetric = text("joints whose coarse pose is from histograms"), reason("papers.bridge-histograms")
     figure_1 = _Of(text("figure {number}", number="1"), name, "line", "")
@@ -248,7 +248,7 @@ def _orders(found: Found, name: str, why: Reason) -> list[Row]:
 def _of_side(found: Found, side: str, numbers: dict[str, Any]) -> list[Row]:
     """Rows of tables 4 to 7 and figures 18 to 21 of one bridge of real parts."""
     made = []
-    table = int(SIDES[side][-1])
+    table = SIDES[side]
     why = reason("papers.bridge-open-joints")
     for number, method in ((table, "line"), (table + 2, "design-aided")):
         gaps = np.abs(np.array(numbers[f"table_{number}"]))

@@ -13,8 +13,9 @@ import numpy as np
 
 from processor import diagnostics, scene_cloud
 from processor.evaluation import evaluate
+from processor.evaluation import stitching as against_truth
 from processor.language.messages import Text, text
-from processor.model import Floats, Reason, Scene, Status, StepRun, reason
+from processor.model import Floats, Reason, Scene, Statistic, Status, StepRun, reason
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Row, Rule
 from processor.pipeline import Execution
@@ -71,13 +72,13 @@ def _stations(result: Result) -> int:
 def _figures(method: str, result: Result, path: Path, scene: Scene) -> dict[str, float]:
     """Return how many scans were placed, the errors of their positions by the truth, and the scales' errors."""
     report = evaluate.evaluate(path, Execution(scene, (StepRun(step.NAME, method, "{}", result),), {}))
-    errors = {metric.name: metric.value for metric in report.metrics}
+    errors = {(metric.quantity, metric.statistic): metric.value for metric in report.metrics}
     placed = result.scans.placed
     scales = 1e6 * np.abs(result.scans.scale[placed] - 1.0)
     return {
         f"{method}: placed": float(placed.sum()),
-        f"{method}: position, rms": errors.get("station positions after datum fit, rms", NAN),
-        f"{method}: position, largest": errors.get("station positions after datum fit, max", NAN),
+        f"{method}: position, rms": errors.get((against_truth.AFTER_FIT, Statistic.RMS), NAN),
+        f"{method}: position, largest": errors.get((against_truth.AFTER_FIT, Statistic.MAX), NAN),
         f"{method}: ambiguous": float(sum(status is Status.AMBIGUOUS for status in result.scans.status)),
         f"{method}: scale, ppm": float(scales.max(initial=0.0)),
     }

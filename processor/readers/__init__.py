@@ -25,13 +25,13 @@ def read(path: Path) -> list[RawScan]:
     """
     suffix = path.suffix.lower()
     if is_closed(path):
-        raise InputError(f"{path}: {closed_formats.advice(suffix)}")
+        raise InputError(closed_formats.advice(suffix), path=path)
     if suffix not in _FORMATS:
-        raise InputError(f"{path}: expected a scan file ({', '.join(SUFFIXES)}), found {suffix or 'no suffix'}")
+        raise InputError(f"expected a scan file ({', '.join(SUFFIXES)}), found {suffix or 'no suffix'}", path=path)
     if not path.is_file():
-        raise InputError(f"{path}: {'expected a file, found a folder' if path.is_dir() else 'no such file'}")
+        raise InputError("expected a file, found a folder" if path.is_dir() else "no such file", path=path)
     if not path.stat().st_size:
-        raise InputError(f"{path}: the file is empty; copy or export it again")
+        raise InputError("the file is empty; copy or export it again", path=path)
     module = _FORMATS[suffix]
     try:
         if getattr(module, "needs_sandbox", lambda _: False)(path):
@@ -41,9 +41,9 @@ def read(path: Path) -> list[RawScan]:
             scans: list[RawScan] = module.read(path)
         return scans
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+        raise InputError(f"cannot be read ({error.strerror or error})", path=path) from error
     except MemoryError:
-        raise InputError(f"{path}: needs more memory than is available; split the scan or thin it out") from None
+        raise InputError("needs more memory than is available; split the scan or thin it out", path=path) from None
 
 
 def is_closed(path: Path) -> bool:

@@ -55,7 +55,7 @@ def read(path: Path) -> list[RawScan]:
         try:
             count = file.scan_count
             if not count:
-                raise InputError(f"{path}: expected scans, found none")
+                raise InputError("expected scans, found none", path=path)
             scan_names = names(scan_name(path), [_stored_name(file.get_header(i)) for i in range(count)])
             return [_read_scan(path, file, i, scan_names) for i in range(count)]
         finally:
@@ -71,11 +71,11 @@ def _check_structure(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(HEADER.size)
         if len(head) < HEADER.size or not head.startswith(b"ASTM-E57"):
-            raise InputError(f"{path}: not a readable E57 file: it has no E57 header; copy or export it again")
+            raise InputError("not a readable E57 file: it has no E57 header; copy or export it again", path=path)
         _, _, _, length, start, xml_length, page = HEADER.unpack(head)
         pages = -(-(start % PAGE + xml_length) // PAYLOAD) + 1
         if page != PAGE or length != size or start > size or xml_length > min(size, XML_LIMIT):
-            raise InputError(f"{path}: its header does not fit its size of {size} bytes; copy or export it again")
+            raise InputError(f"its header does not fit its size of {size} bytes; copy or export it again", path=path)
         first = start // PAGE
         file.seek(first * PAGE)
         raw = file.read(pages * PAGE)
@@ -83,13 +83,15 @@ def _check_structure(path: Path) -> None:
     text = b"".join(raw[i : i + PAYLOAD] for i in range(0, len(raw), PAGE))
     text = text[start % PAGE : start % PAGE + xml_length]
     if text[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in text:
-        raise InputError(f"{path}: expected XML in UTF-8, found another encoding; export it again")
+        raise InputError("expected XML in UTF-8, found another encoding; export it again", path=path)
     if re.search(rb"<!(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise InputError(f"{path}: its XML declares a document type or entities, which is not allowed; export it again")
+        raise InputError(
+            "its XML declares a document type or entities, which is not allowed; export it again", path=path
+        )
     declared = re.match(rb"\s*<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)", text.removeprefix(b"\xef\xbb\xbf"))
     if declared and declared[1].lower() not in (b"utf-8", b"utf8", b"us-ascii"):
         encoding = declared[1][:40].decode("latin-1")
-        raise InputError(f"{path}: expected XML in UTF-8, found {encoding!r}; export it again")
+        raise InputError(f"expected XML in UTF-8, found {encoding!r}; export it again", path=path)
 
 
 def names(stem: str, stored: Sequence[str]) -> list[str]:
@@ -127,13 +129,14 @@ def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> 
     declared = int(header.point_count)
     if declared > 8 * path.stat().st_size:  # less than a bit a point
         raise InputError(
-            f"{path}: scan {index + 1} declares {declared} points, more than the file can hold; copy or export it again"
+            f"scan {index + 1} declares {declared} points, more than the file can hold; copy or export it again",
+            path=path,
         )
     fields = set(header.point_fields)
     cartesian = fields.issuperset(CARTESIAN)
     if not cartesian and not fields.issuperset(SPHERICAL):
         raise InputError(
-            f"{path}: expected Cartesian or spherical points in scan {name!r}, found {', '.join(sorted(fields))}"
+            f"expected Cartesian or spherical points in scan {name!r}, found {', '.join(sorted(fields))}", path=path
         )
     axes = CARTESIAN if cartesian else SPHERICAL
     points, intensity, cells, colour = _read_points(path, name, file, header, axes)
@@ -212,10 +215,10 @@ def _read_points(
         pieces.read(rows, read, declared)
     if read != declared:
         raise InputError(
-            f"{path}: expected {declared} points in scan {name!r} as declared, found {read}; copy it again"
+            f"expected {declared} points in scan {name!r} as declared, found {read}; copy it again", path=path
         )
     if declared and not count:
-        raise InputError(f"{path}: scan {name!r} holds no returns: all of its {declared} points are marked invalid")
+        raise InputError(f"scan {name!r} holds no returns: all of its {declared} points are marked invalid", path=path)
     return points[:count], intensity[:count], [lines[:count] for lines in cells], colour[:count]
 
 
@@ -276,7 +279,8 @@ def _pose(path: Path, name: str, header: Any) -> Floats:
         length = float(np.sqrt(w * w + x * x + y * y + z * z))
         if not 0.99 < length < 1.01:
             raise InputError(
-                f"{path}: the pose of scan {name!r} has a quaternion of length {length:g}, expected 1; export it again"
+                f"the pose of scan {name!r} has a quaternion of length {length:g}, expected 1; export it again",
+                path=path,
             )
         from scipy.spatial.transform import Rotation  # loaded in a quarter of a second, which other formats spare
 
@@ -284,5 +288,5 @@ def _pose(path: Path, name: str, header: Any) -> Floats:
     if node.isDefined("translation"):
         pose[:3, 3] = [float(node["translation"][key].value()) for key in "xyz"]
     if not np.isfinite(pose).all():
-        raise InputError(f"{path}: the pose of scan {name!r} has numbers that are not finite; export it again")
+        raise InputError(f"the pose of scan {name!r} has numbers that are not finite; export it again", path=path)
     return pose

@@ -23,15 +23,16 @@ def errors_name_the_file(path: Path, kind: str) -> Iterator[None]:
         raise
     except BaseException as error:
         message = (str(error).strip().splitlines() or [""])[0][:200] or type(error).__name__
-        raise InputError(f"{path}: not a readable {kind} file: {message}; copy or export it again") from error
+        raise InputError(f"not a readable {kind} file: {message}; copy or export it again", path=path) from error
 
 
 def check_declared_points(path: Path, kind: str, declared: int, least_bytes: float, room: int) -> None:
     """Raise InputError if ``declared`` points of at least ``least_bytes`` each do not fit in ``room`` bytes."""
     if declared < 0 or declared * least_bytes > room:
         raise InputError(
-            f"{path}: the header declares {declared} points, but the file has only {room} bytes for them; "
-            f"this {kind} file is cut off or damaged: copy or export it again"
+            f"the header declares {declared} points, but the file has only {room} bytes for them; "
+            f"this {kind} file is cut off or damaged: copy or export it again",
+            path=path,
         )
 
 
@@ -54,8 +55,9 @@ def check_last_row(path: Path, kind: str) -> None:
             number = sum(block.count(b"\n") for block in iter(lambda: file.read(1 << 20), b"")) + 1
         text = lines[-1].decode("latin-1").strip()[-40:]
         raise InputError(
-            f"{path}: not a readable {kind} file: line {number}: expected {decimals[0]} decimals as in the lines "
-            f"before, found the end of the file within a row ({text!r}); copy or export it again"
+            f"not a readable {kind} file: line {number}: expected {decimals[0]} decimals as in the lines "
+            f"before, found the end of the file within a row ({text!r}); copy or export it again",
+            path=path,
         )
 
 

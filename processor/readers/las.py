@@ -53,8 +53,9 @@ def read(path: Path) -> list[RawScan]:
         day = "" if header.creation_date is None else header.creation_date.isoformat()
         if not np.isfinite([header.scales, header.offsets]).all() or not np.all(header.scales):
             raise InputError(
-                f"{path}: expected finite scales and offsets, and scales other than 0, found {header.scales} and "
-                f"{header.offsets}; export it again"
+                f"expected finite scales and offsets, and scales other than 0, found {header.scales} and "
+                f"{header.offsets}; export it again",
+                path=path,
             )
         points, intensity = allocate(declared, 3), allocate(declared)
         station = allocate(declared, dtype=np.uint16)
@@ -74,7 +75,7 @@ def read(path: Path) -> list[RawScan]:
             pieces.read(len(piece), count, declared)
             named = named or bool(station[rows].any())
     if count != declared:
-        raise InputError(f"{path}: expected {declared} points as declared, found {count}; copy it again")
+        raise InputError(f"expected {declared} points as declared, found {count}; copy it again", path=path)
     # 0 in all points: the stations are unknown.
     scan = build_scan(path, scan_name(path), points, unit=unit, intensity=intensity, station=station if named else ())
     return [dataclasses.replace(coloured(scan, colour), scanned=day)]
@@ -86,7 +87,7 @@ def _check_header(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(HEADER_1_4)
     if not head.startswith(b"LASF") or len(head) < LEAST_HEADER:
-        raise InputError(f"{path}: not a readable LAS file: it has no LAS header; copy or export it again")
+        raise InputError("not a readable LAS file: it has no LAS header; copy or export it again", path=path)
     start, vlrs, form, length, count = struct.unpack_from("<IIBHI", head, COUNTS_AT)
     extended_start, extended = 0, 0
     if head[VERSION_MINOR_AT] >= 4 and len(head) >= HEADER_1_4:
@@ -98,14 +99,15 @@ def _check_header(path: Path) -> None:
         or extended * EVLR_HEADER > size
         or extended_start > size
     ):
-        raise InputError(f"{path}: the header's counts do not fit the file of {size} bytes; copy or export it again")
+        raise InputError(f"the header's counts do not fit the file of {size} bytes; copy or export it again", path=path)
     packed = bool(form & PACKED)
     check_declared_points(path, "LAS", count, length / (LAZ_LIMIT if packed else 1), size - start)
     # From version 1.3 on, other data may follow the points.
     if not packed and head[VERSION_MINOR_AT] < 3 and size - start - count * length >= length:
         raise InputError(
-            f"{path}: the header declares {count} points, but there is room for {(size - start) // length}; "
-            "the file was not finished or its header is damaged: export it again"
+            f"the header declares {count} points, but there is room for {(size - start) // length}; "
+            "the file was not finished or its header is damaged: export it again",
+            path=path,
         )
 
 
@@ -132,16 +134,17 @@ def _unit(path: Path, vlrs: Any, fits_degrees: bool) -> str:
     unit = unit or UNIT
     if heights and heights != unit:
         raise InputError(
-            f"{path}: expected one unit, found x and y in {unit}, z in {heights}, by its coordinate system; "
-            "export it in one unit"
+            f"expected one unit, found x and y in {unit}, z in {heights}, by its coordinate system; "
+            "export it in one unit",
+            path=path,
         )
     return unit
 
 
 def _in_degrees(path: Path) -> InputError:
     return InputError(
-        f"{path}: expected projected coordinates, found longitude and latitude; export it in a projected system, in "
-        "metres"
+        "expected projected coordinates, found longitude and latitude; export it in a projected system, in metres",
+        path=path,
     )
 
 

@@ -53,7 +53,7 @@ def read(path: Path) -> list[RawScan]:
     names, count = header.names, header.points
     missing = [name for name in "xyz" if name not in names]
     if missing:
-        raise InputError(f"{path}: expected FIELDS with x, y, z, found {' '.join(names)}")
+        raise InputError(f"expected FIELDS with x, y, z, found {' '.join(names)}", path=path)
     intensity, station = first_named(names, INTENSITY_NAMES), first_named(names, STATION_NAMES)
     fields = [names.index(name) for name in (*"xyz", intensity, station) if name]
     columns = [allocate(count, 3), *(allocate(count) for _ in fields[3:])]
@@ -88,7 +88,7 @@ def read_header(path: Path) -> Header:
     data = head.find(b"\nDATA ")
     stop = head.find(b"\n", data + 1)
     if data < 0 or stop < 0:
-        raise InputError(f"{path}: not a readable PCD file: it has no DATA line; copy or export it again")
+        raise InputError("not a readable PCD file: it has no DATA line; copy or export it again", path=path)
     lines = {}
     for line in head[:stop].decode("latin-1").splitlines():
         words = line.split()
@@ -96,13 +96,13 @@ def read_header(path: Path) -> Header:
             lines[words[0]] = words[1:]
     missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT") if not lines.get(key)]
     if missing:
-        raise InputError(f"{path}: not a readable PCD file: its header has no {missing[0]} line; export it again")
+        raise InputError(f"not a readable PCD file: its header has no {missing[0]} line; export it again", path=path)
     names = lines["FIELDS"]
     with errors_name_the_file(path, "PCD"):
         sizes, kinds = lines["SIZE"], lines["TYPE"]
         counts = [int(word) for word in lines.get("COUNT", ["1"] * len(names))]
         if not len(names) == len(sizes) == len(kinds) == len(counts):
-            raise InputError(f"{path}: FIELDS, SIZE, TYPE and COUNT differ in length; export the file again")
+            raise InputError("FIELDS, SIZE, TYPE and COUNT differ in length; export the file again", path=path)
         codes = {"F": ("4", "8"), "I": ("1", "2", "4", "8"), "U": ("1", "2", "4", "8")}
         if any(size not in codes.get(kind, ()) for size, kind in zip(sizes, kinds, strict=True)):
             raise ValueError(f"expected TYPE F, I or U of a SIZE of these, found {kinds} of {sizes}"[:200])
@@ -113,7 +113,7 @@ def read_header(path: Path) -> Header:
         if form not in ("ascii", "binary", "binary_compressed") or min(counts) < 1 or max(counts) > HEADER_LIMIT:
             raise ValueError(f"unknown DATA {form[:40]}, or COUNT outside 1 to {HEADER_LIMIT}")
     if width * height != points:
-        raise InputError(f"{path}: WIDTH {width} x HEIGHT {height} is not POINTS {points}; export the file again")
+        raise InputError(f"WIDTH {width} x HEIGHT {height} is not POINTS {points}; export the file again", path=path)
     room = path.stat().st_size - stop - 1
     row = sum(int(size) * n for size, n in zip(sizes, counts, strict=True))
     least = {"ascii": 2 * sum(counts), "binary": row}.get(form, row / LZF_LIMIT)

@@ -60,9 +60,9 @@ def read(path: Path) -> list[RawScan]:
     before = header.elements[: header.elements.index(vertex)] if vertex in header.elements else []
     missing = [name for name in "xyz" if name not in vertex.types]
     if missing:
-        raise InputError(f"{path}: expected vertices with x, y, z, found {', '.join(vertex.types) or 'none'}")
+        raise InputError(f"expected vertices with x, y, z, found {', '.join(vertex.types) or 'none'}", path=path)
     if vertex.list_counts or (header.order and any(element.list_counts for element in before)):
-        raise InputError(f"{path}: expected vertices only, found lists before or within them; export points only")
+        raise InputError("expected vertices only, found lists before or within them; export points only", path=path)
     intensity, station = first_named(vertex.types, INTENSITY_NAMES), first_named(vertex.types, STATION_NAMES)
     wanted = [*"xyz", *(name for name in (intensity, station) if name)]
     columns = [allocate(vertex.count, 3), *(allocate(vertex.count) for _ in wanted[3:])]
@@ -104,7 +104,7 @@ def read_header(path: Path) -> Header:
     end = head.find(b"end_header")
     stop = head.find(b"\n", end)
     if not head.startswith(b"ply") or end < 0 or stop < 0:
-        raise InputError(f"{path}: not a readable PLY file: it has no PLY header; copy or export it again")
+        raise InputError("not a readable PLY file: it has no PLY header; copy or export it again", path=path)
     room = path.stat().st_size - stop - 1
     order, elements = "", list[_Element]()
     with errors_name_the_file(path, "PLY"):
@@ -130,12 +130,14 @@ def read_header(path: Path) -> Header:
     # The last number of an ASCII file needs no separator after it.
     if least > room + (not order):
         raise InputError(
-            f"{path}: the header declares {least} bytes of data or more, but {room} follow; "
-            "the file is cut off or damaged: copy or export it again"
+            f"the header declares {least} bytes of data or more, but {room} follow; "
+            "the file is cut off or damaged: copy or export it again",
+            path=path,
         )
     if exact and order and least < room:
         raise InputError(
-            f"{path}: the header declares {least} bytes of data, but {room} follow; "
-            "header and data do not match: export it again"
+            f"the header declares {least} bytes of data, but {room} follow; "
+            "header and data do not match: export it again",
+            path=path,
         )
     return Header(order, elements, stop + 1)

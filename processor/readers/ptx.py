@@ -41,7 +41,7 @@ def read(path: Path) -> list[RawScan]:
             with errors_name_the_file(path, "PTX"):
                 first = rows.line()
     if not scans:
-        raise InputError(f"{path}: expected scans, found none")
+        raise InputError("expected scans, found none", path=path)
     if len(scans) == 1:
         return scans
     return [dataclasses.replace(scan, name=f"{scan_name(path)}-{i}") for i, scan in enumerate(scans, 1)]
@@ -58,12 +58,15 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
         numbers = []
     if len(numbers) != 10 or any(len(row) != width for row, width in zip(numbers, widths, strict=True)):
         raise InputError(
-            f"{path}: scan {number} has no PTX header of ten lines (columns, rows, position, axes, matrix); "
-            "the file is cut off or damaged, or has more cells than declared: export it again"
+            f"scan {number} has no PTX header of ten lines (columns, rows, position, axes, matrix); "
+            "the file is cut off or damaged, or has more cells than declared: export it again",
+            path=path,
         )
     cells = columns * lines
     if columns < 1 or lines < 1:
-        raise InputError(f"{path}: expected a grid of 1 x 1 cells or more, found {columns} x {lines} in scan {number}")
+        raise InputError(
+            f"expected a grid of 1 x 1 cells or more, found {columns} x {lines} in scan {number}", path=path
+        )
     check_declared_points(path, "PTX", cells, SHORTEST_ROW, size)
     T_project_scan = _rigid(path, number, np.array(numbers[6:]).T)
     with errors_name_the_file(path, "PTX"):
@@ -80,9 +83,9 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
             read += len(piece)
             pieces.read(len(piece), rows.bytes_read(), rows.size)
     if read != cells:
-        raise InputError(f"{path}: expected {cells} cells in scan {number}, found {read}; copy or export it again")
+        raise InputError(f"expected {cells} cells in scan {number}, found {read}; copy or export it again", path=path)
     if not count:
-        raise InputError(f"{path}: scan {number} holds no returns, only cells of 0 0 0")
+        raise InputError(f"scan {number} holds no returns, only cells of 0 0 0", path=path)
     position = T_project_scan[:3, :3].T @ (np.array(numbers[2]) - T_project_scan[:3, 3])
     scan = build_scan(
         path,
@@ -103,8 +106,9 @@ def _rigid(path: Path, number: int, T: Floats) -> Floats:
     off = float(np.abs(R.T @ R - np.eye(3)).max()) if np.isfinite(T).all() else float("nan")
     if not (off < RIGID_TOLERANCE and np.linalg.det(R) > 0 and np.abs(T[3] - [0, 0, 0, 1]).max() < RIGID_TOLERANCE):
         raise InputError(
-            f"{path}: the matrix of scan {number} is not a rotation and a translation "
-            f"(R^T R is {off:.3g} off the identity, determinant {np.linalg.det(R):.3g}); export the scan unscaled"
+            f"the matrix of scan {number} is not a rotation and a translation "
+            f"(R^T R is {off:.3g} off the identity, determinant {np.linalg.det(R):.3g}); export the scan unscaled",
+            path=path,
         )
     u, _, vt = np.linalg.svd(R)
     exact = np.eye(4)

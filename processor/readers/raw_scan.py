@@ -62,13 +62,14 @@ def build_scan(
     InputError without points, and for coordinates that are not finite.
     """
     if not len(points):
-        raise InputError(f"{path}: scan {name!r} holds no points; export it again")
+        raise InputError(f"scan {name!r} holds no points; export it again", path=path)
     low, high = large_arrays.extremes(points)
     if not (np.isfinite(low) and np.isfinite(high)):
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         raise InputError(
-            f"{path}: {len(bad)} of {len(points)} points of {name!r} have coordinates that are not finite, "
-            f"the first in row {bad[0] + 1}; remove them or export the scan again"
+            f"{len(bad)} of {len(points)} points of {name!r} have coordinates that are not finite, "
+            f"the first in row {bad[0] + 1}; remove them or export the scan again",
+            path=path,
         )
     farthest = max(-low, high)
     origin = np.zeros(3)

@@ -94,7 +94,7 @@ def read(path: Path, module: str) -> list[RawScan]:
             _forget(helper)
             raise
     if "error" in answer:
-        raise InputError(f"{path}{answer['error']}" if answer["about_file"] else answer["error"])
+        raise InputError(answer["error"], path=path if answer["about_file"] else None)
     return _scans(answer, descriptor, folder is not None)
 
 
@@ -148,12 +148,12 @@ def _death(path: Path, helper: _Helper, error: BaseException) -> InputError:
     if code in (-signal.SIGPROF, -signal.SIGALRM) or isinstance(error, TimeoutError):
         reason = f"reading took more than {limit_s(path):.0f} s, far more than a file of its size needs"
     elif code == -signal.SIGKILL:
-        return InputError(f"{path}: reading was killed, most likely for lack of memory; free some and run again")
+        return InputError("reading was killed, most likely for lack of memory; free some and run again", path=path)
     else:
         reason = (
             f"the library that reads it crashed ({signal.Signals(-code).name if code < 0 else f'exit code {code}'})"
         )
-    return InputError(f"{path}: {reason}; the file is damaged: copy or export it again")
+    return InputError(f"{reason}; the file is damaged: copy or export it again", path=path)
 
 
 @atexit.register
@@ -345,12 +345,12 @@ def _answer(path: Path, module: str, shared: _Shared) -> dict[str, Any]:
         with np.errstate(invalid="ignore"):
             scans = importlib.import_module(f"processor.readers.{module}").read(path)
     except InputError as error:
-        message = str(error)
-        return {"error": message.removeprefix(str(path)), "about_file": message.startswith(str(path))}
+        about_file = error.path == path
+        return {"error": error.problem if about_file else str(error), "about_file": about_file}
     except OSError as error:
-        return {"error": f": cannot be read ({error.strerror or error})", "about_file": True}
+        return {"error": f"cannot be read ({error.strerror or error})", "about_file": True}
     except MemoryError:
-        return {"error": ": needs more memory than a file of its size should; is it damaged?", "about_file": True}
+        return {"error": "needs more memory than a file of its size should; is it damaged?", "about_file": True}
     records = []
     for scan in scans:
         arrays = {}

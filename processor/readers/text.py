@@ -85,7 +85,7 @@ def read(path: Path) -> list[RawScan]:
             if following is None or declared < 0:
                 break
             if not re.fullmatch(r"\d+", following):
-                raise InputError(f"{path}: expected {declared} points as declared, found more; export it again")
+                raise InputError(f"expected {declared} points as declared, found more; export it again", path=path)
             declared = int(following)
     names = [scan_name(path)] if len(tables) == 1 else [f"{scan_name(path)}-{i}" for i in range(1, len(tables) + 1)]
     return [
@@ -162,7 +162,7 @@ def sniff(path: Path) -> Layout:
         "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig" if head[:3] == b"\xef\xbb\xbf" else ""
     )
     if not encoding and b"\0" in head:
-        raise InputError(f"{path}: expected a table of numbers as text, found binary data")
+        raise InputError("expected a table of numbers as text, found binary data", path=path)
     text = head.decode(encoding, "replace") if encoding else decoded(head)
     encoding = encoding or "latin-1"  # never fails, and only numbers are decoded
     lines = text.splitlines()
@@ -210,8 +210,9 @@ def _check_passed_over(path: Path, lines: Sequence[str], width: int) -> None:
         if stripped.startswith(COMMENTS) or len(cells) != width or 2 * sum(map(_is_number, cells)) < width:
             continue
         raise InputError(
-            f"{path}: line {number}: expected {width} numbers or the names of the columns, found {stripped[:60]!r}; "
-            "correct it, or begin a remark with #"
+            f"line {number}: expected {width} numbers or the names of the columns, found {stripped[:60]!r}; "
+            "correct it, or begin a remark with #",
+            path=path,
         )
 
 
@@ -278,7 +279,7 @@ def _columns(path: Path, layout: Layout) -> _Columns:
         units = {(match.group("unit") or "").lower() for match in matches if match}
         if len(units) != 1:
             raise InputError(
-                f"{path}: expected x, y, z in one unit, found different units ({', '.join(layout.header)})"
+                f"expected x, y, z in one unit, found different units ({', '.join(layout.header)})", path=path
             )
         others = [first_named(names, pattern) for pattern in (INTENSITY_NAMES, STATION_NAMES)]
         intensity, station = (names.index(name) if name else None for name in others)
@@ -287,7 +288,7 @@ def _columns(path: Path, layout: Layout) -> _Columns:
         return _Columns(wanted, intensity, station, units.pop(), colour)
     if sum(map(bool, axes)) > 1 and len(names) != layout.columns:
         raise InputError(
-            f"{path}: the header names {len(names)} columns ({' '.join(names)[:80]}), but rows have {layout.columns}"
+            f"the header names {len(names)} columns ({' '.join(names)[:80]}), but rows have {layout.columns}", path=path
         )
     _check_plain(path, layout)
     return _Columns([0, 1, 2], 3 if layout.columns in (4, 7) else None, colour=(4, 5, 6) if layout.columns == 7 else ())
@@ -298,13 +299,15 @@ def _check_plain(path: Path, layout: Layout) -> None:
     rows = layout.sample
     if layout.columns == 6 and layout.separator == "," and all(re.fullmatch(r"[+-]?\d+", c) for r in rows for c in r):
         raise InputError(
-            f"{path}: commas are either separators of six whole numbers or decimal signs of three numbers; "
-            "separate by semicolons, or name the columns in a first line"
+            "commas are either separators of six whole numbers or decimal signs of three numbers; "
+            "separate by semicolons, or name the columns in a first line",
+            path=path,
         )
     counts = [row[0] for row in rows]
     counting = len(counts) >= COUNTED and counts[0].isdecimal() and layout.columns >= 4
     if counting and counts == [str(int(counts[0]) + i) for i in range(len(counts))]:
         raise InputError(
-            f"{path}: expected coordinates, found row numbers in the first column ({', '.join(counts[:3])}, ...); "
-            "name the columns in a first line (id x y z), or leave the row numbers out"
+            f"expected coordinates, found row numbers in the first column ({', '.join(counts[:3])}, ...); "
+            "name the columns in a first line (id x y z), or leave the row numbers out",
+            path=path,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.pipeline import Execution
-from processor.report.step_report import step_report
+from processor.report.reports_of_steps import step_report
 from processor.report.style import CaptionedPngs, default_settings
 
 

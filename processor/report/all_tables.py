@@ -12,7 +12,7 @@ from processor.model import METRIC_NAMES, Metric, Statistic, StepRun
 from processor.pipeline import Execution
 from processor.report import characteristics
 from processor.report.limit_table import limit_table
-from processor.report.step_report import step_report
+from processor.report.reports_of_steps import characteristics_of, step_report
 from processor.report.table import Table
 
 LIMITS = "-limits"  # ends the file of what a step compared with limits
@@ -56,6 +56,6 @@ def tables_of_run(execution: Execution, report: ErrorReport) -> list[Table]:
     tables: list[Table] = []
     for run, others in execution.by_step():
         tables += tables_of_step(run, others, report)
-    held = [one for run, _ in execution.by_step() for one in characteristics.of_run(execution.scene, run)]
+    held = [one for run, _ in execution.by_step() for one in characteristics_of(execution.scene, run)]
     tables += [characteristics.table(held)] if held else []
     return [*tables, checks_table(report)] if report.metrics else tables

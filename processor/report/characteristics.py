@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from processor.language.messages import Message, label, text
 from processor.limits.judging import JudgedLimits
-from processor.model import WORST_FIRST, Scene, StepRun, Verdict
-from processor.report.step_report import step_report
+from processor.model import WORST_FIRST, Verdict
 from processor.report.table import NAN, Table
 
 FILE = "characteristics"
@@ -48,9 +47,8 @@ class Characteristic:
         return self.nominal + self.deviation
 
 
-def of_run(scene: Scene, run: StepRun) -> list[Characteristic]:
-    """Return the characteristics of a step, worst first, else in their order."""
-    found = [*step_report(run.step).characteristics(scene, run), *of_limits(getattr(run.result, "limits", None))]
+def worst_first(found: Iterable[Characteristic]) -> list[Characteristic]:
+    """Return characteristics with the worst first, else in their order."""
     return sorted(found, key=lambda one: ORDER.get(one.verdict, len(ORDER)))
 
 
@@ -91,7 +89,7 @@ def _bound(value: float) -> float:
 
 def summary(found: Iterable[Characteristic]) -> Message:
     """Say how many characteristics have which verdict, and name the first of the worst."""
-    ordered = sorted(found, key=lambda one: ORDER.get(one.verdict, len(ORDER)))
+    ordered = worst_first(found)
     if not ordered:
         return text("Nothing was compared with limits.")
     worst = ordered[0].verdict

@@ -9,7 +9,7 @@ from processor.limits.judging import JudgedLimits
 from processor.model import Clips, StepRun
 from processor.pipeline import Execution
 from processor.report import verdict_counts
-from processor.report.step_report import step_report
+from processor.report.reports_of_steps import step_report
 
 
 def clipped(clips: Clips) -> Text:

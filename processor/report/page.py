@@ -14,8 +14,9 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, messages, text
 from processor.model import Scene, Status, StepRun, Verdict, Word, worst
 from processor.pipeline import Execution
-from processor.report import all_tables, characteristics, headline, page_script, templates, title_block
-from processor.report.step_report import step_report
+from processor.report import all_tables, characteristics, headline, templates, title_block
+from processor.report.reports_of_steps import characteristics_of, step_report
+from processor.report.scripts import page_script
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table, headings, numeric, shown
 from processor.targets.summary import summary
@@ -91,7 +92,7 @@ def _about(scene: Scene) -> Text:
         "scans": len(scene.scans),
         "points": points,
         "units": scene.units,
-        "reason": [label(one) for one in scene.units_reason.split("; ")],
+        "reason": scene.units_reason,
     }
     if points:
         return text(
@@ -110,7 +111,7 @@ def _banner(execution: Execution) -> dict[str, Any]:
     """Return the verdict on everything, in a word, and what it rests on."""
     runs = [run for run, _ in execution.by_step()]
     verdict = worst(run.verdict for run in runs)
-    told = characteristics.summary(one for run in runs for one in characteristics.of_run(execution.scene, run))
+    told = characteristics.summary(one for run in runs for one in characteristics_of(execution.scene, run))
     sentences, tone = [told], TONES[verdict]
     if verdict is not Verdict.NONE and headline.unverified(execution):
         tone = tone if verdict is Verdict.FAIL else "open"
@@ -204,7 +205,7 @@ def _section(
     tables = [table for table in all_tables.tables_of_step(run, others, report) if table.on_page]
     if run.result.status == Status.FAILED:
         tables = [table for table in tables if table.rows]
-    held = [] if report_of.own_table else characteristics.of_run(execution.scene, run)
+    held = [] if report_of.own_table else characteristics_of(execution.scene, run)
     lead = [characteristics.table(held, report_of.characteristics_note)] if held else []
     lead += [table for table in tables if table.file in LEAD]
     further = [table for table in tables if table.file not in LEAD and table.folded]

@@ -21,6 +21,7 @@ from processor.model import Verdict, worst
 from processor.pipeline import Execution
 from processor.report import characteristics, headline, title_block
 from processor.report.characteristics import Characteristic
+from processor.report.reports_of_steps import characteristics_of
 from processor.report.style import CaptionedPngs, chinese_font, drawable, families, pdf
 from processor.report.table import shown
 
@@ -84,7 +85,7 @@ def _front(execution: Execution, say: Messages) -> Iterator[Figure]:
     runs = [run for run, _ in execution.by_step()]
     scene, verdict = execution.scene, worst(run.verdict for run in runs)
     word = say.text(text("NO VERDICT") if verdict is Verdict.NONE else verdict).upper()
-    held = [one for run in runs for one in characteristics.of_run(scene, run)]
+    held = [one for run in runs for one in characteristics_of(scene, run)]
     lines = [Line(scene.name, 16, "bold"), Line("")]
     lines += [
         Line(word, 18, "bold", COLOURS.get(verdict, "black")),
@@ -175,7 +176,7 @@ def _page(lines: Sequence[Line]) -> Figure:
 def _characteristics(execution: Execution, say: Messages) -> Iterator[Figure]:
     """Yield the pages of the table, worst first in each step."""
     for run, _ in execution.by_step():
-        held = characteristics.of_run(execution.scene, run)
+        held = characteristics_of(execution.scene, run)
         for start in range(0, len(held), ROWS_A_PAGE):
             page = Figure(figsize=A4)
             heading = say.text(text("Characteristics, step {step}", step=run.step))

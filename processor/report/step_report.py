@@ -1,8 +1,7 @@
-"""The report of a step: ``REPORT`` of ``section.py`` in the folder of the step's package (``pipeline.package_of``)."""
+"""What the report of a step consists of; :mod:`.reports_of_steps` finds that of each."""
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message
 from processor.model import Scene, StepRun, Verdict
-from processor.pipeline import Execution, package_of
+from processor.pipeline import Execution
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table
 
@@ -40,9 +39,3 @@ class StepReport:
     further_figures: tuple[str, ...] = ()  # file names of the pictures that stand among the further tables
     files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
     interactive_data: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None
-
-
-def step_report(step: str) -> StepReport:
-    """Return the functions that make the report of a step."""
-    report: StepReport = importlib.import_module(f"processor.report.{package_of(step)}.section").REPORT
-    return report

@@ -25,7 +25,9 @@ NAN = float("nan")
 class Table:
     """A titled table: in a CSV file of the name ``file`` where that is not empty, on the page and on the terminal.
 
-    ``groups`` are headings above the columns, one each, of which equal neighbours are merged; CSV files have none.
+    ``columns`` are the names in the CSV file, with units. ``headings`` are those for display, one each; without them
+    they are the words of the names without units, which the title states. ``groups`` are headings above the columns,
+    one each, of which equal neighbours are merged; CSV files have none.
     """
 
     title: str | Message
@@ -34,6 +36,7 @@ class Table:
     file: str = ""
     note: str | Message = ""
     groups: tuple[str | Message, ...] = ()
+    headings: tuple[str, ...] = ()
     on_page: bool = True
     on_terminal: bool = True
     folded: bool = False  # on the page: among the further tables, which a reader opens
@@ -112,11 +115,10 @@ def plain_text(table: Table, most: int = 40) -> str:
 
 
 def headings(table: Table) -> tuple[str, ...]:
-    """Return the columns' names for display, without unit (in the title) and without the part in their group."""
-    names = [column.removesuffix("_mm").removesuffix("_mrad").replace("_", " ") for column in table.columns]
-    if table.groups:
-        names = [name.split(" ")[-1] if group else name for name, group in zip(names, table.groups, strict=True)]
-    return tuple(names)
+    """Return the headings of the columns for display: those of the table, or the names without their units."""
+    if table.headings:
+        return table.headings
+    return tuple(column.removesuffix("_mm").removesuffix("_mrad").replace("_", " ") for column in table.columns)
 
 
 def _group_line(table: Table, widths: list[int]) -> str:

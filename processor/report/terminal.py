@@ -15,7 +15,7 @@ from processor.plain_text import printable
 from processor.report import all_tables, headline
 from processor.report import table as report_table
 from processor.report.limit_table import worst_first
-from processor.report.step_report import step_report
+from processor.report.reports_of_steps import step_report
 
 MOST_LINES, LONGEST = 15, 200
 TO_DO, REASONS, LIMITS = 4, 3, 3  # most lines of each step

@@ -11,7 +11,7 @@ from processor.model import UsageError
 from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, headline, page, pdf, workbook
 from processor.report import table as report_table
-from processor.report.step_report import step_report
+from processor.report.reports_of_steps import step_report
 from processor.report.style import default_settings
 from processor.results.file_names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON, STEPS
 from processor.results.to_json import results_json

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import messages
 from processor.model import Scene, StepRun, worst
 from processor.pipeline import Execution
-from processor.results.fields_to_json import as_object
+from processor.results.fields_to_json import as_object, reason_json
 from processor.results.file_names import FORMAT, FORMAT_VERSION
 from processor.store.json_values import json_ready
 
@@ -23,7 +24,7 @@ def results_json(execution: Execution, report: ErrorReport, headline: str = "") 
         "headline": headline,
         "input": made["input"],
         "input_sha256": made["input_sha256"],
-        "units": {"read_as": execution.scene.units, "reason": execution.scene.units_reason, "written_as": "mm"},
+        "units": _units(execution.scene),
         **_clips(execution.scene),
         **({"scanned": made["epoch"]["scanned"]} if made.get("epoch", {}).get("scanned") else {}),
         "seed": made["seed"],
@@ -49,6 +50,16 @@ def results_json(execution: Execution, report: ErrorReport, headline: str = "") 
     }
     written: dict[str, Any] = json_ready(content)
     return written
+
+
+def _units(scene: Scene) -> dict[str, Any]:
+    """Write how the coordinates were read, and why: in English, and as codes with values."""
+    return {
+        "read_as": scene.units,
+        "reason": messages("en").text(scene.units_reason),
+        "reasons": [reason_json(one) for one in scene.units_reason],
+        "written_as": "mm",
+    }
 
 
 def _clips(scene: Scene) -> dict[str, Any]:

@@ -64,7 +64,7 @@ def read_design(path: Path, unit: str) -> CadDesign:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise InputError(f"cannot be read ({error.strerror or error})", path=path) from None
     key = hashlib.sha256(b"\0".join((content, path.suffix.lower().encode(), unit.encode(), __version__.encode())))
     with _cache() as cache:
         meshes = cache / key.hexdigest()
@@ -128,12 +128,12 @@ def _record(meshes: Path, path: Path) -> tuple[list[tuple[str, str]], str]:
         stated = str(record.get("unit_stated") or "")
     except (OSError, ValueError, KeyError, TypeError):
         shutil.rmtree(meshes, ignore_errors=True)
-        raise InputError(f"{meshes}: was damaged and has been removed; run again") from None
+        raise InputError("was damaged and has been removed; run again", path=meshes) from None
     if problems:
         more = f", and {len(problems) - 1} more" if len(problems) > 1 else ""
-        raise InputError(f"{path}: cannot be converted to meshes completely ({problems[0]}{more}); export it again")
+        raise InputError(f"cannot be converted to meshes completely ({problems[0]}{more}); export it again", path=path)
     if not names or any(Path(mesh).name != mesh for _, mesh in names):
-        raise InputError(f"{path}: expected solids or surfaces, found none; export it with them")
+        raise InputError("expected solids or surfaces, found none; export it with them", path=path)
     return names, stated
 
 
@@ -183,7 +183,7 @@ def _designgen(path: Path) -> list[str]:
     if program:
         return [program]
     raise InputError(
-        f"{path}: a CAD file needs designgen with its CAD kernel: pip install 'steel-scan-check[designgen]'"
+        "a CAD file needs designgen with its CAD kernel: pip install 'steel-scan-check[designgen]'", path=path
     )
 
 
@@ -193,21 +193,21 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
     try:
         making = Path(tempfile.mkdtemp(prefix=".making-", dir=cache))
     except OSError as error:
-        raise InputError(f"{cache}: cannot be written ({error.strerror or error})") from error
+        raise InputError(f"cannot be written ({error.strerror or error})", path=cache) from error
     try:
         # A copy of the hashed bytes, under a name that cannot be mistaken for an option.
         source = making / f"{SOURCE}{path.suffix.lower()}"
         source.write_bytes(content)
         failure = _run(command, source, making / "meshes", unit)
         if failure:
-            raise InputError(f"{path}: {failure.replace(f'{source}: ', '')}")
+            raise InputError(f"{failure.replace(f'{source}: ', '')}", path=path)
         (making / "meshes" / CHECKSUM).write_text(_sha256(making / "meshes"), "ascii")
         with suppress(OSError):  # another process has made them meanwhile
             os.replace(making / "meshes", meshes)
         if not meshes.is_dir():
-            raise InputError(f"{path}: expected meshes from designgen import, found none; run again")
+            raise InputError("expected meshes from designgen import, found none; run again", path=path)
     except OSError as error:
-        raise InputError(f"{cache}: cannot be written ({error.strerror or error})") from error
+        raise InputError(f"cannot be written ({error.strerror or error})", path=cache) from error
     finally:
         shutil.rmtree(making, ignore_errors=True)
 
@@ -221,4 +221,4 @@ def _run(command: list[str], source: Path, out: Path, unit: str) -> str:
     if (out / RECORD).is_file():
         return ""
     code = -ended.code if ended.cause is process.Cause.SIGNAL else ended.code
-    return ended.last_line.removeprefix("error: ") or f"designgen import ended with exit code {code}"
+    return ended.error or ended.last_line or f"designgen import ended with exit code {code}"

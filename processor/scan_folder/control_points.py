@@ -68,15 +68,15 @@ def _not_negative(where: str, sd_mm: float) -> float:
 
 def _from_csv(path: Path) -> list[Measured]:
     if not path.is_file():
-        raise InputError(f"{path}: expected a file of control points, found a folder")
+        raise InputError("expected a file of control points, found a folder", path=path)
     if path.stat().st_size > LARGEST_FILE:
         raise InputError(
-            f"{path}: expected at most {LARGEST_FILE} bytes, found {path.stat().st_size}; is it the right file?"
+            f"expected at most {LARGEST_FILE} bytes, found {path.stat().st_size}; is it the right file?", path=path
         )
     rows = csv_rows(path)
     header = tuple(name.strip().lower() for name in rows[0][1]) if rows else ()
     if sorted(header) != sorted(COLUMNS):
-        raise InputError(f"{path}: expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}")
+        raise InputError(f"expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}", path=path)
     measured = []
     for line, row in rows[1:]:
         where = f"{path}: line {line}"

@@ -44,18 +44,19 @@ def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | Frame
         return _read_nodes(path, table_unit)
     if is_surface(path):
         raise InputError(
-            f"{path}: a {suffix[1:].upper()} file alone is a design of kind structure; an arch bridge or a space frame "
-            "needs a design.json (its components may name such files as 'mesh')"
+            f"a {suffix[1:].upper()} file alone is a design of kind structure; an arch bridge or a space frame "
+            "needs a design.json (its components may name such files as 'mesh')",
+            path=path,
         )
     if suffix != ".json":
-        raise InputError(f"{path}: expected a design as .json or .csv, found {suffix or 'no suffix'}")
+        raise InputError(f"expected a design as .json or .csv, found {suffix or 'no suffix'}", path=path)
     design = read_json(path)
     kind = design.text("kind")
     if kind == "arch-bridge":
         return _arch(folder, design)
     if kind == "space-frame":
         return _frame(design)
-    raise InputError(f"{path}: expected kind arch-bridge or space-frame, found {kind!r}")
+    raise InputError(f"expected kind arch-bridge or space-frame, found {kind!r}", path=path)
 
 
 def read_json(path: Path) -> Table:
@@ -68,13 +69,13 @@ def read_json_value(path: Path) -> Any:
     try:
         return json.loads(_text(path))
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable JSON: {error}") from None
+        raise InputError(f"not readable JSON: {error}", path=path) from None
 
 
 def _text(path: Path) -> str:
     if path.stat().st_size > TEXT_LIMIT:
         raise InputError(
-            f"{path}: expected at most {TEXT_LIMIT} bytes, found {path.stat().st_size}; is it the right file?"
+            f"expected at most {TEXT_LIMIT} bytes, found {path.stat().st_size}; is it the right file?", path=path
         )
     return read_text(path)
 
@@ -305,23 +306,23 @@ def _read_nodes(path: Path, table_unit: str) -> FrameDesign:
             if match.group(1):
                 units.add(match.group(2))
     if set(columns) != {"id", "x", "y", "z", "radius"} or len(units) != 1:
-        raise InputError(f"{path}: expected columns id,x,y,z,radius of one unit, found {first.strip()[:80]!r}")
+        raise InputError(f"expected columns id,x,y,z,radius of one unit, found {first.strip()[:80]!r}", path=path)
     try:
         unit = known_unit(units.pop() or table_unit)
     except UsageError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(str(error), path=path) from None
     ids, numbers = [], []
     for line, row in rows[1:]:
         if len(row) > len(header) and any(cell.strip() for cell in row[len(header) :]):
-            raise InputError(f"{path}: line {line}: expected {len(header)} cells, found {len(row)}: {row}")
+            raise InputError(f"line {line}: expected {len(header)} cells, found {len(row)}: {row}", path=path)
         try:
             cells = [row[columns[key]].strip() for key in ("x", "y", "z", "radius")]
             values = [float(cell.replace(",", ".") if separator != "," else cell) for cell in cells]
             ids.append(int(row[columns["id"]]))
         except (ValueError, IndexError):
-            raise InputError(f"{path}: line {line}: expected id,x,y,z,radius, found {row}") from None
+            raise InputError(f"line {line}: expected id,x,y,z,radius, found {row}", path=path) from None
         if not np.isfinite(values).all() or values[3] <= 0 or abs(ids[-1]) >= 2**53:
-            raise InputError(f"{path}: line {line}: expected finite numbers and a radius above 0, found {row}")
+            raise InputError(f"line {line}: expected finite numbers and a radius above 0, found {row}", path=path)
         numbers.append(values)
     _check_ids(str(path), ids)
     table = np.array(numbers) * MM_PER_UNIT[unit]

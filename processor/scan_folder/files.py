@@ -28,7 +28,7 @@ def only_cad_file(folder: Path) -> str:
 def missing(path: Path) -> InputError:
     """Return the error of a path that leads nowhere, with the names in its folder that are most like it."""
     near = sorted(one.name for one in path.parent.iterdir()) if path.parent.is_dir() else []
-    return InputError(f"{path}: there is no such file or folder{did_you_mean(path.name, near)}")
+    return InputError(f"there is no such file or folder{did_you_mean(path.name, near)}", path=path)
 
 
 def existing(path: Path) -> Path:

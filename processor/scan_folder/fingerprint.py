@@ -76,7 +76,7 @@ def content_hash(path: Path, without: Path | None = None) -> str:
                 continue
             _feed(digest, file)
     except (FileNotFoundError, NotADirectoryError, RuntimeError):
-        raise InputError(f"{path}: was deleted while it was read; run again when it is complete") from None
+        raise InputError("was deleted while it was read; run again when it is complete", path=path) from None
     return digest.hexdigest()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from processor import large_arrays, readers, record_checks, store
 from processor.geometry import rigid
+from processor.language.messages import messages
 from processor.model import (
     KINDS,
     ArchDesign,
@@ -20,6 +21,7 @@ from processor.model import (
     InputError,
     Ints,
     Labels,
+    Reason,
     Scan,
     Scene,
     Stations,
@@ -27,6 +29,7 @@ from processor.model import (
     TitleBlock,
     Tolerance,
     did_you_mean,
+    reason,
 )
 from processor.progress import tracked
 from processor.readers import RawScan
@@ -72,9 +75,6 @@ KEYS = (
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FLOAT_STEP_MM = 1.0
 NAN = float("nan")
-GUESSED = "guessed from the scans' size"
-GUESSED_DESIGN = "design and components as processor init guesses them, as there is no project.toml"
-UNSURE_DESIGN = "design and components as processor init guesses them, some not sure, as there is no project.toml"
 
 Design = ArchDesign | FrameDesign | StructureDesign
 Keep = Callable[[Scan], Scan]
@@ -230,13 +230,13 @@ def _read_project(folder: Path) -> _Project:
         try:
             table = Table.of(str(path), tomllib.loads(read_text(path)))
         except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise InputError(f"{path}: not readable TOML: {error}") from None
+            raise InputError(f"not readable TOML: {error}", path=path) from None
     guessed = None if path.exists() else _guess(folder)
     table.only(KEYS)
     kind = table.text("kind", "")
     if kind and kind not in KINDS:
         like = did_you_mean(kind, KINDS)
-        raise InputError(f"{path}: unknown kind {kind!r}{like}; expected one of {', '.join(KINDS)}")
+        raise InputError(f"unknown kind {kind!r}{like}; expected one of {', '.join(KINDS)}", path=path)
     found = next((name for name in DESIGNS if (folder / name).exists()), "")
     named = table.text("design", "") or found
     if not named and guessed is None and not path.exists():
@@ -310,8 +310,9 @@ def _open_scans(folder: Path, files: Sequence[Path]) -> list[Path]:
     if not scans:
         packed = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in readers.ARCHIVES]
         raise InputError(
-            f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none"
-            + (f"; unpack {packed[0]} first" if packed else "")
+            f"expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none"
+            + (f"; unpack {packed[0]} first" if packed else ""),
+            path=folder,
         )
     return scans
 
@@ -328,21 +329,21 @@ def _scene(
     scans: list[Scan] = []
     scan_units: list[str] = []
     days: set[str] = set()
-    reasons: dict[str, str] = {}
+    reasons: dict[str, Reason] = {}  # why a unit was taken, by units
     clipper = Clipper(read_boxes(project.table, MM_PER_UNIT[project.units or option or "m"]), project.table.where)
     for entry in tracked(project.entries):
         if entry.component and parts and entry.component not in parts:
             raise InputError(
-                f"{entry.path}: the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}"
+                f"the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}", path=entry.path
             )
         for raw in _read_raws(entry, scans):
-            unit, reason = _unit(raw, entry.path, project, option)
+            unit, why = _unit(raw, entry.path, project, option)
             days |= {raw.scanned} - {""}
-            reasons.setdefault(unit, reason)
+            reasons.setdefault(unit, why)
             scan = clipper.clip(_scan(raw, entry, unit, parts, stations))
             if any(scan.name == other.name for other in scans):
-                raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
-            _check_unit(entry.path, scan, unit, reason, design)
+                raise InputError(f"a second scan named {scan.name!r}; rename one of the files", path=entry.path)
+            _check_unit(entry.path, scan, unit, messages("en").text(why), design)
             scans.append(keep(scan))
             scan_units.append(unit)
     where = stations or _stations(scans)
@@ -357,7 +358,7 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason="; ".join([*dict.fromkeys(reasons.values()), *_said(project)]),
+        units_reason=(*_different(reasons.values()), *_said(project)),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
         control=control_points(project.control, scans, scan_units, where, unit, search is not None),
@@ -368,10 +369,18 @@ def _scene(
     )
 
 
-def _said(project: _Project) -> list[str]:
+def _different(reasons: Iterable[Reason]) -> list[Reason]:
+    """Return each reason once, in their order; reasons have no hash."""
+    different: list[Reason] = []
+    for one in reasons:
+        different += [] if one in different else [one]
+    return different
+
+
+def _said(project: _Project) -> tuple[Reason, ...]:
     if project.guessed is None:
-        return []
-    return [UNSURE_DESIGN if project.guessed.unsure else GUESSED_DESIGN]
+        return ()
+    return (reason("units.design-guessed-unsure") if project.guessed.unsure else reason("units.design-guessed"),)
 
 
 def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
@@ -379,7 +388,7 @@ def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
     raws = readers.read(entry.path)
     several = len(raws) > 1
     if several and (entry.pose is not None or entry.position is not None):
-        raise InputError(f"{entry.path}: holds {len(raws)} scans, so one 'pose' or 'position' does not fit them")
+        raise InputError(f"holds {len(raws)} scans, so one 'pose' or 'position' does not fit them", path=entry.path)
     for number in range(1, len(raws) + 1):
         raw = raws.pop(0)
         if several and any(raw.name == other.name for other in scans):  # scanners name the first of each file S1
@@ -387,28 +396,29 @@ def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
         yield raw
 
 
-def _unit(raw: RawScan, path: Path, project: _Project, option: str) -> tuple[str, str]:
+def _unit(raw: RawScan, path: Path, project: _Project, option: str) -> tuple[str, Reason]:
     if option:
-        return option, "given by --units"
+        return option, reason("units.by-option")
     if raw.unit:
-        return known_unit(raw.unit), f"given by the {path.suffix.lower()[1:]} file or its format"
+        return known_unit(raw.unit), reason("units.by-format", format=path.suffix.lower()[1:])
     if project.units:
-        return project.units, GUESSED if project.guessed else f"given in {PROJECT}"
+        return project.units, (reason("units.by-size") if project.guessed else reason("units.by-project", file=PROJECT))
     if project.design is None and project.guessed is None and (why := units.not_metres(raw.points)):
         return "mm", why
-    return "m", "taken as metres, as scanners write: neither the format nor the project gives a unit"
+    return "m", reason("units.as-scanners-write")
 
 
 def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Stations | None) -> Scan:
     if len(raw.points) < FEWEST_POINTS:
         raise InputError(
-            f"{entry.path}: scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more"
+            f"scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more", path=entry.path
         )
     scale = MM_PER_UNIT[unit]
     if raw.step * scale > FLOAT_STEP_MM:
         raise InputError(
-            f"{entry.path}: the coordinates of scan {raw.name!r} are in 32 bits, which so far from their origin have "
-            f"steps of {raw.step * scale:.3g} mm; export it in double precision, or nearer to its origin"
+            f"the coordinates of scan {raw.name!r} are in 32 bits, which so far from their origin have "
+            f"steps of {raw.step * scale:.3g} mm; export it in double precision, or nearer to its origin",
+            path=entry.path,
         )
     pose = np.array(raw.T_project_scan if entry.pose is None else entry.pose)
     if pose.size:
@@ -422,8 +432,8 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
         least, most = map(int, large_arrays.extremes(raw.station))
         if not 0 <= least <= most <= len(stations.ids):
             raise InputError(
-                f"{entry.path}: its points name stations {least} to {most}, "
-                f"but {STATIONS} has {len(stations.ids)}, counted from 1"
+                f"its points name stations {least} to {most}, but {STATIONS} has {len(stations.ids)}, counted from 1",
+                path=entry.path,
             )
     scanner = position if position.size else np.zeros(3)
     origin = raw.origin * scale
@@ -471,7 +481,7 @@ def _stations(scans: list[Scan]) -> Stations | None:
     return Stations(tuple(positions), np.array(list(positions.values()))) if positions else None
 
 
-def _check_unit(path: Path, scan: Scan, unit: str, reason: str, design: Design | None) -> None:
+def _check_unit(path: Path, scan: Scan, unit: str, source: str, design: Design | None) -> None:
     """Raise InputError if a scan's size shows that its unit is wrong, by itself or beside its design."""
     nominal, ratios = np.empty((0, 3)), units.STRUCTURE_RATIOS
     if isinstance(design, ArchDesign):
@@ -482,5 +492,5 @@ def _check_unit(path: Path, scan: Scan, unit: str, reason: str, design: Design |
     elif design is not None:
         nominal = design.vertices
     what, advice = f"{path}: scan {scan.name!r}", f"give its unit by --units or in {PROJECT}"
-    units.check_ratio(what, scan.points, nominal, ratios, unit, reason, f"{advice}, or correct the design's units")
-    units.check_extent(what, scan.points, unit, reason, advice, units.STRAY)
+    units.check_ratio(what, scan.points, nominal, ratios, unit, source, f"{advice}, or correct the design's units")
+    units.check_extent(what, scan.points, unit, source, advice, units.STRAY)

@@ -82,7 +82,7 @@ def guess(folder: Path, design_units: str = "") -> Guess:
     without such a folder.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected a scan folder, found {'a file' if folder.exists() else 'nothing'}")
+        raise InputError(f"expected a scan folder, found {'a file' if folder.exists() else 'nothing'}", path=folder)
     project = Guess(str(folder), folder.resolve().name)
     path = _written_design(folder, project)
     groups = [] if path else surface_files.candidates(folder)
@@ -93,7 +93,7 @@ def guess(folder: Path, design_units: str = "") -> Guess:
         project.scans += [_read_scan(folder, file, project) for file in scan_files(folder, [path]) if file in surfaces]
     if not project.scans:
         raise InputError(
-            f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none"
+            f"expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none", path=folder
         )
     shapes = _shapes(design) if isinstance(design, ArchDesign) else {}
     _guess_units(project, _sizes(design), shapes)
@@ -131,22 +131,22 @@ def _shown_design(
     """Return the design that meshes or CAD files show: of an arch bridge or a frame, else one surface of a whole."""
     scans = [(scan.radius, scan.units) for scan in project.scans if not scan.error]
     found = list[GuessedDesign]()
-    doubts = list[str]()
+    without = list[GuessedDesign]()
     for group in groups:
         try:
             guessed = guess_design.guess(folder, group, scans, design_units)
         except InputError as error:
-            project.unsure.append(f"design: {str(error).replace(f'{folder}/', '')}")
+            project.unsure.append(f"design: {_within(folder, error)}")
             continue
-        found += [guessed] if guessed.design is not None else []
-        doubts += guessed.doubts if guessed.design is None else ()
+        (without if guessed.design is None else found).append(guessed)
     if len(found) == 1:
         _take_design(project, found[0])
         return found[0].design
     paths = [path for group in groups for path in group]
     if len(paths) == 1 and not found:
         project.design, project.design_reason = str(paths[0].relative_to(folder)), "the only candidate"
-        project.unsure += [text for text in doubts if not text.startswith("units of the design")]
+        # The unit of one surface of the whole is that of 'design_units', which has a doubt of its own.
+        project.unsure += [text for one in without for text in one.doubts]
         return _read_design(folder, paths[0], project)
     if not paths:
         project.unsure.append("design: none found, so scans are not compared with one")
@@ -157,7 +157,7 @@ def _shown_design(
         f"design: several files may be it ({named}); name one as 'design', with kind = \"structure\", or write a "
         "design.json"
     )
-    project.unsure += [f"design: {text}" for text in doubts]
+    project.unsure += [f"design: {text}" for one in without for text in one.questions]
     return None
 
 
@@ -167,7 +167,7 @@ def _take_design(project: Guess, guessed: GuessedDesign) -> None:
     project.kind_reason = project.design_reason = guessed.reason
     if guessed.kind_doubt:
         project.unsure.append(f"kind: taken as {project.kind}: {guessed.kind_doubt}")
-    project.unsure += guessed.doubts
+    project.unsure += guessed.questions
 
 
 def _has_kind(path: Path) -> bool:
@@ -211,7 +211,7 @@ def _read_scan(folder: Path, path: Path, project: Guess) -> ScanGuess:
         existing_file_in(folder, scan.file, str(folder))
         raws = readers.read(path)
     except InputError as error:
-        scan.error = str(error).replace(f"{folder}/", "")
+        scan.error = _within(folder, error)
         project.unsure.append(f"{scan.file}: cannot be read, so it is written as a comment: {scan.error}")
         return scan
     scan.units = known_unit(raws[0].unit) if raws[0].unit else ""
@@ -221,6 +221,13 @@ def _read_scan(folder: Path, path: Path, project: Guess) -> ScanGuess:
     if len(raws) > 1:
         scan.reason = f"holds {len(raws)} scans: {', '.join(raw.name for raw in raws[:6])}"
     return scan
+
+
+def _within(folder: Path, error: InputError) -> str:
+    """Return the message of an error, with the file named as from the folder that it is in."""
+    if error.path is None or not error.path.is_relative_to(folder):
+        return str(error)
+    return f"{error.path.relative_to(folder)}: {error.problem}"
 
 
 def _sample(raws: Sequence[RawScan]) -> Floats:
@@ -470,6 +477,6 @@ def write_design(folder: Path, project: Guess) -> None:
         (folder / name).parent.mkdir(exist_ok=True)
         with replacing(folder / name) as temporary:
             write_mesh(temporary, vertices, faces)
-    questions = [*([project.made.kind_doubt] if project.made.kind_doubt else []), *project.made.doubts]
+    questions = [*([project.made.kind_doubt] if project.made.kind_doubt else []), *project.made.questions]
     with replacing(folder / project.design) as temporary:
         write_json(temporary, guess_design.content(project.made, questions))

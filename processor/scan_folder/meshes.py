@@ -23,14 +23,17 @@ def read_mesh(path: Path) -> tuple[Floats, Ints]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         known = ", ".join((*MESH_SUFFIXES, *CAD_SUFFIXES))
-        raise InputError(f"{path}: expected a mesh or CAD file ({known}), found {suffix or 'no suffix'}")
+        raise InputError(f"expected a mesh or CAD file ({known}), found {suffix or 'no suffix'}", path=path)
     vertices, faces = _read_ply_mesh(path) if suffix == ".ply" else _read_other_mesh(path, suffix)
     if not len(vertices) or not len(faces):
-        raise InputError(f"{path}: expected a mesh with faces, found {len(vertices)} vertices and {len(faces)} faces")
+        raise InputError(
+            f"expected a mesh with faces, found {len(vertices)} vertices and {len(faces)} faces", path=path
+        )
     if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(
-            f"{path}: expected finite vertices and faces of these, found vertices that are not finite or faces of "
-            "vertices that do not exist; export it again"
+            "expected finite vertices and faces of these, found vertices that are not finite or faces of "
+            "vertices that do not exist; export it again",
+            path=path,
         )
     return vertices, faces
 

@@ -22,7 +22,7 @@ def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
     rows = csv_rows(path)
     header = tuple(cell.strip().lower() for cell in rows[0][1]) if rows else ()
     if header != COLUMNS:
-        raise InputError(f"{path}: expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}")
+        raise InputError(f"expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}", path=path)
     known = {scan.name for scan in scans}
     names_a, names_b, point_names, numbers = [], [], [], []
     for line, row in rows[1:]:
@@ -46,6 +46,6 @@ def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
         point_names.append(row[2].strip())
         numbers.append(values)
     if not numbers:
-        raise InputError(f"{path}: holds no points; expected three or more for each pair of scans")
+        raise InputError("holds no points; expected three or more for each pair of scans", path=path)
     table = np.array(numbers) * MM_PER_UNIT[unit]
     return Picks(tuple(names_a), tuple(names_b), tuple(point_names), table[:, :3], table[:, 3:])

@@ -15,7 +15,7 @@ def read_text(path: Path) -> str:
     try:
         return decoded(path.read_bytes())
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise InputError(f"cannot be read ({error.strerror or error})", path=path) from None
 
 
 def csv_rows(path: Path, separator: str = ",") -> list[tuple[int, list[str]]]:

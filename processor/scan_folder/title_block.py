@@ -65,13 +65,13 @@ def _logo(folder: Path, table: Table) -> bytes:
     try:
         size = path.stat().st_size
         if size > MOST_BYTES:
-            raise InputError(f"{path}: expected a logo of at most {MOST_BYTES} bytes, found {size}; make it smaller")
+            raise InputError(f"expected a logo of at most {MOST_BYTES} bytes, found {size}; make it smaller", path=path)
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: {advice}, it cannot be read ({error.strerror or error})") from None
+        raise InputError(f"{advice}, it cannot be read ({error.strerror or error})", path=path) from None
     problem = _problem(data)
     if problem:
-        raise InputError(f"{path}: {advice}, found {problem}; export the logo again as PNG")
+        raise InputError(f"{advice}, found {problem}; export the logo again as PNG", path=path)
     return data
 
 

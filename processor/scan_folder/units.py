@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor import large_arrays, unit_ratio
-from processor.model import Floats, InputError, UsageError
+from processor.model import Floats, InputError, Reason, UsageError, reason
 
 MM_PER_UNIT = {
     "mm": 1.0,
@@ -66,23 +66,23 @@ def radius(points: Floats) -> float:
     return float(np.linalg.norm(points - middle, axis=1).max())
 
 
-def not_metres(points: Floats) -> str:
-    """Return why points (n, 3) of a format without a unit are taken as mm, "" where they may be metres.
+def not_metres(points: Floats) -> Reason | None:
+    """Return why points (n, 3) of a format without a unit are taken as mm, None where they may be metres.
 
     As metres the scan would be larger than any structure, or its points too far apart to show one. Points nearer to
     each other than half a millimetre in a scan below 2 m are not told from metres.
     """
     sample = large_arrays.every(points, max(1, len(points) // SAMPLE))
     if not len(sample):
-        return ""
+        return None
     low, high = np.quantile(sample, [STRAY, 1.0 - STRAY], axis=0)
     extent = float((high - low).max())
     if extent > LARGEST_M:
-        return f"taken as millimetres: in metres the scan would be {extent / 1000.0:.3g} km across; no unit is given"
+        return reason("units.too-large-in-metres", extent_km=extent / 1000.0)
     spacing = _spacing(points, int(np.argmax(high - low))) if len(points) >= FEWEST_FOR_SPACING else 0.0
     if spacing > WIDEST_SPACING_M:
-        return f"taken as millimetres: in metres its points would be {spacing:.3g} m apart; no unit is given"
-    return ""
+        return reason("units.too-sparse-in-metres", spacing_m=spacing)
+    return None
 
 
 def _spacing(points: Floats, axis: int) -> float:
@@ -123,10 +123,10 @@ def _ordered(points: Floats, axis: int, ranks: tuple[int, int]) -> tuple[float, 
     return float(np.partition(between, first)[first]), float(np.partition(between, last)[last])
 
 
-def check_extent(what: str, points: Floats, unit: str, reason: str, advice: str, stray: float = 0.0) -> None:
+def check_extent(what: str, points: Floats, unit: str, source: str, advice: str, stray: float = 0.0) -> None:
     """Raise InputError if points (n, 3) in mm, read in ``unit``, extend farther than any structure.
 
-    Their position on the map does not matter. ``what`` names file and object, ``reason`` the source of the unit;
+    Their position on the map does not matter. ``what`` names file and object, ``source`` how the unit was found;
     ``stray`` is the share of points at either end of an axis that do not count.
     """
     sample = large_arrays.every(points, max(1, len(points) // SAMPLE))
@@ -140,18 +140,18 @@ def check_extent(what: str, points: Floats, unit: str, reason: str, advice: str,
     others = [f"{extent * MM_PER_UNIT[u] / 1000.0:.3g} m if it were {u}" for u in ("m", "mm") if u != unit]
     raise InputError(
         f"{what}: expected at most {LARGEST_KM:g} km across, found {extent_mm / MM_PER_UNIT['km']:.3g} km with its "
-        f"unit read as {unit} ({reason}); it would be {' and '.join(others)}: {advice}"
+        f"unit read as {unit} ({source}); it would be {' and '.join(others)}: {advice}"
     )
 
 
 def check_ratio(
-    what: str, points: Floats, nominal: Floats, ratios: tuple[float, ...], unit: str, reason: str, advice: str
+    what: str, points: Floats, nominal: Floats, ratios: tuple[float, ...], unit: str, source: str, advice: str
 ) -> None:
     """Raise InputError if the size of a scan's points (n, 3), mm, differs from its design's by a ratio of units.
 
     A mistaken unit scales all extents alike, a floor around a small part does not. ``nominal`` (m, 3) are the
-    vertices of the design, or none; sizes are distances from the middle. ``what`` names file and scan, ``reason``
-    the source of ``unit``.
+    vertices of the design, or none; sizes are distances from the middle. ``what`` names file and scan, ``source``
+    how ``unit`` was found.
     """
     size = radius(nominal) if len(nominal) else 0.0
     if not size > 0.0:
@@ -165,7 +165,7 @@ def check_ratio(
     likely = [name for name, mm in MM_PER_UNIT.items() if abs(MM_PER_UNIT[unit] / mm / factor - 1.0) < 0.01]
     raise InputError(
         f"{what} is {ratio:.4g} times as large as the design, close to {factor:.4g}: its unit was read as {unit} "
-        f"({reason}), which seems wrong{f' (is it {likely[0]}?)' if likely else ''}; {advice}"
+        f"({source}), which seems wrong{f' (is it {likely[0]}?)' if likely else ''}; {advice}"
     )
 
 

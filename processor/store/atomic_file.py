@@ -31,7 +31,7 @@ def replacing(path: Path) -> Iterator[Path]:
         if isinstance(error, RuntimeError) and not message:
             raise
         reason = message[1] if message else getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be written ({reason}); free the disk or choose another folder") from error
+        raise InputError(f"cannot be written ({reason}); free the disk or choose another folder", path=path) from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -294,6 +294,8 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
     if "lists" in metadata:
         return _read_json(group, name, lambda row: tuple(map(str, row)))
     if "reasons" in metadata:
+        if "of_text" in metadata and getattr(group[name], "shape", None) == ():
+            return metadata["of_text"](read_text(group, name))
         by_row = bool(metadata["reasons"])
         return _read_json(
             group, name, lambda row: tuple(map(_reason_from_json, row)) if by_row else _reason_from_json(row)

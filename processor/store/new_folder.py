@@ -50,4 +50,6 @@ def new_folder(folder: Path) -> Iterator[Path]:
 def unwritable(folder: Path, error: OSError) -> InputError:
     """Return the error of a folder that cannot be written."""
     reason = error.strerror or error
-    return InputError(f"{folder}: cannot be written ({reason}); nothing was kept: free the disk or name another folder")
+    return InputError(
+        f"cannot be written ({reason}); nothing was kept: free the disk or name another folder", path=folder
+    )

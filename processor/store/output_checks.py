@@ -25,17 +25,17 @@ def existing_parent(out: Path) -> Path:
 def check_file(path: Path) -> None:
     """Raise InputError where a file cannot be written, also for the lack of its folder."""
     if path.is_dir():
-        raise InputError(f"{path}: is a folder; name a file")
+        raise InputError("is a folder; name a file", path=path)
     if not path.absolute().parent.exists():
-        raise InputError(f"{path}: cannot be written: there is no folder {path.parent}; make it first")
+        raise InputError(f"cannot be written: there is no folder {path.parent}; make it first", path=path)
     _try(path, path.absolute().parent)
 
 
 def _try(path: Path, place: Path) -> None:
     if not place.is_dir():
-        raise InputError(f"{path}: cannot be written: {place} is a file; name another place")
+        raise InputError(f"cannot be written: {place} is a file; name another place", path=path)
     try:
         os.rmdir(tempfile.mkdtemp(prefix=".trial-", dir=place))
     except OSError as error:
         why = error.strerror or error
-        raise InputError(f"{path}: cannot be written ({why}); nothing was done: name another place") from error
+        raise InputError(f"cannot be written ({why}); nothing was done: name another place", path=path) from error

@@ -32,13 +32,14 @@ def replacing_folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(making, ignore_errors=True)
         if isinstance(error, OSError):
             raise _unwritable(out, error) from error
-        if isinstance(error, InputError):  # of a file in the folder that was removed
-            raise InputError(str(error).replace(str(making), str(out))) from error
+        if isinstance(error, InputError) and error.path is not None and error.path.is_relative_to(making):
+            # The file was in the folder that is removed: the message names the place that it was for.
+            raise InputError(error.problem, path=out / error.path.relative_to(making)) from error
         raise
 
 
 def _unwritable(out: Path, error: OSError) -> InputError:
-    return InputError(f"{out}: cannot be written ({error.strerror or error}); nothing was changed there")
+    return InputError(f"cannot be written ({error.strerror or error}); nothing was changed there", path=out)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -27,13 +27,14 @@ import processor.store.codec as codec
 import processor.store.file_structure_checks as file_structure_checks
 import processor.store.scan_tiles as scan_tiles
 from processor import large_arrays
-from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth, per_point_fields
+from processor.language.messages import messages
+from processor.model import InputError, Ints, PointLabels, Reason, Scan, Scene, StepRun, Truth, per_point_fields
 from processor.store.atomic_file import replacing
 from processor.store.codec import DecodeError
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
-FORMAT_VERSION = "1.4"  # of scenes and truths
-READABLE = ("1.2", "1.3", FORMAT_VERSION)  # fields added since may be absent
+FORMAT_VERSION = "1.5"  # of scenes and truths
+READABLE = ("1.2", "1.3", "1.4", FORMAT_VERSION)  # fields added since may be absent
 RESULTS_VERSION = "2.3"
 RESULTS_READABLE = ("2.0", "2.1", "2.2", RESULTS_VERSION)
 WITHOUT_CHECKSUMS = ("1.2", "1.3", "2.0")
@@ -51,6 +52,7 @@ HISTORY = [
     "what a part's mesh is made from",
     "1.3: control points",
     "1.4: checksums",
+    "1.5: how coordinates were read, as reasons with codes",
 ]
 
 # Exceptions of HDF5 and h5py for a damaged file; none of them names the file.
@@ -103,24 +105,25 @@ def write_scene(path: Path, scene: Scene, truth: Truth | None, provenance: Mappi
 def _check(path: Path, scene: Scene) -> None:
     names = [scan.name for scan in scene.scans]
     if len(set(names)) != len(names):
-        raise InputError(f"{path}: expected scans of different names, found {', '.join(sorted(names))}; rename one")
+        raise InputError(f"expected scans of different names, found {', '.join(sorted(names))}; rename one", path=path)
     for scan in scene.scans:
         blocks = large_arrays.blocks(len(scan.points))
         bad = sum(int(np.count_nonzero(~np.isfinite(scan.points[rows]).all(axis=1))) for rows in blocks)
         if bad or not np.isfinite(scan.origin).all():
             culprit = f"{bad} points" if bad else "an origin"
-            raise InputError(f"{path}: scan {scan.name!r} has {culprit} with coordinates that are not finite")
+            raise InputError(f"scan {scan.name!r} has {culprit} with coordinates that are not finite", path=path)
 
 
 def _in_order(labels: PointLabels, orders: Mapping[str, Ints], path: Path) -> PointLabels:
     order = orders.get(labels.scan)
     if order is None:
-        raise InputError(f"{path}: the truth has labels of a scan {labels.scan!r}, which is not in the scene")
+        raise InputError(f"the truth has labels of a scan {labels.scan!r}, which is not in the scene", path=path)
     columns = {name: getattr(labels, name) for name in per_point_fields(PointLabels)}
     for name, column in columns.items():
         if len(column) not in (0, len(order)):
             raise InputError(
-                f"{path}: expected {len(order)} labels ({name}) of the points of {labels.scan!r}, found {len(column)}"
+                f"expected {len(order)} labels ({name}) of the points of {labels.scan!r}, found {len(column)}",
+                path=path,
             )
     return dataclasses.replace(labels, **{name: column[order] for name, column in columns.items() if len(column)})
 
@@ -175,18 +178,19 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
                 raise DecodeError(faults)
             yield file
     except DecodeError as error:
-        raise InputError(f"{path}: {_listed(error.problems)}") from error
+        raise InputError(_listed(error.problems), path=path) from error
     except checksums.ChecksumError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(str(error), path=path) from error
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError("no such file", path=path) from None
     except large_arrays.NoRoomError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        raise InputError(f"cannot be read ({error.strerror})", path=path) from error
     except DAMAGE as error:
         wanted = " or ".join(FORMATS[kind] for kind in kinds)
         raise InputError(
-            f"{path}: expected a {wanted} file (HDF5), found one that is damaged, cut off or of another kind "
-            f"({_first_line(error)}); make or copy it again"
+            f"expected a {wanted} file (HDF5), found one that is damaged, cut off or of another kind "
+            f"({_first_line(error)}); make or copy it again",
+            path=path,
         ) from error
 
 
@@ -239,6 +243,8 @@ def read_scene(path: Path, points: bool = True) -> Scene:
     with opened(path, ["scene"]) as file:
         read_scan = scan_tiles.read_scan if points else scan_tiles.read_scan_alone
         scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: read_scan})
+        _check_reasons(scene.units_reason, "/scene/units_reason")
+        _check_reasons(scene.target_remarks, "/scene/target_remarks")
         if points:
             return _possible(scene, "/scene")
         # Steps look stations up by the numbers of the points: their range is known before any step begins.
@@ -247,6 +253,15 @@ def read_scene(path: Path, points: bool = True) -> Scene:
         scans = (dataclasses.replace(s, point_station=e) for s, e in zip(scene.scans, extremes, strict=True))
         _possible(dataclasses.replace(scene, scans=tuple(scans)), "/scene")
         return scene
+
+
+def _check_reasons(reasons: Sequence[Reason], where: str) -> None:
+    """Raise DecodeError for reasons that lack a value of their text, or have one of another kind."""
+    for i, reason in enumerate(reasons):
+        try:
+            messages("en").text(reason)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise DecodeError([f"{where}, row {i}: expected the values of {reason.code!r} ({error!r})"]) from None
 
 
 def _possible(record: Record, where: str) -> Record:
@@ -314,7 +329,7 @@ def problems(path: Path) -> list[str]:
             read(path)
         except InputError as error:
             cause = error.__cause__
-            return cause.problems if isinstance(cause, DecodeError) else [str(error).removeprefix(f"{path}: ")]
+            return cause.problems if isinstance(cause, DecodeError) else [error.problem]
         return []
 
     def read_header(path: Path) -> None:
@@ -350,7 +365,7 @@ def damage(path: Path) -> tuple[bool, list[str]]:
             if checksums.has_any(file):
                 return True, checksums.problems(file)
     except InputError as error:
-        return True, [str(error).removeprefix(f"{path}: ")]
+        return True, [error.problem]
     return False, problems(path)
 
 
@@ -402,6 +417,8 @@ def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int =
                     digest.update(np.ascontiguousarray(part, kind).data)
                 continue
             item = getattr(value, field.name)
+            if field.metadata.get("hashed_as_text"):
+                item = messages("en").text(item)
             if not newer or (item is not None and not (isinstance(item, np.ndarray) and item.size == 0)):
                 _feed(digest, field.name, item, pieces)
         digest.update(b")")

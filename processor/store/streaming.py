@@ -23,7 +23,7 @@ def _naming_the_file(group: Any) -> Iterator[None]:
     try:
         yield
     except (DecodeError, ChecksumError, OSError) as error:
-        raise InputError(f"{group.file.filename}: {error}") from error
+        raise InputError(str(error), path=group.file.filename) from error
 
 
 @dataclass(frozen=True)

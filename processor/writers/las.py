@@ -47,7 +47,7 @@ def _write(laspy: Any, path: Path, cloud: Cloud) -> int:
             # Steps from the offset, without large coordinates in between.
             from_offset = block.points + shift
             if np.abs(from_offset).max(initial=0.0) > FARTHEST_MM:
-                raise InputError(f"{path}: {cloud.name!r} is over 200 km large: LAS cannot hold it to 0.1 mm")
+                raise InputError(f"{cloud.name!r} is over 200 km large: LAS cannot hold it to 0.1 mm", path=path)
             record = laspy.ScaleAwarePointRecord.zeros(len(block.points), header=header)
             record.X, record.Y, record.Z = np.rint(from_offset * (METRES / STEP_M)).astype(np.int32).T
             _fill(record, block.fields, cloud.brightest)

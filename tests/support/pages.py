@@ -16,7 +16,7 @@ from tests.support.metrics import metric
 
 # --- what a reader sees ---
 
-UNITS = {"mm", "mrad", "ci", "ci95"}
+UNITS = {"mm", "km", "mrad", "ci", "ci95"}
 METHODS = {"adjustment", "corner", "line", "design", "aided", "ray", "ransac", "least", "squares"}
 STANDARDS = {"GB", "Cram", "rao"}  # Cramér-Rao, the name of a bound
 IN_FILES = {

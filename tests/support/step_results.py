@@ -45,7 +45,14 @@ def plate(columns=24, rows=12, side=50.0):
 def scene(names=("S1",), name="site"):
     points, design = plate()
     scans = tuple(Scan(one, points, np.zeros(3), T_project_scan=np.eye(4)) for one in names)
-    return Scene(name, "structure", scans, structure=design, units="mm", units_reason="given in project.toml")
+    return Scene(
+        name,
+        "structure",
+        scans,
+        structure=design,
+        units="mm",
+        units_reason=(reason("units.by-project", file="project.toml"),),
+    )
 
 
 def stitching(names=("S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "S9")):

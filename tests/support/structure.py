@@ -1,6 +1,7 @@
 """The structure of the sources, read with ast: modules, imports, circles, sizes."""
 
 import ast
+import re
 from collections import Counter, defaultdict
 from functools import cache
 from pathlib import Path
@@ -28,7 +29,8 @@ def tree(path):
 def imports(path):
     """Every module that a file imports, those inside functions too; of `from a import b` both a and a.b.
 
-    Imports for type checkers alone do not count, and neither do names in strings.
+    Of `import_module(f"a.{name}.b")` these are all modules whose names fit. Imports for type checkers alone do not
+    count, and neither do other names in strings.
     """
     found = set()
     only_types = {
@@ -45,7 +47,17 @@ def imports(path):
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) == "import_module":
+            found |= modules_named(node.args[0])
     return frozenset(found)
+
+
+def modules_named(name):
+    """The modules of the project that an argument of import_module can name; a field of an f-string is any word."""
+    if not isinstance(name, ast.JoinedStr) or not isinstance(name.values[0], ast.Constant):
+        return set()
+    pattern = "".join(re.escape(one.value) if isinstance(one, ast.Constant) else r"\w+" for one in name.values)
+    return {module for module in MODULES if re.fullmatch(pattern, module)}
 
 
 def within(names, *packages):
@@ -183,3 +195,72 @@ def wrong_arrows():
             if rank[target] >= rank[room] or (room in STEPS and target not in FOR_STEPS):
                 found.append(f"{name} -> {other}")
     return found
+
+
+CUTS = (
+    "split",
+    "rsplit",
+    "partition",
+    "rpartition",
+    "startswith",
+    "endswith",
+    "removeprefix",
+    "removesuffix",
+    "replace",
+)
+FOR_PEOPLE = {
+    "message",
+    "reason",
+    "reasons",
+    "units_reason",
+    "doubt",
+    "doubts",
+    "problem",
+    "problems",
+    "fault",
+    "faults",
+}
+
+
+def messages_read_again(sources=SOURCES):
+    """Calls that cut, or look into, a text for people: a message, a reason, a doubt, or an error as a text.
+
+    ``split()`` at white space puts a text on one line and reads nothing.
+    """
+    found = []
+    for path in sources:
+        calls = [node for node in ast.walk(tree(path)) if isinstance(node, ast.Call)]
+        names = FOR_PEOPLE | _items_for_people(tree(path))
+        found += [
+            f"{path.name}:{node.lineno} {ast.unparse(node.func)}"
+            for node in calls
+            if isinstance(node.func, ast.Attribute)
+            and node.func.attr in CUTS
+            and not (node.func.attr == "split" and not node.args)
+            and _for_people(node.func.value, names)
+        ]
+    return found
+
+
+def _items_for_people(parsed):
+    """The names of the items of lists of texts for people, in loops over them."""
+    return {
+        node.target.id
+        for node in ast.walk(parsed)
+        if isinstance(node, ast.For | ast.comprehension) and isinstance(node.target, ast.Name)
+        if _for_people(node.iter, FOR_PEOPLE)
+    }
+
+
+def _for_people(node, names):
+    """Whether an expression is a text for people, or a part of one, by the names in it."""
+    if isinstance(node, ast.Subscript):
+        return _for_people(node.value, names)
+    if isinstance(node, ast.Call):
+        name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+        if name == "str" and node.args:
+            return "error" in ast.unparse(node.args[0]) or _for_people(node.args[0], names)
+        if isinstance(node.func, ast.Attribute):  # message.strip().split(...), messages("en").text(...).split(...)
+            return _for_people(node.func.value, names) or ast.unparse(node.func.value).startswith("messages(")
+        return name in names
+    return getattr(node, "id", getattr(node, "attr", "")) in names

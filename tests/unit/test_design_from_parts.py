@@ -344,7 +344,7 @@ def test_the_unit_comes_from_scans_that_state_theirs(tmp_path, suffix, unit, siz
     (tmp_path / "design.json").unlink()
     again = scan_folder.read_input(tmp_path)
     assert again.arch.joint_points == pytest.approx(scene.arch.joint_points, abs=1e-5)
-    assert "processor init" in again.units_reason
+    assert again.units_reason[-1].code == "units.design-guessed"
 
 
 @pytest.mark.parametrize(("unit", "size_mm"), [("mm", 1.0), ("m", 1000.0)])
@@ -383,7 +383,7 @@ def test_bodies_of_cad_files_without_a_unit_have_the_guessed_one(tmp_path, monke
         path.write_text("ISO-10303-21;")
     guessed = guess_design.guess(tmp_path, paths, [])
     assert asked[-1] == "m"
-    assert guessed.doubts[0].startswith("units of the design: taken as m")
+    assert guessed.unit_doubt.startswith("units of the design: taken as m")
     assert guessed.units == ("mm" if one_file else "m")  # of one file each part's mesh is written, in mm
     assert np.abs(guessed.design.joint_points - joints).max() < CORNER_MM
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from processor.model import InputError, Scan, Scene, Truth, UsageError
+from processor.model import InputError, Scan, Scene, Truth, UsageError, reason
 from processor.scan_folder import folder
 from processor.store import store
 from tests.support.scan_folders import BOX, TRIANGLES, surface, write_ply, write_xyz
@@ -23,7 +23,7 @@ def project(place, text):
 def test_a_bridge_without_a_project_file(bridge):
     scene = folder.read_input(bridge)
     assert (scene.name, scene.kind, scene.units) == ("bridge", "arch-bridge", "m")
-    assert "taken as metres" in scene.units_reason
+    assert [one.code for one in scene.units_reason] == ["units.as-scanners-write"]
     assert [(scan.name, scan.component) for scan in scene.scans] == [("foot1", "foot1"), ("rib1", "rib1")]
     assert np.allclose(scene.scans[0].points, surface(0) * 1000.0, rtol=0, atol=0.001)
     arch = scene.arch
@@ -62,7 +62,7 @@ def test_all_that_a_project_file_says(bridge):
     )
     scene = folder.read_input(bridge)
     assert (scene.name, scene.units, scene.temperature_C) == ("东桥", "cm", 31.5)
-    assert "project.toml" in scene.units_reason
+    assert scene.units_reason == (reason("units.by-project", file="project.toml"),)
     first = scene.scans[0]
     assert (first.name, first.component, first.station, first.sigma_mm) == ("扫描", "foot1", "S1", 2.5)
     assert first.position.tolist() == [10, 20, 30]

@@ -10,7 +10,7 @@ import pytest
 
 import processor
 from processor import record_checks
-from processor.model import Checked, InputError, Scene
+from processor.model import ArchDesign, Checked, DesignPart, InputError, Scene
 from processor.store import store
 from tests.support.impossible_scenes import impossible_scenes, possible
 
@@ -75,3 +75,15 @@ def test_what_is_unknown_is_not_impossible():
     assert record_checks.problems(Found(poses)) == []
     (fault,) = record_checks.problems(Found(poses + 1.0))
     assert fault.startswith("/T_a_b, row 0: expected a rotation")
+
+
+def test_a_fault_names_the_file_of_its_field_and_leaves_values_as_they_are():
+    """A name with the signs that separate a fault's parts is neither cut nor changed."""
+    arch = ArchDesign(
+        (DesignPart("a/b.c: d, e"), DesignPart("f")), ("J1",), ("a/b.c: d, e",), ("g/h",), np.ones((1, 8, 3))
+    )
+    scene = dataclasses.replace(possible(), arch=arch)
+    with pytest.raises(InputError) as caught:
+        record_checks.check(scene, "folder", {"arch": "folder/design.json"})
+    said = "folder/design.json: arch.joint_right, row 0: expected one of parts.name, found 'g/h'"
+    assert str(caught.value).startswith(said)

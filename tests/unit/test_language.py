@@ -16,7 +16,9 @@ from processor.preassembly.ends.section import PlateFace
 from processor.preassembly.result import Gauge
 from processor.preassembly.verdicts import joint_measures, trim_and_build_up
 from processor.registration.surface_registration import Motion
-from processor.report import all_figures, page, page_script
+from processor.report import all_figures, page
+from processor.report.scripts import page_script
+from processor.scan_folder import units
 from processor.space_frame.design.matching import FrameRelation
 from tests.support.ball_results import of_frame, whole, with_truth
 from tests.support.bridge_results import LIMITS, SECTION, of_bridge, with_band
@@ -51,6 +53,13 @@ def test_live_figures_are_translated_but_for_names():
 
 
 # --- Chinese -------------------------------------------------------------------------------------------------------
+
+
+def why_mm():
+    """The reasons for scans without a unit that would be too large in metres, and too sparse in metres."""
+    line = np.zeros((2000, 3))
+    line[:, 0] = np.arange(2000.0)
+    return units.not_metres(10.0 * line), units.not_metres(line)
 
 
 def chinese_page(execution, report):
@@ -99,9 +108,7 @@ def a_bridge():
         ),
     )
     runs = (dataclasses.replace(first, result=result), dataclasses.replace(others[0], result=other))
-    return dataclasses.replace(
-        execution, runs=runs, scene=dataclasses.replace(execution.scene, units_reason="made in millimetres")
-    )
+    return dataclasses.replace(execution, runs=runs, scene=dataclasses.replace(execution.scene, units_reason=why_mm()))
 
 
 def a_frame():
@@ -131,7 +138,7 @@ def a_frame():
         metric("balls called ok, lowest point over 3 mm off", 1.0, 0.0, unit="", step="spheres", method="ransac"),
     )
     execution, truth = of_frame(result, with_truth()[0])
-    scene = dataclasses.replace(execution.scene, units_reason="given in project.toml")
+    scene = dataclasses.replace(execution.scene, units_reason=(reason("units.by-project", file="project.toml"),))
     return dataclasses.replace(execution, scene=scene), ErrorReport(metrics, truth.true_radii, truth.true_centres)
 
 

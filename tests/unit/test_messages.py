@@ -18,6 +18,7 @@ from processor.papers import rows
 from processor.validation import change_detection, coverage, curves
 
 SOURCES = Path(processor.__file__).parent
+GENERATOR = SOURCES.parent / "designgen"
 OTHERS = [code for code in CODES if code != "en"]
 
 
@@ -26,7 +27,7 @@ def all_calls():
     """Every call in the sources, with its file."""
     return [
         (path.name, node)
-        for path in sorted(SOURCES.rglob("*.py"))
+        for path in (*sorted(SOURCES.rglob("*.py")), *sorted(GENERATOR.rglob("*.py")))
         for node in ast.walk(ast.parse(path.read_text("utf-8")))
         if isinstance(node, ast.Call)
     ]

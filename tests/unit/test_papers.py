@@ -13,7 +13,7 @@ from processor.jobs import process
 from processor.jobs.process import Cause
 from processor.language.messages import NO_NUMBER, text
 from processor.model import UsageError, reason
-from processor.papers import bolt_balls, command, data_sets, parameters, preassembly
+from processor.papers import bolt_balls, command, measuring, parameters, preassembly
 from processor.papers.data_sets import DataSet, Found, Measured
 from processor.papers.rows import Outcome, Row, Rule, holds, is_smaller
 from processor.report.charts import line_chart as drawing
@@ -87,7 +87,7 @@ def test_a_seed_that_failed_does_not_refute_a_statement():
 
 def test_where_a_data_set_failed_no_statement_is_made_and_no_median_is_stated():
     for number in ("000", "001", "002", "004"):
-        module = data_sets.module_of(number)
+        module = measuring.module_of(number)
         failed = Found([Measured(one, failed="out of paper") for one in module.data_sets(0)])
         found = module.rows(failed)
         assert not [str(one.quantity) for one in found if one.outcome in (Outcome.YES, Outcome.NO)]
@@ -105,11 +105,11 @@ def hanging_job(job):
 def test_measuring_ends_at_its_limit(tmp_path, monkeypatch):
     ended = process.Ended(Cause.EXIT, 0, "", 1.0, 1.0, 1.0)
     monkeypatch.setattr(process, "run", lambda *_, **__: ended)
-    monkeypatch.setattr(data_sets, "measured", hanging_job)
-    monkeypatch.setattr(data_sets, "MEASURING_S", 0.5)
-    made = data_sets.make_and_measure(DataSet("001", "100 balls", "balls-100", (), 0), scratch=str(tmp_path))
+    monkeypatch.setattr(measuring, "measured", hanging_job)
+    monkeypatch.setattr(measuring, "MEASURING_S", 0.5)
+    made = measuring.make_and_measure(DataSet("001", "100 balls", "balls-100", (), 0), scratch=str(tmp_path))
     assert made.failed == "measuring took longer than 0 s"
-    stopped = data_sets.make_and_measure(
+    stopped = measuring.make_and_measure(
         DataSet("001", "100 balls", "balls-100", (), 0), lambda: True, scratch=str(tmp_path)
     )
     assert "longer" not in stopped.failed
@@ -164,10 +164,10 @@ def test_four_points_with_one_behind_the_ball_make_a_sphere_of_metres():
 )
 def test_a_paper_on_a_tiny_data_set(number, tmp_path):
     recipe, settings = TINY[number]
-    module = data_sets.module_of(number)
+    module = measuring.module_of(number)
     named = [one.name for one in module.data_sets(3)]
     assert [one.seed for one in module.data_sets(3)] == [3] * len(named)
-    made = data_sets.make_and_measure(DataSet(number, named[0], recipe, settings, 1), scratch=str(tmp_path))
+    made = measuring.make_and_measure(DataSet(number, named[0], recipe, settings, 1), scratch=str(tmp_path))
     assert not made.failed, made.failed
     assert not list(tmp_path.iterdir())
     found = Found([made])
@@ -189,7 +189,7 @@ def measured_without_scenes(data_set, *_, **__):
 
 
 def test_the_command_writes_one_page_and_one_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(data_sets, "make_and_measure", measured_without_scenes)
+    monkeypatch.setattr(measuring, "make_and_measure", measured_without_scenes)
     out = tmp_path / "out"
     words = ["papers", "-o", str(out), "--only", "001", "--seeds", "2", "--lang", "zh"]
     for _ in range(2):  # the second replaces the first

@@ -178,6 +178,14 @@ def test_terminal_text_is_aligned_and_without_control_characters():
     ]
 
 
+def test_headings_are_those_of_the_table_and_else_the_names_without_units():
+    columns = ("joint", "rotation_ci95_mrad", "least_gap_mm")
+    assert report_table.headings(all_tables.Table("t", columns, ())) == ("joint", "rotation ci95", "least gap")
+    named = all_tables.Table("t", columns, (), headings=("joint", "ci95", "gap"))
+    assert report_table.headings(named) == ("joint", "ci95", "gap")
+    assert report_table.csv_text(named) == "joint,rotation_ci95_mrad,least_gap_mm\n"
+
+
 def test_long_tables_are_cut_on_the_terminal_and_say_so():
     table = all_tables.Table("t", ("a",), tuple((i,) for i in range(50)), "long")
     lines = report_table.plain_text(table, most=10).splitlines()
@@ -257,7 +265,9 @@ def test_a_run_without_any_answer_is_drawn_too():
 @pytest.mark.usefixtures("blank_pictures")
 def test_the_page_escapes_names_and_loads_nothing():
     bad = "<script>alert(1)</script>"
-    scene = dataclasses.replace(arch_scene((bad, "rib1", "foot2")), name=bad, units_reason=bad)
+    scene = dataclasses.replace(
+        arch_scene((bad, "rib1", "foot2")), name=bad, units_reason=(reason("units.as-stated", text=bad),)
+    )
     text = render(
         of_bridge(scene, names=(bad, "rib1", "foot2")), ErrorReport((Metric("s", bad, 1.0, unit=bad, limit=2.0),))
     )

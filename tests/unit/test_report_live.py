@@ -9,8 +9,8 @@ import subprocess
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.report import page_script
 from processor.report.preassembly import live_data as preassembly_data
+from processor.report.scripts import page_script
 from processor.results import to_json
 from tests.support.bridge_results import of_bridge
 from tests.support.report_pages import BAD, Page, rendered

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from processor import pipeline
 from processor.evaluation import stitching as stitching_evaluation
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import InputError, Scan, Scene, StationTruth, Truth, UsageError
+from processor.model import InputError, Scan, Scene, StationTruth, Truth, UsageError, reason
 from processor.report import write_results
 from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
@@ -234,7 +234,9 @@ def test_a_run_writes_all_reports(three, tmp_path):
     """results.json as specified, poses that are read back exactly, both figures, all tables."""
     _, scans, result = three
     path = tmp_path / "room.h5"
-    store.write_scene(path, Scene("room", "structure", scans, units="mm", units_reason="made so"), None, {})
+    store.write_scene(
+        path, Scene("room", "structure", scans, units="mm", units_reason=(reason("units.made-in-mm"),)), None, {}
+    )
     scene = pipeline.read(path, None)
     execution = pipeline.execute(path, scene, pipeline.plan(("stitch",), (), {}, None))
     write_results.write_results(tmp_path / "out", execution, ErrorReport())

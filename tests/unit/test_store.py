@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import pickle
 from dataclasses import dataclass
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
 from processor import store
+from processor.language.messages import messages
 from processor.model import (
     Checked,
     FrameDesign,
@@ -29,6 +32,8 @@ from processor.model import (
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Balls
 from processor.store import checksums, codec
+from processor.store.replaced_folder import replacing_folder
+from tests.support.old_files import sealed_again
 from tests.support.store_scenes import a_scene, surface_points
 
 HALF_STEP = 0.5e-4 * (1.0 + 1e-6)  # mm: points are kept to 0.0001 mm
@@ -72,7 +77,12 @@ def test_a_scene_comes_back(written):
     back = store.read_scene(written)
     assert same(back.arch, scene.arch)
     assert same(back.stations, scene.stations)
-    assert (back.name, back.kind, back.units_reason, back.temperature_C) == ("桥", "arch-bridge", "said", 21.5)
+    assert (back.name, back.kind, back.units_reason, back.temperature_C) == (
+        "桥",
+        "arch-bridge",
+        scene.units_reason,
+        21.5,
+    )
     assert back.frame is None
     given, found = scene.scans[0], back.scans[0]
     assert same(
@@ -164,6 +174,42 @@ def test_hash_is_pinned():
     """A change of this number loses every cached result: it needs a reason."""
     scene = Scene("a", "structure", (Scan("s", [[1.0, 2.0, 3.0]]),))
     assert store.scene_hash(scene) == "7153acca7173970bcf49a09b87d571fa0cec12095625f37881754a2bd46d62f6"
+
+
+def test_the_hash_is_that_of_the_time_when_a_unit_s_source_was_a_text():
+    scene = Scene("a", "structure", (Scan("s", [[1.0, 2.0, 3.0]]),))
+    digest = "b936a6d120037ebf7fa7805bd6d28a264faa7edf5317ddae59338cc7b10717d9"
+    for why in ("units.as-scanners-write", "units.by-option", "units.made-in-mm"):
+        text = messages("en").text(reason(why))
+        by_code = dataclasses.replace(scene, units_reason=(reason(why), reason("units.design-guessed")))
+        by_text = (reason("units.as-stated", text=f"{text}; {messages('en').text(reason('units.design-guessed'))}"),)
+        assert store.scene_hash(by_code) == store.scene_hash(dataclasses.replace(scene, units_reason=by_text))
+    made = dataclasses.replace(scene, units_reason=(reason("units.made-in-mm"),))
+    assert store.scene_hash(made) == digest
+
+
+def with_units_reason(path, data, version):
+    """Put another dataset in the place of the reasons for the unit, as another version of the program writes it."""
+    with h5py.File(path, "r+") as file:
+        del file["scene/units_reason"]
+        file["scene"].create_dataset("units_reason", data=data)
+        del file.attrs["format_version"]
+        file.attrs["format_version"] = np.bytes_(version)
+    return sealed_again(path)
+
+
+def test_the_source_of_a_unit_in_an_earlier_file_is_its_text(written):
+    whole = store.read_scene(written)
+    text = np.bytes_("given by --units")
+    earlier = store.read_scene(with_units_reason(written, text, "1.4"))
+    assert earlier.units_reason == (reason("units.as-stated", text="given by --units"),)
+    assert store.scene_hash(earlier) == store.scene_hash(whole)
+
+
+def test_reasons_without_the_values_of_their_text_are_a_fault_of_the_file(written):
+    bad = np.array([b'{"code": "units.by-format", "values": {}}'])
+    with pytest.raises(InputError, match=r"/scene/units_reason, row 0: expected the values of 'units.by-format'"):
+        store.read_scene(with_units_reason(written, bad, store.store.FORMAT_VERSION))
 
 
 @pytest.mark.parametrize(
@@ -356,3 +402,24 @@ def test_a_dataset_has_the_bytes_that_h5py_gives_it(tmp_path, data):
         assert checksum == hashlib.sha256(stated + np.asarray(data).tobytes()).hexdigest().encode()
         dataset.attrs.create(checksums.ATTRIBUTE, checksum, dtype=h5py.string_dtype("ascii", 64))
     assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_an_error_has_its_path_beside_its_problem_in_another_process_as_well():
+    error = pickle.loads(pickle.dumps(InputError("a: b; c", path=Path("d: e.h5"))))
+    assert (str(error), error.path, error.problem) == ("d: e.h5: a: b; c", Path("d: e.h5"), "a: b; c")
+    bare = pickle.loads(pickle.dumps(InputError("a: b")))
+    assert (str(bare), bare.path, bare.problem) == ("a: b", None, "a: b")
+    assert len(InputError("word " * 10_000, path="f").problem) < 7_000
+
+
+def test_an_error_of_a_file_in_a_folder_that_is_removed_names_its_place(tmp_path):
+    with pytest.raises(InputError) as caught, replacing_folder(tmp_path / "out") as making:
+        raise InputError("cannot be written", path=making / "a" / "b.csv")
+    assert str(caught.value) == f"{tmp_path / 'out' / 'a' / 'b.csv'}: cannot be written"
+
+
+def test_faults_of_a_file_do_not_repeat_its_name(tmp_path):
+    path = tmp_path / "a.h5"
+    path.write_bytes(b"x")
+    assert all(str(path) not in fault for fault in store.store.problems(path))
+    assert store.store.damage(path)[1][0].startswith("expected a processor-scene or")

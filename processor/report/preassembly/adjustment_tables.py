@@ -30,6 +30,10 @@ WHAT_TO_DO = (
     "least_groove_gap_ci95_mm", "greatest_groove_gap_mm", "greatest_groove_gap_ci95_mm", "rotation_mrad",
     "rotation_ci95_mrad", "rotation_about", "probability_now", "probability_after",
 )  # fmt: skip
+HEADINGS = (
+    "joint", "verdict", "proposal", "misalignment", "ci95", "gap", "ci95", "gap", "ci95", "rotation", "ci95", "about",
+    "now", "after",
+)  # fmt: skip
 PROPOSAL = WHAT_TO_DO.index("proposal")
 _GROUPS: tuple[str | Message, ...] = (
     "", "", "", *[text("misalignment (mm)")] * 2, *[text("groove gap, least (mm)")] * 2,
@@ -125,12 +129,13 @@ def _what_to_do(adjustment: Adjustment, method: str) -> list[Table]:
     rows = tuple(_joint_rows(adjustment))
     proposals = tuple((row[0], row[PROPOSAL]) for row in rows)
     return [
-        Table(title, WHAT_TO_DO, rows, file=TO_DO, note=_NOTE, groups=_GROUPS, on_terminal=False),
+        Table(title, WHAT_TO_DO, rows, file=TO_DO, note=_NOTE, groups=_GROUPS, headings=HEADINGS, on_terminal=False),
         Table(
             title,
             _without_proposal(WHAT_TO_DO),
             tuple(map(_without_proposal, rows)),
             groups=_without_proposal(_GROUPS),
+            headings=_without_proposal(HEADINGS),
             on_page=False,
         ),
         Table(text("Proposals"), ("joint", "proposal"), proposals, on_page=False),
@@ -285,6 +290,7 @@ def _trade_off(result: Result, adjustment: Adjustment, method: str) -> Table:
         file="trade-off",
         note=text("The result was made with lambda {weight:g}.", weight=adjustment.weight),
         groups=("", *[text("splicing error")] * 2, *[text("linear error")] * 2),
+        headings=("lambda", *["mean", "max"] * 2),
         on_terminal=False,
         folded=True,
     )

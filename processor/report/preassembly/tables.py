@@ -69,7 +69,10 @@ def _summary(runs: Sequence[StepRun]) -> Table:
         *[text("linear error, Foot 1 best-fit")] * 2,
     )
     title = text("Splicing and linear error by method (mm)")
-    return Table(title, columns, rows, file="summary", note=text("{sentences:.}", sentences=note), groups=groups)
+    return Table(
+        title, columns, rows, file="summary", note=text("{sentences:.}", sentences=note), groups=groups,
+        headings=("method", *["mean", "max"] * 3),
+    )  # fmt: skip
 
 
 def _half_widths(runs: Sequence[StepRun]) -> list[Text]:

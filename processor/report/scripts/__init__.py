@@ -1,1 +1,1 @@
-"""Scripts of the report page."""
+"""Scripts of the pages, and what puts them there."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,9 @@ PARTS = ("foot", "rib", "crown")  # words in the names of an arch bridge's parts
 class GuessedDesign:
     """A design as guessed from surfaces.
 
-    ``design`` is None where there is none, and ``doubts`` say why. ``units`` are those of design.json, ``meshes`` the
-    files (path below the folder, vertices (v, 3) in mm, triangles) to be written beside it, by part.
+    ``design`` is None where there is none; the doubts have the reason. ``kind_doubt`` and ``unit_doubt`` are "" where
+    the kind and the unit are sure, ``doubts`` are all others. ``units`` are those of design.json, ``meshes`` the files
+    (path below the folder, vertices (v, 3) in mm, triangles) to be written beside it, by part.
     """
 
     design: ArchDesign | FrameDesign | None = None
@@ -31,10 +32,16 @@ class GuessedDesign:
     units: str = "mm"
     reason: str = ""
     kind_doubt: str = ""
+    unit_doubt: str = ""
     root_gap_mm: float = 0.0
     files: tuple[str, ...] = ()
     mesh_of: dict[str, str] = field(default_factory=dict)
     meshes: tuple[tuple[str, Floats, Ints], ...] = ()
+
+    @property
+    def questions(self) -> tuple[str, ...]:
+        """What is not sure of a design that was found, apart from its kind."""
+        return (*([self.unit_doubt] if self.unit_doubt else []), *self.doubts)
 
 
 @dataclass(frozen=True)
@@ -69,17 +76,18 @@ def guess(
     if balls.design is not None:
         return GuessedDesign(
             design=balls.design if units.unit else None,
-            doubts=(*doubts, *_unit_doubts(units), *balls.doubts),
+            doubts=(*doubts, *balls.doubts),
+            unit_doubt=_unit_doubt(units),
             units=_json_unit(surfaces, units),
             reason=f"balls and the tubes between them, in {_some(names)}",
             files=names,
         )
     units = _unit(surfaces, scans, given_unit, as_whole=len(surfaces) == 1)
-    doubts += _unit_doubts(units)
     if not units.unit:
-        return GuessedDesign(doubts=tuple(doubts), files=names)
+        return GuessedDesign(doubts=tuple(doubts), unit_doubt=_unit_doubt(units), files=names)
     surfaces = _in_unit(folder, surfaces, before, units.unit)
-    return _bridge(_bodies(folder, surfaces, units.unit), names, tuple(doubts), _json_unit(surfaces, units))
+    guessed = _bridge(_bodies(folder, surfaces, units.unit), names, tuple(doubts), _json_unit(surfaces, units))
+    return replace(guessed, unit_doubt=_unit_doubt(units))
 
 
 def _in_unit(
@@ -104,11 +112,11 @@ def _unit(
     return guess_unit.guess([surface.vertices for surface in surfaces], scans, as_whole)
 
 
-def _unit_doubts(units: guess_unit.DesignUnit) -> list[str]:
+def _unit_doubt(units: guess_unit.DesignUnit) -> str:
     if units.sure:
-        return []
+        return ""
     taken = f"taken as {units.unit}" if units.unit else "not clear"
-    return [f"units of the design: {taken}: {units.reason}; state it by --design-units"]
+    return f"units of the design: {taken}: {units.reason}; state it by --design-units"
 
 
 def _json_unit(surfaces: Sequence[surface_files.Surface], units: guess_unit.DesignUnit) -> str:

@@ -90,7 +90,7 @@ def read(folder: Path, path: Path, unit: str) -> Surface:
         return Surface(path, design.vertices / MM_PER_UNIT[unit], design.faces, design.bodies, "")
     vertices, faces = read_mesh(path)
     if len(faces) < 4:
-        raise InputError(f"{path}: expected a mesh of a body, found {len(faces)} faces")
+        raise InputError(f"expected a mesh of a body, found {len(faces)} faces", path=path)
     return Surface(path, vertices, faces, None, "")
 
 
