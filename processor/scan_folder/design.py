@@ -60,8 +60,9 @@ def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | Frame
 
 def read_json(path: Path) -> Table:
     """Read a JSON file that holds an object. Raises InputError for any other."""
+    text = _text(path)
     try:
-        data = json.loads(_text(path))
+        data = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable JSON: {error}") from None
     return Table.of(str(path), data)

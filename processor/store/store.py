@@ -27,7 +27,7 @@ import processor.store.codec as codec
 import processor.store.file_structure_checks as file_structure_checks
 import processor.store.scan_tiles as scan_tiles
 from processor import large_arrays
-from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth, per_point_fields
+from processor.model import InputError, Ints, PlainError, PointLabels, Scan, Scene, StepRun, Truth, per_point_fields
 from processor.store.atomic_file import replacing
 from processor.store.codec import DecodeError
 
@@ -182,6 +182,8 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
         raise InputError(f"{path}: no such file") from None
     except large_arrays.NoRoomError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except PlainError:  # of what is done with the open file
+        raise
     except DAMAGE as error:
         wanted = " or ".join(FORMATS[kind] for kind in kinds)
         raise InputError(
