@@ -75,6 +75,16 @@ def test_a_sphere_of_a_target():
     assert held.covariance[3, 3] == 0.0
 
 
+def test_a_sphere_without_noise():
+    """As one makes it to try the function: residuals of rounding alone are no scale of noise."""
+    direction = np.random.default_rng(0).normal(size=(2000, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    for points in (direction, direction[direction[:, 0] > 0.1]):
+        fit = processor.fit_sphere(CENTRE + RADIUS * points)
+        assert fit.status is Status.OK
+        np.testing.assert_allclose([*fit.centre, fit.radius], [*CENTRE, RADIUS], atol=1e-6)
+
+
 def test_the_first_sphere_of_a_process_takes_less_than_three_seconds():
     """With the kernels compiled: a script that fits one target starts a process for it."""
     code = (
