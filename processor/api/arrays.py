@@ -24,7 +24,7 @@ from processor.geometry import mesh_distance, normal_orientation, rigid
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Floats, Reason, Status, reason
-from processor.registration import surface_registration
+from processor.registration import main_body, principal, surface_registration
 from processor.registration.surface_registration import Placed
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.design import unit_mistakes
@@ -81,7 +81,8 @@ class Pose:
     ``T_design_scan`` (4, 4) maps the scan's coordinates to the design's, mm. ``covariance`` (6, 6): rotation about the
     design's axes in rad, translation in mm, for a small motion applied on the left; NaN where the points do not
     determine the pose. ``status``: ok; ambiguous = another pose fits about as well, ``rival`` (4, 4); weak = the points
-    do not determine every motion; failed = most points are not at the design. ``rival`` is None without another pose.
+    do not determine every motion, or many are not at the design; failed = most are not. ``rival`` is None without
+    another pose.
     ``reasons`` state why the status is not ok, and where the sizes of scan and mesh suggest different units.
     """
 
@@ -265,13 +266,18 @@ def _placed(
 def _assessed(
     points: Floats, surface: MeshSurface, T: Floats, placed: Placed, *, ambiguous: bool
 ) -> tuple[Status, tuple[Reason, ...]]:
-    """Return the status of points (n, 3) placed by T (4, 4), and why it is not ok."""
+    """Return the status of points (n, 3) placed by T (4, 4), without ground and walls, and why it is not ok."""
+    of_body = main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
+    points = points if of_body is None else points[of_body]
     near, _ = surface.tree.query(rigid.apply(T, points), distance_upper_bound=surface_registration.NEAR_MM, workers=-1)
     share = float(np.isfinite(near).mean())
     if share < surface_registration.NEAR_SHARE:
         near_mm = surface_registration.NEAR_MM
         return Status.FAILED, (reason("register.not-at-mesh", share=100.0 * share, near_mm=near_mm),)
     reasons = []
+    if share < 1.0 - surface_registration.CLUTTER_SHARE:
+        elsewhere = 100.0 * (1.0 - share)
+        reasons.append(reason("register.points-elsewhere", share=elsewhere, near_mm=surface_registration.NEAR_MM))
     if ambiguous:
         reasons.append(reason("register.ambiguous"))
     if not np.isfinite(placed.T_best_fit).all():

@@ -21,6 +21,7 @@ SCALES = {"normal_diameter": 200.0, "projection_diameter": 100.0, "max_depth": 5
 NO_LENGTHS = ["1", None, True, 1j, [1], np.array([100.0]), np.array([1.0, 2.0]), np.nan, -1.0, 10**400]
 CORNERS = [[0, 0, 0], [900, 0, 0], [0, 900, 0], [0, 0, 900]]
 SIDES = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
+T_SCAN_MESH = rigid.transform(rigid.rotation_from_vector(np.array([0.3, -1.1, 2.0])), np.array([5e5, 3e6, 100.0]))
 
 
 def ball(centre=(0.0, 0.0, 0.0), scanner=(9000.0, 0.0, 0.0), count=2000):
@@ -119,8 +120,7 @@ def scan():
     """A scan of the bracket in a frame of its own, mm, and the bracket's mesh."""
     mesh = bracket()
     points = np.asarray(trimesh.sample.sample_surface(mesh, 4000, seed=3)[0])
-    T = rigid.transform(rigid.rotation_from_vector(np.array([0.3, -1.1, 2.0])), np.array([5e5, 3e6, 100.0]))
-    return rigid.apply(T, points), np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    return rigid.apply(T_SCAN_MESH, points), np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 @pytest.mark.parametrize(
@@ -152,6 +152,24 @@ def test_a_pose_states_why_it_is_not_ok(scan):
     assert small.status in (Status.AMBIGUOUS, Status.WEAK)
     assert reason("register.undetermined") in small.reasons
     assert small.reasons[-1].code in ("register.sizes-differ", "register.unit-mistake")
+
+
+def test_ground_about_a_part_counts_for_nothing(scan):
+    points, vertices, faces = scan
+    rng = np.random.default_rng(1)
+    ground = np.column_stack([rng.uniform(-6000.0, 8000.0, (10_000, 2)), rng.normal(-1000.0, 1.0, 10_000)])
+    pose = processor.register(np.vstack([points, rigid.apply(T_SCAN_MESH, ground)]), vertices, faces)
+    assert (pose.status, pose.reasons) == (Status.OK, ())
+
+
+def test_a_pose_at_which_a_third_of_the_points_has_no_surface_is_weak(scan):
+    """What stands in the part is no ground or wall, which are left out."""
+    points, vertices, faces = scan
+    rng = np.random.default_rng(1)
+    beside = rng.uniform([0.0, 0.0, 200.0], [1500.0, 1500.0, 900.0], (1500, 3)) + vertices.min(axis=0)
+    pose = processor.register(np.vstack([points, rigid.apply(T_SCAN_MESH, beside)]), vertices, faces)
+    assert pose.status is Status.WEAK
+    assert [one.code for one in pose.reasons] == ["register.points-elsewhere"]
 
 
 # --- m3c2
