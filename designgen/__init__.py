@@ -120,6 +120,5 @@ def scan(
 
     of_file = isinstance(model, str | os.PathLike)
     name = Path(model).stem if of_file else "model"
-    places = stations if isinstance(stations, int) else str(stations)
-    recipe = models.recipe_of(str(model) if of_file else name, places, scanner, units, settings or {})
+    recipe = models.recipe_of(str(model) if of_file else name, stations, scanner, units, settings or {})
     return scenes.make(name, recipe, seed, None if of_file else loading.load(model, units, name))

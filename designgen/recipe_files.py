@@ -63,6 +63,8 @@ def overridden(recipe: Mapping[str, Any], settings: Sequence[str] | Mapping[str,
     The values of texts are read as TOML, or taken as text where they are not TOML. Raises UsageError for a text without
     a value, and for a section that is a value in the recipe.
     """
+    if not isinstance(settings, Mapping | list | tuple) or not all(isinstance(setting, str) for setting in settings):
+        raise UsageError(f'settings: expected a mapping by "section.key", got {settings!r}')
     pairs: Iterable[tuple[str, Any]]
     pairs = settings.items() if isinstance(settings, Mapping) else [_parsed(setting) for setting in settings]
     result = copy.deepcopy(dict(recipe))

@@ -313,8 +313,12 @@ def _plain(name: str) -> str:
 LONGEST_WORD, LONGEST_MESSAGE = 1_000, 6_000
 
 
-class PlainError(Exception):
-    """An error of one message for people; of what came by the megabyte, the message shows the beginning."""
+class PlainError(ValueError):
+    """An error of one message for people; of what came by the megabyte, the message shows the beginning.
+
+    It is a ValueError, as callers of the Python interface expect of wrong arguments: where code catches ValueError
+    around what may raise one of these, it lets these pass first.
+    """
 
     def __init__(self, message: str = "") -> None:
         super().__init__(_shortened(message))

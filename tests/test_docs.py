@@ -19,8 +19,9 @@ import processor.cli.main
 from docs import make_parameters
 from processor import pipeline
 from processor.batch import batch
-from processor.evaluation import truth_json
+from processor.evaluation import evaluate, truth_json
 from processor.limits import standards
+from processor.model import Status, Verdict
 from processor.scan_folder import folder
 from processor.scan_folder.folder import read_input
 from tests.support import batches, cad_in_process
@@ -29,7 +30,6 @@ pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-MODULES = {"processor": processor, "designgen": designgen}
 PROGRAMS = {"processor": processor.cli.main.commands, "designgen": designgen.cli.commands}
 README_LINES = 120
 LARGEST_PICTURE = 300_000
@@ -285,11 +285,55 @@ def test_parameters_in_the_pages_exist():
                 record = getattr(record, name)
 
 
-def test_the_functions_of_the_python_page_exist():
-    code = "\n".join(blocks(ROOT / "docs/python.md", "python"))
-    names = re.findall(r"\b(processor|designgen)\.(\w+)\(", code)
+@pytest.fixture
+def arguments(tmp_path):
+    """Small arguments of the names that the Python page uses: a frame's folder, a ball, a body, two planes."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(3000, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    corners = np.array([[0.0, 0.0, 0.0], [900.0, 0.0, 0.0], [0.0, 700.0, 0.0], [0.0, 0.0, 500.0]])
+    sides = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    plane = np.column_stack([rng.uniform(-500.0, 500.0, (4000, 2)), rng.normal(0.0, 1.0, 4000)])
+    folder_of_scans = ROOT / "fixtures/scan-folder"
+    return {
+        "path": folder_of_scans,
+        "path_or_scene": folder_of_scans,
+        "points": (75.0 + rng.normal(0.0, 0.5, (3000, 1))) * direction,
+        "vertices": corners,
+        "faces": sides,
+        "reference": plane,
+        "compared": plane + np.array([0.0, 0.0, 5.0]),
+        "truth": evaluate.truth_of(folder_of_scans),
+        "scene_file": tmp_path / "scene.h5",
+        "folder": tmp_path / "clouds",
+        "model": (corners, sides),
+    }
+
+
+def test_the_lines_of_the_python_page_run(arguments):
+    """Each returns what the page's table names. The ball is registered to no body: its pose fails."""
+    exec("\n".join(blocks(ROOT / "docs/python.md", "python")), arguments)
+    names = re.findall(
+        r"^\| `(?:processor|designgen)\.(\w+)`", (ROOT / "docs/python.md").read_text("utf-8"), re.MULTILINE
+    )
     assert len(names) == 10
-    assert [f"{module}.{name}" for module, name in names if not hasattr(MODULES[module], name)] == []
+    results, sphere, pose = (arguments[name] for name in ("results", "sphere", "pose"))
+    assert results.verdict in tuple(Verdict)
+    assert results.steps["spheres"].status is Status.OK
+    assert len(results.checks) > 0
+    assert (sphere.centre.shape, sphere.covariance.shape) == ((3,), (4, 4))
+    assert (sphere.status, sphere.reasons) == (Status.OK, ())
+    assert sphere.radius == pytest.approx(75.0, abs=0.1)
+    assert (pose.T_design_scan.shape, pose.covariance.shape) == ((4, 4), (6, 6))
+    assert pose.rival is None or pose.rival.shape == (4, 4)
+    assert pose.status in tuple(Status)
+    assert np.median(arguments["table"].distance) == pytest.approx(5.0, abs=0.1)
+    assert {(one.name, one.value, one.limit, one.unit, one.passed) for one in arguments["metrics"]}
+    converted, files = arguments["converted"], arguments["files"]
+    assert (converted.path, converted.units) == (arguments["scene_file"], "m")
+    assert all((files.folder / name).exists() for name in files.files)
+    assert sum(files.files.values()) == sum(converted.points.values())
+    assert len(arguments["scene"].scans) == 6  # of the last line: a scan a station
 
 
 def test_the_table_of_standards_is_that_of_the_files():

@@ -15,6 +15,10 @@ EXAMPLES = {path.stem: path for path in sorted((ROOT / "examples").glob("*.py"))
 # What an example calls and prints.
 NEEDS = {
     "fit_target": ([(processor, "read"), (processor, "fit_sphere")], "radius "),
+    "register_scan": (
+        [(designgen, "scan"), (processor, "register"), (processor, "export"), (processor, "convert")],
+        "read as mm (given in project.toml)",
+    ),
     "compare_clouds": ([(processor, "m3c2")], "largest movement"),
     "simulate_data_set": ([(designgen, "make"), (processor, "run"), (processor, "check")], "noise 2.0 mm, seed 2"),
     "run_folder": ([(processor, "run")], "step spheres: ok"),

@@ -18,7 +18,7 @@ from designgen.cad import faults
 from designgen.cad.bodies import UNITS_MM, CadFile
 from designgen.cad.process import received
 from processor.jobs.process import Cause, isolated, run
-from processor.model import InputError, UsageError
+from processor.model import InputError, PlainError, UsageError
 from processor.store.new_folder import check_new, new_folder
 from processor.writers.ply import write_mesh
 
@@ -80,6 +80,8 @@ def read(
         answer.seek(0)
         try:
             content_read = received(answer)
+        except PlainError:  # what the process reports
+            raise
         except (ValueError, KeyError, TypeError, EOFError, MemoryError):
             raise InputError(f"{path}: the CAD kernel made nonsense of it: it is damaged; export it again") from None
     if not content_read.bodies:

@@ -38,6 +38,8 @@ def load(model: Any, units: str = "", name: str = "model") -> Model:
         vertices, faces = _arrays(model)
         bodies, notes = mesh_bodies.bodies_of(name, [("", vertices, faces)], name)
         return Model(name, tuple(bodies), tuple(notes))
+    if isinstance(model, tuple | list | np.ndarray):
+        raise InputError(f"model: expected vertices (v, 3) and faces (f, 3), found {len(model)} arrays or rows")
     cad, notes = cadquery_objects.bodies_of(name, model, name)
     return _named(name, name, (cad, notes))
 

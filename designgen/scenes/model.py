@@ -6,6 +6,8 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,18 +43,25 @@ class Params:
 
 
 def recipe_of(
-    file: str, stations: int | str, scanner: str, units: str, settings: Sequence[str] | Mapping[str, Any]
+    file: str,
+    stations: int | str | PathLike[str],
+    scanner: str,
+    units: str,
+    settings: Sequence[str] | Mapping[str, Any],
 ) -> Recipe:
     """Return the recipe of a scan of a model: ``stations`` is a number or a JSON file of places."""
+    if isinstance(stations, bool) or not isinstance(stations, Integral | str | PathLike):
+        raise UsageError(f"stations: expected a number from 1 or a .json file, got {stations!r}")
+    places = str(stations)
     recipe: Recipe = {
         "kind": "structure",
         "model": {"file": file, "units": units},
         "scan": {"mode": scanner_module.MODE, "scanner": scanner},
     }
-    if isinstance(stations, int) or stations.isdigit():
-        recipe["scan"]["stations"] = [int(stations)]
-    elif stations.lower().endswith(".json"):
-        recipe["model"]["stations"] = stations
+    if isinstance(stations, Integral) or places.isdigit():
+        recipe["scan"]["stations"] = [int(places)]
+    elif places.lower().endswith(".json"):
+        recipe["model"]["stations"] = places
     else:
         raise UsageError(f"--stations {stations}: expected a number from 1 or a .json file")
     return overridden(recipe, settings)

@@ -3,27 +3,49 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from processor import unit_ratio
+from processor.api.argument_checks import (
+    MOST_RATIO,
+    extent_of,
+    faces_of,
+    length_of,
+    normals_of,
+    points_of,
+    positions_of,
+)
 from processor.deviation import measure as deviation_measure
 from processor.geometry import m3c2 as m3c2_distances
 from processor.geometry import mesh_distance, normal_orientation, rigid
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import MeshSurface
-from processor.model import Floats, Reason, Status
-from processor.registration import surface_registration
+from processor.model import Floats, Reason, Status, reason
+from processor.registration import main_body, principal, surface_registration
+from processor.registration.surface_registration import Placed
 from processor.scene_cloud import MergedCloud
+from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import Params
 from processor.space_frame.result import Flag
 from processor.space_frame.spheres import search_without_design
 
-LEAST_EXTENT_MM = 2.0  # nothing that is scanned is smaller: the coordinates are in metres
 LEAST_POINTS = 10
 LEAST_SCAN_POINTS = 100
-MOST_RATIO = 30.0  # of the extents of a scan and its design; beyond it the units differ
+LEAST_RADIUS_MM = 1.0  # no target is smaller: the radius is in metres
+MOST_RADIUS_SHARE = 5.0  # of the span of the points; a cap of a larger sphere cannot be told from a plane
+LEAST_RANGE_MM = 100.0  # median distance of the points; no scanner measures nearer than that
+LEAST_ANGLE = 1e-4  # rad, of the whole cloud seen from the scanner; no beam is as narrow
+AWAY_COS, MOST_AWAY = -0.1, 0.05  # of the normals to the rays; share of a sphere's points that face away
+ON_SPHERE = 3.0  # rms residuals
+MOST_LENGTH_RATIO = 300.0  # of two lengths of M3C2; beyond it their units differ
+CORE_FACTOR = 1000.0  # of metres and mm
+CORE_COVERS, BESIDE = 0.5, 0.05  # shares of the reference's extent: least extent of core points, and room beside
+UNITS_MM = (10.0, 25.4)  # cm and inches; larger ones are beyond MOST_RATIO
+UNIT_TOLERANCE = 0.3  # of a ratio of sizes along the axes: a scan is turned, and covers about its design
+LIKE_SIZE = 3.0  # ratio of sizes up to which nothing is stated
 FACING_MARGIN = 0.1  # difference of shares of points that face the scanner between two poses
 
 
@@ -59,13 +81,16 @@ class Pose:
     ``T_design_scan`` (4, 4) maps the scan's coordinates to the design's, mm. ``covariance`` (6, 6): rotation about the
     design's axes in rad, translation in mm, for a small motion applied on the left; NaN where the points do not
     determine the pose. ``status``: ok; ambiguous = another pose fits about as well, ``rival`` (4, 4); weak = the points
-    do not determine every motion; failed = most points are not at the design. ``rival`` is None without another pose.
+    do not determine every motion, or many are not at the design; failed = most are not. ``rival`` is None without
+    another pose.
+    ``reasons`` state why the status is not ok, and where the sizes of scan and mesh suggest different units.
     """
 
     T_design_scan: Floats
     covariance: Floats
     status: Status
     rival: Floats | None
+    reasons: tuple[Reason, ...] = ()
 
 
 def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.ArrayLike | None = None) -> SphereFit:
@@ -88,29 +113,31 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
 
     Raises
     ------
-    ValueError : wrong shape, NaN, too few points, or coordinates that seem to be in metres.
+    ValueError : wrong shape, NaN, too few points, points that coincide, coordinates that seem to be in metres, a radius
+        that no target has or the cloud cannot hold, a scanner that cannot have measured the points.
     """
-    cloud = _points(points, "points", LEAST_POINTS)
-    if radius is not None and (isinstance(radius, str) or not 0.0 < radius < np.inf):
-        raise ValueError(f"radius: expected a positive length in mm, got {radius!r}")
+    cloud = points_of(points, "points", LEAST_POINTS)
+    held = None if radius is None else _radius(radius, extent_of(cloud))
     origin = cloud.mean(axis=0)
     seen_from = None
     if scanner is not None:
-        seen_from = _positions(scanner, "scanner", cloud.shape) - origin
-    params = Params(radius_mm=float("nan") if radius is None else float(radius), max_balls=1)
+        seen_from = positions_of(scanner, "scanner", cloud.shape) - origin
+        _check_scanner(cloud - origin, seen_from)
+    params = Params(radius_mm=float("nan") if held is None else held, max_balls=1)
     measured = search_without_design.search(MergedCloud(cloud - origin, origin, seen_from), params)
     balls = measured.balls
     if not len(balls):
+        doubt = None if held is None else unit_mistakes.implausible(held)
         return SphereFit(
             centre=np.full(3, np.nan),
             radius=float("nan"),
             covariance=np.full((4, 4), np.nan),
             status=Status.FAILED,
-            reasons=measured.reasons,
+            reasons=measured.reasons if doubt is None else (*measured.reasons, doubt),
             points=0,
             rms=float("nan"),
         )
-    return SphereFit(
+    fitted = SphereFit(
         centre=balls.centres[0],
         radius=float(balls.radii[0]),
         covariance=balls.covariance[0],
@@ -119,6 +146,54 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
         points=int(balls.points[0]),
         rms=float(balls.rms[0]),
     )
+    if seen_from is not None and fitted.status is Status.OK:
+        _check_faces(cloud - fitted.centre, seen_from + origin - fitted.centre, fitted)
+    return fitted
+
+
+def _radius(radius: Any, extent: float) -> float:
+    """Return a radius in mm. Raises ValueError where points that span ``extent`` mm cannot be of such a sphere."""
+    length = length_of(radius, "radius")
+    if length < LEAST_RADIUS_MM:
+        raise ValueError(
+            f"radius: expected the radius of a target in mm, got {length:g}; it seems to be in metres: multiply by 1000"
+        )
+    if length > MOST_RADIUS_SHARE * extent:
+        raise ValueError(
+            f"radius: expected at most {MOST_RADIUS_SHARE:g} times the span of the points, {extent:.4g} mm, got"
+            f" {length:g}; radius and points are expected in mm"
+        )
+    return length
+
+
+def _check_scanner(points: Floats, scanner: Floats) -> None:
+    """Raise ValueError for positions (n, 3) from where no scanner can have measured the points (n, 3)."""
+    distance, extent = float(np.median(np.linalg.norm(points - scanner, axis=1))), extent_of(points)
+    if distance < LEAST_RANGE_MM:
+        raise ValueError(
+            f"scanner: expected a position in mm in the points' frame, got one {distance:.4g} mm from the points"
+            " (median); no scanner measures that near: is it in metres?"
+        )
+    if extent < LEAST_ANGLE * distance:
+        raise ValueError(
+            f"scanner: expected a position in mm in the points' frame, got one {distance:.4g} mm from the points, which"
+            f" span {extent:.4g} mm; no scanner distinguishes points so close together from there: is it in metres?"
+        )
+
+
+def _check_faces(points: Floats, scanner: Floats, sphere: SphereFit) -> None:
+    """Raise ValueError where many points on a sphere about (0, 0, 0) face away from the positions (n, 3) given."""
+    height = np.linalg.norm(points, axis=1)
+    on = np.abs(height - sphere.radius) < ON_SPHERE * sphere.rms
+    normal, sight = points[on] / height[on, None], (scanner - points)[on]
+    cosine = np.einsum("ni,ni->n", normal, sight) / np.linalg.norm(sight, axis=1)
+    away = float((cosine < AWAY_COS).mean()) if on.any() else 0.0
+    if away > MOST_AWAY:
+        raise ValueError(
+            f"scanner: expected the position in mm in the points' frame from where they were measured, but"
+            f" {100.0 * away:.0f} % of the points on the sphere face away from the one given; of several stations give"
+            " (n, 3), the position of each point"
+        )
 
 
 def register(
@@ -142,44 +217,83 @@ def register(
 
     Raises
     ------
-    ValueError : wrong shapes, NaN, too few points, faces that name no vertex, points and mesh in different units.
+    ValueError : wrong shapes, NaN, too few points, faces that name no vertex or have no area, points and mesh in
+        different units.
     """
-    cloud, corners = _points(points, "points", LEAST_SCAN_POINTS), _points(vertices, "vertices", 3)
-    triangles = np.asarray(faces)
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
-        raise ValueError(f"faces: expected an array (f, 3) of whole numbers, got {triangles.dtype} {triangles.shape}")
-    if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(corners):
-        raise ValueError(f"faces: expected numbers of vertices from 0 to {len(corners) - 1}")
-    ratio = float(np.ptp(cloud, axis=0).max() / np.ptp(corners, axis=0).max())
+    cloud, corners = points_of(points, "points", LEAST_SCAN_POINTS), points_of(vertices, "vertices", 3)
+    triangles = faces_of(faces, corners, mesh_distance.LEAST_AREA)
+    ratio = extent_of(cloud) / extent_of(corners[np.unique(triangles)])
     if not 1.0 / MOST_RATIO < ratio < MOST_RATIO:
         raise ValueError(f"points: {ratio:.3g} times as large as the mesh; expected both in mm")
     scan_origin, origin = cloud.mean(axis=0), corners.mean(axis=0)
     local = cloud - scan_origin
-    surface = mesh_distance.of_design(corners - origin, triangles.astype(np.int64))
-    given = rigid.transform(np.eye(3), scan_origin - origin)
-    placed = surface_registration.place(local, surface, given, "auto")
-    rival = placed.T_rival if placed.ambiguous else None
-    if rival is not None and scanners is not None:
-        seen_from = _positions(scanners, "scanners", cloud.shape) - scan_origin
-        shares = [_facing_share(local, seen_from, surface, T) for T in (placed.T, rival)]
-        if shares[1] > shares[0] + FACING_MARGIN:
-            placed = surface_registration.place(local, surface, rival, "fine")
-        rival = None if abs(shares[1] - shares[0]) > FACING_MARGIN else rival
+    seen_from = None if scanners is None else positions_of(scanners, "scanners", cloud.shape) - scan_origin
+    surface = mesh_distance.of_design(corners - origin, triangles)
+    placed, rival = _placed(local, surface, rigid.transform(np.eye(3), scan_origin - origin), seen_from)
     determined = bool(np.isfinite(placed.T_best_fit).all())
     T = placed.T_best_fit if determined else placed.T
-    near, _ = surface.tree.query(rigid.apply(T, local), distance_upper_bound=surface_registration.NEAR_MM, workers=-1)
-    if np.isfinite(near).mean() < surface_registration.NEAR_SHARE:
-        status = Status.FAILED
-    elif rival is not None:
-        status = Status.AMBIGUOUS
-    else:
-        status = Status.WEAK if placed.weak or not determined else Status.OK
+    status, reasons = _assessed(local, surface, T, placed, ambiguous=rival is not None)
+    if status is not Status.OK and not 1.0 / LIKE_SIZE < ratio < LIKE_SIZE:
+        reasons = (*reasons, _sizes(ratio))
     return Pose(
         T_design_scan=deviation_measure.global_pose(T, scan_origin, origin),
         covariance=rigid.about_origin(placed.covariance, origin),
         status=status,
         rival=None if rival is None else deviation_measure.global_pose(rival, scan_origin, origin),
+        reasons=reasons,
     )
+
+
+def _placed(
+    points: Floats, surface: MeshSurface, given: Floats, scanners: Floats | None
+) -> tuple[Placed, Floats | None]:
+    """Place points (n, 3) at a surface; of two poses that fit alike, at that which faces the scanners (n, 3).
+
+    Returns the other pose (4, 4) as well, None where there is none.
+    """
+    placed = surface_registration.place(points, surface, given, "auto")
+    if not placed.ambiguous:
+        return placed, None
+    rival = placed.T_rival
+    if scanners is None:
+        return placed, rival
+    shares = [_facing_share(points, scanners, surface, T) for T in (placed.T, rival)]
+    if shares[1] > shares[0] + FACING_MARGIN:
+        placed = surface_registration.place(points, surface, rival, "fine")
+    return placed, None if abs(shares[1] - shares[0]) > FACING_MARGIN else rival
+
+
+def _assessed(
+    points: Floats, surface: MeshSurface, T: Floats, placed: Placed, *, ambiguous: bool
+) -> tuple[Status, tuple[Reason, ...]]:
+    """Return the status of points (n, 3) placed by T (4, 4), without ground and walls, and why it is not ok."""
+    of_body = main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
+    points = points if of_body is None else points[of_body]
+    near, _ = surface.tree.query(rigid.apply(T, points), distance_upper_bound=surface_registration.NEAR_MM, workers=-1)
+    share = float(np.isfinite(near).mean())
+    if share < surface_registration.NEAR_SHARE:
+        near_mm = surface_registration.NEAR_MM
+        return Status.FAILED, (reason("register.not-at-mesh", share=100.0 * share, near_mm=near_mm),)
+    reasons = []
+    if share < 1.0 - surface_registration.CLUTTER_SHARE:
+        elsewhere = 100.0 * (1.0 - share)
+        reasons.append(reason("register.points-elsewhere", share=elsewhere, near_mm=surface_registration.NEAR_MM))
+    if ambiguous:
+        reasons.append(reason("register.ambiguous"))
+    if not np.isfinite(placed.T_best_fit).all():
+        reasons.append(reason("register.undetermined"))
+    elif placed.weak:
+        reasons.append(reason("deviation.weak", motions=placed.weak))
+    status = Status.AMBIGUOUS if ambiguous else Status.WEAK if reasons else Status.OK
+    return status, tuple(reasons)
+
+
+def _sizes(ratio: float) -> Reason:
+    """Return the reason of a scan ``ratio`` times as large as its mesh, with the unit that would explain it."""
+    unit_mm = unit_ratio.nearest_factor(max(ratio, 1.0 / ratio), UNITS_MM, UNIT_TOLERANCE)
+    if unit_mm is None:
+        return reason("register.sizes-differ", ratio=ratio)
+    return reason("register.unit-mistake", ratio=ratio, unit_mm=unit_mm)
 
 
 def _facing_share(points: Floats, scanners: Floats, surface: MeshSurface, T: Floats) -> float:
@@ -225,89 +339,98 @@ def m3c2(
 
     Raises
     ------
-    ValueError : wrong shapes, NaN, no points, lengths that are not positive or wider than the reference.
+    ValueError : wrong shapes, NaN, no points, lengths that are not positive or wider than the reference, normals that
+        are not of length 1, clouds of different units, and no core point with points of both clouds within reach.
     """
-    first, second = (_points(reference, "reference", 1, in_mm=False), _points(compared, "compared", 1, in_mm=False))
-    places = first if core is None else _points(core, "core", 1, in_mm=False)
-    _check_lengths(first, normal_diameter, projection_diameter, max_depth, registration_error)
+    first, second = points_of(reference, "reference", 1, in_mm=False), points_of(compared, "compared", 1, in_mm=False)
+    places = first if core is None else points_of(core, "core", 1, in_mm=False)
+    scales = _scales(normal_diameter, projection_diameter, max_depth)
+    error = length_of(registration_error, "registration_error", zero=True, unit="")
+    given = None if normals is None else normals_of(normals, places.shape)
+    _check_units(first, second, places, scales.projection_diameter)
     origin = first.mean(axis=0)
-    local = places - origin
-    grid = m3c2_distances.grid(first - origin, projection_diameter)
-    if normals is None:
-        fitted = m3c2_distances.normals(m3c2_distances.grid(first - origin, normal_diameter), local, normal_diameter)
-        directions = normal_orientation.turned(fitted, local, normal_diameter, None).normals
-    else:
-        directions = _finite(normals, "normals")
-        if directions.shape != places.shape:
-            raise ValueError(
-                f"normals: expected shape {places.shape}, one normal per core point; got {directions.shape}"
-            )
+    directions = _fitted_normals(first - origin, places - origin, scales.normal_diameter) if given is None else given
     measured = m3c2_distances.distances(
-        grid,
-        m3c2_distances.grid(second - origin, projection_diameter),
-        local,
+        m3c2_distances.grid(first - origin, scales.projection_diameter),
+        m3c2_distances.grid(second - origin, scales.projection_diameter),
+        places - origin,
         directions,
-        projection_diameter_mm=projection_diameter,
-        max_depth_mm=max_depth,
-        registration_error_mm=registration_error,
+        projection_diameter_mm=scales.projection_diameter,
+        max_depth_mm=scales.max_depth,
+        registration_error_mm=error,
     )
+    _check_reach(measured)
     return CorePoints(**vars(measured), core=places, normals=directions)
 
 
-def _check_lengths(
-    reference: Floats,
-    normal_diameter: float,
-    projection_diameter: float,
-    max_depth: float,
-    registration_error: float,
-) -> None:
-    if not 0.0 <= registration_error < np.inf:
-        raise ValueError(f"registration_error: expected 0 or a positive length, got {registration_error}")
-    for name, value in (
-        ("normal_diameter", normal_diameter),
-        ("projection_diameter", projection_diameter),
-        ("max_depth", max_depth),
-    ):
-        if not 0.0 < value < np.inf:
-            raise ValueError(f"{name}: expected a positive length, got {value}")
-    extent = float(np.ptp(reference, axis=0).max())
+class _Scales(NamedTuple):
+    normal_diameter: float
+    projection_diameter: float
+    max_depth: float
+
+
+def _scales(normal_diameter: Any, projection_diameter: Any, max_depth: Any) -> _Scales:
+    """Return the lengths. Raises ValueError where one must be in another unit; a depth may be as great as one likes."""
+    lengths = _Scales(
+        *(
+            length_of(value, name, unit=" in the unit of the coordinates")
+            for name, value in zip(_Scales._fields, (normal_diameter, projection_diameter, max_depth), strict=True)
+        )
+    )
+    pairs = (
+        ("max_depth", "projection_diameter"),
+        ("projection_diameter", "normal_diameter"),
+        ("normal_diameter", "projection_diameter"),
+    )
+    for name, other in pairs:
+        small, large = getattr(lengths, name), getattr(lengths, other)
+        if small * MOST_LENGTH_RATIO < large:
+            raise ValueError(
+                f"{name}: {small:g} is less than 1/{MOST_LENGTH_RATIO:g} of {other}, {large:g}; expected lengths of one"
+                " unit"
+            )
+    return lengths
+
+
+def _fitted_normals(reference: Floats, core: Floats, normal_diameter: float) -> Floats:
+    """Fit normals (k, 3) at core points (k, 3). Raises ValueError where there is none."""
+    fitted = m3c2_distances.normals(m3c2_distances.grid(reference, normal_diameter), core, normal_diameter)
+    if not np.isfinite(fitted.normals).any():
+        raise ValueError(
+            f"normal_diameter: within {normal_diameter:g} no core point has enough points of the reference; expected"
+            " core points on the reference, and lengths and coordinates in one unit"
+        )
+    return normal_orientation.turned(fitted, core, normal_diameter, None).normals
+
+
+def _check_reach(measured: Distances) -> None:
+    """Raise ValueError where no core point has points of both clouds."""
+    if not ((measured.n1 > 0) & (measured.n2 > 0)).any():
+        raise ValueError(
+            f"core: none of the {len(measured.n1)} core points has points of both clouds within reach (the reference at"
+            f" {np.count_nonzero(measured.n1)}, compared at {np.count_nonzero(measured.n2)}); expected clouds of one"
+            " place, in one frame, and lengths and coordinates in one unit"
+        )
+
+
+def _check_units(reference: Floats, compared: Floats, core: Floats, projection_diameter: float) -> None:
+    """Raise ValueError where sizes show that clouds, core points or lengths are in different units."""
+    extent, other, of_core = extent_of(reference), extent_of(compared), extent_of(core)
     if projection_diameter > extent > 0.0:
         raise ValueError(
             f"projection_diameter: {projection_diameter:g} is wider than the reference, which spans {extent:g};"
             " expected lengths and coordinates in one unit"
         )
-
-
-def _points(values: npt.ArrayLike, name: str, least: int, in_mm: bool = True) -> Floats:
-    """Check an array of points, and with ``in_mm`` that they are not in metres."""
-    points = _finite(values, name)
-    if points.ndim != 2 or points.shape[1] != 3:
-        unit = " in mm" if in_mm else ""
-        raise ValueError(f"{name}: expected an array (n, 3) of coordinates{unit}, got shape {points.shape}")
-    if len(points) < least:
-        raise ValueError(f"{name}: expected {least} points or more, got {len(points)}")
-    extent = float(np.ptp(points, axis=0).max())
-    if in_mm and len(points) > 1 and extent < LEAST_EXTENT_MM:
+    if extent > 0.0 and other > 0.0 and not 1.0 / MOST_RATIO < other / extent < MOST_RATIO:
         raise ValueError(
-            f"{name}: span {extent:.4g}; expected coordinates in mm, these seem to be in metres: multiply them by 1000"
+            f"compared: spans {other:.4g}, the reference {extent:.4g}; expected clouds of one unit and about one size:"
+            " cut the larger to where the other is"
         )
-    return points
-
-
-def _positions(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Floats:
-    """Return the scanner's position for each point: (3,) for all, or one of ``shape`` (n, 3)."""
-    positions = _finite(values, name)
-    if positions.shape not in ((3,), shape):
-        raise ValueError(f"{name}: expected shape (3,) or {shape}, got {positions.shape}")
-    return np.broadcast_to(positions, shape)
-
-
-def _finite(values: Any, name: str) -> Floats:
-    try:
-        array = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected numbers, got {type(values).__name__}") from None
-    bad = int(np.count_nonzero(~np.isfinite(array)))
-    if bad:
-        raise ValueError(f"{name}: expected finite numbers, got {bad} of {array.size} that are NaN or infinite")
-    return array
+    lower, upper = reference.min(axis=0) - BESIDE * extent, reference.max(axis=0) + BESIDE * extent
+    for factor in (CORE_FACTOR, 1.0 / CORE_FACTOR):
+        inside = (factor * core >= lower) & (factor * core <= upper)
+        if of_core > 0.0 and inside.all() and CORE_COVERS * extent < factor * of_core:
+            raise ValueError(
+                f"core: spans {of_core:.4g}, the reference {extent:.4g}; core points times {factor:g} lie all over it:"
+                " expected coordinates of one unit"
+            )

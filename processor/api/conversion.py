@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from processor import large_arrays, pipeline
+from processor.api.argument_checks import path_of, text_of
 from processor.evaluation import evaluate
 from processor.language.messages import messages
 from processor.model import Scan, Truth, UsageError, per_point_fields
@@ -46,7 +47,7 @@ def convert(input_: str | Path, output: str | Path, units: str | None = None) ->
     InputError : the input cannot be used, or the output cannot be written.
     UsageError : the input is a scene file already, the output has another suffix than .h5, or the unit is unknown.
     """
-    path, out = files.existing(Path(input_)), Path(output)
+    path, out = files.existing(path_of(input_, "input_")), path_of(output, "output")
     if path.is_file() and path.suffix.lower() == ".h5":
         raise UsageError(f"{path}: is a scene file already; name a scan folder or a scan file")
     if out.suffix.lower() != ".h5":
@@ -57,7 +58,7 @@ def convert(input_: str | Path, output: str | Path, units: str | None = None) ->
     before = fingerprint.signature(path.resolve(), out.resolve())
     with large_arrays.in_files(out.absolute().parent):
         with stage(f"reading {path.name}"):
-            scene = pipeline.read(path, units)
+            scene = pipeline.read(path, None if units is None else text_of(units, "units"))
         truth = evaluate.truth_of(path)
         fingerprint.check_unchanged(path.resolve(), before, out.resolve())
         with stage(f"writing {out.name}"):

@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from processor import large_arrays, pipeline, record_checks
+from processor.api.argument_checks import length_of, path_of, seed_of, text_of
 from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.parallel import one_blas_thread
 from processor.jobs import tile_cluster
-from processor.language.messages import messages
-from processor.model import LONGEST_NAME, Metric, Scene, Truth, Verdict, worst
+from processor.language.messages import CODES, messages
+from processor.model import LONGEST_NAME, Metric, Scene, Truth, UsageError, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
 from processor.report import headline, write_results
@@ -88,7 +89,7 @@ def read(path: str | Path, units: str | None = None) -> Scene:
     InputError : the input cannot be used.
     UsageError : the unit is unknown, or ``units`` is given for a scene file, which states its own.
     """
-    return pipeline.read(files.existing(Path(path)), units)
+    return pipeline.read(files.existing(path_of(path, "path")), None if units is None else text_of(units, "units"))
 
 
 def run(
@@ -129,8 +130,12 @@ def run(
     InputError : the input cannot be used, or the output cannot be written.
     UsageError : a name or parameter is unknown, no scheduler answers, or its workers have other software.
     """
+    text_of(lang, "lang", CODES)
+    for name, text in (("units", units), ("cluster", cluster)):
+        if text is not None:
+            text_of(text, name)
     results = compute(input_, output, steps, method, params, units, seed, log=log, cluster=cluster)
-    return write(results, None if output is None else Path(output), lang)
+    return write(results, None if output is None else path_of(output, "output"), lang)
 
 
 def compute(
@@ -151,8 +156,9 @@ def compute(
     Points beyond 64 MB lie in files without a name beside the output, without one in the folder for temporary files.
     The results.h5 in the folder ``so_far`` holds the steps that are done, while others run.
     """
-    wanted, methods, parameters = _names(steps), _names(method), _parameters(params)
-    out = None if output is None else Path(output)
+    wanted, methods, parameters = _names(steps, "steps"), _names(method, "method"), _parameters(params)
+    out = None if output is None else path_of(output, "output")
+    seed = None if seed is None else seed_of(seed)
     if isinstance(input_, Scene):
         record_checks.check(input_, f"scene {input_.name[:LONGEST_NAME]!r}")
         jobs = pipeline.jobs_for(input_, wanted, methods, parameters, seed)
@@ -160,7 +166,7 @@ def compute(
             write_results.check_output(out, None)
         with tile_cluster.on_cluster(cluster, log), one_blas_thread():
             return Results(pipeline.execute(Path(input_.name), input_, jobs, log))
-    path = files.existing(Path(input_))
+    path = files.existing(path_of(input_, "input_", " or a scene"))
     if out is not None:
         write_results.check_output(out, path)
     if wanted:
@@ -213,7 +219,10 @@ def check(results: Results, truth: Truth) -> tuple[Metric, ...]:
     Raises
     ------
     InputError : the truth is that of another scene.
+    UsageError : ``results`` are no Results, or ``truth`` is no Truth.
     """
+    _check_kind(results, Results, "results", "of processor.run")
+    _check_kind(truth, Truth, "truth", "of designgen.make or designgen.scan, which return (scene, truth)")
     return evaluate.against(truth, results.execution, results.scene.name).metrics
 
 
@@ -245,16 +254,28 @@ def export(
     InputError : the input has changed since the run, or the folder cannot be written.
     UsageError : a name is unknown, the folder exists, or a step that is needed was not run.
     """
-    source = results.execution if isinstance(results, Results) else Path(results)
-    return clouds_export.export(source, Path(folder), what, format, spacing_mm or 0.0)
+    source = results.execution if isinstance(results, Results) else path_of(results, "results", " or Results")
+    spacing = 0.0 if spacing_mm is None else length_of(spacing_mm, "spacing_mm", zero=True)
+    return clouds_export.export(source, path_of(folder, "folder"), what, format, spacing)
+
+
+def _check_kind(value: Any, kind: type, name: str, source: str) -> None:
+    if not isinstance(value, kind):
+        raise UsageError(f"{name}: expected {kind.__name__} {source}, got {type(value).__name__}")
 
 
 def _parameters(params: str | Path | Mapping[str, Any] | None) -> Mapping[str, Any]:
-    return params if isinstance(params, Mapping) else pipeline.read_params(None if params is None else Path(params))
+    if isinstance(params, Mapping):
+        return {text_of(step, "params: name of a step"): table for step, table in params.items()}
+    if params is None:
+        return {}
+    return pipeline.read_params(path_of(params, "params", " or a mapping of one table per step"))
 
 
-def _names(value: Names) -> tuple[str, ...]:
+def _names(value: Names, name: str) -> tuple[str, ...]:
     if value is None:
         return ()
     parts = value.split(",") if isinstance(value, str) else value
+    if not isinstance(parts, Sequence) or not all(isinstance(part, str) for part in parts):
+        raise UsageError(f"{name}: expected names, in a list or one text with commas, got {value!r}")
     return tuple(part.strip() for part in parts if part.strip())

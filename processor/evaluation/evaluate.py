@@ -14,7 +14,7 @@ import numpy as np
 from processor import pipeline
 from processor.evaluation import truth_json
 from processor.evaluation.space_frame import true_rows
-from processor.model import Floats, InputError, Metric, Scene, Truth
+from processor.model import Floats, InputError, Metric, PlainError, Scene, Truth
 from processor.pipeline import Execution
 from processor.scan_folder import folder
 from processor.space_frame import step as space_frame_step
@@ -76,6 +76,8 @@ def against(truth: Truth, execution: Execution, source: str) -> ErrorReport:
     for run in execution.runs:
         try:
             found = _check_of(run.step)(execution.scene, run.result, truth)
+        except PlainError:  # of points that are read here
+            raise
         except (LookupError, ValueError) as error:
             raise InputError(
                 f"{source}: the truth does not fit what step {run.step} found ({error!r}); is it of another scene?"

@@ -193,6 +193,7 @@ def ransac(
 # --- Robust geometric fit
 
 
+LEAST_SCALE = 1e-8  # of the radius: below any noise, above the rounding of points without noise
 WINDOW = 4.0  # in scales: residuals within it determine the scale
 STEEPEST = 0.3  # cosine of incidence below which the beam is split at the limb, and errors of angles dominate
 ITERATIONS = 100
@@ -242,7 +243,7 @@ def robust_fit(
     state = np.append(np.zeros(3), start.radius if radius_mm is None else radius_mm)
     free = 4 if radius_mm is None else 3
     scale = scale_mm
-    tiny = 1e-12 * max(start.radius, 1.0) + 1e-300
+    tiny = LEAST_SCALE * start.radius
     converged = False
     considered = np.ones(len(points), bool)
     for iteration in range(ITERATIONS):

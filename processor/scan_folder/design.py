@@ -66,8 +66,9 @@ def read_json(path: Path) -> Table:
 
 def read_json_value(path: Path) -> Any:
     """Read a JSON file that holds any value. Raises InputError for a file that is not JSON."""
+    text = _text(path)
     try:
-        return json.loads(_text(path))
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"not readable JSON: {error}", path=path) from None
 

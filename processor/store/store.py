@@ -28,7 +28,18 @@ import processor.store.file_structure_checks as file_structure_checks
 import processor.store.scan_tiles as scan_tiles
 from processor import large_arrays
 from processor.language.messages import messages
-from processor.model import InputError, Ints, PointLabels, Reason, Scan, Scene, StepRun, Truth, per_point_fields
+from processor.model import (
+    InputError,
+    Ints,
+    PlainError,
+    PointLabels,
+    Reason,
+    Scan,
+    Scene,
+    StepRun,
+    Truth,
+    per_point_fields,
+)
 from processor.store.atomic_file import replacing
 from processor.store.codec import DecodeError
 
@@ -185,6 +196,8 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
         raise InputError("no such file", path=path) from None
     except large_arrays.NoRoomError as error:
         raise InputError(f"cannot be read ({error.strerror})", path=path) from error
+    except PlainError:  # of what is done with the open file
+        raise
     except DAMAGE as error:
         wanted = " or ".join(FORMATS[kind] for kind in kinds)
         raise InputError(

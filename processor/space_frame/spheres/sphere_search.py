@@ -22,6 +22,7 @@ from processor.geometry import point_grid
 from processor.geometry.linalg_small import assign
 from processor.geometry.parallel import over_ranges
 from processor.geometry.sphere import (
+    LEAST_SCALE,
     RobustFit,
     Sphere,
     canonical_order,
@@ -360,7 +361,7 @@ def _accepted(cloud: Cloud, start: Sphere, least_points: int, radius_mm: float |
         close = off < BAND * start.radius
         if np.count_nonzero(close) < least // 2 or _facing(points[near], close, start) < ROUGHLY_FACING:
             return None
-        scale = 2.0 * MAD_TO_SD * float(np.median(off[close]))
+        scale = max(2.0 * MAD_TO_SD * float(np.median(off[close])), LEAST_SCALE * start.radius)
         fit = robust_fit(points[near], start, scale, radius_mm, None if scanner is None else scanner[near])
         if fit is None or not _stands_out(points[near], fit, least):
             return None
@@ -406,7 +407,7 @@ def _denser(points: Floats, ball: Sphere, times: float, scale: float | None = No
     off = ball.residuals(points)
     if scale is None:
         close = np.abs(off[np.abs(off) < BAND * ball.radius])
-        scale = robust_sd(close)
+        scale = max(robust_sd(close), LEAST_SCALE * ball.radius)
     width = 3.0 * scale
     at = np.count_nonzero(np.abs(off) <= width)
     outside = np.count_nonzero((off > width) & (off <= 3.0 * width))
