@@ -21,7 +21,7 @@ from processor.registration import principal
 
 VOXELS = (200.0, 140.0, 100.0, 70.0)  # along the scan's diagonal, the most that the points allow
 PER_VOXEL = 6  # points of an occupied voxel, on average
-FEWEST = 200  # voxels of a scan that is searched
+FEWEST = 40  # voxels of a part
 LARGER = 0.02  # of the longest size, by which a scan that holds more than its part is larger
 LARGER_AREA = 1.3  # of a plane, by the part's largest side: cells at its rim are partly empty
 TRIALS, SAMPLE = 1000, 4000  # of random planes, and of points that they are compared with
