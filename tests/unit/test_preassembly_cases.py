@@ -449,6 +449,24 @@ def test_a_part_on_trestles_above_a_floor_of_more_points_is_found_right():
     assert np.abs(edges.departure / sd)[known].max() < 4.5
 
 
+def test_a_scan_that_is_denser_at_one_end_starts_at_the_parts_place():
+    parts, design = ribs()
+    points, rng = cloud(parts[1]), np.random.default_rng(5)
+    dense = points[:, 0] < np.quantile(points[:, 0], 0.2)
+    points = points[dense | (rng.random(len(points)) < 0.1)]
+    scan, _ = scanned(points)
+    by_axes = attitude.principal_hypotheses(scan.points, design.parts[1])
+    starts = [attitude.at_extents(scan.points, design.parts[1], one) for one in by_axes]
+
+    def off(poses):
+        return min(np.linalg.norm(rigid.apply(one, scan.points) - points, axis=1).max() for one in poses)
+
+    assert off(by_axes) > 500.0
+    assert off(starts) < 60.0
+    half = scan.points[points[:, 0] < np.median(points[:, 0])]
+    np.testing.assert_array_equal(attitude.at_extents(half, design.parts[1], by_axes[0]), by_axes[0])
+
+
 @pytest.mark.slow
 def test_no_random_pose_is_wrong_and_called_ok():
     parts, design = bridge()

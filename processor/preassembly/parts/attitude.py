@@ -33,6 +33,7 @@ SAME_SIZE = 0.05  # relative difference of sizes along an axis that a piece of f
 # right one may have converged some millimetres off.
 PROMISING, PROMISING_MM = 4.0, 10.0
 ROUGH_KEPT = 4  # of the promising hypotheses, for a rough pose
+EXTENTS = (0.002, 0.998)  # quantiles of points, without single outliers
 SHORT_SHARE = 0.1  # of its length, by which a scan of a whole part may be shorter
 NO_FIT_MM = 25.0  # misfit, about a plate's thickness, beyond which no pose explains the scan
 SAME_POSE_MM = 5.0  # poses are equal where no corner of the part differs by more
@@ -150,6 +151,21 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
     return hypotheses
 
 
+def at_extents(points: Floats, part: DesignPart, T: Floats) -> Floats:
+    """Move a T_bridge_scan (4, 4) so that the middle of the scan's extents lies at that of the part's.
+
+    Where a scan is denser at one end its centre is not the part's, and a part of even curvature slides along itself
+    from there. A scan that is shorter than the part stays.
+    """
+    axes = principal.of_mesh(part.vertices, part.faces).axes
+    whole, placed = part.vertices @ axes, rigid.apply(T, points) @ axes
+    low, high = np.quantile(placed, EXTENTS, axis=0)
+    if high[0] - low[0] < (1.0 - SHORT_SHARE) * np.ptp(whole[:, 0]):
+        return T
+    move = 0.5 * (whole.min(axis=0) + whole.max(axis=0) - low - high)
+    return rigid.transform(np.eye(3), axes @ move) @ T
+
+
 def _rotations(scan_axes: Floats, design_axes: Floats) -> list[Floats]:
     """Return the eight proper rotations (3, 3) that align the long axes, and the cross axes in either order."""
     turns = principal.turns(((0, 1, 2), (0, 2, 1)))
@@ -168,7 +184,7 @@ def piece_hypotheses(seeds: Floats, part: DesignPart) -> list[Floats]:
     hypotheses = []
     for R in _rotations(principal.of_points(seeds).axes, design_axes):
         turned = seeds @ R.T @ design_axes
-        piece_low, piece_high = np.quantile(turned, [0.002, 0.998], axis=0)  # without single outliers
+        piece_low, piece_high = np.quantile(turned, EXTENTS, axis=0)
         moves = np.stack([low - piece_low, 0.5 * (low + high - piece_low - piece_high), high - piece_high], axis=1)
         same_size = np.abs((high - low) - (piece_high - piece_low)) < SAME_SIZE * (high - low)
         tried = [move[1:2] if same else move for move, same in zip(moves, same_size, strict=True)]
@@ -247,7 +263,8 @@ def _coarse(
 ) -> list[_Candidate]:
     """Align all hypotheses by a few hundred points, and return the promising ones, the best first."""
     seeds, few = even
-    starts = [_Candidate(T, T) for T in principal_hypotheses(points, part)]
+    by_axes = principal_hypotheses(points, part)
+    starts = [_Candidate(T, T) for T in by_axes] + [_Candidate(at_extents(seeds, part, T), T) for T in by_axes]
     coarse = each(partial(_align, few, surface, COARSE_GATES_MM), starts)
     if pieces and min(c.misfit for c in coarse) > PIECE_MM:
         coarse += _of_pieces(seeds, few, surface, part)
