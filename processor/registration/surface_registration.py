@@ -183,6 +183,7 @@ NEAR_MM = 100.0  # of the design's surface
 NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
 FINE_POINTS = 30_000
 RIVAL_POINTS = 8_000  # enough to tell attitudes apart: the fit of the one that is chosen uses FINE_POINTS
+SIDE_ROUNDS = 3  # one for each axis
 LEAST_SHIFT_MM = 2.0  # thinner plates are not told apart by the side of their surface
 FACE_COS, MOST_AREA, FACE_ROUNDS = 0.9, 0.5, 5  # faces about along an axis, their least share of the area
 PROMISING = 3.0  # ratio of two poses' errors after the coarse registration, below which the fine one decides
@@ -376,10 +377,16 @@ def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> lis
     found.append((first.rms_mm, first.T_target_source))
     if np.isfinite(first.T_rival).all():
         found.append((first.ambiguity * first.rms_mm, first.T_rival))
-    distinct = _distinct(found, points.mean(axis=0), size)
-    promising = [T for error, T in distinct if error <= PROMISING * distinct[0][0]]
-    shifted = [refined(start) for T in promising for start in _other_sides(points, design.points, axes.axes, T)]
-    return _distinct([*distinct, *shifted], points.mean(axis=0), size)
+    square, centre = _along_faces(axes.axes, surface), points.mean(axis=0)
+    distinct = _distinct(found, centre, size)
+    for _ in range(SIDE_ROUNDS):
+        promising = [T for error, T in distinct if error <= PROMISING * distinct[0][0]]
+        shifted = [refined(start) for T in promising for start in _other_sides(points, design.points, square, T)]
+        before = distinct[0][0]
+        distinct = _distinct([*distinct, *shifted], centre, size)
+        if not distinct[0][0] < before:  # plates along several axes may lie on their other sides
+            break
+    return distinct
 
 
 def _distinct(found: list[tuple[float, Floats]], centre: Floats, size: float) -> list[tuple[float, Floats]]:

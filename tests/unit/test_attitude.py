@@ -67,6 +67,34 @@ def test_the_side_of_a_plate_that_was_scanned_lies_on_its_own_side(thickness):
     assert not found.ambiguous
 
 
+def angle():
+    """An L of two plates, 1500 and 400 by 600 mm."""
+    section = [(0.0, 0.0), (1500.0, 0.0), (1500.0, 20.0), (20.0, 20.0), (20.0, 400.0), (0.0, 400.0)]
+    vertices = np.array([(x, y, z) for y in (0.0, 600.0) for x, z in section])
+    ends = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)]
+    faces = [*ends, *((c + 6, b + 6, a + 6) for a, b, c in ends)]
+    for a, b in zip(range(6), (1, 2, 3, 4, 5, 0), strict=True):
+        faces += [(a, a + 6, b + 6), (a, b + 6, b)]
+    return trimesh.Trimesh(vertices, faces)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_plates_of_which_one_side_each_was_scanned_lie_on_their_own_sides(seed):
+    """An angle of plates of 20 mm, seen from within: one plate after the other has to change sides."""
+    design = angle()
+    points, face = trimesh.sample.sample_surface(design, 12_000, seed=seed)
+    seen = (design.face_normals[face] @ np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]) > 0.5).any(
+        axis=1
+    )
+    rng = np.random.default_rng(seed)
+    points = points[seen] + rng.normal(0.0, 0.3, (int(seen.sum()), 3))
+    T = rigid.transform(rigid.rotation_from_vector(2.0 * rng.normal(size=3)), 2e3 * rng.normal(size=3))
+    surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
+    found = surface_registration.place(rigid.apply(rigid.invert(T), points), surface, np.eye(4), "auto")
+    off = rigid.apply(found.T @ rigid.invert(T), points) - points
+    assert np.linalg.norm(off, axis=1).max() < 1.0
+
+
 def test_a_scan_the_wrong_way_round_in_the_design_s_frame_is_turned():
     design = structure(*(bracket(x, y) for x in (-2400.0, -1200.0, 300.0) for y in (1.0, -1.0)))
     points = np.asarray(trimesh.sample.sample_surface(design, 15_000, seed=2)[0])
