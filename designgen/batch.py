@@ -235,7 +235,7 @@ def _made_or_kept(job: Job) -> Outcome:
 
 def _earlier(path: Path, job: Job) -> Content | str:
     """Return the content of the scene of an earlier run, or the reason why it cannot be kept."""
-    from processor.store import store
+    from processor.store import checksums, store
 
     try:
         provenance = store.read_provenance(path)
@@ -244,7 +244,7 @@ def _earlier(path: Path, job: Job) -> Content | str:
     expected = json.loads(json.dumps(_provenance(job.recipe, job.parameters, job.seed, job.software)))
     if different := [key for key in expected if provenance.get(key) != expected[key]]:
         return f"was made with other {' and '.join(different)}"
-    digest = _sha256(path)
+    digest = checksums.of_file(path)
     if job.indexed is not None:
         return job.indexed if digest == job.indexed.sha256 else "is damaged (not the bytes that the index has)"
     if problems := store.problems(path):
@@ -253,22 +253,14 @@ def _earlier(path: Path, job: Job) -> Content | str:
 
 
 def _content(path: Path, digest: str | None = None) -> Content:
-    from processor.store import store
+    from processor.store import checksums, store
 
     scene = store.read_scene(path)
     points = sum(len(scan.points) for scan in scene.scans)
     truth = store.read_truth(path)
     assert truth is not None  # every scene is written with it
     numbers = card.numbers_of(truth)
-    return Content(len(scene.scans), points, store.scene_hash(scene), digest or _sha256(path), numbers)
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+    return Content(len(scene.scans), points, store.scene_hash(scene), digest or checksums.of_file(path), numbers)
 
 
 # --- the folder -------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from processor import large_arrays
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-# Labels and grid numbers come by the ten million: they are kept small. Coordinates never are.
+# Labels and grid numbers have small integer types to save memory; coordinates are always float64.
 Labels = npt.NDArray[np.int32]
 Codes = npt.NDArray[np.uint8]
 Shorts = npt.NDArray[np.float32]
@@ -705,7 +705,7 @@ class Scene(Checked):
     units: str = "mm"  # of the input's coordinates, and why they were read so
     units_reason: tuple[Reason, ...] = reasons(of_text=_units_as_stated, hashed_as_text=True)
     structure: StructureDesign | None = None
-    tolerance: Tolerance | None = None  # None: nothing was said
+    tolerance: Tolerance | None = None  # None: the input does not state it
     control: Control | None = newer()
     picks: Picks | None = newer()
     title_block: TitleBlock | None = newer(hashed=False)

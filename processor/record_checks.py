@@ -19,7 +19,7 @@ from processor.model import LARGEST_MM, Checked, Fault, InputError, Meaning, Wor
 
 POSE_TOLERANCE = 1e-3  # of R^T R - I
 SHOWN = 60  # characters of a value
-UNDECLARED = Meaning()  # of a field that says nothing
+UNDECLARED = Meaning()  # of a field without a declaration
 
 Record = TypeVar("Record")
 Array = npt.NDArray[Any]

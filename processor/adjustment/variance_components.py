@@ -41,7 +41,7 @@ def between_stations(residual: Floats, station: Ints, cell: Ints) -> float:
         return 0.0
     middle = np.bincount(cell_of_group, w * mean) / np.where(total > 0.0, total, 1.0)
     scatter = np.bincount(cell_of_group, w * (mean - middle[cell_of_group]) ** 2)
-    # Cells count alike: one with many points tells no more about the stations than another.
+    # Cells have equal weight: more points in a cell add no information on the stations.
     surplus = (scatter - (count - 1))[several]
     weight = (total - square / np.where(total > 0.0, total, 1.0))[several]
     # The variance comes from few stations: widen it so that 1.96 standard deviations cover what Student's t covers.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from processor.model import Floats, InputError, Reason, UsageError, reason
 from processor.readers import RawScan
 from processor.readers.raw_scan import FAR, ORIGIN_STEP
 from processor.scan_folder.units import MM_PER_UNIT
+from processor.store import checksums
 
 CLOUDS = ("reference", "compared", "core")
 
@@ -181,7 +181,7 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     if not np.isfinite(distances.distance).any():
         why = diagnosis.no_distance(first.cells.points, second.cells.points, core, summary.without_normal, used)
         raise InputError(f"{request.reference} and {request.compared}: no core point has a distance: {why}")
-    given = {} if request.normals is None else {"normals": _sha256(request.normals)}
+    given = {} if request.normals is None else {"normals": checksums.of_file(request.normals)}
     comparison = Comparison(
         request=request,
         origin=origin,
@@ -265,15 +265,7 @@ def _read(path: Path) -> _Cloud:
         raws = readers.read(path)
     if not sum(len(scan.points) for scan in raws):
         raise InputError(f"{path}: expected points, found none")
-    return _Cloud(path, [scan for scan in raws if len(scan.points)], _sha256(path))
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-    return digest.hexdigest()
+    return _Cloud(path, [scan for scan in raws if len(scan.points)], checksums.of_file(path))
 
 
 def _unit(clouds: list[_Cloud]) -> str:

@@ -16,7 +16,7 @@ PIT_THICKNESSES = 5.0  # largest diameter of a pit by the plate's thickness: ben
 CRACK_RATIO = 4.0  # least length of a crack by its width
 CRACK_THICKNESSES = 3.0  # largest width of a crack by the plate's thickness
 SOFTNESS = 0.15  # of the logarithm of a number by its limit: scale of the logistic function
-COIN = 0.5  # the confidence that tells nothing
+COIN = 0.5  # confidence of a random choice between two classes
 LEAST_CONFIDENCE = 0.6  # below it the class is unknown
 BORDER_CONFIDENCE = 0.95  # of edge loss and missing part, told apart by the borders that they reach
 

@@ -30,7 +30,7 @@ from processor.robust_statistics import finite_median
 CHANCE_MM2 = 1e8  # the area that false alarms are counted on
 CURVE_STRIPS = 40
 SMALL_CELLS = 8.0  # of diameter, below which a bump is fitted to points instead of cells
-SHALLOW_SHARE = 0.1  # of the amplitude of a component's shape, as the model may be wrong by
+SHALLOW_SHARE = 0.1  # of the amplitude of a component's shape, by which the model may be wrong
 THROUGH_SHARE = 0.7  # of the points expected on a crack, below which rays went through
 SIDE_SHARE = 0.2  # of a plate's half width, that counts as its side
 HELD_SHARE = 0.2  # of the largest deviation, up to which a side stayed in place

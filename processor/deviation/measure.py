@@ -78,7 +78,7 @@ def _doubted(result: Result, placement: Placement) -> Result:
     """Put first why a result is not sure.
 
     Either the scan does not lie at the design, or scans were left out, or single points scatter as they do at a wrong
-    pose, or the registration is less certain than what scanners and single points are wrong by.
+    pose, or the registration is less certain than scanners and single points are.
     """
     status, error = result.status, result.registration_error
     given = result.registration is Registration.AS_GIVEN

@@ -79,7 +79,7 @@ def _automatic(scene: Scene, picked: Picked, reference: int, params: Params) -> 
     solution, coarse = registered.solution, registered.coarse
     gross = [pair.is_gross for pair in registered.pairs]
     noise = float(np.median([cloud.sigma_mm for cloud in registered.clouds]))
-    # Where the prior tells more of a scan's range error than the faces do.
+    # Where the prior determines a scan's range error better than the faces.
     unseen = np.flatnonzero(solution.ranges_sd > np.sqrt(0.5) * VIEW_MM).tolist()
     by_class = reason("stitch.ranges-by-class", scans=tuple(scans[s].name for s in unseen), sd_mm=VIEW_MM)
     return Network(

@@ -14,6 +14,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -24,6 +25,7 @@ from processor import large_arrays
 ATTRIBUTE = "sha256"
 NAME = ATTRIBUTE.encode()
 PART_ITEMS = 1 << 20
+BLOCK = 1 << 20  # bytes
 # Columns found whole by this process. Steps read a column several times; later passes rely on the chunks' checksums.
 _WHOLE: set[tuple[object, ...]] = set()
 DAMAGED = "is damaged: its checksum is not that of what was written; make or copy the file again"
@@ -31,6 +33,15 @@ DAMAGED = "is damaged: its checksum is not that of what was written; make or cop
 
 class ChecksumError(ValueError):
     """A dataset holds something else than was written; the message names it."""
+
+
+def of_file(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes, read block by block."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def begin(path: str, dataset: Any) -> Any:

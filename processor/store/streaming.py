@@ -19,7 +19,7 @@ PIECE = 1 << 20
 
 @contextmanager
 def _naming_the_file(group: Any) -> Iterator[None]:
-    """Raise InputError for damage that is found while points are read: a step takes no other error for the input's."""
+    """Raise InputError for damage that is found while points are read: steps take no other for the input's."""
     try:
         yield
     except (DecodeError, ChecksumError, OSError) as error:

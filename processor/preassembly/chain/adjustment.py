@@ -163,7 +163,7 @@ def left_open(
     if start < 0:
         return np.full((8, 3), np.nan), np.full((24, 24), np.nan)
     rows = slice(start, start + 24)
-    # What holds the parts must not keep them from following the joints.
+    # The constraint along the chord has the joints' weight, so that it does not restrain them.
     to_motion = _solve(observed, weight, len(members), hold=weight, without=rows)
     after = np.eye(len(observed.value))[rows] + observed.A[rows] @ to_motion
     return (after @ observed.value).reshape(8, 3), after @ observed.covariance @ after.T
@@ -175,7 +175,7 @@ def _solve(
     """Matrix (p, n) from observations to the motions of least weighted squares; some rows may be left out."""
     root = np.ones(len(observed.value))
     root[24 * int((observed.gap_row >= 0).sum()) : -parts] = np.sqrt(weight)
-    # A chain without a break slides as the objective has it: to hold it would move its gaps by hundredths of a mm.
+    # A chain without a break is free to slide: a constraint would change its gaps by hundredths of a mm.
     broken = (observed.gap_row < 0).any() or not len(observed.gap_row)
     root[-parts:] = np.sqrt(hold) if broken or not observed.in_row else 0.0
     root[without] = 0.0

@@ -234,7 +234,7 @@ def rough(points: Floats, part: DesignPart, surface: Surface, *, pieces: bool, k
     coarse = _coarse(points, even, surface, part, pieces=pieces)[:kept]
     box = _corners(points)
     best, *others = _distinct(each(partial(_align, even[1], surface, FINE_GATES_MM), coarse), box)
-    # A pose turned half round may have the least misfit of few points: what they show decides.
+    # A pose turned half round may have the least misfit of few points: the surface that only one pose has decides.
     rivals = [c for c in others if c.misfit <= RIVAL_RATIO * best.misfit + 0.5]
     for other in (*_slid(even[1], surface, best, box), *rivals):
         of_best, of_other = _evidence(points, surface, best.T, other.T)

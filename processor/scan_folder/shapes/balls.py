@@ -111,7 +111,7 @@ def _alike(edges: Ints, centres: Floats, radii: Floats) -> Ints:
 def _of_rounded(body: Body, used: Ints) -> list[list[float]]:
     """Return the spheres among the faces without a facet in ``used`` (n,), whose normals turn in all directions.
 
-    Where coordinates are rounded by more than a facet bulges, its edges say nothing, but the whole face does.
+    Where coordinates are rounded by more than a facet bulges, single edges are too uncertain: the whole face is used.
     """
     label = body.faces_between
     count = int(label.max()) + 1

@@ -56,7 +56,7 @@ def find(body: Body) -> Tubes:
 def _of_rounded(body: Body, used: Ints) -> list[tuple[Floats, float]]:
     """Return the cylinders among the faces without a facet in ``used`` (n,), whose normals turn about an axis.
 
-    Where coordinates are rounded by more than a facet bulges, its edges say nothing, but the whole face does.
+    Where coordinates are rounded by more than a facet bulges, single edges are too uncertain: the whole face is used.
     """
     label = body.faces_between
     count = int(label.max()) + 1

@@ -1,10 +1,10 @@
 """Which of the places where members meet have balls: nodes of scaffolds, pipes and purlins have none.
 
-Two things in the points about a node tell. A ball's surface lies at one distance from the node, where clamps and
-crossing tubes differ from a sphere by a share of their size. And members of bolted balls narrow to sleeves before the
-ball, so that points lie inside the tube's surface, where a tube that goes on would hide them. Not all frames have
-sleeves: how often nodes of either kind have them is estimated from all nodes. What a node's own points leave open is
-decided by the nodes that its members lead to.
+Two properties of the points about a node distinguish them. A ball's surface lies at one distance from the node, where
+clamps and crossing tubes differ from a sphere by a share of their size. And members of bolted balls narrow to sleeves
+before the ball, so that points lie inside the tube's surface, where a tube that goes on would hide them. Not all frames
+have sleeves: how often nodes of either kind have them is estimated from all nodes. What a node's own points leave open
+is decided by the nodes that its members lead to.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 

@@ -119,8 +119,8 @@ def _mean_cosines(seen: Floats) -> Floats:
 def _offset_or_beam(fits: list[_Fit], cosines: Floats, radius_offset: float, variance: float) -> tuple[float, float]:
     """Return standard deviations (mm) of an offset of ranges and of a change of radii by a wide beam.
 
-    Of an offset of the radii one half of the variance is that of an offset of ranges, as far as the scanner's class and
-    the mean of the views, which has the field's variance, may have it (95 %). The rest is that of a beam.
+    Half of the variance of the radii's offset is attributed to an offset of ranges, which is limited to its 95 % bound
+    by the scanner's class and the variance of the mean of the views. The rest is attributed to the width of the beam.
     """
     change = float(np.mean([fit.gain[3] @ cosines[fit.cells] for fit in fits])) if fits else 0.0
     limit = NORMAL_95 * float(np.hypot(OFFSET_MM, np.sqrt(variance)))
