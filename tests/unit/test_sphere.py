@@ -349,6 +349,16 @@ def test_a_ball_of_a_hundredth_of_a_street_is_found(place, radius):
     assert one.fit.inliers[on].mean() > 0.9
 
 
+@pytest.mark.parametrize("radius", [None, 300.0])
+def test_a_ball_in_four_lines_of_a_scanner_is_found(radius):
+    """A tenth of the points of the ball lies on one line, and has no normal."""
+    centre, rays = np.array([2900.0, 700.0, -250.0]), street_clouds.lines(np.linspace(-25.0, 15.0, 16), 0.2)
+    points, on = street_clouds.street(np.random.default_rng(0), centre, 300.0, sigma=4.0, rays=rays)
+    assert len(np.unique(np.round(np.degrees(np.arcsin(points[on, 2] / np.linalg.norm(points[on], axis=1))), 1))) <= 5
+    (one,) = find_balls(points, np.random.default_rng(0), most=10, radius_mm=radius)
+    assert np.linalg.norm(one.fit.sphere.centre - centre) < 10.0
+
+
 def test_a_street_without_a_ball_has_none():
     points, _ = street_clouds.street(np.random.default_rng(4), None, 300.0)
     assert find_balls(points, np.random.default_rng(0), most=10) == []

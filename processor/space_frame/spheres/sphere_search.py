@@ -49,6 +49,8 @@ REFINEMENTS = 3
 STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
 ROUGHEST = 0.05  # noise over radius, above which a ball is not distinguishable from a cluster of points
 FACING = 0.985  # median cosine between the cloud's own normals and the ball's
+NEIGHBOURHOODS = (0.1, 0.2, 0.4)  # of the ball's points, the least that is no line
+OF_A_LINE = 0.05  # ratio of the variances along and across the neighbourhood of a line
 ROUGHLY_FACING = 0.9  # the same of a proposal
 MISFIT = 0.5  # of the scale: cell means of residuals on a ball are noise alone
 ROUND = 0.02  # of the radius: nothing but a ball departs from a sphere by less
@@ -454,17 +456,26 @@ def _facing(points: Floats, on: npt.NDArray[np.bool_], ball: Sphere) -> float:
     """Median cosine between the normals of neighbourhoods of points (n, 3), on the ball or not, and its radii.
 
     Tubes, edges and volumes that only cross the surface have other normals. A neighbourhood is about a tenth of the
-    ball's points, so that it is wide compared with the noise at any density.
+    ball's points, so that it is wide compared with the noise at any density. Where the ball was scanned in few lines
+    one line has as many, which has no normal: neighbourhoods are then wider.
     """
     query = points[on][:: max(1, int(on.sum()) // 200)]
     if not len(query):
         return 0.0
-    k = min(len(points), max(8, int(on.sum()) // 10))
-    near = points[cKDTree(points).query(query, k=k)[1]]
-    near = near - near.mean(axis=1, keepdims=True)
-    normal = np.linalg.eigh(np.einsum("mki,mkj->mij", near, near))[1][:, :, 0]
-    radial = query - ball.centre
-    return float(np.median(np.abs(np.sum(normal * radial, axis=1)) / np.linalg.norm(radial, axis=1)))
+    tree, radial = cKDTree(points), query - ball.centre
+    cosine = np.empty(len(query))
+    left = np.arange(len(query))
+    for share in NEIGHBOURHOODS:
+        k = min(len(points), max(8, int(share * on.sum())))
+        near = points[tree.query(query[left], k=k)[1]]
+        near = near - near.mean(axis=1, keepdims=True)
+        variance, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", near, near))
+        normal = axes[:, :, 0]
+        cosine[left] = np.abs(np.sum(normal * radial[left], axis=1)) / np.linalg.norm(radial[left], axis=1)
+        left = left[variance[:, 1] < OF_A_LINE * variance[:, 2]]
+        if not len(left):
+            break
+    return float(np.median(cosine))
 
 
 def _misfit(points: Floats, residual: Floats, ball: Sphere, scale: float) -> float:
