@@ -132,7 +132,7 @@ def _checked(job: Job, result: Record | Lost) -> Record:
         return result
     else:
         why = reason("batch.not-shared")
-    return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why, lasting=False)
+    return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why)
 
 
 def _token_file(state: Path) -> Path:

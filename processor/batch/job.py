@@ -133,7 +133,7 @@ def _is_of_output(error: BaseException | None) -> bool:
 
 def _failure_to_retry(job: Job, why: Reason) -> Record:
     """Record a failure that is tried again in the next run."""
-    return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why, lasting=False)
+    return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why)
 
 
 def _token(job: Job) -> str:

@@ -31,7 +31,10 @@ class JobStatus(Word):
 
 @dataclass(frozen=True)
 class Record:
-    """How a job ended. ``identity`` is the hash of all that it depends on; ``reason`` that of a failure."""
+    """How a job ended. ``identity`` is the hash of all that it depends on; ``reason`` that of a failure.
+
+    A failure that is not the input's has no identity, so that the job is tried again.
+    """
 
     input: str
     identity: str
@@ -42,7 +45,6 @@ class Record:
     figures: dict[str, Any] = field(default_factory=dict)
     steps: dict[str, str] = field(default_factory=dict)  # status by step
     limits: dict[str, float] = field(default_factory=dict)  # by name, of those that ended it
-    lasting: bool = True  # False: the failure is not the input's, and the job is tried again
     kept: bool = False  # from an earlier run of the batch
     seconds: float = 0.0
     peak_mb: float = 0.0
