@@ -228,14 +228,18 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     where it is by ``auto``, and the best fit is only reported. ``scanner`` (n, 3) is the position that each point was
     measured from, if known: it helps to distinguish attitudes. Ground and what stands about the structure is left out.
     """
-    if how in ("auto", "coarse"):
-        of_body = main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
-        if of_body is not None:
-            points, scanner = points[of_body], None if scanner is None else scanner[of_body]
     axes = principal.of_mesh(surface.vertices, surface.faces)
     few = thinned(points, FINE_POINTS)
-    near, _ = surface.tree.query(rigid.apply(given, few), distance_upper_bound=NEAR_MM, workers=-1)
-    near_share = float(np.isfinite(near).mean())
+    near_share = _near_share(few, surface, given)
+    of_body = None
+    if how in ("auto", "coarse"):
+        of_body = main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
+    if of_body is not None:
+        few_of_body = thinned(points[of_body], FINE_POINTS)
+        of_body_near = _near_share(few_of_body, surface, given)
+        if near_share < NEAR_SHARE or of_body_near >= near_share:  # else it is something else beside the structure
+            few, near_share = few_of_body, of_body_near
+            points, scanner = points[of_body], None if scanner is None else scanner[of_body]
     registration, rivals, ambiguity = Registration.AS_GIVEN, [], NAN
     if how == "coarse" or (how == "auto" and near_share < NEAR_SHARE):
         registration = Registration.COARSE
@@ -274,11 +278,15 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     )
 
 
+def _near_share(points: Floats, surface: MeshSurface, T: Floats) -> float:
+    """Share of points (n, 3), placed by T (4, 4), near the design's surface."""
+    near, _ = surface.tree.query(rigid.apply(T, points), distance_upper_bound=NEAR_MM, workers=-1)
+    return float(np.isfinite(near).mean())
+
+
 def fits_design(placed: Placed, points: Floats, surface: MeshSurface) -> bool:
     """Whether points (n, 3), or half of them beside clutter, lie near the surface at the pose that was found."""
-    few = thinned(points, FINE_POINTS)
-    near, _ = surface.tree.query(rigid.apply(placed.T, few), distance_upper_bound=NEAR_MM, workers=-1)
-    return bool(np.isfinite(near).mean() >= NEAR_SHARE)
+    return _near_share(thinned(points, FINE_POINTS), surface, placed.T) >= NEAR_SHARE
 
 
 def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:

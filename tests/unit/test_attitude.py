@@ -143,3 +143,16 @@ def test_axes_of_a_body_without_flat_faces_along_them_stay():
     surface = mesh_distance.of_design(np.asarray(ball.vertices), np.asarray(ball.faces).astype(np.int64))
     axes = rigid.rotation_from_vector(np.array([0.3, -0.2, 0.1]))
     np.testing.assert_array_equal(surface_registration._along_faces(axes, surface), axes)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_scan_at_its_design_stays_there_beside_another_structure_of_its_size(seed):
+    """Six in ten points are the structure's; the other one is seen better, as the largest piece of the scan."""
+    design = structure(bracket(-1500.0, 1.0), bracket(700.0, -1.0))
+    points = np.asarray(trimesh.sample.sample_surface(design, 25_000, seed=seed)[0])
+    here = points[:15_000][points[:15_000, 0] > -2000.0]
+    other = points[15_000:] + np.array([0.0, 9000.0, 0.0])
+    surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
+    found = surface_registration.place(np.vstack([here, other]), surface, np.eye(4), "auto")
+    assert found.registration is surface_registration.Registration.AS_GIVEN
+    assert np.abs(found.T_best_fit - np.eye(4))[:3, 3].max() < 1.0
