@@ -23,7 +23,8 @@ from processor.preassembly.parts import attitude
 from processor.report import terminal, write_results
 from processor.space_frame.result import Result as FrameResult
 from processor.store import store
-from tests.support import arch_clouds, commands
+from tests.support.clouds import arch_clouds
+from tests.support.processes import commands
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
@@ -407,7 +408,7 @@ def test_names_from_outside_are_shown_as_text(frame, tmp_path):
 
 def test_a_bridge_through_the_pipeline(tmp_path, monkeypatch):
     scene, truth = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=2)
-    # The search for attitudes takes most of the time; tests/unit/test_diagnostics.py has it in a run of such a bridge.
+    # The search for attitudes takes most of the time: tests/pipeline/test_diagnostics.py runs it on such a bridge.
     known = dict(zip(truth.arch.names, truth.arch.T_bridge_scan, strict=True))
     monkeypatch.setattr(
         attitude, "find", lambda _, part: attitude.Attitude(known[part.name], known[part.name], Status.OK)

@@ -14,8 +14,8 @@ from processor import pipeline, readers
 from processor.model import Scene, StepRun, UsageError
 from processor.report.reports_of_steps import step_report
 from processor.store import store
-from tests.support.metrics import metric
-from tests.support.records import assert_equal
+from tests.support.results.metrics import metric
+from tests.support.results.records import assert_equal
 
 STEPS = pipeline.step_modules()
 
