@@ -67,7 +67,7 @@ def test_timed_adds_the_processor_seconds_of_every_call():
     assert 0.0 < once < seconds["step"] < 5.0
 
 
-def test_measured_tells_seconds_and_memory_of_a_process_of_its_own(tmp_path):
+def test_measured_returns_seconds_and_memory_of_a_child_process(tmp_path):
     run = [sys.executable, "-S", "-c", "x = bytearray(60_000_000); t = sum(range(3_000_000))"]
     found = cost.measured(run, tmp_path)
     assert 60.0 < found["mb"] < 150.0

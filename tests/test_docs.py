@@ -1,4 +1,4 @@
-"""README and docs: their commands exist and run, their links lead somewhere, their tables say what the code says."""
+"""README and docs: their commands exist and run, their links have targets, their tables agree with the code."""
 
 import dataclasses
 import functools
@@ -265,7 +265,7 @@ def test_the_index_names_every_page():
     assert all(f"]({path.as_posix()})" in text for path in pages if path.name != "index.md")
 
 
-def test_the_readme_is_short_and_says_what_it_must():
+def test_readme_is_short_and_has_its_required_parts():
     text = (ROOT / "README.md").read_text("utf-8")
     assert len(text.splitlines()) <= README_LINES
     assert "No licence has been chosen" in text
@@ -364,7 +364,7 @@ def test_the_page_of_the_scan_folder_names_every_key():
             assert kind == "as_built" or f"`{name}`" in truth, (kind, name)
 
 
-def test_the_runner_installs_what_the_check_asks_for():
+def test_workflow_installs_the_system_libraries_of_the_check():
     asked = set(re.findall(r"\.so\.\d+=(\S+?)[\s\"]", (ROOT / ".ci/system-libraries").read_text("utf-8")))
     assert len(asked) == 5
     for path in (ROOT / ".github/workflows").glob("*.yml"):

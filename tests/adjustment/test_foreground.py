@@ -85,7 +85,7 @@ def test_a_beam_past_the_edge_of_a_plate_is_no_dent_of_its_far_side():
     assert passed.tolist() == [False, True]
 
 
-def test_an_edge_far_before_a_wall_seen_at_a_glance_is_no_slope():
+def test_points_beside_a_rail_before_a_wall_at_grazing_incidence_are_marked():
     """A rail stands 80 mm before the wall: of its neighbours on the wall, the rail lies within the slope of a dent."""
     scanner, step = np.array([-20_000.0, -4_600.0, 0.0]), 1.0e-3
     turn, rise = (x.ravel() for x in np.meshgrid(np.arange(0.15, 0.45, step), np.arange(-10, 11) * step))

@@ -28,7 +28,7 @@ def at_places(kriged, at):
     return both @ kriged.mean, np.sqrt(np.diag(both @ kriged.covariance @ both.T))
 
 
-def test_waves_are_followed_and_their_interval_holds():
+def test_kriging_follows_waves_and_its_interval_covers():
     rng = np.random.default_rng(0)
     off, pulls = [], []
     for _ in range(60):
@@ -56,7 +56,7 @@ def test_without_waves_it_is_least_squares():
     np.testing.assert_allclose(kriged.covariance[:3, :3], by_noise, rtol=1e-9, atol=1e-15)
 
 
-def test_a_trend_that_patches_in_a_line_do_not_determine_is_as_expected_before():
+def test_trend_undetermined_by_collinear_patches_equals_the_conditional_gaussian():
     rng = np.random.default_rng(2)
     x = np.arange(25.0, 500.0, 50.0)
     trend = np.stack([np.ones_like(x), x / 500.0, np.full(len(x), 0.3), 0.3 * x / 500.0], axis=1)

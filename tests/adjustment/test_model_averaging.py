@@ -45,7 +45,7 @@ def test_a_mixture_of_two_sets_equals_the_average_over_all_hypotheses():
         assert found.log_evidence == pytest.approx(whole.log_evidence)
 
 
-def test_weights_are_learned_from_the_others():
+def test_weights_are_estimated_from_the_other_items():
     before = np.array([1.0, 1.0, 2.0])
     logs = np.log(np.array([[0.9, 0.1, 1e-9], [0.8, 0.2, 1e-9], [1e-9, 1e-9, 1.0], [0.9, 0.1, 1e-9]]))
     one_trait = np.arange(3)[None]
@@ -60,7 +60,7 @@ def test_weights_are_learned_from_the_others():
     np.testing.assert_allclose(silent, np.tile([0.25, 0.25, 0.5], (3, 1)))
 
 
-def test_traits_are_learned_separately():
+def test_weights_of_traits_are_estimated_separately():
     """Two shifts by two bends: two ends of either shift are straight, the bend of the last one is unknown."""
     traits = np.array([[0, 0, 1, 1], [0, 1, 0, 1]])
     near, far, far_alone = np.log([[1.0, 1e-6, 1e-6, 1e-6], [1e-6, 1e-6, 1.0, 1e-6], [1e-6, 1e-6, 1.0, 1.0]])

@@ -43,7 +43,7 @@ def test_a_movement_of_whole_plates_is_no_difference_between_views():
     assert opposite_sides.view_sd(points, normals, along + 5.0 * normals[:, 2], variance, SIDE) < NOISE
 
 
-def test_steel_seen_from_one_side_does_not_show_it():
+def test_view_sd_is_zero_where_only_one_side_of_the_plates_was_seen():
     points, normals, along, variance = plates(1, 1.0)
     along[normals[:, 2] < 0.0] = np.nan
     assert opposite_sides.view_sd(points, normals, along, variance, SIDE) == 0.0
@@ -62,7 +62,7 @@ def merged(scene, shifts):
     return Scene(scene.name, "structure", (Scan("merged", points),), structure=scene.structure, units="mm")
 
 
-def test_levels_of_detection_of_a_merged_cloud_include_what_its_views_differ_by():
+def test_levels_of_detection_of_a_merged_cloud_include_view_differences():
     scene = merged(plate(20.0, 3, STATIONS, False), (0.4, -0.4))
     result = deviation_step.run(scene, AS_IT_LIES)
     assert "deviation.views-differ" in [reason.code for reason in result.reasons]

@@ -1,4 +1,4 @@
-"""What viewpoints disagree by: from the two sides of plates, by draws of known size."""
+"""Variance between viewpoints: from the two sides of plates, by draws of known size."""
 
 import numpy as np
 import pytest
@@ -80,7 +80,7 @@ def test_a_plate_of_which_one_side_was_seen_has_no_thickness():
     assert view_variance.variances([]) == view_variance.NONE
 
 
-def test_what_no_plates_show_is_of_the_scanners_class_and_what_they_show_is_kept():
+def test_view_variances_unknown_from_plates_are_those_of_the_scanner_class():
     term = scanner_class.VIEW_MM**2
     assert view_variance.variances([]).or_of_class() == view_variance.NONE._replace(level=term, ring=term)
     one = view_variance.variances([plate(np.random.default_rng(1), 0.3)])

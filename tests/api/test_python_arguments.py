@@ -154,7 +154,7 @@ def test_a_pose_states_why_it_is_not_ok(scan):
     assert small.reasons[-1].code in ("register.sizes-differ", "register.unit-mistake")
 
 
-def test_ground_about_a_part_counts_for_nothing(scan):
+def test_ground_around_a_part_does_not_change_the_status_of_its_pose(scan):
     points, vertices, faces = scan
     rng = np.random.default_rng(1)
     ground = np.column_stack([rng.uniform(-6000.0, 8000.0, (10_000, 2)), rng.normal(-1000.0, 1.0, 10_000)])
@@ -226,7 +226,7 @@ def test_clouds_and_lengths_of_different_units(change, message):
         processor.m3c2(**{"reference": first, "compared": second, **SCALES, **change(first, second)})
 
 
-def test_places_without_an_answer_are_no_error_beside_others():
+def test_core_points_without_neighbours_are_nan_beside_others():
     first, second = planes()
     table = processor.m3c2(first, second, core=[[0.0, 0.0, 0.0], [1e4, 0.0, 0.0]], **SCALES)
     np.testing.assert_array_equal(np.isfinite(table.distance), [True, False])
@@ -280,7 +280,7 @@ def test_a_truth_is_not_the_pair_that_designgen_returns():
 # --- Errors of the project are ValueErrors, and pass unchanged where those of others are caught
 
 
-def test_an_error_passes_an_open_scene_file(tmp_path):
+def test_error_raised_with_an_open_scene_file_is_not_replaced(tmp_path):
     scene, truth = designgen.scan((CORNERS, SIDES), stations=1, settings={"scan.step_mrad": 20.0})
     store.write_scene(tmp_path / "scene.h5", scene, truth, {})
     for kind in (InputError, UsageError):
@@ -295,7 +295,7 @@ def test_a_file_that_is_too_large_is_not_called_unreadable_json(tmp_path, monkey
         design.read_json(tmp_path / "design.json")
 
 
-def test_an_error_of_points_that_are_read_passes_the_checks(monkeypatch):
+def test_error_raised_by_a_check_is_not_replaced(monkeypatch):
     def check(*_):
         raise InputError("mine")
 

@@ -1,4 +1,4 @@
-"""Batches: what is found, that a bad input stops nothing, a killed batch goes on, and nothing is half written."""
+"""Batches: inputs found, bad inputs recorded, killed batches resumed, and no half-written results."""
 
 import csv
 import fcntl
@@ -136,7 +136,7 @@ def test_a_root_that_is_a_scan_folder_is_one_input(tmp_path):
     assert found_in(tmp_path)[0] == ["more", "scans"]
 
 
-def test_what_is_left_out_is_said(tmp_path):
+def test_skipped_folders_files_and_links_are_reported_with_reasons(tmp_path):
     folder(tmp_path / "bridge")
     (tmp_path / "bridge/project.toml").touch()
     folder(tmp_path / "bridge/inner")
@@ -161,7 +161,7 @@ def test_what_is_left_out_is_said(tmp_path):
 # --- the hash of an input -------------------------------------------------------------------------------------------
 
 
-def test_every_byte_and_name_counts_and_nothing_else(tmp_path):
+def test_content_hash_depends_on_bytes_and_names_alone(tmp_path):
     one = folder(tmp_path / "one")
     (one / "empty").mkdir()
     first = fingerprint.content_hash(one)
@@ -316,7 +316,7 @@ def test_a_job_is_the_processor_in_a_process_of_its_own(site, tmp_path):
     assert not processes_of(str(tmp_path))
 
 
-def test_only_what_changed_is_done_again(site, tmp_path):
+def test_only_changed_inputs_are_processed_again(site, tmp_path):
     root, out = copied(site, tmp_path)
     before, bytes_ = attempts(out), summaries(out)
     done = run(root, "-o", out, *SPHERES, "--json", code=1, program=None)
@@ -338,7 +338,7 @@ def test_only_what_changed_is_done_again(site, tmp_path):
     assert said(out)["cut"]["status"] == "done"
 
 
-def test_parameters_and_software_are_part_of_what_is_kept(tmp_path, monkeypatch):
+def test_changed_parameters_or_software_run_an_input_again(tmp_path, monkeypatch):
     root, out = folder(tmp_path / "root/a").parent, tmp_path / "out"
     params, seeded = tmp_path / "p.toml", ("--seed", 1)
     params.write_text("[spheres]\nradius_mm = 50.0\n")
@@ -366,7 +366,7 @@ def planted_site(root, count):
 
 
 @pytest.mark.parametrize(("count", "kills"), [(20, 1), pytest.param(30, 3, marks=pytest.mark.slow)])
-def test_killed_it_ends_as_if_undisturbed(tmp_path, count, kills):
+def test_killed_and_resumed_batch_equals_an_undisturbed_one(tmp_path, count, kills):
     killed(tmp_path, planted_site(tmp_path / "root", count), count, kills)
 
 
@@ -430,7 +430,7 @@ def test_a_signal_stops_it_cleanly(tmp_path, stop):
     assert not (out / ".batch/work").exists()
 
 
-def test_a_child_that_holds_its_interpreter_dies_at_its_limit(tmp_path):
+def test_child_process_that_ignores_signals_ends_at_its_time_limit(tmp_path):
     folder(tmp_path / "root/a", "deaf")
     run(tmp_path / "root", "-o", tmp_path / "out", "--timeout-s", 1, code=1)
     assert said(tmp_path / "out")["a"]["reason"].startswith("took longer")
@@ -445,7 +445,7 @@ def test_two_batches_in_one_folder_are_refused(tmp_path):
     process.communicate()
 
 
-def test_a_bar_on_a_terminal_and_nowhere_else(tmp_path):
+def test_progress_bar_is_shown_on_a_terminal_alone(tmp_path):
     folder(tmp_path / "root/a")
     assert run(tmp_path / "root", "-o", tmp_path / "out").stderr == ""
     try:
@@ -482,7 +482,7 @@ def test_results_of_an_input_that_is_bad_now_are_taken_away(tmp_path):
     assert not (tmp_path / "out/a").exists()
 
 
-def test_what_is_not_its_own_is_left_alone(tmp_path):
+def test_output_folder_with_foreign_files_is_not_changed(tmp_path):
     folder(tmp_path / "root/a")
     (tmp_path / "out/a").mkdir(parents=True)
     (tmp_path / "out/a/mine").write_text("mine")
@@ -536,7 +536,7 @@ def test_a_run_on_a_full_disk_leaves_nothing(site, small_disk, size):
     assert not os.listdir(place)
 
 
-def test_output_that_cannot_be_written_to(tmp_path, site, small_disk):
+def test_unwritable_output_is_refused_before_the_work(tmp_path, site, small_disk):
     place = small_disk("ro")
     folder(tmp_path / "root/a")
     done = run(tmp_path / "root", "-o", place / "out", code=3)
@@ -650,7 +650,7 @@ def test_figures_of_all_steps():
     assert "verdict" not in summary_values({"steps": {}, "checks": [], "verdict": "none"})
 
 
-def test_names_that_are_no_text_are_shown_escaped():
+def test_undecodable_names_are_shown_escaped():
     assert summary.readable("a\udcff\n") == "a\\xff\N{REPLACEMENT CHARACTER}"
     assert json.dumps(summary.readable("桥")) == '"\\u6865"'
 
@@ -664,7 +664,7 @@ def cluster(tmp_path):
         yield one
 
 
-def test_a_cluster_that_loses_a_worker_gives_the_same_summary_and_one_that_is_lost_is_said(tmp_path, cluster):
+def test_lost_worker_changes_no_summary_and_lost_scheduler_is_reported(tmp_path, cluster):
     address, (scheduler, worker, _) = cluster
     for i in range(12):
         folder(tmp_path / f"root/{i}", "segfault" if i == 5 else "slow" if i == 7 else "", f"1 2 {i}\n")
@@ -719,7 +719,7 @@ def test_a_cluster_with_tls_as_the_page_describes_takes_only_those_with_the_key(
             assert why in run(tmp_path / "root", "-o", tmp_path / "other", "--cluster", other, code=2).stderr
 
 
-def test_a_cluster_that_does_not_answer_is_said(tmp_path, monkeypatch):
+def test_unreachable_cluster_is_refused_before_anything_is_written(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(runner, "CONNECT_S", 1)
     folder(tmp_path / "root/a")

@@ -57,7 +57,7 @@ def fake(tmp_path, monkeypatch):
     return make
 
 
-def test_all_bodies_once(fake, tmp_path):
+def test_all_bodies_are_read_and_converted_only_once(fake, tmp_path):
     path, calls = fake()
     for _ in range(2):
         vertices, faces, _ = cad.read(path, "m")
@@ -104,13 +104,13 @@ def test_the_unit_of_a_file_that_states_none(fake):
         ({"mesh": "../../../x.ply"}, "expected solids or surfaces"),
     ],
 )
-def test_what_is_not_whole_is_refused(fake, says, expected):
+def test_incomplete_conversions_are_refused(fake, says, expected):
     path, _ = fake(**says)
     with pytest.raises(InputError, match=expected):
         cad.read(path, "m")
 
 
-def test_a_cache_that_cannot_be_written_is_done_without(fake, tmp_path):
+def test_unwritable_cache_is_ignored(fake, tmp_path):
     (tmp_path / "cache").touch()
     path, calls = fake()
     for _ in range(2):
@@ -118,7 +118,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(fake, tmp_path):
     assert calls() == ["--default-units m"] * 2
 
 
-def test_without_designgen_the_error_says_what_to_install(tmp_path, monkeypatch):
+def test_without_designgen_the_error_states_what_to_install(tmp_path, monkeypatch):
     (tmp_path / "a.ifc").write_text("ISO-10303-21;")
     monkeypatch.setattr(cad.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -66,7 +66,7 @@ def test_a_box_comes_back_in_its_unit(box, tmp_path):
 
 
 @pytest.mark.usefixtures("cad_here")
-def test_surfaces_without_a_solid_are_said_to_be_such(tmp_path):
+def test_surface_without_a_solid_is_reported_as_surface_without_volume(tmp_path):
     step_files.write_step(tmp_path / "s.step", {"sheet": cq.Shell.makeShell([cq.Face.makePlane(50.0, 20.0)])})
     (body,) = cad_files.read(tmp_path / "s.step").bodies
     assert not body.solid
@@ -384,7 +384,7 @@ def test_memory_is_limited(box):
         cad_files.read(box, memory_bytes=2 * 10**8)
 
 
-def test_what_is_lost_is_said(tmp_path):
+def test_open_solid_in_a_step_file_is_reported_and_exits_with_1(tmp_path):
     shapes = {"whole": cq.Solid.makeBox(1, 2, 3), "torn": cq.Solid.makeBox(40, 50, 60)}
     path = tmp_path / "torn.step"
     step_files.write_step(path, shapes)
@@ -407,7 +407,7 @@ def test_what_is_lost_is_said(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_large_sphere_takes_seconds_and_says_its_deviation(tmp_path):
+def test_large_sphere_is_meshed_in_seconds_and_its_deviation_is_stated(tmp_path):
     radius = 2500.0
     step_files.write_step(tmp_path / "s.step", {"tank": cq.Solid.makeSphere(radius, angleDegrees1=-90)})
     started = time.monotonic()

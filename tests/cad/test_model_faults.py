@@ -51,7 +51,7 @@ def test_a_bolt_in_its_hole_touches_and_one_in_the_full_overlaps():
 
 
 @pytest.mark.usefixtures("cad_here")
-def test_what_is_wrong_is_said_on_import_and_on_scan(tmp_path, monkeypatch, capsys, caplog):
+def test_faults_of_a_model_are_reported_on_import_and_on_scan(tmp_path, monkeypatch, capsys, caplog):
     web, rib = cq.Solid.makeBox(400, 300, 20), cq.Solid.makeBox(20, 300, 200, cq.Vector(10, 0, 5))
     shell = cq.Workplane().box(100, 100, 100).faces("<X").val()
     path = tmp_path / "part.step"
@@ -73,13 +73,13 @@ def test_what_is_wrong_is_said_on_import_and_on_scan(tmp_path, monkeypatch, caps
 
 
 @pytest.mark.parametrize(("scale", "doubted"), [(1.0, False), (0.001, True), (1e5, True)])
-def test_a_size_that_no_structure_has_is_doubted(scale, doubted, caplog):
+def test_implausible_size_of_a_model_gives_a_warning_about_its_unit(scale, doubted, caplog):
     with caplog.at_level(logging.WARNING, "designgen"):
         loading.say(loading.load((scale * BOX.vertices, BOX.faces)))
     assert any("is its unit right?" in line for line in caplog.messages) == doubted
 
 
-def test_a_mesh_says_how_large_it_is_in_mm(tmp_path):
+def test_mesh_without_a_unit_is_reported_with_its_size_in_mm(tmp_path):
     BOX.export(tmp_path / "box.stl")
     assert (
         "taken as mm, 400 x 300 x 200 mm in all; state another by --units"
@@ -135,7 +135,7 @@ def test_facets_of_a_design_are_turned_outward(mesh, faces, found, apart):
         assert (outward > 0.0).all()
 
 
-def test_a_design_that_is_inside_out_gives_the_same_deviations_and_says_so(tmp_path):
+def test_inverted_design_gives_the_same_deviations_with_a_message(tmp_path):
     found = {}
     for name, faces in (("sound", BOX.faces), ("inverted", BOX.faces[:, ::-1])):
         place = tmp_path / name

@@ -61,7 +61,7 @@ def table(folder):
     return dict(zip(COLUMNS, np.array([[float(cell) for cell in row] for row in rows[1:]]).T, strict=True))
 
 
-def test_all_of_it_at_utm_coordinates(clouds, tmp_path, monkeypatch, capsys):
+def test_comparison_at_utm_coordinates_equals_brute_force_and_writes_all_files(clouds, tmp_path, monkeypatch, capsys):
     first, second, core_file = clouds
     out = tmp_path / "out"
     options = ("--normal-diameter", 0.08, "--projection-diameter", 0.05, "--max-depth", 0.04)
@@ -151,7 +151,7 @@ def test_normals_come_from_a_file(clouds, tmp_path):
         compare.compare(Request(first, second, core_file, moved, **request))
 
 
-def test_a_normal_diameter_that_is_not_used_is_not_said(clouds, tmp_path):
+def test_unused_normal_diameter_is_not_reported_as_a_scale(clouds, tmp_path):
     first, second, core_file = clouds
     normals = written(tmp_path / "up.txt", np.tile([0.0, 0.0, 1.0], (50, 1)))
     for given in (0.0, 0.08):
@@ -173,7 +173,7 @@ def wall(seed, off=0.0, count=6000):
     return np.column_stack([x, off + rng.normal(0.0, 0.002, count), z])
 
 
-def test_a_wall_that_moved_has_moved_one_way(tmp_path, monkeypatch, capsys):
+def test_distances_of_a_moved_upright_wall_have_one_sign(tmp_path, monkeypatch, capsys):
     first, second = written(tmp_path / "a.xyz", wall(1)), written(tmp_path / "b.xyz", wall(2, 0.05))
     assert called(monkeypatch, first, second, "-o", tmp_path / "out") == 0
     found = table(tmp_path / "out")
@@ -187,7 +187,7 @@ def test_a_wall_that_moved_has_moved_one_way(tmp_path, monkeypatch, capsys):
     assert (turned["by_up"], turned["by_convention"], turned["surfaces_by_convention"]) == (0, 6000, 1)
 
 
-def test_an_upright_wall_looks_at_the_scanners_that_the_reference_knows(tmp_path):
+def test_normals_of_upright_walls_point_to_the_scanners_of_the_reference(tmp_path):
     """Two scanners on either side of two walls, each with a pose of its own."""
     scans = []
     for i, side in enumerate((-1.0, 1.0)):
@@ -207,7 +207,7 @@ def test_an_upright_wall_looks_at_the_scanners_that_the_reference_knows(tmp_path
         assert found.turned.scanner == len(found.core)
 
 
-def test_nothing_in_common_is_bad_input_and_why(clouds, tmp_path):
+def test_clouds_without_overlap_are_refused_with_the_likely_cause(clouds, tmp_path):
     first, second, _ = clouds
     cloud = np.loadtxt(second) - UTM
     small = {"projection_diameter": 1e-6, "max_depth": 1e-5}
@@ -233,7 +233,7 @@ def test_nothing_in_common_is_bad_input_and_why(clouds, tmp_path):
             compare.compare(Request(one, other, **given))
 
 
-def test_a_unit_is_claimed_for_those_that_say_it_alone(tmp_path, monkeypatch, capsys):
+def test_unit_is_stated_only_if_an_input_states_it(tmp_path, monkeypatch, capsys):
     plane = np.array([[x, y, 0.0] for x in range(20) for y in range(20)])
     a, b = written(tmp_path / "a.xyz", plane), written(tmp_path / "b.xyz", plane + np.array([0.0, 0.0, 0.5]))
     core = written(tmp_path / "core.csv", plane, "x[m] y[m] z[m]")
@@ -253,7 +253,7 @@ def test_a_unit_is_claimed_for_those_that_say_it_alone(tmp_path, monkeypatch, ca
 @pytest.mark.parametrize(
     "option", ["--radius", "--cylinder-radius", "--cyl-radius", "--normal-radius", "--projection-radius", "--rad"]
 )
-def test_who_gives_a_radius_is_told_of_diameters(clouds, tmp_path, monkeypatch, capsys, option):
+def test_radius_option_is_refused_with_the_option_of_the_diameter(clouds, tmp_path, monkeypatch, capsys, option):
     for given in ((option, "0.1"), (f"{option}=0.1",)):
         assert called(monkeypatch, *clouds[:2], "-o", tmp_path / "out", *given) == 2
         said = capsys.readouterr().err
@@ -262,7 +262,7 @@ def test_who_gives_a_radius_is_told_of_diameters(clouds, tmp_path, monkeypatch, 
         assert "twice the radius" in said
 
 
-def test_what_has_no_answer_is_nan(tmp_path):
+def test_values_without_a_result_are_nan_in_the_csv(tmp_path):
     origin = np.zeros(3)
     nan = np.array([np.nan])
     found = Distances(nan, nan, np.array([0]), np.array([2]), nan, np.array([0.5]))
@@ -339,7 +339,7 @@ def test_units_of_each_file_and_of_heights(tmp_path, monkeypatch):
         ("m/", "expected a unit of the heights after the slash"),
     ],
 )
-def test_a_slip_in_units_is_named(clouds, text, said):
+def test_mistyped_units_are_refused_by_name(clouds, text, said):
     with pytest.raises(UsageError, match=said):
         compare.compare(Request(clouds[0], clouds[1], units=text))
 

@@ -120,7 +120,7 @@ def test_whole_numbers_of_las_are_kept(tmp_path, blocks):
     assert sorted(map(tuple, back.tolist())) == sorted(map(tuple, whole.tolist()))
 
 
-def test_a_unit_that_is_given_counts(tmp_path, blocks):
+def test_given_units_are_stored_in_the_scene(tmp_path, blocks):
     points = np.random.default_rng(2).uniform(-100.0, 100.0, (400, 3)).round(3)
     np.savetxt(tmp_path / "a.xyz", points, fmt="%.3f")
     done = CliRunner().invoke(
@@ -134,7 +134,7 @@ def test_a_unit_that_is_given_counts(tmp_path, blocks):
     np.testing.assert_allclose(back[np.lexsort(back.T)], 25.4 * points[np.lexsort(points.T)], atol=5.1e-5)
 
 
-def test_a_scene_without_a_unit_is_judged_by_blocks_as_by_the_whole(tmp_path, monkeypatch):
+def test_unit_guessed_by_blocks_equals_that_of_the_whole_scene(tmp_path, monkeypatch):
     """Points 0.9 m apart if they were metres: taken as millimetres, by the nearest points of a slab."""
     x, y = np.mgrid[:60, :60]
     points = 0.9 * np.c_[x.ravel(), y.ravel(), 0.01 * (x * y).ravel()]
@@ -166,7 +166,7 @@ def test_the_truth_comes_along_with_its_labels_in_the_order_of_the_points(tmp_pa
     assert store.read_truth(tmp_path / "s.h5").labels == ()
 
 
-def test_clips_come_along(tmp_path, blocks):
+def test_clips_of_a_project_are_applied_and_stored_on_conversion(tmp_path, blocks):
     _, out = exported(merged(np.zeros(3)), tmp_path, "ply")
     toml = out / "project.toml"
     toml.write_text(toml.read_text() + "\n[[clip]]\nbox = [[-1e5, -1e5, -1e5], [0, 1e5, 1e5]]\n")
@@ -201,7 +201,7 @@ def test_exit_codes(tmp_path):
         assert not (tmp_path / "t.h5").exists()
 
 
-def test_the_output_is_tried_before_the_work_and_stays_whole(tmp_path, monkeypatch):
+def test_output_is_checked_before_reading_and_kept_if_writing_fails(tmp_path, monkeypatch):
     np.savetxt(tmp_path / "a.xyz", np.random.default_rng(0).uniform(size=(100, 3)))
     out = tmp_path / "s.h5"
     processor.convert(tmp_path / "a.xyz", out)
@@ -224,7 +224,7 @@ def test_the_output_is_tried_before_the_work_and_stays_whole(tmp_path, monkeypat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.xyz", "s.h5"]
 
 
-def test_a_disk_too_small_for_the_points_is_said(tmp_path, blocks, monkeypatch):
+def test_disk_without_room_for_the_points_is_refused_by_file(tmp_path, blocks, monkeypatch):
     np.savetxt(tmp_path / "a.xyz", np.random.default_rng(0).uniform(size=(100, 3)))
     formats.write_ptx(tmp_path / "b.ptx", stations_apart(np.zeros(3)).scans[0], None)
 

@@ -159,7 +159,7 @@ def test_scans_without_a_sure_pose_are_left_out_and_named(hall, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_a_free_scale_is_in_the_points(hall, tmp_path):
+def test_free_scale_is_applied_to_exported_points(hall, tmp_path):
     scans, poses, _ = hall
     scaled = poses.copy()
     scaled[1, :3, :3] *= 1.004
@@ -272,7 +272,7 @@ def test_memory_scene_file_and_folder_give_the_same_cloud(room, stored, tmp_path
     np.testing.assert_allclose(cloud_of(tmp_path / "c/merged.ply"), expected, atol=1e-6)
 
 
-def test_the_command_writes_and_says_what(room, tmp_path, monkeypatch):
+def test_export_command_lists_the_files_that_it_writes(room, tmp_path, monkeypatch):
     place, results = room
     monkeypatch.chdir(place)
     target = tmp_path / "laz"
@@ -427,7 +427,7 @@ def test_thinned_points_keep_their_distance_and_leave_no_hole(most, spacing, tmp
     assert len(kept) < (6500 if spacing == 25.0 else 150)
 
 
-def test_of_points_in_one_slab_the_first_in_order_are_kept(tmp_path):
+def test_thinning_keeps_the_first_points_of_a_slab(tmp_path):
     points = RNG.uniform(0.0, 1000.0, (3000, 3))
     kept, _ = collected(thinning.thinned(cloud(points), 90.0, tmp_path))
     expected = []
@@ -535,7 +535,7 @@ def test_a_clean_scan_has_no_clutter(measured, tmp_path):
 # --- parts
 
 
-def test_points_put_aside_are_those_in_memory(tmp_path):
+def test_points_spooled_to_disk_equal_those_in_memory(tmp_path):
     scans = (swept("S1", 1), dataclasses.replace(swept("S2", 2), intensity=(), colour=()))
     scene = Scene("hall", "structure", scans)
     spool = Spool(tmp_path)

@@ -1,4 +1,4 @@
-"""Parts of bridges and balls and tubes of frames as structures: where they are compared, and what is no defect."""
+"""Parts of bridges and balls and tubes of frames as structures: where they are compared, and without false defects."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_each_part_is_compared_at_its_own_best_fit(compared):
     assert np.nanmax(np.abs(left)) < 2.0
 
 
-def test_the_dent_is_found_on_its_part_and_nothing_else(compared):
+def test_dent_is_found_on_its_part_without_false_defects(compared):
     _, result = compared
     found = result.defects
     assert found.component == ("right",)

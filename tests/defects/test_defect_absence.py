@@ -1,4 +1,4 @@
-"""Missing material in clouds merged from stations that nothing is known of; points and shadows in closed form."""
+"""Missing material in clouds merged from unknown stations; points and shadows in closed form."""
 
 import numpy as np
 import pytest
@@ -102,7 +102,7 @@ def run(scene, earlier=AT_DESIGN):
 
 
 @pytest.mark.parametrize(("seed", "earlier"), [(1, {}), (2, AT_DESIGN)])
-def test_nothing_is_missing_from_steel_as_designed(seed, earlier):
+def test_steel_as_designed_has_no_missing_parts(seed, earlier):
     """Of the first cloud the step itself finds that it lies at the design."""
     assert run(cloud_of(BOXES, seed), earlier)[0] == []
 
@@ -161,7 +161,7 @@ def test_a_body_that_no_station_sees_is_not_missing():
     assert run(cloud_of(BOXES, 5, stations=STATIONS[:3]))[0] == []
 
 
-def test_where_the_cloud_was_cropped_nothing_is_missing():
+def test_cropped_region_of_a_cloud_is_not_missing():
     assert run(cloud_of(BOXES, 6, cut=((1100.0, -1e4, -1e4), (1e4, 1e4, 1e4))))[0] == []
     assert run(cloud_of(BOXES, 7, cut=((-1e4, -1e4, 560.0), (1e4, 1e4, 1e4))))[0] == []
 

@@ -1,4 +1,4 @@
-"""Which cells of a design are examined, and what is taken of the errors of views that are not named."""
+"""Which cells of a design are examined, and how errors of unnamed views are estimated."""
 
 import dataclasses
 
@@ -57,7 +57,7 @@ def test_the_foot_of_a_rib_is_a_border_of_the_web():
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.7])
-def test_what_a_body_hides_is_the_area_of_the_contact(turn):
+def test_area_hidden_by_a_touching_body_is_the_contact_area(turn):
     R = trimesh.transformations.rotation_matrix(turn, [1, 2, 3])
     web, rib = ([[0, 0, 0], [2000, 20, 1000]], [[989, -130, 200], [1021, 0, 800]])
     bodies = [trimesh.creation.box(bounds=np.array(bounds, float)) for bounds in (web, rib)]
@@ -95,7 +95,7 @@ def ribs(seed, between):
     return surface, pairs_of(surface, seed, error[side] + noise)
 
 
-def test_views_differ_by_what_the_sides_of_plates_do():
+def test_sd_of_unnamed_views_is_that_between_the_sides_of_plates():
     found = []
     for seed in range(20):
         surface, pairs = ribs(seed, 0.5)
@@ -105,7 +105,7 @@ def test_views_differ_by_what_the_sides_of_plates_do():
     assert np.median(found) == pytest.approx(0.5, rel=0.25)
 
 
-def test_what_views_differ_by_is_no_defect_and_a_dent_is():
+def test_differences_of_unnamed_views_are_no_defect_but_a_dent_is():
     for seed in range(3):
         surface, pairs = ribs(seed, 0.5)
         named, unnamed = (field_of(surface, pairs, stations) for stations in (NAMED, UNNAMED))
@@ -119,7 +119,7 @@ def test_what_views_differ_by_is_no_defect_and_a_dent_is():
         assert scan_statistic.search(dented, surface, levels).sign[on & (off < 60.0)].all()
 
 
-def test_the_scatter_of_windows_does_not_count_views_again():
+def test_inflation_of_windows_is_smaller_for_unnamed_views():
     surface, pairs = ribs(1, 0.5)
     named, unnamed = (field_of(surface, pairs, stations) for stations in (NAMED, UNNAMED))
     first, second = (scan_statistic.levels_of(field, surface, 1e-8, 0.02) for field in (named, unnamed))
@@ -173,7 +173,7 @@ def test_few_degrees_of_freedom_need_larger_deviations():
     assert found == {30.0: False, 1e6: True}
 
 
-def test_a_cell_beyond_the_end_of_a_line_is_no_region():
+def test_single_cell_in_line_with_a_ridge_is_not_part_of_its_region():
     """A ridge of one cell's width, and a cell in line with it that deviates as one in fifteen does by chance."""
     surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
     field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))

@@ -67,7 +67,7 @@ def test_bodies_in_contact_as_designed_have_no_defects(gap):
 
 
 @pytest.mark.parametrize("move", [10.0])
-def test_a_body_that_moved_is_one_report_under_its_name_and_nothing_is_invented(move):
+def test_moved_body_is_reported_once_by_name_without_false_defects(move):
     built = {"asbuilt.tube.move_mm": [0.0, 0.0, move], "asbuilt.beam.dent_mm": 5.0, **DENT}
     scene, _ = scanned(0.0, 1, built)
     defects = found(scene).defects
@@ -137,7 +137,7 @@ def test_bodies_of_one_name_and_without_a_name_are_numbered_and_counted():
     assert said == ["defects.names-shared", "defects.names-missing"]
 
 
-def test_a_movement_is_as_uncertain_at_an_unseen_corner_as_it_scatters_there():
+def test_uncertainty_of_a_movement_at_an_unseen_corner_equals_its_scatter():
     """Of a beam of which a third was seen, the fitted movement of the far end is turned by the noise of that third."""
     frame = shape_models.Frame(np.zeros(3), np.eye(3), np.array([1500.0, 150.0, 6.0]), 150.0)
     rng, sigma = np.random.default_rng(4), 0.2

@@ -1,4 +1,4 @@
-"""Points of a scan on the cells of a design: where noise moves a point, and what it does to the means of cells."""
+"""Points of a scan on the cells of a design: effect of noise on places of points and means of cells."""
 
 import numpy as np
 import pytest

@@ -49,7 +49,7 @@ def test_a_plate_that_is_off_within_the_error_of_its_pose_has_no_defect():
 
 
 @pytest.mark.parametrize("inward", [lambda x, z: np.zeros(len(x)), DENT])
-def test_the_back_that_one_station_saw_alone_may_be_off(inward):
+def test_range_error_of_the_class_is_no_defect_on_a_side_seen_by_one_station(inward):
     """Its ranges are 0.6 mm too long, within what a view of a scanner may be off; the back is as designed."""
     rng, station = np.random.default_rng(7), np.array([0.4 * SIDE, 4000.0, 500.0])
     x, z = rng.uniform(0.0, SIDE, (2, 14_000))

@@ -31,7 +31,7 @@ def round_off(s):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_bump_is_a_bump(seed):
+def test_local_bump_is_classified_as_bump_with_its_depth(seed):
     cells = place(lambda u, v: -9.0 * round_off(np.hypot((u - 3000.0) / 170.0, (v - 500.0) / 220.0)),
                   (3000, 500), (140, 170), seed)  # fmt: skip
     fitted = profiles.fit(cells, -1)
@@ -64,7 +64,7 @@ def test_a_step_jumps_along_a_line(reach, depth, kind):
         assert classification.of_profile(fitted, 16.0, before).defect_class == kind
 
 
-def test_where_the_cells_end_is_no_step():
+def test_border_of_the_seen_cells_is_not_classified_as_a_step():
     cells = place(
         lambda u, v: 6.0 * round_off((u - 3060.0) / 120.0) * round_off((v - 500.0) / 200.0),
         (3060, 500), (60, 150), 1, seen=lambda u, v: u > 3020.0,
@@ -83,7 +83,7 @@ def lobes(depths, spacing=150.0, chart=3, off=0.0):
     return found
 
 
-def test_half_waves_in_turn_are_one_wave():
+def test_alternating_lobes_in_a_line_are_joined_into_one_wave():
     assert waves.waves(lobes([5.0, -5.2, 4.8, -4.0])) == [[0, 1, 2, 3]]
     assert waves.waves(lobes([5.0, -5.2])) == []  # two are no row
     assert waves.waves(lobes([5.0, 5.2, 4.8])) == []  # to one side

@@ -50,7 +50,7 @@ def test_an_undamaged_structure_has_no_defect(seed):
     assert result.noise == pytest.approx(0.4, rel=0.05)
 
 
-def test_what_chance_brings_is_called_doubtful():
+def test_chance_detections_are_flagged_doubtful():
     """Asked for 5000 false alarms on 100 m2 there are some on 1 m2, at most as many, and none passes for sure."""
     result = run(scene_of(3, flat), false_alarms=5000.0)
     allowed = 5000.0 * result.examined_mm2 / 1e8
@@ -134,7 +134,7 @@ def test_missing_corners_edges_and_holes_are_named():
     assert area["component-3"] == pytest.approx(np.pi * 50.0**2, rel=0.15)
 
 
-def test_a_hole_seen_from_both_sides_is_one_missing_part_without_a_picture():
+def test_hole_seen_from_both_sides_is_one_missing_part_without_a_face():
     """Its cells face both ways, so that no face is the one to draw."""
 
     def missing(x, z):
@@ -153,7 +153,7 @@ def test_a_hole_seen_from_both_sides_is_one_missing_part_without_a_picture():
     assert figures.files(result)["defects.pdf"].startswith(b"%PDF")
 
 
-def test_what_something_hides_is_not_missing():
+def test_surface_in_the_shadow_of_clutter_is_not_missing():
     """A ball in the way of both stations: no point of the surface in its shadow."""
     clutter = (1200.0, -250.0, 300.0, 90.0)
     scene = scene_of(3, flat, clutter=clutter)
@@ -177,7 +177,7 @@ def test_what_something_hides_is_not_missing():
     ],
 )
 def test_shapes_of_whole_components(kind, inward, depth):
-    """On the second of four plates; the others tell where the whole is."""
+    """On the second of four plates; the others determine the pose of the whole."""
     result = run(scene_of(4, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)))
     assert found(result) == [(kind, "component-2")]
     assert abs(result.defects.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
@@ -199,7 +199,7 @@ def test_stations_that_are_off_are_no_defect():
     assert found(result) == []
 
 
-def test_the_last_movement_is_added_once(monkeypatch):
+def test_unsettled_alignment_gives_the_same_pose_as_a_settled_one(monkeypatch):
     """The whole is 1.5 mm off; an alignment that never settles gives the same pose as one that does."""
     scene = scene_of(4, lambda x, z: np.full(len(x), 1.5))
     settled = run(scene)
@@ -268,7 +268,7 @@ def test_the_papers_chain_finds_a_dent_and_is_seeded():
     np.testing.assert_array_equal(again.defects.depth_max, result.defects.depth_max)
 
 
-def test_what_is_written(dented):
+def test_defects_in_results_json_have_the_documented_keys(dented):
     written = json_ready(as_object(dented[1]))
     (one,) = written["defects"]
     keys = {"id", "class", "confidence", "component", "centre", "area_mm2", "depth_max", "depth_ci95", "volume_mm3"}
@@ -276,7 +276,7 @@ def test_what_is_written(dented):
     assert one["class"] == "dent"
 
 
-def test_what_cannot_be_used_is_said():
+def test_scene_without_design_or_points_and_bad_parameters_are_refused():
     scene = scene_of(2, flat, spacing=20.0)
     with pytest.raises(InputError, match="design"):
         defects_step.run(dataclasses.replace(scene, structure=None), defects_step.Params())
@@ -333,7 +333,7 @@ def two_sides(seed, off_mm):
     return blocks, J, moved
 
 
-def test_stations_that_agree_are_not_moved_by_what_hardly_shows():
+def test_shifts_of_agreeing_stations_stay_near_zero_where_undetermined():
     shifts = []
     for seed in range(3):
         blocks, J, _ = two_sides(seed, 0.0)
@@ -344,7 +344,7 @@ def test_stations_that_agree_are_not_moved_by_what_hardly_shows():
     assert max(shifts) < 0.1  # with a prior of 3 mm for every station, up to 0.7 mm
 
 
-def test_what_stations_leave_undetermined_is_in_their_covariance():
+def test_covariance_of_station_shifts_includes_undetermined_directions():
     z = []
     for seed in range(20):
         blocks, J, moved = two_sides(seed, 0.5)
@@ -378,7 +378,7 @@ def test_facets_are_the_nearest_that_a_scanner_can_see():
     np.testing.assert_allclose(normals[facet[0]], [0.0, -1.0, 0.0])
 
 
-def test_cells_cover_what_a_design_has():
+def test_cells_cover_the_area_of_a_design():
     plate = surface_charts.of_mesh(*box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0)), 5.0)
     area = 2.0 * (300.0 * 200.0 + 300.0 * 12.0 + 200.0 * 12.0)
     assert plate.area_mm2 == pytest.approx(area, rel=0.02)
@@ -450,7 +450,7 @@ def test_numbers_by_hand():
         ("", lambda p: np.zeros(len(p))),
     ],
 )
-def test_one_shape_is_chosen(kind, height):
+def test_shape_of_a_deformed_plate_is_identified_and_a_flat_plate_has_none(kind, height):
     a, b = (x.ravel() for x in np.meshgrid(np.linspace(-485.0, 485.0, 34), np.linspace(-285.0, 285.0, 20)))
     points = np.stack([a, b, np.zeros(len(a))], axis=1)
     frame = shape_models.Frame(np.zeros(3), np.eye(3), np.array([500.0, 300.0, 6.0]), 300.0)
@@ -463,7 +463,7 @@ def test_one_shape_is_chosen(kind, height):
         np.testing.assert_allclose(value, height(points), atol=0.06 if kind != "step" else 0.7)
 
 
-def test_the_pieces_of_a_crack_are_one_and_what_lies_beside_it_is_not():
+def test_pieces_in_line_with_a_crack_are_joined_and_others_are_not():
     """Cells by their places on the front of a plate: a slim piece, others in its line, one that lies 4 cells off."""
     design = design_of(1)
     whole = surface_charts.gridded(surface_charts.of_mesh(design.vertices, design.faces, 60.0), 10.0)

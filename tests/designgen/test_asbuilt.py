@@ -28,7 +28,7 @@ def frames(s):
     return point[0], tangent[0], normal[0]
 
 
-def test_nothing_wrong_changes_nothing():
+def test_part_without_errors_equals_its_design():
     for s in (RIB.s0, RIB.s1):
         np.testing.assert_allclose(built().key_points(s), RIB.key_points(s), atol=1e-9)
     p, q = np.random.default_rng(0).uniform(size=(2, 200))
@@ -104,7 +104,7 @@ def test_real_bridges_gape_as_in_the_source_paper(name):
     assert all(len(scan.points) for scan in scene.scans)
 
 
-def test_dents_waves_and_missing_pieces_are_where_the_truth_says():
+def test_dents_waves_and_missing_pieces_are_at_the_places_of_the_truth():
     params = imperfections.ArchParams(dents=2, missing_pieces=1, waviness_mm=0.0)
     ledger = imperfections.Ledger()
     parts = arch_bridge.build(arch_bridge.Params())
@@ -173,7 +173,7 @@ def test_the_truth_of_a_warm_bridge_maps_back_to_the_design():
 
 
 def test_dents_and_missing_pieces_keep_apart():
-    """Many on each part: no dent reaches into a hole, whose edge would then not be where the truth says."""
+    """Many on each part: no dent reaches into a hole, since the hole's edge would then differ from the truth."""
     parts = arch_bridge.build(arch_bridge.Params())
     params = imperfections.ArchParams(dents=30, missing_pieces=30, dent_radius_mm=120.0)
     ledger = imperfections.Ledger()
@@ -237,7 +237,7 @@ def test_plates_that_vary_a_little_are_built():
 
 @pytest.mark.parametrize("setting", ["asbuilt.sag_mm=5", "asbuilt.nonsense=5", "asbuilt=5"])
 @pytest.mark.parametrize("name", ["arch-s1", "frame-small", "truss-bridge", "plates-defects", "stadium-roof"])
-def test_what_a_kind_cannot_be_built_with_is_refused(name, setting):
+def test_errors_unsupported_by_a_kind_of_structure_are_refused(name, setting):
     recipe = {key: value for key, value in recipe_files.load(name)[1].items() if key != "asbuilt"}
     recipe = recipe_files.overridden(recipe, [setting])
     if (name, setting) == ("stadium-roof", "asbuilt.sag_mm=5"):

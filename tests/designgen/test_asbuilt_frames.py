@@ -19,7 +19,7 @@ def frame_with(**params):
     return imperfections.frame(FRAME, imperfections.FrameParams(**params), generator(1, "x"), ledger), ledger.record()
 
 
-def test_frames_are_built_otherwise_by_what_the_truth_says():
+def test_errors_built_into_a_frame_equal_those_of_the_truth():
     same, truth = frame_with()
     np.testing.assert_array_equal(same.centres, FRAME.centres)
     assert truth.what == ()

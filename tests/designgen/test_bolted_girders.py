@@ -41,7 +41,7 @@ def test_the_mesh_of_a_girder_encloses_the_volume_of_its_solid():
 
 
 @pytest.mark.parametrize("mode", ["surface", "rays"])
-def test_what_is_scanned_lies_on_the_solid_as_drilled(mode):
+def test_scanned_points_of_a_girder_lie_on_its_drilled_solid(mode):
     settings = {"surface": {"spacing_mm": 12.0, "sigma_mm": 0.0}, "rays": QUIET}[mode]
     scene, truth, shifts = made(seed=2, scan=settings, mode=mode)
     drilled = assembly.build(SIZES, BOLTS, shifts)

@@ -1,4 +1,4 @@
-"""The card of a data set: splits by scene, what the files hold, the law of the noise; the same set, the same card."""
+"""The card of a data set: splits by scene, content of the files, law of the noise; the same set, the same card."""
 
 import hashlib
 import json
@@ -35,7 +35,7 @@ def plates(tmp_path_factory):
     return folder, make(folder, "plates-defects", "--seed", 2, "--count", 2, *varied, *DENTS)
 
 
-def test_a_card_says_what_the_files_hold(plates):
+def test_card_states_the_counts_of_the_files(plates):
     folder, made = plates
     points, defects, sources, names = [], 0, np.zeros(3, dtype=int), set()
     for path in sorted(folder.glob("*.h5")):
@@ -66,7 +66,7 @@ def test_a_card_states_the_law_of_the_noise(plates):
     assert sampled["numbers"] == {"sigma_mm": 2.0, "outlier_share": 0.0}
 
 
-def test_the_page_says_the_same(plates):
+def test_markdown_card_states_the_values_of_the_json_card(plates):
     folder, made = plates
     page = (folder / "card.md").read_text("utf-8")
     for said in (f"{made['points']['all']:,}", made["index"]["sha256"], "0.3, 1", "seeds 2 to 3", made["about"]):

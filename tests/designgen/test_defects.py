@@ -1,4 +1,4 @@
-"""Defects of plates and girders: what the truth says of each against the faces as built, integrated here."""
+"""Defects of plates and girders: the truth of each against the faces as built, integrated here."""
 
 import numpy as np
 import pytest
@@ -134,7 +134,7 @@ def test_waves_of_any_length(length, depth):
 
 
 def test_a_girder_loses_steel_where_its_web_ends():
-    """Nothing else of the girder is there: its flanges lie along the web's upper and lower edges."""
+    """No other part of the girder is there: its flanges lie along the web's upper and lower edges."""
     row = ROWS["girder"]
     for seed in range(5):
         components, patches, truth = row_of(row, ("edge-loss",), {}, seed)
@@ -179,7 +179,7 @@ def test_the_flanges_stay_where_a_web_waves():
         ({"form": "girder", "height_mm": 120.0}, "edge-loss", {}, r"loss_mm: expected at most 41\.8"),
     ],
 )
-def test_what_does_not_fit_is_refused(row, kind, sizes, said):
+def test_defect_too_large_for_its_plate_is_refused_with_the_limit(row, kind, sizes, said):
     with pytest.raises(UsageError, match=rf"^asbuilt\.{said}") as refused:
         row_of(row, ("none", kind), sizes)
     assert f"{row.get('form', 'plate')}-2-{kind}, " in str(refused.value)

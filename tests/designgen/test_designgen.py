@@ -123,7 +123,7 @@ def test_clean_points_lie_on_the_surface_evenly():
     assert len(bottom) == pytest.approx(area / 100.0, rel=0.02)
 
 
-def test_a_bolt_ball_is_what_is_left_of_the_sphere():
+def test_volume_of_a_bolt_ball_is_the_sphere_less_caps_and_bores():
     directions = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
     params = bolt_ball.Params(50.0, directions, bolt_ball.connection(60.0))
     solid = bolt_ball.build(params)
@@ -158,7 +158,7 @@ def test_a_frame_of_balls_sleeves_cones_and_tubes():
         np.testing.assert_allclose(np.linalg.norm(own - frame.centres[node], axis=1), 60.0, atol=1e-9)
 
 
-def test_noise_and_outliers_are_what_was_asked_for():
+def test_noise_and_outliers_are_those_of_the_recipe():
     part = arch_bridge.build(arch_bridge.Params())[2]
     clean = sampler.scan_part(part, 2, sampler.Params(spacing_mm=20.0, sigma_mm=0.0), generator(3, "a"))
     noisy = sampler.scan_part(
@@ -233,7 +233,7 @@ def test_impossible_frames_are_refused_by_key(setting, said):
     assert said in str(refused.value)
 
 
-def test_an_exported_folder_holds_design_and_truth(tmp_path):
+def test_exported_folder_has_design_and_truth(tmp_path):
     small = ["scan.spacing_mm=40", "frame.nodes_x=2", "frame.nodes_y=2"]
     recipe = recipe_files.overridden(recipe_files.load("frame-small")[1], small)
     scene, truth = make("roof", recipe)
@@ -317,7 +317,7 @@ def test_the_list_has_columns():
     assert all(line[column - 1] == " " and line[column] != " " for line in entries)
 
 
-def test_the_software_of_a_scene_is_what_makes_it():
+def test_software_of_a_scene_lists_the_libraries_that_make_it():
     code = (
         "import sys, designgen\n"
         "for name in ('arch-s1', 'frame-small', 'plates-defects', 'arch-s1-rays'):\n"

@@ -112,7 +112,7 @@ def copied(folder, to):
 # --- what is made -----------------------------------------------------------------------------------------------------
 
 
-def test_index_says_what_is_in_the_files(made):
+def test_index_states_the_hashes_and_counts_of_the_files(made):
     assert scenes(made) == [f"frame-small-0000{i}-seed{6 + i}.h5" for i in (1, 2, 3)]
     assert sorted(os.listdir(made)) == [*OF_SET, *scenes(made), "index.csv"]
     found = rows(made)
@@ -176,7 +176,7 @@ def test_file_names_are_safe(name, tmp_path):
 # --- run again --------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_there_is_kept(made, tmp_path):
+def test_existing_scenes_are_kept_on_a_second_run(made, tmp_path):
     folder = copied(made, tmp_path / "set")
     before, when = digests(folder), times(folder)
     said = json.loads(run("-o", folder, "--count", 3, "--seed", 7, "--json").stdout)
@@ -187,7 +187,7 @@ def test_what_is_there_is_kept(made, tmp_path):
     assert times(folder) == when
 
 
-def test_a_changed_parameter_is_made_again_and_said(made, tmp_path):
+def test_scenes_of_other_parameters_are_made_again_with_a_message(made, tmp_path):
     folder = copied(made, tmp_path / "set")
     done = run("-o", folder, "--count", 3, "--seed", 7, "--set", "scan.sigma_mm=0")
     assert done.stderr.count("was made with other parameters; made again") == 3
@@ -220,7 +220,7 @@ def cut(path):
 
 
 @pytest.mark.parametrize("damage", [flip, cut, lambda path: path.write_text("no scene")])
-def test_a_damaged_file_is_made_again_and_said(made, tmp_path, damage):
+def test_damaged_scene_is_made_again_with_a_message(made, tmp_path, damage):
     folder = copied(made, tmp_path / "set")
     damage(folder / "frame-small-00002-seed8.h5")
     done = run("-o", folder, "--count", 3, "--seed", 7)
@@ -239,7 +239,7 @@ def test_a_cut_file_is_found_without_an_index(made, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "file,points\nframe-small-00001-seed7.h5,many\n", "\x00\xff\n,,,\n"])
-def test_an_index_by_another_hand_does_no_harm(made, tmp_path, text):
+def test_foreign_index_is_replaced_without_changing_scenes(made, tmp_path, text):
     folder = copied(made, tmp_path / "set")
     (folder / "index.csv").write_text(text, "latin-1")
     run("-o", folder, "--count", 3, "--seed", 7)
@@ -359,7 +359,7 @@ def test_stops_cleanly(whole, tmp_path, sent, code, to_all):
         assert (folder / name).read_bytes() == (whole / name).read_bytes()
 
 
-def test_a_process_that_dies_costs_its_own_job_alone(tmp_path):
+def test_dying_process_loses_its_job_alone(tmp_path):
     names = ["a", "always", "b", "c", "d"]
     for name in "acd":
         (tmp_path / name).touch()
@@ -404,7 +404,7 @@ def test_a_failed_scene_leaves_no_older_one_under_its_name(made, tmp_path):
     assert scenes(folder) == scenes(made)[1:]
 
 
-def test_a_job_with_other_software_than_its_worker_touches_nothing(made, tmp_path):
+def test_job_of_other_software_than_its_worker_writes_no_files(made, tmp_path):
     folder = copied(made, tmp_path / "set")
     name, recipe = recipe_files.load("frame-small")
     job = batch.plan(folder, name, recipe, {}, 7, 1)[0]
@@ -451,7 +451,7 @@ def test_a_file_where_the_folder_should_be_and_the_other_way_round(made, tmp_pat
     assert "this is a folder" in run("-o", made, code=2).stderr
 
 
-def test_a_bar_on_a_terminal_and_nowhere_else(made, tmp_path):
+def test_progress_bar_is_shown_on_a_terminal_alone(made, tmp_path):
     folder = copied(made, tmp_path / "set")
     assert run("-o", folder, "--count", 3, "--seed", 7).stderr == ""
     try:
@@ -485,7 +485,7 @@ def cluster(tmp_path):
         yield one
 
 
-def test_a_cluster_that_loses_a_worker_makes_the_same_folder_and_one_that_is_lost_is_said(whole, tmp_path, cluster):
+def test_lost_worker_changes_no_file_and_lost_scheduler_is_reported(whole, tmp_path, cluster):
     address, (scheduler, worker, _) = cluster
     folder = tmp_path / "set"
     process = started(folder, "--cluster", address)
@@ -508,7 +508,7 @@ def test_a_cluster_that_loses_a_worker_makes_the_same_folder_and_one_that_is_los
 
 
 @pytest.mark.slow
-def test_a_cluster_that_does_not_answer_is_said(tmp_path):
+def test_unreachable_cluster_is_refused_before_anything_is_written(tmp_path):
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "index.csv").write_text("mine")
     address = f"tcp://127.0.0.1:{dask_cluster.free_port()}"
@@ -517,7 +517,7 @@ def test_a_cluster_that_does_not_answer_is_said(tmp_path):
     assert os.listdir(tmp_path / "set") == ["index.csv"], "nothing was begun"
 
 
-def test_without_dask_the_error_says_how_to_install_it(monkeypatch):
+def test_without_dask_the_error_states_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
         pytest.raises(UsageError, match=r"pip install 'steel-scan-check\[cluster\]'"),

@@ -27,7 +27,7 @@ def mark_every_ray(monkeypatch):
     monkeypatch.setattr(edge_footprints, "mark_edges", every)
 
 
-def test_nothing_thin_between_the_rays_is_overlooked(monkeypatch):
+def test_subdividing_all_rays_finds_no_more_mixed_pixels_of_thin_objects(monkeypatch):
     """Where every ray is cut into sub-rays, no more mixed pixels appear than where only edges and thin things are."""
     builder = Builder()
     rng = np.random.default_rng(4)
@@ -262,8 +262,8 @@ def test_edges_are_followed_as_far_as_footprints_reach():
     np.testing.assert_array_equal(edge.any(axis=1), [2 < column < 17 for column in range(20)])
 
 
-def test_nothing_is_nearer_than_the_nearest_range():
-    """By hand: over a triangle's middle, beside its edge, beyond its corner; a ball; nothing at all."""
+def test_nearest_range_to_surfaces_is_that_worked_by_hand():
+    """By hand: over a triangle's middle, beside its edge, beyond its corner; from a ball; without surfaces."""
     corners = np.array([[-100.0, -100.0, 0.0], [300.0, -100.0, 0.0], [-100.0, 300.0, 0.0]])
     plate = Builder()
     plate.polygon(0, "plate", corners)

@@ -128,7 +128,7 @@ def test_the_volume_of_a_dent_is_that_of_its_points(tmp_path):
     assert -moved.sum() * 0.25 == pytest.approx(bump.volume, rel=1e-4)
 
 
-def test_errors_of_stations_look_like_the_motion_that_the_truth_states():
+def test_motion_by_station_errors_has_the_covariance_of_the_truth():
     """The covariance against fits to draws of the errors, as the generator draws them."""
     module = runpy.run_path(str(FOREIGN / "steelwork.py"))
     rng = np.random.default_rng(5)
@@ -163,7 +163,7 @@ def test_a_piece_that_reaches_two_borders_is_a_missing_part(tmp_path):
 # --- the truth as JSON ------------------------------------------------------------------------------------------------
 
 
-def test_a_truth_of_another_format_is_passed_over(tmp_path):
+def test_truth_in_another_format_is_ignored(tmp_path):
     assert truth_json.read(tmp_path) is None
     for text in ('{"centres": [[0, 0, 0]]}', "[1, 2]", "no json"):
         (tmp_path / "truth.json").write_text(text)
@@ -199,7 +199,7 @@ def test_a_segment_that_lies_on_longer_parts_is_none_of_them(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_foot_is_not_placed_a_plates_thickness_off(tmp_path):
+def test_foot_on_either_side_of_its_end_plate_is_assigned_right(tmp_path):
     """Both sides of its end plate of 40 mm are stable places: the scan passed for that of the other foot."""
     scene = folder.read_input(make("arch_bridge", tmp_path, "stations=4", "spacing=16", seed=5))
     scan = next(scan for scan in scene.scans if scan.component == "SP-E")

@@ -148,7 +148,7 @@ def test_points_lie_on_the_face_that_their_label_names(seen, name):
         assert departures(points, faces[int(face.removeprefix("face ")) - 1]).max() < TOLERANCE_MM, face
 
 
-def test_labels_name_bodies_and_what_is_as_designed_has_no_defect(seen):
+def test_labels_name_bodies_and_bodies_as_designed_have_no_defect(seen):
     assert seen.scene.kind == "structure"
     assert all(label.part_names == NAMES for label in seen.truth.labels)
     assert len(seen.truth.defects.ids) == 0
@@ -227,7 +227,7 @@ def test_same_seed_same_bytes_and_a_recipe_is_the_same_as_the_command(tmp_path, 
         assert a.points.tobytes() == b.points.tobytes()
 
 
-def test_files_come_back(tmp_path, caplog):
+def test_models_in_step_python_and_stl_are_loaded_with_their_size(tmp_path, caplog):
     step, python, stl = (tmp_path / name for name in ("part.step", "part.py", "part.stl"))
     cq.exporters.export(SOLIDS["plane"], str(step))
     python.write_text("import cadquery as cq\nresult = cq.Workplane().box(300, 200, 100)\n")
@@ -267,7 +267,7 @@ def test_stations_from_a_file_and_placed(tmp_path):
             station_placement.given(path, 1)
 
 
-def test_stations_see_what_can_be_seen():
+def test_placed_stations_see_every_visible_face_of_a_box():
     """Of a box every face but those that no upright scanner sees is seen by the stations together."""
     model = loading.load(SOLIDS["plane"])
     _, truth = designgen.scan(SOLIDS["plane"], stations=6, settings=FEW)

@@ -54,7 +54,7 @@ def test_a_part_of_an_arch_alone(recipe, expected):
         assert abs(found.depth_max[row] - 5.0) < max(0.5, found.depth_ci95[row])
 
 
-def test_a_part_that_there_is_none_of(tmp_path):
+def test_unknown_part_or_conflicting_keys_of_a_recipe_are_refused(tmp_path):
     recipe = recipe_files.load("arch-rib")[1]
     for settings, message in (
         ({"model.part": "rib9"}, 'model.part: expected one of foot1, .*, got "rib9"'),

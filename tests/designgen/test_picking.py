@@ -27,7 +27,7 @@ def scans_of(count=4, points=500):
     return [Scan(f"s{k}", rigid.apply(rigid.invert(T[k]), hall) - origin, origin) for k in range(count)], T
 
 
-def test_picks_of_a_steady_hand_are_the_same_place_in_both_scans():
+def test_picks_without_noise_are_the_same_place_in_both_scans():
     scans, T = scans_of()
     picks, places = picking.pick(scans, T, picking.Params(points=4, sigma_mm=0.0, apart_mm=3000.0), 5)
     rows = {scan.name: k for k, scan in enumerate(scans)}
@@ -85,7 +85,7 @@ def test_corners_are_picked_where_the_first_scan_saw_them_and_the_second_may():
         picking.pick(scans, T, params, 4, corners, lambda points: points[:, 0] > 1e9)
 
 
-def test_a_scanner_with_a_window_sees_nothing_beside_it():
+def test_scanner_with_a_window_returns_no_points_outside_it():
     recipe = recipe_files.overridden(
         recipe_files.load("truss-bridge-chain")[1], ["scan.step_mrad=15.0", "picks.sigma_mm=0"]
     )

@@ -90,7 +90,7 @@ def test_hits_lie_on_spheres_tubes_and_sleeves(seen):
     assert {"sleeve", "cone"} <= {surfaces.surface_names[k] for k in np.unique(returns.surface)}
 
 
-def test_points_are_put_where_the_encoders_say(seen):
+def test_points_lie_at_the_angles_of_the_encoders_with_their_errors(seen):
     _, _, _, returns = seen
     np.testing.assert_allclose(np.linalg.norm(returns.points, axis=1), np.linalg.norm(returns.hits, axis=1), atol=1e-4)
 
@@ -120,7 +120,7 @@ def test_georeferenced_hits_stay_exact(seen):
     assert np.abs(off).max() < 1e-4
 
 
-def test_another_caster_sees_the_same():
+def test_hits_and_ranges_agree_with_open3d():
     """Open3D on fine meshes of the same shapes: the same ones in front, the same ranges to the facets' error."""
     builder, meshes = Builder(), []
     rng = np.random.default_rng(8)
@@ -405,7 +405,7 @@ def test_large_and_slim_triangles_are_met_wherever_they_are():
     np.testing.assert_allclose(found, nearest, rtol=1e-9)
 
 
-def test_only_flat_faces_are_met_on_their_nets():
+def test_only_flat_faces_are_intersected_by_their_nets():
     """A dent, a wave that is 0 at every knot, a tube: none of them is taken for its net; a face of a box is."""
 
     def flat(p, q):
@@ -430,7 +430,7 @@ def test_only_flat_faces_are_met_on_their_nets():
 
 
 def test_grazing_rays_stay_near_their_net():
-    """A face whose function knows nothing far outside of 0 to 1, seen along its bends: no ray asks for that."""
+    """A face whose function is undefined far outside of 0 to 1, seen along its bends: no ray evaluates it there."""
     asked = [0.0]
 
     def at(p, q):
@@ -453,7 +453,7 @@ def test_grazing_rays_stay_near_their_net():
     assert len(x) > 8_000
 
 
-def test_what_is_too_near_hides_what_is_behind_it():
+def test_object_nearer_than_the_minimum_range_shadows_what_lies_behind():
     builder = Builder()
     plate = np.array([[-2000.0, 0.0, -2000.0], [2000.0, 0.0, -2000.0], [2000.0, 0.0, 2000.0], [-2000.0, 0.0, 2000.0]])
     builder.polygon(0, "plate", plate + np.array([0.0, 3000.0, 0.0]))
@@ -482,7 +482,7 @@ def test_strongest_echo_by_hand():
     np.testing.assert_array_equal(found, [[0.2, 0.2, 0.0, 0.0], [0.2, 0.0, 0.2, 0.0]])
 
 
-def test_what_is_behind_is_not_seen_and_ranges_are_limited():
+def test_hidden_and_out_of_range_objects_return_no_points():
     builder = Builder()
     plate = np.array([[-2000.0, 0.0, -2000.0], [2000.0, 0.0, -2000.0], [2000.0, 0.0, 2000.0], [-2000.0, 0.0, 2000.0]])
     builder.polygon(0, "near", plate + np.array([0.0, 3000.0, 0.0]))
@@ -518,7 +518,7 @@ def test_weak_signals_are_lost_and_some_returns_stray():
     assert (stray.range_error_mm[outliers] <= 0.0).mean() > 0.99
 
 
-def test_a_station_is_wrong_by_what_its_truth_says():
+def test_range_and_tilt_errors_of_a_station_equal_those_of_its_truth():
     surfaces = surfaces_of(frame_of_balls())
     T = standing(2500.0, 2800.0, 1600.0)
     device = dataclasses.replace(QUIET, offset_mm=2.0, scale_ppm=50.0, tilt_urad=100.0)

@@ -73,7 +73,7 @@ def test_the_nearest_face_is_taken_and_its_clearance_is_the_distance_of_the_next
     assert not np.isfinite(below.clearance[2])
 
 
-def test_what_is_within_another_body_or_in_contact_with_it_is_enclosed():
+def test_points_inside_or_in_contact_with_another_body_are_enclosed():
     def box(size, at):
         return trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
 

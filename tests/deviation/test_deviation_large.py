@@ -1,4 +1,4 @@
-"""Step deviation on more points than are held at once: all of them count, in blocks, as they do in memory."""
+"""Step deviation on more points than fit into memory: results by blocks equal those in memory."""
 
 import dataclasses
 
@@ -57,7 +57,7 @@ def test_outliers_scanners_and_sources_are_those_of_the_whole(options, small, mo
     assert large.spacing_mm == pytest.approx(held.spacing_mm, rel=0.03)  # of another sample
 
 
-def test_points_alone_beyond_the_halo_hardly_count(small, monkeypatch):
+def test_isolated_points_beyond_the_halo_hardly_change_the_inliers(small, monkeypatch):
     """Their mean distance is overstated: the limit, and a point or two at it, change."""
     exact = cloud.of_scene(scene_of(), 20, 1.0).kept
     monkeypatch.setattr(large_cloud, "HALO", 20.0)
@@ -84,8 +84,8 @@ def test_movements_are_those_of_the_whole(options, small, monkeypatch):
     assert whole.core.n1.sum() > COUNT
 
 
-def test_all_points_count_where_none_are_to_be_left_out(small, monkeypatch):
-    """As many points as are held, and four times as many: the intervals of core points halve, at the same places."""
+def test_all_points_are_used_without_a_limit_of_points(small, monkeypatch):
+    """As many points as fit into memory, and four times as many: the intervals of the same core points halve."""
     scene = scene_of(outliers=0)
     few = dataclasses.replace(scene, scans=(dataclasses.replace(scene.scans[0], points=scene.scans[0].points[::4]),))
     params = Params(register="none", registration_error_mm=0.0, **{**EQUAL, "projection_diameter_mm": 200.0})

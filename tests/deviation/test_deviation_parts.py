@@ -40,7 +40,7 @@ def test_spacing_is_of_a_plane_with_one_point_a_square():
     assert neighbors.spacing(neighbors.of_spacing(np.zeros((9, 3)))) == 0.0
 
 
-def test_scales_hold_the_points_they_promise():
+def test_derived_scales_contain_the_intended_number_of_points():
     assert m3c2.diameter_for(20, np.sqrt(1e6 / 500.0)) == pytest.approx(225.7, abs=0.1)  # 500 points/m2
     assert [m3c2.rounded(x) for x in (0.12345, 225.7, 1e-7, 100.0)] == [0.124, 226.0, 1e-7, 100.0]
     cloud, other = wavy(20_000, 5), wavy(5000, 6, 30.0)
@@ -68,7 +68,7 @@ def test_a_share_of_independent_places_has_the_interval_of_its_count():
     assert 0.9 <= covered / 200 <= 1.0
 
 
-def test_a_share_of_places_that_agree_counts_them_once():
+def test_share_of_correlated_places_has_the_interval_of_one_per_place():
     marks = np.repeat(np.random.default_rng(8).random(100) < 0.3, 50)
     places = np.repeat(np.arange(100.0), 50)[:, None] * [100.0, 0.0, 0.0]
     found = m3c2.share(marks, places, 60.0)
@@ -95,19 +95,19 @@ def planes_compared(seed, off=0.0, error=0.0):
     ).significant.mean()  # fmt: skip
 
 
-def test_where_its_assumptions_hold_a_twentieth_is_beyond_the_level_of_detection():
+def test_five_percent_are_significant_for_normal_noise_without_change():
     """Normal noise, no registration error: 5 %, and a little more as sd of few points are a little small."""
     shares = [planes_compared(seed) for seed in range(12)]
     assert 0.04 < np.mean(shares) < 0.06
     assert 0.025 < min(shares) < max(shares) < 0.085  # some 1000 cylinders that share no point: sd 0.7 %
 
 
-def test_a_registration_that_is_off_shows_unless_it_is_said():
+def test_unstated_registration_error_gives_significant_distances():
     assert planes_compared(20, off=1.5) > 0.5
     assert planes_compared(20, off=1.5, error=1.5) < 0.05
 
 
-def test_the_summary_counts_what_has_no_level():
+def test_summary_counts_core_points_without_level_of_detection():
     nan = np.nan
     found = Distances(
         np.array([1.0, -3.0, nan, 2.0]), np.array([0.5, 4.0, nan, nan]), np.array([30, 30, 0, 30]),
@@ -159,7 +159,7 @@ def test_axes_are_swapped_where_two_are_alike_alone():
 # --- movements -----------------------------------------------------------------------------------------------------
 
 
-def test_adaptive_voxels_hold_their_points():
+def test_adaptive_voxels_contain_their_number_of_points():
     rng = np.random.default_rng(10)
     dense, sparse = rng.uniform(0.0, 10.0, (5000, 3)), rng.uniform(0.0, 1000.0, (300, 3))
     points = np.vstack([dense, sparse])
@@ -208,7 +208,7 @@ def test_facets_of_a_tube_are_as_round_as_the_tube():
     assert not coarse_tube.slopes.any()  # would bulge by 17 mm: no tube
 
 
-def test_a_movement_along_the_normal_is_what_moved_wherever_points_look():
+def test_movement_along_the_normal_is_that_of_the_body_for_any_point_normals():
     rng = np.random.default_rng(13)
     angle = rng.uniform(-1.0, 1.0, 4000)
     normals = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(4000)])
@@ -234,7 +234,7 @@ def test_a_movement_along_the_normal_is_what_moved_wherever_points_look():
     assert found.count[2] == 0
 
 
-def test_its_interval_holds_for_few_points_too():
+def test_interval_of_a_movement_covers_for_six_points():
     rng = np.random.default_rng(14)
     held = 0
     for _ in range(400):

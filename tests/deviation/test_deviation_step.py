@@ -172,7 +172,7 @@ def test_an_undamaged_structure_is_a_twentieth_beyond_where_the_frame_is_sure(se
     assert cautious.significant_share < result.significant_share
 
 
-def test_a_scanner_tells_the_sides_of_a_plate_apart():
+def test_side_of_a_thin_plate_is_decided_by_the_scanner_position():
     """A plate 10 mm thick, seen from the front, that moved back by 7 mm: nearer to its own back."""
     mesh = trimesh.creation.box((1500.0, 10.0, 1000.0))
     rng = np.random.default_rng(6)
@@ -306,7 +306,7 @@ def test_after_a_stitch_that_failed_later_steps_do_not_run(tmp_path, monkeypatch
     assert written["deviation"]["status"] == written["defects"]["status"] == "failed"
 
 
-def test_what_is_no_structure_and_what_has_no_design():
+def test_deviation_without_design_or_with_too_few_points_is_refused():
     scene, _ = scene_of(7, count=5000)
     without = Scene("bracket", "structure", scene.scans, units="mm")
     assert deviation_step.applies(scene)
@@ -332,7 +332,7 @@ def test_what_is_no_structure_and_what_has_no_design():
     assert np.isnan(lost.significant_share)
 
 
-def test_the_papers_chain_says_what_its_scales_leave(tmp_path):
+def test_method_paper_reports_points_without_level_at_its_scales(tmp_path):
     scene, truth = scene_of(8, count=20_000)
     result = deviation_step.run(scene, deviation_step.Params(method="paper", register="fine"))
     assert (result.normal_diameter, result.projection_diameter) == (110.541, 55.270)
@@ -398,7 +398,7 @@ def _at(x, y, z):
     return shift
 
 
-def test_a_pose_that_is_another_of_those_that_fit_is_not_held_against_the_truth():
+def test_ambiguous_pose_other_than_the_true_one_is_not_compared_with_the_truth():
     scene, truth = arch()
     result = deviation_step.run(scene, deviation_step.Params(register="none"))
     half = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, np.pi])), np.zeros(3))
@@ -433,7 +433,7 @@ def test_the_least_and_the_greatest_have_their_intervals(tmp_path):
     assert rows["greatest, 95 % interval, from"] == pytest.approx(written["max_ci95"][0])
 
 
-def test_the_mean_has_what_stations_have_alone_and_in_common():
+def test_interval_of_the_mean_includes_common_and_separate_range_errors():
     """Ranges of six stations around a cube are off, alone and together: the mean scatters as its interval states."""
     rng = np.random.default_rng(15)
     points = rng.uniform(-500.0, 500.0, (6000, 3))
@@ -467,7 +467,7 @@ def test_the_mean_has_what_stations_have_alone_and_in_common():
     assert alone > np.hypot(0.2, 0.2), "of one face the pose itself is in the mean"
 
 
-def test_it_is_written_as_the_interface_says(tmp_path):
+def test_deviation_in_results_json_has_the_keys_of_the_interface(tmp_path):
     scene, truth = scene_of(9, count=20_000)
     jobs = pipeline.plan(("deviation",), (), {}, 0)
     found = pipeline.execute(tmp_path / "scene.h5", scene, jobs)

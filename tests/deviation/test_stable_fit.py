@@ -65,7 +65,7 @@ def test_half_of_a_structure_that_moved_does_not_take_the_other_half_along(seed)
     assert found.limit_mm < 1.0
 
 
-def test_covariances_hold_where_all_is_stable():
+def test_covariances_agree_with_errors_of_a_stable_structure():
     core = beams()
     turn, shift = [1e-4, -2e-4, 3e-4], [2.0, -3.0, 4.0]
     u = displaced(core, turn, shift)

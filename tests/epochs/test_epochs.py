@@ -79,7 +79,7 @@ def test_of_components_that_do_not_change_five_percent_are_called_changed():
     assert alone / trials > 0.7
 
 
-def test_the_strongest_of_many_is_widened_for_their_number():
+def test_interval_of_the_strongest_of_many_is_widened_for_their_number():
     one, of_many = (change.of_component("d", "c", [of_values([0.0, 1.2], [0.7, 0.7], chosen_from=n)]) for n in (1, 900))
     assert one.finding is Finding.CHANGED
     assert of_many.finding is Finding.WITHIN
@@ -91,7 +91,7 @@ def test_a_doubtful_value_makes_the_change_doubtful():
     assert found.finding is Finding.DOUBTFUL
 
 
-def test_a_value_at_one_epoch_or_without_interval_says_nothing():
+def test_value_of_one_epoch_or_without_interval_gives_an_unknown_change():
     for value, half in (([1.0, np.nan], [0.1, np.nan]), ([1.0, 2.0], [np.nan, np.nan])):
         assert change.of_component("i", "c", [of_values(value, half)]).finding is Finding.UNKNOWN
 
@@ -103,7 +103,7 @@ def test_an_epoch_without_an_interval_does_not_hide_the_others():
     assert found.leading.value == pytest.approx(8.0)
 
 
-def test_the_widening_of_one_value_does_not_depend_on_how_many_another_was_chosen_from():
+def test_widening_of_a_value_does_not_depend_on_the_number_behind_another():
     """The levels of all values of a component add up to 5 %, whatever each was chosen from."""
     one = of_values([0.0, 1.2], [0.7, 0.7])
     of_many = of_values([0.0, 0.0], [0.7, 0.7], chosen_from=900)
@@ -136,7 +136,7 @@ def findings(module, *results):
     return {name: change.of_component("s", name, of_it) for name, of_it in by_name.items()}
 
 
-def test_nodes_of_a_design_are_told_by_their_ids():
+def test_nodes_of_a_design_are_matched_by_their_ids():
     first = whole()
     moved = np.array(first.balls.movement)
     moved[0, 0] += 5.0
@@ -149,7 +149,7 @@ def test_nodes_of_a_design_are_told_by_their_ids():
     assert found["12"].finding is Finding.UNKNOWN
 
 
-def test_balls_without_a_design_are_told_by_their_places():
+def test_balls_without_a_design_are_matched_by_position():
     first = balls(flag=("ok", "ok", "not-found"))
     order = [1, 0, 2]
     there = first.balls
@@ -175,7 +175,7 @@ def test_movements_against_different_datums_are_doubtful():
     assert codes(space_frame, first, fitted) == ["epochs.gauges-differ"]
 
 
-def test_ids_are_of_no_use_where_an_epoch_has_no_movements():
+def test_balls_of_epochs_without_movements_are_matched_by_position():
     """Centres are in each scan's own frame: by ids alone a shift of the frame by metres would be a movement."""
     first, later = whole(), without_design(whole())
     far = dataclasses.replace(later, balls=dataclasses.replace(later.balls, centres=later.balls.centres + 5000.0))
@@ -228,20 +228,20 @@ def test_surfaces_by_component_and_the_place_that_moved_most():
     assert found["right"].finding is Finding.WITHIN
 
 
-def test_core_points_elsewhere_leave_the_mean():
+def test_means_are_compared_although_core_points_differ():
     found = findings(deviation, surface(np.zeros(20)), surface(np.full(20, 2.0), shift=9.0))
     assert [str(one.series.quantity) for one in found["left"].changes] == ["mean deviation", "movement z"]
     assert found["left"].leading.value == pytest.approx(2.0)
     assert found["left"].leading.ci95 == pytest.approx(0.5 * np.sqrt(2.0))
 
 
-def test_another_spacing_of_core_points_is_said():
+def test_different_core_points_are_reported():
     first, later = surface(np.zeros(20)), surface(np.zeros(20), shift=9.0)
     assert codes(deviation, first, first) == ["epochs.registered-to-design"]
     assert codes(deviation, first, later) == ["epochs.registered-to-design", "epochs.core-points-elsewhere"]
 
 
-def test_core_points_that_coincide_by_chance_do_not_stand_for_all():
+def test_core_points_shared_by_chance_do_not_limit_the_comparison():
     """A third epoch of another spacing has a few core points of the first: they must not be all that is compared."""
     later = np.zeros(20)
     later[3] = 4.0
@@ -348,7 +348,7 @@ def test_a_defect_that_grew_is_one_defect():
     assert found["web"].finding is Finding.CHANGED
 
 
-def test_defects_apart_are_two():
+def test_distant_defects_are_two_series():
     assert len(list(defects.series([defect(2.0), defect(2.0, x=400.0)]))) == 2
 
 
@@ -463,7 +463,7 @@ def site(tmp_path):
     return root
 
 
-def test_runs_stand_in_the_order_of_their_days(site):
+def test_runs_are_sorted_by_date(site):
     found = epoch.read(site)
     assert [(one.folder, one.day.isoformat()) for one in found] == [
         ("b", "2026-03-01"), ("2026-08-15/c", "2026-08-15"), ("a", "2026-11-20"),
@@ -471,7 +471,7 @@ def test_runs_stand_in_the_order_of_their_days(site):
     assert [one.day_from for one in found] == ["[report] scanned", "name of the folder", "scan files"]
 
 
-def test_the_last_that_is_a_day_of_a_name_is_the_day(tmp_path):
+def test_day_of_a_run_is_the_last_date_in_its_path(tmp_path):
     for name in ("2026-11-20/run-12345678", "2026-11-21"):
         stored(tmp_path, name, {"inspect": inspected(5000.0)})
     assert [one.day.isoformat() for one in epoch.read(tmp_path)] == ["2026-11-20", "2026-11-21"]
@@ -498,7 +498,7 @@ def member(length, diameter=60.0):
 
 
 @pytest.mark.parametrize("diameter", [60.0, 58.0])
-def test_a_member_that_changed_by_its_balls_is_not_counted_again(tmp_path, diameter):
+def test_length_changed_by_moved_balls_is_not_counted_as_a_second_change(tmp_path, diameter):
     moved = np.array(whole().balls.movement)
     moved[0, 0] += 9.0
     later = whole(changed={"movement": moved})
@@ -518,7 +518,7 @@ def test_a_member_that_changed_by_its_balls_is_not_counted_again(tmp_path, diame
         assert any("member 10-11, diameter" in line for line in said)
 
 
-def test_the_page_has_what_changed_before_the_picture_and_all_else_behind(tmp_path):
+def test_page_has_changes_before_the_picture_and_the_rest_after_it(tmp_path):
     parts = [
         (inspected(5000.0), inspected(5000.0, name="flange")),
         (inspected(5009.0), inspected(5000.1, name="flange")),
@@ -538,7 +538,7 @@ def called(*arguments):
     return CliRunner().invoke(commands, list(map(str, arguments)), standalone_mode=False)
 
 
-def test_the_command_says_what_changed_and_writes_the_folder(site, tmp_path):
+def test_history_command_prints_the_changes_and_writes_the_folder(site, tmp_path):
     out = tmp_path / "out"
     done = called("history", site, "-o", out)
     assert done.exception is None, done.output
@@ -576,13 +576,13 @@ def test_the_page_in_chinese_has_no_english_left(site, tmp_path):
         ({"scanned": "2026-12-01", "kind": "space-frame"}, "z", "expected runs of one structure"),
     ],
 )
-def test_what_cannot_be_compared_is_said_in_one_line(site, facts, digest, said):
+def test_runs_that_cannot_be_compared_are_refused_in_one_line(site, facts, digest, said):
     stored(site, "z", {"inspect": inspected(5000.0)}, digest=digest, **facts)
     with pytest.raises(InputError, match=said):
         epoch.read(site)
 
 
-def test_one_run_is_too_few_and_other_structures_have_nothing_in_common(tmp_path):
+def test_single_run_and_runs_of_other_structures_are_refused(tmp_path):
     stored(tmp_path / "one", "2026-01-01", {"inspect": inspected(1.0)})
     with pytest.raises(InputError, match="two folders of results or more"):
         epoch.read(tmp_path / "one")

@@ -1,4 +1,4 @@
-"""What is said against the truth, and what is not said without one."""
+"""Results compared with a truth, and results without one."""
 
 import dataclasses
 
@@ -48,12 +48,12 @@ def execution(made_of, *runs):
     return pipeline.Execution(made_of, tuple(StepRun("spheres", r.method, "{}", r) for r in runs), {})
 
 
-def test_with_a_design_a_ball_is_known_by_its_id():
+def test_balls_with_a_design_are_matched_with_the_truth_by_id():
     found = result([8, 3, 99], [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]], [1.0, 1.0, 1.0])
     np.testing.assert_array_equal(true_rows(scene(), found.balls, TRUE), [2, 0, -1])
 
 
-def test_without_a_design_a_ball_is_known_by_its_place():
+def test_balls_without_a_design_are_matched_with_the_truth_by_position():
     found = result([3, 5, 8], [[1990.0, 0, 10], [1049, 0, 0], [500, 0, 0]], [60.0, 50.0, 45.0])
     np.testing.assert_array_equal(true_rows(scene(False), found.balls, TRUE), [2, 1, -1])
     lost = result([0], [[NAN] * 3], [NAN])
@@ -79,7 +79,7 @@ def test_checks_of_comparison_runs_bear_the_methods_name(tmp_path):
     assert len(values) == len(report.metrics)
 
 
-def test_no_truth_no_checks(tmp_path):
+def test_input_without_a_truth_gives_an_empty_error_report(tmp_path):
     store.write_scene(tmp_path / "f.h5", scene(), None, {})
     found = execution(scene(), result(TRUE.ids, TRUE.centres, TRUE.radii))
     assert evaluate(tmp_path / "f.h5", found) == ErrorReport()

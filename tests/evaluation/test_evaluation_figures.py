@@ -1,4 +1,4 @@
-"""Figures of results held against a truth, by results made by hand: what is within its interval is counted so."""
+"""Figures of results compared with a truth, by results made by hand: values within their intervals are counted."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def slab(error, turn=0.0, half=True, by_stations=()):
     return figures(deviation.check(scene, result, truth))
 
 
-def test_a_structure_in_a_frame_of_its_own_is_held_against_the_truth_there():
+def test_deviations_are_evaluated_against_the_truth_in_the_frame_of_the_structure():
     found = slab(0.3)
     # The truth is a plane through the nearest points: at the step it is neither side's.
     assert found["deviations within their 95 % intervals"].value > 95.0
@@ -104,7 +104,7 @@ def test_bodies_that_touch_have_each_its_own_truth():
         StructureTruth(at[:5], up[:5], moved[:5], bodies)
 
 
-def test_a_pose_that_is_turned_is_told_by_its_error_and_by_the_steel_that_did_not_move():
+def test_turned_pose_shows_in_its_error_and_in_significant_unmoved_steel():
     found = slab(0.0, turn=1.0)
     assert found["pose, turn"].value == pytest.approx(1.0, rel=1e-6)
     assert found["pose, shift of the middle"].value == pytest.approx(0.0, abs=1e-6)
@@ -113,7 +113,7 @@ def test_a_pose_that_is_turned_is_told_by_its_error_and_by_the_steel_that_did_no
     assert found["deviations within their 95 % intervals"].value > 95.0  # what is true of that pose
 
 
-def test_limits_of_a_pose_admit_what_errors_of_stations_look_like():
+def test_limits_of_a_pose_include_the_motion_by_station_errors():
     """99 % of the draws of a motion by the covariance that the truth states, beside what the method may be off by."""
     rng = np.random.default_rng(0)
     turns, shifts = 25e-6 * rng.standard_normal((200_000, 3)), 0.12 * rng.standard_normal((200_000, 3))
@@ -199,7 +199,7 @@ def of_bodies(*rows):
 DENT, MOVED = ("dent", "a", 0.0, 5.0, 1.0), ("misalignment", "b", 1000.0, 5.0, 1.0)
 
 
-def test_defects_are_held_against_the_names_of_bodies():
+def test_defects_are_matched_with_the_truth_by_body_names():
     assert of_bodies(DENT, MOVED) == [0, 0, 0, 0, 0]
     assert of_bodies(("dent", "b", 0.0, 5.0, 1.0), MOVED) == [1, 0, 0, 0, 0]
     assert of_bodies(("misalignment", "a", 0.0, 5.0, 1.0), MOVED) == [0, 0, 1, 0, 0]
@@ -220,7 +220,7 @@ def test_the_other_side_of_a_dented_plate_is_no_false_alarm():
 
 
 @pytest.mark.parametrize(("shift", "share"), [(0.15, 100.0), (0.25, 500.0 / 6.0)])
-def test_poses_of_pairs_are_held_against_the_truth_wherever_their_frame_lies(shift, share):
+def test_poses_of_pairs_are_compared_with_the_truth_in_any_frame(shift, share):
     """Standard deviations of 0.1 mm and 0.01 mrad at a frame's origin 90 m off: one axis is off by ``shift``."""
     true = np.stack([np.eye(4), PROJECT])
     T_a_b = rigid.transform(np.eye(3), np.array([shift, 0.0, 0.0])) @ PROJECT

@@ -8,7 +8,7 @@ from processor.distinct_rows import distinct, distinct_points
 
 @pytest.mark.parametrize("span", [3, 40, 10**6, 2**40])
 @pytest.mark.parametrize("columns", [1, 2, 4])
-def test_they_are_those_of_numpy(span, columns):
+def test_distinct_rows_equal_those_of_numpy(span, columns):
     rows = np.random.default_rng(columns).integers(-span, span, (5_000, columns))
     rows = np.vstack([rows, rows[::3]])
     found = distinct(rows)
@@ -17,7 +17,7 @@ def test_they_are_those_of_numpy(span, columns):
         np.testing.assert_array_equal(own, theirs.reshape(own.shape))
 
 
-def test_of_no_rows():
+def test_distinct_rows_of_an_empty_array_are_empty():
     found = distinct(np.empty((0, 3), np.int64))
     assert found.rows.shape == (0, 3)
     assert len(found.first) == len(found.number) == len(found.count) == 0

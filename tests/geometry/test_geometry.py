@@ -94,7 +94,7 @@ def test_point_to_point_agrees_with_open3d():
     assert found.rms == pytest.approx(theirs.inlier_rmse, rel=1e-6)
 
 
-def test_point_to_plane_brings_a_box_home():
+def test_point_to_plane_icp_recovers_the_pose_of_a_box():
     rng = np.random.default_rng(3)
     points = rng.uniform(-1.0, 1.0, (6000, 3)) * [3000.0, 900.0, 500.0]
     axis = rng.integers(0, 3, len(points))

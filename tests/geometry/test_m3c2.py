@@ -1,4 +1,4 @@
-"""M3C2 held against brute force written from its definition, real planes, and what must not matter."""
+"""M3C2 against brute force from its definition and real planes; order and threads must not change it."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def both(reference, compared, core, normal_diameter=80.0, diameter=50.0, depth=4
 
 
 @pytest.mark.parametrize("case", [(80.0, 50.0, 40.0), (60.0, 120.0, 5.0), (200.0, 20.0, 300.0)])
-def test_it_is_what_brute_force_finds(case):
+def test_normals_and_distances_equal_those_by_brute_force(case):
     reference, compared = wavy(20_000, 1), wavy(15_000, 2, 5.0)
     core = np.vstack([reference[:150], wavy(40, 3, 15.0), [[-400.0, 0.0, 0.0], [1e6, 0.0, 0.0], [500.0, 500.0, 70.0]]])
     normals, found = both(reference, compared, core, *case)
@@ -47,7 +47,7 @@ def test_it_is_what_brute_force_finds(case):
     assert (found.n1[~known] == 0).all()
 
 
-def test_any_direction_is_as_good_as_up():
+def test_distances_are_right_along_normals_of_any_direction():
     rng = np.random.default_rng(4)
     reference, compared = rng.uniform(0.0, 300.0, (2, 6000, 3))
     core = rng.uniform(-20.0, 320.0, (200, 3))
@@ -84,7 +84,7 @@ def test_a_cloud_is_at_no_distance_from_itself():
     assert not found.significant.any()
 
 
-def test_neither_order_nor_threads_show():
+def test_order_of_points_and_threads_do_not_change_the_results():
     reference, compared = wavy(30_000, 6), wavy(30_000, 7)
     reference[100:200] = reference[:100]  # twice the same
     core = reference[::7]
@@ -118,7 +118,7 @@ def test_points_on_a_line_have_no_normal():
     assert np.isnan(m3c2.normals(m3c2.grid(line, 20.0), line, 40.0).normals).all()
 
 
-def test_the_sign_of_a_normal_follows_what_it_should_look_at():
+def test_normals_are_turned_towards_the_given_directions():
     normals = np.array([[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
     np.testing.assert_array_equal(m3c2.oriented(normals, UP), np.abs(normals))
     towards = np.array([[0.0, 0.0, -2.0], [0.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])

@@ -69,7 +69,7 @@ def _walked(surface, point, at):
     return at, (point - corners[0]) @ surface.normals[at], max(-share[side], 0.0) * height
 
 
-def test_walks_end_where_they_do_step_by_step():
+def test_walks_over_facets_end_where_a_step_by_step_walk_ends():
     mesh = trimesh.creation.cylinder(500.0, 2000.0, sections=48)
     surface = mesh_distance.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
     rng = np.random.default_rng(3)
@@ -99,7 +99,7 @@ def slivers(count, length=3000.0, width=3.0, seed=3):
 
 
 @pytest.mark.parametrize("count", [20, 4000], ids=["few", "so many that voxels are larger"])
-def test_every_voxel_that_a_sliver_comes_near_has_it_once(count, monkeypatch):
+def test_every_voxel_near_a_sliver_facet_lists_it_once(count, monkeypatch):
     vertices, faces = slivers(count)
     monkeypatch.setattr(mesh_distance, "MOST_ENTRIES", 200_000)
     cross, double = mesh_distance.double_areas(vertices, faces)

@@ -1,4 +1,4 @@
-"""Signs of normals: up where that tells, one over each connected surface where it does not, whatever the order."""
+"""Signs of normals: upwards where that decides, else one sign for each connected surface, in any order of points."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def turned(cloud, core=None, scanner=None, across=ACROSS):
     return found, normal_orientation.turned(found, core, across, scanner)
 
 
-def test_what_up_decides_is_as_before_to_the_bit():
+def test_normals_of_level_surfaces_equal_those_oriented_upwards_bit_for_bit():
     cloud = wavy(20_000, 1)
     found, got = turned(cloud)
     np.testing.assert_array_equal(got.normals, oriented(found.normals, UP))
@@ -44,7 +44,7 @@ def test_what_up_decides_is_as_before_to_the_bit():
     ("along", "outward"),
     [((1, 0), (0, 1)), ((0, 1), (1, 0)), ((1, 1), (-1, 1)), ((1, -1), (1, 1)), ((1, 2), (2, -1))],
 )
-def test_an_upright_wall_has_one_side_by_convention(along, outward):
+def test_normals_of_an_upright_wall_have_one_side_by_convention(along, outward):
     for seed in range(3):
         found, got = turned(wall(seed, along))
         assert 0.3 < (oriented(found.normals, UP)[:, :2] @ outward > 0.0).mean() < 0.7  # as it was: by chance
@@ -52,7 +52,7 @@ def test_an_upright_wall_has_one_side_by_convention(along, outward):
         assert (got.convention, got.surfaces) == (8000, 1)
 
 
-def test_a_wall_that_leans_as_a_whole_looks_up():
+def test_normals_of_a_leaning_wall_point_upwards_on_the_whole():
     _, got = turned(wall(3, lean=0.05))
     assert got.up == 0
     assert (got.normals[:, 1] > 0.0).all()  # the side that looks up, though some of its normals do not
@@ -62,7 +62,7 @@ def test_a_wall_that_leans_as_a_whole_looks_up():
     np.testing.assert_array_equal(got.normals, oriented(steep.normals, UP))
 
 
-def test_a_wall_has_the_side_of_the_floor_that_it_rises_from():
+def test_normals_of_a_wall_point_to_the_side_of_its_floor():
     rng = np.random.default_rng(5)
     for side in (1.0, -1.0):
         x, y = rng.uniform(0.0, 1000.0, (2, 8000))
@@ -83,7 +83,7 @@ def test_a_tube_that_stands_alone_looks_outward():
     assert (np.einsum("ni,ni->n", got.normals[:, :2], cloud[:, :2]) > 0.0).all()
 
 
-def test_a_scanner_tells_what_up_does_not():
+def test_normals_of_an_upright_wall_point_to_the_scanner():
     cloud = wall(8)
     scanner = np.broadcast_to([500.0, -4000.0, 500.0], cloud.shape)
     _, got = turned(cloud, scanner=scanner)
@@ -95,7 +95,7 @@ def test_a_scanner_tells_what_up_does_not():
     assert got.scanner > 3000 < got.neighbours
 
 
-def test_neither_the_order_nor_repeated_points_show():
+def test_order_and_repeated_points_do_not_change_orientations():
     aside = np.array([600.0, 600.0, 0.0])
     cloud = np.vstack([tube(9, 4000), wall(10, (1, -1), 4000) + aside, wavy(4000, 11) - [0.0, 0.0, 90.0]])
     cloud = np.vstack([cloud, np.repeat(cloud[:300], 15, axis=0)])
@@ -106,7 +106,7 @@ def test_neither_the_order_nor_repeated_points_show():
     np.testing.assert_array_equal(np.abs(first.normals), np.abs(found.normals))
 
 
-def test_few_core_points_far_apart_and_none_at_all():
+def test_orientation_works_for_few_distant_or_no_core_points():
     cloud = wall(13)
     _, got = turned(cloud, np.array([[100.0 + 80.0 * i, 0.0, 500.0] for i in range(11)]))
     assert (got.normals[:, 1] > 0.9).all()

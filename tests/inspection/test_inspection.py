@@ -114,7 +114,7 @@ def random_covariance(rng, n, scale):
     return scale**2 * (np.diag(rng.uniform(0.3, 1.0, n)) + 0.5 * shared @ shared.T)
 
 
-def test_intervals_hold_the_true_values_in_95_of_100_cases():
+def test_intervals_cover_the_true_values_in_95_of_100_cases():
     rng = np.random.default_rng(4)
     covariance = random_covariance(rng, 48, 0.3)
     root = np.linalg.cholesky(covariance)
@@ -139,7 +139,7 @@ def test_lengths_include_the_scale_of_the_scanner():
 
 @pytest.mark.parametrize(("bow", "least"), [(0.0, 0.88), (3.0, 0.88), (-3.0, 0.88)])
 def test_sweep_is_measured_from_the_parts_own_ends(bow, least):
-    """Of 80 cases 71 or more are held with a probability of 99 %, if it is 95 % in each."""
+    """Of 80 intervals 71 or more cover with a probability of 99 %, if each covers with 95 %."""
     rng = np.random.default_rng(7)
     n = len(CHAINAGE)
     tilted = 5.0 + 4e-3 * CHAINAGE  # a motion of the part is no sweep
@@ -159,7 +159,7 @@ def test_sweep_is_measured_from_the_parts_own_ends(bow, least):
         assert set(signs) == {np.sign(bow)}
 
 
-def test_what_was_not_seen_has_a_reason_and_no_value():
+def test_unseen_characteristics_have_a_reason_and_no_value():
     ends = RIB.copy()
     ends[1] = np.nan
     covariance = np.zeros((48, 48))

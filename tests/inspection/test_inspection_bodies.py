@@ -62,8 +62,8 @@ def runs():
     return found
 
 
-def test_intervals_hold_what_was_built(runs):
-    """50 values: with 95 % each, 44 or more are held in 98 of 100 cases."""
+def test_intervals_cover_the_deviations_as_built(runs):
+    """50 intervals: with 95 % each, 44 or more cover in 98 of 100 cases."""
     errors = []
     for _, built, result in runs:
         found = by_id(result)
@@ -179,7 +179,7 @@ def test_a_plate_has_a_thickness_and_no_height():
     assert not any(one.quantity is Quantity.HEIGHT for one in found.values())
 
 
-def test_what_cannot_be_inspected_is_said():
+def test_scene_without_design_or_deviation_is_not_inspected_with_a_reason():
     with pytest.raises(InputError, match="needs a design"):
         inspection_step.run(Scene("x", "structure"), inspection_step.Params())
     scene = beam_clouds.beam(Built(), 1, count=2000)
@@ -230,7 +230,7 @@ def test_the_step_is_partial_if_a_body_was_not_seen_and_failed_if_none_was(runs)
         assert result.status is status
 
 
-def test_the_twist_of_a_flange_holds_where_a_web_hides_half_of_it_from_each_station():
+def test_twist_interval_of_a_half_hidden_flange_covers():
     """Three stations see one strip each, with a shift and a turn of .35 mm over half the length."""
     mesh = trimesh.creation.box((6000.0, 300.0, 20.0))
     design = StructureDesign("flange", np.asarray(mesh.vertices), np.asarray(mesh.faces))

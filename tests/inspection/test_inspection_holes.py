@@ -70,7 +70,7 @@ def test_only_round_holes_through_a_plate_are_holes(what, count):
     assert len(holes_of(body.findSolid())) == count
 
 
-def test_the_bore_of_a_tube_is_none():
+def test_bore_of_a_tube_is_not_a_hole():
     tube = cq.Workplane().circle(60.0).circle(52.0).extrude(2000.0)
     assert holes_of(tube.val()) == []
 
@@ -124,7 +124,7 @@ def without_motion(departure):
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_intervals_hold_the_places_pitches_and_diameters_that_were_drilled(known):
+def test_intervals_cover_drilled_places_pitches_and_diameters(known):
     held: dict[str, list[bool]] = {"along": [], "across": [], "pitch": [], "diameter": []}
     for seed in range(15):
         rng = np.random.default_rng(seed)

@@ -76,7 +76,7 @@ def test_tubes_have_diameter_and_bow():
     assert (bow.deviation, bow.ci95) == (0.5, pytest.approx(0.3))
 
 
-def test_what_was_not_seen_has_a_reason():
+def test_unseen_members_have_a_reason():
     found = inspected()
     missing = found["10-12"]  # node 12 was not found, and no tube leads to it
     assert missing.status is Status.FAILED
@@ -88,7 +88,7 @@ def test_what_was_not_seen_has_a_reason():
 @pytest.mark.parametrize(
     ("limit", "verdict"), [(1.0, Verdict.PASS), (0.6, Verdict.INDETERMINATE), (0.15, Verdict.FAIL)]
 )
-def test_a_bow_is_held_against_the_limit_of_the_project(limit, verdict):
+def test_bow_is_judged_by_the_limit_of_the_project(limit, verdict):
     bounds = {"part_bow_mm": np.array([-limit, limit])}
     tolerance = standards.override(Tolerance(), bounds, "project.toml")
     assert by_id(inspected(tolerance=tolerance)["10-11"], "bow").verdict is verdict
@@ -119,7 +119,7 @@ def test_deviation_of_a_frame_needs_spheres():
     ("flag", "verdict"),
     [("ok", Verdict.PASS), ("low-confidence", Verdict.INDETERMINATE), ("wrong-size", Verdict.INDETERMINATE)],
 )
-def test_a_length_to_a_flagged_sphere_has_no_sure_verdict(flag, verdict):
+def test_length_to_a_flagged_sphere_is_indeterminate(flag, verdict):
     tolerance = standards.override(Tolerance(), {"part_length_mm": np.array([-99.0, 99.0])}, "project.toml")
     found = ball_results.whole()
     flags = (Flag(flag), Flag.OK, *found.balls.flag[2:])

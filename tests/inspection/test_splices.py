@@ -32,7 +32,7 @@ def shares(*groups):
 
 
 @pytest.mark.parametrize(("off", "share"), [(0.9, 1.0), (1.1, 0.5)])
-def test_a_pitch_that_is_too_long_is_no_motion(off, share):
+def test_pitch_error_is_not_absorbed_by_a_rigid_motion(off, share):
     """Two holes of the right part are 2 off too far apart: a pin of 1 mm less passes up to 1 mm."""
     left = drilled("west", [-100.0, 0.0, 0.0], [X, Y], ROW, np.zeros((2, 2)))
     right = drilled("east", [100.0, 0.0, 0.0], [X, Y], ROW, [[-off, 0.0], [off, 0.0]])
@@ -112,7 +112,7 @@ def test_a_part_that_was_moved_and_turned_passes():
     assert shares(*groups)["splice-pass-through"].deviation == 0.0
 
 
-def test_intervals_hold_the_share_of_the_true_places():
+def test_intervals_cover_the_share_of_the_true_places():
     held = []
     for seed in range(60):
         rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Child processes and those that run jobs in them: limits, stopping, and the end of all that was started."""
+"""Child processes and pools of them: limits, stopping, and the end of all descendants."""
 
 import os
 import subprocess
@@ -47,7 +47,7 @@ def test_a_child_ends_with_its_parent(group):
     assert not alive(child)
 
 
-def test_how_a_command_ended():
+def test_end_of_a_command_has_cause_exit_code_and_last_line():
     def ended(code, **limits):
         return process.run([sys.executable, "-c", code], **limits)
 
@@ -62,7 +62,7 @@ def test_how_a_command_ended():
     assert ended(SLEEP, timeout_s=0.1, own_group=False).cause is Cause.TIME
 
 
-def test_nothing_that_a_command_started_is_left(tmp_path):
+def test_all_descendants_of_a_command_are_ended(tmp_path):
     code = (
         "import subprocess, sys; from pathlib import Path;"
         f"inner = subprocess.Popen([sys.executable, '-c', {SLEEP!r}]); Path(sys.argv[1]).write_text(str(inner.pid))"
@@ -80,7 +80,7 @@ def fail(_):
     raise ImportError("no module\nnamed x")
 
 
-def test_a_job_that_raises_is_lost_and_its_process_goes_on():
+def test_raising_job_is_lost_and_its_process_takes_the_next():
     pool = process.Pool()
     assert pool.do(fail, 1) == Lost(Loss.NOT_RUN, "ImportError: no module named x")
     assert pool.do(abs, -2) == 2
@@ -113,7 +113,7 @@ def test_an_error_of_a_job_here_stops_the_others():
     assert sorted(stopped) == [1, 2]
 
 
-def test_a_signal_is_raised_where_it_is_looked_for():
+def test_signal_is_raised_at_the_next_check():
     with runner.stoppable() as check_stop:
         check_stop()
         os.kill(os.getpid(), 15)
@@ -124,7 +124,7 @@ def test_a_signal_is_raised_where_it_is_looked_for():
 
 
 @pytest.mark.parametrize("name", ["", "file"])
-def test_a_lock_is_taken_once(tmp_path, name):
+def test_lock_is_refused_while_it_is_taken(tmp_path, name):
     with (
         runner.locked(tmp_path / name, "busy"),
         pytest.raises(UsageError, match="busy"),

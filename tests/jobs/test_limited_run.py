@@ -1,4 +1,4 @@
-"""A run with limits: what ended it is named, and what was done is kept."""
+"""A run with limits: the cause of its end is reported, and finished steps are stored."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def ended(cause, code=0, last_line=""):
     return Ended(cause, code=code, last_line=last_line, seconds=1.0, peak_mb=1.0, max_rss_mb=1.0)
 
 
-def test_what_is_done_is_kept_before_each_step(tmp_path, site):
+def test_results_so_far_are_stored_before_each_step(tmp_path, site):
     part = tmp_path / "out.part"
     runs.compute(site, steps="deviation", method="default,paper", so_far=part)
     (first,), provenance = pipeline.read_runs(part / "results.h5")
@@ -44,7 +44,7 @@ def test_what_is_done_is_kept_before_each_step(tmp_path, site):
     assert (part / "report.html").is_file()
 
 
-def test_what_is_kept_does_not_change_the_results(tmp_path, site):
+def test_storing_intermediate_results_does_not_change_the_results(tmp_path, site):
     for out, so_far in (("a", None), ("b", tmp_path / "part")):
         runs.write(runs.compute(site, steps="deviation", so_far=so_far), tmp_path / out)
     assert (tmp_path / "a" / "results.h5").read_bytes() == (tmp_path / "b" / "results.h5").read_bytes()
@@ -72,7 +72,7 @@ def test_a_run_within_its_limits_is_as_without(tmp_path, site):
     assert (bad.returncode, "no such file" in bad.stderr) == (3, True)
 
 
-def test_every_end_has_a_reason():
+def test_ended_run_has_a_reason_for_each_cause():
     assert limited_run._why(ended(Cause.EXIT), 1.0, 100) == ""
     assert "within 1 s" in limited_run._why(ended(Cause.TIME), 1.0, None)
     assert "100 MB" in limited_run._why(ended(Cause.EXIT, 3, "error: Unable to allocate 9 GiB"), None, 100)

@@ -1,4 +1,4 @@
-"""What is being done is shown on a terminal alone, and only where it lasts."""
+"""Progress is shown on a terminal alone, and only for long stages."""
 
 import io
 import sys
@@ -15,7 +15,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize(("terminal", "lasts"), [(True, True), (True, False), (False, True)])
-def test_what_lasts_is_said_on_a_terminal(monkeypatch, terminal, lasts):
+def test_long_stage_is_shown_on_a_terminal_alone(monkeypatch, terminal, lasts):
     shown = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", shown)
     monkeypatch.setattr(progress, "PATIENCE_S", 0.01 if lasts else 60.0)
@@ -29,12 +29,12 @@ def test_what_lasts_is_said_on_a_terminal(monkeypatch, terminal, lasts):
     assert not progress._stages
 
 
-def test_what_fails_within_a_stage_is_not_held_back(monkeypatch):
+def test_errors_within_a_stage_are_raised(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     with pytest.raises(ValueError, match="no"), progress.stage("measuring"):
         raise ValueError("no")
     assert not progress._stages
 
 
-def test_items_are_counted_without_a_stage_too():
+def test_tracked_items_are_returned_without_a_stage():
     assert list(progress.tracked([1, 2])) == [1, 2]

@@ -37,7 +37,7 @@ def test_tiles_are_computed_here_in_order():
     assert [int(part[0]) for part, _, _ in found] == [0, 2, 4, 6, 8, 10, 12]
 
 
-def test_tiles_are_passed_over_once_and_not_held():
+def test_tiles_are_generated_one_by_one():
     """The next tile is made only when the result of the last one was taken: many tiles need no memory."""
     made = []
     found = tiles.mapped(np.sum, (made.append(k) or tile for k, tile in enumerate(TILES)))
@@ -84,7 +84,7 @@ def test_a_worker_with_other_software_is_named(dask_cluster, monkeypatch):  # no
         list(tiles.mapped(np.sum, TILES))
 
 
-def test_a_worker_that_ends_costs_its_tile_alone(tmp_path):
+def test_dying_worker_has_its_tile_computed_again(tmp_path):
     """Its tile is computed again; Dask gives up after some attempts, and the message says what to do."""
     with cluster_in(tmp_path) as cluster:
         cluster.add_worker("a")

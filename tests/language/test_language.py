@@ -31,14 +31,14 @@ CODES = [code for code in messages_.CODES if code != "en"]
 
 
 @pytest.mark.parametrize("code", CODES)
-def test_all_that_the_scripts_say_is_known(code):
+def test_texts_of_the_scripts_are_translated(code):
     script, _ = page_script.script()
     said = set(re.findall(r'say\("([^"]+)"\)', script))
     assert len(said) > 20
     assert said - set(messages(code).of_scripts(script)) == set()
 
 
-def test_names_from_files_are_left_alone():
+def test_names_from_files_are_not_translated():
     execution = of_bridge(names=("top", "rib1", "foot2"), joints=("gap", "J2"))
     seen = Visible(page.html(execution, ErrorReport(), {}, "zh"))
     assert {"top", "gap"} <= set(seen.texts)
@@ -143,7 +143,7 @@ def a_frame():
 
 
 @pytest.mark.parametrize("made", [lambda: (a_bridge(), ErrorReport()), a_frame], ids=["bridge", "frame"])
-def test_nothing_but_names_and_units_is_left_in_english(made):
+def test_chinese_page_has_english_names_and_units_alone(made):
     seen = Visible(chinese_page(*made()))
     assert seen.lang == "zh"
     assert len(seen.texts) > 100
@@ -151,7 +151,7 @@ def test_nothing_but_names_and_units_is_left_in_english(made):
 
 
 @pytest.mark.parametrize("size_mm", [0.2, 1.0, 4.0])
-def test_no_proposal_keeps_a_word_of_english(size_mm):
+def test_proposals_are_translated_completely(size_mm):
     chinese = messages("zh")
     rng = np.random.default_rng(int(10 * size_mm))
     said = set()
@@ -165,5 +165,5 @@ def test_no_proposal_keeps_a_word_of_english(size_mm):
 
 
 @pytest.mark.parametrize("code", [code for code in messages("zh").reasons if code.startswith("spheres.")])
-def test_what_is_said_of_balls_is_known(code):
+def test_reasons_of_balls_are_translated_completely(code):
     assert latin([literal for literal, *_ in string.Formatter().parse(messages("zh").reasons[code])]) == []

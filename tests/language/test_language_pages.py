@@ -101,7 +101,7 @@ def given():
 
 
 @pytest.mark.parametrize("made", [stitched, controlled, given, searched])
-def test_nothing_but_names_and_units_is_left_in_english(made):
+def test_chinese_page_has_english_names_and_units_alone(made):
     execution, report = made()
     text = page.html(execution, report, all_figures.draw_figures(execution, report), "zh")
     assert left_in_english(text) == []
@@ -129,7 +129,7 @@ def test_reasons_of_the_search_are_in_chinese(reasons):
     assert latin([messages("zh").sentences(reasons)], STAYS | NAMES) == []
 
 
-def test_a_word_of_two_senses_has_that_of_its_vocabulary_or_column():
+def test_ambiguous_word_is_translated_by_its_vocabulary_or_column():
     say = messages("zh").text
     assert (say(label("step")), say(DefectClass.STEP), say(label("missed: step"))) == ("步骤", "错台", "漏检：错台")
     assert (say(label("misalignment")), say(DefectClass.MISALIGNMENT)) == ("接口错边", "整体偏位")

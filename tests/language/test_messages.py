@@ -1,4 +1,4 @@
-"""The catalogues of messages: complete in every language, and nothing in them that no program uses."""
+"""The catalogues of messages: complete in every language, without unused messages."""
 
 import ast
 import functools
@@ -85,7 +85,7 @@ def test_every_text_of_the_sources_is_translated_with_the_same_values(code):
 
 
 @pytest.mark.parametrize("code", OTHERS)
-def test_words_of_a_catalogue_are_of_a_vocabulary(code):
+def test_words_of_a_catalogue_belong_to_their_vocabulary(code):
     assert pipeline.step_modules()
     assert (
         len({record.JobStatus, change_detection.ChangeKind, coverage.Holds, curves.CurveKind, rows.Outcome, Finding})
@@ -97,7 +97,7 @@ def test_words_of_a_catalogue_are_of_a_vocabulary(code):
             assert word in [str(one) for one in VOCABULARIES[name]], key
 
 
-def test_no_message_stands_twice():
+def test_no_message_of_a_catalogue_is_defined_twice():
     for code in CODES:
         for section in ("reasons", "texts", "words"):
             every = [key for file in catalogue(code).values() for key in file.get(section, {})]

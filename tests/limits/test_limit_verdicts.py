@@ -75,21 +75,21 @@ def given(of_components=None, **limits):
     ("value", "ci95", "verdict"),
     [(4.0, 0.9, PASS), (4.0, 1.1, OPEN), (6.0, 1.1, OPEN), (6.0, 0.9, FAIL), (4.0, math.nan, OPEN)],
 )
-def test_an_interval_decides(value, ci95, verdict):
+def test_verdict_follows_from_the_interval_of_the_value(value, ci95, verdict):
     tolerance = given(node_place_mm=5.0)
     (limit,) = tolerance.limits
     assert judging.compare(limit, Measured.within("n", value, ci95)).verdict is verdict
     assert judging.compare(limit, Measured.within("n", value, ci95, doubtful=True)).verdict is OPEN
 
 
-def test_a_limit_by_an_unknown_size_decides_nothing():
+def test_limit_by_an_unknown_size_gives_an_indeterminate_verdict():
     limit = standards.find(standards.load("JGJ 7-2010"), "support_centre_mm")
     assert judging.compare(limit, Measured.within("n", 1.0, 0.1)).verdict is OPEN
     assert judging.compare(limit, Measured.within("n", 1.0, 0.1, {"length": 30_000.0})).verdict is PASS
     assert judging.compare(limit, Measured.within("n", 11.0, 0.1, {"length": 30_000.0})).verdict is FAIL
 
 
-def test_every_row_is_read_or_says_what_it_needs():
+def test_every_limit_is_compared_or_states_what_it_needs():
     read = {measure for of_step in measurands.MEASURES.values() for measure in of_step}
     rows = [row for content in standards.files() for row in content["limit"]]
     for row in rows:
@@ -158,7 +158,7 @@ def test_a_pass_needs_every_interval_and_a_fail_one_beyond_chance():
     assert judged(*surface(values), given(deviation_mm=[-5.0, 5.0]))["right"] is FAIL
 
 
-def test_the_worse_side_decides():
+def test_side_with_the_worse_deviation_sets_the_verdict():
     values = np.zeros((2, 20))
     values[0, :2] = 8.0, -30.0
     lod95 = np.ones(40)
@@ -176,7 +176,7 @@ def test_a_share_of_the_surface_may_be_limited():
     assert judged(*surface(values), given(**limits))["left"] is OPEN
 
 
-def test_what_is_not_sure_or_not_seen_is_indeterminate():
+def test_unseen_or_uncertain_components_are_indeterminate():
     values = np.zeros((2, 10))
     values[1] = np.nan
     tolerance = given(deviation_mm=[-5.0, 5.0])
@@ -246,7 +246,7 @@ def test_defects_are_judged_by_class_component_depth_and_area():
     assert of_defects(given(pit_area_mm2=0.0)) == [("2 pit flange", "pit_area_mm2", FAIL)]
 
 
-def test_what_is_doubtful_of_a_defect_decides_nothing():
+def test_doubtful_defects_give_indeterminate_verdicts():
     tolerance = given(defect_depth_mm=3.0)
     assert of_defects(tolerance, defects(doubtful=[True, False]))[0][2] is OPEN
     bound = ((), (reason("defects.depth-bound"),))
@@ -258,7 +258,7 @@ def test_what_is_doubtful_of_a_defect_decides_nothing():
     assert [row[2] for row in of_defects(tolerance, failed)] == [OPEN]
 
 
-def test_a_surface_passes_only_where_the_limit_would_be_seen():
+def test_surface_passes_only_if_a_defect_of_the_limit_is_detectable():
     none = defects(
         defect_class=(), confidence=[], otherwise=(), component=(), depth_max=[], depth_ci95=[], area_mm2=[],
         doubtful=[], reasons=(),
@@ -470,13 +470,13 @@ def test_limits_of_components_are_read(tmp_path):
         ("[[tolerance.component]]\ndeviation_mm = [-1, 1]", "expected a text as 'name', found nothing"),
     ],
 )
-def test_a_slip_is_one_clear_line(tmp_path, text, said):
+def test_mistyped_limits_are_refused_in_one_line(tmp_path, text, said):
     with pytest.raises(InputError, match=said) as found:
         read(tmp_path, text)
     assert "\n" not in str(found.value)
 
 
-def test_a_component_that_the_design_has_not_is_named(tmp_path):
+def test_limits_of_an_unknown_component_are_refused_by_name(tmp_path):
     found = given({"wed*": {"deviation_mm": [-3.0, 3.0]}})
     with pytest.raises(InputError, match=r"no component 'wed\*' \(did you mean 'web'\?\); the design has web, flange"):
         tolerance.check_components("project.toml", found, ("web", "flange"))
@@ -485,7 +485,7 @@ def test_a_component_that_the_design_has_not_is_named(tmp_path):
     tolerance.check_components("project.toml", None, ("web",))
 
 
-def test_names_are_suggested_by_their_letters():
+def test_mistyped_name_gets_the_most_similar_suggestion():
     assert did_you_mean("preasemble", ["preassemble", "spheres"]) == " (did you mean 'preassemble'?)"
     assert did_you_mean("xyz", ["preassemble", "spheres"]) == ""
 
@@ -511,7 +511,7 @@ def test_joints_are_counted_in_words(verdicts, said):
 
 @pytest.mark.usefixtures("blank_pictures")
 def test_a_frame_with_supports_through_the_command_line(tmp_path):
-    """Supports of a frame are held against the rows of JGJ 7; one that was designed 30 mm higher fails."""
+    """Supports of a frame are judged by the rows of JGJ 7; one that was designed 30 mm higher fails."""
     place = tmp_path / "frame"
     shutil.copytree(ROOT / "fixtures/scan-folder", place)
     design = json.loads((place / "design.json").read_text("utf-8"))

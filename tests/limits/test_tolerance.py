@@ -1,4 +1,4 @@
-"""Limits as data: what the files hold, what a project may say, and what it hears of a slip."""
+"""Limits as data: content of the files, limits of a project, and messages on mistakes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def write_project(place, text):
     return place
 
 
-def test_every_row_says_what_it_is():
+def test_every_limit_has_a_meaning_source_and_measure():
     assert len(standards.standards()) >= 6
     for name, standard in standards.standards().items():
         keys = [row.key for row in standard.limits]
@@ -53,7 +53,7 @@ def test_measures_are_those_of_the_bridges_steps():
     assert (*joints.MEASURES, *chain.MEASURES) == measurands.MEASURES["preassemble"]
 
 
-def test_only_what_was_seen_in_print_is_verified():
+def test_only_limits_checked_in_print_are_verified():
     seen = {(name, row.clause) for name, one in standards.standards().items() for row in one.limits if row.verified}
     assert seen == {("GB 50205-2020", "11.3.6"), ("JGJ 7-2010", "6.11"), ("AWS D1.1", "7.22.9")}
 
@@ -118,13 +118,13 @@ def test_a_projects_own_limits_win_and_go_through_the_store(tmp_path):
     assert store.scene_hash(scene) != store.scene_hash(dataclasses.replace(scene, tolerance=None))
 
 
-def test_limits_without_a_standard_are_all_there_is(tmp_path):
+def test_project_without_a_standard_has_its_own_limits_alone(tmp_path):
     scene = folder.read_input(write_project(tmp_path, "[tolerance]\nsplice_eccentricity_mm = 4.0\n"))
     assert [row.key for row in scene.tolerance.limits] == ["splice_eccentricity_mm"]
     assert standards.bounds(scene.tolerance.limits[0], {}) == (-math.inf, 4.0)
 
 
-def test_a_project_may_limit_what_no_standard_does(tmp_path):
+def test_project_may_set_a_limit_that_no_standard_has(tmp_path):
     for name in standards.standards():
         assert standards.find(standards.load(name), standards.NODE_PLACE) is None
     for text in ("", 'standard = "JGJ 7-2010"\n'):
@@ -133,7 +133,7 @@ def test_a_project_may_limit_what_no_standard_does(tmp_path):
         assert (own.high, own.verified, own.source) == (15.0, True, "project.toml")
 
 
-def test_nothing_said_is_nothing_held(tmp_path):
+def test_empty_tolerance_table_gives_no_limits(tmp_path):
     assert folder.read_input(write_project(tmp_path, "[tolerance]\n")).tolerance is None
     assert standards.default_for(None).standard == "GB 50205-2020"
     empty = Scene("e", "structure", (Scan("s", np.eye(3)),), tolerance=Tolerance())
@@ -141,7 +141,7 @@ def test_nothing_said_is_nothing_held(tmp_path):
     assert store.read_scene(tmp_path / "e.h5").tolerance == Tolerance()
 
 
-def test_blanks_of_balls():
+def test_blank_tolerances_of_balls_follow_their_diameters():
     # Half of +2/-1 up to a diameter of 120 and of +3/-1.5 above.
     gb = standards.load("GB 50205-2020")
     for limits in (gb, Tolerance(), standards.load("JGJ 7-2010")):

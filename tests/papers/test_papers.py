@@ -63,7 +63,7 @@ def row(published, values, rule):
         (Rule.HOLDS, 1.0, (math.nan, math.nan), Outcome.NOT_MADE, math.nan),
     ],
 )
-def test_what_counts_as_reproduced(rule, published, values, outcome, worst):
+def test_outcome_of_a_statement_follows_its_rule(rule, published, values, outcome, worst):
     made = row(published, values, rule)
     assert made.outcome == outcome
     np.testing.assert_equal(made.worst, worst)
@@ -115,7 +115,7 @@ def test_measuring_ends_at_its_limit(tmp_path, monkeypatch):
     assert "longer" not in stopped.failed
 
 
-def test_differences_of_two_methods_by_motions_are_told_from_others():
+def test_differences_of_methods_by_rigid_motions_leave_no_residual():
     # Corners and middles of a section, gaps changed by a small rotation and a shift of the part.
     rng = np.random.default_rng(1)
     corners = np.array([[0, 700, -900], [0, -700, -900], [0, -700, 900], [0, 700, 900.0]])
@@ -128,7 +128,7 @@ def test_differences_of_two_methods_by_motions_are_told_from_others():
     assert preassembly.beyond_rigid(picked)[0] == pytest.approx(0.5, rel=0.25)
 
 
-def test_the_papers_tables_keep_the_papers_statement():
+def test_tables_of_the_paper_agree_with_its_statement():
     # "At most 1 mm" between both methods, and nothing of it by a motion: see the page.
     tables = {key: np.array(value) for key, value in preassembly.published().items() if key.startswith("table")}
     assert {table.shape for table in tables.values()} == {(8, 12)}

@@ -1,4 +1,4 @@
-"""What the stages of the papers' methods find: numbers in results.h5, clouds on request; neither changes a result."""
+"""Diagnostics of the stages of the papers' methods: numbers in results.h5, clouds on request; results do not change."""
 
 import csv
 from pathlib import Path
@@ -26,7 +26,7 @@ def turned(angle, shift):
     return rigid.transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array(shift))
 
 
-def test_only_a_taker_hears_and_nobody_hears_other_threads():
+def test_notes_are_recorded_in_their_own_thread_while_recording():
     diagnostics.note("a", x=1.0)
     with diagnostics.recording() as notes:
         with diagnostics.at("joint"), diagnostics.at("top"):

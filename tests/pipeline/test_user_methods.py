@@ -1,4 +1,4 @@
-"""Methods of the user's own: run beside ours, named by the user alone."""
+"""Methods of the user's own: run beside the built-in ones, named by the user alone."""
 
 import json
 import re
@@ -43,7 +43,7 @@ def test_the_example_of_the_page_runs_beside_ours(place):
     assert [run.method for run in runs] == ["ray", "my_module.my_method"]
 
 
-def test_a_method_gets_what_it_names_and_its_result_is_checked(place):
+def test_user_method_receives_its_named_arguments_and_its_result_is_checked(place):
     (place / "other_module.py").write_text(
         "def fine(scene, params, earlier=None):\n    return earlier\n"
         "def short(scene, params):\n    return 3\n"

@@ -1,4 +1,4 @@
-"""Gaps held against those of the truth, with members made by hand: exact ends and edges, no points."""
+"""Gaps compared with those of the truth, with members made by hand: exact ends and edges, no points."""
 
 import dataclasses
 
@@ -46,7 +46,7 @@ def as_designed():
 
 
 def member(i, ends, edges, unseen, without):
-    """Return what a scan without noise says of part i.
+    """Return the features of part i that a scan without noise has.
 
     Nothing is known of the ends (part, 0 or 1) ``unseen`` and of the parts ``without``.
     """
@@ -127,8 +127,8 @@ def checked(unseen, without, off=0.0, built=as_built):
 
 
 @pytest.mark.parametrize(("unseen", "without", "joints"), [((), (), 4), (((4, 0),), (), 3), ((), (2,), 2)])
-def test_gaps_are_held_against_what_the_answer_could_know(unseen, without, joints):
-    """A joint without an answer pulls nowhere: the other gaps are not those of a chain that it holds together."""
+def test_gaps_are_evaluated_without_the_pull_of_unmeasured_joints(unseen, without, joints):
+    """A joint without a result has no pull: the other gaps are not those of a chain closed by it."""
     found = checked(unseen, without)
     assert found["gaps, number"] == 24 * joints
     assert found["gaps against the truth's, rms"] < 0.03

@@ -52,7 +52,7 @@ def test_the_joints_of_a_loop_lead_from_right_to_left():
     assert at == left
 
 
-def test_ends_are_start_and_end_but_of_branches():
+def test_parts_have_two_ends_and_branches_one_per_joint():
     joined = pairs((0, 1), (1, 2), (1, 3))
     assert topology.ends_of(joined, 0) == ((None, -1.0), (0, 1.0))
     assert topology.ends_of(joined, 2) == ((1, -1.0), (None, 1.0))
@@ -142,7 +142,7 @@ def test_the_interval_of_a_closure_covers_it():
     assert 0.90 <= share <= 0.99  # of 360: 95 % within 4.4 standard deviations of a share
 
 
-def test_key_points_of_parts_without_edges_hold_the_line():
+def test_weight_trades_fit_of_key_points_for_closure_of_joints():
     """With much weight the parts stay where their key points fit the design, with none the joints close."""
     design, frames = graph("node")
     ends = exact_ends(design, np.random.default_rng(5), 2.0)
@@ -177,7 +177,7 @@ def test_the_covariance_of_motions_is_that_of_repeated_measurements():
 
 
 def test_corners_as_built_are_those_of_the_errors():
-    """Corner P1 of an end: length, skews and its own displacement, in the joint's axes; nothing of the other end."""
+    """Corner P1 of an end: length, skews and its own displacement, in the joint's axes; without the other end."""
     (first, second, _) = assembly.build(assembly.Params()).parts
     errors = prismatic.EndErrors(np.array([2.0, 1e-3, -2e-3]), np.arange(12.0).reshape(4, 3))
     none = prismatic.EndErrors(np.zeros(3), np.zeros((4, 3)))
@@ -315,7 +315,7 @@ def test_a_node_with_three_branches_is_measured_at_each_joint():
     np.testing.assert_array_equal(again.components.at_joints[0].key_points_sd, at_node.key_points_sd)
 
 
-def test_methods_of_the_paper_refuse_what_is_no_row():
+def test_methods_of_the_paper_refuse_branched_assemblies():
     recipe = {"kind": "assembly", "assembly": {"type": "node"}, "scan": {"spacing_mm": 200.0}}
     scene, _ = make("node", recipe, 4)
     with pytest.raises(InputError, match="takes components in a row"):

@@ -35,17 +35,17 @@ def scanned(part, seed=1, spacing_mm=30.0):
 @pytest.mark.parametrize(
     ("came", "asked", "found"), [(2, 1, 2), pytest.param(1, 2, 1, marks=pytest.mark.slow), (3, 0, 1), (0, 2, 0)]
 )
-def test_a_scan_of_another_size_is_of_the_part_that_has_it(shapes, came, asked, found):
+def test_scan_of_another_size_is_assigned_to_the_parts_of_that_size(shapes, came, asked, found):
     """Ribs 1 and 3, and the feet, differ by their marks alone: any of them stands for both."""
     assert assignment.rather(scanned(came), asked, shapes) == found
 
 
 @pytest.mark.parametrize("part", range(5))
-def test_a_scan_of_its_part_goes_on(shapes, part):
+def test_scan_of_its_own_part_gets_no_other_assignment(shapes, part):
     assert assignment.rather(scanned(part), part, shapes) is None
 
 
-def test_a_piece_of_a_part_is_not_taken_for_another(shapes):
+def test_scan_of_half_a_part_gets_no_other_assignment(shapes):
     points = scanned(1)
     along = (points - points.mean(axis=0)) @ np.linalg.svd(points[::10] - points[::10].mean(axis=0))[2][0]
     assert assignment.rather(points[along < 0.0], 1, shapes) is None
@@ -75,7 +75,7 @@ def test_every_wrong_assignment_is_named_with_the_matching(order):
     assert headline.values["matching"] == tuple(f"Scan_{i + 1:03d} = {name}" for i, name in enumerate(names))
 
 
-def test_what_cannot_be_told_apart_stays_open():
+def test_scans_of_indistinguishable_parts_stay_unassigned():
     """Two scans without a mark, each of rib 1 or rib 3: neither is named, and neither is wrong."""
     either = ("rib1", "rib3")
     solved = assignment.solve(scans_of(("rib3", "foot1", "rib1"), either, ("foot1",), either))
@@ -85,7 +85,7 @@ def test_what_cannot_be_told_apart_stays_open():
     assert wrong.code == "preassemble.scan-of-others"
 
 
-def test_the_part_that_is_left_is_that_of_the_scan_without_a_mark():
+def test_scan_without_a_mark_is_assigned_to_the_remaining_part():
     either = ("rib1", "rib3")
     solved = assignment.solve(scans_of(("rib1", "foot1", "rib3"), either, ("rib1",), ("foot1",)))
     assert [scan.parts for scan in solved] == [("rib3",), ("rib1",), ("foot1",)]
@@ -94,7 +94,7 @@ def test_the_part_that_is_left_is_that_of_the_scan_without_a_mark():
     assert solved[0].parts == every
 
 
-def test_two_scans_of_one_part_keep_it():
+def test_two_scans_may_be_assigned_to_one_part():
     solved = assignment.solve(scans_of(("rib1", "rib2"), ("rib2",), ("rib2",)))
     assert [scan.parts for scan in solved] == [("rib2",), ("rib2",)]
     assert [bool(scan.wrong) for scan in solved] == [True, False]

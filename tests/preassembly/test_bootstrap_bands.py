@@ -39,7 +39,7 @@ def banded(design, parts, method, **given):
     return bootstrap_bands.with_bands(methods.assemble(parts, design, params), repeated, design, params)
 
 
-def test_a_bound_is_what_one_more_hardly_exceeds():
+def test_bound_is_exceeded_by_one_more_draw_in_less_than_five_percent():
     rng = np.random.default_rng(1)
     every = np.array([5.0, 0.0, 0.0]) + rng.normal(0.0, 2.0, (6, 4_000, 3))
     exceeded = np.linalg.norm(every[5], axis=1) > bootstrap_bands.bound(every[:5])
@@ -57,7 +57,7 @@ def test_too_few_answers_have_no_bound():
     assert np.isnan(bootstrap_bands.bound(vectors)).tolist() == [False, True]
 
 
-def test_a_part_as_built_is_laid_on_its_design():
+def test_points_of_a_part_as_built_are_projected_onto_its_design():
     design, rng = arch_clouds.design().parts[2], np.random.default_rng(2)
     points = arch_clouds.scan_points(2, 20.0, 0.5, rng)
     middle = points.mean(axis=0)
@@ -84,7 +84,7 @@ def test_a_part_as_built_is_laid_on_its_design():
 # Corner is held to its bands over bridges, below: its errors along one bridge are a single rotation.
 @pytest.mark.parametrize("method", ["design-aided", "line"])
 @pytest.mark.slow
-def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
+def test_band_covers_the_errors_of_a_bridge_as_designed(bridge, method):
     """All deviations of this bridge are errors of the method: its parts are exactly as designed."""
     result = banded(*bridge, method)
     borders = np.cumsum([0.0, *(part.edges.design_left.length for part in bridge[1])])
@@ -106,7 +106,7 @@ def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
 
 
 @pytest.mark.slow
-def test_over_bridges_the_bands_hold_what_they_say():
+def test_bands_cover_the_errors_over_several_bridges():
     held = {method: [] for method in PAPER_METHODS}
     for seed in range(1, 9):
         scene, truth = arch_clouds.bridge(spacing_mm=15.0, sigma_mm=1.0, seed=seed)
@@ -136,7 +136,7 @@ def test_where_the_chain_is_broken_there_is_no_band(bridge):
     assert banded(*given, repetitions=3).linear.assembled.ci95.tobytes() == of.ci95.tobytes()
 
 
-def test_without_repetitions_nothing_is_said_of_uncertainty(bridge):
+def test_without_repetitions_no_uncertainty_is_stated(bridge):
     result = banded(*bridge, "corner", repetitions=0)
     assert not result.bands_as_designed
     assert [one.code for one in result.reasons] == ["preassemble.no-uncertainty", "preassemble.inner-edges"]

@@ -53,7 +53,7 @@ def off(mesh, points):
 
 
 @pytest.mark.parametrize("bridge", [{}, {"curve": "circle"}, {"curve": "catenary", "span_mm": 60_000.0}])
-def test_a_rib_is_its_outer_faces(bridge):
+def test_surrogate_of_a_rib_is_its_outer_faces(bridge):
     part = parts(**bridge)[1]
     mesh = trimesh.Trimesh(*surrogate_of(parts(**bridge), 1), process=False)
     s, b, h, w = sections(part)
@@ -64,7 +64,7 @@ def test_a_rib_is_its_outer_faces(bridge):
 
 
 @pytest.mark.parametrize("i", [0, 4])
-def test_a_foot_claims_nothing_that_its_one_joint_does_not_tell(i):
+def test_surrogate_of_a_foot_omits_faces_that_its_one_joint_does_not_determine(i):
     part = parts()[i]
     vertices, faces = surrogate_of(parts(), i)
     mesh = trimesh.Trimesh(vertices, faces, process=False)

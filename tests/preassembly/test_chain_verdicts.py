@@ -36,7 +36,7 @@ def chord(value, sd):
         (2, 0.1, "fail"),
     ],
 )
-def test_a_span_is_held_against_the_projects_limit(value, sd, verdict):
+def test_span_is_judged_by_the_limit_of_the_project(value, sd, verdict):
     found = chain.judge(chord(value, sd), own(span_mm=[-1.0, 1.0]), 24_000.0)
     assert (found.verdict, found.limits.verdict) == (verdict, (verdict,))
     limits = found.limits
@@ -57,7 +57,7 @@ def test_a_standard_is_cited():
     assert (set(found.edition), set(found.source), set(found.verified)) == ({"2020"}, {"from memory"}, {False})
 
 
-def test_edges_are_held_all_along_and_limits_hang_on_the_span():
+def test_edges_are_judged_along_their_length_by_limits_of_the_span():
     rng = np.random.default_rng(2)
     values, sd = rng.uniform(-2.0, 2.0, 300), np.full(300, 0.1)
     values[17] = 4.5  # 30 m / 6000 = 5 mm
@@ -109,7 +109,7 @@ def test_quantities_of_the_edges_by_hand():
     assert [len(found[name][0]) for name in ("inner_arc", "lateral_axis")] == [4, 2]
 
 
-def test_a_limit_that_nothing_is_held_against_is_said():
+def test_unused_limits_are_reported():
     assert chain.unused_limits(GB) == []
     mixed = standards.override(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
     assert [limit.key for limit in chain.unused_limits(mixed)] == ["bow_mm"]
@@ -120,7 +120,7 @@ def test_a_limit_that_nothing_is_held_against_is_said():
     assert reason("preassemble.unused-limits", limits=("bow_mm",)) in to_result._reasons(assembly)
 
 
-def test_an_unsure_chain_is_left_open():
+def test_doubtful_chain_is_indeterminate():
     doubt = reason("preassemble.joint-unknown", joint="J4")
     found = chain.judge(chord(-30.0, 0.5), GB, 24_000.0, (doubt,))
     assert (found.verdict, found.limits.verdict) == ("indeterminate", ("indeterminate", "indeterminate"))
@@ -131,7 +131,7 @@ def test_an_unsure_chain_is_left_open():
     assert [one.code for one in none.reasons] == ["preassemble.no-chain-limit"]
 
 
-def test_the_span_is_not_known_where_a_joint_is_not():
+def test_span_is_nan_if_a_joint_is_not_measured():
     """Without gaps the distance between the parts beside a joint is not measured."""
     line = np.array([[0.0, 0.0, 0.0], [1e3, 0.0, 0.0]])
     parts = tuple(DesignPart(str(i), bottom_edge_left=line, bottom_edge_right=line) for i in range(2))
@@ -140,7 +140,7 @@ def test_the_span_is_not_known_where_a_joint_is_not():
     assert np.isnan(span_and_closure.span([], adjusted, design)).all()
 
 
-def test_a_joint_left_open_has_no_limit_that_is_sure():
+def test_limits_of_an_undecided_joint_are_indeterminate():
     limits = joints.ComparedLimits(
         key=("a",),
         what=("b",),
@@ -163,7 +163,7 @@ def test_a_joint_left_open_has_no_limit_that_is_sure():
     assert joints.left_open(verdict, ()) is verdict
 
 
-def test_mean_and_largest_of_many_alike_are_as_unsure_as_one():
+def test_mean_and_largest_of_correlated_values_have_the_interval_of_one():
     """1.96 sd for one value, and for the mean of a hundred values that may be fully correlated."""
     of = span_and_closure.mean_max_ci95
     np.testing.assert_allclose(of(np.array([[3.0]]), np.array([[0.04]])), 0.392, rtol=1e-3)

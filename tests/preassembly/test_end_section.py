@@ -24,7 +24,7 @@ def girder(of, errors=None):
 
 
 @pytest.mark.parametrize("of", ["box", "stiffened-box"])
-def test_a_box_has_four_faces_whatever_is_inside(of):
+def test_box_section_has_four_faces_with_any_inner_plates(of):
     _, surface, key_points = girder(of)
     place = end_place(key_points, 1.0, surface)
     assert place.section == section.of_box(place.half) or all(face.plate for face in place.section.faces)
@@ -103,7 +103,7 @@ def test_corners_are_where_the_faces_and_the_end_meet(of):
 
 
 @pytest.mark.parametrize("radius_mm", [1_500.0, 3_000.0])
-def test_outer_faces_of_a_strongly_curved_part_are_those_that_hold_its_corners(radius_mm):
+def test_outer_faces_of_a_strongly_curved_part_contain_its_corners(radius_mm):
     """Over the zone of the joint the inner side of the flange lies nearer to the level of the corners."""
     part, joint = curved_box(radius_mm)
     outer = outer_faces.outer_faces(part, [joint])

@@ -247,11 +247,11 @@ def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
     assert abs(moved[0]) < 1.0
 
 
-def test_a_bridge_without_an_end_that_was_seen_has_none_to_judge():
+def test_bridge_without_seen_ends_has_no_estimated_ends():
     assert joint_end.estimate([]) == []
 
 
-def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
+def test_registration_error_is_common_to_both_ends_of_a_part():
     """Intervals of gaps and movements against 400 draws, with the registrations' errors included."""
     rng = np.random.default_rng(8)
     corners = np.array([[0.0, y, z] for y, z in ((700, -900), (-700, -900), (-700, 900), (700, 900))], float)
@@ -348,7 +348,7 @@ def test_a_face_seen_as_a_strip_and_one_outlier_keeps_its_corners():
 
 
 @pytest.mark.parametrize("thickness", [16.0, 24.0])
-def test_the_inner_side_beyond_a_strip_of_the_outer_face_is_told_from_it(thickness):
+def test_inner_side_is_separated_from_a_strip_of_the_outer_face(thickness):
     """The outer side was seen within 100 mm of the end, the inner one beyond; the plate is tilted by 4 mm a metre."""
     rng = np.random.default_rng(7)
     x, w = -rng.uniform(0.0, 500.0, 400), rng.uniform(-1.0, 1.0, 400)

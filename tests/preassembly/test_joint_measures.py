@@ -135,7 +135,7 @@ def test_half_widths_against_draws():
 
 
 @pytest.mark.parametrize("shape", ["level", "two alike", "wedge", pytest.param("zero", marks=pytest.mark.slow)])
-def test_intervals_of_extremes_hold(shape):
+def test_intervals_of_extremes_cover(shape):
     """True extremes lie within the intervals in at least 95 % of measurements, however many points are alike."""
     true = np.zeros((8, 3))
     if shape == "two alike":
@@ -164,7 +164,7 @@ def test_intervals_of_extremes_hold(shape):
     assert at.shape == (250, 8)
 
 
-def test_a_lone_extreme_has_the_interval_of_a_single_value():
+def test_single_extreme_has_the_interval_of_one_value():
     covariance = np.diag(np.full(24, 0.04))
     gaps = np.zeros((8, 3))
     gaps[3, 0] = 5.0
@@ -218,7 +218,7 @@ def test_misalignment_against_its_limit(value, verdict, probability):
     assert found.limits.ci95[0] == pytest.approx(1.959964 * 0.5)
 
 
-def test_a_value_on_the_limit_conforms_in_just_half_of_the_draws():
+def test_value_on_its_limit_has_a_probability_of_one_half():
     assert judge(lone(2.0, 0.5), only(misalignment_mm=2.0)).probability == 0.5
 
 
@@ -246,7 +246,7 @@ def test_two_limits_and_the_root_gap():
     assert judge(at_rest(gaps, covariance), both).probability == pytest.approx(0.25, abs=0.02)
 
 
-def test_what_a_verdict_says_of_its_limit():
+def test_verdict_states_clause_value_and_probability_of_its_limits():
     found = judge(lone(0.5, 0.1), GB)
     assert found.verdict == "pass"
     assert found.limits.key == ("misalignment_mm", "groove_gap_mm")
@@ -297,7 +297,7 @@ def test_eccentricity():
     assert judge(at_rest(gaps, np.eye(24)), en).probability == pytest.approx(0.45, abs=0.06)
 
 
-def test_the_same_answer_every_time():
+def test_judging_twice_gives_the_same_result():
     covariance = some_covariance(4)
     one, two = (judge(at_rest(np.ones((8, 3)), covariance), GB) for _ in range(2))
     assert repr(one) == repr(two)

@@ -114,14 +114,14 @@ def test_reduced_boxes_find_the_inner_edges_of_the_plates():
     np.testing.assert_allclose(edges.key_points[7], [0, inner_b, 0], atol=4.0)
 
 
-def test_reduced_boxes_without_points_say_so():
+def test_reduced_boxes_without_points_are_none():
     cut = box_end()
     rng = np.random.default_rng(0)
     assert edge_features.reduced_boxes(cut[np.abs(cut[:, 1]) > 200.0], 1.0, 4.0, BoxParams(), rng) is None
     assert edge_features.reduced_boxes(cut[:20], 1.0, 4.0, BoxParams(), rng) is None
 
 
-def test_the_joint_frame_looks_along_the_bridge():
+def test_x_axis_of_the_joint_frame_points_along_the_bridge():
     points = arch_clouds.key_points(0.4 * arch_clouds.ARC)
     T = joint_frame(points)
     ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))
@@ -191,7 +191,7 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
         np.testing.assert_allclose(rigid.apply(T_right, right) - rigid.apply(T_left, left), gap, atol=1e-9)
 
 
-def test_the_adjustment_states_intervals_that_hold(bridge, runs):
+def test_intervals_of_the_adjustment_cover(bridge, runs):
     _, truth = bridge
     result = runs["adjustment"]
     components, joints, trade_off = result.components, result.joints, result.trade_off
@@ -214,7 +214,7 @@ def test_the_adjustment_states_intervals_that_hold(bridge, runs):
 
 
 @pytest.mark.slow
-def test_the_adjustment_measures_what_was_built_otherwise(bridge):
+def test_adjustment_measures_the_errors_as_built(bridge):
     """A rib cut 3 mm short at one end and shifted scans: the gap shows there and nowhere else."""
     scene, truth = bridge
     rib, T = scene.scans[2], truth.arch.T_bridge_scan[2]
@@ -266,7 +266,7 @@ def test_a_part_of_another_place_is_not_assembled(bridge):
     assert np.isnan(result.joints.gaps[[0, 1, 2]]).all()
 
 
-def test_the_design_keeps_the_line(runs):
+def test_design_aided_method_has_half_the_linear_error_of_others(runs):
     # As found by the source paper: chained by joints alone, the bridge turns with Foot 1's attitude.
     mean = {method: run.linear.assembled.error.mean for method, run in runs.items()}
     assert mean["design-aided"] < 0.5 * mean["line"]
@@ -295,7 +295,7 @@ def test_a_coarse_pose_is_sought_near_the_principal_axes():
     np.testing.assert_array_equal(T, start)
 
 
-def test_pairs_on_lines_leave_no_shift_along_the_lines_points():
+def test_point_to_line_icp_recovers_the_pose_along_the_lines():
     # Points of one end lie between those of the other; the ends themselves are the same.
     source = ring(spacing=25.0)[5:]
     corners = np.array([[0, 700, -900], [0, -700, -900], [0, -700, 900], [0, 700, 900.0], [0, 700, -900]])
@@ -306,7 +306,7 @@ def test_pairs_on_lines_leave_no_shift_along_the_lines_points():
     assert far.paired_share == 0.0
 
 
-def test_the_edge_box_is_of_the_plate_at_hand():
+def test_edge_box_is_sized_by_the_plate_thickness():
     rng = np.random.default_rng(0)
     for plate in (16.0, 24.0, 40.0):
         cut = edge_features.cut_joint_end(box_end(plate=plate), np.eye(4), 1.0, np.array([900.0, 1100.0]), BoxParams())
@@ -330,7 +330,7 @@ def test_a_part_that_leaves_a_wide_gap_is_called_weak(bridge, runs):
 
 
 @pytest.mark.slow
-def test_an_origin_taken_off_changes_nothing(bridge, runs):
+def test_origin_of_scans_does_not_change_the_gaps(bridge, runs):
     scene, _ = bridge
     far = np.array([5.0e8, 4.3e9, 1.0e5])
     moved = dataclasses.replace(scene, scans=tuple(dataclasses.replace(s, origin=far) for s in scene.scans))
@@ -344,7 +344,7 @@ def test_an_origin_taken_off_changes_nothing(bridge, runs):
 
 
 @pytest.mark.slow
-def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
+def test_missing_joint_end_breaks_the_chain_with_a_reason(bridge):
     scene, truth = bridge
     rib = scene.scans[2]
     T = truth.arch.T_bridge_scan[2]
@@ -361,7 +361,7 @@ def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
     assert np.isnan(result.joints.gaps[1:]).all()
 
 
-def test_a_temperature_that_is_not_corrected_is_said(bridge, monkeypatch):
+def test_uncorrected_temperature_is_reported(bridge, monkeypatch):
     scene, _ = bridge
     monkeypatch.setattr(methods, "assemble", lambda *_: preassembly_step.Result("ok", "corner"))
     params = preassembly_step.Params(method="corner")
@@ -370,7 +370,7 @@ def test_a_temperature_that_is_not_corrected_is_said(bridge, monkeypatch):
     assert result.reasons == (reason("preassemble.temperature-not-corrected", temperature=31.5),)
 
 
-def test_what_cannot_be_assembled_is_refused(bridge):
+def test_missing_design_scan_or_method_is_refused(bridge):
     scene, _ = bridge
     with pytest.raises(InputError, match="arch-bridge design"):
         preassembly_step.run(Scene("x", "arch-bridge", scene.scans), preassembly_step.Params())

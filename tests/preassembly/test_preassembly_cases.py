@@ -128,7 +128,7 @@ def test_half_a_web_missing_leaves_the_ends_right():
     assert_found_right(parts, design, points[~gone])
 
 
-def test_a_foot_as_erected_is_found_without_a_turn():
+def test_erected_foot_is_registered_without_a_turn():
     parts, design = bridge()
     found = measured(design, 0, Scan("scan", cloud(parts[0], spacing_mm=20.0) + np.array([100.0, -50.0, 20.0])))
     T = rigid.transform(np.eye(3), np.array([-100.0, 50.0, -20.0]))
@@ -137,7 +137,7 @@ def test_a_foot_as_erected_is_found_without_a_turn():
 
 
 @pytest.mark.parametrize("share", [0.01, pytest.param(0.02, marks=pytest.mark.slow)])
-def test_outliers_all_about_do_not_pull(share):
+def test_outliers_around_a_part_do_not_displace_its_pose(share):
     parts, design = ribs()
     points, rng = cloud(parts[1]), np.random.default_rng(3)
     low, high = points.min(axis=0) - 300.0, points.max(axis=0) + 300.0
@@ -174,7 +174,7 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
 
 
 @pytest.mark.parametrize(("asked", "came"), [(1, 3), pytest.param(0, 4, marks=pytest.mark.slow)])
-def test_parts_of_one_shape_are_told_apart_by_their_mark(asked, came, monkeypatch):
+def test_parts_of_one_shape_are_distinguished_by_their_mark(asked, came, monkeypatch):
     """Rib 3 turned round equals rib 1 but for its mark: it fits rib 1 to the noise."""
     parts, design = bridge()
     scan, T = scanned(cloud(parts[came], spacing_mm=20.0, sigma_mm=2.0))
@@ -199,14 +199,14 @@ def without_the_marks_places(part, points):
     return points[(np.linalg.norm(points[:, None] - places, axis=2) > 400.0).all(axis=1)]
 
 
-def test_a_part_of_which_no_mark_was_seen_says_which_other_it_may_be():
+def test_part_without_its_mark_in_the_scan_names_the_other_candidates():
     parts, design = bridge()
     scan, _ = scanned(without_the_marks_places(parts[1], cloud(parts[1], spacing_mm=20.0)))
     found = measured(design, 1, scan)
     assert (found.status, found.reasons) == ("ok", (reason("preassemble.mark-not-seen", parts=("rib3",)),))
 
 
-def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_own():
+def test_mark_is_identified_on_a_plate_that_bulges_by_its_height():
     parts, design = bridge()
     part, points = parts[1], cloud(parts[1], spacing_mm=14.0)
     s, u = part.pad
@@ -255,7 +255,7 @@ def on_foot():
 
 
 @pytest.mark.parametrize("strays", [0, 3])
-def test_what_lies_on_a_part_of_another_size_by_half_is_not_taken_for_it(on_foot, strays, monkeypatch):
+def test_scan_that_covers_half_of_another_part_is_rejected_or_unsure(on_foot, strays, monkeypatch):
     """The upper half of this foot has the rib's section, and the rest looks like clutter. Clutter hides the size."""
     design, scan = on_foot
     clutter = np.random.default_rng(1).normal(0.0, 100.0, (40 * strays, 3)) + 9e3
@@ -285,7 +285,7 @@ def test_another_part_is_not_taken_for_a_foot(clutter, index):
     assert (right.attitude.status, right.rejected, right.doubts) == ("ok", (), ())
 
 
-def test_how_much_of_a_part_its_points_lie_on():
+def test_covered_share_of_a_part_equals_the_share_seen():
     parts, design = bridge()
     shape = shapes_of(design)[RIB]
     points = cloud(parts[RIB], spacing_mm=30.0)
@@ -296,7 +296,7 @@ def test_how_much_of_a_part_its_points_lie_on():
         assert measure._covered(own, np.eye(4), shape) == pytest.approx(share, abs=0.03)
 
 
-def test_a_rival_farther_along_is_not_called_a_turn():
+def test_rival_pose_shifted_along_the_part_is_reported_as_a_shift():
     _, design = bridge()
     surface = shapes_of(design)[1]
     along = rigid.transform(np.eye(3), 240.0 * surface.axes[:, 0])
@@ -319,7 +319,7 @@ def test_half_a_part_is_found_however_it_lies_in_its_file(upper, seed):
 
 
 @pytest.mark.slow
-def test_a_scan_of_one_end_only_says_so():
+def test_scan_of_one_end_alone_is_not_ok_and_has_a_reason():
     parts, design = bridge()
     part = parts[RIB]
     points = cloud(part, spacing_mm=16.0)
@@ -332,7 +332,7 @@ def test_a_scan_of_one_end_only_says_so():
         assert_right(found, design, RIB, part, T, ("start",))
 
 
-def test_two_scans_of_one_part_make_one(monkeypatch):
+def test_two_scans_of_one_part_are_combined(monkeypatch):
     """One scan shows the left side, the other the right: each constrains the part, only both show whole ends.
 
     Which part half a scan is of is searched for in test_assignment.

@@ -104,7 +104,7 @@ def test_a_wedge_is_cut_where_it_is_narrow_and_filled_where_it_is_wide():
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_cuts_are_planes_that_take_nothing_on(seed):
+def test_cut_plane_is_the_nearest_one_that_never_adds_material(seed):
     rng = np.random.default_rng(seed)
     A = np.column_stack([np.ones(8), POINTS[:, 1:] / 1000.0])
     lacking = rng.normal(1.0, 2.0, 8) + A[:, 1:] @ rng.normal(0.0, 3.0, 2)
@@ -155,7 +155,7 @@ def test_the_probability_after_a_cut_against_draws():
     np.testing.assert_allclose(better.cut, 3.5, atol=1e-9)
 
 
-def test_as_it_is_half_of_the_draws_keep_a_limit_that_a_value_is_on():
+def test_probability_as_is_is_one_half_for_a_value_on_its_limit():
     covariance = np.zeros((24, 24))
     covariance[3 * 6 + 2, 3 * 6 + 2] = 0.25
     gaps = along(0.0)
@@ -169,7 +169,7 @@ def test_as_it_is_half_of_the_draws_keep_a_limit_that_a_value_is_on():
     assert proposed(gaps, covariance).probability == pytest.approx(norm.cdf(1.0), abs=0.01)
 
 
-def test_nothing_is_cut_in_order_to_be_filled_again():
+def test_corner_overlap_is_cut_alone_where_a_plane_would_cut_open_points():
     """One corner overlaps by 45.9 mm, its neighbours are open: a plane through it would cut these as well."""
     x = _between([13.0, 10.3, -45.9, 16.0])
     found = proposed(along(x))
@@ -190,7 +190,7 @@ def _between(corners):
     return np.concatenate([corners, 0.5 * (corners + np.roll(corners, -1))])
 
 
-def test_what_no_cut_makes_hold_is_said():
+def test_no_cut_is_proposed_with_a_reason_where_none_meets_the_limits():
     """Plates bent by 20 mm between the corners: no cut from corner to corner follows them."""
     x = _between([-5.0, -5.0, -5.0, -5.0])
     x[4:] += [20.0, -20.0, 20.0, -20.0]
@@ -200,7 +200,7 @@ def test_what_no_cut_makes_hold_is_said():
     assert "0%" not in messages("en").sentences(found.reasons)
 
 
-def test_a_joint_of_unsure_parts_gets_no_proposal_and_one_of_weak_parts_says_so():
+def test_ambiguous_parts_get_no_proposal_and_weak_parts_a_remark():
     gaps = joint_measures.measure(along(-3.0), np.zeros((24, 24)), np.eye(4), POINTS)
     doubt = reason("preassemble.ambiguous-part", part="rib1")
     unsure = propose(gaps, GB, EXACT, doubts=(doubt,))
@@ -215,7 +215,7 @@ def test_a_joint_of_unsure_parts_gets_no_proposal_and_one_of_weak_parts_says_so(
     assert weak.reasons[0].values["parts"] == (part,)
 
 
-def test_no_trim_mends_what_is_misaligned():
+def test_misalignment_is_reported_as_not_removable_by_trimming():
     gaps = along(-2.0)
     gaps[6, 2], gaps[5, 1] = 3.1, -2.4
     found = proposed(gaps)
@@ -245,7 +245,7 @@ def test_a_cut_that_gains_too_little_is_not_proposed():
     assert codes(found)[0] == "no-work-gains"
 
 
-def test_what_is_not_known_is_said():
+def test_unknown_gaps_and_missing_limits_are_reported():
     unknown = proposed(np.full((8, 3), np.nan), np.full((24, 24), np.nan))
     assert unknown.action == "unknown"
     assert np.isnan(unknown.cut).all()
@@ -267,7 +267,7 @@ def test_parameters_that_make_no_sense():
             TrimParams(cut_sd_mm=bad)
 
 
-def test_the_same_proposal_every_time():
+def test_proposing_twice_gives_the_same_proposal():
     covariance = 0.04 * np.eye(24)
     one, two = (proposed(along(-2.0 + POINTS[:, 2] / H), covariance, params=TrimParams()) for _ in range(2))
     assert repr(one) == repr(two)

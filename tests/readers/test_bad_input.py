@@ -138,7 +138,7 @@ def damaged(content, rng):
 
 
 def attempt(read, path):
-    """What a reader returns and None, or None and what it says. Any other exception passes."""
+    """Return a reader's result and None, or None and its message. Any other exception is raised."""
     try:
         return read(path), None
     except InputError as error:

@@ -142,7 +142,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize("case", TABLES)
-def test_text(tmp_path, case):
+def test_text_tables_are_read_with_their_separators(tmp_path, case):
     name, text = TABLES[case]
     scan = one(put(tmp_path / name, text))
     assert np.array_equal(scan.points, POINTS)

@@ -43,7 +43,7 @@ def test_good_files_are_read(tmp_path, format_):
         assert all(len(scan.points) >= 20 for scan in readers.read(tmp_path / name))
 
 
-def test_a_crash_of_a_library_is_an_answer_and_the_next_file_is_read(tmp_path):
+def test_crashing_library_gives_an_input_error_and_the_next_file_is_read(tmp_path):
     for number in range(200):
         name, content = damaged("laz", number)
         (tmp_path / name).write_bytes(content)

@@ -219,7 +219,7 @@ def test_names_in_gb18030(tmp_path, suffix):
         ("a.dp", r"DotProduct.*Dot3D"),
     ],
 )
-def test_closed_formats_are_answered_with_how_to_export(tmp_path, name, why):
+def test_closed_formats_are_refused_with_export_instructions(tmp_path, name, why):
     (tmp_path / name).mkdir() if name == "a.fls" else (tmp_path / name).touch()
     with pytest.raises(InputError, match=why):
         folder.read_input(tmp_path)

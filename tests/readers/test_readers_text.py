@@ -82,7 +82,7 @@ def test_tables_against_numpy(monkeypatch, separator, pieces, workers):
         ("1 2 3" + " " * (1 << 21), {}, "longer than"),
     ],
 )
-def test_what_is_no_number_is_said_with_its_line(monkeypatch, text, how, why):
+def test_non_numeric_text_is_refused_with_its_line(monkeypatch, text, how, why):
     monkeypatch.setattr(rows_module, "PIECE_BYTES", 4)
     with pytest.raises(ValueError, match=why):
         numbers(text, **how)
@@ -93,7 +93,7 @@ def read(tmp_path, name, text):
     return readers.read(tmp_path / name)
 
 
-def test_columns_are_found_by_what_surveyors_call_them(tmp_path):
+def test_columns_are_recognised_by_surveying_names(tmp_path):
     text = "Point,Northing (m),Easting (m),Height (m)\nA 1,20,10,30\n<b>,21,11,31\n"
     (scan,) = read(tmp_path, "a.csv", text)
     assert scan.points.tolist() == [[10, 20, 30], [11, 21, 31]]
@@ -145,7 +145,7 @@ def test_short_lines_after_long_ones(tmp_path, monkeypatch):
     assert scan.points[:, 0].tolist() == [*range(50), *[1] * 5_000]
 
 
-def test_many_grids_in_one_ptx_are_told_apart_however_the_text_is_cut(tmp_path):
+def test_many_grids_in_one_ptx_are_separated_for_any_block_size(tmp_path):
     """Parts that threads take end in the middle of a grid, or hold the head of the next one."""
     rng = np.random.default_rng(5)
     grids = [rng.uniform(1.0, 9.0, (rows, 4)).round(4) for rows in (3000, 6001, 9000, 3, 7000)]

@@ -39,7 +39,7 @@ def test_a_bracket_distinguishes_the_attitudes_of_a_box(seed):
     assert not ambiguous
 
 
-def test_a_displaced_and_a_missing_bracket_turn_nothing_over():
+def test_displaced_and_missing_brackets_do_not_turn_the_attitude():
     at = [-2400.0, -1200.0, 300.0, 1800.0]
     design = structure(*(bracket(x, y) for x in at for y in (1.0, -1.0)))
     built = structure(*(bracket(x, y) for x in at[1:] for y in (1.0, -1.0)), bracket(at[0], 1.0, up=14.0))
@@ -50,7 +50,7 @@ def test_a_displaced_and_a_missing_bracket_turn_nothing_over():
 
 
 @pytest.mark.parametrize("thickness", [6.0, 20.0, 40.0])
-def test_the_side_of_a_plate_that_was_scanned_lies_on_its_own_side(thickness):
+def test_scanned_side_of_a_plate_is_registered_to_the_same_side(thickness):
     box = trimesh.creation.box(
         (240.0, 170.0, 160.0), rigid.transform(np.eye(3), [-170.0, -115.0, 80.0 + thickness / 2])
     )
@@ -79,14 +79,14 @@ def test_a_scan_the_wrong_way_round_in_the_design_s_frame_is_turned():
     np.testing.assert_allclose(wrong.T[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-3)
 
 
-def test_what_nothing_distinguishes_is_ambiguous():
+def test_attitude_without_distinguishing_features_is_ambiguous():
     design = structure(bracket(1500.0, 1.0))
     assert placed(structure(), structure(), 0)[1]
     assert placed(design, structure(), 0)[1]  # the bracket was left out: nothing shows where it belongs
     assert not placed(design, design, 0)[1]
 
 
-def test_a_contradiction_as_large_as_the_evidence_is_no_choice():
+def test_attitude_is_ambiguous_if_contradiction_equals_evidence():
     design = structure(bracket(-1500.0, 1.0), bracket(900.0, 1.0))
     points = np.asarray(trimesh.sample.sample_surface(structure(bracket(-1500.0, 1.0)), 15_000, seed=1)[0])
     surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))

@@ -63,14 +63,14 @@ def test_a_part_among_things_that_do_not_touch_it_is_found(others):
     assert of_others < 0.001
 
 
-def test_what_touches_a_part_stays_with_it():
+def test_objects_touching_a_part_are_kept_with_it():
     rng = np.random.default_rng(2)
     of_part, of_others = found(rng, ground, trestle)
     assert of_part > 0.999
     assert 0.0 < of_others < len(trestle(rng)) / (len(trestle(rng)) + len(ground(rng)))
 
 
-def test_the_scan_is_found_wherever_it_lies():
+def test_main_body_is_found_in_any_pose():
     rng = np.random.default_rng(3)
     points = np.concatenate([part(rng), ground(rng)])
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -80,21 +80,21 @@ def test_the_scan_is_found_wherever_it_lies():
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
-def test_a_part_or_a_piece_of_it_alone_stays_as_it_is(share):
+def test_no_points_are_dropped_from_a_part_or_a_piece_alone(share):
     points = part(np.random.default_rng(4))
     assert main_body.of_sizes(points[points[:, 0] <= share * SIZE[0]], [SIZE]) is None
 
 
-def test_stray_points_alone_are_no_reason_to_leave_anything_out():
+def test_no_points_are_dropped_because_of_stray_points_alone():
     rng = np.random.default_rng(5)
     points = np.concatenate([part(rng), rng.uniform(-1000.0, 7000.0, (300, 3))])
     assert main_body.of_sizes(points, [SIZE]) is None
 
 
-def test_of_a_few_points_nothing_is_left_out():
+def test_no_points_are_dropped_from_small_clouds():
     assert main_body.of_sizes(np.random.default_rng(6).uniform(0.0, 1e5, (50, 3)), [SIZE]) is None
     assert main_body.of_sizes(np.zeros((10, 3)), [SIZE]) is None
 
 
-def test_of_something_far_larger_than_the_part_nothing_is_left_out():
+def test_no_points_are_dropped_from_a_body_far_larger_than_the_part():
     assert main_body.of_sizes(1000.0 * part(np.random.default_rng(7)), [SIZE]) is None

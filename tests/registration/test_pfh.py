@@ -57,7 +57,7 @@ def cloud():
 
 
 @pytest.mark.parametrize("bins", [5, 3])
-def test_bin_by_bin(cloud, bins):
+def test_histograms_equal_the_definition_bin_by_bin(cloud, bins):
     points, normals = cloud
     found = pfh.histograms(points, normals, 45.0, bins)
     assert found.shape == (60, bins**3)

@@ -1,4 +1,4 @@
-"""The pages of batches, comparisons, nights and defects in a browser: nothing said, nothing asked for, no name run."""
+"""The pages of batches, comparisons, nights and defects in a browser: no console messages, requests or run names."""
 
 import json
 

@@ -186,7 +186,7 @@ def test_headings_are_those_of_the_table_and_else_the_names_without_units():
     assert report_table.csv_text(named) == "joint,rotation_ci95_mrad,least_gap_mm\n"
 
 
-def test_long_tables_are_cut_on_the_terminal_and_say_so():
+def test_long_tables_are_cut_on_the_terminal_with_a_remark():
     table = all_tables.Table("t", ("a",), tuple((i,) for i in range(50)), "long")
     lines = report_table.plain_text(table, most=10).splitlines()
     assert len(lines) == 13
@@ -203,7 +203,7 @@ def test_gaps_stand_as_in_the_source_paper():
 
 
 @pytest.mark.usefixtures("blank_pictures")
-def test_a_joint_without_an_answer_is_not_a_perfect_one():
+def test_joint_without_a_result_is_not_shown_as_zero():
     found = TablesOfPage(render(of_bridge(), ErrorReport())).tables["Joints, method design-aided (mm)"]
     assert found[1] == ["J1", "foot1", "rib1", "4.600", "8.200", "P8, z", "indeterminate"]
     assert found[2] == ["J2", "rib1", "foot2", "–", "–", "", "indeterminate"]
@@ -282,7 +282,7 @@ def test_the_page_escapes_names_and_loads_nothing():
 
 
 @pytest.mark.usefixtures("blank_pictures")
-def test_the_page_says_first_what_came_out():
+def test_page_begins_with_the_outcome():
     execution, report = of_frame()
     text = render(execution, report)
     assert text.index("1 of 3 balls without a flag") < text.index("<h2>")

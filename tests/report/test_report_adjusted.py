@@ -52,7 +52,7 @@ def number(text):
 
 
 @pytest.mark.usefixtures("blank_pictures")
-def test_what_to_do_holds_the_numbers_of_results_json():
+def test_table_what_to_do_has_the_numbers_of_results_json():
     execution = of_bridge()
     step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     on_page = Page(rendered(execution)).tables["Joints: what to do, method adjustment"][2:]
@@ -79,7 +79,7 @@ def test_what_to_do_holds_the_numbers_of_results_json():
     assert float(rows[1]["least_groove_gap_mm"]) == -1.75
 
 
-def test_limits_say_clause_and_whether_they_were_verified():
+def test_table_of_limits_has_clause_and_verification():
     execution = of_bridge()
     step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     rows = of_file(execution, "limits")
@@ -143,7 +143,7 @@ def test_gaps_have_intervals_in_the_joints_axes_too():
     assert len(of_file(execution, "gaps-line")[0]) == 8
 
 
-def test_both_poses_of_an_ambiguous_part_and_what_would_decide():
+def test_ambiguous_part_is_listed_with_both_poses():
     rows = of_file(of_bridge(), "candidates")
     assert [row["candidate"] for row in rows] == ["as assembled", "the other pose"]
     assert [float(row["turned_deg"]) for row in rows] == [0.0, 180.0]
@@ -151,7 +151,7 @@ def test_both_poses_of_an_ambiguous_part_and_what_would_decide():
     assert len(Page(rendered(of_bridge())).tables["Parts that fit in two poses"]) == 3
 
 
-def test_what_limits_the_accuracy_has_a_file_and_stands_on_the_terminal():
+def test_accuracy_budget_is_written_and_shown_on_the_terminal():
     rows = of_file(of_bridge(), "accuracy")
     assert rows[0]["statement"].startswith("J1 P1: ± 0.087 mm (95 %), 69% of the variance from the end face")
     assert rows[1]["statement"].startswith("a scan of rib1 that shows more of the end face")
@@ -160,7 +160,7 @@ def test_what_limits_the_accuracy_has_a_file_and_stands_on_the_terminal():
     )
 
 
-def test_why_a_method_failed_is_said_and_it_is_not_drawn():
+def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     execution = of_bridge()
     (row,) = of_file(execution, "components-compared")
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
@@ -209,7 +209,7 @@ def test_span_closure_budget_and_trade_off_as_tables():
 
 
 @pytest.mark.usefixtures("blank_pictures")
-def test_methods_without_intervals_have_none_of_these():
+def test_methods_without_intervals_have_no_tables_of_the_adjustment():
     runs = (StepRun("preassemble", "line", "{}", assembled("line")),)
     execution = Execution(arch_scene(), runs, PROVENANCE)
     files = {table.file for table in all_tables.tables_of_run(execution, ErrorReport())}
@@ -224,7 +224,7 @@ def test_a_pass_is_marked_as_good_only_by_limits_that_are_verified(verified, ton
     assert page._tone(StepRun("preassemble", "adjustment", "{}", result)) == tone
 
 
-def test_the_verdict_stands_before_all_else_and_what_to_do_before_the_pictures():
+def test_page_has_verdict_then_actions_then_pictures():
     text = rendered(of_bridge())
     places = [
         text.index(one)
@@ -268,7 +268,7 @@ def unknown(result, joints, parts):
 
 
 @pytest.mark.parametrize(("joints", "parts", "pictures"), [((1,), (2,), 2), ((0, 1), (0, 1, 2), 0)])
-def test_what_is_not_known_is_said_and_not_drawn(joints, parts, pictures):
+def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
     execution = of_bridge()
     result = unknown(execution.runs[0].result, list(joints), parts)
     execution = dataclasses.replace(execution, runs=(dataclasses.replace(execution.runs[0], result=result),))
@@ -298,7 +298,7 @@ def test_every_picture_shows_something():
     assert "95 %" in str(found["linear-error.png"][0])
 
 
-def test_pictures_follow_what_they_show():
+def test_pictures_change_with_their_data_alone():
     """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
     before = drawn(of_bridge())["preassemble"]
     execution = of_bridge()
@@ -320,7 +320,7 @@ def test_scales_are_round_numbers(value, wanted):
 
 
 def test_parts_unroll_face_by_face():
-    """A straight box 4 m by 0.45 m by 1.1 m: the middle of each face is where the girth says."""
+    """A straight box 4 m by 0.45 m by 1.1 m: the middle of each face lies at its place along the girth."""
     part = arch_scene().arch.parts[0]
     corners = [[x, y, z] for x in np.linspace(50.0, 3950.0, 40) for y in (0.0, 450.0) for z in (0.0, 1100.0)]
     middles = [[1000.0, 225, 0], [1000, 0, 550], [1000, 225, 1100], [1000, 450, 550], [3000, 450, 100]]
@@ -330,7 +330,7 @@ def test_parts_unroll_face_by_face():
     np.testing.assert_allclose(flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0], atol=0.01)
 
 
-def test_numbers_of_large_gaps_stay_within_their_frames_and_a_joint_without_gaps_says_so(monkeypatch):
+def test_numbers_of_large_gaps_fit_their_frames_and_missing_gaps_are_stated(monkeypatch):
     figures_made = []
 
     def kept(figure):

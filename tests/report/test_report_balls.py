@@ -78,7 +78,7 @@ def test_the_worst_verdict_is_that_of_the_result():
 
 
 @pytest.mark.parametrize("matching", ["ambiguous", "failed"])
-def test_nothing_passes_where_it_is_not_known_which_node_is_which(matching):
+def test_nodes_have_no_pass_while_their_matching_is_uncertain(matching):
     assert set(whole(matching=matching).balls.verdict) == {"indeterminate", "none"}
 
 
@@ -139,7 +139,7 @@ def test_results_json_of_a_whole_frame():
     assert np.shape(step["stations"][1]["T"]) == (4, 4)
 
 
-def test_results_json_holds_only_what_there_is():
+def test_results_json_has_no_keys_of_absent_results():
     paper = balls()
     execution = Execution(scene(whole()), (StepRun("spheres", "ransac", "{}", paper),), PROVENANCE)
     step = to_json.results_json(execution, ErrorReport())["steps"]["spheres"]
@@ -190,7 +190,7 @@ def test_csv_of_nodes_tubes_and_stations():
     assert (moved["station"], moved["dx_mm"], moved["dy_mm"], moved["dz_mm"]) == ("'=S2", "1.0", "-2.0", "3.0")
 
 
-def test_a_stations_shift_is_that_at_the_balls():
+def test_shift_of_a_station_is_stated_at_the_middle_of_the_balls():
     # Half a milliradian about z through a point 500 km away: the transform's translation is 250 m, the shift is none.
     far = np.array([5e8, 4e9, 0.0])
     R = np.array([[math.cos(5e-4), -math.sin(5e-4), 0.0], [math.sin(5e-4), math.cos(5e-4), 0.0], [0.0, 0.0, 1.0]])
@@ -211,7 +211,7 @@ def moved_to(result, centres, T):
     )
 
 
-def test_without_a_limit_the_table_says_so():
+def test_table_of_nodes_states_a_missing_or_uncertain_limit():
     (table,) = [one for one in all_tables.tables_of_run(*of_frame(whole(limit=NAN))) if one.file == "nodes"]
     assert "node_place_mm" in str(table.note)
     (table,) = [one for one in all_tables.tables_of_run(*of_frame(whole(matching="ambiguous"))) if one.file == "nodes"]
@@ -219,7 +219,7 @@ def test_without_a_limit_the_table_says_so():
     assert "not certain" in str(table.note)
 
 
-def test_the_terminal_has_a_summary_what_to_look_at_and_the_stations():
+def test_terminal_shows_summary_flagged_balls_and_stations():
     shown = [one for one in all_tables.tables_of_run(*of_frame()) if one.on_terminal]
     assert [str(one.title).split(",")[0] for one in shown] == [
         "Balls in short", "Flagged balls", "Stations against each other (mm"
@@ -450,7 +450,7 @@ def test_targets_without_members_have_lowest_points_and_bounds():
     assert any(one.on_terminal and "radius_mm" in one.columns for one in found.values())
 
 
-def test_the_expected_distribution_holds_as_many_errors_as_there_are():
+def test_expected_distribution_integrates_to_the_number_of_errors():
     x = np.linspace(-5.0, 5.0, 1001)
     y = space_frame_figures._mixture(x, np.array([0.2, 0.5, NAN, 0.0]), 0.1)
     assert y.sum() * (x[1] - x[0]) / 0.1 == pytest.approx(2.0, abs=1e-6)
@@ -458,7 +458,7 @@ def test_the_expected_distribution_holds_as_many_errors_as_there_are():
     assert space_frame_figures._mixture(x, np.array([NAN]), 0.1) is None
 
 
-def test_where_the_design_has_a_ball():
+def test_designed_places_are_transformed_into_the_scan():
     T = pose(TURN, (7e5, -2e5, 100.0))
     made = whole(T=T)
     np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""Pages in a browser: they react, load nothing, say nothing on the console, and hold the numbers of results.json."""
+"""Pages in a browser: they react, load no files, leave the console empty, and have the numbers of results.json."""
 
 import csv
 import io

@@ -45,7 +45,7 @@ def test_the_view_holds_the_surface_and_an_outline_a_defect():
     assert found["places"][0]["outward"] == [0.0, -1.0, 0.0]
 
 
-def test_nothing_is_drawn_of_what_failed():
+def test_failed_search_has_no_view():
     assert drawn(Result(status="failed", method="default")) is None
 
 
@@ -88,7 +88,7 @@ def test_all_places_are_drawn_where_there_are_few(plates):
 
 
 @pytest.mark.parametrize("most", [2000, 500, 60])
-def test_many_are_thinned_alike_on_every_face(plates, most):
+def test_many_points_are_thinned_evenly_on_every_face(plates, most):
     found, field = plates
     made = defect_grids.of_surface([], field, found, np.zeros(3), most)
     at = made.points
@@ -100,7 +100,7 @@ def test_many_are_thinned_alike_on_every_face(plates, most):
     assert len(np.unique(strip[:, 0])) >= 2000.0 / steps[0] - 1
 
 
-def test_small_defects_are_drawn_whole_and_lie_on_large_ones(plates):
+def test_small_defects_are_drawn_in_full_above_large_ones(plates):
     found, field = plates
     away = np.linalg.norm(found.centres - [1000.0, 0.0, 500.0], axis=1)
     small, large = np.flatnonzero(away < 60.0), np.flatnonzero(found.centres[:, 1] == 0.0)

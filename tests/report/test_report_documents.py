@@ -91,7 +91,7 @@ def texts_of(page):
     return [one.get_text() for one in page.texts]
 
 
-def test_the_document_is_chinese_where_there_is_a_font(a_chinese_font):
+def test_document_is_chinese_if_a_font_is_installed(a_chinese_font):
     execution = signed()
     seen = texts_of(front(execution, "zh"))
     assert any("桥 Meyer" in one for one in seen)
@@ -103,7 +103,7 @@ def test_the_document_is_chinese_where_there_is_a_font(a_chinese_font):
     assert data != written(execution)
 
 
-def test_without_a_font_it_is_english_with_question_marks(monkeypatch):
+def test_document_without_a_font_is_english_with_question_marks(monkeypatch):
     for module in (style, pdf):
         monkeypatch.setattr(module, "chinese_font", lambda: "")
     style._has.cache_clear()

@@ -1,4 +1,4 @@
-"""Maps of deviations: which core points make a face, what the steps of colour are, and what a map says."""
+"""Maps of deviations: which core points make a face, the steps of colour, and the text of a map."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_the_two_sides_of_a_plate_are_two_faces_and_a_gap_parts_one():
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_the_band_is_a_step_of_its_own_and_the_others_are_round(scale):
+def test_allowed_band_is_one_colour_step_and_the_other_levels_are_round(scale):
     band = Band(-1.0 * scale, 2.0 * scale, text("allowed"))
     norm, colours, levels = face_maps.steps(scale * np.linspace(-9.0, 9.0, 1001), band)
     assert levels == sorted(levels)
@@ -82,7 +82,7 @@ def test_the_map_keeps_a_dent_and_evens_out_noise():
     assert -6.5 < smooth.min() < -4.8
 
 
-def test_what_was_not_seen_is_counted_and_a_run_draws_the_limit_of_the_project():
+def test_unseen_core_points_are_counted_and_the_limit_of_the_project_is_drawn():
     points, normals = plate()
     known = np.where(normals[:, 1] > 0, 0.5, np.nan)
     with default_settings():

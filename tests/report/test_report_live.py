@@ -18,7 +18,7 @@ from tests.support.results.bridge_results import of_bridge
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 
-def test_the_page_carries_what_its_script_draws():
+def test_page_embeds_the_data_of_its_script():
     execution = of_bridge()
     kinds = Page(rendered(execution)).scripts
     assert [kind for kind, _ in kinds] == ["application/json", ""]

@@ -67,7 +67,7 @@ def test_a_result_as_json_has_names_truth_values_and_nulls():
     assert "control" not in written
 
 
-def test_each_point_says_how_far_the_other_scan_lies(made):
+def test_each_point_has_its_signed_distance_to_the_other_scan(made):
     data = live_data.live_data(made.scene, made.runs)
     assert [part["name"] for part in data["parts"]] == list(NAMES[:3])
     off = [np.array(part["residual"], float) for part in data["parts"]]

@@ -53,7 +53,7 @@ def picture(format_="PNG", size=(40, 20)):
 # --- project.toml ---
 
 
-def test_known_keys_come_first_and_empty_ones_not_at_all(tmp_path):
+def test_title_block_lists_known_keys_first_and_omits_empty_ones(tmp_path):
     block = read_input(folder_of(tmp_path, FULL)).title_block
     assert dict(zip(block.keys, block.values, strict=True)) == {
         "company": "Steelwork Ltd", "project": "East bridge", "drawing": "D-1042", "order": "7781",
@@ -71,7 +71,7 @@ def test_a_logo_is_kept_as_it_is(tmp_path, format_):
     assert title_block.of(scene, of_bridge().provenance)["logo"].startswith(f"data:image/{format_.lower()};base64,")
 
 
-def test_the_title_block_is_no_part_of_what_was_measured(tmp_path):
+def test_title_block_does_not_change_the_hash_of_a_scene(tmp_path):
     """A name can be added after the run: the results are those of the same scene."""
     with_block = read_input(folder_of(tmp_path, FULL))
     without = dataclasses.replace(with_block, title_block=None)
@@ -138,7 +138,7 @@ def test_every_text_of_the_title_block_is_text(tmp_path):
     assert f"data:image/png;base64,{base64.b64encode(picture()).decode()}" in text
 
 
-def test_without_a_title_block_nobody_signs():
+def test_without_a_title_block_there_are_no_signatures():
     found = title_block.of(of_bridge().scene, of_bridge().provenance)
     assert (found["company"], found["logo"], found["signatures"]) == ("", "", [])
     assert [value for _, value in found["rows"]] == ["b.h5, SHA-256 00", "processor 0"]
@@ -194,7 +194,7 @@ def test_characteristics_are_those_of_results_json_worst_first():
     assert span["nominal"] == pytest.approx(0.5 * (12_000.0 + 4_000.0))
 
 
-def test_a_verdict_is_told_by_colour_sign_and_word(tmp_path):
+def test_verdict_is_shown_by_colour_sign_and_word(tmp_path):
     path = tmp_path / "r.html"
     path.write_text(rendered(of_bridge()), "utf-8")
     with opened(path) as shown:

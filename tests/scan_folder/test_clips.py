@@ -1,4 +1,4 @@
-"""Boxes that scans are cut by: held against NumPy, in frames and units, on every column; and each mistake named."""
+"""Boxes that clip scans: compared with NumPy, in frames and units, on every column; mistakes are refused by name."""
 
 import json
 import re
@@ -128,7 +128,7 @@ def test_each_mistake_is_named(tmp_path, toml, said):
     assert "project.toml" in str(raised.value)
 
 
-def test_what_was_clipped_is_said_and_written_and_exported_without(tmp_path):
+def test_clipped_points_are_counted_and_absent_from_exports(tmp_path):
     place = tmp_path / "in"
     place.mkdir()
     rng = np.random.default_rng(2)

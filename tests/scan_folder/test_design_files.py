@@ -201,7 +201,7 @@ def test_bad_meshes(bridge):
         folder.read_input(bridge)
 
 
-def test_not_json(bridge):
+def test_unreadable_json_of_a_design_is_refused(bridge):
     for text in ("{", "[" * 100_000, "[]"):
         (bridge / "design.json").write_text(text)
         with pytest.raises(InputError, match=r"design\.json: (not readable JSON|expected a table)"):

@@ -69,7 +69,7 @@ def test_hollow_balls_and_coarse_ones():
     assert max(compare(one.design, truth)) < NODE_MM
 
 
-def test_what_is_not_sure_is_told():
+def test_uncertain_balls_and_tubes_are_reported_as_doubts():
     bodies, (centres, radii, _, _) = frame_solids.solids(0)
     lone = ("lone", *frame_solids.ball(centres[0] + [0.0, 0.0, 3000.0], 60.0))
     pole = (

@@ -95,7 +95,7 @@ def test_a_design_in_another_frame_is_refused(R, reason):
     assert "turn the design" in one.doubts[0]
 
 
-def test_names_numbered_against_x_are_told():
+def test_names_numbered_against_the_order_of_parts_are_reported():
     one = found(bridge_parts.bridge()[0], bridge_parts.names(5)[::-1])
     assert order(one.design) == bridge_parts.names(5)[::-1]
     assert len(one.doubts) == 1
@@ -152,7 +152,7 @@ def chamfered(vertices, faces, steps=1):
     ],
     ids=["end plate", "bevel", "chamfer", "offset", "overlap", "rounded"],
 )
-def test_corners_that_are_not_clear_are_not_sure(flaw, reason):
+def test_unclear_corners_are_reported_as_doubts(flaw, reason):
     meshes, _ = bridge_parts.bridge(5, 0)
     flaw(meshes, bridge_parts.cutting_planes(5, 0))
     one = found(meshes)
@@ -230,7 +230,7 @@ def test_parts_without_a_clear_order_make_no_design(change, reason):
     assert reason in one.doubts[0]
 
 
-def test_a_part_that_meets_nothing_is_left_out_and_told():
+def test_part_without_neighbours_is_left_out_with_a_remark():
     meshes, joints = bridge_parts.bridge()
     one = found([*meshes, (meshes[2][0] + [0.0, 9000.0, 0.0], meshes[2][1])], [*bridge_parts.names(5), "spare"])
     assert order(one.design) == bridge_parts.names(5)
@@ -348,7 +348,7 @@ def test_the_unit_comes_from_scans_that_state_theirs(tmp_path, suffix, unit, siz
 
 
 @pytest.mark.parametrize(("unit", "size_mm"), [("mm", 1.0), ("m", 1000.0)])
-def test_a_unit_that_nothing_states_is_not_sure(tmp_path, unit, size_mm):
+def test_guessed_unit_of_a_design_is_marked_unsure(tmp_path, unit, size_mm):
     meshes, _ = bridge_parts.bridge()
     for name, (vertices, faces) in zip(bridge_parts.names(5), meshes, strict=True):
         write_ply(tmp_path / f"design/{name}.ply", vertices / size_mm, faces)
@@ -388,7 +388,7 @@ def test_bodies_of_cad_files_without_a_unit_have_the_guessed_one(tmp_path, monke
     assert np.abs(guessed.design.joint_points - joints).max() < CORNER_MM
 
 
-def test_inches_are_asked_for(tmp_path):
+def test_design_in_inches_is_made_only_with_stated_units(tmp_path):
     meshes, joints = bridge_parts.bridge()
     for name, (vertices, faces) in zip(bridge_parts.names(5), meshes, strict=True):
         write_ply(tmp_path / f"design/{name}.ply", vertices / 25.4, faces)

@@ -35,7 +35,7 @@ def test_a_bridge_without_a_project_file(bridge):
     assert arch.joint_points[0, 7].tolist() == [4000, 80, 5]
 
 
-def test_all_that_a_project_file_says(bridge):
+def test_all_keys_of_a_project_file_are_read(bridge):
     write_xyz(bridge / "scans/扫描.xyz", surface(0) * 100.0)
     write_xyz(bridge / "more.xyz", surface(1) * 100.0)
     project(
@@ -129,7 +129,7 @@ def test_a_single_file_and_a_scene(tmp_path):
     assert store.scene_hash(folder.read_input(path)) == store.scene_hash(store.read_scene(path))
 
 
-def test_where_a_truth_is(bridge):
+def test_truth_file_is_found_beside_a_folder_of_scans(bridge):
     assert folder.truth_file(bridge) is None
     assert folder.truth_file(bridge / "scans/foot1.xyz") is None
     store.write_truth(bridge / "truth.h5", Truth())
@@ -141,7 +141,7 @@ def test_where_a_truth_is(bridge):
 # --- units ---------------------------------------------------------------------------------------------------------
 
 
-def test_which_unit_counts(tmp_path):
+def test_units_of_the_command_precede_those_of_project_and_file(tmp_path):
     write_xyz(tmp_path / "a.xyz", np.eye(3, 3).repeat(2, axis=0))
     np.savetxt(tmp_path / "b.csv", np.eye(3, 3).repeat(2, axis=0), delimiter=",", header="x_cm,y_cm,z_cm")
 
@@ -186,7 +186,7 @@ def test_a_turned_part_is_no_wrong_unit(bridge):
 
 
 def test_a_scan_larger_than_any_structure_has_a_wrong_unit(tmp_path):
-    """Design and scan in mm, both read as metres: their ratio says nothing."""
+    """Design and scan in mm, both read as metres: their ratio does not show the error."""
     write_ply(tmp_path / "design.ply", BOX * 10_000.0)
     write_ply(tmp_path / "scans/hall.ply", surface() * 10_000.0)
     text = 'kind = "structure"\nunits = "{}"\ndesign = "design.ply"\n[[scan]]\nfile = "scans/hall.ply"\n'

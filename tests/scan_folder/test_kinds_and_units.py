@@ -1,4 +1,4 @@
-"""A folder that somebody made by hand: what it is read as, and which step runs, or what to do next."""
+"""A folder made by hand: kind and units that are read, the step that runs, or the advice."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_the_unit_is_that_of_a_structure_and_the_one_that_init_writes(tmp_path, 
     assert guess.LARGEST_M == units.LARGEST_M
 
 
-def test_what_is_said_goes_before_what_seems(tmp_path):
+def test_stated_units_take_precedence_over_guessed_ones(tmp_path):
     write(tmp_path / "hall" / "scan.xyz", box((1500.0, 800, 300), 8.0))
     assert read_input(tmp_path / "hall", "inch").units == "inch"
     (tmp_path / "hall/project.toml").write_text('units = "cm"\n')
@@ -72,7 +72,7 @@ def test_the_spacing_does_not_depend_on_the_order_of_a_large_cloud():
     assert found == pytest.approx([0.08, 0.08], abs=0.01)
 
 
-def test_one_scan_alone_is_answered_with_the_line_that_leads_on(tmp_path):
+def test_lone_scan_is_refused_with_the_commands_to_run(tmp_path):
     write(tmp_path / "target.xyz", box((1.0, 1, 1), 0.03))
     with pytest.raises(UsageError, match=r"--steps spheres; .*processor init; .*processor compare REFERENCE COMPARED"):
         pipeline.steps_for(read_input(tmp_path / "target.xyz"))

@@ -1,4 +1,4 @@
-"""`processor init`: kinds, units and components guessed from files; what is not sure is said."""
+"""`processor init`: kinds, units and components guessed from files; uncertain guesses are marked."""
 
 import json
 import subprocess
@@ -40,7 +40,7 @@ FACES = ((0, 1, 3), (0, 3, 2), (4, 5, 7), (4, 7, 6), (0, 1, 5), (0, 5, 4), (2, 3
         ("扫描", []),
     ],
 )
-def test_names_mean_components(stem, expected):
+def test_file_names_are_mapped_to_components(stem, expected):
     assert component_names.components(stem, ORDER) == expected
 
 
@@ -65,7 +65,7 @@ def test_names_of_a_chinese_design():
         ("is2", ""),
     ],
 )
-def test_names_of_stations(stem, expected):
+def test_file_names_are_mapped_to_stations(stem, expected):
     assert component_names.station(stem) == expected
 
 
@@ -143,7 +143,7 @@ def test_a_bridge_with_names_and_without(bridge):
     assert "# temperature_C" in (bridge / "project.toml").read_text("utf-8")
 
 
-def test_a_name_that_its_shape_contradicts_is_said(bridge):
+def test_name_contradicted_by_the_shape_is_marked_unsure(bridge):
     write_scan(bridge / "rib1.xyz", box_points(SIZES["rib2"], 1) * 1000.0)
     write_scan(bridge / "odd.xyz", box_points((6.0, 3.0, 3.0), 2) * 1000.0)
     found = guess.guess(bridge)
@@ -156,7 +156,7 @@ def test_a_name_that_its_shape_contradicts_is_said(bridge):
     assert any("no scan is assigned to" in text and "foot1" in text for text in found.unsure)
 
 
-def test_the_shape_decides_on_scans_that_are_only_numbered(bridge):
+def test_numbered_scans_are_assigned_by_their_shape(bridge):
     for i, name in enumerate(("rib2", "foot2", "rib1", "foot1"), 1):
         write_scan(bridge / f"scans/Scan_{i:03d}.xyz", box_points(SIZES[name], i))
     scans = guess.guess(bridge).scans
@@ -182,7 +182,7 @@ def test_the_shape_of_a_part_is_measured_without_the_ground_about_it(bridge):
     assert [(one.component, one.sure) for one in found.scans] == [("rib2", True), ("rib1", True)]
 
 
-def test_a_name_is_not_sure_where_the_shape_is_that_of_another(bridge):
+def test_name_is_unsure_if_the_shape_matches_another_part(bridge):
     """The extents differ by 8 %: a scan with gaps might, but these are those of rib 2."""
     size = np.array(SIZES["rib1"]) * 1000.0 * np.array([1.08, 1.0, 1.0])
     write_mesh(bridge / "design/rib2.obj", size, 13_000.0)
@@ -226,7 +226,7 @@ def test_one_mesh_is_a_structure(tmp_path):
         folder.read_input(tmp_path)
 
 
-def test_nothing_is_overwritten_and_names_are_quoted(tmp_path):
+def test_existing_project_file_is_kept_and_names_are_quoted(tmp_path):
     place = tmp_path / 'a "b"\\\x7f 桥'
     write_scan(place / '"]\n[x.xyz', box_points((3.0, 2.0, 1.0), 1))
     assert init(place).exit_code == 0
@@ -249,7 +249,7 @@ def test_project_files_in_gb18030_are_read(tmp_path):
     assert folder.read_input(tmp_path).name == "东桥"
 
 
-def test_the_command_says_its_file(bridge):
+def test_init_command_prints_kind_and_number_of_scans(bridge):
     write_scan(bridge / "rib1.xyz", box_points(SIZES["rib1"], 1))
     done = subprocess.run(
         [sys.executable, "-m", "processor", "init", str(bridge)], capture_output=True, text=True, cwd=ROOT, check=False

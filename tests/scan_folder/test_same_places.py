@@ -1,4 +1,4 @@
-"""Vertices that meshes repeat."""
+"""Vertices that a mesh repeats, joined by position."""
 
 import numpy as np
 import pytest

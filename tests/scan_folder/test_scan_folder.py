@@ -1,4 +1,4 @@
-"""Exported scan folders: read back whole, and read by programs that share nothing with ours."""
+"""Exported scan folders: read back completely, and read by independent programs."""
 
 import dataclasses
 import hashlib
@@ -174,7 +174,7 @@ def test_quaternions_of_all_kinds_of_rotations():
         assert min(np.abs(q - expected).max(), np.abs(q + expected).max()) < 1e-12
 
 
-def test_what_cannot_be_written_is_refused(tmp_path):
+def test_scene_unfit_for_the_format_is_refused_before_writing(tmp_path):
     scene = stations_apart(np.zeros(3))
     bare = dataclasses.replace(
         scene, scans=tuple(dataclasses.replace(s, grid_row=[], grid_column=[]) for s in scene.scans)
@@ -231,7 +231,7 @@ def test_the_truth_is_found_by_the_names_that_scans_are_read_by(make, format_, t
     assert rank == sum(len(scan.points) for scan in scene.scans)
 
 
-def test_odd_names_in_e57_are_numbers_in_the_truth_too(tmp_path):
+def test_invalid_names_in_e57_are_numbered_in_the_truth_as_in_the_reader(tmp_path):
     """The generator's notion of an odd name is the reader's."""
     points = on_grid(50)[0]
     taken = [Scan(name, points) for name in ("t-2", "a/b", "ok")]
@@ -248,7 +248,7 @@ def test_odd_names_in_e57_are_numbers_in_the_truth_too(tmp_path):
 
 
 @pytest.mark.parametrize("format_", FORMATS)
-def test_a_station_that_saw_nothing_is_left_out_and_said(format_, tmp_path):
+def test_station_without_points_is_left_out_with_a_message(format_, tmp_path):
     scene = stations_apart(np.zeros(3))
     blind = Scan("S2", np.empty((0, 3)), station="S2", position=np.zeros(3), T_project_scan=np.eye(4))
     scene = dataclasses.replace(scene, scans=(scene.scans[0], blind, scene.scans[2]))

@@ -1,4 +1,4 @@
-"""The schemas of docs/schemas: valid, in step with the reader, and held by every folder that designgen exports."""
+"""The schemas of docs/schemas: valid, consistent with the reader, and met by every folder that designgen exports."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Text of TOML is read back by tomllib as what it was."""
+"""Written TOML is read back unchanged by tomllib."""
 
 import datetime
 import math

@@ -119,7 +119,7 @@ def test_hangers_that_are_too_long_fail():
 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 90.0])
-def test_the_lowest_line_of_a_tube_is_held_against_the_ceiling(degrees):
+def test_clearance_of_a_tube_is_that_of_its_lowest_line(degrees):
     """A tube of radius 40 mm from (0, 0, 500) upwards: its lowest line begins 40 cos(angle) below its axis."""
     angle = np.deg2rad(degrees)
     end = np.array([0.0, 0.0, 500.0]) + 2000.0 * np.array([np.cos(angle), 0.0, np.sin(angle)])

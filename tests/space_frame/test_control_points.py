@@ -144,7 +144,7 @@ def same(one, other):
     return all(np.array_equal(getattr(one, f.name), getattr(other, f.name)) for f in dataclasses.fields(one))
 
 
-def test_tables_and_a_csv_say_the_same(tmp_path):
+def test_control_points_in_toml_and_csv_are_read_alike(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     (tmp_path / "c").mkdir()
@@ -161,7 +161,7 @@ def test_tables_and_a_csv_say_the_same(tmp_path):
         assert len(scene.scans) == 2
 
 
-def test_units_are_the_scans_where_seen_and_the_projects_where_known(tmp_path):
+def test_sightings_have_the_units_of_scans_and_known_points_of_the_project(tmp_path):
     found = folder.read_input(place(tmp_path, TOML, CSV), units="m").control
     np.testing.assert_array_equal(found.positions[0], [1000.0, 2000.0, 300.0])
     np.testing.assert_array_equal(found.seen[0], [2e6, 4e6, 3e5])
@@ -206,7 +206,7 @@ def test_a_csv_is_no_scan_and_may_name_stations_of_a_merged_cloud(tmp_path):
         ("", "", "expected columns"),
     ],
 )
-def test_nonsense_is_named(tmp_path, toml, csv, said):
+def test_invalid_control_points_are_refused_in_one_line(tmp_path, toml, csv, said):
     with pytest.raises(InputError, match=said) as error:
         folder.read_input(place(tmp_path, TOML + toml, csv))
     assert "\n" not in str(error.value)
@@ -216,12 +216,12 @@ def test_nonsense_is_named(tmp_path, toml, csv, said):
     ("value", "said"),
     [("3", "expected a text"), ('"."', "found a folder"), ('"../x.csv"', "leads out"), ('"no"', "no file")],
 )
-def test_a_table_that_is_not_there(tmp_path, value, said):
+def test_missing_control_file_is_refused(tmp_path, value, said):
     with pytest.raises(InputError, match=said):
         folder.read_input(place(tmp_path, f"control = {value}\n{TOML}"))
 
 
-def test_a_scene_file_keeps_them_and_one_of_the_format_before_has_none(tmp_path):
+def test_control_points_are_stored_and_absent_from_older_files(tmp_path):
     scene = folder.read_input(place(tmp_path, TOML, CSV))
     store.write_scene(tmp_path / "s.h5", scene, None, {})
     again = store.read_scene(tmp_path / "s.h5")
@@ -234,7 +234,7 @@ def test_a_scene_file_keeps_them_and_one_of_the_format_before_has_none(tmp_path)
     assert store.read_scene(tmp_path / "old.h5").control is None
 
 
-def test_coordinates_of_another_frame_are_told(tmp_path):
+def test_control_points_in_another_frame_are_refused(tmp_path):
     far = CSV.replace("T1,,1000.0", "T1,,500000000.0")
     scene = folder.read_input(place(tmp_path, TOML, far))
     with pytest.raises(InputError, match="control points lie 5e\\+05 m from where"):
@@ -242,7 +242,7 @@ def test_coordinates_of_another_frame_are_told(tmp_path):
 
 
 @pytest.mark.parametrize(("factor", "said"), [(1000.0, "1000"), (1.0 / 25.4, "1/25.4"), (1.3, "")])
-def test_control_points_in_another_unit_are_told_with_the_factor(tmp_path, factor, said):
+def test_control_points_in_another_unit_are_refused_with_the_factor(tmp_path, factor, said):
     places = np.array([[5000.0, 2000.0, 300.0], [9000.0, 500.0, 100.0], [100.0, 7000.0, 300.0]])
     rows = ["name,scan,x,y,z,sd_mm"]
     for i, (x, y, z) in enumerate(places):

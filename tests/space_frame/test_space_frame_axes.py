@@ -26,7 +26,7 @@ def ends_at(rng, nodes, per_node, sd=0.1, eccentricity=0.0, starts=None, respons
     return axis_intersection.axis_ends(node, starts, points, directions, side, covariance, response)
 
 
-def test_axes_meet_where_they_do():
+def test_intersections_of_exact_axes_are_the_nodes():
     rng = np.random.default_rng(1)
     nodes = rng.uniform(-5e4, 5e4, (20, 3))
     starts = nodes + rng.uniform(-20.0, 20.0, nodes.shape)
@@ -37,7 +37,7 @@ def test_axes_meet_where_they_do():
 
 
 @pytest.mark.parametrize("eccentricity", [0.0, 1.0])
-def test_covariance_is_honest_with_and_without_eccentric_axes(eccentricity):
+def test_covariance_agrees_with_errors_with_and_without_eccentric_axes(eccentricity):
     rng = np.random.default_rng(2)
     nodes = rng.uniform(-1e4, 1e4, (1500, 3))
     for per_node in (3, 6):
@@ -49,7 +49,7 @@ def test_covariance_is_honest_with_and_without_eccentric_axes(eccentricity):
         assert met.eccentricity_mm == pytest.approx(max(eccentricity, 0.02), abs=0.08)
 
 
-def test_an_axis_that_is_a_stranger_is_left_out():
+def test_outlying_axis_is_excluded_from_its_node():
     rng = np.random.default_rng(3)
     nodes = rng.uniform(-1e4, 1e4, (50, 3))
     ends = ends_at(rng, nodes, 6, 0.1)
@@ -77,7 +77,7 @@ def test_two_axes_fix_a_point_and_one_or_parallel_ones_do_not():
 
 
 def test_a_station_moves_all_axes_of_a_node_alike():
-    """One station alone, off by 2 mm for each axis: so is the node, whatever the axes' scatter says."""
+    """One station alone, off by 2 mm for each axis: so is the node, whatever the axes' scatter."""
     rng = np.random.default_rng(5)
     nodes = np.zeros((1, 3))
     response = np.zeros((6, 1, 4, 2))

@@ -38,7 +38,7 @@ def test_residual_of_a_square_and_of_a_slanting_ray():
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_derivatives_are_the_differences(known):
+def test_jacobian_equals_finite_differences(known):
     rng = np.random.default_rng(1)
     p = np.array([18.0, -9.0, -41.0])
     u = np.array([0.3, 0.1, 0.9]) / np.linalg.norm([0.3, 0.1, 0.9]) * known
@@ -51,7 +51,7 @@ def test_derivatives_are_the_differences(known):
         assert J[i] == pytest.approx(numeric, abs=1e-7)
 
 
-def test_selection_looks_at_the_ray_and_not_at_the_noisy_point():
+def test_selection_depends_on_the_ray_and_not_on_the_noisy_point():
     """Rays that meet a member's flat, the process hole or the limb are left out, wherever along them the point is."""
     up = np.array([0.0, 0.0, 1.0])
     at = np.array([[0.0, 0.0], [12.0, 0.0], [20.0, 0.0], [49.8, 0.0], [60.0, 0.0], [0.0, 30.0]])
@@ -67,7 +67,7 @@ def test_selection_looks_at_the_ray_and_not_at_the_noisy_point():
         assert count == 1
 
 
-def test_weights_are_whole_and_then_nothing():
+def test_weight_is_one_for_small_and_zero_for_large_residuals():
     assert [weight(t) for t in (0.0, -3.0, 4.5, 9.0)] == [1.0, 1.0, 0.0, 0.0]
     assert weight(3.75) == pytest.approx((1.0 - 0.25) ** 2)
     t = np.random.default_rng(2).standard_normal(400_000)
@@ -84,7 +84,7 @@ def test_inverse_is_that_of_another_library():
     assert not inverse_of(np.diag([1.0, 2.0, 0.0, 1.0]), out)
 
 
-def test_a_station_that_may_have_moved_is_worth_less():
+def test_covariance_with_station_shifts_is_that_of_the_joint_problem():
     """The ball's covariance with unknown shifts is that of the joint problem with the shifts as unknowns."""
     rng = np.random.default_rng(4)
     u = rng.normal(size=(40, 3)) * [0.4, 0.4, 0.0] + [0.0, 0.0, 1.0]
@@ -120,7 +120,7 @@ def test_a_station_that_may_have_moved_is_worth_less():
         pytest.param(45.0, 30, 0.25, 2.0, 1, marks=pytest.mark.slow),
     ],
 )
-def test_errors_keep_to_the_bound_and_intervals_hold(radius, count, visible, sigma, several):
+def test_errors_reach_the_bound_and_intervals_cover(radius, count, visible, sigma, several):
     draws = 600
     errors, covariance, bounds, *_ = ball_fit.trial(
         np.random.default_rng(7), draws, radius, count, visible, sigma, several
@@ -152,7 +152,7 @@ def test_the_noise_is_read_from_residuals():
     assert worth < 20
 
 
-def test_without_rays_half_of_what_noise_may_bring_is_taken_off_and_the_rest_is_in_the_interval():
+def test_radius_without_rays_is_corrected_by_half_the_noise_bias():
     rng = np.random.default_rng(12)
     draws, count, radius, sigma = 400, 200, 45.0, 2.0
     normal = rng.standard_normal((draws * count, 3))
@@ -199,7 +199,7 @@ def test_the_scatter_of_radii_is_that_of_the_balls():
 
 
 def test_an_offset_that_all_radii_share_is_found_with_its_standard_deviation():
-    """Radii fused with a prior about their sizes: the mean of what the points say, by its own standard deviation."""
+    """Radii fused with a prior about their sizes: the mean of the fitted radii, by its standard deviation."""
     rng = np.random.default_rng(4)
     pulls = []
     for shared in (0.0, -0.25):

@@ -30,7 +30,7 @@ def errors(result, truth, rows=slice(None)):
     return np.linalg.norm(result.balls.centres[rows] - truth.frame.centres[rows], axis=1)
 
 
-def test_every_ball_is_found_blind(roof):
+def test_every_ball_is_found_without_a_design(roof):
     scene, truth = roof
     result = space_frame_step.run(dataclasses.replace(scene, frame=None), space_frame_step.Params())
     assert result.status == "ok"
@@ -70,7 +70,7 @@ def test_a_design_of_another_frame_is_found(roof):
     assert np.linalg.norm(back, axis=1).max() < 30.0
 
 
-def test_a_node_that_was_not_built_is_not_found_and_one_that_was_not_designed_is_told(roof):
+def test_unbuilt_node_is_not_found_and_undesigned_node_is_extra(roof):
     scene, truth = roof
     frame = scene.frame
     centres, ids = frame.centres.copy(), frame.ids.copy()
@@ -167,7 +167,7 @@ def truly_wrong(scene, truth):
     return set(scene.frame.ids[np.abs(truth.frame.radii - scene.frame.radii) > 3.0].tolist())
 
 
-def test_the_balls_sizes_tell_how_a_square_roof_is_turned(square):
+def test_sizes_of_balls_decide_the_turn_of_a_square_roof(square):
     scene, truth = square
     x, _, z = scene.frame.centres.max(axis=0)
     beyond = [[x + 3000.0, 3000.0, z], [x + 3000.0, 6000.0, z], [-3000.0, 0.0, z]]
@@ -259,7 +259,7 @@ def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
     assert baselines.RAW not in again.reasons
 
 
-def test_a_wrong_size_is_told_without_a_catalogue(square):
+def test_wrong_size_is_flagged_without_a_catalogue(square):
     scene, truth = square
     result = space_frame_step.run(scene, space_frame_step.Params(catalogue="none"))
     reasons = [result.balls.reasons[i] for i, flag in enumerate(result.balls.flag) if flag == "wrong-size"]
@@ -270,7 +270,7 @@ def test_a_wrong_size_is_told_without_a_catalogue(square):
     assert "low-confidence" not in {result.balls.flag[i] for i in np.flatnonzero(result.balls.points > 30)}
 
 
-def test_a_wrong_size_that_the_catalogue_lacks_is_told_where_the_interval_excludes_the_designed_one(square):
+def test_wrong_size_missing_in_the_catalogue_is_flagged_by_its_interval(square):
     scene, truth = square
     result = space_frame_step.run(scene, space_frame_step.Params(radii_mm=(45.0, 50.0)))
     largest = scene.frame.ids[np.argmax(truth.frame.radii)]

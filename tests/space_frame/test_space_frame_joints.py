@@ -50,13 +50,13 @@ def test_joints_of_a_scaffold_are_no_nodes():
     assert distance.max() < 10.0
 
 
-def test_balls_without_sleeves_are_told_by_their_surface():
+def test_balls_without_sleeves_are_recognised_by_their_surface():
     odds = ball_or_none.log_odds_of_ball(np.array([40.0] * 8 + [-9.0] * 4 + [1.0]), np.array([-60.0] * 12 + [-20.0]))
     assert (odds[:8] > 3.0).all()
     assert (odds[8:12] < -3.0).all()
 
 
-def test_a_clamp_that_seems_round_is_told_by_the_clamps_about_it():
+def test_round_looking_clamp_follows_the_neighbouring_clamps():
     sphere, neck = np.array([30.0] * 20 + [6.0, -5.0, -8.0, -6.0]), np.array([50.0] * 20 + [-40.0] * 4)
     pairs = np.array([(i, i + 1) for i in range(19)] + [(20, 21), (20, 22), (20, 23)])
     assert (
@@ -66,7 +66,7 @@ def test_a_clamp_that_seems_round_is_told_by_the_clamps_about_it():
 
 
 @pytest.mark.parametrize("chain", [5, 9])
-def test_joints_that_show_nothing_follow_their_neighbours(chain):
+def test_joints_without_evidence_follow_their_neighbours(chain):
     pairs = np.stack([np.arange(chain - 1), np.arange(1, chain)], axis=1)
     odds = np.zeros(chain)
     odds[0] = 9.0

@@ -84,6 +84,6 @@ def test_a_corner_of_two_members_is_a_node_where_both_lead_to_nodes():
     assert len(graph(lines_of(*[toward(corners[i], corners[j]) for i, j in ladder], *loose)).nodes) == 6
 
 
-def test_nothing():
+def test_graph_of_no_or_one_line_has_no_nodes():
     assert len(graph(Lines(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))).nodes) == 0
     assert len(graph(lines_of(toward(ORIGIN, X))).nodes) == 0

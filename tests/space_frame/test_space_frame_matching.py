@@ -1,4 +1,4 @@
-"""Nodes against a design: which is which in any frame, what cannot be told, and how far each moved."""
+"""Nodes against a design: matching in any frame, ambiguous matchings, and movements of nodes."""
 
 import numpy as np
 import pytest
@@ -92,7 +92,7 @@ def test_coordinates_of_a_map_grid():
     assert np.abs(placed[on] - d.centres[cloud.truth[on]]).max() < 25.0  # what the nodes moved, no digits lost
 
 
-def test_a_flat_grid_of_one_size_is_ambiguous_and_its_answers_hold_the_true_one():
+def test_flat_grid_of_one_size_is_ambiguous_with_the_true_pose_among_rivals():
     d = design("flat", radii=(45.0,))
     for seed in range(3):
         cloud = Cloud(d, seed)
@@ -111,7 +111,7 @@ def test_a_square_grid_has_four_answers():
     assert min(cloud.error(T) for T in (found.T_design_scan, *found.rivals)) < 4.0
 
 
-def test_one_layer_turned_over_is_told_by_gravity_alone():
+def test_attitude_of_a_flat_layer_is_restricted_by_gravity_alone():
     d = design("flat", nx=7, ny=12, layers=1, radii=(60.0,))
     upright = Cloud(d, 2, missing=0.1, extra=0.05, pose=37.0)
     found = match(upright.found(), d)
@@ -125,7 +125,7 @@ def test_one_layer_turned_over_is_told_by_gravity_alone():
 
 
 @pytest.mark.parametrize("by", ["radii", "members", "shape", "a missing corner"])
-def test_what_distinguishes_decides(by):
+def test_pose_is_unique_as_far_as_sizes_members_or_shape_determine_it(by):
     more, members = {}, None
     if by == "members":  # diagonals run one way: a quarter turn lays nodes onto nodes, and members onto nothing
         d = design("flat", nx=8, ny=8, layers=1, radii=(60.0,), diagonals=True)
@@ -179,7 +179,7 @@ def test_balls_are_measured_where_the_pattern_leaves_several_poses_and_nowhere_e
     assert len(asked) == 4
 
 
-def test_half_a_flat_roof_may_be_any_half():
+def test_half_a_flat_roof_is_ambiguous():
     """What was scanned is a part that fits in several places: none of them is a guess worth giving alone."""
     d = design("flat", nx=10, ny=10, radii=(45.0,))
     cloud = Cloud(d, 5, missing=0.0, extra=0.0, off=5.0)
@@ -190,7 +190,7 @@ def test_half_a_flat_roof_may_be_any_half():
     assert min(cloud.error(T) for T in (found.T_design_scan, *found.rivals)) < 4.0
 
 
-def test_same_frame_one_bay_on_is_not_believed():
+def test_coordinates_shifted_by_one_bay_are_ambiguous():
     """Coordinates off by one bay lay most nodes of a flat grid onto others."""
     d = design("flat", nx=9, ny=13, radii=(45.0,))
     cloud = Cloud(d, 1, missing=0.02, extra=0.0, pose="same")
@@ -231,7 +231,7 @@ def test_the_order_of_the_nodes_does_not_matter():
     np.testing.assert_allclose(other.T_design_scan, one.T_design_scan, atol=1e-6)
 
 
-def test_covariance_of_the_pose_is_honest():
+def test_covariance_of_the_pose_agrees_with_its_errors():
     """Pulls of the pose at the structure's middle and of its turns, nodes moving at random."""
     d = design(nx=6, ny=7)
     middle = d.centres.mean(axis=0)
@@ -281,7 +281,7 @@ def test_movements_in_the_designs_own_frame():
     )
 
 
-def test_movements_after_a_best_fit_have_honest_intervals():
+def test_intervals_of_movements_after_a_best_fit_cover():
     """Against the true movements after the same fit of the true nodes; few nodes: the fit's own error counts."""
     d = design(nx=3, ny=3, layers=2, radii=SIZES)
     pulls = []
@@ -341,7 +341,7 @@ def test_warm_steel_is_no_movement():
     assert np.abs(cold.vector).max() > 4.0  # 12 m times 12e-6 times 30 K
 
 
-def test_one_node_far_off_does_not_draw_the_others():
+def test_displaced_node_does_not_shift_the_others():
     d = design(nx=5, ny=5)
     cloud = Cloud(d, 0, missing=0.0, extra=0.0, off=1.0, pose=50.0)
     positions = cloud.positions.copy()

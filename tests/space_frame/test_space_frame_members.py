@@ -60,7 +60,7 @@ def bytes_of(record):
     return [np.asarray(getattr(record, name)).tobytes() for name in record.__dataclass_fields__]
 
 
-def test_all_nodes_and_members_are_found_blind(frame, source):
+def test_all_nodes_and_members_are_found_without_a_design(frame, source):
     nodes, tubes = find(source)
     rows = matched(nodes, frame.nodes)
     assert nodes.count == len(frame.nodes)
@@ -73,7 +73,7 @@ def test_all_nodes_and_members_are_found_blind(frame, source):
     assert np.abs(lengths - tubes.lengths - 270.0).max() < 80.0
 
 
-def test_errors_are_as_large_as_said():
+def test_errors_of_nodes_agree_with_their_covariance():
     found = []
     for seed in range(4):
         rng = np.random.default_rng(100 + seed)
@@ -111,7 +111,7 @@ def test_same_bytes_whatever_the_order_the_chunks_and_the_threads(source, how):
         assert bytes_of(one) == bytes_of(two)
 
 
-def test_scanners_unknown(frame, source):
+def test_nodes_are_found_without_scanner_positions(frame, source):
     nodes, _ = find(InMemory(source.points))
     rows = matched(nodes, frame.nodes)
     assert np.median(np.linalg.norm(nodes.positions[rows] - frame.nodes, axis=1)) < 1.0
@@ -135,7 +135,7 @@ def test_lamps_pipes_and_strays_are_no_nodes(frame, source):
     matched(nodes, frame.nodes)
 
 
-def test_nothing_is_found_where_there_is_nothing():
+def test_clouds_without_a_frame_have_no_nodes_and_tubes():
     rng = np.random.default_rng(6)
     scanner = np.array([[0.0, 0.0, 0.0]])
     sphere = frame_clouds.ball(np.array([3000.0, 0.0, 0.0]), 50.0, 4000, scanner[0], 1.0, rng)
@@ -159,7 +159,7 @@ def test_a_member_that_is_not_there_is_left_out(frame, source):
     assert nodes.axis_count[-1] == 0
 
 
-def test_stations_that_are_off_are_seen_and_told(frame):
+def test_station_shifts_are_included_in_the_covariance_of_nodes(frame):
     rng = np.random.default_rng(7)
     pulls, formal = [], []
     for _ in range(6):
@@ -174,7 +174,7 @@ def test_stations_that_are_off_are_seen_and_told(frame):
 
 
 @pytest.mark.parametrize("radius", [20.0, 57.0, 70.0])
-def test_other_tubes(radius):
+def test_tubes_of_other_radii_are_measured(radius):
     rng = np.random.default_rng(8)
     frame = frame_clouds.grid(3, 3, spacing=3500.0, depth=2400.0, rng=rng)
     points, station = frame_clouds.scanned(frame, rng, radius=radius, ball_radius=110.0, per_tube=600)

@@ -90,7 +90,7 @@ def test_stations_are_laid_onto_each_other():
     assert found.floor_mm < 0.2
 
 
-def test_covariances_are_honest_over_many_seeds():
+def test_covariances_agree_with_errors_over_many_seeds():
     """Pulls of centres seen from two stations each, datum and all, and of the stations against each other."""
     pulls, between = [], []
     for seed in range(30):
@@ -152,7 +152,7 @@ def test_range_offsets_are_found():
     np.testing.assert_allclose(before - after, found.range_offset[station], atol=1e-6)
 
 
-def test_of_range_offsets_only_what_stations_differ_by_is_corrected():
+def test_only_differences_of_range_offsets_between_stations_are_corrected():
     """A wide beam on thin tubes looks like an offset of all ranges: balls must not be moved by that."""
     _, seen, rng = frame(8, 5, 5, per_pair=60)
     offset = np.array([1.8, 0.5, 1.2, 0.4])
@@ -173,7 +173,7 @@ def test_of_range_offsets_only_what_stations_differ_by_is_corrected():
     np.testing.assert_allclose(along, found.shared_offset_sd**2 * np.diag([0.0, 0.0, 1.0]), atol=1e-2 * along[2, 2])
 
 
-def test_stations_are_left_where_a_wide_beam_explains_as_much_as_they_seem_off():
+def test_stations_are_not_corrected_if_a_wide_beam_explains_their_residuals():
     for shift_mm, status in ((0.1, "doubtful"), (4.0, "ok")):
         _, seen, rng = frame(8, 5, 5, per_pair=60, shift_mm=shift_mm, turn_rad=0.0)
         ray = seen.points.points - seen.scanners[seen.points.station]
@@ -185,7 +185,7 @@ def test_stations_are_left_where_a_wide_beam_explains_as_much_as_they_seem_off()
 
 
 def test_without_control_the_datum_is_the_mean_of_the_stations():
-    """The common translation is known to sd / sqrt(s) of the stations' own, whatever the tubes say."""
+    """The common translation is known to sd / sqrt(s) of the stations' own, whatever the tubes."""
     _, seen, rng = frame(2, 5, 5, grid=(3, 3), per_pair=30)
     found = registered(seen, rng)
     middle = found.places.mean(axis=0)
@@ -196,7 +196,7 @@ def test_without_control_the_datum_is_the_mean_of_the_stations():
     np.testing.assert_allclose(found.datum_at(middle[None])[0], found.common(middle)[3:, 3:], rtol=1e-6, atol=1e-9)
 
 
-def test_control_points_hold_the_datum():
+def test_control_points_fix_the_datum():
     nodes, seen, rng = frame(4, 5, 5, per_pair=40)
     corner = nodes[[0, 4, 20, 24, 40]]
     share = np.zeros((5, 4))
@@ -239,7 +239,7 @@ def targets(seen, seed, count, sd=0.3, off=None, sightings=2):
     )  # fmt: skip
 
 
-def test_covariances_with_control_points_are_honest_over_many_seeds():
+def test_covariances_with_control_points_agree_with_errors_over_many_seeds():
     """Pulls of nodes after the correction, the error that the sightings of one target share among them."""
     pulls, shift, doubted = [], [], 0
     for seed in range(30):
@@ -293,7 +293,7 @@ def test_a_wrong_sighting_is_left_out_alone_and_named(sightings):
 
 
 def test_control_points_that_contradict_each_other_widen_the_intervals():
-    """Of three none can be told to be wrong; of one alone nothing but the stations' own scatter speaks against it."""
+    """Of three none can be identified as wrong; a single one is contradicted by the stations' own scatter alone."""
     nodes, seen, _ = frame(4, 5, 5, per_pair=40)
     three = targets(seen, 3, 3)
     away = three.target[0] - three.target[[2, 4]].mean(axis=0)
@@ -310,7 +310,7 @@ def test_control_points_that_contradict_each_other_widen_the_intervals():
         assert (np.abs(moved) < 2.0 * sd).all()
 
 
-def test_one_station_is_held_by_control_points():
+def test_single_station_is_placed_by_control_points():
     _, seen, rng = frame(1, 5, 5, grid=(1, 1), per_pair=40)
     shift = np.array([30.0, -20.0, 8.0])
     found = registered(seen, rng, control=targets(seen, 2, 4, off=shift))
@@ -319,7 +319,7 @@ def test_one_station_is_held_by_control_points():
     assert np.abs(left / np.sqrt(np.diag(found.covariance)[3:6])).max() < 4.0
 
 
-def test_a_declared_shift_of_all_stations_is_in_the_datum():
+def test_declared_common_shift_of_stations_is_added_to_the_datum_variance():
     _, seen, _ = frame(2, 5, 5, grid=(3, 3), per_pair=30)
     own, more = (registered(seen, np.random.default_rng(1), datum_mm=sd) for sd in (0.0, 3.0))
     variance = [np.diag(one.common(one.places.mean(axis=0)))[3:] for one in (own, more)]
@@ -328,7 +328,7 @@ def test_a_declared_shift_of_all_stations_is_in_the_datum():
     assert more.datum[0].values["sd"] > 3.0
 
 
-def test_two_control_points_help_without_holding_all():
+def test_two_control_points_reduce_the_covariance_of_the_datum():
     nodes, seen, _ = frame(4, 5, 5, per_pair=40)
     share = np.full((2, 4), 0.25)
     control = ControlPoints(("A", "B"), nodes[[0, 24]] + [3.0, 0.0, 0.0], nodes[[0, 24]], np.full((2, 3), 0.1), share)
@@ -340,8 +340,8 @@ def test_two_control_points_help_without_holding_all():
     assert [one.code for one in held.datum] == ["spheres.datum-stations-and-control"]
 
 
-def test_a_motion_that_no_tube_tells_is_named_and_stays_uncertain():
-    """All tubes along x: how the stations lie along x, nothing says."""
+def test_motion_undetermined_by_tubes_is_reported_and_stays_uncertain():
+    """All tubes lie along x: the positions of the stations along x are undetermined."""
     rng = np.random.default_rng(3)
     y, z = np.meshgrid(np.arange(6) * 1500.0, [6000.0, 7500.0, 9000.0])
     start = np.stack([np.zeros(18), y.ravel(), z.ravel()], axis=1)
@@ -390,7 +390,7 @@ def test_one_station_is_its_own_datum_and_stations_without_ties_are_unknown():
     assert np.isnan(found.covariance).all()
 
 
-def test_points_of_unknown_stations_and_tubes_without_points_do_no_harm():
+def test_points_without_station_and_tubes_without_points_are_accepted():
     _, seen, rng = frame(1, 5, 5, per_pair=40)
     station = seen.points.station.copy()
     station[::7] = -1
@@ -520,7 +520,7 @@ def test_a_floor_is_an_unknown_of_its_own():
     np.testing.assert_allclose(np.linalg.inv(M), np.linalg.inv(more)[:8, :8], rtol=1e-8, atol=1e-12)
 
 
-def test_small_algebra_is_numpys():
+def test_small_linear_algebra_equals_that_of_numpy():
     rng = np.random.default_rng(1)
     A = rng.normal(size=(9, 9))
     A = A @ A.T + np.eye(9)

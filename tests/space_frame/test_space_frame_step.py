@@ -62,7 +62,7 @@ def only_ball(scene):
     return replace(scene, frame=one, scans=(Scan("one", scene.scans[0].points[near]),))
 
 
-def test_in_kind_ransac_beats_least_squares():
+def test_ransac_has_smaller_radius_errors_than_least_squares():
     scene, truth = frame()
     by_method = {method: metrics(scene, space_frame_step.run(scene, Params(method=method)), truth) for method in PAPERS}
     median = {method: by_name["radius error, median"].value for method, by_name in by_method.items()}
@@ -106,7 +106,7 @@ def test_a_ball_without_points_is_data_and_no_exception():
     assert space_frame_step.run(nothing, Params(method="least-squares")).status == "failed"
 
 
-def test_a_cloud_without_members_is_still_held_against_its_design():
+def test_cloud_without_members_is_compared_with_its_design():
     scene, truth = frame(k=4)
     gone = np.linalg.norm(scene.scans[0].points - scene.frame.centres[2], axis=1) < 200.0
     fewer = replace(scene, scans=(Scan("all", scene.scans[0].points[~gone]),))
@@ -120,7 +120,7 @@ def test_a_cloud_without_members_is_still_held_against_its_design():
     assert set(space_frame_step.run(small, Params()).balls.flag) == {"wrong-size"}
 
 
-def test_balls_without_members_have_an_interval_that_holds_a_range_offset():
+def test_intervals_of_balls_without_members_cover_a_range_offset():
     """A scanner whose ranges are 0.6 mm too long, below three balls: their fits are moved by as much."""
     scene, truth = frame(k=3)
     true = truth.frame.centres[::-1]
@@ -156,7 +156,7 @@ def test_a_fit_that_leaves_its_crop_is_not_found():
     assert [one.code for one in result.balls.reasons[0]] == ["spheres.fit-left-crop"]
 
 
-def test_wrong_size_and_right_size():
+def test_ball_of_another_size_than_designed_is_flagged():
     rng = np.random.default_rng(3)
     nodes = np.array([[0.0, 0.0, 0.0], [PITCH, 0.0, 0.0]])
     d = rng.normal(size=(2, 400, 3))
@@ -205,7 +205,7 @@ def target(rng, n=800, view=(0.0, 0.0, 1.0)):
     return 70.0 * d[d @ np.asarray(view) > 0.3][:n]
 
 
-def test_search_without_a_design_uses_known_scanners():
+def test_search_without_a_design_uses_the_scanner_positions():
     rng = np.random.default_rng(5)
     position = np.array([0.0, 0.0, 8000.0])
     points = target(rng)
@@ -230,7 +230,7 @@ def test_search_without_a_design_uses_known_scanners():
     assert reason("spheres.robust-distances") in unknown.reasons
 
 
-def test_the_bound_of_a_target_is_what_its_points_allow():
+def test_bound_of_a_target_is_that_of_its_points():
     rng = np.random.default_rng(8)
     position = np.array([3000.0, 1000.0, 8000.0])
     view = position / np.linalg.norm(position)
@@ -251,7 +251,7 @@ def test_the_bound_of_a_target_is_what_its_points_allow():
 
 
 @pytest.mark.parametrize(("scale", "factor"), [(1000.0, "1/1000"), (1e-3, "1000"), (1e6, "")])
-def test_a_ball_of_no_plausible_radius_is_doubted_and_the_unit_named(scale, factor):
+def test_implausible_radius_lowers_confidence_and_names_the_unit(scale, factor):
     rng = np.random.default_rng(5)
     points = scale * (target(rng) + rng.normal(0.0, 0.3, (800, 3)))
     result = space_frame_step.run(Scene("t", "structure", (Scan("s", points),)), Params())
@@ -261,7 +261,7 @@ def test_a_ball_of_no_plausible_radius_is_doubted_and_the_unit_named(scale, fact
     assert doubt.values.get("factor", "") == factor
 
 
-def test_search_says_when_it_stopped_early_and_when_there_is_nothing():
+def test_search_reports_an_early_stop_and_an_empty_result():
     rng = np.random.default_rng(6)
     points = np.vstack([target(rng) + np.array([500.0 * i, 0.0, 0.0]) for i in range(3)]) + rng.normal(
         0.0, 0.3, (2400, 3)

@@ -46,7 +46,7 @@ def scan(rng, sigma=1.0, count=700, bow=(0.0, 0.0), moved=None, ends=True, stati
 
 
 def at_ends(fit):
-    """Across the tube, from the true ends to the line found (2 ends, 2), and the standard deviations said."""
+    """Across the tube, from the true ends to the line found (2 ends, 2), and the stated standard deviations."""
     found, sds = [], []
     side, other = fit.side[0], np.cross(fit.directions[0], fit.side[0])
     for true in (A, A + LENGTH * U):
@@ -198,7 +198,7 @@ def test_a_bow_is_found_and_the_ends_stay(bow):
     assert np.abs(at_ends(straight)[0]).max() > 0.8
 
 
-def test_stations_that_are_off():
+def test_covariance_of_a_tube_includes_station_shifts():
     rng = np.random.default_rng(6)
     excess, pulls, blind = np.zeros((2, 3)), [], []
     for _ in range(60):
@@ -215,7 +215,7 @@ def test_stations_that_are_off():
     assert np.sqrt(np.mean(np.square(blind))) > 3.0  # without it the covariance is wrong
 
 
-def test_without_errors_stations_are_not_off():
+def test_stations_without_errors_have_no_excess_scatter():
     rng = np.random.default_rng(7)
     excess = sum(fitted(*scan(rng, 1.0, count=500))[0].scatter[0] for _ in range(30))
     assert excess[:, 0].sum() / excess[:, 1].sum() < 0.02

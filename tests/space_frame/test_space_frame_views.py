@@ -30,7 +30,7 @@ def fitted(seed, shift_mm):
 
 
 @pytest.mark.parametrize("shift_mm", [0.0, 0.6])
-def test_lowest_points_hold_whether_views_agree_or_not(shift_mm):
+def test_intervals_of_lowest_points_cover_with_and_without_view_differences(shift_mm):
     pulls, wide = [], []
     for seed in range(5):
         found = fitted(seed, shift_mm)
@@ -51,7 +51,7 @@ def test_errors_of_views_common_to_all_spheres_are_part_of_the_whole():
     assert (shared[:, 2, 2] > 0.2**2 - 1e-9).all()
 
 
-def test_tubes_of_a_merged_cloud_hold_shifted_views():
+def test_intervals_of_tubes_of_a_merged_cloud_cover_shifted_views():
     """A tube seen from below: what its fit takes up of the views' errors is in the intervals, more if seen less."""
     found = fitted(1, 0.6)
     below, narrow = np.zeros((2, 24))
@@ -78,7 +78,7 @@ def test_tubes_of_a_merged_cloud_hold_shifted_views():
     assert (np.einsum("mii->mi", whole - least) > 0.0).all()
 
 
-def test_differences_between_balls_hold_views_that_differ_and_are_narrow_where_they_agree():
+def test_intervals_between_balls_cover_and_are_narrow_if_views_agree():
     """Centres less their mean, which no common shift moves: neither too narrow nor, without errors, too wide."""
     rms = {}
     for shift_mm in (0.0, 0.6):

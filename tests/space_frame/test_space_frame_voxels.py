@@ -76,7 +76,7 @@ def test_a_line_is_one_segment(cloud):
     assert np.linalg.norm(np.cross(one.points[0], one.directions[0])) < 10.0
 
 
-def test_a_share_of_the_points_is_kept_by_their_coordinates_alone(cloud):
+def test_hash_thinning_depends_on_coordinates_alone(cloud):
     whole = {tuple(p) for p in np.rint(cloud * 100.0).astype(int).tolist()}
     kept = hash_sampling.thinned(InMemory(cloud), 10_000)
     assert len(kept) == pytest.approx(10_000, abs=4.0 * np.sqrt(7_500))
@@ -129,7 +129,7 @@ def test_points_near_lines_are_those_near_by_hand(cloud):
         assert sorted(map(tuple, got.tolist())) == sorted(map(tuple, want.tolist()))
 
 
-def test_a_line_with_little_room_keeps_the_largest_share_that_fits(cloud):
+def test_full_line_crop_keeps_the_largest_share_that_fits(cloud):
     rng = np.random.default_rng(5)
     points, directions, low, high = lines(rng, 25)
     near = line_crops.corridors(points, directions, low, high, 120.0)
@@ -149,7 +149,7 @@ def test_a_line_with_little_room_keeps_the_largest_share_that_fits(cloud):
         assert (one.places[rows] == two.places[rows]).all()
 
 
-def test_ranges_cover_all_once_and_errors_come_through():
+def test_parallel_ranges_cover_every_index_once_and_raise_errors():
     for count in (0, 1, 31, 1000):
         done = np.zeros(count, int)
 

@@ -35,7 +35,7 @@ def test_free_radius(name):
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_held_radius(name):
+def test_fixed_radius_gives_the_published_centre(name):
     result = space_frame_step.run(scene(name), space_frame_step.Params(radius_mm=50.0))
     assert (result.status, result.balls.flag, result.balls.radii[0]) == ("ok", ("ok",), 50.0)
     assert np.linalg.norm(result.balls.centres[0] - PUBLISHED[name]) < 0.1
@@ -43,7 +43,7 @@ def test_held_radius(name):
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_known_scanner(name):
+def test_known_scanner_position_gives_the_published_centre(name):
     result = space_frame_step.run(scene(name, position=np.zeros(3)), space_frame_step.Params(radius_mm=50.0))
     assert result.status == "ok"
     assert reason("spheres.robust-ranges") in result.reasons
@@ -51,14 +51,14 @@ def test_known_scanner(name):
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_seed_makes_no_difference(name):
+def test_seed_does_not_change_the_result(name):
     results = [space_frame_step.run(scene(name), space_frame_step.Params(seed=seed)) for seed in (1, 2)]
     assert results[0].balls.centres.tobytes() == results[1].balls.centres.tobytes()
     assert results[0].balls.covariance.tobytes() == results[1].balls.covariance.tobytes()
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_bounds_stand_beside_the_estimate(name):
+def test_bound_and_efficiency_are_given_with_the_estimate(name):
     result = space_frame_step.run(scene(name, position=np.zeros(3)), space_frame_step.Params())
     assert result.balls.stations.tolist() == [1]
     assert np.isfinite(result.balls.bound_sd).all()
@@ -66,7 +66,7 @@ def test_bounds_stand_beside_the_estimate(name):
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_mount_alone_holds_no_ball(name):
+def test_mount_without_its_ball_gives_no_ball(name):
     whole = scene(name)
     scan = whole.scans[0]
     off = np.linalg.norm(scan.points + scan.origin - PUBLISHED[name], axis=1) - 50.0

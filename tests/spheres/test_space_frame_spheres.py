@@ -70,7 +70,7 @@ def test_order_chunks_and_threads_change_nothing(roof, found, monkeypatch):
     assert same_bytes(found, alone)
 
 
-def test_moving_all_by_the_map_grid_moves_nothing(roof, found):
+def test_origin_of_map_coordinates_does_not_change_the_fit(roof, found):
     """Coordinates travel less an origin: what that origin is does not enter."""
     _, _, _, source, nodes, tubes = roof
     moved = dataclasses.replace(source, origin=np.array([5e8, 4.3e9, 1e5]))
@@ -96,7 +96,7 @@ def test_wrong_sizes_are_named_and_the_right_ones_are_not(roof):
     assert np.array(found.flag)[np.delete(np.arange(12), [2, 7])].tolist() == ["ok"] * 10
 
 
-def test_a_doubtful_size_is_no_evidence_against_the_nominal_one():
+def test_nominal_size_is_kept_against_a_doubtful_other_size():
     nan = np.nan
     choice = SizeChoice(
         states=np.tile([0.0, 0.0, 0.0, 50.0], (4, 1)),
@@ -111,7 +111,7 @@ def test_a_doubtful_size_is_no_evidence_against_the_nominal_one():
     assert choice.second[:3].tolist() == [50.0, 55.0, 60.0]
 
 
-def test_without_scanners_the_bias_is_said_to_stand(roof):
+def test_bias_without_scanner_positions_is_reported(roof):
     centres, radii, _, source, nodes, tubes = roof
     unknown = InMemory(source.points)
     found = fit_spheres(unknown, nodes, tubes, catalogue.load())
@@ -121,7 +121,7 @@ def test_without_scanners_the_bias_is_said_to_stand(roof):
     assert np.abs(found.lowest[:, 2] - centres[:, 2] + radii)[good].max() < 3.0
 
 
-def test_a_node_without_points_is_known_from_its_axes_alone(roof):
+def test_node_without_points_is_placed_by_its_axes_alone(roof):
     _, _, _, source, nodes, tubes = roof
     away = dataclasses.replace(
         nodes,
@@ -170,7 +170,7 @@ def test_stations_that_moved_are_noticed_and_enter_the_covariance():
     assert np.sqrt(np.mean(pull**2)) < 1.6
 
 
-def test_crops_hold_what_is_near_and_nothing_else(roof):
+def test_crops_hold_exactly_the_points_within_their_radius(roof):
     _, _, _, source, nodes, _ = roof
     positions = np.vstack([nodes.positions, nodes.positions[:1] + np.array([100.0, 0.0, 0.0])])  # two that share points
     got = sphere_crops.gather(source, positions, 150.0)
@@ -212,7 +212,7 @@ def test_crops_of_many_points_keep_an_even_share_whatever_the_order():
     assert np.bincount(got.station[: kept[0]]).min() > 0.28 * kept[0]
 
 
-def test_the_papers_estimators_run_on_the_same_points(roof, found):
+def test_methods_of_the_paper_use_the_points_of_method_ray(roof, found):
     _, radii, _, source, nodes, tubes = roof
     limits = standards.default_for(None)
     plain, drawn = (
@@ -245,7 +245,7 @@ def test_on_raw_crops_consensus_is_far_better_than_least_squares(roof, found):
     assert (plain.balls.points > found.points).all()
 
 
-def test_catalogues_are_data_and_say_whether_they_were_checked():
+def test_catalogues_state_their_verification_and_bad_ones_are_refused():
     assert catalogue.load().verified is False
     assert catalogue.of_radii([60, 45.0, 60]).radii.tolist() == [45.0, 60.0]
     with pytest.raises(UsageError, match="plausible"):

@@ -100,7 +100,7 @@ def test_formal_covariance_is_the_scatter_on_a_whole_sphere():
     ],
     ids=["none", "three", "one place", "one plane"],
 )
-def test_algebraic_says_when_there_is_no_sphere(points):
+def test_algebraic_fit_of_degenerate_points_is_none(points):
     assert algebraic(points) is None
 
 
@@ -177,7 +177,7 @@ def test_ransac_leaves_a_tube_out():
     assert abs(algebraic(points).radius - 45.0) > 3.0
 
 
-def test_ransac_does_not_see_the_order_of_the_points():
+def test_ransac_does_not_depend_on_the_order_of_the_points():
     rng = np.random.default_rng(9)
     points = np.vstack([cap(rng, 150) + rng.normal(0.0, 2.0, (150, 3)), rng.uniform(-65.0, 65.0, (80, 3))])
     order = rng.permutation(len(points))
@@ -216,7 +216,7 @@ def test_robust_fit_withstands_contamination_on_one_side():
     assert not held.sphere.covariance[3].any()
 
 
-def test_robust_fit_forgets_its_start_and_moves_with_its_points():
+def test_robust_fit_does_not_depend_on_its_start_and_moves_with_its_points():
     rng = np.random.default_rng(12)
     points = contaminated(rng)
     here = robust_fit(points, Sphere(np.array([0.5, -0.5, 0.3]), 50.8, NOWHERE), 1.0).sphere
@@ -263,7 +263,7 @@ def test_robust_intervals_cover_and_ranges_take_the_bias_away():
     assert 0.88 <= np.mean(covered) <= 0.99
 
 
-def test_robust_fit_says_when_points_are_too_few():
+def test_robust_fit_of_too_few_points_is_none():
     points = cap(np.random.default_rng(14), 5)
     assert robust_fit(points, Sphere(np.zeros(3), 45.0, NOWHERE), 1.0) is None
 
@@ -372,7 +372,7 @@ def test_crops_agree_with_every_distance():
     assert [len(rows) for rows in nearest_crops(np.empty((0, 3)), centres, reaches)] == [0] * 12
 
 
-def test_a_trees_crown_is_rougher_than_the_street_and_is_not_sure():
+def test_rough_tree_crown_has_low_confidence_and_a_smooth_ball_is_ok():
     rng = np.random.default_rng(3)
     rays = street_clouds.lines(np.linspace(-25.0, 20.0, 40), 0.3)
     street, _ = street_clouds.street(rng, None, 300.0, sigma=3.0, rays=rays)

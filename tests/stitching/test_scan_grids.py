@@ -130,7 +130,7 @@ def test_e57_of_another_library_keeps_rows_and_columns(tmp_path):
         (np.array([0.0, 1, 2, np.inf, 4, 5]), False),
     ],
 )
-def test_e57_numbers_that_are_no_rows_cost_the_grid_alone(tmp_path, row, kept):
+def test_invalid_row_numbers_in_e57_drop_the_grid_and_keep_the_points(tmp_path, row, kept):
     points = np.arange(18.0).reshape(6, 3) + 1.0
     good = columns_of(points, rowIndex=np.arange(6), columnIndex=np.arange(6))
     write_e57(tmp_path / "a.e57", [columns_of(points, rowIndex=row, columnIndex=np.arange(6)), good])
@@ -153,7 +153,7 @@ def test_a_real_scan_has_its_grid():
 # --- what is taken for a scanner's grid ------------------------------------------------------------------------------
 
 
-def test_a_sweep_is_a_scanners_grid_wherever_the_scanner_is():
+def test_sweep_is_recognised_as_a_grid_for_any_scanner_position():
     points, row, column = swept()
     at = np.array([5.0, -3.0, 1.0])
     turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
@@ -189,7 +189,7 @@ def made_up(case):
     ["a cell twice", "rows and columns swapped", "rows of a hundred", "all in one row", "all in one column",
      "cells of gigabytes", "too few to tell"],
 )  # fmt: skip
-def test_other_rows_are_no_scanners_grid(case):
+def test_rows_of_other_orders_are_not_recognised_as_a_grid(case):
     row, column = scanner_grid.of_scanner(*made_up(case), np.zeros(3))
     assert len(row) == len(column) == 0
 
@@ -208,7 +208,7 @@ def test_a_large_scan_is_judged_by_a_part_of_it():
     assert len(scanner_grid.of_scanner(points, row, column, np.zeros(3))[0]) == len(points)
 
 
-def test_a_position_in_the_project_file_counts(tmp_path):
+def test_position_in_the_project_file_is_used_to_recognise_a_grid(tmp_path):
     points, row, column = swept()
     at = np.array([40_005.0, -3.0, 1.0])  # so far that an origin is taken off
     write_e57(tmp_path / "a.e57", [columns_of(points + at, rowIndex=row, columnIndex=column)])
@@ -274,7 +274,7 @@ def test_stitching_finds_the_same_ends_in_files_as_in_the_scene(room, tmp_path):
 
 
 @pytest.mark.slow
-def test_stitching_is_as_good_from_files_as_from_the_scene(tmp_path):
+def test_stitching_errors_from_files_equal_those_from_the_scene(tmp_path):
     """Of the truss each scan sees other sides of the bars: without the grid they lie decimetres off, or end for end."""
     name, recipe = recipe_files.load("truss-bridge")
     scene, truth = make(name, recipe_files.overridden(recipe, ["scan.step_mrad=8"]))

@@ -301,7 +301,7 @@ def test_poses_by_control_points_are_checked_in_the_control_frame():
     assert controlled["pose components within their 95 % intervals"] == pytest.approx(100.0 * 5 / 6)
 
 
-def test_a_tilted_scan_is_right_where_its_points_are():
+def test_true_pose_of_a_tilted_scan_maps_its_points_to_their_places():
     """Points p of a scan with a tilt w are p + w x p: a pose turned back by w brings them to their places."""
     T = np.stack([stitch_clouds.pose([3000.0, -2000.0, 1500.0], 40.0)] * 2)
     tilt = np.array([[2e-5, -3e-5], [0.0, 0.0]])

@@ -139,7 +139,7 @@ def test_the_adjustment_is_that_of_another_solver():
     np.testing.assert_allclose(found.covariance / np.outer(sd, sd), want / np.outer(sd, sd), atol=2e-3)
 
 
-def test_intervals_hold_over_draws_and_nothing_is_doubted_without_a_blunder():
+def test_intervals_cover_and_no_sighting_is_rejected_without_a_blunder():
     draws = 240
     inside, squares, normal, doubted = [], [], [], 0
     for seed in range(draws):
@@ -162,7 +162,7 @@ def test_intervals_hold_over_draws_and_nothing_is_doubted_without_a_blunder():
 
 
 def test_control_points_correct_the_network_too():
-    """By the reference alone a scan far away is as wrong as the network; seen there, control points tell."""
+    """By the reference alone a scan far away is as wrong as the network; control points seen there correct it."""
     with_control, alone = [], []
     for seed in range(30):
         T, C, true, points = toy(seed, known_sd=0.1, seen_sd=0.1, count=12)
@@ -220,7 +220,7 @@ def test_a_scan_that_its_control_points_contradict_is_weak():
     np.testing.assert_array_equal(found.control.sightings.used, points.scan != 2)
 
 
-def test_where_it_cannot_be_told_which_point_is_wrong_intervals_hold_it():
+def test_intervals_cover_a_blunder_that_cannot_be_located():
     """Three points: one of them 40 mm off, and any of them may be it."""
     T, C, true, points = toy(2, count=3, wrong=(0, [40.0, 0.0, 0.0]))
     found = adjusted(T, C, points)
@@ -231,7 +231,7 @@ def test_where_it_cannot_be_told_which_point_is_wrong_intervals_hold_it():
     assert (np.abs(in_site(found)[:, :3, 3] - true[:, :3, 3]) < 3.0 * sd).all()
 
 
-def test_sightings_that_do_not_say_how_sure_they_are_count_as_single_points():
+def test_sightings_without_sd_get_the_assumed_sd_of_single_points():
     """Taken as exact, they would contradict one another; as sure as stated, they give what stated ones do."""
     T, C, _, points = toy(3, seen_sd=0.8)
     blank = dataclasses.replace(points, seen_sd=np.zeros(len(points.seen_sd)))
@@ -243,7 +243,7 @@ def test_sightings_that_do_not_say_how_sure_they_are_count_as_single_points():
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_one_or_two_points_hold_nothing(count):
+def test_one_or_two_control_points_are_not_used(count):
     T, C, _, points = toy(0, count=count)
     found = adjusted(T, C, points)
     shortage = reason("stitch.control-few", points=count)
@@ -262,7 +262,7 @@ def test_points_on_a_line_cannot_turn_the_scans_round_it():
     assert found.reasons == (reason("stitch.control-not-used", shortage=reason("stitch.control-on-a-line")),)
 
 
-def test_scans_that_were_not_placed_neither_hold_nor_hinder():
+def test_scans_without_a_pose_do_not_affect_the_control_adjustment():
     T, C, _, points = toy(4)
     T, C = T.copy(), C.copy()
     T[3] = np.nan
@@ -335,7 +335,7 @@ def rows_of(path):
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
-def test_a_folder_with_control_points_says_what_they_hold(tmp_path):
+def test_control_points_of_a_folder_reach_tables_json_and_terminal(tmp_path):
     """From control.csv, in m, one point a blunder, to the tables, the JSON and the terminal."""
     T, scans = four(step_mrad=20.0, grid=False)
     points = targets(T)

@@ -65,7 +65,7 @@ def matches(share, gap):
     )  # fmt: skip
 
 
-def test_ends_in_one_gap_weigh_as_one_and_ends_anywhere_by_their_number():
+def test_ends_in_one_gap_weigh_as_one_and_spread_ends_by_their_number():
     """200 ends of a post at one position in one gap: the variance of their mean is that of a single end, w^2 / 12."""
     rng = np.random.default_rng(0)
     post_ends = edge_constraints.variance(matches(0.3 + rng.normal(0.0, 0.005, 200), np.zeros(200, np.int64)))

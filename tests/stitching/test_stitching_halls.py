@@ -1,4 +1,4 @@
-"""Halls of nearly equal bays: only crates, brackets and the ends tell them apart."""
+"""Halls of nearly equal bays: only crates, brackets and the ends distinguish them."""
 
 import numpy as np
 import pytest

@@ -48,7 +48,7 @@ def test_seven_parameters_absorb_a_scale_that_six_show():
 
 @pytest.mark.parametrize("scale", [0.995, 1.0, 1.005])
 @pytest.mark.parametrize("noise", [0.0, 5.0])
-def test_the_written_matrix_of_seven_parameters_holds_the_scale(scale, noise):
+def test_written_matrix_of_seven_parameters_includes_the_scale(scale, noise):
     """Places of the structure by each scan's matrix, against the truth: the pose that is judged is the one written."""
     errors, pulls = [], []
     for seed in range(10):

@@ -52,7 +52,7 @@ def test_a_pose_by_a_single_overlap_is_refuted_by_free_space():
     np.testing.assert_allclose(network.refuted(alone, 3, 0), [0.0, 2.02 / 50.0, 3.1 / 50.0])
 
 
-def test_a_motion_that_was_applied_is_no_rival_of_the_pose_it_gave(monkeypatch):
+def test_applied_motion_is_not_a_rival_of_the_resulting_pose(monkeypatch):
     """Every motion seems better than the pose at hand: the rivals in the result are those of the last poses."""
     poses = []
 
@@ -114,7 +114,7 @@ def test_links_are_overlaps_that_free_space_does_not_contradict():
     assert network.links(scores) == [(0, 1)]
 
 
-def test_groups_leave_a_scan_of_another_place_alone():
+def test_scan_of_another_place_is_in_a_group_of_its_own():
     pose = np.eye(4)
     good, bad = ([pairwise.ScoredPose(pose, 60.0, against, 0.3)] for against in (0.0, 9.0))
     group = network.groups({(0, 1): bad, (0, 2): good, (1, 2): bad, (2, 3): good, (1, 3): []}, 4)

@@ -67,7 +67,7 @@ def blocks_of(T, points, normals, scale, each, shift=None, seen=None):
     )  # fmt: skip
 
 
-def test_scales_of_ranges_are_told_from_the_poses():
+def test_range_scales_are_separated_from_the_poses():
     """Without noise in the means the poses are exact, whatever the scatter of the points about them."""
     T, scale = stations(), 1e-6 * np.array([4.0, -7.0, 5.0, -2.0])
     blocks = blocks_of(T, *wall_points(), scale, each=200_000)
@@ -78,7 +78,7 @@ def test_scales_of_ranges_are_told_from_the_poses():
     np.testing.assert_allclose(solution.T[:, :3, 3], T[:, :3, 3], atol=0.02)
 
 
-def test_the_scatter_of_points_is_no_scale():
+def test_scatter_of_points_does_not_bias_the_range_scales():
     """Residuals are smaller in smaller scans: the least sum of squares alone would make all of them too small."""
     T = stations()
     blocks = blocks_of(T, *wall_points(), np.zeros(4), each=1_000_000)
@@ -115,7 +115,7 @@ def test_the_noise_follows_incidence_and_range(across, along):
     assert np.abs(np.median(found / true) - 1.0) < 0.1
 
 
-def test_the_noise_is_one_number_where_rays_are_not_known():
+def test_noise_is_one_number_for_scans_with_unknown_rays():
     n = 30
     planes = Planes(np.full(n, 20.0), np.eye(3)[np.arange(n) % 3] * 1e4, np.tile([0.0, 0.0, 1.0], (n, 1)),
                     np.tile([3.4, 1e4, 1e4], (n, 1)), np.tile(np.eye(3), (n, 1, 1)))  # fmt: skip

@@ -44,7 +44,7 @@ def assert_covered(result, T):
     assert np.sqrt(np.mean(np.square(pulls))) < 1.5
 
 
-def test_offsets_of_the_ranges_are_told_from_the_poses():
+def test_range_offsets_are_separated_from_the_poses():
     """Opposite walls show them: without an unknown of its own an offset goes into the poses, by its size."""
     T, scans = four(3, step_mrad=20.0)
     offsets = (1.5, -1.0, 0.0, -1.5)
@@ -58,7 +58,7 @@ def test_offsets_of_the_ranges_are_told_from_the_poses():
     assert np.abs(off).max() < 0.3
 
 
-def test_range_errors_of_dark_walls_are_told_from_the_poses():
+def test_range_errors_of_walls_are_separated_from_the_poses():
     """Each wall, the floor and the ceiling have a range error of their own, that all scans of it share."""
     T, scans = four(3, step_mrad=20.0)
     errors = np.array([[3.0, -1.0, 2.0], [-2.0, 1.5, -3.0]])  # at the low and high ends of x, y, z, mm
@@ -72,7 +72,7 @@ def test_range_errors_of_dark_walls_are_told_from_the_poses():
     assert_covered(result, T)
 
 
-def test_a_range_error_that_no_ray_shows_is_stated_by_the_class():
+def test_range_error_of_a_scan_with_unknown_rays_is_that_of_the_class():
     """In a frame whose origin is not the scanner the rays are not known; the other scans' range errors are seen."""
     _, scans = four(3, step_mrad=20.0, grid=False)
     lost = dataclasses.replace(scans[1], points=scans[1].points + np.array([0.0, 0.0, 1e4]))

@@ -104,7 +104,7 @@ def test_chunks_that_change_places_are_noticed_when_all_are_read(tmp_path):
             _ = column[4:8]
 
 
-def test_what_is_taken_away_is_noticed(scene_file):
+def test_removed_member_of_a_file_is_detected(scene_file):
     """A member that may be absent, with its checksums, is one whose absence is noticed."""
     with h5py.File(scene_file, "r+") as file:
         del file["scene/stations"]
@@ -134,7 +134,7 @@ def verify(*arguments):
     return commands.here("processor", "verify", *arguments)
 
 
-def test_verify(tmp_path, scene_file, results_file):
+def test_verify_command_counts_whole_damaged_and_unchecked_files(tmp_path, scene_file, results_file):
     ended = verify(tmp_path)
     assert (ended.returncode, ended.stdout.splitlines()[-1]) == (0, "2 whole")
     without_checksums(results_file)

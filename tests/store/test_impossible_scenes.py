@@ -17,7 +17,7 @@ from tests.support.scenes.impossible_scenes import impossible_scenes, possible
 CASES = {name: (scene, place) for name, scene, place in impossible_scenes()}
 
 
-def test_there_are_a_hundred_and_what_is_possible_is_taken(tmp_path):
+def test_there_are_a_hundred_cases_and_a_possible_scene_is_accepted(tmp_path):
     assert len(CASES) >= 100
     store.write_scene(tmp_path / "s.h5", possible(), None, {})
     assert store.read_scene(tmp_path / "s.h5").name == "site"
@@ -46,7 +46,7 @@ def test_an_impossible_scene_is_refused_with_its_place(tmp_path, case):
         processor.run(scene)
 
 
-def test_the_columns_of_every_record_of_a_scene_say_what_they_mean():
+def test_every_number_field_of_a_scene_declares_its_meaning():
     """A record that is added later is checked, since it cannot leave out the meaning of its numbers."""
     unsaid = {"Scan.intensity", "Scan.colour"}  # any number
     seen, waiting = set(), [Scene]
@@ -65,7 +65,7 @@ def test_the_columns_of_every_record_of_a_scene_say_what_they_mean():
     assert {"Scan", "FrameDesign", "Limit", "DesignBodies", "Control"} <= seen
 
 
-def test_what_is_unknown_is_not_impossible():
+def test_unknown_poses_are_accepted_and_impossible_ones_are_refused():
     poses = np.stack([np.eye(4), np.full((4, 4), np.nan)])
 
     @dataclasses.dataclass(frozen=True)

@@ -272,7 +272,7 @@ def test_a_box_reads_only_its_tiles(tmp_path):
 # --- truth and results ---------------------------------------------------------------------------------------------
 
 
-def test_truth_on_its_own(written, tmp_path):
+def test_truth_is_copied_to_a_file_of_its_own(written, tmp_path):
     alone = tmp_path / "truth.h5"
     assert store.copy_truth(written, alone)
     assert same(store.read_truth(alone), store.read_truth(written))
@@ -369,7 +369,7 @@ def test_scenes_that_are_not_written(tmp_path):
     assert not path.exists()
 
 
-def test_results_of_the_old_format_are_refused_with_what_to_do(tmp_path):
+def test_results_of_the_old_format_are_refused_with_advice(tmp_path):
     path = tmp_path / "results.h5"
     store.write_results(path, [], {})
     with h5py.File(path, "r+") as file:

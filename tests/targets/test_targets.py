@@ -42,7 +42,7 @@ def test_centres_at_ten_metres(step, median_mm, most_mm):
     assert max(errors) < most_mm
 
 
-def test_standard_deviations_hold_the_errors():
+def test_standard_deviations_agree_with_the_errors_of_targets():
     """Of three coordinates of thirty boards at all turns: 90 errors; the bounds hold 99.9 % of such sets."""
     squares = []
     for seed in range(30):
@@ -68,7 +68,7 @@ def test_the_order_of_the_points_does_not_matter():
     assert np.array_equal(one.centre, other.centre)
 
 
-def test_nothing_without_intensities_contrast_or_points():
+def test_no_checkerboard_is_found_without_intensities_contrast_or_points():
     points, intensity, _ = board(np.random.default_rng(1))
     assert checkerboard.find(points, np.ones(len(points)), SIDE) == []
     assert checkerboard.find(points, np.empty(0), SIDE) == []
@@ -106,12 +106,12 @@ DECOYS = {
 
 
 @pytest.mark.parametrize("name", DECOYS)
-def test_what_looks_alike_is_no_target(name):
+def test_similar_patterns_are_no_target(name):
     half = 280.0 if name == "chess" else 400.0  # its crossings are tried one by one: there are fifty of them
     assert checkerboard.find(*painted(DECOYS[name], half=half), SIDE) == []
 
 
-def test_the_same_wall_with_a_target():
+def test_painted_target_on_a_wall_is_found_at_its_centre():
     target = on_board(lambda u, v: u * v > 0.0 and max(abs(u), abs(v)) < 75.0)
     (one,) = checkerboard.find(*painted(target), SIDE)
     assert one.centre == pytest.approx([5000.0, 0.0, 0.0], abs=3.0 * one.sd + 0.2)
@@ -131,12 +131,12 @@ def test_a_pattern_names_targets_whatever_the_frame(seed):
     assert naming.by_pattern(np.vstack([places, stray]), known).tolist() == [*seen.tolist(), -1]
 
 
-def test_a_symmetric_pattern_names_nothing():
+def test_symmetric_pattern_assigns_no_names():
     corners = 4000.0 * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     assert (naming.by_pattern(corners + 1.0, corners) == -1).all()
 
 
-def test_two_targets_name_nothing_without_a_pose():
+def test_two_targets_get_names_by_a_pose_alone():
     known = np.random.default_rng(0).uniform(0.0, 9000.0, (6, 3))
     assert (naming.by_pattern(known[:2], known) == -1).all()
     assert naming.by_pose(known[[4, 2]] + 5.0, known).tolist() == [4, 2]
@@ -171,7 +171,7 @@ def test_found_targets_become_sightings_of_control_points():
     assert report.files(scene) == {}
 
 
-def test_a_stated_sighting_stays():
+def test_stated_sighting_is_not_replaced_by_a_found_one():
     scene, centre = scene_of_board()
     stated = dataclasses.replace(scene.control, point=[0], scan=[0], station=[-1], seen=[centre + 1.0], seen_sd=[0.7])
     found = find.with_targets(dataclasses.replace(scene, control=stated))
@@ -212,7 +212,7 @@ def test_a_search_that_makes_no_sense_is_refused(tmp_path, text, said):
         folder.read_input(tmp_path)
 
 
-def test_known_coordinates_alone_are_enough_where_scans_are_searched(tmp_path):
+def test_control_points_without_sightings_are_accepted_with_a_target_search(tmp_path):
     np.savetxt(tmp_path / "scan.xyz", np.random.default_rng(0).uniform(size=(50, 3)))
     (tmp_path / "control.csv").write_text("name,scan,x,y,z,sd_mm\nT1,,1.0,2.0,3.0,0.5\n")
     (tmp_path / "project.toml").write_text("")
@@ -227,7 +227,7 @@ def test_known_coordinates_alone_are_enough_where_scans_are_searched(tmp_path):
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.slow
 def test_a_room_with_targets_and_decoys(seed):
-    """Every target with points enough is found and named, nothing else is, and places are within 0.3 mm and 4 sd."""
+    """Every target with enough points is found and named, without false ones, and places are within 0.3 mm and 4 sd."""
     settings = {"scan.step_mrad": 4.0, "room.spheres": 0, "room.checkerboard_mm": 300.0, "room.decoys": 8}
     scene, truth = designgen.make("room-targets", seed=seed, settings=settings)
     found = find.with_targets(scene).targets
@@ -255,7 +255,7 @@ def _points_on(label, number):
 # --- what is not found, with a remark ---------------------------------------------------------------------------------
 
 
-def test_points_without_intensity_cost_no_target():
+def test_points_without_intensity_do_not_prevent_a_target():
     points, intensity, centre = board(np.random.default_rng(7), side=SIDE)
     on_it = np.flatnonzero(np.linalg.norm(points - centre, axis=1) < 40.0)
     intensity[on_it[::25]] = np.nan
@@ -263,7 +263,7 @@ def test_points_without_intensity_cost_no_target():
     assert np.linalg.norm(one.centre - centre) < 0.6
 
 
-def test_a_scan_without_intensities_is_said_not_to_be_searched():
+def test_scan_without_intensities_is_reported_as_not_searched():
     scene, _ = scene_of_board()
     blank = dataclasses.replace(scene.scans[0], intensity=np.empty(0))
     found = find.with_targets(dataclasses.replace(scene, scans=(blank,)))
@@ -273,7 +273,7 @@ def test_a_scan_without_intensities_is_said_not_to_be_searched():
     assert find.with_targets(scene).target_remarks == ()
 
 
-def test_places_and_spheres_that_were_not_searched_are_said(monkeypatch):
+def test_places_and_spheres_beyond_the_search_limit_are_reported(monkeypatch):
     scene, _ = scene_of_board()
     monkeypatch.setattr(checkerboard, "MOST_SEEDS", 2)
     found = find.with_targets(scene)
@@ -290,7 +290,7 @@ def test_places_and_spheres_that_were_not_searched_are_said(monkeypatch):
     assert len(found.targets) == 1
 
 
-def test_the_interval_of_a_target_has_what_all_ranges_of_a_view_share():
+def test_interval_of_a_target_includes_the_common_range_error_of_a_view():
     """The class of scanners: 0.5 mm, one standard deviation, for the ranges of one view."""
     scene, _ = scene_of_board()
     found = find.with_targets(scene)
@@ -321,7 +321,7 @@ def test_two_targets_of_a_posed_scan_have_names_if_their_distance_agrees():
     assert naming.by_pose(line + 3.0, line).tolist() == [0, 1, 2]
 
 
-def test_targets_that_contradict_each_other_are_said():
+def test_contradicting_targets_are_reported():
     known = spread_targets()
     seen = known.copy()
     seen[2, 2] += 40.0

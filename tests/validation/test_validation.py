@@ -49,7 +49,7 @@ def read(tmp_path, text, full=False):
 # --- matrix and cells -----------------------------------------------------------------------------------------------
 
 
-def test_lists_are_multiplied_and_seeds_of_a_night_are_its_own(tmp_path):
+def test_lists_of_settings_are_combined_and_fresh_seeds_differ_by_night(tmp_path):
     found = read(tmp_path, TWO_CELLS)
     tonight = found.cells(night.number_of(NIGHT))
     assert [(c.case.settings[0], c.seed) for c in tonight if c.fixed] == [
@@ -62,7 +62,7 @@ def test_lists_are_multiplied_and_seeds_of_a_night_are_its_own(tmp_path):
     assert len(read(tmp_path, TWO_CELLS, full=True).cells(1)) == 8
 
 
-def test_a_cell_is_known_by_all_that_is_asked_for(tmp_path):
+def test_key_of_a_cell_depends_on_all_settings_but_methods(tmp_path):
     keys = {cell.key for cell in read(tmp_path, TWO_CELLS).cells(1)}
     for old, new in (("2.0]", "3.0]"), ("[1, 2]", "[1, 3]"), ('"none"', '"common"'), ('["ransac", "ray"]', '["ray"]')):
         others = {cell.key for cell in read(tmp_path, TWO_CELLS.replace(old, new)).cells(1)}
@@ -94,12 +94,12 @@ def test_a_cell_is_known_by_all_that_is_asked_for(tmp_path):
         ('aim.x = "up"\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]', "low, high or a number"),
     ],
 )
-def test_what_a_matrix_gets_wrong_is_said(tmp_path, text, said):
+def test_mistakes_in_a_matrix_are_refused_by_name(tmp_path, text, said):
     with pytest.raises(UsageError, match=said):
         read(tmp_path, text)
 
 
-def test_a_matrix_that_is_none(tmp_path):
+def test_unreadable_matrix_is_refused(tmp_path):
     with pytest.raises(InputError, match="expected a matrix in TOML"):
         read(tmp_path, "[[cell")
     with pytest.raises(InputError, match="expected a matrix in TOML"):
@@ -121,7 +121,7 @@ def test_foreign_cells_name_settings_that_their_generators_have():
         assert {setting.split("=")[0] for setting in case.settings} <= set(known), case.name
 
 
-def test_figures_are_told_apart_by_method():
+def test_figures_are_separated_by_method():
     found = validation_nights.results({"radii, bias": 0.5, "ransac | radii, bias": None, "other: x": (2.0, 1.0, "%")})
     found["comparison"] = {"spheres": [{"method": "ransac"}]}
     figures = cells.check_values(found)
@@ -186,7 +186,7 @@ def test_done_cells_are_not_done_again_and_failed_ones_are(tmp_path):
     assert stored(tmp_path / "out", "SELECT COUNT(*) FROM figures") == [(8,)]
 
 
-def test_other_software_does_a_night_again_only_where_that_is_asked_for(tmp_path):
+def test_night_of_other_software_is_replaced_only_by_again(tmp_path):
     asked, done = validation_nights.matrix(validation_nights.case()), []
     run(tmp_path / "out", asked, done=done)
     other = software_identity.Software("code-2", "", {})
@@ -243,7 +243,7 @@ def test_limits_missed_reach_the_ci_server(tmp_path):
     assert (missed["name"], missed["value"], missed["limit"]) == ("lowest <1>", 2.0, 1.0)
 
 
-def test_folders_and_files_that_are_something_else(tmp_path):
+def test_foreign_folder_file_or_locked_output_is_refused(tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("", "utf-8")
     for path, said in ((tmp_path / "full", "holds no earlier nights"), (tmp_path / "full" / "thesis.txt", "is a file")):

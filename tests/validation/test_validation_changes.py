@@ -1,4 +1,4 @@
-"""What counts as a change, held against other libraries, brute force, and nights drawn from stored cells."""
+"""Detection of changes against other libraries, brute force, and nights drawn from stored cells."""
 
 import dataclasses
 import functools
@@ -62,12 +62,12 @@ def rows(night, values, fixed=True, name=NAME, unit="mm", recipe=None, digest=No
         ("pose, largest turn", "mrad", 0.1, 0.3),
     ],
 )
-def test_where_better_lies(name, unit, better, worse):
+def test_loss_of_a_worse_figure_is_larger(name, unit, better, worse):
     measure = loss(name, unit, described(name)[2], {})
     assert measure.of(worse) - measure.of(better) > 0.0
 
 
-def test_the_matrix_may_say_where_better_lies():
+def test_matrix_may_set_the_better_direction_of_a_figure():
     assert loss("share", "%", Better.HIGH, {"share": "low"}).of(2.0) > loss(
         "share", "%", Better.HIGH, {"share": "low"}
     ).of(1.0)
@@ -88,7 +88,7 @@ def test_the_paired_test_is_a_t_test_of_log_ratios():
     assert (back.kind, str(back.message)) == ("improvement", "20 % better")
 
 
-def test_few_scenes_are_held_against_the_scatter_from_seed_to_seed():
+def test_change_of_few_scenes_is_compared_with_the_scatter_between_seeds():
     """Three scenes worse by 27 to 43 %; of one case figures scatter by 10 % from seed to seed, over 40 nights."""
     rng = np.random.default_rng(2)
     given = [
@@ -125,7 +125,7 @@ def test_rounding_is_no_change_and_scatter_is_no_regression():
     assert change.kind == "changed"
 
 
-def test_other_scenes_are_not_compared_and_lost_figures_are_told():
+def test_other_scenes_are_not_compared_and_lost_figures_are_reported():
     before = rows("2026-01-01", [0.5] * 5)
     others = rows("2026-01-02", [0.9] * 5, digest="another")
     found = change_detection.find(before + others, "2026-01-02", {})
@@ -157,7 +157,7 @@ def test_the_rank_test_is_exact():
     assert test.p_better == pytest.approx((sums <= seen).mean(), abs=1e-12)
 
 
-def test_an_unaccepted_regression_is_no_level():
+def test_unaccepted_regression_is_not_the_new_reference():
     given = rows("2026-01-01", [0.5] * 5) + rows("2026-01-02", [0.6] * 5) + rows("2026-01-03", [0.6] * 5)
     assert change_detection.find(given, "2026-01-03", {}).changes == ()
     (again,) = change_detection.find(given, "2026-01-03", {NAME: {"2026-01-02"}}).changes

@@ -1,4 +1,4 @@
-"""Curves of the history: what differs in one setting alone, pooled over scenes, and detection by size."""
+"""Curves of the history: scenes that differ in one setting alone, pooled, and detection by size."""
 
 import json
 

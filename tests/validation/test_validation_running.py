@@ -65,7 +65,7 @@ def test_parameters_are_written_as_toml():
     assert tomllib.loads(toml.document(table)) == table
 
 
-def test_stopping_ends_what_is_under_way(tmp_path):
+def test_closing_the_runner_ends_running_cells(tmp_path):
     cell = Cell(validation_nights.case(), 1, True)
     started = time.monotonic()
     with cell_runner.cell_runner(None, 1, tmp_path, print) as run:
