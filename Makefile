@@ -36,7 +36,7 @@ lint: $(VENV)/.test
 
 # docs/parameters.md from the code; the rest of docs/ is written by hand.
 docs: $(VENV)/.test
-	$(BIN)/python -m docs.make_parameters
+	$(BIN)/python -m docs.scripts.make_parameters
 
 bench: $(VENV)/.test
 	$(BIN)/python -m pip install --quiet --editable ".[designgen,test,bench]"

@@ -1,14 +1,16 @@
-"""What all tests share: kernels compiled once for all workers, blank pictures, no search for garbage in what stays."""
+"""Settings and fixtures of all tests: kernels compiled once for all workers, rare garbage collection, pictures."""
 
 import base64
 import contextlib
 import fcntl
 import gc
 import hashlib
+import json
 import os
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numba.core.caching import FunctionCache
@@ -16,6 +18,9 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
 from processor.jobs import garbage
+from tests.support.files.scan_folders import BOX, arch_design, surface, write_ply, write_xyz
+from tests.support.pages import browser
+from tests.support.solids import cad_in_process
 
 PIXEL = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
@@ -65,3 +70,27 @@ def pytest_collection_finish():
 def blank_pictures(monkeypatch):
     """Write every picture as one white pixel: for tests of all else on a page, as drawing takes most of the time."""
     monkeypatch.setattr(FigureCanvasAgg, "print_png", lambda _, out, **__: out.write(PIXEL))
+
+
+@pytest.fixture
+def bridge(tmp_path):
+    """A folder of two scans in metres and a design in mm."""
+    place = tmp_path / "bridge"
+    for i, name in enumerate(("foot1", "rib1")):
+        write_xyz(place / f"scans/{name}.xyz", surface(i))
+        write_ply(place / f"design/{name}.ply", (BOX + np.array([4.0 * i, 0, 0])) * 1000.0)
+    (place / "design.json").write_text(json.dumps(arch_design()))
+    return place
+
+
+@pytest.fixture
+def cad_here(monkeypatch):
+    """CAD files are read by this process: see :mod:`tests.support.solids.cad_in_process`."""
+    cad_in_process.read_here(monkeypatch)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def browser_of_a_file():
+    """Close the browser that tests of a file have opened after the last of them."""
+    yield
+    browser.SHARED.close()

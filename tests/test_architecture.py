@@ -95,7 +95,7 @@ def test_tests_share_code_through_support():
 
 
 @pytest.mark.parametrize("module", ["processor.cli.main", "designgen.cli"])
-def test_help_comes_at_once(module):
+def test_help_is_printed_within_a_second_without_heavy_imports(module):
     code = (
         f"import sys; from {module} import commands\n"
         "try: commands(['--help'])\n"
@@ -112,7 +112,7 @@ def test_help_comes_at_once(module):
     assert min(took) < 1.0
 
 
-def test_a_run_begins_without_what_few_runs_need():
+def test_run_starts_without_rarely_used_imports():
     """A batch starts a process for every input: half a second each of loading all distributions and PDF fonts."""
     code = (
         "import sys; from processor import pipeline; from processor.api import runs\n"

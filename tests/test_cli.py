@@ -1,4 +1,4 @@
-"""The command line as users and scripts meet it: exit codes, JSON, refusals, and that nothing is half written."""
+"""The command line as users and scripts meet it: exit codes, JSON, refusals, and no half-written files."""
 
 import csv
 import dataclasses
@@ -23,7 +23,8 @@ from processor.preassembly.parts import attitude
 from processor.report import terminal, write_results
 from processor.space_frame.result import Result as FrameResult
 from processor.store import store
-from tests.support import arch_clouds, commands
+from tests.support.clouds import arch_clouds
+from tests.support.processes import commands
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
@@ -138,7 +139,7 @@ def test_a_step_named_twice_runs_once():
     assert len(pipeline.plan(("spheres", "spheres"), ("ransac", "ransac"), {}, 0)) == 1
 
 
-def test_what_a_step_did_not_foresee_is_said_in_one_line(frame, tmp_path, monkeypatch, capsys):
+def test_unexpected_error_of_a_step_is_printed_in_one_line(frame, tmp_path, monkeypatch, capsys):
     scene, _ = frame
     store.write_scene(tmp_path / "s.h5", scene, None, {})
     monkeypatch.setattr("processor.space_frame.step.run", lambda *_: [][0])
@@ -164,14 +165,14 @@ def test_names_with_control_characters_stay_in_one_line(called, tmp_path):
     assert "\x1b" not in done.stderr
 
 
-def test_a_file_name_that_is_no_text_is_refused(tmp_path):
+def test_file_name_that_is_not_utf8_is_refused(tmp_path):
     path = tmp_path / os.fsdecode(b"b\xff.xyz")
     np.savetxt(path, ball_cloud(count=100) / 1000.0)
     with pytest.raises(InputError, match="not UTF-8"):
         pipeline.read(path, None)
 
 
-def test_output_that_nobody_reads_ends_quietly(sphere_run):
+def test_closed_pipe_ends_the_command_without_a_message(sphere_run):
     folder, _ = sphere_run
     command = f"{sys.executable} -m processor check {folder / 'out'} --json | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, cwd=ROOT, check=False)
@@ -267,7 +268,7 @@ def test_a_verdict_sets_the_exit_code_where_asked(called, frame, tmp_path, monke
     assert found["headline"] in (tmp_path / "out" / "report.html").read_text("utf-8")
 
 
-def test_the_terminal_says_the_headline_what_to_do_why_and_where_the_report_is(called, frame, tmp_path):
+def test_terminal_shows_headline_actions_reasons_and_path_of_the_report(called, frame, tmp_path):
     store.write_scene(tmp_path / "s.h5", frame[0], None, {})
     said = called("run", "s.h5", cwd=tmp_path)
     found = json.loads((tmp_path / "s-results" / "results.json").read_text("utf-8"))
@@ -286,7 +287,7 @@ def test_the_terminal_says_the_headline_what_to_do_why_and_where_the_report_is(c
     assert (both.returncode, "exclude each other" in both.stderr) == (2, True)
 
 
-def test_many_lines_become_fifteen(frame, tmp_path, monkeypatch):
+def test_terminal_output_is_limited_to_fifteen_lines(frame, tmp_path, monkeypatch):
     store.write_scene(tmp_path / "s.h5", frame[0], None, {})
     _, report = run_in_process(tmp_path / "s.h5", tmp_path / "out")
     execution = pipeline.read_execution(tmp_path / "out" / "results.h5", tmp_path / "s.h5", None)
@@ -298,7 +299,7 @@ def test_many_lines_become_fifteen(frame, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("option", [[], ["--quiet"], ["--json"]])
-def test_a_step_that_failed_says_why_and_exits_with_1(called, tmp_path, option):
+def test_failed_step_prints_its_reason_and_exits_with_1(called, tmp_path, option):
     rng = np.random.default_rng(0)
     np.savetxt(tmp_path / "plane.xyz", np.c_[rng.uniform(size=(3000, 2)), 0.0005 * rng.normal(size=3000)])
     said = called("run", "plane.xyz", "-o", "out", "--steps", "spheres", *option, cwd=tmp_path)
@@ -316,7 +317,7 @@ def test_results_of_another_input_are_not_replaced_by_default(called, frame, tmp
     assert (said.returncode, "holds results of 's.h5', not of 's.xyz'" in said.stderr) == (2, True)
 
 
-def test_outputs_are_tried_before_the_work(called, tmp_path, monkeypatch):
+def test_outputs_are_checked_before_processing(called, tmp_path, monkeypatch):
     np.savetxt(tmp_path / "good.xyz", ball_cloud() / 1000.0)
     (tmp_path / "file").touch()
     (tmp_path / "done").mkdir()
@@ -340,7 +341,7 @@ def test_outputs_are_tried_before_the_work(called, tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["done", "file", "good.xyz"]
 
 
-def test_help_of_run_lists_what_there_is(called):
+def test_help_of_run_lists_steps_methods_standards_and_examples(called):
     said = called("run", "--help").stdout
     for name, module in pipeline.step_modules().items():
         assert all(word in said for word in (name, *module.METHODS))
@@ -361,7 +362,7 @@ def test_help_of_run_lists_what_there_is(called):
         (["batch", "fodler", "-o", "c"], "(did you mean 'folder'?)"),
     ],
 )
-def test_a_slip_is_answered_with_the_name_that_is_like_it(called, tmp_path, arguments, said):
+def test_mistyped_name_is_answered_with_a_similar_one(called, tmp_path, arguments, said):
     np.savetxt(tmp_path / "good.xyz", ball_cloud(count=200) / 1000.0)
     (tmp_path / "folder").mkdir()
     done = called(*arguments, cwd=tmp_path)
@@ -407,7 +408,7 @@ def test_names_from_outside_are_shown_as_text(frame, tmp_path):
 
 def test_a_bridge_through_the_pipeline(tmp_path, monkeypatch):
     scene, truth = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=2)
-    # The search for attitudes takes most of the time; tests/unit/test_diagnostics.py has it in a run of such a bridge.
+    # The search for attitudes takes most of the time: tests/pipeline/test_diagnostics.py runs it on such a bridge.
     known = dict(zip(truth.arch.names, truth.arch.T_bridge_scan, strict=True))
     monkeypatch.setattr(
         attitude, "find", lambda _, part: attitude.Attitude(known[part.name], known[part.name], Status.OK)
@@ -452,7 +453,7 @@ def test_a_bridge_through_the_pipeline(tmp_path, monkeypatch):
         (["run", "good.xyz", "-o", ".", "--steps", "spheres"], 2, "holds the input"),
     ],
 )
-def test_what_cannot_be_done_is_said_in_one_line(called, tmp_path, arguments, code, said):
+def test_unusable_inputs_and_outputs_are_refused_in_one_line(called, tmp_path, arguments, code, said):
     (tmp_path / "empty.xyz").touch()
     (tmp_path / "nan.xyz").write_text("0 0 0\n1 nan 0\n0 1 0\n0 0 1\n1 1 1\n")
     (tmp_path / "few.xyz").write_text("0 0 0\n1 0 0\n")

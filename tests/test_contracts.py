@@ -1,4 +1,4 @@
-"""What every step, reader and recipe owes: found by their names, held over the folders."""
+"""The contracts of every step, reader and recipe, checked over the folders."""
 
 import dataclasses
 import importlib
@@ -14,14 +14,14 @@ from processor import pipeline, readers
 from processor.model import Scene, StepRun, UsageError
 from processor.report.reports_of_steps import step_report
 from processor.store import store
-from tests.support.metrics import metric
-from tests.support.records import assert_equal
+from tests.support.results.metrics import metric
+from tests.support.results.records import assert_equal
 
 STEPS = pipeline.step_modules()
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_a_step_has_its_names(name):
+def test_every_step_has_the_names_of_the_contract(name):
     module = STEPS[name]
     assert isinstance(module.NEEDS, tuple)
     assert module.METHODS[0] == module.Params().method
@@ -42,7 +42,7 @@ def test_an_empty_result_goes_through_the_store(name, tmp_path):
     assert_equal(back.result, result)
 
 
-def test_every_reader_says_what_it_reads():
+def test_every_reader_declares_its_suffixes():
     every = {
         m.name: importlib.import_module(f"processor.readers.{m.name}") for m in pkgutil.iter_modules(readers.__path__)
     }

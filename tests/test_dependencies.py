@@ -37,7 +37,7 @@ def listed(name):
 
 
 @pytest.mark.parametrize("name", ["locked.txt", "lowest.txt"])
-def test_a_list_has_all_that_is_asked_for_in_versions_that_are_allowed(name):
+def test_locked_list_has_every_dependency_in_an_allowed_version(name):
     found, text = listed(name)
     for asked in ASKED:
         if asked.marker is not None and name == "lowest.txt" and not asked.marker.evaluate({"python_version": "3.10"}):

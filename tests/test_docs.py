@@ -1,4 +1,4 @@
-"""README and docs: their commands exist and run, their links lead somewhere, their tables say what the code says."""
+"""README and docs: their commands exist and run, their links have targets, their tables agree with the code."""
 
 import dataclasses
 import functools
@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 import designgen.cli
 import processor.cli.main
-from docs import make_parameters
+from docs.scripts import make_parameters
 from processor import pipeline
 from processor.batch import batch
 from processor.evaluation import evaluate, truth_json
@@ -24,12 +24,13 @@ from processor.limits import standards
 from processor.model import Status, Verdict
 from processor.scan_folder import folder
 from processor.scan_folder.folder import read_input
-from tests.support import batches, cad_in_process
+from tests.support.processes import batches
+from tests.support.solids import cad_in_process
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = {"processor": processor.cli.main.commands, "designgen": designgen.cli.commands}
 README_LINES = 120
 LARGEST_PICTURE = 300_000
@@ -67,30 +68,34 @@ RUN = (
 ELSEWHERE = {
     "processor run my-bridge -o results": "make demo",
     "processor run my-bridge -o results --method adjustment,design-aided": "make demo",
-    "processor run my-bridge -o results --steps inspect": "tests/unit/test_inspection.py",
-    "processor run my-truss -o results --steps stitch": "tests/unit/test_stitching.py",
-    "processor run my-truss -o results --steps stitch --method three-point": "tests/unit/test_stitching_picks.py",
-    "processor export results -o assembled --what assembled --format e57": "tests/unit/test_export.py",
-    "processor batch /scans -o /results --cluster tcp://10.0.0.1:8786": "tests/unit/test_batch.py",
-    "processor batch /scans -o /results --cluster tls://10.0.0.1:8786": "tests/unit/test_batch.py",
-    "processor run my-hall -o results --steps deviation --cluster tcp://10.0.0.1:8786": "tests/unit/test_tiles.py",
-    "processor compare before.laz after.laz -o change --cluster tcp://10.0.0.1:8786": "tests/unit/test_tiles.py",
-    "processor validate mine.toml -o nights --jobs 2": "tests/unit/test_validation_running.py",
-    "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": "tests/unit/test_validation_running.py",
-    "processor history runs -o history": "tests/unit/test_epochs.py",
-    "processor validate -o nights --accept": "tests/unit/test_validation.py",
+    "processor run my-bridge -o results --steps inspect": "tests/inspection/test_inspection.py",
+    "processor run my-truss -o results --steps stitch": "tests/stitching/test_stitching.py",
+    "processor run my-truss -o results --steps stitch --method three-point": "tests/stitching/test_stitching_picks.py",
+    "processor export results -o assembled --what assembled --format e57": "tests/clouds/test_export.py",
+    "processor batch /scans -o /results --cluster tcp://10.0.0.1:8786": "tests/batch/test_batch.py",
+    "processor batch /scans -o /results --cluster tls://10.0.0.1:8786": "tests/batch/test_batch.py",
+    "processor run my-hall -o results --steps deviation --cluster tcp://10.0.0.1:8786": "tests/jobs/test_tiles.py",
+    "processor compare before.laz after.laz -o change --cluster tcp://10.0.0.1:8786": "tests/jobs/test_tiles.py",
+    "processor validate mine.toml -o nights --jobs 2": "tests/validation/test_validation_running.py",
+    "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": (
+        "tests/validation/test_validation_running.py"
+    ),
+    "processor history runs -o history": "tests/epochs/test_epochs.py",
+    "processor validate -o nights --accept": "tests/validation/test_validation.py",
     "processor papers -o papers": "make weekend",
     "processor run my-frame -o results --steps spheres --method ray,my_module:my_method": (
-        "tests/unit/test_user_methods.py"
+        "tests/pipeline/test_user_methods.py"
     ),
     "designgen make frame-1040 -o roof.h5 --seed 3": "make weekend",
     "designgen scan hall.ifczip -o hall.h5 --stations places.json --scanner pulse --set scan.step_mrad=0.5": (
-        "tests/unit/test_models.py"
+        "tests/designgen/test_models.py"
     ),
     "designgen make arch-s1-rays -o set --count 100 --vary scanner.noise_mm=0.3,1,2 --jobs 4": (
-        "tests/unit/test_designgen_batch.py"
+        "tests/designgen/test_designgen_batch.py"
     ),
-    "designgen make frame-small -o set --count 100 --cluster tcp://10.0.0.1:8786": "tests/unit/test_designgen_batch.py",
+    "designgen make frame-small -o set --count 100 --cluster tcp://10.0.0.1:8786": (
+        "tests/designgen/test_designgen_batch.py"
+    ),
 }
 
 
@@ -256,17 +261,18 @@ def test_links_lead_somewhere(path):
 
 def test_the_index_names_every_page():
     text = (ROOT / "docs/index.md").read_text("utf-8")
-    assert all(f"]({path.name})" in text for path in PAGES if path.parent == ROOT / "docs" and path.name != "index.md")
+    pages = [path.relative_to(ROOT / "docs") for path in PAGES if path.is_relative_to(ROOT / "docs")]
+    assert all(f"]({path.as_posix()})" in text for path in pages if path.name != "index.md")
 
 
-def test_the_readme_is_short_and_says_what_it_must():
+def test_readme_is_short_and_has_its_required_parts():
     text = (ROOT / "README.md").read_text("utf-8")
     assert len(text.splitlines()) <= README_LINES
     assert "No licence has been chosen" in text
     assert ".venv/bin/processor" in text
     assert "pip install ." in text
     assert "slow" in text
-    assert (ROOT / "docs/report.png").stat().st_size < LARGEST_PICTURE
+    assert (ROOT / "docs/pictures/report.png").stat().st_size < LARGEST_PICTURE
 
 
 def test_the_page_of_parameters_is_that_of_the_code():
@@ -358,7 +364,7 @@ def test_the_page_of_the_scan_folder_names_every_key():
             assert kind == "as_built" or f"`{name}`" in truth, (kind, name)
 
 
-def test_the_runner_installs_what_the_check_asks_for():
+def test_workflow_installs_the_system_libraries_of_the_check():
     asked = set(re.findall(r"\.so\.\d+=(\S+?)[\s\"]", (ROOT / ".ci/system-libraries").read_text("utf-8")))
     assert len(asked) == 5
     for path in (ROOT / ".github/workflows").glob("*.yml"):

@@ -385,7 +385,7 @@ def make_defects(folder: Path, settings: dict[str, Any], rng: np.random.Generato
         plate = cuboids[notched]
         corner = plate.centre + plate.half * [0, np.sign(plate.centre[1]), 1]
         side = rng.uniform(50, 90)
-        # A piece that reaches two borders of its plate is a missing part: docs/defects.md, classes.
+        # A piece that reaches two borders of its plate is a missing part: docs/steps/defects.md, classes.
         rows.append(("missing-part", corner - side / 2 * np.array([0, np.sign(corner[1]), 1]), side**2, np.nan, np.nan))
         cut = _notch(corner, side)
     stations = around(np.array([0, -300.0, -700]), np.array([6400, 300.0, 760]), 6, 2600.0, (500.0, 3300.0), rng)

@@ -7,7 +7,7 @@ processor seconds (user and system, its children's too) and its largest resident
 the processor seconds of the step alone, and the exponents are of these: the slope of log seconds over log size by least
 squares. Of memory, what the smallest scene of the step takes is subtracted first. Libraries of linear algebra get one
 thread, the program has the cores. A run of the smallest size goes before each step, so that compiled code is there. Of
-several rounds the least seconds count. ``--quick`` takes the two smallest sizes only. docs/make_cost.py makes
+several rounds the least seconds count. ``--quick`` takes the two smallest sizes only. docs/scripts/make_cost.py makes
 docs/cost.md from the file.
 """
 
@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from docs import make_cost
+from docs.scripts import make_cost
 from processor.store import store
 from tests.bench import cost_peers, cost_series, m3c2
 from tests.bench.cost_series import Series, Size

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from processor.geometry import m3c2, neighbors, normal_orientation
-from tests.support.m3c2_clouds import brute
+from tests.support.clouds.m3c2_clouds import brute
 
 NORMAL_MM, PROJECTION_MM, DEPTH_MM = 110.0, 55.0, 100.0
 

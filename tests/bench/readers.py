@@ -28,8 +28,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.support import watched_reading
-from tests.support.damaged_files import good_files
+from tests.support.files.damaged_files import good_files
+from tests.support.processes import watched_reading
 
 ROUNDS, MOST_ROUNDS, ENOUGH_S = 3, 9, 20.0
 LEAST_RATIO, MOST_MEMORY = 1.3, 2.5

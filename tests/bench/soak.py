@@ -27,10 +27,10 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.support import bad_inputs
+from tests.support.files import bad_inputs
 
 ROOT = Path(__file__).resolve().parents[2]
-BATCH = (sys.executable, str(ROOT / "tests/support/failing_job.py"), "batch")
+BATCH = (sys.executable, str(ROOT / "tests/support/processes/failing_job.py"), "batch")
 OPTIONS = ("--jobs", "1", "--timeout-s", "60", "--memory-mb", "600")
 OPTIONS += ("--steps", "spheres", "--method", "least-squares", "--seed", "3")
 GROUPS = Path("/sys/fs/cgroup")

@@ -30,7 +30,7 @@ import trimesh
 import processor
 from processor.model import Scan, Scene, StructureDesign
 from processor.store import store
-from tests.support.dask_cluster import DaskCluster, cluster_in
+from tests.support.processes.dask_cluster import DaskCluster, cluster_in
 
 
 def scene(count: int) -> Scene:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("processor", "designgen")
+OTHER_FOLDERS = ("tests", "docs", "fixtures", "examples")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 MOST_FILES, MOST_LINES, MOST_ARGUMENTS = 20, 60, 10
 
@@ -100,7 +101,10 @@ def circles():
 
 
 def crowded_folders():
-    counts = Counter(str(path.parent.relative_to(ROOT)) for path in SOURCES)
+    """Map each folder of more than ``MOST_FILES`` files to their number: modules of packages, all files elsewhere."""
+    others = (path for place in OTHER_FOLDERS for path in (ROOT / place).rglob("*"))
+    files = [*SOURCES, *(path for path in others if path.is_file() and "__pycache__" not in path.parts)]
+    counts = Counter(str(path.parent.relative_to(ROOT)) for path in files)
     return {folder: count for folder, count in counts.items() if count > MOST_FILES}
 
 

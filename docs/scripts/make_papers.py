@@ -1,0 +1,56 @@
+"""Write the tables of docs/papers.md: ``python -m docs.scripts.make_papers OUT/papers.json``, of any files."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+PAGE = Path(__file__).parents[1] / "papers.md"
+MARK = "<!-- below: written by docs/scripts/make_papers.py from papers.json -->"
+
+
+def main() -> None:
+    """Replace what stands below the mark."""
+    contents = [json.loads(Path(path).read_text("utf-8")) for path in sys.argv[1:]]
+    lines = [line for content in contents for line in (*tables(content), "")]
+    above = PAGE.read_text("utf-8").partition(MARK)[0]
+    PAGE.write_text(above + MARK + "\n\n" + "\n".join(lines[:-1]) + "\n", "utf-8")
+
+
+def tables(content: dict[str, Any]) -> list[str]:
+    """Return the lines of the tables, and of the reasons below each, which their rows number."""
+    seeds = content["seeds"]
+    papers = list(dict.fromkeys(row["paper"] for row in content["rows"]))
+    lines = [f"Papers {', '.join(papers)}: {content['line']}."]
+    lines = [f"{lines[0]} Ours is the median (worst) over the seeds."] if seeds > 1 else lines
+    for paper in papers:
+        rows = [row for row in content["rows"] if row["paper"] == paper]
+        reasons = list(dict.fromkeys(row["reason"]["text"] for row in rows))
+        lines += ["", f"### Paper {paper}", ""]
+        lines += ["| place | data set | method | figure | published | ours (worst) | reproduced | reason |"]
+        lines += ["|---|---|---|---|---|---|---|---|"]
+        for row in rows:
+            unit = f" {row['unit']}" if row["unit"] else ""
+            ours = f"{number(row['median'])} ({number(row['worst'])}){unit}"
+            published = "" if row["published"] is None else number(row["published"]) + unit
+            cells = (
+                row["place"], row["data"], row["method"], row["quantity"], published,
+                ours if row["median"] is not None else "–", row["reproduced"] or "",
+                str(reasons.index(row["reason"]["text"]) + 1),
+            )  # fmt: skip
+            lines.append("| " + " | ".join(cells) + " |")
+        lines += ["", *(f"{i}. {reason[:1].upper()}{reason[1:]}." for i, reason in enumerate(reasons, 1))]
+    return lines
+
+
+def number(value: float | None) -> str:
+    """Write a number with three significant digits, a dash for none."""
+    if value is None:
+        return "–"
+    return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""Variance between viewpoints: from the two sides of plates, by draws of known size."""
+
+import numpy as np
+import pytest
+
+from processor.adjustment import scanner_class
+from processor.preassembly.ends import view_variance
+
+
+def plate(rng, apart, thick=24.0, waves=0.0, off=None, count=3_000):
+    """Points on both sides of a plate of 500 by 900 mm; each side is ``off``, or by a draw of ``apart`` mm."""
+    heights, places, inner = [], [], []
+    off = apart * rng.standard_normal(2) if off is None else off
+    for side, level in ((False, off[0]), (True, off[1] - thick)):
+        at = rng.uniform((-500.0, -450.0), (0.0, 450.0), (count, 2))
+        shape = waves * np.sin(2.0 * np.pi * at[:, 0] / 700.0)
+        heights.append(level + shape + rng.standard_normal(len(at)))
+        places.append(at)
+        inner.append(np.full(len(at), side))
+    at = np.vstack(places)
+    terms = np.stack([np.ones(len(at)), at[:, 0] / 500.0, at[:, 1] / 450.0], axis=1)
+    return view_variance.thickness(terms, at, np.concatenate(heights), np.concatenate(inner))
+
+
+def test_waves_of_a_plate_do_not_change_its_thickness():
+    rng = np.random.default_rng(0)
+    found = np.array([plate(rng, 0.0, waves=3.0).value for _ in range(20)])
+    assert np.abs(found[:, 0].mean() - 24.0) < 0.03
+    assert found[:, 0].std() < 0.1
+
+
+def pair(rng, apart, thick=24.0):
+    """Two opposite plates of an end, seen from the same two sides: shifts of views point outward on one alone."""
+    off = apart * rng.standard_normal(2)
+    return [plate(rng, apart, thick, off=one, count=1_500) for one in (off, -off[::-1])]
+
+
+# Of 12 pairs of opposite plates less 3 means of equal thickness 9 are left. By Student's t they are widened by
+# 1.33 = (2.26 / 1.96)^2. The class counts for 2 more: (9 * 1.33 * 0.3^2 + 2 * 0.5^2) / 11 = 1.59 * 0.3^2. Of 0.1 mm
+# the 95 % limit is less than that: 9 / 3.33 = 2.71, by the 5 % quantile of chi-square.
+@pytest.mark.parametrize(("apart", "wider"), [(0.1, 2.71), (0.3, 1.59)])
+def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart, wider):
+    rng = np.random.default_rng(1)
+    found = [
+        view_variance.variances(
+            [one for thick in (14.0, 20.0, 30.0) for _ in range(4) for one in pair(rng, apart, thick)]
+        )
+        for _ in range(60)
+    ]
+    assert np.mean([one.level for one in found]) == pytest.approx(wider * apart**2, rel=0.2)
+    assert all(one.evident for one in found)
+
+
+def test_opposite_plates_of_one_end_show_no_difference_between_views():
+    """Whatever views differ by, the two plates differ from each other by noise alone."""
+    rng = np.random.default_rng(4)
+    found = view_variance.variances([one for thick in (24.0, 30.0) for one in pair(rng, 0.3, thick)])
+    assert (found.known, found.evident, found.level) == (False, False, 0.0)
+
+
+def test_ends_that_differ_as_others_do_contradict_as_rarely_as_stated():
+    """Tails of plates that differ as their model has it are uniform, also of few ends."""
+    rng = np.random.default_rng(5)
+    tails = [view_variance.tails([pair(rng, 0.3) + pair(rng, 0.3, 30.0) for _ in range(4)]) for _ in range(60)]
+    assert np.isfinite(tails).all()
+    assert np.mean(np.array(tails) < 0.05) < 0.08  # of 240, correlated: 0.05 + 2 standard deviations of 0.015
+
+
+def test_noise_alone_is_no_difference_between_viewpoints():
+    rng = np.random.default_rng(2)
+    found = [view_variance.variances([plate(rng, 0.0) for _ in range(16)]) for _ in range(20)]
+    assert not any(one.evident for one in found)
+    assert np.sqrt(np.mean([one.level for one in found])) < 0.02
+
+
+def test_a_plate_of_which_one_side_was_seen_has_no_thickness():
+    at = np.random.default_rng(3).uniform(0.0, 500.0, (1_000, 2))
+    terms = np.stack([np.ones(1_000), *(at / 500.0).T], axis=1)
+    assert view_variance.thickness(terms, at, np.zeros(1_000), np.zeros(1_000, bool)) is None
+    assert view_variance.variances([]) == view_variance.NONE
+
+
+def test_view_variances_unknown_from_plates_are_those_of_the_scanner_class():
+    term = scanner_class.VIEW_MM**2
+    assert view_variance.variances([]).or_of_class() == view_variance.NONE._replace(level=term, ring=term)
+    one = view_variance.variances([plate(np.random.default_rng(1), 0.3)])
+    assert (one.level, one.or_of_class().level, one.or_of_class().ring) == (0.0, term, term)
+    shown = view_variance.variances([plate(np.random.default_rng(k), 0.0) for k in range(4)])
+    assert shown.or_of_class() == shown

@@ -1,0 +1,213 @@
+"""The Python interface, called as a user calls it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import designgen
+import processor
+from processor import pipeline
+from processor.geometry import rigid
+from processor.model import InputError, Scene, Status, UsageError, Verdict
+from tests.support.solids.meshes import bracket
+
+FRAME_OF_FOUR = Path(__file__).resolve().parents[2] / "fixtures" / "frame-of-four.toml"
+SCAN_FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "scan-folder"
+CENTRE, RADIUS = np.array([1.0e6, 2.0e6, 100.0]), 75.0
+
+
+def test_import_is_quick():
+    code = "import time; start = time.perf_counter(); import processor; print(time.perf_counter() - start)"
+    took = [
+        float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout) for _ in range(3)
+    ]
+    assert min(took) < 0.5
+
+
+def test_every_name_of_the_interface_is_there():
+    for name in processor.__all__:
+        assert getattr(processor, name)
+    with pytest.raises(AttributeError, match="no attribute 'magic'"):
+        processor.magic  # noqa: B018
+
+
+def test_both_packages_are_typed():
+    assert (Path(processor.__file__).parent / "py.typed").exists()
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_steps_run_with_one_thread_of_linear_algebra(in_memory, monkeypatch):
+    """With more the last digits of results would depend on the machine."""
+    seen = []
+    execute = pipeline.execute
+
+    def observed(*arguments):
+        seen.extend(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+        return execute(*arguments)
+
+    monkeypatch.setattr(pipeline, "execute", observed)
+    with threadpool_limits(2, user_api="blas"):
+        processor.run(
+            processor.read(SCAN_FOLDER) if in_memory else SCAN_FOLDER, steps="spheres", method="least-squares"
+        )
+    assert set(seen) == {1}
+
+
+def test_a_sphere_of_a_target():
+    rng = np.random.default_rng(1)
+    direction = rng.normal(size=(3000, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    direction = direction[direction[:, 0] > 0.1]
+    points = CENTRE + (RADIUS + rng.normal(0.0, 0.5, (len(direction), 1))) * direction
+    clutter = CENTRE + rng.uniform(-300.0, 300.0, (150, 3))
+    fit = processor.fit_sphere(np.vstack([points, clutter]))
+    sd = np.sqrt(np.diag(fit.covariance))
+    assert fit.status is Status.OK
+    assert (np.abs(fit.centre - CENTRE) < 4.0 * sd[:3] + 0.1).all()
+    assert abs(fit.radius - RADIUS) < 4.0 * sd[3] + 0.1
+    held = processor.fit_sphere(points, radius=RADIUS)
+    assert held.radius == RADIUS
+    assert held.covariance[3, 3] == 0.0
+
+
+def test_a_sphere_without_noise():
+    """As one makes it to try the function: residuals of rounding alone are no scale of noise."""
+    direction = np.random.default_rng(0).normal(size=(2000, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    for points in (direction, direction[direction[:, 0] > 0.1]):
+        fit = processor.fit_sphere(CENTRE + RADIUS * points)
+        assert fit.status is Status.OK
+        np.testing.assert_allclose([*fit.centre, fit.radius], [*CENTRE, RADIUS], atol=1e-6)
+
+
+def test_the_first_sphere_of_a_process_takes_less_than_three_seconds():
+    """With the kernels compiled: a script that fits one target starts a process for it."""
+    code = (
+        "import numpy as np, time, processor\n"
+        "z, turn = np.linspace(0.0, 0.999, 2000), 2.399963 * np.arange(2000)\n"
+        "side = np.sqrt(1.0 - z**2)\n"
+        "points = 75.0 * np.column_stack([side * np.cos(turn), side * np.sin(turn), z])\n"
+        "points += np.random.default_rng(0).normal(0.0, 0.5, points.shape)\n"
+        "start = time.process_time()\n"
+        "assert processor.fit_sphere(points).status.value == 'ok'\n"
+        "print(time.process_time() - start)"
+    )  # of the processor: other work on the machine does not count
+    took = [
+        float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout) for _ in range(2)
+    ]
+    assert took[1] < 3.0  # the first may compile
+
+
+def test_a_radius_and_a_scanner_that_cannot_be_used():
+    points = np.random.default_rng(0).uniform(-100.0, 100.0, (20, 3))
+    with pytest.raises(ValueError, match="radius: expected a positive length in mm, got 'a'"):
+        processor.fit_sphere(points, radius="a")
+    for scanner in (np.zeros(2), np.zeros((5, 3)), 0.0):
+        with pytest.raises(ValueError, match=r"scanner: expected shape \(3,\) or \(20, 3\), got"):
+            processor.fit_sphere(points, scanner=scanner)
+
+
+def test_points_of_no_sphere_fail_and_are_no_error():
+    fit = processor.fit_sphere(np.random.default_rng(0).uniform(-500.0, 500.0, (300, 3)))
+    assert fit.status in (Status.FAILED, Status.WEAK)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: p / 1000.0, "in metres"),
+        (lambda p: p[:5], "10 points or more, got 5"),
+        (lambda p: p[:, :2], r"array \(n, 3\).*got shape"),
+        (lambda p: np.where(p > p.mean(), np.nan, p), "NaN or infinite"),
+        (lambda _: "points", "expected numbers"),
+    ],
+)
+def test_arrays_that_cannot_be_used(change, message):
+    rng = np.random.default_rng(0)
+    points = CENTRE + RADIUS * np.array([d / np.linalg.norm(d) for d in rng.normal(size=(200, 3))])
+    with pytest.raises(ValueError, match=message):
+        processor.fit_sphere(change(points))
+    with pytest.raises(ValueError, match="expected"):
+        processor.m3c2(change(points)[:0], points, normal_diameter=50.0, projection_diameter=20.0, max_depth=10.0)
+
+
+def test_a_shift_of_a_plane_by_m3c2():
+    rng = np.random.default_rng(2)
+    first = np.column_stack([rng.uniform(-1000.0, 1000.0, (20_000, 2)), rng.normal(0.0, 1.0, 20_000)]) + CENTRE
+    second = first + np.array([0.0, 0.0, 5.0])
+    scales = {"normal_diameter": 200.0, "projection_diameter": 100.0, "max_depth": 50.0}
+    table = processor.m3c2(first, second, core=first[:300], **scales)
+    np.testing.assert_allclose(np.median(table.distance), 5.0, atol=1e-3)
+    assert table.significant.all()
+    assert table.core.shape == table.normals.shape == (300, 3)
+    given = processor.m3c2(first, second, core=first[:10], normals=np.tile([0.0, 0.0, -1.0], (10, 1)), **scales)
+    np.testing.assert_allclose(given.distance, -5.0, atol=0.5)
+    metres = {name: length / 1e6 for name, length in scales.items()}
+    small = processor.m3c2(first / 1e6, second / 1e6, core=first[:300] / 1e6, **metres)
+    np.testing.assert_allclose(1e6 * small.distance, table.distance, atol=1e-3)
+    with pytest.raises(ValueError, match=r"array \(n, 3\) of coordinates, got"):
+        processor.m3c2(first[:, :2], second, **scales)
+    with pytest.raises(ValueError, match="one unit"):
+        processor.m3c2(first / 100.0, second / 100.0, **scales)
+    with pytest.raises(ValueError, match="positive"):
+        processor.m3c2(first, second, **{**scales, "max_depth": 0.0})
+    with pytest.raises(ValueError, match="registration_error: expected 0 or"):
+        processor.m3c2(first, second, **scales, registration_error=-1.0)
+
+
+def test_a_folder_is_read_and_run(tmp_path):
+    scene = processor.read(SCAN_FOLDER)
+    assert isinstance(scene, Scene)
+    results = processor.run(SCAN_FOLDER, tmp_path / "out", steps="spheres")
+    assert (tmp_path / "out" / "results.json").exists()
+    assert results.steps["spheres"].status in tuple(Status)
+    assert isinstance(results.verdict, Verdict)
+    assert results.checks  # the folder holds a truth
+    with pytest.raises(InputError, match="no such file"):
+        processor.run(tmp_path / "nothing")
+    with pytest.raises(UsageError, match="no step 'magic'"):
+        processor.run(SCAN_FOLDER, steps=["magic"])
+
+
+def test_a_scene_is_run_and_compared_with_its_truth():
+    scene, truth = designgen.make(str(FRAME_OF_FOUR), seed=1)
+    results = processor.run(scene, method=("ray", "ransac"))
+    assert results.checks == ()
+    assert set(results.comparison["spheres"]) == {"ransac"}
+    checks = processor.check(results, truth)
+    assert {check.method for check in checks} == {"", "ransac"}
+
+
+def test_a_scan_is_registered_to_its_mesh_from_any_pose():
+    mesh = bracket()
+    rng = np.random.default_rng(3)
+    points = np.asarray(trimesh.sample.sample_surface(mesh, 20_000, seed=3)[0]) + rng.normal(0.0, 1.0, (20_000, 3))
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.3, -1.1, 2.0])), np.array([5e5, 3e6, 100.0]))
+    scan = rigid.apply(rigid.invert(T), points)
+    pose = processor.register(scan, mesh.vertices, mesh.faces)
+    off = pose.T_design_scan @ rigid.invert(T)
+    assert np.abs(rigid.apply(off, mesh.vertices) - mesh.vertices).max() < 0.5
+    assert pose.status in (Status.OK, Status.AMBIGUOUS, Status.WEAK)
+    assert pose.covariance.shape == (6, 6)
+    for faces, message in ((mesh.faces.astype(float), "whole numbers"), (mesh.faces + 10_000, "numbers of vertices")):
+        with pytest.raises(ValueError, match=message):
+            processor.register(scan, mesh.vertices, faces)
+    with pytest.raises(ValueError, match="expected both in mm"):
+        processor.register(scan, np.asarray(mesh.vertices) * 1000.0, mesh.faces)
+
+
+def test_a_scanner_decides_between_poses_that_fit_alike():
+    """A square plate of one side seen: turned over it fits as well, but then its seen side faces away."""
+    plate = trimesh.creation.box((2000.0, 1500.0, 4.0))
+    rng = np.random.default_rng(4)
+    places = rng.uniform([-1000.0, -750.0], [1000.0, 750.0], (8000, 2))
+    seen = np.column_stack([places, 2.0 + rng.normal(0.0, 0.5, 8000)])
+    pose = processor.register(seen, plate.vertices, plate.faces, scanners=[0.0, 0.0, 5000.0])
+    up = pose.T_design_scan[:3, :3] @ [0.0, 0.0, 1.0]
+    height = rigid.apply(pose.T_design_scan, seen)[:, 2].mean()
+    assert np.sign(up[2]) == np.sign(height)

@@ -1,0 +1,156 @@
+"""Bad models: messages on bodies that overlap, shells, names and sizes, and what is done to a design's mesh."""
+
+import json
+import logging
+import re
+
+import cadquery as cq
+import numpy as np
+import pytest
+import trimesh
+
+from designgen import __main__
+from designgen.cad import faults
+from designgen.models import loading
+from processor.deviation import step as deviation_step
+from processor.model import DesignFaults
+from processor.scan_folder import folder, mesh_faults
+
+BOX = trimesh.creation.box((400.0, 300.0, 200.0))
+
+
+def assembly(**shapes):
+    made = cq.Assembly(name="parts")
+    for name, shape in shapes.items():
+        made.add(shape, name=name)
+    return made
+
+
+def overlaps(**shapes):
+    model = loading.load(assembly(**shapes))
+    bodies = [faults.Named(body.name, body.vertices, body.triangles, True) for body in model.bodies]
+    return [(*pair[:2], pytest.approx(pair[2], abs=1e-6)) for pair in faults.overlapping(bodies)]
+
+
+@pytest.mark.parametrize("gap", [-40.0, -0.3, -0.05, 0.0, 5.0])
+def test_bodies_that_overlap_and_bodies_that_touch(gap):
+    beam = cq.Solid.makeBox(300, 50, 50, cq.Vector(100 + gap, 25, 25))
+    found = overlaps(plate=cq.Solid.makeBox(100, 100, 100), beam=beam)
+    assert found == ([("plate", "beam", -gap)] if gap < -0.1 else [])
+
+
+def test_a_bolt_in_its_hole_touches_and_one_in_the_full_overlaps():
+    bolt = cq.Solid.makeCylinder(10, 500, cq.Vector(0, 0, -200))
+    plate = cq.Workplane().box(100, 100, 30)
+    assert overlaps(plate=plate.faces(">Z").workplane().hole(20).val(), bolt=bolt) == []
+    ((first, second, depth),) = overlaps(plate=plate.val(), bolt=bolt)
+    assert (first, second) == ("plate", "bolt")
+    assert 8.0 < depth.expected <= 15.0 + 1e-6  # half the plate, or the bolt's radius
+    inside = overlaps(plate=plate.val(), pin=cq.Solid.makeBox(4, 4, 4, cq.Vector(10, 10, -2)))
+    assert [pair[:2] for pair in inside] == [("plate", "pin")], "wholly inside"
+
+
+@pytest.mark.usefixtures("cad_here")
+def test_faults_of_a_model_are_reported_on_import_and_on_scan(tmp_path, monkeypatch, capsys, caplog):
+    web, rib = cq.Solid.makeBox(400, 300, 20), cq.Solid.makeBox(20, 300, 200, cq.Vector(10, 0, 5))
+    shell = cq.Workplane().box(100, 100, 100).faces("<X").val()
+    path = tmp_path / "part.step"
+    cq.exporters.export(cq.Workplane(obj=cq.Compound.makeCompound([web, rib, shell])), str(path))
+    monkeypatch.setattr("sys.argv", ["designgen", "import", str(path), "-o", str(tmp_path / "meshes")])
+    with pytest.raises(SystemExit) as ended:
+        __main__.main()
+    assert not ended.value.code
+    said = [line.removeprefix(f"{path}: ") for line in capsys.readouterr().err.splitlines()]
+    said = [line for line in said if "part" in line]
+    assert said[0] == "3 bodies have no names in the file: they are numbered, as part-1"
+    assert said[1] == "'part-3' is not closed: written as it is; check it in the CAD program"
+    assert re.match(r"'part-1' and 'part-2' overlap by (9\.\d|10\.0) mm: they are taken as they are", said[2])
+    assert json.loads((tmp_path / "meshes/import.json").read_text())["notes"] == said
+    with caplog.at_level(logging.WARNING, "designgen"):
+        loading.say(loading.load(assembly(web=web, rib=rib)))
+    (line,) = (line for line in caplog.messages if "overlap" in line)
+    assert re.match(r"model: 'web' and 'rib' overlap by (9\.\d|10\.0) mm: they are taken as they are", line)
+
+
+@pytest.mark.parametrize(("scale", "doubted"), [(1.0, False), (0.001, True), (1e5, True)])
+def test_implausible_size_of_a_model_gives_a_warning_about_its_unit(scale, doubted, caplog):
+    with caplog.at_level(logging.WARNING, "designgen"):
+        loading.say(loading.load((scale * BOX.vertices, BOX.faces)))
+    assert any("is its unit right?" in line for line in caplog.messages) == doubted
+
+
+def test_mesh_without_a_unit_is_reported_with_its_size_in_mm(tmp_path):
+    BOX.export(tmp_path / "box.stl")
+    assert (
+        "taken as mm, 400 x 300 x 200 mm in all; state another by --units"
+        in loading.load(tmp_path / "box.stl").notes[0]
+    )
+
+
+# --- a design's mesh, as processor reads it ---------------------------------------------------------------------------
+
+
+def _apart(mesh):
+    """The mesh with vertices of its own for each facet, as STL has them."""
+    return mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3)
+
+
+def _turned(faces, rows):
+    faces = np.array(faces)
+    faces[rows] = faces[rows, ::-1]
+    return faces
+
+
+HOLLOW = trimesh.util.concatenate([trimesh.creation.icosphere(2, 500.0), trimesh.creation.box((90.0, 80.0, 70.0))])
+CAVITY = _turned(HOLLOW.faces, slice(len(HOLLOW.faces) - 12, None))
+
+
+@pytest.mark.parametrize("apart", [False, True], ids=["shared vertices", "vertices apart"])
+@pytest.mark.parametrize(
+    ("mesh", "faces", "found"),
+    [
+        (BOX, BOX.faces, None),
+        (BOX, BOX.faces[:, ::-1], DesignFaults(turned=12)),
+        (BOX, _turned(BOX.faces, [2, 7]), DesignFaults(turned=2)),
+        (BOX, _turned(BOX.faces, [0, 1, 2, 4, 5, 6, 8, 9, 10]), DesignFaults(turned=9)),
+        (BOX, BOX.faces[1:], DesignFaults(open_edges=3, open_parts=1)),
+        (BOX, _turned(BOX.faces[1:], [4]), DesignFaults(turned=1, open_edges=3, open_parts=1)),
+        (HOLLOW, CAVITY, None),
+        (HOLLOW, CAVITY[:, ::-1], DesignFaults(turned=len(CAVITY))),
+    ],
+    ids=["sound", "inside out", "two", "most", "hole", "hole and one", "cavity", "cavity inside out"],
+)
+def test_facets_of_a_design_are_turned_outward(mesh, faces, found, apart):
+    vertices = mesh.vertices
+    if apart:
+        vertices, faces = _apart(trimesh.Trimesh(vertices, faces, process=False))
+    mended, told = mesh_faults.mended(np.asarray(vertices), np.asarray(faces, np.int64))
+    if mesh is HOLLOW and found is not None:
+        assert trimesh.Trimesh(vertices, mended, process=False).volume > 0.0
+        return
+    assert told == found
+    whole = trimesh.Trimesh(vertices, mended, process=False)
+    outward = np.einsum("ni,ni->n", whole.face_normals, whole.triangles_center)
+    if mesh is BOX:
+        assert (outward > 0.0).all()
+
+
+def test_inverted_design_gives_the_same_deviations_with_a_message(tmp_path):
+    found = {}
+    for name, faces in (("sound", BOX.faces), ("inverted", BOX.faces[:, ::-1])):
+        place = tmp_path / name
+        place.mkdir()
+        trimesh.Trimesh(BOX.vertices, faces, process=False).export(place / "design.ply")
+        points = trimesh.sample.sample_surface(BOX, 20_000, seed=1)[0] * [1.0, 1.0, 1.02]
+        np.savetxt(place / "scan.xyz", points)
+        (place / "project.toml").write_text(
+            'kind = "structure"\nunits = "mm"\ndesign = "design.ply"\n[[scan]]\nfile = "scan.xyz"\n'
+        )
+        scene = folder.read_input(place)
+        found[name] = deviation_step.run(scene, deviation_step.Params(register="none"))
+    told = [reason for reason in found["inverted"].reasons if reason.code.startswith("design.")]
+    assert [(reason.code, reason.values) for reason in told] == [("design.turned", {"turned": 12})]
+    assert not [reason for reason in found["sound"].reasons if reason.code.startswith("design.")]
+    assert found["sound"].max > 1.5
+    assert found["inverted"].max == pytest.approx(found["sound"].max, abs=0.1)
+    assert found["inverted"].mean == pytest.approx(found["sound"].mean, abs=0.02)

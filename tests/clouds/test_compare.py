@@ -1,0 +1,359 @@
+"""processor compare: what it writes, in the inputs' own unit and order, and what it refuses."""
+
+import csv
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processor.__main__ import main
+from processor.compare import compare
+from processor.compare.compare import Request
+from processor.geometry.m3c2 import Distances
+from processor.model import InputError, Scan, Scene, UsageError
+from processor.report import comparison
+from processor.report.deviation import core_points_csv
+from processor.report.deviation.core_points_csv import COLUMNS
+from processor.store import store
+from tests.support.clouds.m3c2_clouds import brute, wavy
+
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
+UTM = np.array([512_345.25, 5_412_678.5, 231.0])  # metres
+
+
+def written(path, points, header="", columns="%.17g"):
+    np.savetxt(path, points, fmt=columns, header=header, comments="")
+    return path
+
+
+@pytest.fixture
+def clouds(tmp_path):
+    """Two clouds in metres at UTM coordinates, 5 mm apart, and core points."""
+    first, second = wavy(6000, 1) / 1000.0 + UTM, wavy(6000, 2, 5.0) / 1000.0 + UTM
+    core = np.random.default_rng(3).permutation(first)[:50]
+    names = ("first.xyz", "second.xyz", "core.xyz")
+    return [written(tmp_path / name, one) for name, one in zip(names, (first, second, core), strict=True)]
+
+
+def run(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "processor", "compare", *map(str, arguments)], capture_output=True, text=True
+    )
+
+
+def called(monkeypatch, *arguments):
+    """Exit code of the command within this process."""
+    monkeypatch.setattr(sys, "argv", ["processor", "compare", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    return end.value.code or 0
+
+
+def table(folder):
+    with (folder / "compare.csv").open() as file:
+        rows = list(csv.reader(file))
+    assert tuple(rows[0]) == COLUMNS
+    return dict(zip(COLUMNS, np.array([[float(cell) for cell in row] for row in rows[1:]]).T, strict=True))
+
+
+def test_comparison_at_utm_coordinates_equals_brute_force_and_writes_all_files(clouds, tmp_path, monkeypatch, capsys):
+    first, second, core_file = clouds
+    out = tmp_path / "out"
+    options = ("--normal-diameter", 0.08, "--projection-diameter", 0.05, "--max-depth", 0.04)
+    assert called(
+        monkeypatch, first, second, "-o", out, "--core", core_file, *options, "--registration-error", 0.0003
+    ) == 0  # fmt: skip
+    found = table(out)
+    core = np.loadtxt(core_file)
+    for axis, column in zip("xyz", core.T, strict=True):
+        np.testing.assert_array_equal(found[axis], column)  # every bit, in the order of the core file
+    normals = np.column_stack([found["nx"], found["ny"], found["nz"]])
+    assert (normals[:, 2] > 0.0).all()
+    local = [np.loadtxt(path) - UTM for path in (first, second, core_file)]
+    distance, lod95, n1, n2, std1, std2 = brute(*local, normals, 0.05, 0.04, 0.0003)
+    for name, expected in [("n1", n1), ("n2", n2)]:
+        np.testing.assert_array_equal(found[name], expected)
+    for name, expected in [("distance", distance), ("lod95", lod95), ("std1", std1), ("std2", std2)]:
+        np.testing.assert_allclose(found[name], expected, atol=2e-9)  # of coordinates that have 1e-9 themselves
+    np.testing.assert_array_equal(found["significant"], np.abs(found["distance"]) > found["lod95"])
+    record = json.loads((out / "compare.json").read_text())
+    assert record["parameters"]["projection_diameter"] == 0.05
+    assert record["parameters"]["registration_error"] == 0.0003
+    assert set(record["inputs"]) == {"reference", "compared", "core"}
+    assert record["summary"]["core_points"] == 50
+    assert record["summary"]["mean"] == pytest.approx(np.mean(distance), abs=1e-8)
+    low, high = record["summary"]["significant_share_ci95"]
+    assert low <= record["summary"]["significant_share"] <= high
+    assert (out / "map.png").read_bytes().startswith(b"\x89PNG")
+    page = (out / "report.html").read_text()
+    assert "http" not in page.replace("http-equiv", "")
+    assert "median level of detection" in capsys.readouterr().out
+    assert called(monkeypatch, first, second, "-o", out, "--core", core_file, *options) == 0  # in place of the first
+
+
+def test_without_options_the_scales_are_made_from_the_density(clouds, tmp_path):
+    first, second, _ = clouds
+    said = []
+    found = compare.compare(Request(first, second), said.append)
+    assert len(found.core) == 6000
+    np.testing.assert_array_equal(found.core + found.origin, np.loadtxt(first))
+    inside = (found.distances.n1 >= 20) & (found.distances.n2 >= 20)
+    assert inside.mean() > 0.95
+    assert found.scales.normal_diameter_mm >= found.scales.projection_diameter_mm
+    text = "\n".join(said)
+    used = found.scales
+    assert f"normal diameter {used.normal_diameter_mm:.6g}" in text
+    assert f"projection diameter {used.projection_diameter_mm:.6g}" in text
+    assert f"max depth to either side {used.max_depth_mm:.6g}" in text
+    again = compare.compare(Request(first, second))
+    np.testing.assert_array_equal(found.distances.lod95, again.distances.lod95)
+
+
+def test_the_unit_is_that_of_the_files_and_two_are_refused(tmp_path):
+    plane = np.array([[x, y, 0.0] for x in range(20) for y in range(20)])
+    a = written(tmp_path / "a.csv", plane, "x[mm] y[mm] z[mm]")
+    b = written(tmp_path / "b.csv", plane + np.array([0.0, 0.0, 0.5]), "x[mm] y[mm] z[mm]")
+    c = written(tmp_path / "c.csv", plane, "x[m] y[m] z[m]")
+    found = compare.compare(Request(a, b))
+    assert found.unit == "mm"
+    np.testing.assert_allclose(found.distances.distance, 0.5, atol=1e-12)
+    with pytest.raises(InputError, match="one unit"):
+        compare.compare(Request(a, c))
+
+
+def test_normals_come_from_a_file(clouds, tmp_path):
+    first, second, core_file = clouds
+    core = np.loadtxt(core_file)
+    normals = np.tile([0.6, 0.0, -0.8], (len(core), 1)) * 2.0
+    request = {"projection_diameter": 0.08, "max_depth": 0.06}
+    tables = [
+        written(tmp_path / "three.txt", normals / 2.0),
+        written(tmp_path / "six.txt", np.hstack([core, normals / 2.0])),
+        written(tmp_path / "named.csv", np.hstack([normals, core]), "nx ny nz x y z"),
+    ]
+    results = [compare.compare(Request(first, second, core_file, one, **request)) for one in tables]
+    for one in results:
+        np.testing.assert_allclose(one.normals, normals / 2.0)
+        np.testing.assert_array_equal(one.distances.distance, results[0].distances.distance)
+    for rows, said in [
+        (normals[:-1], "for each of 50"), (normals * 0.0, "no direction"), (core, "expected unit normals"),
+        (np.hstack([core, 100.0 * normals]), "expected unit normals"),
+    ]:  # fmt: skip
+        with pytest.raises(InputError, match=said):
+            compare.compare(Request(first, second, core_file, written(tmp_path / "bad.txt", rows), **request))
+    moved = written(tmp_path / "moved.txt", np.hstack([core[::-1], normals]))
+    with pytest.raises(InputError, match="elsewhere"):
+        compare.compare(Request(first, second, core_file, moved, **request))
+
+
+def test_unused_normal_diameter_is_not_reported_as_a_scale(clouds, tmp_path):
+    first, second, core_file = clouds
+    normals = written(tmp_path / "up.txt", np.tile([0.0, 0.0, 1.0], (50, 1)))
+    for given in (0.0, 0.08):
+        said = []
+        found = compare.compare(Request(first, second, core_file, normals, normal_diameter=given), said.append)
+        text = "\n".join(said)
+        assert not re.search(r"normal diameter \d", text)
+        assert "normals of file up.txt" in text
+        assert ("--normal-diameter is not used" in text) == (given > 0.0)
+        parameters = comparison.as_json(found)["parameters"]
+        assert parameters["normal_diameter"] is None
+        assert "normal_diameter" not in parameters["given"]
+
+
+def wall(seed, off=0.0, count=6000):
+    """An upright wall of 3 m along x, with 2 mm of noise; metres."""
+    rng = np.random.default_rng(seed)
+    x, z = rng.uniform(0.0, 3.0, (2, count))
+    return np.column_stack([x, off + rng.normal(0.0, 0.002, count), z])
+
+
+def test_distances_of_a_moved_upright_wall_have_one_sign(tmp_path, monkeypatch, capsys):
+    first, second = written(tmp_path / "a.xyz", wall(1)), written(tmp_path / "b.xyz", wall(2, 0.05))
+    assert called(monkeypatch, first, second, "-o", tmp_path / "out") == 0
+    found = table(tmp_path / "out")
+    assert np.nanmean(found["distance"]) == pytest.approx(0.05, abs=1e-3)
+    assert (found["distance"] > 0.0).all()
+    assert (found["ny"] > 0.0).all()
+    said = "6000 of 6000 normals are of upright surfaces"
+    assert said in capsys.readouterr().out
+    assert said in (tmp_path / "out" / "report.html").read_text()
+    turned = json.loads((tmp_path / "out" / "compare.json").read_text())["normals_turned"]
+    assert (turned["by_up"], turned["by_convention"], turned["surfaces_by_convention"]) == (0, 6000, 1)
+
+
+def test_normals_of_upright_walls_point_to_the_scanners_of_the_reference(tmp_path):
+    """Two scanners on either side of two walls, each with a pose of its own."""
+    scans = []
+    for i, side in enumerate((-1.0, 1.0)):
+        points = 1000.0 * wall(i) + [0.0, 2000.0 * side, 0.0]  # seen from the middle
+        T = np.eye(4)
+        T[:3, 3] = [1500.0, 100.0 * side, 1500.0]
+        scans.append(Scan(f"S{i}", points - T[:3, 3], position=np.zeros(3), T_project_scan=T))
+    store.write_scene(tmp_path / "a.h5", Scene("a", "structure", tuple(scans), units="mm"), None, {})
+    nearer = [1000.0 * wall(i + 2) + [0.0, 1950.0 * side, 0.0] for i, side in enumerate((-1.0, 1.0))]
+    moved = written(tmp_path / "b.csv", np.vstack(nearer), "x[mm] y[mm] z[mm]")
+    core = np.array([[1500.0, -2000.0, 1500.0], [1500.0, 2000.0, 1500.0], [700.0, 2000.0, 1500.0]])
+    core_file = written(tmp_path / "core.csv", core, "x[mm] y[mm] z[mm]")
+    for given in (core_file, None):
+        found = compare.compare(Request(tmp_path / "a.h5", moved, given))
+        np.testing.assert_array_equal(np.sign(found.normals[:, 1]), -np.sign(found.core[:, 1]))
+        np.testing.assert_allclose(found.distances.distance, 50.0, atol=2.0)
+        assert found.turned.scanner == len(found.core)
+
+
+def test_clouds_without_overlap_are_refused_with_the_likely_cause(clouds, tmp_path):
+    first, second, _ = clouds
+    cloud = np.loadtxt(second) - UTM
+    small = {"projection_diameter": 1e-6, "max_depth": 1e-5}
+    near = written(tmp_path / "near.xyz", np.loadtxt(first) - UTM)
+    cases = [
+        (first, written(tmp_path / "mm.xyz", 1000.0 * np.loadtxt(second)), {}, "about 1000: .* different units"),
+        (near, written(tmp_path / "ft.xyz", cloud / 0.3048), {}, None),
+        (near, written(tmp_path / "inch.xyz", cloud * 39.37), {}, "about 39.37"),
+        (near, written(tmp_path / "ten.xyz", cloud * 10.0 + 700.0), {}, "about 10: "),
+        (first, written(tmp_path / "far.xyz", cloud + UTM + [1000.0, 0.0, 0.0]), {}, "compared cloud .* lie 999"),
+        (first, second, {"core": near}, "core points .* apart"),
+        (first, written(tmp_path / "up.xyz", cloud + UTM + [0.0, 0.0, 0.5]), {"max_depth": 0.1}, "--max-depth"),
+        (first, second, {"normal_diameter": 1e-6}, "normal-diameter"),
+        (first, second, {**small, "normal_diameter": 0.1}, "projection-diameter"),
+        (first, written(tmp_path / "one.xyz", cloud[:1] + UTM), {}, "holds 1 point;"),
+        (written(tmp_path / "two.xyz", cloud[:2] + UTM), first, {}, "holds 2 points;"),
+    ]  # fmt: skip
+    for one, other, given, said in cases:
+        if said is None:
+            assert len(compare.compare(Request(one, other, **given)).core)
+            continue
+        with pytest.raises(InputError, match=said):
+            compare.compare(Request(one, other, **given))
+
+
+def test_unit_is_stated_only_if_an_input_states_it(tmp_path, monkeypatch, capsys):
+    plane = np.array([[x, y, 0.0] for x in range(20) for y in range(20)])
+    a, b = written(tmp_path / "a.xyz", plane), written(tmp_path / "b.xyz", plane + np.array([0.0, 0.0, 0.5]))
+    core = written(tmp_path / "core.csv", plane, "x[m] y[m] z[m]")
+    for named, options, unit in ((a, ("--core", core), ""), (core, (), "m")):
+        assert called(monkeypatch, named if unit else a, b, "-o", tmp_path / "out", *options) == 0
+        out, err = capsys.readouterr()
+        record = json.loads((tmp_path / "out" / "compare.json").read_text())
+        assert (record["unit"] == "m") == bool(unit)
+        assert (" m," in out) == bool(unit)
+        assert "the unit m is given by core.csv only; not by " in out
+        assert "the unit m is given by" in err
+        assert [note["code"] for note in record["notes"]] == ["compare.unit"]
+    found = compare.compare(Request(a, b))
+    assert comparison.as_json(found)["unit_note"] is None
+
+
+@pytest.mark.parametrize(
+    "option", ["--radius", "--cylinder-radius", "--cyl-radius", "--normal-radius", "--projection-radius", "--rad"]
+)
+def test_radius_option_is_refused_with_the_option_of_the_diameter(clouds, tmp_path, monkeypatch, capsys, option):
+    for given in ((option, "0.1"), (f"{option}=0.1",)):
+        assert called(monkeypatch, *clouds[:2], "-o", tmp_path / "out", *given) == 2
+        said = capsys.readouterr().err
+        assert f"No such option: {option}" in said
+        assert "--projection-diameter" in said
+        assert "twice the radius" in said
+
+
+def test_values_without_a_result_are_nan_in_the_csv(tmp_path):
+    origin = np.zeros(3)
+    nan = np.array([np.nan])
+    found = Distances(nan, nan, np.array([0]), np.array([2]), nan, np.array([0.5]))
+    text = core_points_csv.csv_text(origin, np.zeros((1, 3)), found, np.full((1, 3), np.nan))
+    assert text.splitlines()[1] == "0.0,0.0,0.0,nan,nan,0,0,2,nan,0.5,nan,nan,nan"
+
+
+def test_the_page_may_be_chinese(clouds, tmp_path, monkeypatch):
+    assert called(monkeypatch, *clouds[:2], "-o", tmp_path / "out", "--core", clouds[2], "--lang", "zh") == 0
+    text = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert '<html lang="zh">' in text
+    assert "核心点" in text
+
+
+def test_bad_input_is_one_line_and_exit_3(clouds, tmp_path, monkeypatch, capsys):
+    first, second, _ = clouds
+    out = tmp_path / "out"
+    empty, text, one = tmp_path / "empty.xyz", tmp_path / "text.xyz", tmp_path / "one.xyz"
+    empty.write_bytes(b"")
+    text.write_text("no numbers here\n")
+    one.write_text("1 2 3\n1 2 3\n1 2 3\n")
+    cases = [
+        (tmp_path / "none.xyz", second), (first, empty), (text, second), (one, one), (one, first), (first, one),
+        (first, tmp_path), (first, second, "--core", text), (first, second, "--normals", tmp_path / "none.txt"),
+    ]  # fmt: skip
+    for case in cases:
+        assert called(monkeypatch, *case, "-o", out) == 3
+        said = capsys.readouterr()
+        errors = [line for line in said.err.splitlines() if line.startswith("error")]
+        assert len(errors) == 1
+        assert "Traceback" not in said.err
+        assert not out.exists()
+    for options in (("--projection-diameter", "0"), ("--max-depth", "-1"), ("--registration-error", "x")):
+        assert called(monkeypatch, first, second, "-o", out, *options) == 2
+    with pytest.raises(UsageError, match="max-depth"):
+        Request(first, second, max_depth=float("nan"))
+    assert called(monkeypatch, first, second, "-o", tmp_path) == 2  # holds the inputs
+    assert Path(first).exists()
+
+
+def test_the_command_runs_as_its_own_process(clouds, tmp_path):
+    first, second, core_file = clouds
+    done = run(first, second, "-o", tmp_path / "out", "--core", core_file, "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["summary"]["core_points"] == 50
+    assert "projection diameter" in done.stderr
+
+
+def test_units_of_each_file_and_of_heights(tmp_path, monkeypatch):
+    """The same two clouds in m; the compared one in feet; and the reference with its heights in survey feet."""
+    first, second = wavy(3000, 1) / 1000.0, wavy(3000, 2, 5.0) / 1000.0
+    us_ft = 1200.0 / 3937.0
+    in_m = [written(tmp_path / f"{k}.xyz", one) for k, one in enumerate((first, second))]
+    in_ft = written(tmp_path / "ft.xyz", second / 0.3048)
+    heights = written(tmp_path / "heights.xyz", first / [1.0, 1.0, us_ft])
+    options = ("--normal-diameter", 0.08, "--projection-diameter", 0.05, "--max-depth", 0.04)
+    found = []
+    for name, units, files in (("a", (), in_m), ("b", ("--units", "m,ft"), (in_m[0], in_ft)),
+                               ("c", ("--units", "m/us-ft,ft"), (heights, in_ft))):  # fmt: skip
+        assert called(monkeypatch, *files, "-o", tmp_path / name, *options, *units) == 0
+        found.append(table(tmp_path / name))
+    for other in found[1:]:
+        np.testing.assert_allclose(other["distance"], found[0]["distance"], atol=1e-9)
+        np.testing.assert_allclose(other["z"], found[0]["z"], atol=1e-12)
+    assert json.loads((tmp_path / "c/compare.json").read_text())["unit"] == "m"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("furlong", "--units furlong: unknown unit 'furlong'"),
+        ("m,m,m", "expected one unit, or two"),
+        ("m,", "expected one unit, or two"),
+        ("m/", "expected a unit of the heights after the slash"),
+    ],
+)
+def test_mistyped_units_are_refused_by_name(clouds, text, said):
+    with pytest.raises(UsageError, match=said):
+        compare.compare(Request(clouds[0], clouds[1], units=text))
+
+
+def test_three_points_give_a_normal(tmp_path):
+    """As in PDAL and CloudCompare: a plane through three points; two give none."""
+    plane = np.array([[0.0, 0, 0], [1, 0, 0.5], [0, 1, 0], [50, 0, 0], [51, 0, 0], [100, 0, 0]])
+    first = written(tmp_path / "first.xyz", plane)
+    second = written(tmp_path / "second.xyz", plane + np.array([0.0, 0, 0.1]))
+    core = written(tmp_path / "core.xyz", plane[[0, 3, 5]])
+    found = compare.compare(
+        Request(first, second, core=core, normal_diameter=4.0, projection_diameter=4.0, max_depth=2.0)
+    )
+    expected = np.array([-0.5, 0.0, 1.0]) / np.sqrt(1.25)
+    np.testing.assert_allclose(found.normals[0], expected, atol=1e-12)
+    assert np.isnan(found.normals[1:]).all()
+    assert found.distances.distance[0] == pytest.approx(0.1 * expected[2])

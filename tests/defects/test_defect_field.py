@@ -1,0 +1,208 @@
+"""Which cells of a design are examined, and how errors of unnamed views are estimated."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from processor.adjustment import scanner_class
+from processor.defects import alignment, deviation_field, regions, scan_statistic, surface_charts
+from processor.defects.observations import Pairs, Stations
+
+EDGE, SIGMA, POINTS = 8.0, 0.5, 12
+SCANNER = np.array([[1000.0, -9000.0, 4000.0]])
+UNNAMED, NAMED = Stations(("merged",), np.full((1, 3), np.nan)), Stations(("S1",), SCANNER)
+
+
+def surface_of(boxes, cell):
+    bodies = [trimesh.creation.box(bounds=np.array(bounds, float)) for bounds in boxes]
+    mesh = trimesh.util.concatenate(bodies)
+    return surface_charts.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64), cell)
+
+
+def pairs_of(surface, seed, mean=None):
+    """Pairs of one station on every cell, and on some cells another ``mean``."""
+    rng, cells = np.random.default_rng(seed), np.flatnonzero(surface.share > 0.5)
+    value = rng.normal(0.0, SIGMA / np.sqrt(POINTS), len(surface.share)) if mean is None else mean
+    n, count = len(cells), np.full(len(cells), POINTS)
+    none = np.zeros(n, np.int64)
+    return Pairs(cells, none, count, none, value[cells], SIGMA**2 * (count - 1.0), none)
+
+
+def field_of(surface, pairs, stations=NAMED):
+    still = alignment.none(surface, 1, 0.0)
+    return deviation_field.of_pairs(pairs, surface, stations, still, deviation_field.inner_cells(surface, EDGE))
+
+
+@pytest.mark.parametrize("cell", [5.0, 20.0, 25.0])
+def test_no_examined_cell_comes_nearer_to_the_border_than_asked(cell):
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], cell)  # each size is a whole number of cells
+    inner = field_of(surface, pairs_of(surface, 1)).inner > 0
+    off = np.minimum(surface.centres, np.array([1000.0, 600.0, 400.0]) - surface.centres)
+    border = np.where(np.abs(surface.outward) > 0.5, np.inf, off).min(axis=1) - 0.5 * cell
+    assert border[inner].min() >= EDGE - 0.5 * cell / surface_charts.PER_SIDE - 1e-6
+    assert inner[border > EDGE + cell].all()
+
+
+def test_the_foot_of_a_rib_is_a_border_of_the_web():
+    surface = surface_of([[[0, 0, 0], [2000, 20, 1000]], [[993, -130, 0], [1007, 0, 1000]]], 25.0)
+    web = (surface.outward[:, 1] < -0.5) & (np.abs(surface.centres[:, 1]) < 1e-6)
+    inner = field_of(surface, pairs_of(surface, 1)).inner > 0
+    from_foot = np.abs(surface.centres[:, 0] - 1000.0) - 7.0 - 12.5  # of the cell's near side
+    assert not (inner & web & (from_foot < EDGE - 3.2)).any()
+    away = web & (from_foot > EDGE + 25.0)
+    inside = (np.abs(surface.centres[:, 0] - 1000.0) < 900.0) & (np.abs(surface.centres[:, 2] - 500.0) < 400.0)
+    assert inner[away & inside].all()
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+def test_area_hidden_by_a_touching_body_is_the_contact_area(turn):
+    R = trimesh.transformations.rotation_matrix(turn, [1, 2, 3])
+    web, rib = ([[0, 0, 0], [2000, 20, 1000]], [[989, -130, 200], [1021, 0, 800]])
+    bodies = [trimesh.creation.box(bounds=np.array(bounds, float)) for bounds in (web, rib)]
+    mesh = trimesh.util.concatenate(bodies).apply_transform(R)
+    surface = surface_charts.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64), 20.0)
+    hidden = surface.hidden & surface.covered
+    up = surface.outward @ R[:3, :3] @ [0.0, -1.0, 0.0] > 0.5
+    foot = surface.outward @ R[:3, :3] @ [0.0, 1.0, 0.0] > 0.5
+    sample_mm2 = (20.0 / surface_charts.PER_SIDE) ** 2
+    for side in (up, foot):  # the web beneath the rib, and the rib's end
+        assert hidden[side].sum() * sample_mm2 == pytest.approx(32.0 * 600.0, rel=0.1)
+    assert not hidden[~(up | foot)].any()
+
+
+def test_points_alone_on_a_face_are_not_examined():
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
+    pairs = pairs_of(surface, 1)
+    up = surface.outward[pairs.cell, 2] > 0.5
+    alone = up & (np.linalg.norm(surface.centres[pairs.cell, :2] - [490.0, 290.0], axis=1) < 11.0)
+    rows = np.flatnonzero(~up | alone)
+    fewer = Pairs(*(column[rows] for column in vars(pairs).values()))
+    seen = field_of(surface, fewer).seen > 0
+    assert 1 <= alone.sum() <= 2
+    assert not seen[surface.outward[:, 2] > 0.5].any()
+    assert seen[surface.outward[:, 2] < -0.5].any()
+
+
+def ribs(seed, between):
+    """The surface of ten plates, and pairs that differ by an error of the view of each side."""
+    surface = surface_of([[[500.0 * k, 0, 0], [500.0 * k + 14.0, 400, 600]] for k in range(10)], 20.0)
+    rng = np.random.default_rng(seed)
+    side = alignment.chart_of_cells(surface)
+    error = between * rng.normal(size=int(side.max()) + 1)
+    noise = rng.normal(0.0, SIGMA / np.sqrt(POINTS), len(side))
+    return surface, pairs_of(surface, seed, error[side] + noise)
+
+
+def test_sd_of_unnamed_views_is_that_between_the_sides_of_plates():
+    found = []
+    for seed in range(20):
+        surface, pairs = ribs(seed, 0.5)
+        found.append(field_of(surface, pairs, UNNAMED).views)
+        assert field_of(surface, pairs, NAMED).views == 0.0
+    # Ten independent sums a seed: the median of their squares is known to half of itself.
+    assert np.median(found) == pytest.approx(0.5, rel=0.25)
+
+
+def test_differences_of_unnamed_views_are_no_defect_but_a_dent_is():
+    for seed in range(3):
+        surface, pairs = ribs(seed, 0.5)
+        named, unnamed = (field_of(surface, pairs, stations) for stations in (NAMED, UNNAMED))
+        # The scatter of windows alone: it is not known that whole faces move alike.
+        levels = scan_statistic.levels_of(unnamed, surface, 1e-8, 0.02)
+        assert not scan_statistic.search(unnamed, surface, levels).sign.any()
+        assert scan_statistic.search(named, surface, levels).sign.any()
+        off = np.linalg.norm(surface.centres[:, 1:] - [200.0, 300.0], axis=1)
+        on = (off < 100.0) & (surface.outward[:, 0] > 0.5) & (surface.centres[:, 0] < 20.0)
+        dented = unnamed.minus(np.where(on, 10.0 * np.cos(0.5 * np.pi * np.minimum(off / 100.0, 1.0)), 0.0))
+        assert scan_statistic.search(dented, surface, levels).sign[on & (off < 60.0)].all()
+
+
+def test_inflation_of_windows_is_smaller_for_unnamed_views():
+    surface, pairs = ribs(1, 0.5)
+    named, unnamed = (field_of(surface, pairs, stations) for stations in (NAMED, UNNAMED))
+    first, second = (scan_statistic.levels_of(field, surface, 1e-8, 0.02) for field in (named, unnamed))
+    assert first.inflation[0] > 2.0
+    assert (second.inflation < first.inflation).all()
+
+
+def test_the_pose_of_unnamed_views_has_the_covariance_of_the_class():
+    surface = surface_of([[[900.0 * k, 0, 0], [900.0 * k + 300.0, 400, 500]] for k in range(4)], 40.0)
+    pairs = pairs_of(surface, 2)
+    stations = Stations(("merged",), np.full((1, 3), np.nan)), Stations(("a", "b"), np.full((2, 3), np.nan))
+    unnamed, named = (alignment.align(pairs, surface, of, 1.0) for of in stations)
+    added = unnamed.covariance - named.covariance
+    # 0.2 mm of a shift and 0.2 mm of ranges along each axis; 0.2 mm at half of the points' diagonal.
+    arm = 0.5 * np.linalg.norm([3000.0, 400.0, 500.0])
+    np.testing.assert_allclose(np.diag(added)[:3], (0.2 / arm) ** 2, rtol=0.06)
+    np.testing.assert_allclose(np.diag(added)[3:], 0.08, rtol=0.06)
+    assert unnamed.pose_covariance()[3, 3] > scanner_class.SHIFT_MM**2
+
+
+def test_a_cell_that_a_far_station_sees_alone_has_its_noise():
+    """A near station sees most of each face with little noise, a far one a few cells of it alone, with much."""
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
+    rng, cells = np.random.default_rng(3), np.flatnonzero(surface.share > 0.5)
+    alone = rng.random(len(cells)) < 0.05
+    sd, count = np.where(alone, 1.2, 0.3), np.where(alone, 5, 20)
+    square = sd**2 * rng.chisquare(count - 1.0)
+    none, station = np.zeros(len(cells), np.int64), alone.astype(np.int64)
+    pairs = Pairs(cells, station, count, none, rng.normal(0.0, sd / np.sqrt(count)), square, none)
+    stations = Stations(("near", "far"), np.vstack([SCANNER, 3.0 * SCANNER]))
+    still, inner = alignment.none(surface, 2, 0.0), deviation_field.inner_cells(surface, EDGE)
+    field = deviation_field.of_pairs(pairs, surface, stations, still, inner)
+    for of_station in (alone, ~alone):
+        z = (field.deviation / np.sqrt(field.variance))[cells[of_station]]
+        assert np.sqrt((z**2).mean()) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * len(z)))
+    assert (field.dof[cells] > 100.0).all()
+
+
+def test_few_degrees_of_freedom_need_larger_deviations():
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
+    known = dataclasses.replace(field_of(surface, pairs_of(surface, 1)), dof=np.empty(0))
+    levels = scan_statistic.levels_of(known, surface, 1e-8, 0.0)
+    up = np.flatnonzero((known.seen > 0) & (surface.outward[:, 2] > 0.5))
+    deviation = known.deviation.copy()
+    deviation[up[len(up) // 2]] = 1.15 * levels.threshold[0] * levels.inflation[0] * np.sqrt(known.variance[up[0]])
+    found = {}
+    for dof in (30.0, 1e6):
+        field = dataclasses.replace(known, deviation=deviation, dof=np.full(len(deviation), dof))
+        field = scan_statistic.widened(field, levels)
+        found[dof] = bool(scan_statistic.search(field, surface, levels).sign.any())
+    assert found == {30.0: False, 1e6: True}
+
+
+def test_single_cell_in_line_with_a_ridge_is_not_part_of_its_region():
+    """A ridge of one cell's width, and a cell in line with it that deviates as one in fifteen does by chance."""
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
+    field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
+    levels = scan_statistic.levels_of(field, surface, 1e-8, 0.0)
+    up = (field.seen > 0) & (surface.outward[:, 2] > 0.5)
+    row = np.flatnonzero(up & (np.abs(surface.centres[:, 1] - surface.centres[up, 1][0] - 300.0) < 1.0))
+    row = row[np.argsort(surface.centres[row, 0])]
+    ridge, beyond = row[10:18], row[23]
+    deviation = np.zeros(len(surface.share))
+    deviation[ridge] = 3.5 * np.sqrt(field.variance[ridge])
+    deviation[beyond] = 1.5 * np.sqrt(field.variance[beyond])
+    found = scan_statistic.search(dataclasses.replace(field, deviation=deviation), surface, levels).sign
+    assert set(np.flatnonzero(found)) == set(ridge)
+
+
+def test_a_region_is_significant_by_its_own_cells():
+    """Nine cells of 1.7 standard deviations are 5.1 together, four are 3.4; what is missing needs no deviation."""
+    surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
+    field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
+    levels = dataclasses.replace(
+        scan_statistic.levels_of(field, surface, 1e-8, 0.0), threshold=np.full(len(scan_statistic.SIDES), 5.0)
+    )
+    cells = np.flatnonzero((field.seen > 0) & (surface.outward[:, 2] > 0.5))[:9]
+    deviating = dataclasses.replace(field, deviation=np.sqrt(field.variance) * 1.7 * levels.inflation.max())
+    chart = int(np.searchsorted(surface.charts.first, cells[0], side="right")) - 1
+    for number, sign, expected in ((9, 1, True), (4, 1, False), (4, 0, True)):
+        region = regions.Region(chart, cells[:number], sign, 9.0, 0.0)
+        assert regions.is_significant(region, deviating, levels) is expected
+    region = regions.Region(chart, cells[:9], 1, 9.0, 0.0)
+    mean_sd = float(np.sqrt(field.variance[cells[:9]].mean() / 9.0)) * levels.inflation.max()
+    differing = dataclasses.replace(deviating, views=mean_sd)  # the deviation is 5.1 / sqrt(2) standard deviations
+    assert not regions.is_significant(region, differing, levels)

@@ -1,0 +1,576 @@
+"""Defects found on clouds made here: plates seen from stations, their damage and their truth in closed form."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from processor.defects import (
+    alignment,
+    baseline,
+    defect_grids,
+    detect,
+    deviation_field,
+    regions,
+    scan_statistic,
+    shape_models,
+    surface_charts,
+)
+from processor.defects import step as defects_step
+from processor.defects.measures import thickness_at
+from processor.geometry import mesh_bodies, mesh_distance, rigid
+from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
+from processor.report.defects import figures, section
+from processor.results.fields_to_json import as_object
+from processor.store.json_values import json_ready
+from tests.support.clouds.plate_rows import BOX_FACES, GAP, SIDE, THICK, box, bump, design_of, flat, scene_of
+from tests.support.scenes.at_design import AT_DESIGN
+
+
+def run(scene, **params):
+    """The defects of a scene that lies at its design, see :mod:`tests.support.scenes.at_design`."""
+    return defects_step.run(scene, defects_step.Params(**params), AT_DESIGN)
+
+
+def found(result):
+    return list(zip(result.defects.defect_class, result.defects.component, strict=True))
+
+
+# --- the whole step ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_an_undamaged_structure_has_no_defect(seed):
+    result = defects_step.run(scene_of(3, flat, seed=seed), defects_step.Params())
+    assert result.status == "ok"
+    assert found(result) == []
+    inner = SIDE - 16.0  # less a border of 8 mm, and what a row of cells may take
+    assert 3 * (inner - 2.0 * result.cell) ** 2 <= result.examined_mm2 <= 3 * inner**2
+    assert result.noise == pytest.approx(0.4, rel=0.05)
+
+
+def test_chance_detections_are_flagged_doubtful():
+    """Asked for 5000 false alarms on 100 m2 there are some on 1 m2, at most as many, and none passes for sure."""
+    result = run(scene_of(3, flat), false_alarms=5000.0)
+    allowed = 5000.0 * result.examined_mm2 / 1e8
+    assert 0 < len(result.defects) < allowed
+    assert result.defects.doubtful.all()
+    assert (result.defects.chance <= 5000.0 * (1.0 + 1e-9)).all()
+    fewer = (result.defects.chance < 500.0).sum()
+    assert fewer < 0.1 * allowed + 3.0 * np.sqrt(0.1 * allowed)  # a tenth as often ten times as strong
+    assert "no defects found and" in str(section.REPORT.summary(result)[0])
+
+
+def from_behind(scene, inward, count, seed):
+    """The scene with a scan of the plates' backs, which ``inward`` (x, z) moves as it does the fronts."""
+    rng, station = np.random.default_rng(seed), np.array([0.5 * count * (SIDE + GAP), 4000.0, 600.0])
+    n = int((SIDE / 5.5) ** 2)
+    parts = []
+    for i in range(count):
+        x, z = i * (SIDE + GAP) + rng.uniform(0.0, SIDE, n), rng.uniform(0.0, SIDE, n)
+        parts.append(np.stack([x, THICK + inward(x, z), z], axis=1))
+    ray = np.vstack(parts) - station
+    away = np.linalg.norm(ray, axis=1)[:, None]
+    points = station + ray * (1.0 + rng.normal(0.0, 0.4, away.shape) / away)
+    scan = Scan("S3", points, position=station, T_project_scan=np.eye(4))
+    return dataclasses.replace(scene, scans=(*scene.scans, scan))
+
+
+@pytest.mark.parametrize("depth", [4.0, -4.0])
+def test_a_plate_dented_through_is_one_defect_though_both_sides_show_it(depth):
+    pushed, pit = bump(depth, 90.0, (250.0, 300.0)), bump(3.0, 40.0, (1250.0, 350.0))
+    scene = scene_of(3, lambda x, z: pushed(x, z) + pit(x, z))
+    result = run(from_behind(scene, pushed, 3, 9))
+    assert sorted(name for _, name in found(result)) == ["component-1", "component-2"]
+    kind, _ = next(row for row in found(result) if row[1] == "component-1")
+    assert kind in ("dent", "bulge")
+    assert abs(result.defects.depth_max[result.defects.component.index("component-1")]) == pytest.approx(4.0, rel=0.1)
+
+
+def test_a_dent_a_bulge_and_a_pit_are_measured():
+    dent, bulge, pit = (
+        bump(3.0, 90.0, (250.0, 300.0)),
+        bump(-2.0, 80.0, (1250.0, 350.0)),
+        bump(4.0, 16.0, (2100.0, 200.0)),
+    )
+    scene = scene_of(3, lambda x, z: dent(x, z) + bulge(x, z) + pit(x, z), spacing=3.0)
+    result = run(scene)
+    assert sorted(found(result)) == [("bulge", "component-2"), ("dent", "component-1"), ("pit", "component-3")]
+    assert not result.defects.doubtful.any()
+    for kind, depth, radius, at in (("dent", 3.0, 90.0, (250.0, 300.0)), ("bulge", -2.0, 80.0, (1250.0, 350.0)),
+                                    ("pit", 4.0, 16.0, (2100.0, 200.0))):  # fmt: skip
+        k = result.defects.defect_class.index(kind)
+        assert abs(result.defects.depth_max[k] - depth) < max(0.1 * abs(depth), 2.0 * result.defects.lod95[k])
+        assert abs(result.defects.depth_max[k] - depth) < 2.5 * result.defects.depth_ci95[k]
+        np.testing.assert_allclose(result.defects.centre[k], [at[0], 0.0, at[1]], atol=0.1 * radius + 1.0)
+        assert result.defects.confidence[k] > 0.9
+        deep = np.linalg.norm(result.surface.points - [at[0], 0.0, at[1]], axis=1) < 0.1 * radius + result.cell
+        assert set(result.surface.defect[deep].tolist()) in ({k}, {-1, k})
+        if kind != "pit":  # outward positive, and nearly as deep as its middle
+            assert np.median(result.surface.deviation[deep]) == pytest.approx(-depth, rel=0.15)
+        # A third of the cylinder about a bump (1 - r^2 / R^2)^2.
+        if kind != "pit":
+            assert result.defects.volume_mm3[k] == pytest.approx(np.pi * radius**2 * depth / 3.0, rel=0.05)
+            curvature = 4.0 * abs(depth) / radius**2 * 1000.0
+            assert result.defects.curvature_per_m[k] == pytest.approx(curvature, rel=0.35)
+
+
+def test_missing_corners_edges_and_holes_are_named():
+    def missing(x, z):
+        corner = (x > SIDE - 90.0) & (x <= SIDE) & (z > SIDE - 90.0)
+        edge = (np.abs(x - 1150.0) < 40.0) & (z > SIDE - 50.0)
+        hole = np.hypot(x - 2100.0, z - 300.0) < 50.0
+        return corner | edge | hole
+
+    result = run(scene_of(3, flat, missing, spacing=4.0))
+    assert sorted(found(result)) == [
+        ("edge-loss", "component-2"), ("missing-part", "component-1"), ("missing-part", "component-3"),
+    ]  # fmt: skip
+    np.testing.assert_allclose(result.defects.depth_max, THICK)
+    area = dict(zip(result.defects.component, result.defects.area_mm2, strict=True))
+    assert area["component-1"] == pytest.approx(90.0**2, rel=0.15)
+    assert area["component-2"] == pytest.approx(80.0 * 50.0, rel=0.2)
+    assert area["component-3"] == pytest.approx(np.pi * 50.0**2, rel=0.15)
+
+
+def test_hole_seen_from_both_sides_is_one_missing_part_without_a_face():
+    """Its cells face both ways, so that no face is the one to draw."""
+
+    def missing(x, z):
+        return np.hypot(x - 300.0, z - 300.0) < 60.0
+
+    scene = scene_of(3, flat, missing)
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    half_turn[:3, 3] = [3 * (SIDE + GAP) - GAP, THICK, 0.0]
+    behind = scene_of(3, flat, lambda x, z: missing(3 * (SIDE + GAP) - GAP - x, z), seed=2)
+    backs = (dataclasses.replace(s, name=f"{s.name} behind", T_project_scan=half_turn) for s in behind.scans)
+    result = run(dataclasses.replace(scene, scans=(*scene.scans, *backs)))
+    assert found(result) == [("missing-part", "component-1")]
+    assert result.pictures[0].deviation.size == 0
+    drawn = figures.draw(result)
+    assert set(drawn) == {"defects-maps.png"}
+    assert figures.files(result)["defects.pdf"].startswith(b"%PDF")
+
+
+def test_surface_in_the_shadow_of_clutter_is_not_missing():
+    """A ball in the way of both stations: no point of the surface in its shadow."""
+    clutter = (1200.0, -250.0, 300.0, 90.0)
+    scene = scene_of(3, flat, clutter=clutter)
+    result = run(scene)
+    assert found(result) == []
+    assert result.expected_mm2 < 3 * SIDE**2 - 8_000.0
+    # The same points gone without anything in the way are.
+    kept = [dataclasses.replace(s, points=s.points[s.points[:, 1] > -100.0]) for s in scene.scans]
+    gone = run(dataclasses.replace(scene, scans=tuple(kept)))
+    assert set(found(gone)) == {("missing-part", "component-2")}
+
+
+@pytest.mark.parametrize(
+    ("kind", "inward", "depth"),
+    [
+        ("bend", lambda x, z: 3.0 * np.cos(np.pi * (x - 1200.0) / SIDE), 3.0),
+        ("twist", lambda x, z: 0.006 * (x - 1200.0) / SIDE * (z - 300.0) * 2.0, 1.8),
+        ("waviness", lambda x, z: 1.0 * np.sin(2.0 * np.pi * (x - 1200.0) / 150.0), 1.0),
+        ("step", lambda x, z: np.where(x > 1300.0, 1.5, 0.0), 1.5),
+        ("misalignment", lambda x, z: 2.0 + 0.003 * (z - 300.0), 2.9),
+    ],
+)
+def test_shapes_of_whole_components(kind, inward, depth):
+    """On the second of four plates; the others determine the pose of the whole."""
+    result = run(scene_of(4, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)))
+    assert found(result) == [(kind, "component-2")]
+    assert abs(result.defects.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
+    curve = result.defects.deflection[0]
+    assert len(curve.displacement) == (40 if kind == "bend" else 0)
+    if kind == "bend":
+        at = curve.along
+        np.testing.assert_allclose(curve.displacement, -3.0 * np.cos(np.pi * at / SIDE), atol=0.06)
+
+
+def test_stations_that_are_off_are_no_defect():
+    """Each station has its range zero wrong by half a millimetre, the other way each."""
+    scene = scene_of(3, flat)
+    scans = []
+    for scan, off in zip(scene.scans, (0.5, -0.5), strict=True):
+        ray = scan.points - scan.position
+        scans.append(dataclasses.replace(scan, points=scan.points + off * ray / np.linalg.norm(ray, axis=1)[:, None]))
+    result = run(dataclasses.replace(scene, scans=tuple(scans)))
+    assert found(result) == []
+
+
+def test_unsettled_alignment_gives_the_same_pose_as_a_settled_one(monkeypatch):
+    """The whole is 1.5 mm off; an alignment that never settles gives the same pose as one that does."""
+    scene = scene_of(4, lambda x, z: np.full(len(x), 1.5))
+    settled = run(scene)
+    monkeypatch.setattr(detect, "AGAIN_MM", 0.0)
+    again = run(scene)
+    assert settled.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
+    np.testing.assert_allclose(again.T_design_project[1], settled.T_design_project[1], atol=0.01)  # plates fix y
+    assert again.covariance.shape == (6, 6)
+    assert 0.0 < np.sqrt(again.covariance[4, 4]) < 1.0
+
+
+def test_no_defect_is_sure_where_another_attitude_fits_as_well():
+    """A dent in a box that looks the same from four sides, scanned in a frame of its own."""
+    vertices, faces = box((0.0, 0.0, 0.0), (2000.0, 600.0, 400.0))
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    points, facet = trimesh.sample.sample_surface(solid, 60_000, seed=1)
+    depth = bump(9.0, 150.0, (700.0, 300.0))(points[:, 0], points[:, 1]) * (solid.face_normals[facet][:, 2] > 0.5)
+    points = points - [0.0, 0.0, 1.0] * depth[:, None] + np.random.default_rng(1).normal(0.0, 0.3, points.shape)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 2.0])), np.array([5e4, -3e4, 2e3]))
+    scans = (Scan("S1", rigid.apply(T, points), T_project_scan=np.eye(4)),)
+    scene = Scene("box", "structure", scans, structure=StructureDesign("box", vertices, faces))
+    result = defects_step.run(scene, defects_step.Params())
+    assert result.status == "ambiguous"
+    assert len(result.defects) > 0
+    assert result.defects.doubtful.all()
+    assert (result.defects.confidence <= 0.5).all()
+    assert all(row[-1].code == "defects.pose-ambiguous" for row in result.defects.reasons)
+    assert "no defects found and" in str(section.REPORT.summary(result)[0])
+
+
+@pytest.fixture(scope="module")
+def dented():
+    scene = scene_of(2, bump(3.0, 90.0, (250.0, 300.0)))
+    return scene, run(scene)
+
+
+def test_the_order_of_points_and_the_place_in_the_world_do_not_matter(dented):
+    scene, first = dented
+    mixed = [dataclasses.replace(s, points=np.random.default_rng(5).permutation(s.points)) for s in scene.scans]
+    again = run(dataclasses.replace(scene, scans=tuple(mixed)))
+    assert found(again) == found(first)
+    np.testing.assert_allclose(again.defects.depth_max, first.defects.depth_max, atol=1e-6)
+    np.testing.assert_allclose(again.defects.centre, first.defects.centre, atol=1e-6)
+    far = np.array([4.5e8, 3.2e9, 1e5])
+    T = np.eye(4)
+    T[:3, 3] = far
+    moved = Scene(
+        "far", "structure", tuple(dataclasses.replace(s, T_project_scan=T) for s in scene.scans),
+        structure=StructureDesign("far", scene.structure.vertices + far, scene.structure.faces),
+    )  # fmt: skip
+    there = defects_step.run(moved, defects_step.Params())
+    assert found(there) == found(first)
+    np.testing.assert_allclose(there.defects.depth_max, first.defects.depth_max, atol=1e-3)
+    np.testing.assert_allclose(there.defects.centre - far, first.defects.centre, atol=1e-2)
+
+
+def test_the_papers_chain_finds_a_dent_and_is_seeded():
+    scene = scene_of(2, bump(5.0, 120.0, (250.0, 300.0)), spacing=8.0)
+    params = defects_step.Params(method="paper", paper=baseline.Paper(trials=60, feature_points=80))
+    result = defects_step.run(scene, params)
+    assert set(result.defects.defect_class) == {"unknown"}
+    np.testing.assert_allclose(result.defects.centre[0], [250.0, 2.0, 300.0], atol=12.0)
+    assert result.defects.depth_max[0] == pytest.approx(5.0, abs=1.2)
+    assert len(result.defects.deflection[0].along) > 5
+    again = defects_step.run(scene, params)
+    np.testing.assert_array_equal(again.defects.depth_max, result.defects.depth_max)
+
+
+def test_defects_in_results_json_have_the_documented_keys(dented):
+    written = json_ready(as_object(dented[1]))
+    (one,) = written["defects"]
+    keys = {"id", "class", "confidence", "component", "centre", "area_mm2", "depth_max", "depth_ci95", "volume_mm3"}
+    assert keys <= set(one)
+    assert one["class"] == "dent"
+
+
+def test_scene_without_design_or_points_and_bad_parameters_are_refused():
+    scene = scene_of(2, flat, spacing=20.0)
+    with pytest.raises(InputError, match="design"):
+        defects_step.run(dataclasses.replace(scene, structure=None), defects_step.Params())
+    with pytest.raises(InputError, match="points"):
+        defects_step.run(dataclasses.replace(scene, scans=()), defects_step.Params())
+    with pytest.raises(UsageError, match="reach_mm"):
+        defects_step.run(scene, defects_step.Params(reach_mm=0.0))
+    with pytest.raises(UsageError, match="method"):
+        defects_step.run(scene, defects_step.Params(method="magic"))
+
+
+# --- parts of it ---------------------------------------------------------------------------------------------------
+
+
+def test_false_alarms_are_no_more_than_asked_for():
+    """A hundred square metres of independent noise, over and over: one alarm each is allowed, and chance on top."""
+    plate = surface_charts.of_mesh(*box((0.0, 0.0, 0.0), (10_000.0, 12.0, 10_000.0)), 50.0)
+    chart = int(np.argmin(plate.charts.axes[:, 2, 1]))
+    rows = plate.charts.cells(chart)
+    seen = np.zeros(len(plate.share))
+    seen[rows] = 1.0
+    alarms = 0
+    for seed in range(10):
+        noise = np.random.default_rng(seed).normal(0.0, 0.1, len(seen))
+        ones = np.ones(len(seen), np.int64)
+        field = deviation_field.Field(
+            noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen, 0 * ones, 0 * ones
+        )
+        levels = scan_statistic.levels_of(field, plate, 1e-8, 0.0)
+        sign = scan_statistic.search(field, plate, levels).sign
+        alarms += int((np.abs(plate.charts.image(sign.astype(float), chart)) > 0).any())
+    assert alarms <= 10  # of 10 runs, in each of which 1 is allowed: at 0.63 a run, ten of ten is one in a hundred
+    assert np.all(levels.inflation < 1.1)
+
+
+# --- alignment of stations -----------------------------------------------------------------------------------------
+
+
+def two_sides(seed, off_mm):
+    """Blocks of two pairs of stations, each pair on its side: of the other's they see what hardly shows shifts in x."""
+    rng = np.random.default_rng(seed)
+    moved = off_mm * rng.normal(size=(4, 7)) * [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
+    rows = [(0, 1), (2, 3)] * 600 + [(0, 1, 2, 3)] * 400
+    block = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+    station = np.concatenate(rows)
+    normal = rng.normal(size=(len(rows), 3))
+    normal[1200:, 0] = 0.02
+    normal = (normal / np.linalg.norm(normal, axis=1)[:, None])[block]
+    arm = (rng.uniform(-1.0, 1.0, (len(rows), 3)) * [5000.0, 800.0, 800.0])[block]
+    J = np.hstack([np.cross(arm, normal), normal, np.zeros((len(block), 1))])
+    free = 5.0 * rng.normal(size=len(rows))[block]
+    mean = free + np.einsum("nk,nk->n", J, moved[station]) + 0.2 * rng.normal(size=len(block))
+    blocks = alignment.StationBlocks(block, station, mean, np.full(len(block), 0.04), np.zeros(len(block), np.int64))
+    return blocks, J, moved
+
+
+def test_shifts_of_agreeing_stations_stay_near_zero_where_undetermined():
+    shifts = []
+    for seed in range(3):
+        blocks, J, _ = two_sides(seed, 0.0)
+        x, covariance = alignment.station_movements(blocks, J, 4)
+        shifts.append(np.abs(x[:, 3:6]).max())
+        # Less than the class of scanners has, as four stations agree; shifts along the plates hardly show.
+        assert np.sqrt(np.diag(covariance).reshape(4, 7)[:, 3:6].max()) < alignment.CLASS[3]
+    assert max(shifts) < 0.1  # with a prior of 3 mm for every station, up to 0.7 mm
+
+
+def test_covariance_of_station_shifts_includes_undetermined_directions():
+    z = []
+    for seed in range(20):
+        blocks, J, moved = two_sides(seed, 0.5)
+        x, covariance = alignment.station_movements(blocks, J, 4)
+        between = np.zeros((4, 7))
+        between[:, 3] = [0.5, 0.5, -0.5, -0.5]  # of the sides, along x
+        error = float(((x - moved) * between).sum())
+        z.append(error / np.sqrt(between.ravel() @ covariance @ between.ravel()))
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
+
+
+def test_facets_are_the_nearest_that_a_scanner_can_see():
+    vertices, faces = box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0))
+    normals = np.array(trimesh.Trimesh(vertices, faces, process=False).face_normals)  # writeable, as the step has them
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-30.0, -30.0, -30.0], [330.0, 42.0, 230.0], (2000, 3))
+    grid = mesh_distance.facet_grid(vertices, faces, normals, 60.0)
+    facet, distance = mesh_distance.nearest_visible(grid, points, np.zeros((1, 3)), np.full(2000, -1))
+    _, true, _ = trimesh.proximity.closest_point_naive(trimesh.Trimesh(vertices, faces, process=False), points)
+    corner = vertices[faces[facet, 0]]
+    np.testing.assert_allclose(distance, np.einsum("ni,ni->n", points - corner, normals[facet]), atol=1e-9)
+    nearest = np.array([trimesh.triangles.closest_point(vertices[faces[f]][None], p[None])[0]
+                        for f, p in zip(facet, points, strict=True)])  # fmt: skip
+    np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), true, atol=1e-9)
+    # Deep in the plate, nearer to its back, but seen from the front.
+    deep = np.array([[150.0, 9.0, 100.0]])
+    facet, distance = mesh_distance.nearest_visible(
+        grid, deep, np.array([[150.0, -4000.0, 100.0]]), np.zeros(1, np.int64)
+    )
+    assert distance[0] == pytest.approx(-9.0)
+    np.testing.assert_allclose(normals[facet[0]], [0.0, -1.0, 0.0])
+
+
+def test_cells_cover_the_area_of_a_design():
+    plate = surface_charts.of_mesh(*box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0)), 5.0)
+    area = 2.0 * (300.0 * 200.0 + 300.0 * 12.0 + 200.0 * 12.0)
+    assert plate.area_mm2 == pytest.approx(area, rel=0.02)
+    assert len(plate.names) == 1
+    assert thickness_at(plate, np.array([100.0, 0.0, 90.0]), np.array([0.0, -1.0, 0.0]), 0) == pytest.approx(12.0)
+    tube = trimesh.creation.cylinder(100.0, 1000.0, sections=96)
+    round_ = surface_charts.of_mesh(np.asarray(tube.vertices), np.asarray(tube.faces, np.int64), 10.0)
+    cylinder = np.flatnonzero(round_.charts.kind == surface_charts.CYLINDER)
+    assert len(cylinder) == 1
+    mantle = round_.share[round_.charts.cells(int(cylinder[0]))].sum() * 100.0
+    assert mantle == pytest.approx(2.0 * np.pi * 100.0 * 1000.0, rel=0.02)
+    np.testing.assert_allclose(
+        np.linalg.norm(round_.centres[round_.charts.cells(int(cylinder[0]))][:, :2], axis=1), 100.0, rtol=0.01
+    )
+
+
+def test_vertices_at_one_place_are_one_wherever_the_place_is():
+    """Two triangles of a plate with corners that differ by rounding, on either side of half a hundredth millimetre."""
+    step = mesh_bodies.WELD_MM
+    at = np.array([0.5 * step - 1e-9, 300.5 * step - 1e-9, 0.0])
+    square = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [100.0, 50.0, 0.0], [0.0, 50.0, 0.0]]) + at
+    vertices = np.vstack([square[[0, 1, 2]], square[[0, 2, 3]] + 2e-9])
+    plate = surface_charts.of_mesh(vertices, np.array([[0, 1, 2], [3, 4, 5]]), 10.0)
+    assert len(plate.vertices) == 4
+
+
+def test_bodies_that_touch_are_one_component():
+    web, flange = box((0.0, 0.0, 0.0), (500.0, 10.0, 300.0)), box((0.0, -60.0, 300.0), (500.0, 70.0, 316.0))
+    alone = box((900.0, 0.0, 0.0), (1100.0, 10.0, 300.0))
+    vertices = np.vstack([web[0], flange[0], alone[0]])
+    faces = np.vstack([BOX_FACES, BOX_FACES + 8, BOX_FACES + 16])
+    whole = surface_charts.of_mesh(vertices, faces, 20.0)
+    assert len(whole.names) == 2
+    assert len(set(whole.component_of[:24].tolist())) == 1
+
+
+def test_density_clusters_are_those_of_the_definition():
+    rng = np.random.default_rng(4)
+    points = np.vstack([rng.normal(0, 3, (60, 3)), rng.normal(40, 3, (50, 3)), rng.uniform(-80, 120, (40, 3))])
+    label = baseline.density_clusters(points, 4.0, 4)
+    near = np.linalg.norm(points[:, None] - points[None], axis=2) <= 4.0
+    core = near.sum(axis=1) >= 4
+    reach = np.where(core[:, None] & core[None], near, False)
+    for _ in range(8):  # who is reached by way of others
+        reach = (reach.astype(int) @ reach.astype(int)) > 0
+    same = label[:, None] == label[None]
+    np.testing.assert_array_equal(same[np.ix_(core, core)], reach[np.ix_(core, core)])
+    np.testing.assert_array_equal(label < 0, ~core & ~(near & core[None]).any(axis=1))
+
+
+def test_numbers_by_hand():
+    # Huber, limit 2: 1 -> 0.5; 3 -> 0.5 * 2 * (6 - 2) = 4.
+    assert baseline.huber(np.array([1.0, 3.0]), 2.0) == pytest.approx(4.5)
+    # A parabola of 1 mm at 100 mm: slopes of its chords add up to what it is at the end.
+    x = np.linspace(0.0, 100.0, 2001)
+    curve = defect_grids.by_slopes(x, (x / 100.0) ** 2, 10)
+    np.testing.assert_allclose(curve.displacement, (curve.along / 100.0) ** 2, atol=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "height"),
+    [
+        ("bend", lambda p: -2.0 * np.cos(np.pi * p[:, 0] / 1000.0)),
+        ("twist", lambda p: 3e-6 * p[:, 0] * p[:, 1]),
+        ("waviness", lambda p: 0.8 * np.sin(2.0 * np.pi * p[:, 0] / 230.0)),
+        ("step", lambda p: np.where(p[:, 0] > 130.0, 0.6, 0.0)),
+        ("misalignment", lambda p: 0.5 + 1e-3 * p[:, 1]),
+        ("", lambda p: bump(3.0, 150.0, (100.0, -50.0))(p[:, 0], p[:, 1])),
+        ("", lambda p: np.zeros(len(p))),
+    ],
+)
+def test_shape_of_a_deformed_plate_is_identified_and_a_flat_plate_has_none(kind, height):
+    a, b = (x.ravel() for x in np.meshgrid(np.linspace(-485.0, 485.0, 34), np.linspace(-285.0, 285.0, 20)))
+    points = np.stack([a, b, np.zeros(len(a))], axis=1)
+    frame = shape_models.Frame(np.zeros(3), np.eye(3), np.array([500.0, 300.0, 6.0]), 300.0)
+    mean = height(points) + np.random.default_rng(2).normal(0.0, 0.03, len(a))
+    outward = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    fitted = shape_models.fit(shape_models.Blocks(points, outward, mean, np.full(len(a), 0.03**-2), 30.0), frame)
+    assert [one.kind for one in fitted.shapes] == ([kind] if kind else [])
+    if kind:
+        value = fitted.shapes[0].values(frame, points, outward)
+        np.testing.assert_allclose(value, height(points), atol=0.06 if kind != "step" else 0.7)
+
+
+def test_pieces_in_line_with_a_crack_are_joined_and_others_are_not():
+    """Cells by their places on the front of a plate: a slim piece, others in its line, one that lies 4 cells off."""
+    design = design_of(1)
+    whole = surface_charts.gridded(surface_charts.of_mesh(design.vertices, design.faces, 60.0), 10.0)
+    (chart,) = {
+        int(k) for k in range(len(whole.charts.kind)) if whole.outward[whole.charts.first[k]] @ [0.0, -1.0, 0.0] > 0.9
+    }
+    rows = np.arange(*whole.charts.cells(chart).indices(len(whole.centres))[:2])
+
+    def piece(low, high, x=305.0, sign=-1):
+        at = whole.centres[rows]
+        own = rows[(np.abs(at[:, 0] - x) < 5.0) & (at[:, 2] > low) & (at[:, 2] < high)]
+        return regions.Region(chart, own, sign, 9.0, 1e-12)
+
+    slim, inside, beyond, far = piece(300, 380), piece(410, 425), piece(100, 200), piece(520, 590)
+    beside, raised = piece(410, 425, x=345.0), piece(440, 470, sign=1)
+    first, *others = regions.united([raised, far, beside, beyond, inside, slim], whole, 25.0)
+    # The slim one reaches 80 mm to either side: the piece below is farther, but not than all that lies above it.
+    assert [one.sign for one in first] == [-1]
+    joined = np.concatenate([piece.cells for piece in (slim, inside, beyond, far)])
+    np.testing.assert_array_equal(first[0].cells, np.unique(joined))
+    assert sorted(len(group) for group in others) == [1, 1]
+    assert {id(group[0]) for group in others} == {id(beside), id(raised)}
+
+
+# --- what should have been seen ------------------------------------------------------------------------------------
+
+
+def plates_on_a_wall(gone, gap=0.0):
+    """Expected and missing places of a wall with two plates on it, the points from one station in front of it."""
+    wall = box((0.0, 0.0, 0.0), (2000.0, 20.0, 1000.0))
+    plates = [box((x, -10.0 - gap, 300.0), (x + 400.0, -gap, 700.0)) for x in (300.0, 1300.0)]
+    solids = [wall, *plates]
+    vertices = np.vstack([corners for corners, _ in solids])
+    faces = np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)])
+    built = solids[:-1] if gone else solids
+    rng = np.random.default_rng(1)
+    station = np.array([1000.0, -4000.0, 500.0])
+    x, z = rng.uniform(0.0, 2000.0, 80_000), rng.uniform(0.0, 1000.0, 80_000)
+    y = np.zeros(len(x))
+    for corners, _ in built[1:]:
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        y = np.where((x > low[0]) & (x < high[0]) & (z > low[2]) & (z < high[2]), low[1], y)
+    points = np.stack([x, y + rng.normal(0.0, 0.3, len(x)), z], axis=1)
+    scene = Scene(
+        "wall", "structure", (Scan("S1", points, position=station, T_project_scan=np.eye(4)),),
+        structure=StructureDesign("wall", vertices, faces),
+    )  # fmt: skip
+    return run(scene, align=False, registration_error_mm=0.01)
+
+
+@pytest.mark.parametrize("gap", [-0.1, 0.0, 0.1])
+def test_faces_that_touch_another_body_are_not_missing(gap):
+    assert found(plates_on_a_wall(gone=False, gap=gap)) == []
+
+
+def test_lines_of_sight_end_at_facets():
+    """Lines from a wide plate to a far place cross a narrow plate 600 mm before it, or pass beside it."""
+    near, far = box((0.0, 0.0, 0.0), (1000.0, 10.0, 1000.0)), box((-500.0, 600.0, -500.0), (1500.0, 610.0, 1500.0))
+    vertices, faces = np.vstack([near[0], far[0]]), np.vstack([near[1], far[1] + 8])
+    surface = surface_charts.of_mesh(vertices, faces, 100.0)
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 30.0)
+    rng = np.random.default_rng(3)
+    starts = np.stack([rng.uniform(-450, 1450, 400), np.full(400, 599.0), rng.uniform(-450, 1450, 400)], axis=1)
+    ends = np.repeat([[500.0, -6000.0, 450.0]], 400, axis=0)
+    shares = {y: (599.0 - y) / 6599.0 for y in (10.0, 0.0)}
+    at = [starts + share * (ends - starts) for share in shares.values()]
+    crossed = np.array([((p[:, [0, 2]] > 0.0) & (p[:, [0, 2]] < 1000.0)).all(axis=1) for p in at])
+    row, _, share = mesh_distance.crossings(grid, starts, ends, False)
+    across = np.array([np.isclose(share, expected) for expected in shares.values()])
+    for k in range(2):
+        assert 0 < crossed[k].sum() < 400
+        np.testing.assert_array_equal(np.sort(row[across[k]]), np.flatnonzero(crossed[k]))
+    sides = crossed.any(axis=0)
+    assert set(mesh_distance.crossings(grid, starts, ends, True)[0]) >= set(np.flatnonzero(sides).tolist())
+
+
+def girder_with_brackets(gone):
+    """A web with brackets standing off it, seen from two stations above and below; the last bracket may be gone."""
+    solids = [box((0.0, 0.0, 0.0), (3000.0, 14.0, 1400.0))]
+    solids += [box((x, -140.0, 700.0), (x + 400.0, 0.0, 714.0)) for x in (300.0, 1300.0, 2300.0)]
+    vertices = np.vstack([corners for corners, _ in solids])
+    faces = np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)])
+    built = trimesh.util.concatenate(
+        [trimesh.Trimesh(corners, own, process=False) for corners, own in (solids[:-1] if gone else solids)]
+    )
+    scans = []
+    for seed, station in enumerate(([1500.0, -3500.0, 2500.0], [1500.0, -3500.0, -1200.0])):
+        position = np.array(station)
+        points, facet = trimesh.sample.sample_surface(built, 80_000, seed=seed)
+        points, normal = np.asarray(points), np.asarray(built.face_normals)[facet]
+        front = np.einsum("ni,ni->n", position - points, normal) > 0.0
+        points, normal = points[front], normal[front]
+        surface = surface_charts.of_mesh(np.asarray(built.vertices), np.asarray(built.faces).astype(np.int64), 100.0)
+        grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 50.0)
+        hidden = mesh_distance.crossings(grid, points + normal, np.repeat(position[None], len(points), axis=0), True)[0]
+        points = np.delete(points, hidden, axis=0)
+        ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
+        points = points + np.random.default_rng(seed).normal(0.0, 0.3, len(points))[:, None] * ray
+        scans.append(Scan(f"S{seed}", points, position=position, T_project_scan=np.eye(4)))
+    design = StructureDesign("girder", vertices, faces)
+    return Scene("girder", "structure", tuple(scans), structure=design)
+
+
+def test_a_part_that_is_gone_is_missing_where_scanners_see_through_it():
+    params = defects_step.Params(align=False, registration_error_mm=0.01)
+    whole = defects_step.run(girder_with_brackets(gone=False), params, AT_DESIGN)
+    assert found(whole) == []
+    result = defects_step.run(girder_with_brackets(gone=True), params)
+    assert result.defects.defect_class == ("missing-part",)
+    np.testing.assert_allclose(result.defects.centre[0], [2500.0, -70.0, 707.0], atol=60.0)

@@ -1,0 +1,526 @@
+"""Folders of scenes: the same bytes whoever makes them, taken up after a kill, failures recorded, usage refused."""
+
+import contextlib
+import csv
+import fcntl
+import functools
+import hashlib
+import io
+import json
+import os
+import pty
+import random
+import re
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import h5py
+import numpy as np
+import pytest
+
+from designgen import __main__, batch, recipe_files
+from processor.jobs import process as processes
+from processor.jobs import runner
+from processor.jobs.child import Loss, Lost
+from processor.model import UsageError
+from processor.store import store
+from tests.support.processes import dask_cluster, dying_job
+
+COMMAND = (sys.executable, "-m", "designgen", "make", "frame-small")
+SMALL = ("scan.spacing_mm=60", "frame.nodes_x=2", "frame.nodes_y=2")
+MAKE = (*COMMAND, *(part for setting in SMALL for part in ("--set", setting)))
+LONG = (*COMMAND, "--set", "scan.spacing_mm=25")  # there is time to kill the run
+COUNTS = ["points", "scans", "points_surface", "points_mixed", "points_outlier", "defects"]
+COLUMNS = ["file", "recipe", "seed", "split", *COUNTS, "scene_hash", "sha256", "status", "reason"]
+OF_SET = ["card.json", "card.md"]
+SCENES_OF_KILLED_RUNS = 10
+MARK = "STARTED_FOR"
+
+
+def run(*arguments, code=0, command=MAKE, stderr=None):
+    """Run the command line in this process, whatever processes it starts itself."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["designgen", *command[3:], *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(stderr or err),
+        pytest.raises(SystemExit) as end,
+    ):
+        __main__.main()
+    assert (end.value.code or 0) == code, err.getvalue()
+    assert "Traceback" not in err.getvalue()
+    return SimpleNamespace(stdout=out.getvalue(), stderr=err.getvalue())
+
+
+def run_by_itself(*arguments, code=0, command=MAKE):
+    """Run the command line in a process of its own."""
+    done = subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, timeout=300)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@pytest.fixture(scope="module", autouse=True)
+def processes_stay():
+    """Processes that make scenes stay for the runs of other tests: each takes a second to load what it needs."""
+    close = processes.POOL.close
+    with mock.patch.object(processes.POOL, "close"):
+        yield
+    close()
+
+
+def digests(folder):
+    """SHA-256 of every file in a folder, hidden ones too, by name."""
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.iterdir()}
+
+
+def rows(folder):
+    with (folder / "index.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def scenes(folder):
+    return sorted(p.name for p in folder.iterdir() if p.suffix == ".h5")
+
+
+def times(folder):
+    return {p.name: p.stat().st_mtime_ns for p in folder.iterdir() if p.suffix == ".h5"}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Three seeds made by one process; not to be changed."""
+    folder = tmp_path_factory.mktemp("batch") / "set"
+    run_by_itself("-o", folder, "--count", 3, "--seed", 7)
+    return folder
+
+
+def copied(folder, to):
+    to.mkdir()
+    for path in folder.iterdir():
+        (to / path.name).write_bytes(path.read_bytes())
+    return to
+
+
+# --- what is made -----------------------------------------------------------------------------------------------------
+
+
+def test_index_states_the_hashes_and_counts_of_the_files(made):
+    assert scenes(made) == [f"frame-small-0000{i}-seed{6 + i}.h5" for i in (1, 2, 3)]
+    assert sorted(os.listdir(made)) == [*OF_SET, *scenes(made), "index.csv"]
+    found = rows(made)
+    assert list(found[0]) == COLUMNS
+    for row, name, seed in zip(found, scenes(made), ("7", "8", "9"), strict=True):
+        path = made / name
+        with h5py.File(path) as file:  # the bytes and the counts, read without the code under test
+            counts = [len(scan["part"]) for scan in file["truth/labels"].values()]
+            sources = [np.bincount(scan["source"], minlength=3) for scan in file["truth/labels"].values()]
+        assert row["file"] == name
+        assert (row["recipe"], row["seed"], row["status"], row["reason"]) == ("frame-small", seed, "done", "")
+        assert (int(row["scans"]), int(row["points"])) == (len(counts), sum(counts))
+        assert [int(row[f"points_{name}"]) for name in ("surface", "mixed", "outlier")] == np.sum(sources, 0).tolist()
+        assert row["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert row["scene_hash"] == store.scene_hash(store.read_scene(path))
+    assert len({row["scene_hash"] for row in found}) == 3
+
+
+def test_two_processes_make_the_same_bytes_and_so_does_a_single_scene(made, tmp_path):
+    said = json.loads(run("-o", tmp_path / "two", "--count", 3, "--seed", 7, "--jobs", 2, "--json").stdout)
+    assert digests(tmp_path / "two") == digests(made)
+    assert (said["scenes"], said["done"], said["made"], said["kept"], said["failed"]) == (3, 3, 3, 0, [])
+    assert said["points"] == sum(int(row["points"]) for row in rows(made))
+    run("-o", tmp_path / "one.h5", "--seed", 8)
+    assert (tmp_path / "one.h5").read_bytes() == (made / "frame-small-00002-seed8.h5").read_bytes()
+
+
+def test_every_combination_in_the_order_given(tmp_path):
+    varied = ("--vary", "scan.spacing_mm=80, 60", "--vary", "frame.radii_mm=[45.0, 50.0],[60.0]")
+    run("-o", tmp_path / "set", *varied, command=COMMAND)
+    found = rows(tmp_path / "set")
+    assert list(found[0]) == [*COLUMNS[:4], "scan.spacing_mm", "frame.radii_mm", *COLUMNS[4:]]
+    pairs = [(row["scan.spacing_mm"], row["frame.radii_mm"]) for row in found]
+    assert pairs == [("80", "[45.0, 50.0]"), ("80", "[60.0]"), ("60", "[45.0, 50.0]"), ("60", "[60.0]")]
+    for row, radii in zip(found, [{45.0, 50.0}, {60.0}] * 2, strict=True):
+        assert row["seed"] == "1"  # the recipe's own
+        frame = store.read_scene(tmp_path / "set" / row["file"]).frame
+        assert set(np.unique(frame.radii)) == radii
+    assert int(found[2]["points"]) / int(found[0]["points"]) == pytest.approx((80 / 60) ** 2, rel=0.05)
+
+
+def test_more_seeds_later_leave_the_numbers_as_they_were(tmp_path):
+    name, recipe = recipe_files.load("frame-small")
+    varied = {"scan.spacing_mm": ["60", "80"], "scan.sigma_mm": ["0", "1"]}
+    few, many = (batch.plan(tmp_path, name, recipe, varied, 4, count) for count in (2, 5))
+    assert many[:8] == few
+    assert [job.seed for job in few] == [4] * 4 + [5] * 4
+    assert [job.varied for job in few[:4]] == [("60", "0"), ("60", "1"), ("80", "0"), ("80", "1")]
+
+
+@pytest.mark.parametrize("name", ["../../../etc/x", "-rf", ".hidden", "a b;c|d", "桥 东/西", "x" * 300])
+def test_file_names_are_safe(name, tmp_path):
+    (job,) = batch.plan(tmp_path, name, {"kind": "space-frame"}, {}, None, 1)
+    assert "/" not in job.file
+    assert job.file[0] not in ".-"
+    assert not re.search(r"[\s;|]", job.file)
+    assert len(job.file.encode()) < 220
+    (tmp_path / job.file).touch()
+
+
+# --- run again --------------------------------------------------------------------------------------------------------
+
+
+def test_existing_scenes_are_kept_on_a_second_run(made, tmp_path):
+    folder = copied(made, tmp_path / "set")
+    before, when = digests(folder), times(folder)
+    said = json.loads(run("-o", folder, "--count", 3, "--seed", 7, "--json").stdout)
+    assert (said["made"], said["kept"]) == (0, 3)
+    (folder / "index.csv").unlink()
+    run("-o", folder, "--count", 3, "--seed", 7)
+    assert digests(folder) == before
+    assert times(folder) == when
+
+
+def test_scenes_of_other_parameters_are_made_again_with_a_message(made, tmp_path):
+    folder = copied(made, tmp_path / "set")
+    done = run("-o", folder, "--count", 3, "--seed", 7, "--set", "scan.sigma_mm=0")
+    assert done.stderr.count("was made with other parameters; made again") == 3
+    assert not set(digests(folder).values()) & set(digests(made).values())
+    done = run("-o", folder, "--count", 2, "--seed", 7)
+    assert done.stderr.count("made again") == 2
+    assert "1 scene(s) of other runs are left as they are, e.g. frame-small-00003-seed9.h5" in done.stderr
+    assert [row["sha256"] for row in rows(folder)] == [row["sha256"] for row in rows(made)[:2]]
+
+
+def test_other_software_is_made_again(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(batch, "__version__", "9.9")
+    folder = copied(made, tmp_path / "set")
+    name, recipe = recipe_files.load("frame-small")
+    job = batch.plan(folder, name, recipe_files.overridden(recipe, list(SMALL)), {}, 7, 1)[0]
+    outcome = batch.run_job(job)
+    assert outcome.made
+    assert outcome.replaced == "was made with other software; made again"
+    assert store.read_provenance(folder / job.file)["software"]["designgen"] == "9.9"
+
+
+def flip(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+@pytest.mark.parametrize("damage", [flip, cut, lambda path: path.write_text("no scene")])
+def test_damaged_scene_is_made_again_with_a_message(made, tmp_path, damage):
+    folder = copied(made, tmp_path / "set")
+    damage(folder / "frame-small-00002-seed8.h5")
+    done = run("-o", folder, "--count", 3, "--seed", 7)
+    assert "1 made now" in done.stdout
+    assert re.search(r"00002-seed8\.h5: is damaged.*made again", done.stderr)
+    assert done.stderr.count("made again") == 1
+    assert digests(folder) == digests(made)
+
+
+def test_a_cut_file_is_found_without_an_index(made, tmp_path):
+    folder = copied(made, tmp_path / "set")
+    (folder / "index.csv").unlink()
+    cut(folder / "frame-small-00003-seed9.h5")
+    assert "1 made now" in run("-o", folder, "--count", 3, "--seed", 7).stdout
+    assert digests(folder) == digests(made)
+
+
+@pytest.mark.parametrize("text", ["", "file,points\nframe-small-00001-seed7.h5,many\n", "\x00\xff\n,,,\n"])
+def test_foreign_index_is_replaced_without_changing_scenes(made, tmp_path, text):
+    folder = copied(made, tmp_path / "set")
+    (folder / "index.csv").write_text(text, "latin-1")
+    run("-o", folder, "--count", 3, "--seed", 7)
+    assert digests(folder) == digests(made)
+
+
+def test_leftovers_are_removed_and_other_files_are_not(made, tmp_path):
+    folder = copied(made, tmp_path / "set")
+    for name in (".frame-small-00001-seed7.h5.123-0a1b2c3d.tmp", ".index.csv.9-00000000.tmp", "mine.tmp", ".notes.tmp"):
+        (folder / name).write_text("half")
+    run("-o", folder, "--count", 3, "--seed", 7)
+    assert set(os.listdir(folder)) - set(os.listdir(made)) == {"mine.tmp", ".notes.tmp"}
+
+
+# --- stopped and killed -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What runs that are killed must come to in the end."""
+    folder = tmp_path_factory.mktemp("whole") / "set"
+    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, command=LONG)
+    return folder
+
+
+def started(folder, *more):
+    command = [*LONG, "-o", folder, "--count", SCENES_OF_KILLED_RUNS, *more]
+    # A shell in the background hands down interrupts that are ignored; here they are to arrive.
+    listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    return subprocess.Popen(
+        [*map(str, command)],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=listening,
+        env={**os.environ, MARK: str(folder)},
+    )
+
+
+def until(condition, seconds=120):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.005)
+
+
+def until_scenes(folder, number, process):
+    """Wait until a run has made some scenes and is still at work."""
+    until(lambda: process.poll() is not None or (folder.exists() and len(scenes(folder)) >= number))
+    assert process.poll() is None, process.communicate()[1]
+    assert len(scenes(folder)) < SCENES_OF_KILLED_RUNS, "too late to disturb it"
+
+
+def members(folder):
+    """Processes alive that were started for a folder, by their environment in /proc; zombies have none."""
+    mark, found = f"{MARK}={folder}\0".encode(), []
+    for environ in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if mark in environ.read_bytes():
+                found.append(int(environ.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def until_gone(folder):
+    until(lambda: not members(folder), 10)
+
+
+@pytest.mark.parametrize("kills", [(1, 5), pytest.param((1, 3, 6), marks=pytest.mark.slow)])
+def test_killed_at_random_and_run_again(whole, tmp_path, kills):
+    """Killed when so many scenes are made, at least one of them by the run that is killed."""
+    folder, dice = tmp_path / "set", random.Random(5)
+    for left in kills:
+        kept = len(scenes(folder)) if folder.exists() else 0
+        process = started(folder, "--jobs", 2)
+        until_scenes(folder, max(left, kept + 1), process)
+        time.sleep(dice.uniform(0.0, 0.1))
+        assert len(members(folder)) >= 3  # the command and its workers, of which one may just be replaced
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL, "killed too late"
+        until_gone(folder)  # what it started goes with it
+        for name in scenes(folder):  # no half file under a final name
+            assert (folder / name).read_bytes() == (whole / name).read_bytes()
+        assert not (folder / "index.csv").exists()
+        leftover = folder / ".frame-small-00007-seed7.h5.77-01234567.tmp"
+        leftover.write_bytes(b"half")
+    kept = times(folder)
+    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, "--jobs", 2, command=LONG)
+    assert digests(folder) == digests(whole)
+    assert kept == {name: when for name, when in times(folder).items() if name in kept}
+
+
+@pytest.mark.parametrize(
+    ("sent", "code", "to_all"),
+    [
+        (signal.SIGTERM, 143, False),  # kill
+        (signal.SIGINT, 130, True),  # Ctrl-C
+        # One handler is for both signals, and what the run starts leads groups of its own, to which neither comes.
+        pytest.param(signal.SIGTERM, 143, True, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, 130, False, marks=pytest.mark.slow),
+    ],
+)
+def test_stops_cleanly(whole, tmp_path, sent, code, to_all):
+    folder = tmp_path / "set"
+    process = started(folder, "--jobs", 2)
+    until_scenes(folder, 2, process)
+    os.killpg(process.pid, sent) if to_all else process.send_signal(sent)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == code, said
+    assert "Traceback" not in said
+    assert re.search(r"stopped: \d+ of 10 scene\(s\) are done; run again to go on", said)
+    assert sorted(os.listdir(folder)) == scenes(folder), "neither an index nor temporary files"
+    until_gone(folder)
+    for name in scenes(folder):
+        assert (folder / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_dying_process_loses_its_job_alone(tmp_path):
+    names = ["a", "always", "b", "c", "d"]
+    for name in "acd":
+        (tmp_path / name).touch()
+    do = functools.partial(processes.in_process, dying_job.kill_own_process)
+    found = {path.name: result for path, result in runner.Local(2).run(do, [tmp_path / name for name in names])}
+    lost = found.pop("always")
+    assert lost == Lost(Loss.DIED)
+    assert batch.reason_of(lost).startswith("the process that made it died twice")
+    assert {name: result[:2] for name, result in found.items()} == {name: (name, "1") for name in "abcd"}
+    assert os.getpid() not in {result[2] for result in found.values()}
+
+
+# --- failures and usage -----------------------------------------------------------------------------------------------
+
+
+def test_a_combination_that_fails_is_recorded_and_the_rest_goes_on(tmp_path):
+    first = run("-o", tmp_path / "set", "--vary", "frame.depth_mm=2100,-5,2200", code=1)
+    found = rows(tmp_path / "set")
+    assert [row["status"] for row in found] == ["done", "failed", "done"]
+    assert "depth_mm" in found[1]["reason"]
+    assert [found[1][key] for key in ("points", "scans", "scene_hash", "sha256")] == [""] * 4
+    assert f"{found[1]['file']}: failed: {found[1]['reason']}" in first.stderr
+    assert scenes(tmp_path / "set") == [found[0]["file"], found[2]["file"]]
+    before = digests(tmp_path / "set")
+    said = json.loads(run("-o", tmp_path / "set", "--vary", "frame.depth_mm=2100,-5,2200", "--json", code=1).stdout)
+    assert said["failed"] == [{"file": found[1]["file"], "reason": found[1]["reason"]}]
+    assert (said["made"], said["kept"]) == (0, 2)
+    assert digests(tmp_path / "set") == before
+    elsewhere = tmp_path / "another folder"
+    run("-o", elsewhere, "--vary", "frame.depth_mm=2100,-5,2200", "--jobs", 2, code=1)
+    assert digests(elsewhere) == before
+
+
+def test_all_failed_is_wrong_usage(tmp_path):
+    run("-o", tmp_path / "set", "--vary", "frame.no_such_key=1,2", code=2)
+    assert [row["status"] for row in rows(tmp_path / "set")] == ["failed", "failed"]
+
+
+def test_a_failed_scene_leaves_no_older_one_under_its_name(made, tmp_path):
+    folder = copied(made, tmp_path / "set")
+    run("-o", folder, "--count", 1, "--seed", 7, "--set", "frame.depth_mm=-5", code=2)
+    assert scenes(folder) == scenes(made)[1:]
+
+
+def test_job_of_other_software_than_its_worker_writes_no_files(made, tmp_path):
+    folder = copied(made, tmp_path / "set")
+    name, recipe = recipe_files.load("frame-small")
+    job = batch.plan(folder, name, recipe, {}, 7, 1)[0]
+    job.software["numpy"] = "0.1"
+    outcome = batch.run_job(job)
+    assert outcome.content is None
+    assert re.fullmatch(r"a worker has other software: numpy \S+, not 0\.1; .*", outcome.reason)
+    assert digests(folder) == digests(made)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--count", "0"], "--count"),
+        (["--count", "2", "--jobs", "0"], "--jobs"),
+        (["--count", "100000"], "at most 99,999"),
+        (["--count", "2", "--seed", str(2**63)], "below 2^63"),
+        (["--vary", "scan.sigma_mm"], "expected section.key=v1,v2"),
+        (["--vary", "scan.sigma_mm="], "an empty one"),
+        (["--vary", "scan.sigma_mm=1,,2"], "an empty one"),
+        (["--vary", "scan.sigma_mm=1,2,1"], "1 is given twice"),
+        (["--vary", "frame.radii_mm=[45.0"], "not closed"),
+        (["--vary", "seed=1,2"], "--seed and --count"),
+        (["--vary", "scan.sigma_mm=1", "--vary", "scan.sigma_mm=2"], "varied twice"),
+        (["--vary", "scan.spacing_mm=50"], "set by --set as well"),
+        (["--vary", "kind.x=1"], "kind is not a section"),
+        (["--jobs", "2"], "add --count or --vary"),
+        (["--cluster", "tcp://127.0.0.1:1"], "add --count or --vary"),
+        (["--count", "2", "--cluster", "tcp://127.0.0.1:1", "--jobs", "2"], "exclude each other"),
+        (["--count", "2", "--set", "seed=-1"], "expected a whole number"),
+    ],
+)
+def test_usage_refused(arguments, says, tmp_path):
+    done = run("-o", tmp_path / "set", *arguments, code=2)
+    assert says in done.stderr
+    assert not (tmp_path / "set").exists()
+
+
+def test_a_file_where_the_folder_should_be_and_the_other_way_round(made, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    assert "many scenes need a folder" in run("-o", tmp_path / "file", "--count", 2, code=2).stderr
+    assert "many scenes need a folder" in run("-o", tmp_path / "file" / "set", "--count", 2, code=2).stderr
+    assert (tmp_path / "file").read_text() == "mine"
+    assert "this is a folder" in run("-o", made, code=2).stderr
+
+
+def test_progress_bar_is_shown_on_a_terminal_alone(made, tmp_path):
+    folder = copied(made, tmp_path / "set")
+    assert run("-o", folder, "--count", 3, "--seed", 7).stderr == ""
+    try:
+        ours, theirs = pty.openpty()
+    except OSError:
+        pytest.skip("this machine has no pseudo-terminals")
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    with os.fdopen(theirs, "w") as terminal:
+        done = run("-o", folder, "--count", 3, "--seed", 7, "--json", stderr=terminal)
+        shown = os.read(ours, 100_000).decode()
+    os.close(ours)
+    assert "3/3" in shown
+    assert json.loads(done.stdout)["kept"] == 3
+
+
+def test_two_runs_in_one_folder_are_refused(tmp_path):
+    folder = tmp_path / "set"
+    process = started(folder)
+    until_scenes(folder, 1, process)
+    assert "another designgen" in run("-o", folder, "--count", 2, code=2).stderr
+    process.terminate()
+    process.communicate()
+
+
+# --- on a cluster -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    with dask_cluster.forked(tmp_path) as one:
+        yield one
+
+
+def test_lost_worker_changes_no_file_and_lost_scheduler_is_reported(whole, tmp_path, cluster):
+    address, (scheduler, worker, _) = cluster
+    folder = tmp_path / "set"
+    process = started(folder, "--cluster", address)
+    until_scenes(folder, 2, process)
+    worker.kill()
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 0, said
+    assert digests(folder) == digests(whole)
+    # The same cluster, with the worker that it has left, loses its scheduler; the next run goes on without it.
+    folder = tmp_path / "another"
+    process = started(folder, "--cluster", address)
+    until_scenes(folder, 2, process)
+    scheduler.kill()
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 3, said
+    assert f"--cluster {address}: the connection is lost; run again to go on" in said
+    assert "Traceback" not in said
+    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, command=LONG)
+    assert digests(folder) == digests(whole)
+
+
+@pytest.mark.slow
+def test_unreachable_cluster_is_refused_before_anything_is_written(tmp_path):
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "index.csv").write_text("mine")
+    address = f"tcp://127.0.0.1:{dask_cluster.free_port()}"
+    done = run("-o", tmp_path / "set", "--count", 2, "--cluster", address, code=2)
+    assert f"--cluster {address}: expected the address of a Dask scheduler that answers" in done.stderr
+    assert os.listdir(tmp_path / "set") == ["index.csv"], "nothing was begun"
+
+
+def test_without_dask_the_error_states_how_to_install_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with (
+        pytest.raises(UsageError, match=r"pip install 'steel-scan-check\[cluster\]'"),
+        runner.executor("tcp://x:1", 1, print),
+    ):
+        pass

@@ -1,0 +1,214 @@
+"""Foreign generators: same bytes for the same seed, and truths that agree with the points in closed form."""
+
+import ast
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processor.evaluation import truth_json
+from processor.model import InputError
+from processor.preassembly.parts import assignment, attitude
+from processor.scan_folder import folder
+
+ROOT = Path(__file__).resolve().parents[2]
+FOREIGN = ROOT / "designgen" / "foreign"
+SCRIPTS = sorted(path for path in FOREIGN.glob("*.py") if path.name != "__init__.py")
+SMALL = {
+    "arch_bridge": ("spacing=60", "stations=3", "span=9000", "rise=2000"),
+    "space_frame": ("rows=2", "columns=2", "stations=2", "step_mrad=8"),
+    "steelwork": ("case=plate", "step_mrad=8", "spacing=20"),
+}
+COARSER = {"arch_bridge": ("spacing=200",)}  # where bytes alone are compared
+QUIET = {
+    "arch_bridge": ("noise=0", "noise_ppm=0", "range_offset=0", "shift=0", "rotation_urad=0", "drift=0",
+                    "incidence_bias=0", "outliers=0", "beam=0", "clutter=0"),
+    "space_frame": ("noise=0", "noise_ppm=0", "range_offset=0", "shift=0", "rotation_urad=0", "outliers=0",
+                    "clutter=0", "mixed=0"),
+    "steelwork": ("noise=0", "noise_ppm=0", "range_offset=0", "shift=0", "rotation_urad=0", "bias=0", "outliers=0",
+                  "beam=0"),
+}  # fmt: skip
+
+
+def make(name, out, *settings, seed=3):
+    words = [word for setting in settings for word in ("--set", setting)]
+    command = [sys.executable, str(FOREIGN / f"{name}.py"), str(out), "--seed", str(seed), *words]
+    subprocess.run(command, check=True, capture_output=True)
+    return out
+
+
+def contents(path):
+    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_a_generator_shares_no_code(path):
+    modules = {
+        name.split(".")[0]
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    assert modules <= {*sys.stdlib_module_names, "numpy"}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_same_seed_makes_the_same_bytes(name, tmp_path):
+    one, again, other = (
+        contents(make(name, tmp_path / str(i), *SMALL[name], *COARSER.get(name, ()), seed=seed))
+        for i, seed in enumerate((3, 3, 4))
+    )
+    assert one == again
+    assert one.keys() == other.keys()
+    assert one["truth.json"] != other["truth.json"]
+
+
+def test_points_of_a_bridge_lie_on_the_true_parts(tmp_path):
+    """The scan, by its true pose, lies within the box of the true key points' sections, and on its outer faces."""
+    path = make("arch_bridge", tmp_path, *SMALL["arch_bridge"], *QUIET["arch_bridge"], "waviness=0", "fabrication=0")
+    truth, scene = truth_json.read(path).arch, folder.read_input(path)
+    assert truth.names == ("SP-W", "SEG-1", "SEG-2", "SEG-3", "SP-E") == tuple(scan.component for scan in scene.scans)
+    for i, scan in enumerate(scene.scans):
+        T = truth.T_bridge_scan[i]
+        at = scan.points @ T[:3, :3].T + scan.origin @ T[:3, :3].T + T[:3, 3]
+        left, right = truth.edges_bridge[i]
+        assert np.abs(left[:, 1] - 350.0).max() < 1e-9 > np.abs(right[:, 1] + 350.0).max()
+        webs = np.abs(np.abs(at[:, 1]) - 350.0) < 0.05  # the files round to 0.05 mm
+        assert webs.mean() > 0.25
+        known = np.isfinite(truth.key_points_scan[i])
+        placed = truth.key_points_scan[i] @ T[:3, :3].T + T[:3, 3]
+        np.testing.assert_allclose(placed[known], truth.key_points_bridge[i][known], atol=1e-6)
+        if 0 < i < 4:  # an end's four corners span its plane; rims lie in it
+            for corners, out in zip(truth.key_points_bridge[i], (-1.0, 1.0), strict=True):
+                normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
+                normal *= np.sign(normal[0]) * out / np.linalg.norm(normal)
+                near = np.linalg.norm(at - corners.mean(axis=0), axis=1) < 700.0
+                assert ((at[near] - corners[0]) @ normal).max() < 0.1
+
+
+def test_rays_end_on_balls_and_members(tmp_path):
+    path = make("space_frame", tmp_path, *SMALL["space_frame"], *QUIET["space_frame"], "step_mrad=3")
+    truth, (scan,) = truth_json.read(path).frame, folder.read_input(path).scans
+    points = scan.points + scan.origin
+    distance = np.linalg.norm(points[:, None] - truth.centres, axis=2) - truth.radii
+    assert distance.min() > -1e-6  # none within a ball
+    on = np.abs(distance) < 1e-6
+    assert (on.sum(axis=0) >= 5).all()
+    np.testing.assert_allclose(truth.lowest, truth.centres - np.outer(truth.radii, [0, 0, 1]))
+
+
+def test_a_plate_as_designed_is_scanned_as_designed(tmp_path):
+    path = make("steelwork", tmp_path, *SMALL["steelwork"], *QUIET["steelwork"])
+    truth, scene = truth_json.read(path), folder.read_input(path)
+    T = truth.pose.T_design_project
+    (scan,) = scene.scans
+    at = (scan.points + scan.origin) @ T[:3, :3].T + T[:3, 3]
+    low, high = scene.structure.vertices.min(axis=0), scene.structure.vertices.max(axis=0)
+    assert (at > low - 1e-6).all()
+    assert (at < high + 1e-6).all()
+    assert np.isin(np.round(at[:, 2], 6), (0.0, 12.0, 108.0)).mean() > 0.5
+    assert not truth.structure.displacement.any()
+
+
+def test_the_volume_of_a_dent_is_that_of_its_points(tmp_path):
+    module = runpy.run_path(str(FOREIGN / "steelwork.py"))
+    bump = module["Bump"](np.array([10.0, 300.0, -5.0]), 80.0, 6.0, np.array([0.0, 1.0, 0.0]))
+    x, z = (v.ravel() for v in np.meshgrid(np.arange(-90.0, 110, 0.5), np.arange(-105.0, 95, 0.5)))
+    moved = bump(np.column_stack([x, np.full(x.shape, 300.0), z]))
+    assert moved[:, 1].min() == pytest.approx(-6.0)
+    assert -moved.sum() * 0.25 == pytest.approx(bump.volume, rel=1e-4)
+
+
+def test_motion_by_station_errors_has_the_covariance_of_the_truth():
+    """The covariance against fits to draws of the errors, as the generator draws them."""
+    module = runpy.run_path(str(FOREIGN / "steelwork.py"))
+    rng = np.random.default_rng(5)
+    points = rng.uniform([0.0, 0.0, 0.0], [4000.0, 2000.0, 1500.0], (600, 3))
+    normals = np.eye(3)[rng.integers(0, 3, 600)] * rng.choice([-1.0, 1.0], (600, 1))
+    stations = np.array([[-3000.0, 500, 900], [7000, 900, 2500], [2000, -4000, 1000]])
+    of, settings = rng.integers(0, 3, 600), module["SETTINGS"]
+    J = np.hstack([np.cross(points, normals), normals])
+    solve, draws = np.linalg.pinv(J), np.empty((3000, 6))
+    for draw in draws:
+        moved = points.copy()
+        for k, station in enumerate(stations):
+            ray = points[of == k] - station
+            offset = settings["range_offset"] * rng.normal() * ray / np.linalg.norm(ray, axis=1)[:, None]
+            moved[of == k] = module["turned"](points[of == k] + offset, station, settings, rng)
+        draw[:] = solve @ np.einsum("ni,ni->n", moved - points, normals)
+    stated = module["by_stations"](points, normals, of, stations, settings)
+    root = np.linalg.inv(np.linalg.cholesky(stated))
+    np.testing.assert_allclose(root @ np.cov(draws.T) @ root.T, np.eye(6), atol=0.12)  # 3000 draws: 0.026 each
+
+
+def test_a_piece_that_reaches_two_borders_is_a_missing_part(tmp_path):
+    """As docs/steps/defects.md defines the classes: the corner of a rib, whose borders are at 430 and 700 mm."""
+    path = make("steelwork", tmp_path, "case=defects", "step_mrad=8", "spacing=40")
+    truth = truth_json.read(path).defects
+    off = np.array([430.0, 700.0]) - np.abs(truth.centres[:, 1:])
+    sides = np.sqrt(truth.area_mm2)
+    corner = np.flatnonzero((np.abs(off - sides[:, None] / 2) < 1e-6).all(axis=1))
+    assert [truth.classes[k] for k in corner] == ["missing-part"]
+
+
+# --- the truth as JSON ------------------------------------------------------------------------------------------------
+
+
+def test_truth_in_another_format_is_ignored(tmp_path):
+    assert truth_json.read(tmp_path) is None
+    for text in ('{"centres": [[0, 0, 0]]}', "[1, 2]", "no json"):
+        (tmp_path / "truth.json").write_text(text)
+        assert truth_json.read(tmp_path) is None
+
+
+def test_bodies_of_a_structure_are_read(tmp_path):
+    bodies = {"names": ["a"], "of_point": [0], "shift": [[0, 0, 5]], "turn": [[0, 0, 0]]}
+    structure = {"points": [[1, 2, 3]], "normals": [[0, 0, 1]], "displacement": [[0, 0, 5]], "bodies": bodies}
+    (tmp_path / "truth.json").write_text(json.dumps({"format": "processor-truth", "structure": structure}))
+    read = truth_json.read(tmp_path).structure.bodies
+    assert (read.names, read.moved.tolist()) == (("a",), [True])
+
+
+def test_faults_of_a_truth_are_named(tmp_path):
+    for table, fault in (
+        ({"bridge": {}}, "unknown key 'bridge'"),
+        ({"frame": {"ids": [1], "centres": [[0, 0]], "radii": [1]}}, "FrameTruth.centres"),
+        ({"frame": {"sizes": [1]}}, "sizes"),
+    ):
+        (tmp_path / "truth.json").write_text(json.dumps({"format": "processor-truth"} | table))
+        with pytest.raises(InputError, match=fault):
+            truth_json.read(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_segment_that_lies_on_longer_parts_is_none_of_them(tmp_path):
+    """To 30 mm SEG-1 lies on either springing and on SEG-3: as much of it as of a piece of them with clutter."""
+    scene = folder.read_input(make("arch_bridge", tmp_path, "stations=4", "spacing=16", seed=1))
+    shapes = attitude.Shapes(scene.arch)
+    scan = next(scan for scan in scene.scans if scan.component == "SEG-1")
+    assert [assignment.rather(scan.points, k, shapes) for k in range(5)] == [1, None, 1, 1, 1]
+
+
+@pytest.mark.slow
+def test_foot_on_either_side_of_its_end_plate_is_assigned_right(tmp_path):
+    """Both sides of its end plate of 40 mm are stable places: the scan passed for that of the other foot."""
+    scene = folder.read_input(make("arch_bridge", tmp_path, "stations=4", "spacing=16", seed=5))
+    scan = next(scan for scan in scene.scans if scan.component == "SP-E")
+    assert assignment.rather(scan.points, 4, attitude.Shapes(scene.arch)) is None
+
+
+@pytest.mark.slow
+def test_a_rough_pose_turned_half_round_does_not_name_another_part(tmp_path):
+    """Of few points, the turned pose of SEG-1 has the least misfit: its scan passed for that of SEG-3."""
+    scene = folder.read_input(make("arch_bridge", tmp_path, "stations=4", "spacing=16", "raised=3700", seed=3))
+    scan = next(scan for scan in scene.scans if scan.component == "SEG-1")
+    assert assignment.rather(scan.points, 1, attitude.Shapes(scene.arch)) is None

@@ -1,0 +1,269 @@
+"""Figures of results compared with a truth, by results made by hand: values within their intervals are counted."""
+
+import numpy as np
+import pytest
+
+from processor.defects.result import Defects
+from processor.defects.result import Result as DefectsResult
+from processor.deviation.result import CorePoints
+from processor.deviation.result import Result as DeviationResult
+from processor.evaluation import defects, deviation, error_statistics, space_frame, stitching
+from processor.geometry import rigid
+from processor.model import (
+    BodyTruth,
+    DefectTruth,
+    DesignBodies,
+    FrameTruth,
+    PoseTruth,
+    RecordError,
+    Scan,
+    Scene,
+    StationTruth,
+    Statistic,
+    StructureDesign,
+    StructureTruth,
+    Truth,
+)
+from processor.stitching.result import Pairs, Scans
+from processor.stitching.result import Result as StitchResult
+from tests.support.results import ball_results
+
+PROJECT = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 2.0])), np.array([9e4, -3e4, 700.0]))
+
+
+def figures(metrics):
+    return {one.name: one for one in metrics}
+
+
+# --- deviation --------------------------------------------------------------------------------------------------------
+
+
+def slab(error, turn=0.0, half=True, by_stations=()):
+    """A slab of which x > 0 moved up by 5 mm, measured ``error`` too high with an LOD95 of 0.5, in a frame of its own.
+
+    The pose found is turned by ``turn`` mrad about the middle of the part that did not move.
+    """
+    x, y = (
+        v.ravel() for v in np.meshgrid(np.arange(-2000.0, 2000.0, 50.0) + 25.0, np.arange(-500.0, 500.0, 50.0) + 25)
+    )
+    at = np.column_stack([x, y, 0.0 * x])
+    up = np.tile([0.0, 0.0, 1.0], (len(at), 1))
+    moved = 5.0 * (x > 0.0) * half
+    middle = np.array([-1000.0, 0.0, 0.0]) if half else np.zeros(3)
+    R = rigid.rotation_from_vector(np.array([0.0, 1e-3 * turn, 0.0]))
+    off = rigid.transform(R, middle - R @ middle)
+    seen = at + moved[:, None] * up
+    core = CorePoints(
+        points=at, normals=up, distance=rigid.apply(off, seen)[:, 2] + error, lod95=np.full(len(at), 0.5),
+        n1=np.full(len(at), 9), n2=np.full(len(at), 9), std1=np.zeros(len(at)), std2=np.zeros(len(at)),
+    )  # fmt: skip
+    found = core.distance
+    result = DeviationResult(
+        status="ok", method="default", T_design_scan=off @ PROJECT, core=core, covariance=1e-6 * np.eye(6),
+        min_ci95=found.min() + np.array([-0.5, 0.5]), max_ci95=found.max() + np.array([-0.5, 0.5]),
+    )  # fmt: skip
+    truth = Truth(structure=StructureTruth(at, up, moved[:, None] * up), pose=PoseTruth(PROJECT, by_stations))
+    scene = Scene("slab", "structure", (Scan("s", at),))
+    return figures(deviation.check(scene, result, truth))
+
+
+def test_deviations_are_evaluated_against_the_truth_in_the_frame_of_the_structure():
+    found = slab(0.3)
+    # The truth is a plane through the nearest points: at the step it is neither side's.
+    assert found["deviations within their 95 % intervals"].value > 95.0
+    assert found["least and greatest deviations within their 95 % intervals"].value == 100.0
+    assert found["unmoved steel beyond LOD95"].value == found["moved steel within LOD95"].value == 0.0
+    assert found["pose, shift of the middle"].value == pytest.approx(0.0, abs=1e-6)
+    assert (found["pose, shift of the middle"].limit, found["pose, turn"].limit) == (0.5, 0.05)
+    beyond = slab(0.7)
+    assert beyond["deviations within their 95 % intervals"].value < 5.0
+    assert beyond["unmoved steel beyond LOD95"].value == 100.0
+
+
+def test_bodies_that_touch_have_each_its_own_truth():
+    """Two plates side by side, one 3 mm up: with bodies named, the truth beside the joint is that of each plate."""
+    x, y = (c.ravel() for c in np.meshgrid(np.arange(0.0, 2000.0, 50.0) + 5.0, np.arange(0.0, 1000.0, 50.0)))
+    at, of_point = np.stack([x, y, np.zeros(len(x))], axis=1), (x > 1000.0).astype(np.int32)
+    # The edge of the second plate, seen from the first, faces it: its points are of no face that core points are on.
+    edge = np.stack([np.full(20, 1000.0), np.arange(20) * 50.0, np.full(20, -2.0)], axis=1)
+    at, of_point = np.vstack([at, edge]), np.append(of_point, np.ones(20, np.int32))
+    up = np.vstack([np.tile([0.0, 0.0, 1.0], (len(x), 1)), np.tile([-1.0, 0.0, 0.0], (20, 1))])
+    moved = 3.0 * of_point[:, None] * [0.0, 0.0, 1.0]
+    bodies = BodyTruth(("a", "b"), of_point, [[0.0] * 3, [0.0, 0.0, 3.0]], np.zeros((2, 3)))
+    core = CorePoints(
+        points=at[: len(x)], normals=up[: len(x)], distance=moved[: len(x), 2], lod95=np.full(len(x), 0.1),
+        n1=np.full(len(x), 9), n2=np.full(len(x), 9), std1=np.zeros(len(x)), std2=np.zeros(len(x)),
+    )  # fmt: skip
+    result = DeviationResult(status="ok", method="default", T_design_scan=np.eye(4), core=core)
+    name, scene = "deviations within their 95 % intervals", Scene("plates", "structure", (Scan("s", at),))
+    of_bodies = figures(deviation.check(scene, result, Truth(structure=StructureTruth(at, up, moved, bodies))))
+    assert of_bodies[name].value == 100.0
+    assert of_bodies["unmoved steel beyond LOD95"].value == of_bodies["moved steel within LOD95"].value == 0.0
+    assert figures(deviation.check(scene, result, Truth(structure=StructureTruth(at, up, moved))))[name].value < 90.0
+    with pytest.raises(RecordError, match="a row for each of 5 points, found 820"):
+        StructureTruth(at[:5], up[:5], moved[:5], bodies)
+
+
+def test_turned_pose_shows_in_its_error_and_in_significant_unmoved_steel():
+    found = slab(0.0, turn=1.0)
+    assert found["pose, turn"].value == pytest.approx(1.0, rel=1e-6)
+    assert found["pose, shift of the middle"].value == pytest.approx(0.0, abs=1e-6)
+    # Of the unmoved part what is farther than 500 mm from its middle is 0.5 mm off, of 2000 mm.
+    assert found["unmoved steel beyond LOD95"].value == pytest.approx(50.0, abs=3.0)
+    assert found["deviations within their 95 % intervals"].value > 95.0  # what is true of that pose
+
+
+def test_limits_of_a_pose_include_the_motion_by_station_errors():
+    """99 % of the draws of a motion by the covariance that the truth states, beside what the method may be off by."""
+    rng = np.random.default_rng(0)
+    turns, shifts = 25e-6 * rng.standard_normal((200_000, 3)), 0.12 * rng.standard_normal((200_000, 3))
+    most_turn, most_shift = (np.quantile(np.linalg.norm(x, axis=1), 0.99) for x in (turns, shifts))
+    about_middle = np.diag([25e-6**2] * 3 + [0.12**2] * 3)
+    found = slab(0.0, turn=0.09, by_stations=rigid.about_origin(about_middle, np.array([-1000.0, 0.0, 0.0])))
+    assert found["pose, turn"].limit == pytest.approx(np.hypot(0.05, 1e3 * most_turn), rel=0.01)
+    assert found["pose, shift of the middle"].limit == pytest.approx(np.hypot(0.5, most_shift), rel=0.01)
+    assert found["pose, turn"].passed
+    assert not slab(0.0, turn=0.09)["pose, turn"].passed
+
+
+def test_steel_as_designed_has_the_mean_and_the_pose_of_the_truth():
+    found = slab(0.04, half=False)
+    assert found["mean of steel as designed"].value == pytest.approx(0.04)
+    assert found["mean of steel as designed"].passed
+    assert not slab(-0.06, half=False)["mean of steel as designed"].passed
+    assert found["poses within their 95 % intervals"].value == 100.0
+    assert slab(0.04, half=False)["wrong poses called ok"].passed
+    assert not slab(0.04, turn=3000.0, half=False)["wrong poses called ok"].passed
+    assert slab(0.04, turn=10.0, half=False)["poses within their 95 % intervals"].value == pytest.approx(500.0 / 6.0)
+
+
+# --- defects ----------------------------------------------------------------------------------------------------------
+
+
+def test_depths_and_volumes_have_their_coverage_and_parts_that_are_gone_have_none():
+    count = 3
+    found = Defects(
+        id=np.arange(count), defect_class=("dent", "bulge", "missing-part"), confidence=np.ones(count),
+        otherwise=("pit",) * count, component=("web",) * count, centre=np.diag([1e3, 2e3, 3e3]),
+        area_mm2=np.array([900.0, 1000.0, 5000.0]), depth_max=np.array([5.2, -8.0, 0.0]),
+        depth_ci95=np.array([0.3, 0.3, 0.3]), depth_mean=np.zeros(count), volume_mm3=np.array([1500.0, -2600.0, 0.0]),
+        volume_ci95=np.array([50.0, 50.0, 50.0]), axes=np.tile(np.eye(3), (count, 1, 1)), extent=np.ones((count, 2)),
+        edge_distance=np.zeros(count), curvature_per_m=np.zeros(count), lod95=np.full(count, 0.1), z=np.ones(count),
+        chance=np.zeros(count), doubtful=np.zeros(count, bool), reasons=((),) * count,
+    )  # fmt: skip
+    nan = float("nan")
+    truth = DefectTruth(
+        ids=[1, 2, 3], classes=("dent", "bulge", "missing-part"), components=("web",) * 3,
+        centres=np.diag([1e3, 2e3, 3e3]), area_mm2=[1000.0, 1000.0, 5000.0], depth_max_mm=[5.0, -9.0, nan],
+        volume_mm3=[1460.0, -2620.0, nan],
+    )  # fmt: skip
+    result = DefectsResult(status="ok", method="default", defects=found, examined_mm2=1e6)
+    told = figures(defects.check(Scene("s", "structure"), result, Truth(defects=truth)))
+    assert told["depths within their 95 % intervals"].value == 50.0  # 0.2 of 0.3; 1.0 of 0.3
+    assert told["volumes within their 95 % intervals"].value == 100.0
+    assert (told["depths, number"].value, told["areas, bias"].value) == (2.0, pytest.approx(-5.0))
+    assert told["depth error, max"].value == pytest.approx(1.0)
+
+
+def of_bodies(*rows):
+    """Return the figures of defects by class, component, place along x, depth and side; b moved, a has a dent at 0."""
+    count = len(rows)
+    classes, components, x, depth, side = zip(*rows, strict=True)
+    found = Defects(
+        id=np.arange(count), defect_class=classes, confidence=np.ones(count), otherwise=("pit",) * count,
+        component=components, centre=np.outer(x, [1.0, 0.0, 0.0]), area_mm2=np.full(count, 1e4), depth_max=depth,
+        depth_ci95=np.ones(count), depth_mean=np.zeros(count), volume_mm3=np.zeros(count), volume_ci95=np.ones(count),
+        axes=np.tile(np.eye(3), (count, 1, 1)) * np.array(side)[:, None, None], extent=np.ones((count, 2)),
+        edge_distance=np.zeros(count), curvature_per_m=np.zeros(count), lod95=np.full(count, 0.1), z=np.ones(count),
+        chance=np.zeros(count), doubtful=np.zeros(count, bool), reasons=((),) * count,
+    )  # fmt: skip
+    true = DefectTruth(
+        ids=[0, 1], classes=("dent", "misalignment"), components=("a", "b"), centres=[[0.0] * 3, [1e3, 0.0, 0.0]],
+        area_mm2=[1e4, 1e4], depth_max_mm=[5.0, 5.0], volume_mm3=[0.0, 0.0],
+    )  # fmt: skip
+    moved = BodyTruth(("a", "b"), np.zeros(1, np.int32), [[0.0] * 3, [5.0, 0.0, 0.0]], np.zeros((2, 3)))
+    structure = StructureTruth(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), moved)
+    design = StructureDesign("s", np.zeros((3, 3)), [[0, 1, 2]], DesignBodies(("a", "b"), [0]))
+    result = DefectsResult(status="ok", method="default", defects=found, examined_mm2=1e6)
+    scene, truth = Scene("s", "structure", structure=design), Truth(structure=structure, defects=true)
+    told = figures(defects.check(scene, result, truth))
+    names = (
+        "defects of another body than the true one",
+        "moved bodies that are not one misalignment",
+        "bodies called misaligned that did not move",
+        "other sides of dents and bulges",
+    )
+    return [*(told[name].value for name in names), told["false alarms"].value]
+
+
+DENT, MOVED = ("dent", "a", 0.0, 5.0, 1.0), ("misalignment", "b", 1000.0, 5.0, 1.0)
+
+
+def test_defects_are_matched_with_the_truth_by_body_names():
+    assert of_bodies(DENT, MOVED) == [0, 0, 0, 0, 0]
+    assert of_bodies(("dent", "b", 0.0, 5.0, 1.0), MOVED) == [1, 0, 0, 0, 0]
+    assert of_bodies(("misalignment", "a", 0.0, 5.0, 1.0), MOVED) == [0, 0, 1, 0, 0]
+    assert of_bodies(DENT, MOVED, ("misalignment", "b", 1010.0, 5.0, 1.0)) == [0, 1, 0, 0, 1]
+    assert of_bodies(DENT, ("misalignment", "a", 1000.0, 5.0, 1.0), MOVED) == [0, 0, 1, 0, 1], "by its name"
+    assert of_bodies(DENT) == [0, 1, 0, 0, 0]
+
+
+def test_the_other_side_of_a_dented_plate_is_no_false_alarm():
+    assert of_bodies(DENT, MOVED, ("unknown", "a", 30.0, -4.0, -1.0)) == [0, 0, 0, 1, 0]
+    assert of_bodies(DENT, MOVED, ("unknown", "a", 30.0, -4.0, 1.0)) == [0, 0, 0, 0, 1], "the same side"
+    assert of_bodies(DENT, MOVED, ("unknown", "b", 30.0, -4.0, -1.0)) == [0, 0, 0, 0, 1], "another body"
+    assert of_bodies(DENT, MOVED, ("unknown", "a", 30.0, 4.0, -1.0)) == [0, 0, 0, 0, 1], "inward, too"
+    assert of_bodies(DENT, MOVED, ("unknown", "a", 90.0, -4.0, -1.0)) == [0, 0, 0, 0, 1], "beside it"
+
+
+# --- stitching --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("shift", "share"), [(0.15, 100.0), (0.25, 500.0 / 6.0)])
+def test_poses_of_pairs_are_compared_with_the_truth_in_any_frame(shift, share):
+    """Standard deviations of 0.1 mm and 0.01 mrad at a frame's origin 90 m off: one axis is off by ``shift``."""
+    true = np.stack([np.eye(4), PROJECT])
+    T_a_b = rigid.transform(np.eye(3), np.array([shift, 0.0, 0.0])) @ PROJECT
+    nan = np.full((2, 3), np.nan)
+    scans = Scans(
+        name=("a", "b"), status=("ok", "ok"), reasons=((), ()), T_project_scan=true,
+        covariance=np.zeros((2, 6, 6)), position=true[:, :3, 3], position_sd=nan, rotation_sd=nan,
+        rivalry=np.zeros(2), T_rival_scan=np.full((2, 4, 4), np.nan), from_frame=("a", "b"), to_frame=("p", "p"),
+    )  # fmt: skip
+    pairs = Pairs(
+        a=("a",), b=("b",), overlap=[0.5], residual=[0.1], used=[True], reasons=((),), shared=[9], T_a_b=T_a_b[None],
+        covariance=np.diag([1e-5] * 3 + [0.1] * 3)[None] ** 2, scale=[1.0002], scale_sd=[0.0001],
+        from_frame=("b",), to_frame=("a",),
+    )  # fmt: skip
+    result = StitchResult(status="ok", method="automatic", reference="a", scans=scans, pairs=pairs)
+    truth = Truth(stations=StationTruth(("a", "b"), true, np.zeros(2), np.zeros(2), np.zeros((2, 2))))
+    told = figures(stitching.check(Scene("s", "structure"), result, truth))
+    assert told["poses of pairs within their 95 % intervals"].value == pytest.approx(share)
+    assert told["scales within their 95 % intervals"].value == 0.0
+
+
+# --- balls ------------------------------------------------------------------------------------------------------------
+
+
+def test_sizes_that_are_called_wrong_are_counted():
+    balls = ball_results.balls(method="ray", radii=(45.5, 60.0, 55.0), flag=("ok", "wrong-size", "wrong-size"))
+    of = balls.balls
+    true = FrameTruth(of.ids, np.zeros((3, 3)), of.nominal_radii + np.array([0.2, 0.1, -5.0]), np.zeros((3, 3)))
+    rows = np.arange(3)
+    found = {one.quantity: one for one in space_frame._sizes(of, true, rows, rows, True)}
+    assert found["right sizes called wrong"].value == 1.0
+    assert found["right sizes called wrong"].limit == 0.0
+    assert found["wrong sizes called right"].value == 0.0
+
+
+# --- shares -----------------------------------------------------------------------------------------------------------
+
+
+def test_errors_without_an_interval_are_not_counted():
+    nan = float("nan")
+    told = {
+        one.statistic: one.value
+        for one in error_statistics.covered("s", "x", np.array([0.5, 2.0, 1.0, nan]), np.array([1.0, 1.0, nan, 1.0]))
+    }
+    assert (told[Statistic.COVERAGE], told[Statistic.NUMBER]) == (50.0, 2.0)
+    assert error_statistics.covered("s", "x", np.array([nan]), np.array([1.0])) == []

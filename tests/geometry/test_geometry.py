@@ -1,0 +1,241 @@
+"""Rigid motions, principal axes, lines and closest points against closed forms, hand-worked numbers and Open3D."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from processor.geometry import neighbors, rigid
+from processor.geometry.polyline import Line, Polyline, crossing, fit_line, ransac_line
+from processor.registration import icp, principal
+from processor.robust_statistics import robust_sd
+
+
+def test_fit_recovers_a_quarter_turn_worked_by_hand():
+    source = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0], [1.0, 1.0, 1.0]])
+    target = np.array([[5.0, 1.0, 0.0], [3.0, 0.0, 0.0], [5.0, 0.0, 3.0], [4.0, 1.0, 1.0]])  # (x, y) -> (5 - y, x)
+    T = rigid.fit(source, target)
+    np.testing.assert_allclose(T, [[0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-12)
+
+
+def test_fit_never_mirrors():
+    source = np.random.default_rng(0).normal(size=(20, 3))
+    T = rigid.fit(source, source * [1.0, 1.0, -1.0])
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+
+
+def test_invert_and_angle():
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 0.3])), np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(rigid.invert(T) @ T, np.eye(4), atol=1e-15)
+    assert rigid.rotation_angle(T[:3, :3]) == pytest.approx(np.sqrt(0.14), abs=1e-14)
+    tiny = rigid.rotation_from_vector(np.array([1e-9, 0.0, 0.0]))
+    assert rigid.rotation_angle(tiny) == pytest.approx(1e-9, rel=1e-6)
+    assert rigid.rotation_angle(np.diag([-1.0, -1.0, 1.0])) == pytest.approx(np.pi)
+
+
+def test_mesh_axes_of_a_box_surface():
+    # The surface of a 6 x 4 x 2 box: variance along an axis of half-length a is the faces' share by area.
+    a, b, c = 3.0, 2.0, 1.0
+    corners = np.array([[x, y, z] for x in (-a, a) for y in (-b, b) for z in (-c, c)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for q in quads for t in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))])
+    area = 8.0 * (b * c + a * c + a * b)
+    along_x = (8.0 * b * c * a**2 + 8.0 * a * c * a**2 / 3.0 + 8.0 * a * b * a**2 / 3.0) / area
+    found = principal.of_mesh(corners + 1e6, faces)
+    np.testing.assert_allclose(found.centre, [1e6] * 3)
+    assert found.variances[0] == pytest.approx(along_x)
+    assert abs(found.axes[0, 0]) == pytest.approx(1.0)
+    assert np.linalg.det(found.axes) == pytest.approx(1.0)
+
+
+def test_the_sign_choices_are_rotations():
+    turns = principal.turns(((0, 1, 2),))
+    assert [np.linalg.det(turn) for turn in turns] == [1.0] * 4
+    assert len({tuple(np.diag(turn)) for turn in turns}) == 4
+
+
+def test_line_distance_and_crossing_by_hand():
+    line = Line(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(line.distances(np.array([[7.0, 3.0, 4.0], [1.0, 0.0, 0.0]])), [5.0, 0.0])
+    other = Line(np.array([2.0, 5.0, 1.0]), np.array([0.0, 1.0, 0.0]))
+    np.testing.assert_allclose(crossing(line, other), [2.0, 0.0, 0.5])
+    assert np.isnan(crossing(line, Line(np.ones(3), line.direction))).all()
+
+
+def test_ransac_line_passes_over_outliers():
+    rng = np.random.default_rng(1)
+    points = np.linspace(0.0, 100.0, 40)[:, None] * np.array([0.6, 0.8, 0.0]) + rng.normal(0.0, 0.1, (40, 3))
+    points[::3] += rng.uniform(20.0, 50.0, (14, 3))
+    line = ransac_line(points, 1.0, 0.999, 500, rng)
+    assert line is not None
+    assert abs(line.direction @ [0.6, 0.8, 0.0]) == pytest.approx(1.0, abs=1e-4)
+    assert ransac_line(np.zeros((5, 3)), 1.0, 0.99, 50, rng) is None
+    assert abs(fit_line(points).direction @ [0.6, 0.8, 0.0]) < 0.99  # which least squares alone does not
+
+
+def test_polyline_nearest_by_hand():
+    line = Polyline.through(np.array([[0.0, 0, 0], [10.0, 0, 0], [10.0, 10.0, 0]]))
+    s, offset = line.nearest(np.array([[4.0, 3.0, 0.0], [13.0, 6.0, 4.0], [-1.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(s, [4.0, 16.0, 0.0])
+    np.testing.assert_allclose(offset, [[0, 3, 0], [3, 0, 4], [-1, 0, 0]])
+    np.testing.assert_allclose(line.at(np.array([15.0])), [[10.0, 5.0, 0.0]])
+
+
+def test_point_to_point_agrees_with_open3d():
+    o3d = pytest.importorskip("open3d")
+    rng = np.random.default_rng(2)
+    target = rng.uniform(0.0, 1000.0, (800, 3))
+    T_true = rigid.transform(rigid.rotation_from_vector(np.array([0.01, -0.02, 0.015])), np.array([5.0, -4.0, 3.0]))
+    source = rigid.apply(rigid.invert(T_true), target) + rng.normal(0.0, 1.0, target.shape)
+    found = icp.point_to_point(source, target, np.eye(4), max_distance_mm=80.0, max_iterations=200)
+    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud)) for cloud in (source, target)]
+    criteria = o3d.pipelines.registration.ICPConvergenceCriteria(1e-12, 1e-12, 200)
+    theirs = o3d.pipelines.registration.registration_icp(*clouds, 80.0, np.eye(4), criteria=criteria)
+    np.testing.assert_allclose(found.T_target_source, theirs.transformation, atol=1e-6)
+    assert found.rms == pytest.approx(theirs.inlier_rmse, rel=1e-6)
+
+
+def test_point_to_plane_icp_recovers_the_pose_of_a_box():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1.0, 1.0, (6000, 3)) * [3000.0, 900.0, 500.0]
+    axis = rng.integers(0, 3, len(points))
+    side = np.where(rng.uniform(size=len(points)) < 0.5, -1.0, 1.0)
+    normals = np.zeros_like(points)
+    points[np.arange(len(points)), axis] = side * np.array([3000.0, 900.0, 500.0])[axis]
+    normals[np.arange(len(points)), axis] = side
+    T_true = rigid.transform(rigid.rotation_from_vector(np.array([0.01, 0.02, -0.01])), np.array([40.0, -30.0, 20.0]))
+    source = rigid.apply(rigid.invert(T_true), points[::7]) + rng.normal(0.0, 0.5, (len(points[::7]), 3))
+    boxes = icp.boxes_of(cKDTree(points))
+    found = icp.point_to_plane(source, boxes, normals, np.eye(4), gates_mm=(200.0, 50.0, 10.0))
+    moved = rigid.apply(found.T_target_source @ rigid.invert(T_true), np.array([[3000.0, 900.0, 500.0]]))
+    assert np.linalg.norm(moved - [3000.0, 900.0, 500.0]) < 0.2
+
+
+def point_to_plane_by_arrays(source, points, normals, start, gates_mm, axes):
+    """Return the pose of icp.point_to_plane, by a plain search for all points and whole arrays."""
+    tree, T = cKDTree(points), start
+    for gate in gates_mm:
+        for _ in range(15):
+            placed = rigid.apply(T, source)
+            distance, index = tree.query(placed, distance_upper_bound=3.0 * gate)
+            p, at = placed[np.isfinite(distance)], index[np.isfinite(distance)]
+            r = np.einsum("ni,ni->n", p - points[at], normals[at])
+            keep = np.abs(r) <= gate
+            p, n, r = p[keep], normals[at][keep], r[keep]
+            weight = np.minimum(1.0, 1.345 * robust_sd(r, gate / 12.0) / np.maximum(np.abs(r), 1e-12))
+            weight *= 1.0 if axes is None else icp.balance(icp.facing(n, axes))
+            centre = p.mean(axis=0)
+            J = np.hstack([np.cross(p - centre, n), n])
+            step = np.linalg.lstsq(J.T @ (weight[:, None] * J), -J.T @ (weight * r), rcond=None)[0]
+            R = rigid.rotation_from_vector(step[:3])
+            T = rigid.transform(R, centre + step[3:] - R @ centre) @ T
+            reach = np.linalg.norm(p - centre, axis=1).max()
+            if np.linalg.norm(step[:3]) * reach + np.linalg.norm(step[3:]) < 1e-3 * gate:
+                break
+    return T
+
+
+@pytest.mark.parametrize("turn", [0.02, 0.3])
+@pytest.mark.parametrize("sides", [1, 3])
+def test_point_to_plane_by_its_kernel_is_that_by_arrays(turn, sides):
+    rng = np.random.default_rng(8)
+    points, normals = rng.uniform(-1.0, 1.0, (4000, 3)) * [3000.0, 900.0, 500.0], np.zeros((4000, 3))
+    axis = 2 - rng.integers(0, sides, len(points))  # of one side alone, three motions are not determined
+    points[np.arange(len(points)), axis] = np.array([3000.0, 900.0, 500.0])[axis]
+    normals[np.arange(len(points)), axis] = 1.0
+    T = rigid.transform(rigid.rotation_from_vector(np.array([turn, -0.02, 0.01])), np.array([60.0, -30.0, 20.0]))
+    source = rigid.apply(T, points[::7]) + rng.normal(0.0, 0.5, (len(points[::7]), 3))
+    boxes, gates = icp.boxes_of(cKDTree(points)), (400.0, 150.0, 12.0)
+    for axes in (None, rigid.rotation_from_vector(np.array([0.02, 0.01, 0.0]))):
+        found = icp.point_to_plane(source, boxes, normals, np.eye(4), gates_mm=gates, axes=axes).T_target_source
+        expected = point_to_plane_by_arrays(source, points, normals, np.eye(4), gates, axes)
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7)
+
+
+def test_point_to_plane_without_pairs_leaves_the_pose():
+    points, normals = np.eye(3)[[0, 1, 2, 0, 1, 2, 0]] * 10.0, np.eye(3)[[2, 2, 2, 2, 2, 2, 2]]
+    boxes = icp.boxes_of(cKDTree(points))
+    found = icp.point_to_plane(points + 1e4, boxes, normals, np.eye(4), gates_mm=(50.0, 10.0))
+    assert (found.rms, found.paired_share, found.iterations) == (np.inf, 0.0, 1)
+    np.testing.assert_array_equal(found.T_target_source, np.eye(4))
+
+
+@pytest.mark.parametrize("count", [3, 40, 3000])
+def test_partners_of_points_that_move_are_those_of_a_plain_search(count):
+    rng = np.random.default_rng(6)
+    tree = cKDTree(rng.uniform(0.0, 1000.0, (count, 3)))
+    boxes = icp.boxes_of(tree)
+    points = rng.uniform(-100.0, 1100.0, (2000, 3))
+    known, near = icp.nothing_known(len(points)), np.empty(len(points), np.bool_)
+    for step, reach in ((0.0, 90.0), (300.0, 90.0), (20.0, 90.0), (3.0, 90.0), (0.3, 60.0), (0.0, 60.0), (3.0, 200.0)):
+        points = points + rng.normal(0.0, step, points.shape)
+        icp.find_partners(boxes, points, reach, known, near)
+        distance, expected = tree.query(points, distance_upper_bound=reach)
+        np.testing.assert_array_equal(near, np.isfinite(distance))
+        np.testing.assert_array_equal(boxes.row[known.first[near]], expected[near])
+        assert 0 < near.sum() < len(points)
+
+
+def test_spacing_of_a_grid_and_of_random_points():
+    x, y = np.meshgrid(np.arange(100.0) * 7.0, np.arange(100.0) * 7.0)
+    grid = np.stack([x.ravel(), y.ravel(), 0.0 * x.ravel()], axis=1)
+    assert neighbors.surface_spacing(grid) == pytest.approx(7.0, rel=0.15)
+    rng = np.random.default_rng(4)
+    loose = np.column_stack([rng.uniform(0.0, 700.0, (10_000, 2)), np.zeros(10_000)])
+    assert neighbors.surface_spacing(loose) == pytest.approx(7.0, rel=0.10)
+    assert np.isnan(neighbors.surface_spacing(np.zeros((1, 3))))
+    many = np.column_stack([rng.uniform(0.0, 7000.0, 250_000), rng.uniform(0.0, 1750.0, 250_000), np.zeros(250_000)])
+    assert neighbors.surface_spacing(many) == pytest.approx(7.0, rel=0.05)
+
+
+def test_outliers_are_those_of_open3d():
+    o3d = pytest.importorskip("open3d")
+    rng = np.random.default_rng(5)
+    points = np.vstack(
+        [np.column_stack([rng.uniform(0, 500, (4000, 2)), np.zeros(4000)]), rng.uniform(0, 500, (40, 3))]
+    )
+    grid = neighbors.of_spacing(points)
+    ours = np.zeros(len(points), bool)
+    ours[grid.order] = neighbors.statistical_inliers(grid, 20, 2.0)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    # Open3D counts the point itself as its first neighbour, so its mean is 20/21 of ours; the rule is scale-free.
+    theirs = np.zeros(len(points), bool)
+    theirs[np.asarray(cloud.remove_statistical_outlier(21, 2.0)[1])] = True
+    assert (ours != theirs).mean() < 0.001
+    assert ours[:4000].mean() > 0.98
+    assert ours[4000:].mean() < 0.2
+
+
+def test_voxel_means_by_hand():
+    points = np.array([[0.0, 0, 0], [1.0, 0, 0], [10.0, 0, 0], [11.0, 2.0, 0], [30.0, 0, 0]])
+    means = neighbors.voxel_means(points, 5.0, least=2)
+    np.testing.assert_allclose(means, [[0.5, 0, 0], [10.5, 1.0, 0]])
+
+
+def test_voxel_means_do_not_depend_on_how_many_voxels_are_empty():
+    points = np.random.default_rng(7).uniform(0.0, 100.0, (500, 3))
+    near = neighbors.voxel_means(points, 10.0)  # 1000 voxels for 500 points
+    far = neighbors.voxel_means(np.vstack([points, np.full((1, 3), 1e5)]), 10.0)  # 10^12 voxels
+    np.testing.assert_array_equal(far[:-1], near)
+    np.testing.assert_array_equal(far[-1], [1e5, 1e5, 1e5])
+
+
+def test_the_order_by_cells_does_not_depend_on_that_of_the_file():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0.0, 300.0, (2_000, 3)).round(0)  # some coordinates are equal
+    shuffled = points[rng.permutation(len(points))]
+    sorted_points = points[neighbors.by_cell(points, 40.0)]
+    np.testing.assert_array_equal(sorted_points, shuffled[neighbors.by_cell(shuffled, 40.0)])
+
+
+@pytest.mark.parametrize("grid_mm", [1e-6, 7.0])
+def test_the_order_by_cells_is_that_of_sorting_by_cell_and_coordinates(grid_mm):
+    points = np.round(np.random.default_rng(5).uniform(0.0, 300.0, (3000, 3)) / grid_mm) * grid_mm
+    x, y, z = (points - points.min(axis=0)).T // 40.0
+    np.testing.assert_array_equal(neighbors.by_cell(points, 40.0), np.lexsort((*points.T[::-1], z, y, x)))
+
+
+def test_the_nearest_rotation_is_the_polar_factor_and_never_a_reflection():
+    R = rigid.rotation_from_vector(np.array([0.4, -1.1, 0.7]))
+    stretch = np.array([[3.0, 0.5, 0.1], [0.5, 2.0, 0.3], [0.1, 0.3, 1.0]])
+    np.testing.assert_allclose(rigid.nearest_rotation(R @ stretch), R, atol=1e-14)
+    np.testing.assert_allclose(rigid.nearest_rotation(np.diag([3.0, 2.0, -1.0])), np.eye(3), atol=1e-14)

@@ -1,0 +1,117 @@
+"""Signs of normals: upwards where that decides, else one sign for each connected surface, in any order of points."""
+
+import numpy as np
+import pytest
+
+from processor.geometry import m3c2, neighbors, normal_orientation
+from processor.geometry.m3c2 import oriented
+from processor.geometry.normal_orientation import UP
+from tests.support.clouds.m3c2_clouds import wavy
+
+ACROSS = 120.0  # normal diameter, mm
+
+
+def wall(seed, along=(1.0, 0.0), count=8000, size=1000.0, sigma=2.0, lean=0.0):
+    """An upright wall through zero along a level direction, that leans by so much."""
+    rng = np.random.default_rng(seed)
+    u, z = rng.uniform(0.0, size, (2, count))
+    a, b = np.array(along) / np.linalg.norm(along)
+    off = rng.normal(0.0, sigma, count) - lean * z
+    return np.column_stack([u * a - off * b, u * b + off * a, z])
+
+
+def tube(seed, count=12_000, radius=150.0):
+    rng = np.random.default_rng(seed)
+    angle, z = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(0.0, 800.0, count)
+    r = radius + rng.normal(0.0, 1.0, count)
+    return np.column_stack([r * np.cos(angle), r * np.sin(angle), z])
+
+
+def turned(cloud, core=None, scanner=None, across=ACROSS):
+    core = cloud if core is None else core
+    found = m3c2.normals(neighbors.of_spacing(cloud), core, across)
+    return found, normal_orientation.turned(found, core, across, scanner)
+
+
+def test_normals_of_level_surfaces_equal_those_oriented_upwards_bit_for_bit():
+    cloud = wavy(20_000, 1)
+    found, got = turned(cloud)
+    np.testing.assert_array_equal(got.normals, oriented(found.normals, UP))
+    assert (got.up, got.upright) == (len(cloud), 0)
+
+
+@pytest.mark.parametrize(
+    ("along", "outward"),
+    [((1, 0), (0, 1)), ((0, 1), (1, 0)), ((1, 1), (-1, 1)), ((1, -1), (1, 1)), ((1, 2), (2, -1))],
+)
+def test_normals_of_an_upright_wall_have_one_side_by_convention(along, outward):
+    for seed in range(3):
+        found, got = turned(wall(seed, along))
+        assert 0.3 < (oriented(found.normals, UP)[:, :2] @ outward > 0.0).mean() < 0.7  # as it was: by chance
+        assert (got.normals[:, :2] @ outward > 0.0).all()
+        assert (got.convention, got.surfaces) == (8000, 1)
+
+
+def test_normals_of_a_leaning_wall_point_upwards_on_the_whole():
+    _, got = turned(wall(3, lean=0.05))
+    assert got.up == 0
+    assert (got.normals[:, 1] > 0.0).all()  # the side that looks up, though some of its normals do not
+    _, other = turned(wall(3, lean=-0.05))
+    assert (other.normals[:, 1] < 0.0).all()
+    steep, got = turned(wall(4, lean=0.4))
+    np.testing.assert_array_equal(got.normals, oriented(steep.normals, UP))
+
+
+def test_normals_of_a_wall_point_to_the_side_of_its_floor():
+    rng = np.random.default_rng(5)
+    for side in (1.0, -1.0):
+        x, y = rng.uniform(0.0, 1000.0, (2, 8000))
+        floor = np.column_stack([x, side * y, rng.normal(0.0, 1.0, 8000)])
+        upright = wall(6, sigma=1.0)
+        _, got = turned(np.vstack([floor, upright]))
+        high = slice(8000, None)
+        above = upright[:, 2] > 100.0
+        assert (side * got.normals[high][above, 1] > 0.0).all()
+        assert got.neighbours > 5000
+        assert got.surfaces <= 2
+        assert (got.normals[:8000][np.abs(floor[:, 1]) > 100.0, 2] > 0.9).all()
+
+
+def test_a_tube_that_stands_alone_looks_outward():
+    cloud = tube(7)
+    _, got = turned(cloud)
+    assert (np.einsum("ni,ni->n", got.normals[:, :2], cloud[:, :2]) > 0.0).all()
+
+
+def test_normals_of_an_upright_wall_point_to_the_scanner():
+    cloud = wall(8)
+    scanner = np.broadcast_to([500.0, -4000.0, 500.0], cloud.shape)
+    _, got = turned(cloud, scanner=scanner)
+    assert (got.normals[:, 1] < 0.0).all()
+    assert (got.scanner, got.convention) == (len(cloud), 0)
+    half = np.where(cloud[:, :1] < 500.0, scanner, np.nan)  # the rest follows its neighbours
+    _, got = turned(cloud, scanner=half)
+    assert (got.normals[:, 1] < 0.0).all()
+    assert got.scanner > 3000 < got.neighbours
+
+
+def test_order_and_repeated_points_do_not_change_orientations():
+    aside = np.array([600.0, 600.0, 0.0])
+    cloud = np.vstack([tube(9, 4000), wall(10, (1, -1), 4000) + aside, wavy(4000, 11) - [0.0, 0.0, 90.0]])
+    cloud = np.vstack([cloud, np.repeat(cloud[:300], 15, axis=0)])
+    found, first = turned(cloud)
+    mixed = np.random.default_rng(12).permutation(len(cloud))
+    _, again = turned(cloud[mixed])
+    np.testing.assert_array_equal(again.normals, first.normals[mixed])
+    np.testing.assert_array_equal(np.abs(first.normals), np.abs(found.normals))
+
+
+def test_orientation_works_for_few_distant_or_no_core_points():
+    cloud = wall(13)
+    _, got = turned(cloud, np.array([[100.0 + 80.0 * i, 0.0, 500.0] for i in range(11)]))
+    assert (got.normals[:, 1] > 0.9).all()
+    for core in (np.array([[500.0, 0.0, 500.0]]), np.array([[500.0, 0.0, 500.0], [1e5, 0.0, 0.0]])):
+        _, got = turned(cloud, core)
+        assert got.normals[0, 1] > 0.9
+    assert np.isnan(got.normals[1]).all()
+    assert turned(cloud, np.empty((0, 3)))[1].upright == 0

@@ -1,0 +1,135 @@
+"""Child processes and pools of them: limits, stopping, and the end of all descendants."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+
+import pytest
+
+from processor.jobs import process, runner
+from processor.jobs.child import Loss, Lost
+from processor.jobs.process import Cause
+from processor.model import InputError, UsageError
+
+SLEEP = "import time; time.sleep(60)"
+PARENT = """
+import sys
+from processor.jobs import process
+child = process.start(process.isolated(
+    "from processor.jobs.child import end_with_parent; end_with_parent(); import os, time;"
+    "print(os.getpid(), flush=True); time.sleep(60)"
+), stdout=None, own_group=sys.argv[1] == "own")
+child.wait()
+"""
+
+
+def alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat", encoding="ascii") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("group", ["own", "parent's"])
+def test_a_child_ends_with_its_parent(group):
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, group], stdout=subprocess.PIPE, text=True)
+    child = int(parent.stdout.readline())
+    assert alive(child)
+    parent.kill()
+    parent.communicate()
+    deadline = time.monotonic() + 10.0
+    while alive(child) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not alive(child)
+
+
+def test_end_of_a_command_has_cause_exit_code_and_last_line():
+    def ended(code, **limits):
+        return process.run([sys.executable, "-c", code], **limits)
+
+    exited = ended("import sys; x = b'x' * 2**26; print('one\\n\\ntwo \\n\\n', file=sys.stderr); sys.exit(3)")
+    assert (exited.cause, exited.code, exited.last_line) == (Cause.EXIT, 3, "two")
+    assert exited.max_rss_mb > 64.0
+    killed = ended("import os, signal; os.kill(os.getpid(), signal.SIGTERM)")
+    assert (killed.cause, killed.code) == (Cause.SIGNAL, 15)
+    assert ended(SLEEP, timeout_s=0.1).cause is Cause.TIME
+    assert ended(f"x = b'x' * 2**27; {SLEEP}", memory_mb=100).cause is Cause.MEMORY
+    assert ended(SLEEP, stopped=lambda: True).cause is Cause.STOPPED
+    assert ended(SLEEP, timeout_s=0.1, own_group=False).cause is Cause.TIME
+
+
+def test_all_descendants_of_a_command_are_ended(tmp_path):
+    code = (
+        "import subprocess, sys; from pathlib import Path;"
+        f"inner = subprocess.Popen([sys.executable, '-c', {SLEEP!r}]); Path(sys.argv[1]).write_text(str(inner.pid))"
+    )
+    ended = process.run([sys.executable, "-c", code, str(tmp_path / "pid")])
+    assert ended.cause is Cause.EXIT
+    inner = int((tmp_path / "pid").read_text())
+    deadline = time.monotonic() + 10.0
+    while alive(inner) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not alive(inner)
+
+
+def fail(_):
+    raise ImportError("no module\nnamed x")
+
+
+def test_raising_job_is_lost_and_its_process_takes_the_next():
+    pool = process.Pool()
+    assert pool.do(fail, 1) == Lost(Loss.NOT_RUN, "ImportError: no module named x")
+    assert pool.do(abs, -2) == 2
+    assert len(pool._idle) == 1
+    pool.close()
+
+
+def test_a_job_is_stopped_at_once():
+    pool, stop = process.Pool(), threading.Event()
+    threading.Timer(0.5, stop.set).start()
+    started = time.monotonic()
+    assert pool.do(time.sleep, 60.0, stop.is_set) == Lost(Loss.STOPPED)
+    assert time.monotonic() - started < 20.0
+    assert not pool._idle
+
+
+def test_an_error_of_a_job_here_stops_the_others():
+    stopped, all_began = [], threading.Barrier(3, timeout=60.0)
+
+    def do(job, is_stopped):
+        all_began.wait()
+        if job == 0:
+            raise InputError("no room")
+        while not is_stopped():
+            time.sleep(0.01)
+        stopped.append(job)
+
+    with pytest.raises(InputError, match="no room"), closing(runner.Local(3).run(do, range(3))) as results:
+        list(results)
+    assert sorted(stopped) == [1, 2]
+
+
+def test_signal_is_raised_at_the_next_check():
+    with runner.stoppable() as check_stop:
+        check_stop()
+        os.kill(os.getpid(), 15)
+        time.sleep(0.1)
+        with pytest.raises(runner.StoppedError) as caught:
+            check_stop()
+    assert caught.value.exit_code == 143
+
+
+@pytest.mark.parametrize("name", ["", "file"])
+def test_lock_is_refused_while_it_is_taken(tmp_path, name):
+    with (
+        runner.locked(tmp_path / name, "busy"),
+        pytest.raises(UsageError, match="busy"),
+        runner.locked(tmp_path / name, "busy"),
+    ):
+        pass
+    with runner.locked(tmp_path / name, "busy"):
+        pass

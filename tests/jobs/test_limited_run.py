@@ -1,0 +1,79 @@
+"""A run with limits: the cause of its end is reported, and finished steps are stored."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from processor import pipeline
+from processor.api import runs
+from processor.cli import limited_run
+from processor.jobs.process import Cause, Ended
+from processor.store import store
+from tests.support.processes import commands
+from tests.support.results.step_results import scene
+
+
+@pytest.fixture
+def site(tmp_path):
+    path = tmp_path / "site.h5"
+    store.write_scene(path, scene(), None, {})
+    return path
+
+
+def run(*arguments):
+    command = [sys.executable, "-m", "processor", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def ended(cause, code=0, last_line=""):
+    return Ended(cause, code=code, last_line=last_line, seconds=1.0, peak_mb=1.0, max_rss_mb=1.0)
+
+
+def test_results_so_far_are_stored_before_each_step(tmp_path, site):
+    part = tmp_path / "out.part"
+    runs.compute(site, steps="deviation", method="default,paper", so_far=part)
+    (first,), provenance = pipeline.read_runs(part / "results.h5")
+    assert first.step == "deviation"
+    assert provenance["planned"] == ["deviation (default)", "deviation (paper)"]
+    said = limited_run._what_is_done(part, site)
+    assert said.startswith("done: deviation (default); not done: deviation (paper); ")
+    assert commands.here("processor", "report", part, site).returncode in (0, 1)
+    assert (part / "report.html").is_file()
+
+
+def test_storing_intermediate_results_does_not_change_the_results(tmp_path, site):
+    for out, so_far in (("a", None), ("b", tmp_path / "part")):
+        runs.write(runs.compute(site, steps="deviation", so_far=so_far), tmp_path / out)
+    assert (tmp_path / "a" / "results.h5").read_bytes() == (tmp_path / "b" / "results.h5").read_bytes()
+
+
+def test_limits_end_a_run(tmp_path, site):
+    out = tmp_path / "out"
+    for option, value, said in (
+        ("--memory-mb", 64, "expected the run to take at most 64 MB (--memory-mb), it took more"),
+        ("--timeout-s", 0.2, "expected the run to end within 0.2 s (--timeout-s), it did not"),
+    ):
+        ended = run("run", site, "-o", out, "--steps", "deviation", option, value)
+        assert ended.returncode == 3
+        assert ended.stderr.splitlines()[-1].startswith(f"error: {site}: {said}; ")
+        assert not out.exists()
+
+
+def test_a_run_within_its_limits_is_as_without(tmp_path, site):
+    out = tmp_path / "out"
+    ended = run("run", site, "-o", out, "--steps", "deviation", "--timeout-s", 500, "--memory-mb", 4_000)
+    assert ended.returncode in (0, 1), ended.stderr
+    assert (out / "results.json").is_file()
+    assert not (tmp_path / "out.part").exists()
+    bad = run("run", tmp_path / "absent", "-o", out, "--timeout-s", 500)
+    assert (bad.returncode, "no such file" in bad.stderr) == (3, True)
+
+
+def test_ended_run_has_a_reason_for_each_cause():
+    assert limited_run._why(ended(Cause.EXIT), 1.0, 100) == ""
+    assert "within 1 s" in limited_run._why(ended(Cause.TIME), 1.0, None)
+    assert "100 MB" in limited_run._why(ended(Cause.EXIT, 3, "error: Unable to allocate 9 GiB"), None, 100)
+    assert "SIGSEGV" in limited_run._why(ended(Cause.SIGNAL, 11), None, 100)

@@ -1,0 +1,226 @@
+"""Tiles of one scene on a cluster: the same results as here, whatever happens to workers."""
+
+import os
+from collections import Counter
+
+import numpy as np
+import pytest
+
+import processor
+from processor import tiles
+from processor.api import runs
+from processor.cli.main import commands
+from processor.compare import core_tiles
+from processor.compare.compare import Request, compare
+from processor.deviation import cloud, large_cloud
+from processor.geometry import m3c2, point_grid
+from processor.jobs import runner, tile_cluster
+from processor.model import InputError, Scan, Scene, Stations, UsageError
+from processor.space_frame.spheres import node_tiles
+from processor.store import store
+from processor.tiles import Shared
+from tests.support.clouds import frame_clouds
+from tests.support.clouds.m3c2_clouds import wavy
+from tests.support.processes import tile_functions
+from tests.support.processes.dask_cluster import cluster_in, dask_cluster  # noqa: F401
+from tests.support.scenes.bracket_scenes import scene_of
+
+TILES = [np.full(3, float(k)) for k in range(7)]
+
+
+def no_log(_):
+    """Drop a line of progress."""
+
+
+def test_tiles_are_computed_here_in_order():
+    found = tiles.mapped(tile_functions.scaled, TILES, Shared(np.array([2.0])))
+    assert [int(part[0]) for part, _, _ in found] == [0, 2, 4, 6, 8, 10, 12]
+
+
+def test_tiles_are_generated_one_by_one():
+    """The next tile is made only when the result of the last one was taken: many tiles need no memory."""
+    made = []
+    found = tiles.mapped(np.sum, (made.append(k) or tile for k, tile in enumerate(TILES)))
+    next(found)
+    assert made == [0]
+
+
+def test_ranges_cover_all_rows():
+    assert [(part.start, part.stop) for part in tiles.ranges(10, 4)] == [(0, 4), (4, 8), (8, 10)]
+    assert tiles.ranges(0, 4) == []
+
+
+def test_tiles_on_a_cluster_come_in_order_from_its_workers(dask_cluster):  # noqa: F811
+    factor = Shared(np.array([2.0]))
+    with tile_cluster.on_cluster(dask_cluster.address, no_log):
+        for _ in range(2):
+            found = list(tiles.mapped(tile_functions.scaled, iter(TILES), factor))
+            assert [int(part[0]) for part, _, _ in found] == [0, 2, 4, 6, 8, 10, 12]
+            assert all(writeable for _, writeable, _ in found)
+            assert {pid for *_, pid in found} <= {one.pid for one in dask_cluster.workers.values()}
+        assert [pid for *_, pid in tiles.mapped(tile_functions.scaled, TILES[:1], factor)] == [os.getpid()]
+    assert {pid for *_, pid in tiles.mapped(tile_functions.scaled, TILES, factor)} == {os.getpid()}
+
+
+def test_errors_of_tiles_are_raised(dask_cluster):  # noqa: F811
+    with tile_cluster.on_cluster(dask_cluster.address, no_log):
+        with pytest.raises(InputError, match="tile 0: refused"):
+            list(tiles.mapped(tile_functions.refused, TILES))
+        with pytest.raises(InputError, match="a worker has too little memory for a tile"):
+            list(tiles.mapped(tile_functions.without_memory, TILES))
+
+
+def test_a_worker_with_other_software_is_named(dask_cluster, monkeypatch):  # noqa: F811
+    other = {**tile_cluster.software(), "numpy": "1.0"}
+    monkeypatch.setattr(tile_cluster, "software", lambda: other)
+    message = rf"--cluster {dask_cluster.address}: tcp://.*: a worker has other software: numpy .*, not 1.0"
+    with pytest.raises(UsageError, match=message), tile_cluster.on_cluster(dask_cluster.address, no_log):
+        pass
+    monkeypatch.setattr(tile_cluster, "_check_workers", lambda _: None)  # as of a worker that joins later
+    with (
+        pytest.raises(InputError, match=r"a worker has other software: numpy .*, not 1.0"),
+        tile_cluster.on_cluster(dask_cluster.address, no_log),
+    ):
+        list(tiles.mapped(np.sum, TILES))
+
+
+def test_dying_worker_has_its_tile_computed_again(tmp_path):
+    """Its tile is computed again; Dask gives up after some attempts, and the message says what to do."""
+    with cluster_in(tmp_path) as cluster:
+        cluster.add_worker("a")
+        cluster.add_worker("b")
+        attempts = tmp_path / "attempts"
+        attempts.mkdir()
+        with tile_cluster.on_cluster(cluster.address, no_log):
+            found = list(tiles.mapped(tile_functions.ends_its_worker, TILES, Shared(str(attempts))))
+        np.testing.assert_array_equal(found, np.sqrt(TILES))
+        again = {k for k, n in Counter(one.name.split("-")[0] for one in attempts.iterdir()).items() if n > 1}
+        assert "2" in again
+        assert len(again) <= 2 * tile_cluster.AHEAD, "of those submitted, what it had begun or not handed over"
+        assert sum(one.poll() is not None for one in cluster.workers.values()) == 1
+
+
+# --- results ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Scans of a few thousand points are large, and their slabs small."""
+    monkeypatch.setattr(cloud, "MOST_POINTS", 5_000)
+    monkeypatch.setattr(cloud, "SAMPLE_POINTS", 4_000)
+    monkeypatch.setattr(large_cloud, "SLAB_POINTS", 2_000)
+    monkeypatch.setattr(large_cloud, "PASS_POINTS", 2_000)
+
+
+@pytest.fixture
+def used(monkeypatch):
+    """The names of the functions whose tiles a cluster computes."""
+    names, results = set(), tile_cluster._ClusterWorkers.results
+
+    def noted(self, function, *rest):
+        names.add(function.__name__)
+        return results(self, function, *rest)
+
+    monkeypatch.setattr(tile_cluster._ClusterWorkers, "results", noted)
+    return names
+
+
+def stored(scene, path, step, cluster):
+    """The bytes of results.h5, without the report."""
+    execution = runs.compute(scene, steps=step, cluster=cluster).execution
+    store.write_results(path, execution.runs, execution.provenance)
+    return path.read_bytes()
+
+
+def test_a_deviation_has_the_same_bytes_as_here(dask_cluster, small, used, tmp_path):  # noqa: F811
+    scene = scene_of(scans=2, count=8_000)
+    here, there = (stored(scene, tmp_path / "a.h5", "deviation", one) for one in (None, dask_cluster.address))
+    assert used == {"_near", "_first_of", "_second_of", "_last_of", "_on_pieces_of"}
+    assert here == there
+
+
+def test_spheres_have_the_same_bytes_as_here(dask_cluster, used, tmp_path, monkeypatch):  # noqa: F811
+    points, station = frame_clouds.scanned(frame_clouds.grid(3, 2), np.random.default_rng(1))
+    scan = Scan("s", points, point_station=station)
+    stations = Stations(("A", "B", "C", "D"), frame_clouds.STATIONS)
+    scene = Scene("frame", "space-frame", (scan,), stations=stations, units="mm")
+    found = []
+    for nodes, cluster in ((200, None), (3, None), (3, dask_cluster.address)):
+        monkeypatch.setattr(node_tiles, "NODES", nodes)
+        found.append(stored(scene, tmp_path / "a.h5", "spheres", cluster))
+    assert used == {"_chosen", "_fitted"}
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.slow
+def test_a_run_writes_the_same_files_as_here(dask_cluster, small, tmp_path):  # noqa: F811
+    store.write_scene(tmp_path / "bracket.h5", scene_of(scans=2), None, {})
+    for out, cluster in (("here", None), ("there", dask_cluster.address)):
+        processor.run(tmp_path / "bracket.h5", tmp_path / out, steps="deviation", cluster=cluster)
+    for name in ("results.h5", "results.json", "deviation.csv"):
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes(), name
+
+
+def test_core_points_in_tiles_are_measured_as_at_once(monkeypatch):
+    """Upright and level surfaces, places far away, and places and normals that are unknown."""
+    monkeypatch.setattr(core_tiles, "CORE_POINTS", 300)
+    first, second = (np.vstack([one, one[:, [2, 0, 1]]]) for one in (wavy(4000, 1), wavy(4000, 2, 5.0)))
+    core = np.vstack([first[::4], [[1e6, 0.0, 0.0], [np.nan, 0.0, 0.0]]])
+    grids = m3c2.grid(first, 60.0), m3c2.grid(second, 60.0)
+    normals, tiled = m3c2.normals(grids[0], core, 90.0), core_tiles.normals(grids[0], core, 90.0)
+    lengths = core_tiles.Lengths(60.0, 40.0, 0.5)
+    whole = m3c2.distances(*grids, core, normals.normals, **lengths._asdict())
+    parts = core_tiles.distances(*grids, core, normals.normals, lengths)
+    assert np.isfinite(whole.lod95).sum() > 1500
+    for one, other in ((normals, tiled), (whole, parts)):
+        for name, values in vars(one).items():
+            np.testing.assert_array_equal(getattr(other, name), values)
+
+
+def test_a_part_of_a_grid_holds_the_points_about_a_box():
+    points = np.random.default_rng(1).uniform(-50.0, 50.0, (5000, 3))
+    grid = point_grid.of_points(points, 4.0)
+    low, high = np.array([-20.0, 5.0, -60.0]), np.array([0.0, 30.0, 0.0])
+    part = point_grid.within(grid, low, high)
+    inside = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    assert set(inside) <= set(part.order)
+    assert part.count < 0.5 * grid.count
+    np.testing.assert_array_equal(points[part.order], part.cells.points)
+    assert point_grid.within(grid, low + 500.0, high + 500.0).count == 0
+
+
+def test_a_comparison_has_the_same_bytes_as_here(dask_cluster, used, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(core_tiles, "CORE_POINTS", 1000)
+    for name, points in (("a.xyz", wavy(3000, 1)), ("b.xyz", wavy(3000, 2, 5.0))):
+        np.savetxt(tmp_path / name, points)
+    request, found = Request(tmp_path / "a.xyz", tmp_path / "b.xyz"), []
+    for address in (None, dask_cluster.address):
+        with tile_cluster.on_cluster(address, no_log):
+            found.append(compare(request))
+    assert used == {"_normals", "_distances"}
+    for name in ("distance", "lod95", "n1", "n2", "std1", "std2"):
+        here, there = (getattr(one.distances, name) for one in found)
+        assert here.tobytes() == there.tobytes()
+    assert found[0].normals.tobytes() == found[1].normals.tobytes()
+
+
+@pytest.mark.parametrize("command", [("run", "a.xyz", "--steps", "spheres"), ("compare", "a.xyz", "b.xyz")])
+def test_commands_take_a_cluster(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "CONNECT_S", 0.2)
+    for name in ("a.xyz", "b.xyz"):
+        np.savetxt(tmp_path / name, wavy(100, 1))
+    arguments = [str(tmp_path / one) if one.endswith(".xyz") else one for one in command]
+    with pytest.raises(UsageError, match="expected the address of a Dask scheduler that answers"):
+        commands([*arguments, "-o", str(tmp_path / "out"), "--cluster", "tcp://127.0.0.1:1"], standalone_mode=False)
+
+
+@pytest.mark.slow
+def test_a_comparison_writes_the_same_files_as_here(dask_cluster, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(core_tiles, "CORE_POINTS", 1000)
+    for name, points in (("a.xyz", wavy(3000, 1)), ("b.xyz", wavy(3000, 2, 5.0))):
+        np.savetxt(tmp_path / name, points)
+    for out, further in (("here", []), ("there", ["--cluster", dask_cluster.address])):
+        arguments = ["compare", tmp_path / "a.xyz", tmp_path / "b.xyz", "-o", tmp_path / out, *further]
+        commands([str(one) for one in arguments], standalone_mode=False)
+    for path in (tmp_path / "here").iterdir():
+        assert path.read_bytes() == (tmp_path / "there" / path.name).read_bytes(), path.name

@@ -1,0 +1,152 @@
+"""Limits as data: content of the files, limits of a project, and messages on mistakes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from processor.limits import measurands, standards
+from processor.model import InputError, Limit, Scan, Scene, Tolerance
+from processor.preassembly.verdicts import chain, joints
+from processor.scan_folder import folder
+from processor.space_frame.spheres import assessment
+from processor.store import store
+
+MEASURES = ("", *(measure for of_step in measurands.MEASURES.values() for measure in of_step))
+
+
+def limit(standard, key):
+    return standards.find(standards.load(standard), key)
+
+
+def write_project(place, text):
+    np.savetxt(place / "scan.xyz", np.random.default_rng(0).uniform(size=(50, 3)))
+    (place / "project.toml").write_text(text)
+    return place
+
+
+def test_every_limit_has_a_meaning_source_and_measure():
+    assert len(standards.standards()) >= 6
+    for name, standard in standards.standards().items():
+        keys = [row.key for row in standard.limits]
+        assert len(set(keys)) == len(keys), name
+        for row in standard.limits:
+            assert row.what, row.key
+            assert row.source, row.key
+            assert row.measure in MEASURES or row.measure.startswith("part ")
+            assert row.key.endswith({"mm": "_mm", "arcmin": "_arcmin", "1": "_ratio"}[row.unit])
+            assert (row.rule in ("smaller", "sum")) == (not math.isnan(row.high_ratio) and not math.isnan(row.high)), (
+                row.key
+            )
+            assert bool(row.of) == (not all(map(math.isnan, (row.high_ratio, row.above_mm, row.up_to_mm))))
+            low, high = standards.bounds(
+                row, dict.fromkeys(("length", "thickness", "diameter", "spacing", "height"), 1000.0)
+            )
+            assert low < high < math.inf
+            assert not (row.verified and not row.clause), "a verified row has its clause"
+
+
+def test_measures_are_those_of_the_bridges_steps():
+    assert (*joints.MEASURES, *chain.MEASURES) == measurands.MEASURES["preassemble"]
+
+
+def test_only_limits_checked_in_print_are_verified():
+    seen = {(name, row.clause) for name, one in standards.standards().items() for row in one.limits if row.verified}
+    assert seen == {("GB 50205-2020", "11.3.6"), ("JGJ 7-2010", "6.11"), ("AWS D1.1", "7.22.9")}
+
+
+def test_numbers_by_hand():
+    assert standards.bounds(limit("GB 50205-2020", "misalignment_mm"), {}) == (-math.inf, 2.0)
+    assert standards.bounds(limit("GB 50205-2020", "groove_gap_mm"), {}) == (-1.0, 2.0)
+    bow = limit("GB 50205-2020", "bow_mm")  # l/1500 and 10
+    assert standards.bounds(bow, {"length": 12_000.0})[1] == pytest.approx(8.0)
+    assert standards.bounds(bow, {"length": 30_000.0})[1] == 10.0
+    assert math.isnan(standards.bounds(bow, {})[1])
+    for name, expected in (("EN 1090-2", 4.0), ("EN 1090-2 class 1", 4.0), ("EN 1090-2 class 2", 3.0)):
+        # At 10 m: 10000/5000 + 2 = 4 and 10000/10000 + 2 = 3.
+        bounds = standards.bounds(limit(name, "length_mm"), {"length": 10_000.0})
+        assert bounds == pytest.approx((-expected, expected))
+    edge = limit("JTG arch rib", "misalignment_mm")  # 0.2 t and 2
+    assert standards.bounds(edge, {"thickness": 8.0})[1] == pytest.approx(1.6)
+    assert standards.bounds(edge, {"thickness": 24.0})[1] == 2.0
+    camber = limit("GB 50205-2020", "camber_not_specified_mm")  # +l/2000, -0
+    assert standards.bounds(camber, {"length": 40_000.0}) == pytest.approx((0.0, 20.0))
+
+
+def test_unknown_standard_names_those_there_are():
+    with pytest.raises(InputError, match=r"'GB 50205'.*GB 50205-2020, JGJ 7-2010"):
+        standards.load("GB 50205")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('standard = "ISO 1"', r"project\.toml: tolerance: unknown standard 'ISO 1'; .*EN 1090-2 class 2"),
+        (
+            "misalignment = 2.0",
+            r"unknown key 'misalignment' \(did you mean .*\?\); known are standard, root_gap_mm, .*node_place",
+        ),
+        ("misalignment_mm = [0, 2]", r"expected a number as 'misalignment_mm', found a list"),
+        ("groove_gap_mm = 2.0", r"expected numbers of shape 2 as 'groove_gap_mm', found 2\.0"),
+        ("groove_gap_mm = [2.0, -1.0]", r"expected two numbers, least and greatest as 'groove_gap_mm'"),
+        ("root_gap_mm = 'no'", r"expected a number as 'root_gap_mm'"),
+        ("standard = 5", "expected a text as 'standard'"),
+    ],
+)
+def test_a_slip_in_a_project_is_named(tmp_path, text, said):
+    with pytest.raises(InputError, match=said):
+        folder.read_input(write_project(tmp_path, f"[tolerance]\n{text}\n"))
+
+
+def test_a_projects_own_limits_win_and_go_through_the_store(tmp_path):
+    text = '[tolerance]\nstandard = "GB 50205-2020"\nmisalignment_mm = 1.5\ngroove_gap_mm = [-2, 3]\nroot_gap_mm = 6\n'
+    scene = folder.read_input(write_project(tmp_path, text))
+    found = scene.tolerance
+    own = standards.find(found, "misalignment_mm")
+    assert (own.high, own.verified, own.clause, own.source) == (1.5, True, "", "project.toml")
+    assert standards.bounds(standards.find(found, "groove_gap_mm"), {}) == (-2.0, 3.0)
+    assert standards.find(found, "span_mm").high == 5.0
+    assert len(found.limits) == len(standards.load("GB 50205-2020").limits)
+    assert found.root_gap_mm == 6.0
+    store.write_scene(tmp_path / "s.h5", scene, None, {})
+    assert store.problems(tmp_path / "s.h5") == []
+    back = store.read_scene(tmp_path / "s.h5").tolerance
+    assert repr(back) == repr(found)
+    assert store.scene_hash(scene) != store.scene_hash(dataclasses.replace(scene, tolerance=None))
+
+
+def test_project_without_a_standard_has_its_own_limits_alone(tmp_path):
+    scene = folder.read_input(write_project(tmp_path, "[tolerance]\nsplice_eccentricity_mm = 4.0\n"))
+    assert [row.key for row in scene.tolerance.limits] == ["splice_eccentricity_mm"]
+    assert standards.bounds(scene.tolerance.limits[0], {}) == (-math.inf, 4.0)
+
+
+def test_project_may_set_a_limit_that_no_standard_has(tmp_path):
+    for name in standards.standards():
+        assert standards.find(standards.load(name), standards.NODE_PLACE) is None
+    for text in ("", 'standard = "JGJ 7-2010"\n'):
+        scene = folder.read_input(write_project(tmp_path, f"[tolerance]\n{text}node_place_mm = 15\n"))
+        own = standards.find(scene.tolerance, standards.NODE_PLACE)
+        assert (own.high, own.verified, own.source) == (15.0, True, "project.toml")
+
+
+def test_empty_tolerance_table_gives_no_limits(tmp_path):
+    assert folder.read_input(write_project(tmp_path, "[tolerance]\n")).tolerance is None
+    assert standards.default_for(None).standard == "GB 50205-2020"
+    empty = Scene("e", "structure", (Scan("s", np.eye(3)),), tolerance=Tolerance())
+    store.write_scene(tmp_path / "e.h5", empty, None, {})
+    assert store.read_scene(tmp_path / "e.h5").tolerance == Tolerance()
+
+
+def test_blank_tolerances_of_balls_follow_their_diameters():
+    # Half of +2/-1 up to a diameter of 120 and of +3/-1.5 above.
+    gb = standards.load("GB 50205-2020")
+    for limits in (gb, Tolerance(), standards.load("JGJ 7-2010")):
+        assert assessment.blank_tolerance(60.0, limits) == (0.5, 1.0)
+        assert assessment.blank_tolerance(60.001, limits) == (0.75, 1.5)
+    own = Tolerance(limits=(Limit("ball_blank_diameter_small_mm", "x", low=-4.0, high=6.0, up_to_mm=120.0),))
+    assert assessment.blank_tolerance(50.0, own) == (2.0, 3.0)
+    assert assessment.blank_tolerance(75.0, own) == (0.75, 1.5)

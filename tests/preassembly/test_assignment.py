@@ -1,0 +1,130 @@
+"""Scans assigned to parts that they are not of: found before the costly registration, named, and matched."""
+
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from processor.geometry import rigid
+from processor.language.messages import messages
+from processor.model import Scene, reason
+from processor.preassembly import assemble
+from processor.preassembly import step as preassembly_step
+from processor.preassembly.parts import assignment
+from processor.preassembly.parts.assignment import ScanParts
+from processor.preassembly.parts.attitude import Shapes
+from processor.preassembly.result import Result
+from processor.preassembly.verdicts import reasons
+from tests.support.clouds import arch_clouds
+
+NAMES = arch_clouds.NAMES
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    return Shapes(arch_clouds.design())
+
+
+def scanned(part, seed=1, spacing_mm=30.0):
+    rng = np.random.default_rng(seed)
+    points = arch_clouds.scan_points(part, spacing_mm, 1.0, rng)
+    return rigid.apply(arch_clouds.random_pose(rng), points)
+
+
+@pytest.mark.parametrize(
+    ("came", "asked", "found"), [(2, 1, 2), pytest.param(1, 2, 1, marks=pytest.mark.slow), (3, 0, 1), (0, 2, 0)]
+)
+def test_scan_of_another_size_is_assigned_to_the_parts_of_that_size(shapes, came, asked, found):
+    """Ribs 1 and 3, and the feet, differ by their marks alone: any of them stands for both."""
+    assert assignment.rather(scanned(came), asked, shapes) == found
+
+
+@pytest.mark.parametrize("part", range(5))
+def test_scan_of_its_own_part_gets_no_other_assignment(shapes, part):
+    assert assignment.rather(scanned(part), part, shapes) is None
+
+
+def test_scan_of_half_a_part_gets_no_other_assignment(shapes):
+    points = scanned(1)
+    along = (points - points.mean(axis=0)) @ np.linalg.svd(points[::10] - points[::10].mean(axis=0))[2][0]
+    assert assignment.rather(points[along < 0.0], 1, shapes) is None
+
+
+def test_a_scan_of_something_else_is_of_no_part(shapes):
+    ball = np.random.default_rng(0).normal(size=(4_000, 3))
+    assert assignment.rather(3000.0 * ball / np.linalg.norm(ball, axis=1)[:, None], 1, shapes) == -1
+
+
+def scans_of(assigned, *parts):
+    return [ScanParts(f"Scan_{i:03d}", name, one) for i, (name, one) in enumerate(zip(assigned, parts, strict=True), 1)]
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(4)))[1:])
+def test_every_wrong_assignment_is_named_with_the_matching(order):
+    """All 24 permutations but the right one; scan i is of part i."""
+    names = NAMES[:4]
+    solved = assignment.solve(scans_of([names[k] for k in order], *((name,) for name in names)))
+    parts = [SimpleNamespace(identities=(scan,)) for scan in solved]
+    (headline,) = reasons.of_assignment(parts)
+    wrong = [i for i, k in enumerate(order) if i != k]
+    written = messages("en").sentences([headline])
+    for i in wrong:
+        assert f"Scan_{i + 1:03d} is {names[i]}, not {names[order[i]]}" in written
+    assert len(headline.values["scans"]) == len(wrong)
+    assert headline.values["matching"] == tuple(f"Scan_{i + 1:03d} = {name}" for i, name in enumerate(names))
+
+
+def test_scans_of_indistinguishable_parts_stay_unassigned():
+    """Two scans without a mark, each of rib 1 or rib 3: neither is named, and neither is wrong."""
+    either = ("rib1", "rib3")
+    solved = assignment.solve(scans_of(("rib3", "foot1", "rib1"), either, ("foot1",), either))
+    assert [scan.parts for scan in solved] == [either, ("foot1",), either]
+    assert not any(scan.wrong for scan in solved)
+    (wrong,) = ScanParts("S", "foot1", either).wrong
+    assert wrong.code == "preassemble.scan-of-others"
+
+
+def test_scan_without_a_mark_is_assigned_to_the_remaining_part():
+    either = ("rib1", "rib3")
+    solved = assignment.solve(scans_of(("rib1", "foot1", "rib3"), either, ("rib1",), ("foot1",)))
+    assert [scan.parts for scan in solved] == [("rib3",), ("rib1",), ("foot1",)]
+    every = ("foot1", "rib1", "rib3")  # a scan of which nothing is known is not named by exclusion
+    solved = assignment.solve(scans_of(("rib1", "foot1", "rib3"), every, ("rib1",), ("foot1",)))
+    assert solved[0].parts == every
+
+
+def test_two_scans_may_be_assigned_to_one_part():
+    solved = assignment.solve(scans_of(("rib1", "rib2"), ("rib2",), ("rib2",)))
+    assert [scan.parts for scan in solved] == [("rib2",), ("rib2",)]
+    assert [bool(scan.wrong) for scan in solved] == [True, False]
+    assert [one.code for one in ScanParts("S", "rib1", ()).wrong] == ["preassemble.scan-of-none"]
+    assert [one.code for one in ScanParts("rib1", "rib1", ("rib2",)).wrong] == ["preassemble.named-scan-of-other"]
+
+
+def test_a_scan_that_is_assigned_to_no_part_is_named(monkeypatch):
+    scene, _ = arch_clouds.bridge(spacing_mm=200.0, seed=1)
+    spare = type(scene.scans[0])("spare", scene.scans[0].points, component="crane")
+    monkeypatch.setattr(assemble, "assemble", lambda *_: Result("ok", "adjustment"))
+    scene = Scene("b", "arch-bridge", (*scene.scans, spare), arch=scene.arch)
+    result = preassembly_step.run(scene, preassembly_step.Params())
+    assert result.reasons == (reason("preassemble.scans-without-part", scans=("spare",)),)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [(1, 2, 3, 4, 0), (4, 3, 2, 1, 0), (2, 0, 1, 3, 4)])
+def test_a_bridge_of_wrong_scans_is_not_assembled(order):
+    scene, _ = arch_clouds.bridge(spacing_mm=24.0, sigma_mm=1.0, seed=3)
+    scans = tuple(
+        type(scan)(f"Scan_{i + 1:03d}", scan.points, component=NAMES[k])
+        for i, (scan, k) in enumerate(zip(scene.scans, order, strict=True))
+    )
+    result = preassembly_step.run(Scene("b", "arch-bridge", scans, arch=scene.arch), preassembly_step.Params())
+    assert result.reasons[0].code == "preassemble.wrong-assignment"
+    matching = dict(one.split(" = ") for one in result.reasons[0].values["matching"])
+    ribs = {"rib1", "rib3"}  # equal, their marks included, so that they stand for each other
+    for i, (name, k) in enumerate(zip(NAMES, order, strict=True)):
+        assert set(matching[f"Scan_{i + 1:03d}"].split(" / ")) == (ribs if name in ribs else {name})
+        right = name == NAMES[k] or {name, NAMES[k]} == ribs
+        assert result.components.status[k] == ("ok" if right else "failed")
+    assert [one.code for one in result.adjustment.advice] == ["preassemble.assign-scans"]

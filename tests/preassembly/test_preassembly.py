@@ -1,0 +1,380 @@
+"""The source paper's preassembly on a bridge made with numpy: attitudes, features, errors, and reported failures."""
+
+import dataclasses
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from processor import diagnostics
+from processor.evaluation import preassembly as preassembly_evaluation
+from processor.geometry import rigid
+from processor.geometry.polyline import Polyline
+from processor.model import InputError, Scene, UsageError, Verdict, reason
+from processor.preassembly import assembly_errors
+from processor.preassembly import step as preassembly_step
+from processor.preassembly.baselines import edge_features, joint_alignment, methods
+from processor.preassembly.ends.joint_frame import joint_frame
+from processor.preassembly.params import PAPER_METHODS, BoxParams, MatchParams, SliceParams
+from processor.preassembly.parts import attitude
+from processor.registration import icp
+from tests.support.clouds import arch_clouds
+from tests.support.scenes import known_attitudes
+
+
+@pytest.fixture(scope="module")
+def bridge():
+    return arch_clouds.bridge(spacing_mm=10.0, sigma_mm=1.0, seed=1)
+
+
+@pytest.fixture(scope="module")
+def runs(bridge):
+    """Results of all methods; features, common to the paper's three, and the attitudes of all are found once."""
+    scene, truth = bridge
+    scans = [own[0] for own in preassembly_step.scans_in_order(scene, scene.arch)]
+    seek, known = attitude.find, known_attitudes.find_by(truth)  # two parts have the shapes of others
+    with mock.patch.object(attitude, "find", lambda *at: (known if at[1].name in ("rib3", "foot2") else seek)(*at)):
+        parts = methods.extract(scans, scene.arch, preassembly_step.Params())
+    found = {one: methods.assemble(parts, scene.arch, preassembly_step.Params(method=one)) for one in PAPER_METHODS}
+    attitudes = {part.scan.component: part.attitude for part in parts}
+    with mock.patch.object(attitude, "find", lambda _, part, __: attitudes[part.name]):
+        return found | {"adjustment": preassembly_step.run(scene, preassembly_step.Params())}
+
+
+@pytest.mark.slow  # by day those of the bridge that every method assembles
+@pytest.mark.parametrize("seed", range(4))
+def test_attitudes_are_right_from_any_pose(seed):
+    scene, truth = arch_clouds.bridge(spacing_mm=12.0, sigma_mm=1.0, seed=100 + seed)
+    for part, scan, T in zip(scene.arch.parts, scene.scans, truth.arch.T_bridge_scan, strict=True):
+        found = attitude.find(scan.points, part)
+        assert found.status == "ok"
+        assert rigid.rotation_angle(found.T_principal[:3, :3] @ T[:3, :3].T) < np.radians(1.0)
+        assert rigid.rotation_angle(found.T_surface[:3, :3] @ T[:3, :3].T) < np.radians(0.05)
+
+
+def test_a_symmetric_rib_without_its_mark_is_ambiguous():
+    design = arch_clouds.design().parts[2]
+    whole = design.faces[: -2 * 800]  # the pad is the last face
+    bare = dataclasses.replace(design, faces=whole, vertices=design.vertices[: whole.max() + 1])
+    rng = np.random.default_rng(0)
+    points = arch_clouds.scan_points(2, 12.0, 1.0, rng)
+    found = attitude.find(rigid.apply(arch_clouds.random_pose(rng), points), bare)
+    assert found.status == "ambiguous"
+    assert [one.code for one in found.reasons] == ["preassemble.rival-rotation"]
+    assert found.reasons[0].values["degrees"] == pytest.approx(180.0, abs=0.5)
+
+
+@pytest.mark.slow
+def test_a_scan_of_something_else_fits_no_attitude():
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(20_000, 3))
+    points = 3000.0 * ball / np.linalg.norm(ball, axis=1)[:, None]
+    assert attitude.find(points, arch_clouds.design().parts[1]).status == "failed"
+
+
+def test_surface_samples_lie_on_the_mesh_and_cover_it_evenly():
+    part = arch_clouds.design().parts[1]
+    surface = attitude.sample_surface(part)
+    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    np.testing.assert_allclose(surface.points.mean(axis=0), (area @ (a + b + c)) / 3.0 / area.sum(), atol=30.0)
+    np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1.0)
+
+
+def box_end(spacing=4.0, sigma=0.0, width=900.0, height=1100.0, plate=24.0):
+    """A straight box that ends at x = 0, in its joint's frame, sampled on outer, inner and end faces."""
+    rng = np.random.default_rng(7)
+    b, h = 0.5 * width, 0.5 * height
+    clouds = []
+    for inset in (0.0, plate):
+        n = int(600.0 * 2.0 * (width + height) / spacing**2)
+        t = rng.uniform(0.0, 4.0, n)
+        side, q = np.floor(t), 2.0 * (t % 1.0) - 1.0
+        y = np.select([side == 0, side == 1, side == 2], [q * b, b - inset, q * b], -(b - inset))
+        z = np.select([side == 0, side == 1, side == 2], [h - inset, q * h, -(h - inset)], q * h)
+        inside = (np.abs(y) <= b - inset) & (np.abs(z) <= h - inset)
+        clouds.append(np.column_stack([rng.uniform(-600.0, 0.0, n), y, z])[inside])
+    n = int(width * height / spacing**2)
+    y, z = rng.uniform(-b, b, n), rng.uniform(-h, h, n)
+    ring = (np.abs(y) >= b - plate) | (np.abs(z) >= h - plate)
+    clouds.append(np.column_stack([np.zeros(n), y, z])[ring])
+    points = np.vstack(clouds)
+    return points + sigma * rng.normal(size=points.shape)
+
+
+def test_reduced_boxes_find_the_inner_edges_of_the_plates():
+    # As published: the point nearest to P lies on the end's inner edge, a plate's thickness inside the outer edge.
+    edges = edge_features.reduced_boxes(box_end(), 1.0, 4.0, BoxParams(edge_box_mm=36.0), np.random.default_rng(0))
+    inner_b, inner_h = 450.0 - 24.0, 550.0 - 24.0
+    expected = np.array(
+        [[0, inner_b, -inner_h], [0, -inner_b, -inner_h], [0, -inner_b, inner_h], [0, inner_b, inner_h]]
+    )
+    np.testing.assert_allclose(edges.key_points[:4], expected, atol=4.0)
+    np.testing.assert_allclose(edges.key_points[4], [0, 0, -inner_h], atol=4.0)
+    np.testing.assert_allclose(edges.key_points[7], [0, inner_b, 0], atol=4.0)
+
+
+def test_reduced_boxes_without_points_are_none():
+    cut = box_end()
+    rng = np.random.default_rng(0)
+    assert edge_features.reduced_boxes(cut[np.abs(cut[:, 1]) > 200.0], 1.0, 4.0, BoxParams(), rng) is None
+    assert edge_features.reduced_boxes(cut[:20], 1.0, 4.0, BoxParams(), rng) is None
+
+
+def test_x_axis_of_the_joint_frame_points_along_the_bridge():
+    points = arch_clouds.key_points(0.4 * arch_clouds.ARC)
+    T = joint_frame(points)
+    ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))
+    here = arch_clouds.position(np.array([0.4 * arch_clouds.ARC]), np.zeros(1), np.zeros(1))
+    np.testing.assert_allclose(T[:3, 0], (ahead - here)[0], atol=1e-4)
+    np.testing.assert_allclose(T[:3, 1], [0, 1, 0], atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+
+
+def test_slices_follow_the_bottom_edges():
+    rng = np.random.default_rng(3)
+    points = arch_clouds.scan_points(2, 8.0, 0.5, rng)
+    part = arch_clouds.design().parts[2]
+    left, right = edge_features.slice_edges(points, np.eye(4), 8.0, 0.5, SliceParams())
+    for found, design in ((left, part.bottom_edge_left), (right, part.bottom_edge_right)):
+        offset = np.linalg.norm(Polyline.through(design).nearest(found)[1], axis=1)
+        assert len(found) > 500
+        assert np.median(offset) < 2.0 * 8.0
+        # no points of the end faces, along which the lowest point of a slice moves up
+        assert np.quantile(offset, 0.99) < 8.0 * 8.0
+
+
+def test_linear_error_of_a_lifted_edge_by_hand():
+    x = np.arange(0.0, 2000.0, 5.0)
+    edge = np.column_stack([x, np.zeros_like(x), np.zeros_like(x)])
+    design = Polyline.through(edge[[0, -1]])
+    noisy = edge + np.array([0.0, 3.0, 4.0]) + np.random.default_rng(0).normal(0.0, 2.0, edge.shape)
+    found = assembly_errors.linear_error([assembly_errors.BottomEdges(noisy, edge, design, design)], [np.eye(4)])
+    assert set(found.edge) == {"left", "right"}
+    left = np.array(found.edge) == "left"
+    assert found.deviation[left].mean() == pytest.approx(5.0, abs=0.3)  # the noise does not add to it
+    np.testing.assert_allclose(found.deviation[~left], 0.0, atol=1e-12)
+    assert np.diff(found.chainage[left]) == pytest.approx(200.0)
+
+
+def test_splicing_error_by_hand():
+    gaps = np.zeros((2, 8, 3))
+    gaps[0, 0] = [-3.0, 1.0, 0.0]
+    gaps[1, 7] = np.nan
+    mean, largest = assembly_errors.splicing_error(gaps)
+    assert mean == pytest.approx(4.0 / 45.0)
+    assert largest == 3.0
+
+
+@pytest.mark.parametrize("method", preassembly_step.METHODS)
+def test_every_method_assembles_the_bridge(bridge, runs, method):
+    scene, truth = bridge
+    result = runs[method]
+    assert result.status == "ok"
+    assert result.components.name == arch_clouds.NAMES
+    assert result.splicing.mean < 10.0  # one spacing
+    checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
+    assert checks["wrong poses called ok"].passed
+    if method in PAPER_METHODS:
+        # The key points lie on the inner edges: off by the root of the sum of two thicknesses squared.
+        assert checks["key points in the scan, rms"].value == pytest.approx(np.hypot(24.0, 24.0) * 0.87, rel=0.2)
+    else:
+        assert checks["key points in the scan, rms"].value < 0.5
+    for left, right, gap, T_left, T_right in zip(
+        result.components.key_points_scan[:-1, 1],
+        result.components.key_points_scan[1:, 0],
+        result.joints.gaps,
+        result.components.T_bridge_scan[:-1],
+        result.components.T_bridge_scan[1:],
+        strict=True,
+    ):
+        np.testing.assert_allclose(rigid.apply(T_right, right) - rigid.apply(T_left, left), gap, atol=1e-9)
+
+
+def test_intervals_of_the_adjustment_cover(bridge, runs):
+    _, truth = bridge
+    result = runs["adjustment"]
+    components, joints, trade_off = result.components, result.joints, result.trade_off
+    off = components.key_points_scan - truth.arch.key_points_scan
+    known = np.isfinite(components.key_points_sd)
+    assert known.sum() == 8 * 8 * 3
+    pull = (off / components.key_points_sd)[known]
+    # An end has 19 independent coordinates of 24: 8 ends determine the ratio to a tenth.
+    assert 0.7 < np.sqrt((pull**2).mean()) < 1.3
+    for size in (off[known], components.key_points_sd[known]):
+        assert np.sqrt((size**2).mean()) < 0.12
+    np.testing.assert_array_less(np.abs(joints.gaps), 2.0 * joints.gap_ci95)  # perfect parts: no gap but noise
+    assert result.splicing.mean < 0.1
+    assert set(joints.verdict) == {result.overall} == {Verdict.PASS}
+    # A larger weight of the design moves the edges closer to it and widens the gaps.
+    splicing, linear = trade_off.splicing_mean, trade_off.linear_mean
+    assert (np.diff(trade_off.weight) < 0.0).all()
+    assert (np.diff(splicing) <= 1e-6).all()
+    assert (np.diff(linear) >= -1e-6).all()
+
+
+@pytest.mark.slow
+def test_adjustment_measures_the_errors_as_built(bridge):
+    """A rib cut 3 mm short at one end and shifted scans: the gap shows there and nowhere else."""
+    scene, truth = bridge
+    rib, T = scene.scans[2], truth.arch.T_bridge_scan[2]
+    points = rigid.apply(T, rib.points)
+    ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))[0]
+    here = arch_clouds.position(np.array([0.4 * arch_clouds.ARC]), np.zeros(1), np.zeros(1))[0]
+    depth = (points - here) @ (ahead - here)
+    near = depth < 100.0
+    points[near] += 3.0 * np.clip(1.0 - depth[near, None] / 100.0, 0.0, 1.0) * (ahead - here)
+    cut = dataclasses.replace(rib, points=rigid.apply(rigid.invert(T), points))
+    scans = (*scene.scans[:2], cut, *scene.scans[3:])
+    result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params())
+    moved = rigid.apply(T, result.components.key_points_scan[2, 0]) - truth.arch.key_points_bridge[2, 0]
+    np.testing.assert_allclose(moved @ (ahead - here), 3.0, atol=0.35)
+    # Edges do not constrain a part along its length: the gap closes, and the span is shorter by as much.
+    assert np.abs(result.joints.gaps[1] @ (ahead - here)).max() < 0.6
+    shift = [
+        rigid.apply(result.components.T_bridge_scan[i] @ rigid.invert(truth.arch.T_bridge_scan[i]), points.mean(axis=0))
+        - points.mean(axis=0)
+        for i in (0, 4)
+    ]
+    assert np.linalg.norm(shift[1] - shift[0]) == pytest.approx(3.0, abs=0.6)
+
+
+@pytest.mark.slow
+def test_a_warm_bridge_is_assembled_at_the_reference_temperature(bridge):
+    scene, truth = bridge
+    grown = 1.0 + 12e-6 * 30.0
+    warm = tuple(dataclasses.replace(s, points=s.points * grown) for s in scene.scans)
+    result = preassembly_step.run(dataclasses.replace(scene, scans=warm, temperature_C=50.0), preassembly_step.Params())
+    off = result.components.key_points_scan / grown - truth.arch.key_points_scan
+    assert np.sqrt(np.nanmean(off**2)) < 0.12
+    assert np.abs(result.joints.gaps).max() < 1.0
+    assert reason("preassemble.temperature-corrected") in result.reasons
+
+
+@pytest.mark.slow
+def test_a_part_of_another_place_is_not_assembled(bridge):
+    scene, _ = bridge
+    swapped = list(scene.scans)
+    foot, rib = swapped[0], swapped[2]
+    swapped[0], swapped[2] = (
+        dataclasses.replace(rib, name="foot1", component="foot1"),
+        dataclasses.replace(foot, name="rib2", component="rib2"),
+    )
+    result = preassembly_step.run(dataclasses.replace(scene, scans=tuple(swapped)), preassembly_step.Params())
+    assert result.status == "partial"
+    assert "ok" not in (result.components.status[0], result.components.status[2])
+    assert np.isnan(result.joints.gaps[[0, 1, 2]]).all()
+
+
+def test_design_aided_method_has_half_the_linear_error_of_others(runs):
+    # As found by the source paper: chained by joints alone, the bridge turns with Foot 1's attitude.
+    mean = {method: run.linear.assembled.error.mean for method, run in runs.items()}
+    assert mean["design-aided"] < 0.5 * mean["line"]
+    assert mean["design-aided"] < 0.5 * mean["corner"]
+
+
+def ring(length=1400.0, height=1800.0, spacing=25.0):
+    """Points along the four edges of a joint."""
+    y, z = np.arange(0.0, length, spacing), np.arange(0.0, height, spacing)
+    sides = [(y, 0.0 * y), (y, 0.0 * y + height), (0.0 * z, z), (0.0 * z + length, z)]
+    return np.vstack([np.column_stack([0.0 * a, a - 0.5 * length, b - 0.5 * height]) for a, b in sides])
+
+
+def test_a_coarse_pose_is_sought_near_the_principal_axes():
+    # The ring lies on itself when turned by 180 degrees about any axis: histograms alone find each of the four poses.
+    source = ring()
+    start = rigid.transform(rigid.rotation_from_vector(np.array([0.01, -0.02, 0.01])), np.array([30.0, -20.0, 10.0]))
+    found = [joint_alignment._coarse(source, ring(), start, MatchParams(), np.random.default_rng(i)) for i in range(4)]
+    for T, reasons in found:
+        assert reasons == ()
+        assert np.degrees(rigid.rotation_angle(T[:3, :3])) < 8.0
+        assert np.linalg.norm(T[:3, 3]) < 100.0
+    nowhere = MatchParams(pfh_limit_mm=1e-6)
+    T, reasons = joint_alignment._coarse(source, ring(), start, nowhere, np.random.default_rng(0))
+    assert [one.code for one in reasons] == ["preassemble.no-coarse-pose"]
+    np.testing.assert_array_equal(T, start)
+
+
+def test_point_to_line_icp_recovers_the_pose_along_the_lines():
+    # Points of one end lie between those of the other; the ends themselves are the same.
+    source = ring(spacing=25.0)[5:]
+    corners = np.array([[0, 700, -900], [0, -700, -900], [0, -700, 900], [0, 700, 900.0], [0, 700, -900]])
+    start = rigid.transform(rigid.rotation_from_vector(np.array([0.004, 0.003, -0.002])), np.array([3.0, 9.0, -8.0]))
+    fine = icp.point_to_lines(source, [Polyline.through(corners)], start, max_iterations=200, tolerance=1e-9)
+    np.testing.assert_allclose(rigid.apply(fine.T_target_source, source), source, atol=0.01)
+    far = icp.point_to_lines(source + 1e4, [Polyline.through(corners)], start, max_distance_mm=10.0)
+    assert far.paired_share == 0.0
+
+
+def test_edge_box_is_sized_by_the_plate_thickness():
+    rng = np.random.default_rng(0)
+    for plate in (16.0, 24.0, 40.0):
+        cut = edge_features.cut_joint_end(box_end(plate=plate), np.eye(4), 1.0, np.array([900.0, 1100.0]), BoxParams())
+        across = cut[:, 2].max() - cut[:, 2]
+        middle = across[np.abs(cut[:, 1]) < 300.0]
+        assert edge_features.edge_box(middle, BoxParams()) == pytest.approx(1.5 * plate, abs=1.5)
+        one_side = np.abs(rng.normal(size=500))
+        assert edge_features.edge_box(one_side, BoxParams(plate_mm=20.0)) == 30.0
+        assert edge_features.edge_box(middle, BoxParams(edge_box_mm=33.0)) == 33.0
+
+
+@pytest.mark.slow
+def test_a_part_that_leaves_a_wide_gap_is_called_weak(bridge, runs):
+    scene, _ = bridge
+    widest = np.abs(runs["corner"].joints.gaps).max(axis=(1, 2))
+    limit = float(np.sort(widest)[1:3].mean())  # two of the four joints gape wider
+    found = preassembly_step.run(scene, preassembly_step.Params(method="corner", gap_limit_mm=limit))
+    assert [one == "weak" for one in found.components.status] == [False, *(widest > limit)]
+    assert found.status == "partial"
+    assert [one.code for row in found.components.reasons for one in row].count("preassemble.wide-gap") == 2
+
+
+@pytest.mark.slow
+def test_origin_of_scans_does_not_change_the_gaps(bridge, runs):
+    scene, _ = bridge
+    far = np.array([5.0e8, 4.3e9, 1.0e5])
+    moved = dataclasses.replace(scene, scans=tuple(dataclasses.replace(s, origin=far) for s in scene.scans))
+    found = preassembly_step.run(moved, preassembly_step.Params(method="corner"))
+    np.testing.assert_array_equal(found.joints.gaps, runs["corner"].joints.gaps)
+    again, before = found.components, runs["corner"].components
+    np.testing.assert_allclose(again.key_points_scan - far, before.key_points_scan, atol=1e-5)
+    again = rigid.apply(again.T_bridge_scan[1], again.key_points_scan[1, 0])
+    expected = rigid.apply(before.T_bridge_scan[1], before.key_points_scan[1, 0])
+    np.testing.assert_allclose(again, expected, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_missing_joint_end_breaks_the_chain_with_a_reason(bridge):
+    scene, truth = bridge
+    rib = scene.scans[2]
+    T = truth.arch.T_bridge_scan[2]
+    start = arch_clouds.CUTS[2] * arch_clouds.ARC
+    middle = arch_clouds.position([start], [0.0], [550.0])
+    near = np.linalg.norm(rigid.apply(T, rib.points) - middle, axis=1) < 1300.0  # its mark stays
+    cut = dataclasses.replace(rib, points=rib.points[~near])
+    scans = (*scene.scans[:2], cut, *scene.scans[3:])
+    result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params(method="line"))
+    assert result.status == "partial"
+    assert result.components.status == ("ok", "ok", "failed", "failed", "failed")
+    (at_joint,) = (one for one in result.components.reasons[2] if one.code == "preassemble.at")
+    assert [one.code for one in at_joint.values["reasons"]] == ["preassemble.joint-end-misplaced"]
+    assert np.isnan(result.joints.gaps[1:]).all()
+
+
+def test_uncorrected_temperature_is_reported(bridge, monkeypatch):
+    scene, _ = bridge
+    monkeypatch.setattr(methods, "assemble", lambda *_: preassembly_step.Result("ok", "corner"))
+    params = preassembly_step.Params(method="corner")
+    kept = {"parts": [], "notes": diagnostics.Notes(), "scanned again": []}
+    result = preassembly_step.run(dataclasses.replace(scene, temperature_C=31.5), params, kept)
+    assert result.reasons == (reason("preassemble.temperature-not-corrected", temperature=31.5),)
+
+
+def test_missing_design_scan_or_method_is_refused(bridge):
+    scene, _ = bridge
+    with pytest.raises(InputError, match="arch-bridge design"):
+        preassembly_step.run(Scene("x", "arch-bridge", scene.scans), preassembly_step.Params())
+    with pytest.raises(InputError, match="expected a scan of component 'rib3', found none"):
+        preassembly_step.run(dataclasses.replace(scene, scans=scene.scans[:3]), preassembly_step.Params())
+    with pytest.raises(UsageError, match="unknown method 'magic'"):
+        preassembly_step.run(scene, preassembly_step.Params(method="magic"))

@@ -1,0 +1,110 @@
+"""Point feature histograms against the definition written out pair by pair, and their invariances."""
+
+import math
+
+import numpy as np
+import pytest
+
+from processor.geometry import rigid
+from processor.registration import pfh
+
+
+def cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def dot(a, b):
+    return sum(p * q for p, q in zip(a, b, strict=True))
+
+
+def histogram_by_definition(points, normals, query, radius, bins):
+    """Rusu's definition, one pair after the other, in plain Python."""
+    near = [k for k in range(len(points)) if math.dist(points[k], points[query]) <= radius]
+    counts, pairs = [0] * bins**3, 0
+    for first in range(len(near)):
+        for second in range(first + 1, len(near)):
+            s, t = near[first], near[second]
+            line = [q - p for p, q in zip(points[s], points[t], strict=True)]
+            D = math.sqrt(dot(line, line))
+            # The source is the point whose normal makes the smaller angle with the line between the two.
+            if math.acos(min(1.0, abs(dot(normals[s], line)) / D)) > math.acos(
+                min(1.0, abs(dot(normals[t], line)) / D)
+            ):
+                s, t, line = t, s, [-c for c in line]
+            u = normals[s]
+            v = cross(u, [c / D for c in line])
+            norm = math.sqrt(dot(v, v))
+            v = [c / norm for c in v]
+            w = cross(u, v)
+            alpha, beta = dot(v, normals[t]), dot(u, line) / D
+            theta = math.atan2(dot(w, normals[t]), dot(u, normals[t]))
+            cells = [
+                min(bins - 1, int(bins * (alpha + 1.0) / 2.0)),
+                min(bins - 1, int(bins * (beta + 1.0) / 2.0)),
+                min(bins - 1, int(bins * (theta + math.pi) / (2.0 * math.pi))),
+            ]
+            counts[cells[0] + bins * cells[1] + bins * bins * cells[2]] += 1
+            pairs += 1
+    return [c / pairs for c in counts]
+
+
+@pytest.fixture
+def cloud():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0.0, 100.0, (60, 3))
+    normals = rng.normal(size=(60, 3))
+    return points, normals / np.linalg.norm(normals, axis=1)[:, None]
+
+
+@pytest.mark.parametrize("bins", [5, 3])
+def test_histograms_equal_the_definition_bin_by_bin(cloud, bins):
+    points, normals = cloud
+    found = pfh.histograms(points, normals, 45.0, bins)
+    assert found.shape == (60, bins**3)
+    for query in range(60):
+        expected = histogram_by_definition(points.tolist(), normals.tolist(), query, 45.0, bins)
+        np.testing.assert_allclose(found[query], expected, atol=1e-12)
+
+
+def test_one_pair_worked_by_hand():
+    # Two points 2 apart on the x axis, both normals along +y: V = U x x = -z, W = U x V = -x,
+    # so alpha = V.N = 0, beta = U.x = 0, theta = atan2(W.N, U.N) = atan2(0, 1) = 0: the middle bin of all three.
+    points = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    normals = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    found = pfh.histograms(points, normals, 3.0, 5)
+    assert found[0, 2 + 5 * 2 + 25 * 2] == 1.0
+
+
+def test_order_and_motion_change_nothing(cloud):
+    points, normals = cloud
+    found = pfh.histograms(points, normals, 45.0)
+    order = np.random.default_rng(1).permutation(60)
+    np.testing.assert_allclose(pfh.histograms(points[order], normals[order], 45.0), found[order], atol=1e-12)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.7, -1.1, 0.4])), np.array([10.0, 20.0, 30.0]))
+    turned = pfh.histograms(rigid.apply(T, points), normals @ T[:3, :3].T, 45.0)
+    assert np.abs(turned - found).max() < 0.02  # a pair on a bin's border may fall either way
+
+
+def test_normals_of_a_plate_point_across_it():
+    rng = np.random.default_rng(2)
+    plate = np.column_stack([rng.uniform(0.0, 100.0, (400, 2)), np.zeros(400)])
+    assert np.abs(pfh.normals(plate, 20.0)[:, 2]).min() > 0.999
+
+
+def test_coarse_alignment_on_a_shape_with_corners():
+    rng = np.random.default_rng(3)
+    shape = np.vstack(
+        [
+            rng.uniform(0.0, 1.0, (80, 3)) * s + o
+            for s, o in [((900, 10, 10), (0, 0, 0)), ((10, 500, 300), (900, 0, 0)), ((200, 300, 10), (300, 100, 400))]
+        ]
+    )
+    T = rigid.transform(rigid.rotation_from_vector(np.array([1.0, 0.5, -2.0])), np.array([100.0, -200.0, 300.0]))
+    moved = rigid.apply(T, shape)
+    described = [pfh.histograms(c, pfh.normals(c, 200.0), 200.0) for c in (shape, moved)]
+    found = pfh.coarse_alignment(shape, moved, *described, tolerance_mm=20.0, iterations=3000, rng=rng)
+    assert np.linalg.norm(rigid.apply(found, shape) - moved, axis=1).max() < 40.0
+
+
+def test_a_point_alone_has_an_empty_histogram():
+    assert pfh.histograms(np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]]), 1.0).sum() == 0.0

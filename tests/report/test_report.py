@@ -1,0 +1,372 @@
+"""results.json, tables, figures and the page, from results written by hand."""
+
+import csv
+import dataclasses
+import io
+import json
+import os
+import re
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from processor.evaluation.evaluate import ErrorReport
+from processor.model import (
+    FrameDesign,
+    InputError,
+    Metric,
+    Scan,
+    Scene,
+    StepRun,
+    UsageError,
+    reason,
+)
+from processor.pipeline import Execution
+from processor.preassembly.result import Deviations, Result
+from processor.report import all_figures, all_tables, page, write_results
+from processor.report import table as report_table
+from processor.results import to_json
+from processor.space_frame import step as space_frame_step
+from processor.store import store
+from tests.support.pages.report_pages import TablesOfPage, drawn
+from tests.support.results.ball_results import balls
+from tests.support.results.bridge_results import KEYS, NAN, PROVENANCE, arch_scene, assembled
+from tests.support.results.metrics import metric
+from tests.support.results.records import assert_equal
+
+
+def frame_scene(k=3):
+    design = FrameDesign(np.arange(k) + 7, np.arange(3.0 * k).reshape(k, 3) * 1000.0, np.full(k, 45.0))
+    return Scene("frame", "space-frame", (Scan("s", np.zeros((2, 3))),), frame=design)
+
+
+def of_bridge(scene=None, **kwargs):
+    runs = [
+        StepRun("preassemble", m, "{}", assembled(m, scale=s, **kwargs)) for m, s in (("design-aided", 1), ("line", 40))
+    ]
+    return Execution(scene or arch_scene(**kwargs), tuple(runs), PROVENANCE)
+
+
+def of_frame():
+    runs = (
+        StepRun("spheres", "ransac", "{}", balls()),
+        StepRun("spheres", "least-squares", "{}", balls("least-squares", (44.0, NAN, 60.0))),
+    )
+    true = np.array([45.0, 50.0, 60.0])
+    report = ErrorReport((metric("a", 1.0, 0.5, step="spheres"),), {"ransac": true, "least-squares": true})
+    return Execution(frame_scene(), runs, PROVENANCE), report
+
+
+def render(execution, report):
+    figures = drawn(execution) if report == ErrorReport() else all_figures.draw_figures(execution, report)
+    return page.html(execution, report, figures)
+
+
+# --- results.json --------------------------------------------------------------------------------------------------
+
+
+def strict(text):
+    def refuse(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_results_json_has_the_names_that_scripts_rely_on():
+    made = to_json.results_json(of_bridge(), ErrorReport())
+    found = strict(json.dumps(made, allow_nan=False))
+    assert (found["format"], found["format_version"], found["checks"]) == ("processor-results", "1.0", [])
+    step = found["steps"]["preassemble"]
+    first, _, last = step["components"]
+    assert first["T_bridge_scan"] == np.eye(4).tolist()
+    assert first["key_points_scan"]["start"] == {}
+    assert first["key_points_scan"]["end"] == {key: [3.0 * i, 3.0 * i + 1, 3.0 * i + 2] for i, key in enumerate(KEYS)}
+    assert first["key_points_sd"] == {"start": {}, "end": {}}
+    assert first["covariance"] == [[None] * 6] * 6
+    assert (last["status"], last["T_bridge_scan"]) == ("failed", [[None] * 4] * 4)
+    one, two = step["joints"]
+    assert (one["name"], one["left"], one["right"], one["verdict"]) == ("J1", "foot1", "rib1", "indeterminate")
+    assert one["points"]["P3"] == {"gap": pytest.approx([3.0, -3.1, 3.2]), "ci95": [None] * 3}
+    assert two["points"]["P3"]["gap"] == [None] * 3
+    assert step["splicing_error"] == {"mean": 4.6, "max": 8.2}
+    linear = step["linear_error"]
+    assert (linear["mean"], linear["max"]) == (2.0, 3.0)
+    assert len(linear["stations"]) == len(linear["deviation"]) == len(linear["edge"]) == 120
+    assert step["trade_off"] == []
+    assert [one["method"] for one in found["comparison"]["preassemble"]] == ["line"]
+
+
+def test_results_json_of_balls():
+    execution, report = of_frame()
+    found = strict(json.dumps(to_json.results_json(execution, report), allow_nan=False))
+    ok, _, missing = found["steps"]["spheres"]["balls"]
+    assert {"id", "centre", "radius", "lowest", "covariance", "points", "visible_fraction", "evidence", "flag"} <= set(
+        ok
+    )
+    assert (ok["id"], ok["radius"], ok["centre"], ok["lowest"]) == (7, 45.5, [0, 1000, 2000], [0, 1000, 1954.5])
+    assert np.shape(ok["covariance"]) == (4, 4)
+    assert (missing["radius"], missing["centre"], missing["flag"]) == (None, [None] * 3, "not-found")
+    assert found["checks"] == [
+        {
+            "step": "spheres", "name": "a", "method": "", "quantity": "a", "statistic": "value", "value": 1.0,
+            "limit": 0.5, "unit": "mm", "better": "low", "passed": False,
+        }
+    ]  # fmt: skip
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+
+
+def by_file(execution, report, file):
+    (table,) = [one for one in all_tables.tables_of_run(execution, report) if one.file == file]
+    return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
+
+
+def test_csv_of_gaps_and_stations():
+    gaps = by_file(of_bridge(), ErrorReport(), "gaps")
+    assert len(gaps) == 16
+    assert gaps[2] == {
+        "joint": "J1",
+        "point": "P3",
+        "dx_mm": "3.0",
+        "dy_mm": "-3.1",
+        "dz_mm": "3.2",
+        "ci95_dx_mm": "",
+        "ci95_dy_mm": "",
+        "ci95_dz_mm": "",
+    }
+    assert gaps[10]["dx_mm"] == ""
+    linear = by_file(of_bridge(), ErrorReport(), "linear")
+    assert (linear[61]["edge"], linear[61]["chainage_mm"], linear[61]["deviation_mm"]) == ("right", "200.0", "1.2")
+
+
+def test_csv_of_balls_holds_the_error_against_the_true_radius():
+    first, second, third = by_file(*of_frame(), "balls")
+    assert (first["radius_mm"], first["true_radius_mm"], first["radius_error_mm"]) == ("45.5", "45.0", "0.5")
+    assert second["radius_error_mm"] == "10.0"
+    assert (third["radius_mm"], third["radius_error_mm"]) == ("", "")
+    assert float(first["formal_ci95_radius_mm"]) == pytest.approx(1.96 * 0.2, abs=1e-4)
+    (ransac, least) = by_file(*of_frame(), "summary")
+    assert (ransac["fitted"], ransac["largest_mm"]) == ("2", "10.0")
+    assert (least["fitted"], least["median_mm"]) == ("2", "0.5")
+
+
+@pytest.mark.parametrize("name", ["=1+1", "+1", "-1", "@a", "\t=x", "\r=x", "\n=x", "＝1", '"', 'a",=1'])
+def test_no_name_becomes_a_formula_in_a_spreadsheet(name):
+    table = all_tables.Table("t", ("a", "b"), ((name, -1.5),))
+    _, row = csv.reader(io.StringIO(report_table.csv_text(table), newline=""))
+    assert row[1] == "-1.5"
+    assert not row[0].startswith(("=", "+", "-", "@", "\t", "\r", "\n", "＝"))
+    if name.isprintable():
+        assert row[0].removeprefix("'") == name
+
+
+def test_terminal_text_is_aligned_and_without_control_characters():
+    table = all_tables.Table(
+        "t\x1b[31m",
+        ("name", "mean_mm", "max_mm"),
+        (("钢 1", 1.0, NAN), ("a\x1b]0;b\n", -22.5, 3.0)),
+        groups=("", "a long heading here", "a long heading here"),
+    )
+    assert report_table.plain_text(table).splitlines() == [
+        "t�[31m",
+        "           a long heading here",
+        "  name        mean         max",
+        "  钢 1       1.000           –",
+        "  a�]0;b�  -22.500       3.000",
+    ]
+
+
+def test_headings_are_those_of_the_table_and_else_the_names_without_units():
+    columns = ("joint", "rotation_ci95_mrad", "least_gap_mm")
+    assert report_table.headings(all_tables.Table("t", columns, ())) == ("joint", "rotation ci95", "least gap")
+    named = all_tables.Table("t", columns, (), headings=("joint", "ci95", "gap"))
+    assert report_table.headings(named) == ("joint", "ci95", "gap")
+    assert report_table.csv_text(named) == "joint,rotation_ci95_mrad,least_gap_mm\n"
+
+
+def test_long_tables_are_cut_on_the_terminal_with_a_remark():
+    table = all_tables.Table("t", ("a",), tuple((i,) for i in range(50)), "long")
+    lines = report_table.plain_text(table, most=10).splitlines()
+    assert len(lines) == 13
+    assert lines[-1] == "  ... and 40 more in long.csv"
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_gaps_stand_as_in_the_source_paper():
+    found = TablesOfPage(render(of_bridge(), ErrorReport())).tables["Splicing error, method design-aided (mm)"]
+    assert found[0] == ["", "J1: foot1 & rib1", "J2: rib1 & foot2"]
+    assert found[1] == ["point", "dx", "dy", "dz", "dx", "dy", "dz"]
+    assert found[4] == ["P3", "3.000", "-3.100", "3.200", "–", "–", "–"]
+    assert len(found) == 10
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_joint_without_a_result_is_not_shown_as_zero():
+    found = TablesOfPage(render(of_bridge(), ErrorReport())).tables["Joints, method design-aided (mm)"]
+    assert found[1] == ["J1", "foot1", "rib1", "4.600", "8.200", "P8, z", "indeterminate"]
+    assert found[2] == ["J2", "rib1", "foot2", "–", "–", "", "indeterminate"]
+
+
+# --- figures and page ----------------------------------------------------------------------------------------------
+
+
+def figures_of_both():
+    drawn = all_figures.draw_figures(of_bridge(), ErrorReport()) | all_figures.draw_figures(*of_frame())
+    return drawn["preassemble"] | drawn["spheres"]
+
+
+def test_figures_are_the_same_bytes_whatever_the_users_settings():
+    first = figures_of_both()
+    with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0, "savefig.facecolor": "black"}):
+        again = figures_of_both()
+        assert mpl.rcParams["font.size"] == 20.0
+    assert set(first) == {"bridge.png", "linear-error.png", "gaps-by-axis.png", "plan.png", "radius-errors.png"}
+    assert first == again
+    for _, png in first.values():
+        assert png[:8] == b"\x89PNG\r\n\x1a\n"
+        assert b"tEXt" not in png
+
+
+@pytest.mark.parametrize("name", ["$\\frac$", "$x", "桥拱一", "_hidden", "a\nb", "x" * 5000, "<b>&amp;"])
+def test_any_name_can_be_drawn_and_shown(name):
+    execution = of_bridge(names=(name, "rib1", "foot2"), joints=(name, "J2"))
+    found = TablesOfPage(render(execution, ErrorReport()))
+    assert found.tables["Components"][1][0] == report_table.shown(name)
+
+
+def test_a_run_without_any_answer_is_drawn_too():
+    given = assembled()
+    unknown = Deviations(deviation=np.full(120, NAN))
+    nothing = dataclasses.replace(
+        given,
+        joints=dataclasses.replace(given.joints, gaps=np.full((2, 8, 3), NAN)),
+        linear=dataclasses.replace(given.linear, assembled=unknown, best_fit=unknown),
+    )
+    bridge = Execution(arch_scene(), (StepRun("preassemble", "line", "{}", nothing),), PROVENANCE)
+    assert "Preassembly: partial" in render(bridge, ErrorReport())
+    none = balls(radii=(NAN, NAN), flag=("not-found",) * 2)
+    report = ErrorReport((), {"ransac": np.full(2, NAN)})
+    assert "0 of 2 balls" in render(
+        Execution(frame_scene(2), (StepRun("spheres", "ransac", "{}", none),), PROVENANCE), report
+    )
+    empty = space_frame_step.Result("failed", "ransac", (reason("spheres.no-ball", points=9),))
+    assert "o ball stands out" in render(
+        Execution(frame_scene(2), (StepRun("spheres", "ransac", "{}", empty),), PROVENANCE), ErrorReport()
+    )
+    exact = balls(radii=(45.0, 45.0), flag=("ok", "ok"))
+    report = ErrorReport((), {"ransac": np.full(2, 45.0)})
+    assert "2 of 2 balls" in render(
+        Execution(frame_scene(2), (StepRun("spheres", "ransac", "{}", exact),), PROVENANCE), report
+    )
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_the_page_escapes_names_and_loads_nothing():
+    bad = "<script>alert(1)</script>"
+    scene = dataclasses.replace(
+        arch_scene((bad, "rib1", "foot2")), name=bad, units_reason=(reason("units.as-stated", text=bad),)
+    )
+    text = render(
+        of_bridge(scene, names=(bad, "rib1", "foot2")), ErrorReport((Metric("s", bad, 1.0, unit=bad, limit=2.0),))
+    )
+    found = TablesOfPage(text)
+    assert found.tags.count("script") == 2  # the page's own, and its data
+    assert "alert" not in "".join(re.findall("<script>.*?</script>", text, re.DOTALL))
+    assert text.count("&lt;script&gt;alert(1)") >= 5
+    pictures = [address for address in found.addresses if address != "data:,"]
+    assert pictures
+    assert all(address.startswith("data:image/png;base64,") for address in pictures)
+    assert not any(word in text for word in ("@import", "url(", "http://", "https://"))
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_page_begins_with_the_outcome():
+    execution, report = of_frame()
+    text = render(execution, report)
+    assert text.index("1 of 3 balls without a flag") < text.index("<h2>")
+    assert text.index("1 wrong-size, 1 not-found") < text.index("<h2>")
+    assert text.index("1 of 1 accuracy limits missed") < text.index("<h2>")
+    assert "No truth" in render(of_bridge(), ErrorReport())
+
+
+def test_a_roof_of_many_balls_keeps_the_page_small():
+    k = 30_000
+    many = balls(radii=np.full(k, 45.0), flag=("low-confidence",) * k)
+    runs = (StepRun("spheres", "ransac", "{}", many), StepRun("spheres", "least-squares", "{}", many))
+    text = page.html(Execution(frame_scene(), runs, PROVENANCE), ErrorReport(), {})
+    assert len(text) < 12_000_000
+    assert f"The first 2000 of {k} rows" in text
+
+
+# --- the folder of results -----------------------------------------------------------------------------------------
+
+
+def contents(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_earlier_results_are_replaced_as_a_whole(tmp_path):
+    out = tmp_path / "deep" / "out"
+    write_results.write_results(out, *of_frame())
+    assert "balls.csv" in contents(out)
+    write_results.write_results(out, of_bridge(), ErrorReport())
+    found = contents(out)
+    assert "balls.csv" not in found
+    assert {"results.h5", "results.json", "report.html", "gaps.csv", "figures/bridge.png"} <= set(found)
+    assert [p.name for p in out.parent.iterdir()] == ["out"]
+
+
+@pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.parametrize("where", ["page", "move"])
+def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
+    out = tmp_path / "out"
+    write_results.write_results(out, *of_frame())
+    before = contents(tmp_path)
+    if where == "page":
+        monkeypatch.setattr(page, "html", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    else:
+        replace = os.replace
+
+        def failing(source, target):
+            if os.fspath(target) == os.fspath(out) and not os.fspath(source).endswith("old"):
+                raise OSError(28, "No space left on device")
+            replace(source, target)
+
+        monkeypatch.setattr(os, "replace", failing)
+    with pytest.raises(InputError, match=r"cannot be written \(No space left"):
+        write_results.write_results(out, of_bridge(), ErrorReport())
+    monkeypatch.undo()
+    assert contents(tmp_path) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_with_anything_else_in_it_is_refused(tmp_path):
+    source, out = tmp_path / "b.h5", tmp_path / "out"
+    source.touch()
+    write_results.check_output(out, source)
+    out.mkdir()
+    write_results.check_output(out, source)
+    write_results.write_results(out, *of_frame())
+    write_results.check_output(out, source)
+    (out / "my-notes.txt").touch()
+    with pytest.raises(UsageError, match=r"my-notes\.txt"):
+        write_results.check_output(out, source)
+    (out / "my-notes.txt").unlink()
+    with pytest.raises(UsageError, match="holds the input"):
+        write_results.check_output(out, out / "results.h5")
+    with pytest.raises(UsageError, match="is a file"):
+        write_results.check_output(source, source)
+    (out / "results.json").unlink()
+    with pytest.raises(UsageError, match="no earlier results"):
+        write_results.check_output(out, source)
+
+
+@pytest.mark.parametrize("made", [assembled(), balls()], ids=["preassemble", "spheres"])
+def test_results_go_through_the_store_unchanged(made, tmp_path):
+    step = "preassemble" if isinstance(made, Result) else "spheres"
+    store.write_results(tmp_path / "r.h5", [StepRun(step, made.method, "{}", made)], {})
+    (back,) = store.read_results(tmp_path / "r.h5", {step: type(made)})
+    assert_equal(back.result, made)

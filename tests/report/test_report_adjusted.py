@@ -1,0 +1,359 @@
+"""What the report shows of an adjustment: tables, pictures, and the live figures of the page."""
+
+import csv
+import dataclasses
+import io
+import json
+from types import SimpleNamespace
+
+import matplotlib.image
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from processor.evaluation.evaluate import ErrorReport
+from processor.model import Status, StepRun, Verdict
+from processor.pipeline import Execution
+from processor.preassembly.result import Deviations
+from processor.preassembly.verdicts import joint_measures
+from processor.report import all_figures, all_tables, page
+from processor.report import table as report_table
+from processor.report.preassembly import joint_figures, residual_map
+from processor.report.style import rounded
+from processor.results import to_json
+from tests.support.pages.report_pages import Page, drawn, rendered
+from tests.support.results.bridge_results import (
+    OWN,
+    PROVENANCE,
+    SECTION,
+    adjusted,
+    arch_scene,
+    assembled,
+    judged_joints,
+    of_bridge,
+    trade_off,
+    verdicts,
+    with_band,
+)
+
+NAN = float("nan")
+
+
+def of_file(execution, file):
+    (table,) = [one for one in all_tables.tables_of_run(execution, ErrorReport()) if one.file == file]
+    return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
+
+
+def number(text):
+    return None if text in ("", "–") else float(text)
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_table_what_to_do_has_the_numbers_of_results_json():
+    execution = of_bridge()
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    on_page = Page(rendered(execution)).tables["Joints: what to do, method adjustment"][2:]
+    rows = of_file(execution, "what-to-do")
+    assert [row["joint"] for row in rows] == ["J1", "J2"]
+    for row, shown, joint, verdict in zip(rows, on_page, step["joint_measures"], step["joints"], strict=True):
+        assert row["verdict"] == verdict["verdict"] == "fail"
+        assert row["proposal"] == shown[2] == joint["proposal"]["sentence"]
+        wanted = [
+            joint["measures"][name][part]
+            for name in ("misalignment", "groove_gap_least", "groove_gap_greatest")
+            for part in ("value", "ci95")
+        ]
+        assert [float(cell) for cell in list(row.values())[3:9]] == pytest.approx(wanted, abs=1e-6)
+        assert [float(cell) for cell in shown[3:9]] == pytest.approx(wanted, abs=5e-4)
+        turns = {axis: joint["measures"][f"rotation_{axis}"] for axis in "xyz"}
+        assert max(abs(one["value"]) for one in turns.values()) == pytest.approx(
+            abs(float(row["rotation_mrad"])), abs=1e-6
+        )
+        assert turns[row["rotation_about"]]["ci95"] == pytest.approx(float(row["rotation_ci95_mrad"]), abs=1e-6)
+        assert number(row["probability_now"]) == pytest.approx(joint["probability"], abs=1e-6)
+        assert number(row["probability_after"]) == pytest.approx(joint["proposal"]["probability"], abs=1e-6)
+    assert float(rows[0]["greatest_groove_gap_mm"]) == 3.5
+    assert float(rows[1]["least_groove_gap_mm"]) == -1.75
+
+
+def test_table_of_limits_has_clause_and_verification():
+    execution = of_bridge()
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    rows = of_file(execution, "limits")
+    wanted = [limit for joint in step["joint_measures"] for limit in joint["limits"]]
+    assert len(rows) == len(wanted) == 4
+    for row, limit in zip(rows, wanted, strict=True):
+        assert (row["limit"], row["verdict"], row["clause"]) == (limit["what"], limit["verdict"], limit["clause"])
+        cells = [number(row[f"{name}_mm"]) for name in ("value", "ci95", "least", "greatest")]
+        for cell, name in zip(cells, ("value", "ci95", "low", "high"), strict=True):
+            assert cell == (None if limit[name] is None else pytest.approx(limit[name], abs=1e-6))
+    assert {limit["verified"] for limit in wanted} == {True, False}
+    page = rendered(execution)
+    assert "NOT VERIFIED" not in page
+    (note,) = {limit["clause"] for limit in wanted if not limit["verified"]}
+    (said,) = [line for line in Page(page).text.splitlines() if "not compared with the published text" in line]
+    assert note in said
+
+
+def test_limits_of_the_chain_stand_beside_those_of_joints():
+    execution = of_bridge()
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    (chain,) = step["chain_limits"]
+    (limit,) = chain["limits"]
+    (row,) = of_file(execution, "limits-chain")
+    assert chain["verdict"] == row["verdict"] == limit["verdict"] == "indeterminate"
+    assert (limit["limit"], limit["source"], limit["edition"], limit["verified"]) == (
+        "span_mm", "project.toml", "1", False,
+    )  # fmt: skip
+    assert [float(row[f"{name}_mm"]) for name in ("value", "least", "greatest")] == [-1.25, -1.0, 1.0]
+    assert row["source"] == "project.toml"
+    parsed = Page(rendered(execution))
+    assert "Whole chain: indeterminate" in parsed.text
+    held = {row[0]: row[1] for row in parsed.tables["Characteristics"][1:]}
+    assert held["chain span"] == "indeterminate"
+    # What was stated and is held against nothing is said.
+    assert step["limits_not_held"] == ["bow_mm"]
+    assert of_file(execution, "limits-not-held") == [{"key": "bow_mm", "limit": "bow of a unit preassembled"}]
+    on_terminal = [
+        str(table.title) for table in all_tables.tables_of_run(execution, ErrorReport()) if table.on_terminal
+    ]
+    assert {"Limits of the whole chain, method adjustment (mm)", "Limits that nothing is compared with"} <= set(
+        on_terminal
+    )
+
+
+def test_gaps_have_intervals_in_the_joints_axes_too():
+    execution = of_bridge()
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    rows = of_file(execution, "gaps")
+    assert list(rows[0])[:8] == ["joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm"]
+    for j, joint in enumerate(step["joint_measures"]):
+        for k, key in enumerate(f"P{i}" for i in range(1, 9)):
+            assert joint["gaps_joint_axes_ci95"][key] == pytest.approx([0.196] * 3, abs=1e-4)
+            row = rows[8 * j + k]
+            assert [float(row[f"{one}_mm"]) for one in ("along", "left", "up")] == pytest.approx(
+                joint["gaps_joint_axes"][key], abs=1e-6
+            )
+            assert [float(row[f"ci95_{one}_mm"]) for one in ("along", "left", "up")] == pytest.approx(
+                joint["gaps_joint_axes_ci95"][key], abs=1e-6
+            )
+    assert len(of_file(execution, "gaps-line")[0]) == 8
+
+
+def test_ambiguous_part_is_listed_with_both_poses():
+    rows = of_file(of_bridge(), "candidates")
+    assert [row["candidate"] for row in rows] == ["as assembled", "the other pose"]
+    assert [float(row["turned_deg"]) for row in rows] == [0.0, 180.0]
+    assert [float(row["xt_mm"]) for row in rows] == [0.0, 5.0]
+    assert len(Page(rendered(of_bridge())).tables["Parts that fit in two poses"]) == 3
+
+
+def test_accuracy_budget_is_written_and_shown_on_the_terminal():
+    rows = of_file(of_bridge(), "accuracy")
+    assert rows[0]["statement"].startswith("J1 P1: ± 0.087 mm (95 %), 69% of the variance from the end face")
+    assert rows[1]["statement"].startswith("a scan of rib1 that shows more of the end face")
+    assert any(
+        table.file == "accuracy" and table.on_terminal for table in all_tables.tables_of_run(of_bridge(), ErrorReport())
+    )
+
+
+def test_failed_method_is_listed_with_its_reason_and_not_drawn():
+    execution = of_bridge()
+    (row,) = of_file(execution, "components-compared")
+    assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
+    answered = drawn(execution)["preassemble"]["linear-error.png"]
+    assert "without a band, for they state no uncertainty: line" in str(answered[0])
+    line = execution.runs[1]
+    linear = line.result.linear
+    own = dataclasses.replace(
+        line.result,
+        splicing=dataclasses.replace(line.result.splicing, ci95=[9.0, 9.0]),
+        linear=dataclasses.replace(
+            linear,
+            assembled=with_band(linear.assembled, 9.0, [9.0, 9.0]),
+            best_fit=with_band(linear.best_fit, 9.0, [9.0, 9.0]),
+        ),
+    )
+    alone = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=own)))
+    caption, picture = all_figures.draw_figures(alone, ErrorReport())["preassemble"]["linear-error.png"]
+    assert "the error of these methods for parts exactly as designed, scanned alike: line" in str(caption)
+    assert picture != answered[1]
+    (summary,) = (table for table in all_tables.tables_of_run(alone, ErrorReport()) if table.file == "summary")
+    assert "Of a bridge exactly as designed, scanned alike, line states up to 9.000" in str(summary.note)
+    nothing = Deviations(deviation=np.full(120, NAN))
+    result = dataclasses.replace(line.result, linear=dataclasses.replace(linear, assembled=nothing, best_fit=nothing))
+    silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
+    caption, picture = drawn(silent)["preassemble"]["linear-error.png"]
+    assert "without a result, so not drawn: line" in str(caption)
+    assert picture != answered[1]
+    data = json.loads(Page(rendered(silent)).scripts[0][1])["steps"]["preassemble"]
+    assert [one["method"] for one in data["linear"]] == ["adjustment"]
+
+
+def test_span_closure_budget_and_trade_off_as_tables():
+    execution = of_bridge()
+    span, along, *rest = of_file(execution, "span")
+    assert (span["departure"], span["ci95"], span["unit"], span["beyond_its_interval"]) == ("-1.25", "0.5", "mm", "yes")
+    assert (along["departure"], along["ci95"], along["unit"]) == ("1.0", "0.25", "mm")
+    assert [row["unit"] for row in rest] == ["mm", "mm", "mrad", "mrad", "mrad"]
+    assert [row["beyond_its_interval"] for row in rest] == ["yes", "yes", "no", "no", "yes"]
+    assert of_file(execution, "budget")[2] == {"source": "scanner offset", "sd_mm": "0.2"}
+    assert [row["linear_max_mm"] for row in of_file(execution, "trade-off")] == ["2.0", "3.0", "9.0"]
+    measures = of_file(execution, "measures")
+    assert len(measures) == 22
+    low, value, high = (float(measures[0][name]) for name in ("low95", "value", "high95"))
+    assert low < value < high
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_methods_without_intervals_have_no_tables_of_the_adjustment():
+    runs = (StepRun("preassemble", "line", "{}", assembled("line")),)
+    execution = Execution(arch_scene(), runs, PROVENANCE)
+    files = {table.file for table in all_tables.tables_of_run(execution, ErrorReport())}
+    assert not files & {"what-to-do", "limits", "measures", "span", "budget", "trade-off"}
+    assert not set(drawn(execution)["preassemble"]) & OWN
+    assert "What limits the accuracy" not in rendered(execution)
+
+
+@pytest.mark.parametrize(("verified", "tone"), [(True, "good"), (False, "")])
+def test_a_pass_is_marked_as_good_only_by_limits_that_are_verified(verified, tone):
+    result = SimpleNamespace(status=Status.OK, overall=Verdict.PASS, verified=verified)
+    assert page._tone(StepRun("preassemble", "adjustment", "{}", result)) == tone
+
+
+def test_page_has_verdict_then_actions_then_pictures():
+    text = rendered(of_bridge())
+    places = [
+        text.index(one)
+        for one in (
+            "2 of 2 joints fail",
+            "verdicts are provisional",
+            "-1.250 ± 0.500",
+            "J1 P1: ±",
+            "A scan of rib1",
+            "<h2>",
+        )
+    ]
+    assert places == sorted(places)
+    assert text.index("Joints: what to do") < text.index("data:image/png")
+    assert '<li class="bad">' in text
+
+
+def unknown(result, joints, parts):
+    """Take away what is known of these joints and parts."""
+    before = result.adjustment
+    gaps, distance = result.joints.gaps.copy(), before.residuals.distance.copy()
+    gaps[joints], distance[np.isin(before.residuals.component, parts)] = NAN, NAN
+    records = list(before.joints.measures)
+    for j in joints:
+        records[j] = joint_measures.measure(np.full((8, 3), NAN), np.full((24, 24), NAN), np.eye(4), SECTION)
+    adjustment = dataclasses.replace(
+        before,
+        joints=judged_joints(result.joints.name, records),
+        residuals=dataclasses.replace(before.residuals, distance=distance),
+        span_departure=NAN,
+        span_ci95=NAN,
+        closure=np.full((2, 3), NAN),
+        closure_ci95=np.full((2, 3), NAN),
+    )
+    return dataclasses.replace(
+        result,
+        joints=dataclasses.replace(result.joints, gaps=gaps, verdict=verdicts(adjustment)),
+        trade_off=trade_off(np.full((3, 4), NAN)),
+        adjustment=adjustment,
+    )
+
+
+@pytest.mark.parametrize(("joints", "parts", "pictures"), [((1,), (2,), 2), ((0, 1), (0, 1, 2), 0)])
+def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
+    execution = of_bridge()
+    result = unknown(execution.runs[0].result, list(joints), parts)
+    execution = dataclasses.replace(execution, runs=(dataclasses.replace(execution.runs[0], result=result),))
+    found = drawn(execution)["preassemble"]
+    assert len({"gap-vectors.png", "residuals.png", "trade-off.png"} & set(found)) == pictures
+    parsed = Page(rendered(execution))
+    last = parsed.tables["Joints: what to do, method adjustment"][-1]
+    assert last[:2] == ["J2", "indeterminate"]
+    assert "scan both ends" in last[2]
+    assert set(last[3:]) <= {"–", ""}
+    assert "Closure by" not in parsed.text
+    data = json.loads(parsed.scripts[0][1])["steps"]["preassemble"]
+    assert data["joints"][1]["gap"] == [[None] * 3] * 8
+
+
+# --- pictures ------------------------------------------------------------------------------------------------------
+
+
+def test_every_picture_shows_something():
+    found = drawn(of_bridge())["preassemble"]
+    assert set(found) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
+    for name, (caption, png) in found.items():
+        pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
+        dark = (pixels.min(axis=2) < 0.9).mean()
+        assert 0.005 < dark < 0.9, name
+        assert caption
+    assert "95 %" in str(found["linear-error.png"][0])
+
+
+def test_pictures_change_with_their_data_alone():
+    """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
+    before = drawn(of_bridge())["preassemble"]
+    execution = of_bridge()
+    run = execution.runs[0]
+    before_of = run.result.adjustment
+    residuals = dataclasses.replace(before_of.residuals, distance=-3.0 * np.abs(before_of.residuals.distance))
+    other = dataclasses.replace(run.result, adjustment=dataclasses.replace(before_of, residuals=residuals, weight=1.0))
+    after = all_figures.draw_figures(
+        dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
+    )["preassemble"]
+    assert {name for name in OWN if before[name] != after[name]} == {"residuals.png", "trade-off.png"}
+
+
+@pytest.mark.parametrize(
+    ("value", "wanted"), [(0.3, 1.0), (1.0, 1.0), (4.99, 2.0), (5.0, 5.0), (760.0, 500.0), (1e4, 1e4)]
+)
+def test_scales_are_round_numbers(value, wanted):
+    assert rounded(value) == pytest.approx(wanted)
+
+
+def test_parts_unroll_face_by_face():
+    """A straight box 4 m by 0.45 m by 1.1 m: the middle of each face lies at its place along the girth."""
+    part = arch_scene().arch.parts[0]
+    corners = [[x, y, z] for x in np.linspace(50.0, 3950.0, 40) for y in (0.0, 450.0) for z in (0.0, 1100.0)]
+    middles = [[1000.0, 225, 0], [1000, 0, 550], [1000, 225, 1100], [1000, 450, 550], [3000, 450, 100]]
+    flat = residual_map.unroll(part, np.array(corners + middles))
+    np.testing.assert_allclose(flat.edges, [0.0, 0.45, 1.55, 2.0, 3.1], atol=0.01)
+    np.testing.assert_allclose(flat.around[-5:], [0.225, 1.0, 1.775, 2.55, 3.0], atol=0.01)
+    np.testing.assert_allclose(flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0], atol=0.01)
+
+
+def test_numbers_of_large_gaps_fit_their_frames_and_missing_gaps_are_stated(monkeypatch):
+    figures_made = []
+
+    def kept(figure):
+        FigureCanvasAgg(figure).draw()
+        figures_made.append(figure)
+        return b""
+
+    monkeypatch.setattr(joint_figures, "png", kept)
+    result = unknown(adjusted(), [1], ())
+    wide = joint_measures.measure(np.outer(np.arange(8.0), [-6.6, 3.0, 3.0]), 0.2 * np.eye(24), np.eye(4), SECTION)
+    records = (wide, result.adjustment.joints.measures[1])
+    judged = dataclasses.replace(result.adjustment.joints, measures=records)
+    adjustment = dataclasses.replace(result.adjustment, joints=judged)
+    joint_figures.gap_vectors(dataclasses.replace(result, adjustment=adjustment))
+    shown, silent = figures_made[0].axes
+    numbers = [one for one in shown.texts if one.get_text().startswith("P")]
+    assert len(numbers) == 8
+    frame = shown.get_window_extent()
+    for one in numbers:
+        box = one.get_window_extent()
+        assert frame.x0 <= box.x0, one.get_text()
+        assert box.x1 <= frame.x1, one.get_text()
+        assert frame.y0 <= box.y0, one.get_text()
+        assert box.y1 <= frame.y1, one.get_text()
+    assert [one.get_text() for one in silent.texts] == ["no gaps computed"]
+    assert silent.get_title() == "J2: INDETERMINATE"

@@ -1,0 +1,484 @@
+"""Balls of a whole frame as reported: results.json, tables, drawing and figures, from a result written by hand."""
+
+import csv
+import dataclasses
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+
+import ezdxf
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from processor.evaluation.evaluate import ErrorReport
+from processor.model import Scan, Scene, Stations, StepRun, Verdict, reason
+from processor.pipeline import Execution
+from processor.report import all_figures, all_tables, page, write_results
+from processor.report import table as report_table
+from processor.report.space_frame import close_ups, dxf
+from processor.report.space_frame import figures as space_frame_figures
+from processor.report.space_frame import tables as space_frame_tables
+from processor.results import to_json
+from processor.space_frame.result import (
+    ControlDeviations,
+    Result,
+    StationCorrections,
+    Tubes,
+)
+from processor.store import store
+from tests.support.pages.report_pages import TablesOfPage
+from tests.support.results.ball_results import (
+    NAN,
+    NOMINAL,
+    TURN,
+    balls,
+    of_frame,
+    pose,
+    repeated,
+    scene,
+    whole,
+    with_truth,
+    without_design,
+)
+from tests.support.results.bridge_results import PROVENANCE
+from tests.support.results.records import assert_equal
+
+
+def by_file(file, *args):
+    (table,) = [one for one in all_tables.tables_of_run(*of_frame(*args)) if one.file == file]
+    return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
+
+
+# --- verdicts ------------------------------------------------------------------------------------------------------
+
+
+def test_verdicts_by_hand():
+    found = whole().balls
+    # 3-4-0: along (0.6, 0.8, 0) the variance is 0.36 * 0.25 + 0.64 * 1 = 0.73; 12 down: 4; 0.3-0-0.4: 0.36/4 + 0.64 * 4
+    np.testing.assert_allclose(found.movement_size[[0, 1, 3]], [5.0, 12.0, 0.5])
+    np.testing.assert_allclose(found.movement_size_ci95[[0, 1, 3]], 1.96 * np.sqrt([0.73, 4.0, 2.65]), rtol=1e-4)
+    assert np.isnan(found.movement_size[[2, 4]]).all()
+    assert found.verdict == ("pass", "indeterminate", "none", "pass", "none")
+    assert whole(limit=8.0).balls.verdict[1] == "fail"
+    assert whole(limit=5.5).balls.verdict[0] == "indeterminate"
+    assert whole(limit=2.0).balls.verdict == ("fail", "fail", "none", "indeterminate", "none")
+    assert whole(limit=NAN).balls.verdict == ("none",) * 5
+
+
+def test_the_worst_verdict_is_that_of_the_result():
+    assert whole().overall is Verdict.INDETERMINATE
+    assert whole(limit=8.0).overall is Verdict.FAIL
+    assert whole(limit=NAN).overall is Verdict.NONE
+
+
+@pytest.mark.parametrize("matching", ["ambiguous", "failed"])
+def test_nodes_have_no_pass_while_their_matching_is_uncertain(matching):
+    assert set(whole(matching=matching).balls.verdict) == {"indeterminate", "none"}
+
+
+def test_a_ball_that_was_not_seen_neither_passes_nor_fails():
+    for limit in (100.0, 0.001):
+        unseen = whole(limit=limit, changed={"evidence": ("axes", "ball", "axes", "axes", "fused")}).balls
+        assert unseen.verdict[0] == unseen.verdict[3] == "indeterminate"
+    assert whole(limit=NAN, changed={"evidence": ("axes",) * 5}).balls.verdict[0] == "none"
+
+
+def test_a_node_that_did_not_move_has_no_direction_but_a_verdict():
+    still = whole(changed={"movement": np.zeros((5, 3))}).balls
+    assert still.verdict[0] == "pass"
+    assert still.movement_size[0] == 0.0
+
+
+# --- results.json --------------------------------------------------------------------------------------------------
+
+
+def written(result):
+    made = to_json.results_json(*of_frame(result))
+    return json.loads(json.dumps(made, allow_nan=False))["steps"]["spheres"]
+
+
+def test_results_json_of_a_whole_frame():
+    step = written(whole())
+    first, second, lost, _, extra = step["balls"]
+    assert first["size"] == 45.0
+    assert (first["axes"], first["stations"]) == (3, 2)
+    assert first["bound_sd"] == {"x": 0.08, "y": 0.16, "z": 0.24, "radius": 0.04, "lowest": 0.09}
+    assert first["efficiency"] == {"centre": 0.8, "radius": 0.9, "lowest": 0.95}
+    assert first["movement"]["vector"] == [3.0, 4.0, 0.0]
+    assert first["movement"]["ci95"] == pytest.approx([0.98, 1.96, 3.92])
+    assert first["movement"]["verdict"] == "pass"
+    assert second["movement"]["size"] == 12.0
+    assert "movement" not in lost
+    assert "movement" not in extra
+    assert step["gauge"] == "design frame"
+    assert step["movement_limit"] == {"mm": 10.0, "source": "project.toml"}
+    assert step["matching"]["status"] == "ok"
+    assert step["matching"]["T_design_scan"] == np.eye(4).tolist()
+    assert np.shape(step["matching"]["covariance"]) == (6, 6)
+    assert step["matching"]["rivals"] == []
+    assert [(one["a"], one["b"], one["bow"]) for one in step["tubes"]] == [(10, 11, 0.5), (13, -1, 1.5)]
+    assert step["tubes"][0]["start"] == [100.0, 0.0, 6000.0]
+    assert [one["name"] for one in step["stations"]] == ["S1", "=S2"]
+    assert step["stations"][0]["reasons"] == []
+    assert step["stations"][1]["reasons"][0]["code"] == "spheres.weak-motions"
+    assert first["reasons"] == []
+    assert second["reasons"] == [
+        {
+            "code": "spheres.other-size",
+            "values": {"size": 60.0, "nominal": 50.0},
+            "text": "size 60 mm instead of 50 mm",
+        }
+    ]
+    assert [one["code"] for one in step["reasons"]] == ["spheres.ranges"]
+    assert np.shape(step["stations"][1]["T"]) == (4, 4)
+
+
+def test_results_json_has_no_keys_of_absent_results():
+    paper = balls()
+    execution = Execution(scene(whole()), (StepRun("spheres", "ransac", "{}", paper),), PROVENANCE)
+    step = to_json.results_json(execution, ErrorReport())["steps"]["spheres"]
+    assert set(step) == {"status", "method", "reasons", "balls", "verdict"}
+    assert "size" not in step["balls"][0]
+    blind = written(without_design(whole()))
+    assert not {"gauge", "matching", "movement_limit"} & set(blind)
+    assert "tubes" in blind
+    assert "movement" not in blind["balls"][0]
+
+
+def test_the_result_goes_through_the_store_unchanged(tmp_path):
+    made = whole()
+    store.write_results(tmp_path / "r.h5", [StepRun("spheres", "ray", "{}", made)], {})
+    (back,) = store.read_results(tmp_path / "r.h5", {"spheres": Result})
+    assert_equal(back.result, made)
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+
+
+def test_csv_of_balls_and_of_lowest_points():
+    first, second, lost, *_ = by_file("balls", None, with_truth()[0])
+    assert float(first["ci95_x_mm"]) == pytest.approx(0.196, abs=1e-4)
+    assert float(first["ci95_radius_mm"]) == pytest.approx(0.098, abs=1e-4)
+    assert (first["size_mm"], first["nominal_radius_mm"], first["radius_error_mm"]) == ("45.0", "45.0", "0.1")
+    assert (first["bound_sd_z_mm"], first["efficiency_lowest_z"], first["evidence"]) == ("0.24", "0.95", "fused")
+    assert (second["flag"], second["remark"]) == ("wrong-size", "size 60 mm instead of 50 mm")
+    assert not [name for name in first if "formal" in name]
+    assert lost["x_mm"] == lost["radius_mm"] == ""
+    crew = by_file("lowest")
+    assert list(crew[0]) == ["id", "x_mm", "y_mm", "z_mm", "ci95_z_mm", "radius_mm", "flag"]
+    assert (crew[0]["x_mm"], crew[0]["z_mm"], crew[0]["radius_mm"]) == ("3.0", "5954.9", "45.1")
+    assert float(crew[1]["ci95_z_mm"]) == pytest.approx(0.392, abs=1e-4)
+    assert (crew[2]["z_mm"], crew[2]["flag"]) == ("", "not-found")
+
+
+def test_csv_of_nodes_tubes_and_stations():
+    nodes = by_file("nodes")
+    assert (nodes[0]["dx_mm"], nodes[0]["dy_mm"], nodes[0]["movement_mm"]) == ("3.0", "4.0", "5.0")
+    assert [row["verdict"] for row in nodes] == ["pass", "indeterminate", "", "pass", ""]
+    assert {row["limit_mm"] for row in nodes} == {"10.0"}
+    one, open_end = by_file("tubes")
+    assert (one["ball_a"], one["ball_b"], one["length_mm"], one["bow_mm"]) == ("10", "11", "2800.0", "0.5")
+    assert (open_end["ball_b"], open_end["start_y_mm"]) == ("", "3900.0")
+    still, moved = by_file("stations")
+    assert (still["dx_mm"], still["turn_z_mrad"]) == ("0.0", "0.0")
+    assert (moved["station"], moved["dx_mm"], moved["dy_mm"], moved["dz_mm"]) == ("'=S2", "1.0", "-2.0", "3.0")
+
+
+def test_shift_of_a_station_is_stated_at_the_middle_of_the_balls():
+    # Half a milliradian about z through a point 500 km away: the transform's translation is 250 m, the shift is none.
+    far = np.array([5e8, 4e9, 0.0])
+    R = np.array([[math.cos(5e-4), -math.sin(5e-4), 0.0], [math.sin(5e-4), math.cos(5e-4), 0.0], [0.0, 0.0, 1.0]])
+    made = whole()
+    centres = made.balls.centres + far
+    middle = np.nanmean(centres, axis=0)
+    T = np.array([pose(), pose(R, middle - R @ middle + [0.0, 0.0, 2.0])])
+    _, moved = by_file("stations", moved_to(made, centres, T))
+    assert [float(moved[name]) for name in ("dx_mm", "dy_mm", "dz_mm")] == pytest.approx([0.0, 0.0, 2.0], abs=2e-5)
+    assert float(moved["turn_z_mrad"]) == pytest.approx(0.5, abs=1e-6)
+
+
+def moved_to(result, centres, T):
+    return dataclasses.replace(
+        result,
+        balls=dataclasses.replace(result.balls, centres=centres),
+        stations=dataclasses.replace(result.stations, T=T),
+    )
+
+
+def test_table_of_nodes_states_a_missing_or_uncertain_limit():
+    (table,) = [one for one in all_tables.tables_of_run(*of_frame(whole(limit=NAN))) if one.file == "nodes"]
+    assert "node_place_mm" in str(table.note)
+    (table,) = [one for one in all_tables.tables_of_run(*of_frame(whole(matching="ambiguous"))) if one.file == "nodes"]
+    assert "10 mm by project.toml" in str(table.note)
+    assert "not certain" in str(table.note)
+
+
+def test_terminal_shows_summary_flagged_balls_and_stations():
+    shown = [one for one in all_tables.tables_of_run(*of_frame()) if one.on_terminal]
+    assert [str(one.title).split(",")[0] for one in shown] == [
+        "Balls in short", "Flagged balls", "Stations against each other (mm"
+    ]  # fmt: skip
+    values = {str(row[0]): row[1] for row in shown[0].rows}
+    assert (values["balls"], values["flag ok"], values["flag not-found"]) == (5, 2, 1)
+    assert values["95 % half-width of the radius, median"] == pytest.approx(0.098, abs=1e-4)
+    assert (values["movement of a node, largest"], values["nodes, verdict pass"]) == (12.0, 2)
+    assert [row[0] for row in shown[1].rows] == [11, 12, 13]
+
+
+# --- drawing -------------------------------------------------------------------------------------------------------
+
+
+def opened(data):
+    return ezdxf.read(io.StringIO(data.decode("utf-8")))
+
+
+@pytest.mark.parametrize("T", [pose(), pose(TURN, (7e5, -2e5, 100.0))], ids=["same frame", "turned"])
+def test_a_drawing_read_back(T):
+    document = opened(dxf.drawing(whole(T=T)))
+    assert not document.audit().has_errors
+    assert document.header["$INSUNITS"] == 4  # millimetres
+    space = document.modelspace()
+    count = {
+        (kind, layer): len(space.query(f'{kind}[layer=="{layer}"]'))
+        for kind, layer in (
+            ("CIRCLE", "NODES"), ("POINT", "NODES"), ("LINE", "AXES"), ("LINE", "MOVEMENTS"), ("TEXT", "IDS"),
+            ("POINT", "LOWEST"),
+        )
+    }  # fmt: skip
+    assert list(count.values()) == [4, 4, 2, 3, 4, 4]
+    assert len(space) == sum(count.values())
+    assert {text.dxf.text for text in space.query("TEXT")} == {"10", "11", "13", "14"}
+    assert sorted(round(c.dxf.radius, 6) for c in space.query("CIRCLE")) == [45.0, 45.1, 50.0, 60.2]
+    moved = {
+        tuple(np.round(T[:3, :3] @ line.dxf.start + T[:3, 3], 4)) for line in space.query('LINE[layer=="MOVEMENTS"]')
+    }
+    assert moved == {tuple(NOMINAL[i]) for i in (0, 1, 3)}
+
+
+def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
+    code = (
+        "import hashlib; from processor.report.space_frame import dxf;"
+        "from tests.support.results.ball_results import whole;"
+        "print(hashlib.sha256(dxf.drawing(whole())).hexdigest())"
+    )
+    data = dxf.drawing(whole())
+    assert not ezdxf.options.write_fixed_meta_data_for_testing
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONHASHSEED": "7"},  # the order of sets differs
+    )
+    assert done.stdout.strip() == hashlib.sha256(data).hexdigest()
+    assert b"S2" not in data
+    assert b"determined" not in data
+
+
+def test_starting_the_program_loads_no_drawing_library():
+    code = "import sys, processor.cli.main, processor.report.write_results; assert 'ezdxf' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
+    execution, report = of_frame()
+    write_results.write_results(tmp_path / "out", execution, report)
+    found = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {
+        "nodes.dxf",
+        "flagged-balls.pdf",
+        "balls.csv",
+        "lowest.csv",
+        "nodes.csv",
+        "tubes.csv",
+        "stations.csv",
+    } <= found
+    write_results.check_output(tmp_path / "out", tmp_path / "b.h5")
+    write_results.write_results(
+        tmp_path / "out", Execution(execution.scene, (StepRun("spheres", "ransac", "{}", balls()),), PROVENANCE), report
+    )
+    assert not {"nodes.dxf", "lowest.csv", "nodes.csv"} & {path.name for path in (tmp_path / "out").iterdir()}
+
+
+# --- figures and page ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def compared():
+    """A run compared with truth, its report, and all its figures."""
+    report, result = with_truth()
+    execution, report = of_frame(result, report)
+    return execution, report, all_figures.draw_figures(execution, report)
+
+
+def test_figures_of_a_frame_and_those_of_balls_to_look_at(compared):
+    execution, report, drawn = compared
+    found = drawn["spheres"]
+    assert set(found) == {
+        "plan.png", "radius-errors.png", "ball-errors.png", "flagged-ball-11.png", "flagged-ball-12.png",
+        "flagged-ball-13.png",
+    }  # fmt: skip
+    assert "times their size" in str(found["plan.png"][0])
+    assert "minus truth" in str(found["ball-errors.png"][0])
+    assert "sd" not in str(found["ball-errors.png"][0])
+    assert str(found["flagged-ball-11.png"][0]).startswith("Ball 11, wrong-size")
+    with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0}):
+        assert all_figures.draw_figures(execution, report)["spheres"] == found
+
+
+def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
+    found = all_figures.draw_figures(*of_frame(points=np.empty((0, 3))))["spheres"]
+    assert set(found) == {"plan.png", "ball-errors.png"}
+    assert "Standard deviations" in str(found["ball-errors.png"][0])  # there is no truth to compare with
+
+
+def test_at_most_twelve_balls_have_a_picture_worst_first(monkeypatch):
+    assert close_ups.MOST_BALLS == 12
+    monkeypatch.setattr(close_ups, "MOST_BALLS", 4)  # of seven, as more take seconds
+    made = repeated(whole(), 3)
+    drawn = close_ups.draw(scene(made), made)
+    captions = [str(caption) for caption, _ in drawn.values()]
+    assert len(drawn) == 4
+    flags = [caption.split(",")[1].split(":")[0].strip() for caption in captions]
+    assert flags == [*["wrong-size"] * 3, "not-found"]
+    assert "the first 4 of 7" in captions[0]
+    every = close_ups.flagged_rows(scene(made), made)
+    assert pages_of(close_ups.document(scene(made), made)) == len(every) == 7
+
+
+def pages_of(pdf):
+    assert pdf.startswith(b"%PDF-")
+    return len(re.findall(rb"/Type /Page\b", pdf))
+
+
+def test_a_ball_to_look_at_has_a_page_with_its_numbers():
+    made = whole()
+    i = made.balls.flag.index("wrong-size")
+    said = dict(close_ups._numbers(made.balls, i, np.array([1.0, -2.0, 0.5])))
+    half = 1.96 * np.sqrt(made.balls.covariance[i, 3, 3])
+    assert said["radius"] == f"{made.balls.radii[i]:.2f} ± {half:.2f}"
+    assert said["off the design's place, y"] == "2.00"  # found less designed
+    pdf = close_ups.document(scene(made), made)
+    assert pages_of(pdf) == 3
+    assert pdf == close_ups.document(scene(made), made)
+    fine = whole(changed={"flag": ("ok",) * 5})
+    assert close_ups.document(scene(fine), fine) == b""
+
+
+def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-500.0, 500.0, (5000, 3))
+    origin = np.array([4e8, 3e9, 0.0])
+    T = pose(TURN, (100.0, 0.0, 0.0))
+    scans = (
+        Scan("a", points[:2000], origin),
+        Scan("b", (points[2000:] + origin - T[:3, 3]) @ T[:3, :3], T_project_scan=T),
+    )
+    made = Scene("s", "space-frame", scans, stations=Stations())
+    centres = origin + np.array([[0.0, 0.0, 0.0], [200.0, -100.0, 300.0]])
+    for crop, centre, far in zip(
+        close_ups.crops_about(made, centres, np.array([90.0, 150.0])), centres, (90.0, 150.0), strict=True
+    ):
+        away = np.linalg.norm(points + origin - centre, axis=1)
+        assert len(crop) == (away <= far).sum() > 0
+        np.testing.assert_allclose(np.sort(np.linalg.norm(crop, axis=1)), np.sort(away[away <= far]), atol=1e-5)
+
+
+def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
+    """The same bytes, though of the file only the tiles about each ball are read."""
+    rng = np.random.default_rng(4)
+    made = whole()
+    T = pose(TURN, (100.0, 0.0, 0.0))
+    near = np.repeat(made.balls.centres[made.balls.placed], 300, axis=0)
+    far = rng.uniform(-5e3, 5e3, (60_000, 3)) + near.mean(axis=0)
+    points = np.vstack([near + rng.uniform(-150.0, 150.0, near.shape), far])
+    origin = np.array([500.0, -300.0, 0.0])
+    scans = (
+        Scan("a", (points - T[:3, 3]) @ T[:3, :3] - origin, origin, T_project_scan=T),
+        Scan("b", points[:5000], point_station=np.zeros(5000, np.int32)),
+    )
+    one = dataclasses.replace(scene(made), scans=scans, stations=Stations(("S1",), np.zeros((1, 3))))
+    store.write_scene(tmp_path / "s.h5", one, None, {})
+    in_memory = close_ups.draw(store.read_scene(tmp_path / "s.h5"), made)
+    alone = store.read_scene(tmp_path / "s.h5", points=False)
+    assert len(in_memory) > 1
+    assert close_ups.draw(alone, made) == {}
+    assert close_ups.draw(alone, made, tmp_path / "s.h5") == in_memory
+
+
+def test_control_points_have_a_table_and_their_place_in_results_json():
+    made = whole(
+        datum=(reason("spheres.datum-control", points=2),),
+        control=ControlDeviations(
+            points=("T1", "T2"),
+            off=[[0.3, 0.0, -0.4], [30.0, 0.0, 0.0]],
+            used=[True, False],
+            scans=("S1", "S2"),
+        ),
+    )
+    (table,) = (one for one in space_frame_tables.step_tables([StepRun("spheres", "ray", "{}", made)], ErrorReport())
+                if one.file == "control")  # fmt: skip
+    assert table.columns[0] == "control_point"
+    name, *off, used, scan = table.rows[0]
+    assert (name, off, str(used), scan) == ("T1", [0.3, 0.0, -0.4, pytest.approx(0.5)], "yes", "S1")
+    assert table.columns[-1] == "scan"
+    assert str(table.rows[1][-2]).startswith("no, ")
+    step = written(made)
+    assert [one["text"] for one in step["datum"]] == ["2 control points"]
+    assert [(one["name"], one["scan"], one["used"]) for one in step["control"]] == [
+        ("T1", "S1", True),
+        ("T2", "S2", False),
+    ]
+    assert not {"datum", "control"} & set(written(whole()))
+
+
+def test_targets_without_members_have_lowest_points_and_bounds():
+    columns = {"sizes": np.full(5, NAN), "axes": np.zeros(5, int), "nominal_radii": np.full(5, NAN)}
+    made = without_design(whole(changed=columns, tubes=Tubes(), stations=StationCorrections()))
+    found = {
+        one.file: one for one in space_frame_tables.step_tables([StepRun("spheres", "ray", "{}", made)], ErrorReport())
+    }
+    assert {"balls", "lowest"} <= set(found)
+    assert {"bound_sd_lowest_z_mm", "efficiency_radius"} <= set(found["balls"].columns)
+    assert any(one.on_terminal and "radius_mm" in one.columns for one in found.values())
+
+
+def test_expected_distribution_integrates_to_the_number_of_errors():
+    x = np.linspace(-5.0, 5.0, 1001)
+    y = space_frame_figures._mixture(x, np.array([0.2, 0.5, NAN, 0.0]), 0.1)
+    assert y.sum() * (x[1] - x[0]) / 0.1 == pytest.approx(2.0, abs=1e-6)
+    assert y[500] == pytest.approx(0.1 * (1 / 0.2 + 1 / 0.5) / math.sqrt(2.0 * math.pi))
+    assert space_frame_figures._mixture(x, np.array([NAN]), 0.1) is None
+
+
+def test_designed_places_are_transformed_into_the_scan():
+    T = pose(TURN, (7e5, -2e5, 100.0))
+    made = whole(T=T)
+    np.testing.assert_allclose(
+        close_ups.designed_places(scene(made), made)[:4] @ T[:3, :3].T + T[:3, 3], NOMINAL[:4], atol=1e-6
+    )
+    assert np.isnan(close_ups.designed_places(scene(made), made)[4]).all()
+
+
+def test_the_page_of_a_frame(compared):
+    execution, report, drawn = compared
+    text = page.html(execution, report, drawn)
+    found = TablesOfPage(text)
+    assert {"Nodes against the design (mm)", "Flagged balls, method ray (mm)", "Balls, method ray (mm)"} <= set(
+        found.tables
+    )
+    assert found.tables["Nodes against the design (mm)"][1][-3] == "pass"
+    assert len([one for one in found.addresses if one.startswith("data:image/png")]) == len(drawn["spheres"])
+    assert "Nodes against the design" in text[text.index("<h2>") :]
+
+
+def test_a_roof_of_thirty_thousand_keeps_the_page_small():
+    execution, report = of_frame(repeated(whole(), 6000))
+    assert len(page.html(execution, report, {})) < 12_000_000

@@ -1,0 +1,508 @@
+"""The design of an arch bridge from a mesh or CAD body a part: order, joints, bottom edges, and what is not sure."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from designgen import batch, recipe_files
+from designgen.curves import make as make_curve
+from designgen.designs import arch_rib
+from designgen.designs.arch_part import Plates, solid
+from designgen.export import folder as export_folder
+from designgen.export import step_files
+from processor.api import runs
+from processor.cli import main
+from processor.geometry.polyline import Polyline
+from processor.model import ArchDesign, DesignBodies
+from processor.scan_folder import cad, guess
+from processor.scan_folder import folder as scan_folder
+from processor.scan_folder.shapes import arch_bridge, guess_design
+from processor.scan_folder.shapes.body import stacked, welded
+from processor.scan_folder.units import MM_PER_UNIT
+from tests.support.files.scan_folders import write_ply
+from tests.support.solids import bridge_parts
+
+CORNER_MM = 0.05
+I_HEIGHT, I_WIDTH, I_FLANGE, I_WEB = 900.0, 400.0, 30.0, 16.0
+
+
+def found(meshes, names=None):
+    names = names or bridge_parts.names(len(meshes))
+    return arch_bridge.find([welded(name, *mesh) for name, mesh in zip(names, meshes, strict=True)])
+
+
+def order(design):
+    return [part.name for part in design.parts]
+
+
+def joined(*meshes):
+    """Several meshes as one."""
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
+    faces = [faces + k for (_, faces), k in zip(meshes, first, strict=False)]
+    return np.vstack([vertices for vertices, _ in meshes]), np.vstack(faces)
+
+
+@pytest.mark.parametrize("parts", [2, 5, 7, 11])
+@pytest.mark.parametrize("gap", [0.0, 8.0, 55.0])
+def test_joints_are_those_of_the_closed_form(parts, gap):
+    for seed in range(2):
+        meshes, joints = bridge_parts.bridge(parts, seed, gap)
+        shuffled = np.random.default_rng(seed).permutation(parts)
+        one = found([meshes[k] for k in shuffled], [bridge_parts.names(parts)[k] for k in shuffled])
+        assert one.doubts == ()
+        assert order(one.design) == bridge_parts.names(parts)
+        assert one.root_gap_mm == pytest.approx(gap, abs=0.01)
+        assert np.abs(one.design.joint_points - joints).max() < CORNER_MM
+        for part in one.design.parts:
+            for side, edge in enumerate((part.bottom_edge_left, part.bottom_edge_right)):
+                assert (np.diff(edge[:, 0]) > 0.0).all()
+                curve = Polyline.through(bridge_parts.edge(side, edge[:, 0]))
+                assert np.abs(curve.vertices - edge).max() < 0.1
+
+
+def test_bottom_edges_lead_from_joint_to_joint():
+    one = found(bridge_parts.bridge(5, 1)[0]).design
+    for k, part in enumerate(one.parts):
+        for side, edge in enumerate((part.bottom_edge_left, part.bottom_edge_right)):
+            if k > 0:
+                assert np.linalg.norm(edge[0] - one.joint_points[k - 1, side]) < CORNER_MM
+            if k < 4:
+                assert np.linalg.norm(edge[-1] - one.joint_points[k, side]) < CORNER_MM
+
+
+def turned(axis, angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.roll(np.roll([[1, 0, 0], [0, c, -s], [0, s, c]], axis, axis=0), axis, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("R", "reason"),
+    [
+        (turned(2, np.pi / 2), "follow each other along Y"),
+        (turned(2, 0.5), "29 degrees from X"),
+        (turned(0, np.pi / 2), "rises along Y"),
+        (turned(0, np.pi), "hangs down"),
+        (turned(1, np.pi / 2), "along Z"),
+    ],
+)
+def test_a_design_in_another_frame_is_refused(R, reason):
+    one = found([(vertices @ R.T, faces) for vertices, faces in bridge_parts.bridge()[0]])
+    assert one.design is None
+    assert reason in one.doubts[0]
+    assert "turn the design" in one.doubts[0]
+
+
+def test_names_numbered_against_the_order_of_parts_are_reported():
+    one = found(bridge_parts.bridge()[0], bridge_parts.names(5)[::-1])
+    assert order(one.design) == bridge_parts.names(5)[::-1]
+    assert len(one.doubts) == 1
+    assert "numbered the other way" in one.doubts[0]
+
+
+def slab(plane, scale, thickness):
+    """An end plate on a plane, larger than the section by a factor."""
+    four = bridge_parts.section(*plane)[:4]
+    four = four.mean(axis=0) + scale * (four - four.mean(axis=0))
+    sides = [q for k in range(4) for q in ((k, (k + 1) % 4, (k + 1) % 4 + 4), (k, (k + 1) % 4 + 4, k + 4))]
+    return np.vstack([four, four + thickness * plane[1]]), np.array(
+        [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6), *sides]
+    )
+
+
+def bevelled(vertices, faces):
+    """The outer corners of the start's face drawn in by 15 mm over 12 mm of length."""
+    vertices, outer = vertices.copy(), vertices[:4].copy()
+    along, inside = vertices[4:8] - outer, outer.mean(axis=0) - outer
+    vertices[4:8] = outer + 12.0 * along / np.linalg.norm(along, axis=1, keepdims=True)
+    vertices[:4] = outer + 15.0 * inside / np.linalg.norm(inside, axis=1, keepdims=True)
+    return vertices, faces
+
+
+def chamfered(vertices, faces, steps=1):
+    """The part's outer faces with the lower left corner cut off by 40 mm, or rounded in several steps."""
+    rows, count = bridge_parts.ROWS, steps + 4
+    four = vertices[: 4 * rows].reshape(rows, 4, 3)
+    up, right = four[:, 3] - four[:, 0], four[:, 1] - four[:, 0]
+    one = four[:, 0] + 40.0 * up / np.linalg.norm(up, axis=1, keepdims=True)
+    two = four[:, 0] + 40.0 * right / np.linalg.norm(right, axis=1, keepdims=True)
+    round_ = [(1 - t) ** 2 * one + 2 * t * (1 - t) * four[:, 0] + t**2 * two for t in np.linspace(0, 1, steps + 1)]
+    round_ = [one, two] if steps == 1 else round_
+    loops = np.stack([*round_, four[:, 1], four[:, 2], four[:, 3]], axis=1)
+    k = np.arange(count)
+    triangles = []
+    for i in range(rows - 1):
+        a, b = count * i + k, count * i + np.roll(k, -1)
+        triangles += [*np.stack([a, b, b + count], axis=1), *np.stack([a, b + count, a + count], axis=1)]
+    ends = [(e, e + m, e + m + 1) for e in (0, count * (rows - 1)) for m in range(1, count - 1)]
+    return loops.reshape(-1, 3), np.array([*triangles, *ends])
+
+
+@pytest.mark.parametrize(
+    ("flaw", "reason"),
+    [
+        (lambda m, p: m.__setitem__(1, joined(m[1], slab(p[1], 1.2, 20.0))), "off its outer faces"),
+        (lambda m, p: m.__setitem__(1, bevelled(*m[1])), "off its outer faces"),
+        (lambda m, p: m.__setitem__(1, chamfered(*m[1])), "5 corners instead of four"),
+        (lambda m, p: m.__setitem__(1, (m[1][0] + [0.0, 5.0, 0.0], m[1][1])), "the two ends differ by 5.0 mm"),
+        (lambda m, p: m.__setitem__(1, (m[1][0] - 5.0 * p[1][1], m[1][1])), "overlap by 5.0 mm"),
+        (lambda m, p: m.__setitem__(1, (m[1][0].round(0), m[1][1])), "rounded"),
+    ],
+    ids=["end plate", "bevel", "chamfer", "offset", "overlap", "rounded"],
+)
+def test_unclear_corners_are_reported_as_doubts(flaw, reason):
+    meshes, _ = bridge_parts.bridge(5, 0)
+    flaw(meshes, bridge_parts.cutting_planes(5, 0))
+    one = found(meshes)
+    assert order(one.design) == bridge_parts.names(5)
+    assert any(reason in text for text in one.doubts), one.doubts
+
+
+def test_edges_that_are_not_sharp_are_left_out(tmp_path):
+    meshes, _ = bridge_parts.bridge(5, 0)
+    meshes[2] = chamfered(*meshes[2], steps=8)
+    for name, mesh in zip(bridge_parts.names(5), meshes, strict=True):
+        bridge_parts.write_obj(tmp_path / f"design/{name}.obj", *mesh)
+    write_scans(tmp_path, meshes, bridge_parts.names(5))
+    assert "? bottom edges of rib2: left out" in init(tmp_path)
+    parts = scan_folder.read_input(tmp_path).arch.parts
+    assert [len(part.bottom_edge_left) > 0 for part in parts] == [True, True, False, True, True]
+
+
+def test_behind_a_bevel_or_an_end_plate_the_outer_faces_are_followed():
+    meshes, joints = bridge_parts.bridge(5, 0)
+    meshes[1] = bevelled(*meshes[1])
+    meshes[2] = joined(meshes[2], slab(bridge_parts.cutting_planes(5, 0)[2], 1.2, 20.0))
+    one = found(meshes)
+    assert np.abs(one.design.joint_points - joints).max() < 1.0
+    assert sum("off its outer faces" in text for text in one.doubts) == 2
+
+
+def test_a_ring_has_no_order():
+    angles = np.arange(0.0, 2.0 * np.pi + 0.1, np.pi / 3.0)
+    planes = [(np.array([0.0, 0.0, 0.0]), np.array([-np.sin(a), 0.0, np.cos(a)])) for a in angles]
+
+    def section(plane, y, r):
+        return plane[0] + np.array([r * plane[1][2], y, -r * plane[1][0]])
+
+    def segment(a, b):
+        outer, inner = (
+            np.array(
+                [
+                    section(p, y, r)
+                    for p in (a, b)
+                    for y, r in ((w, 5e3 + t), (-w, 5e3 + t), (-w, 6e3 - t), (w, 6e3 - t))
+                ]
+            )
+            for w, t in ((400.0, 0.0), (380.0, 20.0))
+        )
+        sides = [q for k in range(4) for q in ((k, (k + 1) % 4, (k + 1) % 4 + 4), (k, (k + 1) % 4 + 4, k + 4))]
+        rings = [(e + k, e + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
+        rings += [(e + (k + 1) % 4, e + 8 + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
+        return np.vstack([outer, inner]), np.array([*sides, *((i + 8, j + 8, k + 8) for i, j, k in sides), *rings])
+
+    one = found([segment(a, b) for a, b in pairwise(planes)], list("abcdef"))
+    assert one.design is None
+    assert "make up a ring" in one.doubts[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda m: m.append(m[2]), "the order of the parts is not clear"),
+        (lambda m: m.pop(2), "several chains"),
+        (lambda m: m.__setitem__(1, (m[1][0], m[1][1][:-8])), "not closed: rib1"),
+        (lambda m: m.__setitem__(slice(None), [(v / 1000.0, f) for v, f in m]), "no two of"),
+        (lambda m: m.extend([(v + np.array([0.0, 6000.0, 0.0]), f) for v, f in m]), "make a folder for each bridge"),
+    ],
+    ids=["twice", "missing", "open", "metres", "two bridges"],
+)
+def test_parts_without_a_clear_order_make_no_design(change, reason):
+    meshes, _ = bridge_parts.bridge()
+    change(meshes)
+    one = found(
+        meshes,
+        [f"part{k}" if reason[:3] != "not" else n for k, n in enumerate((bridge_parts.names(5) * 2)[: len(meshes)])],
+    )
+    assert one.design is None
+    assert reason in one.doubts[0]
+
+
+def test_part_without_neighbours_is_left_out_with_a_remark():
+    meshes, joints = bridge_parts.bridge()
+    one = found([*meshes, (meshes[2][0] + [0.0, 9000.0, 0.0], meshes[2][1])], [*bridge_parts.names(5), "spare"])
+    assert order(one.design) == bridge_parts.names(5)
+    assert np.abs(one.design.joint_points - joints).max() < CORNER_MM
+    assert "spare: meets no part" in one.doubts[0]
+
+
+def i_beam(start, end):
+    """A prism of I-section from x to x, that leans with the line z = 0.1 x up to the middle and falls behind it."""
+    h, w, f, t = I_HEIGHT, I_WIDTH / 2, I_FLANGE, I_WEB / 2
+    outline = np.array(
+        [
+            [-w, 0],
+            [w, 0],
+            [w, f],
+            [t, f],
+            [t, h - f],
+            [w, h - f],
+            [w, h],
+            [-w, h],
+            [-w, h - f],
+            [-t, h - f],
+            [-t, f],
+            [-w, f],
+        ]
+    )
+    cap = [
+        (0, 1, 2),
+        (0, 2, 3),
+        (0, 3, 10),
+        (0, 10, 11),
+        (7, 5, 6),
+        (7, 4, 5),
+        (7, 9, 4),
+        (7, 8, 9),
+        (3, 4, 9),
+        (3, 9, 10),
+    ]
+    ends = [
+        np.column_stack([np.full(12, x), outline[:, 0], outline[:, 1] + 1000.0 - 0.1 * abs(x)]) for x in (start, end)
+    ]
+    k = np.arange(12)
+    sides = [(i, (i + 1) % 12, (i + 1) % 12 + 12) for i in k] + [(i, (i + 1) % 12 + 12, i + 12) for i in k]
+    return np.vstack(ends), np.array([*sides, *cap, *((a + 12, c + 12, b + 12) for a, b, c in cap)])
+
+
+def test_sections_of_i_beams():
+    one = found(
+        [i_beam(-9000.0, -3000.0), i_beam(-3000.0, 0.0), i_beam(0.0, 3000.0), i_beam(3000.0, 9000.0)], list("abcd")
+    )
+    assert one.doubts == ()
+    w, h = I_WIDTH / 2, I_HEIGHT
+    four = [[w, 0.0], [-w, 0.0], [-w, h], [w, h], [0.0, 0.0], [-w, h / 2], [0.0, h], [w, h / 2]]
+    for points, x in zip(one.design.joint_points, (-3000.0, 0.0, 3000.0), strict=True):
+        assert points == pytest.approx(np.column_stack([np.full(8, x), four + np.array([0.0, 1000.0 - 0.1 * abs(x)])]))
+
+
+# --- folders ----------------------------------------------------------------------------------------------------------
+
+
+def write_scans(place, meshes, names, scale=1.0, header=""):
+    """Points on the parts as scans, in the bridge's frame."""
+    (place / "scans").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for name, (vertices, faces) in zip(names, meshes, strict=True):
+        share = rng.dirichlet([1.0, 1.0, 1.0], 4000)
+        corners = vertices[faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        points = np.einsum("nk,nki->ni", share, corners[rng.choice(len(faces), 4000, p=area / area.sum())]) * scale
+        np.savetxt(place / f"scans/{name}.csv", points, fmt="%.4f", delimiter=",", header=header, comments="")
+
+
+def init(place, *options):
+    done = CliRunner().invoke(main.commands, ["init", str(place), *options], catch_exceptions=False)
+    assert done.exit_code == 0
+    return done.output
+
+
+WRITERS = {"obj": bridge_parts.write_obj, "stl": bridge_parts.write_stl, "ply": write_ply}
+
+
+UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4, "ft": 304.8}
+# By day every format and every unit: no format states its unit, so that units do not depend on the format.
+BY_DAY = {("obj", "mm"), ("obj", "inch"), ("stl", "m"), ("stl", "ft"), ("ply", "inch"), ("ply", "m")}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "unit", "size_mm"),
+    [
+        pytest.param(suffix, unit, size, marks=() if (suffix, unit) in BY_DAY else pytest.mark.slow)
+        for suffix in WRITERS
+        for unit, size in UNITS.items()
+    ],
+)
+def test_the_unit_comes_from_scans_that_state_theirs(tmp_path, suffix, unit, size_mm):
+    meshes, joints = bridge_parts.bridge(5, 2)
+    for name, (vertices, faces) in zip(bridge_parts.names(5), meshes, strict=True):
+        WRITERS[suffix](tmp_path / f"Modelle 3D/{name}.{suffix}", vertices / size_mm, faces)
+    write_scans(tmp_path, meshes, bridge_parts.names(5), 0.001, "x_m,y_m,z_m")
+    output = init(tmp_path)
+    assert "5 parts (foot1, rib1, rib2, rib3, foot2), 4 joint(s)" in output
+    assert "?" not in output
+    written = json.loads((tmp_path / "design.json").read_text("utf-8"))
+    assert written["units"] == unit
+    assert "unsure" not in written
+    scene = scan_folder.read_input(tmp_path)
+    assert np.abs(scene.arch.joint_points - joints).max() < CORNER_MM
+    assert [scan.component for scan in scene.scans] == sorted(bridge_parts.names(5))
+    # The same without the files that init wrote.
+    (tmp_path / "project.toml").unlink()
+    (tmp_path / "design.json").unlink()
+    again = scan_folder.read_input(tmp_path)
+    assert again.arch.joint_points == pytest.approx(scene.arch.joint_points, abs=1e-5)
+    assert again.units_reason[-1].code == "units.design-guessed"
+
+
+@pytest.mark.parametrize(("unit", "size_mm"), [("mm", 1.0), ("m", 1000.0)])
+def test_guessed_unit_of_a_design_is_marked_unsure(tmp_path, unit, size_mm):
+    meshes, _ = bridge_parts.bridge()
+    for name, (vertices, faces) in zip(bridge_parts.names(5), meshes, strict=True):
+        write_ply(tmp_path / f"design/{name}.ply", vertices / size_mm, faces)
+    write_scans(tmp_path, meshes, bridge_parts.names(5), 1.0 / size_mm)
+    output = init(tmp_path)
+    assert f"? units of the design: taken as {unit}" in output
+    assert json.loads((tmp_path / "design.json").read_text("utf-8"))["unsure"][0].startswith("? units of the design")
+
+
+@pytest.mark.parametrize("one_file", [True, False])
+def test_bodies_of_cad_files_without_a_unit_have_the_guessed_one(tmp_path, monkeypatch, one_file):
+    """The bridge in numbers of metres; facets are those of a file in the unit that is asked for."""
+    meshes, joints = bridge_parts.bridge()
+    made = dict(zip(bridge_parts.names(5), meshes, strict=True))
+    asked = []
+
+    def read_design(path, unit):
+        asked.append(unit)
+        parts = made if path.stem == "bridge" else {path.stem: made[path.stem]}
+        bodies = [
+            welded(name, vertices / 1000.0 * MM_PER_UNIT[unit], faces) for name, (vertices, faces) in parts.items()
+        ]
+        body = stacked("all", bodies)
+        of_facet = np.repeat(np.arange(len(bodies)), [len(one.faces) for one in bodies])
+        names = DesignBodies(names=tuple(parts), of_facet=of_facet)
+        return cad.CadDesign(body.vertices, body.faces, names, unit_stated=False)
+
+    monkeypatch.setattr(cad, "read_design", read_design)
+    (tmp_path / "design").mkdir()
+    paths = [tmp_path / f"design/{name}.step" for name in (["bridge"] if one_file else made)]
+    for path in paths:
+        path.write_text("ISO-10303-21;")
+    guessed = guess_design.guess(tmp_path, paths, [])
+    assert asked[-1] == "m"
+    assert guessed.unit_doubt.startswith("units of the design: taken as m")
+    assert guessed.units == ("mm" if one_file else "m")  # of one file each part's mesh is written, in mm
+    assert np.abs(guessed.design.joint_points - joints).max() < CORNER_MM
+
+
+def test_design_in_inches_is_made_only_with_stated_units(tmp_path):
+    meshes, joints = bridge_parts.bridge()
+    for name, (vertices, faces) in zip(bridge_parts.names(5), meshes, strict=True):
+        write_ply(tmp_path / f"design/{name}.ply", vertices / 25.4, faces)
+    write_scans(tmp_path, meshes, bridge_parts.names(5), 1.0 / 25.4)
+    output = init(tmp_path)
+    assert "not clear" in output
+    assert "--design-units" in output
+    assert not (tmp_path / "design.json").exists()
+    init(tmp_path, "--force", "--design-units", "inch")
+    assert np.abs(scan_folder.read_input(tmp_path).arch.joint_points - joints).max() < CORNER_MM
+
+
+def test_two_files_of_one_name_and_a_root_gap(tmp_path):
+    meshes, _ = bridge_parts.bridge(5, 0, 6.0)
+    for name, mesh in zip(bridge_parts.names(5), meshes, strict=True):
+        bridge_parts.write_obj(tmp_path / f"design/{name}.obj", *mesh)
+    bridge_parts.write_stl(tmp_path / "design/rib1.stl", *meshes[1])
+    write_scans(tmp_path, meshes, bridge_parts.names(5), 0.001, "x_m,y_m,z_m")
+    assert "? rib1: there are rib1.stl, rib1.obj; rib1.stl is read" in init(tmp_path)
+    assert scan_folder.read_input(tmp_path).tolerance.root_gap_mm == pytest.approx(6.0, abs=0.01)
+    (tmp_path / "project.toml").unlink()
+    (tmp_path / "design.json").unlink()
+    assert scan_folder.read_input(tmp_path).tolerance.root_gap_mm == pytest.approx(6.0, abs=0.01)
+
+
+def test_a_design_that_is_there_is_not_changed(tmp_path):
+    meshes, _ = bridge_parts.bridge()
+    for name, mesh in zip(bridge_parts.names(5), meshes, strict=True):
+        bridge_parts.write_obj(tmp_path / f"design/{name}.obj", *mesh)
+    write_scans(tmp_path, meshes, bridge_parts.names(5))
+    init(tmp_path)
+    (tmp_path / "design.json").write_text((tmp_path / "design.json").read_text("utf-8") + "\n", "utf-8")
+    before = (tmp_path / "design.json").read_bytes()
+    init(tmp_path, "--force")
+    assert (tmp_path / "design.json").read_bytes() == before
+
+
+@pytest.mark.usefixtures("cad_here")
+def test_a_step_file_with_all_parts_of_our_own_bridge(tmp_path):
+    """Four ribs as solids of one file, whose names are those of the bodies."""
+    curve = make_curve("parabola", 9000.0, 2000.0)
+    cuts = curve.length * np.array([0.0, 0.29, 0.56, 0.7, 1.0])
+    parts = [
+        arch_rib.build(f"拱肋{k + 1}", curve, (cuts[k], cuts[k + 1]), 500.0, 600.0, Plates(16.0, 14.0, 12.0))
+        for k in range(4)
+    ]
+    tmp_path.joinpath("CAD").mkdir()
+    step_files.write_step(tmp_path / "CAD/bridge v3.step", {part.name: solid(part) for part in reversed(parts)})
+    (tmp_path / "scans").mkdir()
+    np.savetxt(tmp_path / "scans/a.xyz", np.random.default_rng(0).uniform(0.0, 1.0, (500, 3)))
+    guessed = guess.guess(tmp_path)
+    assert isinstance(guessed.made.design, ArchDesign)
+    assert guessed.made.doubts == ()
+    assert order(guessed.made.design) == [part.name for part in parts]
+    for k, points in enumerate(guessed.made.design.joint_points):
+        u, v = np.array([250.0, -250.0, -250.0, 250.0]), np.array([0.0, 0.0, 600.0, 600.0])
+        four = curve.point(np.full(4, cuts[k + 1]), u, v)
+        assert np.abs(points - np.vstack([four, 0.5 * (four + np.roll(four, -1, axis=0))])).max() < CORNER_MM
+    guess.write_design(tmp_path, guessed)
+    written = scan_folder.read_design(tmp_path, tmp_path / "design.json", "m")
+    assert np.abs(written.joint_points - guessed.made.design.joint_points).max() < 1e-5
+    assert (tmp_path / "design-parts/拱肋3.ply").is_file()
+    # What init has made is no second design.
+    (tmp_path / "design.json").unlink()
+    assert guess.guess(tmp_path).made.doubts == ()
+
+
+@pytest.mark.usefixtures("cad_here")
+def test_a_step_file_a_part_of_an_independent_bridge(tmp_path):
+    import cadquery as cq
+
+    expected = []
+    for k, name in enumerate(bridge_parts.names(5)):
+        # Flat faces between sections that lean and are skew: a tapered box with a tapered hole, closed nowhere.
+        cut = [section_of_stretch(k), section_of_stretch(k + 1)]
+        outer, inner = (
+            cq.Solid.makeLoft(
+                [cq.Wire.makePolygon([cq.Vector(*p) for p in four[which]], close=True) for four in cut], True
+            )
+            for which in (0, 1)
+        )
+        (tmp_path / "Teile").mkdir(exist_ok=True)
+        cq.exporters.export(cq.Workplane(outer.cut(inner)), str(tmp_path / f"Teile/{name}.step"))
+        expected.append(cut[0][0])
+    (tmp_path / "scans").mkdir()
+    np.savetxt(tmp_path / "scans/a.xyz", np.random.default_rng(0).uniform(0.0, 1.0, (500, 3)))
+    made = guess.guess(tmp_path).made
+    assert made.doubts == ()
+    assert order(made.design) == bridge_parts.names(5)
+    assert np.abs(made.design.joint_points[:, :4] - np.array(expected[1:])).max() < CORNER_MM
+
+
+def section_of_stretch(k):
+    """Outer and inner corners (4, 3) of cut k in its plane, P1 to P4."""
+    point, normal = bridge_parts.cutting_planes(5, 3)[k]
+    return [
+        np.array([bridge_parts.edge(c, bridge_parts.crossing(c, point, normal, inner), inner) for c in range(4)])
+        for inner in (False, True)
+    ]
+
+
+@pytest.mark.slow
+def test_the_gaps_of_a_bridge_are_those_with_its_own_design(tmp_path):
+    name, recipe = recipe_files.load("arch-s1")
+    batch.make_scene(tmp_path / "s1.h5", name, recipe_files.overridden(recipe, ["scan.spacing_mm=20"]), 3)
+    given, left = tmp_path / "given", tmp_path / "left"
+    for place in (given, left):
+        export_folder.export(tmp_path / "s1.h5", place, "ply", with_truth=False)
+    (left / "design.json").unlink()
+    (left / "project.toml").unlink()
+    without = runs.run(left).steps["preassemble"]
+    init(left)
+    written, expected = runs.run(left).steps["preassemble"], runs.run(given).steps["preassemble"]
+    assert np.isfinite(expected.joints.gaps).all()
+    for result in (without, written):
+        # The edges of the two designs differ by the sag of chords, 2 microns.
+        assert result.joints.gaps == pytest.approx(expected.joints.gaps, abs=0.002)

@@ -1,0 +1,128 @@
+"""The schemas of docs/schemas: valid, consistent with the reader, and met by every folder that designgen exports."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from designgen import recipe_files
+from designgen.export import folder as export_folder
+from designgen.scenes.make import make
+from processor.limits import standards
+from processor.model import KEY_POINTS, InputError, Tolerance
+from processor.scan_folder import control_points, folder, tolerance
+from processor.scan_folder.folder import read_input
+from processor.scan_folder.units import MM_PER_UNIT, SYNONYMS
+from processor.store import store
+
+ROOT = Path(__file__).resolve().parents[2]
+SCHEMAS = {path.name.removesuffix(".schema.json"): path for path in sorted((ROOT / "docs/schemas").glob("*.json"))}
+SQUARE = [[0.0, 0.0, 0.0], [2000.0, 0.0, 0.0], [0.0, 2000.0, 0.0], [2000.0, 2000.0, 0.0]]
+RECIPES = {
+    "arch-s1": ["scan.spacing_mm=100"],
+    "frame-small": ["scan.spacing_mm=60"],
+    "frame-1040": ["frame.nodes_x=5", "frame.nodes_y=6", "frame.shape=flat", "scan.step_mrad=15", "scan.merged=true"],
+    "truss-bridge-picks": ["scan.step_mrad=15"],
+}
+
+
+def schema(name):
+    return json.loads(SCHEMAS[name].read_text("utf-8"))
+
+
+def problems(name, content):
+    return [error.message for error in jsonschema.Draft202012Validator(schema(name)).iter_errors(content)]
+
+
+def problems_of_folder(path):
+    found = problems("project", folder.tomllib.loads((path / "project.toml").read_text("utf-8")))
+    if (path / "design.json").exists():
+        design = json.loads((path / "design.json").read_text("utf-8"))
+        found += problems({"arch-bridge": "design-arch", "space-frame": "design-frame"}[design["kind"]], design)
+    if (path / "stations.json").exists():
+        found += problems("stations", json.loads((path / "stations.json").read_text("utf-8")))
+    return found
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_a_schema_is_valid(name):
+    jsonschema.Draft202012Validator.check_schema(schema(name))
+
+
+def test_the_project_schema_names_every_key_that_is_read():
+    project = schema("project")
+    definitions = project["$defs"]
+    assert set(folder.KEYS) <= set(project["properties"])
+    assert set(folder.SCAN_KEYS) <= set(definitions["scan"]["properties"])
+    assert set(control_points.KEYS) == set(definitions["control"]["properties"])
+    assert {*tolerance.KEYS, *standards.choice(Tolerance())} == set(definitions["tolerance"]["properties"])
+    assert set(definitions["tolerance"]["properties"]["standard"]["enum"]) == set(standards.standards())
+    for name in ("project", "design-arch", "design-frame"):
+        assert set(schema(name)["$defs"]["unit"]["enum"]) == {*MM_PER_UNIT, *SYNONYMS}
+    assert set(schema("design-arch")["$defs"]["joint"]["properties"]["points"]["required"]) == set(KEY_POINTS)
+
+
+def test_the_stored_scan_folder_is_valid():
+    assert problems_of_folder(ROOT / "fixtures/scan-folder") == []
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_exported_folders_are_valid(name, tmp_path):
+    _, recipe = recipe_files.load(name)
+    scene, truth = make(name, recipe_files.overridden(recipe, RECIPES[name]))
+    store.write_scene(tmp_path / "scene.h5", scene, truth, {})
+    export_folder.export(tmp_path / "scene.h5", tmp_path / "folder", "ply", with_truth=False)
+    assert problems_of_folder(tmp_path / "folder") == []
+    assert (tmp_path / "folder/stations.json").exists() == (name == "frame-1040")
+    assert (tmp_path / "folder/picks.csv").exists() == (name == "truss-bridge-picks")
+
+
+def frame(**changes):
+    nodes = [{"id": i, "centre": centre, "radius": 60.0} for i, centre in enumerate(SQUARE)]
+    members = [{"a": 0, "b": 1, "tube_diameter": 60.0}]
+    return {"units": "mm", "kind": "space-frame", "nodes": nodes, "members": members} | changes
+
+
+@pytest.mark.parametrize(
+    "design",
+    [
+        frame(units="furlong"),
+        frame(nodes=[]),
+        frame(nodes=[{"id": 0, "centre": [0, 0], "radius": 60.0}]),
+        frame(nodes=[{"id": 0, "centre": [0, 0, 0], "radius": -1.0}]),
+        frame(nodes=[{"id": "a", "centre": [0, 0, 0], "radius": 1.0}]),
+        frame(members=[{"a": 0, "b": 1}]),
+        frame(bolts=[]),
+    ],
+)
+def test_what_the_frame_schema_refuses_is_refused_by_the_reader(design, tmp_path):
+    assert problems("design-frame", frame()) == []
+    assert problems("design-frame", design)
+    (tmp_path / "design.json").write_text(json.dumps(design))
+    (tmp_path / "scan.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n0 0 1\n")
+    with pytest.raises(InputError):
+        read_input(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'kind = "tower"',
+        'colour = "red"',
+        "[[scan]]\ncomponent = 'rib1'",
+        "[[scan]]\nfile = '../scan.xyz'",
+        "[[scan]]\nfile = 'scan.xyz'\nsigma_mm = 0.0",
+        "[[scan]]\nfile = 'scan.xyz'\npose = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]",
+        "[tolerance]\nstandard = 'none'",
+        "[tolerance]\nmisalignment_mm = [1.0, 2.0]",
+        "[[control]]\nname = 'T1'\nposition = [0, 0, 0]",
+        "[[control]]\nname = 'T1'\nseen = [0, 0, 0]",
+    ],
+)
+def test_what_the_project_schema_refuses_is_refused_by_the_reader(text, tmp_path):
+    assert problems("project", folder.tomllib.loads(text))
+    (tmp_path / "project.toml").write_text(text)
+    (tmp_path / "scan.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n0 0 1\n")
+    with pytest.raises(InputError):
+        read_input(tmp_path)

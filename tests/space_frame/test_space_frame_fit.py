@@ -1,0 +1,215 @@
+"""Residuals, masks and the solution of one ball: numbers by hand, differences, Monte Carlo against the bound."""
+
+import numpy as np
+import pytest
+
+from processor.geometry.linalg_small import inverse_of
+from processor.space_frame import catalogue
+from processor.space_frame.members.records import Members, Nodes
+from processor.space_frame.points.sphere_crops import Crops
+from processor.space_frame.spheres import fit_all
+from processor.space_frame.spheres.gauss_newton import (
+    Observations,
+    Prior,
+    SphereMask,
+    Unknowns,
+    residual,
+    select,
+    solve,
+    weight,
+)
+from processor.space_frame.spheres.noise_model import limb_cosine, noise_model, radius_offset, radius_scatter
+from processor.space_frame.spheres.records import StochasticModel
+from tests.bench import ball_fit
+
+
+def test_residual_of_a_square_and_of_a_slanting_ray():
+    # along z at a ball of 50 at height 1000: the sphere is met at 950; at 30 off the axis, at 960 with cosine 0.8
+    e, cosine, *J = residual(0.0, 0.0, 953.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1000.0, 50.0)
+    assert (e, cosine) == pytest.approx((3.0, 1.0))
+    assert pytest.approx([0.0, 0.0, -1.0, 1.0]) == J
+    e, cosine, *_ = residual(30.0, 0.0, 955.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1000.0, 50.0)
+    assert (e, cosine) == pytest.approx((-5.0, 0.8))
+    assert residual(51.0, 0.0, 955.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1000.0, 50.0)[:2] == (0.0, 0.0)
+    # without a ray: the distance from the surface
+    e, cosine, *J = residual(30.0, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 45.0)
+    assert (e, cosine) == pytest.approx((5.0, 1.0))
+    assert pytest.approx([-0.6, -0.8, 0.0, -1.0]) == J
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_jacobian_equals_finite_differences(known):
+    rng = np.random.default_rng(1)
+    p = np.array([18.0, -9.0, -41.0])
+    u = np.array([0.3, 0.1, 0.9]) / np.linalg.norm([0.3, 0.1, 0.9]) * known
+    state = np.append(rng.normal(0, 1, 3), 50.0)
+    J = np.array(residual(*p, *u, *state)[2:])
+    for i in range(4):
+        d = np.zeros(4)
+        d[i] = 1e-5
+        numeric = (residual(*p, *u, *(state + d))[0] - residual(*p, *u, *(state - d))[0]) / 2e-5
+        assert J[i] == pytest.approx(numeric, abs=1e-7)
+
+
+def test_selection_depends_on_the_ray_and_not_on_the_noisy_point():
+    """Rays that meet a member's flat, the process hole or the limb are left out, wherever along them the point is."""
+    up = np.array([0.0, 0.0, 1.0])
+    at = np.array([[0.0, 0.0], [12.0, 0.0], [20.0, 0.0], [49.8, 0.0], [60.0, 0.0], [0.0, 30.0]])
+    for off in (-6.0, 0.0, 6.0):
+        depth = np.sqrt(np.maximum(50.0**2 - (at**2).sum(1), 0.0))
+        points = np.column_stack([at, off - depth])
+        member = np.array([0.0, np.sin(0.65), -np.cos(0.65)])[None]  # its axis leaves the ball near (0, 30)
+        chosen = np.zeros(len(at), np.uint8)
+        state = np.array([0.0, 0.0, 0.0, 50.0])
+        mask = SphereMask(np.zeros((1, 3)), member, np.array([15.0]), 15.0, 0.15)
+        count = select(points, np.tile(up, (len(at), 1)), mask, state, 40.0, chosen)
+        assert chosen.tolist() == [2, 2, 1, 0, 0, 2]
+        assert count == 1
+
+
+def test_weight_is_one_for_small_and_zero_for_large_residuals():
+    assert [weight(t) for t in (0.0, -3.0, 4.5, 9.0)] == [1.0, 1.0, 0.0, 0.0]
+    assert weight(3.75) == pytest.approx((1.0 - 0.25) ** 2)
+    t = np.random.default_rng(2).standard_normal(400_000)
+    w = np.array([weight(x) for x in t[:40_000]])
+    assert w.mean() > 0.998  # next to nothing of normal noise is lost
+
+
+def test_inverse_is_that_of_another_library():
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(7, 4))
+    out = np.empty((4, 4))
+    assert inverse_of(A.T @ A, out)
+    np.testing.assert_allclose(out, np.linalg.inv(A.T @ A), rtol=1e-9)
+    assert not inverse_of(np.diag([1.0, 2.0, 0.0, 1.0]), out)
+
+
+def test_covariance_with_station_shifts_is_that_of_the_joint_problem():
+    """The ball's covariance with unknown shifts is that of the joint problem with the shifts as unknowns."""
+    rng = np.random.default_rng(4)
+    u = rng.normal(size=(40, 3)) * [0.4, 0.4, 0.0] + [0.0, 0.0, 1.0]
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    u[20:] = u[20:, [2, 1, 0]]
+    foot = rng.normal(0, 15, (40, 3))
+    foot -= (foot * u).sum(1)[:, None] * u
+    points = foot - np.sqrt(50.0**2 - (foot**2).sum(1))[:, None] * u
+    station = np.repeat([0, 1], 20).astype(np.int32)
+    T = np.tile(4.0 * np.eye(3), (2, 1, 1))
+    state, covariance = np.array([0.0, 0.0, 0.0, 50.0]), np.empty((4, 4))
+    used = solve(
+        Observations(points, u, np.full(40, 1e4), station), np.ones(40, np.uint8),
+        StochasticModel(np.array([1.0, 0.0, 0.0]), T), 1.0, Prior(np.zeros((3, 3)), 50.0, 0.0),
+        Unknowns(state, np.zeros((2, 3)), np.zeros((2, 3, 8))), 1e-9, 20, covariance,
+    )  # fmt: skip
+    assert used == 40
+    J = np.zeros((40, 10))
+    for i in range(40):
+        J[i, :4] = residual(*points[i], *u[i], 0.0, 0.0, 0.0, 50.0)[2:]
+        J[i, 4 + 3 * station[i] : 7 + 3 * station[i]] = J[i, :3]
+    joint = J.T @ J + np.diag([0.0] * 4 + [0.25] * 6)
+    np.testing.assert_allclose(covariance, np.linalg.inv(joint)[:4, :4], rtol=1e-6)
+    np.testing.assert_allclose(state, [0, 0, 0, 50.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("radius", "count", "visible", "sigma", "several"),
+    [
+        (45.0, 60, 0.25, 2.0, 3),
+        (150.0, 30, 0.1, 1.0, 1),
+        pytest.param(45.0, 200, 0.25, 2.0, 1, marks=pytest.mark.slow),
+        pytest.param(45.0, 30, 0.25, 2.0, 1, marks=pytest.mark.slow),
+    ],
+)
+def test_errors_reach_the_bound_and_intervals_cover(radius, count, visible, sigma, several):
+    draws = 600
+    errors, covariance, bounds, *_ = ball_fit.trial(
+        np.random.default_rng(7), draws, radius, count, visible, sigma, several
+    )
+    chance = 2.5 / np.sqrt(2.0 * draws)  # of an rms, beyond which one in a hundred falls
+    assert max(ball_fit.ratios(errors, bounds)) < 1.05 + chance
+    sd = np.sqrt(np.einsum("kii->ki", covariance))
+    pulls = np.sqrt(np.mean((errors / sd) ** 2, axis=0))
+    assert (pulls > 0.95 - chance).all()
+    assert (pulls < 1.10 + chance).all()
+    lowest = errors @ ball_fit.DOWN / np.sqrt(np.einsum("i,kij,j->k", ball_fit.DOWN, covariance, ball_fit.DOWN))
+    assert 0.92 < np.mean(np.abs(lowest) < 1.96) < 0.98
+    if visible == 0.25:
+        assert abs(errors[:, 3].mean()) < 0.05 + 2.5 * errors[:, 3].std() / np.sqrt(draws)
+
+
+def test_the_noise_is_read_from_residuals():
+    rng = np.random.default_rng(8)
+    c, R = rng.uniform(0.15, 1.0, 40_000), rng.uniform(4e3, 3e4, 40_000)
+    variance = 0.25 + 2e-9 * R**2 / c + 0.1 * (1 - c**2) / c**2
+    e = np.sqrt(variance) * rng.standard_normal(40_000)
+    e[:2000] = -30.0  # stray
+    noise, believed = noise_model(e, c, R, np.ones(40_000), np.array([4.0, 0.0, 0.0]))
+    model = noise[0] + noise[1] * R**2 / c + noise[2] * (1 - c**2) / c**2
+    assert believed == 40_000
+    assert np.median(np.abs(np.sqrt(model / variance) - 1.0)) < 0.08
+    few, worth = noise_model(e[:20], c[:20], R[:20], np.ones(20), np.array([4.0, 0.0, 0.0]))
+    assert few.tolist() == [4.0, 0.0, 0.0]
+    assert worth < 20
+
+
+def test_radius_without_rays_is_corrected_by_half_the_noise_bias():
+    rng = np.random.default_rng(12)
+    draws, count, radius, sigma = 400, 200, 45.0, 2.0
+    normal = rng.standard_normal((draws * count, 3))
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    most = sigma**2 / radius  # by which noise in all directions lengthens distances from the centre
+
+    def radii(noise):
+        points = radius * normal + noise
+        crops = Crops(np.arange(draws + 1) * count, points, np.full(len(points), -1, np.int32))
+        unfixed = np.full((draws, 3, 3), np.nan)
+        nodes = Nodes(np.zeros((draws, 3)), unfixed, np.zeros(draws, np.int64), np.full(draws, np.nan))
+        params = fit_all.RayFitParams(sigma_mm=2.0, process_hole_mm=0.0)
+        found = fit_all.fit_crops(crops, np.empty((0, 3)), nodes, Members(), catalogue.of_radii([]), params=params)
+        return found.radii - radius, (found.covariance - found.views.covariance)[:, 3, 3]
+
+    chance = 4.0 * sigma / np.sqrt(draws * count)
+    off, variance = radii(rng.normal(0.0, sigma, (draws * count, 3)))
+    assert off.mean() == pytest.approx(0.5 * most, abs=chance)
+    assert np.median(variance) == pytest.approx(sigma**2 / count + most**2 / 12.0, rel=0.06)
+    off, _ = radii(rng.normal(0.0, sigma, (draws * count, 1)) * normal)
+    assert off.mean() == pytest.approx(-0.5 * most, abs=chance)
+
+
+def test_the_limb_is_left_out_where_it_is_biased():
+    rng = np.random.default_rng(9)
+    c = rng.uniform(0.15, 1.0, 30_000)
+    e = rng.standard_normal(30_000)
+    ones = np.ones(30_000)
+    unit = np.array([1.0, 0.0, 0.0])
+    assert limb_cosine(e, c, ones, ones, unit, 0.15) == 0.15
+    assert limb_cosine(np.where(c < 0.28, e - 0.5, e), c, ones, ones, unit, 0.15) == pytest.approx(0.35)
+
+
+def test_the_scatter_of_radii_is_that_of_the_balls():
+    rng = np.random.default_rng(10)
+    sizes = np.resize([45.0, 60.0], 800)
+    true = sizes + rng.normal(0, 0.2, 800)
+    own = rng.uniform(0.1, 0.6, 800)  # sd of what points alone say
+    measured = true + own * rng.standard_normal(800)
+    weight_ = 1 / own**2 + 1 / 0.4**2
+    posterior = (measured / own**2 + sizes / 0.4**2) / weight_
+    assert radius_scatter(posterior, 1 / weight_, sizes, 0.4, 0.4) == pytest.approx(0.2, abs=0.04)
+    assert radius_scatter(posterior[:2], 1 / weight_[:2], sizes[:2], 0.4, 0.4) == pytest.approx(0.4, abs=0.08)
+
+
+def test_an_offset_that_all_radii_share_is_found_with_its_standard_deviation():
+    """Radii fused with a prior about their sizes: the mean of the fitted radii, by its standard deviation."""
+    rng = np.random.default_rng(4)
+    pulls = []
+    for shared in (0.0, -0.25):
+        for _ in range(200):
+            sizes = rng.choice([45.0, 60.0, 80.0], 80)
+            own = rng.uniform(0.1, 0.5, 80)
+            points = sizes + shared + 0.3 * rng.standard_normal(80) + own * rng.standard_normal(80)
+            weight = 1.0 / own**2 + 1.0 / 0.3**2
+            fused = (points / own**2 + sizes / 0.3**2) / weight
+            found, sd = radius_offset(fused, 1.0 / weight, sizes, 0.3, 0.3)
+            pulls.append((found - shared) / sd)
+    assert 0.88 < np.sqrt(np.mean(np.square(pulls))) < 1.12  # 400 draws: 3.5 %
+    assert radius_offset(np.empty(0), np.empty(0), np.empty(0), 0.3, 0.3) == (0.0, np.inf)

@@ -1,0 +1,280 @@
+"""A whole ray-cast roof by method ray: blind, with its design, with one of another frame or of other nodes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from designgen import recipe_files
+from designgen.scenes.make import make
+from processor import pipeline
+from processor.evaluation import space_frame
+from processor.geometry import parallel, rigid
+from processor.model import Scan, reason
+from processor.space_frame import step as space_frame_step
+from processor.space_frame import to_result
+from processor.space_frame.design.movement import verdict_of
+from processor.space_frame.points.scene_source import of_scene
+from processor.space_frame.spheres import baselines
+
+ROOF = ["frame.nodes_x=6", "frame.nodes_y=5", "scan.stations=[2,2]", "scan.clutter=6", "scan.step_mrad=2.2"]
+
+
+@pytest.fixture(scope="module")
+def roof():
+    return make("roof", recipe_files.overridden(recipe_files.load("frame-1040")[1], ROOF), 3)
+
+
+def errors(result, truth, rows=slice(None)):
+    """Distances (k,) of the balls of the design's nodes, in its order, from the true ones."""
+    return np.linalg.norm(result.balls.centres[rows] - truth.frame.centres[rows], axis=1)
+
+
+def test_every_ball_is_found_without_a_design(roof):
+    scene, truth = roof
+    result = space_frame_step.run(dataclasses.replace(scene, frame=None), space_frame_step.Params())
+    assert result.status == "ok"
+    assert len(result.balls.ids) == len(truth.frame.ids)
+    checks = {
+        metric.name: metric for metric in space_frame.check(dataclasses.replace(scene, frame=None), result, truth)
+    }
+    assert all(metric.passed for metric in checks.values())
+    assert checks["nodes found within 3 mm"].value == 100.0
+    assert checks["nodes that are none"].value == 0.0
+    assert "spheres.joined-only" in codes(result.reasons)
+    assert 0.7 < checks["centres, rms of error by standard deviation"].value < 1.3
+
+
+def test_rows_are_the_designs_nodes_in_its_order(roof):
+    scene, truth = roof
+    result = space_frame_step.run(scene, space_frame_step.Params())
+    assert result.balls.ids.tolist() == scene.frame.ids.tolist()
+    assert result.movement_reference.gauge == "design frame"
+    assert errors(result, truth).max() < 1.5
+    true = truth.frame.centres - scene.frame.centres
+    pull = (result.balls.movement - true) / (result.balls.movement_ci95 / 1.96)
+    assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3
+
+
+def test_a_design_of_another_frame_is_found(roof):
+    scene, truth = roof
+    R, t = rigid.rotation_from_vector(np.array([0.02, -0.01, 0.7])), np.array([5.0e8, 4.3e9, 1e3])
+    moved = dataclasses.replace(scene.frame, centres=scene.frame.centres @ R.T + t)
+    result = space_frame_step.run(dataclasses.replace(scene, frame=moved), space_frame_step.Params())
+    assert result.matching.status == "ok"
+    assert result.movement_reference.gauge == "best fit"
+    assert errors(result, truth).max() < 1.5
+    turn = result.matching.T_design_scan[:3, :3] @ R.T
+    assert np.degrees(rigid.rotation_angle(turn)) < 0.1  # nodes move by 5 mm over 12 m
+    back = rigid.apply(result.matching.T_design_scan, result.balls.centres) - moved.centres
+    assert np.linalg.norm(back, axis=1).max() < 30.0
+
+
+def test_unbuilt_node_is_not_found_and_undesigned_node_is_extra(roof):
+    scene, truth = roof
+    frame = scene.frame
+    centres, ids = frame.centres.copy(), frame.ids.copy()
+    centres[7] += [0.0, 0.0, -900.0]  # nothing is there
+    own = (frame.member_a != frame.ids[7]) & (frame.member_b != frame.ids[7])
+    other = dataclasses.replace(
+        frame,
+        centres=centres,
+        ids=ids,
+        member_a=frame.member_a[own],
+        member_b=frame.member_b[own],
+        tube_diameters=frame.tube_diameters[own],
+    )
+    result = space_frame_step.run(dataclasses.replace(scene, frame=other), space_frame_step.Params())
+    assert result.balls.flag[7] == "not-found"
+    assert np.isnan(result.balls.centres[7]).all()
+    rest = np.arange(len(ids)) != 7
+    assert errors(result, truth, rest).max() < 1.5
+    assert result.status == "partial"
+
+
+def test_a_ball_of_another_size_is_named(roof):
+    scene, _ = roof
+    radii = scene.frame.radii.copy()
+    radii[3] += 10.0
+    result = space_frame_step.run(
+        dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, radii=radii)), space_frame_step.Params()
+    )
+    assert [i for i, flag in enumerate(result.balls.flag) if flag == "wrong-size"] == [3]
+
+
+@pytest.mark.parametrize(("chunk", "threads_used"), [(1 << 20, 2), (70_001, 1), (12_345, 3)])
+def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used, monkeypatch):
+    scene, _ = roof
+    first = space_frame_step.run(scene, space_frame_step.Params())
+    pools, pool = set(), parallel._pool
+    monkeypatch.setattr(parallel, "usable", lambda: threads_used)
+    monkeypatch.setattr(parallel, "_pool", lambda count: (pools.add(count), pool(count))[1])
+    monkeypatch.setattr(to_result, "of_scene", lambda *given: dataclasses.replace(of_scene(*given), chunk_size=chunk))
+    rng = np.random.default_rng(1)
+    scans = []
+    for scan in scene.scans:
+        order = rng.permutation(len(scan.points))
+        columns = {name: getattr(scan, name) for name in ("points", "intensity", "grid_row", "grid_column")}
+        scans.append(dataclasses.replace(scan, **{k: v[order] if len(v) else v for k, v in columns.items()}))
+    again = space_frame_step.run(dataclasses.replace(scene, scans=tuple(scans)), space_frame_step.Params())
+    assert pools == {threads_used} - {1}  # one thread needs no pool
+    for name in ("balls", "tubes", "stations", "matching"):
+        for field in dataclasses.fields(getattr(first, name)):
+            one, other = getattr(getattr(first, name), field.name), getattr(getattr(again, name), field.name)
+            same = one.tobytes() == other.tobytes() if isinstance(one, np.ndarray) else repr(one) == repr(other)
+            assert same, f"{name}.{field.name}"
+    assert repr((first.status, first.reasons, first.datum)) == repr((again.status, again.reasons, again.datum))
+
+
+# --- a square roof -------------------------------------------------------------------------------------------------
+
+SQUARE = [
+    "frame.nodes_x=5", "frame.nodes_y=5", "frame.shape='flat'", "frame.radii_mm=[45.0,50.0,60.0]",
+    "asbuilt.wrong_sizes=3", "scan.stations=[2,2]", "scan.clutter=4", "scan.step_mrad=2.2",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def square():
+    return make("square", recipe_files.overridden(recipe_files.load("frame-1040")[1], SQUARE), 3)
+
+
+def elsewhere(frame, without=(), extra=(), radius=50.0):
+    """A design in another frame, less some of its nodes, with others (n, 3) that were never built."""
+    R, t = rigid.rotation_from_vector(np.array([0.02, -0.01, 1.1])), np.array([5.0e8, 4.3e9, 9e4])
+    keep = ~np.isin(frame.ids, without)
+    own = ~np.isin(frame.member_a, without) & ~np.isin(frame.member_b, without)
+    return dataclasses.replace(
+        frame,
+        ids=np.append(frame.ids[keep], 900 + np.arange(len(extra))),
+        centres=np.vstack([frame.centres[keep], np.reshape(extra, (-1, 3))]) @ R.T + t,
+        radii=np.append(frame.radii[keep], np.full(len(extra), radius)),
+        member_a=frame.member_a[own],
+        member_b=frame.member_b[own],
+        tube_diameters=frame.tube_diameters[own],
+    ), R  # fmt: skip
+
+
+def codes(reasons):
+    return {one.code for one in reasons}
+
+
+def wrong_sizes(result):
+    return set(result.balls.ids[np.array(result.balls.flag) == "wrong-size"].tolist())
+
+
+def truly_wrong(scene, truth):
+    return set(scene.frame.ids[np.abs(truth.frame.radii - scene.frame.radii) > 3.0].tolist())
+
+
+def test_sizes_of_balls_decide_the_turn_of_a_square_roof(square):
+    scene, truth = square
+    x, _, z = scene.frame.centres.max(axis=0)
+    beyond = [[x + 3000.0, 3000.0, z], [x + 3000.0, 6000.0, z], [-3000.0, 0.0, z]]
+    assert len(truly_wrong(scene, truth)) == 3
+    for without, extra in (((), ()), (scene.frame.ids[[7, 20]], beyond)):
+        design, R = elsewhere(scene.frame, without, extra)
+        result = space_frame_step.run(dataclasses.replace(scene, frame=design), space_frame_step.Params())
+        assert result.matching.status == "ok"
+        assert np.degrees(rigid.rotation_angle(result.matching.T_design_scan[:3, :3] @ R.T)) < 0.2
+        assert wrong_sizes(result) == truly_wrong(scene, truth) - set(without)
+        assert (np.array(result.balls.flag) == "not-found").sum() == len(extra)
+
+
+def test_where_the_pose_stays_ambiguous_no_ball_is_called_wrong_on_its_account(square):
+    scene, _ = square
+    low = scene.frame.centres.min(axis=0)
+    corner = (np.abs(scene.frame.centres[:, :2] - low[:2]) < 100.0).all(axis=1)
+    assert corner.sum() == 1
+    # of one size but for a corner: which of four that is, one ball does not decide
+    radii = np.where(corner, 60.0, 50.0)
+    design, _ = elsewhere(dataclasses.replace(scene.frame, radii=radii))
+    result = space_frame_step.run(dataclasses.replace(scene, frame=design), space_frame_step.Params())
+    assert result.matching.status == "ambiguous"
+    disputed = np.isnan(result.balls.nominal_radii)
+    assert disputed.sum() == len(result.matching.rivals) + 1 >= 2
+    assert all("spheres.ambiguous-node" in codes(result.balls.reasons[i]) for i in np.flatnonzero(disputed))
+    assert not wrong_sizes(result) & set(result.balls.ids[disputed].tolist())
+    assert len(wrong_sizes(result)) > 10  # whatever the pose, they are not of the one size
+
+
+def emptied(scene, truth, row, onward):
+    """The scene without what was seen within 130 mm of a ball: those rays end ``onward`` mm farther on; None = gone."""
+    scans = []
+    for scan in scene.scans:
+        T = scan.T_project_scan
+        away = np.linalg.norm(rigid.apply(T, scan.points) + T[:3, :3] @ scan.origin - truth.frame.centres[row], axis=1)
+        points, near = scan.points.copy(), away < 130.0
+        if onward is None:
+            points = points[~near]
+        else:
+            ray = points[near] - scan.position
+            points[near] += onward * ray / np.linalg.norm(ray, axis=1)[:, None]
+        scans.append(Scan(scan.name, points, scan.origin, T_project_scan=T, position=scan.position))
+    return dataclasses.replace(scene, scans=tuple(scans))
+
+
+def test_a_ball_that_rays_went_through_is_missing_and_one_that_was_not_seen_has_no_verdict(square):
+    scene, truth = square
+    row = int(np.argmin(np.linalg.norm(truth.frame.centres - truth.frame.centres.mean(axis=0), axis=1)))
+    for onward, flag, code in (
+        (900.0, "not-found", "spheres.missing"),
+        (None, "low-confidence", "spheres.few-rays"),
+        (-900.0, "low-confidence", "spheres.hidden"),
+    ):
+        result = space_frame_step.run(emptied(scene, truth, row, onward), space_frame_step.Params())
+        assert result.balls.flag[row] == flag, onward
+        assert code in codes(result.balls.reasons[row])
+        assert reason("spheres.axes-alone", axes=8) in result.balls.reasons[row]
+        found = result.balls
+        verdicts = [
+            verdict_of(size, half, 1.0, evidence != "axes")
+            for size, half, evidence in zip(found.movement_size, found.movement_size_ci95, found.evidence, strict=True)
+        ]
+        assert verdicts[row] == ("none" if flag == "not-found" else "indeterminate")
+        assert "fail" in verdicts
+        assert np.isnan(result.balls.centres[row]).all() == (flag == "not-found")
+
+
+def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
+    scene, truth = square
+    params = {"spheres": {"min_points": 8, "raw_crops": False}}
+    jobs = pipeline.plan(("spheres",), ("ray", "ransac", "least-squares"), params, 0)
+    runs = pipeline.execute(tmp_path / "s.h5", scene, jobs).runs
+    ray = runs[0].result
+    error = {run.method: np.abs(run.result.balls.radii - truth.frame.radii)[ray.balls.points > 30] for run in runs}
+    alone = space_frame_step.run(scene, space_frame_step.Params(method="least-squares"))
+    for run in runs[1:]:
+        np.testing.assert_array_equal(run.result.balls.ids, ray.balls.ids)
+        assert baselines.SAME in run.result.reasons
+        # tens of points of a ball and sleeves beside: hundreds are in the crop
+        assert (run.result.balls.points <= 1.3 * ray.balls.points + 10).all()
+        assert run.result.balls.points.sum() < 0.8 * alone.balls.points.sum()
+    assert np.median(error["least-squares"]) < 0.7 * np.median(
+        np.abs(alone.balls.radii - truth.frame.radii)[ray.balls.points > 30]
+    )
+    assert np.median(error["ray"]) < np.median(error["least-squares"])
+    again = pipeline.execute(tmp_path / "s.h5", scene, jobs[1:]).runs[0].result
+    assert baselines.SAME not in again.reasons
+    assert baselines.RAW not in again.reasons
+
+
+def test_wrong_size_is_flagged_without_a_catalogue(square):
+    scene, truth = square
+    result = space_frame_step.run(scene, space_frame_step.Params(catalogue="none"))
+    reasons = [result.balls.reasons[i] for i, flag in enumerate(result.balls.flag) if flag == "wrong-size"]
+    assert all("spheres.beyond-blank" in codes(one) for one in reasons)
+    assert wrong_sizes(result) >= truly_wrong(scene, truth)
+    off = truth.frame.radii - scene.frame.radii
+    assert wrong_sizes(result) <= set(scene.frame.ids[(off > 1.0) | (off < -0.5)].tolist())
+    assert "low-confidence" not in {result.balls.flag[i] for i in np.flatnonzero(result.balls.points > 30)}
+
+
+def test_wrong_size_missing_in_the_catalogue_is_flagged_by_its_interval(square):
+    scene, truth = square
+    result = space_frame_step.run(scene, space_frame_step.Params(radii_mm=(45.0, 50.0)))
+    largest = scene.frame.ids[np.argmax(truth.frame.radii)]
+    assert wrong_sizes(result) == {largest}
+    assert "spheres.beyond-blank" in codes(result.balls.reasons[list(result.balls.ids).index(largest)])
+    flag = dict(zip(result.balls.ids.tolist(), result.balls.flag, strict=True))
+    assert all(flag[one] != "ok" for one in truly_wrong(scene, truth))

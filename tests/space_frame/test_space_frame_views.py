@@ -1,0 +1,96 @@
+"""Merged clouds of frames whose views nobody names: what the views have in common is part of the intervals."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from processor.space_frame.catalogue import of_radii
+from processor.space_frame.members.records import Members
+from processor.space_frame.spheres import fit_all
+from processor.space_frame.spheres.view_errors import of_tubes
+from tests.support.clouds import ball_clouds
+from tests.support.clouds.memory_source import InMemory
+
+STATIONS = np.array([[-7000.0, -6500, -4500], [7500, -6000, -4500], [6500, 7000, -4500], [-6000, 7500, -4500]])
+CENTRES = np.array([[x, y, 0.0] for x in (-4000.0, 0, 4000) for y in (-4000.0, 0, 4000)])
+RADII = np.array([53.0, 60, 67] * 3)
+
+
+def fitted(seed, shift_mm):
+    """Fit balls in a merged cloud; each view has a shift, and the axes have the mean of all."""
+    rng = np.random.default_rng(seed)
+    shifts = shift_mm * rng.standard_normal((len(STATIONS), 3))
+    named, nodes, members = ball_clouds.frame(
+        rng, CENTRES, RADII, STATIONS, step_mrad=1.5, sigma=1.0, node_sd=0.3, shifts=shifts
+    )
+    chunk = next(iter(named.chunks()))
+    merged = InMemory(chunk.points, np.full(len(chunk.points), -1, np.int32), np.empty((0, 3)))
+    return fit_all.fit_spheres(merged, nodes, members, of_radii(RADII))
+
+
+@pytest.mark.parametrize("shift_mm", [0.0, 0.6])
+def test_intervals_of_lowest_points_cover_with_and_without_view_differences(shift_mm):
+    pulls, wide = [], []
+    for seed in range(5):
+        found = fitted(seed, shift_mm)
+        pulls.append((found.lowest[:, 2] - (CENTRES[:, 2] - RADII)) / found.lowest_sd)
+        wide.append(np.median(found.lowest_sd))
+        message = next(one for one in found.messages if one.code == "spheres.unnamed-views")
+        sd = dict(message.values)["common"]
+        assert sd < (0.25 if shift_mm == 0.0 else 3.0 * shift_mm)
+    assert np.mean(np.abs(pulls) < 1.96) > 0.85
+    assert np.median(wide) < (0.35 if shift_mm == 0.0 else 1.0)
+
+
+def test_errors_of_views_common_to_all_spheres_are_part_of_the_whole():
+    found = fitted(1, 0.6)
+    shared = found.views.shared @ np.swapaxes(found.views.shared, 1, 2)
+    left = found.covariance - shared
+    assert (np.linalg.eigvalsh(left).min(axis=1) > 0.0).all()
+    assert (shared[:, 2, 2] > 0.2**2 - 1e-9).all()
+
+
+def test_intervals_of_tubes_of_a_merged_cloud_cover_shifted_views():
+    """A tube seen from below: what its fit takes up of the views' errors is in the intervals, more if seen less."""
+    found = fitted(1, 0.6)
+    below, narrow = np.zeros((2, 24))
+    below[12:], narrow[15:21] = 10.0, 10.0
+    tubes = Members(
+        points=np.zeros((2, 3)),
+        directions=np.tile([1.0, 0.0, 0.0], (2, 1)),
+        side=np.tile([0.0, 1.0, 0.0], (2, 1)),
+        lengths=np.full(2, 1000.0),
+        radii=np.full(2, 30.0),
+        bow=np.zeros((2, 2)),
+        covariance=np.zeros((2, 5, 5)),
+        node_a=np.full(2, -1),
+        node_b=np.full(2, -1),
+        count=np.full(2, 100),
+        rms=np.ones(2),
+        around=np.stack([below, narrow]),
+    )
+    whole = of_tubes(found.views, tubes)
+    assert (np.linalg.eigvalsh(whole) > 0.0).all()
+    assert whole[1, 2, 2] > whole[0, 2, 2]
+    least = of_tubes(dataclasses.replace(found.views, sd=0.0), tubes)
+    assert (np.einsum("mii->mi", least)[:, :2] > 0.2**2 - 1e-9).all()
+    assert (np.einsum("mii->mi", whole - least) > 0.0).all()
+
+
+def test_intervals_between_balls_cover_and_are_narrow_if_views_agree():
+    """Centres less their mean, which no common shift moves: neither too narrow nor, without errors, too wide."""
+    rms = {}
+    for shift_mm in (0.0, 0.6):
+        pulls = []
+        for seed in range(5):
+            found = fitted(seed, shift_mm)
+            off = found.centres - CENTRES
+            shared = found.views.shared[:, :3]
+            own = found.covariance[:, :3, :3] - shared @ np.swapaxes(shared, 1, 2)
+            apart = shared - shared.mean(axis=0)
+            variance = np.einsum("kii->ki", own + apart @ np.swapaxes(apart, 1, 2))
+            pulls.append((off - off.mean(axis=0)) / np.sqrt(variance))
+        rms[shift_mm] = float(np.sqrt(np.mean(np.square(pulls))))
+    assert 0.5 < rms[0.0] < 1.15
+    assert 0.5 < rms[0.6] < 1.15

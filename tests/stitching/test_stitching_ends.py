@@ -1,0 +1,141 @@
+"""Ends of faces between the rays of a scan grid: position, variance, and points near borders."""
+
+import numpy as np
+
+from processor.geometry import scanner_rays
+from processor.stitching.fine import edge_constraints
+from processor.stitching.planes import borders, face_ends
+from processor.stitching.planes.extraction import Planes
+from tests.support.clouds.stitch_clouds import pose, scan
+
+
+def test_rays_fitted_to_a_grid_are_the_simulated_ones():
+    made = scan("S", pose([0.0, 0.0, 1500.0], 0.0), 1, step_mrad=20.0, sigma_mm=0.0)
+    keep = np.arange(len(made.points)) % 3 > 0
+    row, column = made.grid_row.astype(np.int64), made.grid_column.astype(np.int64)
+    rays = scanner_rays.fitted(made.points[keep], row[keep], column[keep])
+    true = made.points / np.linalg.norm(made.points, axis=1)[:, None]
+    np.testing.assert_allclose(rays.of(row, column), true, atol=1e-9)
+    lost = scanner_rays.unanswered(rays, row[keep], column[keep])
+    assert len(lost) == (~keep).sum()
+    np.testing.assert_allclose(np.sort(lost, axis=0), np.sort(true[~keep], axis=0), atol=1e-9)
+
+
+def post(width_mm, phase, step=5e-3, range_mm=20_000.0):
+    """Ends of a post 20 m ahead against the sky, x along the ray; columns at (i + phase) steps, 30 rows."""
+    column, row = np.meshgrid(np.arange(200), np.arange(30))
+    turn = (column.ravel() - 100 + phase) * step
+    up = (row.ravel() - 10) * step
+    u = np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], axis=1)
+    p = u * (range_mm / u[:, 0])[:, None]
+    # The ground below determines the columns of the grid.
+    low = row.ravel() < 4
+    hit = low | (np.abs(p[:, 1]) < 0.5 * width_mm)
+    p[low] *= 0.6
+    plane = Planes(
+        np.ones(1), np.array([[range_mm, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.ones((1, 3)), np.eye(3)[None]
+    )
+    r, c = row.ravel()[hit], column.ravel()[hit]
+    piece = np.where(low[hit], -1, 0)
+    piece[~low[hit] & (r % 7 > 0)] = -1  # in a planar piece in few rows only
+    rays = scanner_rays.fitted(p[hit], r, c)
+    return face_ends.ends_of(p[hit], r, c, piece, plane, 2.0, rays)
+
+
+def test_ends_of_a_post_are_unbiased_for_all_phases_of_the_rays():
+    """A post of 1.3 steps is hit by one ray or by two, and its ends are used in both cases."""
+    for width in (130.0, 250.0):
+        shares = []
+        for phase in np.linspace(0.0, 1.0, 40, endpoint=False):
+            ends = post(width, phase)
+            side = (np.abs(ends.across[:, 1]) > 50.0) & (ends.across[:, 1] > 0.0)
+            assert side.sum() >= 20  # of 26 rows, of which 4 were in a piece
+            shares.append(np.mean((ends.points[side, 1] - 0.5 * width) / ends.across[side, 1]))
+        assert np.abs(shares).max() < 0.51
+        assert abs(np.mean(shares)) < 0.03
+
+
+def matches(share, gap):
+    n = len(share)
+    zeros = np.zeros(n, np.int64)
+    width = np.full(n, 60.0)
+    return edge_constraints.Matches(
+        piece=zeros, scan=zeros, points=np.zeros((n, 3)), off=share * width, width=width,
+        normal=np.tile([0.0, 1.0, 0.0], (n, 1)), gap=gap, edge=zeros,
+    )  # fmt: skip
+
+
+def test_ends_in_one_gap_weigh_as_one_and_spread_ends_by_their_number():
+    """200 ends of a post at one position in one gap: the variance of their mean is that of a single end, w^2 / 12."""
+    rng = np.random.default_rng(0)
+    post_ends = edge_constraints.variance(matches(0.3 + rng.normal(0.0, 0.005, 200), np.zeros(200, np.int64)))
+    assert 1.0 / (1.0 / post_ends).sum() > 0.98 * 60.0**2 / 12.0
+    anywhere = (0.618034 * np.arange(200)) % 1.0 - 0.5
+    slanting = edge_constraints.variance(matches(anywhere, np.arange(200)))
+    np.testing.assert_allclose(slanting, 60.0**2 / 12.0)
+    steep = edge_constraints.variance(matches(np.linspace(-0.5, 0.5, 200), np.zeros(200, np.int64)))
+    np.testing.assert_allclose(1.0 / (1.0 / steep).sum(), 60.0**2 / 12.0 / 200, rtol=0.3)
+
+
+def test_variance_of_ends_in_step_with_the_grid():
+    """Compared with the variance of the mean position over explicit shifts of the edge across a whole gap."""
+    rng = np.random.default_rng(1)
+    moves = (np.arange(1000) + 0.5) / 1000.0
+    for share in (np.full(40, 0.2), np.tile([-0.4, 0.1], 20), 0.1 * rng.standard_normal(40) - 0.2, np.array([0.37])):
+        shifted = (share[None] - moves[:, None] + 0.5) % 1.0 - 0.5
+        want = np.mean(shifted.mean(axis=1) ** 2) * len(share)
+        got = edge_constraints.in_step(share, np.zeros(len(share), np.int64))
+        np.testing.assert_allclose(got, max(want, 1.0 / 12.0), rtol=0.08)  # 16 harmonics, of which two in step have 8
+
+
+def test_far_edges_of_an_inclined_face_are_unbiased():
+    """A floor that ends 9 m ahead of a scanner 1.5 m above it: rays are even in angle, so that gaps widen outwards."""
+    height, edge, step = 1500.0, 9000.0, 2e-3
+    off, width = [], []
+    for phase in np.linspace(0.0, 1.0, 50, endpoint=False):
+        column, row = np.meshgrid(np.arange(60), np.arange(300))
+        turn, up = (column.ravel() - 30.3) * step, -0.4507 + (row.ravel() + phase) * step
+        u = np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], axis=1)
+        p = u * (-height / u[:, 2])[:, None]
+        hit = (u[:, 2] < 0.0) & (p[:, 0] < edge)
+        beside = ~hit & (row.ravel() > 280)  # points above determine the rows of the grid
+        p[beside] = 20_000.0 * u[beside]
+        keep = hit | beside
+        plane = Planes(
+            np.ones(1), np.array([[0.0, 0.0, -height]]), np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3)), np.eye(3)[None]
+        )
+        r, c = row.ravel()[keep], column.ravel()[keep]
+        ends = face_ends.ends_of(
+            p[keep], r, c, np.where(hit[keep], 0, -1), plane, 2.0, scanner_rays.fitted(p[keep], r, c)
+        )
+        far = (ends.across[:, 0] > 0.0) & (np.abs(ends.across[:, 1]) < 0.5 * ends.across[:, 0])
+        assert far.sum() >= 40
+        off += (ends.points[far, 0] - edge).tolist()
+        width += ends.across[far, 0].tolist()
+    # Half way along the face would be too far out by 2e-3 / 3 times 6, the tangent of the incidence: 0.4 % of the gap.
+    assert abs(np.mean(off)) < 0.001 * np.mean(width)
+
+
+def test_points_next_to_another_face_are_left_out():
+    """A box corner: the front 5 m ahead ends at y = 0, and its side runs away from there."""
+    y = np.linspace(-500.0, 200.0, 15) + 3.0
+    front = np.stack([np.full(15, 5000.0), y, np.zeros(15)], axis=1)
+    side = y > 0.0
+    front[side, 0] += 1.5 * y[side]
+    points = np.vstack([front + np.array([0.0, 0.0, 40.0 * i]) for i in range(3)])
+    grid = np.arange(45).reshape(3, 15)
+    piece = np.where(points[:, 1] < 60.0, 0, -1)  # two columns of the side face are in the piece
+    plane = Planes(
+        np.ones(1), np.array([[5000.0, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.full((1, 3), 4.0), np.eye(3)[None]
+    )
+    clear = borders.inside(points, grid, piece, plane).reshape(3, 15)
+    ends_at = int((y < 0.0).sum())  # the first column there lies 4.5 mm behind the front, within the noise
+    assert not clear[:, ends_at:].any()
+    assert clear[:, 1:ends_at].all()
+    # A bar hit by two columns of rays, with background on both sides, would lose all points: it keeps them.
+    bar = np.stack([np.full(8, 5000.0), np.tile([0.0, 40.0], 4), np.repeat(40.0 * np.arange(4), 2)], axis=1)
+    behind = np.stack([np.full(8, 5080.0), np.tile([-40.0, 80.0], 4), np.repeat(40.0 * np.arange(4), 2)], axis=1)
+    places = np.stack([np.arange(8, 16, 2), np.arange(0, 8, 2), np.arange(1, 8, 2), np.arange(9, 16, 2)], axis=1)
+    clear = borders.inside(np.vstack([bar, behind]), places, np.repeat([0, -1], 8), plane)
+    assert clear[:8].all()
+    assert not clear[8:].any()

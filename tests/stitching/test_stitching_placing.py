@@ -1,0 +1,132 @@
+"""Coarse registration of a scan beside those already placed, with given scores."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from processor.geometry import rigid
+from processor.model import Status
+from processor.stitching import to_result
+from processor.stitching.coarse import network, pairwise
+from processor.stitching.planes import free_space
+
+
+def test_a_group_of_equal_poses_has_the_score_of_its_best_member(monkeypatch):
+    """Beside scan 0 the right pose of scan 2 is 250 mm off and contradicted by others; beside scan 1 it is exact."""
+    right, turned = (rigid.transform(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 50_000.0))
+    near = rigid.transform(np.eye(3), np.array([250.0, 0.0, 0.0]))
+
+    def distance(pose, other):
+        return float(np.linalg.norm(pose[:3, 3] - other[:3, 3]))
+
+    def score_beside(self, i, j, pose):
+        against = 10.0 if distance(pose, turned) < 1.0 else 0.05 * distance(pose, right)
+        return pairwise.ScoredPose(pose, 600.0, against, 0.4)
+
+    monkeypatch.setattr(network.Network, "score_beside", score_beside)
+    monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: distance(T, S) < 500.0)
+    candidates = {
+        (0, 2): [pairwise.ScoredPose(near, 1.0, 0.0, 0.4), pairwise.ScoredPose(turned, 0.9, 0.0, 0.4)],
+        (1, 2): [pairwise.ScoredPose(right, 1.0, 0.0, 0.4), pairwise.ScoredPose(turned, 0.9, 0.0, 0.4)],
+    }
+    scans = [SimpleNamespace(side_mm=700.0)] * 3
+    placed = network.Network(scans=scans, candidates=candidates, T=np.tile(np.eye(4), (3, 1, 1)), placed=[0, 1])
+    assert network.joint_score(placed, 2, [0], near) < network.joint_score(placed, 2, [0], turned)
+    ranked = network.rank_poses(placed, 2, [0, 1])
+    np.testing.assert_array_equal(ranked[0][1], right)
+    np.testing.assert_array_equal(ranked[1][1], turned)
+    assert ranked[0][0] > 0.9 > 0.1 > ranked[1][0]
+
+
+def test_a_pose_by_a_single_overlap_is_refuted_by_free_space():
+    """A bridge turned end for end: most patches match, and a few lie in free space of the other scan."""
+    T = np.eye(4)
+    right, turned, separate = (pairwise.ScoredPose(T, 50.0, a, o) for a, o in ((0.02, 0.3), (1.1, 0.5), (2.0, 0.01)))
+    np.testing.assert_array_equal(network.refuted({(0, 1): right}, 2, 0), [0.0, 0.0])
+    np.testing.assert_allclose(network.refuted({(0, 1): turned}, 2, 0), [0.0, 1.1 / 50.0])
+    # Two overlaps that agree are not both wrong; a pair with almost no overlap is no support.
+    both = {(0, 1): right, (0, 2): turned, (1, 2): turned}
+    np.testing.assert_array_equal(network.refuted(both, 3, 0), [0.0, 0.0, 0.0])
+    alone = {(0, 1): right, (0, 2): turned, (1, 2): separate}
+    np.testing.assert_allclose(network.refuted(alone, 3, 0), [0.0, 2.02 / 50.0, 3.1 / 50.0])
+
+
+def test_applied_motion_is_not_a_rival_of_the_resulting_pose(monkeypatch):
+    """Every motion seems better than the pose at hand: the rivals in the result are those of the last poses."""
+    poses = []
+
+    def moves(placed, coarse, reference):
+        poses.append(placed.T.copy())
+        return [network.Move(scans=[1], M=rigid.transform(np.eye(3), np.array([100.0, 0.0, 0.0])), ratio=2.0)]
+
+    scored = pairwise.ScoredPose(np.eye(4), 600.0, 0.0, 0.4)
+    monkeypatch.setattr(network.Network, "score_beside", lambda self, i, j, pose: scored)
+    monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: np.array_equal(T, S))
+    monkeypatch.setattr(network, "_moves", moves)
+    scans = [SimpleNamespace(side_mm=700.0)] * 2
+    placed = network.place(scans, {(0, 1): [pairwise.ScoredPose(np.eye(4), 1.0, 0.0, 0.4)]}, 0)
+    np.testing.assert_array_equal(poses[-1], placed.T)
+    np.testing.assert_allclose((placed.T_rival[1] @ rigid.invert(placed.T[1]))[:3, 3], [100.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("against", "ambiguous"), [(0.05, True), (3.0, False)])
+def test_scans_beyond_a_rival_pose_are_ambiguous_together(monkeypatch, against, ambiguous):
+    """Free space decides between two bays, if it contradicts one of them; else all that lies beyond is ambiguous."""
+    step, off = (rigid.transform(np.eye(3), np.array([x, 0.0, 0.0])) for x in (6000.0, 12000.0))
+    T = np.stack([rigid.transform(np.eye(3), np.array([6000.0 * i, 0.0, 0.0])) for i in range(4)])
+    poses = {}
+
+    def score_beside(self, i, j, pose):
+        apart = (rigid.invert(self.T[i]) @ pose)[0, 3] / 6000.0 * (1 if j > i else -1)
+        if abs(i - j) == 1 and apart == 1.0:
+            return pairwise.ScoredPose(pose, 60.0, 0.0, 0.3)
+        if {i, j} == {1, 2} and apart == 2.0:
+            return pairwise.ScoredPose(pose, 60.0, against, 0.3)
+        return pairwise.ScoredPose(pose, 0.0, 0.0 if abs(apart) >= 2.0 and {i, j} != {2, 3} else 9.0, 1e-9)
+
+    monkeypatch.setattr(network.Network, "score_beside", score_beside)
+    monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: bool(np.abs(T - S).max() < 500.0))
+    for i in range(3):
+        poses[i, i + 1] = [pairwise.ScoredPose(step, 60.0, 0.0, 0.3)]
+    poses[1, 2].append(pairwise.ScoredPose(off, 60.0, 0.05, 0.3))
+    scans = [SimpleNamespace(side_mm=700.0)] * 4
+    placed = network.place(scans, poses, 0)
+    np.testing.assert_allclose(placed.T, T)
+    assert (placed.rivalry[2:] > network.AMBIGUOUS).tolist() == [ambiguous] * 2
+    assert (placed.rivalry[:2] < network.AMBIGUOUS).all()
+
+
+def test_scans_that_join_only_through_an_ambiguous_one_are_ambiguous():
+    status = [Status.OK, Status.AMBIGUOUS, Status.OK, Status.OK]
+    assert to_result._not_joined([(0, 1), (1, 2), (0, 3)], status, 0) == [2]
+    assert to_result._not_joined([(0, 1), (1, 2), (0, 3), (2, 3)], status, 0) == []
+    assert to_result._not_joined(None, status, 0) == []
+
+
+def test_links_are_overlaps_that_free_space_does_not_contradict():
+    pose = np.eye(4)
+    scores = {
+        (0, 1): pairwise.ScoredPose(pose, 60.0, 0.1, 0.3),
+        (0, 2): pairwise.ScoredPose(pose, 60.0, 0.9, 0.3),
+        (1, 2): pairwise.ScoredPose(pose, 6.0, 0.0, 0.03),
+    }
+    assert network.links(scores) == [(0, 1)]
+
+
+def test_scan_of_another_place_is_in_a_group_of_its_own():
+    pose = np.eye(4)
+    good, bad = ([pairwise.ScoredPose(pose, 60.0, against, 0.3)] for against in (0.0, 9.0))
+    group = network.groups({(0, 1): bad, (0, 2): good, (1, 2): bad, (2, 3): good, (1, 3): []}, 4)
+    assert group[0] == group[2] == group[3] != group[1]
+
+
+def test_far_patches_between_rays_are_no_contradiction():
+    """A ray every 1.1 degrees: 480 mm are resolved at 5 m, not at 40 m, and not on a floor at grazing incidence."""
+    space = free_space.FreeSpace(np.zeros((6, 82, 82)))
+    points = np.array([[5000.0, 0.0, 0.0], [40000.0, 0.0, 0.0], [9000.0, 0.0, -500.0]])
+    normals = np.array([[-1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    share = space.resolved(points, normals, 480.0)
+    assert share[0] == 1.0
+    assert share[1] < 0.12
+    assert share[2] < 0.12

@@ -1,0 +1,148 @@
+"""Errors of ranges in the adjustment: scales, noise by incidence and range, and the jackknife on regions."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from processor.stitching.fine import bundle_adjustment, jackknife, noise_model
+from processor.stitching.fine.correspondences import Blocks
+from processor.stitching.planes import extraction
+from processor.stitching.planes.extraction import Planes
+from processor.stitching.planes.face_ends import Ends
+from processor.stitching.planes.scan_planes import Cloud
+
+HALL = np.array([60000.0, 40000.0, 12000.0])
+SIGMA_MM = 2.0
+PARTS = 4  # pieces of a wall along each side
+
+
+def stations():
+    """Poses T_hall_scan (4, 4, 4) at four places of a hall."""
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[:, :3, 3] = [[12000.0, 9000, 1600], [45000, 12000, 1700], [30000, 33000, 1500], [8000, 28000, 1700]]
+    T[:, :3, :3] = Rotation.from_euler("z", [[10.0], [75], [200], [-60]], degrees=True).as_matrix()
+    return T
+
+
+def wall_points():
+    """Points (n, 9, 3) of the pieces of the hall's walls, floor and ceiling, and their normals (n, 3)."""
+    points, normals = [], []
+    for axis in range(3):
+        others = [k for k in range(3) if k != axis]
+        for end in (0.0, HALL[axis]):
+            for i, j in np.ndindex(PARTS, PARTS):
+                square = np.zeros((9, 3))
+                square[:, others] = (np.array([i, j]) + np.indices((3, 3)).reshape(2, 9).T / 2.0) / PARTS
+                square *= HALL
+                square[:, axis] = end
+                points.append(square)
+                normals.append(np.eye(3)[axis])
+    return np.array(points), np.array(normals)
+
+
+def blocks_of(T, points, normals, scale, each, shift=None, seen=None):
+    """Blocks of exact planes with the scatter of ``each`` points a block: noise across the planes, none in the means.
+
+    ``scale`` (k,) are those of the scans' ranges; ``shift`` (k, n) moves the points of blocks across their planes.
+    """
+    k, n = len(T), len(points)
+    rows = [(p, s) for p in range(n) for s in range(k) if seen is None or seen[s, p]]
+    sums, rays = [], []
+    for p, s in rows:
+        there = points[p] + (0.0 if shift is None else shift[s, p]) * normals[p]
+        local = (1.0 + scale[s]) * (there - T[s, :3, 3]) @ T[s, :3, :3]
+        weight = each / len(local) / SIGMA_MM**2
+        x = np.hstack([local, np.ones((len(local), 1))])
+        u = local / np.linalg.norm(local, axis=1)[:, None]
+        total = weight * x.T @ x
+        normal = T[s, :3, :3].T @ normals[p]
+        total[:3, :3] += each * np.outer(normal, normal)
+        sums.append(extraction.triangle(total[None])[0])
+        rays.append(weight * u.T @ np.hstack([x, u]))
+    piece, scan = np.array(rows).T
+    none = np.full(len(rows), -1, np.int64)
+    return Blocks(
+        piece=piece, scan=scan, sums=np.array(sums), count=np.full(len(rows), float(each)), kind=none + 1, pieces=n,
+        rays=np.array(rays), face=none,
+    )  # fmt: skip
+
+
+def test_range_scales_are_separated_from_the_poses():
+    """Without noise in the means the poses are exact, whatever the scatter of the points about them."""
+    T, scale = stations(), 1e-6 * np.array([4.0, -7.0, 5.0, -2.0])
+    blocks = blocks_of(T, *wall_points(), scale, each=200_000)
+    start = T.copy()
+    start[1:, :3, 3] += [1.0, -2.0, 0.5]
+    solution = bundle_adjustment.solve(blocks, start, 0, tau=(0.0, 0.0, 0.0))
+    np.testing.assert_allclose(solution.of_scans[:, 1], scale, atol=3e-7)
+    np.testing.assert_allclose(solution.T[:, :3, 3], T[:, :3, 3], atol=0.02)
+
+
+def test_scatter_of_points_does_not_bias_the_range_scales():
+    """Residuals are smaller in smaller scans: the least sum of squares alone would make all of them too small."""
+    T = stations()
+    blocks = blocks_of(T, *wall_points(), np.zeros(4), each=1_000_000)
+    solution = bundle_adjustment.solve(blocks, T, 0, tau=(0.0, 0.0, 0.0))
+    assert np.abs(solution.of_scans[:, 1]).max() < 1e-8
+
+
+def cloud_of(planes, position=True):
+    """A cloud whose cells are its pieces."""
+    return Cloud(
+        origin=np.zeros(3), has_position=position, cell_mm=100.0, sigma_mm=1.0, sums=np.zeros((len(planes.mean), 10)),
+        mean=planes.mean, normal=planes.normal, planes=planes, ends=Ends(), free_space=None,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("across", "along"), [((0.0, 0.0), (4.0, 0.0)), ((0.02, 0.03), (0.1, 0.2))])
+def test_the_noise_follows_incidence_and_range(across, along):
+    """Variances a + b R^2 across the face and along the ray; every seventh piece is rough."""
+    rng = np.random.default_rng(1)
+    n, dof = 900, 40.0
+    mean, normal = (rng.normal(size=(n, 3)) for _ in range(2))
+    R = rng.uniform(3e3, 4e4, n)
+    mean *= (R / np.linalg.norm(mean, axis=1))[:, None]
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    c2, r2 = np.einsum("ni,ni->n", mean, normal) ** 2 / R**2, (R / 1e4) ** 2
+    true = across[0] + across[1] * r2 + (along[0] + along[1] * r2) * c2
+    scatter = true * rng.chisquare(dof, n) / dof
+    scatter[::7] += 9.0
+    variance = np.column_stack([scatter * dof / (dof + 3.0), np.full((n, 2), 1e4)])
+    planes = Planes(np.full(n, dof + 3.0), mean, normal, variance, np.tile(np.eye(3), (n, 1, 1)))
+    found = noise_model.variances(cloud_of(planes))
+    steep = c2 > 0.04  # the least variance at grazing incidence is a bound
+    assert np.abs(np.log(found / true)[steep]).max() < 0.25
+    assert np.abs(np.median(found / true) - 1.0) < 0.1
+
+
+def test_noise_is_one_number_for_scans_with_unknown_rays():
+    n = 30
+    planes = Planes(np.full(n, 20.0), np.eye(3)[np.arange(n) % 3] * 1e4, np.tile([0.0, 0.0, 1.0], (n, 1)),
+                    np.tile([3.4, 1e4, 1e4], (n, 1)), np.tile(np.eye(3), (n, 1, 1)))  # fmt: skip
+    np.testing.assert_allclose(noise_model.variances(cloud_of(planes, position=False)), 3.4 * 20.0 / 17.0)
+
+
+def test_a_region_that_a_pose_rests_on_is_no_contradiction():
+    """One scan sees an end of the hall in one corner alone: without it the pose is loose, and moves by far more."""
+    T, (points, normals) = stations(), wall_points()
+    corner = (points.mean(axis=1) < [1.0, 15000.0, 1e9]).all(axis=1)
+    seen = np.ones((4, len(points)), bool)
+    seen[2] = (np.abs(normals[:, 0]) < 0.5) | corner
+    worst = []
+    for seed in range(5):
+        shift = np.random.default_rng(seed).normal(0.0, 0.05, (4, len(points)))
+        blocks = blocks_of(T, points, normals, np.zeros(4), each=1600, shift=shift, seen=seen)
+        solution = bundle_adjustment.solve(blocks, T, 0, tau=(0.0, 0.0, 0.0))
+        worst.append(jackknife.factors(blocks, solution, 0).max())
+    assert worst == [1.0] * 5
+
+
+def test_errors_of_a_region_raise_the_covariance():
+    """Points of one half of the hall lie off by ten standard deviations of a block in one scan."""
+    T, (points, normals) = stations(), wall_points()
+    shift = np.zeros((4, len(points)))
+    shift[2] = 0.5 * (points.mean(axis=1)[:, 1] > 20000.0) * np.sign(points.mean(axis=1)[:, 0] - 30000.0)
+    blocks = blocks_of(T, points, normals, np.zeros(4), each=1600, shift=shift)
+    solution = bundle_adjustment.solve(blocks, T, 0, tau=(0.0, 0.0, 0.0), robust=False)
+    factor = jackknife.factors(blocks, solution, 0)
+    assert factor[2] == factor.max() > 3.0

@@ -1,0 +1,1 @@
+"""Clouds made with numpy alone."""

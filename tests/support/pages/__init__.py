@@ -1,0 +1,1 @@
+"""Pages of reports, read as text or in a browser."""

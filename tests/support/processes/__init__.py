@@ -1,0 +1,1 @@
+"""Programs, batches and clusters that tests start."""

@@ -1,0 +1,1 @@
+"""Results and records made by hand."""
