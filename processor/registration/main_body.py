@@ -22,7 +22,7 @@ from processor.registration import principal
 VOXELS = (200.0, 140.0, 100.0, 70.0)  # along the scan's diagonal, the most that the points allow
 PER_VOXEL = 6  # points of an occupied voxel, on average
 FEWEST = 40  # voxels of a part
-LARGER = 0.02  # of the longest size, by which a scan that holds more than its part is larger
+LARGER = 0.02  # of each size, by which a scan that holds more than its part is larger
 LARGER_AREA = 1.3  # of a plane, by the part's largest side: cells at its rim are partly empty
 TRIALS, SAMPLE = 1000, 4000  # of random planes, and of points that they are compared with
 THIN = 0.25  # voxels by which points on a plane may lie off it
@@ -40,16 +40,15 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
         return None
     largest = np.max(sizes, axis=0) * (1.0 + LARGER)
     side = LARGER_AREA * float(largest[0] * largest[1])
-    left = np.ones(len(even), bool)
     if (principal.sizes(even) <= largest).all():
         return None
-    while left.sum() >= FEWEST and (principal.sizes(even[left]) > largest).any():
-        on = _plane(even[left], step, side)
-        if on is None:
-            break
+    left = np.ones(len(even), bool)
+    while (on := _plane(even[left], step, side)) is not None:
         left[np.flatnonzero(left)[on]] = False
-    if left.sum() < FEWEST:
-        return None
+        if left.sum() < FEWEST:
+            return None
+        if (principal.sizes(even[left]) <= largest).all():
+            break
     piece = np.zeros(len(even), bool)
     piece[np.flatnonzero(left)[_largest_piece(even[left], step)]] = True
     best = piece if _misfit(even[piece], sizes) <= _misfit(even[left], sizes) else left
