@@ -386,13 +386,14 @@ def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> lis
     if np.isfinite(first.T_rival).all():
         found.append((first.ambiguity * first.rms_mm, first.T_rival))
     square, centre = _along_faces(axes.axes, surface), points.mean(axis=0)
-    distinct = _distinct(found, centre, size)
-    for _ in range(SIDE_ROUNDS):
-        promising = [T for error, T in distinct if error <= PROMISING * distinct[0][0]]
+    distinct = untried = _distinct(found, centre, size)
+    for _ in range(SIDE_ROUNDS):  # plates along several axes may lie on their other sides
+        least = distinct[0][0]
+        promising = [T for error, T in untried if error <= PROMISING * least]
         shifted = [refined(start) for T in promising for start in _other_sides(points, design.points, square, T)]
-        before = distinct[0][0]
         distinct = _distinct([*distinct, *shifted], centre, size)
-        if not distinct[0][0] < before:  # plates along several axes may lie on their other sides
+        untried = [one for one in distinct if any(one is other for other in shifted)]
+        if not distinct[0][0] < least:
             break
     return distinct
 

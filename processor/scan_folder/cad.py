@@ -200,7 +200,7 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
         source.write_bytes(content)
         failure = _run(command, source, making / "meshes", unit)
         if failure:
-            raise InputError(f"{failure.replace(f'{source}: ', '')}", path=path)
+            raise InputError(failure.replace(f"{source}: ", ""), path=path)
         (making / "meshes" / CHECKSUM).write_text(_sha256(making / "meshes"), "ascii")
         with suppress(OSError):  # another process has made them meanwhile
             os.replace(making / "meshes", meshes)
