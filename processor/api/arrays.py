@@ -24,7 +24,7 @@ from processor.geometry import mesh_distance, normal_orientation, rigid
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Floats, Reason, Status, reason
-from processor.registration import main_body, principal, surface_registration
+from processor.registration import surface_registration
 from processor.registration.surface_registration import Placed
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.design import unit_mistakes
@@ -267,10 +267,9 @@ def _assessed(
     points: Floats, surface: MeshSurface, T: Floats, placed: Placed, *, ambiguous: bool
 ) -> tuple[Status, tuple[Reason, ...]]:
     """Return the status of points (n, 3) placed by T (4, 4), without ground and walls, and why it is not ok."""
-    of_body = main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
+    of_body = surface_registration.body_of(points, surface)
     points = points if of_body is None else points[of_body]
-    near, _ = surface.tree.query(rigid.apply(T, points), distance_upper_bound=surface_registration.NEAR_MM, workers=-1)
-    share = float(np.isfinite(near).mean())
+    share = surface_registration.near_share(points, surface, T)
     if share < surface_registration.NEAR_SHARE:
         near_mm = surface_registration.NEAR_MM
         return Status.FAILED, (reason("register.not-at-mesh", share=100.0 * share, near_mm=near_mm),)

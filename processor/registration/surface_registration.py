@@ -230,18 +230,18 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     """
     axes = principal.of_mesh(surface.vertices, surface.faces)
     few = thinned(points, FINE_POINTS)
-    near_share = _near_share(few, surface, given)
+    share = near_share(few, surface, given)
     of_body = None
     if how in ("auto", "coarse"):
-        of_body = main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
+        of_body = body_of(points, surface)
     if of_body is not None:
         few_of_body = thinned(points[of_body], FINE_POINTS)
-        of_body_near = _near_share(few_of_body, surface, given)
-        if near_share < NEAR_SHARE or of_body_near >= near_share:  # else it is something else beside the structure
-            few, near_share = few_of_body, of_body_near
+        of_body_share = near_share(few_of_body, surface, given)
+        if share < NEAR_SHARE or of_body_share >= share:  # else it is something else beside the structure
+            few, share = few_of_body, of_body_share
             points, scanner = points[of_body], None if scanner is None else scanner[of_body]
     registration, rivals, ambiguity = Registration.AS_GIVEN, [], NAN
-    if how == "coarse" or (how == "auto" and near_share < NEAR_SHARE):
+    if how == "coarse" or (how == "auto" and share < NEAR_SHARE):
         registration = Registration.COARSE
         poses = _attitudes(even(points), surface, axes)
         starts = [T for error, T in poses if error <= PROMISING * poses[0][0]]
@@ -268,7 +268,7 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
         T_best_fit=best,
         covariance=fitted.covariance,
         ambiguity=ambiguity,
-        near_share=near_share,
+        near_share=share,
         shift=rigid.apply(between, middle) - middle,
         turn=rigid.rotation_angle(between[:3, :3]),
         weak=fitted.weak,
@@ -278,7 +278,12 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     )
 
 
-def _near_share(points: Floats, surface: MeshSurface, T: Floats) -> float:
+def body_of(points: Floats, surface: MeshSurface) -> Bools | None:
+    """Return which points (n, 3) are not of the ground or what stands about the structure; None where all are."""
+    return main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
+
+
+def near_share(points: Floats, surface: MeshSurface, T: Floats) -> float:
     """Share of points (n, 3), placed by T (4, 4), near the design's surface."""
     near, _ = surface.tree.query(rigid.apply(T, points), distance_upper_bound=NEAR_MM, workers=-1)
     return float(np.isfinite(near).mean())
@@ -286,7 +291,7 @@ def _near_share(points: Floats, surface: MeshSurface, T: Floats) -> float:
 
 def fits_design(placed: Placed, points: Floats, surface: MeshSurface) -> bool:
     """Whether points (n, 3), or half of them beside clutter, lie near the surface at the pose that was found."""
-    return _near_share(thinned(points, FINE_POINTS), surface, placed.T) >= NEAR_SHARE
+    return near_share(thinned(points, FINE_POINTS), surface, placed.T) >= NEAR_SHARE
 
 
 def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:
