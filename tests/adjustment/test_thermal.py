@@ -11,5 +11,5 @@ def test_ten_metres_of_steel_25_kelvin_warmer_are_3_mm_longer():
     assert 10_000.0 * (thermal.expansion(45.0) - 1.0) == pytest.approx(3.0)
 
 
-def test_an_unknown_temperature_changes_nothing():
+def test_expansion_at_an_unknown_temperature_is_one():
     assert thermal.expansion(math.nan) == 1.0

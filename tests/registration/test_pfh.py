@@ -66,7 +66,7 @@ def test_histograms_equal_the_definition_bin_by_bin(cloud, bins):
         np.testing.assert_allclose(found[query], expected, atol=1e-12)
 
 
-def test_one_pair_worked_by_hand():
+def test_histograms_of_one_pair_fill_the_bin_computed_by_hand():
     # Two points 2 apart on the x axis, both normals along +y: V = U x x = -z, W = U x V = -x,
     # so alpha = V.N = 0, beta = U.x = 0, theta = atan2(W.N, U.N) = atan2(0, 1) = 0: the middle bin of all three.
     points = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
@@ -75,7 +75,7 @@ def test_one_pair_worked_by_hand():
     assert found[0, 2 + 5 * 2 + 25 * 2] == 1.0
 
 
-def test_order_and_motion_change_nothing(cloud):
+def test_histograms_do_not_depend_on_the_order_and_pose_of_the_points(cloud):
     points, normals = cloud
     found = pfh.histograms(points, normals, 45.0)
     order = np.random.default_rng(1).permutation(60)

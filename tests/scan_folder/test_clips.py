@@ -99,7 +99,7 @@ def test_many_points_are_clipped_in_pieces_alike(monkeypatch):
     assert pieces.record().inside.tolist() == whole.record().inside.tolist()
 
 
-def test_without_a_box_nothing_changes(tmp_path):
+def test_input_without_clip_boxes_has_no_clip_record(tmp_path):
     assert read_input(folder_of(tmp_path, "")).clips is None
 
 

@@ -170,7 +170,7 @@ def test_ball_of_another_size_than_designed_is_flagged():
     np.testing.assert_allclose(result.balls.radii, [50.0, 45.4], atol=0.2)
 
 
-def test_offsets_and_poses_change_nothing():
+def test_balls_do_not_depend_on_map_offsets_and_on_poses_of_scans():
     scene, _ = frame(k=3)
     utm = np.array([500_000_000.0, 4_300_000_000.0, 0.0])
     points = scene.scans[0].points
@@ -279,7 +279,7 @@ def test_search_reports_an_early_stop_and_an_empty_result():
     assert space_frame_step.run(Scene("empty", "structure"), Params()).status == "failed"
 
 
-def test_check_by_numbers_worked_by_hand():
+def test_check_metrics_of_known_errors_equal_those_computed_by_hand():
     centres = np.array([[0.0, 0.0, 0.0], [1000.0, 0.0, 0.0], [2000.0, 0.0, 0.0]])
     truth = FrameTruth(ids=[7, 8, 9], centres=centres, radii=[45.0, 45.0, 45.0], lowest=centres - [0.0, 0.0, 45.0])
     got = centres[[2, 0, 1]] + np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 30.0]])

@@ -75,7 +75,7 @@ def test_mount_without_its_ball_gives_no_ball(name):
     assert (result.status, len(result.balls)) == ("failed", 0)
 
 
-def test_a_large_offset_changes_nothing():
+def test_sphere_of_a_real_scan_does_not_depend_on_a_map_offset():
     here = scene("SPH102")
     scan = here.scans[0]
     utm = np.array([500_000_000.0, 4_300_000_000.0, 0.0])

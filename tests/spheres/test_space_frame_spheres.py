@@ -60,7 +60,7 @@ def test_every_ball_has_its_size_and_its_place(roof, found):
     assert found.noise[0] + found.noise[2] == pytest.approx(4.0, rel=0.2)
 
 
-def test_order_chunks_and_threads_change_nothing(roof, found, monkeypatch):
+def test_fit_spheres_gives_the_same_bytes_for_any_order_chunks_and_threads(roof, found, monkeypatch):
     _, _, _, source, nodes, tubes = roof
     order = np.random.default_rng(1).permutation(source.count)
     mixed = InMemory(source.points[order], source.station[order], source.scanners, chunk_size=3001)

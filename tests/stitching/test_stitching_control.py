@@ -73,7 +73,7 @@ def in_site(found):
     return rigid.transform(np.eye(3), found.centre) @ found.T
 
 
-def test_a_square_worked_by_hand():
+def test_adjust_on_a_square_of_control_points_equals_residuals_and_covariance_by_hand():
     """Corners alternately 1 mm high and low: no motion takes that up, and a quarter of it shows in each height."""
     square = np.array([[100.0, 100.0, 0.0], [-100.0, 100.0, 0.0], [-100.0, -100.0, 0.0], [100.0, -100.0, 0.0]])
     high = np.array([1.0, -1.0, 1.0, -1.0])
@@ -319,7 +319,7 @@ def test_picked_scans_are_laid_to_control_points():
     np.testing.assert_array_equal(result.closures.mm, free.closures.mm)
 
 
-def test_without_control_points_nothing_changes():
+def test_stitching_with_too_few_control_points_equals_stitching_without():
     _, scene = network(1, 2.0)
     few = targets(np.array([np.eye(4)] * 5), count=2)
     results = [

@@ -23,7 +23,7 @@ def codes(reasons):
     return [reason.code for reason in reasons]
 
 
-def test_three_points_worked_by_hand():
+def test_fit_pair_of_three_points_equals_the_pose_computed_by_hand():
     """b rotated by 90 degrees about z and shifted: x_a = (-y_b + 10, x_b + 20, z_b)."""
     b = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
     a = np.array([[10.0, 20.0, 0.0], [10.0, 120.0, 0.0], [-40.0, 20.0, 0.0]])
