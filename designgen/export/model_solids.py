@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from designgen.cad import files
-from designgen.models import as_built, cadquery_objects, loading
+from designgen.models import body_deviations, cadquery_objects, loading
 from designgen.models.model import Model, ModelBody
 from designgen.recipe_params import filled
 from designgen.scenes.model import Params, part_solid
@@ -44,7 +44,7 @@ def of_recipe(recipe: Mapping[str, Any]) -> tuple[dict[str, cq.Shape], Model]:
     return dict(zip((body.name for body in model.bodies), solids, strict=True)), model
 
 
-def movement(body: ModelBody, params: as_built.Params | None) -> cq.Location:
+def movement(body: ModelBody, params: body_deviations.Params | None) -> cq.Location:
     """Return the movement of a body as built: turned about the middle of its box, and moved."""
     import cadquery as cq
 

@@ -22,7 +22,7 @@ from designgen.designs import (
     structure_registry,
 )
 from designgen.export import model_solids
-from designgen.models import as_built
+from designgen.models import body_deviations
 from designgen.randomness import generator
 from designgen.recipe_params import filled
 from processor.model import UsageError
@@ -53,7 +53,7 @@ def write_as_built(recipe: Mapping[str, Any], seed: int, folder: Path) -> list[P
             write_step(written[-1], {part.name: arch_part.solid(part)})
     elif "model" in recipe:
         shapes, model = model_solids.of_recipe(recipe)
-        params = as_built.params_of(recipe, tuple(shapes))
+        params = body_deviations.params_of(recipe, tuple(shapes))
         built = {
             body.name: shapes[body.name].moved(model_solids.movement(body, params.get(body.name)))
             for body in model.bodies

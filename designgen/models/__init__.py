@@ -1,1 +1,1 @@
-"""Models to scan: CAD files, meshes and CadQuery objects. Read ``model``, then ``loading``, then ``placement``."""
+"""Models to scan: CAD files, meshes and CadQuery objects. Read ``model``, then ``loading``, then ``as_built``."""

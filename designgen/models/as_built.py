@@ -1,65 +1,24 @@
-"""Bodies of a model built otherwise than designed: moved, turned, bent, dented, left out; with the truth of each.
-
-A section ``[asbuilt."NAME"]`` of a recipe is about the body NAME. A deviation is a displacement of the design's points:
-first bend and dent, then the movement of the whole body.
-"""
+"""Models built otherwise than designed: the bodies as built, and the truth of their deviations."""
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from designgen.asbuilt.imperfections import Ledger
-from designgen.checks import expect_all
-from designgen.designs.patch import Displacement, Surface
+from designgen.designs.patch import Surface
+from designgen.models.body_deviations import Defect, Deviation, Params, Triangles, deviation_of, missing_part
 from designgen.models.model import Model, ModelBody
-from designgen.models.station_placement import spread
 from designgen.models.subdivision import Spacing, subdivided
-from designgen.randomness import generator
-from designgen.recipe_params import filled
-from designgen.scanning import triangle_tree
-from processor.model import AsBuilt, BodyTruth, Bools, DefectTruth, Floats, StructureTruth, UsageError
+from designgen.models.surface_samples import sample_surface, triangle_areas
+from processor.model import AsBuilt, BodyTruth, DefectTruth, Floats, StructureTruth
 
 TRUTH_POINTS, LEAST_TRUTH_POINTS = 20_000, 60  # of the whole model, by area; of a body, at least
 DENT_TRUTH_POINTS = 400  # in addition, in and about a dent
-FACET_MM = 0.005  # chords of displaced triangles that have no other surface depart by at most that
-NET_SHARE = 0.25  # of a dent's radius: longest edge of the net of other faces within it
-FREE_MM = 500.0  # a dent is drawn where so much is free before the surface
-FACING = 0.7  # cosine between a normal and a direction that it counts as facing
-ANYWHERE = float("inf")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Params:
-    """Deviations of one body. The axes are those of the model.
-
-    ``turn_deg`` is a rotation vector about the middle of the body's box. ``bend_mm`` is the largest displacement along
-    ``bend_along``, at the middle of the body's length; "0, 0, 0": along its least thickness. ``dent_at_mm``: the dent
-    is at the nearest place of the surface; without it, one is drawn.
-    """
-
-    move_mm: tuple[float, ...] = (0.0, 0.0, 0.0)
-    turn_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
-    bend_mm: float = 0.0
-    bend_along: tuple[float, ...] = (0.0, 0.0, 0.0)
-    dent_mm: float = 0.0  # depth, positive inward
-    dent_radius_mm: float = 100.0
-    dent_at_mm: tuple[float, ...] = (ANYWHERE, ANYWHERE, ANYWHERE)
-    missing: bool = False
-
-    def __post_init__(self) -> None:
-        threes = ("move_mm", "turn_deg", "bend_along", "dent_at_mm")
-        expect_all(
-            "asbuilt",
-            *((len(getattr(self, key)) == 3, key, list(getattr(self, key)), "three numbers") for key in threes),
-            (self.dent_radius_mm > 0.0, "dent_radius_mm", self.dent_radius_mm, "a length above 0"),
-            (abs(self.dent_mm) <= self.dent_radius_mm, "dent_mm", self.dent_mm, "at most dent_radius_mm"),
-        )
 
 
 @dataclass(frozen=True)
@@ -72,85 +31,41 @@ class Built:
     ledger: AsBuilt | None
 
 
-@dataclass(frozen=True)
-class _Defect:
-    kind: str
-    body: str
-    centre: Floats
-    area: float
-    depth: float
-    _: dataclasses.KW_ONLY
-    volume: float
-
-
-@dataclass(frozen=True)
-class _View:
-    """The triangles of all bodies, and their tree."""
-
-    tree: triangle_tree.Tree
-    corners: Floats
-
-    @classmethod
-    def of(cls, model: Model) -> _View:
-        corners = np.concatenate([body.vertices[body.triangles] for body in model.bodies])
-        tree = triangle_tree.build(corners)
-        return cls(tree, corners[tree.order])
-
-    def free(self, start: Floats, end: Floats) -> Bools:
-        return triangle_tree.free(self.tree, self.corners, start, end, 1e-3)
-
-
-def params_of(recipe: Mapping[str, Any], names: Sequence[str]) -> dict[str, Params]:
-    """Return the deviations of a recipe's bodies by name; UsageError for an unknown body or key."""
-    section = recipe.get("asbuilt", {})
-    if not isinstance(section, Mapping):
-        raise UsageError(f"asbuilt: expected a section, got {section!r}")
-    for name, table in section.items():
-        if not isinstance(table, Mapping):
-            raise UsageError(f'asbuilt.{name}: expected a section of a body, [asbuilt."NAME"], got {table!r}')
-        if name not in names:
-            near = difflib.get_close_matches(name, names, 3) or list(names[:3])
-            raise UsageError(
-                f"asbuilt.{name}: the model has no body of this name; there are {len(names)}, as {', '.join(near)}"
-            )
-    return {name: filled(Params, {f"asbuilt.{name}": table}, f"asbuilt.{name}") for name, table in section.items()}
-
-
 def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
-    """Return a model as built, and its truth."""
-    ledger, defects = Ledger(), list[_Defect]()
+    """Return a model as built, and its truth; bodies without ``params`` are as designed."""
+    ledger, defects = Ledger(), list[Defect]()
     built: list[ModelBody | None] = []
-    truths = list[_Sampled]()
-    areas = np.array([_areas(body).sum() for body in model.bodies])
-    view = _View.of(model) if params else None
+    sampled = list[_SampledBody]()
+    areas = np.array([triangle_areas(body).sum() for body in model.bodies])
+    triangles = Triangles.of(model) if params else None
     for row, (body, share) in enumerate(zip(model.bodies, areas / areas.sum(), strict=True)):
         count = max(LEAST_TRUTH_POINTS, int(TRUTH_POINTS * share))
-        points, normals = spread(body.vertices[body.triangles], count)
-        deviations = params.get(body.name)
-        if deviations is None:
+        points, normals = sample_surface(body.vertices[body.triangles], count)
+        of_body = params.get(body.name)
+        if of_body is None:
             built.append(body)
-            truths.append(_Sampled(row, points, normals, np.zeros_like(points)))
+            sampled.append(_SampledBody(row, points, normals, np.zeros_like(points)))
             continue
-        if deviations.missing:
+        if of_body.missing:
             built.append(None)
             ledger.note("left out", body.name, 1.0, "count")
-            defects.append(_missing(body))
+            defects.append(missing_part(body))
             continue
-        assert view is not None
-        parts = _parts(body, deviations, view, seed)
-        built.append(_displaced(body, parts))
-        near = _about(parts, body)
+        assert triangles is not None
+        deviation = deviation_of(body, of_body, triangles, seed)
+        built.append(_displaced(body, deviation))
+        near = _sampled_about_dent(body, deviation)
         points, normals = np.concatenate([points, near[0]]), np.concatenate([normals, near[1]])
-        truths.append(_Sampled(row, points, normals, parts.displacement(points)))
-        defects += parts.defects
-        for what, value, unit in parts.notes:
+        sampled.append(_SampledBody(row, points, normals, deviation.displacement(points)))
+        defects += deviation.defects
+        for what, value, unit in deviation.notes:
             ledger.note(what, body.name, value, unit)
-    movement = _sampled_movement(model, params, truths)
-    return Built(tuple(built), movement, _truth(defects), ledger.record() if params else None)
+    movement = _structure_truth(model, params, sampled)
+    return Built(tuple(built), movement, _defect_truth(defects), ledger.record() if params else None)
 
 
-class _Sampled(NamedTuple):
-    """Points (n, 3) of the design of the body in a row of the model, normals, and displacements."""
+class _SampledBody(NamedTuple):
+    """Points (n, 3) on the design of the body in ``row`` of the model, mm, unit normals, and displacements, mm."""
 
     row: int
     points: Floats
@@ -158,15 +73,15 @@ class _Sampled(NamedTuple):
     displacement: Floats
 
 
-def _sampled_movement(model: Model, params: Mapping[str, Params], of_bodies: Sequence[_Sampled]) -> StructureTruth:
+def _structure_truth(model: Model, params: Mapping[str, Params], of_bodies: Sequence[_SampledBody]) -> StructureTruth:
     """Return the movement of all bodies, and of each as a whole."""
-    gone = np.full(3, np.nan)
+    left_out = np.full(3, np.nan)
     as_wholes = [params.get(body.name, Params()) for body in model.bodies]
     bodies = BodyTruth(
         names=tuple(body.name for body in model.bodies),
         of_point=np.repeat([one.row for one in of_bodies], [len(one.points) for one in of_bodies]).astype(np.int32),
-        shift=np.array([gone if one.missing else one.move_mm for one in as_wholes]),
-        turn=np.array([gone if one.missing else np.radians(one.turn_deg) for one in as_wholes]),
+        shift=np.array([left_out if one.missing else one.move_mm for one in as_wholes]),
+        turn=np.array([left_out if one.missing else np.radians(one.turn_deg) for one in as_wholes]),
     )
     empty = [np.empty((0, 3))]
     return StructureTruth(
@@ -177,7 +92,7 @@ def _sampled_movement(model: Model, params: Mapping[str, Params], of_bodies: Seq
     )
 
 
-def _truth(defects: Sequence[_Defect]) -> DefectTruth:
+def _defect_truth(defects: Sequence[Defect]) -> DefectTruth:
     return DefectTruth(
         ids=np.arange(len(defects)),
         classes=tuple(defect.kind for defect in defects),
@@ -189,225 +104,34 @@ def _truth(defects: Sequence[_Defect]) -> DefectTruth:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Parts:
-    """The deviation of one body: displacement, whether the shape stays as it is, and the net that it needs."""
-
-    displacement: Displacement
-    rigid: bool
-    spacings: tuple[Spacing, ...]
-    defects: tuple[_Defect, ...]
-    notes: tuple[tuple[str, float, str], ...]
-    dent: tuple[Floats, float] | None  # middle and radius
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Change:
-    """One deviation of a body's shape."""
-
-    field: Displacement
-    spacing: Spacing
-    defect: _Defect
-    notes: tuple[tuple[str, float, str], ...]
-
-
-def _parts(body: ModelBody, params: Params, view: _View, seed: int) -> _Parts:
-    """Return the deviation of a body by its parameters."""
-    bend = [_bend(body, params)] if params.bend_mm else []
-    dent = [_dent(body, params, view, seed)] if params.dent_mm else []
-    changes, moved = bend + dent, _movement(body, params)
-
-    def displacement(points: Floats) -> Floats:
-        shape = np.zeros_like(points)
-        for change in changes:
-            shape = shape + change.field(points)
-        result: Floats = shape if moved is None else shape + moved(points + shape)
-        return result
-
-    defects = [change.defect for change in changes]
-    notes = [note for change in changes for note in change.notes]
-    if moved is not None:
-        defects.append(_misalignment(body, moved))
-        for key, unit in (("move_mm", "mm"), ("turn_deg", "deg")):
-            what = key.partition("_")[0]
-            notes += [(f"{what}, {axis}", c, unit) for axis, c in zip("xyz", getattr(params, key), strict=True)]
-    return _Parts(
-        displacement=displacement,
-        rigid=not changes,
-        spacings=tuple(change.spacing for change in changes),
-        defects=tuple(defects),
-        notes=tuple(notes),
-        dent=(dent[0].defect.centre, params.dent_radius_mm) if dent else None,
-    )
-
-
-def _of_facets(body: ModelBody) -> bool:
-    return any(surface is None for surface in body.surfaces)
-
-
-def _bend(body: ModelBody, params: Params) -> _Change:
-    """Return a bend: half a wave along the body, which is largest at its middle and vanishes at its ends."""
-    middle, along, length, across = _axis(body, params)
-    most = params.bend_mm
-
-    def field(x: Floats) -> Floats:
-        result: Floats = np.outer(most * np.cos(np.pi * ((x - middle) @ along) / length), across)
-        return result
-
-    # A chord h departs from a curve by h^2 / 8 times the curvature, bend (pi / length)^2.
-    facet = length / np.pi * float(np.sqrt(8.0 * FACET_MM / abs(most)))
-    longest = min(facet, length / 16.0) if _of_facets(body) else length / 16.0
-    front = float(_areas(body)[_normals(body) @ across > FACING].sum())
-    return _Change(
-        field=field,
-        spacing=Spacing(middle, float("inf"), longest),
-        defect=_Defect("bend", body.name, middle, front, abs(most), volume=front * abs(most) * 2.0 / np.pi),
-        notes=(("bend", most, "mm"),),
-    )
-
-
-def _dent(body: ModelBody, params: Params, view: _View, seed: int) -> _Change:
-    """Return a round dent; it fades out in depth, so that an opposite wall stays."""
-    centre, inward = _dent_place(body, params, view, seed)
-    radius, depth = params.dent_radius_mm, params.dent_mm
-
-    def field(points: Floats) -> Floats:
-        arm = points - centre
-        below = arm @ inward
-        share = np.minimum((np.einsum("ni,ni->n", arm, arm) - below**2) / radius**2, 1.0)
-        fade = np.clip(2.0 * np.abs(below) / radius - 1.0, 0.0, 1.0)
-        result: Floats = np.outer(depth * (1.0 - share) ** 2 * (1.0 - fade**2) ** 2, inward)
-        return result
-
-    # The curvature in the middle is 4 depth / radius^2.
-    facet = float(np.sqrt(2.0 * FACET_MM / abs(depth)))
-    longest = radius * (min(facet, NET_SHARE) if _of_facets(body) else NET_SHARE)
-    area = np.pi * radius**2
-    kind = "dent" if depth > 0.0 else "bulge"
-    places = [(f"dent, {axis}", float(c), "mm") for axis, c in zip("xyz", centre, strict=True)]
-    return _Change(
-        field=field,
-        spacing=Spacing(centre, 1.5 * radius, longest),
-        defect=_Defect(kind, body.name, centre, area, depth, volume=area * depth / 3.0),
-        notes=(("dent, depth", depth, "mm"), ("dent, radius", radius, "mm"), *places),
-    )
-
-
-def _misalignment(body: ModelBody, moved: Displacement) -> _Defect:
-    """Return a moved body as a defect: half of its surface, by the components along the normals."""
-    middles, areas = body.vertices[body.triangles].mean(axis=1), _areas(body)
-    out = np.abs(np.einsum("ni,ni->n", moved(middles), _normals(body)))
-    box = 0.5 * (body.vertices.min(axis=0) + body.vertices.max(axis=0))
-    return _Defect(
-        "misalignment", body.name, box, 0.5 * float(areas.sum()), float(out.max()), volume=0.5 * float(areas @ out)
-    )
-
-
-def _movement(body: ModelBody, params: Params) -> Displacement | None:
-    """Return the displacement of a body that is moved and turned about the middle of its box; None for neither."""
-    move, turn = np.array(params.move_mm), np.radians(params.turn_deg)
-    angle = float(np.linalg.norm(turn))
-    if angle == 0.0 and not move.any():
-        return None
-    x, y, z = turn / angle if angle else np.zeros(3)
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    change = np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
-    middle = 0.5 * (body.vertices.min(axis=0) + body.vertices.max(axis=0))
-
-    def moved(points: Floats) -> Floats:
-        result: Floats = (points - middle) @ change.T + move
-        return result
-
-    return moved
-
-
-def _dent_place(body: ModelBody, params: Params, view: _View, seed: int) -> tuple[Floats, Floats]:
-    """Return the middle (3,) of a dent on the surface, and the unit normal (3,) into the body."""
-    points, normals = spread(body.vertices[body.triangles], 2000)
-    at = np.array(params.dent_at_mm)
-    if np.isfinite(at).all():
-        nearest = int(np.argmin(np.linalg.norm(points - at, axis=1)))
-        # The plane of the nearest of many points, as these are not dense.
-        return at - normals[nearest] * float((at - points[nearest]) @ normals[nearest]), -normals[nearest]
-    # Of places with room before them, some of those farthest from other faces; one of them by chance.
-    areas = np.array([_areas(body)[body.face == k].sum() for k in range(len(body.face_names))])
-    on_face = np.abs(areas - areas.max()) < 0.01 * areas.max()
-    rows = np.flatnonzero(on_face[body.face])
-    points, normals = spread(body.vertices[body.triangles[rows]], 500)
-    free = view.free(points + 1e-3 * normals, points + FREE_MM * normals)
-    points, normals = (points[free], normals[free]) if free.any() else (points, normals)
-    others = body.vertices[body.triangles[np.setdiff1d(np.arange(len(body.face)), rows)]]
-    if len(others):
-        edges = spread(others, 4000)[0]
-        apart = np.min([np.linalg.norm(points - edge, axis=1) for edge in edges], axis=0)
-        best = np.flatnonzero(apart >= 0.8 * apart.max())
-    else:
-        best = np.arange(len(points))
-    pick = int(best[generator(seed, f"dent {body.name}").integers(len(best))])
-    return points[pick], -normals[pick]
-
-
-def _axis(body: ModelBody, params: Params) -> tuple[Floats, Floats, float, Floats]:
-    """Return middle, direction and length of a body's longest extent, and the direction across in which it bends."""
-    wanted = np.array(params.bend_along)
-    points, _ = spread(body.vertices[body.triangles], 2000)
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    reach = body.vertices @ axes.T
-    low, high = reach.min(axis=0), reach.max(axis=0)
-    across = wanted - axes[0] * (wanted @ axes[0]) if wanted.any() else axes[2]
-    size = float(np.linalg.norm(across))
-    if size < 1e-9:
-        raise UsageError(f"asbuilt.{body.name}.bend_along: expected a direction across the body's length")
-    return 0.5 * (low + high) @ axes, axes[0], float(high[0] - low[0]), across / size
-
-
-def _missing(body: ModelBody) -> _Defect:
-    areas = _areas(body)
-    points, _ = spread(body.vertices[body.triangles], 500)
-    corners = body.vertices[body.triangles]
-    volume = abs(float(np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum())) / 6.0
-    area = 0.5 * float(areas.sum())
-    return _Defect("missing-part", body.name, points.mean(axis=0), area, volume / area, volume=volume)
-
-
-def _about(parts: _Parts, body: ModelBody) -> tuple[Floats, Floats]:
-    """Return points and normals on the design in and about a dent, for the truth."""
-    if parts.dent is None:
+def _sampled_about_dent(body: ModelBody, deviation: Deviation) -> tuple[Floats, Floats]:
+    """Return points (n, 3) and normals (n, 3) on the design in and about a dent; none without a dent."""
+    if deviation.dent is None:
         return np.empty((0, 3)), np.empty((0, 3))
-    centre, radius = parts.dent
+    centre, radius = deviation.dent
     whole = subdivided(body, [Spacing(centre, 1.5 * radius, 0.2 * radius)])
     corners = whole.vertices[whole.triangles]
     near = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) < 1.4 * radius
-    return spread(corners[near], DENT_TRUTH_POINTS) if near.any() else (np.empty((0, 3)), np.empty((0, 3)))
+    return sample_surface(corners[near], DENT_TRUTH_POINTS) if near.any() else (np.empty((0, 3)), np.empty((0, 3)))
 
 
-def _displaced(body: ModelBody, parts: _Parts) -> ModelBody:
-    """Return a body whose points are displaced; its net is made finer where the displacement is not a rigid one."""
-    finer = subdivided(body, parts.spacings) if parts.spacings else body
+def _displaced(body: ModelBody, deviation: Deviation) -> ModelBody:
+    """Return a body whose points are displaced; triangles are divided where the displacement is not rigid."""
+    finer = subdivided(body, deviation.spacings) if deviation.spacings else body
 
     def moved(at: Surface) -> Surface:
         def displaced_at(p: Floats, q: Floats) -> Floats:
             points = at(p, q)
-            result: Floats = points + parts.displacement(points)
+            result: Floats = points + deviation.displacement(points)
             return result
 
         return displaced_at
 
     return dataclasses.replace(
         finer,
-        vertices=finer.vertices + parts.displacement(finer.vertices),
+        vertices=finer.vertices + deviation.displacement(finer.vertices),
         surfaces=tuple(None if at is None else moved(at) for at in finer.surfaces),
-        flat=tuple(flat and (parts.rigid or at is None) for flat, at in zip(finer.flat, finer.surfaces, strict=True)),
+        flat=tuple(
+            flat and (deviation.rigid or at is None) for flat, at in zip(finer.flat, finer.surfaces, strict=True)
+        ),
     )
-
-
-def _areas(body: ModelBody) -> Floats:
-    a, b, c = np.moveaxis(body.vertices[body.triangles], 1, 0)
-    areas: Floats = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return areas
-
-
-def _normals(body: ModelBody) -> Floats:
-    a, b, c = np.moveaxis(body.vertices[body.triangles], 1, 0)
-    normals: Floats = np.cross(b - a, c - a) / np.maximum(2.0 * _areas(body), 1e-300)[:, None]
-    return normals

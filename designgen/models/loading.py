@@ -13,7 +13,7 @@ import numpy as np
 from designgen.cad import faults, files
 from designgen.cad.bodies import Body, is_closed
 from designgen.models import cadquery_objects, mesh_bodies, mesh_files
-from designgen.models.model import Model, ModelBody, of_cad, turned, unique
+from designgen.models.model import Model, ModelBody, of_cad, unique_names, with_normals_reversed
 from processor.model import Floats, InputError, Ints, UsageError
 
 PYTHON = ".py"
@@ -55,7 +55,7 @@ def _arrays(model: Any) -> tuple[Floats, Ints]:
     raise InputError("model: expected finite vertices (v, 3) and faces (f, 3) of rows of these, found others")
 
 
-def say(model: Model) -> None:
+def log_notes(model: Model) -> None:
     """Log the notes of a model, and what is wrong with its bodies together, as warnings, a line each."""
     bodies = [
         faults.Named(body.name, body.vertices, body.triangles, is_closed(body.triangles)) for body in model.bodies
@@ -104,12 +104,12 @@ def _named(model: str, file: str, found: tuple[Sequence[Body | ModelBody], list[
     names, stem = [body.name for body in bodies], Path(file).stem
     notes += faults.of_names(names, stem)
     result, open_, inverted = [], [], []
-    for body, name in zip(bodies, unique(names), strict=True):
+    for body, name in zip(bodies, unique_names(names), strict=True):
         assert isinstance(body, Body)
         inward = body.closed and faults.volume(body.vertices, body.faces) < 0.0
         inverted += [name] if inward else []
         open_ += [] if body.closed else [name]
-        result.append(of_cad(turned(body) if inward else body, name))
+        result.append(of_cad(with_normals_reversed(body) if inward else body, name))
     notes += faults.of_shells(open_, inverted, "scanned as it is, from both sides")
     unnamed = len(faults.numbered(names, stem))
     return Model(model, tuple(result), tuple(notes), faults.shared_count(names), unnamed)

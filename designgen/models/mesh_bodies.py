@@ -8,7 +8,8 @@ import numpy as np
 
 from designgen.cad import faults
 from designgen.models.mesh_files import Piece
-from designgen.models.model import ModelBody, components, of_mesh, shared_edges, unique
+from designgen.models.mesh_topology import connected_components, count_open_edges, shared_edges
+from designgen.models.model import ModelBody, of_mesh, unique_names
 from processor.model import Floats, InputError, Ints
 
 JOIN_SHARE = 1e-9  # of the model's size: vertices nearer to each other are one
@@ -38,13 +39,14 @@ def bodies_of(path: str, pieces: Sequence[Piece], stem: str) -> tuple[list[Model
     if unnamed > 1:
         notes.append(f"{unnamed} connected parts have no names and are numbered as bodies {names[0]} to {names[-1]}")
     notes += faults.repeated(names)
-    for name, (_, _, faces) in zip(unique(names), found, strict=True):
-        if holes := _open_edges(faces):
+    names = unique_names(names)
+    for name, (_, _, faces) in zip(names, found, strict=True):
+        if open_edges := count_open_edges(faces):
             notes.append(
-                f"{name!r} is not closed ({holes} open edges): it is scanned as it is, from both sides; close its "
+                f"{name!r} is not closed ({open_edges} open edges): it is scanned as it is, from both sides; close its "
                 "holes if it is a solid"
             )
-    return [of_mesh(name, points, faces) for name, (_, points, faces) in zip(unique(names), found, strict=True)], notes
+    return [of_mesh(name, points, faces) for name, (_, points, faces) in zip(names, found, strict=True)], notes
 
 
 def _joined(vertices: Floats, triangles: Ints, reach: float) -> tuple[Floats, Ints]:
@@ -64,15 +66,10 @@ def _compact(vertices: Floats, triangles: Ints) -> tuple[Floats, Ints]:
     return vertices[used], inverse.reshape(triangles.shape).astype(np.int64)
 
 
-def _open_edges(triangles: Ints) -> int:
-    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    return int((np.unique(edges, axis=0, return_counts=True)[1] % 2).sum())
-
-
 def _oriented(vertices: Floats, triangles: Ints, name: str, notes: list[str]) -> list[Ints]:
     """Return the triangles of each connected part with outward normals; a cavity is of the part around it."""
     a, b, ends = shared_edges(triangles)
-    label = components(len(triangles), a, b)
+    label = connected_components(len(triangles), a, b)
     directions = [(triangles[rows] == ends[:, :1]).argmax(axis=1) for rows in (a, b)]
     after = [triangles[rows, (k + 1) % 3] == ends[:, 1] for rows, k in zip((a, b), directions, strict=True)]
     against = after[0] == after[1]  # two triangles that use their edge in one direction have opposite normals
@@ -93,7 +90,7 @@ def _oriented(vertices: Floats, triangles: Ints, name: str, notes: list[str]) ->
         if host >= 0:
             cavities.append((host, part))
             continue
-        inward = volumes[i] < 0.0 and not _open_edges(part)
+        inward = volumes[i] < 0.0 and not count_open_edges(part)
         turned[rows[i]] ^= inward
         result[i] = part[:, ::-1] if inward else part
     for host, part in cavities:
@@ -107,15 +104,14 @@ def _oriented(vertices: Floats, triangles: Ints, name: str, notes: list[str]) ->
 
 def _turned(count: int, a: Ints, b: Ints, against: np.ndarray) -> np.ndarray:
     """Return which triangles (count,) to turn so that all of a part agree with its first."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    from scipy.sparse import coo_matrix, csgraph
 
     # A graph with two nodes for each triangle, as it is and turned; an edge joins the two pairs that agree.
     rows = np.concatenate([a, a + count])
     columns = np.concatenate([np.where(against, b + count, b), np.where(against, b, b + count)])
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), (2 * count, 2 * count))
-    label = connected_components(graph, directed=False)[1]
-    part = components(count, a, b)
+    label = csgraph.connected_components(graph, directed=False)[1]
+    part = connected_components(count, a, b)
     first = np.unique(part, return_index=True)[1]
     result: np.ndarray = label[:count] != label[first][part]
     return result

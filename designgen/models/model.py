@@ -11,6 +11,7 @@ import numpy as np
 from designgen.cad.bodies import Body
 from designgen.cad.face_surfaces import PLANE, surface_of
 from designgen.designs.patch import Surface, Trimmed
+from designgen.models.mesh_topology import connected_components, shared_edges
 from processor.model import DesignBodies, Floats, Ints
 
 SMOOTH_COS = np.cos(1e-2)  # of the angle between two faces at a common edge, up to which they are one smooth surface
@@ -95,26 +96,26 @@ def of_cad(body: Body, name: str) -> ModelBody:
         triangles=body.faces,
         face=body.forms.of_triangle,
         pq=body.forms.corner_uv,
-        face_names=tuple(unique([form.name for form in forms])),
+        face_names=tuple(unique_names([form.name for form in forms])),
         surfaces=surfaces,
         flat=flat,
         smooth=_smooth(body, [None if plane else surface for plane, surface in zip(flat, surfaces, strict=True)]),
     )
 
 
-def turned(body: Body) -> Body:
-    """Return a CAD body with the normals of its triangles in the other direction."""
+def with_normals_reversed(body: Body) -> Body:
+    """Return a CAD body whose triangles are wound the other way, so that their normals are reversed."""
     forms = body.forms and dataclasses.replace(body.forms, corner_uv=body.forms.corner_uv[:, ::-1])
     return dataclasses.replace(body, faces=body.faces[:, ::-1], forms=forms)
 
 
 def of_mesh(name: str, vertices: Floats, triangles: Ints, most_deg: float = 20.0) -> ModelBody:
-    """Return a mesh as a body; triangles that meet at less than ``most_deg`` are one face."""
+    """Return a mesh as a body; triangles whose normals differ by less than ``most_deg`` at their edge are one face."""
     first, second, third = (vertices[triangles[:, i]] for i in range(3))
     normal = _unit(np.cross(second - first, third - first))
     a, b, _ = shared_edges(triangles)
     level = np.einsum("ni,ni->n", normal[a], normal[b]) >= np.cos(np.radians(most_deg))
-    face = components(len(triangles), a[level], b[level])
+    face = connected_components(len(triangles), a[level], b[level])
     count = int(face.max(initial=-1)) + 1
     return ModelBody(
         name=name,
@@ -129,7 +130,7 @@ def of_mesh(name: str, vertices: Floats, triangles: Ints, most_deg: float = 20.0
     )
 
 
-def unique(names: Sequence[str]) -> list[str]:
+def unique_names(names: Sequence[str]) -> list[str]:
     """Return names with a number after each that has been used before: "web", "web (2)"."""
     taken = set(names)
     counts: dict[str, int] = {}
@@ -143,29 +144,6 @@ def unique(names: Sequence[str]) -> list[str]:
         taken.add(said)
         result.append(said)
     return result
-
-
-def shared_edges(triangles: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return the pairs of triangles (k,), (k,) with a common edge, and the ends (k, 2) of the edge."""
-    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    key = edges[:, 0] * (int(triangles.max(initial=0)) + 1) + edges[:, 1]
-    order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(key[order][1:] == key[order][:-1])
-    first, second = order[same], order[same + 1]
-    return first // 3, second // 3, edges[first]
-
-
-def components(count: int, a: Ints, b: Ints) -> Ints:
-    """Return the number (count,) of each item's group, in order of the first items, where pairs a, b are connected."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    label = connected_components(coo_matrix((np.ones(len(a), bool), (a, b)), (count, count)), directed=False)[1]
-    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    numbers: Ints = rank[inverse.reshape(-1)]
-    return numbers
 
 
 def _smooth(body: Body, surfaces: Sequence[Surface | None]) -> tuple[int, ...]:
@@ -182,7 +160,7 @@ def _smooth(body: Body, surfaces: Sequence[Surface | None]) -> tuple[int, ...]:
     distinct, which = np.unique(pairs, axis=0, return_inverse=True)
     sharp = np.bincount(which.reshape(-1), weights=~level, minlength=len(distinct)) > 0
     joined = distinct[~sharp]
-    return tuple(components(len(surfaces), joined[:, 0], joined[:, 1]).tolist())
+    return tuple(connected_components(len(surfaces), joined[:, 0], joined[:, 1]).tolist())
 
 
 def _at_edges(body: Body, surfaces: Sequence[Surface | None], rows: Ints, ends: Ints) -> Floats:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from designgen.low_discrepancy import in_square
 from designgen.models.model import Model
+from designgen.models.surface_samples import sample_surface
 from designgen.randomness import generator
 from designgen.scanning import triangle_tree
 from designgen.scanning.returns import LOWEST_DEG
@@ -33,7 +33,7 @@ DISTANCE_SHARE, NEAREST_MM, FARTHEST_MM = 0.75, 1_000.0, 12_000.0  # distance fr
 ROOM_SHARE, ROOM_MM = 1.5, 600.0  # free distance around a station, in units of the least range
 
 
-def given(path: Path, seed: int) -> dict[str, Floats]:
+def read_stations(path: Path, seed: int) -> dict[str, Floats]:
     """Return the poses T_scene_station of upright scanners at the positions (mm, in the model's frame) of a JSON file.
 
     The file is {"S1": {"position": [x, y, z], "heading_deg": 0.0}, ...}, or a list of such with "id"; without a heading
@@ -74,7 +74,9 @@ def _drawn(name: str, seed: int) -> float:
     return float(generator(seed, f"place {name}").uniform(0.0, 2.0 * np.pi))
 
 
-def placed(model: Model, count: int, distance_mm: float | None, device: Scanner, seed: int) -> dict[str, Floats]:
+def place_stations(
+    model: Model, count: int, distance_mm: float | None, device: Scanner, seed: int
+) -> dict[str, Floats]:
     """Return the poses of ``count`` upright scanners S1, S2, ... of a model, mm.
 
     ``distance_mm``: of the nearer ring from the model's box; None: by the size of the model.
@@ -87,7 +89,7 @@ def placed(model: Model, count: int, distance_mm: float | None, device: Scanner,
         distance_mm = min(max(DISTANCE_SHARE * size, NEAREST_MM, 1.5 * device.min_range_mm), FARTHEST_MM)
     tree = triangle_tree.build(corners)
     ordered = corners[tree.order]
-    points, normals = spread(corners, SAMPLES)
+    points, normals = sample_surface(corners, SAMPLES)
     places = _candidates(low, high, distance_mm, _room(device), points)
     margin = 1e-6 * size
     seen = np.stack([_seen(tree, ordered, place, points, normals, device, margin) for place in places])
@@ -102,19 +104,6 @@ def placed(model: Model, count: int, distance_mm: float | None, device: Scanner,
 
 def _room(device: Scanner) -> float:
     return max(ROOM_SHARE * device.min_range_mm, ROOM_MM)
-
-
-def spread(corners: Floats, count: int) -> tuple[Floats, Floats]:
-    """Return points (n, 3) spread over triangles (f, 3, 3) in proportion to their areas, and unit normals (n, 3)."""
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(across, axis=1)
-    ends = np.cumsum(area)
-    rows = np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1])
-    u, v = in_square(np.arange(count)).T
-    root = np.sqrt(u)[:, None]
-    a, b, c = (corners[rows, i] for i in range(3))
-    points = (1.0 - root) * a + root * ((1.0 - v)[:, None] * b + v[:, None] * c)
-    return points, across[rows] / area[rows, None]
 
 
 def _candidates(low: Floats, high: Floats, distance: float, room: float, points: Floats) -> Floats:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from designgen.cad.faults import distances
+from designgen.models.mesh_topology import edges_of
 from designgen.models.model import ModelBody
 from processor.model import Floats, Ints
 
@@ -34,7 +35,7 @@ def subdivided(body: ModelBody, spacings: Sequence[Spacing]) -> ModelBody:
     """Return a body with a finer net. New vertices lie in the middles of edges, on the surfaces of the faces."""
     vertices, triangles, pq, face = body.vertices, body.triangles, body.pq, body.face
     for _ in range(MOST_ROUNDS):
-        edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        edges = edges_of(triangles)
         # Pairs as numbers, in the same order: rows take ten times as long to sort.
         number, which = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True)
         key, which = np.stack(np.divmod(number, len(vertices)), axis=1), which.reshape(-1, 3)

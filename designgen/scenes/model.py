@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from designgen.designs import arch_bridge, arch_part
-from designgen.models import as_built, loading, station_placement
+from designgen.models import as_built, body_deviations, loading, station_placement
 from designgen.models.model import Model, ModelBody
 from designgen.recipe_files import Recipe, overridden
 from designgen.recipe_params import filled
@@ -78,10 +78,10 @@ def make(
         raise UsageError('scan.mode: a model is scanned from stations; set scan.mode = "rays"')
     if model is None:
         model = _part(section.part, recipe) if section.part else loading.load(Path(section.file), section.units)
-    loading.say(model)
+    loading.log_notes(model)
     params, origin = scanning.params, np.array(scanning.params.origin_mm)
     names = tuple(body.name for body in model.bodies)
-    built = as_built.build(model, as_built.params_of(recipe, names), seed)
+    built = as_built.build(model, body_deviations.params_of(recipe, names), seed)
     poses = _poses(model, recipe, scanning, seed)
     surveyed = survey.survey(_surfaces(built.bodies), names, poses, scanning.device, params, seed)
     scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
@@ -136,6 +136,6 @@ def _poses(model: Model, recipe: Mapping[str, Any], scanning: ByRays, seed: int)
     """Return the stations' poses, given or placed so that most of the surface is seen."""
     given = filled(Params, recipe, "model").stations
     if given:
-        return station_placement.given(Path(given), seed)
+        return station_placement.read_stations(Path(given), seed)
     distance = scanning.params.distance_mm if "distance_mm" in recipe.get("scan", {}) else None
-    return station_placement.placed(model, math.prod(scanning.params.stations), distance, scanning.device, seed)
+    return station_placement.place_stations(model, math.prod(scanning.params.stations), distance, scanning.device, seed)

@@ -16,8 +16,8 @@ from OCP.gp import gp_Pnt
 
 import designgen
 from designgen import __main__, recipe_files
-from designgen.models import as_built, loading, station_placement
-from designgen.models.model import of_mesh, unique
+from designgen.models import as_built, body_deviations, loading, station_placement
+from designgen.models.model import of_mesh, unique_names
 from designgen.scanning import returns, scanner, surfaces, survey
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import make
@@ -118,7 +118,7 @@ def surfaces_of(model):
 def hits_on(model, step_mrad=6.0, stations=4):
     """Places that the middles of whole footprints hit, in the model's frame."""
     found = []
-    for name, T in station_placement.placed(model, stations, None, QUIET, 0).items():
+    for name, T in station_placement.place_stations(model, stations, None, QUIET, 0).items():
         seen = returns.scan_station(
             surfaces_of(model.bodies), T, QUIET, scanner.Params(step_mrad=step_mrad), 1, name, keep_hits=True
         ).returns
@@ -237,7 +237,7 @@ def test_models_in_step_python_and_stl_are_loaded_with_their_size(tmp_path, capl
         np.testing.assert_allclose(np.ptp(vertices, axis=0), [300.0, 200.0, 100.0])
         assert len(triangles) == 12
     with caplog.at_level(logging.WARNING, "designgen"):
-        loading.say(loading.load(stl))
+        loading.log_notes(loading.load(stl))
     assert "names no unit: its numbers are taken as mm" in caplog.text
     assert np.ptp(loading.load(stl, "inch").mesh()[0]) > 25.0 * 300.0 / 2.0
 
@@ -254,17 +254,17 @@ def test_stations_from_a_file_and_placed(tmp_path):
     np.testing.assert_allclose(scene.scans[0].T_project_scan[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
     device = scanner.Scanner(**scanner.preset("phase"))
     model = loading.load((CORNERS, SIDES))
-    few, more, many = (station_placement.placed(model, count, None, device, 1) for count in (2, 3, 4))
+    few, more, many = (station_placement.place_stations(model, count, None, device, 1) for count in (2, 3, 4))
     assert list(more) == ["S1", "S2", "S3"]
     for name, T in few.items():
         np.testing.assert_array_equal(T, more[name])
         np.testing.assert_array_equal(T, many[name])
     path.write_text(json.dumps([{"id": "A", "position": [0, -3000, 500], "heading_deg": 90.0}]))
-    np.testing.assert_allclose(station_placement.given(path, 0)["A"][:3, 3], [0, -3000, 500])
+    np.testing.assert_allclose(station_placement.read_stations(path, 0)["A"][:3, 3], [0, -3000, 500])
     for wrong in ("{}", "[1]", '{"A": {"position": [1, 2]}}', '{"A": {"position": [1, 2, 3], "heading_deg": "x"}}'):
         path.write_text(wrong)
         with pytest.raises(InputError, match=r"places\.json: expected stations as"):
-            station_placement.given(path, 1)
+            station_placement.read_stations(path, 1)
 
 
 def test_placed_stations_see_every_visible_face_of_a_box():
@@ -354,7 +354,9 @@ def test_bodies_as_built_are_where_the_truth_has_them(source):
     if source == "mesh":
         plate = loading.load((plate.bodies[0].vertices, plate.bodies[0].triangles))
     name = plate.bodies[0].name
-    params = as_built.Params(dent_mm=5.0, dent_radius_mm=90.0, dent_at_mm=(100.0, 20.0, 10.0), move_mm=(0.0, 0.0, 7.0))
+    params = body_deviations.Params(
+        dent_mm=5.0, dent_radius_mm=90.0, dent_at_mm=(100.0, 20.0, 10.0), move_mm=(0.0, 0.0, 7.0)
+    )
     built = as_built.build(plate, {name: params}, 0)
     assert built.defects.classes == ("dent", "misalignment")
     np.testing.assert_allclose(built.defects.depth_max_mm, [5.0, 7.0])
@@ -370,19 +372,19 @@ def test_bodies_as_built_are_where_the_truth_has_them(source):
 
 def test_bodies_that_bend_turn_and_are_left_out():
     beam = loading.load(cq.Workplane().box(2000, 100, 40))
-    built = as_built.build(beam, {"model-1": as_built.Params(bend_mm=6.0, bend_along=(0.0, 0.0, 1.0))}, 0)
+    built = as_built.build(beam, {"model-1": body_deviations.Params(bend_mm=6.0, bend_along=(0.0, 0.0, 1.0))}, 0)
     hits = hits_on(dataclasses.replace(beam, bodies=built.bodies))
     top = hits[(np.abs(hits[:, 1]) < 40.0) & (np.abs(hits[:, 0]) < 900.0) & (hits[:, 2] > 15.0)]
     assert len(top) > 100
     np.testing.assert_allclose(top[:, 2], 20.0 + 6.0 * np.cos(np.pi * top[:, 0] / 2000.0), atol=0.01)
-    turned = as_built.build(beam, {"model-1": as_built.Params(turn_deg=(0.0, 0.0, 90.0))}, 0).bodies[0]
+    turned = as_built.build(beam, {"model-1": body_deviations.Params(turn_deg=(0.0, 0.0, 90.0))}, 0).bodies[0]
     np.testing.assert_allclose(np.ptp(turned.vertices, axis=0), [100.0, 2000.0, 40.0], atol=1e-9)
-    gone = as_built.build(beam, {"model-1": as_built.Params(missing=True)}, 0)
+    gone = as_built.build(beam, {"model-1": body_deviations.Params(missing=True)}, 0)
     assert gone.bodies == (None,)
     assert gone.defects.classes == ("missing-part",)
     assert gone.defects.volume_mm3[0] == pytest.approx(2000.0 * 100.0 * 40.0)
     with pytest.raises(UsageError, match="no body of this name; there are 1, as model-1"):
-        as_built.params_of({"asbuilt": {"modell-1": {}}}, ["model-1"])
+        body_deviations.params_of({"asbuilt": {"modell-1": {}}}, ["model-1"])
 
 
 def test_a_recipe_names_a_model_beside_it(tmp_path):
@@ -445,11 +447,11 @@ def test_bodies_of_one_name_are_numbered(tmp_path, caplog):
     model = loading.load(tmp_path / "two.stl", "mm")
     assert [body.name for body in model.bodies] == ["rib", "rib (2)"]
     with caplog.at_level(logging.WARNING, "designgen"):
-        loading.say(model)
+        loading.log_notes(model)
     assert caplog.messages == [
         "two: 2 bodies share 1 name(s), as 'rib' 2 times: they are numbered, 'rib', 'rib (2)', ..."
     ]
-    assert unique(["web", "web", "web (2)", "web"]) == ["web", "web (3)", "web (2)", "web (4)"]
+    assert unique_names(["web", "web", "web (2)", "web"]) == ["web", "web (3)", "web (2)", "web (4)"]
 
 
 @pytest.mark.parametrize(
