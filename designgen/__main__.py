@@ -8,7 +8,7 @@ import traceback
 import click
 
 from designgen.cli import commands
-from processor.jobs import garbage
+from processor.jobs import garbage_collection
 from processor.model import InputError, UsageError
 from processor.plain_text import printable
 
@@ -17,7 +17,7 @@ WRONG_USAGE, BAD_INPUT = 2, 3
 
 def main() -> None:
     """Run the command line; exit with 0 when done, 2 on wrong usage, 3 on bad input or an error of the file system."""
-    garbage.search_rarely()
+    garbage_collection.collect_rarely()
     try:
         sys.exit(commands(standalone_mode=False))
     except click.exceptions.Exit as end:

@@ -11,7 +11,7 @@ import click
 
 from processor.cli.common import log_line, print_error_line
 from processor.cli.main import commands
-from processor.jobs import garbage
+from processor.jobs import garbage_collection
 from processor.model import InputError, UsageError
 
 WRONG_USAGE, BAD_INPUT = 2, 3
@@ -20,7 +20,7 @@ OUTPUT_CUT = 141  # as a shell reports SIGPIPE
 
 def main() -> None:
     """Run the command line; the exit codes are those of processor --help."""
-    garbage.search_rarely()
+    garbage_collection.collect_rarely()
     try:
         _main()
     except SystemExit as end:

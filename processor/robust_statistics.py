@@ -9,6 +9,7 @@ from scipy.special import stdtrit
 from processor.model import NORMAL_95, Floats
 
 MAD_TO_SD = 1.4826  # standard deviation of normal values over their median absolute deviation
+CHI2_MEDIAN = 0.4549  # median of the chi-square distribution with one degree of freedom
 TUKEY = 4.685  # standard deviations at which Tukey's biweight is 0: 95 % efficient for normal errors
 
 

@@ -17,7 +17,7 @@ from numba.core.caching import FunctionCache
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
-from processor.jobs import garbage
+from processor.jobs import garbage_collection
 from tests.support.files.scan_folders import BOX, arch_design, surface, write_ply, write_xyz
 from tests.support.pages import browser
 from tests.support.solids import cad_in_process
@@ -63,7 +63,7 @@ def pytest_collection_finish():
     """Leave out of further collections what is loaded now and stays: libraries of half a million objects."""
     gc.collect()
     gc.freeze()
-    garbage.search_rarely()
+    garbage_collection.collect_rarely()
 
 
 @pytest.fixture

@@ -1,0 +1,1 @@
+"""Statistics that several steps share: tests, variances, averages over hypotheses, and assumed errors of scanners."""

@@ -15,8 +15,8 @@ from typing import Protocol
 import numpy as np
 from scipy.special import chdtri
 
-from processor.adjustment.control_points import LEAST_POINTS
 from processor.geometry.linalg_small import cholesky, solve
+from processor.geometry.rigid import LEAST_POINTS
 from processor.model import Bools, Floats, Ints
 
 # --- Tests of the misfits of one adjustment
@@ -182,7 +182,9 @@ def leave_out(point: Ints, predicted: Prediction) -> Snooped:
         numbers = np.unique(point[accepted])
         without = [n for n in numbers.tolist() if _worst(point, accepted & (point != n), predicted)[1] <= 1.0]
         remain = len(numbers) - 1
-        if not (remain >= LEAST_POINTS and (len(without) == 1 or (not without and remain > LEAST_POINTS))):
+        # One point alone explains the contradiction, or several are wrong and enough points remain to find the next.
+        is_decided = len(without) == 1 or (not without and remain > LEAST_POINTS)
+        if remain < LEAST_POINTS or not is_decided:
             return Snooped(accepted, tuple(rejected), worst, off, remain == 0)
         number = without[0] if without else worst
         size = _ratio(predicted, accepted & (point == number), accepted & (point != number))[1]

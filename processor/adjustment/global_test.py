@@ -15,7 +15,7 @@ from scipy.special import fdtrc
 from processor.model import Floats
 
 BY_CHANCE = 1e-3  # probability that noise as modelled makes any test of one result fail
-PREDICTIVE = 2.0
+PREDICTIVE = 2.0  # largest probability, over a, that a posterior predictive probability falls below a (Meng)
 
 
 def tail(square: Floats | float, dof: float, noise_dof: float) -> Floats:

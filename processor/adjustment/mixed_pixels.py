@@ -1,12 +1,14 @@
-"""Points beside something nearer to the scanner: their beams may have hit both, and state a range between the two.
+"""Mixed pixels: points whose beams may also have hit a nearer surface.
 
 A beam has a width of some millimetres. At the outline of a body it meets the body and what is behind, and a phase
 scanner states a mean of the two ranges (mixed pixel, Hebert and Krotkov 1992). Such points lie in the air or, where the
-body behind is near, a little before its surface. They are recognised by their neighbours in direction: one of them is
-of another face, and lies before that of the point; or it is of the same face or of none, and lies so far before the
-point itself that no slope of steel would bring it there: on top of a bulge all neighbours lie before the face, but none
-does that. Steel of another face needs no slope: where a face is seen at a glance, an edge far before it lies within the
-slope of a dent.
+body behind is near, a little before its surface. A point is marked because of a neighbour in direction that lies:
+
+- on another face, and more than HIGHER_MM before the face of the point. Its slope is not tested: on a face at grazing
+  incidence, an edge far before it lies within the slope of a dent;
+- on no face, and before the face of the point by more than HIGHER_MM and SLOPE times the distance along the face;
+- on the same face, and before the point itself by more than these two together: on top of a bulge all neighbours lie
+  before the face, but the slope is less.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -47,10 +49,10 @@ class _Others(NamedTuple):
     step: float
 
 
-def beside(
+def mark(
     points: Floats, scanner: Floats, normals: Floats, height: Floats, face: Ints, every: tuple[Floats, Ints]
 ) -> Bools:
-    """Mark the points (n, 3) seen from a scanner (3,) that have something before their face beside them.
+    """Mark the points (n, 3), mm, seen from a scanner (3,), whose beams may also have hit a nearer surface.
 
     ``normals`` (n, 3) are of the points' faces, ``height`` (n,) is how far the points lie above these, mm,
     and ``face`` (n,) numbers the faces. ``every`` are all points (m, 3) of the scanner, of which these are some, and
@@ -63,7 +65,7 @@ def beside(
     if not (len(points) and step > 0.0):
         return marked
     nearest = float(np.quantile(np.linalg.norm(points - scanner, axis=1), NEAREST_SHARE))
-    key, columns = _keys(directions, WINDOW_STEPS * step + half_beam(nearest) / nearest)
+    key, columns = _keys(directions, WINDOW_STEPS * step + half_beam_width(nearest) / nearest)
     order = np.argsort(key, kind="stable")
     others = _Others(np.ascontiguousarray(everything[order]), faces[order], key[order], columns, step)
     points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
@@ -75,7 +77,7 @@ def beside(
     return marked
 
 
-def half_beam(away: T) -> T:
+def half_beam_width(away: T) -> T:
     """Return half the width of a beam, mm, at distances from its scanner, mm."""
     return HALF_EXIT_MM + HALF_DIVERGENCE * away
 

@@ -2,8 +2,8 @@
 
 Departures are normal about zero with a covariance that depends on their size. Every size is a hypothesis; the estimate
 is the average over the hypotheses, weighted by their marginal likelihood (Rasmussen and Williams, Gaussian Processes
-for Machine Learning, 2006, eqs. 2.23, 2.24 and 2.30). Departures of the size of the noise are so drawn to zero, large
-ones are taken as measured, and the covariance includes that the size is not known.
+for Machine Learning, 2006, eqs. 2.23, 2.24 and 2.30). Departures of the size of the noise are shrunk to zero, large
+ones are kept as measured, and the covariance includes the uncertainty of the size.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def estimate(
 
 def log_likelihoods(value: Floats, noise: Floats, priors: Sequence[Floats], known: Bools | None = None) -> Floats:
     """Logarithm (h,) of the marginal likelihood of values (n,) under each prior, a covariance (k, k)."""
-    at = _all_or(known, priors)
+    at = _known_or_all(known, priors)
     logs = []
     for prior in priors:
         factor = cho_factor(prior[np.ix_(at, at)] + noise, lower=True)
@@ -72,7 +72,7 @@ def average(
     value: Floats, noise: Floats, priors: Sequence[Floats], logs: Floats, known: Bools | None = None
 ) -> Estimate:
     """Average over hypotheses; ``logs`` (h,) are :func:`log_likelihoods` plus the logarithm of the prior weights."""
-    at = _all_or(known, priors)
+    at = _known_or_all(known, priors)
     share = np.exp(logs - logs.max())
     log_evidence = float(logs.max() + np.log(share.sum()))
     share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
@@ -163,5 +163,5 @@ def smooth(chainage: Floats, value: Floats, variance: Floats, pose: Floats) -> E
     return estimate(value[known], np.diag(variance[known]), hypotheses, known)
 
 
-def _all_or(known: Bools | None, priors: Sequence[Floats]) -> Bools:
+def _known_or_all(known: Bools | None, priors: Sequence[Floats]) -> Bools:
     return np.ones(len(priors[0]), bool) if known is None else known

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from processor.adjustment import scanner_class
+from processor.adjustment import scanner_class_errors
 from processor.defects.observations import Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
@@ -28,7 +28,7 @@ PRIOR = np.array([2e-4] * 3 + [3.0] * 3 + [2.0])
 LEAST_PRIOR = np.array([1e-6] * 3 + [0.02] * 3 + [0.02])
 # Of the class of scanners, whose error of a view is a translation and a range offset, with the degrees of freedom that
 # an uncertainty by a factor of two amounts to: two or three stations hardly show their own standard deviations.
-CLASS = np.array([0.0] * 3 + [np.sqrt(0.5) * scanner_class.VIEW_MM] * 4)
+CLASS = np.array([0.0] * 3 + [np.sqrt(0.5) * scanner_class_errors.VIEW_SD_MM] * 4)
 CLASS_FREE = np.array([0.0] * 3 + [4.0] * 4)
 GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of parameters with one variance component each
 WHOLE_PRIOR = np.array([5e-3] * 3 + [50.0] * 3)
@@ -136,7 +136,7 @@ def align(
     residual = blocks.mean - np.einsum("nk,nk->n", J, movements[blocks.station])
     whole, covariance, gain = _whole(residual[used], J[used, :6], component[used])
     if stations.unnamed:
-        covariance = covariance + scanner_class.pose_covariance(points[used] - start.centre)
+        covariance = covariance + scanner_class_errors.pose_covariance(points[used] - start.centre)
     response = _response(gain, J[used], blocks.station[used], len(stations.names))
     return replace(start, whole=whole, covariance=covariance, fitted=True, response=response)
 

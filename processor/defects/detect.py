@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from processor import scene_cloud
-from processor.adjustment import scanner_class
+from processor.adjustment import scanner_class_errors
 from processor.defects import (
     alignment,
     component_shapes,
@@ -120,7 +120,9 @@ def _of_names(bodies: DesignBodies | None) -> Iterator[Reason]:
 def _of_views(search: to_result.Search) -> Iterator[Reason]:
     """Yield what is taken of the errors of views that are not named."""
     if search.points.observed.stations.unnamed and search.alignment.fitted:
-        yield reason("defects.views-by-class", shift=scanner_class.SHIFT_MM, offset=scanner_class.OFFSET_MM)
+        yield reason(
+            "defects.views-by-class", shift=scanner_class_errors.SHIFT_SD_MM, offset=scanner_class_errors.OFFSET_SD_MM
+        )
     if search.field.views > 0.0:
         yield reason("defects.views-differ", sd=search.field.views)
 

@@ -139,7 +139,7 @@ def _of_scan(
             rows = station_of[on] == k
             of_face = surface.normals[facet[on[rows]]], deviation[on[rows]], smooth[on[rows]]
             every = points[station_of == k], smooth[station_of == k]
-            mixed[rows] |= mixed_pixels.beside(points[on[rows]], positions[k], *of_face, every)
+            mixed[rows] |= mixed_pixels.mark(points[on[rows]], positions[k], *of_face, every)
     return chart, layout(surface.charts, chart, places), station_of[on], deviation[on], mixed
 
 
@@ -186,7 +186,8 @@ def _at_outline(surface: DesignSurface, facet: Ints, points: Floats, scanners: F
     across /= np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None]
     off = np.abs(np.einsum("ni,ni->n", arm, across))
     is_convex = np.einsum("ni,ni->n", arm, surface.normals[facet[rows]]) > 0.0
-    marked[rows] = is_convex & (off > charts.radius[chart] - mixed_pixels.half_beam(np.linalg.norm(sight, axis=1)))
+    half_width = mixed_pixels.half_beam_width(np.linalg.norm(sight, axis=1))
+    marked[rows] = is_convex & (off > charts.radius[chart] - half_width)
     return marked
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from processor import diagnostics
-from processor.adjustment.groups import group_means
+from processor.adjustment.point_groups import group_means
 from processor.deviation import cloud, result_fields
 from processor.deviation import measure as deviation_measure
 from processor.deviation.cloud import ScanCloud

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.adjustment import scanner_class
+from processor.adjustment import scanner_class_errors
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.geometry import rigid
@@ -34,8 +34,8 @@ def mean_sd(scan: ScanCloud, T: Floats, core: Samples, moved: Movement, covarian
     noise = overlap * float((moved.sd[known] ** 2 / moved.count[known]).sum()) / len(known) ** 2
     J = np.hstack([np.cross(points, normals), normals]).mean(axis=0)
     shares = _shares(scan, T, points, normals)
-    own = scanner_class.VIEW_MM**2 * float((shares**2).sum())
-    common = scanner_class.OFFSET_MM**2 * float(shares.sum()) ** 2
+    own = scanner_class_errors.VIEW_SD_MM**2 * float((shares**2).sum())
+    common = scanner_class_errors.OFFSET_SD_MM**2 * float(shares.sum()) ** 2
     return float(np.sqrt(noise + J @ covariance @ J + own + common))
 
 

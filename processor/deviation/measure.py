@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.adjustment import opposite_sides, scanner_class
+from processor.adjustment import scanner_class_errors, unnamed_views
 from processor.deviation import mean_uncertainty, result_fields, stable_fit, surface_movement
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
@@ -93,7 +93,7 @@ def _doubted(result: Result, placement: Placement) -> Result:
         result.on_surface_share
     ):
         first, status = reason("deviation.no-fit", sigma=result.sigma), Status.WEAK if status is Status.OK else status
-    elif status is Status.OK and error > max(UNCERTAIN * result.sigma, scanner_class.SHIFT_MM) and not given:
+    elif status is Status.OK and error > max(UNCERTAIN * result.sigma, scanner_class_errors.SHIFT_SD_MM) and not given:
         first, status = reason("deviation.registration-uncertain", sd=error, sigma=result.sigma), Status.WEAK
     else:
         return result
@@ -118,7 +118,7 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
         # Each scanned point counts at ``overlap`` core points.
         variance = stable_fit.overlap(diameter, core_spacing) * moved.sd**2 / np.maximum(moved.count, 1)
         side = CELL_DIAMETERS * diameter
-        views = opposite_sides.view_sd(core.points, core.normals, moved.along, variance, side)
+        views = unnamed_views.view_sd(core.points, core.normals, moved.along, variance, side)
     return Measured(
         core=core, moved=moved, shared=np.hypot(shared, views), views=views, diameter=diameter, spacing=core_spacing,
         depth=depth, on_surface=share,
@@ -270,7 +270,7 @@ def _uncertainty(
     """Return the covariance (6, 6) of the pose, and the standard deviation of the mean, with what scans share."""
     core = measured.core
     covariance = fits.of(params.fit).covariance if fits.determined else placed.covariance
-    common = scanner_class.pose_covariance(core.points)
+    common = scanner_class_errors.pose_covariance(core.points)
     registered = placed.registration is not Registration.AS_GIVEN
     covariance = covariance + common if registered else covariance
     of_pose = covariance if registered and np.isfinite(covariance).all() else common
@@ -281,7 +281,7 @@ def _uncertainty(
 def _of_views(scan: ScanCloud, placed: Placed, measured: Measured) -> Iterator[Reason]:
     """Yield what is taken of the errors that all views have in common, where these placed the scan."""
     if placed.registration is not Registration.AS_GIVEN:
-        sizes = {"shift": scanner_class.SHIFT_MM, "offset": scanner_class.OFFSET_MM}
+        sizes = {"shift": scanner_class_errors.SHIFT_SD_MM, "offset": scanner_class_errors.OFFSET_SD_MM}
         if scan.unnamed_views:
             yield reason("deviation.views-by-class", **sizes)
         else:

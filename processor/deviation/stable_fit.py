@@ -15,14 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.adjustment.opposite_sides import CHI2_MEDIAN
 from processor.deviation.local_translation import Movement
 from processor.distinct_rows import distinct
 from processor.geometry import rigid
 from processor.geometry.m3c2 import Z95
 from processor.geometry.mesh_distance import Samples
 from processor.model import Floats, Ints
-from processor.robust_statistics import TUKEY, biweight
+from processor.robust_statistics import CHI2_MEDIAN, TUKEY, biweight
 
 BLOCKS_ALONG = 40.0  # blocks along the extent of the structure
 BLOCK_DIAMETERS = 3.0  # least side of a block

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.adjustment.groups import pieces
-from processor.adjustment.opposite_sides import SURE
+from processor.adjustment.point_groups import pieces
+from processor.adjustment.unnamed_views import SIGNIFICANT
 from processor.deviation.local_translation import Movement
 from processor.geometry.mesh_distance import Samples
 from processor.large_arrays import put_aside, release
@@ -121,4 +121,4 @@ def _between(cell: Ints, mean: Floats, noise: Floats, enough: npt.NDArray[np.boo
     scatter = np.bincount(cell, (mean - middle[cell]) ** 2) / np.maximum(count - 1, 1)
     surplus = (scatter - np.bincount(cell, noise) / np.maximum(count, 1))[several]
     variance = float(surplus.mean())
-    return variance if variance > SURE * float(surplus.std()) / np.sqrt(len(surplus)) else 0.0
+    return variance if variance > SIGNIFICANT * float(surplus.std()) / np.sqrt(len(surplus)) else 0.0

@@ -6,6 +6,8 @@ import numpy as np
 
 from processor.model import Floats
 
+LEAST_POINTS = 3  # that determine a rigid motion
+
 
 def transform(rotation: Floats, translation: Floats) -> Floats:
     """Build T (4, 4) from a rotation (3, 3) and a translation (3,)."""
@@ -87,6 +89,15 @@ def about_origin(covariance: Floats, position: Floats) -> Floats:
     return at_origin
 
 
+def moved_about_own_origins(T: Floats, motion: Floats) -> Floats:
+    """Rotate poses T (k, 4, 4) about their own origins and shift them, by ``motion`` (k, 6), rad and mm."""
+    moved: Floats = T.copy()
+    for s in np.flatnonzero(np.abs(motion).sum(axis=1) > 0.0):
+        moved[s, :3, :3] = rotation_from_vector(motion[s, :3]) @ T[s, :3, :3]
+        moved[s, :3, 3] = T[s, :3, 3] + motion[s, 3:]
+    return moved
+
+
 def cross_matrix(v: Floats) -> Floats:
     """Matrix (3, 3) of the cross product of ``v`` (3,) with another vector."""
     x, y, z = v
@@ -110,6 +121,17 @@ def fit(source: Floats, target: Floats) -> Floats:
     proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])
     R = Vt.T @ proper @ U.T
     return transform(R, centre_target - R @ centre_source)
+
+
+def points_determine_motion(places: Floats, least_share: float, least_mm: float = 0.0) -> bool:
+    """Whether points (n, 3), mm, determine a rigid motion: LEAST_POINTS of them or more, not nearly on a line.
+
+    Their second principal extent is more than a share of the first, and ``least_mm`` or more.
+    """
+    if len(places) < LEAST_POINTS:
+        return False
+    extent = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+    return bool(extent[1] > least_share * extent[0] and extent[1] >= least_mm)
 
 
 def axes_across(direction: Floats) -> Floats:

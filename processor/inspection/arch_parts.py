@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from processor.adjustment import scanner_class
+from processor.adjustment import scanner_class_errors
 from processor.geometry.polyline import Polyline
 from processor.inspection import characteristic, part_geometry
 from processor.inspection.characteristic import Characteristic
@@ -184,7 +184,7 @@ def _of_ends(values: Sequence[Value], design: Floats, shape: Any, needed: Sequen
             yield characteristic.absent(value.id, value.quantity, nominal, why)
         else:
             deviation = float(value.of(as_built)) - nominal
-            variance = covariance[row, row] + scanner_class.scale_variance(nominal)
+            variance = covariance[row, row] + scanner_class_errors.scale_variance(nominal)
             yield characteristic.normal(value.id, value.quantity, nominal, deviation, variance)
 
 
@@ -201,7 +201,7 @@ def _foot_length(part: DesignPart, design: Floats, shape: Any, joint: int) -> tu
     departure = shape.ends[joint, 4] - design[joint, 4]
     rows = slice(24 * joint + 12, 24 * joint + 15)
     variance = float(along @ shape.ends_covariance[rows, rows] @ along) + shape.outer_variance
-    return nominal, float(departure @ along) + shape.outer, variance + scanner_class.scale_variance(nominal)
+    return nominal, float(departure @ along) + shape.outer, variance + scanner_class_errors.scale_variance(nominal)
 
 
 def _axis(part: DesignPart, shape: Any) -> tuple[AxisDepartures, list[Characteristic]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.adjustment import extremes
+from processor.adjustment import maximum_interval
 from processor.inspection.result import Characteristics, Quantity
 from processor.limits import judging, standards
 from processor.limits.judging import Comparison, Measured
@@ -58,7 +58,7 @@ def greatest(quantity: Quantity, departure: Floats, covariance: Floats) -> Chara
     inner = slice(1, -1)
     sign = np.where(departure < 0.0, -1.0, 1.0)
     of_sizes = covariance * np.outer(sign, sign)
-    size, low, high = extremes.of_correlated(np.abs(departure)[inner], of_sizes[inner, inner], folded=True)
+    size, low, high = maximum_interval.of_correlated(np.abs(departure)[inner], of_sizes[inner, inner], folded=True)
     at = 1 + int(np.argmax(np.abs(departure)[inner]))
     return Characteristic(str(quantity), quantity, 0.0, deviation=sign[at] * size, low=low, high=high, size=True)
 

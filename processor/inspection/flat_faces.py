@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from processor import scene_cloud
-from processor.adjustment import groups, scanner_class
+from processor.adjustment import point_groups, scanner_class_errors
 from processor.distinct_rows import distinct, distinct_points
 from processor.geometry import mesh_bodies, mesh_distance
 from processor.inspection import design_holes
@@ -117,7 +117,7 @@ def observed(design: StructureDesign, result: Any) -> Observed | None:
     shared = core.std1 / np.sqrt(np.maximum(core.n1, 1))
     if any(reason.code == "deviation.views-by-class" for reason in result.reasons):
         # Two opposite faces: their sum has twice the offset of all ranges.
-        by_class = scanner_class.SHIFT_MM**2 + 2.0 * scanner_class.OFFSET_MM**2
+        by_class = scanner_class_errors.SHIFT_SD_MM**2 + 2.0 * scanner_class_errors.OFFSET_SD_MM**2
         shared = np.sqrt(shared**2 + by_class)
     return Observed(
         places=core.points,
@@ -212,11 +212,11 @@ def _pieces(seen: Observed, normals: Floats, rows: Ints) -> Pieces:
     rows = rows[np.isfinite(seen.deviation[rows])]
     if not len(rows):
         return Pieces(np.empty((0, 3)), np.empty(0), np.empty(0), 0.0)
-    piece = groups.pieces(seen.places[rows], normals[seen.facet[rows]], seen.side)
+    piece = point_groups.pieces(seen.places[rows], normals[seen.facet[rows]], seen.side)
     count = np.bincount(piece)
     enough = count >= FEWEST_POINTS
     return Pieces(
-        places=groups.group_means(seen.places[rows], piece)[enough],
+        places=point_groups.group_means(seen.places[rows], piece)[enough],
         value=(np.bincount(piece, seen.deviation[rows]) / count)[enough],
         noise=(np.bincount(piece, seen.noise[rows]) / count**2)[enough] + FLOOR_MM**2,
         shared=float(np.median(seen.shared[rows])),

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor import scene_cloud
-from processor.adjustment import scanner_class, thermal
-from processor.adjustment.groups import joined_numbers
+from processor.adjustment import scanner_class_errors, thermal
+from processor.adjustment.point_groups import joined_numbers
 from processor.geometry import rigid
 from processor.inspection import bore_fit, characteristic
 from processor.inspection.bore_fit import BorePoints, Fitted
@@ -137,7 +137,7 @@ def _designed(group: Group) -> Floats:
 def _referred(fitted: Fitted, places: Floats, radius: Floats, temperature_C: float) -> Fitted:
     """Bring holes to the reference temperature, and add the error of the scanner's scale to their covariance."""
     size = np.column_stack([places - places.mean(axis=0), radius])
-    expansion, by_scale = thermal.expansion(temperature_C), scanner_class.SCALE * size.ravel()
+    expansion, by_scale = thermal.expansion(temperature_C), scanner_class_errors.SCALE_SD * size.ravel()
     return fitted._replace(
         departure=(size + fitted.departure) / expansion - size,
         covariance=fitted.covariance / expansion**2 + np.outer(by_scale, by_scale),

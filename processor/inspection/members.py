@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.adjustment import scanner_class, thermal
+from processor.adjustment import scanner_class_errors, thermal
 from processor.components.frame_members import SEEN
 from processor.inspection import characteristic
 from processor.inspection.characteristic import Characteristic
@@ -89,7 +89,7 @@ def _length(
     of_balls = float(sum(along @ balls.covariance[k][:3, :3] @ along for k in at))
     deviation = actual / thermal.expansion(scene.temperature_C) - nominal
     length = characteristic.normal(
-        "length", Quantity.LENGTH, nominal, deviation, of_balls + scanner_class.scale_variance(actual)
+        "length", Quantity.LENGTH, nominal, deviation, of_balls + scanner_class_errors.scale_variance(actual)
     )
     flagged = [k for k in at if str(balls.flag[k]) != CERTAIN]
     why = tuple(reason("inspect.node-flagged", node=int(balls.ids[k]), flag=balls.flag[k]) for k in flagged)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from processor import scene_cloud
-from processor.adjustment import extremes, scanner_class, thermal
+from processor.adjustment import maximum_interval, scanner_class_errors, thermal
 from processor.geometry import rigid
 from processor.inspection import characteristic, flat_faces, holes
 from processor.inspection.characteristic import Characteristic
@@ -205,7 +205,7 @@ def _sizes(
             continue
         (back, of_back), (front, of_front) = (_term(side, 0) for side in pair if side is not None)
         deviation = (axis.size + back + front) / expansion - axis.size
-        variance = of_back + of_front + scanner_class.scale_variance(axis.size)
+        variance = of_back + of_front + scanner_class_errors.scale_variance(axis.size)
         yield characteristic.normal(str(name), name, axis.size, deviation, variance)
 
 
@@ -339,8 +339,8 @@ def _peak_to_valley(id_: str, side: Side) -> Characteristic:
     # Of several pieces that are about equal the noise picks the extremes: its effect is found by repetition.
     repeated = shrunk + gain * sd * np.random.default_rng(SEED).standard_normal((REPETITIONS, len(sd)))
     by_noise = float(np.ptp(repeated, axis=1).mean() - np.ptp(shrunk))
-    _, high_low, high_high = extremes.of_independent(rest, sd)
-    _, low_low, low_high = extremes.of_independent(-rest, sd)
+    _, high_low, high_high = maximum_interval.of_independent(rest, sd)
+    _, low_low, low_high = maximum_interval.of_independent(-rest, sd)
     return Characteristic(
         id_,
         Quantity.FLATNESS,

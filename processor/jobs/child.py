@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from enum import Enum
 from queue import SimpleQueue
 
-from processor.jobs import garbage
+from processor.jobs import garbage_collection
 
 # The parent samples the memory used and kills; the kernel's limit on allocations stops what grows between two samples.
 ALLOCATED_PER_USED, ALLOCATED_BEYOND_MB = 2, 1024
@@ -105,7 +105,7 @@ def _receive(messages: SimpleQueue[bytes]) -> None:
 
 def main() -> None:
     """Run the module or script of the command line."""
-    garbage.search_rarely()
+    garbage_collection.collect_rarely()
     guard(int(sys.argv[1]))
     sys.argv[:] = sys.argv[2:]
     if sys.argv[0].endswith(".py"):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from processor import scene_cloud
-from processor.adjustment.groups import group_means
+from processor.adjustment.point_groups import group_means
 from processor.deviation import baseline, cloud, step
 from processor.deviation.params import Params
 from processor.deviation.result import Result

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from processor import diagnostics
-from processor.jobs import making, process
+from processor.jobs import process
 from processor.jobs.child import Loss, Lost
 from processor.jobs.process import Cause
+from processor.jobs.scene_command import scene_command
 from processor.papers import bolt_balls, defects, deviation, preassembly, stitching
 from processor.papers.data_sets import DataSet, Measured
 from processor.writers import step_clouds
@@ -62,7 +63,7 @@ def make_and_measure(
     started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="set-", dir=scratch, ignore_cleanup_errors=True) as made:
         scene = Path(made) / "scene.h5"
-        words = making.words(data_set.recipe, scene, data_set.seed, data_set.settings)
+        words = scene_command(data_set.recipe, scene, data_set.seed, data_set.settings)
         ended = process.run(
             (*process.GUARDED, "0", *words), env=process.environment(1), timeout_s=MAKING_S, stopped=stopped
         )

@@ -22,7 +22,7 @@ from processor.space_frame.members.members import Measured
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.result import Flag
-from processor.space_frame.spheres import assessment, ball_or_none, fit_all, hidden_or_missing
+from processor.space_frame.spheres import assessment, ball_presence, fit_all, hidden_or_missing
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
 from processor.space_frame.stations.control_points import ControlPoints
@@ -173,7 +173,7 @@ def blind(source: Source, params: members.Params) -> Start | None:
         return None
     rows = np.full(len(graph.nodes), -1, np.int64)
     start = _measured(source, graph.nodes, graph.pairs, rows, params)
-    start = replace(start, balls=ball_or_none.nodes_with_ball(source, start.measured, start.positions, params.threads))
+    start = replace(start, balls=ball_presence.nodes_with_ball(source, start.measured, start.positions, params.threads))
     others = int((~start.balls & members.meeting(start.measured, params.largest_scatter_mm)).sum())
     return replace(start, reasons=(reason("spheres.other-joints", joints=others),)) if others else start
 

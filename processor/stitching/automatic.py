@@ -20,12 +20,12 @@ from processor.stitching.fine import (
     correspondences,
     edge_constraints,
     jackknife,
-    pair_checks,
+    pairs_and_loops,
 )
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.contradictions import Contradiction
 from processor.stitching.fine.correspondences import Blocks, CellTable
-from processor.stitching.fine.pair_checks import Pair
+from processor.stitching.fine.pairs_and_loops import Pair
 from processor.stitching.params import Params
 from processor.stitching.planes import scan_planes
 from processor.stitching.planes.scan_planes import Cloud
@@ -170,7 +170,9 @@ def _largest_shift(T: Floats, S: Floats) -> float:
 def _measure_pairs(blocks: Blocks, solution: Solution) -> list[Pair]:
     """Register all pairs that share enough pieces, each by itself."""
     placed = np.flatnonzero(np.isfinite(solution.T).all(axis=(1, 2)))
-    pairs = [pair_checks.measure(blocks, solution, a, b) for a, b in itertools.combinations(placed.tolist(), 2)]
+    pairs = [
+        pairs_and_loops.register_pair(blocks, solution, a, b) for a, b in itertools.combinations(placed.tolist(), 2)
+    ]
     return [pair for pair in pairs if pair is not None]
 
 

@@ -19,7 +19,7 @@ from processor.model import NORMAL_95, Floats, Picks, Reason, Scan, reason
 from processor.robust_statistics import student_factor
 from processor.stitching import pose_covariance
 from processor.stitching.common_points import LEAST_HEIGHT, LEAST_POINTS, units_slip
-from processor.stitching.fine.pair_checks import Pair
+from processor.stitching.fine.pairs_and_loops import Pair
 
 LEAST_SD_MM = 1e-6  # of picks without any error, as in tests
 BY_CHANCE = 1e-3  # probability that the picks of any pair of a network scatter so much

@@ -11,9 +11,9 @@ from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, InputError, Ints, Reason, Scan, Scene, Status, reason
 from processor.stitching import pose_covariance
 from processor.stitching.coarse.network import AMBIGUOUS
-from processor.stitching.fine import control_points, pair_checks
+from processor.stitching.fine import control_points, pairs_and_loops
 from processor.stitching.fine.contradictions import Contradiction
-from processor.stitching.fine.pair_checks import Pair
+from processor.stitching.fine.pairs_and_loops import Pair
 from processor.stitching.params import Params
 from processor.stitching.result import NAN, Closures, ControlPoints, Pairs, ProjectFrame, Result, Scans
 
@@ -198,14 +198,14 @@ def _assess(
     """Return the status of a scan with a pose, and the first reason that it is not ok."""
     if network.contrary[s] > CONTRARY:
         return Status.WEAK, reason("stitch.free-space", percent=100.0 * network.contrary[s])
-    if network.contradictions and network.contradictions[s].counts:
+    if network.contradictions and network.contradictions[s].is_significant:
         other = network.contradictions[s]
         return Status.WEAK, reason(
             "stitch.faces-contradict",
             agree=other.agree,
             shift_mm=other.shift_mm,
             turn_mrad=other.turn_mrad,
-            contradict=other.hold,
+            contradict=other.oppose,
         )
     if network.by_control and (contradiction := network.by_control[s]):
         return Status.WEAK, contradiction
@@ -253,7 +253,7 @@ def _pairs(names: Sequence[str], network: Network) -> Pairs:
 def _closures(names: Sequence[str], network: Network) -> Closures:
     used = [pair for pair, is_used in zip(network.pairs, network.used, strict=True) if is_used]
     weights = np.array([1.0 / max(float(np.trace(pair.covariance[3:6, 3:6])), 1e-12) for pair in used])
-    loops = pair_checks.loops(used, weights, len(names)) if used else []
+    loops = pairs_and_loops.loops(used, weights, len(names)) if used else []
     return Closures(
         loop=tuple(tuple(names[i] for i in loop.rows) for loop in loops),
         mm=np.array([loop.mm for loop in loops]),

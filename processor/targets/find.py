@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from processor.adjustment import scanner_class
+from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
 from processor.model import Control, Floats, Ints, Reason, Scan, Scene, TargetKind, Targets, reason
 from processor.space_frame.result import Balls
@@ -16,7 +16,6 @@ from processor.targets.checkerboard import Checkerboard
 
 LEAST_SD_MM = 0.05  # of a target's place: what a fit does not see, as the sheet's flatness
 # Of the ranges of a view: it moves all of its targets along their rays, and no fit of one target shows it.
-VIEW_MM = scanner_class.VIEW_MM
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +33,7 @@ class _Found:
     @property
     def with_view_sd(self) -> float:
         """Standard deviation of the place, with the error that all ranges of its view share."""
-        return float(np.hypot(max(self.sd, LEAST_SD_MM), VIEW_MM))
+        return float(np.hypot(max(self.sd, LEAST_SD_MM), scanner_class_errors.VIEW_SD_MM))
 
 
 def with_targets(scene: Scene) -> Scene:

@@ -12,10 +12,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from processor.jobs import making, process, runner
+from processor.jobs import process, runner
 from processor.jobs.child import Lost
 from processor.jobs.exit_codes import WITH_RESULTS
 from processor.jobs.process import Cause, Ended
+from processor.jobs.scene_command import scene_command
 from processor.results.file_names import RESULTS_JSON
 from processor.validation.cells import Cell, Origin, Outcome
 from processor.writers import toml
@@ -90,7 +91,7 @@ def _scene(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) ->
         recipe = folder / f"{recipe}.{'py' if foreign else 'toml'}"
         recipe.write_text(spec["recipe_text"], "utf-8")
     scene = folder / ("scene" if foreign else "scene.h5")
-    made = command(*making.words(recipe, scene, spec["seed"], spec["settings"], foreign))
+    made = command(*scene_command(recipe, scene, spec["seed"], spec["settings"], foreign))
     if made.cause is not Cause.EXIT or made.code != 0:
         raise _FailedError(_reason(spec["recipe"] if foreign else "designgen make", made))
     return scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.adjustment import scanner_class
+from processor.adjustment import scanner_class_errors
 from processor.defects import alignment, deviation_field, regions, scan_statistic, surface_charts
 from processor.defects.observations import Pairs, Stations
 
@@ -137,7 +137,7 @@ def test_the_pose_of_unnamed_views_has_the_covariance_of_the_class():
     arm = 0.5 * np.linalg.norm([3000.0, 400.0, 500.0])
     np.testing.assert_allclose(np.diag(added)[:3], (0.2 / arm) ** 2, rtol=0.06)
     np.testing.assert_allclose(np.diag(added)[3:], 0.08, rtol=0.06)
-    assert unnamed.pose_covariance()[3, 3] > scanner_class.SHIFT_MM**2
+    assert unnamed.pose_covariance()[3, 3] > scanner_class_errors.SHIFT_SD_MM**2
 
 
 def test_a_cell_that_a_far_station_sees_alone_has_its_noise():

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from processor.adjustment.groups import group_means
+from processor.adjustment.point_groups import group_means
 from processor.deviation import cloud as deviation_cloud
 from processor.deviation import local_translation as moving
 from processor.geometry import m3c2, mesh_distance, neighbors, rigid

@@ -11,7 +11,7 @@ import trimesh
 from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline
-from processor.adjustment import scanner_class
+from processor.adjustment import scanner_class_errors
 from processor.defects import design_pose
 from processor.defects.params import Params as DefectParams
 from processor.deviation import baseline, mean_uncertainty
@@ -457,7 +457,7 @@ def test_interval_of_the_mean_includes_common_and_separate_range_errors():
     ranges = rng.normal(0.0, 0.5, (4000, 6)) + rng.normal(0.0, 0.2, (4000, 1))
     share = np.bincount(station, cosine[station, rows], 6) / len(points)
     assert np.std(ranges @ share) == pytest.approx(sd, rel=0.05)
-    pose = scanner_class.pose_covariance(points)
+    pose = scanner_class_errors.pose_covariance(points)
     assert mean_uncertainty.mean_sd(scan, np.eye(4), core, moved, pose, 1.0) == pytest.approx(sd, rel=0.02), (
         "all around"
     )

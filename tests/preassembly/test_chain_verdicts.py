@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from processor.adjustment import extremes
+from processor.adjustment import maximum_interval
 from processor.limits import standards
 from processor.model import ArchDesign, DesignPart, Tolerance, reason
 from processor.preassembly import to_result
@@ -75,7 +75,7 @@ def test_edges_are_judged_along_their_length_by_limits_of_the_span():
     # Where many can be the extreme, the band covers all of them.
     low, high = [], []
     for _ in range(400):
-        _, bottom, top = extremes.of_independent(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
+        _, bottom, top = maximum_interval.of_independent(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
         low.append(bottom)
         high.append(top)
     assert np.mean((np.array(low) <= 0.0) & (np.array(high) >= 0.0)) >= 0.95

@@ -11,7 +11,7 @@ from designgen import recipe_files
 from designgen.designs import arch_bridge, arch_mesh
 from designgen.scanning import sampler
 from designgen.scenes.make import make
-from processor.adjustment import scanner_class
+from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
 from processor.geometry.neighbors import by_cell
 from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene, reason
@@ -188,7 +188,7 @@ def test_parts_of_one_shape_are_distinguished_by_their_mark(asked, came, monkeyp
     monkeypatch.setattr(attitude, "find", lambda *_: attitude.Attitude(T, T, "ok"))
     found = measured(design, came, scan)
     # The plates of a foot's only end show nothing of what views differ by.
-    by_class = (reason("preassemble.viewpoints-by-class", sd=scanner_class.VIEW_MM),)
+    by_class = (reason("preassemble.viewpoints-by-class", sd=scanner_class_errors.VIEW_SD_MM),)
     assert (found.status, found.reasons) == ("ok", by_class if came in (0, 4) else ())
 
 

@@ -16,7 +16,7 @@ from processor.geometry.sphere import (
 )
 from processor.model import Scan, Scene
 from processor.space_frame import step as space_frame_step
-from processor.space_frame.spheres.sphere_search import LEAST_POINTS, find_balls
+from processor.space_frame.spheres.sphere_detection import LEAST_POINTS, find_balls
 from tests.support.clouds import street_clouds
 
 NOWHERE = np.zeros((4, 4))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from processor.adjustment import extremes
+from processor.adjustment import maximum_interval
 from processor.geometry import rigid
 from processor.model import KEY_POINTS, NORMAL_95, ArchDesign, Floats, Reason, Status, Word, reason
 from processor.preassembly import topology
@@ -203,7 +203,7 @@ def mean_max_ci95(vectors: Floats, variance: Floats) -> tuple[float, float]:
         return float("nan"), float("nan")
     variance = np.maximum(variance[known], 0.0)
     size, sd = np.linalg.norm(vectors[known], axis=1), np.sqrt(variance.max(axis=1))
-    largest, low, high = extremes.of_independent(size, sd, vectors.shape[1])
+    largest, low, high = maximum_interval.of_independent(size, sd, vectors.shape[1])
     return NORMAL_95 * float(np.sqrt(variance.sum(axis=1).mean())), max(high - largest, largest - low)
 
 

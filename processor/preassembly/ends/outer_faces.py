@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.adjustment import kriging, patches
+from processor.adjustment import kriging
+from processor.adjustment.patch_means import patch_means
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.model import Bools, Floats, Ints, Reason, reason
@@ -190,13 +191,13 @@ def _with_waves(coefficients: Floats, used: UsedPoints, at: Floats, face: EndFac
     """Estimate a face with its waves by points ``at`` (n, 2), along and across it from its middle."""
     half = face.half
     spacing = np.sqrt(2.0 * half * ZONE_MM / len(at))
-    found = patches.patches(at, used.residual, max(PATCH_MM, PATCH_SPACINGS * float(spacing)))
+    found = patch_means(at, used.residual, max(PATCH_MM, PATCH_SPACINGS * float(spacing)))
     terms = PLAIN if face.narrow else list(range(FACE))
     trend = basis(found.centre[:, 0], found.centre[:, 1] / half)[:, terms]
-    noise = max(found.noise, FLOOR_MM**2)
+    noise = max(found.noise_variance, FLOOR_MM**2)
     dof = len(used.residual) - len(found.mean)
     means = kriging.Means(
-        place=found.centre, value=found.mean, variance=noise / found.number, trend=trend, dof=dof,
+        place=found.centre, value=found.mean, variance=noise / found.points, trend=trend, dof=dof,
         trend_mean=-coefficients[terms], trend_sd=REACH_MM,
     )  # fmt: skip
     nodes = np.stack([np.zeros(len(NODES)), half * np.array(NODES)], axis=1)

@@ -20,8 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from processor.adjustment import global_test, patches
-from processor.adjustment.scanner_class import VIEW_MM
+from processor.adjustment import global_test
+from processor.adjustment.patch_means import patch_numbers
+from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd, student_factor
 
@@ -62,7 +63,7 @@ class Variances(NamedTuple):
 
     def or_of_class(self) -> Variances:
         """Return the variances with the levels of the scanner's class where the plates do not show them."""
-        return self if self.known else self._replace(level=VIEW_MM**2, ring=VIEW_MM**2)
+        return self if self.known else self._replace(level=VIEW_SD_MM**2, ring=VIEW_SD_MM**2)
 
 
 NONE = Variances()
@@ -74,7 +75,7 @@ def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickn
     The two sides are compared patch by patch: ``at`` (n, 2) is the place of the points along and across the plate, mm,
     ``trend`` (n, 3) are the terms there, and ``inner`` (n,) marks the points behind the outer side.
     """
-    patch = patches.cubes(at, PATCH_MM)
+    patch = patch_numbers(at, PATCH_MM)
     count = int(patch.max(initial=-1)) + 1
     difference, variance = np.zeros(count), np.zeros(count)
     enough = np.ones(count, bool)
@@ -184,7 +185,7 @@ def _with_class(between: float, squares: float, by_noise: float, dof: int) -> fl
     95 % confidence limit of what the plates show: a network may be better than its class.
     """
     pairs = dof / OF_PAIR
-    both = (between * pairs + VIEW_MM**2 * OF_CLASS) / (pairs + OF_CLASS)
+    both = (between * pairs + VIEW_SD_MM**2 * OF_CLASS) / (pairs + OF_CLASS)
     return min(both, _estimate(squares, by_noise, dof) * pairs / float(chdtri(pairs, 0.95)))
 
 

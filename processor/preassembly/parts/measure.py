@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import variance_components
-from processor.adjustment.groups import joined_numbers
+from processor.adjustment.point_groups import joined_numbers
 from processor.geometry import box_girder, rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.geometry.neighbors import by_cell, thinned

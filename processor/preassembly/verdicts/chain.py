@@ -1,7 +1,7 @@
 """Verdict on the whole chain: span, and bottom edges along, sideways and in height.
 
 As for joints, a pass and a fail are sure with 95 %. A limit that applies all along the bridge is compared with the
-extremes over all chainages, see :func:`processor.adjustment.extremes.of_independent`.
+extremes over all chainages, see :func:`processor.adjustment.maximum_interval.of_independent`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import ndtr
 
-from processor.adjustment import extremes
+from processor.adjustment import maximum_interval
 from processor.limits import standards as limits_of
 from processor.limits.guard_band import guard_band
 from processor.model import NORMAL_95, Floats, Limit, Reason, Tolerance, Verdict, reason, worst
@@ -103,13 +103,13 @@ def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, doub
         return Comparison(value=nan, ci95=nan, low=low, high=high, verdict=Verdict.INDETERMINATE, probability=nan)
     sides = []
     for sign, bound in ((-1.0, -low), (1.0, high)):
-        value, bottom, top = extremes.of_independent(sign * values, sd)
+        value, bottom, top = maximum_interval.of_independent(sign * values, sd)
         sides.append((bound - value, sign * value, top - value, guard_band((bottom, top), -math.inf, bound)))
     verdict = worst([side[3] for side in sides])
     _, value, half_width, _ = min(sides, key=lambda side: side[0])
     probability = nan
     if len(values) == 1 and not doubtful:
-        spread = max(float(sd[0]), extremes.EXACT_MM)
+        spread = max(float(sd[0]), maximum_interval.EXACT_MM)
         probability = float(ndtr((high - value) / spread) - ndtr((low - value) / spread))
     verdict = Verdict.INDETERMINATE if doubtful else verdict
     return Comparison(value=value, ci95=half_width, low=low, high=high, verdict=verdict, probability=probability)

@@ -3,7 +3,7 @@
 All are in the joint's axes, x along the bridge, y left, z up. A gap is right part minus left part: along x positive is
 open and negative an overlap. Plates meet across their faces: bottom and top (P5, P7) along z, the webs (P6, P8) along
 y, the corners (P1..P4) along both. A shift along a plate is no misalignment of it. Least and greatest of several gaps
-have intervals by :mod:`processor.adjustment.extremes`.
+have intervals by :mod:`processor.adjustment.maximum_interval`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.adjustment import extremes
+from processor.adjustment import maximum_interval
 from processor.geometry import rigid
 from processor.model import KEY_POINTS, NORMAL_95, Checked, Floats, Ints, Rows, Word, column, names, words
 
@@ -153,8 +153,8 @@ def _row(name: JointQuantity, value: float, unit: str, half_width: float) -> _Ro
 def _groove_rows(gaps: Floats, covariance: Floats) -> list[_Row]:
     x, spread = gaps[:, 0], covariance[np.ix_(_ALONG, _ALONG)]
     mean_sd = float(np.sqrt(max(spread.mean(), 0.0)))
-    negative, below, above = extremes.of_correlated(-x, spread)
-    greatest, low, high = extremes.of_correlated(x, spread)
+    negative, below, above = maximum_interval.of_correlated(-x, spread)
+    greatest, low, high = maximum_interval.of_correlated(x, spread)
     return [
         _row(JointQuantity.GROOVE_GAP_MEAN, float(x.mean()), "mm", NORMAL_95 * mean_sd),
         _Row(JointQuantity.GROOVE_GAP_LEAST, -negative, "mm", -above, -below),
@@ -165,7 +165,7 @@ def _groove_rows(gaps: Floats, covariance: Floats) -> list[_Row]:
 def _misalignment_row(gaps: Floats, covariance: Floats) -> _Row:
     across, spread = gaps.ravel()[_ROWS], covariance[np.ix_(_ROWS, _ROWS)]
     sign = np.where(across < 0.0, -1.0, 1.0)
-    greatest, low, high = extremes.of_correlated(sign * across, spread * np.outer(sign, sign), folded=True)
+    greatest, low, high = maximum_interval.of_correlated(sign * across, spread * np.outer(sign, sign), folded=True)
     return _Row(JointQuantity.MISALIGNMENT, greatest, "mm", low, high)
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.adjustment.extremes import draws
+from processor.adjustment import normal_draws
 from processor.limits import standards as limits_of
 from processor.limits.guard_band import guard_band
 from processor.limits.judging import clause_of
@@ -134,7 +134,9 @@ def judge(measures: Measures, tolerance: Tolerance) -> Conformity:
     if not limits:
         standard = tolerance.standard or LimitOrigin.PROJECT
         return Conformity(reasons=(reason("preassemble.no-joint-limit", standard=standard),))
-    drawn = draws(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3) if measures.known else None
+    drawn = None
+    if measures.known:
+        drawn = normal_draws.antithetic(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3)
     comparisons = []
     all_kept: Bools = np.ones(0 if drawn is None else len(drawn), bool)
     complete = drawn is not None

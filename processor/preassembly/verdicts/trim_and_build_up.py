@@ -26,7 +26,7 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import linprog
 
-from processor.adjustment.extremes import SEED, draws
+from processor.adjustment import normal_draws
 from processor.limits import standards as limits_of
 from processor.model import (
     KEY_POINTS,
@@ -179,7 +179,7 @@ def propose(
     if not measures.known:
         return _no_proposal(reason("preassemble.gaps-unknown"))
     limits = {limit.measure: limit for limit in reversed(joint_limits(tolerance))}
-    drawn = draws(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3)
+    drawn = normal_draws.antithetic(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3)
 
     def conforming(limit: Limit, gaps: Floats) -> Bools | None:
         bounds = allowed(limit, tolerance)
@@ -253,7 +253,7 @@ def _cut_errors(points: Floats, sd_mm: float, count: int) -> Floats:
     """Errors (count, 8) of cuts: planes with equal errors of depth and both tilts, together sd_mm at a corner."""
     half = np.abs(points).max(axis=0)
     shape = np.column_stack([np.ones(8), points[:, 1] / half[1], points[:, 2] / half[2]]) / np.sqrt(3.0)
-    normal = np.random.default_rng([SEED, 1]).standard_normal((count // 2, 3))
+    normal = np.random.default_rng([normal_draws.SEED, 1]).standard_normal((count // 2, 3))
     errors: Floats = sd_mm * np.concatenate([normal, -normal]) @ shape.T
     return errors
 

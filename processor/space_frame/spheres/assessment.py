@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from processor.adjustment.scanner_class import SHIFT_MM
+from processor.adjustment.scanner_class_errors import SHIFT_SD_MM
 from processor.geometry.sphere import BANDS, SECTORS
 from processor.limits import standards
 from processor.model import NORMAL_95, Bools, Floats, Reason, Tolerance, reason
@@ -237,7 +237,7 @@ def _messages(context: FitContext) -> tuple[Reason, ...]:
                 "spheres.unnamed-views",
                 sd=context.views.sd,
                 common=context.views.common_sd,
-                shift=SHIFT_MM,
+                shift=SHIFT_SD_MM,
                 offset=context.views.offset_sd,
             )
         )

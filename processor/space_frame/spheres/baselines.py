@@ -27,7 +27,7 @@ from processor.space_frame.spheres import sleeve_radii
 from processor.space_frame.spheres.fit_all import RayFitParams
 from processor.space_frame.spheres.gauss_newton import VISIBLE, SphereMask, select
 from processor.space_frame.spheres.records import Spheres
-from processor.space_frame.spheres.single_fits import Row, as_result, assessed, generator, missing
+from processor.space_frame.spheres.single_fit_results import Row, as_result, assessed, generator, missing
 
 MARGIN_MM = 8.0  # on both sides of a sphere's surface: about what the ray fit uses with 2 mm of noise
 SLEEVES_MM = 26.0  # beyond a sphere: sleeves are measured there

@@ -17,8 +17,8 @@ from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.points.sphere_crops import Crops, gather
 from processor.space_frame.spheres import assessment, node_tiles, noise_model, sleeve_radii
+from processor.space_frame.spheres.crop_rays import with_rays
 from processor.space_frame.spheres.gauss_newton import CUT_SD, LEAST_COSINE
-from processor.space_frame.spheres.rays import with_rays
 from processor.space_frame.spheres.records import (
     AMBIGUOUS,
     CropsWithRays,
@@ -146,12 +146,13 @@ def fit_crops(
         offset = noise_model.radius_offset(
             fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
         )
+    views = None
+    if not scanners_known:
+        views = view_errors(problem.crops, residuals.weights, fits, priors, nodes.positions, offset[0])
     context = assessment.FitContext(
         catalogue=catalogue,
         scanners_known=scanners_known,
-        views=None
-        if scanners_known
-        else view_errors(problem.crops, residuals.weights, fits, priors, nodes.positions, offset[0]),
+        views=views,
         noise=setting.noise,
         radius_sd=setting.radius_sd,
         station_sd=setting.station_sd if station_covariance is None else NAN,

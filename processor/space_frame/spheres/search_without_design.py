@@ -11,18 +11,18 @@ from processor.model import Status, Tolerance, reason
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Flag, Result
-from processor.space_frame.spheres import sphere_search
-from processor.space_frame.spheres.assessment import LARGEST_SCALE
-from processor.space_frame.spheres.single_fits import Row, as_result, assessed, generator, missing
+from processor.space_frame.spheres import sphere_detection
+from processor.space_frame.spheres.assessment import DOWN, LARGEST_SCALE
+from processor.space_frame.spheres.single_fit_results import Row, as_result, assessed, generator, missing
 
 
 def search(cloud: MergedCloud, params: Params) -> Result:
     """Search a cloud for spheres that stand out of it by themselves."""
     radius = None if np.isnan(params.radius_mm) else params.radius_mm
-    least = max(params.min_points, sphere_search.LEAST_POINTS)
+    least = max(params.min_points, sphere_detection.LEAST_POINTS)
     # fixed: the result must not depend on the seed
     fixed = generator(replace(params, seed=0), "search")
-    candidates = sphere_search.find_balls(cloud.points, fixed, params.max_balls, least, radius, cloud.scanner)
+    candidates = sphere_detection.find_balls(cloud.points, fixed, params.max_balls, least, radius, cloud.scanner)
     if not candidates:
         return Result(Status.FAILED, params.method, (reason("spheres.no-ball", points=len(cloud.points)),))
     rows = [_searched(id_, candidate, cloud, params) for id_, candidate in enumerate(candidates)]
@@ -42,7 +42,7 @@ def search(cloud: MergedCloud, params: Params) -> Result:
     return _with_bounds(result, rows) if params.method == "ray" else result
 
 
-def _searched(id_: int, candidate: sphere_search.Ball, cloud: MergedCloud, params: Params) -> Row:
+def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, params: Params) -> Row:
     on = cloud.points[candidate.fit.inliers]
     sphere: Sphere | None = candidate.fit.sphere
     if params.method == "least-squares":
@@ -50,7 +50,7 @@ def _searched(id_: int, candidate: sphere_search.Ball, cloud: MergedCloud, param
     if sphere is None:
         return missing(id_, NAN, len(on), reason("spheres.no-sphere"))
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
-    times = candidate.fit.scale / sphere_search.flat_noise(cloud.points, sphere.radius)
+    times = candidate.fit.scale / sphere_detection.flat_noise(cloud.points, sphere.radius)
     if times > LARGEST_SCALE:
         row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, reason("spheres.rough", times=times)))
     if params.method == "least-squares":
@@ -64,9 +64,8 @@ def _searched(id_: int, candidate: sphere_search.Ball, cloud: MergedCloud, param
 def _with_bounds(result: Result, rows: list[Row]) -> Result:
     """Add the Cramér-Rao bounds of each sphere, and the efficiencies."""
     balls, bounds = result.balls, np.array([row.bound for row in rows])
-    down = np.array([0.0, 0.0, 1.0, -1.0])
     variance, least = (np.einsum("kii->ki", C) for C in (balls.covariance, bounds))
-    least_lowest = np.sqrt(np.einsum("i,kij,j->k", down, bounds, down))
+    least_lowest = np.sqrt(np.einsum("i,kij,j->k", DOWN, bounds, DOWN))
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = np.sqrt(least[:, :3].sum(axis=1) / variance[:, :3].sum(axis=1))
         efficiency = np.stack([centre, np.sqrt(least[:, 3] / variance[:, 3]), least_lowest / balls.lowest_sd], axis=1)

@@ -1,6 +1,6 @@
-"""Errors that the points of one view have in common, where a merged cloud does not name its views.
+"""Uncertainty of spheres by errors that the points of one view share, where a merged cloud does not name its views.
 
-They displace surfaces by a smooth field (:mod:`processor.space_frame.spheres.displacement_field`), whose size the
+They displace surfaces by a smooth field (:mod:`processor.space_frame.spheres.view_error_field`), whose size the
 residuals of all balls show. A shift of all views together, and an offset of all their ranges, look like places and
 radii: they are stated by the scanner's class. If radii are off their sizes on the mean, this may be an offset of
 ranges, which moves surfaces that are seen from below, or a wide beam, which does not; both are taken to be equally
@@ -15,19 +15,19 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.spatial.distance import cdist
 
-from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
+from processor.adjustment.scanner_class_errors import OFFSET_SD_MM, SHIFT_SD_MM
 from processor.geometry.sphere import sphere_cells
 from processor.model import NORMAL_95, Floats, Ints
 from processor.space_frame.members.records import Members
-from processor.space_frame.spheres.displacement_field import (
+from processor.space_frame.spheres.records import CropsWithRays, Fits, Priors, ViewErrors
+from processor.space_frame.spheres.view_error_field import (
     BallResiduals,
     ViewField,
     correlation,
     directions,
-    field_of,
+    estimate_field,
     modes,
 )
-from processor.space_frame.spheres.records import CropsWithRays, Fits, Priors, ViewErrors
 
 LEAST_POINTS = 30
 LEAST_CELLS = 8
@@ -67,7 +67,7 @@ def view_errors(
             seen[fit.cells] += fit.counts
     rows = [k for k, fit in found.items() if len(fit.cells) >= LEAST_CELLS and fit.counts.sum() >= LEAST_POINTS]
     sampled = _neighbours(rows, places)
-    field = field_of([_residuals(found[k], places[k]) for k in sampled])
+    field = estimate_field([_residuals(found[k], places[k]) for k in sampled])
     cosines = _mean_cosines(seen)
     offset_sd, beam_sd = _offset_or_beam(list(found.values()), cosines, radius_offset, field.variance)
     shared, own = _of_spheres(found, field, cosines, places, offset_sd, beam_sd)
@@ -90,7 +90,7 @@ def of_tubes(views: ViewErrors, members: Members) -> Floats:
     J = np.column_stack([across, np.ones(sectors)])
     factor = correlation(across @ across.T)
     normals, cosines = directions(), _mean_cosines(views.seen)
-    covariance = np.tile(np.diag([SHIFT_MM**2, SHIFT_MM**2, 0.0]), (count, 1, 1))
+    covariance = np.tile(np.diag([SHIFT_SD_MM**2, SHIFT_SD_MM**2, 0.0]), (count, 1, 1))
     for m, points in enumerate(members.around):
         weighted = (J * points[:, None]).T
         gain = np.linalg.pinv(weighted @ J, rcond=1e-6, hermitian=True) @ weighted
@@ -123,10 +123,10 @@ def _offset_or_beam(fits: list[_Fit], cosines: Floats, radius_offset: float, var
     by the scanner's class and the variance of the mean of the views. The rest is attributed to the width of the beam.
     """
     change = float(np.mean([fit.gain[3] @ cosines[fit.cells] for fit in fits])) if fits else 0.0
-    limit = NORMAL_95 * float(np.hypot(OFFSET_MM, np.sqrt(variance)))
+    limit = NORMAL_95 * float(np.hypot(OFFSET_SD_MM, np.sqrt(variance)))
     offset = radius_offset / change if abs(radius_offset) < limit * abs(change) else limit
     explained = 0.5 * (offset * change) ** 2
-    return float(np.hypot(OFFSET_MM, np.sqrt(0.5) * offset)), float(np.sqrt(max(radius_offset**2 - explained, 0.0)))
+    return float(np.hypot(OFFSET_SD_MM, np.sqrt(0.5) * offset)), float(np.sqrt(max(radius_offset**2 - explained, 0.0)))
 
 
 # --- spheres ---------------------------------------------------------------------------------------------------------
@@ -196,7 +196,7 @@ def _of_spheres(
     count, knots = at_knots.shape
     known = 5
     shared, own = np.zeros((count, 4, known + factor.shape[1] * knots)), np.zeros((count, 4, 4))
-    shared[:, :3, :3] = SHIFT_MM * np.eye(3)
+    shared[:, :3, :3] = SHIFT_SD_MM * np.eye(3)
     own_share = np.maximum(1.0 - np.sum(at_knots**2, axis=1), 0.0)
     for k, fit in found.items():
         change = np.sqrt(field.variance) * fit.gain @ factor[fit.cells]

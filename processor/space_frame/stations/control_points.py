@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from processor.adjustment import control_points, data_snooping
+from processor.adjustment import data_snooping
+from processor.adjustment.sighting_covariance import sighting_covariance
 from processor.geometry import rigid
 from processor.geometry.linalg_small import cholesky, product, solve
 from processor.model import Bools, Checked, Floats, Ints, Reason, column, names, reason
@@ -54,7 +55,7 @@ class ControlPoints(Checked):
     def hold_all(self) -> bool:
         """Whether they alone determine the pose of the whole cloud: three of them, not on one line."""
         targets = self.target[np.unique(self.points, return_index=True)[1]]
-        return control_points.determine_motion(targets, OFF_LINE)
+        return rigid.points_determine_motion(targets, OFF_LINE)
 
     def name_of(self, number: int) -> str:
         """Name of the target with a number."""
@@ -88,7 +89,7 @@ class ControlPoints(Checked):
     def covariance(self) -> Floats:
         """Covariance (3 c, 3 c) of target minus sighting, without the stations' errors."""
         target_sd = self.target_sd if len(self.target_sd) else np.zeros(len(self.ids))
-        return control_points.covariance(self.points, target_sd, self.sd)
+        return sighting_covariance(self.points, target_sd, self.sd)
 
     def added(self, H: Floats, g: Floats, x: Floats, places: Floats) -> tuple[Floats, Floats]:
         """Return the normal equations H (7 s, 7 s), g (7 s,) at x with those of the sightings added."""

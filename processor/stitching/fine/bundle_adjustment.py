@@ -16,24 +16,23 @@ import numpy.typing as npt
 from numba import njit
 from scipy.optimize import brentq
 
-from processor.adjustment.scanner_class import SCALE, VIEW_MM
+from processor.adjustment.scanner_class_errors import SCALE_SD, VIEW_SD_MM
 from processor.geometry import rigid
 from processor.model import Floats, Ints
-from processor.stitching.fine.correspondences import Blocks
+from processor.stitching.fine.correspondences import FACE_END, KINDS, ON_PIECE, Blocks
 from processor.stitching.planes import extraction, hashing
 from processor.stitching.planes.extraction import Planes
 
-HUBER = 2.5
-DROPPED = 6.0  # standard deviations of a scan's misfit on a piece
-OUTLIER_WEIGHT = 1e-6
-ASIDE, ROUNDS = 1e-3, 8  # a weight below which a block counts as an outlier; rounds of reweighting at fixed poses
+HUBER_SIGMAS = 2.5  # misfit of a scan on a piece, from which on its weight decreases
+REJECTION_SIGMAS = 6.0  # misfit from which on a scan's points on a piece are outliers
+REJECTED_WEIGHT, LEAST_INLIER_WEIGHT = 1e-6, 1e-3
+REWEIGHTINGS = 8  # at fixed poses
 PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # weak priors on the poses: undetermined components stay as they are
-MEDIAN = 0.6745  # of |z|, z normal
-KINDS = 2
+MEDIAN_OF_ABS_Z = 0.6745  # z standard normal
 COLUMNS = 9  # unknowns of a block: the pose of its scan, the scan's range errors (offset, scale), and its face's
 LEAST_FACE_MM, MOST_FACE_MM = 1e-3, 10.0  # standard deviation of the range errors of faces: where none show, at most
-EVEN, WIDE_SIGMAS = 3, 0.3  # first iterations with almost equal weights of all pieces: tau by the noise of a point
-LEAST_REAL = 0.01  # least share of the information in a direction that is taken as real
+EQUAL_ITERATIONS, INITIAL_TAU_SIGMAS = 3, 0.3  # first iterations weight pieces almost equally: tau, by point noise
+LEAST_GENUINE_SHARE = 0.01  # of the information in a direction: least that is taken as not spurious
 LEAST_BLOCKS = 10  # to estimate tau from
 STILL_MM = 1e-4  # largest shift of a pose at convergence
 
@@ -88,25 +87,25 @@ def solve(
         none = np.empty(0)
         return Solution(
             T=T, covariance=covariance, offset=none, tau=tuple(common.tolist()), weight=none, ranges=ranges,
-            ranges_sd=np.full(k, VIEW_MM),
+            ranges_sd=np.full(k, VIEW_SD_MM),
         )  # fmt: skip
     weight = np.ones(len(blocks.piece))
     initial = _initial_tau(blocks) if robust and tau is None else np.zeros(KINDS + 1)
     for iteration in range(iterations):
-        least = initial if iteration < EVEN else np.zeros(KINDS + 1)
+        least = initial if iteration < EQUAL_ITERATIONS else np.zeros(KINDS + 1)
         equations = _linearize(blocks, T, ranges, np.maximum(common, least), weight)
         if iteration and tau is None:
             common[:KINDS] = _estimate_tau(blocks, equations.offset, equations.variance, common)
             common[KINDS] = _estimate_face_sd(equations, unknowns, k, ranges)
-        if iteration == EVEN and initial.any():
+        if iteration == EQUAL_ITERATIONS and initial.any():
             weight = _robust_weights(blocks, _with_slack(equations, slack_mm))
             continue
         change = _newton_step(equations, unknowns, ranges, common[KINDS])
         step, ranges = change[: 6 * k].reshape(k, 6), ranges + change[6 * k :]
-        T = _moved_by(T, step)
+        T = rigid.moved_about_own_origins(T, step)
         if robust:
             weight = _robust_weights(blocks, _with_slack(equations, slack_mm))
-        if iteration > EVEN and np.abs(step[:, 3:]).max(initial=0.0) < STILL_MM:
+        if iteration > EQUAL_ITERATIONS and np.abs(step[:, 3:]).max(initial=0.0) < STILL_MM:
             break
     equations = _linearize(blocks, T, ranges, common, weight)
     at = np.ix_(unknowns, unknowns)
@@ -124,12 +123,12 @@ def weights_at(blocks: Blocks, solution: Solution) -> Floats:
     weight, tau = np.ones(len(blocks.piece)), np.array(solution.tau)
     k = len(solution.T)
     ranges = np.concatenate([solution.ranges[: 2 * k], np.zeros(blocks.faces)])
-    for _ in range(ROUNDS):
+    for _ in range(REWEIGHTINGS):
         weight = _robust_weights(blocks, _linearize(blocks, solution.T, ranges, tau, weight).z)
     return weight
 
 
-def without(
+def solve_without(
     blocks: Blocks, solution: Solution, reference: int, out: npt.NDArray[np.bool_], almost_none: float
 ) -> tuple[Floats, Floats]:
     """Return step (6k,) and covariance (6k, 6k) of the poses if blocks ``out`` (b,) had the weight ``almost_none``.
@@ -354,7 +353,7 @@ def _newton_step(equations: _Equations, unknowns: Ints, ranges: Floats, face_mm:
 def _prior(ranges: int, k: int, face_mm: float) -> Floats:
     """Return the information of the priors: weak ones of k poses; range errors of scans by their class, of faces."""
     of_poses = np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k)
-    of_scans = np.repeat([VIEW_MM**-2, SCALE**-2], k)
+    of_scans = np.repeat([VIEW_SD_MM**-2, SCALE_SD**-2], k)
     of_faces = np.full(ranges - 2 * k, max(face_mm, LEAST_FACE_MM) ** -2)
     return np.diag(np.concatenate([of_poses, of_scans, of_faces]))
 
@@ -394,22 +393,12 @@ def _estimate_face_sd(equations: _Equations, unknowns: Ints, k: int, ranges: Flo
     return float(np.sqrt(brentq(slope, 0.0, MOST_FACE_MM**2)))
 
 
-def _moved_by(T: Floats, step: Floats) -> Floats:
-    """Rotate poses about their own origins and shift them by ``step`` (k, 6)."""
-    poses: Floats = T.copy()
-    for s in np.flatnonzero(np.abs(step).sum(axis=1) > 0.0):
-        R = rigid.rotation_from_vector(step[s, :3])
-        poses[s, :3, :3] = R @ T[s, :3, :3]
-        poses[s, :3, 3] = T[s, :3, 3] + step[s, 3:]
-    return poses
-
-
 def _sandwich(N: Floats, spurious: Floats) -> Floats:
     """Return the covariance of an estimate whose normal matrix N is spurious in part: the larger, the more of it is."""
     L = np.linalg.cholesky(N)
     S = np.linalg.solve(L, np.linalg.solve(L, spurious).T)
     share, V = np.linalg.eigh(0.5 * (S + S.T))
-    half = np.linalg.solve(L.T, V) / np.maximum(1.0 - share, LEAST_REAL)
+    half = np.linalg.solve(L.T, V) / np.maximum(1.0 - share, LEAST_GENUINE_SHARE)
     covariance: Floats = half @ half.T
     return covariance
 
@@ -429,8 +418,9 @@ def _robust_weights(blocks: Blocks, z: Floats) -> Floats:
 
     Of two scans it cannot be decided which one is wrong, and a single one would seem to fit without any misfit.
     """
-    weight = np.where(np.abs(z) > DROPPED, OUTLIER_WEIGHT, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)))
-    left = np.bincount(blocks.piece, weight > ASIDE, blocks.pieces)
+    huber = np.minimum(1.0, HUBER_SIGMAS / np.maximum(np.abs(z), 1e-9))
+    weight = np.where(np.abs(z) > REJECTION_SIGMAS, REJECTED_WEIGHT, huber)
+    left = np.bincount(blocks.piece, weight > LEAST_INLIER_WEIGHT, blocks.pieces)
     least = np.ones(blocks.pieces)
     np.minimum.at(least, blocks.piece, weight)
     weights: Floats = np.where(left[blocks.piece] < 2, least[blocks.piece], weight)
@@ -450,11 +440,11 @@ def _initial_tau(blocks: Blocks) -> Floats:
 
     Else a wall of thousands of points with an object leaning on it would outweigh everything else.
     """
-    points = blocks.kind == 0
+    points = blocks.kind == ON_PIECE
     if not points.any():
         return np.zeros(KINDS + 1)
     sigma = float(np.median(np.sqrt(blocks.count[points] / np.maximum(blocks.sums[points, 9], 1e-300))))
-    return np.array([WIDE_SIGMAS * sigma, 0.0, 0.0])
+    return np.array([INITIAL_TAU_SIGMAS * sigma, 0.0, 0.0])
 
 
 def _unit_variance(blocks: Blocks) -> Floats:
@@ -462,7 +452,7 @@ def _unit_variance(blocks: Blocks) -> Floats:
 
     If an edge runs along the scanner's rows or columns, all its ends have the same error, in shares of a step.
     """
-    unit: Floats = np.where(blocks.kind == 1, blocks.count / np.maximum(blocks.sums[:, 9], 1e-300), 1.0)
+    unit: Floats = np.where(blocks.kind == FACE_END, blocks.count / np.maximum(blocks.sums[:, 9], 1e-300), 1.0)
     return unit
 
 
@@ -476,12 +466,12 @@ def _estimate_tau(blocks: Blocks, offset: Floats, variance: Floats, before: Floa
             continue
         r2, v, u = offset[rows] ** 2, variance[rows], unit[rows]
         low, high = 0.0, float(np.sqrt(np.max(r2 / u)))
-        if np.median(r2 / v) <= MEDIAN**2:
+        if np.median(r2 / v) <= MEDIAN_OF_ABS_Z**2:
             tau[kind] = 0.0
             continue
         for _ in range(40):
             middle = 0.5 * (low + high)
-            if np.median(r2 / (v + middle**2 * u)) > MEDIAN**2:
+            if np.median(r2 / (v + middle**2 * u)) > MEDIAN_OF_ABS_Z**2:
                 low = middle
             else:
                 high = middle

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from processor.adjustment import control_points, data_snooping
+from processor.adjustment import data_snooping
+from processor.adjustment.sighting_covariance import sighting_covariance
 from processor.geometry import rigid
 from processor.model import Bools, Control, Floats, InputError, Ints, Reason, reason
 from processor.stitching import common_points
@@ -51,7 +52,7 @@ class Sightings:
     @property
     def covariance(self) -> Floats:
         """Covariance (3m, 3m) of known less seen places, without that of the scans' poses; the same along all axes."""
-        return control_points.covariance(self.point, self.known_sd, self.seen_sd)
+        return sighting_covariance(self.point, self.known_sd, self.seen_sd)
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ def poses_of_scans(control: Control | None, origins: Sequence[Floats]) -> dict[i
     for s in np.unique(control.scan).tolist():
         rows = control.scan == s
         seen, known = control.seen[rows] - origins[s], control.positions[control.point[rows]] - middle
-        if control_points.determine_motion(known, common_points.LEAST_HEIGHT, LEAST_SPREAD_MM):
+        if rigid.points_determine_motion(known, common_points.LEAST_HEIGHT, LEAST_SPREAD_MM):
             T = rigid.fit(seen, known)
             if np.linalg.norm(rigid.apply(T, seen) - known, axis=1).max() <= GROSS_MM:
                 poses[s] = T
@@ -188,7 +189,7 @@ def fitted(sightings: Sightings, T: Floats, prior: Floats, factor: float = 1.0) 
             f"the distances between control points are {scale:.5g} times those in the scans: units mixed up ({slip})?"
         )
     for _ in range(ROUNDS):
-        poses = _corrected(T, d)
+        poses = rigid.moved_about_own_origins(T, d)
         arm = np.einsum("mij,mj->mi", poses[sightings.scan, :3, :3], sightings.seen)
         by_scan = np.zeros((m, 3, len(T), 6))
         by_scan[np.arange(m), :, sightings.scan] = M[:3, :3] @ rigid.motion(arm)
@@ -211,8 +212,8 @@ def fitted(sightings: Sightings, T: Floats, prior: Floats, factor: float = 1.0) 
     of_scans = prior - gain @ J @ prior + gain_A @ motion @ gain_A.T
     joint = np.block([[motion, cross], [cross.T, of_scans]])
     return Fit(
-        M=M, T=_corrected(T, d), misfit=b, observed=Q, weight=weight, cofactor=weight - weighted @ motion @ weighted.T,
-        by_scans=J, covariance=0.5 * (joint + joint.T),
+        M=M, T=rigid.moved_about_own_origins(T, d), misfit=b, observed=Q, weight=weight,
+        cofactor=weight - weighted @ motion @ weighted.T, by_scans=J, covariance=0.5 * (joint + joint.T),
     )  # fmt: skip
 
 
@@ -275,10 +276,10 @@ def _loosened(sightings: Sightings, T: Floats, prior: Floats) -> tuple[Fit, floa
 def _shortage(sightings: Sightings) -> Reason | None:
     """Return why sightings do not determine the frame, or None: fewer than three points, or nearly on a line."""
     first = np.unique(sightings.point, return_index=True)[1]
-    if len(first) < control_points.LEAST_POINTS:
+    if len(first) < rigid.LEAST_POINTS:
         return reason("stitch.control-few", points=len(first))
     sd = float(np.hypot(sightings.known_sd, sightings.seen_sd).max())
-    if not control_points.determine_motion(sightings.known[first], common_points.LEAST_HEIGHT, CLEAR * sd):
+    if not rigid.points_determine_motion(sightings.known[first], common_points.LEAST_HEIGHT, CLEAR * sd):
         return reason("stitch.control-on-a-line")
     return None
 
@@ -294,15 +295,6 @@ def _placed(sightings: Sightings, T: Floats) -> Floats:
     poses = T[sightings.scan]
     placed: Floats = np.einsum("mij,mj->mi", poses[:, :3, :3], sightings.seen) + poses[:, :3, 3]
     return placed
-
-
-def _corrected(T: Floats, d: Floats) -> Floats:
-    """Rotate poses (k, 4, 4) about their own origins and shift them by d (k, 6)."""
-    corrected: Floats = T.copy()
-    for s in np.flatnonzero(np.abs(d).sum(axis=1) > 0.0):
-        corrected[s, :3, :3] = rigid.rotation_from_vector(d[s, :3]) @ T[s, :3, :3]
-        corrected[s, :3, 3] += d[s, 3:]
-    return corrected
 
 
 def _residuals(every: Sightings, used: Bools, placed: Bools, fit: Fit, factor: float) -> tuple[Floats, Floats, Floats]:

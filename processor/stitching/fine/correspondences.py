@@ -19,6 +19,8 @@ from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.patches import facing
 from processor.stitching.planes.scan_planes import LIMIT_SIGMAS, Cloud
 
+ON_PIECE, FACE_END = 0, 1  # kinds of blocks
+KINDS = 2
 LEVELS = 7
 SAME_COS = float(np.cos(np.radians(8.0)))
 MOST_NORMALS = 1500
@@ -32,8 +34,8 @@ PRIOR_DOF = 20.0  # with which a piece's points are taken to scatter as the nois
 class Blocks:
     """The points of each scan on each piece: one row for a scan and piece, sorted by piece.
 
-    ``sums`` (b, 10) are moments weighted by 1 / variance, in the frame of the scan's cloud. ``kind`` 0 = points on the
-    piece, 1 = ends of faces that are bounded by the piece.
+    ``sums`` (b, 10) are moments weighted by 1 / variance, in the frame of the scan's cloud. ``kind`` is ON_PIECE for
+    points on the piece, FACE_END for ends of faces that are bounded by the piece.
     """
 
     piece: Ints
@@ -171,7 +173,7 @@ def _blocks(cells: CellTable, T: Floats, rows: Ints, piece: Ints) -> Blocks:
     of_scan = scan[first][enough]
     world = hashing.summed(extraction.transformed(sums, T[of_scan]), number, pieces)
     return Blocks(
-        piece=number, scan=of_scan, sums=sums, count=count[enough], kind=np.zeros(len(number), np.int64), pieces=pieces,
+        piece=number, scan=of_scan, sums=sums, count=count[enough], kind=np.full(len(number), ON_PIECE), pieces=pieces,
         rays=weighted[:, 10:].reshape(-1, 3, 7), face=_faces(extraction.planes_of(world), cells)[number],
     )  # fmt: skip
 

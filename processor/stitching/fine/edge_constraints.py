@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.stitching.fine.bundle_adjustment import Solution
-from processor.stitching.fine.correspondences import Blocks
+from processor.stitching.fine.correspondences import FACE_END, Blocks
 from processor.stitching.planes import extraction, hashing
 from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.scan_planes import Cloud
@@ -56,7 +56,7 @@ class Matches:
 
 
 def with_ends(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Blocks:
-    """Add the ends of faces to the pieces that bound them, as blocks of kind 1; see :func:`match`."""
+    """Add the ends of faces to the pieces that bound them, as blocks of kind FACE_END; see :func:`match`."""
     if not blocks.pieces:
         return blocks
     ends = match(clouds, blocks, T, gate_mm, clear=True)
@@ -76,7 +76,7 @@ def with_ends(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) ->
         scan=np.concatenate([blocks.scan, key % len(T)])[order],
         sums=np.vstack([blocks.sums, sums])[order],
         count=np.concatenate([blocks.count, np.bincount(inverse).astype(float)])[order],
-        kind=np.concatenate([blocks.kind, np.ones(len(key), np.int64)])[order],
+        kind=np.concatenate([blocks.kind, np.full(len(key), FACE_END)])[order],
         pieces=blocks.pieces,
         rays=np.concatenate([blocks.rays, rays.reshape(-1, 3, 7)])[order],
         face=np.concatenate([blocks.face, np.full(len(key), -1)])[order],
@@ -201,8 +201,7 @@ def resolve_loose_motions(clouds: list[Cloud], blocks: Blocks, faces: Solution, 
     ``faces`` is an adjustment without ends. Along each of its loose motions all shifts up to ``reach_mm`` are tried.
     At the right one every correctly matched end lies between its two rays; wrongly matched ends agree on no shift.
     """
-    T: Floats = faces.T.copy()
-    k = len(T)
+    T = faces.T
     heaviest = np.full(blocks.pieces, -1, np.int64)  # scan with the largest weight on each piece
     order = np.argsort(blocks.sums[:, 9], kind="stable")
     heaviest[blocks.piece[order]] = blocks.scan[order]  # the last one written remains
@@ -217,9 +216,7 @@ def resolve_loose_motions(clouds: list[Cloud], blocks: Blocks, faces: Solution, 
         if sensitive.sum() < NEIGHBOURS:
             continue
         step = _best_shift(ends.off[sensitive], rate[sensitive], 0.5 * ends.width[sensitive] + SLACK_MM, reach_mm)
-        for s in range(k):
-            T[s, :3, :3] = rigid.rotation_from_vector(step * motion[s, :3]) @ T[s, :3, :3]
-            T[s, :3, 3] += step * motion[s, 3:]
+        T = rigid.moved_about_own_origins(T, step * motion)
     return T
 
 

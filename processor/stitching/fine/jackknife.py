@@ -18,7 +18,7 @@ from processor.model import Floats, Ints
 from processor.stitching.fine import bundle_adjustment
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import Blocks
-from processor.stitching.fine.pair_checks import Pair
+from processor.stitching.fine.pairs_and_loops import Pair
 from processor.stitching.planes import extraction, hashing
 
 HALVINGS = 3
@@ -53,10 +53,10 @@ def factors(blocks: Blocks, solution: Solution, reference: int) -> Floats:
     mean = extraction.scatter(hashing.summed(world, blocks.piece, blocks.pieces))[0]
     region = regions(mean)[blocks.piece]
     none = np.zeros(len(region), bool)
-    rest, whole = bundle_adjustment.without(blocks, solution, reference, none, ALMOST_NONE)
+    rest, whole = bundle_adjustment.solve_without(blocks, solution, reference, none, ALMOST_NONE)
     square = np.zeros(k)
     for g in range(REGIONS):
-        step, covariance = bundle_adjustment.without(blocks, solution, reference, region == g, ALMOST_NONE)
+        step, covariance = bundle_adjustment.solve_without(blocks, solution, reference, region == g, ALMOST_NONE)
         square += _squares(step - rest, covariance - whole, whole)
     for s in range(k):
         ratio = square[s] / (6.0 * REGIONS)

@@ -1,4 +1,4 @@
-"""The command that makes a scene, in a process of its own, as processor does not import designgen."""
+"""The command line of designgen, or of a foreign script, that makes a scene; processor does not import designgen."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 
-def words(
+def scene_command(
     recipe: str | Path, scene: Path, seed: int, settings: Sequence[str], foreign: bool = False
 ) -> tuple[str, ...]:
-    """Return module or script, and arguments, that make the scene of a recipe: a name or a TOML file of designgen.
+    """Return module or script, and its arguments, that make a ``scene`` file from a recipe: a name or a TOML file.
 
     The recipe of a ``foreign`` scene is the script that makes it. ``settings`` are texts ``section.key=value``.
     """

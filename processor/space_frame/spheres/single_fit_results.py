@@ -1,4 +1,4 @@
-"""A sphere that was fitted by itself: its flag with every reason for it, and the result of all of them."""
+"""Assessment of spheres that were fitted one by one: flag and reasons of each, and the step's result of all."""
 
 from __future__ import annotations
 

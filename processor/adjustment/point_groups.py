@@ -1,4 +1,4 @@
-"""Pieces of faces, numbers of groups, and means over groups."""
+"""Groups of points: by cells of faces, joined from several parts, and the means over them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from processor.model import Floats, Ints, Labels
 
 
 def pieces(points: Floats, normals: Floats, side: float) -> Ints:
-    """Return the piece (k,) of a face that each place (k, 3) is on, by its cell and the direction of its normal."""
+    """Return the number (k,), from 0, of the piece of a face that each point (k, 3), mm, lies on.
+
+    A piece is a cube of edge ``side``, mm, and a rounded direction of the unit normals (k, 3).
+    """
     place = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
     return distinct(np.hstack([place, np.rint(normals).astype(np.int64)])).number
 
@@ -24,7 +27,7 @@ def group_means(values: Floats, group: Ints) -> Floats:
 
 
 def joined_numbers(by_part: Sequence[Ints | Labels]) -> Ints:
-    """Return the numbers (n,), from 0, of groups in the joined points of several parts; no group is of two parts."""
+    """Return the group (n,), from 0, of each of the concatenated points of several parts; no group is of two parts."""
     numbers, before = [np.empty(0, np.int64)], 0
     for group in by_part:
         number = np.unique(group, return_inverse=True)[1].reshape(-1).astype(np.int64)

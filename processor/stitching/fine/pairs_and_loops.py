@@ -12,7 +12,7 @@ from processor.model import Floats
 from processor.stitching import pose_covariance
 from processor.stitching.fine import bundle_adjustment
 from processor.stitching.fine.bundle_adjustment import Solution
-from processor.stitching.fine.correspondences import Blocks
+from processor.stitching.fine.correspondences import ON_PIECE, Blocks
 
 LEAST_PIECES = 6
 GROSS_PROBABILITY = 1e-6
@@ -46,7 +46,7 @@ class Loop:
     ratio: float
 
 
-def measure(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
+def register_pair(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
     """Register a pair by its shared pieces alone; None if these are too few.
 
     Outliers keep their weights from the network, since two scans alone cannot decide which of them is wrong.
@@ -59,7 +59,7 @@ def measure(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
     solution = bundle_adjustment.solve(local, start, 0, iterations=3, robust=False, tau=network.tau)
     covariance = solution.covariance[6:, 6:]
     d = pose_covariance.difference(solution.T[1], start[1])[:6]
-    points = local.kind == 0
+    points = local.kind == ON_PIECE
     weight = local.sums[points, 9]
     residual = float(np.sqrt((weight * solution.offset[points] ** 2).sum() / max(weight.sum(), 1e-12)))
     return Pair(

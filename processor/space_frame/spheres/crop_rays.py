@@ -1,4 +1,4 @@
-"""Rays of the points gathered about nodes."""
+"""Rays and ranges of the points gathered about nodes, from the scanners that saw them."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from processor.space_frame.spheres.records import CropsWithRays
 
 
 def with_rays(crops: Crops, nodes: Floats, scanners: Floats, threads: int) -> CropsWithRays:
-    """Add the rays of gathered points from the scanners (s, 3) that saw them."""
+    """Add unit rays and ranges, mm, of gathered points from the scanners (s, 3) that saw them.
+
+    The points are relative to their ``nodes`` (k, 3); nodes and scanners are in one frame, mm.
+    """
     rays, ranges = np.zeros((len(crops.points), 3)), np.zeros(len(crops.points))
     found = CropsWithRays(crops.start, crops.points, rays, ranges, crops.station)
     over_ranges(partial(_aim, found, nodes, scanners), len(nodes), threads)

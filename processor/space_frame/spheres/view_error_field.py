@@ -1,4 +1,4 @@
-"""Displacement of merged surfaces by the errors of views that nobody names: its covariance and how large it is.
+"""Gaussian field over the normals by which errors of unnamed views displace merged surfaces: covariance and size.
 
 A view displaces the part of a surface that it sees by one vector: its shift, its rotation times the lever arm, and its
 range offset along its rays. Its points on a ball have normals within a right angle of its direction and a density
@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.adjustment.scanner_class import VIEW_MM
+from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.geometry.sphere import BANDS, SECTORS
 from processor.model import Floats, Ints
 
@@ -87,10 +87,10 @@ def modes() -> Floats:
     return factor
 
 
-def field_of(balls: list[BallResiduals]) -> ViewField:
+def estimate_field(balls: list[BallResiduals]) -> ViewField:
     """Estimate the field's variance and lengths, by the residuals of balls and the scanner's class."""
     # Equal probability for equal ratios, to the class's error of a view; beyond it less, as of a Cauchy distribution.
-    prior = -np.log1p((SD_MM / VIEW_MM) ** 2)
+    prior = -np.log1p((SD_MM / VIEW_SD_MM) ** 2)
     log_probability = np.tile(prior, (len(LENGTHS_MM), 1))
     known = [(ball.place, score) for ball in balls if (score := _score(ball)) is not None]
     if known:

@@ -1,8 +1,8 @@
-"""Errors of views that are not named, from the two sides of plates and bars.
+"""Standard deviation of the errors of views that a merged cloud does not name, from the two sides of plates and bars.
 
-The views of a merged cloud have errors of registration and range of their own. Where a piece of steel was seen from two
-opposite sides, its movement cancels in the sum of the outward movements of both. What the sum is beyond its noise is
-what the views of the two sides differ by, or a thickness other than designed. Each side has half of its variance.
+Each view has errors of registration and range of its own. The movement of a plate cancels in the sum of the outward
+movements of its two sides. The variance of the sums beyond that of noise is due to the views of the two sides, or to a
+thickness other than designed. Half of it is attributed to each side.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
-from processor.adjustment.groups import group_means, pieces
+from processor.adjustment.point_groups import group_means, pieces
 from processor.model import Floats, Ints
+from processor.robust_statistics import CHI2_MEDIAN
 
 FEWEST_PLACES = 3  # of a piece
 FEWEST_PAIRS = 8
 FLOOR_MM = 1e-3  # least noise, for scans without any
 BESIDE = 0.25  # of a piece's side, the most by which two sides lie beside each other
 OPPOSED = -0.9  # largest cosine between the normals of two sides
-SURE = 2.0  # standard errors from which on a variance is not that of chance
-CHI2_MEDIAN = 0.4549  # of chi-squared with one degree of freedom
+SIGNIFICANT = 2.0  # standard errors of a variance, from which on it is significant
 MEDIAN_SD = 1.065  # of the median of n values of chi-squared with one degree of freedom, times sqrt(n)
 
 
 def view_sd(points: Floats, normals: Floats, along: Floats, variance: Floats, side_mm: float) -> float:
-    """Return the standard deviation of what a view's points have in common, mm; 0 where nothing shows it.
+    """Return the standard deviation, mm, of the error that the points of one view share; 0 if it is not significant.
 
     ``along`` (n,) are outward movements at points (n, 3) with unit normals (n, 3), mm, NaN where there is none.
     Their ``variance`` (n,) is from noise, as if they were independent. Pieces have a side of ``side_mm``.
@@ -52,7 +52,7 @@ def view_sd(points: Floats, normals: Floats, along: Floats, variance: Floats, si
     def surplus(view_variance: float) -> float:
         return float(np.median(square / (noises + 2.0 * view_variance))) - CHI2_MEDIAN
 
-    if surplus(0.0) <= SURE * MEDIAN_SD / np.sqrt(independent):
+    if surplus(0.0) <= SIGNIFICANT * MEDIAN_SD / np.sqrt(independent):
         return 0.0
     return float(np.sqrt(brentq(surplus, 0.0, float(square.max()) / CHI2_MEDIAN)))
 

@@ -9,15 +9,13 @@ value has it. Values that cannot be the greatest are left out; where one stands 
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from scipy.special import chdtri
 
+from processor.adjustment import normal_draws
 from processor.model import NORMAL_95, Floats
 
-DRAWS, FACTOR_DRAWS = 4_000, 10_000
-SEED = 20
+DRAWS = 10_000  # of the errors, for the width of the band
 CLEAR_SD = 4.0  # a value this many standard deviations of their difference below the greatest is not the greatest
 EXACT_MM = 1e-9
 
@@ -53,35 +51,11 @@ def of_correlated(values: Floats, covariance: Floats, folded: bool = False) -> t
     return float(values[top]), max(low, 0.0) if folded else low, high
 
 
-def draws(mean: Floats, covariance: Floats, count: int = DRAWS, seed: int = SEED) -> Floats:
-    """Draw (count, n) from a normal distribution, the same draws every time, each with its mirror image.
-
-    By the mirror images linear functions of the draws are exact: a value on its limit keeps it in exactly half of them.
-    """
-    errors = _errors(covariance, count // 2, seed)
-    drawn: Floats = mean + np.concatenate([errors, -errors])
-    return drawn
-
-
-def _errors(covariance: Floats, count: int, seed: int) -> Floats:
-    """Draw errors (count, n) of a covariance (n, n), the same every time."""
-    scale, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    errors: Floats = (_standard_normal(count, len(scale), seed) * np.sqrt(np.maximum(scale, 0.0))) @ axes.T
-    return errors
-
-
-@lru_cache(maxsize=4)  # every quantity of a part has as many values: drawing them again takes a third of the time
-def _standard_normal(count: int, n: int, seed: int) -> Floats:
-    drawn: Floats = np.random.default_rng(seed).standard_normal((count, n))
-    drawn.flags.writeable = False
-    return drawn
-
-
 def _factor(covariance: Floats) -> float:
     """Return the number of standard deviations within which all errors of a joint draw stay with 95 %."""
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     noisy = sd > 0.0
     if noisy.sum() < 2:
         return NORMAL_95
-    errors = _errors(covariance[np.ix_(noisy, noisy)], FACTOR_DRAWS, SEED)
+    errors = normal_draws.errors_of(covariance[np.ix_(noisy, noisy)], DRAWS)
     return max(NORMAL_95, float(np.quantile(np.abs(errors / sd[noisy]).max(axis=1), 0.95)))

@@ -26,7 +26,7 @@ def marked(points, wall, every, is_wall=None):
     """The wall is face 0, the post another."""
     normals, is_wall = np.tile([0.0, -1.0, 0.0], (wall.sum(), 1)), wall if is_wall is None else is_wall
     face = np.zeros(wall.sum(), np.int64)
-    return mixed_pixels.beside(points[wall], SCANNER, normals, -points[wall, 1], face, (every, np.where(is_wall, 0, 1)))
+    return mixed_pixels.mark(points[wall], SCANNER, normals, -points[wall, 1], face, (every, np.where(is_wall, 0, 1)))
 
 
 def test_points_beside_a_post_are_marked_and_no_others():
@@ -36,7 +36,7 @@ def test_points_beside_a_post_are_marked_and_no_others():
     off = np.abs(points[wall, 0]) - shadow
     step_mm = 5000.0 * STEP
     assert found[off < step_mm].all()
-    assert not found[off > mixed_pixels.WINDOW_STEPS * step_mm + mixed_pixels.half_beam(5000.0) + step_mm].any()
+    assert not found[off > mixed_pixels.WINDOW_STEPS * step_mm + mixed_pixels.half_beam_width(5000.0) + step_mm].any()
 
 
 def test_without_the_post_nothing_is_marked_whatever_the_noise_of_a_point_itself():
@@ -96,7 +96,7 @@ def test_points_beside_a_rail_before_a_wall_at_grazing_incidence_are_marked():
     points, wall = np.where(is_rail, on_rail, on_wall), ~is_rail[:, 0]
     normals, face = np.tile([0.0, -1.0, 0.0], (wall.sum(), 1)), np.zeros(wall.sum(), np.int64)
     faces = np.where(wall, 0, 1)
-    found = mixed_pixels.beside(points[wall], scanner, normals, -points[wall, 1], face, (points, faces))
+    found = mixed_pixels.mark(points[wall], scanner, normals, -points[wall, 1], face, (points, faces))
     turned = np.arctan2(ray[:, 1], ray[:, 0])
     beside = np.abs(turned[wall] - turned[~wall].min() + step) < 0.3 * step  # past the rail's far end
     assert beside.sum() == 21

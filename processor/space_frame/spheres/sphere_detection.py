@@ -1,4 +1,4 @@
-"""Search for balls in a whole cloud, without a design or a crop.
+"""Detection of spheres in a whole cloud, without a design or a crop.
 
 Patches of the cloud at every scale propose spheres: a patch about as wide as a ball holds most of its visible surface
 and little else, however small a share of the cloud the ball is. Each scale uses the cloud thinned to a cell, so that

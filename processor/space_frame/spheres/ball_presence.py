@@ -1,4 +1,4 @@
-"""Which of the places where members meet have balls: nodes of scaffolds, pipes and purlins have none.
+"""Classification of nodes, the places where members meet: with a ball, or without as in scaffolds, pipes and purlins.
 
 Two properties of the points about a node distinguish them. A ball's surface lies at one distance from the node, where
 clamps and crossing tubes differ from a sphere by a share of their size. And members of bolted balls narrow to sleeves
@@ -24,8 +24,8 @@ from processor.space_frame.members.members import Measured
 from processor.space_frame.points import sphere_crops
 from processor.space_frame.points.source import Source
 from processor.space_frame.spheres import sleeve_radii
+from processor.space_frame.spheres.crop_rays import with_rays
 from processor.space_frame.spheres.gauss_newton import residual
-from processor.space_frame.spheres.rays import with_rays
 
 REACH_MM = 240.0  # about a node: sleeve and cone of an ordinary ball
 POINTS = 512  # of a node, at most
@@ -33,12 +33,12 @@ RADII = np.arange(25.0, 160.0, 2.5)
 LEAST_RATIO = 1.25  # of a ball's radius to that of its thinnest tube
 LUMP = 0.12  # rms departure of a cylinder or box from the nearest sphere, in radii
 BESIDE_MM = 25.0  # points this far from a surface are those of something else
-STRAY, STRAY_OF_LUMP = 0.05, 0.3  # share of points that are on neither, at a ball and at something else
+STRAY, STRAY_OF_LUMP = 0.05, 0.3  # share of points on other surfaces, at a ball and at a lump
 NECKS = np.array([60.0, 85.0, 110.0, 140.0, 180.0])  # lengths of sleeve and cone together, mm
-SLEEVE_SHARE = 0.45  # of it
+SLEEVE_SHARE = 0.45  # of that length is the sleeve's
 SLEEVE_SPREAD = 0.1  # sd of a sleeve's radius about the usual one, in tube radii
 CLAMP = 1.6  # tube radii from the node: no sleeve begins nearer
-CLEAR_MM = 5.0  # of either
+CLEAR_MM = 5.0  # distance of a sleeve from ball or clamp
 MISTAKEN = 0.01  # probability that evidence of one kind is wrong as a whole, however many points it has
 UNLIKE = 0.2  # probability that a member joins a ball and something else
 ITERATIONS = 50

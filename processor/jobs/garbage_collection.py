@@ -5,7 +5,7 @@ import gc
 THRESHOLDS = (50_000, 20, 100)
 
 
-def search_rarely() -> None:
+def collect_rarely() -> None:
     """Look for reference cycles less often than Python does by itself.
 
     Compiling kernels makes millions of small objects that stay: searched as often as usual, they take a third of the

@@ -1,0 +1,36 @@
+"""Draws from normal distributions of given covariance, the same every time."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from processor.model import Floats
+
+DRAWS = 4_000
+SEED = 20
+
+
+def antithetic(mean: Floats, covariance: Floats, count: int = DRAWS, seed: int = SEED) -> Floats:
+    """Draw (count, n) from a normal distribution, each draw with its mirror image about the mean (antithetic draws).
+
+    By the mirror images linear functions of the draws are exact: a value on its limit keeps it in exactly half of them.
+    """
+    errors = errors_of(covariance, count // 2, seed)
+    drawn: Floats = mean + np.concatenate([errors, -errors])
+    return drawn
+
+
+def errors_of(covariance: Floats, count: int, seed: int = SEED) -> Floats:
+    """Draw errors (count, n) of mean 0 and a covariance (n, n), which may be singular."""
+    scale, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    errors: Floats = (_standard_normal(count, len(scale), seed) * np.sqrt(np.maximum(scale, 0.0))) @ axes.T
+    return errors
+
+
+@lru_cache(maxsize=4)  # every quantity of a part has as many values: drawing them again takes a third of the time
+def _standard_normal(count: int, n: int, seed: int) -> Floats:
+    drawn: Floats = np.random.default_rng(seed).standard_normal((count, n))
+    drawn.flags.writeable = False
+    return drawn

@@ -1,0 +1,39 @@
+"""Errors assumed for the class of terrestrial laser scanners, phase-shift and pulsed, where data cannot show them.
+
+Standard deviations from data sheets and practice (type B evaluation of the GUM), not estimates from the scans.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Floats
+
+# What the points of one view have in common, relative to other views: data sheets give a range error of 1 mm for up to
+# 130 m, which is taken as the limit of 95 %.
+VIEW_SD_MM = 0.5
+# Scale of the ranges of one view, without unit: the same data sheets give 10 ppm beside 1 mm, as a limit of 95 %.
+SCALE_SD = 5e-6
+# Shift of all views together, along each axis: targets are measured to about 1 mm, and a network rests on some 25
+# sightings of them.
+SHIFT_SD_MM = 0.2
+# Zero offset of the ranges of a calibrated scanner, which all of its views have in common.
+OFFSET_SD_MM = 0.2
+
+
+def scale_variance(length: float) -> float:
+    """Return the variance, mm^2, of a length, mm, by the scale of the scanner."""
+    return (SCALE_SD * length) ** 2
+
+
+def pose_covariance(points: Floats) -> Floats:
+    """Covariance (6, 6), rad and mm, of a rotation about the frame's origin and a translation that all views share.
+
+    ``points`` (n, 3), mm, are those that the views saw.
+
+    The offset of all ranges moves what is seen from one side, and the views' shifts rotate what lies between them.
+    """
+    arm = 0.5 * float(np.linalg.norm(np.ptp(points, axis=0)))
+    rotation, shift = SHIFT_SD_MM**2 / max(arm, 1.0) ** 2, SHIFT_SD_MM**2 + OFFSET_SD_MM**2
+    return rigid.about_origin(np.diag(np.repeat([rotation, shift], 3)), points.mean(axis=0))
