@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from processor.cli.common import UNITS, debug_option
+from processor.cli.common import LANGUAGES, UNITS, debug_option
 from processor.model import UsageError
 from processor.plain_text import printable
 
@@ -16,9 +16,12 @@ from processor.plain_text import printable
 @click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
 @click.option("--force", is_flag=True, help="replace the project.toml that is there")
 @click.option("--design-units", type=click.Choice(UNITS), help="unit of a design that states none  [default: guessed]")
+@click.option(
+    "--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of comments and lines"
+)
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @debug_option
-def init(folder: Path, force: bool, design_units: str | None, as_json: bool) -> None:
+def init(folder: Path, force: bool, design_units: str | None, lang: str, as_json: bool) -> None:
     """Write FOLDER/project.toml as its files suggest: kind, units, design, and which scan is which component.
 
     Without a design.json it is written, too, where meshes or CAD files show one: the parts of an arch bridge in order
@@ -27,6 +30,7 @@ def init(folder: Path, force: bool, design_units: str | None, as_json: bool) -> 
     Components are recognised by their names and by their shapes against the design. What is uncertain is printed and
     marked in the file: check it before the first run.
     """
+    from processor.language.messages import messages, text
     from processor.scan_folder import files, guess
     from processor.store.atomic_file import replacing
 
@@ -34,15 +38,19 @@ def init(folder: Path, force: bool, design_units: str | None, as_json: bool) -> 
     if path.exists() and not force:
         raise UsageError(f"{path}: is there already; --force replaces it")
     project = guess.guess(folder, design_units or "")
-    text = guess.to_toml(project)
-    guess.write_design(folder, project)
+    content = guess.to_toml(project, lang)
+    guess.write_design(folder, project, lang)
     with replacing(path) as temporary:
-        temporary.write_text(text, "utf-8")
+        temporary.write_text(content, "utf-8")
     if as_json:
         click.echo(json.dumps(guess.as_json(project), ensure_ascii=False))
         return
+    write = messages(lang).text
     if project.made:
-        click.echo(f"{folder / project.design}: {guess.summary(project)}")
-    click.echo(f"{path}: kind {project.kind}, {len(project.scans)} file(s) of scans")
-    for question in project.unsure:
-        click.echo(printable(f"? {question}"))
+        made = text("{file}: {content}", file=str(folder / project.design), content=guess.summary(project))
+        click.echo(printable(write(made)))
+    scans = len(project.scans)
+    line = text("{file}: kind {kind}, {files} file(s) of scans", file=str(path), kind=project.kind, files=scans)
+    click.echo(printable(write(line)))
+    for doubt in project.doubts:
+        click.echo(printable(f"? {write(doubt)}"))

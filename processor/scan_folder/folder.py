@@ -272,7 +272,7 @@ def _guess(folder: Path) -> Guess | None:
     if any((folder / name).exists() for name in DESIGNS) or not surface_files.candidates(folder):
         return None
     guessed = guess.guess(folder)
-    return guessed if guessed.made and not guessed.made.kind_doubt else None
+    return guessed if guessed.made and not guessed.made.kind_doubts else None
 
 
 def _entry(folder: Path, scan: Table) -> _Entry:
@@ -380,7 +380,7 @@ def _different(reasons: Iterable[Reason]) -> list[Reason]:
 def _said(project: _Project) -> tuple[Reason, ...]:
     if project.guessed is None:
         return ()
-    return (reason("units.design-guessed-unsure") if project.guessed.unsure else reason("units.design-guessed"),)
+    return (reason("units.design-guessed-unsure") if project.guessed.doubts else reason("units.design-guessed"),)
 
 
 def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:

@@ -1,4 +1,7 @@
-"""The content of a scan folder's project.toml and design.json guessed from its files, with what is not sure."""
+"""The content of a scan folder's project.toml and design.json guessed from its files, with reasons and doubts.
+
+A doubt is a reason why an entry may be wrong, or why it is missing.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,8 @@ from scipy.optimize import linear_sum_assignment
 
 from processor import large_arrays, readers
 from processor.geometry import mesh_distance
-from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints
+from processor.language.messages import Text, messages, text
+from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints, Reason, reason
 from processor.readers import RawScan
 from processor.registration import main_body, principal
 from processor.scan_folder import component_names
@@ -45,7 +49,7 @@ class ScanGuess:
     file: str
     component: str = ""
     station: str = ""
-    reason: str = ""
+    reasons: tuple[Reason, ...] = ()
     sure: bool = True
     error: str = ""  # why the file could not be read
     units: str = ""  # given by the format
@@ -58,21 +62,21 @@ class ScanGuess:
 
 @dataclass
 class Guess:
-    """The content of project.toml, each entry with its reason, and messages on what is not sure."""
+    """The content of project.toml, each entry with its reasons, and the doubts about them."""
 
     folder: str
     name: str
     kind: str = ""
-    kind_reason: str = ""
+    kind_reasons: tuple[Reason, ...] = ()
     design: str = ""
-    design_reason: str = ""
+    design_reasons: tuple[Reason, ...] = ()
     design_units: str = ""
     made: GuessedDesign | None = None  # the design that design.json is to hold
     units: str = ""
-    units_reason: str = ""
-    stations: str = ""
+    units_reasons: tuple[Reason, ...] = ()
+    stations: str = ""  # the file with the scanners' positions
     scans: list[ScanGuess] = field(default_factory=list)
-    unsure: list[str] = field(default_factory=list)
+    doubts: list[Reason] = field(default_factory=list)
 
 
 def guess(folder: Path, design_units: str = "") -> Guess:
@@ -102,7 +106,7 @@ def guess(folder: Path, design_units: str = "") -> Guess:
     elif not design:
         _guess_kind(project)
     if (folder / STATIONS).is_file():
-        project.stations = f"{STATIONS} gives the scanners' positions"
+        project.stations = STATIONS
     return project
 
 
@@ -113,15 +117,14 @@ def _written_design(folder: Path, project: Guess) -> Path | None:
     """Return a design.json, design.csv or another JSON file that states a kind; None without one."""
     for name in DESIGNS:
         if (folder / name).is_file():
-            project.design, project.design_reason = name, "found by its name"
+            project.design, project.design_reasons = name, (reason("init.by-file-name"),)
             return folder / name
     tables = [path for path in sorted(folder.glob("*.json")) if path.name != STATIONS and _has_kind(path)]
     if len(tables) == 1:
-        project.design, project.design_reason = tables[0].name, "the only candidate"
+        project.design, project.design_reasons = tables[0].name, (reason("init.only-candidate"),)
         return tables[0]
     if tables:
-        named = ", ".join(path.name for path in tables[:5])
-        project.unsure.append(f"design: several files may be it ({named}); name one as 'design'")
+        project.doubts.append(reason("init.several-designs", files=tuple(path.name for path in tables[:5])))
     return None
 
 
@@ -136,7 +139,7 @@ def _shown_design(
         try:
             guessed = guess_design.guess(folder, group, scans, design_units)
         except InputError as error:
-            project.unsure.append(f"design: {_within(folder, error)}")
+            project.doubts.append(reason("init.design-unreadable", error=_within(folder, error)))
             continue
         (without if guessed.design is None else found).append(guessed)
     if len(found) == 1:
@@ -144,30 +147,25 @@ def _shown_design(
         return found[0].design
     paths = [path for group in groups for path in group]
     if len(paths) == 1 and not found:
-        project.design, project.design_reason = str(paths[0].relative_to(folder)), "the only candidate"
+        project.design, project.design_reasons = str(paths[0].relative_to(folder)), (reason("init.only-candidate"),)
         # The unit of one surface of the whole is that of 'design_units', which has a doubt of its own.
-        project.unsure += [text for one in without for text in one.doubts]
+        project.doubts += [doubt for one in without for doubt in one.other_doubts]
         return _read_design(folder, paths[0], project)
     if not paths:
-        project.unsure.append("design: none found, so scans are not compared with one")
+        project.doubts.append(reason("init.no-design"))
         return None
     candidates = [one.files[0] for one in found] or [str(path.relative_to(folder)) for path in paths]
-    named = ", ".join(candidates[:5])
-    project.unsure.append(
-        f"design: several files may be it ({named}); name one as 'design', with kind = \"structure\", or write a "
-        "design.json"
-    )
-    project.unsure += [f"design: {text}" for one in without for text in one.questions]
+    project.doubts.append(reason("init.several-surfaces", files=tuple(candidates[:5])))
+    project.doubts += [reason("init.of-design", reason=doubt) for one in without for doubt in one.doubts]
     return None
 
 
 def _take_design(project: Guess, guessed: GuessedDesign) -> None:
     project.made, project.design = guessed, DESIGNS[0]
     project.kind = "arch-bridge" if isinstance(guessed.design, ArchDesign) else "space-frame"
-    project.kind_reason = project.design_reason = guessed.reason
-    if guessed.kind_doubt:
-        project.unsure.append(f"kind: taken as {project.kind}: {guessed.kind_doubt}")
-    project.unsure += guessed.questions
+    project.kind_reasons = project.design_reasons = guessed.reasons
+    project.doubts += [reason("init.kind-taken", kind=project.kind, reason=doubt) for doubt in guessed.kind_doubts]
+    project.doubts += guessed.doubts
 
 
 def _has_kind(path: Path) -> bool:
@@ -178,18 +176,18 @@ def _has_kind(path: Path) -> bool:
 
 
 def _read_design(folder: Path, path: Path, project: Guess) -> ArchDesign | FrameDesign | Surface | None:
-    """Read the design; if it cannot be read, a message is added and the guess continues without."""
+    """Read the design; if it cannot be read, a doubt is added and the guess continues without."""
     try:
         existing_file_in(folder, str(path.relative_to(folder)), str(folder))
         if is_surface(path):
-            project.kind, project.kind_reason = "structure", f"{project.design} is one surface of the whole"
+            project.kind, project.kind_reasons = "structure", (reason("init.one-surface", file=project.design),)
             return read_surface(path, "mm")[:2]
         design = read_design(folder, path, "m")
     except InputError as error:
-        project.unsure.append(f"design: {error}")
+        project.doubts.append(reason("init.design-unreadable", error=str(error)))
         return None
     project.kind = "arch-bridge" if isinstance(design, ArchDesign) else "space-frame"
-    project.kind_reason = f"the kind of {project.design}"
+    project.kind_reasons = (reason("init.kind-of-design", file=project.design),)
     return design
 
 
@@ -212,14 +210,15 @@ def _read_scan(folder: Path, path: Path, project: Guess) -> ScanGuess:
         raws = readers.read(path)
     except InputError as error:
         scan.error = _within(folder, error)
-        project.unsure.append(f"{scan.file}: cannot be read, so it is written as a comment: {scan.error}")
+        project.doubts.append(reason("init.scan-unreadable", file=scan.file, error=scan.error))
         return scan
     scan.units = known_unit(raws[0].unit) if raws[0].unit else ""
     points = _sample(raws)
     scan.sample = points
     scan.radius = radius(points - points.mean(axis=0))
     if len(raws) > 1:
-        scan.reason = f"holds {len(raws)} scans: {', '.join(raw.name for raw in raws[:6])}"
+        names = tuple(raw.name for raw in raws[:6])
+        scan.reasons = (reason("init.several-scans", scans=len(raws), names=names),)
     return scan
 
 
@@ -271,10 +270,10 @@ def _guess_units(project: Guess, nominal: Sequence[float], shapes: Mapping[str, 
     without = [scan for scan in project.scans if not scan.units and not scan.error]
     if project.design and project.kind == "structure" and Path(project.design).suffix.lower() in MESH_SUFFIXES:
         project.design_units = "mm"
-        project.unsure.append(f"design_units: {project.design} has no unit; taken as mm, as CAD writes meshes")
+        project.doubts.append(reason("init.mesh-without-unit", file=project.design))
     if not without:
-        given = sorted({scan.units for scan in project.scans if scan.units})
-        project.units_reason = f"given by the scans' formats: {', '.join(given)}" if given else ""
+        given = tuple(sorted({scan.units for scan in project.scans if scan.units}))
+        project.units_reasons = (reason("init.units-by-formats", units=given),) if given else ()
         return
     if shapes:
         of_unit = {
@@ -283,7 +282,7 @@ def _guess_units(project: Guess, nominal: Sequence[float], shapes: Mapping[str, 
         }
         best = min(UNITS, key=of_unit.__getitem__)
         if of_unit[best] <= LIKE_SHAPE:
-            project.units, project.units_reason = best, "the scans are as large as the design in it"
+            project.units, project.units_reasons = best, (reason("init.units-by-design"),)
             return
     if nominal:
         sizes = np.array(nominal)
@@ -293,27 +292,26 @@ def _guess_units(project: Guess, nominal: Sequence[float], shapes: Mapping[str, 
         }
         project.units = best = min(UNITS, key=misfits.__getitem__)
         if misfits[best] <= np.log1p(UNIT_TOLERANCE):
-            project.units_reason = "the scans are as large as the design in it"
+            project.units_reasons = (reason("init.units-by-design"),)
             return
-        project.units_reason = f"the nearest to the design's size, and off by a factor of {np.exp(misfits[best]):.3g}"
+        why = reason("init.units-nearest", factor=np.exp(misfits[best]))
     else:
         extent = 2.0 * float(np.median([scan.radius for scan in without]))
         project.units = "m" if extent <= LARGEST_M else "mm"
-        project.units_reason = f"a scan has an extent of {extent:.4g}"
-    project.unsure.append(f"units: taken as {project.units}: {project.units_reason}")
+        why = reason("init.units-by-extent", extent=extent)
+    project.units_reasons = (why,)
+    project.doubts.append(reason("init.units-taken", units=project.units, reason=why))
 
 
 def _guess_kind(project: Guess) -> None:
-    project.kind, project.kind_reason = "structure", "the only kind that needs no design"
+    project.kind, project.kind_reasons = "structure", (reason("init.needs-no-design"),)
     for scan in project.scans:
         scan.station = component_names.station(scan.stem)
-    project.unsure.append(
-        "kind: taken as structure; a roof of bolt balls is a space-frame, a bridge in parts needs a design.json"
-    )
+    project.doubts.append(reason("init.kind-without-design"))
 
 
 def _guess_components(project: Guess, shapes: Mapping[str, Floats]) -> None:
-    """Assign components to scans by name and shape; contradictions and ambiguities are added to ``unsure``."""
+    """Assign components to scans by name and shape; contradictions and ambiguities are added to the doubts."""
     names = list(shapes)
     scans = [scan for scan in project.scans if not scan.error]
     for scan in scans:
@@ -321,162 +319,186 @@ def _guess_components(project: Guess, shapes: Mapping[str, Floats]) -> None:
         scan.station = component_names.station(scan.stem)
         _choose(scan, component_names.components(scan.stem, names))
     _assign_similar(scans, names)
-    project.unsure += [
-        f"{scan.file}: {scan.component or 'no component'}: {scan.reason}" for scan in scans if not scan.sure
-    ]
-    files = {name: [scan.file for scan in project.scans if scan.component == name] for name in names}
-    missing = [name for name in names if not files[name]]
+    project.doubts += [_doubt(scan) for scan in scans if not scan.sure]
+    files = {name: tuple(scan.file for scan in project.scans if scan.component == name) for name in names}
+    missing = tuple(name for name in names if not files[name])
     if missing:
-        project.unsure.append(f"no scan is assigned to {', '.join(missing)}")
-    project.unsure += [
-        f"{name}: {len(files[name])} scans are assigned to it ({', '.join(files[name])})"
+        project.doubts.append(reason("init.components-without-scan", components=missing))
+    project.doubts += [
+        reason("init.component-of-several-scans", component=name, scans=len(files[name]), files=files[name])
         for name in names
         if len(files[name]) > 1
     ]
+
+
+def _doubt(scan: ScanGuess) -> Reason:
+    if not scan.component:
+        return reason("init.scan-of-no-component", file=scan.file, reasons=scan.reasons)
+    return reason("init.scan-of-component", file=scan.file, component=scan.component, reasons=scan.reasons)
 
 
 def _assign_similar(scans: Sequence[ScanGuess], names: Sequence[str]) -> None:
     """Assign the scans whose shape matches several components to those left, with the least differences in sum."""
     taken = {scan.component for scan in scans if scan.sure}
     left = [name for name in names if name not in taken]
-    unsure = [scan for scan in scans if not scan.sure and len(scan.similar) > 1]
-    cost = np.array([[scan.differences[name] if name in scan.similar else 1.0 for name in left] for scan in unsure])
-    for row, column in zip(*linear_sum_assignment(cost.reshape(len(unsure), len(left))), strict=True):
-        scan, name = unsure[row], left[column]
+    doubtful = [scan for scan in scans if not scan.sure and len(scan.similar) > 1]
+    cost = np.array([[scan.differences[name] if name in scan.similar else 1.0 for name in left] for scan in doubtful])
+    for row, column in zip(*linear_sum_assignment(cost.reshape(len(doubtful), len(left))), strict=True):
+        scan, name = doubtful[row], left[column]
         if name in scan.similar:
             scan.component = name
             only = sum(other in left for other in scan.similar) == 1
-            scan.reason += f"; {'the only one of them left' if only else 'any of them may be right'}"
+            scan.reasons += (reason("init.only-one-left") if only else reason("init.any-of-them"),)
 
 
 def _choose(scan: ScanGuess, named: Sequence[str]) -> None:
     """Choose a scan's component among those ``named`` by its file, else among all, by the differences of extents."""
-    several, differences = f"{scan.reason}; " if scan.reason else "", scan.differences
+    several, differences = scan.reasons, scan.differences
     by_shape = sorted(named or differences, key=lambda name: differences[name])
     best = by_shape[0]
-    shape = f"extents within {100.0 * differences[best]:.2g} % of the design's"
+    within = reason("init.extents-within", percent=100.0 * differences[best])
     if len(named) == 1:
         scan.component = best
         # A scan with gaps may have other extents than its part, but by chance those of another.
         nearest = min(differences, key=lambda name: differences[name])
         other = differences[nearest] <= SAME_SHAPE < differences[best]
         scan.sure = differences[best] <= OTHER_SHAPE and not several and not other
-        scan.reason = f"{several}by its name; {shape}"
+        scan.reasons = (*several, reason("init.by-name"), within)
         if other or differences[best] > OTHER_SHAPE:
-            scan.reason = f"{several}by its name, but its extents differ by {100.0 * differences[best]:.2g} %" + (
-                f"; the extents match {nearest}" if differences[nearest] <= LIKE_SHAPE else ""
-            )
+            scan.reasons = (*several, reason("init.name-contradicted", percent=100.0 * differences[best]))
+            if differences[nearest] <= LIKE_SHAPE:
+                scan.reasons += (reason("init.extents-of-other", component=nearest),)
         return
     same = [name for name in by_shape if differences[name] <= SAME_SHAPE]
     similar = same or [name for name in by_shape if differences[name] <= LIKE_SHAPE]
     scan.component, scan.similar = best if similar else "", tuple(name for name in differences if name in similar)
     scan.sure = len(same) == 1 and not several
-    which = f"its name matches {', '.join(named)}; " if named else "its name matches no component; "
+    name = reason("init.name-of-several", components=tuple(named)) if named else reason("init.name-of-none")
+    shape: tuple[Reason, ...] = (reason("init.by-shape"), within)
     if not similar:
-        difference = f"the nearest, {best}, differs by {100.0 * differences[best]:.0f} %"
-        scan.reason = f"{several}{which}its extents match none of them ({difference})"
+        shape = (reason("init.extents-of-none", component=best, percent=100.0 * differences[best]),)
     elif len(similar) > 1:
-        scan.reason = f"{several}{which}its extents match {', '.join(scan.similar)}"
-    else:
-        scan.reason = f"{several}{which}by its shape alone; {shape}"
+        shape = (reason("init.extents-of-several", components=scan.similar),)
+    scan.reasons = (*several, name, *shape)
 
 
 # --- the guess as project.toml and as JSON ----------------------------------------------------------------------------
 
 
-def to_toml(project: Guess) -> str:
-    """Return the text of project.toml, with reasons and further keys as comments."""
-    lines = ["# Made by `processor init`. What is unsure is marked with a question mark."]
-    lines += [f"# ? {_one_line(text)}" for text in project.unsure] + [""]
+def to_toml(project: Guess, lang: str = "en") -> str:
+    """Return the text of project.toml, with reasons and further keys as comments in a language."""
+
+    def comment(message: Text | Reason) -> str:
+        return f"# {_one_line(message, lang)}"
+
+    lines = [comment(text("Made by `processor init`. What is unsure is marked with a question mark."))]
+    lines += [f"# ? {_one_line(doubt, lang)}" for doubt in project.doubts] + [""]
     lines.append(f"name = {as_toml(project.name)}")
-    lines.append(f"kind = {as_toml(project.kind)}  # {_one_line(project.kind_reason)}")
+    lines.append(f"kind = {as_toml(project.kind)}  # {_one_line(project.kind_reasons, lang)}")
     if project.units:
-        lines.append(
-            f"units = {as_toml(project.units)}  # of scans whose format gives none: {_one_line(project.units_reason)}"
-        )
+        why = text("of scans whose format gives none: {reasons}", reasons=project.units_reasons)
+        lines.append(f"units = {as_toml(project.units)}  {comment(why)}")
     else:
-        lines.append(f'# units = "m"  # not needed: {_one_line(project.units_reason)}')
+        lines.append(f'# units = "m"  {comment(text("not needed: {reasons}", reasons=project.units_reasons))}')
     if project.design:
-        lines.append(f"design = {as_toml(project.design)}  # {_one_line(project.design_reason)}")
+        lines.append(f"design = {as_toml(project.design)}  # {_one_line(project.design_reasons, lang)}")
     else:
-        lines.append('# design = "design.json"  # or one mesh, STEP or IFC file of the whole, of kind structure')
+        of_whole = text("or one mesh, STEP or IFC file of the whole, of kind structure")
+        lines.append(f'# design = "design.json"  {comment(of_whole)}')
     if project.design_units:
-        lines.append(f"design_units = {as_toml(project.design_units)}  # of the mesh, which has no unit")
-    lines.append("# temperature_C = 20.0  # of the steel while it was scanned")
+        of_mesh = text("of the mesh, which has no unit")
+        lines.append(f"design_units = {as_toml(project.design_units)}  {comment(of_mesh)}")
+    lines.append(f"# temperature_C = 20.0  {comment(text('of the steel while it was scanned'))}")
     if project.stations:
-        lines.append(f"# {_one_line(project.stations)}")
+        lines.append(comment(text("{file} gives the scanners' positions", file=project.stations)))
     for scan in project.scans:
-        lines += ["", *_scan_lines(scan)]
+        lines += ["", *_scan_lines(scan, lang)]
     gap = project.made.root_gap_mm if project.made else 0.0
-    lines += [
-        "",
-        *(
-            ["[tolerance]", f"root_gap_mm = {gap!r}  # between the ends as modelled"]
-            if gap > 0.0
-            else ["# [tolerance]"]
-        ),
-    ]
-    lines += ['# standard = "GB 50205-2020"', ""]
-    return "\n".join(lines)
+    if gap > 0.0:
+        lines += ["", "[tolerance]", f"root_gap_mm = {gap!r}  {comment(text('between the ends as modelled'))}"]
+    else:
+        lines += ["", "# [tolerance]"]
+    return "\n".join([*lines, '# standard = "GB 50205-2020"', ""])
 
 
-def _scan_lines(scan: ScanGuess) -> list[str]:
+def _scan_lines(scan: ScanGuess, lang: str) -> list[str]:
     if scan.error:
-        return [
-            f"# {scan.file!a} cannot be read: {_one_line(scan.error)}",
-            "# [[scan]]",
-            f"# file = {as_toml(scan.file)}",
-        ]
+        unreadable = text("{file} cannot be read: {error}", file=repr(scan.file), error=scan.error)
+        return [f"# {_one_line(unreadable, lang)}", "# [[scan]]", f"# file = {as_toml(scan.file)}"]
     lines = ["[[scan]]", f"file = {as_toml(scan.file)}"]
-    reason = f"  # {'' if scan.sure else '? '}{_one_line(scan.reason)}" if scan.reason else ""
+    why = f"  # {'' if scan.sure else '? '}{_one_line(scan.reasons, lang)}" if scan.reasons else ""
     if scan.component:
-        lines.append(f"component = {as_toml(scan.component)}{reason}")
-    elif reason:
-        lines.append(reason.strip())
+        lines.append(f"component = {as_toml(scan.component)}{why}")
+    elif why:
+        lines.append(why.strip())
     if scan.station:
         lines.append(f"# station = {as_toml(scan.station)}")
     return lines
 
 
-def _one_line(text: str) -> str:
-    return "".join(c if c.isprintable() else " " for c in " ".join(text.split()))
+def _one_line(message: Text | Reason | tuple[Reason, ...], lang: str) -> str:
+    written = messages(lang).text(message)
+    return "".join(c if c.isprintable() else " " for c in " ".join(written.split()))
 
 
 def as_json(project: Guess) -> dict[str, Any]:
-    """Return the guess as an object for JSON."""
-    keys = ("kind", "kind_reason", "design", "design_reason", "design_units", "units", "units_reason", "unsure")
-    scan_keys = ("file", "component", "station", "reason", "sure", "error")
-    scans = [{key: getattr(scan, key) for key in scan_keys} for scan in project.scans]
-    return {"file": f"{project.folder}/{PROJECT}", "name": project.name} | {
-        **{key: getattr(project, key) for key in keys},
+    """Return the guess as an object for JSON, its texts in English."""
+    english = messages("en").text
+    scans = [
+        {
+            "file": scan.file,
+            "component": scan.component,
+            "station": scan.station,
+            "reason": english(scan.reasons),
+            "sure": scan.sure,
+            "error": scan.error,
+        }
+        for scan in project.scans
+    ]
+    return {
+        "file": f"{project.folder}/{PROJECT}",
+        "name": project.name,
+        "kind": project.kind,
+        "kind_reason": english(project.kind_reasons),
+        "design": project.design,
+        "design_reason": english(project.design_reasons),
+        "design_units": project.design_units,
+        "units": project.units,
+        "units_reason": english(project.units_reasons),
+        "unsure": [english(doubt) for doubt in project.doubts],
         "scans": scans,
         "made": [f"{project.folder}/{name}" for name in (project.design, *_meshes(project))] if project.made else [],
     }
 
 
-def summary(project: Guess) -> str:
+def summary(project: Guess) -> Text:
     """Return what the guessed design holds, in a line."""
     design = project.made.design if project.made else None
     if isinstance(design, ArchDesign):
-        order = ", ".join(part.name for part in design.parts)
-        return f"{len(design.parts)} parts ({order}), {len(design.joint_names)} joint(s)"
+        names = tuple(part.name for part in design.parts)
+        return text(
+            "{parts} parts ({names}), {joints} joint(s)",
+            parts=len(design.parts),
+            names=names,
+            joints=len(design.joint_names),
+        )
     if isinstance(design, FrameDesign):
-        return f"{len(design.ids)} node(s), {len(design.member_a)} member(s)"
-    return "no design"
+        return text("{nodes} node(s), {members} member(s)", nodes=len(design.ids), members=len(design.member_a))
+    return text("no design")
 
 
 def _meshes(project: Guess) -> list[str]:
     return [name for name, _, _ in project.made.meshes] if project.made else []
 
 
-def write_design(folder: Path, project: Guess) -> None:
-    """Write the guessed design.json, and the meshes that it names, to a folder."""
+def write_design(folder: Path, project: Guess, lang: str = "en") -> None:
+    """Write the guessed design.json with its doubts in a language, and the meshes that it names, to a folder."""
     if project.made is None:
         return
     for name, vertices, faces in project.made.meshes:
         (folder / name).parent.mkdir(exist_ok=True)
         with replacing(folder / name) as temporary:
             write_mesh(temporary, vertices, faces)
-    questions = [*([project.made.kind_doubt] if project.made.kind_doubt else []), *project.made.questions]
+    doubts = [messages(lang).text(doubt) for doubt in (*project.made.kind_doubts, *project.made.doubts)]
     with replacing(folder / project.design) as temporary:
-        write_json(temporary, guess_design.content(project.made, questions))
+        write_json(temporary, guess_design.content(project.made, doubts))

@@ -16,6 +16,7 @@ from designgen.export import step_files
 from processor.api import runs
 from processor.cli import main
 from processor.geometry.polyline import Polyline
+from processor.language.messages import messages
 from processor.model import ArchDesign, DesignBodies
 from processor.scan_folder import cad, guess
 from processor.scan_folder import folder as scan_folder
@@ -23,6 +24,8 @@ from processor.scan_folder.shapes import arch_bridge, guess_design
 from processor.scan_folder.shapes.body import stacked, welded
 from processor.scan_folder.units import MM_PER_UNIT
 from tests.support.files.scan_folders import write_ply
+from tests.support.pages.pages import latin
+from tests.support.results.reasons import codes, values
 from tests.support.solids import bridge_parts
 
 CORNER_MM = 0.05
@@ -79,27 +82,27 @@ def turned(axis, angle):
 
 
 @pytest.mark.parametrize(
-    ("R", "reason"),
+    ("R", "code"),
     [
-        (turned(2, np.pi / 2), "follow each other along Y"),
-        (turned(2, 0.5), "29 degrees from X"),
-        (turned(0, np.pi / 2), "rises along Y"),
-        (turned(0, np.pi), "hangs down"),
-        (turned(1, np.pi / 2), "along Z"),
+        (turned(2, np.pi / 2), "init.along-y"),
+        (turned(2, 0.5), "init.off-x"),
+        (turned(0, np.pi / 2), "init.rises-along-y"),
+        (turned(0, np.pi), "init.hangs-down"),
+        (turned(1, np.pi / 2), "init.along-z"),
     ],
 )
-def test_a_design_in_another_frame_is_refused(R, reason):
+def test_a_design_in_another_frame_is_refused(R, code):
     one = found([(vertices @ R.T, faces) for vertices, faces in bridge_parts.bridge()[0]])
     assert one.design is None
-    assert reason in one.doubts[0]
-    assert "turn the design" in one.doubts[0]
+    assert codes(one.doubts) == ["init.other-frame", code]
+    if code == "init.off-x":
+        assert values(one.doubts, code)["degrees"] == pytest.approx(np.degrees(0.5), abs=0.5)
 
 
 def test_names_numbered_against_the_order_of_parts_are_reported():
     one = found(bridge_parts.bridge()[0], bridge_parts.names(5)[::-1])
     assert order(one.design) == bridge_parts.names(5)[::-1]
-    assert len(one.doubts) == 1
-    assert "numbered the other way" in one.doubts[0]
+    assert codes(one.doubts) == ["init.numbered-backwards"]
 
 
 def slab(plane, scale, thickness):
@@ -141,23 +144,25 @@ def chamfered(vertices, faces, steps=1):
 
 
 @pytest.mark.parametrize(
-    ("flaw", "reason"),
+    ("flaw", "code", "expected"),
     [
-        (lambda m, p: m.__setitem__(1, joined(m[1], slab(p[1], 1.2, 20.0))), "off its outer faces"),
-        (lambda m, p: m.__setitem__(1, bevelled(*m[1])), "off its outer faces"),
-        (lambda m, p: m.__setitem__(1, chamfered(*m[1])), "5 corners instead of four"),
-        (lambda m, p: m.__setitem__(1, (m[1][0] + [0.0, 5.0, 0.0], m[1][1])), "the two ends differ by 5.0 mm"),
-        (lambda m, p: m.__setitem__(1, (m[1][0] - 5.0 * p[1][1], m[1][1])), "overlap by 5.0 mm"),
-        (lambda m, p: m.__setitem__(1, (m[1][0].round(0), m[1][1])), "rounded"),
+        (lambda m, p: m.__setitem__(1, joined(m[1], slab(p[1], 1.2, 20.0))), "init.off-outer-faces", {}),
+        (lambda m, p: m.__setitem__(1, bevelled(*m[1])), "init.off-outer-faces", {}),
+        (lambda m, p: m.__setitem__(1, chamfered(*m[1])), "init.not-four-corners", {"corners": 5}),
+        (lambda m, p: m.__setitem__(1, (m[1][0] + [0.0, 5.0, 0.0], m[1][1])), "init.corners-differ", {"mm": 5.0}),
+        (lambda m, p: m.__setitem__(1, (m[1][0] - 5.0 * p[1][1], m[1][1])), "init.ends-overlap", {"mm": 5.0}),
+        (lambda m, p: m.__setitem__(1, (m[1][0].round(0), m[1][1])), "init.rounded-parts", {"parts": ("rib1",)}),
     ],
     ids=["end plate", "bevel", "chamfer", "offset", "overlap", "rounded"],
 )
-def test_unclear_corners_are_reported_as_doubts(flaw, reason):
+def test_unclear_corners_are_reported_as_doubts(flaw, code, expected):
     meshes, _ = bridge_parts.bridge(5, 0)
     flaw(meshes, bridge_parts.cutting_planes(5, 0))
     one = found(meshes)
     assert order(one.design) == bridge_parts.names(5)
-    assert any(reason in text for text in one.doubts), one.doubts
+    for name, value in expected.items():
+        assert values(one.doubts, code)[name] == pytest.approx(value, abs=CORNER_MM)
+    assert code in codes(one.doubts)
 
 
 def test_edges_that_are_not_sharp_are_left_out(tmp_path):
@@ -166,7 +171,8 @@ def test_edges_that_are_not_sharp_are_left_out(tmp_path):
     for name, mesh in zip(bridge_parts.names(5), meshes, strict=True):
         bridge_parts.write_obj(tmp_path / f"design/{name}.obj", *mesh)
     write_scans(tmp_path, meshes, bridge_parts.names(5))
-    assert "? bottom edges of rib2: left out" in init(tmp_path)
+    assert values(guess.guess(tmp_path).doubts, "init.bottom-edges-left-out")["part"] == "rib2"
+    init(tmp_path)
     parts = scan_folder.read_input(tmp_path).arch.parts
     assert [len(part.bottom_edge_left) > 0 for part in parts] == [True, True, False, True, True]
 
@@ -177,7 +183,7 @@ def test_behind_a_bevel_or_an_end_plate_the_outer_faces_are_followed():
     meshes[2] = joined(meshes[2], slab(bridge_parts.cutting_planes(5, 0)[2], 1.2, 20.0))
     one = found(meshes)
     assert np.abs(one.design.joint_points - joints).max() < 1.0
-    assert sum("off its outer faces" in text for text in one.doubts) == 2
+    assert codes(one.doubts).count("init.off-outer-faces") == 2
 
 
 def test_a_ring_has_no_order():
@@ -205,29 +211,29 @@ def test_a_ring_has_no_order():
 
     one = found([segment(a, b) for a, b in pairwise(planes)], list("abcdef"))
     assert one.design is None
-    assert "make up a ring" in one.doubts[0]
+    assert codes(one.doubts) == ["init.ring"]
 
 
 @pytest.mark.parametrize(
-    ("change", "reason"),
+    ("change", "expected"),
     [
-        (lambda m: m.append(m[2]), "the order of the parts is not clear"),
-        (lambda m: m.pop(2), "several chains"),
-        (lambda m: m.__setitem__(1, (m[1][0], m[1][1][:-8])), "not closed: rib1"),
-        (lambda m: m.__setitem__(slice(None), [(v / 1000.0, f) for v, f in m]), "no two of"),
-        (lambda m: m.extend([(v + np.array([0.0, 6000.0, 0.0]), f) for v, f in m]), "make a folder for each bridge"),
+        (lambda m: m.append(m[2]), "init.crowded"),
+        (lambda m: m.pop(2), "init.several-chains"),
+        (lambda m: m.__setitem__(1, (m[1][0], m[1][1][:-8])), "init.several-chains"),
+        (lambda m: m.__setitem__(slice(None), [(v / 1000.0, f) for v, f in m]), "init.none-meet"),
+        (lambda m: m.extend([(v + np.array([0.0, 6000.0, 0.0]), f) for v, f in m]), "init.several-chains"),
     ],
     ids=["twice", "missing", "open", "metres", "two bridges"],
 )
-def test_parts_without_a_clear_order_make_no_design(change, reason):
+def test_parts_without_a_clear_order_make_no_design(change, expected):
     meshes, _ = bridge_parts.bridge()
+    closed = len(meshes[1][1])
     change(meshes)
-    one = found(
-        meshes,
-        [f"part{k}" if reason[:3] != "not" else n for k, n in enumerate((bridge_parts.names(5) * 2)[: len(meshes)])],
-    )
+    one = found(meshes, [f"part{k}" for k in range(len(meshes))])
     assert one.design is None
-    assert reason in one.doubts[0]
+    assert one.doubts[0].code == expected
+    if len(meshes[1][1]) < closed:
+        assert values(one.doubts, "init.unclosed")["parts"] == ("part1",)
 
 
 def test_part_without_neighbours_is_left_out_with_a_remark():
@@ -235,7 +241,7 @@ def test_part_without_neighbours_is_left_out_with_a_remark():
     one = found([*meshes, (meshes[2][0] + [0.0, 9000.0, 0.0], meshes[2][1])], [*bridge_parts.names(5), "spare"])
     assert order(one.design) == bridge_parts.names(5)
     assert np.abs(one.design.joint_points - joints).max() < CORNER_MM
-    assert "spare: meets no part" in one.doubts[0]
+    assert values(one.doubts, "init.parts-left-out")["parts"] == ("spare",)
 
 
 def i_beam(start, end):
@@ -353,9 +359,25 @@ def test_guessed_unit_of_a_design_is_marked_unsure(tmp_path, unit, size_mm):
     for name, (vertices, faces) in zip(bridge_parts.names(5), meshes, strict=True):
         write_ply(tmp_path / f"design/{name}.ply", vertices / size_mm, faces)
     write_scans(tmp_path, meshes, bridge_parts.names(5), 1.0 / size_mm)
-    output = init(tmp_path)
-    assert f"? units of the design: taken as {unit}" in output
-    assert json.loads((tmp_path / "design.json").read_text("utf-8"))["unsure"][0].startswith("? units of the design")
+    (doubt,) = guess.guess(tmp_path).made.unit_doubts
+    assert (doubt.code, doubt.values["unit"]) == ("init.design-unit-taken", unit)
+    written = f"? {messages('en').text(doubt)}"
+    assert written in init(tmp_path).splitlines()
+    assert json.loads((tmp_path / "design.json").read_text("utf-8"))["unsure"] == [written]
+
+
+def test_chinese_init_has_no_english_doubts_in_the_design_it_writes(tmp_path):
+    meshes, _ = bridge_parts.bridge()
+    meshes[1], meshes[2] = bevelled(*meshes[1]), chamfered(*meshes[2], steps=8)
+    for name, mesh in zip(bridge_parts.names(5), meshes, strict=True):
+        write_ply(tmp_path / f"design/{name}.ply", *mesh)
+    write_scans(tmp_path, meshes, bridge_parts.names(5))
+    output = init(tmp_path, "--lang", "zh").replace(str(tmp_path), "")
+    unsure = json.loads((tmp_path / "design.json").read_text("utf-8"))["unsure"]
+    assert len(unsure) > 3
+    assert set(unsure) <= set(output.splitlines())
+    names = {*bridge_parts.names(5), *(f"J{k}" for k in range(1, 5)), "kind", "arch", "bridge", "design", "units"}
+    assert latin(output.splitlines(), {*names, "json", "project", "toml", "mm", "cm"}) == []
 
 
 @pytest.mark.parametrize("one_file", [True, False])
@@ -383,7 +405,7 @@ def test_bodies_of_cad_files_without_a_unit_have_the_guessed_one(tmp_path, monke
         path.write_text("ISO-10303-21;")
     guessed = guess_design.guess(tmp_path, paths, [])
     assert asked[-1] == "m"
-    assert guessed.unit_doubt.startswith("units of the design: taken as m")
+    assert values(guessed.unit_doubts, "init.design-unit-taken")["unit"] == "m"
     assert guessed.units == ("mm" if one_file else "m")  # of one file each part's mesh is written, in mm
     assert np.abs(guessed.design.joint_points - joints).max() < CORNER_MM
 
@@ -393,9 +415,8 @@ def test_design_in_inches_is_made_only_with_stated_units(tmp_path):
     for name, (vertices, faces) in zip(bridge_parts.names(5), meshes, strict=True):
         write_ply(tmp_path / f"design/{name}.ply", vertices / 25.4, faces)
     write_scans(tmp_path, meshes, bridge_parts.names(5), 1.0 / 25.4)
-    output = init(tmp_path)
-    assert "not clear" in output
-    assert "--design-units" in output
+    assert "init.design-unit-unclear" in codes(guess.guess(tmp_path).doubts)
+    init(tmp_path)
     assert not (tmp_path / "design.json").exists()
     init(tmp_path, "--force", "--design-units", "inch")
     assert np.abs(scan_folder.read_input(tmp_path).arch.joint_points - joints).max() < CORNER_MM
@@ -407,7 +428,9 @@ def test_two_files_of_one_name_and_a_root_gap(tmp_path):
         bridge_parts.write_obj(tmp_path / f"design/{name}.obj", *mesh)
     bridge_parts.write_stl(tmp_path / "design/rib1.stl", *meshes[1])
     write_scans(tmp_path, meshes, bridge_parts.names(5), 0.001, "x_m,y_m,z_m")
-    assert "? rib1: there are rib1.stl, rib1.obj; rib1.stl is read" in init(tmp_path)
+    doubts = guess.guess(tmp_path).doubts
+    assert [(doubt.code, doubt.values["file"]) for doubt in doubts] == [("init.files-of-one-name", "rib1.stl")]
+    init(tmp_path)
     assert scan_folder.read_input(tmp_path).tolerance.root_gap_mm == pytest.approx(6.0, abs=0.01)
     (tmp_path / "project.toml").unlink()
     (tmp_path / "design.json").unlink()

@@ -10,8 +10,11 @@ import pytest
 from click.testing import CliRunner
 
 from processor.cli import main
-from processor.model import InputError, UsageError
+from processor.language.messages import messages
+from processor.model import InputError, UsageError, reason
 from processor.scan_folder import component_names, folder, guess
+from tests.support.pages.pages import latin
+from tests.support.results.reasons import codes, values
 
 ROOT = Path(__file__).resolve().parents[2]
 ORDER = ("foot1", "rib1", "rib2", "foot2")
@@ -117,6 +120,10 @@ def init(place, *options):
     return CliRunner().invoke(main.commands, ["init", str(place), *options])
 
 
+def english(code):
+    return messages("en").text(reason(code))
+
+
 def test_a_bridge_with_names_and_without(bridge):
     for i, (stem, name) in enumerate(
         {"拱脚1 '东'": "foot1", "A": "rib1", "2号拱肋_扫描": "rib2", "B": "foot2"}.items()
@@ -126,7 +133,7 @@ def test_a_bridge_with_names_and_without(bridge):
     assert done.exit_code == 0, done.output
     said = json.loads(done.output)
     assert (said["kind"], said["units"], said["design"]) == ("arch-bridge", "m", "design.json")
-    assert "as large as the design" in said["units_reason"]
+    assert said["units_reason"] == english("init.units-by-design")
     scans = {one["file"]: one for one in said["scans"]}
     assert {file: one["component"] for file, one in scans.items()} == {
         "scans/拱脚1 '东'.xyz": "foot1",
@@ -136,7 +143,7 @@ def test_a_bridge_with_names_and_without(bridge):
     }
     assert [file for file, one in scans.items() if not one["sure"]] == ["scans/B.xyz"]  # both feet have its shape
     assert len(said["unsure"]) == 1
-    assert "the only one of them left" in said["unsure"][0]
+    assert english("init.only-one-left") in said["unsure"][0]
     scene = folder.read_input(bridge)
     assert (scene.name, scene.kind, scene.units) == ("东桥", "arch-bridge", "m")
     assert {scan.name: scan.component for scan in scene.scans}["A"] == "rib1"
@@ -150,10 +157,11 @@ def test_name_contradicted_by_the_shape_is_marked_unsure(bridge):
     assert found.units == "mm"
     one = next(one for one in found.scans if one.file == "rib1.xyz")
     assert (one.component, one.sure) == ("rib1", False)
-    assert "the extents match rib2" in one.reason
+    assert values(one.reasons, "init.extents-of-other")["component"] == "rib2"
     odd = next(one for one in found.scans if one.file == "odd.xyz")
     assert (odd.component, odd.sure) == ("", False)
-    assert any("no scan is assigned to" in text and "foot1" in text for text in found.unsure)
+    assert "foot1" in values(found.doubts, "init.components-without-scan")["components"]
+    assert codes(odd.reasons) == ["init.name-of-none", "init.extents-of-none"]
 
 
 def test_numbered_scans_are_assigned_by_their_shape(bridge):
@@ -167,7 +175,7 @@ def test_numbered_scans_are_assigned_by_their_shape(bridge):
     feet = [one for one in scans if one.component.startswith("foot")]
     assert {one.component for one in feet} == {"foot1", "foot2"}
     assert not any(one.sure for one in feet)
-    assert all("any of them may be right" in one.reason for one in feet)
+    assert all("init.any-of-them" in codes(one.reasons) for one in feet)
 
 
 def test_the_shape_of_a_part_is_measured_without_the_ground_about_it(bridge):
@@ -189,7 +197,7 @@ def test_name_is_unsure_if_the_shape_matches_another_part(bridge):
     write_scan(bridge / "scans/rib1.xyz", box_points(size / 1000.0, 1))
     (one,) = guess.guess(bridge).scans
     assert (one.component, one.sure) == ("rib1", False)
-    assert "the extents match rib2" in one.reason
+    assert values(one.reasons, "init.extents-of-other")["component"] == "rib2"
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("mm", 1000.0), ("cm", 100.0), ("inch", 1 / 0.0254)])
@@ -204,8 +212,8 @@ def test_no_design_and_a_scan_that_cannot_be_read(tmp_path):
     (tmp_path / "cut.ply").write_bytes(b"ply\nformat")
     done = init(tmp_path)
     assert done.exit_code == 0, done.output
-    assert "? design: none found" in done.output
-    assert "? cut.ply: cannot be read" in done.output
+    assert f"? {english('init.no-design')}" in done.output.splitlines()
+    assert values(guess.guess(tmp_path).doubts, "init.scan-unreadable")["file"] == "cut.ply"
     text = (tmp_path / "project.toml").read_text("utf-8")
     assert '# station = "S2"' in text
     scene = folder.read_input(tmp_path)
@@ -224,6 +232,26 @@ def test_one_mesh_is_a_structure(tmp_path):
     (tmp_path / "project.toml").write_text('design = "design/hall.obj"\n', "utf-8")  # then the mesh is in m as well
     with pytest.raises(InputError, match=r"close to 0\.001"):
         folder.read_input(tmp_path)
+
+
+def test_chinese_init_has_chinese_comments_and_lines_and_english_json(bridge):
+    write_scan(bridge / "rib1.xyz", box_points(SIZES["rib2"], 1))
+    write_scan(bridge / "rib2.xyz", box_points(SIZES["rib2"], 2))
+    write_scan(bridge / "scans/S1.xyz", box_points((6.0, 3.0, 3.0), 3))
+    write_scan(bridge / "scans/S2.xyz", box_points(SIZES["foot1"], 4))
+    (bridge / "stations.json").write_text("{}")
+    done = init(bridge, "--lang", "zh")
+    assert done.exit_code == 0, done.output
+    lines = (bridge / "project.toml").read_text("utf-8").splitlines()
+    comments = [line.rpartition("# ")[2] for line in lines if "# " in line]
+    assert len(comments) > 10
+    names = {*ORDER, "S1", "S2", "scans", "xyz", "stations", "station", "design", "project", "json", "toml"}
+    keys = {"kind", "arch", "bridge", "units", "standard", "GB", "processor", "init", "tolerance"}
+    printed = done.output.replace(str(bridge), "").splitlines()
+    assert len(printed) > 4
+    assert latin([*comments, *printed], names | keys) == []
+    in_english = init(bridge, "--force", "--json").output
+    assert init(bridge, "--force", "--json", "--lang", "zh").output == in_english
 
 
 def test_existing_project_file_is_kept_and_names_are_quoted(tmp_path):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.model import ArchDesign, DesignPart, Floats
+from processor.model import ArchDesign, DesignPart, Floats, Reason, reason
 from processor.scan_folder.component_names import numbered_backwards
 from processor.scan_folder.shapes import chain as chains
 from processor.scan_folder.shapes.body import Body
@@ -23,19 +23,19 @@ PLAUSIBLE_MM = (150.0, 10_000.0)  # sizes of a section
 END_MM = 0.5  # between the end of a bottom edge and the corner of the next joint
 REACH_SHARE = 0.6  # of a foot's length that its bottom edges have to reach from the joint
 ALIKE = 0.1  # relative difference of the lengths of a part's two bottom edges
-SIDES = ("left", "right")
+LEFT, RIGHT = 0, 1  # rows of the lower corners of an end
 
 
 @dataclass(frozen=True)
 class GuessedArch:
-    """A design, or None, with what is not sure about it and the reason.
+    """A design and the doubts about it; None and the reasons where there is none.
 
     ``root_gap_mm`` is the modelled gap between the ends at the joints, NaN where it differs. ``arched``: the parts rise
     from both ends.
     """
 
     design: ArchDesign | None
-    doubts: tuple[str, ...]
+    doubts: tuple[Reason, ...]
     root_gap_mm: float = 0.0
     arched: bool = False
 
@@ -44,7 +44,7 @@ class GuessedArch:
 class _End:
     corners: Floats  # P1..P4 (4, 3)
     outward: Floats  # (4, 3) where the edges lead a mm farther along the normal
-    doubt: str = ""
+    doubt: Reason | None = None
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class _Joint:
     left: _End  # of the left part
     right: _End
     points: Floats  # P1..P8
-    doubts: tuple[str, ...]
+    doubts: tuple[Reason, ...]
 
 
 def find(bodies: Sequence[Body]) -> GuessedArch:
     """Return the design of the parts of an arch bridge, in the bridge's frame, mm; without one the reason."""
     chain = chains.find(bodies)
-    if isinstance(chain, str):
+    if isinstance(chain, Reason):
         return GuessedArch(None, (chain,))
     problem = chains.frame_problem(chain)
     if problem:
@@ -69,23 +69,26 @@ def find(bodies: Sequence[Body]) -> GuessedArch:
     joints = []
     for number in range(len(chain.contacts)):
         joint = _joint(chain, number)
-        if isinstance(joint, str):
+        if isinstance(joint, Reason):
             return GuessedArch(None, (joint, *doubts))
         joints.append(joint)
-        doubts += [f"joint {joint.name} of {_pair(chain, number)}: {text}" for text in joint.doubts]
+        left, right = chain.parts[number].name, chain.parts[number + 1].name
+        doubts += [
+            reason("init.at-joint", joint=joint.name, left=left, right=right, reason=doubt) for doubt in joint.doubts
+        ]
     parts = []
     for number in range(len(chain.parts)):
-        part, doubt = _part(chain, joints, number)
+        part, of_part = _part(chain, joints, number)
         parts.append(part)
-        doubts += [doubt] if doubt else []
+        doubts += of_part
     doubts += _numbering(chain)
-    rounded = [part.name for part in chain.parts if part.step_mm]
+    rounded = tuple(part.name for part in chain.parts if part.step_mm)
     if rounded:
-        doubts.append(f"corners and edges: the coordinates of {', '.join(rounded)} are rounded to 0.1 mm or more")
+        doubts.append(reason("init.rounded-parts", parts=rounded))
     gaps = [contact.gap_mm for contact in chain.contacts]
     alike = max(gaps) - min(gaps) < SAME_MM
     if not alike:
-        doubts.append(f"root gap: from {min(gaps):.2f} to {max(gaps):.2f} mm at the joints")
+        doubts.append(reason("init.root-gaps-differ", least=min(gaps), most=max(gaps)))
     design = ArchDesign(
         tuple(parts),
         joint_names=tuple(joint.name for joint in joints),
@@ -97,38 +100,36 @@ def find(bodies: Sequence[Body]) -> GuessedArch:
     return GuessedArch(design, tuple(doubts), gap, chains.rises(chain))
 
 
-def _pair(chain: Chain, number: int) -> str:
-    return f"{chain.parts[number].name} and {chain.parts[number + 1].name}"
-
-
 # --- joints -----------------------------------------------------------------------------------------------------------
 
 
-def _joint(chain: Chain, number: int) -> _Joint | str:
+def _joint(chain: Chain, number: int) -> _Joint | Reason:
     contact = chain.contacts[number]
     a, b = chain.parts[number], chain.parts[number + 1]
     plane = _plane(contact, a, b)
     if plane is None:
-        return f"{_pair(chain, number)}: their ends do not face along the span, so left and right are not clear"
+        return reason("init.sides-not-clear", left=a.name, right=b.name)
     left, right = _end(a, contact.a, plane, -1.0), _end(b, contact.b, plane, 1.0)
     if left is None or right is None:
-        return f"{_pair(chain, number)}: the end of {(b if left else a).name} encloses no area"
-    doubts = ["they meet in a second pair of faces that is nearly as large"] if contact.rival else []
-    doubts += [f"{part.name}: {end.doubt}" for part, end in ((a, left), (b, right)) if end.doubt]
+        return reason("init.end-without-area", left=a.name, right=b.name, part=(b if left else a).name)
+    doubts = [reason("init.second-contact")] if contact.rival else []
+    doubts += [
+        reason("init.of-part", part=part.name, reason=end.doubt) for part, end in ((a, left), (b, right)) if end.doubt
+    ]
     # Edges that are skew to the joint go on across the gap.
     middles = [plane.flat(end.corners + 0.5 * contact.gap_mm * end.outward) for end in (left, right)]
     in_plane = np.abs(middles[0] - middles[1]).max()
     if in_plane > SAME_MM:
-        doubts.append(f"the corners of the two ends differ by {in_plane:.1f} mm")
+        doubts.append(reason("init.corners-differ", mm=in_plane))
     gaps = (right.corners - left.corners) @ plane.normal
     if contact.gap_mm < -OVERLAP_MM:
-        doubts.append(f"the ends overlap by {-contact.gap_mm:.1f} mm")
+        doubts.append(reason("init.ends-overlap", mm=-contact.gap_mm))
     if np.ptp(gaps) > SAME_MM:
-        doubts.append(f"its gap is not even ({gaps.min():.2f} to {gaps.max():.2f} mm)")
+        doubts.append(reason("init.gap-uneven", least=gaps.min(), most=gaps.max()))
     four = plane.flat(0.5 * (left.corners + right.corners))
     size = np.ptp(four, axis=0)
     if not (PLAUSIBLE_MM[0] < size.min() and size.max() < PLAUSIBLE_MM[1]):
-        doubts.append(f"a section of {size[0]:.4g} x {size[1]:.4g} mm is unusual: is the unit right?")
+        doubts.append(reason("init.section-unusual", width=size[0], height=size[1]))
     return _Joint(f"J{number + 1}", plane, left, right, points=key_points(plane, four), doubts=tuple(doubts))
 
 
@@ -151,54 +152,56 @@ def _end(body: Body, face: PlaneFace, joint: SectionPlane, inward: float) -> _En
     skin = skin_at_end(body, plane, inward)
     outward = np.broadcast_to(-inward * normal, (4, 3))
     if skin is None:
-        return _End(plane.space(found.places), outward, found.doubt or "the sections behind its end have other corners")
+        return _End(plane.space(found.places), outward, found.doubt or reason("init.other-corners-behind"))
     at_end, change = skin
     outward = outward + change[:, :1] * plane.left + change[:, 1:] * plane.up
     off = float(np.abs(at_end - found.places).max())
     if found.doubt or off > SKIN_MM:
-        doubt = found.doubt or f"the corners of its end are {off:.1f} mm off its outer faces; these are taken"
-        return _End(plane.space(at_end), outward, doubt)
+        return _End(plane.space(at_end), outward, found.doubt or reason("init.off-outer-faces", mm=off))
     return _End(plane.space(found.places), outward)
 
 
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _part(chain: Chain, joints: Sequence[_Joint], number: int) -> tuple[DesignPart, str]:
-    """Return a part with its bottom edges from start to end, or none, and why they are not sure."""
+def _part(chain: Chain, joints: Sequence[_Joint], number: int) -> tuple[DesignPart, list[Reason]]:
+    """Return a part with its bottom edges from start to end, or none, and the doubts about them."""
     body = chain.parts[number]
     start = joints[number - 1] if number else None
     end = joints[number] if number < len(joints) else None
-    edges, doubts = [], []
-    for k, side in enumerate(SIDES):
+    edges, doubts = [], list[Reason]()
+    for k in (LEFT, RIGHT):
         near, far = (start.right, end.left if end else None) if start else (end.left if end else None, None)
         assert near is not None
         edge = follow(body, near.corners[k], -near.outward[k])
         edge, doubt = _between(edge, near.corners[k], None if far is None else far.corners[k])
         if len(edge) and far is None and _reach(body, edge) < REACH_SHARE:
-            doubt = f"ends {np.linalg.norm(edge[-1] - edge[0]):.0f} mm from the joint"
-        doubts += [f"the lower {side} edge {doubt}"] if doubt else []
+            doubt = reason("init.edge-short", mm=np.linalg.norm(edge[-1] - edge[0]))
+        if doubt:
+            doubts.append(
+                reason("init.left-edge", reason=doubt) if k == LEFT else reason("init.right-edge", reason=doubt)
+            )
         edges.append(smooth(edge if start is not None else edge[::-1]))
     lengths = [float(np.linalg.norm(np.diff(edge, axis=0), axis=1).sum()) for edge in edges]
     if min(lengths) == 0.0:
-        text = f"bottom edges of {body.name}: left out: {'; '.join(doubts)}"
-        return DesignPart(body.name, body.vertices, body.faces), text
+        left_out = reason("init.bottom-edges-left-out", part=body.name, reasons=tuple(doubts))
+        return DesignPart(body.name, body.vertices, body.faces), [left_out]
     if abs(lengths[0] - lengths[1]) > ALIKE * max(lengths):
-        doubts.append(f"its bottom edges are {lengths[0]:.0f} and {lengths[1]:.0f} mm long")
-    text = f"bottom edges of {body.name}: {'; '.join(doubts)}" if doubts else ""
-    return DesignPart(body.name, body.vertices, body.faces, edges[0], edges[1]), text
+        doubts.append(reason("init.edges-differ", left=lengths[0], right=lengths[1]))
+    part = DesignPart(body.name, body.vertices, body.faces, edges[0], edges[1])
+    return part, [reason("init.bottom-edges", part=body.name, reasons=tuple(doubts))] if doubts else []
 
 
-def _between(edge: Floats, first: Floats, last: Floats | None) -> tuple[Floats, str]:
-    """Return an edge (n, 3) that begins and ends at the corners (3,) of the joints, and why it is not sure.
+def _between(edge: Floats, first: Floats, last: Floats | None) -> tuple[Floats, Reason | None]:
+    """Return an edge (n, 3) that begins and ends at the corners (3,) of the joints, and the doubt about it.
 
     n = 0 for none.
     """
     if not len(edge):
-        return edge, "is not sharp at the corner of the joint"
-    doubt = ""
+        return edge, reason("init.edge-not-sharp")
+    doubt = None
     if np.linalg.norm(edge[0] - first) > END_MM:
-        edge, doubt = np.vstack([first, edge]), "begins behind the corner"
+        edge, doubt = np.vstack([first, edge]), reason("init.edge-begins-late")
     else:
         edge = np.vstack([first, edge[1:]])
     if last is None:
@@ -208,8 +211,8 @@ def _between(edge: Floats, first: Floats, last: Floats | None) -> tuple[Floats, 
         return np.vstack([edge[:-1], last]), doubt
     if away.min() < BEVEL_MM:
         kept = edge[: max(1, int((away > BEVEL_MM).sum()))]
-        return np.vstack([kept, last]), "ends before the corner of the next joint"
-    return edge[:0], "does not lead from joint to joint"
+        return np.vstack([kept, last]), reason("init.edge-ends-early")
+    return edge[:0], reason("init.edge-ends-elsewhere")
 
 
 def _reach(body: Body, edge: Floats) -> float:
@@ -218,11 +221,7 @@ def _reach(body: Body, edge: Floats) -> float:
     return float(np.linalg.norm(edge[-1] - edge[0]) / farthest)
 
 
-def _numbering(chain: Chain) -> list[str]:
+def _numbering(chain: Chain) -> list[Reason]:
     """Return a doubt where the names are numbered against X."""
-    names = [part.name for part in chain.parts]
-    if not numbered_backwards(names):
-        return []
-    return [
-        f"order: {', '.join(names)} along X, but their names are numbered the other way; does X point the right way?"
-    ]
+    names = tuple(part.name for part in chain.parts)
+    return [reason("init.numbered-backwards", parts=names)] if numbered_backwards(names) else []

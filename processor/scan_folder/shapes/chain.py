@@ -8,7 +8,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from processor.model import Floats
+from processor.model import Floats, Reason, reason
 from processor.scan_folder.shapes.body import Body
 from processor.scan_folder.shapes.contact_faces import Contact, contact
 
@@ -23,7 +23,7 @@ class Chain:
 
     parts: tuple[Body, ...]
     contacts: tuple[Contact, ...]
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Reason, ...] = ()
 
     @property
     def middles(self) -> Floats:
@@ -36,7 +36,7 @@ def _middle(points: Floats) -> Floats:
     return np.asarray(0.5 * (points.min(axis=0) + points.max(axis=0)))
 
 
-def find(bodies: Sequence[Body]) -> Chain | str:
+def find(bodies: Sequence[Body]) -> Chain | Reason:
     """Return the longest chain of bodies that meet end to end, or why there is none."""
     contacts: dict[tuple[int, int], Contact] = {}
     for i, k in combinations(range(len(bodies)), 2):
@@ -55,21 +55,17 @@ def find(bodies: Sequence[Body]) -> Chain | str:
     crowded = [i for i, others in beside.items() if len(others) > 2]
     if crowded:
         i = crowded[0]
-        return f"{bodies[i].name} meets {_names(bodies, beside[i])}: the order of the parts is not clear"
+        return reason("init.crowded", part=bodies[i].name, others=_names(bodies, beside[i]))
     chains = _paths(beside)
+    everything, unclosed = _names(bodies, range(len(bodies))), _unclosed(bodies)
     if not chains and contacts:
-        return f"{_names(bodies, range(len(bodies)))} make up a ring, which has no first part"
+        return reason("init.ring", parts=everything)
     if not chains:
-        return (
-            f"no two of {_names(bodies, range(len(bodies)))} meet end to end, or lie {GAP_MM:g} mm apart at most"
-            f"{_open(bodies)}"
-        )
+        return reason("init.none-meet", parts=everything, gap_mm=GAP_MM, unclosed=unclosed)
     chains.sort(key=lambda chain: -len(chain))
     if len(chains) > 1:
-        return (
-            f"there are several chains of parts ({_names(bodies, chains[0])}; {_names(bodies, chains[1])}), which do "
-            f"not meet{_open(bodies)}; make a folder for each bridge, or correct the parts between them"
-        )
+        first, second = (_names(bodies, chain) for chain in chains[:2])
+        return reason("init.several-chains", first=first, second=second, unclosed=unclosed)
     order = chains[0]
     if _joint_x(contacts, order[0], order[1]) > _joint_x(contacts, order[-2], order[-1]) or (
         len(order) == 2 and bodies[order[0]].centre[0] > bodies[order[1]].centre[0]
@@ -80,11 +76,9 @@ def find(bodies: Sequence[Body]) -> Chain | str:
 
 def _chain(bodies: Sequence[Body], order: Sequence[int], contacts: Mapping[tuple[int, int], Contact]) -> Chain:
     doubts = []
-    left_out = [body.name for i, body in enumerate(bodies) if i not in order]
+    left_out = tuple(body.name for i, body in enumerate(bodies) if i not in order)
     if left_out:
-        doubts.append(
-            f"{', '.join(left_out)}: meets no part of the bridge end to end{_open(bodies)}, so it is left out"
-        )
+        doubts.append(reason("init.parts-left-out", parts=left_out, unclosed=_unclosed(bodies)))
     joints = []
     for i, k in pairwise(order):
         one = contacts[min(i, k), max(i, k)]
@@ -92,19 +86,20 @@ def _chain(bodies: Sequence[Body], order: Sequence[int], contacts: Mapping[tuple
     return Chain(tuple(bodies[i] for i in order), tuple(joints), tuple(doubts))
 
 
-def _open(bodies: Sequence[Body]) -> str:
-    """Return which bodies are not closed: they may lack the faces of their ends."""
+def _unclosed(bodies: Sequence[Body]) -> tuple[Reason, ...]:
+    """Return which bodies are not closed, () for none: they may lack the faces of their ends."""
     names = [body.name for body in bodies if body.open_edges]
-    return f" (not closed: {', '.join(names[:6])}{', ...' if len(names) > 6 else ''})" if names else ""
+    shown = (*names[:6], *(["..."] if len(names) > 6 else []))
+    return (reason("init.unclosed", parts=shown),) if names else ()
 
 
 def _joint_x(contacts: Mapping[tuple[int, int], Contact], i: int, k: int) -> float:
     return float(contacts[min(i, k), max(i, k)].a.origin[0])
 
 
-def _names(bodies: Sequence[Body], which: Sequence[int]) -> str:
-    names = [bodies[i].name for i in which]
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+def _names(bodies: Sequence[Body], which: Sequence[int]) -> tuple[str, ...] | Reason:
+    names = tuple(bodies[i].name for i in which)
+    return names if len(names) <= 6 else reason("init.and-others", names=names[:6], others=len(names) - 6)
 
 
 def _paths(beside: Mapping[int, Sequence[int]]) -> list[list[int]]:
@@ -121,26 +116,28 @@ def _paths(beside: Mapping[int, Sequence[int]]) -> list[list[int]]:
     return paths
 
 
-def frame_problem(chain: Chain) -> str:
-    """Return why a chain is not in the bridge's frame (X along the span, Z up); "" if it is."""
+def frame_problem(chain: Chain) -> Reason | None:
+    """Return why a chain is not in the bridge's frame (X along the span, Z up); None if it is."""
     points = np.vstack([chain.parts[0].centre, chain.middles, chain.parts[-1].centre])
     span = points[-1] - points[0]
     off = float(np.arctan2(abs(span[1]), abs(span[0])))
     rise = _rise(points)
-    turned = "turn the design so that X is along the span and Z up"
+    arched = np.linalg.norm(rise) > RISE_SHARE * np.linalg.norm(span)
     if abs(span[2]) > max(abs(span[0]), abs(span[1])):
-        return f"the parts follow each other along Z; {turned}"
-    if off > SPAN_RAD:
-        along = "along Y" if off > np.pi / 2 - SPAN_RAD else f"{np.degrees(off):.0f} degrees from X"
-        return f"the parts follow each other {along}; {turned}"
-    if (np.diff(points[:, 0]) <= 0.0).any():
-        return f"the parts do not follow each other along X; {turned}"
-    if np.linalg.norm(rise) > RISE_SHARE * np.linalg.norm(span):
-        if abs(rise[1]) > abs(rise[2]):
-            return f"the arch rises along Y; {turned}"
-        if rise[2] < 0.0:
-            return f"the arch hangs down along Z; {turned}"
-    return ""
+        found = reason("init.along-z")
+    elif off > np.pi / 2 - SPAN_RAD:
+        found = reason("init.along-y")
+    elif off > SPAN_RAD:
+        found = reason("init.off-x", degrees=np.degrees(off))
+    elif (np.diff(points[:, 0]) <= 0.0).any():
+        found = reason("init.not-along-x")
+    elif arched and abs(rise[1]) > abs(rise[2]):
+        found = reason("init.rises-along-y")
+    elif arched and rise[2] < 0.0:
+        found = reason("init.hangs-down")
+    else:
+        return None
+    return reason("init.other-frame", reason=found)
 
 
 def rises(chain: Chain) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.model import KEY_POINTS, ArchDesign, Floats, FrameDesign, Ints
+from processor.model import KEY_POINTS, ArchDesign, Floats, FrameDesign, Ints, Reason, reason
 from processor.scan_folder import component_names
 from processor.scan_folder.shapes import arch_bridge, guess_unit, space_frame, surface_files
 from processor.scan_folder.shapes.body import Body, stacked, welded
@@ -22,26 +22,27 @@ PARTS = ("foot", "rib", "crown")  # words in the names of an arch bridge's parts
 class GuessedDesign:
     """A design as guessed from surfaces.
 
-    ``design`` is None where there is none; the doubts have the reason. ``kind_doubt`` and ``unit_doubt`` are "" where
-    the kind and the unit are sure, ``doubts`` are all others. ``units`` are those of design.json, ``meshes`` the files
-    (path below the folder, vertices (v, 3) in mm, triangles) to be written beside it, by part.
+    A doubt is a reason why something in it may be wrong, or why ``design`` is None. ``kind_doubts`` and ``unit_doubts``
+    are () where kind and unit are sure, ``other_doubts`` are about all else; ``reasons`` say what shows the design.
+    ``units`` are those of design.json, ``meshes`` the files (path below the folder, vertices (v, 3) in mm, triangles)
+    to be written beside it, by part.
     """
 
     design: ArchDesign | FrameDesign | None = None
-    doubts: tuple[str, ...] = ()
+    other_doubts: tuple[Reason, ...] = ()
     units: str = "mm"
-    reason: str = ""
-    kind_doubt: str = ""
-    unit_doubt: str = ""
+    reasons: tuple[Reason, ...] = ()
+    kind_doubts: tuple[Reason, ...] = ()
+    unit_doubts: tuple[Reason, ...] = ()
     root_gap_mm: float = 0.0
     files: tuple[str, ...] = ()
     mesh_of: dict[str, str] = field(default_factory=dict)
     meshes: tuple[tuple[str, Floats, Ints], ...] = ()
 
     @property
-    def questions(self) -> tuple[str, ...]:
-        """What is not sure of a design that was found, apart from its kind."""
-        return (*([self.unit_doubt] if self.unit_doubt else []), *self.doubts)
+    def doubts(self) -> tuple[Reason, ...]:
+        """All doubts but those about the kind."""
+        return (*self.unit_doubts, *self.other_doubts)
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class _Parts:
     bodies: list[Body]
     mesh_of: dict[str, str]
     meshes: tuple[tuple[str, Floats, Ints], ...] = ()
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Reason, ...] = ()
 
 
 def guess(
@@ -71,23 +72,23 @@ def guess(
     surfaces = _in_unit(folder, surfaces, given_unit or "mm", before)
     bodies = _bodies(folder, surfaces, units.unit or "mm").bodies
     if not bodies:
-        return GuessedDesign(doubts=(*doubts, "no surface has an area"), files=names)
-    balls = space_frame.find(stacked("all", bodies))
-    if balls.design is not None:
+        return GuessedDesign(other_doubts=(*doubts, reason("init.no-area")), files=names)
+    frame = space_frame.find(stacked("all", bodies))
+    if frame is not None:
         return GuessedDesign(
-            design=balls.design if units.unit else None,
-            doubts=(*doubts, *balls.doubts),
-            unit_doubt=_unit_doubt(units),
+            design=frame.design if units.unit else None,
+            other_doubts=(*doubts, *frame.doubts),
+            unit_doubts=units.doubts,
             units=_json_unit(surfaces, units),
-            reason=f"balls and the tubes between them, in {_some(names)}",
+            reasons=(reason("init.shown-by-balls", files=_some(names)),),
             files=names,
         )
     units = _unit(surfaces, scans, given_unit, as_whole=len(surfaces) == 1)
     if not units.unit:
-        return GuessedDesign(doubts=tuple(doubts), unit_doubt=_unit_doubt(units), files=names)
+        return GuessedDesign(other_doubts=tuple(doubts), unit_doubts=units.doubts, files=names)
     surfaces = _in_unit(folder, surfaces, before, units.unit)
     guessed = _bridge(_bodies(folder, surfaces, units.unit), names, tuple(doubts), _json_unit(surfaces, units))
-    return replace(guessed, unit_doubt=_unit_doubt(units))
+    return replace(guessed, unit_doubts=units.doubts)
 
 
 def _in_unit(
@@ -106,17 +107,10 @@ def _unit(
     surfaces: Sequence[surface_files.Surface], scans: Sequence[tuple[float, str]], given: str, as_whole: bool
 ) -> guess_unit.DesignUnit:
     if given:
-        return guess_unit.DesignUnit(given, "given", True)
+        return guess_unit.DesignUnit(given)
     if all(surface.unit for surface in surfaces):
-        return guess_unit.DesignUnit("mm", "the CAD files state their units", True)
+        return guess_unit.DesignUnit("mm")
     return guess_unit.guess([surface.vertices for surface in surfaces], scans, as_whole)
-
-
-def _unit_doubt(units: guess_unit.DesignUnit) -> str:
-    if units.sure:
-        return ""
-    taken = f"taken as {units.unit}" if units.unit else "not clear"
-    return f"units of the design: {taken}: {units.reason}; state it by --design-units"
 
 
 def _json_unit(surfaces: Sequence[surface_files.Surface], units: guess_unit.DesignUnit) -> str:
@@ -124,20 +118,20 @@ def _json_unit(surfaces: Sequence[surface_files.Surface], units: guess_unit.Desi
     return "mm" if all(surface.unit for surface in surfaces) else units.unit or "mm"
 
 
-def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_unit: str) -> GuessedDesign:
+def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[Reason, ...], json_unit: str) -> GuessedDesign:
     whole = len(names) == 1
     found = arch_bridge.find(parts.bodies)
     named = _named_as_parts(parts.bodies)
     if found.design is None or (whole and not found.arched and not named):
-        told = [f"as an arch bridge: {text}" for text in found.doubts if named or not whole]
-        return GuessedDesign(doubts=(*doubts, *told), files=tuple(names))
+        of_bridge = [reason("init.as-arch-bridge", reason=doubt) for doubt in found.doubts if named or not whole]
+        return GuessedDesign(other_doubts=(*doubts, *of_bridge), files=tuple(names))
     mesh_of = {part.name: parts.mesh_of[part.name] for part in found.design.parts}
     return GuessedDesign(
         design=found.design,
-        doubts=(*doubts, *parts.doubts, *found.doubts),
+        other_doubts=(*doubts, *parts.doubts, *found.doubts),
         units="mm" if parts.meshes else json_unit,
-        reason=f"{len(mesh_of)} parts that meet end to end, in {_some(names)}",
-        kind_doubt=_kind_doubt(found.arched, named),
+        reasons=(reason("init.shown-by-parts", parts=len(mesh_of), files=_some(names)),),
+        kind_doubts=_kind_doubts(found.arched, named),
         root_gap_mm=found.root_gap_mm,
         files=tuple(names),
         mesh_of=mesh_of,
@@ -145,14 +139,14 @@ def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_u
     )
 
 
-def _kind_doubt(arched: bool, named: bool) -> str:
+def _kind_doubts(arched: bool, named: bool) -> tuple[Reason, ...]:
     if not arched:
-        return "the parts follow each other in a straight line, which is no arch"
-    return "" if named else "the parts meet end to end and rise, but no name says that they are an arch's"
+        return (reason("init.straight"),)
+    return () if named else (reason("init.arch-not-named"),)
 
 
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (" and more" if len(names) > 3 else "")
+def _some(names: Sequence[str]) -> tuple[str, ...] | Reason:
+    return tuple(names) if len(names) <= 3 else reason("init.and-more", names=tuple(names[:3]))
 
 
 def _names(folder: Path, paths: Sequence[Path]) -> tuple[str, ...]:
@@ -175,7 +169,7 @@ def _bodies(folder: Path, surfaces: Sequence[surface_files.Surface], units: str)
                 mesh_of[body.name] = str(surface.path.relative_to(folder))
         return _Parts(bodies, mesh_of)
     (surface,), (scale,) = surfaces, scales
-    meshes, doubts = list[tuple[str, Floats, Ints]](), list[str]()
+    meshes, doubts = list[tuple[str, Floats, Ints]](), list[Reason]()
     for name, vertices, faces in surface_files.bodies(surface):
         body = welded(name, vertices * scale, faces)
         if body is not None:
@@ -183,12 +177,10 @@ def _bodies(folder: Path, surfaces: Sequence[surface_files.Surface], units: str)
             mesh_of[name] = f"{surface_files.MADE}/{_stem(name, mesh_of)}.ply"
             meshes.append((mesh_of[name], body.vertices, body.faces))
     if surface.bodies is None:
-        doubts.append(f"names: the parts are pieces of {surface.path.name}, numbered in its order")
+        doubts.append(reason("init.pieces-numbered", file=surface.path.name))
     elif surface.bodies.unnamed or surface.bodies.shared:
-        doubts.append(
-            f"names: of the bodies of {surface.path.name} {surface.bodies.unnamed} have none and "
-            f"{surface.bodies.shared} share theirs; they were numbered"
-        )
+        unnamed, shared = surface.bodies.unnamed, surface.bodies.shared
+        doubts.append(reason("init.bodies-numbered", file=surface.path.name, unnamed=unnamed, shared=shared))
     return _Parts(bodies, mesh_of, tuple(meshes), tuple(doubts))
 
 
@@ -202,11 +194,11 @@ def _stem(name: str, taken: dict[str, str]) -> str:
     return stem
 
 
-def content(guessed: GuessedDesign, questions: Sequence[str]) -> dict[str, Any]:
-    """Return the object of design.json; ``questions`` say what is not sure in it."""
+def content(guessed: GuessedDesign, doubts: Sequence[str]) -> dict[str, Any]:
+    """Return the object of design.json, with the doubts as texts."""
     head: dict[str, Any] = {"units": guessed.units}
-    if questions:
-        head["unsure"] = [f"? {text}" for text in questions]
+    if doubts:
+        head["unsure"] = [f"? {doubt}" for doubt in doubts]
     scale = 1.0 / MM_PER_UNIT[guessed.units]
     if isinstance(guessed.design, ArchDesign):
         return {**head, "kind": "arch-bridge", **_arch(guessed.design, guessed.mesh_of, scale)}

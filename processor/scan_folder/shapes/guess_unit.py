@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.model import Floats
+from processor.model import Floats, Reason, reason
 from processor.scan_folder.units import MM_PER_UNIT, radius
 
 UNITS = ("mm", "m", "inch", "cm", "ft")
@@ -18,11 +18,10 @@ USUAL = ("mm", "m")  # what CAD writes
 
 @dataclass(frozen=True)
 class DesignUnit:
-    """A unit of length, "" if none is likelier than the others, with the reason, and whether it is sure."""
+    """A unit of length, "" if none is likelier than the others, and the doubt about it; () where it is sure."""
 
     unit: str
-    reason: str
-    sure: bool
+    doubts: tuple[Reason, ...] = ()
 
 
 def guess(surfaces: Sequence[Floats], scans: Sequence[tuple[float, str]], as_whole: bool) -> DesignUnit:
@@ -40,15 +39,24 @@ def guess(surfaces: Sequence[Floats], scans: Sequence[tuple[float, str]], as_who
         }
         best, second = sorted(UNITS, key=misfit.__getitem__)[:2]
         if misfit[best] <= np.log1p(SURE) and misfit[second] > np.log1p(TOLERANCE):
-            return DesignUnit(best, "the scans, whose formats state a unit, are as large as the design in it", True)
+            return DesignUnit(best)
     extent = float(np.ptp(whole, axis=0).max())
     possible = [u for u in UNITS if SIZES_M[0] <= extent * MM_PER_UNIT[u] / 1000.0 <= SIZES_M[1]]
     likely = [u for u in possible if u in USUAL]
-    which = " or ".join(possible) if possible else "none of the usual units"
-    if len(likely) != 1 and "mm" not in likely:
-        return DesignUnit("", f"an extent of {extent:.4g} would be {which}", False)
+    if not possible:
+        return _unclear(reason("init.extent-of-no-unit", extent=extent))
+    if not likely:
+        either: str | Reason = possible[0]
+        for other in possible[1:]:
+            either = reason("init.or", first=either, second=other)
+        return _unclear(reason("init.extent-of-several-units", extent=extent, units=either))
     unit = "mm" if "mm" in likely else likely[0]
-    others = "".join(f", and in {u}" for u in possible if u != unit)
-    return DesignUnit(
-        unit, f"no file states it; an extent of {extent:.4g} is that of a structure in {unit}{others}", False
-    )
+    units: str | Reason = unit
+    for other in (u for u in possible if u != unit):
+        units = reason("init.and-in", first=units, second=other)
+    why = reason("init.extent-in-units", extent=extent, units=units)
+    return DesignUnit(unit, (reason("init.design-unit-taken", unit=unit, reason=why),))
+
+
+def _unclear(why: Reason) -> DesignUnit:
+    return DesignUnit("", (reason("init.design-unit-unclear", reason=why),))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from processor.model import Floats
+from processor.model import Floats, Reason, reason
 from processor.scan_folder.shapes.body import Body
 
 STRAIGHT_MM = 0.1  # a corner of the hull that is nearer to the line of its neighbours is none
@@ -53,10 +53,10 @@ class SectionPlane:
 
 @dataclass(frozen=True)
 class Corners:
-    """Corners P1..P4 (4, 2) of a section in its plane, left and up; ``doubt``: why they are not clear, else ""."""
+    """Corners P1..P4 (4, 2) of a section in its plane, left and up; ``doubt``: why they are not clear."""
 
     places: Floats
-    doubt: str = ""
+    doubt: Reason | None = None
 
 
 def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
@@ -78,7 +78,7 @@ def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
     ways = np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
     chosen = (unit @ ways.T).argmax(axis=0)
     if len(set(chosen.tolist())) < 4:
-        return Corners(hull[chosen], f"its outline has no four corners of a box (it has {len(hull)} in all)")
+        return Corners(hull[chosen], reason("init.no-corners-of-box", corners=len(hull)))
     return Corners(hull[chosen], _doubt(hull[chosen], len(hull)))
 
 
@@ -96,18 +96,18 @@ def _without_straight(hull: Floats, straight_mm: float) -> Floats:
     return hull
 
 
-def _doubt(four: Floats, count: int) -> str:
+def _doubt(four: Floats, count: int) -> Reason | None:
     if count > 4:
-        return f"its outline has {count} corners instead of four"
+        return reason("init.not-four-corners", corners=count)
     sides = np.roll(four, -1, axis=0) - four
     sides /= np.linalg.norm(sides, axis=1, keepdims=True)
     turn = np.abs(np.einsum("ki,ki->k", sides, np.roll(sides, 1, axis=0)))
     if turn.max() > np.sin(SQUARE_RAD):
-        return f"a corner is {np.degrees(np.arcsin(turn.max())):.0f} degrees from a right angle"
+        return reason("init.not-square", degrees=np.degrees(np.arcsin(turn.max())))
     level = np.arcsin(np.abs(sides[[0, 2], 1]).max())
     if level > LEVEL_RAD:
-        return f"its lower or upper edge slopes by {np.degrees(level):.0f} degrees across the bridge"
-    return ""
+        return reason("init.edge-slopes", degrees=np.degrees(level))
+    return None
 
 
 def key_points(plane: SectionPlane, four: Floats) -> Floats:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.model import Floats, FrameDesign, Ints
+from processor.model import Floats, FrameDesign, Ints, Reason, reason
 from processor.scan_folder.shapes import balls, tubes
 from processor.scan_folder.shapes.balls import Balls
 from processor.scan_folder.shapes.body import Body
@@ -18,7 +17,7 @@ FEWEST_BALLS, FEWEST_MEMBERS = 3, 2
 OFF_AXIS = 0.3  # of a ball's radius: its centre may lie so far from the axis of a tube that ends there
 TRUE_AXIS = 0.05  # of the radius: with more the design is eccentric, or the ball another's
 SHORT = 0.3  # of the clear distance between two balls: a shorter cylinder is a sleeve, a bolt or a bore
-LONG = 10.0  # a tube that leads to no two balls, this many radii long, is told
+LONG = 10.0  # a tube that leads to no two balls, this many radii long, is reported
 OTHER_SHARE = 0.01  # of the surface that may be neither a ball nor along a member
 NEAR_BALL, NEAR_AXIS = 1.3, 2.5  # radii within which a facet belongs to a ball or a member
 SAMPLE = 40_000  # facets
@@ -27,33 +26,33 @@ PLAUSIBLE_MM = (20.0, 600.0)  # radii of balls
 
 @dataclass(frozen=True)
 class GuessedFrame:
-    """A design, or None, with what is not sure about it and the reason."""
+    """A design and the doubts about it."""
 
-    design: FrameDesign | None
-    doubts: tuple[str, ...] = ()
+    design: FrameDesign
+    doubts: tuple[Reason, ...] = ()
 
 
-def find(body: Body) -> GuessedFrame:
-    """Return the design of a space frame whose surfaces are one mesh in mm; without one the reason."""
+def find(body: Body) -> GuessedFrame | None:
+    """Return the design of a space frame whose surfaces are one mesh in mm; None without balls and tubes between."""
     nodes = balls.find(body)
     if len(nodes.radii) < FEWEST_BALLS:
-        return GuessedFrame(None, (f"{len(nodes.radii)} ball(s) found",))
+        return None
     pipes = tubes.find(body)
     a, b, which, off = _members(nodes, pipes)
     if len(a) < FEWEST_MEMBERS:
-        return GuessedFrame(None, (f"{len(nodes.radii)} balls found, but {len(a)} tube(s) between two of them",))
+        return None
     doubts = _doubts(nodes, a, b, off)
     aside = _aside(body, nodes, pipes.ends[which], pipes.radii[which])
     if aside > OTHER_SHARE:
-        doubts.append(f"members: {100.0 * aside:.0f} % of the surface lies along none of them; are some missing?")
+        doubts.append(reason("init.surface-aside", percent=100.0 * aside))
     if body.step_mm:
-        doubts.append("members: coordinates are rounded to 0.1 mm or more, so some may not be found")
+        doubts.append(reason("init.rounded-frame"))
     lengths = np.linalg.norm(pipes.ends[:, 1] - pipes.ends[:, 0], axis=1)
     used = np.isin(np.arange(len(lengths)), which)
     inside = _coaxial(pipes, which)
     others = int((~used & ~inside & (lengths > LONG * pipes.radii)).sum())
     if others:
-        doubts.append(f"members: {others} tube(s) lead to no two balls, so they are left out")
+        doubts.append(reason("init.tubes-left-out", tubes=others))
     ids = np.arange(len(nodes.radii))
     return GuessedFrame(
         FrameDesign(
@@ -132,28 +131,28 @@ def _coaxial(pipes: Tubes, which: Ints) -> np.ndarray:
     return result
 
 
-def _doubts(nodes: Balls, a: Ints, b: Ints, off: Floats) -> list[str]:
+def _doubts(nodes: Balls, a: Ints, b: Ints, off: Floats) -> list[Reason]:
     doubts = []
-    unsure = np.flatnonzero(~nodes.sure)
-    if len(unsure):
-        share = 100.0 * nodes.cover[unsure[0]]
+    doubtful = np.flatnonzero(~nodes.sure)
+    if len(doubtful):
+        percent, rms_mm = 100.0 * nodes.cover[doubtful[0]], nodes.rms[doubtful[0]]
         doubts.append(
-            f"nodes: {_listed(unsure)} may be no ball: {share:.0f} % of its surface is there, "
-            f"{nodes.rms[unsure[0]]:.2g} mm rms off a sphere"
+            reason("init.doubtful-balls", count=len(doubtful), nodes=_first(doubtful), percent=percent, rms_mm=rms_mm)
         )
     odd = np.flatnonzero((nodes.radii < PLAUSIBLE_MM[0]) | (nodes.radii > PLAUSIBLE_MM[1]))
     if len(odd):
-        doubts.append(f"nodes: {_listed(odd)} of unusual radius ({nodes.radii[odd[0]]:.4g} mm); is the unit right?")
+        radius_mm = nodes.radii[odd[0]]
+        doubts.append(reason("init.unusual-radii", count=len(odd), nodes=_first(odd), radius_mm=radius_mm))
     alone = np.setdiff1d(np.arange(len(nodes.radii)), np.concatenate([a, b]))
     if len(alone):
-        doubts.append(f"nodes: {_listed(alone)}: no tube leads to it")
+        doubts.append(reason("init.nodes-alone", count=len(alone), nodes=_first(alone)))
     eccentric = np.flatnonzero(off > TRUE_AXIS)
     if len(eccentric):
-        pairs = ", ".join(f"{a[m]}-{b[m]}" for m in eccentric[:6])
-        doubts.append(f"members: {len(eccentric)} do not lead through the centres of their balls ({pairs})")
+        pairs = tuple(f"{a[m]}-{b[m]}" for m in eccentric[:6])
+        doubts.append(reason("init.eccentric-members", count=len(eccentric), pairs=pairs))
     return doubts
 
 
-def _listed(which: Sequence[int] | Ints) -> str:
-    listed = ", ".join(str(k) for k in which[:6])
-    return f"{len(which)} ({listed}{', ...' if len(which) > 6 else ''})"
+def _first(which: Ints) -> tuple[int | str, ...]:
+    """Return the first six numbers, and dots for all others."""
+    return (*which[:6].tolist(), *(["..."] if len(which) > 6 else []))

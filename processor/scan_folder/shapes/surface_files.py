@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from processor.model import DesignBodies, Floats, InputError, Ints
+from processor.model import DesignBodies, Floats, InputError, Ints, Reason, reason
 from processor.scan_folder import cad
 from processor.scan_folder.checked_table import existing_file_in
 from processor.scan_folder.files import SCANS, belongs
@@ -62,7 +62,7 @@ def _is_surface(path: Path) -> bool:
     return any(line.startswith(b"element face") and not line.endswith(b" 0") for line in head.splitlines())
 
 
-def one_a_stem(files: Sequence[Path]) -> tuple[list[Path], list[str]]:
+def one_a_stem(files: Sequence[Path]) -> tuple[list[Path], list[Reason]]:
     """Return one file for each name, a CAD file before a mesh, and a doubt for each that is there several times."""
     by_stem = defaultdict(list)
     for path in files:
@@ -73,7 +73,8 @@ def one_a_stem(files: Sequence[Path]) -> tuple[list[Path], list[str]]:
         paths.sort(key=lambda path: order.index(path.suffix.lower()))
         chosen.append(paths[0])
         if len(paths) > 1:
-            doubts.append(f"{paths[0].stem}: there are {', '.join(p.name for p in paths)}; {paths[0].name} is read")
+            names = tuple(path.name for path in paths)
+            doubts.append(reason("init.files-of-one-name", name=paths[0].stem, files=names, file=names[0]))
     return sorted(chosen), doubts
 
 
