@@ -19,7 +19,7 @@ from processor.defects.params import Params
 from processor.defects.places import other_side, profiles, waves
 from processor.defects.places.profiles import Profile
 from processor.defects.places.waves import Lobe
-from processor.defects.regions import Region, unrolled
+from processor.defects.regions import Region
 from processor.defects.result import DOUBTFUL, Curve, DefectClass, Defects, Result, Windows
 from processor.defects.scan_statistic import Levels
 from processor.defects.shape_models import RIGID, Frame
@@ -248,15 +248,13 @@ def _place_defects(search: Search) -> Iterator[Defect]:
         if values is not None:
             cells = np.unique(np.concatenate([region.cells for region in group]))
             found.append((group[0], Defect(values=values, component=component, cells=cells, field=search.residuals)))
+    behind = _other_sides(search.surface, found)
+    pushed = [k for k, of_place in enumerate(found) if k not in behind and _is_pushed(search.surface, *of_place)]
     in_wave: set[int] = set()
-    waving = [
-        k for k, (region, defect) in enumerate(found) if region.sign and _is_pushed(search.surface, region, defect)
-    ]
-    for rows in waves.waves([_lobe(search.surface, *found[k]) for k in waving]):
-        lobes = [waving[row] for row in rows]
+    for rows in waves.waves([_lobe(search.surface, *found[k]) for k in pushed]):
+        lobes = [pushed[row] for row in rows]
         in_wave.update(lobes)
         yield _wave([found[k][1] for k in lobes])
-    behind = _other_sides(search.surface, found)
     for k, (_, defect) in enumerate(found):
         if k not in in_wave and k not in behind:
             yield defect
@@ -286,12 +284,13 @@ def _is_pushed(surface: DesignSurface, region: Region, defect: Defect) -> bool:
 
 
 def _lobe(surface: DesignSurface, region: Region, defect: Defect) -> Lobe:
-    uv = unrolled(surface, region)
+    cells = surface.centres[region.cells]
     return Lobe(
-        chart=region.chart,
-        uv=uv,
-        middle=uv.mean(axis=0),
-        depth=float(defect.values["depth_max"]),
+        component=defect.component,
+        cells=cells,
+        middle=cells.mean(axis=0),
+        outward=surface.outward[region.cells[0]],
+        height=-float(defect.values["depth_max"]),
         width=float(min(defect.values["extent"])),
     )
 

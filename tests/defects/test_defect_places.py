@@ -1,5 +1,7 @@
 """Profiles of places that deviate, waves, and plates held along a side: closed forms on cells with noise."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -72,14 +74,21 @@ def test_border_of_the_seen_cells_is_not_classified_as_a_step():
     assert profiles.fit(cells, 1).profile is not Profile.STEP
 
 
-def lobes(depths, spacing=150.0, chart=3, off=0.0):
+def lobes(heights, spacing=150.0, off=0.0, sides=(), length=100.0):
+    """Return lobes of a plate of 20 mm: rows of cells of 25 mm, those of ``sides`` seen from below."""
     rng = np.random.default_rng(2)
     found = []
-    for k, depth in enumerate(depths):
-        middle = np.array([k * spacing, off * (-1) ** k])
-        grid = np.stack(np.meshgrid(np.arange(-50.0, 51.0, 25.0), np.arange(-200.0, 201.0, 25.0)), axis=-1)
-        uv = middle + grid.reshape(-1, 2)
-        found.append(waves.Lobe(chart=chart, uv=uv, middle=middle + rng.normal(size=2), depth=depth, width=110.0))
+    for k, height in enumerate(heights):
+        side = -1.0 if k in sides else 1.0
+        middle = np.array([k * spacing, off * (-1) ** k, 10.0 * side])
+        along = np.arange(-0.5 * length, 0.5 * length + 1.0, 25.0)
+        grid = np.stack(np.meshgrid(along, np.arange(-200.0, 201.0, 25.0), 0.0), axis=-1).reshape(-1, 3)
+        found.append(
+            waves.Lobe(
+                component=3, cells=middle + grid, middle=middle + np.append(rng.normal(size=2), 0.0),
+                outward=np.array([0.0, 0.0, side]), height=side * height, width=length,
+            )
+        )  # fmt: skip
     return found
 
 
@@ -90,3 +99,20 @@ def test_alternating_lobes_in_a_line_are_joined_into_one_wave():
     assert waves.waves(lobes([5.0, -5.2, 4.8], spacing=400.0)) == []  # far from each other
     assert waves.waves(lobes([5.0, -0.3, 4.8])) == []  # of one that is hardly there
     assert waves.waves(lobes([5.0, -5.2, 4.8], off=150.0)) == []  # not in a line
+
+
+def test_half_waves_seen_on_either_side_of_a_plate_are_one_wave():
+    assert waves.waves(lobes([5.0, -5.2, 4.8, -4.0], sides=(1, 2))) == [[0, 1, 2, 3]]
+    assert waves.waves(lobes([5.0, 5.2, 4.8], sides=(1,))) == []  # to one side of the plate
+
+
+def test_half_waves_are_joined_across_a_gap_into_which_no_other_one_fits():
+    assert waves.waves(lobes([5.0, -5.2, 4.8], spacing=150.0, length=80.0)) == [[0, 1, 2]]
+    assert waves.waves(lobes([5.0, -5.2, 4.8], spacing=170.0, length=75.0)) == []
+
+
+def test_a_place_beside_a_wave_does_not_dissolve_it():
+    row = lobes([5.0, -5.2, 4.8, -4.0])
+    shift = np.array([60.0, 420.0, 0.0])
+    beside = dataclasses.replace(row[1], middle=row[1].middle + shift, cells=row[1].cells + shift, height=4.9)
+    assert waves.waves([*row, beside]) == [[0, 1, 2, 3]]

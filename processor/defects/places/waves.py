@@ -1,75 +1,98 @@
-"""Waves: places in a row on one face that deviate to either side in turn."""
+"""Waves: places in a row on one plate that move it to either side in turn."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processor.defects.places.other_side import PLATE_MM
 from processor.model import Floats
 
 FEWEST = 3  # half waves
-GAP_SHARE = 0.5  # of the smaller width of two half waves, the largest gap between them
-LEAST_SHARE = 0.25  # of the largest amplitude, for a half wave to count
-STRAIGHT_SHARE = 0.5  # of the spacing, the largest rms distance of the middles from their line
-EVEN = 2.0  # ratio of the largest and the least spacing
+GAP_SHARE = 1.0  # of the smaller width of two half waves, the largest gap between them: no other one fits into it
+LEAST_SHARE = 0.25  # ratio of the amplitudes of neighbours, at least
+TURN_COS = 0.8  # of the angle between steps from one half wave to the next
+EVEN = 2.0  # ratio of the lengths of two such steps, at most
+PARALLEL_COS = 0.95  # of the normals of the two sides of a plate
 
 
 @dataclass(frozen=True)
 class Lobe:
-    """A place on a face: cells (n, 2) on it, its middle (2,), the signed depth in mm, and its smaller extent."""
+    """A place on a flat face of a component: its cells (n, 3) and their middle (3,), mm.
 
-    chart: int
-    uv: Floats
+    ``outward`` (3,) is the unit normal of the face, ``height`` the signed amplitude along it, and ``width`` the smaller
+    extent, mm.
+    """
+
+    component: int
+    cells: Floats
     middle: Floats
-    depth: float
+    outward: Floats
+    height: float
     width: float
+
+    def step(self, other: Lobe) -> Floats:
+        """Return the way (3,) to another lobe along the face."""
+        way = other.middle - self.middle
+        return way - (way @ self.outward) * self.outward
 
 
 def waves(lobes: Sequence[Lobe]) -> list[list[int]]:
-    """Return the rows of the lobes of each wave, in their order along it."""
-    pairs = [
-        (i, j)
-        for i in range(len(lobes))
-        for j in range(i)
-        if lobes[i].chart == lobes[j].chart and lobes[i].depth * lobes[j].depth < 0.0 and _near(lobes[i], lobes[j])
-    ]
-    if not pairs:
-        return []
-    rows = np.array(pairs)
-    links = coo_array((np.ones(len(rows), np.int8), (rows[:, 0], rows[:, 1])), (len(lobes),) * 2)
-    group = connected_components(links, directed=False)[1]
-    found = []
-    for number in np.unique(group[rows[:, 0]]):
-        members = np.flatnonzero(group == number).tolist()
-        most = max(abs(lobes[k].depth) for k in members)
-        members = [k for k in members if abs(lobes[k].depth) >= LEAST_SHARE * most]
-        ordered = _in_line(members, lobes) if len(members) >= FEWEST else []
-        if ordered:
-            found.append(ordered)
+    """Return the rows of the lobes of each wave, in their order along it, the longest wave first.
+
+    A lobe is in one wave at most; lobes beside a wave that do not continue it are left out.
+    """
+    neighbours: dict[int, list[int]] = {i: [] for i in range(len(lobes))}
+    for i in range(len(lobes)):
+        for j in range(i):
+            if _alternate(lobes[i], lobes[j]):
+                neighbours[i].append(j)
+                neighbours[j].append(i)
+    rows = [_row(lobes, neighbours, i, j) for i, near in neighbours.items() for j in near]
+    rows.sort(key=lambda row: (-len(row), row))
+    found: list[list[int]] = []
+    taken: set[int] = set()
+    for row in rows:
+        if len(row) >= FEWEST and not taken.intersection(row):
+            taken.update(row)
+            found.append(row if _direction(lobes, row) > 0.0 else row[::-1])
     return found
 
 
-def _near(one: Lobe, other: Lobe) -> bool:
-    gap = float(cKDTree(one.uv).query(other.uv)[0].min())
-    return gap <= GAP_SHARE * min(one.width, other.width)
+def _alternate(one: Lobe, other: Lobe) -> bool:
+    """Return whether two lobes may be neighbouring half waves, on the same or on opposite sides of a plate."""
+    parallel = float(one.outward @ other.outward)
+    apart = abs(float((other.middle - one.middle) @ one.outward))
+    if one.component != other.component or abs(parallel) < PARALLEL_COS or apart > PLATE_MM:
+        return False
+    if one.height * other.height * parallel >= 0.0:
+        return False
+    least, most = sorted((abs(one.height), abs(other.height)))
+    gap = float(cKDTree(one.cells).query(other.cells)[0].min())
+    return least >= LEAST_SHARE * most and gap <= GAP_SHARE * min(one.width, other.width)
 
 
-def _in_line(members: list[int], lobes: Sequence[Lobe]) -> list[int]:
-    """Return the members in order along their line; none if they are not in a line, in turn and evenly spaced."""
-    middles = np.array([lobes[k].middle for k in members])
-    arm = middles - middles.mean(axis=0)
-    axes = np.linalg.eigh(arm.T @ arm)[1]
-    direction = axes[:, 1] * np.sign(axes[np.argmax(np.abs(axes[:, 1])), 1])
-    along = arm @ direction
-    order = np.argsort(along, kind="stable")
-    spacing = np.diff(along[order])
-    signs = np.sign([lobes[members[k]].depth for k in order])
-    straight = float(np.sqrt(np.mean((arm @ axes[:, 0]) ** 2))) <= STRAIGHT_SHARE * float(np.median(spacing))
-    in_turn = bool((signs[1:] != signs[:-1]).all())
-    even = float(spacing.max()) <= EVEN * max(float(spacing.min()), 1e-9)
-    return [members[k] for k in order] if straight and in_turn and even else []
+def _row(lobes: Sequence[Lobe], neighbours: Mapping[int, Sequence[int]], first: int, second: int) -> list[int]:
+    """Continue a row from its first two lobes, each time to the neighbour that is most straight ahead."""
+    row = [first, second]
+    while True:
+        step = lobes[row[-2]].step(lobes[row[-1]])
+        ahead = []
+        for k in neighbours[row[-1]]:
+            onwards = lobes[row[-1]].step(lobes[k])
+            lengths = sorted((float(np.linalg.norm(step)), float(np.linalg.norm(onwards))))
+            cosine = float(step @ onwards) / max(lengths[0] * lengths[1], 1e-9)
+            if k not in row and cosine >= TURN_COS and lengths[1] <= EVEN * lengths[0]:
+                ahead.append((-cosine, k))
+        if not ahead:
+            return row
+        row.append(min(ahead)[1])
+
+
+def _direction(lobes: Sequence[Lobe], row: Sequence[int]) -> float:
+    """Return the larger component of the way along a row: rows are in the order of its increase."""
+    along = lobes[row[-1]].middle - lobes[row[0]].middle
+    return float(along[np.argmax(np.abs(along))])
