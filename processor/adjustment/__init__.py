@@ -1,1 +1,1 @@
-"""Statistics that several steps share: tests, variances, averages over hypotheses, and assumed errors of scanners."""
+"""Statistics of adjustment: tests, variance components, averages over models, and assumed errors of scanners."""

@@ -1,4 +1,4 @@
-"""Data snooping: which control point, sighting or scan the others contradict beyond chance (Baarda 1968).
+"""Data snooping: tests for gross errors in control points, sightings and scans (Baarda 1968).
 
 Two forms of the test serve two kinds of adjustment. :func:`strongest` tests the misfits of one adjustment for an error
 in some directions: a common shift of all sightings of a point, of a single one, or a motion of all that a scan saw. By
@@ -73,7 +73,7 @@ class _Tested:
 
 
 def beyond_chance(square: float, dof: int) -> bool:
-    """Whether all misfits together are larger than their covariances explain."""
+    """Overall test of the model: whether the weighted sum of squared misfits exceeds its quantile of chi-square."""
     return dof > 0 and square > float(chdtri(dof, BY_CHANCE))
 
 

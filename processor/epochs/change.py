@@ -1,12 +1,12 @@
 """Changes of values between epochs, with their 95 % intervals, and whether a component changed.
 
 The errors of two epochs are taken as independent: the half-width of a change is the root of the sum of both squares.
-Of errors that the intervals of both hold and that are the same at both, the change is free, and its interval is too
-wide. Errors that no interval holds are not in that of the change either: the expansion of steel by another temperature,
-scale and offset of another scanner; the remarks of a comparison name them. A component has many values, of which one in
-twenty leaves its interval by chance: a component is called changed where a change exceeds its interval widened for the
-number of changes that were looked at (Bonferroni), so that of all components that did not change 5 % at most are called
-so, as far as the intervals hold all errors.
+Errors common to both epochs cancel in the change; where both intervals include them, that of the change is too wide.
+Errors that neither interval includes are not in that of the change either: the expansion of steel by a temperature that
+was not stated, scale and offset of another scanner; the remarks of a comparison name them. A component has many values,
+of which one in twenty leaves its interval by chance: a component is called changed where a change exceeds its interval
+widened for the number of changes that were looked at (Bonferroni), so that of all components that did not change 5 % at
+most are called so, as far as the intervals hold all errors.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Epochs of step ``deviation``: how far the surface of each component moved: on average, as a body, and at most.
 
-All is over the places that the epochs have in common, as another part of the same surface has another mean: core points
-nearer than their spacing, on the same side. The movement of a body is that part of its deviations that a rigid
+Only places measured at all epochs are used, because means over different parts of a surface are not comparable: core
+points nearer than their spacing, on the same side. The movement of a body is that part of its deviations that a rigid
 motion explains, at its middle; opposite faces cancel in the mean, and not in the movement. Intervals are as if the
 errors of all core points were the same, with the worst signs, which no correlation can exceed.
 

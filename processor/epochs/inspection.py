@@ -1,7 +1,7 @@
 """Epochs of step ``inspect``: the characteristics of each component.
 
-A greatest departure with a sign, such as of sweep, may lie elsewhere at another epoch, and its interval is that of its
-size: sizes are compared. Where the departures along the axis are known, they are compared place by place too, from the
+The place and the sign of a greatest departure, such as sweep, may differ between epochs, so that absolute values are
+compared. Where the departures along the axis are known, they are compared place by place too, from the
 chord over what all epochs have in common.
 """
 

@@ -1,4 +1,4 @@
-"""What the steps hand over for a comparison of epochs: values of one quantity of one component over the epochs."""
+"""Input of the comparison of epochs: one quantity of one component at every epoch."""
 
 from __future__ import annotations
 

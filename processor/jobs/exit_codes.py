@@ -1,4 +1,4 @@
-"""Exit codes of the commands."""
+"""Exit codes of the commands, but for 2, which click gives to wrong arguments."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ FAIL_ON = {
 
 
 def is_refused(verdicts: Iterable[Verdict], fail_on: str | None) -> bool:
-    """Return whether one of the verdicts is as bad as ``--fail-on`` names, or worse; never without that option."""
+    """Return whether any verdict is at least as severe as ``--fail-on``; False without that option."""
     return fail_on is not None and not FAIL_ON[fail_on].isdisjoint(verdicts)

@@ -1,4 +1,4 @@
-"""How often Python looks for garbage in the processes of the command lines."""
+"""Thresholds of the garbage collection in the processes of the commands."""
 
 import gc
 

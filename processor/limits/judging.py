@@ -1,8 +1,8 @@
-"""Measured values against limits: the one place where a step turns an interval and a limit into a verdict.
+"""Measured values against limits: rows of comparisons with a verdict each.
 
 A step states what it measured as :class:`Measured`, a value with its 95 % interval, and gets a row a comparison. A
-value passes where its interval lies within the limit, fails where it lies beyond, and is indeterminate else, also where
-the step doubts the value as a whole or a bound depends on a size that is not known (ISO 14253-1).
+value passes where its interval lies within the limit and fails where it lies beyond. Otherwise it is indeterminate, as
+it is where the step flags the value as doubtful or a bound depends on a size that is not known (ISO 14253-1).
 """
 
 from __future__ import annotations

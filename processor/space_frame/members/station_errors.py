@@ -31,8 +31,8 @@ def of_axes(members: Members, stations: Stations, along: Floats) -> Floats:
 def of_radii(members: Members, stations: Stations) -> Floats:
     """Variances (m,) of the radii by the offset that all ranges have in common, mm^2.
 
-    An offset d moves a point by d times the cosine of incidence. The offset that the tubes show is not subtracted from
-    the ranges, as a wide beam looks like it: it counts as a standard deviation.
+    An offset d moves a point by d times the cosine of incidence. The offset estimated from the tubes is not subtracted
+    from the ranges, because a wide beam has the same effect: its size counts as a standard deviation.
     """
     turn = 2.0 * np.pi * np.arange(SECTORS) / SECTORS
     across = np.column_stack([np.cos(turn), np.sin(turn)])
