@@ -21,7 +21,8 @@ from processor.language.messages import Text, label, messages, text
 from processor.model import InputError, Reason, Status, Verdict
 from processor.plain_text import printable
 from processor.report import templates
-from processor.report.table import csv_of_rows
+from processor.report.columns import columns
+from processor.report.table import csv_of_rows, heading
 from processor.results.file_names import REPORT_PAGE
 from processor.store.atomic_file import replace_text
 
@@ -69,13 +70,17 @@ def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, 
         {"input": readable(name), "reason": _written(why, "en"), "reason_code": why.code}
         for name, why in sorted(left_out.items())
     ]
-    columns = ["input", "status", "verdict", *(name for name in COLUMNS if name != "verdict"), "reason", *ENDS]
+    header = (
+        *columns("input", "status", "verdict"),
+        *(column for name, column in COLUMNS.items() if name != "verdict"),
+        *columns("reason", *ENDS),
+    )
     head = {"format": FORMAT, "format_version": FORMAT_VERSION, "units": "mm", "counts": counts}
     content = head | {"inputs": rows, "left_out": left}
-    replace_text(out / CSV, csv_of_rows(columns, ([row.get(name) for name in columns] for row in rows)))
+    replace_text(out / CSV, csv_of_rows(header, ([row.get(column.name) for column in header] for row in rows)))
     replace_text(out / JSON, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     times = ([readable(r.input), r.status, r.seconds, r.peak_mb, "yes" if r.kept else ""] for _, r in done)
-    replace_text(out / TIMINGS, csv_of_rows(["input", "status", "seconds", "peak_mb", "kept"], times))
+    replace_text(out / TIMINGS, csv_of_rows(columns("input", "status", "seconds", "peak_mb", "kept"), times))
     try:
         page = _html(rows, [ending for _, ending in done], statuses, left_out, lang)
         replace_text(out / PAGE, page)  # last: it is there only if all are
@@ -133,8 +138,9 @@ def _html(
         }
         for row, ending, verdict in zip(rows, records, verdicts, strict=True)
     ]
-    columns = [
-        (label(name.replace("_", " ")), any(row["cells"][i]["number"] for row in shown)) for i, name in enumerate(names)
+    headings = [
+        (heading(COLUMNS[name], messages(lang)), any(row["cells"][i]["number"] for row in shown))
+        for i, name in enumerate(names)
     ]
     page: str = (
         templates.environment("batch", lang)
@@ -143,7 +149,7 @@ def _html(
             lang=lang,
             title=text("{count} {count:?input|inputs}", count=len(rows)),
             counted=text("{counts}.", counts=counted),
-            columns=columns,
+            columns=headings,
             rows=shown,
             left_out=[(readable(name), _written(why, lang)) for name, why in sorted(left_out.items())],
         )

@@ -5,6 +5,7 @@ The catalogue of a language is the TOML files CODE-PART.toml beside this file, i
 - ``[reasons]``: the template of each code of a :class:`processor.model.Reason`; all languages have the same codes.
 - ``[texts]`` (not English): the template for each English template of a :class:`Text`.
 - ``[words]`` (not English): words of vocabularies, ``Class.word`` or, for all classes, ``word``.
+- ``[headings]`` (not English): headings of columns and their units, where ``[texts]`` has none or another sense.
 
 Templates have the syntax of :meth:`str.format` with named fields. Fields without a format have three decimals where
 they are numbers. ``{n:?scan|scans}`` is the first word for n = 1 and the second otherwise. Values that are messages or
@@ -72,10 +73,12 @@ class Messages(string.Formatter):
         self.reasons: dict[str, str] = {}
         self.texts: dict[str, str] = {}
         self.words: dict[str, str] = {}
+        self.headings: dict[str, str] = {}
         for sections in catalogue(code).values():
             self.reasons |= sections.get("reasons", {})
             self.texts |= sections.get("texts", {})
             self.words |= sections.get("words", {})
+            self.headings |= sections.get("headings", {})
 
     def text(self, message: Any) -> str:
         """Write a message, a list of messages, a number, or a name, which stays as it is."""
@@ -92,6 +95,10 @@ class Messages(string.Formatter):
             separators = SEMICOLON if any(isinstance(item, Reason) for item in message) else LIST
             return separators[self.code].join(map(self.text, message))
         return self.format_field(message, "")
+
+    def heading(self, english: str) -> str:
+        """Write the heading of a column, or its unit."""
+        return self.headings.get(english) or self.texts.get(english, english)
 
     def format_field(self, value: Any, format_spec: str) -> str:
         """Write one value of a template."""

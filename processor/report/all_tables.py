@@ -11,6 +11,7 @@ from processor.limits.judging import JudgedLimits
 from processor.model import METRIC_NAMES, Metric, Statistic, StepRun
 from processor.pipeline import Execution
 from processor.report import characteristics
+from processor.report.columns import columns
 from processor.report.limit_table import limit_table
 from processor.report.reports_of_steps import characteristics_of, step_report
 from processor.report.table import Table
@@ -29,8 +30,8 @@ def checks_table(report: ErrorReport) -> Table:
     rows = tuple(
         (label(m.step), metric_name(m), m.value, m.limit, m.unit, _outcome(m.limit, m.passed)) for m in report.metrics
     )
-    columns = ("step", "check", "value", "limit", "unit", "outcome")
-    return Table(text("Checks against the truth"), columns, rows, "checks")
+    header = columns("step", "check", "value", "limit", "unit", "outcome")
+    return Table(text("Checks against the truth"), header, rows, "checks")
 
 
 def metric_name(metric: Metric) -> Text:

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from processor.language.messages import Message, label, text
 from processor.limits.judging import JudgedLimits
 from processor.model import WORST_FIRST, Verdict
+from processor.report.columns import columns
 from processor.report.table import NAN, Table
 
 FILE = "characteristics"
-COLUMNS = (
+COLUMNS = columns(
     "id", "verdict", "quantity", "nominal", "actual", "deviation", "ci95", "lower", "upper", "unit", "limit_from",
 )  # fmt: skip
 ORDER = {verdict: place for place, verdict in enumerate(WORST_FIRST)}

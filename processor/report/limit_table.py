@@ -10,9 +10,10 @@ import numpy as np
 from processor.language.messages import Text, label, text
 from processor.limits.judging import JudgedLimits
 from processor.model import WORST_FIRST
+from processor.report.columns import columns
 from processor.report.table import Table
 
-COLUMNS = ("limit", "of", "verdict", "value", "ci95", "least", "greatest", "unit", "clause")
+COLUMNS = columns("limit", "of", "verdict", "value", "ci95", "least", "greatest", "unit", "clause")
 NOTE = text(
     "± is the 95 % half-width, a dash is no bound or no number. Pass: the whole interval keeps the limit; fail: the "
     "whole interval exceeds it; indeterminate: the limit lies within it, or the value is in doubt."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import itertools
 import json
 from collections.abc import Container, Mapping, Sequence
 from typing import Any
@@ -15,34 +14,17 @@ from processor.language.messages import Text, label, messages, text
 from processor.model import Scene, Status, StepRun, Verdict, Word, worst
 from processor.pipeline import Execution
 from processor.report import all_tables, characteristics, headline, templates, title_block
+from processor.report.columns import Column
 from processor.report.reports_of_steps import characteristics_of, step_report
 from processor.report.scripts import page_script
 from processor.report.style import CaptionedPngs
-from processor.report.table import Table, headings, numeric, shown
+from processor.report.table import Table, groups, headings, numeric, shown, title
 from processor.targets.summary import summary
 
 GOOD = "ok"
 LONG_CELL = 24  # characters
 LEAD = ("what-to-do", "limits-not-held")  # tables above the figures, below the characteristics
 PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
-NAMES = (
-    "method",
-    "joint",
-    "component",
-    "characteristic",
-    "left_part",
-    "right_part",
-    "station",
-    "point",
-    "scan",
-    "a",
-    "b",
-    "loop",
-    "matrix",
-    "key",
-    "of",
-    "id",
-)  # columns that no language translates
 BANNER = {
     Verdict.PASS: text("PASS"),
     Verdict.FAIL: text("FAIL"),
@@ -215,7 +197,7 @@ def _section(
         "lead": [written_table(table, lang) for table in lead],
         "tables": [written_table(table, lang) for table in tables if table.file not in LEAD and not table.folded],
         "further": [written_table(table, lang) for table in further],
-        "further_titles": list(dict.fromkeys(messages(lang).text(table.title) for table in further)),
+        "further_titles": list(dict.fromkeys(title(table, messages(lang)) for table in further)),
         "step": run.step,
     }
 
@@ -235,7 +217,7 @@ def _pictures(step: str, drawn: CaptionedPngs, live: bool) -> list[dict[str, Any
     ]
 
 
-def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:
+def _cell(cell: Any, column: Column, lang: str) -> tuple[str, str]:
     """Return the style of a cell and its text; names from the input are not translated."""
     if isinstance(cell, int | float | np.number):
         return "number", shown(cell)
@@ -244,14 +226,8 @@ def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:
     if not isinstance(cell, str) or isinstance(cell, Word):
         written = shown(messages(lang).text(cell))
     else:
-        written = shown(cell) if column in NAMES else shown(messages(lang).text(label(cell)))
+        written = shown(cell) if column.are_names else shown(messages(lang).text(label(cell)))
     return "long" if len(shown(cell)) > LONG_CELL else "text", written
-
-
-def heading(name: str, lang: str) -> str:
-    """Write the heading of a column; a catalogue may have ``heading|name`` beside another sense of the name."""
-    catalogue = messages(lang)
-    return catalogue.texts.get(f"heading|{name}", catalogue.text(label(name)))
 
 
 def written_table(table: Table, lang: str) -> dict[str, Any]:
@@ -265,12 +241,12 @@ def written_table(table: Table, lang: str) -> dict[str, Any]:
             rows=len(table.rows),
             file=table.file,
         )
-    written = [heading(name, lang) for name in headings(table)]
+    catalogue = messages(lang)
     return {
-        "title": table.title,
+        "title": title(table, catalogue),
         "note": note,
-        "groups": [(name, len(list(members))) for name, members in itertools.groupby(table.groups)],
-        "columns": list(zip(table.columns, written, numeric(table), strict=True)),
+        "groups": groups(table, catalogue),
+        "columns": list(zip(headings(table, catalogue), numeric(table), strict=True)),
         "rows": [
             [_cell(cell, column, lang) for cell, column in zip(row, table.columns, strict=True)]
             for row in table.rows[:MOST_ROWS]

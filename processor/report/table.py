@@ -8,15 +8,16 @@ import io
 import itertools
 import math
 import unicodedata
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from processor.language.messages import Message, Text, label, messages, text
+from processor.language.messages import Message, Messages, Text, label, messages, text
 from processor.model import Checked, Reason, StepRun
 from processor.plain_text import printable, spreadsheet_text
+from processor.report.columns import Column, columns, given
 
 NAN = float("nan")
 
@@ -25,18 +26,15 @@ NAN = float("nan")
 class Table:
     """A titled table: in a CSV file of the name ``file`` where that is not empty, on the page and on the terminal.
 
-    ``columns`` are the names in the CSV file, with units. ``headings`` are those for display, one each; without them
-    they are the words of the names without units, which the title states. ``groups`` are headings above the columns,
-    one each, of which equal neighbours are merged; CSV files have none.
+    ``units`` stand behind the title; headings do not repeat them. CSV files have the names of the columns alone.
     """
 
     title: str | Message
-    columns: tuple[str, ...]
+    columns: tuple[Column, ...]
     rows: tuple[tuple[Any, ...], ...]
     file: str = ""
     note: str | Message = ""
-    groups: tuple[str | Message, ...] = ()
-    headings: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
     on_page: bool = True
     on_terminal: bool = True
     folded: bool = False  # on the page: among the further tables, which a reader opens
@@ -44,11 +42,10 @@ class Table:
 
 def figures_of(title: str, runs: Sequence[StepRun], file: str) -> Table:
     """Tabulate the fields of results with a heading, a column per method; see :func:`processor.model.described`."""
-    columns = [list(_figures(run.result)) for run in runs]
-    rows = tuple(
-        (heading, *(column[i][1] for column in columns), unit) for i, (heading, _, unit) in enumerate(columns[0])
-    )
-    return Table(label(title), ("figure", *(run.method for run in runs), "unit"), rows, file)
+    figures = [list(_figures(run.result)) for run in runs]
+    rows = tuple((heading, *(of[i][1] for of in figures), unit) for i, (heading, _, unit) in enumerate(figures[0]))
+    by_method = given(*(run.method for run in runs))
+    return Table(label(title), (*columns("figure"), *by_method, *columns("unit")), rows, file)
 
 
 def _figures(result: Checked) -> Iterator[tuple[Message, Any, str]]:
@@ -72,12 +69,16 @@ def csv_text(table: Table) -> str:
     return csv_of_rows(table.columns, table.rows)
 
 
-def csv_of_rows(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    """Write columns and rows as CSV; see :func:`csv_text`."""
+def csv_of_rows(columns: Iterable[Column], rows: Iterable[Iterable[Any]], full: bool = False) -> str:
+    """Write columns and rows as CSV; see :func:`csv_text`.
+
+    With ``full`` the cells stand as they are: floats with all digits, nan for none, and texts that the caller has made
+    safe by :func:`csv_cell`.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([csv_cell(cell) for cell in row] for row in rows)
+    writer.writerow([column.name for column in columns])
+    writer.writerows(rows if full else ([csv_cell(cell) for cell in row] for row in rows))
     return out.getvalue()
 
 
@@ -101,11 +102,15 @@ def shown(cell: Any) -> str:
 
 def plain_text(table: Table, most: int = 40) -> str:
     """Write a table for the terminal, columns aligned, at most so many rows."""
-    cells = [list(headings(table)), *([shown(cell) for cell in row] for row in table.rows[:most])]
+    english = messages("en")
+    cells = [
+        list(map(printable, headings(table, english))),
+        *([shown(cell) for cell in row] for row in table.rows[:most]),
+    ]
     widths = [max(_width(row[i]) for row in cells) for i in range(len(table.columns))]
-    lines = [shown(table.title)]
-    if table.groups:
-        lines.append(_group_line(table, widths))
+    lines = [printable(title(table, english))]
+    if above := groups(table, english):
+        lines.append(_group_line(above, widths))
     right = numeric(table)
     lines += ["  " + "  ".join(map(_aligned, row, widths, right)) for row in cells]
     if len(table.rows) > most:
@@ -114,20 +119,65 @@ def plain_text(table: Table, most: int = 40) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def headings(table: Table) -> tuple[str, ...]:
-    """Return the headings of the columns for display: those of the table, or the names without their units."""
-    if table.headings:
-        return table.headings
-    return tuple(column.removesuffix("_mm").removesuffix("_mrad").replace("_", " ") for column in table.columns)
+def title(table: Table, catalogue: Messages) -> str:
+    """Return the title in a language, with the units of the table."""
+    return _with_units(catalogue.text(table.title), table.units, catalogue)
 
 
-def _group_line(table: Table, widths: list[int]) -> str:
+def heading(column: Column, catalogue: Messages, stated: Collection[str] = ()) -> str:
+    """Return a column's heading in a language with its unit, if that is not among the units ``stated`` above it."""
+    if not column.heading:
+        return catalogue.heading(column.unit)
+    return _with_units(
+        catalogue.heading(column.heading), () if column.unit in ("", *stated) else (column.unit,), catalogue
+    )
+
+
+def headings(table: Table, catalogue: Messages) -> tuple[str, ...]:
+    """Return the headings of the columns in a language, with units that neither title nor group states."""
+    return tuple(
+        heading(column, catalogue, (*table.units, *units))
+        for _, members, units in _by_group(table)
+        for column in members
+    )
+
+
+def full_headings(table: Table, catalogue: Messages) -> tuple[str, ...]:
+    """Return the headings of the columns with their groups and units, to be read without title and groups."""
+    return tuple(
+        ": ".join(filter(None, (catalogue.text(column.group), heading(column, catalogue)))) for column in table.columns
+    )
+
+
+def groups(table: Table, catalogue: Messages) -> list[tuple[str, int]]:
+    """Return the headings above groups of columns, "" for none, and how many columns each has; [] without groups."""
+    if not any(column.group for column in table.columns):
+        return []
+    return [
+        (_with_units(catalogue.text(group), units, catalogue), len(members))
+        for group, members, units in _by_group(table)
+    ]
+
+
+def _by_group(table: Table) -> Iterator[tuple[str | Message, list[Column], tuple[str, ...]]]:
+    """Yield groups with their columns, and the unit that a group states as all of its columns with a unit have it."""
+    for group, neighbours in itertools.groupby(table.columns, key=lambda column: column.group):
+        members = list(neighbours)
+        units = {column.unit for column in members} - {"", *table.units}
+        yield group, members, tuple(units) if group and len(units) == 1 else ()
+
+
+def _with_units(written: str, units: Sequence[str], catalogue: Messages) -> str:
+    return f"{written} ({', '.join(map(catalogue.heading, units))})" if units else written
+
+
+def _group_line(above: list[tuple[str, int]], widths: list[int]) -> str:
     """Put each group's heading above its columns, which widen where it is longer."""
     line = "  "
     start = 0
-    for group, members in itertools.groupby(table.groups):
-        columns = range(start, start + len(list(members)))
-        start, heading = columns.stop, shown(group)
+    for group, count in above:
+        columns = range(start, start + count)
+        start, heading = columns.stop, printable(group)
         width = sum(widths[i] for i in columns) + 2 * (len(columns) - 1)
         widths[columns[-1]] += max(0, _width(heading) - width)
         line += heading + " " * (max(width, _width(heading)) - _width(heading) + 2)

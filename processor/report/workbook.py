@@ -5,17 +5,17 @@ from __future__ import annotations
 import datetime
 import io
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import messages
 from processor.model import UsageError, worst
 from processor.pipeline import Execution
 from processor.plain_text import printable
 from processor.report import all_tables, headline, title_block
-from processor.report.table import Table, headings, shown
+from processor.report.table import Table, full_headings, shown
 
 NAME = "report.xlsx"
 EPOCH = datetime.datetime(1980, 1, 1, tzinfo=None)  # of a file without a date of its own
@@ -64,8 +64,9 @@ def _front(execution: Execution) -> list[tuple[str, str]]:
 
 def _sheet(sheet: Any, table: Table, bold: Any) -> None:
     """Write a table: numbers as numbers, all else as text, which no spreadsheet takes for a formula."""
-    for column, name in enumerate(headings(table) if not table.groups else table.columns):
-        sheet.write_string(0, column, name, bold)
+    headings = full_headings(table, messages("en"))
+    for column, heading in enumerate(headings):
+        sheet.write_string(0, column, heading, bold)
     for row, cells in enumerate(table.rows, 1):
         for column, cell in enumerate(cells):
             if isinstance(cell, bool | np.bool_) or not isinstance(cell, int | float | np.number):
@@ -73,10 +74,6 @@ def _sheet(sheet: Any, table: Table, bold: Any) -> None:
             elif math.isfinite(cell):
                 sheet.write_number(row, column, round(float(cell), 6))
     sheet.freeze_panes(1, 1)
-    for column in range(len(table.columns)):
-        sheet.set_column(column, column, _width(table, column))
-
-
-def _width(table: Table, column: int) -> int:
-    sample: Sequence[Any] = table.rows[:200]
-    return min(WIDEST, 2 + max([len(table.columns[column]), *(len(shown(row[column])) for row in sample)]))
+    for column, heading in enumerate(headings):
+        widest = max([len(heading), *(len(shown(row[column])) for row in table.rows[:200])])
+        sheet.set_column(column, column, min(WIDEST, 2 + widest))

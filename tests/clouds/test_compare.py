@@ -57,8 +57,8 @@ def called(monkeypatch, *arguments):
 def table(folder):
     with (folder / "compare.csv").open() as file:
         rows = list(csv.reader(file))
-    assert tuple(rows[0]) == COLUMNS
-    return dict(zip(COLUMNS, np.array([[float(cell) for cell in row] for row in rows[1:]]).T, strict=True))
+    assert rows[0] == [column.name for column in COLUMNS]
+    return dict(zip(rows[0], np.array([[float(cell) for cell in row] for row in rows[1:]]).T, strict=True))
 
 
 def test_comparison_at_utm_coordinates_equals_brute_force_and_writes_all_files(clouds, tmp_path, monkeypatch, capsys):

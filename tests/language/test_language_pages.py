@@ -133,7 +133,7 @@ def test_ambiguous_word_is_translated_by_its_vocabulary_or_column():
     say = messages("zh").text
     assert (say(label("step")), say(DefectClass.STEP), say(label("missed: step"))) == ("步骤", "错台", "漏检：错台")
     assert (say(label("misalignment")), say(DefectClass.MISALIGNMENT)) == ("接口错边", "整体偏位")
-    assert (say(label("side")), page.heading("side", "zh")) == ("立面", "边长")
+    assert (say(label("side")), messages("zh").heading("side")) == ("立面", "边长")
 
 
 # --- a batch --------------------------------------------------------------------------------------------------------

@@ -10,11 +10,12 @@ import pytest
 
 import processor
 from processor import pipeline
-from processor.batch import record
+from processor.batch import record, summary_values
 from processor.epochs.change import Finding
 from processor.language.messages import CODES, Text, catalogue, messages, text
 from processor.model import VOCABULARIES, Status, reason
 from processor.papers import rows
+from processor.report.columns import COLUMNS
 from processor.validation import change_detection, coverage, curves
 
 SOURCES = Path(processor.__file__).parent
@@ -84,6 +85,19 @@ def test_every_text_of_the_sources_is_translated_with_the_same_values(code):
         assert fields(known[template]) == fields(template), template
 
 
+SYMBOL = re.compile(r"lambda|lod95|[a-z]\d?|d[xyz]|n[xyz]|[xyz][xyzt]|m\d\d")  # the same in all languages
+
+
+@pytest.mark.parametrize("code", OTHERS)
+def test_every_column_has_a_heading_in_every_language(code):
+    catalogue, every = messages(code), [*COLUMNS.values(), *summary_values.COLUMNS.values()]
+    assert len(every) > 250
+    words = {column.heading for column in every if not SYMBOL.fullmatch(column.heading)}
+    assert sorted(word for word in words if word and catalogue.heading(word) == word) == []
+    known = {*words, *(column.unit for column in every)}
+    assert sorted(set(catalogue.headings) - known - {"a", "b"}) == []
+
+
 @pytest.mark.parametrize("code", OTHERS)
 def test_words_of_a_catalogue_belong_to_their_vocabulary(code):
     assert pipeline.step_modules()
@@ -99,7 +113,7 @@ def test_words_of_a_catalogue_belong_to_their_vocabulary(code):
 
 def test_no_message_of_a_catalogue_is_defined_twice():
     for code in CODES:
-        for section in ("reasons", "texts", "words"):
+        for section in ("reasons", "texts", "words", "headings"):
             every = [key for file in catalogue(code).values() for key in file.get(section, {})]
             assert len(every) == len(set(every)), sorted({key for key in every if every.count(key) > 1})
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import messages
 from processor.model import (
     FrameDesign,
     InputError,
@@ -25,7 +26,9 @@ from processor.model import (
 from processor.pipeline import Execution
 from processor.preassembly.result import Deviations, Result
 from processor.report import all_figures, all_tables, page, write_results
+from processor.report import columns as report_columns
 from processor.report import table as report_table
+from processor.report.columns import Column, columns, under
 from processor.results import to_json
 from processor.space_frame import step as space_frame_step
 from processor.store import store
@@ -154,7 +157,7 @@ def test_csv_of_balls_holds_the_error_against_the_true_radius():
 
 @pytest.mark.parametrize("name", ["=1+1", "+1", "-1", "@a", "\t=x", "\r=x", "\n=x", "＝1", '"', 'a",=1'])
 def test_no_name_becomes_a_formula_in_a_spreadsheet(name):
-    table = all_tables.Table("t", ("a", "b"), ((name, -1.5),))
+    table = all_tables.Table("t", columns("a", "b"), ((name, -1.5),))
     _, row = csv.reader(io.StringIO(report_table.csv_text(table), newline=""))
     assert row[1] == "-1.5"
     assert not row[0].startswith(("=", "+", "-", "@", "\t", "\r", "\n", "＝"))
@@ -165,12 +168,12 @@ def test_no_name_becomes_a_formula_in_a_spreadsheet(name):
 def test_terminal_text_is_aligned_and_without_control_characters():
     table = all_tables.Table(
         "t\x1b[31m",
-        ("name", "mean_mm", "max_mm"),
+        (*columns("name"), *under("a long heading here", "linear_mean_mm", "linear_max_mm")),
         (("钢 1", 1.0, NAN), ("a\x1b]0;b\n", -22.5, 3.0)),
-        groups=("", "a long heading here", "a long heading here"),
+        units=("mm",),
     )
     assert report_table.plain_text(table).splitlines() == [
-        "t�[31m",
+        "t�[31m (mm)",
         "           a long heading here",
         "  name        mean         max",
         "  钢 1       1.000           –",
@@ -178,16 +181,59 @@ def test_terminal_text_is_aligned_and_without_control_characters():
     ]
 
 
-def test_headings_are_those_of_the_table_and_else_the_names_without_units():
-    columns = ("joint", "rotation_ci95_mrad", "least_gap_mm")
-    assert report_table.headings(all_tables.Table("t", columns, ())) == ("joint", "rotation ci95", "least gap")
-    named = all_tables.Table("t", columns, (), headings=("joint", "ci95", "gap"))
-    assert report_table.headings(named) == ("joint", "ci95", "gap")
-    assert report_table.csv_text(named) == "joint,rotation_ci95_mrad,least_gap_mm\n"
+TURNED = (*columns("joint"), *under("rotation", "rotation_mrad", "rotation_ci95_mrad", "rotation_about"))
+FREE = columns("least_mm", "area_mm2", "mrad")
+
+
+@pytest.mark.parametrize(
+    ("lang", "units", "title", "above", "headings"),
+    [
+        (
+            "en",
+            (),
+            "t",
+            [("", 1), ("rotation (mrad)", 3), ("", 3)],
+            ("joint", "rotation", "ci95", "about", "least (mm)", "area (mm2)", "mrad"),
+        ),
+        (
+            "en",
+            ("mm", "mrad"),
+            "t (mm, mrad)",
+            [("", 1), ("rotation", 3), ("", 3)],
+            ("joint", "rotation", "ci95", "about", "least", "area (mm2)", "mrad"),
+        ),
+        (
+            "zh",
+            ("mm",),
+            "t (mm)",
+            [("", 1), ("rotation (mrad)", 3), ("", 3)],
+            ("接口", "转角", "95% 置信区间半宽", "转轴", "最小", "面积 (mm²)", "mrad"),
+        ),
+    ],
+)
+def test_a_unit_stands_once_in_title_group_or_heading(lang, units, title, above, headings):
+    table, catalogue = all_tables.Table("t", TURNED + FREE, (), units=units), messages(lang)
+    assert report_table.title(table, catalogue) == title
+    assert report_table.groups(table, catalogue) == above
+    assert report_table.headings(table, catalogue) == headings
+
+
+def test_full_headings_state_group_and_unit_and_csv_files_the_names():
+    table = all_tables.Table("t", TURNED, (), units=("mrad",))
+    assert report_table.full_headings(table, messages("en")) == (
+        "joint", "rotation: rotation (mrad)", "rotation: ci95 (mrad)", "rotation: about",
+    )  # fmt: skip
+    assert report_table.csv_text(table) == "joint,rotation_mrad,rotation_ci95_mrad,rotation_about\n"
+
+
+def test_a_name_stands_for_one_column():
+    every = list(report_columns._all())
+    assert len(every) == len(report_columns.COLUMNS)
+    assert Column("lod95_mm", "lod95", "mm") in every
 
 
 def test_long_tables_are_cut_on_the_terminal_with_a_remark():
-    table = all_tables.Table("t", ("a",), tuple((i,) for i in range(50)), "long")
+    table = all_tables.Table("t", columns("a"), tuple((i,) for i in range(50)), "long")
     lines = report_table.plain_text(table, most=10).splitlines()
     assert len(lines) == 13
     assert lines[-1] == "  ... and 40 more in long.csv"

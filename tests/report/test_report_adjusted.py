@@ -120,9 +120,7 @@ def test_limits_of_the_chain_stand_beside_those_of_joints():
     on_terminal = [
         str(table.title) for table in all_tables.tables_of_run(execution, ErrorReport()) if table.on_terminal
     ]
-    assert {"Limits of the whole chain, method adjustment (mm)", "Limits that nothing is compared with"} <= set(
-        on_terminal
-    )
+    assert {"Limits of the whole chain, method adjustment", "Limits that nothing is compared with"} <= set(on_terminal)
 
 
 def test_gaps_have_intervals_in_the_joints_axes_too():

@@ -21,6 +21,7 @@ from processor.model import Scan, Scene, Stations, StepRun, Verdict, reason
 from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, page, write_results
 from processor.report import table as report_table
+from processor.report.columns import columns
 from processor.report.space_frame import close_ups, dxf
 from processor.report.space_frame import figures as space_frame_figures
 from processor.report.space_frame import tables as space_frame_tables
@@ -222,7 +223,7 @@ def test_table_of_nodes_states_a_missing_or_uncertain_limit():
 def test_terminal_shows_summary_flagged_balls_and_stations():
     shown = [one for one in all_tables.tables_of_run(*of_frame()) if one.on_terminal]
     assert [str(one.title).split(",")[0] for one in shown] == [
-        "Balls in short", "Flagged balls", "Stations against each other (mm"
+        "Balls in short", "Flagged balls", "Stations against each other"
     ]  # fmt: skip
     values = {str(row[0]): row[1] for row in shown[0].rows}
     assert (values["balls"], values["flag ok"], values["flag not-found"]) == (5, 2, 1)
@@ -425,10 +426,10 @@ def test_control_points_have_a_table_and_their_place_in_results_json():
     )
     (table,) = (one for one in space_frame_tables.step_tables([StepRun("spheres", "ray", "{}", made)], ErrorReport())
                 if one.file == "control")  # fmt: skip
-    assert table.columns[0] == "control_point"
+    assert table.columns[0].name == "control_point"
     name, *off, used, scan = table.rows[0]
     assert (name, off, str(used), scan) == ("T1", [0.3, 0.0, -0.4, pytest.approx(0.5)], "yes", "S1")
-    assert table.columns[-1] == "scan"
+    assert table.columns[-1].name == "scan"
     assert str(table.rows[1][-2]).startswith("no, ")
     step = written(made)
     assert [one["text"] for one in step["datum"]] == ["2 control points"]
@@ -440,14 +441,14 @@ def test_control_points_have_a_table_and_their_place_in_results_json():
 
 
 def test_targets_without_members_have_lowest_points_and_bounds():
-    columns = {"sizes": np.full(5, NAN), "axes": np.zeros(5, int), "nominal_radii": np.full(5, NAN)}
-    made = without_design(whole(changed=columns, tubes=Tubes(), stations=StationCorrections()))
+    changed = {"sizes": np.full(5, NAN), "axes": np.zeros(5, int), "nominal_radii": np.full(5, NAN)}
+    made = without_design(whole(changed=changed, tubes=Tubes(), stations=StationCorrections()))
     found = {
         one.file: one for one in space_frame_tables.step_tables([StepRun("spheres", "ray", "{}", made)], ErrorReport())
     }
     assert {"balls", "lowest"} <= set(found)
-    assert {"bound_sd_lowest_z_mm", "efficiency_radius"} <= set(found["balls"].columns)
-    assert any(one.on_terminal and "radius_mm" in one.columns for one in found.values())
+    assert {*columns("bound_sd_lowest_z_mm", "efficiency_radius")} <= set(found["balls"].columns)
+    assert any(one.on_terminal and columns("radius_mm")[0] in one.columns for one in found.values())
 
 
 def test_expected_distribution_integrates_to_the_number_of_errors():

@@ -12,7 +12,8 @@ from processor.defects.deviation_field import Field
 from processor.defects.result import Result
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import StepRun
-from processor.report import page, surface_view
+from processor.report import page
+from processor.report.charts import surface_view
 from processor.report.defects import figures, live_data
 from processor.results.fields_to_json import as_object
 from processor.store import store

@@ -177,7 +177,7 @@ def test_characteristics_are_those_of_results_json_worst_first():
         for limit in of_place["limits"]:
             wanted[f"{place} {limit['limit'].removesuffix('_mm').replace('_', ' ')}"] = limit
     (table,) = [t for t in all_tables.tables_of_run(execution, ErrorReport()) if t.file == "characteristics"]
-    rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    rows = [dict(zip((column.name for column in table.columns), row, strict=True)) for row in table.rows]
     assert {str(row["id"]) for row in rows} == set(wanted)
     for row in rows:
         limit = wanted[str(row["id"])]

@@ -10,8 +10,8 @@ import numpy as np
 from processor.defects.result import Defects, Result
 from processor.language.messages import text
 from processor.model import Ints, Scene, StepRun
-from processor.report import surface_view
-from processor.report.surface_view import Region
+from processor.report.charts import surface_view
+from processor.report.charts.surface_view import Region
 
 
 def live_data(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:

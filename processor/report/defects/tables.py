@@ -12,6 +12,7 @@ from processor.defects.result import DefectClass, Result
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import text
 from processor.model import StepRun
+from processor.report.columns import MM, columns
 from processor.report.table import Table
 
 LIST_NOTE = text(
@@ -54,13 +55,13 @@ def _summary(result: Result, method: str) -> Table:
         (text("registration error, one sd, median"), result.registration_error, "mm"),
     ]
     title = text("Defects in short, method {method}", method=method)
-    return Table(title, ("what", "value", "unit"), tuple(rows), "defects-summary")
+    return Table(title, columns("what", "value", "unit"), tuple(rows), "defects-summary")
 
 
 def _list(run: StepRun, is_first: bool) -> Table:
     """List the defects of a run, for the page and the terminal if it is the first."""
     defects = run.result.defects
-    columns = {
+    cells = {
         "id": defects.id,
         "class": defects.defect_class,
         "confidence": defects.confidence,
@@ -84,22 +85,23 @@ def _list(run: StepRun, is_first: bool) -> Table:
         "doubtful": tuple("yes" if doubtful else "no" for doubtful in defects.doubtful),
         "remark": defects.reasons,
     }
-    rows = zip(*(x.tolist() if isinstance(x, np.ndarray) else x for x in columns.values()), strict=True)
-    title = text("Defects, method {method} (mm)", method=run.method)
+    rows = zip(*(x.tolist() if isinstance(x, np.ndarray) else x for x in cells.values()), strict=True)
+    title = text("Defects, method {method}", method=run.method)
     file = "defects" if is_first else f"defects-{run.method}"
     note = LIST_NOTE if is_first else text("{reasons}", reasons=run.result.reasons)
-    return Table(title, tuple(columns), tuple(rows), file, note, on_terminal=is_first)
+    return Table(title, columns(*cells), tuple(rows), file, note, units=MM, on_terminal=is_first)
 
 
 def _least_depth(result: Result) -> Table:
     windows = result.least_depth
-    columns = (windows.side.tolist(), windows.depth.tolist(), windows.noise_inflation.tolist())
+    cells = (windows.side.tolist(), windows.depth.tolist(), windows.noise_inflation.tolist())
     return Table(
-        title=text("Least depth found, by size of place (mm)"),
-        columns=("side_mm", "depth_mm", "noise"),
-        rows=tuple(zip(*columns, strict=True)),
+        title=text("Least depth found, by size of place"),
+        columns=columns("side_mm", "depth_mm", "noise"),
+        rows=tuple(zip(*cells, strict=True)),
         file="defects-least",
         note=LEAST_NOTE,
+        units=MM,
         on_terminal=False,
     )
 
@@ -111,10 +113,11 @@ def _curves(result: Result) -> Table:
         for row in zip(curve.along.tolist(), curve.displacement.tolist(), curve.ci95.tolist(), strict=True)
     )
     return Table(
-        title="Deflection curves (mm)",
-        columns=("id", "along_mm", "displacement_mm", "ci95_mm"),
+        title=text("Deflection curves"),
+        columns=columns("id", "along_mm", "displacement_mm", "ci95_mm"),
         rows=rows,
         file="defects-curves",
+        units=MM,
         on_page=False,
         on_terminal=False,
     )

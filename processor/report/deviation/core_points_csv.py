@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from processor.geometry.m3c2 import Distances
 from processor.model import Floats
+from processor.report.columns import columns
+from processor.report.table import csv_of_rows
 
-COLUMNS = ("x", "y", "z", "distance", "lod95", "significant", "n1", "n2", "std1", "std2", "nx", "ny", "nz")
+COLUMNS = columns(
+    "x", "y", "z", "distance", "lod95", "significant", "n1", "n2", "std1", "std2", "nx", "ny", "nz"
+)  # fmt: skip
 ROWS_AT_ONCE = 50_000
 
 
@@ -18,11 +23,10 @@ def csv_text(origin: Floats, core: Floats, distances: Distances, normals: Floats
 
     nan stands where there is none. n1 and std1 are of the reference, n2 and std2 of the compared cloud.
     """
-    return "".join(_lines(origin, core, distances, normals))
+    return csv_of_rows(COLUMNS, _rows(origin, core, distances, normals), full=True)
 
 
-def _lines(origin: Floats, core: Floats, distances: Distances, normals: Floats) -> Iterator[str]:
-    yield ",".join(COLUMNS) + "\n"
+def _rows(origin: Floats, core: Floats, distances: Distances, normals: Floats) -> Iterator[tuple[Any, ...]]:
     for start in range(0, len(core), ROWS_AT_ONCE):
         part = slice(start, start + ROWS_AT_ONCE)
         significant = distances.significant[part].astype(np.int64)
@@ -30,5 +34,4 @@ def _lines(origin: Floats, core: Floats, distances: Distances, normals: Floats) 
             *(core[part] + origin).T, distances.distance[part], distances.lod95[part], significant, distances.n1[part],
             distances.n2[part], distances.std1[part], distances.std2[part], *normals[part].T,
         )  # fmt: skip
-        texts = [map(repr, column.tolist()) for column in numbers]
-        yield "".join(",".join(row) + "\n" for row in zip(*texts, strict=True))
+        yield from zip(*(column.tolist() for column in numbers), strict=True)

@@ -13,7 +13,7 @@ from processor.geometry.m3c2 import Z95
 from processor.language.messages import Message, text
 from processor.model import Floats, Ints, Scene, Status, StepRun
 from processor.pipeline import Execution
-from processor.report import surface_view
+from processor.report.charts import surface_view
 from processor.report.deviation import core_points_csv, face_maps, figures
 from processor.report.deviation.face_maps import Band
 from processor.report.step_report import StepReport

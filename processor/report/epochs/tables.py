@@ -9,6 +9,7 @@ from typing import Any
 from processor.epochs.change import Change, Component, Finding
 from processor.epochs.compare import History
 from processor.language.messages import Message, label, text
+from processor.report.columns import columns, given
 from processor.report.table import NAN, Table
 
 CHANGED = (Finding.CHANGED, Finding.DOUBTFUL)
@@ -76,8 +77,12 @@ def _components(history: History) -> Table:
         "Follows: the balls that moved and, with their places, changed the length of a member.",
         changes=sum(len(one.changes) for one in history.components),
     )
-    columns = ("component", "finding", "quantity", *names, "change", "ci95", "unit", "since", "step", "follows")
-    return Table(text("Components over the epochs"), columns, rows, COMPONENTS, note)
+    header = (
+        *columns("component", "finding", "quantity"),
+        *given(*names),
+        *columns("change", "ci95", "unit", "since", "step", "follows"),
+    )
+    return Table(text("Components over the epochs"), header, rows, COMPONENTS, note)
 
 
 def _of_change(change: Change | None) -> tuple[float, float]:
@@ -93,16 +98,16 @@ def _epochs(history: History) -> Table:
         )
         for one in history.epochs
     )  # fmt: skip
-    columns = ("day", "day_from", "folder", "input", "scanner", "serial", "temperature_C", "steps")
-    return Table(text("Epochs"), columns, rows, EPOCHS)
+    header = columns("day", "day_from", "folder", "input", "scanner", "serial", "temperature_C", "steps")
+    return Table(text("Epochs"), header, rows, EPOCHS)
 
 
 def _changes(history: History) -> Table:
-    columns = (
+    header = columns(
         "step", "component", "quantity", "unit", "from", "to", "value_from", "value_to", "change", "ci95", "beyond",
         "ci95_widened", "beyond_widened", "doubtful",
     )  # fmt: skip
-    return Table(text("All changes"), columns, tuple(_rows(history)), CHANGES, on_page=False, on_terminal=False)
+    return Table(text("All changes"), header, tuple(_rows(history)), CHANGES, on_page=False, on_terminal=False)
 
 
 def _rows(history: History) -> Iterator[tuple[Any, ...]]:

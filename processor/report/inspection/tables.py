@@ -9,6 +9,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.inspection.result import Characteristics, InspectedComponent, Result
 from processor.language.messages import text
 from processor.model import StepRun
+from processor.report.columns import MM, columns
 from processor.report.table import Table
 
 __all__ = ["Characteristics", "step_tables"]
@@ -27,10 +28,10 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     result: Result = runs[0].result
     if not result.components:
         return []
-    columns = ("component", "characteristic", "quantity", "nominal", "actual", "deviation", "ci95",
+    header = columns("component", "characteristic", "quantity", "nominal", "actual", "deviation", "ci95",
                "lower", "upper", "unit", "verdict", "clause", "remark")  # fmt: skip
     rows = tuple(row for component in result.components for row in _rows(component))
-    tables = [Table(text("Characteristics of components"), columns, rows, "inspect", NOTE, on_terminal=False)]
+    tables = [Table(text("Characteristics of components"), header, rows, "inspect", NOTE, on_terminal=False)]
     if any(len(component.axis) for component in result.components):
         tables.append(_axes(result))
     return tables
@@ -57,6 +58,6 @@ def _axes(result: Result) -> Table:
             )), strict=True,
         )
     )  # fmt: skip
-    columns = ("component", "chainage_mm", "sideways_mm", "sideways_ci95_mm", "up_mm", "up_ci95_mm")
-    title = text("Axes of components against the design's (mm)")
-    return Table(title, columns, rows, "inspect-axes", on_page=False, on_terminal=False)
+    header = columns("component", "chainage_mm", "sideways_mm", "sideways_ci95_mm", "up_mm", "up_ci95_mm")
+    title = text("Axes of components against the design's")
+    return Table(title, header, rows, "inspect-axes", units=MM, on_page=False, on_terminal=False)

@@ -12,6 +12,7 @@ from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.result import Adjustment, Result
 from processor.preassembly.verdicts.joint_measures import JointQuantity
 from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
+from processor.report.columns import MM, columns, under
 from processor.report.limit_table import with_unverified
 from processor.report.table import NAN, Table
 
@@ -26,20 +27,27 @@ CLOSURE = (
 )
 _PAIRS = (JointQuantity.MISALIGNMENT, JointQuantity.GROOVE_GAP_LEAST, JointQuantity.GROOVE_GAP_GREATEST)
 WHAT_TO_DO = (
-    "joint", "verdict", "proposal", "misalignment_mm", "misalignment_ci95_mm", "least_groove_gap_mm",
-    "least_groove_gap_ci95_mm", "greatest_groove_gap_mm", "greatest_groove_gap_ci95_mm", "rotation_mrad",
-    "rotation_ci95_mrad", "rotation_about", "probability_now", "probability_after",
-)  # fmt: skip
-HEADINGS = (
-    "joint", "verdict", "proposal", "misalignment", "ci95", "gap", "ci95", "gap", "ci95", "rotation", "ci95", "about",
-    "now", "after",
-)  # fmt: skip
-PROPOSAL = WHAT_TO_DO.index("proposal")
-_GROUPS: tuple[str | Message, ...] = (
-    "", "", "", *[text("misalignment (mm)")] * 2, *[text("groove gap, least (mm)")] * 2,
-    *[text("groove gap, greatest (mm)")] * 2, *[text("largest rotation (mrad)")] * 3,
-    *[text("probability that all limits hold")] * 2,
-)  # fmt: skip
+    *columns("joint", "verdict", "proposal"),
+    *under(text("misalignment"), "misalignment_mm", "misalignment_ci95_mm"),
+    *under(text("groove gap, least"), "least_groove_gap_mm", "least_groove_gap_ci95_mm"),
+    *under(text("groove gap, greatest"), "greatest_groove_gap_mm", "greatest_groove_gap_ci95_mm"),
+    *under(text("largest rotation"), "rotation_mrad", "rotation_ci95_mrad", "rotation_about"),
+    *under(text("probability that all limits hold"), "probability_now", "probability_after"),
+)
+PROPOSAL = 2  # column of WHAT_TO_DO
+MEASURES = {
+    JointQuantity.GROOVE_GAP_MEAN: text("groove gap mean"),
+    JointQuantity.GROOVE_GAP_LEAST: text("groove gap least"),
+    JointQuantity.GROOVE_GAP_GREATEST: text("groove gap greatest"),
+    JointQuantity.MISALIGNMENT: text("misalignment"),
+    JointQuantity.ECCENTRICITY: text("eccentricity"),
+    JointQuantity.ROTATION_X: text("rotation x"),
+    JointQuantity.ROTATION_Y: text("rotation y"),
+    JointQuantity.ROTATION_Z: text("rotation z"),
+    JointQuantity.OFFSET_X: text("offset x"),
+    JointQuantity.OFFSET_Y: text("offset y"),
+    JointQuantity.OFFSET_Z: text("offset z"),
+}
 _NOTE = text(
     "± is the 95 % half-width. Groove gap: right part minus left along the bridge, positive is open. Pass: the whole "
     "interval keeps the limit; fail: the whole interval exceeds it; indeterminate: the limit lies within it. "
@@ -85,7 +93,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
         *_chain(adjustment, method),
         Table(
             text("Measures of the joints, method {method}", method=method),
-            ("joint", "measure", "value", "ci95", "low95", "high95", "unit"),
+            columns("joint", "measure", "value", "ci95", "low95", "high95", "unit"),
             tuple(_measures(adjustment)),
             file="measures",
             on_terminal=False,
@@ -93,7 +101,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
         ),
         Table(
             text("Span and closure, method {method}", method=method),
-            ("figure", "departure", "ci95", "unit", "beyond_its_interval"),
+            columns("figure", "departure", "ci95", "unit", "beyond_its_interval"),
             tuple(_span_and_closure(adjustment)),
             file="span",
             note=SPAN_NOTE,
@@ -102,7 +110,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
         *_loops(adjustment, method),
         Table(
             text("Budget of the uncertainty, method {method}", method=method),
-            ("source", "sd_mm"),
+            columns("source", "sd_mm"),
             tuple(zip(BudgetSource, adjustment.budget_sd.tolist(), strict=False)),
             file="budget",
             note=BUDGET_NOTE,
@@ -110,7 +118,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
         ),
         Table(
             text("What limits the accuracy, and which scan would help"),
-            ("subject", "statement"),
+            columns("subject", "statement"),
             (
                 (text("what limits the accuracy"), text("{reasons:;}", reasons=adjustment.limiting)),
                 (text("which scan would help"), text("{reasons:;}", reasons=adjustment.advice)),
@@ -129,16 +137,14 @@ def _what_to_do(adjustment: Adjustment, method: str) -> list[Table]:
     rows = tuple(_joint_rows(adjustment))
     proposals = tuple((row[0], row[PROPOSAL]) for row in rows)
     return [
-        Table(title, WHAT_TO_DO, rows, file=TO_DO, note=_NOTE, groups=_GROUPS, headings=HEADINGS, on_terminal=False),
+        Table(title, WHAT_TO_DO, rows, file=TO_DO, note=_NOTE, on_terminal=False),
         Table(
             title,
             _without_proposal(WHAT_TO_DO),
             tuple(map(_without_proposal, rows)),
-            groups=_without_proposal(_GROUPS),
-            headings=_without_proposal(HEADINGS),
             on_page=False,
         ),
-        Table(text("Proposals"), ("joint", "proposal"), proposals, on_page=False),
+        Table(text("Proposals"), columns("joint", "proposal"), proposals, on_page=False),
     ]
 
 
@@ -160,7 +166,7 @@ def _joint_rows(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
 
 
 def _limits(adjustment: Adjustment, method: str) -> Table:
-    columns = (
+    header = columns(
         "joint", "limit", "verdict", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability",
         "clause",
     )  # fmt: skip
@@ -170,7 +176,8 @@ def _limits(adjustment: Adjustment, method: str) -> Table:
         for row in _limit_rows(conformity.limits)
     )
     note = with_unverified(LIMITS_NOTE, _unverified(adjustment.joints.conformity))
-    return Table(text("Limits, method {method} (mm)", method=method), columns, rows, LIMITS, note, on_page=False)
+    title = text("Limits, method {method}", method=method)
+    return Table(title, header, rows, file=LIMITS, note=note, units=MM, on_page=False)
 
 
 def _unverified(judged: Sequence[Conformity]) -> Iterator[str]:
@@ -189,7 +196,7 @@ def _limit_rows(limits: ComparedLimits) -> Iterator[tuple[Any, ...]]:
 
 def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     """Yield the limits of the whole chain, and those stated ones that nothing is compared with."""
-    columns = (
+    header = columns(
         "limit", "verdict", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability", "clause",
         "edition", "source",
     )  # fmt: skip
@@ -201,13 +208,13 @@ def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
         )
     )
     if rows:
-        title = text("Limits of the whole chain, method {method} (mm)", method=method)
+        title = text("Limits of the whole chain, method {method}", method=method)
         note = with_unverified(CHAIN_NOTE, _unverified(adjustment.chain))
-        yield Table(title, columns, rows, file=CHAIN, note=note, on_page=False)
+        yield Table(title, header, rows, file=CHAIN, note=note, units=MM, on_page=False)
     if adjustment.unused_limits:
         yield Table(
             text("Limits that nothing is compared with"),
-            ("key", "limit"),
+            columns("key", "limit"),
             tuple(zip(adjustment.unused_limits, map(label, adjustment.unused_limits_what), strict=True)),
             file="limits-not-held",
             note=text("They are given for this project, and no measured quantity corresponds to them."),
@@ -230,14 +237,14 @@ def _candidates(result: Result, adjustment: Adjustment) -> Iterator[Table]:
     title = text("Parts that fit in two poses")
     yield Table(
         title,
-        ("component", "candidate", "turned_deg", "what_would_decide"),
+        columns("component", "candidate", "turned_deg", "what_would_decide"),
         tuple(rows),
         note=text("Both fit the design alike. The matrices of both, scan to bridge, are in candidates.csv, mm."),
     )
-    places = tuple(f"{row}{column}" + ("_mm" if column == "t" else "") for row in "xyz" for column in "xyzt")
+    places = ("xx", "xy", "xz", "xt_mm", "yx", "yy", "yz", "yt_mm", "zx", "zy", "zz", "zt_mm")
     yield Table(
         title,
-        ("component", "candidate", "turned_deg", *places, "what_would_decide"),
+        columns("component", "candidate", "turned_deg", *places, "what_would_decide"),
         tuple(matrices),
         file="candidates",
         on_page=False,
@@ -248,9 +255,9 @@ def _candidates(result: Result, adjustment: Adjustment) -> Iterator[Table]:
 def _measures(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
     for joint, measures in zip(adjustment.joints.name, adjustment.joints.measures, strict=True):
         rows = measures.quantities
-        columns = (rows.value.tolist(), rows.ci95.tolist(), rows.low.tolist(), rows.high.tolist(), rows.unit)
-        for name, *numbers in zip(rows.name, *columns, strict=True):
-            yield (joint, label(str(name).replace("_", " ")), *numbers)
+        numbers_of = (rows.value.tolist(), rows.ci95.tolist(), rows.low.tolist(), rows.high.tolist(), rows.unit)
+        for name, *numbers in zip(rows.name, *numbers_of, strict=True):
+            yield (joint, MEASURES[name], *numbers)
 
 
 def _span_and_closure(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
@@ -276,21 +283,24 @@ def _loops(adjustment: Adjustment, method: str) -> list[Table]:
             finite = math.isfinite(value) and math.isfinite(half)
             beyond = (text("yes") if abs(value) > half else text("no")) if finite else ""
             rows.append((joint, " > ".join(loops.joints[i]), name, value, half, unit, beyond))
-    columns = ("joint", "further_joints", "figure", "departure", "ci95", "unit", "beyond_its_interval")
+    header = columns("joint", "further_joints", "figure", "departure", "ci95", "unit", "beyond_its_interval")
     title = text("Closure of loops of parts, method {method}", method=method)
-    return [Table(title, columns, tuple(rows), file="loops", note=LOOP_NOTE)]
+    return [Table(title, header, tuple(rows), file="loops", note=LOOP_NOTE)]
 
 
 def _trade_off(result: Result, adjustment: Adjustment, method: str) -> Table:
     trade = result.trade_off
     return Table(
-        text("Trade-off over lambda, method {method} (mm)", method=method),
-        ("lambda", "splicing_mean_mm", "splicing_max_mm", "linear_mean_mm", "linear_max_mm"),
+        text("Trade-off over lambda, method {method}", method=method),
+        (
+            *columns("lambda"),
+            *under(text("splicing error"), "splicing_mean_mm", "splicing_max_mm"),
+            *under(text("linear error"), "linear_mean_mm", "linear_max_mm"),
+        ),
         tuple((weight, *row) for weight, row in zip(trade.weight.tolist(), trade.figures.tolist(), strict=True)),
         file="trade-off",
         note=text("The result was made with lambda {weight:g}.", weight=adjustment.weight),
-        groups=("", *[text("splicing error")] * 2, *[text("linear error")] * 2),
-        headings=("lambda", *["mean", "max"] * 2),
+        units=MM,
         on_terminal=False,
         folded=True,
     )

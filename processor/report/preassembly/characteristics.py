@@ -13,6 +13,16 @@ from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
 from processor.report.characteristics import Characteristic
 from processor.report.table import NAN
 
+LIMITS = {
+    "misalignment_mm": text("misalignment"),
+    "groove_gap_mm": text("groove gap"),
+    "splice_eccentricity_mm": text("splice eccentricity"),
+    "span_mm": text("span"),
+    "unit_length_mm": text("unit length"),
+    "inner_arc_mm": text("inner arc"),
+    "lateral_axis_mm": text("lateral axis"),
+    "elevation_mm": text("elevation"),
+}
 GROOVE_GAP, CHORDS = "groove_gap", ("span", "unit_length")
 CHAIN = text("chain")
 NOTE = text(
@@ -41,7 +51,7 @@ def _held(name: str | Message, limits: ComparedLimits, scene: Scene) -> Iterator
         if not limits.bounds_known[k]:
             clause = text("{clause}; depends on a size that is not known", clause=clause)
         yield Characteristic(
-            id=text("{place} {what}", place=name, what=label(key.removesuffix("_mm").replace("_", " "))),
+            id=text("{place} {what}", place=name, what=LIMITS.get(key, label(key))),
             quantity=label(limits.what[k]),
             nominal=_nominal(key, scene),
             deviation=float(limits.value[k]),

@@ -12,6 +12,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, Text, text
 from processor.model import KEY_POINTS, Floats, Status, StepRun
 from processor.preassembly.result import Result
+from processor.report.columns import MM, columns, under
 from processor.report.preassembly.adjustment_tables import adjusted
 from processor.report.table import NAN, Table
 
@@ -33,12 +34,12 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     """Tables of an assembled bridge, what to do first; ``runs`` are the result and the methods compared with it."""
     first, method = runs[0].result, runs[0].method
     tables = [*adjusted(first, method), _summary(runs), _components(first), *_others(runs[1:]), _joints(first, method)]
-    tables += _by_point(first, text("Splicing error, method {method} (mm)", method=method), first.joints.gaps)
+    tables += _by_point(first, text("Splicing error, method {method}", method=method), first.joints.gaps)
     if np.isfinite(first.joints.gap_ci95).any():
-        title = text("95 % half-widths, method {method} (mm)", method=method)
+        title = text("95 % half-widths, method {method}", method=method)
         tables += [replace(table, folded=True) for table in _by_point(first, title, first.joints.gap_ci95)]
     for run in runs[1:]:
-        title = text("Splicing error, method {method} (mm)", method=run.method)
+        title = text("Splicing error, method {method}", method=run.method)
         by_point = _by_point(run.result, title, run.result.joints.gaps)
         tables += [replace(table, on_terminal=False, folded=True) for table in by_point]
     tables += [_gaps(run, "gaps" if run is runs[0] else f"gaps-{run.method}") for run in runs]
@@ -46,10 +47,12 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
 
 
 def _summary(runs: Sequence[StepRun]) -> Table:
-    columns = (
-        "method", "splicing_mean_mm", "splicing_max_mm", "linear_mean_mm", "linear_max_mm",
-        "foot1_best_fit_linear_mean_mm", "foot1_best_fit_linear_max_mm",
-    )  # fmt: skip
+    header = (
+        *columns("method"),
+        *under(text("splicing error"), "splicing_mean_mm", "splicing_max_mm"),
+        *under(text("linear error, as assembled"), "linear_mean_mm", "linear_max_mm"),
+        *under(text("linear error, Foot 1 best-fit"), "foot1_best_fit_linear_mean_mm", "foot1_best_fit_linear_max_mm"),
+    )
     rows = tuple(
         (run.method, *(value for error in run.result.errors for value in (error.mean, error.max))) for run in runs
     )
@@ -61,18 +64,8 @@ def _summary(runs: Sequence[StepRun]) -> Table:
         ),
         *_half_widths(runs),
     ]
-    splicing, as_assembled = text("splicing error"), text("linear error, as assembled")
-    groups: tuple[str | Message, ...] = (
-        "",
-        *[splicing] * 2,
-        *[as_assembled] * 2,
-        *[text("linear error, Foot 1 best-fit")] * 2,
-    )
-    title = text("Splicing and linear error by method (mm)")
-    return Table(
-        title, columns, rows, file="summary", note=text("{sentences:.}", sentences=note), groups=groups,
-        headings=("method", *["mean", "max"] * 3),
-    )  # fmt: skip
+    title = text("Splicing and linear error by method")
+    return Table(title, header, rows, file="summary", note=text("{sentences:.}", sentences=note), units=MM)
 
 
 def _half_widths(runs: Sequence[StepRun]) -> list[Text]:
@@ -104,7 +97,7 @@ def _components(result: Result) -> Table:
     parts = result.components
     remarks = [text("{reasons:;}", reasons=reasons) for reasons in parts.reasons]
     rows = tuple(zip(parts.name, parts.status, remarks, strict=True))
-    return Table(text("Components"), ("component", "status", "remark"), rows, "components")
+    return Table(text("Components"), columns("component", "status", "remark"), rows, "components")
 
 
 def _others(runs: Sequence[StepRun]) -> list[Table]:
@@ -117,9 +110,9 @@ def _others(runs: Sequence[StepRun]) -> list[Table]:
         )
         if status != Status.OK or reasons
     )
-    columns = ("method", "component", "status", "remark")
+    header = columns("method", "component", "status", "remark")
     return (
-        [Table(text("Components by the methods compared"), columns, rows, "components-compared", folded=True)]
+        [Table(text("Components by the methods compared"), header, rows, "components-compared", folded=True)]
         if rows
         else []
     )
@@ -127,11 +120,12 @@ def _others(runs: Sequence[StepRun]) -> list[Table]:
 
 def _joints(result: Result, method: str) -> Table:
     return Table(
-        text("Joints, method {method} (mm)", method=method),
-        ("joint", "left_part", "right_part", "mean_mm", "largest_mm", "at", "verdict"),
+        text("Joints, method {method}", method=method),
+        columns("joint", "left_part", "right_part", "mean_mm", "largest_mm", "at", "verdict"),
         tuple(_joint(result, j) for j in range(len(result.joints))),
         file="joints",
         note=NO_VERDICT if result.adjustment is None else BY_LIMITS,
+        units=MM,
     )
 
 
@@ -154,17 +148,16 @@ def _gaps(run: StepRun, name: str) -> Table:
         for j, joint in enumerate(joints.name)
         for k, key in enumerate(KEY_POINTS)
     ]
-    columns: tuple[str, ...] = ("joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm")
+    header = columns("joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm")
     if adjustment is not None:  # in the joint's own axes as well
-        axes = ("along", "left", "up")
-        columns = (*columns, *(f"{axis}_mm" for axis in axes), *(f"ci95_{axis}_mm" for axis in axes))
+        header += columns("along_mm", "left_mm", "up_mm", "ci95_along_mm", "ci95_left_mm", "ci95_up_mm")
         measures = adjustment.joints.measures
         local = np.concatenate(
             [[measure.gaps for measure in measures], [measure.gaps_ci95 for measure in measures]], axis=2
         )
         rows = [(*row, *further) for row, further in zip(rows, local.reshape(-1, 6), strict=True)]
     title = text("Gaps at the joints, method {method}", method=run.method)
-    return Table(title, columns, tuple(rows), name, on_page=False, on_terminal=False)
+    return Table(title, header, tuple(rows), name, on_page=False, on_terminal=False)
 
 
 def _linear(result: Result, method: str) -> Table:
@@ -183,7 +176,9 @@ def _linear(result: Result, method: str) -> Table:
     )
     return Table(
         text("Linear error by chainage, method {method}", method=method),
-        ("edge", "chainage_mm", "deviation_mm", "ci95_mm", "foot1_best_fit_deviation_mm", "foot1_best_fit_ci95_mm"),
+        columns(
+            "edge", "chainage_mm", "deviation_mm", "ci95_mm", "foot1_best_fit_deviation_mm", "foot1_best_fit_ci95_mm"
+        ),
         rows,
         file="linear",
         on_page=False,
@@ -199,16 +194,9 @@ def _by_point(result: Result, title: Message, values: Floats) -> list[Table]:
     joints, tables = result.joints, []
     for start in range(0, len(joints), JOINTS_ABREAST):
         chosen = range(start, min(start + JOINTS_ABREAST, len(joints)))
-        tables.append(
-            Table(
-                title,
-                ("point", *["dx", "dy", "dz"] * len(chosen)),
-                tuple((key, *values[chosen, k].ravel().tolist()) for k, key in enumerate(KEY_POINTS)),
-                note=POINTS if start == 0 else "",
-                groups=(
-                    "",
-                    *(f"{joints.name[j]}: {joints.left[j]} & {joints.right[j]}" for j in chosen for _ in "xyz"),
-                ),
-            )
-        )
+        header = columns("point")
+        for j in chosen:
+            header += under(f"{joints.name[j]}: {joints.left[j]} & {joints.right[j]}", "dx_mm", "dy_mm", "dz_mm")
+        rows = tuple((key, *values[chosen, k].ravel().tolist()) for k, key in enumerate(KEY_POINTS))
+        tables.append(Table(title, header, rows, note=POINTS if start == 0 else "", units=MM))
     return tables

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from processor.language.messages import Message, text
 from processor.model import Verdict
+from processor.report.columns import MM, columns
 from processor.report.style import COLOURS, DIVERGING_STOPS, CaptionedPngs, png
 from processor.report.table import Table, csv_of_rows
 from processor.space_frame.ceiling import clashes
@@ -16,7 +17,7 @@ from processor.space_frame.result import Flag, Result
 PLAN, STAKE_OUT = "hangers.png", "stakeout.csv"
 MOST_NAMED = 30
 LENGTHS = LinearSegmentedColormap.from_list("length", DIVERGING_STOPS[2:])
-COLUMNS = ("name", "x_m", "y_m", "z_m", "code")
+COLUMNS = columns("name", "x_m", "y_m", "z_m", "code")
 LOWEST, CEILING = "LOWEST", "CEILING"
 
 
@@ -37,13 +38,13 @@ def tables(result: Result) -> list[Table]:
         )
         for i, ball in enumerate(hangers.ids.tolist())
     )
-    columns = ("id", "verdict", "length_mm", "ci95_mm", "x_mm", "y_mm", "z_mm", "ceiling_z_mm", "flag")
+    header = columns("id", "verdict", "length_mm", "ci95_mm", "x_mm", "y_mm", "z_mm", "ceiling_z_mm", "flag")
     note = text(
         "From each ball's lowest point x, y, z straight down to the ceiling; the input's own frame. Negative: the "
         "ball reaches below the ceiling. Cut to these lengths only after the process hole at the lowest point is "
         "allowed for."
     )
-    return [Table(text("Hangers (mm)"), columns, rows, "hangers", note, on_terminal=False)]
+    return [Table(text("Hangers"), header, rows, "hangers", note, units=MM, on_terminal=False)]
 
 
 def stake_out(result: Result) -> bytes:

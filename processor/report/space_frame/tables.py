@@ -13,13 +13,13 @@ import numpy as np
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import NORMAL_95, Floats, Status, StepRun, Verdict
+from processor.report.columns import MM, XYZ, columns
 from processor.report.space_frame import ceiling
 from processor.report.table import NAN, Table
 from processor.robust_statistics import finite_median
 from processor.space_frame.result import Balls, Evidence, Flag, Result
 from processor.space_frame.spheres.baselines import SAME
 
-XYZ = ("x", "y", "z")
 COORDINATES = tuple(f"{axis}_mm" for axis in XYZ)
 
 
@@ -63,16 +63,16 @@ def _formal(run: StepRun, true: Floats, file: str, first: StepRun) -> Table:
         )
         for i, ball in enumerate(balls.ids.tolist())
     )
-    columns = (
+    header = columns(
         "id", *COORDINATES, "radius_mm", "formal_ci95_radius_mm", "true_radius_mm", "radius_error_mm", "lowest_z_mm",
         "formal_ci95_lowest_z_mm", "points", "flag", "remark",
     )  # fmt: skip
     note = "" if run is first else text("{reasons}", reasons=run.result.reasons)
-    return Table(_title(run.method), columns, rows, file, note, on_terminal=run is first)
+    return Table(_title(run.method), header, rows, file, note, units=MM, on_terminal=run is first)
 
 
 def _title(method: str) -> Message:
-    return text("Balls, method {method} (mm)", method=method)
+    return text("Balls, method {method}", method=method)
 
 
 def _with_bounds(run: StepRun, true: Floats, file: str) -> Table:
@@ -105,14 +105,14 @@ def _with_bounds(run: StepRun, true: Floats, file: str) -> Table:
         )
         for i, ball in enumerate(balls.ids.tolist())
     )
-    columns = (
+    header = columns(
         "id", *COORDINATES, *(f"ci95_{name}" for name in COORDINATES), "radius_mm", "ci95_radius_mm", "size_mm",
         "nominal_radius_mm", "true_radius_mm", "radius_error_mm", "lowest_z_mm", "ci95_lowest_z_mm",
         *(f"bound_sd_{name}_mm" for name in (*XYZ, "radius", "lowest_z")),
         *(f"efficiency_{name}" for name in ("centre", "radius", "lowest_z")),
         "points", "visible_fraction", "rms_mm", "axes", "stations", "evidence", "flag", "remark",
     )  # fmt: skip
-    return Table(_title(run.method), columns, rows, file, on_page=False, on_terminal=False)
+    return Table(_title(run.method), header, rows, file, units=MM, on_page=False, on_terminal=False)
 
 
 def _brief(result: Result, method: str) -> Table:
@@ -133,13 +133,13 @@ def _brief(result: Result, method: str) -> Table:
         )
         for i, ball in enumerate(balls.ids.tolist())
     )
-    columns = (
+    header = columns(
         "id", *COORDINATES, "radius_mm", "ci95_radius_mm", "size_mm", "lowest_z_mm", "ci95_lowest_z_mm", "evidence",
         "flag",
     )  # fmt: skip
     note = text("Bounds, efficiencies and all other figures are in balls.csv.")
     # A few targets fit on a terminal, the balls of a frame do not.
-    return Table(_title(method), columns, rows, note=note, on_terminal=not len(result.tubes))
+    return Table(_title(method), header, rows, note=note, units=MM, on_terminal=not len(result.tubes))
 
 
 def _flagged(result: Result, method: str) -> list[Table]:
@@ -149,8 +149,9 @@ def _flagged(result: Result, method: str) -> list[Table]:
         for i, ball in enumerate(balls.ids.tolist())
         if balls.flag[i] is not Flag.OK
     )
-    columns = ("id", "flag", "remark", *COORDINATES, "radius_mm")
-    return [Table(text("Flagged balls, method {method} (mm)", method=method), columns, rows)] if rows else []
+    header = columns("id", "flag", "remark", *COORDINATES, "radius_mm")
+    title = text("Flagged balls, method {method}", method=method)
+    return [Table(title, header, rows, units=MM)] if rows else []
 
 
 def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
@@ -160,8 +161,8 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
         finite = error[np.isfinite(error)]
         figures = np.quantile(finite, [0.5, 0.95, 1.0]).tolist() if len(finite) else [NAN] * 3
         rows.append((run.method, len(finite), len(error), *figures, _points_used(run)))
-    columns = ("method", "fitted", "balls", "median_mm", "quantile_95_mm", "largest_mm", "points_used")
-    return Table(text("|radius error| by method (mm)"), columns, tuple(rows), "summary")
+    header = columns("method", "fitted", "balls", "median_mm", "quantile_95_mm", "largest_mm", "points_used")
+    return Table(text("|radius error| by method"), header, tuple(rows), "summary", units=MM)
 
 
 def _points_used(run: StepRun) -> Message:
@@ -183,12 +184,12 @@ def _lowest(balls: Balls) -> Table:
         (ball, *balls.lowest[i].tolist(), NORMAL_95 * float(balls.lowest_sd[i]), float(balls.radii[i]), balls.flag[i])
         for i, ball in enumerate(balls.ids.tolist())
     )
-    columns = ("id", *COORDINATES, "ci95_z_mm", "radius_mm", "flag")
+    header = columns("id", *COORDINATES, "ci95_z_mm", "radius_mm", "flag")
     note = text(
         "Lowest point of each ball's sphere, in the input's own frame; a process hole cuts it away. ci95 is the "
         "half-width of the 95 % interval."
     )
-    return Table(text("Lowest points (mm)"), columns, rows, "lowest", note, on_page=False, on_terminal=False)
+    return Table(text("Lowest points"), header, rows, "lowest", note, units=MM, on_page=False, on_terminal=False)
 
 
 # --- the frame -----------------------------------------------------------------------------------------------------
@@ -215,7 +216,7 @@ def _summary(result: Result, method: str) -> Table:
         rows.append((text("matching with the design"), result.matching.status, ""))
     if result.movement_reference is not None:
         rows += _movements(balls)
-    return Table(text("Balls in short, method {method}", method=method), ("what", "value", "unit"), tuple(rows))
+    return Table(text("Balls in short, method {method}", method=method), columns("what", "value", "unit"), tuple(rows))
 
 
 def _movements(balls: Balls) -> Iterator[tuple[Any, ...]]:
@@ -248,13 +249,12 @@ def _nodes(result: Result) -> list[Table]:
         )
         for i, ball in enumerate(balls.ids.tolist())
     )
-    columns = (
+    header = columns(
         "id", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm", "movement_mm", "ci95_movement_mm",
         "limit_mm", "verdict", "flag", "remark",
     )  # fmt: skip
-    return [
-        Table(text("Nodes against the design (mm)"), columns, rows, "nodes", _nodes_note(result), on_terminal=False)
-    ]
+    title, note = text("Nodes against the design"), _nodes_note(result)
+    return [Table(title, header, rows, "nodes", note, units=MM, on_terminal=False)]
 
 
 def _nodes_note(result: Result) -> Message:
@@ -300,12 +300,12 @@ def _tubes(result: Result) -> list[Table]:
         )
         for i in range(len(tubes))
     )
-    columns = (
+    header = columns(
         "tube", "ball_a", "ball_b", *(f"start_{one}" for one in COORDINATES), *(f"end_{one}" for one in COORDINATES),
         "length_mm", "radius_mm", "ci95_radius_mm", "ci95_axis_mm", "bow_mm",
     )  # fmt: skip
     note = text("Axes between the ends of the scanned stretch; bow is the largest deviation from a straight line.")
-    return [Table(text("Tubes (mm)"), columns, rows, "tubes", note, on_page=False, on_terminal=False)]
+    return [Table(text("Tubes"), header, rows, "tubes", note, units=MM, on_page=False, on_terminal=False)]
 
 
 def _stations(result: Result) -> list[Table]:
@@ -320,7 +320,7 @@ def _stations(result: Result) -> list[Table]:
         turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
         shift = (R - np.eye(3)) @ middle + T[:3, 3]
         rows.append((name, *shift.tolist(), *(1000.0 * turn).tolist(), reasons))
-    columns = (
+    header = columns(
         "station", "dx_mm", "dy_mm", "dz_mm", "turn_x_mrad", "turn_y_mrad", "turn_z_mrad", "remark",
     )  # fmt: skip
     note = text(
@@ -329,7 +329,7 @@ def _stations(result: Result) -> list[Table]:
     )
     if result.datum:
         note = text("{note} Datum of all stations: {datum}.", note=note, datum=result.datum)
-    return [Table(text("Stations against each other (mm, mrad)"), columns, tuple(rows), "stations", note)]
+    return [Table(text("Stations against each other"), header, tuple(rows), "stations", note, units=("mm", "mrad"))]
 
 
 def _control(result: Result) -> list[Table]:
@@ -344,6 +344,6 @@ def _control(result: Result) -> list[Table]:
         )
         for name, off, used, scan in zip(control.points, control.off, control.used, control.scans, strict=True)
     )
-    columns = ("control_point", "dx_mm", "dy_mm", "dz_mm", "off_mm", "used", "scan")
+    header = columns("control_point", "dx_mm", "dy_mm", "dz_mm", "off_mm", "used", "scan")
     note = text("Known place minus sighting after the corrections of the stations; one row per sighting.")
-    return [Table(text("Control points (mm)"), columns, rows, "control", note)] if rows else []
+    return [Table(text("Control points"), header, rows, "control", note, units=MM)] if rows else []

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from processor.geometry import parallel, rigid
 from processor.language.messages import text
 from processor.model import NORMAL_95, Floats, Scan, Scene, Status, StepRun
+from processor.report.charts.surface_view import spacing
 from processor.report.style import DIVERGING_STOPS, colour_limit
-from processor.report.surface_view import spacing
 from processor.stitching.result import Result, Scans
 from processor.store.json_values import json_ready
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +9,8 @@ import numpy as np
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import NORMAL_95, StepRun
-from processor.report.table import Table, csv_cell
+from processor.report.columns import MM, columns
+from processor.report.table import Table, csv_cell, csv_of_rows
 from processor.stitching.result import ProjectFrame, Result
 
 OF_SCAN = "stitch.of-scan"  # code of reasons that the table of scans has too
@@ -63,7 +62,7 @@ def _scans(result: Result, method: str, suffix: str) -> Table:
         )
         for i, name in enumerate(scans.name)
     )
-    columns = (
+    header = columns(
         "scan", "status", "x_mm", "y_mm", "z_mm", "ci95_x_mm", "ci95_y_mm", "ci95_z_mm", "ci95_about_x_mrad",
         "ci95_about_y_mrad", "ci95_about_z_mrad", "rivalry", "message",
     )  # fmt: skip
@@ -78,7 +77,7 @@ def _scans(result: Result, method: str, suffix: str) -> Table:
             reference=result.reference,
         )
     title = text("Scans in the project's frame, method {method}", method=method)
-    return Table(title, columns, rows, f"stitch-scans{suffix}", note)
+    return Table(title, header, rows, f"stitch-scans{suffix}", note)
 
 
 def _pairs(result: Result, method: str, suffix: str) -> Table:
@@ -97,14 +96,14 @@ def _pairs(result: Result, method: str, suffix: str) -> Table:
         )
         for i, a in enumerate(pairs.a)
     )
-    columns = (
+    header = columns(
         "a", "b", "overlap_percent", "residual_mm", "shared", "used", "scale_ppm", "scale_ci95_ppm", "message",
     )  # fmt: skip
     note = text(
         "Shared: planar pieces, or picked points, that both scans have. The scale of b in a is a diagnostic "
         "value unless it is free."
     )
-    return Table(text("Pairs of scans, method {method}", method=method), columns, rows, f"stitch-pairs{suffix}", note)
+    return Table(text("Pairs of scans, method {method}", method=method), header, rows, f"stitch-pairs{suffix}", note)
 
 
 def _loops(result: Result, method: str, suffix: str) -> Table:
@@ -118,7 +117,7 @@ def _loops(result: Result, method: str, suffix: str) -> Table:
         "usually about 1."
     )
     title = text("Misclosures of loops, method {method}", method=method)
-    return Table(title, ("loop", "mm", "mrad", "ratio"), rows, f"stitch-loops{suffix}", note)
+    return Table(title, columns("loop", "mm", "mrad", "ratio"), rows, f"stitch-loops{suffix}", note)
 
 
 def _matrices(result: Result, method: str) -> Table:
@@ -132,7 +131,7 @@ def _matrices(result: Result, method: str) -> Table:
         note = TO_GLCS_BY_CONTROL if result.by_control else TO_GLCS_BY_POSE
     rows = tuple((name, *row.tolist()) for name, T in named if np.isfinite(T).all() for row in T[:3])
     title = text("Matrices, method {method}", method=method)
-    return Table(title, ("matrix", "x", "y", "z", "shift_mm"), rows, "", note, on_terminal=False)
+    return Table(title, columns("matrix", "x", "y", "z", "shift_mm"), rows, "", note, on_terminal=False)
 
 
 def _control(result: Result, method: str, suffix: str) -> list[Table]:
@@ -150,18 +149,23 @@ def _control(result: Result, method: str, suffix: str) -> list[Table]:
         )
         for i, name in enumerate(sightings.point)
     )
-    columns = ("point", "scan", "dx_mm", "dy_mm", "dz_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "share_percent", "used")
+    header = columns(
+        "point", "scan", "dx_mm", "dy_mm", "dz_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "share_percent", "used"
+    )
     note = text(
         "Known minus measured place after the adjustment, one row per sighting. Share: how much of an error of the "
         "sighting is visible here; the poses absorb the rest. The sd of an unused sighting is that of its prediction."
     )
-    return [Table(text("Control points (mm), method {method}", method=method), columns, rows, f"control{suffix}", note)]
+    title = text("Control points, method {method}", method=method)
+    return [Table(title, header, rows, f"control{suffix}", note, units=MM)]
 
 
 def _remarks(result: Result, method: str) -> list[Table]:
     """Tabulate the reasons that are of no single scan, for the terminal; the page has all reasons as a paragraph."""
     rows = tuple((single,) for single in result.reasons if single.code != OF_SCAN)
-    return [Table(text("Remarks, method {method}", method=method), ("remark",), rows, on_page=False)] if rows else []
+    return (
+        [Table(text("Remarks, method {method}", method=method), columns("remark"), rows, on_page=False)] if rows else []
+    )
 
 
 def _yes_no(value: np.bool_) -> Message:
@@ -170,13 +174,16 @@ def _yes_no(value: np.bool_) -> Message:
 
 def poses_csv(result: Result) -> bytes:
     """Write poses as CSV: a row per scan, the 4 x 4 matrix row by row, mm, and the frames it maps from and to."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["scan", "status", *(f"m{i}{j}" for i in range(4) for j in range(4)), "from", "to"])
     scans = result.scans
-    for i, name in enumerate(scans.name):
-        matrix = [repr(float(x)) if np.isfinite(x) else "" for x in scans.T_project_scan[i].ravel()]
-        writer.writerow(
-            [csv_cell(name), scans.status[i], *matrix, csv_cell(scans.from_frame[i]), csv_cell(scans.to_frame[i])]
+    places = (f"m{i}{j}" for i in range(4) for j in range(4))
+    rows = (
+        (
+            csv_cell(name),
+            scans.status[i],
+            *(x if np.isfinite(x) else "" for x in scans.T_project_scan[i].ravel().tolist()),
+            csv_cell(scans.from_frame[i]),
+            csv_cell(scans.to_frame[i]),
         )
-    return out.getvalue().encode("utf-8")
+        for i, name in enumerate(scans.name)
+    )
+    return csv_of_rows(columns("scan", "status", *places, "from", "to"), rows, full=True).encode("utf-8")

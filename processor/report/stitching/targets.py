@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from processor.model import NORMAL_95, Scene
+from processor.report.columns import columns
 from processor.report.table import csv_of_rows
 
 FILE = "targets.csv"
-COLUMNS = ("scan", "station", "kind", "name", "x_mm", "y_mm", "z_mm", "ci95_mm", "points", "fit")
+COLUMNS = columns("scan", "station", "kind", "name", "x_mm", "y_mm", "z_mm", "ci95_mm", "points", "fit")
 
 
 def files(scene: Scene) -> dict[str, bytes]:
