@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from processor import diagnostics
 from processor.jobs import making, process
+from processor.jobs.causes import Cause
 from processor.jobs.child import Loss, Lost
-from processor.jobs.process import Cause
 from processor.papers import bolt_balls, defects, deviation, preassembly, stitching
 from processor.papers.data_sets import DataSet, Measured
 from processor.writers import step_clouds
