@@ -8,10 +8,11 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from processor.version import __version__
+
 if TYPE_CHECKING:
     from processor.model import Scene, Truth
 
-__version__ = "0.2.0.dev0"
 __all__ = ["__version__", "make", "scan"]
 
 

@@ -202,17 +202,26 @@ def export(
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="new folder")
 @click.option("--units", default="", help="unit of the numbers, instead of that in the file: mm, m, inch, ...")
 @click.option("--default-units", default="", metavar="UNIT", help="unit of the numbers where the file states none")
+@click.option("--named", type=click.Path(path_type=Path), help="what errors call FILE, the original of a copy")
 @json_option
 @debug_option
 @click.pass_context
-def import_(context: click.Context, file: Path, output: Path, units: str, default_units: str, as_json: bool) -> None:
+def import_(
+    context: click.Context,
+    file: Path,
+    output: Path,
+    units: str,
+    default_units: str,
+    named: Path | None,
+    as_json: bool,
+) -> None:
     """Convert a STEP or IFC FILE to meshes in mm, one for each body, with their sizes in import.json.
 
     Exit codes: 0 done, 1 some bodies could not be read (they are listed), 2 wrong usage, 3 bad input.
     """
     from designgen.cad import files
 
-    report = files.import_file(file, output, units, default_units)
+    report = files.import_file(file, output, units, default_units, named)
     if as_json:
         click.echo(json.dumps(report, ensure_ascii=False))
     else:

@@ -38,7 +38,8 @@ def test_packages_share_only_what_they_may(name):
         assert not within(used, "designgen", "cadquery", "OCP"), "processor imports no CAD"
         assert name.startswith("processor.store") or not within(used, "h5py"), "only the store uses HDF5"
     else:
-        shared = tuple(f"processor.{room}" for room in ("model", "plain_text", "store", "writers", "progress", "jobs"))
+        rooms = ("model", "plain_text", "store", "writers", "progress", "jobs", "version")
+        shared = tuple(f"processor.{room}" for room in rooms)
         others = {n for n in within(own, "processor") if not within({n}, *shared)}
         assert others <= {"processor"}, (
             "designgen shares records, store, writers and jobs with processor, and no geometry"

@@ -17,7 +17,8 @@ from typing import Any
 from designgen.cad import faults
 from designgen.cad.bodies import UNITS_MM, CadFile
 from designgen.cad.process import received
-from processor.jobs.process import Cause, isolated, run
+from processor.jobs.causes import Cause
+from processor.jobs.process import isolated, run
 from processor.model import InputError, PlainError, UsageError
 from processor.store.new_folder import check_new, new_folder
 from processor.writers.ply import write_mesh
@@ -55,7 +56,7 @@ def read(
     ``memory_bytes`` of memory. Raises InputError for a file that cannot be read so, is of another kind, cut off,
     damaged, or without geometry; UsageError for unknown units and where the library for IFC is missing.
     """
-    content = _content(path) if content is None else content
+    content = _content(path, path) if content is None else content
     for unit in filter(None, (units, default_units)):
         unit_mm(unit)
     suffix = ".ifc" if path.suffix.lower() in IFC_SUFFIXES else path.suffix.lower()
@@ -90,15 +91,15 @@ def read(
     return content_read
 
 
-def _content(path: Path) -> bytes:
-    """Return a file's bytes; InputError where they are not of the kind of its suffix, or are cut off."""
+def _content(file: Path, path: Path) -> bytes:
+    """Return a file's bytes; InputError, which names ``path``, where they are not of its kind, or are cut off."""
     suffix = path.suffix.lower()
     if suffix not in STEP_SUFFIXES + IFC_SUFFIXES:
         raise InputError(f"{path}: expected a CAD file (.step, .stp, .ifc, .ifczip), found {suffix or 'no suffix'}")
     try:
-        if path.exists() and not path.is_file():
+        if file.exists() and not file.is_file():
             raise InputError(f"{path}: expected a CAD file, found a folder or device")
-        content = _unzipped(path) if suffix == ZIPPED else path.read_bytes()
+        content = _unzipped(file, path) if suffix == ZIPPED else file.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     if not content[:4096].lstrip(b"\xef\xbb\xbf \r\n\t").startswith(MAGIC):
@@ -115,10 +116,10 @@ def _content(path: Path) -> bytes:
     return content
 
 
-def _unzipped(path: Path) -> bytes:
+def _unzipped(file: Path, path: Path) -> bytes:
     """Return the one IFC file in a zip file; InputError where there is another number, or it cannot be unpacked."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(file) as archive:
             inside = [entry for entry in archive.infolist() if entry.filename.lower().endswith(".ifc")]
             if len(inside) != 1:
                 raise InputError(f"{path}: expected one .ifc file in it, found {len(inside)}; unpack it and name one")
@@ -129,14 +130,18 @@ def _unzipped(path: Path) -> bytes:
         raise InputError(f"{path}: is no zip file, damaged or encrypted; copy or export it again") from None
 
 
-def import_file(path: Path, folder: Path, units: str = "", default_units: str = "") -> dict[str, Any]:
+def import_file(
+    path: Path, folder: Path, units: str = "", default_units: str = "", named: Path | None = None
+) -> dict[str, Any]:
     """Write the meshes of a CAD file and import.json as a new folder; return the content of import.json.
+
+    Errors call the file ``named``, if that is given: the original of a copy.
 
     Raises UsageError where the folder exists and is not empty, InputError as :func:`read`.
     """
     check_new(folder)
-    content = _content(path)
-    cad = read(path, units, default_units, content=content)
+    content = _content(path, named or path)
+    cad = read(named or path, units, default_units, content=content)
     report: dict[str, Any] = {
         "file": path.name,
         "sha256": sha256(content).hexdigest(),

@@ -155,6 +155,12 @@ def text_of(value: Any, name: str, known: Collection[str] = ()) -> str:
     return value
 
 
+def function_of(value: Any, name: str) -> None:
+    """Raise UsageError for what cannot be called."""
+    if not callable(value):
+        raise UsageError(f"{name}: expected a function of one text, got {_shown(value)}")
+
+
 def seed_of(value: Any) -> int:
     """Return a seed. Raises UsageError for anything else than a whole number from 0."""
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from processor import large_arrays, pipeline, record_checks
-from processor.api.argument_checks import length_of, path_of, seed_of, text_of
+from processor.api.argument_checks import function_of, length_of, path_of, seed_of, text_of
 from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
@@ -156,6 +156,7 @@ def compute(
     Points beyond 64 MB lie in files without a name beside the output, without one in the folder for temporary files.
     The results.h5 in the folder ``so_far`` holds the steps that are done, while others run.
     """
+    function_of(log, "log")
     wanted, methods, parameters = _names(steps, "steps"), _names(method, "method"), _parameters(params)
     out = None if output is None else path_of(output, "output")
     seed = None if seed is None else seed_of(seed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import json
 import os
 import secrets
@@ -22,7 +21,7 @@ from processor.batch import record
 from processor.batch.record import JobStatus, Record
 from processor.batch.summary_values import step_status, summary_values
 from processor.jobs import exit_codes, process
-from processor.jobs.process import Cause
+from processor.jobs.causes import Cause, cause_of
 from processor.jobs.software import OtherSoftwareError, check_same, source_digest, versions
 from processor.language.messages import messages
 from processor.model import InputError, Reason, reason
@@ -52,9 +51,6 @@ STATUS = {
     exit_codes.LIMIT_MISSED: JobStatus.LIMIT_MISSED,
 }
 WITH_RESULTS = tuple(STATUS.values())
-# Errors of the output folder, not of an input.
-GONE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-OUTPUT_GONE = tuple(map(os.strerror, GONE))  # in the line that another process ends with
 STOPPED, KILLED = reason("batch.stopped"), reason("batch.killed")
 
 
@@ -117,18 +113,9 @@ def run_job(job: Job, stopped: Callable[[], bool] = process.never) -> Record:
     except OtherSoftwareError as error:
         return _failure_to_retry(job, reason("batch.other-software", difference=error.args[0]))
     except (InputError, OSError) as error:
-        if _is_of_output(error):
+        if cause_of(error) is Cause.OUTPUT:
             raise OutputGoneError(str(error)) from error
         return _failure_to_retry(job, reason("batch.error", message=_one_line(job, str(error))))
-
-
-def _is_of_output(error: BaseException | None) -> bool:
-    """Whether an error, or the one that caused it, is that no more can be written."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in GONE:
-            return True
-        error = error.__cause__
-    return False
 
 
 def _failure_to_retry(job: Job, why: Reason) -> Record:
@@ -171,7 +158,7 @@ def _processed(job: Job, input_sha256: str, identity: str, batch_ended: Callable
         if ended.cause is Cause.SIGNAL and ended.code == signal.SIGKILL:  # no fault of the input
             return _failure_to_retry(job, KILLED)
         status, why, limits, results = _assessed(job, ended, new_results)
-        if why is not None and any(sign in ended.last_line for sign in OUTPUT_GONE):
+        if why is not None and ended.cause is Cause.OUTPUT:
             raise OutputGoneError(messages("en").text(why))
         if fingerprint.content_hash(job.source, job.out) != input_sha256:
             return _failure_to_retry(job, reason("batch.input-changed"))
@@ -235,7 +222,7 @@ def _assessed(job: Job, ended: process.Ended, new_results: Path) -> _Assessed:
     error, last = (
         _one_line(job, line.replace(str(new_results), RESULTS_JSON), 500) for line in (ended.error, ended.last_line)
     )
-    if ended.cause is Cause.MEMORY or "MemoryError" in last or "Unable to allocate" in last:
+    if ended.cause is Cause.MEMORY:
         return _failure(reason("batch.memory", limit=job.memory_mb), memory_mb=float(job.memory_mb))
     if ended.cause is Cause.SIGNAL:
         with suppress(ValueError):

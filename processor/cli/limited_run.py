@@ -9,8 +9,9 @@ from pathlib import Path
 
 from processor.cli.common import print_error_line
 from processor.jobs import process
-from processor.jobs.exit_codes import ENDED_BY_LIMIT, WITH_RESULTS
-from processor.jobs.process import Cause, Ended
+from processor.jobs.causes import Cause
+from processor.jobs.exit_codes import BAD_INPUT, ENDED_BY_LIMIT, WITH_RESULTS
+from processor.jobs.process import Ended
 from processor.model import InputError
 from processor.results.file_names import RESULTS_H5
 
@@ -40,7 +41,7 @@ def limited_run(
         return ENDED_BY_LIMIT
     if ended.code in WITH_RESULTS:
         _remove(part)
-    return ended.code
+    return BAD_INPUT if ended.cause is Cause.OUTPUT else ended.code
 
 
 def _remove(part: Path) -> None:
@@ -53,7 +54,9 @@ def _remove(part: Path) -> None:
 def _why(ended: Ended, timeout_s: float | None, memory_mb: int | None) -> str:
     if ended.cause is Cause.TIME:
         return f"expected the run to end within {timeout_s:g} s (--timeout-s), it did not"
-    if ended.cause is Cause.MEMORY or "MemoryError" in ended.last_line or "Unable to allocate" in ended.last_line:
+    if ended.cause is Cause.MEMORY:
+        if memory_mb is None:
+            return "the run took more memory than it was given"
         return f"expected the run to take at most {memory_mb} MB (--memory-mb), it took more"
     if ended.cause is Cause.SIGNAL:
         with suppress(ValueError):

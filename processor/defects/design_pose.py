@@ -58,7 +58,7 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
             return DesignPose(None, error, (source, *before.reasons))
         if before.status == Status.AMBIGUOUS:
             return _ambiguous(before.T_design_scan, error, (source,))
-        if any(one.code == "deviation.no-fit" for one in before.reasons):
+        if surface_registration.is_unproven(before.reasons):
             doubt = reason("defects.pose-unproven")
             return DesignPose(before.T_design_scan, error, (source,), Status.WEAK, doubt)
         return DesignPose(before.T_design_scan, error, (source,))

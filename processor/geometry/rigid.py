@@ -79,12 +79,14 @@ def motion(points: Floats) -> Floats:
 
 
 def about_origin(covariance: Floats, position: Floats) -> Floats:
-    """Covariance (6, 6) of a motion about the frame's origin from that of the same motion about a ``position`` (3,).
+    """Covariance of a motion about the frame's origin from that of the same motion about a ``position`` (3,).
 
-    A motion is a small turn (rad), then a translation (mm): t_origin = t_position + position x turn.
+    A motion is a small turn (rad), then a translation (mm): t_origin = t_position + position x turn. A covariance of
+    (7, 7) has the logarithm of a scale as well, by which t_origin is less by scale times position.
     """
-    J = np.eye(6)
-    J[3:, :3] = cross_matrix(position)
+    J = np.eye(len(covariance))
+    J[3:6, :3] = cross_matrix(position)
+    J[3:6, 6:] = -position[:, None]
     at_origin: Floats = J @ covariance @ J.T
     return at_origin
 

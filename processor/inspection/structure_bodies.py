@@ -23,6 +23,7 @@ from processor.inspection.holes import Cloud
 from processor.inspection.part_geometry import off_the_chord
 from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.model import Floats, Scene, Status, reason
+from processor.registration import surface_registration
 
 PARALLEL, SQUARE = 0.9999, 0.02  # cosines between normals of opposite faces, and of different axes
 SLENDER = 4.0  # length by height and width from which a body is a member with an axis
@@ -69,7 +70,7 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     if any(body.holes for body in found):
         T = deviation.T_design_scan if deviation.T_design_scan.size else np.eye(4)
         cloud = holes.cloud_of(scene, T, stitched, scene_cloud.local_design(scene.structure)[1])
-    unproven = any(one.code == "deviation.no-fit" for one in deviation.reasons)
+    unproven = surface_registration.is_unproven(deviation.reasons)
     doubtful = deviation.status is Status.AMBIGUOUS or unproven
     components = tuple(
         component for body in found if (component := _component(body, scene, cloud, doubtful)) is not None

@@ -1,7 +1,8 @@
 """Child side of a job: limited memory, end with the parent process, jobs served one after another.
 
 ``python -m processor.jobs.child MEMORY_MB MODULE ARGUMENT...`` runs a module as ``python -m`` does, or a script where
-MODULE ends in ``.py``, within the limit (0: none). Standard input is a pipe that stays open as long as the parent
+MODULE ends in ``.py``, within the limit (0: none); its exit code tells a lack of memory, or of room to write, by the
+codes of :mod:`processor.jobs.causes`. Standard input is a pipe that stays open as long as the parent
 process lives.
 """
 
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 from enum import Enum
 from queue import SimpleQueue
 
-from processor.jobs import garbage_collection
+from processor.jobs import causes, garbage_collection
 
 # The parent samples the memory used and kills; the kernel's limit on allocations stops what grows between two samples.
 ALLOCATED_PER_USED, ALLOCATED_BEYOND_MB = 2, 1024
@@ -108,10 +109,11 @@ def main() -> None:
     garbage_collection.collect_rarely()
     guard(int(sys.argv[1]))
     sys.argv[:] = sys.argv[2:]
-    if sys.argv[0].endswith(".py"):
-        runpy.run_path(sys.argv[0], run_name="__main__")
-        return
-    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+    with causes.exiting_by_cause():
+        if sys.argv[0].endswith(".py"):
+            runpy.run_path(sys.argv[0], run_name="__main__")
+        else:
+            runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":

@@ -16,10 +16,10 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
+from processor.jobs.causes import Cause, of_exit_code
 from processor.jobs.child import Loss, Lost
 
 PERIOD_S = 0.05
@@ -38,16 +38,6 @@ R = TypeVar("R")
 
 
 ERROR = "error: "  # begins the line that a program of this project ends with if it fails
-
-
-class Cause(Enum):
-    """What ended a process."""
-
-    EXIT = "exit"
-    SIGNAL = "signal"
-    TIME = "time"
-    MEMORY = "memory"
-    STOPPED = "stopped"
 
 
 @dataclass(frozen=True)
@@ -161,8 +151,8 @@ def run(
         if stderr.error is not None:
             raise stderr.error
     code: int = process.returncode
-    if cause is Cause.EXIT and code < 0:
-        cause, code = Cause.SIGNAL, -code
+    if cause is Cause.EXIT:
+        cause, code = (Cause.SIGNAL, -code) if code < 0 else (of_exit_code(code), code)
     return Ended(
         cause=cause,
         code=code,

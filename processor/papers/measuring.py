@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from processor import diagnostics
 from processor.jobs import process
+from processor.jobs.causes import Cause
 from processor.jobs.child import Loss, Lost
-from processor.jobs.process import Cause
 from processor.jobs.scene_command import scene_command
 from processor.papers import bolt_balls, defects, deviation, preassembly, stitching
 from processor.papers.data_sets import DataSet, Measured

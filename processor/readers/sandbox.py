@@ -32,6 +32,7 @@ import numpy.typing as npt
 
 import processor.readers.pieces as pieces
 from processor import large_arrays, progress
+from processor.jobs import address_space
 from processor.jobs.child import end_with_parent
 from processor.jobs.process import end, isolated, start
 from processor.model import InputError
@@ -250,7 +251,7 @@ class _Shared:
         size = np.dtype(dtype).itemsize * math.prod(shape)
         if size < SMALL:
             return np.empty(shape, dtype)
-        _allow(size)
+        address_space.extend(size)
         offset = self.end
         self.end += -(-size // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
         self._extend()
@@ -288,23 +289,6 @@ def _address(array: Any) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def _allow(more: int) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    if soft != resource.RLIM_INFINITY:
-        wanted = soft + more if hard == resource.RLIM_INFINITY else min(soft + more, hard)
-        resource.setrlimit(resource.RLIMIT_AS, (wanted, hard))
-
-
-def _limit_memory(slack: int) -> None:
-    """Limit the address space to its present size plus ``slack``, but not above an existing limit."""
-    pages = Path("/proc/self/statm")
-    if not pages.exists():
-        return
-    wanted = int(pages.read_text().split()[0]) * mmap.PAGESIZE + slack
-    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-    resource.setrlimit(resource.RLIMIT_AS, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
-
-
 def serve() -> None:
     """Answer requests until the other side closes."""
     end_with_parent()
@@ -328,7 +312,7 @@ def serve() -> None:
         shared = _Shared(_path(request["folder"]) if request["folder"] else None)
         large_arrays.allocate_with(shared.new)
         pieces.show_with(_Sender(channel))
-        _limit_memory(SLACK_BYTES)
+        address_space.limit(SLACK_BYTES)
         signal.setitimer(signal.ITIMER_PROF, request["limit_s"])
         signal.setitimer(signal.ITIMER_REAL, PATIENCE * request["limit_s"])
         answer = _answer(_path(request["path"]), request["module"], shared)

@@ -7,7 +7,7 @@ symmetric structure. :func:`place` decides which of these a scan needs.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
 from processor.geometry.neighbors import thinned, voxel_means
-from processor.model import NORMAL_95, Bools, Floats, Ints, Word
+from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Word
 from processor.registration import icp, main_body, pose_choice, principal
 from processor.registration.principal import CoarsePose, PrincipalAxes
 from processor.robust_statistics import biweight, robust_sd
@@ -292,6 +292,11 @@ def near_share(points: Floats, surface: MeshSurface, T: Floats) -> float:
 def fits_design(placed: Placed, points: Floats, surface: MeshSurface) -> bool:
     """Whether points (n, 3), or half of them beside clutter, lie near the surface at the pose that was found."""
     return near_share(thinned(points, FINE_POINTS), surface, placed.T) >= NEAR_SHARE
+
+
+def is_unproven(reasons: Iterable[Reason]) -> bool:
+    """Whether step deviation states that single points scatter as they do at a wrong pose; see :func:`most_scatter`."""
+    return any(one.code == "deviation.no-fit" for one in reasons)
 
 
 def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:

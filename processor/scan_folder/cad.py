@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from processor.jobs import process
+from processor.jobs.causes import Cause
 from processor.model import DesignBodies, Floats, InputError, Ints
 from processor.scan_folder.meshes import CAD_SUFFIXES as SUFFIXES
 from processor.scan_folder.meshes import read_mesh
@@ -198,9 +199,7 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
         # A copy of the hashed bytes, under a name that cannot be mistaken for an option.
         source = making / f"{SOURCE}{path.suffix.lower()}"
         source.write_bytes(content)
-        failure = _run(command, source, making / "meshes", unit)
-        if failure:
-            raise InputError(failure.replace(f"{source}: ", ""), path=path)
+        _run(command, source, making / "meshes", unit, path)
         (making / "meshes" / CHECKSUM).write_text(_sha256(making / "meshes"), "ascii")
         with suppress(OSError):  # another process has made them meanwhile
             os.replace(making / "meshes", meshes)
@@ -212,13 +211,15 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
         shutil.rmtree(making, ignore_errors=True)
 
 
-def _run(command: list[str], source: Path, out: Path, unit: str) -> str:
-    """Run designgen import; returns its error message if it made no meshes, else ""."""
-    arguments = ["import", str(source), "-o", str(out), "--default-units", unit]
+def _run(command: list[str], source: Path, out: Path, unit: str, path: Path) -> None:
+    """Run designgen import on ``source``, a copy of ``path``. Raises InputError if it made no meshes."""
+    arguments = ["import", str(source), "-o", str(out), "--default-units", unit, f"--named={path}"]
     ended = process.run([*command, *arguments], own_group=False, timeout_s=LIMIT_S)
-    if ended.cause is process.Cause.TIME:
-        return f"designgen import did not end within {LIMIT_S:g} s"
+    if ended.cause is Cause.TIME:
+        raise InputError(f"designgen import did not end within {LIMIT_S:g} s", path=path)
     if (out / RECORD).is_file():
-        return ""
-    code = -ended.code if ended.cause is process.Cause.SIGNAL else ended.code
-    return ended.error or ended.last_line or f"designgen import ended with exit code {code}"
+        return
+    if ended.error:  # names the file already
+        raise InputError(ended.error)
+    code = -ended.code if ended.cause is Cause.SIGNAL else ended.code
+    raise InputError(ended.last_line or f"designgen import ended with exit code {code}", path=path)

@@ -54,10 +54,3 @@ def adjoint(T: Floats, size: int = 7) -> Floats:
     J[3:6, 3:6] = T[:3, :3]
     J[3:6, 6] = -T[:3, 3]
     return J[:size, :size]
-
-
-def about(covariance: Floats, position: Floats) -> Floats:
-    """Return the covariance of a motion, 6 or 7 rows, about the origin from that about a ``position`` (3,)."""
-    J = adjoint(rigid.transform(np.eye(3), position), len(covariance))
-    at_origin: Floats = J @ covariance @ J.T
-    return at_origin

@@ -102,7 +102,7 @@ def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
     J = J.reshape(3 * n, -1)
     T = rigid.transform(used * R, middle_a - used * R @ middle_b)
     # From motions about the centroid of the points to motions about the origin of b, in a.
-    covariance = pose_covariance.about(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
+    covariance = rigid.about_origin(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
     return PairFit(
         T_a_b=T, scale=scale, scale_sd=scaled_sd / float(np.sqrt((rotated**2).sum())), residuals=residuals,
         sd_mm=difference_sd / np.sqrt(2.0), covariance=covariance, dof=dof,

@@ -26,14 +26,25 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
         sync(path.parent)
     except (OSError, RuntimeError) as error:
-        # HDF5 reports a full disk within a longer text, and not always as an OSError.
-        message = re.search(r"error message = '([^']*)'", str(error))
-        if isinstance(error, RuntimeError) and not message:
+        system_error = _system_error(error)
+        if system_error is None:
             raise
-        reason = message[1] if message else getattr(error, "strerror", None) or error
-        raise InputError(f"cannot be written ({reason}); free the disk or choose another folder", path=path) from error
+        reason = system_error.strerror or system_error
+        message = f"cannot be written ({reason}); free the disk or choose another folder"
+        raise InputError(message, path=path) from system_error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _system_error(error: OSError | RuntimeError) -> OSError | None:
+    """Return the error of the operating system that an exception tells; None for another RuntimeError."""
+    # HDF5 tells the number of the error in its text alone, and not always by an OSError.
+    number = re.search(r"\berrno = (\d+)", str(error))
+    if number:
+        of_hdf5 = OSError(int(number[1]), os.strerror(int(number[1])))
+        of_hdf5.__cause__ = error
+        return of_hdf5
+    return error if isinstance(error, OSError) else None
 
 
 def replace_text(path: Path, text: str) -> None:

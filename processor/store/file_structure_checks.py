@@ -8,13 +8,14 @@ and to datasets of numbers or text of fixed length, stored in the file itself in
 from __future__ import annotations
 
 import math
-import resource
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import h5py
+
+from processor.jobs import address_space
 
 GZIP_LIMIT = 1032  # deflate's largest possible expansion
 CHUNK_LIMIT = 64 * 2**20
@@ -24,26 +25,9 @@ LINKS = {h5py.h5l.TYPE_SOFT: "SoftLink", h5py.h5l.TYPE_EXTERNAL: "ExternalLink"}
 MEMORY_BYTES = 1 << 30  # for a file's structure
 
 
-@contextmanager
-def limited_memory() -> Iterator[None]:
-    """Limit the address space of this process to ``MEMORY_BYTES`` above its present size.
-
-    HDF5 allocates whatever size a damaged file declares.
-    """
-    pages = Path("/proc/self/statm")
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    if not pages.exists():
-        yield
-        return
-    wanted = int(pages.read_text().split()[0]) * resource.getpagesize() + MEMORY_BYTES
-    low = soft != resource.RLIM_INFINITY and soft < wanted
-    try:
-        if not low:
-            resource.setrlimit(resource.RLIMIT_AS, (wanted, hard))
-        yield
-    finally:
-        if not low:
-            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+def limited_memory() -> AbstractContextManager[None]:
+    """Limit this process to ``MEMORY_BYTES`` beyond its present size: HDF5 allocates what a damaged file declares."""
+    return address_space.limited(MEMORY_BYTES)
 
 
 def problems(file: Any, path: Path, visit: Callable[[str, Any], None]) -> list[str]:

@@ -79,11 +79,6 @@ class _Plane:
     off: Floats
 
 
-def find(points: Floats, intensity: Floats, side_mm: float) -> list[Checkerboard]:
-    """Return the targets of :func:`search` alone."""
-    return search(points, intensity, side_mm)[0]
-
-
 def search(points: Floats, intensity: Floats, side_mm: float) -> tuple[list[Checkerboard], int]:
     """Find targets whose square of four fields has sides of ``side_mm``, among points (n, 3), by intensity (n,).
 

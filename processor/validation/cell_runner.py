@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from processor.jobs import process, runner
+from processor.jobs.causes import Cause
 from processor.jobs.child import Lost
 from processor.jobs.exit_codes import WITH_RESULTS
-from processor.jobs.process import Cause, Ended
+from processor.jobs.process import Ended
 from processor.jobs.scene_command import scene_command
 from processor.results.file_names import RESULTS_JSON
 from processor.validation.cells import Cell, Origin, Outcome
@@ -100,6 +101,8 @@ def _scene(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) ->
 def _reason(program: str, ended: Ended) -> str:
     if ended.cause is Cause.STOPPED:
         return f"{program}: stopped"
+    if ended.cause is Cause.MEMORY:
+        return f"{program}: out of memory"
     how = f"signal {ended.code} (out of memory?)" if ended.cause is Cause.SIGNAL else f"exit code {ended.code}"
     return f"{program}: {how}: {ended.last_line[:TAIL]}" if ended.last_line else f"{program}: {how}"
 

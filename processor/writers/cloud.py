@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -88,8 +88,3 @@ def of_scan(scan: Scan) -> Cloud:
         largest={name: int(columns[name].max(initial=0)) for name in GRID if name in columns},
         identity=hashlib.sha256(b"".join([scan.origin.tobytes(), scan.points.tobytes()])).digest(),
     )
-
-
-def of_scans(scans: Sequence[Scan]) -> list[Cloud]:
-    """Return the cloud of each scan; see :func:`of_scan`."""
-    return [of_scan(scan) for scan in scans]

@@ -248,6 +248,7 @@ def test_core_points_without_neighbours_are_nan_beside_others():
         (lambda: processor.run("a", seed=-1), "seed: expected a whole number from 0, got -1"),
         (lambda: processor.run("a", lang="fr"), "lang: expected one of en, zh, got 'fr'"),
         (lambda: processor.run("a", cluster=3), "cluster: expected a text, got 3"),
+        (lambda: processor.run("a", log=3), "log: expected a function of one text, got 3"),
         (lambda: processor.check(3, 4), "results: expected Results of processor.run, got int"),
         (lambda: processor.convert("a", 3), "there is no such file|output: expected a path"),
         (lambda: processor.export(3, "b"), "results: expected a path .*or Results, got int"),

@@ -51,9 +51,9 @@ def cloud(count):
 def write_e57(path, points, intensity):
     from processor.model import Scan
     from processor.writers import e57
-    from processor.writers.cloud import of_scans
+    from processor.writers.cloud import of_scan
 
-    e57.write(path, of_scans([Scan("S1", points * 1_000.0, intensity=intensity.astype(float))]), spherical=False)
+    e57.write(path, [of_scan(Scan("S1", points * 1_000.0, intensity=intensity.astype(float)))], spherical=False)
 
 
 def write_las(path, points, intensity):

@@ -21,15 +21,15 @@ PLY = (
     "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
     "{0} 0 0\n{1} 0 0\n{0} 1000 0\n{0} 0 1000\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
 )
-# Stands for `designgen import FILE -o OUT --default-units U`: the file says what is to happen.
+# Stands for `designgen import FILE -o OUT --default-units U --named=ORIGINAL`: the file says what is to happen.
 FAKE = f"""
 import json, os, pathlib, sys
-source, out = pathlib.Path(sys.argv[2]), pathlib.Path(sys.argv[4])
+source, out, named = pathlib.Path(sys.argv[2]), pathlib.Path(sys.argv[4]), sys.argv[7].partition("=")[2]
 says = json.loads(source.read_text())
 with open(says["log"], "a") as log:
-    log.write(" ".join(sys.argv[5:]) + "\\n")
+    log.write(" ".join(sys.argv[5:7]) + "\\n")
 if says.get("error"):
-    print("error: " + str(source) + ": " + says["error"], file=sys.stderr)
+    print("error: " + named + ": " + says["error"], file=sys.stderr)
     sys.exit(3)
 out.mkdir()
 for i in range(says["bodies"]):

@@ -21,7 +21,7 @@ from processor.model import InputError, PointLabels, Scan, Truth, UsageError
 from processor.scan_folder import folder
 from processor.store import store
 from processor.writers import e57
-from processor.writers.cloud import of_scans
+from processor.writers.cloud import of_scan
 from tests.support.files.scan_bytes import las_bytes, put
 from tests.support.scenes.exported_scenes import exported, merged, on_grid, stations_apart
 
@@ -98,7 +98,7 @@ def test_colours_of_several_scans_in_one_e57(tmp_path, blocks):
         Scan(name, on_grid(300)[0], colour=rng.integers(0, 256, (300, 3)).astype(np.uint8), T_project_scan=np.eye(4))
         for name in ("a", "b")
     ]
-    e57.write(tmp_path / "two.e57", of_scans(scans), spherical=False)
+    e57.write(tmp_path / "two.e57", [*map(of_scan, scans)], spherical=False)
     processor.convert(tmp_path / "two.e57", tmp_path / "two.h5")
     back = store.read_scene(tmp_path / "two.h5")
     assert [scan.name for scan in back.scans] == ["a", "b"]

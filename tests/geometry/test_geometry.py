@@ -32,6 +32,24 @@ def test_invert_and_angle():
     assert rigid.rotation_angle(np.diag([-1.0, -1.0, 1.0])) == pytest.approx(np.pi)
 
 
+@pytest.mark.parametrize("size", [6, 7])
+def test_a_covariance_about_the_origin_is_that_of_points_moved_about_a_position(size):
+    """The motion about the origin that moves points as one about a position does, by its effect on four points."""
+    position, h = np.array([300.0, -200.0, 50.0]), 1e-6
+    points = np.array([[0.0, 0, 0], [1000.0, 0, 0], [0, 1000.0, 0], [0, 0, 1000.0]])
+
+    def moved(x, about):
+        R, t, s = rigid.rotation_from_vector(x[:3]), x[3:6], np.exp(x[6]) if size == 7 else 1.0
+        return (about + s * (points - about) @ R.T + t - points).ravel()
+
+    def effect(about):
+        return np.column_stack([(moved(h * x, about) - moved(-h * x, about)) / (2.0 * h) for x in np.eye(size)])
+
+    at_position = np.diag(np.linspace(1.0, 2.0, size))
+    J = np.linalg.lstsq(effect(np.zeros(3)), effect(position), rcond=None)[0]
+    np.testing.assert_allclose(rigid.about_origin(at_position, position), J @ at_position @ J.T, rtol=1e-5, atol=1e-4)
+
+
 def test_mesh_axes_of_a_box_surface():
     # The surface of a 6 x 4 x 2 box: variance along an axis of half-length a is the faces' share by area.
     a, b, c = 3.0, 2.0, 1.0

@@ -9,10 +9,11 @@ from contextlib import closing
 
 import pytest
 
-from processor.jobs import process, runner
+from processor.jobs import causes, process, runner
+from processor.jobs.causes import Cause
 from processor.jobs.child import Loss, Lost
-from processor.jobs.process import Cause
 from processor.model import InputError, UsageError
+from processor.store import atomic_file
 
 SLEEP = "import time; time.sleep(60)"
 PARENT = """
@@ -60,6 +61,52 @@ def test_end_of_a_command_has_cause_exit_code_and_last_line():
     assert ended(f"x = b'x' * 2**27; {SLEEP}", memory_mb=100).cause is Cause.MEMORY
     assert ended(SLEEP, stopped=lambda: True).cause is Cause.STOPPED
     assert ended(SLEEP, timeout_s=0.1, own_group=False).cause is Cause.TIME
+
+
+GUARDED = """
+import errno, sys
+from processor.model import InputError
+def full_disk():
+    raise OSError(errno.ENOSPC, "no room")
+def reported(error, cause, fail=full_disk):
+    try:
+        try:
+            fail()
+        except (OSError, MemoryError) as first:
+            raise error from (first if cause else None)
+    except InputError:
+        sys.exit(3)
+"""
+
+
+@pytest.mark.parametrize(
+    ("memory_mb", "code", "cause", "exit_code"),
+    [
+        (0, "raise MemoryError", Cause.MEMORY, 86),
+        (1, "bytes(2**31)", Cause.MEMORY, 86),  # more than such a process may allocate
+        (1, "import numpy; numpy.ones(2**28)", Cause.MEMORY, 86),
+        (0, "full_disk()", Cause.OUTPUT, 87),
+        (0, "reported(InputError('no room'), cause=True)", Cause.OUTPUT, 87),
+        (0, "reported(InputError('of another kind'), cause=False)", Cause.EXIT, 3),
+        (0, "reported(InputError('damaged'), cause=True, fail=lambda: bytes(2**62))", Cause.EXIT, 3),
+        (0, "raise OSError(errno.ENOENT, 'MemoryError: No space left on device')", Cause.EXIT, 1),
+        (0, "print('error: MemoryError', file=sys.stderr); sys.exit(3)", Cause.EXIT, 3),
+        (0, "sys.exit(0)", Cause.EXIT, 0),
+    ],
+)
+def test_a_guarded_process_tells_its_cause_by_its_exit_code(tmp_path, memory_mb, code, cause, exit_code):
+    script = tmp_path / "script.py"
+    script.write_text(GUARDED + code)
+    ended = process.run([*process.GUARDED, str(memory_mb), str(script)])
+    assert (ended.cause, ended.code) == (cause, exit_code), ended.last_line
+
+
+@pytest.mark.parametrize("kind", [OSError, RuntimeError])
+def test_a_full_disk_that_hdf5_tells_in_its_text_is_an_error_of_the_output(tmp_path, kind):
+    message = r"cannot be written \(No space left on device\)"
+    with pytest.raises(InputError, match=message) as caught, atomic_file.replacing(tmp_path / "a.h5"):
+        raise kind("Can't write data (write failed, errno = 28, error message = 'No space left on device')")
+    assert causes.cause_of(caught.value) is Cause.OUTPUT
 
 
 def test_all_descendants_of_a_command_are_ended(tmp_path):

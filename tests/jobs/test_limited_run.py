@@ -10,7 +10,8 @@ import pytest
 from processor import pipeline
 from processor.api import runs
 from processor.cli import limited_run
-from processor.jobs.process import Cause, Ended
+from processor.jobs.causes import Cause
+from processor.jobs.process import Ended
 from processor.store import store
 from tests.support.processes import commands
 from tests.support.results.step_results import scene
@@ -75,5 +76,7 @@ def test_a_run_within_its_limits_is_as_without(tmp_path, site):
 def test_ended_run_has_a_reason_for_each_cause():
     assert limited_run._why(ended(Cause.EXIT), 1.0, 100) == ""
     assert "within 1 s" in limited_run._why(ended(Cause.TIME), 1.0, None)
-    assert "100 MB" in limited_run._why(ended(Cause.EXIT, 3, "error: Unable to allocate 9 GiB"), None, 100)
+    assert "100 MB" in limited_run._why(ended(Cause.MEMORY, 86), None, 100)
+    assert "more memory" in limited_run._why(ended(Cause.MEMORY, 86), 1.0, None)
+    assert limited_run._why(ended(Cause.OUTPUT, 87), 1.0, 100) == ""
     assert "SIGSEGV" in limited_run._why(ended(Cause.SIGNAL, 11), None, 100)

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from processor.cli.main import commands
 from processor.jobs import process
-from processor.jobs.process import Cause
+from processor.jobs.causes import Cause
 from processor.language.messages import NO_NUMBER, text
 from processor.model import UsageError, reason
 from processor.papers import bolt_balls, command, measuring, parameters, preassembly

@@ -11,7 +11,7 @@ from processor import readers
 from processor.model import InputError, Scan
 from processor.readers.e57 import cartesian_from_spherical
 from processor.writers import e57
-from processor.writers.cloud import of_scans
+from processor.writers.cloud import of_scan
 from tests.support.files.scan_bytes import DATA, TURNED, las_bytes, needs_data, pcd_header, ply_header, put
 
 POINTS = np.array([[1.5, -2.25, 3.0], [0.1, 0.2, 0.3], [-7.0, 8.0, 1e-3]])
@@ -188,7 +188,7 @@ def test_las_by_the_specification(tmp_path):
 )
 def test_e57_scans_keep_their_names_where_these_are_plain(own, expected, tmp_path):
     scans = [Scan(name, POINTS + i) for i, name in enumerate(own)]
-    e57.write(tmp_path / "a.e57", of_scans(scans), spherical=False)
+    e57.write(tmp_path / "a.e57", [*map(of_scan, scans)], spherical=False)
     assert [scan.name for scan in readers.read(tmp_path / "a.e57")] == expected
 
 

@@ -9,7 +9,7 @@ from processor import readers
 from processor.model import InputError, Scan
 from processor.readers import sandbox
 from processor.writers import e57
-from processor.writers.cloud import of_scans
+from processor.writers.cloud import of_scan
 from tests.support.files.damaged_files import damaged, good_files, with_check_sums
 from tests.support.processes import watched_reading
 
@@ -99,5 +99,5 @@ def test_xml_of_e57_has_no_entities(tmp_path, new, why):
 
 def test_a_name_in_xml_is_text(tmp_path):
     name = "<script>&\"'</script>"
-    e57.write(tmp_path / "a.e57", of_scans([Scan(name, np.eye(3)), Scan("S 2", np.eye(3))]), spherical=False)
+    e57.write(tmp_path / "a.e57", [of_scan(Scan(name, np.eye(3))), of_scan(Scan("S 2", np.eye(3)))], spherical=False)
     assert [scan.name for scan in readers.read(tmp_path / "a.e57")] == ["a-1", "S 2"]  # no slash in a name

@@ -15,7 +15,7 @@ from processor.model import InputError, Scan
 from processor.readers import ascii_rows
 from processor.scan_folder import folder
 from processor.writers import e57
-from processor.writers.cloud import of_scans
+from processor.writers.cloud import of_scan
 from tests.support.files.scan_bytes import las_bytes, ply_header, put
 from tests.support.files.scan_folders import BOX, arch_design, surface, write_ply, write_xyz
 
@@ -73,12 +73,15 @@ def ptx_on_the_map(path):
 def posed_e57(path):
     pose = np.eye(4)
     pose[:3, 3] = BASE * 1_000.0
-    e57.write(path, of_scans([Scan("S1", NEAR * 1_000.0, T_project_scan=pose)]), spherical=True)
+    e57.write(path, [of_scan(Scan("S1", NEAR * 1_000.0, T_project_scan=pose))], spherical=True)
 
 
 DOUBLES = UTM.astype("<f8").tobytes()
 FAR = {
-    "e57": ("a.e57", lambda p: e57.write(p, of_scans([Scan("S1", NEAR * 1e3, origin=BASE * 1e3)]), spherical=False)),
+    "e57": (
+        "a.e57",
+        lambda p: e57.write(p, [of_scan(Scan("S1", NEAR * 1e3, origin=BASE * 1e3))], spherical=False),
+    ),
     "e57 with a pose": ("b.e57", posed_e57),
     "las": ("a.las", las),
     "laz": ("a.laz", laz),

@@ -28,7 +28,7 @@ from processor.model import (
 from processor.scan_folder import folder
 from processor.store import store
 from processor.writers import e57, las, text
-from processor.writers.cloud import of_scan, of_scans
+from processor.writers.cloud import of_scan
 from tests.support.scenes.exported_scenes import exported, merged, on_grid, stations_apart
 
 LIMITS_MM = {"las": 0.0501, "laz": 0.0501, "ptx": 1.1e-4, "xyz": 1.1e-4}  # the rest are doubles
@@ -235,13 +235,13 @@ def test_invalid_names_in_e57_are_numbered_in_the_truth_as_in_the_reader(tmp_pat
     """The generator's notion of an odd name is the reader's."""
     points = on_grid(50)[0]
     taken = [Scan(name, points) for name in ("t-2", "a/b", "ok")]
-    e57.write(tmp_path / "t.e57", of_scans(taken), spherical=False)
+    e57.write(tmp_path / "t.e57", [*map(of_scan, taken)], spherical=False)
     back = folder.read_input(tmp_path / "t.e57")
     assert [scan.name for scan in back.scans] == ["t-1", "t-2", "t-3"]
     assert e57.names_read("t", [scan.name for scan in taken]) == ["t-1", "t-2", "t-3"]
     odd = ["ok", "a/b", " a", ".a", "x" * 101, "a\\b", "a\tb", "S 1"]
     scans = [Scan(name, points + i) for i, name in enumerate(odd)]
-    e57.write(tmp_path / "f.e57", of_scans(scans), spherical=False)
+    e57.write(tmp_path / "f.e57", [*map(of_scan, scans)], spherical=False)
     back = folder.read_input(tmp_path / "f.e57")
     assert [scan.name for scan in back.scans] == e57.names_read("f", [scan.name for scan in scans])
     assert [scan.name for scan in back.scans] == ["ok", *(f"f-{i}" for i in range(2, 8)), "S 1"]
@@ -292,7 +292,7 @@ def test_an_arch_bridge_comes_back_from_e57_with_its_components(spherical, tmp_p
 def test_two_e57_files_may_hold_scans_of_one_name(tmp_path):
     scans = stations_apart(np.zeros(3)).scans
     for stem in ("day1", "day2"):
-        e57.write(tmp_path / f"{stem}.e57", of_scans(scans[:2]), spherical=False)
+        e57.write(tmp_path / f"{stem}.e57", [*map(of_scan, scans[:2])], spherical=False)
     back = folder.read_input(tmp_path)
     assert [scan.name for scan in back.scans] == ["S1", "二号站", "day2-1", "day2-2"]
 

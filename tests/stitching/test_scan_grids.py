@@ -18,7 +18,7 @@ from processor.stitching import step as stitching_step
 from processor.stitching.planes import scan_planes
 from processor.store import store
 from processor.writers import e57
-from processor.writers.cloud import of_scans
+from processor.writers.cloud import of_scan
 from tests.support.clouds import stitch_clouds
 from tests.support.files.scan_bytes import DATA, needs_data
 from tests.support.scenes.exported_scenes import exported, merged
@@ -236,7 +236,7 @@ def room():
 
 def test_e57_brings_the_grid_back(room, tmp_path):
     for spherical in (False, True):
-        e57.write(tmp_path / "a.e57", of_scans(room), spherical=spherical)
+        e57.write(tmp_path / "a.e57", [*map(of_scan, room)], spherical=spherical)
         for ours, theirs in zip(room, folder.read_input(tmp_path / "a.e57").scans, strict=True):
             np.testing.assert_array_equal(theirs.grid_row, ours.grid_row)
             np.testing.assert_array_equal(theirs.grid_column, ours.grid_column)
@@ -262,7 +262,7 @@ def test_a_merged_cloud_has_no_grid_in_e57(tmp_path):
 def test_stitching_finds_the_same_ends_in_files_as_in_the_scene(room, tmp_path):
     ours = room[0]
     formats.write_ptx(tmp_path / "a.ptx", ours, None)
-    e57.write(tmp_path / "b.e57", of_scans([ours]), spherical=False)
+    e57.write(tmp_path / "b.e57", [of_scan(ours)], spherical=False)
     expected = scan_planes.extract(ours, 200.0)
     assert len(expected.ends.points) > 100
     for path in (tmp_path / "a.ptx", tmp_path / "b.e57"):

@@ -23,9 +23,13 @@ SIDE = 150.0
 # --- checkerboards -------------------------------------------------------------------------------------------------
 
 
+def boards_in(points, intensity):
+    return checkerboard.search(points, intensity, SIDE)[0]
+
+
 def found_in(seed, **settings):
     points, intensity, centre = board(np.random.default_rng(seed), side=SIDE, **settings)
-    return checkerboard.find(points, intensity, SIDE), centre
+    return boards_in(points, intensity), centre
 
 
 @pytest.mark.parametrize(
@@ -64,17 +68,17 @@ def test_the_order_of_the_points_does_not_matter():
     rng = np.random.default_rng(3)
     points, intensity, _ = board(rng)
     order = rng.permutation(len(points))
-    (one,), (other,) = (checkerboard.find(points[rows], intensity[rows], SIDE) for rows in (slice(None), order))
+    (one,), (other,) = (boards_in(points[rows], intensity[rows]) for rows in (slice(None), order))
     assert np.array_equal(one.centre, other.centre)
 
 
 def test_no_checkerboard_is_found_without_intensities_contrast_or_points():
     points, intensity, _ = board(np.random.default_rng(1))
-    assert checkerboard.find(points, np.ones(len(points)), SIDE) == []
-    assert checkerboard.find(points, np.empty(0), SIDE) == []
-    assert checkerboard.find(points[:20], intensity[:20], SIDE) == []
+    assert boards_in(points, np.ones(len(points))) == []
+    assert boards_in(points, np.empty(0)) == []
+    assert boards_in(points[:20], intensity[:20]) == []
     rng = np.random.default_rng(2)
-    assert checkerboard.find(points, rng.uniform(0.0, 1.0, len(points)), SIDE) == []
+    assert boards_in(points, rng.uniform(0.0, 1.0, len(points))) == []
 
 
 def painted(colour, seed=0, step=6.0, half=400.0):
@@ -108,12 +112,12 @@ DECOYS = {
 @pytest.mark.parametrize("name", DECOYS)
 def test_similar_patterns_are_no_target(name):
     half = 280.0 if name == "chess" else 400.0  # its crossings are tried one by one: there are fifty of them
-    assert checkerboard.find(*painted(DECOYS[name], half=half), SIDE) == []
+    assert boards_in(*painted(DECOYS[name], half=half)) == []
 
 
 def test_painted_target_on_a_wall_is_found_at_its_centre():
     target = on_board(lambda u, v: u * v > 0.0 and max(abs(u), abs(v)) < 75.0)
-    (one,) = checkerboard.find(*painted(target), SIDE)
+    (one,) = boards_in(*painted(target))
     assert one.centre == pytest.approx([5000.0, 0.0, 0.0], abs=3.0 * one.sd + 0.2)
 
 
@@ -259,7 +263,7 @@ def test_points_without_intensity_do_not_prevent_a_target():
     points, intensity, centre = board(np.random.default_rng(7), side=SIDE)
     on_it = np.flatnonzero(np.linalg.norm(points - centre, axis=1) < 40.0)
     intensity[on_it[::25]] = np.nan
-    (one,) = checkerboard.find(points, intensity, SIDE)
+    (one,) = boards_in(points, intensity)
     assert np.linalg.norm(one.centre - centre) < 0.6
 
 
@@ -295,7 +299,7 @@ def test_interval_of_a_target_includes_the_common_range_error_of_a_view():
     scene, _ = scene_of_board()
     found = find.with_targets(scene)
     points, intensity = scene.scans[0].points, scene.scans[0].intensity
-    (one,) = checkerboard.find(points, intensity, SIDE)
+    (one,) = boards_in(points, intensity)
     assert found.targets.sd[0] == pytest.approx(np.hypot(0.5, max(one.sd, find.LEAST_SD_MM)))
     assert found.control.seen_sd[0] == found.targets.sd[0]
 

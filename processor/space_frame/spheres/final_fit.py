@@ -66,22 +66,31 @@ class ResidualSums(NamedTuple):
     stations: int
 
 
-def fit_final(
-    crops: CropsWithRays,
-    masks: Masks,
-    model: StochasticModel,
-    model_points: float,
-    priors: Priors,
-    states: Floats,
-    first_reach_mm: float,
-    threads: int = 0,
-) -> Finished:
-    """Fit every node whose state (k, 4) is finite, with the priors of its centre and size.
+class NodesToFit(NamedTuple):
+    """Nodes to be fitted: their points, and states (k, 4) of centre and radius, mm, with the priors of these.
+
+    ``model_points`` is the number of points that the noise model is worth, ``first_reach_mm`` the reach of the first
+    steps.
+    """
+
+    crops: CropsWithRays
+    masks: Masks
+    model: StochasticModel
+    model_points: float
+    priors: Priors
+    states: Floats
+    first_reach_mm: float
+    threads: int = 0
+
+
+def fit_final(nodes_to_fit: NodesToFit) -> Finished:
+    """Fit every node whose state is finite, with the priors of its centre and size.
 
     The scale about the noise model is estimated for each sphere, with as many degrees of freedom as points and
-    ``model_points`` more, which the noise model is worth. Bounds are those of the noise and the priors with every point
-    at its full weight and stations fixed. ``first_reach_mm`` is the reach of the first steps, mm.
+    ``model_points`` more. Bounds are those of the noise and the priors with every point at its full weight and stations
+    fixed.
     """
+    crops, masks, model, model_points, priors, states, first_reach_mm, threads = nodes_to_fit
     nodes, count = len(states), len(crops.points)
     residuals = Residuals(np.zeros(count), np.zeros(count), np.zeros(count))
     finished = Finished(

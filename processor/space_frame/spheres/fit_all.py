@@ -18,6 +18,7 @@ from processor.space_frame.points.source import Source
 from processor.space_frame.points.sphere_crops import Crops, gather
 from processor.space_frame.spheres import assessment, node_tiles, noise_model, sleeve_radii
 from processor.space_frame.spheres.crop_rays import with_rays
+from processor.space_frame.spheres.final_fit import NodesToFit
 from processor.space_frame.spheres.gauss_newton import CUT_SD, LEAST_COSINE
 from processor.space_frame.spheres.records import (
     AMBIGUOUS,
@@ -253,7 +254,16 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
     keep_nominal(choice, problem.nominal)
     priors = Priors(problem.centre_weight, choice.sizes, np.full(len(choice.sizes), size_weight))
     final = node_tiles.fit_final(
-        problem.crops, masks, model, setting.model_points, priors, choice.states, CUT_SD * sigma, params.threads
+        NodesToFit(
+            crops=problem.crops,
+            masks=masks,
+            model=model,
+            model_points=setting.model_points,
+            priors=priors,
+            states=choice.states,
+            first_reach_mm=CUT_SD * sigma,
+            threads=params.threads,
+        )
     )
     fits = Fits(
         states=final.states,

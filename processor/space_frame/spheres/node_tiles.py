@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor import tiles
-from processor.model import Bools, Floats
+from processor.model import Bools
 from processor.space_frame.spheres import final_fit, size_selection
 from processor.space_frame.spheres.records import (
     CropsWithRays,
@@ -33,19 +33,6 @@ class _ToChoose(NamedTuple):
     vote_half_width: float
     first_reach_mm: float
     wanted: Bools
-    threads: int
-
-
-class _ToFit(NamedTuple):
-    """Arguments of :func:`final_fit.fit_final` for some nodes."""
-
-    crops: CropsWithRays
-    masks: Masks
-    model: StochasticModel
-    model_points: float
-    priors: Priors
-    states: Floats
-    first_reach_mm: float
     threads: int
 
 
@@ -85,30 +72,22 @@ def _chosen(tile: _ToChoose) -> SizeChoice:
     return size_selection.choose(*tile)
 
 
-def fit_final(
-    crops: CropsWithRays,
-    masks: Masks,
-    model: StochasticModel,
-    model_points: float,
-    priors: Priors,
-    states: Floats,
-    first_reach_mm: float,
-    threads: int = 0,
-) -> Finished:
-    """Fit every node whose state (k, 4) is finite; see :func:`processor.space_frame.spheres.final_fit.fit_final`."""
+def fit_final(nodes_to_fit: final_fit.NodesToFit) -> Finished:
+    """Fit every node whose state is finite; see :func:`processor.space_frame.spheres.final_fit.fit_final`."""
     parts = list(
         tiles.mapped(
-            _fitted,
+            final_fit.fit_final,
             [
-                _ToFit(
-                    crops=_crops(crops, at), masks=_masks(masks, at), model=model, model_points=model_points,
-                    priors=Priors(*(column[at] for column in priors)), states=states[at],
-                    first_reach_mm=first_reach_mm, threads=threads,
+                nodes_to_fit._replace(
+                    crops=_crops(nodes_to_fit.crops, at),
+                    masks=_masks(nodes_to_fit.masks, at),
+                    priors=Priors(*(column[at] for column in nodes_to_fit.priors)),
+                    states=nodes_to_fit.states[at],
                 )
-                for at in _nodes(len(states))
+                for at in _nodes(len(nodes_to_fit.states))
             ],
         )
-    )  # fmt: skip
+    )
     residuals = zip(*(part.residuals for part in parts), strict=True)
     return Finished(
         states=np.concatenate([part.states for part in parts]),
@@ -117,10 +96,6 @@ def fit_final(
         numbers=np.concatenate([part.numbers for part in parts]),
         residuals=Residuals(*(np.concatenate(column) for column in residuals)),
     )
-
-
-def _fitted(tile: _ToFit) -> Finished:
-    return final_fit.fit_final(*tile)
 
 
 def _nodes(count: int) -> list[slice]:

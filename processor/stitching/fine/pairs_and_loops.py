@@ -108,7 +108,7 @@ def _loop(path: list[Pair], start: int) -> Loop:
     for pair in path:
         forward = pair.a == at
         # With rotations about the origin of a's frame the adjoint transforms the covariance.
-        covariance = pose_covariance.about(pair.covariance, pair.T_a_b[:3, 3])
+        covariance = rigid.about_origin(pair.covariance, pair.T_a_b[:3, 3])
         if forward:
             C = C + _transformed(covariance, T)
             T = T @ pair.T_a_b

@@ -15,7 +15,7 @@ import numpy as np
 from processor.model import PointLabels, Scan, Scene, Truth
 from processor.store import store
 from processor.writers import e57
-from processor.writers.cloud import of_scans
+from processor.writers.cloud import of_scan
 
 POINTS = np.random.default_rng(6).normal(0.0, 3.0, (60, 3)).round(4)
 COUNT = len(POINTS)
@@ -84,7 +84,7 @@ def _e57(folder, spherical):
         Scan("S1", 1_000.0 * POINTS, intensity=np.arange(COUNT) % 9.0, T_project_scan=pose, **grid),
         Scan("S2", 1_000.0 * POINTS),
     ]
-    e57.write(folder / "a.e57", of_scans(scans), spherical=spherical)
+    e57.write(folder / "a.e57", [*map(of_scan, scans)], spherical=spherical)
     return (folder / "a.e57").read_bytes()
 
 
@@ -92,7 +92,7 @@ def _integers(folder):
     """An E57 file of scaled integers, with invalid points."""
     from pye57 import libe57
 
-    e57.write(folder / "b.e57", of_scans([Scan("S1", 1_000.0 * POINTS)]), spherical=False)
+    e57.write(folder / "b.e57", [of_scan(Scan("S1", 1_000.0 * POINTS))], spherical=False)
     image = libe57.ImageFile(str(folder / "c.e57"), "w")
     image.extensionsAdd("", libe57.E57_V1_0_URI)
     prototype, scan = libe57.StructureNode(image), libe57.StructureNode(image)

@@ -30,39 +30,6 @@ def rendered(execution):
     return page.html(execution, ErrorReport(), drawn(execution))
 
 
-class Page(HTMLParser):
-    """Tables by title, ids, scripts by their type, and all text."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tables, self.scripts, self.text, self._title, self._in, self._kind = {}, [], "", "", "", ""
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self._in = tag
-        if tag == "script":
-            self.scripts.append([dict(attrs).get("type", ""), ""])
-        if tag == "h3":
-            self._title = ""
-        if tag == "tr":
-            self.tables.setdefault(self._title, []).append([])
-        if tag in ("td", "th"):
-            self.tables[self._title][-1].append("")
-
-    def handle_data(self, data):
-        if self._in == "script":
-            self.scripts[-1][1] += data
-        else:
-            self.text += data
-        if self._in == "h3":
-            self._title += data
-        if self._in in ("td", "th"):
-            self.tables[self._title][-1][-1] += data
-
-    def handle_endtag(self, tag):
-        self._in = ""
-
-
 class TablesOfPage(HTMLParser):
     """Titles of tables, their cells, and every address that a browser would load."""
 
@@ -91,3 +58,23 @@ class TablesOfPage(HTMLParser):
 
     def handle_endtag(self, tag):
         self._in = ""
+
+
+class Page(TablesOfPage):
+    """Also the scripts by their type, and all text outside them."""
+
+    def __init__(self, text):
+        self.scripts, self.text = [], ""
+        super().__init__(text)
+
+    def handle_starttag(self, tag, attrs):
+        super().handle_starttag(tag, attrs)
+        if tag == "script":
+            self.scripts.append([dict(attrs).get("type", ""), ""])
+
+    def handle_data(self, data):
+        super().handle_data(data)
+        if self._in == "script":
+            self.scripts[-1][1] += data
+        else:
+            self.text += data

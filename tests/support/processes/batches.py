@@ -14,7 +14,7 @@ import pytest
 
 from processor import __main__
 from processor.batch import batch, job
-from processor.jobs import process
+from processor.jobs import causes, process
 
 ROOT = Path(__file__).resolve().parents[3]
 ENV = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
@@ -79,7 +79,7 @@ def _run_here(command, *, log, **_):
         file.write(err.getvalue())
     last = ["", *filter(str.strip, err.getvalue().splitlines())][-1]
     code = end.value.code or 0
-    return process.Ended(process.Cause.EXIT, code, last_line=last, seconds=0.0, peak_mb=0.0, max_rss_mb=0.0)
+    return process.Ended(causes.Cause.EXIT, code, last_line=last, seconds=0.0, peak_mb=0.0, max_rss_mb=0.0)
 
 
 def folder(path, plant="", content="1 2 3\n"):

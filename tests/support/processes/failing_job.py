@@ -16,7 +16,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
-from processor.jobs import child
+from processor.jobs import causes, child
 
 
 def fake(source, out):
@@ -77,6 +77,11 @@ def main():
         __main__.main()
         return
     child.guard(int(sys.argv[1]))
+    with causes.told_by_exit_code():
+        job()
+
+
+def job():
     source = Path(sys.argv[4])
     plant(source)
     if source.suffix == ".h5" or (source / "real").exists():

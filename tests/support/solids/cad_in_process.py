@@ -17,7 +17,7 @@ import pytest
 from designgen import __main__
 from designgen.cad import files as cad_files
 from designgen.cad import process as kernel_process
-from processor.jobs.process import Cause
+from processor.jobs.causes import Cause
 from processor.scan_folder import cad as scan_folder_cad
 
 

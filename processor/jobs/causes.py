@@ -1,0 +1,63 @@
+"""What ends a process, as data: a child process passes the cause to its parent as an exit code."""
+
+from __future__ import annotations
+
+import errno
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum
+
+from processor.model import InputError
+
+
+class Cause(Enum):
+    """What ended a process."""
+
+    EXIT = "exit"
+    SIGNAL = "signal"
+    TIME = "time"
+    MEMORY = "memory"
+    OUTPUT = "output"  # nothing more can be written, whatever the input
+    STOPPED = "stopped"
+
+
+# Exit codes of guarded processes; no program of this project ends with one of these otherwise.
+EXIT_CODES = {Cause.MEMORY: 86, Cause.OUTPUT: 87}
+UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+def cause_of(error: BaseException | None) -> Cause | None:
+    """Return the cause by the type of an exception, or of one that led to it; None for any other.
+
+    An exception raised ``from None`` stands for itself. An InputError that a lack of memory led to states a fault of
+    the input: a damaged file may declare any size.
+    """
+    of_input = False
+    while error is not None:
+        of_input = of_input or isinstance(error, InputError)
+        if isinstance(error, MemoryError) and not of_input:
+            return Cause.MEMORY
+        if isinstance(error, OSError) and error.errno in UNWRITABLE:
+            return Cause.OUTPUT
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return None
+
+
+def of_exit_code(code: int) -> Cause:
+    """Return the cause of an exit code."""
+    return next((cause for cause, known in EXIT_CODES.items() if known == code), Cause.EXIT)
+
+
+@contextmanager
+def exiting_by_cause() -> Iterator[None]:
+    """End this process with the exit code of its cause, where an exception ends it or made it exit with an error."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        cause = None if isinstance(error, SystemExit) and not error.code else cause_of(error)
+        if cause is None:
+            raise
+        if not isinstance(error, SystemExit):
+            traceback.print_exc()
+        raise SystemExit(EXIT_CODES[cause]) from error
