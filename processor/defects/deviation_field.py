@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from processor.adjustment import moderated_variances, unnamed_views
+from processor.adjustment import moderated_variances, view_error_from_opposite_sides
 from processor.defects.alignment import Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
@@ -82,7 +82,9 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     views = 0.0
     if stations.unnamed:
         used, side = np.flatnonzero(seen * count), PIECE_CELLS * charts.cell_mm
-        views = unnamed_views.view_sd(surface.centres[used], surface.outward[used], mean[used], variance[used], side)
+        views = view_error_from_opposite_sides.view_sd(
+            surface.centres[used], surface.outward[used], mean[used], variance[used], side
+        )
     of_stations = station_variance(pairs, surface, stations, alignment)
     return Field(
         deviation=mean,

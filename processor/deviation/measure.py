@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.adjustment import scanner_class_errors, unnamed_views
+from processor.adjustment import scanner_class_errors, view_error_from_opposite_sides
 from processor.deviation import mean_uncertainty, result_fields, stable_fit, surface_movement
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
@@ -118,7 +118,7 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
         # Each scanned point counts at ``overlap`` core points.
         variance = stable_fit.overlap(diameter, core_spacing) * moved.sd**2 / np.maximum(moved.count, 1)
         side = CELL_DIAMETERS * diameter
-        views = unnamed_views.view_sd(core.points, core.normals, moved.along, variance, side)
+        views = view_error_from_opposite_sides.view_sd(core.points, core.normals, moved.along, variance, side)
     return Measured(
         core=core, moved=moved, shared=np.hypot(shared, views), views=views, diameter=diameter, spacing=core_spacing,
         depth=depth, on_surface=share,

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.adjustment.point_groups import pieces
-from processor.adjustment.unnamed_views import SIGNIFICANT
+from processor.adjustment.view_error_from_opposite_sides import SIGNIFICANT
 from processor.deviation.local_translation import Movement
 from processor.geometry.mesh_distance import Samples
 from processor.large_arrays import put_aside, release

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from processor.epochs.series import Kind, Series
+from processor.epochs.quantity_series import Kind, Series
 from processor.model import NORMAL_95, Word
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from processor.epochs import change
 from processor.epochs.change import Component, Finding
 from processor.epochs.epoch import Epoch
-from processor.epochs.series import Kind, Series
+from processor.epochs.quantity_series import Kind, Series
 from processor.model import InputError, Reason, reason
 from processor.pipeline import package_of, step_modules
 

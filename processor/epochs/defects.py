@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.defects.result import Defects, Result
-from processor.epochs.series import Kind, Series
+from processor.epochs.quantity_series import Kind, Series
 from processor.language.messages import text
 from processor.model import Floats, Reason, reason
 

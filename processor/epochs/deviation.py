@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from processor.deviation.result import ErrorSource, Result
 from processor.deviation.verdicts import WHOLE
-from processor.epochs.series import Kind, Series, strongest
+from processor.epochs.quantity_series import Kind, Series, strongest
 from processor.language.messages import text
 from processor.model import Bools, Floats, Ints, Reason, Status, reason
 

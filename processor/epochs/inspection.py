@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from processor.epochs.series import Kind, Series, strongest
+from processor.epochs.quantity_series import Kind, Series, strongest
 from processor.inspection.result import AxisDepartures, InspectedComponent, Quantity, Result
 from processor.language.messages import Message, label, text
 from processor.model import Floats, Reason, Status

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from processor.epochs.series import Kind, Series
+from processor.epochs.quantity_series import Kind, Series
 from processor.language.messages import text
 from processor.model import KEY_POINTS, Floats, Reason, Status, reason
 from processor.preassembly.result import Result

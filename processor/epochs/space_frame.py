@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.epochs.series import Kind, Series
+from processor.epochs.quantity_series import Kind, Series
 from processor.language.messages import Message, text
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Status, reason
 from processor.space_frame.result import Flag, MovementGauge, Result

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from processor.limits import standards
-from processor.limits.guard_band import guard_band
+from processor.limits.decision_rule import decide
 from processor.model import Bools, Floats, Limit, Rows, Tolerance, Verdict, column, names, words, worst
 
 NOT_VERIFIED = "not verified"
@@ -97,9 +97,7 @@ def compare(limit: Limit, measured: Measured) -> Comparison:
     unknown = any(map(math.isnan, (low, high, measured.low, measured.high)))
     least, most = (-math.inf, min(-low, high)) if measured.unsigned else (low, high)
     verdict = (
-        Verdict.INDETERMINATE
-        if unknown or measured.doubtful
-        else guard_band((measured.low, measured.high), least, most)
+        Verdict.INDETERMINATE if unknown or measured.doubtful else decide((measured.low, measured.high), least, most)
     )
     return Comparison(limit=limit, measured=measured, low=low, high=high, verdict=verdict)
 

@@ -12,7 +12,7 @@ from processor import diagnostics
 from processor.jobs import process
 from processor.jobs.causes import Cause
 from processor.jobs.child import Loss, Lost
-from processor.jobs.scene_command import scene_command
+from processor.jobs.make_scene_command import scene_command
 from processor.papers import bolt_balls, defects, deviation, preassembly, stitching
 from processor.papers.data_sets import DataSet, Measured
 from processor.writers import step_clouds

@@ -17,8 +17,8 @@ from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.design import matching
 from processor.space_frame.design.matching import Matching, NodePattern
 from processor.space_frame.design.movement import Movement, movement
-from processor.space_frame.members import junctions, members
-from processor.space_frame.members.members import Measured
+from processor.space_frame.members import junctions, member_extraction
+from processor.space_frame.members.member_extraction import Measured
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.result import Flag
@@ -46,7 +46,7 @@ class Options:
     sphere's radius, for spheres without a catalogue's size.
     """
 
-    members: members.Params = field(default_factory=members.Params)
+    members: member_extraction.Params = field(default_factory=member_extraction.Params)
     expansion: float = 1.0
     register_stations: bool = True
     datum_mm: float = 0.0
@@ -133,10 +133,10 @@ def extract(
         return None
     registered = _register(source, start, control, options)
     measured = registered.measured
-    kept = (start.design_row >= 0) | (start.balls & members.meeting(measured, params.largest_scatter_mm))
+    kept = (start.design_row >= 0) | (start.balls & member_extraction.meeting(measured, params.largest_scatter_mm))
     if not kept.any():
         return None
-    measured, start = members.of_nodes(measured, kept), start.of_nodes(kept)
+    measured, start = member_extraction.of_nodes(measured, kept), start.of_nodes(kept)
     nodes, spheres = _fit_spheres(registered.source, measured, start, design, catalogue, options, registered.trusted)
     shared_offset = registered.shared_offset_at(spheres.centres)
     if registered.stations is not None:
@@ -165,25 +165,30 @@ def extract(
 # --- nodes and members -----------------------------------------------------------------------------------------------
 
 
-def blind(source: Source, params: members.Params) -> Start | None:
+def blind(source: Source, params: member_extraction.Params) -> Start | None:
     """Find nodes and members without a design."""
-    lines = members.rough_lines(source, params)
+    lines = member_extraction.rough_lines(source, params)
     graph = junctions.graph(lines) if len(lines.points) > 1 else None
     if graph is None or not len(graph.pairs):
         return None
     rows = np.full(len(graph.nodes), -1, np.int64)
     start = _measured(source, graph.nodes, graph.pairs, rows, params)
     start = replace(start, balls=ball_presence.nodes_with_ball(source, start.measured, start.positions, params.threads))
-    others = int((~start.balls & members.meeting(start.measured, params.largest_scatter_mm)).sum())
+    others = int((~start.balls & member_extraction.meeting(start.measured, params.largest_scatter_mm)).sum())
     return replace(start, reasons=(reason("spheres.other-joints", joints=others),)) if others else start
 
 
 def _measured(
-    source: Source, positions: Floats, pairs: Ints, rows: Ints, params: members.Params, pose: Matching | None = None
+    source: Source,
+    positions: Floats,
+    pairs: Ints,
+    rows: Ints,
+    params: member_extraction.Params,
+    pose: Matching | None = None,
 ) -> Start:
     """Measure the members between pairs of nodes at ``positions`` (k, 3)."""
-    points = members.points_near(source, positions, pairs, params)
-    measured = members.measure(points, source.scanners, positions, pairs, params)
+    points = member_extraction.points_near(source, positions, pairs, params)
+    measured = member_extraction.measure(points, source.scanners, positions, pairs, params)
     every = np.ones(len(positions), bool)
     return Start(positions=positions, pairs=pairs, design_row=rows, measured=measured, balls=every, pose=pose)
 
@@ -208,8 +213,8 @@ def _located(
     source: Source, start: Start, design: FrameDesign, pairs: Ints, catalogue: Catalogue, options: Options
 ) -> Start:
     """Locate the design among nodes found blind, and measure all members of both."""
-    found = start.balls & members.meeting(start.measured, options.members.largest_scatter_mm)
-    seen = members.of_nodes(start.measured, found)
+    found = start.balls & member_extraction.meeting(start.measured, options.members.largest_scatter_mm)
+    seen = member_extraction.of_nodes(start.measured, found)
     node_a, node_b = seen.members.node_a, seen.members.node_b
     pattern = NodePattern(seen.nodes.positions, source.origin, node_a=node_a, node_b=node_b)
 
@@ -249,7 +254,7 @@ def _register(source: Source, start: Start, control: ControlPoints | None, optio
         return _Registered(source, measured, stations)
     corrected = Corrected(source, stations)
     points = corrected_gathered(measured.points, stations)
-    measured = members.measure(points, corrected.scanners, start.positions, start.pairs, options.members)
+    measured = member_extraction.measure(points, corrected.scanners, start.positions, start.pairs, options.members)
     return _Registered(corrected, measured, stations)
 
 

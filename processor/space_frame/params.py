@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from processor.model import UsageError
-from processor.space_frame.members import members
+from processor.space_frame.members import member_extraction
 
 METHODS = ("ray", "ransac", "least-squares")  # the first is the default
 NAN = float("nan")
@@ -23,7 +23,7 @@ class Params:
     radii_mm: tuple[float, ...] = ()  # ray: the user's catalogue, instead
     register_stations: bool = True  # ray: against each other, on the tubes, where their errors require it
     datum_mm: float = 0.0  # ray: standard deviation per axis of a shift common to all stations, without control points
-    members: members.Params = field(default_factory=members.Params)  # ray
+    members: member_extraction.Params = field(default_factory=member_extraction.Params)  # ray
     crop_margin_mm: float = 20.0  # the paper's methods: beyond the nominal radius, about the nominal centre
     raw_crops: bool = True  # the paper's methods beside ray: on all points about its nodes; false: on those it used
     tau_mm: float = 4.0  # ransac: largest distance of an inlier from the surface; two sd of a 2 mm scanner

@@ -14,7 +14,7 @@ from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.design.matching import Matching
 from processor.space_frame.design.movement import Movement, size_of, verdict_of
 from processor.space_frame.extract import Extracted, Options, extract
-from processor.space_frame.members import station_errors
+from processor.space_frame.members import station_error_propagation
 from processor.space_frame.members.records import Members
 from processor.space_frame.params import Params
 from processor.space_frame.points.scene_source import PointReader, SceneSource, of_scene
@@ -184,9 +184,9 @@ def _tubes(extracted: Extracted, ids: Ints, origin: Floats) -> Tubes:
     common = np.zeros((len(half), 3, 3)) if views is None else of_tubes(views, members)
     at_start, at_end, of_radius = common[:, :2, :2], common[:, :2, :2], common[:, 2, 2]
     if stations is not None and np.isfinite(stations.covariance).all():
-        at_start = at_start + station_errors.of_axes(members, stations, -0.5 * members.lengths)
-        at_end = at_end + station_errors.of_axes(members, stations, 0.5 * members.lengths)
-        of_radius = of_radius + station_errors.of_radii(members, stations)
+        at_start = at_start + station_error_propagation.of_axes(members, stations, -0.5 * members.lengths)
+        at_end = at_end + station_error_propagation.of_axes(members, stations, 0.5 * members.lengths)
+        of_radius = of_radius + station_error_propagation.of_radii(members, stations)
     return Tubes(
         a=np.where(members.node_a >= 0, ids[members.node_a], -1),
         b=np.where(members.node_b >= 0, ids[members.node_b], -1),

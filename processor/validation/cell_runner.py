@@ -16,8 +16,8 @@ from processor.jobs import process, runner
 from processor.jobs.causes import Cause
 from processor.jobs.child import Lost
 from processor.jobs.exit_codes import WITH_RESULTS
+from processor.jobs.make_scene_command import scene_command
 from processor.jobs.process import Ended
-from processor.jobs.scene_command import scene_command
 from processor.results.file_names import RESULTS_JSON
 from processor.validation.cells import Cell, Origin, Outcome
 from processor.writers import toml

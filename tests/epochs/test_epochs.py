@@ -15,7 +15,7 @@ from processor.deviation.result import CorePoints, ErrorSource
 from processor.deviation.result import Result as Deviation
 from processor.epochs import change, compare, defects, deviation, epoch, inspection, preassembly, space_frame
 from processor.epochs.change import Finding
-from processor.epochs.series import Series
+from processor.epochs.quantity_series import Series
 from processor.inspection.result import AxisDepartures, Characteristics, InspectedComponent
 from processor.inspection.result import Result as Inspected
 from processor.model import InputError, StepRun

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from processor.limits import standards
-from processor.limits.guard_band import guard_band
+from processor.limits.decision_rule import decide
 from processor.model import Limit, Tolerance, reason
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.verdicts import joint_measures
@@ -187,8 +187,8 @@ def test_single_extreme_has_the_interval_of_one_value():
         ((np.nan, np.nan), "indeterminate"),
     ],
 )
-def test_guard_band(interval, verdict):
-    assert guard_band(interval, -1.0, 2.0) == verdict
+def test_verdict_of_an_interval_against_bounds(interval, verdict):
+    assert decide(interval, -1.0, 2.0) == verdict
 
 
 def lone(value, sd, point=5, axis=1):

@@ -14,7 +14,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.model import StepRun
 from processor.report import page
 from processor.report.charts import surface_view
-from processor.report.defects import figures, live_data
+from processor.report.defects import figures, interactive_view
 from processor.results.fields_to_json import as_object
 from processor.store import store
 from processor.store.json_values import json_ready
@@ -23,7 +23,7 @@ from tests.support.results import step_results
 
 
 def drawn(result):
-    return live_data.live_data(None, step_results.execution(("defects", "default", "{}", result)).runs)
+    return interactive_view.interactive_data(None, step_results.execution(("defects", "default", "{}", result)).runs)
 
 
 def test_the_view_holds_the_surface_and_an_outline_a_defect():

@@ -9,7 +9,7 @@ import subprocess
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.report.preassembly import live_data as preassembly_data
+from processor.report.preassembly import interactive_view as preassembly_data
 from processor.report.scripts import page_script
 from processor.results import to_json
 from tests.support.pages.report_pages import BAD, Page, rendered

@@ -9,7 +9,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
 from processor.model import Scan, StepRun
 from processor.report import all_figures, page
-from processor.report.stitching import live_data
+from processor.report.stitching import interactive_view
 from processor.results.fields_to_json import as_object
 from processor.stitching.result import ControlPoints, ControlSightings
 from processor.store import store
@@ -68,7 +68,7 @@ def test_a_result_as_json_has_names_truth_values_and_nulls():
 
 
 def test_each_point_has_its_signed_distance_to_the_other_scan(made):
-    data = live_data.live_data(made.scene, made.runs)
+    data = interactive_view.interactive_data(made.scene, made.runs)
     assert [part["name"] for part in data["parts"]] == list(NAMES[:3])
     off = [np.array(part["residual"], float) for part in data["parts"]]
     # What lies behind as its scanner sees it is negative, what lies before it positive; both to the rounding.
@@ -83,14 +83,14 @@ def test_each_point_has_its_signed_distance_to_the_other_scan(made):
 
 def test_one_scan_alone_has_no_view(made):
     alone = dataclasses.replace(made.scene, scans=made.scene.scans[:1])
-    assert live_data.live_data(alone, made.runs) is None
+    assert interactive_view.interactive_data(alone, made.runs) is None
 
 
 def test_many_scans_keep_the_page_small(made):
     rng = np.random.default_rng(1)
     scans = [dataclasses.replace(scan, points=rng.normal(0.0, 1e4, (100_000, 3))) for scan in made.scene.scans]
-    data = live_data.live_data(dataclasses.replace(made.scene, scans=tuple(scans)), made.runs)
-    assert sum(len(part["residual"]) for part in data["parts"]) <= live_data.MOST_POINTS
+    data = interactive_view.interactive_data(dataclasses.replace(made.scene, scans=tuple(scans)), made.runs)
+    assert sum(len(part["residual"]) for part in data["parts"]) <= interactive_view.MOST_POINTS
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,8 @@ from processor import pipeline
 from processor.api import runs
 from processor.language.messages import messages
 from processor.model import Ceiling, InputError, Scan, Scene, StepRun
-from processor.report.space_frame import ceiling as ceiling_report
 from processor.report.space_frame import dxf
+from processor.report.space_frame import hangers as ceiling_report
 from processor.report.table import csv_text
 from processor.scan_folder import folder
 from processor.space_frame import plumb_line
@@ -229,8 +229,8 @@ def test_a_run_with_a_ceiling(tmp_path):
 
 
 def test_a_surface_is_read_in_the_units_of_the_project(tmp_path):
-    frame = write_project(tmp_path / "frame", 'surface = "ceiling.obj"')
-    (frame / "ceiling.obj").write_text("v 0 0 2\nv 9 0 2\nv 0 9 2\nf 1 2 3\n")
+    frame = write_project(tmp_path / "frame", 'surface = "hangers.obj"')
+    (frame / "hangers.obj").write_text("v 0 0 2\nv 9 0 2\nv 0 9 2\nf 1 2 3\n")
     unit = {"m": 1000.0, "mm": 1.0}["mm" if 'units = "mm"' in (frame / "project.toml").read_text("utf-8") else "m"]
     assert folder.read_input(frame).ceiling.vertices[:, 2] == pytest.approx([2.0 * unit] * 3)
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from processor.space_frame import extract
-from processor.space_frame.members import members
+from processor.space_frame.members import member_extraction
 from processor.space_frame.spheres import ball_presence
 from tests.support.clouds import frame_clouds
 from tests.support.clouds.frame_clouds import STATIONS
@@ -35,8 +35,8 @@ def found(frame, sleeves=True, seed=3, **kinds):
     extra = [tower(rng, np.array([3100.0, 900.0]), 1570.0, 1090.0, (400.0, 2200.0, 4000.0), s) for s in STATIONS]
     owner = [np.full(len(part), s, np.int32) for s, part in enumerate(extra)]
     source = InMemory(np.concatenate([points, *extra]), np.concatenate([station, *owner]), STATIONS)
-    start = extract.blind(source, members.Params())
-    meeting = members.meeting(start.measured, members.Params().largest_scatter_mm)
+    start = extract.blind(source, member_extraction.Params())
+    meeting = member_extraction.meeting(start.measured, member_extraction.Params().largest_scatter_mm)
     positions = start.measured.nodes.positions
     return positions[meeting], positions[meeting & start.balls]
 

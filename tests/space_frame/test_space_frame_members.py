@@ -4,30 +4,32 @@ import numpy as np
 import pytest
 
 from processor.space_frame import extract
-from processor.space_frame.members import members
+from processor.space_frame.members import member_extraction
 from processor.space_frame.members.records import Members, Nodes
 from tests.support.clouds import frame_clouds
 from tests.support.clouds.frame_clouds import STATIONS
 from tests.support.clouds.memory_source import InMemory
 
-PARAMS = members.Params()
+PARAMS = member_extraction.Params()
 
 
 def find(source, params=None):
     """Nodes and tubes found blind."""
-    params = params or members.Params()
+    params = params or member_extraction.Params()
     start = extract.blind(source, params)
     if start is None:
         return Nodes(), Members()
-    found = members.of_nodes(start.measured, start.balls & members.meeting(start.measured, params.largest_scatter_mm))
+    found = member_extraction.of_nodes(
+        start.measured, start.balls & member_extraction.meeting(start.measured, params.largest_scatter_mm)
+    )
     return found.nodes, found.members
 
 
 def measure(source, starts, pairs, params=None):
     """Nodes and tubes at known places."""
-    params = params or members.Params()
-    points = members.points_near(source, starts, pairs, params)
-    found = members.measure(points, source.scanners, starts, pairs, params)
+    params = params or member_extraction.Params()
+    points = member_extraction.points_near(source, starts, pairs, params)
+    found = member_extraction.measure(points, source.scanners, starts, pairs, params)
     return found.nodes, found.members
 
 
@@ -97,7 +99,7 @@ def test_a_design_20_mm_off_gives_the_same_nodes(frame, source):
 
 @pytest.mark.parametrize("how", ["order", "chunks", "threads"])
 def test_same_bytes_whatever_the_order_the_chunks_and_the_threads(source, how):
-    few = members.Params(kept_points=15_000, tube_points=128, threads=1)  # so that points have to be chosen
+    few = member_extraction.Params(kept_points=15_000, tube_points=128, threads=1)  # so that points have to be chosen
     expected = find(source, few)
     assert expected[0].count > 0
     if how == "order":
@@ -106,7 +108,7 @@ def test_same_bytes_whatever_the_order_the_chunks_and_the_threads(source, how):
     elif how == "chunks":
         other = find(InMemory(source.points, source.station, STATIONS, chunk_size=7_001), few)
     else:
-        other = find(source, members.Params(kept_points=15_000, tube_points=128, threads=3))
+        other = find(source, member_extraction.Params(kept_points=15_000, tube_points=128, threads=3))
     for one, two in zip(expected, other, strict=True):
         assert bytes_of(one) == bytes_of(two)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.space_frame.members import station_errors
+from processor.space_frame.members import station_error_propagation
 from processor.space_frame.members.records import Members
 from processor.space_frame.stations.records import Stations, StationStatus
 
@@ -59,14 +59,14 @@ def fitted_radius_change(places, rng):
 )
 def test_radius_changes_by_an_offset_of_ranges_as_a_fit_to_moved_points_does(places):
     one = stations(places, np.zeros((7 * len(places),) * 2), shared_offset=OFFSET)
-    sd = float(np.sqrt(station_errors.of_radii(tube(), one)[0]))
+    sd = float(np.sqrt(station_error_propagation.of_radii(tube(), one)[0]))
     assert sd == pytest.approx(abs(fitted_radius_change(places, np.random.default_rng(1))), rel=0.02)
 
 
 def test_a_tube_seen_from_one_side_keeps_its_radius():
     """The points lie on a circle of the same radius, shifted along the rays, but for the limb."""
     one = stations([(0, 5000, 0)], np.zeros((7, 7)), shared_offset_sd=OFFSET)
-    assert np.sqrt(station_errors.of_radii(tube(), one)[0]) < 0.01 * OFFSET
+    assert np.sqrt(station_error_propagation.of_radii(tube(), one)[0]) < 0.01 * OFFSET
 
 
 def test_a_motion_common_to_all_stations_moves_the_axis_as_much():
@@ -75,5 +75,5 @@ def test_a_motion_common_to_all_stations_moves_the_axis_as_much():
     J[3:6], J[10:13] = np.eye(3), np.eye(3)
     shift = np.diag([4.0, 1.0, 9.0])
     one = stations(places, J @ shift @ J.T)
-    covariance = station_errors.of_axes(tube(), one, np.array([500.0]))[0]
+    covariance = station_error_propagation.of_axes(tube(), one, np.array([500.0]))[0]
     np.testing.assert_allclose(covariance, np.diag([1.0, 9.0]), atol=1e-9)

@@ -15,7 +15,7 @@ from scipy.special import ndtr
 
 from processor.adjustment import maximum_interval
 from processor.limits import standards as limits_of
-from processor.limits.guard_band import guard_band
+from processor.limits.decision_rule import decide
 from processor.model import NORMAL_95, Floats, Limit, Reason, Tolerance, Verdict, reason, worst
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.part_in_chain import Member
@@ -104,7 +104,7 @@ def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, doub
     sides = []
     for sign, bound in ((-1.0, -low), (1.0, high)):
         value, bottom, top = maximum_interval.of_independent(sign * values, sd)
-        sides.append((bound - value, sign * value, top - value, guard_band((bottom, top), -math.inf, bound)))
+        sides.append((bound - value, sign * value, top - value, decide((bottom, top), -math.inf, bound)))
     verdict = worst([side[3] for side in sides])
     _, value, half_width, _ = min(sides, key=lambda side: side[0])
     probability = nan

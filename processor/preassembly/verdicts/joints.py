@@ -16,7 +16,7 @@ import numpy as np
 
 from processor.adjustment import normal_draws
 from processor.limits import standards as limits_of
-from processor.limits.guard_band import guard_band
+from processor.limits.decision_rule import decide
 from processor.limits.judging import clause_of
 from processor.model import (
     Bools,
@@ -230,14 +230,14 @@ def _compare(measures: Measures, allowed: Allowed) -> tuple[float, float, Verdic
     low, high = allowed.low, allowed.high
     if allowed.limit.measure != "groove_gap":
         value, half_width = measures.of(allowed.limit.measure)
-        return value, half_width, guard_band(measures.interval(allowed.limit.measure), low, high)
+        return value, half_width, decide(measures.interval(allowed.limit.measure), low, high)
     sides = []
     for name, bounds in (("groove_gap_least", (low, math.inf)), ("groove_gap_greatest", (-math.inf, high))):
         gap, half_width = measures.of(name)
         interval = measures.interval(name)
         value = gap - allowed.root_gap_mm
         room = value - low if name == "groove_gap_least" else high - value
-        verdict = guard_band((interval[0] - allowed.root_gap_mm, interval[1] - allowed.root_gap_mm), *bounds)
+        verdict = decide((interval[0] - allowed.root_gap_mm, interval[1] - allowed.root_gap_mm), *bounds)
         sides.append((room, value, half_width, verdict))
     _, value, half_width, _ = min(sides, key=lambda side: side[0])
     return value, half_width, worst([side[3] for side in sides])

@@ -7,7 +7,7 @@ import collections
 from processor.defects.result import DefectClass, Result
 from processor.language.messages import Message, text
 from processor.model import Status
-from processor.report.defects import figures, live_data, tables
+from processor.report.defects import figures, interactive_view, tables
 from processor.report.step_report import StepReport
 
 
@@ -40,5 +40,5 @@ REPORT = StepReport(
     tables=tables.step_tables,
     figures=lambda _, runs, __: figures.draw(runs[0].result),
     files=lambda _, run: figures.files(run.result),
-    interactive_data=live_data.live_data,
+    interactive_data=interactive_view.interactive_data,
 )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from processor.epochs.change import Component, Finding
 from processor.epochs.compare import History
-from processor.epochs.series import Kind
+from processor.epochs.quantity_series import Kind
 from processor.language.messages import Message, text
 from processor.report.epochs.tables import day, ordered
 

@@ -12,7 +12,7 @@ from processor.model import Floats, Status, Verdict, worst
 from processor.preassembly.result import Adjustment, MeanMax, Result
 from processor.preassembly.verdicts.joints import ComparedLimits
 from processor.report import verdict_counts
-from processor.report.preassembly import characteristics, figures, live_data, tables
+from processor.report.preassembly import characteristics, figures, interactive_view, tables
 from processor.report.step_report import StepReport
 
 VERDICTS = {
@@ -148,5 +148,5 @@ REPORT = StepReport(
     characteristics_note=characteristics.NOTE,
     live_figures=figures.SHOWN_LIVE,
     further_figures=figures.OF_OTHER_METHODS,
-    interactive_data=live_data.live_data,
+    interactive_data=interactive_view.interactive_data,
 )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from processor.model import Verdict
-from processor.report.space_frame.node_places import nominal_places
+from processor.report.space_frame.nominal_positions import nominal_places
 from processor.space_frame.result import Hangers, Result
 
 MILLIMETRES = 4  # of $INSUNITS

@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import Floats, Scene, StepRun
-from processor.report.space_frame import ceiling, close_ups
-from processor.report.space_frame.node_places import designed_places, nominal_places
+from processor.report.space_frame import flagged_balls, hangers
+from processor.report.space_frame.nominal_positions import designed_places, nominal_places
 from processor.report.style import (
     COLOURS,
     DASHES,
@@ -48,9 +48,9 @@ def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Pat
             figures[RADIUS_ERRORS] = _radius_errors(runs, report)
         if first.has_bounds:
             figures[BALL_ERRORS] = _ball_errors(runs[0], report)
-    figures |= ceiling.draw(first)
+    figures |= hangers.draw(first)
     if first.has_bounds:
-        figures |= close_ups.draw(scene, first, stored)
+        figures |= flagged_balls.draw(scene, first, stored)
     return figures
 
 

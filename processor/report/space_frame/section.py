@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from processor.language.messages import Message, text
 from processor.model import Status, StepRun
 from processor.pipeline import Execution
-from processor.report.space_frame import ceiling, close_ups, dxf, figures, live_data, tables
+from processor.report.space_frame import dxf, figures, flagged_balls, interactive_view, tables
 from processor.report.step_report import StepReport
 from processor.report.stitching import targets
 from processor.space_frame.result import Flag, Result
@@ -32,11 +32,11 @@ def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
     hangers = run.result.hangers
     files = {"nodes.dxf": dxf.drawing(run.result)} if len(run.result.tubes) or hangers is not None else {}
     if hangers is not None:
-        files[ceiling.STAKE_OUT] = ceiling.stake_out(run.result)
+        files[hangers.STAKE_OUT] = hangers.stake_out(run.result)
     files |= targets.files(execution.scene)
     if run.result.has_bounds:
-        pages = close_ups.document(execution.scene, run.result, execution.stored)
-        files |= {close_ups.DOCUMENT: pages} if pages else {}
+        pages = flagged_balls.document(execution.scene, run.result, execution.stored)
+        files |= {flagged_balls.DOCUMENT: pages} if pages else {}
     return files
 
 
@@ -62,5 +62,5 @@ REPORT = StepReport(
     figures=lambda execution, runs, report: figures.draw(execution.scene, runs, report, execution.stored),
     files=_files,
     why=_why,
-    interactive_data=live_data.live_data,
+    interactive_data=interactive_view.interactive_data,
 )

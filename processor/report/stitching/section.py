@@ -9,7 +9,7 @@ from processor.language.messages import Message, text
 from processor.model import Status, StepRun
 from processor.pipeline import Execution
 from processor.report.step_report import StepReport
-from processor.report.stitching import figures, live_data, tables, targets
+from processor.report.stitching import figures, interactive_view, tables, targets
 from processor.stitching.result import Result
 
 
@@ -52,5 +52,5 @@ REPORT = StepReport(
     figures=figures.draw,
     files=_files,
     why=_why,
-    interactive_data=live_data.live_data,
+    interactive_data=interactive_view.interactive_data,
 )

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from processor.geometry.parallel import over_ranges
 from processor.model import Bools, Floats, Ints
-from processor.space_frame.members.members import Measured
+from processor.space_frame.members.member_extraction import Measured
 from processor.space_frame.points import sphere_crops
 from processor.space_frame.points.source import Source
 from processor.space_frame.spheres import sleeve_radii

@@ -21,7 +21,7 @@ MOST_ON_AN_EDGE = 80
 MOST_CHAINAGES = 3_000
 
 
-def live_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     """Return what the page draws of an assembled bridge, mm; None where there is no design to draw."""
     if scene.arch is None or not scene.arch.parts:
         return None

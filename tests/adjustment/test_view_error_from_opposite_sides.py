@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.adjustment import unnamed_views
+from processor.adjustment import view_error_from_opposite_sides
 from processor.deviation import step as deviation_step
 from processor.model import Scan, Scene
 from tests.support.clouds.plate_clouds import AS_IT_LIES, STATIONS, plate
@@ -28,30 +28,30 @@ def plates(seed, between=0.0):
 
 @pytest.mark.parametrize("between", [0.3, 1.0])
 def test_the_standard_deviation_between_views_is_that_of_the_sides(between):
-    found = [unnamed_views.view_sd(*plates(seed, between), SIDE) for seed in range(30)]
+    found = [view_error_from_opposite_sides.view_sd(*plates(seed, between), SIDE) for seed in range(30)]
     # Twelve independent sums a seed: the median of their squares is known to half of itself.
     assert np.median(found) == pytest.approx(between, rel=0.25)
 
 
 def test_noise_alone_is_no_difference_between_views():
-    found = [unnamed_views.view_sd(*plates(seed), SIDE) for seed in range(30)]
+    found = [view_error_from_opposite_sides.view_sd(*plates(seed), SIDE) for seed in range(30)]
     assert max(found) < NOISE
 
 
 def test_a_movement_of_whole_plates_is_no_difference_between_views():
     points, normals, along, variance = plates(1)
-    assert unnamed_views.view_sd(points, normals, along + 5.0 * normals[:, 2], variance, SIDE) < NOISE
+    assert view_error_from_opposite_sides.view_sd(points, normals, along + 5.0 * normals[:, 2], variance, SIDE) < NOISE
 
 
 def test_view_sd_is_zero_where_only_one_side_of_the_plates_was_seen():
     points, normals, along, variance = plates(1, 1.0)
     along[normals[:, 2] < 0.0] = np.nan
-    assert unnamed_views.view_sd(points, normals, along, variance, SIDE) == 0.0
+    assert view_error_from_opposite_sides.view_sd(points, normals, along, variance, SIDE) == 0.0
 
 
 def test_facing_sides_of_two_bodies_are_not_compared():
     points, normals, along, variance = plates(1, 1.0)
-    assert unnamed_views.view_sd(points, -normals, along, variance, SIDE) == 0.0
+    assert view_error_from_opposite_sides.view_sd(points, -normals, along, variance, SIDE) == 0.0
 
 
 def merged(scene, shifts):

@@ -18,7 +18,7 @@ MOST_BALLS = 5_000  # about 1 MB of the page; flagged balls are always included
 MOST_TUBES = 15_000
 
 
-def live_data(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+def interactive_data(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     """Return what the page draws of balls, mm less ``origin``; None where there are fewer than two."""
     result: Result = runs[0].result
     balls = result.balls

@@ -14,7 +14,7 @@ from processor.report.charts import surface_view
 from processor.report.charts.surface_view import Region
 
 
-def live_data(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+def interactive_data(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     """Return the data of the view of the first run, mm, design frame; None without points on the surface."""
     result: Result = runs[0].result
     everything: Ints = np.arange(len(result.surface), dtype=np.int64)

@@ -16,7 +16,7 @@ from matplotlib.patches import Circle
 
 from processor.language.messages import messages, text
 from processor.model import NORMAL_95, Floats, Scene
-from processor.report.space_frame.node_places import designed_places
+from processor.report.space_frame.nominal_positions import designed_places
 from processor.report.style import COLOURS, CaptionedPngs, number, pdf, png, with_interval, write_beside
 from processor.space_frame.points.scene_source import SceneSource, of_scene
 from processor.space_frame.result import Balls, Flag, Result

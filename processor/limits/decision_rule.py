@@ -5,7 +5,7 @@ from __future__ import annotations
 from processor.model import Verdict
 
 
-def guard_band(interval: tuple[float, float], low: float, high: float) -> Verdict:
+def decide(interval: tuple[float, float], low: float, high: float) -> Verdict:
     """Judge a 95 % interval against bounds: pass wholly within, fail wholly beyond one, else indeterminate."""
     if interval[0] >= low and interval[1] <= high:
         return Verdict.PASS

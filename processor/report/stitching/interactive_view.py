@@ -25,7 +25,7 @@ LEAST_FLAT = 4.0  # least ratio of width to thickness of neighbours that are one
 TONES = ("#0072B2", "#D55E00")  # of stations without and with a flag
 
 
-def live_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     """Return what the page draws of the scans that were placed, mm; None where there are fewer than two."""
     result: Result = runs[0].result
     scans = result.scans
