@@ -3,72 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 
 from processor.model import Floats
 from processor.scan_folder.shapes.body import Body
-from processor.scan_folder.shapes.contact_faces import Contact, contact
+from processor.scan_folder.shapes.connected import Assembly, listed, not_closed
+from processor.scan_folder.shapes.contact_faces import GAP_MM, Contact
 
-GAP_MM = 60.0  # largest root gap of a joint
 SPAN_RAD = np.radians(10.0)  # largest angle in plan between the span and X
 RISE_SHARE = 0.01  # of the span: less is no arch
 
 
-@dataclass(frozen=True)
-class Chain:
-    """Parts (n) in order and the contact of each two neighbours (n - 1), a = left, b = right."""
-
-    parts: tuple[Body, ...]
-    contacts: tuple[Contact, ...]
-    doubts: tuple[str, ...] = ()
-
-    @property
-    def middles(self) -> Floats:
-        """Middle (n - 1, 3) of each joint, mm."""
-        middles: Floats = np.array([0.5 * (_middle(one.a.points) + _middle(one.b.points)) for one in self.contacts])
-        return middles
-
-
-def _middle(points: Floats) -> Floats:
-    return np.asarray(0.5 * (points.min(axis=0) + points.max(axis=0)))
-
-
-def find(bodies: Sequence[Body]) -> Chain | str:
-    """Return the longest chain of bodies that meet end to end, or why there is none."""
-    contacts: dict[tuple[int, int], Contact] = {}
-    for i, k in combinations(range(len(bodies)), 2):
-        far = (bodies[i].bounds[0] - GAP_MM > bodies[k].bounds[1]) | (
-            bodies[k].bounds[0] - GAP_MM > bodies[i].bounds[1]
-        )
-        if far.any():
-            continue
-        one = contact(bodies[i], bodies[k], GAP_MM)
-        if one is not None:
-            contacts[i, k] = one
+def find(bodies: Sequence[Body], contacts: Mapping[tuple[int, int], Contact]) -> Assembly | str:
+    """Return the longest chain of bodies that meet end to end, no body more than two others; or why there is none."""
     beside: dict[int, list[int]] = {i: [] for i in range(len(bodies))}
     for i, k in contacts:
         beside[i].append(k)
         beside[k].append(i)
-    crowded = [i for i, others in beside.items() if len(others) > 2]
-    if crowded:
-        i = crowded[0]
-        return f"{bodies[i].name} meets {_names(bodies, beside[i])}: the order of the parts is not clear"
     chains = _paths(beside)
-    if not chains and contacts:
-        return f"{_names(bodies, range(len(bodies)))} make up a ring, which has no first part"
     if not chains:
         return (
-            f"no two of {_names(bodies, range(len(bodies)))} meet end to end, or lie {GAP_MM:g} mm apart at most"
-            f"{_open(bodies)}"
+            f"no two of {listed(bodies, range(len(bodies)))} meet end to end, or lie {GAP_MM:g} mm apart at most"
+            f"{not_closed(bodies)}"
         )
     chains.sort(key=lambda chain: -len(chain))
     if len(chains) > 1:
         return (
-            f"there are several chains of parts ({_names(bodies, chains[0])}; {_names(bodies, chains[1])}), which do "
-            f"not meet{_open(bodies)}; make a folder for each bridge, or correct the parts between them"
+            f"there are several chains of parts ({listed(bodies, chains[0])}; {listed(bodies, chains[1])}), which do "
+            f"not meet{not_closed(bodies)}; make a folder for each bridge, or correct the parts between them"
         )
     order = chains[0]
     if _joint_x(contacts, order[0], order[1]) > _joint_x(contacts, order[-2], order[-1]) or (
@@ -78,33 +42,23 @@ def find(bodies: Sequence[Body]) -> Chain | str:
     return _chain(bodies, order, contacts)
 
 
-def _chain(bodies: Sequence[Body], order: Sequence[int], contacts: Mapping[tuple[int, int], Contact]) -> Chain:
+def _chain(bodies: Sequence[Body], order: Sequence[int], contacts: Mapping[tuple[int, int], Contact]) -> Assembly:
     doubts = []
-    left_out = [body.name for i, body in enumerate(bodies) if i not in order]
+    left_out = [i for i in range(len(bodies)) if i not in order]
     if left_out:
         doubts.append(
-            f"{', '.join(left_out)}: meets no part of the bridge end to end{_open(bodies)}, so it is left out"
+            f"{listed(bodies, left_out)}: meets no part of the bridge end to end{not_closed(bodies)}, so it is left out"
         )
     joints = []
     for i, k in pairwise(order):
         one = contacts[min(i, k), max(i, k)]
-        joints.append(one if i < k else Contact(one.b, one.a, one.gap_mm, one.rival))
-    return Chain(tuple(bodies[i] for i in order), tuple(joints), tuple(doubts))
-
-
-def _open(bodies: Sequence[Body]) -> str:
-    """Return which bodies are not closed: they may lack the faces of their ends."""
-    names = [body.name for body in bodies if body.open_edges]
-    return f" (not closed: {', '.join(names[:6])}{', ...' if len(names) > 6 else ''})" if names else ""
+        joints.append(one if i < k else one.reverse)
+    links = tuple(pairwise(range(len(order))))
+    return Assembly(tuple(bodies[i] for i in order), links, tuple(joints), tuple(doubts), row=True)
 
 
 def _joint_x(contacts: Mapping[tuple[int, int], Contact], i: int, k: int) -> float:
     return float(contacts[min(i, k), max(i, k)].a.origin[0])
-
-
-def _names(bodies: Sequence[Body], which: Sequence[int]) -> str:
-    names = [bodies[i].name for i in which]
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def _paths(beside: Mapping[int, Sequence[int]]) -> list[list[int]]:
@@ -121,7 +75,7 @@ def _paths(beside: Mapping[int, Sequence[int]]) -> list[list[int]]:
     return paths
 
 
-def frame_problem(chain: Chain) -> str:
+def frame_problem(chain: Assembly) -> str:
     """Return why a chain is not in the bridge's frame (X along the span, Z up); "" if it is."""
     points = np.vstack([chain.parts[0].centre, chain.middles, chain.parts[-1].centre])
     span = points[-1] - points[0]
@@ -143,7 +97,7 @@ def frame_problem(chain: Chain) -> str:
     return ""
 
 
-def rises(chain: Chain) -> bool:
+def rises(chain: Assembly) -> bool:
     """Whether the parts make up an arch, which shows where up is."""
     points = np.vstack([chain.parts[0].centre, chain.middles, chain.parts[-1].centre])
     return bool(_rise(points)[2] > RISE_SHARE * np.linalg.norm(points[-1] - points[0]))

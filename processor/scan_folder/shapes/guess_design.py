@@ -1,9 +1,10 @@
-"""A design.json from the surfaces in a folder: of an arch bridge in parts, or of a space frame."""
+"""A design.json from the surfaces in a folder: of parts that meet end to end, or of a space frame."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -55,12 +56,16 @@ class _Parts:
 
 
 def guess(
-    folder: Path, group: Sequence[Path], scans: Sequence[tuple[float, str]], given_unit: str = ""
+    folder: Path,
+    group: Sequence[Path],
+    scans: Sequence[tuple[float, str]],
+    given_unit: str = "",
+    stems: Sequence[str] = (),
 ) -> GuessedDesign:
     """Guess the design that the files of one folder hold.
 
-    ``scans`` are the radius of each scan and the unit that its format states. Raises InputError for a file that cannot
-    be read.
+    ``scans`` are the radius of each scan and the unit that its format states, ``stems`` the names of their files
+    without suffix. Raises InputError for a file that cannot be read.
     """
     chosen, doubts = surface_files.one_a_stem(group)
     surfaces = [surface_files.read(folder, path, given_unit or "mm") for path in chosen]
@@ -86,7 +91,9 @@ def guess(
     if not units.unit:
         return GuessedDesign(doubts=tuple(doubts), unit_doubt=_unit_doubt(units), files=names)
     surfaces = _in_unit(folder, surfaces, before, units.unit)
-    guessed = _bridge(_bodies(folder, surfaces, units.unit), names, tuple(doubts), _json_unit(surfaces, units))
+    parts = _bodies(folder, surfaces, units.unit)
+    scanned = _scanned_apart(parts.bodies, stems)
+    guessed = _bridge(parts, names, tuple(doubts), _json_unit(surfaces, units), scanned)
     return replace(guessed, unit_doubt=_unit_doubt(units))
 
 
@@ -124,12 +131,15 @@ def _json_unit(surfaces: Sequence[surface_files.Surface], units: guess_unit.Desi
     return "mm" if all(surface.unit for surface in surfaces) else units.unit or "mm"
 
 
-def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_unit: str) -> GuessedDesign:
-    whole = len(names) == 1
+def _bridge(
+    parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_unit: str, scanned: bool
+) -> GuessedDesign:
+    """Return the design of parts that meet end to end; ``scanned``: each scan has the name of one of them."""
     found = arch_bridge.find(parts.bodies)
     named = _named_as_parts(parts.bodies)
-    if found.design is None or (whole and not found.arched and not named):
-        told = [f"as an arch bridge: {text}" for text in found.doubts if named or not whole]
+    likely = named or scanned or len(names) > 1
+    if found.design is None or not (found.arched or likely):
+        told = [f"as an arch bridge: {text}" for text in found.doubts if likely]
         return GuessedDesign(doubts=(*doubts, *told), files=tuple(names))
     mesh_of = {part.name: parts.mesh_of[part.name] for part in found.design.parts}
     return GuessedDesign(
@@ -137,7 +147,7 @@ def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_u
         doubts=(*doubts, *parts.doubts, *found.doubts),
         units="mm" if parts.meshes else json_unit,
         reason=f"{len(mesh_of)} parts that meet end to end, in {_some(names)}",
-        kind_doubt=_kind_doubt(found.arched, named),
+        kind_doubt=_kind_doubt(found, named),
         root_gap_mm=found.root_gap_mm,
         files=tuple(names),
         mesh_of=mesh_of,
@@ -145,8 +155,10 @@ def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_u
     )
 
 
-def _kind_doubt(arched: bool, named: bool) -> str:
-    if not arched:
+def _kind_doubt(found: arch_bridge.GuessedArch, named: bool) -> str:
+    if not found.row:
+        return "the parts make up a ring or have branches; a structure that is built is no assembly of parts"
+    if not found.arched:
         return "the parts follow each other in a straight line, which is no arch"
     return "" if named else "the parts meet end to end and rise, but no name says that they are an arch's"
 
@@ -161,6 +173,14 @@ def _names(folder: Path, paths: Sequence[Path]) -> tuple[str, ...]:
 
 def _named_as_parts(bodies: Sequence[Body]) -> bool:
     return any(word in component_names.plain(body.name).split() for body in bodies for word in PARTS)
+
+
+def _scanned_apart(bodies: Sequence[Body], stems: Sequence[str]) -> bool:
+    """Whether two scans or more have the names of one body each, and none that of several."""
+    names = [body.name for body in bodies]
+    of_scan = [component_names.components(stem, names) for stem in stems]
+    single = [found[0] for found in of_scan if len(found) == 1]
+    return len(set(single)) > 1 and len(single) == len(stems)
 
 
 def _bodies(folder: Path, surfaces: Sequence[surface_files.Surface], units: str) -> _Parts:
@@ -228,7 +248,10 @@ def _arch(design: ArchDesign, mesh_of: Mapping[str, str], scale: float) -> dict[
             design.joint_names, design.joint_left, design.joint_right, design.joint_points, strict=True
         )
     ]
-    return {"order": [part.name for part in design.parts], "components": components, "joints": joints}
+    order = [part.name for part in design.parts]
+    joined = {frozenset(pair) for pair in zip(design.joint_left, design.joint_right, strict=True)}
+    in_order = all(frozenset(pair) in joined for pair in pairwise(order))
+    return {**({"order": order} if in_order else {}), "components": components, "joints": joints}
 
 
 def _frame(design: FrameDesign, scale: float) -> dict[str, Any]:
