@@ -11,6 +11,8 @@ from processor.cli.common import UNITS, debug_option
 from processor.model import UsageError
 from processor.plain_text import printable
 
+PICTURE = "design.png"
+
 
 @click.command()
 @click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
@@ -25,7 +27,7 @@ def init(folder: Path, force: bool, design_units: str | None, as_json: bool) -> 
     with their joints and bottom edges, or the nodes and members of a space frame. One that is there is never changed.
 
     Components are recognised by their names and by their shapes against the design. What is uncertain is printed and
-    marked in the file: check it before the first run.
+    marked in the file, and in a picture of a design that was found, design.png: check it before the first run.
     """
     from processor.scan_folder import files, guess
     from processor.store.atomic_file import replacing
@@ -36,13 +38,18 @@ def init(folder: Path, force: bool, design_units: str | None, as_json: bool) -> 
     project = guess.guess(folder, design_units or "")
     text = guess.to_toml(project)
     guess.write_design(folder, project)
+    if project.made is not None and project.made.design is not None:
+        from processor.report.charts import design_picture
+
+        with replacing(folder / PICTURE) as temporary:
+            temporary.write_bytes(design_picture.draw(project.made.design, project.made.unsure))
     with replacing(path) as temporary:
         temporary.write_text(text, "utf-8")
     if as_json:
         click.echo(json.dumps(guess.as_json(project), ensure_ascii=False))
         return
     if project.made:
-        click.echo(f"{folder / project.design}: {guess.summary(project)}")
+        click.echo(f"{folder / project.design}: {guess.summary(project)}; shown in {PICTURE}")
     click.echo(f"{path}: kind {project.kind}, {len(project.scans)} file(s) of scans")
     for question in project.unsure:
         click.echo(printable(f"? {question}"))

@@ -18,6 +18,7 @@ from processor.api import runs
 from processor.cli import main
 from processor.geometry.polyline import Polyline
 from processor.model import ArchDesign, DesignBodies
+from processor.report.charts import design_picture
 from processor.scan_folder import cad, guess
 from processor.scan_folder import folder as scan_folder
 from processor.scan_folder.shapes import arch_bridge, guess_design
@@ -348,6 +349,28 @@ def init(place, *options):
     done = CliRunner().invoke(main.commands, ["init", str(place), *options], catch_exceptions=False)
     assert done.exit_code == 0
     return done.output
+
+
+def test_the_picture_marks_what_is_not_sure(tmp_path, monkeypatch):
+    meshes, _ = bridge_parts.bridge(5, 0)
+    meshes[1] = bevelled(*meshes[1])
+    meshes[3] = chamfered(*meshes[3], steps=8)
+    names = bridge_parts.names(5)
+    for name, mesh in zip(names, meshes, strict=True):
+        bridge_parts.write_obj(tmp_path / f"design/{name}.obj", *mesh)
+    write_scans(tmp_path, meshes, names)
+    drawn = []
+    real = design_picture._name
+    monkeypatch.setattr(
+        design_picture, "_name", lambda axes, place, name, *rest: drawn.append(name) or real(axes, place, name, *rest)
+    )
+    assert "shown in design.png" in init(tmp_path)
+    assert (tmp_path / "design.png").read_bytes().startswith(b"\x89PNG")
+    sure = {name for name in drawn if not name.startswith("?")}
+    assert {"? J1", "J2"} <= set(drawn)
+    assert f"? {names[3]}" in drawn
+    assert not {f"? {name}" for name in sure} & set(drawn)
+    assert set(names) | {"J1", "J2", "J3", "J4"} == {name.removeprefix("? ") for name in drawn}
 
 
 WRITERS = {"obj": bridge_parts.write_obj, "stl": bridge_parts.write_stl, "ply": write_ply}

@@ -11,7 +11,7 @@ from processor.model import ArchDesign, DesignPart, Floats
 from processor.scan_folder.component_names import numbered_backwards
 from processor.scan_folder.shapes import chain as chains
 from processor.scan_folder.shapes import connected
-from processor.scan_folder.shapes.body import Body
+from processor.scan_folder.shapes.body import Body, Unsure
 from processor.scan_folder.shapes.bottom_edges import BEVEL_MM, follow, smooth
 from processor.scan_folder.shapes.connected import Assembly
 from processor.scan_folder.shapes.contact_faces import Contact, PlaneFace, contacts
@@ -34,7 +34,7 @@ class GuessedArch:
     """A design, or None, with what is not sure about it and the reason.
 
     ``root_gap_mm`` is the modelled gap between the ends at the joints, NaN where it differs. ``arched``: the parts rise
-    from both ends. ``row``: each part is joined to the next alone.
+    from both ends. ``row``: each part is joined to the next alone. ``unsure``: the joints and parts with doubts.
     """
 
     design: ArchDesign | None
@@ -42,6 +42,7 @@ class GuessedArch:
     root_gap_mm: float = 0.0
     arched: bool = False
     row: bool = True
+    unsure: tuple[Unsure, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,18 +72,20 @@ def find(bodies: Sequence[Body]) -> GuessedArch:
     if isinstance(found, str) or problem:
         return GuessedArch(None, (problem,))
     doubts = list(found.doubts)
-    joints = []
+    unsure, joints = [Unsure(body.name, body.centre) for body in found.left_out], []
     for number in range(len(found.contacts)):
         joint = _joint(found, number)
         if isinstance(joint, str):
             return GuessedArch(None, (joint, *doubts))
         joints.append(joint)
         doubts += [f"joint {joint.name} of {_pair(found, number)}: {text}" for text in joint.doubts]
+        unsure += [Unsure(joint.name, joint.points[:4].mean(axis=0))] if joint.doubts else []
     parts = []
     for number, body in enumerate(found.parts):
         part, doubt = _part(found, joints, number) if found.row else (_without_edges(body), "")
         parts.append(part)
         doubts += [doubt] if doubt else []
+        unsure += [Unsure(body.name, body.centre)] if doubt or body.step_mm else []
     doubts += _numbering(found) if found.row else []
     rounded = [part.name for part in found.parts if part.step_mm]
     if rounded:
@@ -99,7 +102,8 @@ def find(bodies: Sequence[Body]) -> GuessedArch:
         joint_points=np.array([joint.points for joint in joints]),
     )
     gap = max(0.0, round(float(np.mean(gaps)), 2)) if alike else float("nan")
-    return GuessedArch(design, tuple(doubts), gap, found.row and chains.rises(found), found.row)
+    arched = found.row and chains.rises(found)
+    return GuessedArch(design, tuple(doubts), root_gap_mm=gap, arched=arched, row=found.row, unsure=tuple(unsure))
 
 
 def _assembly(bodies: Sequence[Body]) -> Assembly | str:

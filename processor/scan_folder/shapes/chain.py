@@ -54,7 +54,8 @@ def _chain(bodies: Sequence[Body], order: Sequence[int], contacts: Mapping[tuple
         one = contacts[min(i, k), max(i, k)]
         joints.append(one if i < k else one.reverse)
     links = tuple(pairwise(range(len(order))))
-    return Assembly(tuple(bodies[i] for i in order), links, tuple(joints), tuple(doubts), row=True)
+    parts, others = (tuple(bodies[i] for i in which) for which in (order, left_out))
+    return Assembly(parts, links, tuple(joints), tuple(doubts), row=True, left_out=others)
 
 
 def _joint_x(contacts: Mapping[tuple[int, int], Contact], i: int, k: int) -> float:

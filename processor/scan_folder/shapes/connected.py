@@ -21,7 +21,7 @@ CROSSES_MM = 10.0  # how far a splice plate reaches on either side of a joint, a
 class Assembly:
     """Parts (n), and joints (m) between them: ``links`` are their left and right parts, ``contacts`` has a = left.
 
-    ``row``: each part is joined to the next alone. ``doubts``: what is not sure.
+    ``row``: each part is joined to the next alone. ``doubts``: what is not sure; ``left_out``: what meets no part.
     """
 
     parts: tuple[Body, ...]
@@ -29,6 +29,7 @@ class Assembly:
     contacts: tuple[Contact, ...]
     doubts: tuple[str, ...] = ()
     row: bool = False
+    left_out: tuple[Body, ...] = ()
 
     @property
     def middles(self) -> Floats:
@@ -107,7 +108,13 @@ def find(bodies: Sequence[Body], contacts: Mapping[tuple[int, int], Contact]) ->
     order, steps = _walk(beside)
     links = [(order.index(i), order.index(k)) for i, k in steps]
     joints = [contacts[i, k] if i < k else contacts[k, i].reverse for i, k in steps]
-    return Assembly(tuple(bodies[i] for i in order), tuple(links), tuple(joints), tuple(doubts))
+    return Assembly(
+        tuple(bodies[i] for i in order),
+        tuple(links),
+        tuple(joints),
+        tuple(doubts),
+        left_out=tuple(bodies[i] for i in left_out),
+    )
 
 
 def _beside(contacts: Mapping[tuple[int, int], Contact]) -> dict[int, list[int]]:

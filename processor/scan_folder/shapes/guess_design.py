@@ -13,7 +13,7 @@ import numpy as np
 from processor.model import KEY_POINTS, ArchDesign, Floats, FrameDesign, Ints
 from processor.scan_folder import component_names
 from processor.scan_folder.shapes import arch_bridge, guess_unit, space_frame, surface_files
-from processor.scan_folder.shapes.body import Body, stacked, welded
+from processor.scan_folder.shapes.body import Body, Unsure, stacked, welded
 from processor.scan_folder.units import MM_PER_UNIT
 
 PARTS = ("foot", "rib", "crown")  # words in the names of an arch bridge's parts
@@ -38,6 +38,7 @@ class GuessedDesign:
     files: tuple[str, ...] = ()
     mesh_of: dict[str, str] = field(default_factory=dict)
     meshes: tuple[tuple[str, Floats, Ints], ...] = ()
+    unsure: tuple[Unsure, ...] = ()  # joints, parts, nodes and members with doubts
 
     @property
     def questions(self) -> tuple[str, ...]:
@@ -86,6 +87,7 @@ def guess(
             units=_json_unit(surfaces, units),
             reason=f"balls and the tubes between them, in {_some(names)}",
             files=names,
+            unsure=balls.unsure,
         )
     units = _unit(surfaces, scans, given_unit, as_whole=len(surfaces) == 1)
     if not units.unit:
@@ -152,6 +154,7 @@ def _bridge(
         files=tuple(names),
         mesh_of=mesh_of,
         meshes=tuple(mesh for mesh in parts.meshes if mesh[0] in mesh_of.values()),
+        unsure=found.unsure,
     )
 
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from processor.model import Floats, FrameDesign, Ints
 from processor.scan_folder.shapes import balls, tubes
 from processor.scan_folder.shapes.balls import Balls
-from processor.scan_folder.shapes.body import Body
+from processor.scan_folder.shapes.body import Body, Unsure
 from processor.scan_folder.shapes.tubes import Tubes
 
 FEWEST_BALLS, FEWEST_MEMBERS = 3, 2
@@ -31,6 +31,7 @@ class GuessedFrame:
 
     design: FrameDesign | None
     doubts: tuple[str, ...] = ()
+    unsure: tuple[Unsure, ...] = ()  # nodes, and members by their middles
 
 
 def find(body: Body) -> GuessedFrame:
@@ -42,7 +43,7 @@ def find(body: Body) -> GuessedFrame:
     a, b, which, off = _members(nodes, pipes)
     if len(a) < FEWEST_MEMBERS:
         return GuessedFrame(None, (f"{len(nodes.radii)} balls found, but {len(a)} tube(s) between two of them",))
-    doubts = _doubts(nodes, a, b, off)
+    doubts, unsure = _doubts(nodes, a, b, off)
     aside = _aside(body, nodes, pipes.ends[which], pipes.radii[which])
     if aside > OTHER_SHARE:
         doubts.append(f"members: {100.0 * aside:.0f} % of the surface lies along none of them; are some missing?")
@@ -60,6 +61,7 @@ def find(body: Body) -> GuessedFrame:
             ids, nodes.centres, nodes.radii, member_a=ids[a], member_b=ids[b], tube_diameters=2.0 * pipes.radii[which]
         ),
         tuple(doubts),
+        unsure,
     )
 
 
@@ -132,8 +134,9 @@ def _coaxial(pipes: Tubes, which: Ints) -> np.ndarray:
     return result
 
 
-def _doubts(nodes: Balls, a: Ints, b: Ints, off: Floats) -> list[str]:
-    doubts = []
+def _doubts(nodes: Balls, a: Ints, b: Ints, off: Floats) -> tuple[list[str], tuple[Unsure, ...]]:
+    """Return what is not sure of nodes and members, as texts and by their places."""
+    doubts = list[str]()
     unsure = np.flatnonzero(~nodes.sure)
     if len(unsure):
         share = 100.0 * nodes.cover[unsure[0]]
@@ -151,7 +154,10 @@ def _doubts(nodes: Balls, a: Ints, b: Ints, off: Floats) -> list[str]:
     if len(eccentric):
         pairs = ", ".join(f"{a[m]}-{b[m]}" for m in eccentric[:6])
         doubts.append(f"members: {len(eccentric)} do not lead through the centres of their balls ({pairs})")
-    return doubts
+    ids = np.unique(np.concatenate([unsure, odd, alone])).astype(np.int64)
+    places = [Unsure(str(k), nodes.centres[k]) for k in ids.tolist()]
+    places += [Unsure(f"{a[m]}-{b[m]}", 0.5 * (nodes.centres[a[m]] + nodes.centres[b[m]])) for m in eccentric.tolist()]
+    return doubts, tuple(places)
 
 
 def _listed(which: Sequence[int] | Ints) -> str:
