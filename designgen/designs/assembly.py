@@ -12,7 +12,7 @@ from designgen.checks import expect
 from designgen.designs import bolting, prismatic, sections
 from designgen.designs.bolting import Bore
 from designgen.designs.patch import Patch
-from designgen.designs.prismatic import End, Girder, Part
+from designgen.designs.prismatic import End, Girder, Node, Part
 from designgen.designs.sections import Section
 from designgen.rigid import rigid
 from processor.model import Floats
@@ -40,8 +40,8 @@ class Params(sections.Params):
             expect(getattr(self, key) >= least, f"assembly.{key}", getattr(self, key), f"{least:g} or more")
         widest = 2.0 * prismatic.PAD_SIZE_MM  # the mark lies on one half of the top
         expect(self.width_mm >= widest, "assembly.width_mm", self.width_mm, f"{widest:g} or more")
-        box = self.type == "row" or self.section != "i"
-        expect(box, "assembly.section", self.section, "a box: nodes are made of boxes alone")
+        box = self.type == "row" or self.section == "box"
+        expect(box, "assembly.section", self.section, "box: nodes are made of plain boxes alone")
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class _Maker:
         self, params: Params, section: Section, bolts: bolting.Params | None = None, shifts: Shifts | None = None
     ) -> None:
         self.params, self.section, self.bolts, self.shifts = params, section, bolts, shifts or {}
-        self.girders: dict[str, Girder] = {}
+        self.made_of: dict[str, Girder | Node] = {}
         self.faces: dict[str, list[Patch]] = {}
         self.reach: dict[str, float] = {}
         self.joints: list[Joint] = []
@@ -113,7 +113,7 @@ class _Maker:
             faces += prismatic.walls(T, 0.0, length, hole, "inner")
         faces += prismatic.end_face(T, 0.0, self.section, "start") + prismatic.end_face(T, length, self.section, "end")
         self.faces[name], self.reach[name] = faces, min(prismatic.FADES_MM, 0.4 * length)
-        self.girders[name] = Girder(T, length, self.section, mark, tuple(bores))
+        self.made_of[name] = Girder(T, length, self.section, mark, tuple(bores))
         return T @ _along(length)
 
     def _bores(self, name: str, length: float, joined: tuple[bool, bool]) -> list[Bore]:
@@ -137,11 +137,12 @@ class _Maker:
             faces += prismatic.walls(T, reach, stub, outline, f"chord{number}")
             faces += prismatic.walls(up, reach, self.upright, outline, f"branch{number}")
         # Half a turn about the third stub would lay the node on itself but for its mark.
-        outer = self.section.outlines[0]
-        faces += prismatic.marked(T, -stub, -h, (outer[TOP], outer[TOP + 1]), -h - prismatic.PAD_SIZE_MM)
+        outer, mark = self.section.outlines[0], -h - prismatic.PAD_SIZE_MM
+        faces += prismatic.marked(T, -stub, -h, (outer[TOP], outer[TOP + 1]), mark)
         faces += prismatic.end_face(T, -stub, self.section, "start") + prismatic.end_face(T, stub, self.section, "end")
         faces += prismatic.end_face(up, self.upright, self.section, "end")
         self.faces[name], self.reach[name] = faces, 0.8 * (self.upright - h)
+        self.made_of[name] = Node(T, stub, self.upright, self.section, mark)
 
     @property
     def upright(self) -> float:
@@ -162,7 +163,7 @@ class _Maker:
                 for part, outward in ((joint.left, 1.0), (joint.right, -1.0))
                 if part == name
             ]
-            parts.append(Part(name, tuple(faces), tuple(ends), self.girders.get(name)))
+            parts.append(Part(name, tuple(faces), tuple(ends), self.made_of[name]))
         return Assembly(tuple(parts), tuple(self.joints))
 
 

@@ -81,13 +81,32 @@ class Girder:
 
 
 @dataclass(frozen=True)
+class Node:
+    """A node with its middle at T: stubs of ``stub`` mm along x to both sides, one of ``upright`` mm along z.
+
+    The mark is on its top at x ``mark`` (mm).
+    """
+
+    T: Floats
+    stub: float
+    upright: float
+    section: Section
+    mark: float
+
+
+@dataclass(frozen=True)
 class Part:
-    """A part: its faces, its ends, and what it is made of if it is a girder."""
+    """A part: its faces, its ends, and what it is made of."""
 
     name: str
     patches: tuple[Patch, ...]
     ends: tuple[End, ...]
-    girder: Girder | None = None
+    made_of: Girder | Node
+
+    @property
+    def girder(self) -> Girder | None:
+        """What the part is made of if it is a girder."""
+        return self.made_of if isinstance(self.made_of, Girder) else None
 
     def displacement(self, points: Floats) -> Floats:
         """Displacements (n, 3) of points (n, 3) of the design, as built."""

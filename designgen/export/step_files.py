@@ -92,21 +92,18 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
         components = structure_registry.design(recipe)
         shapes = {component.name: box_and_tube.solid([component]) for component in components}
     elif kind == "assembly":
-        path, shapes = folder / "assembly.step", _girders(recipe)
+        path, shapes = folder / "assembly.step", _parts_of_assembly(recipe)
     else:
         raise UsageError("--step: the scene does not name the recipe it was made from, so its solids are not known")
     write_step(path, shapes, recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0)))
     return [path]
 
 
-def _girders(recipe: Mapping[str, Any]) -> dict[str, cq.Shape]:
-    """Return the solids of an assembly of girders; UsageError for one with nodes, which are made as meshes alone."""
+def _parts_of_assembly(recipe: Mapping[str, Any]) -> dict[str, cq.Shape]:
+    """Return the solids of the girders and nodes of an assembly."""
     bolts = filled(bolting.Params, recipe, "bolts") if "bolts" in recipe else None
     parts = assembly.build(filled(assembly.Params, recipe, "assembly"), bolts).parts
-    shapes = {part.name: girder.solid(part.girder) for part in parts if part.girder is not None}
-    if len(shapes) < len(parts):
-        raise UsageError("--step: nodes of assemblies are made as meshes alone; export the scene without --step")
-    return shapes
+    return {part.name: girder.solid(part.made_of) for part in parts}
 
 
 def write_step(path: Path, shapes: Mapping[str, cq.Shape], origin_mm: Sequence[float] = (0.0, 0.0, 0.0)) -> None:

@@ -11,6 +11,8 @@ from processor.cli.common import LANGUAGES, UNITS, debug_option
 from processor.model import UsageError
 from processor.plain_text import printable
 
+PICTURE = "design.png"
+
 
 @click.command()
 @click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
@@ -28,7 +30,7 @@ def init(folder: Path, force: bool, design_units: str | None, lang: str, as_json
     with their joints and bottom edges, or the nodes and members of a space frame. One that is there is never changed.
 
     Components are recognised by their names and by their shapes against the design. What is uncertain is printed and
-    marked in the file: check it before the first run.
+    marked in the file, and in a picture of a design that was found, design.png: check it before the first run.
     """
     from processor.language.messages import messages, text
     from processor.scan_folder import files, guess
@@ -38,17 +40,23 @@ def init(folder: Path, force: bool, design_units: str | None, lang: str, as_json
     if path.exists() and not force:
         raise UsageError(f"{path}: is there already; --force replaces it")
     project = guess.guess(folder, design_units or "")
-    content = guess.to_toml(project, lang)
+    table = guess.to_toml(project, lang)
     guess.write_design(folder, project, lang)
+    if project.made is not None and project.made.design is not None:
+        from processor.report.charts import design_picture
+
+        with replacing(folder / PICTURE) as temporary:
+            temporary.write_bytes(design_picture.draw(project.made.design, project.made.unsure))
     with replacing(path) as temporary:
-        temporary.write_text(content, "utf-8")
+        temporary.write_text(table, "utf-8")
     if as_json:
         click.echo(json.dumps(guess.as_json(project), ensure_ascii=False))
         return
     write = messages(lang).text
     if project.made:
-        made = text("{file}: {content}", file=str(folder / project.design), content=guess.summary(project))
-        click.echo(printable(write(made)))
+        made, content = str(folder / project.design), guess.summary(project)
+        line = text("{file}: {content}; shown in {picture}", file=made, content=content, picture=PICTURE)
+        click.echo(printable(write(line)))
     scans = len(project.scans)
     line = text("{file}: kind {kind}, {files} file(s) of scans", file=str(path), kind=project.kind, files=scans)
     click.echo(printable(write(line)))

@@ -96,10 +96,11 @@ def _of_part(design: ArchDesign, component: InspectedComponent, truth: ArchTruth
         true["length-bottom"] = lengths[0] - lengths[1]
     if len(component.axis):
         departures = _departures(design.parts[index], edges, component.axis.chainage)
-        off = part_geometry.off_the_chord(component.axis.chainage)
-        axis = off @ departures.mean(axis=0)
+        designed = [design.parts[index].bottom_edge_left, design.parts[index].bottom_edge_right]
+        points = [Polyline.through(edge).at(component.axis.chainage) for edge in designed]
+        axis = part_geometry.axis_of_shape(*points) @ np.moveaxis(departures, 2, 0).ravel()
         for a, quantity in enumerate((Quantity.SWEEP, Quantity.CAMBER)):
-            true[str(quantity)] = float(np.abs(axis[:, a]).max())
+            true[str(quantity)] = float(np.abs(axis[a]).max())
         at = int(np.argmin(np.abs(component.axis.chainage - component.axis.chainage.mean())))
         true["middle-width-bottom"] = float(departures[0, at, 0] - departures[1, at, 0])
     return true

@@ -207,8 +207,8 @@ def _foot_length(part: DesignPart, design: Floats, shape: Any, joint: int) -> tu
 def _axis(part: DesignPart, shape: Any) -> tuple[AxisDepartures, list[Characteristic]]:
     """Departures of the axis from the design's, and the greatest sideways and up.
 
-    The axis is the middle between the bottom edges; the straight line between its first and its last departure is taken
-    off, so that a turn of the part is none.
+    The axis is the middle between the bottom edges. A motion of the part is taken off. Departures sideways and up are
+    known without their common errors, which are taken as independent.
     """
     left, right = (np.flatnonzero(np.array(shape.edge) == side) for side in ("left", "right"))
     _, *same = np.intersect1d(shape.chainage[left], shape.chainage[right], return_indices=True)
@@ -219,13 +219,14 @@ def _axis(part: DesignPart, shape: Any) -> tuple[AxisDepartures, list[Characteri
         why = reason("inspect.edges-not-seen")
         return AxisDepartures(), [characteristic.absent(str(kind), kind, 0.0, why) for kind in kinds]
     chainage = shape.chainage[left[known]]
-    off = part_geometry.off_the_chord(chainage)
+    both = np.concatenate([left[known], right[known]])
+    edges = (Polyline.through(edge).at(chainage) for edge in (part.bottom_edge_left, part.bottom_edge_right))
     columns, found = [], []
-    for a, kind in enumerate(kinds):
-        both = np.concatenate([left[known], right[known]])
-        mean = 0.5 * np.hstack([off, off])
-        departure = mean @ shape.departure[both, a]
-        covariance = mean @ shape.departure_covariance[a][np.ix_(both, both)] @ mean.T
+    for kind, to_axis in zip(kinds, part_geometry.axis_of_shape(*edges), strict=True):
+        departure = to_axis @ shape.departure[both].T.ravel()
+        of_ways = np.split(to_axis, 2, axis=1)
+        errors = (shape.departure_covariance[a][np.ix_(both, both)] for a in range(2))
+        covariance = sum(way @ one @ way.T for way, one in zip(of_ways, errors, strict=True))
         columns += [departure, NORMAL_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))]
         found.append(characteristic.greatest(kind, departure, covariance))
     return AxisDepartures(

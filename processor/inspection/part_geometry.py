@@ -99,6 +99,34 @@ def off_the_chord(chainage: Floats) -> Floats:
     return off
 
 
+def axis_of_shape(left: Floats, right: Floats) -> Floats:
+    """Matrix (2, k, 4 k) from departures of two edges to those of the axis between them that are the part's own.
+
+    ``left``, ``right`` (k, 3) are points of both edges as designed, from start to end. Columns are the departures of
+    the left and of the right edge sideways, then of both up; the result is sideways and up. A motion of the part is
+    taken off: then the axis departs nowhere at its first and last point, and the edges' departures up show no roll
+    about the chord on the mean. A straight part that rolls keeps its axis, the middle of a curved one goes aside.
+    """
+    axis, width = 0.5 * (left + right), np.linalg.norm(left - right, axis=1)
+    count, chord = len(axis), _unit(axis[-1] - axis[0])
+    sideways = (left - right) / width[:, None]
+    up = _unit(np.cross(np.gradient(axis, axis=0, edge_order=2), sideways))
+    sideways_of_chord = _unit(np.cross(np.cross(chord, sideways.mean(axis=0)), chord))
+    ways = np.stack([chord, sideways_of_chord, np.cross(chord, sideways_of_chord)])
+    moved = [np.broadcast_to(way, (2, count, 3)) for way in ways[1:]]
+    moved += [np.cross(way, np.stack([left, right]) - axis[0]) for way in ways]
+    by_motion = np.stack(
+        [np.einsum("ski,aki->ask", d, np.stack([sideways, up])).ravel() for d in moved], axis=1
+    )  # (4 k, 5)
+    half = 0.5 * np.eye(count)
+    mean = np.kron(np.eye(2), np.hstack([half, half]))  # (2 k, 4 k)
+    roll = np.concatenate([np.zeros(2 * count), 1.0 / width, -1.0 / width]) / count
+    fixed = np.vstack([mean[[0, count - 1, count, 2 * count - 1]], roll])
+    own = np.eye(4 * count) - by_motion @ np.linalg.solve(fixed @ by_motion, fixed)
+    result: Floats = (mean @ own).reshape(2, count, 4 * count)
+    return result
+
+
 def _between(a: tuple[int, int], b: tuple[int, int], ends: Floats) -> Floats:
     """Distance (...) of two key points of the ends (..., 2, 8, 3)."""
     distance: Floats = np.linalg.norm(ends[..., b[0], b[1], :] - ends[..., a[0], a[1], :], axis=-1)

@@ -133,11 +133,12 @@ def _shown_design(
 ) -> ArchDesign | FrameDesign | Surface | None:
     """Return the design that meshes or CAD files show: of an arch bridge or a frame, else one surface of a whole."""
     scans = [(scan.radius, scan.units) for scan in project.scans if not scan.error]
+    stems = [scan.stem for scan in project.scans]
     found = list[GuessedDesign]()
     without = list[GuessedDesign]()
     for group in groups:
         try:
-            guessed = guess_design.guess(folder, group, scans, design_units)
+            guessed = guess_design.guess(folder, group, scans, design_units, stems)
         except InputError as error:
             project.doubts.append(reason("init.design-unreadable", error=_within(folder, error)))
             continue

@@ -6,7 +6,18 @@ import pytest
 
 from designgen import batch
 from designgen.asbuilt import imperfections
-from designgen.designs import arch_bridge, arch_part, box_and_tube, plate_row, space_frame, stadium_roof, truss_bridge
+from designgen.designs import (
+    arch_bridge,
+    arch_part,
+    arch_ring,
+    assembly,
+    box_and_tube,
+    girder,
+    plate_row,
+    space_frame,
+    stadium_roof,
+    truss_bridge,
+)
 from designgen.export import folder as export_folder
 from designgen.randomness import generator
 from designgen.scanning import returns, sampler, scanner, space_frame_surfaces
@@ -119,6 +130,44 @@ def test_rays_meet_arch_parts_where_their_solids_are(number, built):
         assert departures(few, shells_of(solid)).max() < limit, name
     assert {"outer-top", "outer-left", "outer-right", "pad"} <= seen
     assert any(name.startswith("inner") for name in seen)
+
+
+def test_rays_meet_segments_of_rings_where_their_solids_are():
+    part = arch_ring.build(arch_ring.Params())[1]
+    builder = Builder()
+    for patch in arch_part.ray_patches(part):
+        builder.patch(0, patch)
+    middle = part.key_points(0.5 * (part.s0 + part.s1)).mean(axis=0)
+    places = [middle + np.array([500.0, side * 4000.0, 1500.0]) for side in (-1.0, 1.0)]
+    points, names = hits(builder, places, 4.0)
+    for name, few in of_each(points, names, np.random.default_rng(0)):
+        assert departures(few, shells_of(arch_part.solid(part))).max() < TOLERANCE_MM, name
+
+
+@pytest.mark.parametrize(
+    ("type_", "section", "number"),
+    [("node", "box", 0), ("ribs", "box", 1), ("row", "stiffened-box", 0), ("row", "i", 1)],
+    ids=["node", "node of a rib", "stiffened box", "I girder"],
+)
+def test_rays_meet_parts_of_assemblies_where_their_solids_are(type_, section, number):
+    part = assembly.build(assembly.Params(type=type_, section=section)).parts[number]
+    solid = girder.solid(part.made_of)
+    assert solid.isValid()
+    assert len(solid.Solids()) == 1
+    builder = Builder()
+    for patch in part.patches:
+        builder.patch(0, patch)
+    vertices, faces = part.mesh()
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    middle, size = 0.5 * (low + high), float((high - low).max())
+    places = [middle + size * np.array(way) for way in ([0.3, -0.8, 0.4], [-0.9, 0.3, 0.2], [0.1, 0.9, 0.1])]
+    points = hits(builder, places, 4.0)[0]
+    picked = np.random.default_rng(2).choice(len(points), 4 * COUNT, replace=False)
+    assert departures(points[picked], shells_of(solid)).max() < TOLERANCE_MM
+    # No face is missing: the mesh of the faces is closed, and encloses the solid's volume.
+    corners = (vertices - middle)[faces]
+    volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+    assert volume == pytest.approx(solid.Volume(), rel=1e-9)
 
 
 # --- plates, girders, tubes of structures -----------------------------------------------------------------------------

@@ -36,7 +36,7 @@ def test_the_mesh_of_a_girder_encloses_the_volume_of_its_solid():
         volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
         # Bores are polygons in the mesh: of 64 corners, smaller than the circle by 1.6 parts in a thousand.
         bores = sum(np.pi * b.radius**2 * np.linalg.norm(b.end - b.start) for b in part.girder.bores)
-        solid = girder.solid(part.girder).Volume()
+        solid = girder.solid(part.made_of).Volume()
         assert volume - solid == pytest.approx(bores * (1.0 - np.sin(2 * np.pi / 64) * 64 / (2 * np.pi)), rel=1e-3)
 
 
@@ -47,7 +47,7 @@ def test_scanned_points_of_a_girder_lie_on_its_drilled_solid(mode):
     drilled = assembly.build(SIZES, BOLTS, shifts)
     rng = np.random.default_rng(0)
     for part, scan, T in zip(drilled.parts, scene.scans, truth.arch.T_bridge_scan, strict=True):
-        solid = shells(girder.solid(part.girder))
+        solid = shells(girder.solid(part.made_of))
         points = scan.points @ T[:3, :3].T + T[:3, 3]
         in_bore = np.zeros(len(points), bool)
         for bore in part.girder.bores:
@@ -120,6 +120,12 @@ def test_holes_that_do_not_fit_are_refused(changes):
 def test_only_rows_of_i_girders_have_bolts():
     with pytest.raises(UsageError, match="bolts"):
         assembly.build(assembly.Params(type="node"), BOLTS)
+
+
+@pytest.mark.parametrize("section", ["i", "stiffened-box"])
+def test_nodes_of_other_sections_than_plain_boxes_are_refused(section):
+    with pytest.raises(UsageError, match=r"assembly\.section"):
+        assembly.Params(type="node", section=section)
 
 
 # --- the holes of a girder as the processor measures them

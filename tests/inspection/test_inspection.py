@@ -159,6 +159,29 @@ def test_sweep_is_measured_from_the_parts_own_ends(bow, least):
         assert set(signs) == {np.sign(bow)}
 
 
+@pytest.mark.parametrize("opening", [0.0, 0.2, 1.2])
+def test_no_motion_of_a_curved_part_is_sweep_or_camber(opening):
+    """Edges along an arc of an angle, moved and turned by some mrad: what is left is of second order."""
+    angle = np.linspace(-0.5, 0.5, 61) * opening
+    radial = np.column_stack([np.sin(angle), np.zeros(61), np.cos(angle)])
+    straight = np.column_stack([np.linspace(-0.5, 0.5, 61) * L, np.zeros((61, 2))])
+    axis = L / opening * (radial - [0.0, 0.0, 1.0]) if opening else straight
+    left, right = (np.array([0.0, y, 0.0]) + axis for y in (B / 2, -B / 2))
+    to_axis = part_geometry.axis_of_shape(left, right)
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        turn, shift = rng.normal(0.0, 2e-3, 3), rng.normal(0.0, 3.0, 3)
+        moved = [np.cross(turn, edge) + shift for edge in (left, right)]
+        sideways, up = [off[:, 1] for off in moved], [np.einsum("ki,ki->k", off, radial) for off in moved]
+        # Tangents by differences of points 200 mm apart are off by 1e-4 of an angle.
+        assert np.abs(to_axis @ np.concatenate([*sideways, *up])).max() < 5e-3
+    bow = np.sin(np.pi * np.linspace(0.0, 1.0, 61))
+    for a in range(2):
+        bent = np.zeros((2, 2, 61))
+        bent[a] = bow
+        assert to_axis[a] @ bent.ravel() == pytest.approx(bow, abs=1e-9)
+
+
 def test_unseen_characteristics_have_a_reason_and_no_value():
     ends = RIB.copy()
     ends[1] = np.nan

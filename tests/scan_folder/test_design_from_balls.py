@@ -10,6 +10,7 @@ from designgen.designs import space_frame
 from designgen.export import step_files
 from processor.cli import main
 from processor.model import FrameDesign
+from processor.report.charts import design_picture
 from processor.scan_folder import folder as scan_folder
 from processor.scan_folder import guess
 from processor.scan_folder.shapes import space_frame as frame_shapes
@@ -86,6 +87,10 @@ def test_uncertain_balls_and_tubes_are_reported_as_doubts():
     assert values(one.doubts, "init.doubtful-balls")["nodes"] == (4,)
     assert "init.nodes-alone" in codes(one.doubts)
     assert values(one.doubts, "init.tubes-left-out")["tubes"] == 1
+    place = {unsure.name: unsure.place for unsure in one.unsure}
+    assert len(place) == 2
+    assert np.linalg.norm(place["4"] - centres[4]) < 1.0
+    assert any(np.linalg.norm(at - centres[0] - [0.0, 0.0, 3000.0]) < NODE_MM for at in place.values())
     start, end = next(v for name, v, _ in bodies if name == "tube 3").reshape(2, 24, 3)
     bent = np.vstack([start, 0.5 * (start + end) + np.array([0.0, 0.0, 200.0]), end])
     _, faces = frame_solids.lathe([(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)], np.zeros(3), np.array([0.0, 0.0, 1.0]))
@@ -96,6 +101,8 @@ def test_uncertain_balls_and_tubes_are_reported_as_doubts():
     aside = [(name, vertices + off * (name == "tube 0"), faces) for name, vertices, faces in bodies]
     one = frame_shapes.find(welded("all", *frame_solids.joined(aside)))
     assert "init.eccentric-members" in codes(one.doubts)
+    assert len(one.unsure) == 1
+    assert design_picture.draw(one.design, one.unsure).startswith(b"\x89PNG")
 
 
 def test_bodies_without_balls_are_no_frame():

@@ -5,11 +5,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import trimesh
 from click.testing import CliRunner
 
 from designgen import batch, recipe_files
 from designgen.curves import make as make_curve
-from designgen.designs import arch_rib
+from designgen.designs import arch_rib, assembly
 from designgen.designs.arch_part import Plates, solid
 from designgen.export import folder as export_folder
 from designgen.export import step_files
@@ -18,6 +19,7 @@ from processor.cli import main
 from processor.geometry.polyline import Polyline
 from processor.language.messages import messages
 from processor.model import ArchDesign, DesignBodies
+from processor.report.charts import design_picture
 from processor.scan_folder import cad, guess
 from processor.scan_folder import folder as scan_folder
 from processor.scan_folder.shapes import arch_bridge, guess_design
@@ -186,32 +188,73 @@ def test_behind_a_bevel_or_an_end_plate_the_outer_faces_are_followed():
     assert codes(one.doubts).count("init.off-outer-faces") == 2
 
 
-def test_a_ring_has_no_order():
-    angles = np.arange(0.0, 2.0 * np.pi + 0.1, np.pi / 3.0)
-    planes = [(np.array([0.0, 0.0, 0.0]), np.array([-np.sin(a), 0.0, np.cos(a)])) for a in angles]
+def ring_parts(count):
+    """Hollow boxes with mitred ends around Y, and the corners (count, 4, 3) of their ends."""
+    angles = np.arange(count + 1) * 2.0 * np.pi / count
 
-    def section(plane, y, r):
-        return plane[0] + np.array([r * plane[1][2], y, -r * plane[1][0]])
+    def corners(angle, width, low, high):
+        radial = np.array([np.cos(angle), 0.0, np.sin(angle)])
+        return np.array(
+            [r * radial + [0.0, y, 0.0] for y, r in ((width, low), (-width, low), (-width, high), (width, high))]
+        )
 
     def segment(a, b):
         outer, inner = (
-            np.array(
-                [
-                    section(p, y, r)
-                    for p in (a, b)
-                    for y, r in ((w, 5e3 + t), (-w, 5e3 + t), (-w, 6e3 - t), (w, 6e3 - t))
-                ]
-            )
-            for w, t in ((400.0, 0.0), (380.0, 20.0))
+            np.vstack([corners(p, w, 5e3 + t, 6e3 - t) for p in (a, b)]) for w, t in ((400.0, 0.0), (380.0, 20.0))
         )
         sides = [q for k in range(4) for q in ((k, (k + 1) % 4, (k + 1) % 4 + 4), (k, (k + 1) % 4 + 4, k + 4))]
         rings = [(e + k, e + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
         rings += [(e + (k + 1) % 4, e + 8 + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
         return np.vstack([outer, inner]), np.array([*sides, *((i + 8, j + 8, k + 8) for i, j, k in sides), *rings])
 
-    one = found([segment(a, b) for a, b in pairwise(planes)], list("abcdef"))
-    assert one.design is None
-    assert codes(one.doubts) == ["init.ring"]
+    return [segment(*pair) for pair in pairwise(angles)], np.array([corners(a, 400.0, 5e3, 6e3) for a in angles[1:]])
+
+
+def same_corners(found_points, corners):
+    """Greatest distance of P1 to P4 from the corners (4, 3), whichever of them each is."""
+    return np.linalg.norm(found_points[:4, None] - corners, axis=2).min(axis=1).max()
+
+
+@pytest.mark.parametrize("count", [4, 6])
+def test_a_ring_has_a_joint_between_each_two_of_its_parts(count):
+    meshes, corners = ring_parts(count)
+    names = [f"part {k + 1}" for k in range(count)]
+    one = found(meshes, names)
+    assert one.doubts == ()
+    assert not one.row
+    left, right = one.design.joint_left, one.design.joint_right
+    assert list(zip(left, right, strict=True)) == [(names[k], names[(k + 1) % count]) for k in range(count)]
+    for points, four in zip(one.design.joint_points, corners, strict=True):
+        assert same_corners(points, four) < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["node", "ribs"])
+def test_parts_of_nodes_and_braced_ribs_are_joined_as_designed(kind):
+    design = assembly.build(
+        assembly.Params(type=kind, length_mm=4000.3, width_mm=500.2, height_mm=700.3, stub_mm=1401.3)
+    )
+    shuffled = np.random.default_rng(1).permutation(len(design.parts))
+    parts = [design.parts[k] for k in shuffled]
+    one = found([part.mesh() for part in parts], [part.name for part in parts])
+    assert one.doubts == ()
+    expected = {frozenset((joint.left, joint.right)): joint for joint in design.joints}
+    pairs = list(zip(one.design.joint_left, one.design.joint_right, strict=True))
+    assert {frozenset(pair) for pair in pairs} == set(expected)
+    assert len(pairs) == len(expected)
+    for pair, points in zip(pairs, one.design.joint_points, strict=True):
+        joint = expected[frozenset(pair)]
+        corners = np.column_stack([np.zeros(4), joint.section.key_points[:4]]) @ joint.T[:3, :3].T + joint.T[:3, 3]
+        assert same_corners(points, corners) < 1e-6
+
+
+def test_a_part_that_ends_on_a_side_of_another_has_no_section_there():
+    meshes, _ = ring_parts(4)
+    ring = [f"part {k + 1}" for k in range(4)]
+    post = np.array([[x, y, z] for x in (-150.0, 150.0) for y in (400.0, 3000.0) for z in (5100.0, 5900.0)])
+    box = trimesh.convex.convex_hull(post)
+    one = found([*meshes, (np.array(box.vertices), np.array(box.faces))], [*ring, "post"])
+    assert [part.name for part in one.design.parts] == ring
+    assert [(doubt.code, doubt.values["parts"]) for doubt in one.doubts] == [("init.meets-no-part", ("post",))]
 
 
 @pytest.mark.parametrize(
@@ -315,6 +358,28 @@ def init(place, *options):
     return done.output
 
 
+def test_the_picture_marks_what_is_not_sure(tmp_path, monkeypatch):
+    meshes, _ = bridge_parts.bridge(5, 0)
+    meshes[1] = bevelled(*meshes[1])
+    meshes[3] = chamfered(*meshes[3], steps=8)
+    names = bridge_parts.names(5)
+    for name, mesh in zip(names, meshes, strict=True):
+        bridge_parts.write_obj(tmp_path / f"design/{name}.obj", *mesh)
+    write_scans(tmp_path, meshes, names)
+    drawn = []
+    real = design_picture._name
+    monkeypatch.setattr(
+        design_picture, "_name", lambda axes, place, name, *rest: drawn.append(name) or real(axes, place, name, *rest)
+    )
+    assert "design.png" in init(tmp_path).splitlines()[0]
+    assert (tmp_path / "design.png").read_bytes().startswith(b"\x89PNG")
+    sure = {name for name in drawn if not name.startswith("?")}
+    assert {"? J1", "J2"} <= set(drawn)
+    assert f"? {names[3]}" in drawn
+    assert not {f"? {name}" for name in sure} & set(drawn)
+    assert set(names) | {"J1", "J2", "J3", "J4"} == {name.removeprefix("? ") for name in drawn}
+
+
 WRITERS = {"obj": bridge_parts.write_obj, "stl": bridge_parts.write_stl, "ply": write_ply}
 
 
@@ -377,7 +442,7 @@ def test_chinese_init_has_no_english_doubts_in_the_design_it_writes(tmp_path):
     assert len(unsure) > 3
     assert set(unsure) <= set(output.splitlines())
     names = {*bridge_parts.names(5), *(f"J{k}" for k in range(1, 5)), "kind", "arch", "bridge", "design", "units"}
-    assert latin(output.splitlines(), {*names, "json", "project", "toml", "mm", "cm"}) == []
+    assert latin(output.splitlines(), {*names, "json", "png", "project", "toml", "mm", "cm"}) == []
 
 
 @pytest.mark.parametrize("one_file", [True, False])
@@ -502,6 +567,45 @@ def test_a_step_file_a_part_of_an_independent_bridge(tmp_path):
     assert made.doubts == ()
     assert order(made.design) == bridge_parts.names(5)
     assert np.abs(made.design.joint_points[:, :4] - np.array(expected[1:])).max() < CORNER_MM
+
+
+@pytest.mark.usefixtures("cad_here")
+@pytest.mark.parametrize("gap", [0.0, 6.0])
+def test_spliced_girders_of_a_step_file_are_joined_where_they_end(tmp_path, gap):
+    """Splice plates and bolts are no parts: this is said, and the joints are those of the girders."""
+    from tests.support.solids import spliced_girders as girders
+
+    shapes, joints = girders.bodies(gap)
+    step_files.write_step(tmp_path / "all.step", shapes)
+    (tmp_path / "scans").mkdir()
+    for name in ("G1", "G2", "G3"):
+        np.savetxt(tmp_path / f"scans/{name}.xyz", np.random.default_rng(0).uniform(0.0, 1.0, (500, 3)))
+    guessed = guess.guess(tmp_path)
+    design = guessed.made.design
+    assert order(design) == ["G1", "G2", "G3"]
+    b, h = 0.5 * girders.WIDTH, 0.5 * girders.HEIGHT
+    for points, x in zip(design.joint_points, joints, strict=True):
+        assert np.abs(points[:4] - [[x, b, -h], [x, -b, -h], [x, -b, h], [x, b, h]]).max() < CORNER_MM
+    assert guessed.made.root_gap_mm == pytest.approx(gap)
+    assert [doubt.code for doubt in guessed.made.other_doubts] == ["init.splice-plates", "init.fasteners"]
+    assert codes(guessed.made.kind_doubts) == ["init.straight"]
+    guess.write_design(tmp_path, guessed)
+    assert len(list((tmp_path / "design-parts").iterdir())) == 3
+
+
+@pytest.mark.usefixtures("cad_here")
+def test_bodies_of_one_step_file_are_parts_only_where_scans_have_their_names(tmp_path):
+    """Girders end to end in one file may as well be a structure that is built."""
+    from tests.support.solids import spliced_girders as girders
+
+    shapes = {name: shape for name, shape in girders.bodies(0.0)[0].items() if name.startswith("G")}
+    step_files.write_step(tmp_path / "all.step", shapes)
+    (tmp_path / "scans").mkdir()
+    for name in ("S1", "S2"):
+        np.savetxt(tmp_path / f"scans/{name}.xyz", np.random.default_rng(0).uniform(0.0, 1.0, (500, 3)))
+    guessed = guess.guess(tmp_path)
+    assert guessed.made is None
+    assert guessed.kind == "structure"
 
 
 def section_of_stretch(k):

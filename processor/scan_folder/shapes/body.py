@@ -22,6 +22,14 @@ Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
+class Unsure:
+    """A joint, part or node of a guessed design that is not sure, and its place (3,), mm."""
+
+    name: str
+    place: Floats
+
+
+@dataclass(frozen=True)
 class Body:
     """Vertices (v, 3), mm, and triangles (f, 3) of a body; facets that meet share their vertices.
 

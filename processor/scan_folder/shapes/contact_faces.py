@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
 from processor.model import Floats, Ints
 from processor.scan_folder.shapes.body import Body
 
+GAP_MM = 60.0  # largest root gap of a joint
 PLANE_MM = 0.1  # a facet is in a plane if its corners are nearer
 MOST_PLANES = 400
 SMALL_SHARE = 0.02  # of the largest plane's area: smaller ones are not ends
@@ -17,6 +20,7 @@ OVERLAP_SHARE = 0.5  # of the smaller face's extents, in both directions of the 
 LARGER_MM = 200.0  # one section may project so far beyond the other
 OVERLAP_MM = 10.0  # bodies that overlap more do not meet
 RIVAL_SHARE = 0.5  # of the largest pair's area: smaller pairs of faces are not the joint
+FITTING_SHARE = 0.4  # least area of the smaller of two ends by the larger one's
 BESIDE_MM = 5.0  # a pair of faces that is hardly farther apart, in another plane, may as well be the joint
 
 
@@ -46,6 +50,41 @@ class Contact:
     b: PlaneFace
     gap_mm: float
     rival: bool
+
+    @property
+    def reverse(self) -> Contact:
+        """The same contact with a and b exchanged."""
+        return Contact(self.b, self.a, self.gap_mm, self.rival)
+
+    @property
+    def middle(self) -> Floats:
+        """Middle (3,) between both faces, mm."""
+        ends = (0.5 * (face.points.min(axis=0) + face.points.max(axis=0)) for face in (self.a, self.b))
+        return np.asarray(0.5 * sum(ends, np.zeros(3)))
+
+    @property
+    def sizes(self) -> tuple[Floats, Floats]:
+        """Sides (2,) of the rectangle around each face, in the axes of the first, mm."""
+        _, _, Vt = np.linalg.svd(self.a.points - self.a.origin, full_matrices=False)
+        return np.ptp(self.a.points @ Vt[:2].T, axis=0), np.ptp(self.b.points @ Vt[:2].T, axis=0)
+
+    @property
+    def fits(self) -> bool:
+        """Whether the faces are about as large, as those of a bolt's head and a flange are not."""
+        areas = [float(sides.prod()) for sides in self.sizes]
+        return min(areas) >= FITTING_SHARE * max(areas)
+
+
+def contacts(bodies: Sequence[Body]) -> dict[tuple[int, int], Contact]:
+    """Return the contact of each pair of bodies (i, k), i < k, that meet or lie GAP_MM apart at most."""
+    found = {}
+    for i, k in combinations(range(len(bodies)), 2):
+        a, b = bodies[i].bounds, bodies[k].bounds
+        if not ((a[0] - GAP_MM > b[1]) | (b[0] - GAP_MM > a[1])).any():
+            one = contact(bodies[i], bodies[k], GAP_MM)
+            if one is not None:
+                found[i, k] = one
+    return found
 
 
 def contact(a: Body, b: Body, limit_mm: float) -> Contact | None:
@@ -123,6 +162,11 @@ def _overlap(a: PlaneFace, b: PlaneFace) -> bool:
     low, high = np.maximum(x.min(axis=0), y.min(axis=0)), np.minimum(x.max(axis=0), y.max(axis=0))
     smaller = np.minimum(np.ptp(x, axis=0), np.ptp(y, axis=0))
     return bool((high - low > OVERLAP_SHARE * smaller).all())
+
+
+def same_place(a: PlaneFace, b: PlaneFace) -> bool:
+    """Whether two faces of a body lie in one plane and overlap."""
+    return _same_plane(a, b) and _overlap(a, b)
 
 
 def _same_plane(a: PlaneFace, b: PlaneFace) -> bool:

@@ -1,9 +1,10 @@
-"""A design.json from the surfaces in a folder: of an arch bridge in parts, or of a space frame."""
+"""A design.json from the surfaces in a folder: of parts that meet end to end, or of a space frame."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from processor.model import KEY_POINTS, ArchDesign, Floats, FrameDesign, Ints, Reason, reason
 from processor.scan_folder import component_names
 from processor.scan_folder.shapes import arch_bridge, guess_unit, space_frame, surface_files
-from processor.scan_folder.shapes.body import Body, stacked, welded
+from processor.scan_folder.shapes.body import Body, Unsure, stacked, welded
 from processor.scan_folder.units import MM_PER_UNIT
 
 PARTS = ("foot", "rib", "crown")  # words in the names of an arch bridge's parts
@@ -38,6 +39,7 @@ class GuessedDesign:
     files: tuple[str, ...] = ()
     mesh_of: dict[str, str] = field(default_factory=dict)
     meshes: tuple[tuple[str, Floats, Ints], ...] = ()
+    unsure: tuple[Unsure, ...] = ()  # joints, parts, nodes and members with doubts
 
     @property
     def doubts(self) -> tuple[Reason, ...]:
@@ -56,12 +58,16 @@ class _Parts:
 
 
 def guess(
-    folder: Path, group: Sequence[Path], scans: Sequence[tuple[float, str]], given_unit: str = ""
+    folder: Path,
+    group: Sequence[Path],
+    scans: Sequence[tuple[float, str]],
+    given_unit: str = "",
+    stems: Sequence[str] = (),
 ) -> GuessedDesign:
     """Guess the design that the files of one folder hold.
 
-    ``scans`` are the radius of each scan and the unit that its format states. Raises InputError for a file that cannot
-    be read.
+    ``scans`` are the radius of each scan and the unit that its format states, ``stems`` the names of their files
+    without suffix. Raises InputError for a file that cannot be read.
     """
     chosen, doubts = surface_files.one_a_stem(group)
     surfaces = [surface_files.read(folder, path, given_unit or "mm") for path in chosen]
@@ -82,12 +88,15 @@ def guess(
             units=_json_unit(surfaces, units),
             reasons=(reason("init.shown-by-balls", files=_some(names)),),
             files=names,
+            unsure=frame.unsure,
         )
     units = _unit(surfaces, scans, given_unit, as_whole=len(surfaces) == 1)
     if not units.unit:
         return GuessedDesign(other_doubts=tuple(doubts), unit_doubts=units.doubts, files=names)
     surfaces = _in_unit(folder, surfaces, before, units.unit)
-    guessed = _bridge(_bodies(folder, surfaces, units.unit), names, tuple(doubts), _json_unit(surfaces, units))
+    parts = _bodies(folder, surfaces, units.unit)
+    scanned = _scanned_apart(parts.bodies, stems)
+    guessed = _bridge(parts, names, tuple(doubts), _json_unit(surfaces, units), scanned)
     return replace(guessed, unit_doubts=units.doubts)
 
 
@@ -118,12 +127,15 @@ def _json_unit(surfaces: Sequence[surface_files.Surface], units: guess_unit.Desi
     return "mm" if all(surface.unit for surface in surfaces) else units.unit or "mm"
 
 
-def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[Reason, ...], json_unit: str) -> GuessedDesign:
-    whole = len(names) == 1
+def _bridge(
+    parts: _Parts, names: Sequence[str], doubts: tuple[Reason, ...], json_unit: str, scanned: bool
+) -> GuessedDesign:
+    """Return the design of parts that meet end to end; ``scanned``: each scan has the name of one of them."""
     found = arch_bridge.find(parts.bodies)
     named = _named_as_parts(parts.bodies)
-    if found.design is None or (whole and not found.arched and not named):
-        of_bridge = [reason("init.as-arch-bridge", reason=doubt) for doubt in found.doubts if named or not whole]
+    likely = named or scanned or len(names) > 1
+    if found.design is None or not (found.arched or likely):
+        of_bridge = [reason("init.as-arch-bridge", reason=doubt) for doubt in found.doubts if likely]
         return GuessedDesign(other_doubts=(*doubts, *of_bridge), files=tuple(names))
     mesh_of = {part.name: parts.mesh_of[part.name] for part in found.design.parts}
     return GuessedDesign(
@@ -131,16 +143,19 @@ def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[Reason, ...], jso
         other_doubts=(*doubts, *parts.doubts, *found.doubts),
         units="mm" if parts.meshes else json_unit,
         reasons=(reason("init.shown-by-parts", parts=len(mesh_of), files=_some(names)),),
-        kind_doubts=_kind_doubts(found.arched, named),
+        kind_doubts=_kind_doubts(found, named),
         root_gap_mm=found.root_gap_mm,
         files=tuple(names),
         mesh_of=mesh_of,
         meshes=tuple(mesh for mesh in parts.meshes if mesh[0] in mesh_of.values()),
+        unsure=found.unsure,
     )
 
 
-def _kind_doubts(arched: bool, named: bool) -> tuple[Reason, ...]:
-    if not arched:
+def _kind_doubts(found: arch_bridge.GuessedArch, named: bool) -> tuple[Reason, ...]:
+    if not found.row:
+        return (reason("init.no-row"),)
+    if not found.arched:
         return (reason("init.straight"),)
     return () if named else (reason("init.arch-not-named"),)
 
@@ -155,6 +170,14 @@ def _names(folder: Path, paths: Sequence[Path]) -> tuple[str, ...]:
 
 def _named_as_parts(bodies: Sequence[Body]) -> bool:
     return any(word in component_names.plain(body.name).split() for body in bodies for word in PARTS)
+
+
+def _scanned_apart(bodies: Sequence[Body], stems: Sequence[str]) -> bool:
+    """Whether two scans or more have the names of one body each, and none that of several."""
+    names = [body.name for body in bodies]
+    of_scan = [component_names.components(stem, names) for stem in stems]
+    single = [found[0] for found in of_scan if len(found) == 1]
+    return len(set(single)) > 1 and len(single) == len(stems)
 
 
 def _bodies(folder: Path, surfaces: Sequence[surface_files.Surface], units: str) -> _Parts:
@@ -220,7 +243,10 @@ def _arch(design: ArchDesign, mesh_of: Mapping[str, str], scale: float) -> dict[
             design.joint_names, design.joint_left, design.joint_right, design.joint_points, strict=True
         )
     ]
-    return {"order": [part.name for part in design.parts], "components": components, "joints": joints}
+    order = [part.name for part in design.parts]
+    joined = {frozenset(pair) for pair in zip(design.joint_left, design.joint_right, strict=True)}
+    in_order = all(frozenset(pair) in joined for pair in pairwise(order))
+    return {**({"order": order} if in_order else {}), "components": components, "joints": joints}
 
 
 def _frame(design: FrameDesign, scale: float) -> dict[str, Any]:

@@ -15,7 +15,8 @@ CHORDS_MM = 1.0  # the same of a section behind the end, which cuts facets of cu
 SQUARE_RAD = np.radians(35.0)  # largest departure of a corner from a right angle
 LEVEL_RAD = np.radians(20.0)  # largest slope of the lower and upper edges across the bridge
 DEPTHS_MM = np.array([60.0, 120.0, 180.0])  # of the sections that the skin is followed from to the end
-LEFT_COS = 0.5  # least cosine between +Y and the plane of a section
+LEFT = np.array([0.0, 1.0, 0.0])  # +Y, to the left of parts that follow each other along X
+LEFT_COS = 0.5  # least cosine between the way to the left and the plane of a section
 
 
 @dataclass(frozen=True)
@@ -28,9 +29,9 @@ class SectionPlane:
     up: Floats
 
     @staticmethod
-    def across(origin: Floats, normal: Floats) -> SectionPlane | None:
-        """Return the plane; None where +Y is too far from it to say which side is left."""
-        left = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
+    def across(origin: Floats, normal: Floats, way: Floats = LEFT) -> SectionPlane | None:
+        """Return the plane; None where ``way`` (3,), to the left, is too far from it to say which side is left."""
+        left = way - (way @ normal) * normal
         size = float(np.linalg.norm(left))
         if size < LEFT_COS:
             return None

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from processor.model import Floats, FrameDesign, Ints, Reason, reason
 from processor.scan_folder.shapes import balls, tubes
 from processor.scan_folder.shapes.balls import Balls
-from processor.scan_folder.shapes.body import Body
+from processor.scan_folder.shapes.body import Body, Unsure
 from processor.scan_folder.shapes.tubes import Tubes
 
 FEWEST_BALLS, FEWEST_MEMBERS = 3, 2
@@ -30,6 +30,7 @@ class GuessedFrame:
 
     design: FrameDesign
     doubts: tuple[Reason, ...] = ()
+    unsure: tuple[Unsure, ...] = ()  # nodes, and members by their middles
 
 
 def find(body: Body) -> GuessedFrame | None:
@@ -41,7 +42,7 @@ def find(body: Body) -> GuessedFrame | None:
     a, b, which, off = _members(nodes, pipes)
     if len(a) < FEWEST_MEMBERS:
         return None
-    doubts = _doubts(nodes, a, b, off)
+    doubts, unsure = _doubts(nodes, a, b, off)
     aside = _aside(body, nodes, pipes.ends[which], pipes.radii[which])
     if aside > OTHER_SHARE:
         doubts.append(reason("init.surface-aside", percent=100.0 * aside))
@@ -59,6 +60,7 @@ def find(body: Body) -> GuessedFrame | None:
             ids, nodes.centres, nodes.radii, member_a=ids[a], member_b=ids[b], tube_diameters=2.0 * pipes.radii[which]
         ),
         tuple(doubts),
+        unsure,
     )
 
 
@@ -131,8 +133,9 @@ def _coaxial(pipes: Tubes, which: Ints) -> np.ndarray:
     return result
 
 
-def _doubts(nodes: Balls, a: Ints, b: Ints, off: Floats) -> list[Reason]:
-    doubts = []
+def _doubts(nodes: Balls, a: Ints, b: Ints, off: Floats) -> tuple[list[Reason], tuple[Unsure, ...]]:
+    """Return the doubts about nodes and members, and the places of these."""
+    doubts = list[Reason]()
     doubtful = np.flatnonzero(~nodes.sure)
     if len(doubtful):
         percent, rms_mm = 100.0 * nodes.cover[doubtful[0]], nodes.rms[doubtful[0]]
@@ -150,7 +153,10 @@ def _doubts(nodes: Balls, a: Ints, b: Ints, off: Floats) -> list[Reason]:
     if len(eccentric):
         pairs = tuple(f"{a[m]}-{b[m]}" for m in eccentric[:6])
         doubts.append(reason("init.eccentric-members", count=len(eccentric), pairs=pairs))
-    return doubts
+    ids = np.unique(np.concatenate([doubtful, odd, alone])).astype(np.int64)
+    places = [Unsure(str(k), nodes.centres[k]) for k in ids.tolist()]
+    places += [Unsure(f"{a[m]}-{b[m]}", 0.5 * (nodes.centres[a[m]] + nodes.centres[b[m]])) for m in eccentric.tolist()]
+    return doubts, tuple(places)
 
 
 def _first(which: Ints) -> tuple[int | str, ...]:
