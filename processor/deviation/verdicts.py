@@ -17,7 +17,7 @@ from scipy.special import ndtri
 
 from processor.deviation.result import ErrorSource, Result
 from processor.geometry import mesh_distance
-from processor.limits import judging, measurands, standards
+from processor.limits import judging, limit_bounds, measurands, standards
 from processor.limits.judging import Comparison, JudgedLimits, Measured
 from processor.model import NORMAL_95, WORST_FIRST, Bools, Floats, Ints, Limit, Scene, Status, StructureDesign
 
@@ -68,7 +68,7 @@ def _components(result: Result) -> Mapping[str, Bools]:
 
 def _share(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool) -> Measured:
     """Share of core points within a limit: at least, as measured, and at most."""
-    low, high = standards.bounds(limit, {})
+    low, high = limit_bounds.bounds(limit, {})
     if not len(values):
         return Measured(name, np.nan, np.nan, np.nan, doubtful=True)
     within = float(np.mean((values >= low) & (values <= high)))
@@ -79,7 +79,7 @@ def _share(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool) 
 
 def _extreme(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool) -> Comparison:
     """Compare the least and the greatest deviation; return the one of the worse verdict, then nearer to its bound."""
-    low, high = standards.bounds(limit, {})
+    low, high = limit_bounds.bounds(limit, {})
     if not len(values):
         return judging.compare(limit, Measured(name, np.nan, np.nan, np.nan, doubtful=True))
     widened = half * float(ndtri(1.0 - 0.025 / len(values))) / NORMAL_95

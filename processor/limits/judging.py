@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.limits import standards
+from processor.limits import limit_bounds
 from processor.limits.decision_rule import decide
 from processor.model import Bools, Floats, Limit, Rows, Tolerance, Verdict, column, names, words, worst
 
@@ -93,7 +93,7 @@ class Comparison:
 
 def compare(limit: Limit, measured: Measured) -> Comparison:
     """Compare a quantity with a limit; indeterminate where either is not known."""
-    low, high = standards.bounds(limit, measured.sizes_mm)
+    low, high = limit_bounds.bounds(limit, measured.sizes_mm)
     unknown = any(map(math.isnan, (low, high, measured.low, measured.high)))
     least, most = (-math.inf, min(-low, high)) if measured.unsigned else (low, high)
     verdict = (
@@ -109,7 +109,7 @@ def limits_for(tolerance: Tolerance, measure: str, component: str = "") -> list[
     """
     found: dict[str, Limit] = {}
     for limit in tolerance.limits:
-        if limit.measure == measure and standards.names_component(limit, component):
+        if limit.measure == measure and limit_bounds.names_component(limit, component):
             known = found.get(limit.key)
             if known is None or limit.component is not None or known.component is None:
                 found[limit.key] = limit

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from processor.limits import measurands, standards
+from processor.limits import limit_bounds, measurands, project_limits, standards
 from processor.model import Floats, InputError, Limit, Tolerance, did_you_mean
 from processor.scan_folder.checked_table import Table
 from processor.scan_folder.files import PROJECT
@@ -26,10 +26,12 @@ def read_tolerance(project: Table) -> Tolerance | None:
     standard = table.text("standard", "")
     try:
         base = standards.load(standard) if standard else Tolerance()
-        choice = standards.choice(base)
+        choice = project_limits.choice(base)
     except InputError as error:
         raise InputError(f"{table.where}: {error}") from None
-    elsewhere = [key for key in table.values if key not in (*KEYS, *choice) and key in standards.choice(Tolerance())]
+    elsewhere = [
+        key for key in table.values if key not in (*KEYS, *choice) and key in project_limits.choice(Tolerance())
+    ]
     if elsewhere:
         known = ", ".join(limit.key for limit in base.limits)
         raise InputError(f"{table.where}: {standard} has no limit {elsewhere[0]!r}; it has {known}")
@@ -40,7 +42,7 @@ def read_tolerance(project: Table) -> Tolerance | None:
     for entry in table.tables(COMPONENTS):
         _only(entry, ("name", *of_one))
         of_components[entry.text("name")] = {key: _limit(entry, of_one[key]) for key in entry.values if key in of_one}
-    tolerance = standards.override(base, values, PROJECT, table.number("root_gap_mm", 0.0), of_components)
+    tolerance = project_limits.override(base, values, PROJECT, table.number("root_gap_mm", 0.0), of_components)
     _check_share(table, tolerance)
     return tolerance
 
@@ -62,13 +64,13 @@ def _only(table: Table, known: tuple[str, ...]) -> None:
 def _limit(table: Table, limit: Limit) -> Floats:
     """Read one limit: its greatest value, its least one, or both, as the standard's own row has it."""
     key = limit.key
-    if standards.at_least(limit):
+    if limit_bounds.at_least(limit):
         least = table.number(key)
         if not 0.0 < least <= 1.0:
             hint = f"; {least:g} % is {least / 100.0:g}" if 1.0 < least <= 100.0 else ""
             raise InputError(f"{table.where}: expected a share above 0, at most 1, as {key!r}, found {least:g}{hint}")
         return np.array([least])
-    if standards.two_sided(limit):
+    if limit_bounds.two_sided(limit):
         both = table.array(key, 2)
         if not both[0] < both[1]:
             raise InputError(
@@ -87,7 +89,7 @@ def _limit(table: Table, limit: Limit) -> Floats:
 def check_components(where: str, tolerance: Tolerance | None, names: Sequence[str]) -> None:
     """Raise InputError for limits of components that no name of the design fits; without names nothing is checked."""
     for limit in tolerance.limits if tolerance is not None and names else ():
-        if not any(standards.names_component(limit, name) for name in names):
+        if not any(limit_bounds.names_component(limit, name) for name in names):
             assert limit.component is not None
             known = ", ".join(names[:MOST_NAMES]) + (", ..." if len(names) > MOST_NAMES else "")
             raise InputError(

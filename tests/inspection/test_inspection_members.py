@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from processor.inspection import members, step
 from processor.language.messages import messages
-from processor.limits import standards
+from processor.limits import project_limits
 from processor.model import NORMAL_95, FrameDesign, Scene, Status, Tolerance, UsageError, Verdict
 from processor.space_frame.result import Flag
 from tests.support.results import ball_results
@@ -90,12 +90,12 @@ def test_unseen_members_have_a_reason():
 )
 def test_bow_is_judged_by_the_limit_of_the_project(limit, verdict):
     bounds = {"part_bow_mm": np.array([-limit, limit])}
-    tolerance = standards.override(Tolerance(), bounds, "project.toml")
+    tolerance = project_limits.override(Tolerance(), bounds, "project.toml")
     assert by_id(inspected(tolerance=tolerance)["10-11"], "bow").verdict is verdict
 
 
 def test_verdicts_are_indeterminate_where_another_pose_fits_as_well():
-    tolerance = standards.override(Tolerance(), {"part_bow_mm": np.array([-9.0, 9.0])}, "project.toml")
+    tolerance = project_limits.override(Tolerance(), {"part_bow_mm": np.array([-9.0, 9.0])}, "project.toml")
     found = inspected(found=ball_results.whole(matching="ambiguous"), tolerance=tolerance)
     assert by_id(found["10-11"], "bow").verdict is Verdict.INDETERMINATE
 
@@ -120,7 +120,7 @@ def test_deviation_of_a_frame_needs_spheres():
     [("ok", Verdict.PASS), ("low-confidence", Verdict.INDETERMINATE), ("wrong-size", Verdict.INDETERMINATE)],
 )
 def test_length_to_a_flagged_sphere_is_indeterminate(flag, verdict):
-    tolerance = standards.override(Tolerance(), {"part_length_mm": np.array([-99.0, 99.0])}, "project.toml")
+    tolerance = project_limits.override(Tolerance(), {"part_length_mm": np.array([-99.0, 99.0])}, "project.toml")
     found = ball_results.whole()
     flags = (Flag(flag), Flag.OK, *found.balls.flag[2:])
     found = dataclasses.replace(found, balls=dataclasses.replace(found.balls, flag=flags))

@@ -26,7 +26,7 @@ from processor.deviation.result import CorePoints, ErrorSource
 from processor.deviation.result import Result as DeviationResult
 from processor.jobs import exit_codes
 from processor.language.messages import messages
-from processor.limits import judging, measurands, standards
+from processor.limits import judging, measurands, project_limits, standards
 from processor.limits.judging import Measured
 from processor.model import (
     DesignBodies,
@@ -65,7 +65,7 @@ def given(of_components=None, **limits):
         name: {key: np.atleast_1d(np.float64(value)) for key, value in one.items()}
         for name, one in (of_components or {}).items()
     }
-    return standards.override(Tolerance(), values, "project.toml", of_components=named)
+    return project_limits.override(Tolerance(), values, "project.toml", of_components=named)
 
 
 # --- the mechanism
@@ -100,7 +100,7 @@ def test_every_limit_is_compared_or_states_what_it_needs():
 
 def test_classes_of_defects_are_those_of_the_step():
     assert {str(kind) for kind in DefectClass} == set(measurands.DEFECT_CLASSES)
-    for limit in standards.OF_PROJECTS:
+    for limit in project_limits.of_projects():
         if limit.measure in (measurands.DEFECT_DEPTH, measurands.DEFECT_AREA):
             assert measurands.class_of(limit) in ("", *measurands.DEFECT_CLASSES)
 

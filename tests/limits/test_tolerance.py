@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from processor.limits import measurands, standards
+from processor.limits import limit_bounds, measurands, standards
 from processor.model import InputError, Limit, Scan, Scene, Tolerance
 from processor.preassembly.verdicts import chain, joints
 from processor.scan_folder import folder
@@ -42,7 +42,7 @@ def test_every_limit_has_a_meaning_source_and_measure():
                 row.key
             )
             assert bool(row.of) == (not all(map(math.isnan, (row.high_ratio, row.above_mm, row.up_to_mm))))
-            low, high = standards.bounds(
+            low, high = limit_bounds.bounds(
                 row, dict.fromkeys(("length", "thickness", "diameter", "spacing", "height"), 1000.0)
             )
             assert low < high < math.inf
@@ -59,21 +59,21 @@ def test_only_limits_checked_in_print_are_verified():
 
 
 def test_numbers_by_hand():
-    assert standards.bounds(limit("GB 50205-2020", "misalignment_mm"), {}) == (-math.inf, 2.0)
-    assert standards.bounds(limit("GB 50205-2020", "groove_gap_mm"), {}) == (-1.0, 2.0)
+    assert limit_bounds.bounds(limit("GB 50205-2020", "misalignment_mm"), {}) == (-math.inf, 2.0)
+    assert limit_bounds.bounds(limit("GB 50205-2020", "groove_gap_mm"), {}) == (-1.0, 2.0)
     bow = limit("GB 50205-2020", "bow_mm")  # l/1500 and 10
-    assert standards.bounds(bow, {"length": 12_000.0})[1] == pytest.approx(8.0)
-    assert standards.bounds(bow, {"length": 30_000.0})[1] == 10.0
-    assert math.isnan(standards.bounds(bow, {})[1])
+    assert limit_bounds.bounds(bow, {"length": 12_000.0})[1] == pytest.approx(8.0)
+    assert limit_bounds.bounds(bow, {"length": 30_000.0})[1] == 10.0
+    assert math.isnan(limit_bounds.bounds(bow, {})[1])
     for name, expected in (("EN 1090-2", 4.0), ("EN 1090-2 class 1", 4.0), ("EN 1090-2 class 2", 3.0)):
         # At 10 m: 10000/5000 + 2 = 4 and 10000/10000 + 2 = 3.
-        bounds = standards.bounds(limit(name, "length_mm"), {"length": 10_000.0})
+        bounds = limit_bounds.bounds(limit(name, "length_mm"), {"length": 10_000.0})
         assert bounds == pytest.approx((-expected, expected))
     edge = limit("JTG arch rib", "misalignment_mm")  # 0.2 t and 2
-    assert standards.bounds(edge, {"thickness": 8.0})[1] == pytest.approx(1.6)
-    assert standards.bounds(edge, {"thickness": 24.0})[1] == 2.0
+    assert limit_bounds.bounds(edge, {"thickness": 8.0})[1] == pytest.approx(1.6)
+    assert limit_bounds.bounds(edge, {"thickness": 24.0})[1] == 2.0
     camber = limit("GB 50205-2020", "camber_not_specified_mm")  # +l/2000, -0
-    assert standards.bounds(camber, {"length": 40_000.0}) == pytest.approx((0.0, 20.0))
+    assert limit_bounds.bounds(camber, {"length": 40_000.0}) == pytest.approx((0.0, 20.0))
 
 
 def test_unknown_standard_names_those_there_are():
@@ -107,7 +107,7 @@ def test_a_projects_own_limits_win_and_go_through_the_store(tmp_path):
     found = scene.tolerance
     own = standards.find(found, "misalignment_mm")
     assert (own.high, own.verified, own.clause, own.source) == (1.5, True, "", "project.toml")
-    assert standards.bounds(standards.find(found, "groove_gap_mm"), {}) == (-2.0, 3.0)
+    assert limit_bounds.bounds(standards.find(found, "groove_gap_mm"), {}) == (-2.0, 3.0)
     assert standards.find(found, "span_mm").high == 5.0
     assert len(found.limits) == len(standards.load("GB 50205-2020").limits)
     assert found.root_gap_mm == 6.0
@@ -121,7 +121,7 @@ def test_a_projects_own_limits_win_and_go_through_the_store(tmp_path):
 def test_project_without_a_standard_has_its_own_limits_alone(tmp_path):
     scene = folder.read_input(write_project(tmp_path, "[tolerance]\nsplice_eccentricity_mm = 4.0\n"))
     assert [row.key for row in scene.tolerance.limits] == ["splice_eccentricity_mm"]
-    assert standards.bounds(scene.tolerance.limits[0], {}) == (-math.inf, 4.0)
+    assert limit_bounds.bounds(scene.tolerance.limits[0], {}) == (-math.inf, 4.0)
 
 
 def test_project_may_set_a_limit_that_no_standard_has(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from processor.adjustment import maximum_interval
-from processor.limits import standards
+from processor.limits import project_limits, standards
 from processor.model import ArchDesign, DesignPart, Tolerance, reason
 from processor.preassembly import to_result
 from processor.preassembly.chain import span_and_closure
@@ -19,7 +19,7 @@ NAN = float("nan")
 
 
 def own(**limits):
-    return standards.override(Tolerance(), {key: np.array(value) for key, value in limits.items()}, "project.toml")
+    return project_limits.override(Tolerance(), {key: np.array(value) for key, value in limits.items()}, "project.toml")
 
 
 def chord(value, sd):
@@ -111,7 +111,7 @@ def test_quantities_of_the_edges_by_hand():
 
 def test_unused_limits_are_reported():
     assert chain.unused_limits(GB) == []
-    mixed = standards.override(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
+    mixed = project_limits.override(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
     assert [limit.key for limit in chain.unused_limits(mixed)] == ["bow_mm"]
     params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=SimpleNamespace(known=True))
     assembly = SimpleNamespace(

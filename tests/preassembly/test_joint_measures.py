@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from processor.limits import standards
+from processor.limits import project_limits, standards
 from processor.limits.decision_rule import decide
 from processor.model import Limit, Tolerance, reason
 from processor.preassembly.ends.joint_frame import joint_frame
@@ -44,7 +44,9 @@ def some_covariance(seed, scale=0.3):
 
 def only(**limits):
     base = Tolerance("by hand")
-    return standards.override(base, {key: np.atleast_1d(np.float64(value)) for key, value in limits.items()}, "test")
+    return project_limits.override(
+        base, {key: np.atleast_1d(np.float64(value)) for key, value in limits.items()}, "test"
+    )
 
 
 def test_the_joints_axes_are_those_of_its_frame():
@@ -268,8 +270,8 @@ def test_unknown_gaps_and_unknown_sizes_are_indeterminate():
     assert not judge(lone(0.5, 0.1), jtg).limits.bounds_known.any()
     # A project that knows the thickness gives the number: 0.2 x 24 = 4.8 but 2 at most, and 0.2 x 8 = 1.6.
     (key,) = (limit.key for limit in jtg.limits if limit.measure == "misalignment")
-    assert judge(lone(0.5, 0.1), standards.override(jtg, {key: np.array([2.0])}, "x")).verdict == "pass"
-    assert judge(lone(1.7, 0.01), standards.override(jtg, {key: np.array([1.6])}, "x")).verdict == "fail"
+    assert judge(lone(0.5, 0.1), project_limits.override(jtg, {key: np.array([2.0])}, "x")).verdict == "pass"
+    assert judge(lone(1.7, 0.01), project_limits.override(jtg, {key: np.array([1.6])}, "x")).verdict == "fail"
     nothing = judge(lone(0.5, 0.1), standards.load("JGJ 7-2010"))
     assert (nothing.verdict, len(nothing.limits)) == ("indeterminate", 0)
     assert nothing.reasons == (reason("preassemble.no-joint-limit", standard="JGJ 7-2010"),)

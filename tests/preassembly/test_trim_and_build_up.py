@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.stats import norm
 
 from processor.language.messages import messages
-from processor.limits import standards
+from processor.limits import project_limits, standards
 from processor.model import Checked, StepRun, Tolerance, UsageError, reason
 from processor.preassembly.params import TrimParams
 from processor.preassembly.verdicts import joint_measures, joints, trim_and_build_up
@@ -250,7 +250,9 @@ def test_unknown_gaps_and_missing_limits_are_reported():
     assert unknown.action == "unknown"
     assert np.isnan(unknown.cut).all()
     assert codes(unknown) == ["gaps-unknown"]
-    no_groove = proposed(along(-3.0), limits=standards.override(Tolerance(), {"misalignment_mm": np.array([2.0])}, "x"))
+    no_groove = proposed(
+        along(-3.0), limits=project_limits.override(Tolerance(), {"misalignment_mm": np.array([2.0])}, "x")
+    )
     assert (no_groove.action, no_groove.probability) == ("nothing", 1.0)
     assert codes(no_groove)[0] == "no-groove-limit"
     by_thickness = proposed(along(-3.0), limits=standards.load("JTG arch rib"))

@@ -9,7 +9,7 @@ import pytest
 from designgen import recipe_files
 from designgen.export import folder as export_folder
 from designgen.scenes.make import make
-from processor.limits import standards
+from processor.limits import project_limits, standards
 from processor.model import KEY_POINTS, InputError, Tolerance
 from processor.scan_folder import control_points, folder, tolerance
 from processor.scan_folder.folder import read_input
@@ -56,7 +56,7 @@ def test_the_project_schema_names_every_key_that_is_read():
     assert set(folder.KEYS) <= set(project["properties"])
     assert set(folder.SCAN_KEYS) <= set(definitions["scan"]["properties"])
     assert set(control_points.KEYS) == set(definitions["control"]["properties"])
-    assert {*tolerance.KEYS, *standards.choice(Tolerance())} == set(definitions["tolerance"]["properties"])
+    assert {*tolerance.KEYS, *project_limits.choice(Tolerance())} == set(definitions["tolerance"]["properties"])
     assert set(definitions["tolerance"]["properties"]["standard"]["enum"]) == set(standards.standards())
     for name in ("project", "design-arch", "design-frame"):
         assert set(schema(name)["$defs"]["unit"]["enum"]) == {*MM_PER_UNIT, *SYNONYMS}

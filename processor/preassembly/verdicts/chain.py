@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from processor.adjustment import maximum_interval
+from processor.limits import limit_bounds
 from processor.limits import standards as limits_of
 from processor.limits.decision_rule import decide
 from processor.model import NORMAL_95, Floats, Limit, Reason, Tolerance, Verdict, reason, worst
@@ -95,7 +96,7 @@ def unused_limits(tolerance: Tolerance) -> list[Limit]:
 def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, doubtful: bool) -> Comparison:
     """Compare the value nearer to its limit; the probability is of single values only."""
     nan = float("nan")
-    low, high = limits_of.bounds(limit, {"length": span_mm})
+    low, high = limit_bounds.bounds(limit, {"length": span_mm})
     values, sd = measured
     known = np.isfinite(values) & np.isfinite(sd)
     values, sd = values[known], sd[known]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import normal_draws
-from processor.limits import standards as limits_of
+from processor.limits import limit_bounds
 from processor.limits.decision_rule import decide
 from processor.limits.judging import clause_of
 from processor.model import (
@@ -120,7 +120,7 @@ def allowed(limit: Limit, tolerance: Tolerance) -> Allowed:
 
     A project that knows the size gives the limit as a number.
     """
-    low, high = limits_of.bounds(limit, {})
+    low, high = limit_bounds.bounds(limit, {})
     return Allowed(limit, low, high, tolerance.root_gap_mm)
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from processor.adjustment import normal_draws
-from processor.limits import standards as limits_of
+from processor.limits import limit_bounds
 from processor.model import (
     KEY_POINTS,
     Bools,
@@ -229,7 +229,7 @@ def _best_work(
     error = _cut_errors(measures.points, params.cut_sd_mm, len(drawn))
     works = [NO_WORK]
     if judge(measures, groove).verdict is not Verdict.PASS:
-        room = limits_of.bounds(limit, {})[1] - params.aim_mm
+        room = limit_bounds.bounds(limit, {})[1] - params.aim_mm
         works += _works(measures, groove.root_gap_mm + params.aim_mm, max(params.least_mm, SHOWN_MM), room)
     marks = [conforming(limit, work.on(drawn, error)) for work in works]
     chosen = _choice(works, [_share([mark]) for mark in marks])
@@ -345,7 +345,7 @@ def _misaligned_by(measures: Measures, limit: Limit | None) -> Floats:
     """Excess (8, 3) over the limit of misalignment at each point along each axis that counts there."""
     excess = np.full((8, 3), np.nan if limit is None else 0.0)
     if limit is not None:
-        high = limits_of.bounds(limit, {})[1]
+        high = limit_bounds.bounds(limit, {})[1]
         for point, axis in ACROSS:
             excess[point, axis] = max(abs(measures.gaps[point, axis]) - high, 0.0) if not math.isnan(high) else np.nan
     return excess
@@ -423,6 +423,6 @@ def _misalignment_reasons(proposal: Proposal, measures: Measures, limit: Limit |
             )
             for by, p, a in beyond
         )
-        yield reason("preassemble.misaligned", limit=limits_of.bounds(limit, {})[1], edges=edges)
+        yield reason("preassemble.misaligned", limit=limit_bounds.bounds(limit, {})[1], edges=edges)
     elif proposal.misalignment_probability < 0.95:
         yield reason("preassemble.misalignment-near-limit")

@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 
 from processor.adjustment.scanner_class_errors import SHIFT_SD_MM
 from processor.geometry.sphere import BANDS, SECTORS
-from processor.limits import standards
+from processor.limits import limit_bounds, standards
 from processor.model import NORMAL_95, Bools, Floats, Reason, Tolerance, reason
 from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.members.records import Nodes
@@ -321,8 +321,8 @@ def blank_tolerance(radius: float, limits: Tolerance) -> tuple[float, float]:
     """
     for standard in (limits, standards.load(standards.DEFAULT)):
         for limit in standard.limits:
-            if limit.key.startswith("ball_blank_diameter_") and standards.applies(limit, 2.0 * radius):
-                low, high = standards.bounds(limit, {"diameter": 2.0 * radius})
+            if limit.key.startswith("ball_blank_diameter_") and limit_bounds.applies(limit, 2.0 * radius):
+                low, high = limit_bounds.bounds(limit, {"diameter": 2.0 * radius})
                 return -0.5 * low, 0.5 * high
     return NAN, NAN
 
