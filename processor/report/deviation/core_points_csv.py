@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from processor import large_arrays
 from processor.geometry.m3c2 import Distances
 from processor.model import Floats
 
@@ -18,17 +19,17 @@ def csv_text(origin: Floats, core: Floats, distances: Distances, normals: Floats
 
     nan stands where there is none. n1 and std1 are of the reference, n2 and std2 of the compared cloud.
     """
-    return "".join(_lines(origin, core, distances, normals))
+    return "".join(parts(origin, core, distances, normals))
 
 
-def _lines(origin: Floats, core: Floats, distances: Distances, normals: Floats) -> Iterator[str]:
+def parts(origin: Floats, core: Floats, distances: Distances, normals: Floats) -> Iterator[str]:
+    """Pass over the text of :func:`csv_text`."""
     yield ",".join(COLUMNS) + "\n"
-    for start in range(0, len(core), ROWS_AT_ONCE):
-        part = slice(start, start + ROWS_AT_ONCE)
-        significant = distances.significant[part].astype(np.int64)
+    for rows in large_arrays.blocks(len(core), ROWS_AT_ONCE):
+        one = distances.at(rows)
         numbers = (
-            *(core[part] + origin).T, distances.distance[part], distances.lod95[part], significant, distances.n1[part],
-            distances.n2[part], distances.std1[part], distances.std2[part], *normals[part].T,
+            *(core[rows] + origin).T, one.distance, one.lod95, one.significant.astype(np.int64), one.n1, one.n2,
+            one.std1, one.std2, *normals[rows].T,
         )  # fmt: skip
         texts = [map(repr, column.tolist()) for column in numbers]
         yield "".join(",".join(row) + "\n" for row in zip(*texts, strict=True))
