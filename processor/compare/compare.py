@@ -268,10 +268,11 @@ def _seen_from(
         return None
     ends, positions = np.cumsum([len(scan.points) for scan in reference.scans]), allocate(core.count, 3)
     # A normal was fitted to points within half of the diameter.
-    nearest = core_tiles.nearest(grid, core, wanted, 0.5 * diameter) if len(ends) > 1 else np.where(wanted, 0, -1)
+    nearest = core_tiles.nearest(grid, core, wanted, 0.5 * diameter) if len(ends) > 1 else None
     for rows in blocks(core.count):
-        scan = np.searchsorted(ends, nearest[rows], side="right")
-        positions[rows] = scanners[np.where(nearest[rows] < 0, len(ends), scan)]
+        row = np.where(wanted[rows], 0, -1) if nearest is None else nearest[rows]
+        scan = np.searchsorted(ends, row, side="right")
+        positions[rows] = scanners[np.where(row < 0, len(ends), scan)]
     return positions
 
 
