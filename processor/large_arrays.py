@@ -14,7 +14,7 @@ import mmap
 import os
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +31,9 @@ class NoRoomError(OSError):
 
 
 BLOCK_ROWS = 1 << 18
+AT_ONCE = 1 << 20  # rows that are sorted in memory: more are sorted part by part, with the same result
+SUMMED = 128  # numbers that numpy adds in a loop
+PIVOTS = 255
 MEMORY_BYTES = 1 << 26  # of arrays in memory, about 2 million points
 LEAST_BYTES = 1 << 16  # of an array in a file
 TOUCHED_BYTES = 1 << 25  # written one after the other before their pages are given back
@@ -172,6 +175,62 @@ def extremes(array: Array) -> tuple[float, float]:
     return float(np.min([low for low, _ in parts])), float(np.max([high for _, high in parts]))
 
 
+def corners(points: Array) -> tuple[Array, Array]:
+    """Return the least and the greatest number of each column (m,) of an array (n, m), n > 0."""
+    parts = [(points[rows].min(axis=0), points[rows].max(axis=0)) for rows in blocks(len(points))]
+    return np.min([low for low, _ in parts], axis=0), np.max([high for _, high in parts], axis=0)
+
+
+def total(array: Array, of: Callable[[Array], Array] = np.asarray) -> float:
+    """Return the sum of ``of(array)`` (n,), where ``of`` computes a number of each row alone, to the bit of np.sum.
+
+    numpy halves what is more than SUMMED numbers, at a multiple of eight, and adds the sums of the halves.
+    """
+    if len(array) <= max(BLOCK_ROWS, SUMMED):
+        release()
+        return float(np.sum(of(array)))
+    half = len(array) // 2 // 8 * 8
+    return total(array[:half], of) + total(array[half:], of)
+
+
+def median(array: Array) -> float:
+    """Return the median of an array (n,), n > 0, of finite numbers."""
+    if len(array) <= AT_ONCE:
+        return float(np.median(array))
+    return 0.5 * (_of_rank(array, (len(array) - 1) // 2) + _of_rank(array, len(array) // 2))
+
+
+def _of_rank(array: Array, rank: int) -> float:
+    """Return the number of a rank, from 0, by counting the numbers between some of those that may be it."""
+    (low, high), below = extremes(array), 0
+    while low < high:
+        sample = np.sort(np.concatenate([part[:: max(1, len(part) // 8)] for part in _between(array, low, high)]))
+        pivots = np.unique(sample[:: max(1, len(sample) // PIVOTS)])
+        count = np.zeros(2 * len(pivots) + 1, np.int64)  # of numbers less than the first, equal to it, between two, ...
+        for part in _between(array, low, high):
+            place = np.searchsorted(pivots, part) + np.searchsorted(pivots, part, "right")
+            count += np.bincount(place, minlength=len(count))
+        before = below + np.cumsum(count) - count
+        found = int(np.searchsorted(before, rank, "right")) - 1
+        if found % 2:
+            return float(pivots[found // 2])
+        below = int(before[found])
+        low = np.nextafter(pivots[found // 2 - 1], np.inf) if found else low
+        high = np.nextafter(pivots[found // 2], -np.inf) if found < 2 * len(pivots) else high
+    return low
+
+
+def _between(array: Array, low: float, high: float) -> Iterator[Array]:
+    for rows in blocks(len(array)):
+        yield array[rows][(array[rows] >= low) & (array[rows] <= high)]
+
+
+def first_of(array: Array, value: float) -> int:
+    """Return the first row of an array (n,) that has a value, which one has."""
+    found = (rows.start + np.flatnonzero(array[rows] == value) for rows in blocks(len(array)))
+    return int(next(rows[0] for rows in found if len(rows)))
+
+
 def every(array: Array, step: int) -> Array:
     """Return a copy of every k-th row."""
     parts = [array[-(-rows.start // step) * step : rows.stop : step].copy() for rows in blocks(len(array))]
@@ -205,4 +264,44 @@ def chosen(array: Array, kept: npt.NDArray[np.bool_]) -> Array:
         part = array[rows][kept[rows]]
         found[count : count + len(part)] = part
         count += len(part)
+    return found
+
+
+# --- rows sorted through files ----------------------------------------------------------------------------------------
+
+
+def in_parts(
+    passed: Iterable[tuple[Array, ...]],
+    part_of: Callable[[tuple[Array, ...]], npt.NDArray[np.int64]],
+    ends: npt.NDArray[np.int64],
+) -> list[Array]:
+    """Return columns (n, ...), which are ``passed`` block by block, sorted by the part of each row, in order within it.
+
+    ``part_of`` is called for each block and returns the part (m,) of its rows; part k ends before row ``ends[k]``.
+    """
+    found: list[Array] = []
+    place = ends - np.diff(ends, prepend=0)
+    for block in passed:
+        found = found or [allocate(int(ends[-1]), *one.shape[1:], dtype=one.dtype.type) for one in block]
+        part = part_of(block)
+        order, count = np.argsort(part, kind="stable"), np.bincount(part, minlength=len(place))
+        rows = np.repeat(place - (np.cumsum(count) - count), count) + np.arange(len(part))
+        for column, one in zip(found, block, strict=True):
+            column[rows] = one[order]
+        place = place + count
+    return found
+
+
+def put_back(values: Array, rows: npt.NDArray[np.int64]) -> Array:
+    """Return the array (n, ...) whose ``rows`` (n,), each of which is there once, are ``values`` (n, ...)."""
+    if len(rows) <= AT_ONCE:
+        found = allocate(*values.shape, dtype=values.dtype.type)
+        found[rows] = values
+        return found
+    ends = np.array([part.stop for part in blocks(len(rows), AT_ONCE)])
+    passed = ((values[part], rows[part]) for part in blocks(len(rows)))
+    found, row = in_parts(passed, lambda block: block[1] // AT_ONCE, ends)
+    for part in blocks(len(rows), AT_ONCE):
+        own = found[part].copy()
+        found[part][row[part] - part.start] = own
     return found

@@ -56,12 +56,14 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
     All lengths are in the unit of the clouds, with --units in that of REFERENCE; those not given are derived from the
     clouds' density.
     """
+    from processor import large_arrays
     from processor.compare import compare as comparing
     from processor.jobs import tile_cluster
     from processor.language.messages import messages
     from processor.plain_text import printable
     from processor.report import comparison
     from processor.scan_folder.files import missing
+    from processor.store import output_checks
 
     for path in (reference, compared):
         if not path.exists():
@@ -69,9 +71,10 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
     comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
     address = options.pop("cluster")
     given = {name: value for name, value in options.items() if value is not None}
-    with tile_cluster.on_cluster(address, print_error_line):
-        result = comparing.compare(comparing.Request(reference, compared, **given), print_error_line)
-    record = comparison.write(output, result, lang)
+    with large_arrays.in_files(output_checks.existing_parent(output)):
+        with tile_cluster.on_cluster(address, print_error_line):
+            result = comparing.compare(comparing.Request(reference, compared, **given), print_error_line)
+        record = comparison.write(output, result, lang)
     if as_json:
         click.echo(json.dumps(record, ensure_ascii=False))
         return

@@ -1,15 +1,17 @@
-"""M3C2 between two clouds, in their own unit, without a design."""
+"""M3C2 between two clouds, in their own unit, without a design.
+
+Within :func:`processor.large_arrays.in_files` large clouds and results lie in files: no step holds all of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from processor import readers, store
+from processor import large_arrays, readers, store
 from processor.compare import core_tiles, diagnosis, units
 from processor.compare import normals_file as scan_folder_normals
 from processor.compare.core_tiles import Lengths
@@ -18,7 +20,8 @@ from processor.geometry.m3c2 import CloudNormals, Distances, Scales, Summary
 from processor.geometry.normal_orientation import Turned
 from processor.geometry.point_grid import PointGrid
 from processor.language.messages import messages
-from processor.model import Floats, InputError, Reason, UsageError, reason
+from processor.large_arrays import allocate, blocks, put_back
+from processor.model import Floats, InputError, Reason, Scan, UsageError, reason
 from processor.readers import RawScan
 from processor.readers.raw_scan import FAR, ORIGIN_STEP
 from processor.scan_folder.units import MM_PER_UNIT
@@ -120,24 +123,33 @@ class _Cloud:
 
     def lowest(self) -> Floats:
         """Return the least coordinates (3,)."""
-        corner: Floats = np.min([self._placed(scan, np.zeros(3)).min(axis=0) for scan in self.scans], axis=0)
+        corner: Floats = np.min([part.min(axis=0) for part in self._placed(np.zeros(3))], axis=0)
         return corner
 
     def relative_to(self, origin: Floats) -> Floats:
         """Return the points (n, 3) of all scans minus an origin; offsets are subtracted first, for precision."""
-        return np.concatenate([self._placed(scan, origin) for scan in self.scans])
+        points, count = allocate(self.count, 3), 0
+        for part in self._placed(origin):
+            points[count : count + len(part)] = part
+            count += len(part)
+        return points
 
     def scanners(self, origin: Floats) -> list[Floats]:
         """Return the scanner's position (3,) of each scan minus an origin; NaN where the file has none."""
         return [
-            self._placed(replace(scan, points=np.zeros((1, 3)), origin=scan.position), origin)[0]
+            self._at(replace(scan, origin=scan.position), np.zeros((1, 3)), origin)[0]
             if scan.position.size
             else np.full(3, np.nan)
             for scan in self.scans
         ]
 
-    def _placed(self, scan: RawScan, origin: Floats) -> Floats:
-        points, offset, scale = scan.points, scan.origin, self.scale
+    def _placed(self, origin: Floats) -> Iterator[Floats]:
+        for scan in self.scans:
+            for rows in blocks(len(scan.points), large_arrays.AT_ONCE):
+                yield self._at(scan, scan.points[rows], origin)
+
+    def _at(self, scan: RawScan, points: Floats, origin: Floats) -> Floats:
+        offset, scale = scan.origin, self.scale
         if scan.T_project_scan.size:
             T = scan.T_project_scan
             points, offset = points @ T[:3, :3].T, T[:3, :3] @ offset + T[:3, 3]
@@ -159,8 +171,9 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     reference, compared = clouds["reference"], clouds["compared"]
     unit = _unit(list(clouds.values()))
     origin = _origin(reference)
-    core = np.ascontiguousarray(clouds.get("core", reference).relative_to(origin))
+    core = clouds.get("core", reference).relative_to(origin)
     first, second = (neighbors.of_spacing(cloud.relative_to(origin)) for cloud in (reference, compared))
+    tiled = neighbors.of_spacing(core) if "core" in clouds else first
     used = m3c2.derive_scales(
         first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth
     )
@@ -169,16 +182,16 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     _log_scales(request, used, unit, log)
     if request.normals is not None:
         turned, source = None, reason("compare.normals-of-file", file=request.normals.name)
-        normals = scan_folder_normals.read(request.normals, core, origin, used.projection_diameter_mm)
+        normals = scan_folder_normals.read(request.normals, core, origin, used.projection_diameter_mm)[tiled.order]
     else:
-        turned = _fitted_normals(reference, first, core, origin, used.normal_diameter_mm)
+        turned = _fitted_normals(reference, first, tiled, origin, used.normal_diameter_mm)
         normals = turned.normals
         source = reason("compare.normals-of-planes-upright") if turned.upright else reason("compare.normals-of-planes")
-    diameter = used.projection_diameter_mm
-    lengths = Lengths(diameter, used.max_depth_mm, request.registration_error)
-    distances = core_tiles.distances(_sorted(first, diameter), _sorted(second, diameter), core, normals, lengths)
+    distances = _distances((first, second), tiled, normals, used, request.registration_error)
+    normals = put_back(normals, tiled.order)
+    turned = turned and replace(turned, normals=normals)
     summary = m3c2.summary(distances, core, normals, used.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
-    if not np.isfinite(distances.distance).any():
+    if not any(np.isfinite(distances.distance[rows]).any() for rows in blocks(len(core))):
         why = diagnosis.no_distance(first.cells.points, second.cells.points, core, summary.without_normal, used)
         raise InputError(f"{request.reference} and {request.compared}: no core point has a distance: {why}")
     given = {} if request.normals is None else {"normals": checksums.of_file(request.normals)}
@@ -220,31 +233,46 @@ def _read_clouds(request: Request) -> dict[str, _Cloud]:
     return clouds
 
 
-def _fitted_normals(reference: _Cloud, grid: PointGrid, core: Floats, origin: Floats, diameter: float) -> Turned:
+def _distances(
+    clouds: tuple[PointGrid, PointGrid], core: PointGrid, normals: Floats, used: Scales, registration_error: float
+) -> Distances:
+    """Measure at core points with normals (k, 3) in the order of their grid; returns distances in that of the file."""
+    diameter = used.projection_diameter_mm
+    lengths = Lengths(diameter, used.max_depth_mm, registration_error)
+    reference, compared = (_sorted(cloud, diameter) for cloud in clouds)
+    measured = core_tiles.distances(reference, compared, core, normals, lengths)
+    return Distances(**{name: put_back(column, core.order) for name, column in vars(measured).items()})
+
+
+def _fitted_normals(reference: _Cloud, grid: PointGrid, core: PointGrid, origin: Floats, diameter: float) -> Turned:
     """Return oriented normals (k, 3) of planes fitted to the reference, whose points are in ``grid``."""
     fitted = core_tiles.normals(_sorted(grid, diameter), core, diameter)
-    scanner = _seen_from(reference, core, fitted, diameter, origin)
-    return normal_orientation.turned(fitted, core, diameter, scanner)
+    scanner = _seen_from(reference, grid, core, fitted, diameter, origin)
+    return normal_orientation.turned(fitted, core.cells.points, diameter, scanner)
 
 
 def _seen_from(
-    reference: _Cloud, core: Floats, fitted: CloudNormals, normal_diameter: float, origin: Floats
+    reference: _Cloud, grid: PointGrid, core: PointGrid, fitted: CloudNormals, diameter: float, origin: Floats
 ) -> Floats | None:
     """Return the scanner's position (k, 3) at core points whose normals have no sign yet, NaN elsewhere.
 
     None where all normals have a sign, or the file gives no scanner.
     """
-    scanners = reference.scanners(origin)
-    rows = np.flatnonzero(normal_orientation.undecided(fitted, normal_diameter))
-    if not len(rows) or not any(np.isfinite(position).all() for position in scanners):
+    scanners = np.array([*reference.scanners(origin), np.full(3, np.nan)])
+    if not np.isfinite(scanners).all(axis=1).any():
         return None
-    positions = np.full(core.shape, np.nan)
-    if len(scanners) == 1:
-        positions[rows] = scanners[0]
-        return positions
-    _, nearest = cKDTree(reference.relative_to(origin)).query(core[rows], workers=-1)
-    ends = np.cumsum([len(scan.points) for scan in reference.scans])
-    positions[rows] = np.array(scanners)[np.searchsorted(ends, nearest, side="right")]
+    wanted = allocate(core.count, dtype=np.bool_)
+    for rows in blocks(core.count):
+        wanted[rows] = normal_orientation.undecided(fitted.at(rows), diameter)
+    if not wanted.any():
+        return None
+    ends, positions = np.cumsum([len(scan.points) for scan in reference.scans]), allocate(core.count, 3)
+    # A normal was fitted to points within half of the diameter.
+    nearest = core_tiles.nearest(grid, core, wanted, 0.5 * diameter) if len(ends) > 1 else None
+    for rows in blocks(core.count):
+        row = np.where(wanted[rows], 0, -1) if nearest is None else nearest[rows]
+        scan = np.searchsorted(ends, row, side="right")
+        positions[rows] = scanners[np.where(row < 0, len(ends), scan)]
     return positions
 
 
@@ -256,16 +284,19 @@ def _sorted(grid: PointGrid, diameter: float) -> PointGrid:
 
 def _read(path: Path) -> _Cloud:
     if path.suffix.lower() == ".h5" and path.is_file():
-        scans = store.read_scene(path).scans
-        raws = [
-            RawScan(s.name, s.points, s.origin, position=s.position, T_project_scan=s.T_project_scan, unit="mm")
-            for s in scans
-        ]
+        scans = [_bare(scan, "mm") for scan in store.read_scene(path).scans]
     else:
-        raws = readers.read(path)
-    if not sum(len(scan.points) for scan in raws):
+        scans = [_bare(scan, scan.unit) for scan in readers.read(path)]
+    if not sum(len(scan.points) for scan in scans):
         raise InputError(f"{path}: expected points, found none")
-    return _Cloud(path, [scan for scan in raws if len(scan.points)], checksums.of_file(path))
+    return _Cloud(path, [scan for scan in scans if len(scan.points)], checksums.of_file(path))
+
+
+def _bare(scan: Scan | RawScan, unit: str) -> RawScan:
+    """Return a scan without what no distance needs, such as intensities."""
+    return RawScan(
+        scan.name, scan.points, scan.origin, position=scan.position, T_project_scan=scan.T_project_scan, unit=unit
+    )
 
 
 def _unit(clouds: list[_Cloud]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor import unit_ratio
+from processor import large_arrays, unit_ratio
 from processor.geometry.m3c2 import Scales
 from processor.model import Floats
 
@@ -43,7 +43,8 @@ def _different_units(reference: Floats, compared: Floats) -> str:
 
 
 def _extent(cloud: Floats) -> float:
-    return float(np.linalg.norm(np.ptp(cloud, axis=0)))
+    low, high = large_arrays.corners(cloud)
+    return float(np.linalg.norm(high - low))
 
 
 def no_distance(reference: Floats, compared: Floats, core: Floats, without_normal: int, used: Scales) -> str:
@@ -70,5 +71,6 @@ def no_distance(reference: Floats, compared: Floats, core: Floats, without_norma
 
 def box_distance(a: Floats, b: Floats) -> float:
     """Return the distance between the bounding boxes of two clouds (n, 3) and (m, 3), 0 where they overlap."""
-    gap = np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0))
+    (low, high), (other_low, other_high) = large_arrays.corners(a), large_arrays.corners(b)
+    gap = np.maximum(low - other_high, other_low - high)
     return float(np.linalg.norm(np.maximum(gap, 0.0)))

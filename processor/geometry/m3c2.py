@@ -14,11 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from processor import large_arrays
 from processor.distinct_rows import distinct
 from processor.geometry import neighbors, point_grid
 from processor.geometry.linalg_small import eigen
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
+from processor.large_arrays import allocate, blocks, chosen, total
 from processor.model import Bools, Floats, InputError, Ints
 
 CELLS_PER_DIAMETER = 4.0
@@ -35,6 +37,10 @@ class CloudNormals:
     roughness: Floats
     count: Ints
 
+    def at(self, rows: slice) -> CloudNormals:
+        """Return the rows of a slice."""
+        return CloudNormals(self.normals[rows], self.roughness[rows], self.count[rows])
+
 
 @dataclass(frozen=True)
 class Distances:
@@ -50,6 +56,10 @@ class Distances:
     n2: Ints
     std1: Floats
     std2: Floats
+
+    def at(self, rows: slice | Ints) -> Distances:
+        """Return some rows."""
+        return Distances(**{name: column[rows] for name, column in vars(self).items()})
 
     @property
     def significant(self) -> Bools:
@@ -202,7 +212,8 @@ def rounded(value: float) -> float:
 def _normal_diameter(reference: PointGrid, projection: float) -> float:
     """Take NORMAL_TO_ROUGHNESS times the roughness at the scale of the projection, within bounds."""
     places = _scale_sample(reference.cells.points)
-    roughness = normals(reference, places, projection).roughness
+    parts = [normals(reference, places[part], projection) for part in blocks(len(places), neighbors.SEARCHED)]
+    roughness = np.concatenate([np.empty(0), *(part.roughness for part in parts)])
     known = roughness[np.isfinite(roughness)]
     wanted = NORMAL_TO_ROUGHNESS * float(np.median(known)) if len(known) else 0.0
     return float(np.clip(wanted, NORMAL_SHARE[0] * projection, NORMAL_SHARE[1] * projection))
@@ -210,13 +221,15 @@ def _normal_diameter(reference: PointGrid, projection: float) -> float:
 
 def _depth(compared: PointGrid, core: Floats, projection: float) -> float:
     """Take twice the distance of most core points from the other cloud, within bounds; farther ones get no distance."""
-    near = neighbors.nearest(compared, _scale_sample(core))
+    places = _scale_sample(core)
+    parts = [neighbors.nearest(compared, places[part]) for part in blocks(len(places), neighbors.SEARCHED)]
+    near = np.concatenate([np.empty(0), *parts])
     far = float(np.quantile(near[np.isfinite(near)], FAR_QUANTILE)) if np.isfinite(near).any() else 0.0
     return min(max(projection, DEPTH_TO_DISTANCE * far), DEEPEST * projection)
 
 
 def _scale_sample(points: Floats) -> Floats:
-    return points[:: max(1, len(points) // SCALE_SAMPLE)]
+    return large_arrays.every(points, max(1, len(points) // SCALE_SAMPLE))
 
 
 # --- Statistics of all core points
@@ -257,30 +270,47 @@ class Summary:
 
 def summary(measured: Distances, core: Floats, normals: Floats, projection_diameter_mm: float, few: int) -> Summary:
     """Summarise distances at core points (k, 3) with normals (k, 3); fewer than ``few`` points count as few."""
-    known = np.isfinite(measured.lod95)
-    distance = measured.distance[known]
-    significant = measured.significant[known]
-
-    def statistic(name: str) -> float:
-        return float(getattr(np, name)(distance)) if len(distance) else float("nan")
-
+    known = allocate(len(core), dtype=np.bool_)
+    without_normal = few_points = 0
+    for rows in blocks(len(core)):
+        known[rows] = np.isfinite(measured.lod95[rows])
+        without_normal += int((~np.isfinite(normals[rows]).all(axis=1)).sum())
+        few_points += int((np.minimum(measured.n1[rows], measured.n2[rows])[known[rows]] < few).sum())
+    distance, lod95, places = (chosen(column, known) for column in (measured.distance, measured.lod95, core))
+    significant = allocate(len(distance), dtype=np.bool_)
+    for rows in blocks(len(distance)):
+        significant[rows] = np.abs(distance[rows]) > lod95[rows]
+    figures = _figures(distance, lod95) if len(distance) else dict.fromkeys(FIGURES, float("nan"))
     return Summary(
         core_points=len(core),
-        without_normal=int((~np.isfinite(normals).all(axis=1)).sum()),
-        without_lod=int((~known).sum()),
-        few_points=int((np.minimum(measured.n1, measured.n2)[known] < few).sum()),
-        significant=int(significant.sum()),
-        significant_share=share(significant, core[known], SHARE_CELL * projection_diameter_mm),
-        mean=statistic("mean"),
-        median=statistic("median"),
-        sd=statistic("std"),
-        rms=float(np.sqrt(np.mean(distance**2))) if len(distance) else float("nan"),
-        min=statistic("min"),
-        max=statistic("max"),
-        lod95_median=float(np.median(measured.lod95[known])) if known.any() else float("nan"),
-        min_lod95=float(measured.lod95[known][np.argmin(distance)]) if len(distance) else float("nan"),
-        max_lod95=float(measured.lod95[known][np.argmax(distance)]) if len(distance) else float("nan"),
+        without_normal=without_normal,
+        without_lod=len(core) - len(distance),
+        few_points=few_points,
+        significant=int(np.count_nonzero(significant)),
+        significant_share=share(significant, places, SHARE_CELL * projection_diameter_mm),
+        **figures,
     )
+
+
+FIGURES = ("mean", "median", "sd", "rms", "min", "max", "lod95_median", "min_lod95", "max_lod95")
+
+
+def _figures(distance: Floats, lod95: Floats) -> dict[str, float]:
+    """Return FIGURES of distances (k,) with levels of detection (k,), k > 0."""
+    count = len(distance)
+    mean = total(distance) / count
+    low, high = large_arrays.extremes(distance)
+    return {
+        "mean": mean,
+        "median": large_arrays.median(distance),
+        "sd": math.sqrt(total(distance, lambda part: (part - mean) ** 2) / count),
+        "rms": math.sqrt(total(distance, np.square) / count),
+        "min": low,
+        "max": high,
+        "lod95_median": large_arrays.median(lod95),
+        "min_lod95": float(lod95[large_arrays.first_of(distance, low)]),
+        "max_lod95": float(lod95[large_arrays.first_of(distance, high)]),
+    }
 
 
 def share(marked: Bools, places: Floats, cell: float) -> Share:
@@ -290,10 +320,20 @@ def share(marked: Bools, places: Floats, cell: float) -> Share:
     """
     if not len(marked):
         return Share(float("nan"), float("nan"), float("nan"))
-    p = float(marked.mean())
-    number = distinct(np.floor((places - places.min(axis=0)) / cell).astype(np.int64)).number
-    sums = np.bincount(number, marked - p)
-    cells = len(sums)
+    p = int(np.count_nonzero(marked)) / len(marked)
+    low = large_arrays.corners(places)[0]
+
+    def cells_of(rows: slice) -> Ints:
+        return np.floor((places[rows] - low) / cell).astype(np.int64)
+
+    filled = np.empty((0, 3), np.int64)
+    for rows in blocks(len(marked)):
+        filled = distinct(np.concatenate([filled, distinct(cells_of(rows)).rows])).rows
+    cells = len(filled)
+    sums = np.zeros(cells)
+    for rows in blocks(len(marked)):  # added in the order of the rows, whatever the blocks are
+        number = distinct(np.concatenate([filled, cells_of(rows)])).number[cells:]
+        np.add.at(sums, number, marked[rows] - p)
     variance = float(sums @ sums) / len(marked) ** 2 * cells / max(cells - 1, 1)
     count = min(max(p * (1.0 - p) / variance, 1.0), float(len(marked))) if variance > 0.0 else float(cells)
     middle = (p + Z95**2 / (2.0 * count)) / (1.0 + Z95**2 / count)

@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processor import large_arrays
 from processor.distinct_rows import distinct_points
 from processor.geometry import point_grid
 from processor.geometry.parallel import over_ranges
@@ -24,6 +25,7 @@ SPACING_NEIGHBOURS, SPACING_SAMPLE = 8, 20_000
 SLICES, SLICE_POINTS, SLICE_SAMPLE = 5, 40_000, 5_000
 CELLS_OF_POINTS = 2.0  # edge of a cell, in spacings
 LEAST_RANGE = 512  # places per task of a thread
+SEARCHED = 256  # places of a sample at once: their neighbours' pages are given back after that
 GROWTH = 1.5  # factor of the search radius where too few points were found
 CROP_CHUNK = 1 << 20
 MOST_EMPTY = 4  # voxels for each point, up to which the empty ones are counted, too
@@ -33,7 +35,8 @@ def of_spacing(points: Floats) -> PointGrid:
     """Sort the points (n, 3) of a surface into cells that hold a few points each, whatever the spacing is."""
     if len(points) == 0:
         return point_grid.of_points(points, 1.0)
-    widest = float(np.linalg.norm(np.ptp(points, axis=0)))
+    low, high = large_arrays.corners(points)
+    widest = float(np.linalg.norm(high - low))
     coarse = point_grid.of_points(points, widest / np.sqrt(len(points)))
     wanted = CELLS_OF_POINTS * spacing(coarse)
     return point_grid.of_points(points, wanted) if wanted < 0.5 * coarse.cells.size else coarse
@@ -52,7 +55,12 @@ def spacing(grid: PointGrid, rows: Ints | None = None) -> float:
 def farthest_distances(grid: PointGrid, rows: Ints) -> tuple[Floats, int]:
     """Distance (m,) of ``rows`` of a grid to the k-th neighbour, and k; 0 where there is none."""
     k = min(SPACING_NEIGHBOURS, grid.count - 1)
-    return (_distances(grid, grid.cells.points[rows], rows, k)[1] if k > 0 else np.empty(0)), k
+    if k < 1:
+        return np.empty(0), k
+    found = np.empty(len(rows))
+    for part in large_arrays.blocks(len(rows), SEARCHED):
+        found[part] = _distances(grid, grid.cells.points[rows[part]], rows[part], k)[1]
+    return found, k
 
 
 def spacing_of(farthest: Floats, k: int) -> float:

@@ -4,7 +4,8 @@ The sign of a fitted normal is arbitrary. It is chosen upwards except on upright
 within their noise: there the sign of the vertical part is random from point to point. Those normals are turned towards
 their scanner where it is known. The rest are joined to their neighbours along a minimum spanning tree (Hoppe et al.
 1992), so that a surface has one sign: that of the surfaces it joins, or one by convention. The result does not depend
-on the order of the points.
+on the order of the points. Of more than MOST_JOINED points an even sample is joined, and the others follow the nearest
+of it with a nearly parallel normal.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -18,13 +19,15 @@ from scipy.spatial import cKDTree
 
 from processor.geometry.m3c2 import CloudNormals, oriented
 from processor.geometry.parallel import over_ranges
+from processor.large_arrays import allocate, blocks, every
 from processor.model import Bools, Floats, Ints
 
 UP = np.array([0.0, 0.0, 1.0])
 LEAN, MOST_LEAN = 0.2, 0.5  # least vertical part of a normal turned upwards: 12 degrees, more for noisy normals
 SURE = 5.0  # standard deviations
 IN_SIGHT = 0.1  # least cosine between the ray and a normal that is turned towards the scanner
-NEIGHBOURS = 8
+NEIGHBOURS, OF_SAMPLE = 8, 4
+MOST_JOINED, SAMPLE = 1 << 20, 1 << 18  # points; of a sample at least
 NODE = 0.2  # of the normals' diameter: core points nearer to each other with nearly parallel normals are one node
 PARALLEL = 0.7
 GAP = 3.0  # times the median distance of neighbours: points farther apart are not on one surface
@@ -70,20 +73,56 @@ def turned(fitted: CloudNormals, core: Floats, normal_diameter: float, scanner: 
 
     ``scanner`` (k, 3) is the position that the surface was seen from at each core point, NaN = unknown.
     """
-    normals = oriented(fitted.normals, UP)
-    open_, known = undecided(fitted, normal_diameter), int(np.isfinite(fitted.normals).all(axis=1).sum())
-    up = known - int(open_.sum())
-    seen = 0
-    if scanner is not None and open_.any():
-        sight = scanner - core
+    count = len(core)
+    normals, open_ = allocate(count, 3), allocate(count, dtype=np.bool_)
+    up = seen = left = 0
+    for rows in blocks(count):
+        sight = None if scanner is None else scanner[rows] - core[rows]
+        normals[rows], open_[rows], level, known = _by_direction(fitted.at(rows), normal_diameter, sight)
+        now = int(open_[rows].sum())
+        up, seen, left = up + known - level, seen + level - now, left + now
+    if not left:
+        return Turned(normals=normals, up=up, scanner=seen, neighbours=0, convention=0, surfaces=0)
+    if count <= MOST_JOINED:
+        follows, surfaces = _join(fitted, normals, core, open_, normal_diameter)
+        joined = int((follows & open_).sum())
+    else:
+        step = count // SAMPLE
+        columns = (fitted.normals, fitted.roughness, fitted.count, normals, core, open_)
+        one, two, three, own, places, unsigned = (every(column, step) for column in columns)
+        follows, surfaces = _join(CloudNormals(one, two, three), own, places, unsigned, normal_diameter)
+        joined = _follow(normals, core, open_, (places[unsigned], own[unsigned], follows[unsigned]))
+    return Turned(
+        normals=normals, up=up, scanner=seen, neighbours=joined, convention=left - joined, surfaces=surfaces
+    )  # fmt: skip
+
+
+def _by_direction(fitted: CloudNormals, normal_diameter: float, sight: Floats | None) -> tuple[Floats, Bools, int, int]:
+    """Turn normals (k, 3) upwards, or along the ``sight`` (k, 3) to the scanner; returns also which (k,) have no sign.
+
+    Then the number that up does not give a sign, and that of all normals.
+    """
+    normals, level = oriented(fitted.normals, UP), undecided(fitted, normal_diameter)
+    open_, known = level, int(np.isfinite(fitted.normals).all(axis=1).sum())
+    if sight is not None and level.any():
         with np.errstate(invalid="ignore"):
             cosine = np.einsum("ni,ni->n", normals, sight) / np.linalg.norm(sight, axis=1)
-            facing = open_ & (np.abs(cosine) >= IN_SIGHT)
+            facing = level & (np.abs(cosine) >= IN_SIGHT)
             normals = np.where((facing & (cosine < 0.0))[:, None], -normals, normals)
-        open_ = open_ & ~facing
-        seen = int(facing.sum())
+        open_ = level & ~facing
+    return normals, open_, int(level.sum()), known
+
+
+def _join(
+    fitted: CloudNormals, normals: Floats, core: Floats, open_: Bools, normal_diameter: float
+) -> tuple[Bools, int]:
+    """Turn, in place, the normals (k, 3) that are ``open_`` (k,) as those of the surface they are on.
+
+    Returns which (k,) are on one that follows adjoining surfaces, and the number of surfaces that do not.
+    """
+    following = np.zeros(len(core), bool)
     if not open_.any():
-        return Turned(normals=normals, up=up, scanner=seen, neighbours=0, convention=0, surfaces=0)
+        return following, 0
     rows = np.flatnonzero(np.isfinite(normals).all(axis=1))
     rows = rows[np.lexsort(core[rows].T)]  # the result must not depend on the order of the points
     first, node = _nodes(core[rows], normals[rows], open_[rows], normal_diameter)
@@ -92,11 +131,32 @@ def turned(fitted: CloudNormals, core: Floats, normal_diameter: float, scanner: 
     sign, follows, surfaces = _signs(core[some], normals[some], open_[some], noise, normal_diameter)
     alike = np.where(np.einsum("ni,ni->n", normals[rows], normals[some][node]) < 0.0, -1.0, 1.0)
     normals[rows] *= np.where(open_[rows], alike * sign[node], 1.0)[:, None]
-    joined = int((follows[node] & open_[rows]).sum())
-    convention = int(open_.sum()) - joined
-    return Turned(
-        normals=normals, up=up, scanner=seen, neighbours=joined, convention=convention, surfaces=surfaces
-    )  # fmt: skip
+    following[rows] = follows[node]
+    return following, surfaces
+
+
+def _follow(normals: Floats, core: Floats, open_: Bools, sample: tuple[Floats, Floats, Bools]) -> int:
+    """Turn, in place, normals (k, 3) that are ``open_`` (k,) as the nearest of a sample that is nearly parallel.
+
+    The sample is places (m, 3), their normals (m, 3), and which (m,) follow adjoining surfaces; returns how many
+    normals do so with them. Where none near is parallel, the sign is by convention.
+    """
+    places, theirs, follows = sample
+    near = np.arange(1, min(OF_SAMPLE, len(places)) + 1)
+    tree, joined = cKDTree(places), 0
+    for rows in blocks(len(core)):
+        at = rows.start + np.flatnonzero(open_[rows])
+        own, sign = normals[at], normals[at] @ SIDES[0]
+        if len(near) and len(at):
+            index = tree.query(core[at], k=near, workers=-1)[1]
+            cosine = np.einsum("ni,nki->nk", own, theirs[index])
+            alike = np.abs(cosine) >= PARALLEL
+            one, of = np.arange(len(at)), np.argmax(alike, axis=1)
+            found = alike[one, of]
+            sign = np.where(found, cosine[one, of], sign)
+            joined += int((found & follows[index[one, of]]).sum())
+        normals[at] = own * np.where(sign < 0.0, -1.0, 1.0)[:, None]
+    return joined
 
 
 def _noise(fitted: CloudNormals, normal_diameter: float) -> Floats:

@@ -7,13 +7,17 @@ sorted by block, cell and coordinates, so that results computed from them do not
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from processor import large_arrays
 from processor.geometry.parallel import over_ranges
+from processor.large_arrays import allocate, blocks
 from processor.model import Floats, Ints
 
 SIDE = 4  # cells along a block's edge
@@ -39,10 +43,11 @@ class Cells(NamedTuple):
 
 @dataclass(frozen=True)
 class PointGrid:
-    """The cells, and the row (n,) of each of their points in the original cloud."""
+    """The cells, the row (n,) of each of their points in the original cloud, and the keys (b,) of the blocks."""
 
     cells: Cells
     order: Ints
+    keys: Ints  # ascending, as the rows of ``cells.starts``
 
     @property
     def count(self) -> int:
@@ -60,8 +65,20 @@ class PointGrid:
         return np.argsort(_keys(inside.astype(np.int64)), kind="stable").astype(np.int64)
 
 
+class _Part(NamedTuple):
+    """Points (n, 3) in the grid's order and their rows (n,), the keys (b,) of their blocks and where cells start."""
+
+    points: Floats
+    order: Ints
+    keys: Ints
+    starts: Ints  # (b, 65)
+
+
 def of_points(points: Floats, cell: float) -> PointGrid:
-    """Sort points (n, 3), all finite, into cells of the edge ``cell``, or larger where the table would be too large."""
+    """Sort points (n, 3), all finite, into cells of the edge ``cell``, or larger where the table would be too large.
+
+    More than AT_ONCE points are sorted through files, if there are any, part by part (:mod:`processor.large_arrays`).
+    """
     if len(points) == 0:
         none = np.zeros((0, SIDE**3 + 1), np.int64)
         empty = np.full(2, EMPTY, np.int64)
@@ -69,31 +86,93 @@ def of_points(points: Floats, cell: float) -> PointGrid:
             points=np.zeros((0, 3)), keys=empty, blocks=empty.copy(), starts=none, lower=np.zeros(3), size=1.0,
             extent=np.ones(3, np.int64),
         )  # fmt: skip
-        return PointGrid(cells, np.empty(0, np.int64))
-    lower = points.min(axis=0)
-    extent = float((points.max(axis=0) - lower).max())
+        return PointGrid(cells, np.empty(0, np.int64), np.empty(0, np.int64))
+    lower, upper = large_arrays.corners(points)
+    extent = float((upper - lower).max())
     size = max(float(cell), extent / (SIDE * (1 << FIELD) - 2 * SIDE), 1e-300)
-    while True:
-        key = _keys(((points - lower) / size).astype(np.int64))
-        order = np.argsort(key)
-        key = key[order]
-        block_key = key >> 6
-        first = np.flatnonzero(np.concatenate([[True], block_key[1:] != block_key[:-1]]))
-        if len(first) * SIDE**3 <= ROOM_SHARE * len(points) + SIDE**3:
-            break
+    while (whole := _sorted(points, lower, size, (ROOM_SHARE * len(points)) // SIDE**3 + 1)) is None:
         size *= 2.0
-    rows = np.ascontiguousarray(points[order])
-    block = np.cumsum(np.concatenate([[0], block_key[1:] != block_key[:-1]]))
+    keys, rows = _table(whole.keys, large=len(points) > large_arrays.AT_ONCE)
+    reach = ((upper - lower) / size).astype(np.int64) // SIDE + 1
+    cells = Cells(
+        points=whole.points, keys=keys, blocks=rows, starts=whole.starts, lower=lower, size=size, extent=reach
+    )
+    return PointGrid(cells, whole.order, whole.keys)
+
+
+def _sorted(points: Floats, lower: Floats, size: float, most: int) -> _Part | None:
+    """Sort points (n, 3) into cells; None if they fill more than ``most`` blocks.
+
+    More than AT_ONCE points are put apart by the keys of their blocks first, and sorted part by part.
+    """
+
+    def key_of(places: Floats) -> Ints:
+        return _keys(((places - lower) / size).astype(np.int64))
+
+    if len(points) <= large_arrays.AT_ONCE:
+        return _part(points, np.arange(len(points)), key_of(points), most)
+    count = -(-2 * len(points) // large_arrays.AT_ONCE)
+    sample = np.sort(key_of(large_arrays.every(points, -(-len(points) // large_arrays.AT_ONCE))) >> 6)
+    bounds = np.unique(sample[np.arange(1, count) * len(sample) // count])
+
+    def part_of(block: tuple[Floats, ...]) -> Ints:
+        return np.searchsorted(bounds, key_of(block[0]) >> 6, side="right").astype(np.int64)
+
+    filled = np.zeros(len(bounds) + 1, np.int64)
+    for rows in blocks(len(points)):
+        filled += np.bincount(part_of((points[rows],)), minlength=len(filled))
+    passed = ((points[rows], np.arange(rows.start, rows.stop)) for rows in blocks(len(points)))
+    ends = np.cumsum(filled)
+    placed, order = large_arrays.in_parts(passed, part_of, ends)
+    keys, starts = list[Ints](), list[Ints]()
+    for first, last in pairwise([0, *ends.tolist()]):
+        if first == last:
+            continue
+        own = slice(first, last)
+        if (part := _part(placed[own], order[own], key_of(placed[own]), most)) is None:
+            return None
+        placed[own], order[own] = part.points, part.order
+        keys.append(part.keys)
+        starts.append(large_arrays.put_aside(part.starts + first))
+        most -= len(part.keys)
+        large_arrays.release()
+    return _Part(placed, order, np.concatenate(keys), _stacked(starts))
+
+
+def _part(points: Floats, order: Ints, key: Ints, most: int) -> _Part | None:
+    """Sort points (n, 3), rows ``order`` (n,) of a cloud, by keys (n,) and in cells; None beyond ``most`` blocks."""
+    by_key = np.argsort(key)
+    key = key[by_key]
+    block_key = key >> 6
+    begins = block_key[1:] != block_key[:-1]
+    first = np.flatnonzero(np.concatenate([[True], begins]))
+    if len(first) > most:
+        return None
+    rows = np.ascontiguousarray(points[by_key])
+    block = np.cumsum(np.concatenate([[0], begins]))
     count = np.bincount(block * SIDE**3 + (key & 63), minlength=len(first) * SIDE**3).reshape(-1, SIDE**3)
     starts = np.zeros((len(first), SIDE**3 + 1), np.int64)
     np.cumsum(count, axis=1, out=starts[:, 1:])
     starts += first[:, None]
-    order = order.astype(np.int64)
+    order = order[by_key].astype(np.int64)
     over_ranges(lambda a, b: _sort_cells(rows, order, starts, a, b), len(first), least=64)
-    keys, blocks = _table(block_key[first])
-    reach = ((points.max(axis=0) - lower) / size).astype(np.int64) // SIDE + 1
-    cells = Cells(points=rows, keys=keys, blocks=blocks, starts=starts, lower=lower, size=size, extent=reach)
-    return PointGrid(cells, order)
+    return _Part(rows, order, block_key[first], starts)
+
+
+def _stacked(parts: Sequence[Ints]) -> Ints:
+    """Stack arrays (b, m) of parts."""
+    found, at = allocate(sum(map(len, parts)), *parts[0].shape[1:], dtype=np.int64), 0
+    for part in parts:
+        found[at : at + len(part)] = part
+        at += len(part)
+        large_arrays.release()
+    return found
+
+
+def count_within(grid: PointGrid, low: Floats, high: Floats) -> int:
+    """Return the number of points of the blocks that a box from ``low`` (3,) to ``high`` (3,) meets."""
+    starts = grid.cells.starts[_blocks_within(grid, low, high)]
+    return int((starts[:, -1] - starts[:, 0]).sum())
 
 
 def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
@@ -101,32 +180,42 @@ def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
 
     Searches that do not leave the box find the same points in the same order as in the whole grid.
     """
-    cells = grid.cells
-    filled = np.flatnonzero(cells.keys != EMPTY)
-    filled = filled[np.argsort(cells.blocks[filled])]
-    key = cells.keys[filled]
-    block = np.stack([key >> 2 * FIELD, key >> FIELD & ((1 << FIELD) - 1), key & ((1 << FIELD) - 1)], axis=1)
-    edge = SIDE * cells.size
-    # A block more on each side, for the rounding.
-    first, last = (np.floor((corner - cells.lower) / edge) for corner in (low, high))
-    kept = np.flatnonzero(((block >= first - 1.0) & (block <= last + 1.0)).all(axis=1))
+    cells, kept = grid.cells, _blocks_within(grid, low, high)
     starts = cells.starts[kept]
     count = starts[:, -1] - starts[:, 0]
     begin = np.cumsum(count) - count
     rows = np.repeat(starts[:, 0] - begin, count) + np.arange(int(count.sum()))
-    keys, blocks = _table(key[kept])
+    keys, numbers = _table(grid.keys[kept])
     table = cells._replace(
-        points=cells.points[rows], keys=keys, blocks=blocks, starts=starts + (begin - starts[:, 0])[:, None]
+        points=cells.points[rows], keys=keys, blocks=numbers, starts=starts + (begin - starts[:, 0])[:, None]
     )
-    return PointGrid(table, grid.order[rows])
+    return PointGrid(table, grid.order[rows], grid.keys[kept])
 
 
-def _table(block_keys: Ints) -> tuple[Ints, Ints]:
+def _blocks_within(grid: PointGrid, low: Floats, high: Floats) -> Ints:
+    """Return the rows of the blocks that a box meets: along x and y they are searched for, along z compared."""
+    edge = SIDE * grid.cells.size
+    # A block more on each side, for the rounding.
+    first, last = (np.floor((corner - grid.cells.lower) / edge) for corner in (low, high))
+    first = np.clip(first - 1.0, 0.0, grid.cells.extent).astype(np.int64)
+    last = np.clip(last + 1.0, -1.0, grid.cells.extent - 1.0).astype(np.int64)
+    along = np.arange(first[0], last[0] + 1)
+    begin = np.searchsorted(grid.keys, ((along << FIELD) + first[1]) << FIELD)
+    end = np.searchsorted(grid.keys, ((along << FIELD) + last[1] + 1) << FIELD)
+    count = np.maximum(end - begin, 0)
+    rows = np.repeat(begin - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))
+    level = grid.keys[rows] & ((1 << FIELD) - 1)
+    found: Ints = rows[(level >= first[2]) & (level <= last[2])]
+    return found
+
+
+def _table(block_keys: Ints, large: bool = False) -> tuple[Ints, Ints]:
     """Return the hash table of blocks with ``block_keys`` (b,): keys (slots,) and rows (slots,)."""
     slots = 1 << max(4, int(2 * len(block_keys)).bit_length())
-    keys, blocks = np.full(slots, EMPTY, np.int64), np.full(slots, EMPTY, np.int64)
-    _fill(keys, blocks, np.ascontiguousarray(block_keys))
-    return keys, blocks
+    keys, rows = (allocate(slots, dtype=np.int64) if large else np.empty(slots, np.int64) for _ in range(2))
+    keys[:], rows[:] = EMPTY, EMPTY
+    _fill(keys, rows, np.ascontiguousarray(block_keys))
+    return keys, rows
 
 
 def _keys(cell: Ints) -> Ints:

@@ -9,21 +9,25 @@ import math
 from pathlib import Path
 from typing import Any
 
-from processor import pipeline
+import numpy as np
+
+from processor import large_arrays, pipeline
 from processor.compare.compare import Comparison
-from processor.geometry.m3c2 import FEWEST_FOR_LOD
+from processor.geometry.m3c2 import FEWEST_FOR_LOD, Distances
 from processor.geometry.normal_orientation import CONVENTION, Turned
 from processor.language.messages import NO_NUMBER, Message, messages, text
+from processor.model import Floats
 from processor.report import templates, write_results
 from processor.report.deviation import core_points_csv, face_maps
 from processor.report.deviation import figures as deviation_figures
 from processor.report.style import default_settings
 from processor.results.fields_to_json import reason_json
 from processor.store.json_values import json_ready
-from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
+from processor.store.replaced_folder import replacing_folder, write_bytes, write_parts, write_text
 
 TABLE, FIGURES, RECORD, PAGE = "compare.csv", ("map.png", "histogram.png"), "compare.json", "report.html"
 LABEL = "compared minus reference along the normal"
+MOST_DRAWN, SAMPLE = 1 << 20, 1 << 18  # core points; of a sample at least
 OWN_NAMES = (TABLE, *FIGURES, RECORD, PAGE)
 DEFINITION = (
     "distance = compared minus reference, means along the normal; lod95 = 1.96 (sqrt(std1^2/n1 + std2^2/n2) + "
@@ -106,26 +110,44 @@ def _turned(turned: Turned) -> dict[str, Any]:
 def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
     """Write the folder in place of an earlier one, its page in ``lang``; returns the object of compare.json."""
     record = as_json(result)
-    with default_settings():
-        drawn = [
-            face_maps.face_maps(
-                result.core + result.origin,
-                result.normals,
-                result.distances,
-                face_maps.not_sure(result.distances, result.unit),
-                (LABEL, result.unit),
-            ),
-            deviation_figures.histogram(result.distances, LABEL, result.unit),
-        ]
+    drawn = _drawn(result)
     with replacing_folder(out) as making:
-        table = core_points_csv.csv_text(result.origin, result.core, result.distances, result.normals)
-        write_text(making / TABLE, table)
+        table = core_points_csv.parts(result.origin, result.core, result.distances, result.normals)
+        write_parts(making / TABLE, table)
         record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
         write_text(making / RECORD, record_text + "\n")
         for name, (_, data) in zip(FIGURES, drawn, strict=True):
             write_bytes(making / name, data)
         write_text(making / PAGE, _page(result, record, drawn, lang))
     return record
+
+
+def _drawn(result: Comparison) -> list[tuple[Message, bytes]]:
+    """Draw the map and the histogram: captions and PNG."""
+    core, normals, distances = _sample(result)
+    with default_settings():
+        band = face_maps.not_sure(distances, result.unit)
+        drawn = [
+            face_maps.face_maps(core + result.origin, normals, distances, band, (LABEL, result.unit)),
+            deviation_figures.histogram(distances, LABEL, result.unit),
+        ]
+    if len(core) == len(result.core):
+        return drawn
+    said = text("of {count:,} of {all:,} core points, an even sample", count=len(core), all=len(result.core))
+    return [(text("{parts:;}", parts=[caption, said]), data) for caption, data in drawn]
+
+
+def _sample(result: Comparison) -> tuple[Floats, Floats, Distances]:
+    """Return core points, normals and distances to draw: all, or of many every k-th, the least and the greatest."""
+    core, normals, distances = result.core, result.normals, result.distances
+    if len(core) <= MOST_DRAWN:
+        return core, normals, distances
+    rows = np.arange(0, len(core), len(core) // SAMPLE)
+    known = [value for value in (result.summary.min, result.summary.max) if math.isfinite(value)]
+    ends = [large_arrays.first_of(distances.distance, value) for value in known]
+    rows = np.unique(np.concatenate([rows, np.array(ends, np.int64)]))
+    core, normals = large_arrays.taken(core, rows), large_arrays.taken(normals, rows)
+    return core, normals, Distances(**{name: large_arrays.taken(one, rows) for name, one in vars(distances).items()})
 
 
 def lines(result: Comparison) -> list[Message]:

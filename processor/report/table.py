@@ -75,10 +75,14 @@ def csv_of_rows(columns: Iterable[Column], rows: Iterable[Iterable[Any]], full: 
     With ``full`` the cells stand as they are: floats with all digits, nan for none, and texts that the caller has made
     safe by :func:`csv_cell`.
     """
+    cells = rows if full else ([csv_cell(cell) for cell in row] for row in rows)
+    return csv_lines([[column.name for column in columns]]) + csv_lines(cells)
+
+
+def csv_lines(rows: Iterable[Iterable[Any]]) -> str:
+    """Write rows as lines of CSV, their cells as they stand."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([column.name for column in columns])
-    writer.writerows(rows if full else ([csv_cell(cell) for cell in row] for row in rows))
+    csv.writer(out, lineterminator="\n").writerows(rows)
     return out.getvalue()
 
 

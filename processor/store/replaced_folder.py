@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -44,13 +44,23 @@ def _unwritable(out: Path, error: OSError) -> InputError:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text as UTF-8, onto the disk."""
-    write_bytes(path, text.encode("utf-8"))
+    write_parts(path, (text,))
+
+
+def write_parts(path: Path, parts: Iterable[str]) -> None:
+    """Write a text as UTF-8 part by part, onto the disk."""
+    _write(path, (part.encode("utf-8") for part in parts))
 
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file, onto the disk."""
+    _write(path, (data,))
+
+
+def _write(path: Path, parts: Iterable[bytes]) -> None:
     with path.open("wb") as file:
-        file.write(data)
+        for part in parts:
+            file.write(part)
         file.flush()
         os.fsync(file.fileno())
 

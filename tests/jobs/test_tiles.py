@@ -162,19 +162,20 @@ def test_a_run_writes_the_same_files_as_here(dask_cluster, small, tmp_path):  # 
 
 
 def test_core_points_in_tiles_are_measured_as_at_once(monkeypatch):
-    """Upright and level surfaces, places far away, and places and normals that are unknown."""
+    """Upright and level surfaces, a place far away, and normals that are unknown; in the order of the grid."""
     monkeypatch.setattr(core_tiles, "CORE_POINTS", 300)
     first, second = (np.vstack([one, one[:, [2, 0, 1]]]) for one in (wavy(4000, 1), wavy(4000, 2, 5.0)))
-    core = np.vstack([first[::4], [[1e6, 0.0, 0.0], [np.nan, 0.0, 0.0]]])
+    core = np.vstack([first[::4], [[1e6, 0.0, 0.0]]])
     grids = m3c2.grid(first, 60.0), m3c2.grid(second, 60.0)
-    normals, tiled = m3c2.normals(grids[0], core, 90.0), core_tiles.normals(grids[0], core, 90.0)
+    tiled = point_grid.of_points(core, 15.0)
+    normals, in_tiles = m3c2.normals(grids[0], core, 90.0), core_tiles.normals(grids[0], tiled, 90.0)
     lengths = core_tiles.Lengths(60.0, 40.0, 0.5)
     whole = m3c2.distances(*grids, core, normals.normals, **lengths._asdict())
-    parts = core_tiles.distances(*grids, core, normals.normals, lengths)
+    parts = core_tiles.distances(*grids, tiled, in_tiles.normals, lengths)
     assert np.isfinite(whole.lod95).sum() > 1500
-    for one, other in ((normals, tiled), (whole, parts)):
+    for one, other in ((normals, in_tiles), (whole, parts)):
         for name, values in vars(one).items():
-            np.testing.assert_array_equal(getattr(other, name), values)
+            np.testing.assert_array_equal(getattr(other, name), values[tiled.order])
 
 
 def test_a_part_of_a_grid_holds_the_points_about_a_box():

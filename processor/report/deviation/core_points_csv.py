@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
+from processor import large_arrays
 from processor.geometry.m3c2 import Distances
 from processor.model import Floats
 from processor.report.columns import columns
-from processor.report.table import csv_of_rows
+from processor.report.table import csv_lines, csv_of_rows
 
 COLUMNS = columns(
     "x", "y", "z", "distance", "lod95", "significant", "n1", "n2", "std1", "std2", "nx", "ny", "nz"
@@ -23,15 +23,16 @@ def csv_text(origin: Floats, core: Floats, distances: Distances, normals: Floats
 
     nan stands where there is none. n1 and std1 are of the reference, n2 and std2 of the compared cloud.
     """
-    return csv_of_rows(COLUMNS, _rows(origin, core, distances, normals), full=True)
+    return "".join(parts(origin, core, distances, normals))
 
 
-def _rows(origin: Floats, core: Floats, distances: Distances, normals: Floats) -> Iterator[tuple[Any, ...]]:
-    for start in range(0, len(core), ROWS_AT_ONCE):
-        part = slice(start, start + ROWS_AT_ONCE)
-        significant = distances.significant[part].astype(np.int64)
+def parts(origin: Floats, core: Floats, distances: Distances, normals: Floats) -> Iterator[str]:
+    """Pass over the text of :func:`csv_text`."""
+    yield csv_of_rows(COLUMNS, ())
+    for rows in large_arrays.blocks(len(core), ROWS_AT_ONCE):
+        one = distances.at(rows)
         numbers = (
-            *(core[part] + origin).T, distances.distance[part], distances.lod95[part], significant, distances.n1[part],
-            distances.n2[part], distances.std1[part], distances.std2[part], *normals[part].T,
+            *(core[rows] + origin).T, one.distance, one.lod95, one.significant.astype(np.int64), one.n1, one.n2,
+            one.std1, one.std2, *normals[rows].T,
         )  # fmt: skip
-        yield from zip(*(column.tolist() for column in numbers), strict=True)
+        yield csv_lines(zip(*(column.tolist() for column in numbers), strict=True))
