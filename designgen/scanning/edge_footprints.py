@@ -37,7 +37,11 @@ def nearest_mm(surfaces: Surfaces, place: Floats) -> float:
     ranges = np.linalg.norm(surfaces.piece_centre - place, axis=1) - surfaces.piece_radius
     flat = surfaces.kind == TRIANGLE
     nearest = ranges[~flat[surfaces.piece_shape]].min(initial=np.inf)
-    a, b, c = np.moveaxis(surfaces.numbers[flat, :9].reshape(-1, 3, 3) - place, 1, 0)
+    # Only triangles that may be nearer than the nearest corner are compared exactly.
+    corners = surfaces.numbers[flat, :3] - place
+    farthest = np.sqrt(np.einsum("ni,ni->n", corners, corners).min(initial=np.inf)) * (1.0 + 1e-9)
+    close = surfaces.piece_shape[flat[surfaces.piece_shape] & (ranges <= farthest)]
+    a, b, c = np.moveaxis(surfaces.numbers[np.unique(close), :9].reshape(-1, 3, 3) - place, 1, 0)
     for start, end in ((a, b), (b, c), (c, a)):
         along = end - start
         share = -np.einsum("ni,ni->n", start, along) / np.maximum(np.einsum("ni,ni->n", along, along), 1e-300)

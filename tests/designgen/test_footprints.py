@@ -282,6 +282,27 @@ def test_nearest_range_to_surfaces_is_that_worked_by_hand():
     assert edge_footprints.nearest_mm(Builder().to_surfaces(), np.zeros(3)) == np.inf
 
 
+def test_nearest_range_to_many_triangles_is_that_to_the_nearest_of_them():
+    """Each triangle by itself, large and small ones and slivers: none is passed over that may be the nearest."""
+    rng = np.random.default_rng(5)
+    triangles = [
+        rng.uniform(-2000.0, 2000.0, 3)
+        + rng.normal(0.0, size, 3) * rng.uniform(-1.0, 1.0, (3, 1))
+        + rng.normal(0.0, 5.0, (3, 3))
+        for size in rng.choice([10.0, 300.0, 3000.0], 150)
+    ]
+    every = Builder()
+    for corners in triangles:
+        every.polygon(0, "plate", corners)
+    for place in rng.uniform(-3000.0, 3000.0, (40, 3)):
+        single = []
+        for corners in triangles:
+            one = Builder()
+            one.polygon(0, "plate", corners)
+            single.append(edge_footprints.nearest_mm(one.to_surfaces(), place))
+        assert edge_footprints.nearest_mm(every.to_surfaces(), place) == min(single)
+
+
 @pytest.mark.slow
 def test_a_beam_many_times_the_step_is_cut_in_every_row(monkeypatch):
     """Where edges may be further than they are followed: 27 steps here."""
