@@ -67,7 +67,7 @@ def test_faults_of_a_model_are_reported_on_import_and_on_scan(tmp_path, monkeypa
     assert re.match(r"'part-1' and 'part-2' overlap by (9\.\d|10\.0) mm: they are taken as they are", said[2])
     assert json.loads((tmp_path / "meshes/import.json").read_text())["notes"] == said
     with caplog.at_level(logging.WARNING, "designgen"):
-        loading.say(loading.load(assembly(web=web, rib=rib)))
+        loading.log_notes(loading.load(assembly(web=web, rib=rib)))
     (line,) = (line for line in caplog.messages if "overlap" in line)
     assert re.match(r"model: 'web' and 'rib' overlap by (9\.\d|10\.0) mm: they are taken as they are", line)
 
@@ -75,7 +75,7 @@ def test_faults_of_a_model_are_reported_on_import_and_on_scan(tmp_path, monkeypa
 @pytest.mark.parametrize(("scale", "doubted"), [(1.0, False), (0.001, True), (1e5, True)])
 def test_implausible_size_of_a_model_gives_a_warning_about_its_unit(scale, doubted, caplog):
     with caplog.at_level(logging.WARNING, "designgen"):
-        loading.say(loading.load((scale * BOX.vertices, BOX.faces)))
+        loading.log_notes(loading.load((scale * BOX.vertices, BOX.faces)))
     assert any("is its unit right?" in line for line in caplog.messages) == doubted
 
 

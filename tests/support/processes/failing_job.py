@@ -77,7 +77,7 @@ def main():
         __main__.main()
         return
     child.guard(int(sys.argv[1]))
-    with causes.told_by_exit_code():
+    with causes.exiting_by_cause():
         job()
 
 
