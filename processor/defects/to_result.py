@@ -248,11 +248,12 @@ def _place_defects(search: Search) -> Iterator[Defect]:
         if values is not None:
             cells = np.unique(np.concatenate([region.cells for region in group]))
             found.append((group[0], Defect(values=values, component=component, cells=cells, field=search.residuals)))
-    behind = _other_sides(search.surface, found)
-    pushed = [k for k, of_place in enumerate(found) if k not in behind and _is_pushed(search.surface, *of_place)]
+    pushed = [k for k, of_place in enumerate(found) if _is_pushed(search.surface, *of_place)]
+    behind = _other_sides(search.surface, found, pushed)
+    waving = [k for k in pushed if k not in behind]
     in_wave: set[int] = set()
-    for rows in waves.waves([_lobe(search.surface, *found[k]) for k in pushed]):
-        lobes = [pushed[row] for row in rows]
+    for rows in waves.waves([_lobe(search.surface, *found[k]) for k in waving]):
+        lobes = [waving[row] for row in rows]
         in_wave.update(lobes)
         yield _wave([found[k][1] for k in lobes])
     for k, (_, defect) in enumerate(found):
@@ -260,14 +261,13 @@ def _place_defects(search: Search) -> Iterator[Defect]:
             yield defect
 
 
-def _other_sides(surface: DesignSurface, found: list[tuple[Region, Defect]]) -> set[int]:
-    """Return the places of ``found`` that are the other side of a larger one: a plate that was pushed to one side."""
-    pushed = [k for k, (region, defect) in enumerate(found) if _is_pushed(surface, region, defect)]
-    pushed.sort(key=lambda k: -len(found[k][0].cells))
+def _other_sides(surface: DesignSurface, found: list[tuple[Region, Defect]], pushed: list[int]) -> set[int]:
+    """Return those of the places ``pushed``, of steel moved to one side, that are the other side of a larger one."""
+    by_size = sorted(pushed, key=lambda k: -len(found[k][0].cells))
     behind: set[int] = set()
-    for row, k in enumerate(pushed):
+    for row, k in enumerate(by_size):
         region = found[k][0]
-        for larger in pushed[:row]:
+        for larger in by_size[:row]:
             front, plate = found[larger][0], found[larger][1].component
             against = front.sign == -region.sign and plate == found[k][1].component and larger not in behind
             if against and other_side.is_behind(surface, region.cells, front.cells):

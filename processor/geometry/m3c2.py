@@ -270,16 +270,15 @@ class Summary:
 
 def summary(measured: Distances, core: Floats, normals: Floats, projection_diameter_mm: float, few: int) -> Summary:
     """Summarise distances at core points (k, 3) with normals (k, 3); fewer than ``few`` points count as few."""
-    known = allocate(len(core), dtype=np.bool_)
+    known, beyond = (allocate(len(core), dtype=np.bool_) for _ in range(2))
     without_normal = few_points = 0
     for rows in blocks(len(core)):
         known[rows] = np.isfinite(measured.lod95[rows])
+        beyond[rows] = measured.at(rows).significant
         without_normal += int((~np.isfinite(normals[rows]).all(axis=1)).sum())
         few_points += int((np.minimum(measured.n1[rows], measured.n2[rows])[known[rows]] < few).sum())
     distance, lod95, places = (chosen(column, known) for column in (measured.distance, measured.lod95, core))
-    significant = allocate(len(distance), dtype=np.bool_)
-    for rows in blocks(len(distance)):
-        significant[rows] = np.abs(distance[rows]) > lod95[rows]
+    significant = chosen(beyond, known)
     figures = _figures(distance, lod95) if len(distance) else dict.fromkeys(FIGURES, float("nan"))
     return Summary(
         core_points=len(core),

@@ -572,7 +572,7 @@ def test_a_step_file_a_part_of_an_independent_bridge(tmp_path):
 @pytest.mark.usefixtures("cad_here")
 @pytest.mark.parametrize("gap", [0.0, 6.0])
 def test_spliced_girders_of_a_step_file_are_joined_where_they_end(tmp_path, gap):
-    """Splice plates and bolts are no parts: this is said, and the joints are those of the girders."""
+    """Splice plates and bolts are no parts: they are named as left out, and the joints are those of the girders."""
     from tests.support.solids import spliced_girders as girders
 
     shapes, joints = girders.bodies(gap)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.defects.places.other_side import PLATE_MM
+from processor.defects.places.other_side import OPPOSITE_COS, PLATE_MM
 from processor.model import Floats
 
 FEWEST = 3  # half waves
@@ -16,7 +16,6 @@ GAP_SHARE = 1.0  # of the smaller width of two half waves, the largest gap betwe
 LEAST_SHARE = 0.25  # ratio of the amplitudes of neighbours, at least
 TURN_COS = 0.8  # of the angle between steps from one half wave to the next
 EVEN = 2.0  # ratio of the lengths of two such steps, at most
-PARALLEL_COS = 0.95  # of the normals of the two sides of a plate
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ def _alternate(one: Lobe, other: Lobe) -> bool:
     """Return whether two lobes may be neighbouring half waves, on the same or on opposite sides of a plate."""
     parallel = float(one.outward @ other.outward)
     apart = abs(float((other.middle - one.middle) @ one.outward))
-    if one.component != other.component or abs(parallel) < PARALLEL_COS or apart > PLATE_MM:
+    if one.component != other.component or abs(parallel) < -OPPOSITE_COS or apart > PLATE_MM:
         return False
     if one.height * other.height * parallel >= 0.0:
         return False
