@@ -12,7 +12,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtri
 
+from processor import large_arrays
 from processor.adjustment import normal_draws
+from processor.large_arrays import blocks
 from processor.model import NORMAL_95, Floats
 
 DRAWS = 10_000  # of the errors, for the width of the band
@@ -28,8 +30,36 @@ def of_independent(values: Floats, sd: Floats, axes: int = 1) -> tuple[float, fl
     """
     top = int(np.argmax(values))
     near = values >= values[top] - CLEAR_SD * (sd + sd[top]) - EXACT_MM
-    reach = float(np.sqrt(chdtri(axes, 1.0 - 0.95 ** (1.0 / near.sum())))) * sd[near]
+    reach = _sidak_factor(int(near.sum()), axes) * sd[near]
     return float(values[top]), float((values[near] - reach).max()), float((values[near] + reach).max())
+
+
+def of_extreme(values: Floats, errors: Floats, sd_per_error: float, sign: int) -> tuple[float, float, float]:
+    """Greatest (``sign`` 1) or least (-1) of values (n,) that need not fit in memory, and its 95 % interval.
+
+    As of :func:`of_independent`, with ``errors`` (n,) in place of standard deviations, which are ``sd_per_error`` times
+    these: levels of detection. n > 0.
+    """
+    extreme = large_arrays.extremes(values)[sign > 0]
+    limit = sign * extreme - CLEAR_SD * sd_per_error * errors[large_arrays.first_of(values, extreme)] - EXACT_MM
+
+    def near(rows: slice) -> tuple[Floats, Floats]:
+        value, sd = sign * values[rows], sd_per_error * errors[rows]
+        of_near = value >= limit - CLEAR_SD * sd
+        return value[of_near], sd[of_near]
+
+    factor = _sidak_factor(sum(len(near(rows)[0]) for rows in blocks(len(values))), axes=1)
+    low = high = -np.inf
+    for rows in blocks(len(values)):
+        value, sd = near(rows)
+        low = max(low, float((value - factor * sd).max(initial=-np.inf)))
+        high = max(high, float((value + factor * sd).max(initial=-np.inf)))
+    return (extreme, low, high) if sign > 0 else (extreme, -high, -low)
+
+
+def _sidak_factor(count: int, axes: int) -> float:
+    """Return the number of standard deviations within which ``count`` independent errors stay with 95 %."""
+    return float(np.sqrt(chdtri(axes, 1.0 - 0.95 ** (1.0 / count))))
 
 
 def of_correlated(values: Floats, covariance: Floats, folded: bool = False) -> tuple[float, float, float]:

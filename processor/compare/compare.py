@@ -12,11 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from processor import large_arrays, readers, store
+from processor.adjustment import distance_summary
+from processor.adjustment.distance_summary import Summary
 from processor.compare import core_tiles, diagnosis, units
 from processor.compare import normals_file as scan_folder_normals
 from processor.compare.core_tiles import Lengths
 from processor.geometry import m3c2, neighbors, normal_orientation
-from processor.geometry.m3c2 import CloudNormals, Distances, Scales, Summary
+from processor.geometry.m3c2 import CloudNormals, Distances, Scales
 from processor.geometry.normal_orientation import Turned
 from processor.geometry.point_grid import PointGrid
 from processor.language.messages import messages
@@ -190,7 +192,9 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     distances = _distances((first, second), tiled, normals, used, request.registration_error)
     normals = put_back(normals, tiled.order)
     turned = turned and replace(turned, normals=normals)
-    summary = m3c2.summary(distances, core, normals, used.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
+    summary = distance_summary.of_distances(
+        distances, core, normals, used.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER
+    )
     if not any(np.isfinite(distances.distance[rows]).any() for rows in blocks(len(core))):
         why = diagnosis.no_distance(first.cells.points, second.cells.points, core, summary.without_normal, used)
         raise InputError(f"{request.reference} and {request.compared}: no core point has a distance: {why}")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from processor import diagnostics
+from processor.adjustment import distance_summary
 from processor.adjustment.point_groups import group_means
 from processor.deviation import cloud, result_fields
 from processor.deviation import measure as deviation_measure
@@ -54,7 +55,9 @@ def _measured(design_of: StructureDesign, scan: ScanCloud, vertices: Floats, ori
         projection_diameter_mm=preset.projection_diameter_mm, max_depth_mm=preset.max_depth_mm,
         registration_error_mm=error,
     )  # fmt: skip
-    total = m3c2.summary(distances, core, normals, preset.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
+    total = distance_summary.of_distances(
+        distances, core, normals, preset.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER
+    )
     status = Status.OK if total.core_points > total.without_lod else Status.FAILED
     reasons = [
         reason(

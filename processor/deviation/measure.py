@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.adjustment import scanner_class_errors, view_error_from_opposite_sides
+from processor.adjustment import distance_summary, scanner_class_errors, view_error_from_opposite_sides
+from processor.adjustment.distance_summary import Summary
 from processor.deviation import mean_uncertainty, result_fields, stable_fit, surface_movement
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
@@ -216,7 +217,9 @@ def _result(
     error: tuple[float, ErrorSource],
 ) -> Result:
     core = measured.core
-    total = m3c2.summary(distance, core.points, core.normals, measured.diameter, m3c2.PAPER_POINTS_A_CYLINDER)
+    total = distance_summary.of_distances(
+        distance, core.points, core.normals, measured.diameter, m3c2.PAPER_POINTS_A_CYLINDER
+    )
     points = result_fields.core_points(core.points, core.normals, distance)
     if not fits.determined and placed.registration is Registration.AS_GIVEN:
         best = _shifted(scan, placed.T, placed.T_best_fit)
@@ -311,7 +314,7 @@ def _shifted(scan: ScanCloud, used: Floats, T: Floats) -> _Shifted:
 
 
 def _status(
-    placed: Placed, fits: Fits, total: m3c2.Summary, params: Params, moves: tuple[_Shifted, _Shifted]
+    placed: Placed, fits: Fits, total: Summary, params: Params, moves: tuple[_Shifted, _Shifted]
 ) -> tuple[Status, list[Reason]]:
     """Return the status, and its reasons: how the scan was registered."""
     if total.core_points == total.without_lod:

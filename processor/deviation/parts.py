@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
+from processor.adjustment import distance_summary
 from processor.components.bridge_parts import PartScene
 from processor.deviation import result_fields
 from processor.deviation.result import CorePoints, ErrorSource, PartFits, Result
@@ -32,7 +33,7 @@ def deviations(parts: Sequence[PartScene], method: str, one: Callable[[Scene], R
         return Result(status=status, method=method, reasons=reasons, parts=table)
     origin = known[0].origin
     core = _joined([result.core for result in known], [result.origin - origin for result in known])
-    total = m3c2.summary(
+    total = distance_summary.of_distances(
         core.distances, core.points, core.normals, known[0].projection_diameter, m3c2.PAPER_POINTS_A_CYLINDER
     )
     limits = [result.limits for result in known if result.limits is not None]

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from processor.adjustment.distance_summary import Summary
 from processor.deviation.result import NAN, CorePoints
-from processor.geometry.m3c2 import Distances, Summary
+from processor.geometry.m3c2 import Distances
 from processor.model import Floats
 
 NEAR_MM = 10.0
@@ -41,8 +42,8 @@ def statistics(core: CorePoints, total: Summary) -> dict[str, Any]:
         "median": total.median,
         "sd": total.sd,
         "min": total.min,
-        "min_ci95": (total.min - total.min_lod95, total.min + total.min_lod95),
+        "min_ci95": total.min_ci95,
         "max": total.max,
-        "max_ci95": (total.max - total.max_lod95, total.max + total.max_lod95),
+        "max_ci95": total.max_ci95,
         "lod95_median": total.lod95_median,
     }

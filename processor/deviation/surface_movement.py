@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor import tiles
+from processor.adjustment import mixed_pixels
 from processor.deviation import assignment, station_offsets
 from processor.deviation.assignment import Aside, OnSurface
 from processor.deviation.local_translation import Movement, PartSums, Translations
@@ -28,6 +29,7 @@ from processor.tiles import Shared
 LEAST_COS = 0.5  # between the normals at a core point and below a scanned point
 NOISE_SHARE = 0.75  # quantile of the core points' standard deviations that is the noise: noise across edges is larger
 ABOUT = 2.0  # diameters about a core point within which all faces are taken to move alike, to find each point's face
+SAME_MM = 0.1  # between positions of one scanner
 RETURNS = 3.0  # standard deviations from the surface within which a point removed as an outlier is none
 
 
@@ -77,16 +79,17 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Passes:
-    """The ``clouds`` of a scan, the same in every pass, and the points of each near the surface, put aside."""
+    """The ``clouds`` of a scan, the same in every pass; the points of each near the surface, and which are doubtful."""
 
     clouds: Iterable[Cloud]
     fit: Shared[_Fit]
     asides: list[Aside] = field(default_factory=list)
+    doubtful: list[Bools] = field(default_factory=list)
 
     def near(self) -> Iterator[tuple[Cloud, Aside]]:
         """Pass over the points near the surface, cloud by cloud."""
-        for cloud, aside in zip(self.clouds, self.asides, strict=True):
-            yield cloud.of(aside.rows), aside
+        for cloud, aside, doubtful in zip(self.clouds, self.asides, self.doubtful, strict=True):
+            yield replace(cloud.of(aside.rows), doubtful=doubtful), aside
             release()
 
 
@@ -116,9 +119,10 @@ def movement(
     moved sideways does not appear smaller, and the side of a beam that moved is not taken for its top.
 
     Outlier removal takes more points from the outside of a surface than from its inside, where other points are near.
-    The last fit therefore uses those again that lie on the surface. Core points within another body of the design have
-    no movement. Also returns the share of points on the surface, and the standard deviation (k,) of what stations have
-    in common at each core point.
+    The last fit therefore uses those again that lie on the surface. Points that may be mixed pixels, as known from the
+    positions of the scanners, are treated alike. Core points within another body of the design have no movement. Also
+    returns the share of points on the surface, and the standard deviation (k,) of what stations have in common at each
+    core point.
     """
     surface = curved.surface
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, depth_mm)
@@ -146,21 +150,44 @@ def movement(
 def _first(passes: _Passes) -> tuple[Movement, float]:
     """Assign all points, put those near the surface aside, and fit movements to them; also the share that is near."""
     first, near, points = passes.fit.value.sums(), 0, 0
-    for aside, part, sure, count in tiles.mapped(_first_of, passes.clouds, passes.fit):
+    for aside, doubtful, part, counts in tiles.mapped(_first_of, passes.clouds, passes.fit):
         passes.asides.append(aside.put())
+        passes.doubtful.append(put_aside(doubtful))
         first.add_part(part)
-        near, points = near + sure, points + count
+        near, points = near + counts[0], points + counts[1]
         release()
     return first.movement(), near / points
 
 
-def _first_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, PartSums, int, int]:
-    """Return what :func:`_first` needs of a cloud: its points near the surface, sums, and numbers of sure points."""
+def _first_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, Bools, PartSums, tuple[int, int]]:
+    """Return what :func:`_first` needs of a cloud: its points near the surface, which are doubtful, sums, and counts.
+
+    These are the numbers of points near the surface and of all, outliers left out.
+    """
     seen = assignment.assigned(cloud.points, cloud.scanner, fit.curved, fit.grid)
     close = np.abs(seen.distance) <= fit.depth
-    sure = np.flatnonzero(close & ~cloud.doubtful)
+    doubtful = cloud.doubtful
+    if cloud.scanner is not None:
+        doubtful = doubtful | _mixed(cloud.points, cloud.scanner, seen, close, fit.curved)
+    sure = np.flatnonzero(close & ~doubtful)
     part = fit.part(fit.sums(), seen.of(sure), seen.distance[sure])
-    return Aside.of(np.flatnonzero(close), seen), part, len(sure), int((~cloud.doubtful).sum())
+    counts = int((close & ~cloud.doubtful).sum()), int((~cloud.doubtful).sum())
+    return Aside.of(np.flatnonzero(close), seen), doubtful[close], part, counts
+
+
+def _mixed(points: Floats, scanner: Floats, seen: OnSurface, close: Bools, curved: CurvedFacets) -> Bools:
+    """Mark (n,) the mixed pixels among points (n, 3) that are ``close`` (n,) to the surface, scanner by scanner."""
+    surface = curved.surface
+    face = np.where(seen.facet >= 0, surface.part_of[seen.facet], -1)
+    marked, left = np.zeros(len(points), np.bool_), np.arange(len(points))
+    while len(left):
+        of_one = np.abs(scanner[left] - scanner[left[0]]).max(axis=1) <= SAME_MM
+        every, left = left[of_one], left[~of_one]
+        rows = every[close[every]]
+        of_face = surface.normals[seen.facet[rows]], seen.distance[rows], face[rows]
+        of_scanner = points[every], face[every]
+        marked[rows] = mixed_pixels.mark(points[rows], scanner[every[0]], *of_face, of_scanner)
+    return marked
 
 
 def _second(passes: _Passes, around: _Around) -> tuple[list[Ints], Movement, Movement]:

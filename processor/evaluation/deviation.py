@@ -65,18 +65,19 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric("deviation", "true deviation", float(np.sqrt(np.mean(true[known] ** 2))), Statistic.RMS, unit="mm"),
         Metric("deviation", "LOD95", float(np.median(result.core.lod95[known])), Statistic.MEDIAN, unit="mm"),
         *covered("deviation", "deviations", error, result.core.lod95),
-        *_extremes(result, true[known], result.core.distance[known]),
+        *_extremes(result, true[known]),
         *_moved_and_not(result, truth.structure),
         *([] if truth.pose is None else _pose(result, truth.structure, truth.pose)),
     ]
 
 
-def _extremes(result: Result, true: Floats, found: Floats) -> list[Metric]:
+def _extremes(result: Result, true: Floats) -> list[Metric]:
     """Coverage of the least and the greatest deviation, against the true extremes of the core points (k,)."""
     if not (result.min_ci95.size and result.max_ci95.size):
         return []
-    errors = np.array([found.min() - true.min(), found.max() - true.max()])
-    half = np.array([np.ptp(result.min_ci95), np.ptp(result.max_ci95)]) / 2.0
+    intervals = np.array([result.min_ci95, result.max_ci95])
+    errors = intervals.mean(axis=1) - [true.min(), true.max()]
+    half = np.ptp(intervals, axis=1) / 2.0
     return covered("deviation", "least and greatest deviations", errors, half)
 
 

@@ -15,12 +15,11 @@ import numpy as np
 from numba import njit
 
 from processor import large_arrays
-from processor.distinct_rows import distinct
 from processor.geometry import neighbors, point_grid
 from processor.geometry.linalg_small import eigen
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
-from processor.large_arrays import allocate, blocks, chosen, total
+from processor.large_arrays import blocks
 from processor.model import Bools, Floats, InputError, Ints
 
 CELLS_PER_DIAMETER = 4.0
@@ -230,114 +229,6 @@ def _depth(compared: PointGrid, core: Floats, projection: float) -> float:
 
 def _scale_sample(points: Floats) -> Floats:
     return large_arrays.every(points, max(1, len(points) // SCALE_SAMPLE))
-
-
-# --- Statistics of all core points
-
-
-SHARE_CELL = 2.0  # projection diameters: core points nearer to each other share points
-
-
-@dataclass(frozen=True)
-class Share:
-    """A share of core points with its 95 % interval; NaN for no core points."""
-
-    share: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Numbers of core points, and statistics of those with a level of detection; NaN where there is none."""
-
-    core_points: int
-    without_normal: int
-    without_lod: int
-    few_points: int  # core points with a level of detection and few points of either cloud in the cylinder
-    significant: int
-    significant_share: Share
-    mean: float
-    median: float
-    sd: float
-    rms: float
-    min: float
-    max: float
-    lod95_median: float
-    min_lod95: float = float("nan")  # at the core point of the least distance
-    max_lod95: float = float("nan")  # at the core point of the greatest distance
-
-
-def summary(measured: Distances, core: Floats, normals: Floats, projection_diameter_mm: float, few: int) -> Summary:
-    """Summarise distances at core points (k, 3) with normals (k, 3); fewer than ``few`` points count as few."""
-    known, beyond = (allocate(len(core), dtype=np.bool_) for _ in range(2))
-    without_normal = few_points = 0
-    for rows in blocks(len(core)):
-        known[rows] = np.isfinite(measured.lod95[rows])
-        beyond[rows] = measured.at(rows).significant
-        without_normal += int((~np.isfinite(normals[rows]).all(axis=1)).sum())
-        few_points += int((np.minimum(measured.n1[rows], measured.n2[rows])[known[rows]] < few).sum())
-    distance, lod95, places = (chosen(column, known) for column in (measured.distance, measured.lod95, core))
-    significant = chosen(beyond, known)
-    figures = _figures(distance, lod95) if len(distance) else dict.fromkeys(FIGURES, float("nan"))
-    return Summary(
-        core_points=len(core),
-        without_normal=without_normal,
-        without_lod=len(core) - len(distance),
-        few_points=few_points,
-        significant=int(np.count_nonzero(significant)),
-        significant_share=share(significant, places, SHARE_CELL * projection_diameter_mm),
-        **figures,
-    )
-
-
-FIGURES = ("mean", "median", "sd", "rms", "min", "max", "lod95_median", "min_lod95", "max_lod95")
-
-
-def _figures(distance: Floats, lod95: Floats) -> dict[str, float]:
-    """Return FIGURES of distances (k,) with levels of detection (k,), k > 0."""
-    count = len(distance)
-    mean = total(distance) / count
-    low, high = large_arrays.extremes(distance)
-    return {
-        "mean": mean,
-        "median": large_arrays.median(distance),
-        "sd": math.sqrt(total(distance, lambda part: (part - mean) ** 2) / count),
-        "rms": math.sqrt(total(distance, np.square) / count),
-        "min": low,
-        "max": high,
-        "lod95_median": large_arrays.median(lod95),
-        "min_lod95": float(lod95[large_arrays.first_of(distance, low)]),
-        "max_lod95": float(lod95[large_arrays.first_of(distance, high)]),
-    }
-
-
-def share(marked: Bools, places: Floats, cell: float) -> Share:
-    """Share of places (k, 3) that are ``marked`` (k,), with Wilson's interval for the effective number of places.
-
-    Neighbouring places share points and so agree. The effective number follows from how the marks vary between cells.
-    """
-    if not len(marked):
-        return Share(float("nan"), float("nan"), float("nan"))
-    p = int(np.count_nonzero(marked)) / len(marked)
-    low = large_arrays.corners(places)[0]
-
-    def cells_of(rows: slice) -> Ints:
-        return np.floor((places[rows] - low) / cell).astype(np.int64)
-
-    filled = np.empty((0, 3), np.int64)
-    for rows in blocks(len(marked)):
-        filled = distinct(np.concatenate([filled, distinct(cells_of(rows)).rows])).rows
-    cells = len(filled)
-    sums = np.zeros(cells)
-    for rows in blocks(len(marked)):  # added in the order of the rows, whatever the blocks are
-        number = distinct(np.concatenate([filled, cells_of(rows)])).number[cells:]
-        np.add.at(sums, number, marked[rows] - p)
-    variance = float(sums @ sums) / len(marked) ** 2 * cells / max(cells - 1, 1)
-    count = min(max(p * (1.0 - p) / variance, 1.0), float(len(marked))) if variance > 0.0 else float(cells)
-    middle = (p + Z95**2 / (2.0 * count)) / (1.0 + Z95**2 / count)
-    half = Z95 / (1.0 + Z95**2 / count) * math.sqrt(p * (1.0 - p) / count + Z95**2 / (4.0 * count**2))
-    return Share(p, max(0.0, min(p, middle - half)), min(1.0, max(p, middle + half)))
 
 
 # --- The loops of M3C2 and of normals, compiled. Each place is independent, so that threads do not change results.

@@ -89,10 +89,8 @@ def _summary(result: Comparison) -> dict[str, Any]:
     figures = {
         field.name: getattr(summary, field.name)
         for field in dataclasses.fields(summary)
-        if field.name not in ("significant_share", "min_lod95", "max_lod95")
+        if field.name != "significant_share"
     }
-    for end, half in (("min", summary.min_lod95), ("max", summary.max_lod95)):
-        figures[f"{end}_ci95"] = [figures[end] - half, figures[end] + half]
     return figures | {"significant_share": share.share, "significant_share_ci95": [share.low, share.high]}
 
 
@@ -155,11 +153,8 @@ def lines(result: Comparison) -> list[Message]:
     summary = result.summary
     unit = f" {result.unit}" if result.unit else ""
 
-    def number(value: float, half: float = math.nan) -> str:
-        if not math.isfinite(value):
-            return NO_NUMBER
-        interval = f" ± {half:.3g}" if math.isfinite(half) else ""
-        return f"{value:.6g}{interval}{unit}"
+    def number(value: float) -> str:
+        return f"{value:.6g}{unit}" if math.isfinite(value) else NO_NUMBER
 
     with_lod = summary.core_points - summary.without_lod
     total = text("{count} core points, {known} with a level of detection", count=summary.core_points, known=with_lod)
@@ -174,12 +169,18 @@ def lines(result: Comparison) -> list[Message]:
         high=100.0 * share.high,
     )
     distance = text(
-        "distance: mean {mean}, median {median}, sd {sd}, from {least} to {greatest}",
+        "distance: mean {mean}, median {median}, sd {sd}, "
+        "least {least} (95 %: {least_low} to {least_high}), "
+        "greatest {greatest} (95 %: {greatest_low} to {greatest_high})",
         mean=number(summary.mean),
         median=number(summary.median),
         sd=number(summary.sd),
-        least=number(summary.min, summary.min_lod95),
-        greatest=number(summary.max, summary.max_lod95),
+        least=number(summary.min),
+        least_low=number(summary.min_ci95[0]),
+        least_high=number(summary.min_ci95[1]),
+        greatest=number(summary.max),
+        greatest_low=number(summary.max_ci95[0]),
+        greatest_high=number(summary.max_ci95[1]),
     )
     lod95 = text("median level of detection {lod95}", lod95=number(summary.lod95_median))
     return [total, beyond, distance, lod95, *result.notes]

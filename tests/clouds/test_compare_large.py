@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from processor import large_arrays
+from processor.adjustment import distance_summary
 from processor.cli.main import commands
 from processor.compare import core_tiles
 from processor.compare.compare import Request, compare
@@ -186,6 +187,6 @@ def test_a_summary_by_blocks_is_that_of_the_whole(tiny):
     core, normals = 100.0 * rng.random((3000, 3)), rng.normal(size=(3000, 3))
     columns = [rng.normal(size=3000), np.where(rng.random(3000) < 0.2, np.nan, rng.random(3000))]
     found = m3c2.Distances(*columns, *rng.integers(0, 40, (2, 3000)), *rng.random((2, 3000)))
-    whole = m3c2.summary(found, core, normals, 2.0, 20)
+    whole = distance_summary.of_distances(found, core, normals, 2.0, 20)
     tiny()
-    assert m3c2.summary(found, core, normals, 2.0, 20) == whole
+    assert distance_summary.of_distances(found, core, normals, 2.0, 20) == whole

@@ -143,3 +143,26 @@ def test_stations_that_differ_widen_the_level_of_detection(offset):
     else:
         assert 0.06 < np.median(shared) < 0.4  # 0.3 / sqrt(5), widened for five stations
         assert core.distances.significant[known].mean() < 0.1
+
+
+def test_mixed_pixels_behind_bars_are_no_deviation():
+    """A beam that meets the edge of a bar and the wall 20 mm behind it states a range between the two."""
+    scanner, step, bars = np.array([0.0, -5000.0, 0.0]), 2.0e-3, 60.0 * np.arange(-5, 6)
+    turn, rise = (x.ravel() for x in np.meshgrid(np.arange(-40, 41) * step, np.arange(-40, 41) * step))
+    ray = np.stack([np.sin(turn) * np.cos(rise), np.cos(turn) * np.cos(rise), np.sin(rise)], axis=1)
+    x = ray[:, 0] / ray[:, 1] * 4980.0  # in the plane of the bars' faces
+    beside = np.abs(x[:, None] - bars).min(axis=1) - 10.0  # of a bar's edge: bars are 20 mm wide
+    share = np.clip(0.5 - beside / 7.0, 0.0, 1.0)  # of a beam 7 mm wide that meets a bar
+    depth = 5000.0 - 20.0 * share
+    noise = np.random.default_rng(5).normal(0.0, 0.3, len(ray))
+    points = scanner + ray * (depth / ray[:, 1] + noise)[:, None]
+    boxes = [trimesh.creation.box((800.0, 20.0, 800.0)).apply_translation((0.0, 10.0, 0.0))]
+    boxes += [trimesh.creation.box((20.0, 5.0, 800.0)).apply_translation((x, -17.5, 0.0)) for x in bars]
+    mesh = trimesh.util.concatenate(boxes)
+    design = StructureDesign("grating", np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    scene = Scene("grating", "structure", (Scan("s", points, position=scanner),), structure=design, units="mm")
+    result = deviation_step.run(scene, AS_IT_LIES)
+    known = np.isfinite(result.core.lod95)
+    assert known.sum() > 500
+    assert np.abs(result.core.distance[known]).max() < 1.0
+    assert abs(result.mean) < 0.05

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from processor.adjustment import distance_summary
 from processor.adjustment.point_groups import group_means
 from processor.deviation import cloud as deviation_cloud
 from processor.deviation import local_translation as moving
@@ -62,7 +63,9 @@ def test_a_share_of_independent_places_has_the_interval_of_its_count():
     covered = 0
     for _ in range(200):
         marks = rng.random(400) < 0.05
-        found = m3c2.share(marks, np.column_stack([np.arange(400) * 10.0, np.zeros(400), np.zeros(400)]), 5.0)
+        found = distance_summary.share(
+            marks, np.column_stack([np.arange(400) * 10.0, np.zeros(400), np.zeros(400)]), 5.0
+        )
         assert found.low <= found.share <= found.high
         covered += found.low <= 0.05 <= found.high
     assert 0.9 <= covered / 200 <= 1.0
@@ -71,13 +74,13 @@ def test_a_share_of_independent_places_has_the_interval_of_its_count():
 def test_share_of_correlated_places_has_the_interval_of_one_per_place():
     marks = np.repeat(np.random.default_rng(8).random(100) < 0.3, 50)
     places = np.repeat(np.arange(100.0), 50)[:, None] * [100.0, 0.0, 0.0]
-    found = m3c2.share(marks, places, 60.0)
-    alone = m3c2.share(marks[::50], places[::50], 60.0)
+    found = distance_summary.share(marks, places, 60.0)
+    alone = distance_summary.share(marks[::50], places[::50], 60.0)
     assert found.high - found.low == pytest.approx(alone.high - alone.low, rel=0.05)
-    none = m3c2.share(np.zeros(5000, bool), places, 60.0)
+    none = distance_summary.share(np.zeros(5000, bool), places, 60.0)
     assert none.low == 0.0
     assert 0.02 < none.high < 0.05  # rule of three for 100 cells
-    assert np.isnan(m3c2.share(np.zeros(0, bool), np.zeros((0, 3)), 1.0).share)
+    assert np.isnan(distance_summary.share(np.zeros(0, bool), np.zeros((0, 3)), 1.0).share)
 
 
 def planes_compared(seed, off=0.0, error=0.0):
@@ -114,7 +117,7 @@ def test_summary_counts_core_points_without_level_of_detection():
         np.array([30, 10, 30, 3]), np.ones(4), np.ones(4),
     )  # fmt: skip
     normals = np.array([UP, UP, [nan] * 3, UP])
-    total = m3c2.summary(found, np.arange(12.0).reshape(4, 3), normals, 1.0, 20)
+    total = distance_summary.of_distances(found, np.arange(12.0).reshape(4, 3), normals, 1.0, 20)
     assert (total.core_points, total.without_lod, total.without_normal) == (4, 2, 1)
     assert (total.few_points, total.significant) == (1, 1)
     assert (total.mean, total.min, total.max, total.rms) == (-1.0, -3.0, 1.0, pytest.approx(np.sqrt(5.0)))

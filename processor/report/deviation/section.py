@@ -11,7 +11,7 @@ from processor.deviation.result import Result
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.m3c2 import Z95
 from processor.language.messages import Message, text
-from processor.model import Floats, Ints, Scene, Status, StepRun
+from processor.model import Ints, Scene, Status, StepRun
 from processor.pipeline import Execution
 from processor.report.charts import surface_view
 from processor.report.deviation import core_points_csv, face_maps, figures
@@ -29,6 +29,7 @@ def _summary(result: Result) -> tuple[Message, Message]:
     if not len(result.core):
         return result.status, text("{reasons}", reasons=result.reasons)
     low, high = result.significant_share_ci95.tolist()
+    (least_low, least_high), (greatest_low, greatest_high) = result.min_ci95.tolist(), result.max_ci95.tolist()
     head = text(
         "{status}, {share:.1f} % of the surface measured is beyond its LOD95",
         status=result.status,
@@ -36,15 +37,18 @@ def _summary(result: Result) -> tuple[Message, Message]:
     )
     body = text(
         "95 % interval of this share: {low:.1f} to {high:.1f} %. "
-        "Deviations from {least} ± {least_half} to {greatest} ± {greatest_half} mm (95 %), "
-        "{near:.1f} % of them within 10 mm; median LOD95 {lod95} mm, {registration} mm of it registration. "
+        "Least deviation {least} mm (95 %: {least_low} to {least_high}), greatest {greatest} mm "
+        "(95 %: {greatest_low} to {greatest_high}), {near:.1f} % within 10 mm; median LOD95 {lod95} mm, "
+        "{registration} mm of it registration. "
         "{measured} of {core} core points were measured.",
         low=100.0 * low,
         high=100.0 * high,
         least=result.min,
-        least_half=_half(result.min_ci95),
+        least_low=least_low,
+        least_high=least_high,
         greatest=result.max,
-        greatest_half=_half(result.max_ci95),
+        greatest_low=greatest_low,
+        greatest_high=greatest_high,
         near=100.0 * result.within_10mm_share,
         lod95=result.lod95_median,
         registration=Z95 * result.registration_error,
@@ -54,10 +58,6 @@ def _summary(result: Result) -> tuple[Message, Message]:
     if result.status is Status.OK:
         return head, body
     return head, text("{reason}. {rest}", reason=result.reasons[:1], rest=body)
-
-
-def _half(interval: Floats) -> float:
-    return 0.5 * float(interval[1] - interval[0])
 
 
 def _tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
