@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,6 +16,7 @@ from processor.defects.deviation_field import Field, component_of_cells
 from processor.defects.scan_statistic import Levels
 from processor.defects.surface_charts import DesignSurface
 from processor.distinct_rows import distinct
+from processor.geometry import mesh_distance
 from processor.model import NORMAL_95, Floats, Ints
 
 BLOCKS_ALONG, BLOCKS_ACROSS = 36, 16  # of a component's largest face, at least
@@ -44,14 +46,26 @@ class ComponentShape:
 
 @dataclass(frozen=True)
 class SignificantShape:
-    """A significant shape: its largest value (mm, outward positive), the half-width of its 95 % interval, its z."""
+    """A significant shape: its largest value (mm, outward positive), the half-width of its 95 % interval, its z.
+
+    ``volume_ci95`` (mm3) is the half-width of that of the volume that the shape displaces.
+    """
 
     shape: shape_models.Shape
     peak: float
     ci95: float
+    volume_ci95: float
     z: float
     chance: float  # expected number of false alarms as strong on one mm2
     margin: float  # chi-square of the best fit of another kind less this one's
+
+
+class _Levels(NamedTuple):
+    """How much larger than by the noise of blocks the noise of a component is, and the common errors, one sd, mm."""
+
+    inflation: float
+    common_mm: float
+    systematic_mm: float
 
 
 def fit_all(field: Field, surface: DesignSurface) -> list[ComponentShape]:
@@ -136,16 +150,8 @@ def significant(
         size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
         inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
         for shape in candidates:
-            rows = cells_of_shape(surface, field, fit, shape)
-            points, outward = with_corners(surface, rows)
-            value = own = shape.values(fit.frame, points, outward)
-            registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
-            if shape.kind != shape_models.RIGID and not alignment.fitted:
-                # The error of a pose that was not fitted to the design may be large: it moves, it does not deform.
-                own = value - _rigid_part(fit, shape).values(fit.frame, points, outward)
-                registration = np.full_like(value, field.stations_sd(rows, free=True))
-            noise = shape.sd(fit.frame, points, outward) * inflation
-            sd = np.sqrt(noise**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration**2)
+            own_levels = _Levels(inflation, levels.common_mm, levels.systematic_mm)
+            value, own, sd, volume_sd = _errors(fit, shape, surface, field, alignment, own_levels)
             top = int(np.argmax(np.abs(value)))
             z = deviate_of_one(float((np.abs(own) / sd).max()), len(shape.factors))
             if z > threshold:
@@ -153,12 +159,41 @@ def significant(
                     shape=shape,
                     peak=float(value[top]),
                     ci95=NORMAL_95 * float(sd[top]),
+                    volume_ci95=NORMAL_95 * volume_sd,
                     z=z,
                     chance=2.0 * float(ndtr(-z)) * len(shape_models.BASES) / area,
                     margin=fit.fitted.margin / inflation**2,
                 )
                 chosen.setdefault(fit.component, []).append(judged)
     return chosen
+
+
+def _errors(
+    fit: ComponentShape,
+    shape: shape_models.Shape,
+    surface: DesignSurface,
+    field: Field,
+    alignment: Alignment,
+    levels: _Levels,
+) -> tuple[Floats, Floats, Floats, float]:
+    """Return a shape's values (n,) at cells and corners, those that its significance is of, and their errors, one sd.
+
+    The last number is the standard deviation of the volume that the shape displaces, mm3.
+    """
+    rows = cells_of_shape(surface, field, fit, shape)
+    points, outward = with_corners(surface, rows)
+    value = own = shape.values(fit.frame, points, outward)
+    registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
+    if shape.kind != shape_models.RIGID and not alignment.fitted:
+        # The error of a pose that was not fitted to the design may be large: it moves, it does not deform.
+        own = value - _rigid_part(fit, shape).values(fit.frame, points, outward)
+        registration = np.full_like(value, field.stations_sd(rows, free=True))
+    noise = shape.sd(fit.frame, points, outward) * levels.inflation
+    shared = np.sqrt(levels.common_mm**2 + levels.systematic_mm**2 + registration**2)
+    cells = slice(len(rows))
+    swept = np.sign(value[cells]) * cell_areas(surface, rows)
+    swept_sd = levels.inflation * shape.total_sd(fit.frame, points[cells], outward[cells], swept)
+    return value, own, np.hypot(noise, shared), float(np.hypot(swept_sd, np.abs(swept) @ shared[cells]))
 
 
 def _rigid_part(fit: ComponentShape, shape: shape_models.Shape) -> shape_models.Shape:
@@ -216,6 +251,17 @@ def cells_of_shape(
     cells = np.arange(of_face.start, of_face.stop)
     shown: Ints = cells[surface.share[cells] > 0.5]
     return shown if len(shown) else front
+
+
+def cell_areas(surface: DesignSurface, cells: Ints) -> Floats:
+    """Return the areas (n,) of the cells of whole faces, mm2, whose sum is that of the faces' facets.
+
+    Samples of cells at the border give the area of a face to about 1 %.
+    """
+    share = surface.share[cells]
+    on_faces = np.isin(surface.chart_of, np.unique(chart_of_cells(surface)[cells]))
+    exact = mesh_distance.area(surface.vertices, surface.faces[on_faces])
+    return exact * share / max(float(share.sum()), 1e-9)
 
 
 def front_of(surface: DesignSurface, component: int, field: Field) -> Ints:

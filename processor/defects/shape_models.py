@@ -68,6 +68,11 @@ class Shape:
         deviations: Floats = np.sqrt(np.einsum("ni,ij,nj->n", columns, self.covariance, columns))
         return deviations
 
+    def total_sd(self, frame: Frame, points: Floats, outward: Floats, weight: Floats) -> float:
+        """Return the standard deviation of the weighted (n,) sum of the shape's deviations there, by the same noise."""
+        total = weight @ self._columns(frame, points, outward)
+        return float(np.sqrt(total @ self.covariance @ total))
+
     def _columns(self, frame: Frame, points: Floats, outward: Floats) -> Floats:
         return BASES[self.kind](frame.local(points), outward @ frame.axes.T, frame.half, self.at)
 

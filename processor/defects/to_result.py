@@ -12,7 +12,13 @@ import numpy as np
 from processor.defects import classification, defect_grids, measures
 from processor.defects.alignment import Alignment
 from processor.defects.classification import Classification
-from processor.defects.component_shapes import ComponentShape, SignificantShape, cells_of_shape, with_corners
+from processor.defects.component_shapes import (
+    ComponentShape,
+    SignificantShape,
+    cell_areas,
+    cells_of_shape,
+    with_corners,
+)
 from processor.defects.deviation_field import Field
 from processor.defects.measures import CellPoints, Measures
 from processor.defects.params import Params
@@ -175,8 +181,10 @@ def _of_held_plate(search: Search, rows: Ints, shapes: list[SignificantShape], f
     held = min(float(np.sqrt(np.mean(total[side] ** 2))) for side in sides if side.any())
     if held > HELD_SHARE * abs(peak):
         return shapes
-    ci95 = float(np.hypot(bent[0].ci95, rigid_motion[0].ci95))
-    return [dataclasses.replace(bent[0], peak=peak, ci95=ci95)]
+    ci95, volume_ci95 = (
+        float(np.hypot(*of)) for of in zip(*((one.ci95, one.volume_ci95) for one in shapes), strict=True)
+    )
+    return [dataclasses.replace(bent[0], peak=peak, ci95=ci95, volume_ci95=volume_ci95)]
 
 
 def _shape_defect(search: Search, component: int, rows: Ints, judged: SignificantShape, frame: Frame) -> Defect:
@@ -189,7 +197,7 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
         beyond = np.abs(value) > max(judged.ci95, STEP_SHARE * abs(judged.peak))
         part = beyond if beyond.any() else part
         extent[int(judged.shape.at[0])] *= 0.5 * (1.0 - judged.shape.at[1])
-    area = surface.share[rows] * surface.charts.cell_mm**2
+    area = cell_areas(surface, rows)
     both_ways = kind in ("twist", "waviness")
     volume = float((np.abs(value) if both_ways else -value) @ area)
     if kind == RIGID:  # what is swept: a round face goes outward on one side and inward on the other
@@ -206,7 +214,7 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
         depth_ci95=judged.ci95,
         depth_mean=volume / float(area[part].sum()),
         volume_mm3=volume,
-        volume_ci95=judged.ci95 * float(area.sum()) / NORMAL_95,
+        volume_ci95=judged.volume_ci95,
         edge_distance=float(frame.half[:2].min()),
         curvature_per_m=_curvature(judged, frame.half),
         lod95=judged.ci95,

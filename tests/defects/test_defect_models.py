@@ -90,7 +90,7 @@ def test_a_body_is_moved_as_its_shape_states():
     frame = shape_models.Frame(np.array([100.0, 50.0, 25.0]), np.eye(3), np.array([100.0, 50.0, 25.0]), 50.0)
     angle, span = 0.02, 100.0
     shape = shape_models.Shape(shape_models.RIGID, (), np.array([1.0, -2.0, 3.0, 0.0, 0.0, angle * span]))
-    judged = SignificantShape(shape=shape, peak=3.0, ci95=0.1, z=9.0, chance=0.0, margin=9.0)
+    judged = SignificantShape(shape=shape, peak=3.0, ci95=0.1, volume_ci95=9.0, z=9.0, chance=0.0, margin=9.0)
     fit = ComponentShape(0, frame, None, None)
     design = moved_bodies.design("box", surface, {0: (fit, judged)})
     arm = surface.vertices - frame.origin

@@ -181,6 +181,13 @@ def test_shapes_of_whole_components(kind, inward, depth):
     result = run(scene_of(4, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)))
     assert found(result) == [(kind, "component-2")]
     assert abs(result.defects.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
+    if (
+        kind == "misalignment"
+    ):  # by 2 mm on average; a plate that is wrong by its depth's interval everywhere is so by this
+        (area,), (volume,), (ci95,) = result.defects.area_mm2, result.defects.volume_mm3, result.defects.volume_ci95
+        assert area == pytest.approx(SIDE**2, rel=1e-9)
+        assert abs(volume - 2.0 * SIDE**2) < ci95
+        assert 0.5 < ci95 / SIDE**2 / result.defects.depth_ci95[0] <= 1.0
     curve = result.defects.deflection[0]
     assert len(curve.displacement) == (40 if kind == "bend" else 0)
     if kind == "bend":
