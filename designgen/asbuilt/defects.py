@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from designgen.checks import expect
-from designgen.designs import plate_row
-from designgen.designs.box_and_tube import Box, Component
-from designgen.designs.patch import Displacement, Patch, outside
+from designgen.designs import defect_specimens
+from designgen.designs.parametric_face import Displacement, Patch, outside
+from designgen.designs.structure_bodies import Box, Component
 from processor.model import Bools, Floats, UsageError
 
 CLASSES = (
@@ -83,12 +83,12 @@ class Defect:
         return displaced
 
 
-def extent(form: plate_row.Params) -> tuple[float, float]:
+def extent(form: defect_specimens.Params) -> tuple[float, float]:
     """Return length and height of the front, mm; of a girder, those of the web between the flanges."""
     return form.length_mm, form.height_mm - (2.0 * form.flange_mm if form.form == "girder" else 0.0)
 
 
-def draw(kind: str, params: Params, form: plate_row.Params, rng: np.random.Generator, name: str = "") -> Defect:
+def draw(kind: str, params: Params, form: defect_specimens.Params, rng: np.random.Generator, name: str = "") -> Defect:
     """Draw a defect of a class on a component; ``name`` is the component's name in messages.
 
     Raises UsageError for an unknown class and for a size that does not fit on the component.
@@ -104,7 +104,7 @@ def draw(kind: str, params: Params, form: plate_row.Params, rng: np.random.Gener
     return _whole(kind, params, form)
 
 
-def _check_fits(kind: str, params: Params, form: plate_row.Params, name: str) -> None:
+def _check_fits(kind: str, params: Params, form: defect_specimens.Params, name: str) -> None:
     L, H = extent(form)
     least = min(L, H)
     along, across = (L, H) if form.form == "plate" else (H, L)  # with respect to the edge that loses a piece
@@ -144,7 +144,7 @@ def _middle(shares: tuple[float, float], size: tuple[float, float], half: tuple[
     return a, b
 
 
-def _bumped(kind: str, params: Params, form: plate_row.Params, shares: tuple[float, float]) -> Defect:
+def _bumped(kind: str, params: Params, form: defect_specimens.Params, shares: tuple[float, float]) -> Defect:
     pit = kind == "pit"
     radius = params.pit_radius_mm if pit else params.dent_radius_mm
     depth = params.sized("pit_depth_mm" if pit else "dent_depth_mm") * (-1.0 if kind == "bulge" else 1.0)
@@ -167,7 +167,7 @@ def _bumped(kind: str, params: Params, form: plate_row.Params, shares: tuple[flo
     )
 
 
-def _whole(kind: str, params: Params, form: plate_row.Params) -> Defect:
+def _whole(kind: str, params: Params, form: defect_specimens.Params) -> Defect:
     """Return a defect of the whole component, or a step, which is one of its second half."""
     L, H = extent(form)
     place, step, area = (0.0, 0.0), 40.0, L * H
@@ -214,7 +214,7 @@ def _fading(b: Floats, H: float) -> Floats:
     return result
 
 
-def _missing(kind: str, params: Params, form: plate_row.Params, shares: tuple[float, float]) -> Defect:
+def _missing(kind: str, params: Params, form: defect_specimens.Params, shares: tuple[float, float]) -> Defect:
     L, H = extent(form)
     side, beyond = params.sized("loss_mm"), 1.0  # a rectangle that extends beyond an edge leaves no cut face there
     if kind == "edge-loss" and form.form == "plate":
@@ -259,7 +259,7 @@ def _rotation(angle: float, rate: float, shift: float = 0.0) -> Displacement:
     return displacement
 
 
-def damaged(place: plate_row.Place, boxes: list[Box], defect: Defect, front: int = 0) -> list[Patch]:
+def damaged(place: defect_specimens.Place, boxes: list[Box], defect: Defect, front: int = 0) -> list[Patch]:
     """Return the faces of a component with its defect; ``front`` is the row of the body with the missing piece."""
     faces = []
     for number, body in enumerate(boxes):
@@ -272,7 +272,7 @@ def damaged(place: plate_row.Place, boxes: list[Box], defect: Defect, front: int
         for patch in body.patches((a, b, n)):
             face = dataclasses.replace(patch, name=f"{number} {patch.name}", present=_present(patch, place, holes))
             if not defect.front_only or (number == front and patch.name == "+n"):
-                face = face.displaced(lambda x: defect.displacement(place.local(x)) @ plate_row.AXES)
+                face = face.displaced(lambda x: defect.displacement(place.local(x)) @ defect_specimens.AXES)
             faces.append(face)
         faces += [_cut(place, body, hole, i, n) for n, hole in enumerate(holes) for i in range(4)]
     return faces
@@ -290,14 +290,14 @@ def _knots(middle: float, size: float, axis: int, defect: Defect, holes: Floats)
     return knots
 
 
-def _present(patch: Patch, place: plate_row.Place, holes: Floats) -> Bools:
+def _present(patch: Patch, place: defect_specimens.Place, holes: Floats) -> Bools:
     """Mark the cells of a patch's net that lie outside of all holes."""
     p, q = np.meshgrid(0.5 * (patch.p[1:] + patch.p[:-1]), 0.5 * (patch.q[1:] + patch.q[:-1]), indexing="ij")
     local = place.local(patch.at(p.ravel(), q.ravel()))
     return outside(local[:, 0], local[:, 1], holes).reshape(p.shape)
 
 
-def _cut(place: plate_row.Place, body: Box, hole: Floats, side: int, number: int) -> Patch:
+def _cut(place: defect_specimens.Place, body: Box, hole: Floats, side: int, number: int) -> Patch:
     """Return one of the four faces through the plate around a hole, cut off at the plate's edges."""
     low, high = (place.local(body.centre[None])[0] + sign * 0.5 * body.size for sign in (-1.0, 1.0))
     a0, a1 = np.clip(hole[:2], low[0], high[0])
@@ -309,7 +309,7 @@ def _cut(place: plate_row.Place, body: Box, hole: Floats, side: int, number: int
     def at(p: Floats, q: Floats) -> Floats:
         ab = start + np.outer(q, end - start)
         local = np.column_stack([ab, low[2] + p * (high[2] - low[2])])
-        points: Floats = place.origin + local @ plate_row.AXES
+        points: Floats = place.origin + local @ defect_specimens.AXES
         return points
 
     ends = np.array([0.0, 1.0])

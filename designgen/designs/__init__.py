@@ -1,4 +1,5 @@
 """Components in closed form and as CadQuery solids.
 
-Read ``patch`` and ``box_and_tube`` first, then ``arch_part`` and ``bolt_ball``, then the structures made of them.
+Read ``parametric_face`` and ``structure_bodies`` first, then ``arch_part`` and ``bolt_ball``, then the structures made
+of them.
 """

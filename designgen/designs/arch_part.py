@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from designgen.curves import Curve
-from designgen.designs.patch import Patch, Surface, outside
+from designgen.designs.parametric_face import Patch, Surface, outside
 from processor.model import Bools, Floats
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from designgen.designs.bolting import Bore
-from designgen.designs.patch import Patch
+from designgen.designs.parametric_face import Patch
 from designgen.designs.sections import Section
 from processor.model import Bools, Floats, Ints
 

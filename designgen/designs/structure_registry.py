@@ -6,12 +6,16 @@ from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
-from designgen.designs import plate_row, stadium_roof, truss_bridge
-from designgen.designs.box_and_tube import Component
+from designgen.designs import defect_specimens, stadium_roof, truss_bridge
+from designgen.designs.structure_bodies import Component
 from designgen.recipe_params import filled
 from processor.model import UsageError
 
-TYPES: dict[Any, ModuleType] = {"stadium-roof": stadium_roof, "truss-bridge": truss_bridge, "plate-row": plate_row}
+TYPES: dict[Any, ModuleType] = {
+    "stadium-roof": stadium_roof,
+    "truss-bridge": truss_bridge,
+    "plate-row": defect_specimens,
+}
 
 
 def params(recipe: Mapping[str, Any]) -> Any:

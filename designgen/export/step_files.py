@@ -13,12 +13,12 @@ from designgen.cad.process import escape
 from designgen.designs import (
     arch_bridge,
     arch_part,
-    arch_ring,
-    assembly,
     bolting,
-    box_and_tube,
-    girder,
+    closed_ring,
+    girder_assemblies,
+    prismatic_solids,
     space_frame,
+    structure_bodies,
     structure_registry,
 )
 from designgen.export import model_solids
@@ -75,7 +75,7 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
     shapes: dict[str, cq.Shape]
     if kind in ("arch-bridge", "ring"):
         if kind == "ring":
-            parts = arch_ring.build(filled(arch_ring.Params, recipe, "ring"))
+            parts = closed_ring.build(filled(closed_ring.Params, recipe, "ring"))
         else:
             parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
         written = [folder / f"{part.name}.step" for part in parts]
@@ -90,7 +90,7 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
     elif kind == "structure":
         path = folder / "structure.step"
         components = structure_registry.design(recipe)
-        shapes = {component.name: box_and_tube.solid([component]) for component in components}
+        shapes = {component.name: structure_bodies.solid([component]) for component in components}
     elif kind == "assembly":
         path, shapes = folder / "assembly.step", _parts_of_assembly(recipe)
     else:
@@ -102,8 +102,8 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
 def _parts_of_assembly(recipe: Mapping[str, Any]) -> dict[str, cq.Shape]:
     """Return the solids of the girders and nodes of an assembly."""
     bolts = filled(bolting.Params, recipe, "bolts") if "bolts" in recipe else None
-    parts = assembly.build(filled(assembly.Params, recipe, "assembly"), bolts).parts
-    return {part.name: girder.solid(part.made_of) for part in parts}
+    parts = girder_assemblies.build(filled(girder_assemblies.Params, recipe, "assembly"), bolts).parts
+    return {part.name: prismatic_solids.solid(part.made_of) for part in parts}
 
 
 def write_step(path: Path, shapes: Mapping[str, cq.Shape], origin_mm: Sequence[float] = (0.0, 0.0, 0.0)) -> None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from designgen.asbuilt.imperfections import Ledger
-from designgen.designs.patch import Surface
+from designgen.designs.parametric_face import Surface
 from designgen.models.body_deviations import Defect, Deviation, Params, Triangles, deviation_of, missing_part
 from designgen.models.model import Model, ModelBody
 from designgen.models.subdivision import Spacing, subdivided

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from designgen.checks import expect_all
-from designgen.designs.patch import Displacement
+from designgen.designs.parametric_face import Displacement
 from designgen.models.model import Model, ModelBody
 from designgen.models.subdivision import Spacing
 from designgen.models.surface_samples import sample_surface, triangle_areas, triangle_normals

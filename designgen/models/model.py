@@ -10,7 +10,7 @@ import numpy as np
 
 from designgen.cad.bodies import Body
 from designgen.cad.face_surfaces import PLANE, surface_of
-from designgen.designs.patch import Surface, Trimmed
+from designgen.designs.parametric_face import Surface, Trimmed
 from designgen.models.mesh_topology import connected_components, shared_edges
 from processor.model import DesignBodies, Floats, Ints
 

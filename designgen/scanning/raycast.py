@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from designgen.designs.patch import Surface
+from designgen.designs.parametric_face import Surface
 from designgen.scanning import angular_bounds, ray_kernels, tree_kernels
 from designgen.scanning.surfaces import CONE, DISC, SPHERE, TRIANGLE, Surfaces
 from processor.model import Bools, Floats, Labels, Shorts

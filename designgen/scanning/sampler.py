@@ -10,7 +10,7 @@ import numpy as np
 from designgen.checks import expect_all
 from designgen.designs import arch_part, bolt_ball, space_frame
 from designgen.designs.arch_part import Face
-from designgen.designs.patch import Patch, within_triangle
+from designgen.designs.parametric_face import Patch, within_triangle
 from designgen.rigid import perpendicular
 from processor.model import SOURCES, Bools, Codes, Floats, Labels
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from designgen.designs.patch import Patch, Trimmed, within_triangle
+from designgen.designs.parametric_face import Patch, Trimmed, within_triangle
 from designgen.low_discrepancy import in_square
 from designgen.scanning import triangle_tree
 from designgen.scanning.triangle_tree import Tree

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from designgen.asbuilt import imperfections
-from designgen.designs import arch_bridge, arch_mesh, arch_part, arch_ring
-from designgen.designs.patch import Surface
+from designgen.designs import arch_bridge, arch_mesh, arch_part, closed_ring
+from designgen.designs.parametric_face import Surface
 from designgen.randomness import generator, random_pose
 from designgen.recipe_params import filled
 from designgen.rigid import inverse, rigid
@@ -31,7 +31,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
 
 def make_ring(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
     """Make the scene of a closed ring of ribs, as of a bridge."""
-    parts = arch_ring.build(filled(arch_ring.Params, recipe, "ring"))
+    parts = closed_ring.build(filled(closed_ring.Params, recipe, "ring"))
     return _made(name, recipe, scanning, seed, parts, closed=True)
 
 

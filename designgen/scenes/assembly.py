@@ -10,8 +10,8 @@ import numpy as np
 
 from designgen.asbuilt.imperfections import Ledger
 from designgen.checks import expect
-from designgen.designs import assembly as design_of
 from designgen.designs import bolting
+from designgen.designs import girder_assemblies as design_of
 from designgen.designs.prismatic import EndErrors, Part
 from designgen.randomness import generator, random_pose
 from designgen.recipe_params import filled

@@ -11,8 +11,8 @@ import numpy as np
 
 from designgen.asbuilt import defects as asbuilt_defects
 from designgen.asbuilt import imperfections
-from designgen.designs import box_and_tube, plate_row, structure_registry
-from designgen.designs.patch import Displacement, Patch
+from designgen.designs import defect_specimens, structure_bodies, structure_registry
+from designgen.designs.parametric_face import Displacement, Patch
 from designgen.low_discrepancy import van_der_corput
 from designgen.randomness import generator
 from designgen.recipe_params import filled
@@ -39,12 +39,12 @@ from processor.model import (
 
 NEXT_WINDOW_MM = 9_000.0  # from one scan of a station to the next, of a scanner that does not turn
 TRUTH_STEP_MM = 250.0
-Components = tuple[box_and_tube.Component, ...]
+Components = tuple[structure_bodies.Component, ...]
 PartPatches = list[tuple[int, Patch]]  # the row of the component of each face
 OfDefects = Callable[[Floats, PointLabels], Labels]  # points in the design's frame -> defect of each
 
 
-PlacedDefect = tuple[plate_row.Place, asbuilt_defects.Defect]
+PlacedDefect = tuple[defect_specimens.Place, asbuilt_defects.Defect]
 
 
 class Built(NamedTuple):
@@ -76,7 +76,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         if of_defects is not None:
             surveyed = _labelled(surveyed, of_defects)
         scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
-        corners = np.vstack([box_and_tube.mesh_of((one,))[0] for one in components if one.name != "ground"])
+        corners = np.vstack([structure_bodies.mesh_of((one,))[0] for one in components if one.name != "ground"])
         picks = _picks(recipe, scans, station_truth, params, corners + origin, seed)
         if not params.registered:
             scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
@@ -93,7 +93,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         if of_defects is not None:
             label = dataclasses.replace(label, defect=of_defects(cloud.points, label))
         labels = (label,)
-    vertices, faces = box_and_tube.mesh_of(components)
+    vertices, faces = structure_bodies.mesh_of(components)
     scene = Scene(
         name,
         "structure",
@@ -172,14 +172,16 @@ def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Bui
     sizes = filled(asbuilt_defects.Params, recipe, "asbuilt")
     patches: PartPatches = []
     placed: list[PlacedDefect] = []
-    for part, place in enumerate(plate_row.places(form)):
+    for part, place in enumerate(defect_specimens.places(form)):
         if place.defect == "none":
             patches += [(part, patch) for patch in components[part].patches]
             continue
         defect = asbuilt_defects.draw(place.defect, sizes, form, generator(seed, f"defect {place.name}"), place.name)
-        patches += [(part, patch) for patch in asbuilt_defects.damaged(place, plate_row.bodies(form, place), defect)]
+        patches += [
+            (part, patch) for patch in asbuilt_defects.damaged(place, defect_specimens.bodies(form, place), defect)
+        ]
         placed.append((place, defect))
-    centres = [place.origin + np.array([*defect.place, 0.0]) @ plate_row.AXES for place, defect in placed]
+    centres = [place.origin + np.array([*defect.place, 0.0]) @ defect_specimens.AXES for place, defect in placed]
     truth = DefectTruth(
         ids=np.arange(len(placed)),
         classes=tuple(defect.kind for _, defect in placed),
@@ -211,7 +213,7 @@ def _as_designed(components: Components) -> PartPatches:
 def _hidden(components: Components) -> Callable[[int, Floats, Floats], Bools]:
     """Return a function that marks the places on the design's faces inside of a body."""
     faces = [patch for _, patch in _as_designed(components)]
-    inside = box_and_tube.covered(components)
+    inside = structure_bodies.covered(components)
     return lambda row, p, q: inside(faces[row].at(p, q))
 
 
@@ -278,6 +280,6 @@ def _truth(components: Components, displacement: Displacement | None, origin: Fl
             points.append(patch.at(p, q))
             normals.append(normal / np.linalg.norm(normal, axis=1)[:, None])
     x = np.vstack(points)
-    visible = ~box_and_tube.covered(components)(x)
+    visible = ~structure_bodies.covered(components)(x)
     x = x[visible]
     return StructureTruth(x + origin, np.vstack(normals)[visible], displacement(x))

@@ -61,23 +61,23 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
     from processor.jobs import tile_cluster
     from processor.language.messages import messages
     from processor.plain_text import printable
-    from processor.report import comparison
+    from processor.report import cloud_comparison
     from processor.scan_folder.files import missing
     from processor.store import output_checks
 
     for path in (reference, compared):
         if not path.exists():
             raise missing(path)
-    comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
+    cloud_comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
     address = options.pop("cluster")
     given = {name: value for name, value in options.items() if value is not None}
     with large_arrays.in_files(output_checks.existing_parent(output)):
         with tile_cluster.on_cluster(address, print_error_line):
             result = comparing.compare(comparing.Request(reference, compared, **given), print_error_line)
-        record = comparison.write(output, result, lang)
+        record = cloud_comparison.write(output, result, lang)
     if as_json:
         click.echo(json.dumps(record, ensure_ascii=False))
         return
-    for line in comparison.lines(result):
+    for line in cloud_comparison.lines(result):
         click.echo(printable(messages("en").text(line)))
-    click.echo(f"report: {output / comparison.PAGE}")
+    click.echo(f"report: {output / cloud_comparison.PAGE}")

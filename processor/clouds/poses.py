@@ -12,7 +12,7 @@ from processor.components import bridge_parts
 from processor.geometry import rigid
 from processor.model import Floats, InputError, Reason, Scan, Status, UsageError, reason
 from processor.scene_cloud import UNPLACED
-from processor.stitching import pose_covariance
+from processor.stitching import poses_with_scale
 
 
 @dataclass(frozen=True)
@@ -91,10 +91,10 @@ def _stitched(run: Run, what: str) -> Poses:
             continue
         if status != Status.OK:
             remarks.append(reason("export.scan-doubtful", scan=scan.name, status=status))
-        scale = pose_covariance.scale_of(T) if run.parameters["stitch"].get("scale") == "free" else 1.0
+        scale = poses_with_scale.scale_of(T) if run.parameters["stitch"].get("scale") == "free" else 1.0
         if scale != 1.0:
             remarks.append(reason("export.scan-scaled", scan=scan.name, scale=scale))
-        pose = rigid.transform(pose_covariance.rotation_of(T) if scale != 1.0 else T[:3, :3], T[:3, 3])
+        pose = rigid.transform(poses_with_scale.rotation_of(T) if scale != 1.0 else T[:3, :3], T[:3, 3])
         placed.append(Placed(number, scan, pose, scale))
     if not placed:
         raise InputError(f"{run.name}: step stitch placed no scan, so there is nothing to export as {what}")

@@ -7,7 +7,7 @@ import numpy as np
 from processor.evaluation.error_statistics import covered_pulls, pose_pulls
 from processor.geometry import rigid
 from processor.model import Floats, Metric, Scene, StationTruth, Statistic, Status, Truth
-from processor.stitching import pose_covariance
+from processor.stitching import poses_with_scale
 from processor.stitching.result import Result
 
 POSITION_MM, ROTATION_MRAD = 0.5, 0.02
@@ -51,7 +51,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     fitted = datum(T[fit], true[fit]) @ T
     off = np.linalg.norm(fitted[:, :3, 3] - true[:, :3, 3], axis=1)
     turn = 1e3 * np.array(
-        [rigid.rotation_angle(pose_covariance.rotation_of(a) @ b[:3, :3].T) for a, b in zip(fitted, true, strict=True)]
+        [rigid.rotation_angle(poses_with_scale.rotation_of(a) @ b[:3, :3].T) for a, b in zip(fitted, true, strict=True)]
     )
     # The accuracy of points picked by hand is no limit of the software.
     position, rotation = (NAN, NAN) if result.method == "three-point" else (POSITION_MM, ROTATION_MRAD)
@@ -117,8 +117,8 @@ def pulls_of(result: Result, rows: list[int], true: Floats) -> Floats:
             continue
         expected = M @ true_pose
         position = scans.position[i]
-        in_scan = rigid.apply(pose_covariance.invert(scans.T_project_scan[i]), position)
-        rotation = pose_covariance.difference(scans.T_project_scan[i], expected)[:3]
+        in_scan = rigid.apply(poses_with_scale.invert(scans.T_project_scan[i]), position)
+        rotation = poses_with_scale.difference(scans.T_project_scan[i], expected)[:3]
         shift = position - rigid.apply(expected, in_scan)
         pulls.append(np.concatenate([shift / scans.position_sd[i], rotation / scans.rotation_sd[i]]))
     return np.concatenate(pulls) if pulls else np.empty(0)

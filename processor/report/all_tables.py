@@ -12,7 +12,7 @@ from processor.model import METRIC_NAMES, Metric, Statistic, StepRun
 from processor.pipeline import Execution
 from processor.report import characteristics
 from processor.report.columns import columns
-from processor.report.limit_table import limit_table
+from processor.report.limit_comparison_table import limit_table
 from processor.report.reports_of_steps import characteristics_of, step_report
 from processor.report.table import Table
 

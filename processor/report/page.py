@@ -203,7 +203,7 @@ def _section(
 
 
 def _pictures(step: str, drawn: CaptionedPngs, live: bool) -> list[dict[str, Any]]:
-    """Return the pictures of a step; ``twin`` are those that the page's script shows alive, which print shows alone."""
+    """Return the pictures of a step; ``twin`` marks those that are interactive views on the screen."""
     report_of = step_report(step)
     twins = report_of.live_figures if live else ()
     return [

@@ -14,7 +14,7 @@ from processor.pipeline import Execution
 from processor.plain_text import printable
 from processor.report import all_tables, headline
 from processor.report import table as report_table
-from processor.report.limit_table import worst_first
+from processor.report.limit_comparison_table import worst_first
 from processor.report.reports_of_steps import step_report
 
 MOST_LINES, LONGEST = 15, 200

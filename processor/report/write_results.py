@@ -9,7 +9,7 @@ from pathlib import Path
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import UsageError
 from processor.pipeline import Execution
-from processor.report import all_figures, all_tables, headline, page, pdf, workbook
+from processor.report import all_figures, all_tables, headline, page, pdf_report, workbook
 from processor.report import table as report_table
 from processor.report.reports_of_steps import step_report
 from processor.report.style import default_settings
@@ -73,7 +73,7 @@ def write_results(
             step_clouds.write(making / STEPS, _of_stages(execution))
         if "pdf" in further:
             with default_settings():
-                write_bytes(making / pdf.NAME, pdf.document(execution, drawn, lang))
+                write_bytes(making / pdf_report.NAME, pdf_report.document(execution, drawn, lang))
         if "xlsx" in further:
             write_bytes(making / workbook.NAME, workbook.workbook(execution, report))
 

@@ -63,8 +63,9 @@ def stitch(
 
     Candidate poses of all pairs are scored by matching patches and free space, the scans are placed by these one after
     another, and all poses are adjusted on shared planar pieces and ends of faces. The pose by picked points is one of
-    the candidates of its pair; that by control points, of scans that each saw enough of them, is the only one: what
-    repeats itself is decided by them. Scans that overlap with no other one have a pose of NaN.
+    the candidates of its pair. If each scan of a pair saw enough control points to determine its pose, the pose by
+    these is the only candidate, so that repetitive structures are not ambiguous. Scans that overlap with no other one
+    have a pose of NaN.
     """
     clouds = parallel.each(lambda scan: scan_planes.extract(scan, params.cell_mm), scans)
     patches = _sample_patches(clouds)

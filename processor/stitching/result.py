@@ -46,8 +46,9 @@ class Scans(Rows):
     T = exp(xi) T_project_scan. They are relative to the reference scan, unless control points fix the frame.
 
     With ``[stitch] scale = "free"`` a pose holds the scale of its scan: T_project_scan = [s R, t]. The covariance is
-    then that of the rotation about the scan's ``position`` and of the latter, written for the project's origin; the
-    error of the scale, ``scale_sd``, moves a point by its distance from there.
+    then that of the rotation about the scan's ``position`` and of this position, transformed to the project's origin.
+    It does not contain the scale: an error of the scale (``scale_sd``) moves a point in proportion to its distance from
+    the position.
     """
 
     name: tuple[str, ...] = names("k")

@@ -17,8 +17,8 @@ from processor.adjustment import data_snooping
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Picks, Reason, Scan, reason
 from processor.robust_statistics import student_factor
-from processor.stitching import pose_covariance
-from processor.stitching.common_points import LEAST_HEIGHT, LEAST_POINTS, units_slip
+from processor.stitching import poses_with_scale
+from processor.stitching.common_point_checks import LEAST_HEIGHT, LEAST_POINTS, units_slip
 from processor.stitching.fine.pairs_and_loops import Pair
 
 LEAST_SD_MM = 1e-6  # of picks without any error, as in tests
@@ -242,7 +242,7 @@ def _chained(pairs: list[Pair], count: int, reference: int) -> Floats:
         if pair.a in placed:
             T[pair.b] = T[pair.a] @ pair.T_a_b
         else:
-            T[pair.a] = T[pair.b] @ pose_covariance.invert(pair.T_a_b)
+            T[pair.a] = T[pair.b] @ poses_with_scale.invert(pair.T_a_b)
         placed |= {pair.a, pair.b}
     return T
 
@@ -252,9 +252,9 @@ def _equation(pair: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
 
     With m = 6 unknowns per scan, or 7 with its scale: (m, 2m), (m,) and (m, m).
     """
-    m, to_a = len(pair.covariance), pose_covariance.invert(T[pair.a])
-    R, S = pose_covariance.rotation_of(T[pair.a]).T, to_a[:3, :3]
-    r = pose_covariance.difference(to_a @ T[pair.b], pair.T_a_b)[:m]
+    m, to_a = len(pair.covariance), poses_with_scale.invert(T[pair.a])
+    R, S = poses_with_scale.rotation_of(T[pair.a]).T, to_a[:3, :3]
+    r = poses_with_scale.difference(to_a @ T[pair.b], pair.T_a_b)[:m]
     arm = T[pair.b, :3, 3] - T[pair.a, :3, 3]
     A = np.zeros((7, 14))
     A[:3, :3], A[:3, 7:10] = -R, R

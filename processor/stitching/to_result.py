@@ -9,7 +9,7 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, InputError, Ints, Reason, Scan, Scene, Status, reason
-from processor.stitching import pose_covariance
+from processor.stitching import poses_with_scale
 from processor.stitching.coarse.network import AMBIGUOUS
 from processor.stitching.fine import control_points, pairs_and_loops
 from processor.stitching.fine.contradictions import Contradiction
@@ -128,7 +128,7 @@ def _scans(
         posed = base @ network.T[s]
         T[s] = rigid.with_origin(posed, network.origins[s])
         position[s] = posed[:3, 3]
-        of_scan = pose_covariance.turned(network.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6], base[:3, :3])
+        of_scan = poses_with_scale.turned(network.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6], base[:3, :3])
         covariance[s] = rigid.about_origin(of_scan, position[s])
         rotation_sd[s], position_sd[s] = np.sqrt(np.diag(of_scan)[:3]), np.sqrt(np.diag(of_scan)[3:])
         if np.isfinite(network.T_rival[s]).all():
@@ -149,7 +149,7 @@ def _scans(
         position=position,
         position_sd=position_sd,
         rotation_sd=rotation_sd,
-        scale=np.array([pose_covariance.scale_of(pose) if is_free else 1.0 for pose in T]),
+        scale=np.array([poses_with_scale.scale_of(pose) if is_free else 1.0 for pose in T]),
         scale_sd=network.pose_scale_sd if is_free else np.zeros(k),
         rivalry=network.rivalry,
         T_rival_scan=T_rival,

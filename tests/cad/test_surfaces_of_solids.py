@@ -9,13 +9,13 @@ from designgen.asbuilt import imperfections
 from designgen.designs import (
     arch_bridge,
     arch_part,
-    arch_ring,
-    assembly,
-    box_and_tube,
-    girder,
-    plate_row,
+    closed_ring,
+    defect_specimens,
+    girder_assemblies,
+    prismatic_solids,
     space_frame,
     stadium_roof,
+    structure_bodies,
     truss_bridge,
 )
 from designgen.export import folder as export_folder
@@ -133,7 +133,7 @@ def test_rays_meet_arch_parts_where_their_solids_are(number, built):
 
 
 def test_rays_meet_segments_of_rings_where_their_solids_are():
-    part = arch_ring.build(arch_ring.Params())[1]
+    part = closed_ring.build(closed_ring.Params())[1]
     builder = Builder()
     for patch in arch_part.ray_patches(part):
         builder.patch(0, patch)
@@ -150,8 +150,8 @@ def test_rays_meet_segments_of_rings_where_their_solids_are():
     ids=["node", "node of a rib", "stiffened box", "I girder"],
 )
 def test_rays_meet_parts_of_assemblies_where_their_solids_are(type_, section, number):
-    part = assembly.build(assembly.Params(type=type_, section=section)).parts[number]
-    solid = girder.solid(part.made_of)
+    part = girder_assemblies.build(girder_assemblies.Params(type=type_, section=section)).parts[number]
+    solid = prismatic_solids.solid(part.made_of)
     assert solid.isValid()
     assert len(solid.Solids()) == 1
     builder = Builder()
@@ -176,8 +176,8 @@ def test_rays_meet_parts_of_assemblies_where_their_solids_are(type_, section, nu
 @pytest.mark.parametrize(
     "components",
     [
-        plate_row.build(plate_row.Params(form="girder", components=("none", "step"))),
-        plate_row.build(plate_row.Params(components=("none", "none"))),
+        defect_specimens.build(defect_specimens.Params(form="girder", components=("none", "step"))),
+        defect_specimens.build(defect_specimens.Params(components=("none", "none"))),
         truss_bridge.build(truss_bridge.Params())[:12],
         stadium_roof.build(stadium_roof.Params())[:3],
     ],
@@ -194,7 +194,7 @@ def test_rays_meet_structures_where_their_solids_are(components):
     places = [middle + size * np.array([0.3, -0.8, 0.4]), middle + size * np.array([-0.4, 0.9, 0.2])]
     points = hits(builder, places, 4.0)[0]
     assert len(points) > 500
-    shells = shells_of(box_and_tube.solid(components))
+    shells = shells_of(structure_bodies.solid(components))
     picked = np.random.default_rng(2).choice(len(points), 4 * COUNT, replace=False)
     assert departures(points[picked], shells).max() < TOLERANCE_MM
 

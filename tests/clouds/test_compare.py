@@ -15,7 +15,7 @@ from processor.compare import compare
 from processor.compare.compare import Request
 from processor.geometry.m3c2 import Distances
 from processor.model import InputError, Scan, Scene, UsageError
-from processor.report import comparison
+from processor.report import cloud_comparison
 from processor.report.deviation import core_points_csv
 from processor.report.deviation.core_points_csv import COLUMNS
 from processor.store import store
@@ -161,7 +161,7 @@ def test_unused_normal_diameter_is_not_reported_as_a_scale(clouds, tmp_path):
         assert not re.search(r"normal diameter \d", text)
         assert "normals of file up.txt" in text
         assert ("--normal-diameter is not used" in text) == (given > 0.0)
-        parameters = comparison.as_json(found)["parameters"]
+        parameters = cloud_comparison.as_json(found)["parameters"]
         assert parameters["normal_diameter"] is None
         assert "normal_diameter" not in parameters["given"]
 
@@ -247,7 +247,7 @@ def test_unit_is_stated_only_if_an_input_states_it(tmp_path, monkeypatch, capsys
         assert "the unit m is given by" in err
         assert [note["code"] for note in record["notes"]] == ["compare.unit"]
     found = compare.compare(Request(a, b))
-    assert comparison.as_json(found)["unit_note"] is None
+    assert cloud_comparison.as_json(found)["unit_note"] is None
 
 
 @pytest.mark.parametrize(

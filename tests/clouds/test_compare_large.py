@@ -10,7 +10,7 @@ from processor.compare import core_tiles
 from processor.compare.compare import Request, compare
 from processor.geometry import m3c2, neighbors, normal_orientation, point_grid
 from processor.model import Scan, Scene
-from processor.report import comparison
+from processor.report import cloud_comparison
 from processor.store import store
 from tests.support.clouds.m3c2_clouds import wavy
 from tests.support.processes.dask_cluster import cluster_in, dask_cluster  # noqa: F401
@@ -80,7 +80,7 @@ def test_files_have_the_same_bytes_by_tiles(case, inputs, tiny, request):
     whole = compared(inputs, "whole", *CASES[case])
     tiny()
     tiled = compared(inputs, "tiled", *CASES[case])
-    assert set(whole) == set(tiled) == set(comparison.OWN_NAMES)
+    assert set(whole) == set(tiled) == set(cloud_comparison.OWN_NAMES)
     for name, data in whole.items():
         assert tiled[name] == data, name
     assert b"nan" in whole["compare.csv"]
@@ -96,7 +96,7 @@ def test_tiles_on_a_cluster_have_the_same_bytes(dask_cluster, inputs, tiny, blan
 @pytest.fixture
 def few(monkeypatch):
     """Samples of several hundred points are drawn, and joined to surfaces."""
-    for module, name in ((normal_orientation, "MOST_JOINED"), (comparison, "MOST_DRAWN")):
+    for module, name in ((normal_orientation, "MOST_JOINED"), (cloud_comparison, "MOST_DRAWN")):
         monkeypatch.setattr(module, name, 1500)
         monkeypatch.setattr(module, "SAMPLE", 900)
 

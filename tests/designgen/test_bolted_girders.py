@@ -6,13 +6,13 @@ import cadquery as cq
 import numpy as np
 import pytest
 
-from designgen.designs import assembly, bolting, girder
+from designgen.designs import bolting, girder_assemblies, prismatic_solids
 from designgen.scenes import make as scenes
 from processor.inspection import bridge_holes, splices
 from processor.model import Status, UsageError
 from processor.preassembly.result import Components
 
-SIZES = assembly.Params(
+SIZES = girder_assemblies.Params(
     type="row", section="i", parts=2, length_mm=1400.0, width_mm=420.0, height_mm=600.0, flange_mm=20.0, web_mm=12.0
 )
 BOLTS = bolting.Params()
@@ -25,18 +25,18 @@ def shells(shape):
 
 
 def test_a_joint_has_24_holes():
-    for part in assembly.build(SIZES, BOLTS).parts:
+    for part in girder_assemblies.build(SIZES, BOLTS).parts:
         assert len(part.girder.bores) == HOLES
 
 
 def test_the_mesh_of_a_girder_encloses_the_volume_of_its_solid():
-    for part in assembly.build(SIZES, BOLTS).parts:
+    for part in girder_assemblies.build(SIZES, BOLTS).parts:
         vertices, faces = part.mesh()
         corners = (vertices - vertices.mean(axis=0))[faces]
         volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
         # Bores are polygons in the mesh: of 64 corners, smaller than the circle by 1.6 parts in a thousand.
         bores = sum(np.pi * b.radius**2 * np.linalg.norm(b.end - b.start) for b in part.girder.bores)
-        solid = girder.solid(part.made_of).Volume()
+        solid = prismatic_solids.solid(part.made_of).Volume()
         assert volume - solid == pytest.approx(bores * (1.0 - np.sin(2 * np.pi / 64) * 64 / (2 * np.pi)), rel=1e-3)
 
 
@@ -44,10 +44,10 @@ def test_the_mesh_of_a_girder_encloses_the_volume_of_its_solid():
 def test_scanned_points_of_a_girder_lie_on_its_drilled_solid(mode):
     settings = {"surface": {"spacing_mm": 12.0, "sigma_mm": 0.0}, "rays": QUIET}[mode]
     scene, truth, shifts = made(seed=2, scan=settings, mode=mode)
-    drilled = assembly.build(SIZES, BOLTS, shifts)
+    drilled = girder_assemblies.build(SIZES, BOLTS, shifts)
     rng = np.random.default_rng(0)
     for part, scan, T in zip(drilled.parts, scene.scans, truth.arch.T_bridge_scan, strict=True):
-        solid = shells(girder.solid(part.made_of))
+        solid = shells(prismatic_solids.solid(part.made_of))
         points = scan.points @ T[:3, :3].T + T[:3, 3]
         in_bore = np.zeros(len(points), bool)
         for bore in part.girder.bores:
@@ -103,7 +103,7 @@ def made(seed, scan, mode="surface", hole_mm=1.0, bolts=True):
 
 def test_holes_are_drilled_off_their_places_along_their_plates():
     _, _, shifts = made(seed=5, scan={"spacing_mm": 200.0})
-    for part in assembly.build(SIZES, BOLTS).parts:
+    for part in girder_assemblies.build(SIZES, BOLTS).parts:
         for bore, shift in zip(part.girder.bores, shifts[part.name], strict=True):
             assert shift @ np.array([0.0, *(bore.end - bore.start)]) == pytest.approx(0.0, abs=1e-12)
     drawn = np.concatenate([np.concatenate(list(made(s, {"spacing_mm": 500.0})[2].values())) for s in range(6)])
@@ -114,18 +114,18 @@ def test_holes_are_drilled_off_their_places_along_their_plates():
 @pytest.mark.parametrize("changes", [{"hole_mm": 200.0}, {"pitch_mm": 20.0}, {"web_bolts": 30}])
 def test_holes_that_do_not_fit_are_refused(changes):
     with pytest.raises(UsageError, match=r"bolts\."):
-        assembly.build(SIZES, bolting.Params(**changes))
+        girder_assemblies.build(SIZES, bolting.Params(**changes))
 
 
 def test_only_rows_of_i_girders_have_bolts():
     with pytest.raises(UsageError, match="bolts"):
-        assembly.build(assembly.Params(type="node"), BOLTS)
+        girder_assemblies.build(girder_assemblies.Params(type="node"), BOLTS)
 
 
 @pytest.mark.parametrize("section", ["i", "stiffened-box"])
 def test_nodes_of_other_sections_than_plain_boxes_are_refused(section):
     with pytest.raises(UsageError, match=r"assembly\.section"):
-        assembly.Params(type="node", section=section)
+        girder_assemblies.Params(type="node", section=section)
 
 
 # --- the holes of a girder as the processor measures them
@@ -149,7 +149,7 @@ def test_holes_of_girders_are_measured_where_they_were_drilled():
     drilled = bridge_holes.of_parts(scene, SimpleNamespace(components=table, method="adjustment"))
     found = bridge_holes.characteristics(drilled)
     held = []
-    for part in assembly.build(SIZES, BOLTS).parts:
+    for part in girder_assemblies.build(SIZES, BOLTS).parts:
         bores = part.girder.bores
         web = [k for k, bore in enumerate(bores) if abs(bore.end[0] - bore.start[0]) > 1e-6]
         places = np.array([bores[k].middle for k in web])[:, [0, 2]]

@@ -5,7 +5,7 @@ import pytest
 
 from designgen import recipe_files
 from designgen.asbuilt import defects
-from designgen.designs import plate_row, structure_registry
+from designgen.designs import defect_specimens, structure_registry
 from designgen.scenes import structure as scenes_structure
 from processor.model import UsageError
 
@@ -206,7 +206,7 @@ def test_a_pit_leaves_steel_behind_it():
 
 def test_an_unknown_defect_is_refused():
     with pytest.raises(UsageError, match="expected classes of dent, bulge"):
-        defects.draw("rust", defects.Params(), plate_row.Params(), np.random.default_rng(0))
+        defects.draw("rust", defects.Params(), defect_specimens.Params(), np.random.default_rng(0))
 
 
 def test_named_recipes_fit():

@@ -17,7 +17,7 @@ from scipy.integrate import quad
 import designgen
 from designgen import __main__, batch, curves, recipe_files
 from designgen.cli import commands
-from designgen.designs import arch_bridge, arch_mesh, arch_part, arch_ring, bolt_ball, space_frame
+from designgen.designs import arch_bridge, arch_mesh, arch_part, bolt_ball, closed_ring, space_frame
 from designgen.export import folder as export_folder
 from designgen.randomness import generator
 from designgen.scanning import sampler
@@ -370,7 +370,7 @@ def test_a_net_of_points_has_points_on_the_edges_of_every_face():
 
 def test_a_ring_is_closed_and_has_the_volume_of_a_turned_section():
     """Pappus: the area of the section times the way of its centroid, and six pads of 200 x 200 x 20 mm."""
-    parts = arch_ring.build(arch_ring.Params())
+    parts = closed_ring.build(closed_ring.Params())
     for left, right in zip(parts, (*parts[1:], parts[0]), strict=True):
         np.testing.assert_allclose(left.key_points(left.s1), right.key_points(right.s0), atol=1e-9)
     meshes = [trimesh.Trimesh(*arch_mesh.triangulate(part)) for part in parts]

@@ -5,7 +5,7 @@ import pytest
 
 from designgen import recipe_files
 from designgen.asbuilt import defects
-from designgen.designs import box_and_tube, plate_row, stadium_roof, truss_bridge
+from designgen.designs import defect_specimens, stadium_roof, structure_bodies, truss_bridge
 from designgen.scenes.make import make
 
 
@@ -27,7 +27,7 @@ def signed_volume(patches, about):
 def test_boxes_look_outward_in_frames_of_either_hand():
     R, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
     for axes in (R, R * [[-1.0], [1.0], [1.0]]):
-        box = box_and_tube.Box(np.array([100.0, -50.0, 7.0]), axes, np.array([3.0, 5.0, 7.0]))
+        box = structure_bodies.Box(np.array([100.0, -50.0, 7.0]), axes, np.array([3.0, 5.0, 7.0]))
         assert signed_volume(box.patches(), np.zeros(3)) == pytest.approx(105.0)
         knots = tuple(np.array([0.0, 0.3, 1.0]) for _ in range(3))
         assert signed_volume(box.patches(knots), np.zeros(3)) == pytest.approx(105.0)
@@ -35,7 +35,10 @@ def test_boxes_look_outward_in_frames_of_either_hand():
 
 @pytest.mark.parametrize(
     "components",
-    [truss_bridge.build(truss_bridge.Params()), plate_row.build(plate_row.Params(form="girder", components=("step",)))],
+    [
+        truss_bridge.build(truss_bridge.Params()),
+        defect_specimens.build(defect_specimens.Params(form="girder", components=("step",))),
+    ],
     ids=["truss", "girder"],
 )
 def test_every_box_of_a_structure_has_its_volume(components):
@@ -48,11 +51,11 @@ def test_every_box_of_a_structure_has_its_volume(components):
 
 def test_a_hole_takes_its_volume_from_the_plate():
     """The cut faces close the net, and look into the hole."""
-    row = plate_row.Params(components=("crack",))
-    (place,) = plate_row.places(row)
+    row = defect_specimens.Params(components=("crack",))
+    (place,) = defect_specimens.places(row)
     for kind in ("crack", "edge-loss", "missing-part"):
         defect = defects.draw(kind, defects.Params(), row, np.random.default_rng(2))
-        patches = defects.damaged(place, plate_row.bodies(row, place), defect)
+        patches = defects.damaged(place, defect_specimens.bodies(row, place), defect)
         assert signed_volume(patches, place.origin) == pytest.approx(1000.0 * 1000.0 * 12.0 - defect.volume_mm3)
 
 
@@ -104,7 +107,7 @@ def test_no_point_of_the_truth_lies_inside_a_tube():
 
 def inside_by(body, points):
     """How far inside a body points lie, by its corners or its axis alone."""
-    if isinstance(body, box_and_tube.Tube):
+    if isinstance(body, structure_bodies.Tube):
         n = body.end - body.start
         t = (points - body.start) @ n / (n @ n)
         radius = np.linalg.norm(np.cross(points - body.start, n), axis=1) / np.linalg.norm(n)

@@ -14,7 +14,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.normal_orientation import Turned
 from processor.language.messages import label, messages
 from processor.model import reason
-from processor.report import all_figures, comparison, page
+from processor.report import all_figures, cloud_comparison, page
 from processor.stitching.result import ControlPoints, ControlSightings
 from processor.validation import change_detection
 from processor.validation import summary as nights_summary
@@ -169,7 +169,7 @@ def test_a_comparison_in_chinese(tmp_path):
     without = dataclasses.replace(first.summary, without_lod=first.summary.core_points)
     for unit in ("mm", ""):
         for summary_ in (first.summary, without):
-            comparison.write(tmp_path / "out", dataclasses.replace(found, summary=summary_, unit=unit), "zh")
+            cloud_comparison.write(tmp_path / "out", dataclasses.replace(found, summary=summary_, unit=unit), "zh")
             seen = Visible((tmp_path / "out" / "report.html").read_text("utf-8"))
             assert seen.lang == "zh"
             assert "由 前.xyz 至 后.xyz" in seen.texts

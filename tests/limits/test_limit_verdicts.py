@@ -41,7 +41,7 @@ from processor.model import (
     did_you_mean,
     reason,
 )
-from processor.report import headline, limit_table, verdict_counts
+from processor.report import headline, limit_comparison_table, verdict_counts
 from processor.scan_folder import folder, tolerance
 from processor.space_frame import supports
 from processor.space_frame.result import Balls, Evidence, Flag
@@ -389,17 +389,17 @@ def test_the_page_and_the_table_have_the_worst_first_and_name_what_is_not_verifi
     moved = np.zeros((5, 3))
     moved[1, :2] = 0.0, 11.0
     limits = supports.judge(*frame(moved), standards.load("GB 50205-2020"), True)
-    (table,) = limit_table.limit_table(limits, "x-limits")
+    (table,) = limit_comparison_table.limit_table(limits, "x-limits")
     assert [str(row[2]) for row in table.rows] == sorted([str(row[2]) for row in table.rows], key=WORST.index)
     assert "Not verified" not in str(table.note)
     unsure = dataclasses.replace(limits, verified=np.zeros(len(limits), bool))
-    (table,) = limit_table.limit_table(unsure, "x-limits")
+    (table,) = limit_comparison_table.limit_table(unsure, "x-limits")
     assert "Not verified: the limits from GB 50205-2020 11.3.6 were not" in str(table.note)
     failing = limits.of[limits.verdict.index(Verdict.FAIL)]
     assert (
         str(headline.of_limits(limits)) == f"1 of {len(limits)} limits is not kept: {failing}; {len(limits) - 1} pass"
     )
-    assert limit_table.limit_table(None, "x") == []
+    assert limit_comparison_table.limit_table(None, "x") == []
 
 
 # --- networks

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from designgen.designs import assembly, prismatic
+from designgen.designs import girder_assemblies, prismatic
 from designgen.scenes.make import make
 from processor.evaluation import preassembly as evaluation
 from processor.geometry import rigid
@@ -66,7 +66,7 @@ def test_parts_have_two_ends_and_branches_one_per_joint():
 
 def graph(kind):
     """Return an assembly's design, and the frames of its joints."""
-    made = assembly.build(assembly.Params(type=kind, stub_mm=1500.0))
+    made = girder_assemblies.build(girder_assemblies.Params(type=kind, stub_mm=1500.0))
     parts = tuple(DesignPart(part.name, *part.mesh()) for part in made.parts)
     key_points = {end.joint: end.key_points() for part in made.parts for end in part.ends}
     names = tuple(joint.name for joint in made.joints)
@@ -178,7 +178,7 @@ def test_the_covariance_of_motions_is_that_of_repeated_measurements():
 
 def test_corners_as_built_are_those_of_the_errors():
     """Corner P1 of an end: length, skews and its own displacement, in the joint's axes; without the other end."""
-    (first, second, _) = assembly.build(assembly.Params()).parts
+    (first, second, _) = girder_assemblies.build(girder_assemblies.Params()).parts
     errors = prismatic.EndErrors(np.array([2.0, 1e-3, -2e-3]), np.arange(12.0).reshape(4, 3))
     none = prismatic.EndErrors(np.zeros(3), np.zeros((4, 3)))
     built = second.with_errors([none, errors])

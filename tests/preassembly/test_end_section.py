@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from designgen.designs import assembly, prismatic
+from designgen.designs import girder_assemblies, prismatic
 from designgen.scanning import sampler
 from processor.geometry import mesh_distance
 from processor.model import Reason
@@ -18,7 +18,7 @@ SIZES = {"width_mm": 2 * B, "height_mm": 2 * H, "flange_mm": FLANGE, "web_mm": W
 
 def girder(of, errors=None):
     """Return a girder of a section that ends at x = 2500, its design's surface, and its key points there."""
-    part = assembly.build(assembly.Params(section=of, **SIZES)).parts[0]
+    part = girder_assemblies.build(girder_assemblies.Params(section=of, **SIZES)).parts[0]
     surface = mesh_distance.of_mesh(*part.mesh())
     return part.with_errors([errors]) if errors else part, surface, part.ends[0].key_points()
 

@@ -22,7 +22,7 @@ from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, page, write_results
 from processor.report import table as report_table
 from processor.report.columns import columns
-from processor.report.space_frame import dxf, flagged_balls
+from processor.report.space_frame import dxf, flagged_ball_figures
 from processor.report.space_frame import figures as space_frame_figures
 from processor.report.space_frame import tables as space_frame_tables
 from processor.results import to_json
@@ -341,17 +341,17 @@ def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
 
 
 def test_at_most_twelve_balls_have_a_picture_worst_first(monkeypatch):
-    assert flagged_balls.MOST_BALLS == 12
-    monkeypatch.setattr(flagged_balls, "MOST_BALLS", 4)  # of seven, as more take seconds
+    assert flagged_ball_figures.MOST_BALLS == 12
+    monkeypatch.setattr(flagged_ball_figures, "MOST_BALLS", 4)  # of seven, as more take seconds
     made = repeated(whole(), 3)
-    drawn = flagged_balls.draw(scene(made), made)
+    drawn = flagged_ball_figures.draw(scene(made), made)
     captions = [str(caption) for caption, _ in drawn.values()]
     assert len(drawn) == 4
     flags = [caption.split(",")[1].split(":")[0].strip() for caption in captions]
     assert flags == [*["wrong-size"] * 3, "not-found"]
     assert "the first 4 of 7" in captions[0]
-    every = flagged_balls.flagged_rows(scene(made), made)
-    assert pages_of(flagged_balls.document(scene(made), made)) == len(every) == 7
+    every = flagged_ball_figures.flagged_rows(scene(made), made)
+    assert pages_of(flagged_ball_figures.document(scene(made), made)) == len(every) == 7
 
 
 def pages_of(pdf):
@@ -362,15 +362,15 @@ def pages_of(pdf):
 def test_a_ball_to_look_at_has_a_page_with_its_numbers():
     made = whole()
     i = made.balls.flag.index("wrong-size")
-    said = dict(flagged_balls._numbers(made.balls, i, np.array([1.0, -2.0, 0.5])))
+    said = dict(flagged_ball_figures._numbers(made.balls, i, np.array([1.0, -2.0, 0.5])))
     half = 1.96 * np.sqrt(made.balls.covariance[i, 3, 3])
     assert said["radius"] == f"{made.balls.radii[i]:.2f} ± {half:.2f}"
     assert said["off the design's place, y"] == "2.00"  # found less designed
-    pdf = flagged_balls.document(scene(made), made)
+    pdf = flagged_ball_figures.document(scene(made), made)
     assert pages_of(pdf) == 3
-    assert pdf == flagged_balls.document(scene(made), made)
+    assert pdf == flagged_ball_figures.document(scene(made), made)
     fine = whole(changed={"flag": ("ok",) * 5})
-    assert flagged_balls.document(scene(fine), fine) == b""
+    assert flagged_ball_figures.document(scene(fine), fine) == b""
 
 
 def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
@@ -385,7 +385,7 @@ def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
     made = Scene("s", "space-frame", scans, stations=Stations())
     centres = origin + np.array([[0.0, 0.0, 0.0], [200.0, -100.0, 300.0]])
     for crop, centre, far in zip(
-        flagged_balls.crops_about(made, centres, np.array([90.0, 150.0])), centres, (90.0, 150.0), strict=True
+        flagged_ball_figures.crops_about(made, centres, np.array([90.0, 150.0])), centres, (90.0, 150.0), strict=True
     ):
         away = np.linalg.norm(points + origin - centre, axis=1)
         assert len(crop) == (away <= far).sum() > 0
@@ -407,11 +407,11 @@ def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
     )
     one = dataclasses.replace(scene(made), scans=scans, stations=Stations(("S1",), np.zeros((1, 3))))
     store.write_scene(tmp_path / "s.h5", one, None, {})
-    in_memory = flagged_balls.draw(store.read_scene(tmp_path / "s.h5"), made)
+    in_memory = flagged_ball_figures.draw(store.read_scene(tmp_path / "s.h5"), made)
     alone = store.read_scene(tmp_path / "s.h5", points=False)
     assert len(in_memory) > 1
-    assert flagged_balls.draw(alone, made) == {}
-    assert flagged_balls.draw(alone, made, tmp_path / "s.h5") == in_memory
+    assert flagged_ball_figures.draw(alone, made) == {}
+    assert flagged_ball_figures.draw(alone, made, tmp_path / "s.h5") == in_memory
 
 
 def test_control_points_have_a_table_and_their_place_in_results_json():
@@ -463,9 +463,9 @@ def test_designed_places_are_transformed_into_the_scan():
     T = pose(TURN, (7e5, -2e5, 100.0))
     made = whole(T=T)
     np.testing.assert_allclose(
-        flagged_balls.designed_places(scene(made), made)[:4] @ T[:3, :3].T + T[:3, 3], NOMINAL[:4], atol=1e-6
+        flagged_ball_figures.designed_places(scene(made), made)[:4] @ T[:3, :3].T + T[:3, 3], NOMINAL[:4], atol=1e-6
     )
-    assert np.isnan(flagged_balls.designed_places(scene(made), made)[4]).all()
+    assert np.isnan(flagged_ball_figures.designed_places(scene(made), made)[4]).all()
 
 
 def test_the_page_of_a_frame(compared):

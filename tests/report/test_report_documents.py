@@ -13,7 +13,7 @@ from PIL import Image
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import messages
 from processor.model import TitleBlock
-from processor.report import all_tables, pdf, style, workbook
+from processor.report import all_tables, pdf_report, style, workbook
 from processor.report.style import default_settings
 from tests.support.pages.report_pages import drawn
 from tests.support.results.bridge_results import of_bridge
@@ -29,7 +29,7 @@ def signed(names=("foot1", "rib1", "foot2")):
 
 def written(execution):
     with default_settings():
-        return pdf.document(execution, drawn(execution))
+        return pdf_report.document(execution, drawn(execution))
 
 
 def test_the_document_has_a_page_a_figure_and_the_same_bytes_again():
@@ -76,7 +76,7 @@ STAND_IN = "Last Resort High-Efficiency"  # comes with Matplotlib and has a glyp
 
 @pytest.fixture
 def a_chinese_font(monkeypatch):
-    for module in (style, pdf):
+    for module in (style, pdf_report):
         monkeypatch.setattr(module, "chinese_font", lambda: STAND_IN)
     style._has.cache_clear()
     yield
@@ -84,7 +84,7 @@ def a_chinese_font(monkeypatch):
 
 
 def front(execution, lang):
-    return next(iter(pdf._front(execution, messages(lang))))
+    return next(iter(pdf_report._front(execution, messages(lang))))
 
 
 def texts_of(page):
@@ -98,18 +98,18 @@ def test_document_is_chinese_if_a_font_is_installed(a_chinese_font):
     assert any(one.startswith("批准：") or one.startswith("批准") for one in seen)
     assert not any("?" in one for one in seen)
     with default_settings():
-        data = pdf.document(execution, {}, "zh")
+        data = pdf_report.document(execution, {}, "zh")
     assert b"LastResort" in data
     assert data != written(execution)
 
 
 def test_document_without_a_font_is_english_with_question_marks(monkeypatch):
-    for module in (style, pdf):
+    for module in (style, pdf_report):
         monkeypatch.setattr(module, "chinese_font", lambda: "")
     style._has.cache_clear()
     execution = signed()
     with default_settings():
-        assert pdf.document(execution, {}, "zh") == pdf.document(execution, {}, "en")
+        assert pdf_report.document(execution, {}, "zh") == pdf_report.document(execution, {}, "en")
     assert any("? Meyer" in one for one in texts_of(front(execution, "en")))
     style._has.cache_clear()
 
@@ -123,8 +123,8 @@ def test_the_logo_stands_on_the_first_page_in_its_proportions():
     page = front(dataclasses.replace(execution, scene=dataclasses.replace(execution.scene, title_block=block)), "en")
     (axes,) = page.axes
     box = axes.get_position()
-    assert box.width * pdf.A4[0] / (box.height * pdf.A4[1]) == pytest.approx(5.0)
-    assert box.x1 == pytest.approx(pdf.RIGHT)
+    assert box.width * pdf_report.A4[0] / (box.height * pdf_report.A4[1]) == pytest.approx(5.0)
+    assert box.x1 == pytest.approx(pdf_report.RIGHT)
 
 
 @pytest.mark.parametrize(
@@ -137,4 +137,4 @@ def test_the_logo_stands_on_the_first_page_in_its_proportions():
     ],
 )
 def test_lines_are_broken_at_spaces_and_between_chinese_characters(text, lines):
-    assert pdf.lines_of(text, 8) == lines
+    assert pdf_report.lines_of(text, 8) == lines

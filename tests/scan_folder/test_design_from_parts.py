@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from designgen import batch, recipe_files
 from designgen.curves import make as make_curve
-from designgen.designs import arch_rib, assembly
+from designgen.designs import arch_rib, girder_assemblies
 from designgen.designs.arch_part import Plates, solid
 from designgen.export import folder as export_folder
 from designgen.export import step_files
@@ -230,8 +230,8 @@ def test_a_ring_has_a_joint_between_each_two_of_its_parts(count):
 
 @pytest.mark.parametrize("kind", ["node", "ribs"])
 def test_parts_of_nodes_and_braced_ribs_are_joined_as_designed(kind):
-    design = assembly.build(
-        assembly.Params(type=kind, length_mm=4000.3, width_mm=500.2, height_mm=700.3, stub_mm=1401.3)
+    design = girder_assemblies.build(
+        girder_assemblies.Params(type=kind, length_mm=4000.3, width_mm=500.2, height_mm=700.3, stub_mm=1401.3)
     )
     shuffled = np.random.default_rng(1).permutation(len(design.parts))
     parts = [design.parts[k] for k in shuffled]

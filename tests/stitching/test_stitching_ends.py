@@ -4,7 +4,7 @@ import numpy as np
 
 from processor.geometry import scanner_rays
 from processor.stitching.fine import edge_constraints
-from processor.stitching.planes import borders, face_ends
+from processor.stitching.planes import border_exclusion, face_ends
 from processor.stitching.planes.extraction import Planes
 from tests.support.clouds.stitch_clouds import pose, scan
 
@@ -128,7 +128,7 @@ def test_points_next_to_another_face_are_left_out():
     plane = Planes(
         np.ones(1), np.array([[5000.0, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.full((1, 3), 4.0), np.eye(3)[None]
     )
-    clear = borders.inside(points, grid, piece, plane).reshape(3, 15)
+    clear = border_exclusion.inside(points, grid, piece, plane).reshape(3, 15)
     ends_at = int((y < 0.0).sum())  # the first column there lies 4.5 mm behind the front, within the noise
     assert not clear[:, ends_at:].any()
     assert clear[:, 1:ends_at].all()
@@ -136,6 +136,6 @@ def test_points_next_to_another_face_are_left_out():
     bar = np.stack([np.full(8, 5000.0), np.tile([0.0, 40.0], 4), np.repeat(40.0 * np.arange(4), 2)], axis=1)
     behind = np.stack([np.full(8, 5080.0), np.tile([-40.0, 80.0], 4), np.repeat(40.0 * np.arange(4), 2)], axis=1)
     places = np.stack([np.arange(8, 16, 2), np.arange(0, 8, 2), np.arange(1, 8, 2), np.arange(9, 16, 2)], axis=1)
-    clear = borders.inside(np.vstack([bar, behind]), places, np.repeat([0, -1], 8), plane)
+    clear = border_exclusion.inside(np.vstack([bar, behind]), places, np.repeat([0, -1], 8), plane)
     assert clear[:8].all()
     assert not clear[8:].any()

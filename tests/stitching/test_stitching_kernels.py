@@ -5,8 +5,8 @@ from scipy.spatial.transform import Rotation
 
 from processor.stitching.coarse import face_index
 from processor.stitching.fine import correspondences
-from processor.stitching.planes import borders, extraction, hashing
-from processor.stitching.planes.patches import Patches
+from processor.stitching.planes import border_exclusion, extraction, grouped_sums
+from processor.stitching.planes.sampled_patches import Patches
 
 
 def test_keys_are_numbered_as_numpy_does():
@@ -18,22 +18,22 @@ def test_keys_are_numbered_as_numpy_does():
         np.empty(0, np.int64),
     ):
         want, first, number = np.unique(keys, return_index=True, return_inverse=True)
-        got_first, got = hashing.numbered(keys)
+        got_first, got = grouped_sums.numbered(keys)
         np.testing.assert_array_equal(got_first, first)
         np.testing.assert_array_equal(got, number.ravel())
-        assert hashing.distinct_count(keys) == len(want)
+        assert grouped_sums.distinct_count(keys) == len(want)
 
 
 def test_sums_by_group_are_those_of_a_matrix():
     rng = np.random.default_rng(2)
     points, group = rng.normal(size=(300, 3)), rng.integers(0, 9, 300)
     member = (group == np.arange(9)[:, None]).astype(float)
-    np.testing.assert_allclose(hashing.summed(points, group, 9), member @ points)
+    np.testing.assert_allclose(grouped_sums.summed(points, group, 9), member @ points)
     x = np.hstack([points, np.ones((300, 1))])
     want = [[(x[group == g, i] * x[group == g, j]).sum() for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2),
                                                                      (0, 3), (1, 3), (2, 3), (3, 3))]
             for g in range(9)]  # fmt: skip
-    np.testing.assert_allclose(hashing.sums_of_points(points, group, 9), want)
+    np.testing.assert_allclose(grouped_sums.sums_of_points(points, group, 9), want)
 
 
 def random_patches(rng, n, spread):
@@ -86,7 +86,7 @@ def test_points_next_to_the_edge_of_a_bar_are_left_out_without_a_grid():
     piece = np.where(a < 0.0301, 0, -1)  # the cube of the face holds the first points of the side face too
     face = points[~side]
     planes = extraction.planes_of(extraction.sums_of(face).sum(axis=0)[None])
-    clear = borders.inside(points, None, piece, planes)
+    clear = border_exclusion.inside(points, None, piece, planes)
     assert not clear[side].any()
     assert not clear[(a > 0.0181) & ~side].any()
     inner = (a < 0.015) & (np.abs(e) < 0.045)

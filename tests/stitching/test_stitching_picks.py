@@ -10,7 +10,7 @@ from processor.model import InputError, Picks, Scan, Scene
 from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
 from processor.stitching import three_point
-from processor.stitching.common_points import UnitSlip
+from processor.stitching.common_point_checks import UnitSlip
 from tests.support.clouds.stitch_clouds import four, pose
 from tests.support.scenes.picked_networks import network
 

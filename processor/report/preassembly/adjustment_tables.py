@@ -13,7 +13,7 @@ from processor.preassembly.result import Adjustment, Result
 from processor.preassembly.verdicts.joint_measures import JointQuantity
 from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
 from processor.report.columns import MM, columns, under
-from processor.report.limit_table import with_unverified
+from processor.report.limit_comparison_table import with_unverified
 from processor.report.table import NAN, Table
 
 TO_DO, LIMITS, CHAIN = "what-to-do", "limits", "limits-chain"

@@ -21,7 +21,8 @@ def nominal_places(result: Result) -> Floats:
 def designed_places(scene: Scene, result: Result) -> Floats:
     """Return where the design has each ball (k, 3); NaN where it has none.
 
-    Where the node was found that is its place less its movement, else the design's place by the estimated pose.
+    If the movement of the ball is known, this is the measured centre less the movement. Otherwise it is the design's
+    position, placed by the estimated pose if there is one.
     """
     places = nominal_places(result)
     if scene.frame is None:

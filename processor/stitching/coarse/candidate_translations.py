@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from processor.model import Floats, Ints
-from processor.stitching.planes.patches import Patches, facing
+from processor.stitching.planes.sampled_patches import Patches, facing
 
 LIKE_COS = float(np.cos(np.radians(10.0)))
 MOST_VOTERS = 350  # patches of a scan that face one way

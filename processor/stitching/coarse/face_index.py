@@ -13,8 +13,8 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.model import Floats, Ints
-from processor.stitching.planes.hashing import EMPTY, place
-from processor.stitching.planes.patches import Patches
+from processor.stitching.planes.grouped_sums import EMPTY, place
+from processor.stitching.planes.sampled_patches import Patches
 
 FIELD = 21  # bits of a cell's index along each axis
 MASK = (1 << FIELD) - 1

@@ -12,7 +12,7 @@ from processor.model import Floats
 from processor.stitching.coarse import candidate_rotations, candidate_translations, face_index
 from processor.stitching.coarse.candidate_translations import WeightedPatches
 from processor.stitching.coarse.face_index import FaceIndex
-from processor.stitching.planes.patches import sample
+from processor.stitching.planes.sampled_patches import sample
 from processor.stitching.planes.scan_planes import Cloud
 
 

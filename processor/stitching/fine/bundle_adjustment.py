@@ -20,7 +20,7 @@ from processor.adjustment.scanner_class_errors import SCALE_SD, VIEW_SD_MM
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.stitching.fine.correspondences import FACE_END, KINDS, ON_PIECE, Blocks
-from processor.stitching.planes import extraction, hashing
+from processor.stitching.planes import extraction, grouped_sums
 from processor.stitching.planes.extraction import Planes
 
 HUBER_SIGMAS = 2.5  # misfit of a scan on a piece, from which on its weight decreases
@@ -197,7 +197,7 @@ def _linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: F
     columns = np.column_stack([of_scan[:, None] + np.arange(6), 6 * k + blocks.scan, 7 * k + blocks.scan, of_face])
     errors = np.append(ranges, 0.0)[columns[:, 6:] - 6 * k]
     W = in_world(blocks, T, errors[:, 0] + errors[:, 2], errors[:, 1])
-    total = hashing.summed(extraction.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
+    total = grouped_sums.summed(extraction.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
     planes = extraction.planes_of(total)
     n, c = planes.normal[blocks.piece], planes.mean[blocks.piece]
     W = _shifted(W, c)
@@ -211,9 +211,11 @@ def _linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: F
     LsW, Wr = Ls @ W, np.einsum("bij,bj->bi", W, rho)
     Hss = LsW @ Ls.transpose(0, 2, 1)
     Hsp = LsW @ Lp.transpose(0, 2, 1)
-    Hpp = hashing.summed((Lp @ W @ Lp.transpose(0, 2, 1)).reshape(b, 9), blocks.piece, blocks.pieces).reshape(-1, 3, 3)
+    Hpp = grouped_sums.summed((Lp @ W @ Lp.transpose(0, 2, 1)).reshape(b, 9), blocks.piece, blocks.pieces).reshape(
+        -1, 3, 3
+    )
     gs = np.einsum("bij,bj->bi", Ls, Wr)
-    gp = hashing.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
+    gp = grouped_sums.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
     scale = np.einsum("nii->ni", Hpp)
     inverse = np.linalg.inv(Hpp + 1e-12 * np.maximum(scale, 1e-12)[:, :, None] * np.eye(3))
     N, g, spurious = np.zeros((size + 1, size + 1)), np.zeros(size + 1), np.zeros((size + 1, size + 1))

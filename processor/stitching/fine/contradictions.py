@@ -17,7 +17,7 @@ from processor.model import Floats, Ints
 from processor.stitching.fine import bundle_adjustment, correspondences
 from processor.stitching.fine.bundle_adjustment import REJECTION_SIGMAS, Solution
 from processor.stitching.fine.correspondences import FLAT_SIGMAS, KINDS, Blocks, CellTable
-from processor.stitching.planes import extraction, hashing
+from processor.stitching.planes import extraction, grouped_sums
 
 AGREES = 4.0  # standard deviations of a face's misfit after the motion
 LEAST_FACES = 4  # three of a hundred agree by chance in one of 90 scans of a truss
@@ -73,7 +73,7 @@ def _misfits(blocks: Blocks, solution: Solution) -> _Misfits:
     world = extraction.triangle(moments)
     faces = extraction.planes_of(world)
     weighted = world * weight[:, None]
-    rest = hashing.summed(weighted, blocks.piece, blocks.pieces)[blocks.piece] - weighted
+    rest = grouped_sums.summed(weighted, blocks.piece, blocks.pieces)[blocks.piece] - weighted
     others = extraction.planes_of(rest)
     counts = np.bincount(blocks.piece, blocks.count, blocks.pieces)[blocks.piece] - blocks.count
     limit = FLAT_SIGMAS**2

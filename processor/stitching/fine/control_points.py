@@ -18,7 +18,7 @@ from processor.adjustment import data_snooping
 from processor.adjustment.sighting_covariance import sighting_covariance
 from processor.geometry import rigid
 from processor.model import Bools, Control, Floats, InputError, Ints, Reason, reason
-from processor.stitching import common_points
+from processor.stitching import common_point_checks
 from processor.stitching.result import ControlPoints, ControlSightings
 
 CLEAR = 10.0  # least distance from a line in standard deviations; nearer points do not determine the rotation about it
@@ -167,7 +167,7 @@ def poses_of_scans(control: Control | None, origins: Sequence[Floats]) -> dict[i
     for s in np.unique(control.scan).tolist():
         rows = control.scan == s
         seen, known = control.seen[rows] - origins[s], control.positions[control.point[rows]] - middle
-        if rigid.points_determine_motion(known, common_points.LEAST_HEIGHT, LEAST_SPREAD_MM):
+        if rigid.points_determine_motion(known, common_point_checks.LEAST_HEIGHT, LEAST_SPREAD_MM):
             T = rigid.fit(seen, known)
             if np.linalg.norm(rigid.apply(T, seen) - known, axis=1).max() <= GROSS_MM:
                 poses[s] = T
@@ -183,7 +183,7 @@ def fitted(sightings: Sightings, T: Floats, prior: Floats, factor: float = 1.0) 
     m, d = len(sightings.scan), np.zeros((len(T), 6))
     M = rigid.fit(_placed(sightings, T), sightings.known)
     scale = _scale(sightings, T)
-    slip = common_points.units_slip(scale)
+    slip = common_point_checks.units_slip(scale)
     if slip:
         raise InputError(
             f"the distances between control points are {scale:.5g} times those in the scans: units mixed up ({slip})?"
@@ -279,7 +279,7 @@ def _shortage(sightings: Sightings) -> Reason | None:
     if len(first) < rigid.LEAST_POINTS:
         return reason("stitch.control-few", points=len(first))
     sd = float(np.hypot(sightings.known_sd, sightings.seen_sd).max())
-    if not rigid.points_determine_motion(sightings.known[first], common_points.LEAST_HEIGHT, CLEAR * sd):
+    if not rigid.points_determine_motion(sightings.known[first], common_point_checks.LEAST_HEIGHT, CLEAR * sd):
         return reason("stitch.control-on-a-line")
     return None
 

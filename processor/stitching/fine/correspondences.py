@@ -14,9 +14,9 @@ from processor.geometry.neighbors import thinned
 from processor.model import Floats, Ints
 from processor.stitching.coarse import candidate_rotations
 from processor.stitching.fine import noise_model
-from processor.stitching.planes import extraction, hashing
+from processor.stitching.planes import extraction, grouped_sums
 from processor.stitching.planes.extraction import Planes
-from processor.stitching.planes.patches import facing
+from processor.stitching.planes.sampled_patches import facing
 from processor.stitching.planes.scan_planes import LIMIT_SIGMAS, Cloud
 
 ON_PIECE, FACE_END = 0, 1  # kinds of blocks
@@ -144,7 +144,7 @@ def segment(cells: CellTable, T: Floats, gate_mm: float, ranges: Floats | None =
     )  # fmt: skip
     # A cell's own plane must be that of the piece: with a wide gate, cubes may hold two faces.
     on = np.flatnonzero(piece >= 0)
-    planes = extraction.planes_of(hashing.summed(sums[on], piece[on], int(piece.max(initial=-1)) + 1))
+    planes = extraction.planes_of(grouped_sums.summed(sums[on], piece[on], int(piece.max(initial=-1)) + 1))
     n = planes.normal[piece[on]]
     off = np.einsum("ni,ni->n", mean[on] - origin - planes.mean[piece[on]], n)
     same = (np.abs(np.einsum("ni,ni->n", n, normal[on])) > SAME_COS) & (
@@ -161,7 +161,7 @@ def _blocks(cells: CellTable, T: Floats, rows: Ints, piece: Ints) -> Blocks:
     to_ray = ray_maps(cells.mean[rows]) * cells.known[rows, None, None]
     rays = to_ray @ extraction.square(sums)
     rays = np.concatenate([rays, rays @ to_ray.transpose(0, 2, 1)], axis=2).reshape(len(rows), 21)
-    weighted = hashing.summed(np.hstack([sums, rays]), inverse.ravel(), len(first))
+    weighted = grouped_sums.summed(np.hstack([sums, rays]), inverse.ravel(), len(first))
     count: Floats = np.bincount(inverse.ravel(), cells.sums[rows, 9], len(first)).astype(np.float64)
     enough = count >= LEAST_POINTS
     _, number = np.unique(piece[first][enough], return_inverse=True)
@@ -171,7 +171,7 @@ def _blocks(cells: CellTable, T: Floats, rows: Ints, piece: Ints) -> Blocks:
     weighted = weighted[enough] / excess[number][:, None]
     sums = weighted[:, :10]
     of_scan = scan[first][enough]
-    world = hashing.summed(extraction.transformed(sums, T[of_scan]), number, pieces)
+    world = grouped_sums.summed(extraction.transformed(sums, T[of_scan]), number, pieces)
     return Blocks(
         piece=number, scan=of_scan, sums=sums, count=count[enough], kind=np.full(len(number), ON_PIECE), pieces=pieces,
         rays=weighted[:, 10:].reshape(-1, 3, 7), face=_faces(extraction.planes_of(world), cells)[number],

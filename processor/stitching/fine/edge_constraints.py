@@ -12,7 +12,7 @@ from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import FACE_END, Blocks
-from processor.stitching.planes import extraction, hashing
+from processor.stitching.planes import extraction, grouped_sums
 from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.scan_planes import Cloud
 
@@ -65,10 +65,10 @@ def with_ends(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) ->
     weight = 1.0 / (variance(ends) + LEAST_MM**2)
     key, inverse = np.unique(ends.piece * len(T) + ends.scan, return_inverse=True)
     inverse = inverse.ravel()
-    sums = hashing.summed(extraction.sums_of(ends.points) * weight[:, None], inverse, len(key))
+    sums = grouped_sums.summed(extraction.sums_of(ends.points) * weight[:, None], inverse, len(key))
     u = ends.points / np.linalg.norm(ends.points, axis=1)[:, None]
     y = np.hstack([ends.points, np.ones((len(u), 1)), u])
-    rays = hashing.summed((weight[:, None, None] * u[:, :, None] * y[:, None]).reshape(-1, 21), inverse, len(key))
+    rays = grouped_sums.summed((weight[:, None, None] * u[:, :, None] * y[:, None]).reshape(-1, 21), inverse, len(key))
     piece = np.concatenate([blocks.piece, key // len(T)])
     order = np.argsort(piece, kind="stable")
     return Blocks(
@@ -93,7 +93,7 @@ def match(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear:
     introduces no bias.
     """
     world = extraction.transformed(blocks.sums, T[blocks.scan])
-    planes = extraction.planes_of(hashing.summed(world, blocks.piece, blocks.pieces))
+    planes = extraction.planes_of(grouped_sums.summed(world, blocks.piece, blocks.pieces))
     # A piece faces the scanners that saw it; all of them see the same side.
     first = np.unique(blocks.piece, return_index=True)[1]
     towards = np.einsum("ni,ni->n", planes.normal, T[blocks.scan[first], :3, 3] - planes.mean)

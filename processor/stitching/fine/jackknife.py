@@ -19,7 +19,7 @@ from processor.stitching.fine import bundle_adjustment
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import Blocks
 from processor.stitching.fine.pairs_and_loops import Pair
-from processor.stitching.planes import extraction, hashing
+from processor.stitching.planes import extraction, grouped_sums
 
 HALVINGS = 3
 REGIONS = 2**HALVINGS
@@ -50,7 +50,7 @@ def factors(blocks: Blocks, solution: Solution, reference: int) -> Floats:
     if blocks.pieces < REGIONS * LEAST_PIECES:
         return factor
     world = extraction.transformed(blocks.sums, solution.T[blocks.scan])
-    mean = extraction.scatter(hashing.summed(world, blocks.piece, blocks.pieces))[0]
+    mean = extraction.scatter(grouped_sums.summed(world, blocks.piece, blocks.pieces))[0]
     region = regions(mean)[blocks.piece]
     none = np.zeros(len(region), bool)
     rest, whole = bundle_adjustment.solve_without(blocks, solution, reference, none, ALMOST_NONE)

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from processor.geometry import rigid
 from processor.model import Floats
-from processor.stitching import pose_covariance
+from processor.stitching import poses_with_scale
 from processor.stitching.fine import bundle_adjustment
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import ON_PIECE, Blocks
@@ -58,7 +58,7 @@ def register_pair(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | N
     start = np.stack([np.eye(4), rigid.invert(network.T[a]) @ network.T[b]])
     solution = bundle_adjustment.solve(local, start, 0, iterations=3, robust=False, tau=network.tau)
     covariance = solution.covariance[6:, 6:]
-    d = pose_covariance.difference(solution.T[1], start[1])[:6]
+    d = poses_with_scale.difference(solution.T[1], start[1])[:6]
     points = local.kind == ON_PIECE
     weight = local.sums[points, 9]
     residual = float(np.sqrt((weight * solution.offset[points] ** 2).sum() / max(weight.sum(), 1e-12)))
@@ -113,17 +113,17 @@ def _loop(path: list[Pair], start: int) -> Loop:
             C = C + _transformed(covariance, T)
             T = T @ pair.T_a_b
         else:
-            T = T @ pose_covariance.invert(pair.T_a_b)
+            T = T @ poses_with_scale.invert(pair.T_a_b)
             C = C + _transformed(covariance, T)
         at = pair.b if forward else pair.a
         rows.append(at)
-    xi = pose_covariance.difference(T, np.eye(4))[:size]
+    xi = poses_with_scale.difference(T, np.eye(4))[:size]
     ratio = float(xi @ np.linalg.solve(C, xi)) / size
     return Loop(tuple(rows), float(np.linalg.norm(xi[3:6])), float(1e3 * np.linalg.norm(xi[:3])), ratio)
 
 
 def _transformed(covariance: Floats, T: Floats) -> Floats:
     """Transform the covariance of a small motion to the frame that T (4, 4) maps to, by the adjoint of T."""
-    J = pose_covariance.adjoint(T, len(covariance))
+    J = poses_with_scale.adjoint(T, len(covariance))
     transformed: Floats = J @ covariance @ J.T
     return transformed

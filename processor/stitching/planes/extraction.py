@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor.model import Floats, Ints
-from processor.stitching.planes.hashing import numbered, summed
+from processor.stitching.planes.grouped_sums import numbered, summed
 
 BITS = 19
 OFFSET = 1 << (BITS - 1)

@@ -9,7 +9,7 @@ import numpy as np
 from processor.distinct_rows import distinct
 from processor.geometry import scanner_rays
 from processor.model import Floats, Ints, Scan
-from processor.stitching.planes import borders, extraction, hashing
+from processor.stitching.planes import border_exclusion, extraction, grouped_sums
 from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.face_ends import Ends, ends_of, grid_of
 from processor.stitching.planes.free_space import FreeSpace
@@ -18,7 +18,9 @@ POINTS_A_CELL = 5.0
 LEVELS = 6
 KEPT_BELOW = 2  # cells are kept this many levels finer than the piece they belong to
 LIMIT_SIGMAS = 2.5
-NARROW = ((0.004, 0.1), (0.01, 0.15), (0.03, 0.25))  # widths of directions, and share of these that may hold two depths
+# Widths of cells of directions, and shares of the pairs of points of a cell that follow each other in range. The
+# scanner can be at the origin if fewer pairs than this differ by more than DEPTH_STEP, in the narrowest with enough.
+NARROW = ((0.004, 0.1), (0.01, 0.15), (0.03, 0.25))
 DEPTH_STEP = 0.05  # of the range
 
 
@@ -53,8 +55,8 @@ def extract(scan: Scan, cell_mm: float = 0.0) -> Cloud:
         points = points[finite]
     size = cell_mm or cell_size(points)
     cells = extraction.cells_of(points, size)
-    first, of_point = hashing.numbered(extraction.packed(cells))
-    cells, sums = cells[first], hashing.sums_of_points(points, of_point, len(first))
+    first, of_point = grouped_sums.numbered(extraction.packed(cells))
+    cells, sums = cells[first], grouped_sums.sums_of_points(points, of_point, len(first))
     sigma = _scatter(cells, sums, size, scan.sigma_mm)
     piece, level = extraction.flat_pieces(cells, sums, size, LIMIT_SIGMAS * sigma, LEVELS)
     on_grid = known and len(scan.grid_row) > 0
@@ -63,11 +65,11 @@ def extract(scan: Scan, cell_mm: float = 0.0) -> Cloud:
         row, column = scan.grid_row[finite].astype(np.int64), scan.grid_column[finite].astype(np.int64)
     if known:
         on_piece = np.flatnonzero(piece >= 0)
-        rough = extraction.planes_of(hashing.summed(sums[on_piece], piece[on_piece], len(level)))
-        clear = borders.inside(points, grid_of(row, column) if on_grid else None, piece[of_point], rough)
-        sums = hashing.sums_of_points(points[clear], of_point[clear], len(first))
+        rough = extraction.planes_of(grouped_sums.summed(sums[on_piece], piece[on_piece], len(level)))
+        clear = border_exclusion.inside(points, grid_of(row, column) if on_grid else None, piece[of_point], rough)
+        sums = grouped_sums.sums_of_points(points[clear], of_point[clear], len(first))
     merged, piece_of_merged = _merged(cells, sums, piece, level)
-    planes = extraction.planes_of(hashing.summed(merged, piece_of_merged, len(level)))
+    planes = extraction.planes_of(grouped_sums.summed(merged, piece_of_merged, len(level)))
     if known:
         planes = _facing_scanner(planes)
     ends, unanswered = Ends(), np.empty((0, 3))
@@ -90,7 +92,7 @@ def cell_size(points: Floats) -> float:
     size = max(spread, 1e-6) / 1024.0
     while size < spread:
         # The subsample occupies fewer cells than the whole cloud: its mean count is scaled to that of all points.
-        mean_count = len(some) / hashing.distinct_count(extraction.packed(extraction.cells_of(some, size)))
+        mean_count = len(some) / grouped_sums.distinct_count(extraction.packed(extraction.cells_of(some, size)))
         if 1.0 + (mean_count - 1.0) / share >= POINTS_A_CELL:
             break
         size *= 2.0**0.5
@@ -99,8 +101,8 @@ def cell_size(points: Floats) -> float:
 
 def _scatter(cells: Ints, sums: Floats, size: float, sigma_mm: float) -> float:
     """Estimate the scatter of planar places across their planes, mm; at least the scanner's ``sigma_mm``, if known."""
-    first, inverse = hashing.numbered(extraction.packed(cells >> 1))
-    total = hashing.summed(sums, inverse, len(first))
+    first, inverse = grouped_sums.numbered(extraction.packed(cells >> 1))
+    total = grouped_sums.summed(sums, inverse, len(first))
     variance = np.linalg.eigvalsh(extraction.scatter(total[total[:, 9] >= 12.0])[1])
     flat = variance[(variance[:, 0] < 0.02 * variance[:, 1]) & (variance[:, 1] > (0.1 * size) ** 2), 0]
     estimate = float(np.sqrt(np.quantile(np.maximum(flat, 0.0), 0.75))) if len(flat) else 0.02 * size
@@ -117,7 +119,7 @@ def _merged(cells: Ints, sums: Floats, piece: Ints, level: Ints) -> tuple[Floats
     count = int(inverse.max()) + 1 if len(inverse) else 0
     piece_of_merged = np.zeros(count, np.int64)
     piece_of_merged[inverse] = piece[on]
-    return hashing.summed(sums[on], inverse, count), piece_of_merged
+    return grouped_sums.summed(sums[on], inverse, count), piece_of_merged
 
 
 def _facing_scanner(planes: Planes) -> Planes:

@@ -6,7 +6,7 @@ from processor.defects.result import Curve, DefectClass, Defects, Picture, Surfa
 from processor.defects.result import Result as DefectsResult
 from processor.model import Scan, Scene, StepRun, StructureDesign, reason
 from processor.pipeline import Execution
-from processor.stitching.common_points import UnitSlip
+from processor.stitching.common_point_checks import UnitSlip
 from processor.stitching.result import Closures, Pairs, Scans
 from processor.stitching.result import Result as Stitching
 

@@ -11,7 +11,7 @@ import numpy as np
 from designgen.checks import expect
 from designgen.designs import bolting, prismatic, sections
 from designgen.designs.bolting import Bore
-from designgen.designs.patch import Patch
+from designgen.designs.parametric_face import Patch
 from designgen.designs.prismatic import End, Girder, Node, Part
 from designgen.designs.sections import Section
 from designgen.rigid import rigid

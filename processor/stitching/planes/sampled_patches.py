@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.model import Floats, Ints
-from processor.stitching.planes import extraction, hashing
+from processor.stitching.planes import extraction, grouped_sums
 from processor.stitching.planes.scan_planes import Cloud
 
 
@@ -26,8 +26,8 @@ def sample(cloud: Cloud, side_mm: float) -> Patches:
     )
     inverse = inverse.ravel()
     count = np.bincount(inverse, np.ones(len(inverse)), len(first))
-    points = hashing.summed(cloud.mean, inverse, len(first)) / count[:, None]
-    normals = hashing.summed(cloud.normal, inverse, len(first))
+    points = grouped_sums.summed(cloud.mean, inverse, len(first)) / count[:, None]
+    normals = grouped_sums.summed(cloud.normal, inverse, len(first))
     return Patches(points, normals / np.linalg.norm(normals, axis=1)[:, None])
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from designgen.designs.patch import Patch, Surface
+from designgen.designs.parametric_face import Patch, Surface
 from designgen.rigid import perpendicular
 from processor.model import Bools, Floats
 
