@@ -190,10 +190,12 @@ def _errors(
         registration = np.full_like(value, field.stations_sd(rows, free=True))
     noise = shape.sd(fit.frame, points, outward) * levels.inflation
     shared = np.sqrt(levels.common_mm**2 + levels.systematic_mm**2 + registration**2)
-    cells = slice(len(rows))
-    swept = np.sign(value[cells]) * cell_areas(surface, rows)
-    swept_sd = levels.inflation * shape.total_sd(fit.frame, points[cells], outward[cells], swept)
-    return value, own, np.hypot(noise, shared), float(np.hypot(swept_sd, np.abs(swept) @ shared[cells]))
+    moved = swept_cells(surface, field, fit, shape)
+    sides, out = surface.centres[moved], surface.outward[moved]
+    swept = np.sign(shape.values(fit.frame, sides, out)) * cell_areas(surface, moved)
+    swept_sd = levels.inflation * shape.total_sd(fit.frame, sides, out, swept)
+    volume_sd = np.hypot(swept_sd, np.abs(swept).sum() * float(np.sqrt(np.mean(shared**2))))
+    return value, own, np.hypot(noise, shared), float(volume_sd)
 
 
 def _rigid_part(fit: ComponentShape, shape: shape_models.Shape) -> shape_models.Shape:
@@ -253,15 +255,34 @@ def cells_of_shape(
     return shown if len(shown) else front
 
 
+def swept_cells(surface: DesignSurface, field: Field, fit: ComponentShape, shape: shape_models.Shape) -> Ints:
+    """Return the cells that sweep the volume of a shape.
+
+    Of a movement these are cells of all faces that were seen, where they go inward or where they come out, whichever
+    sweeps more: the opposite faces sweep the same volume.
+    """
+    if shape.kind != shape_models.RIGID:
+        return cells_of_shape(surface, field, fit, shape)
+    chart = chart_of_cells(surface)
+    count = np.bincount(chart[field.seen > 0.0], minlength=len(surface.charts.kind))
+    of_component = surface.charts.component[chart] == fit.component
+    cells = np.flatnonzero(of_component & (count[chart] >= FEWEST_SEEN) & (surface.share > 0.5))
+    value = shape.values(fit.frame, surface.centres[cells], surface.outward[cells])
+    inward, outward = ((way * value > 0.0) for way in (-1.0, 1.0))
+    larger: Ints = cells[max(inward, outward, key=lambda side: np.abs(value[side]) @ surface.share[cells[side]])]
+    return larger
+
+
 def cell_areas(surface: DesignSurface, cells: Ints) -> Floats:
-    """Return the areas (n,) of the cells of whole faces, mm2, whose sum is that of the faces' facets.
+    """Return the areas (n,) of cells that their face covers by more than half, mm2; their sum is that of the facets.
 
     Samples of cells at the border give the area of a face to about 1 %.
     """
-    share = surface.share[cells]
-    on_faces = np.isin(surface.chart_of, np.unique(chart_of_cells(surface)[cells]))
-    exact = mesh_distance.area(surface.vertices, surface.faces[on_faces])
-    return exact * share / max(float(share.sum()), 1e-9)
+    chart = chart_of_cells(surface)
+    exact = np.bincount(surface.chart_of, 0.5 * mesh_distance.double_areas(surface.vertices, surface.faces)[1])
+    sampled = np.bincount(chart, np.where(surface.share > 0.5, surface.share, 0.0), len(exact))
+    areas: Floats = surface.share[cells] * (exact / np.maximum(sampled, 1e-9))[chart[cells]]
+    return areas
 
 
 def front_of(surface: DesignSurface, component: int, field: Field) -> Ints:

@@ -17,6 +17,7 @@ from processor.defects.component_shapes import (
     SignificantShape,
     cell_areas,
     cells_of_shape,
+    swept_cells,
     with_corners,
 )
 from processor.defects.deviation_field import Field
@@ -153,7 +154,7 @@ def _shape_defects(search: Search) -> Iterator[Defect]:
         front = cells_of_shape(surface, search.field, fit)
         for shape in _of_held_plate(search, front, shapes, fit.frame) if len(front) else ():
             rows = cells_of_shape(surface, search.field, fit, shape.shape)
-            yield _shape_defect(search, component, rows, _on_cells(shape, fit, surface, rows), fit.frame)
+            yield _shape_defect(search, fit, rows, _on_cells(shape, fit, surface, rows))
 
 
 def _on_cells(judged: SignificantShape, fit: ComponentShape, surface: DesignSurface, rows: Ints) -> SignificantShape:
@@ -187,9 +188,9 @@ def _of_held_plate(search: Search, rows: Ints, shapes: list[SignificantShape], f
     return [dataclasses.replace(bent[0], peak=peak, ci95=ci95, volume_ci95=volume_ci95)]
 
 
-def _shape_defect(search: Search, component: int, rows: Ints, judged: SignificantShape, frame: Frame) -> Defect:
+def _shape_defect(search: Search, fit: ComponentShape, rows: Ints, judged: SignificantShape) -> Defect:
     """Measure a shape of a component on the cells ``rows`` of its largest face."""
-    surface, kind = search.surface, judged.shape.kind
+    surface, component, frame, kind = search.surface, fit.component, fit.frame, judged.shape.kind
     value = judged.shape.values(frame, surface.centres[rows], surface.outward[rows])
     extent = 2.0 * frame.half[:2]
     part = np.ones(len(rows), bool)
@@ -199,10 +200,13 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
         extent[int(judged.shape.at[0])] *= 0.5 * (1.0 - judged.shape.at[1])
     area = cell_areas(surface, rows)
     both_ways = kind in ("twist", "waviness")
-    volume = float((np.abs(value) if both_ways else -value) @ area)
+    volume = on_face = float((np.abs(value) if both_ways else -value) @ area)
     if kind == RIGID:  # what is swept: a round face goes outward on one side and inward on the other
         inward, outward = (float(np.maximum(way * value, 0.0) @ area) for way in (-1.0, 1.0))
-        volume = inward if inward >= outward else -outward
+        on_face = inward if inward >= outward else -outward
+        cells = swept_cells(surface, search.field, fit, judged.shape)
+        moved = np.abs(judged.shape.values(frame, surface.centres[cells], surface.outward[cells]))
+        volume = float(np.copysign(moved @ cell_areas(surface, cells), on_face))
     values = _row(
         classification.of_shape(kind, judged.margin),
         surface.names[component],
@@ -212,7 +216,7 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
         area_mm2=float(area[part].sum()),
         depth_max=abs(judged.peak) if both_ways else -judged.peak,
         depth_ci95=judged.ci95,
-        depth_mean=volume / float(area[part].sum()),
+        depth_mean=on_face / float(area[part].sum()),
         volume_mm3=volume,
         volume_ci95=judged.volume_ci95,
         edge_distance=float(frame.half[:2].min()),

@@ -82,6 +82,8 @@ def test_moved_body_is_reported_once_by_name_without_false_defects(move):
     assert len(sure) == int((~defects.doubtful).sum()), "one report a body"
     row = sure["tube", "misalignment"]
     assert abs(abs(defects.depth_max[row]) - move) < 1.5 * defects.depth_ci95[row]  # 99.7 %
+    swept = 120.0 * 1200.0 * move  # what a tube sweeps across its axis
+    assert abs(abs(defects.volume_mm3[row]) - swept) < 1.5 * defects.volume_ci95[row] < 0.1 * swept
 
 
 def test_a_body_is_moved_as_its_shape_states():
