@@ -19,7 +19,7 @@ from processor import pipeline
 from processor.api import runs
 from processor.language.messages import messages
 from processor.model import Ceiling, InputError, Scan, Scene, StepRun
-from processor.report.space_frame import dxf, hangers
+from processor.report.space_frame import dxf, hanger_report
 from processor.report.table import csv_text
 from processor.scan_folder import folder
 from processor.space_frame import plumb_line
@@ -175,7 +175,7 @@ def test_the_drawing_has_lowest_points_hangers_and_clashes():
 
 
 def test_points_to_stake_out_are_those_of_balls_without_a_flag():
-    rows = list(csv.DictReader(io.StringIO(hangers.stake_out(clashing()).decode("utf-8"))))
+    rows = list(csv.DictReader(io.StringIO(hanger_report.stake_out(clashing()).decode("utf-8"))))
     assert [row["name"] for row in rows] == ["L10", "C10", "L14", "C14"]
     assert rows[0] == {"name": "L10", "x_m": "0.003", "y_m": "0.004", "z_m": "5.9549", "code": "LOWEST"}
     assert rows[1]["z_m"] == "5.9"
@@ -186,17 +186,17 @@ def test_negative_coordinates_to_stake_out_are_numbers():
     west = dataclasses.replace(
         found, hangers=dataclasses.replace(found.hangers, top=found.hangers.top - [1234.5, 0.0, 0.0])
     )
-    rows = list(csv.DictReader(io.StringIO(hangers.stake_out(west).decode("utf-8"))))
+    rows = list(csv.DictReader(io.StringIO(hanger_report.stake_out(west).decode("utf-8"))))
     assert float(rows[0]["x_m"]) == pytest.approx(0.003 - 1.2345, abs=6e-5)
 
 
 def test_table_and_plan():
     found = clashing()
-    (table,) = hangers.tables(found)
+    (table,) = hanger_report.tables(found)
     assert csv_text(table).splitlines()[1].startswith("10,fail,54.9,0.19")
-    assert set(hangers.draw(found)) == {"hangers.png"}
+    assert set(hanger_report.draw(found)) == {"hangers.png"}
     assert "吊杆" in messages("zh").text(table.title)
-    assert hangers.tables(whole()) == []
+    assert hanger_report.tables(whole()) == []
 
 
 def write_project(place, text):

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import Floats, Scene, StepRun
-from processor.report.space_frame import flagged_ball_figures, hangers
+from processor.report.space_frame import flagged_ball_figures, hanger_report
 from processor.report.space_frame.nominal_positions import designed_places, nominal_places
 from processor.report.style import (
     COLOURS,
@@ -48,7 +48,7 @@ def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Pat
             figures[RADIUS_ERRORS] = _radius_errors(runs, report)
         if first.has_bounds:
             figures[BALL_ERRORS] = _ball_errors(runs[0], report)
-    figures |= hangers.draw(first)
+    figures |= hanger_report.draw(first)
     if first.has_bounds:
         figures |= flagged_ball_figures.draw(scene, first, stored)
     return figures

@@ -14,7 +14,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import NORMAL_95, Floats, Status, StepRun, Verdict
 from processor.report.columns import MM, XYZ, columns
-from processor.report.space_frame import hangers
+from processor.report.space_frame import hanger_report
 from processor.report.table import NAN, Table
 from processor.robust_statistics import finite_median
 from processor.space_frame.result import Balls, Evidence, Flag, Result
@@ -36,7 +36,7 @@ def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
         file = "balls" if run is runs[0] else f"balls-{run.method}"
         table = _with_bounds(run, true, file) if run.result.has_bounds else _formal(run, true, file, runs[0])
         tables.append(replace(table, folded=run is not runs[0]))
-    tables += hangers.tables(first)
+    tables += hanger_report.tables(first)
     if whole:
         tables += [_brief(first, runs[0].method), _lowest(first.balls), *_nodes(first), *_tubes(first)]
         tables += [*_stations(first), *_control(first)]
