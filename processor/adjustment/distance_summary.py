@@ -42,13 +42,13 @@ class Summary:
     few_points: int  # core points with a level of detection and few points of either cloud in the cylinder
     significant: int
     significant_share: Share
-    mean: float
-    median: float
-    sd: float
-    rms: float
-    min: float
-    max: float
-    lod95_median: float
+    mean: float = math.nan
+    median: float = math.nan
+    sd: float = math.nan
+    rms: float = math.nan
+    min: float = math.nan
+    max: float = math.nan
+    lod95_median: float = math.nan
     min_ci95: tuple[float, float] = UNKNOWN
     max_ci95: tuple[float, float] = UNKNOWN
 
@@ -66,7 +66,6 @@ def of_distances(
         few_points += int((np.minimum(measured.n1[rows], measured.n2[rows])[known[rows]] < few).sum())
     distance, lod95, places = (chosen(column, known) for column in (measured.distance, measured.lod95, core))
     significant = chosen(beyond, known)
-    figures = _figures(distance, lod95) if len(distance) else dict.fromkeys(FIGURES, math.nan)
     return Summary(
         core_points=len(core),
         without_normal=without_normal,
@@ -74,15 +73,12 @@ def of_distances(
         few_points=few_points,
         significant=int(np.count_nonzero(significant)),
         significant_share=share(significant, places, SHARE_CELL * projection_diameter_mm),
-        **figures,
+        **(_figures(distance, lod95) if len(distance) else {}),
     )
 
 
-FIGURES = ("mean", "median", "sd", "rms", "min", "max", "lod95_median")
-
-
 def _figures(distance: Floats, lod95: Floats) -> dict[str, Any]:
-    """Return FIGURES and the intervals of the extremes of distances (k,) with levels of detection (k,), k > 0."""
+    """Return the statistics, by field of Summary, of distances (k,) with levels of detection (k,), k > 0."""
     count = len(distance)
     mean = total(distance) / count
     low, *of_low = maximum_interval.of_extreme(distance, lod95, 1.0 / Z95, sign=-1)
@@ -106,7 +102,7 @@ def share(marked: Bools, places: Floats, cell: float) -> Share:
     Neighbouring places share points and so agree. The effective number follows from how the marks vary between cells.
     """
     if not len(marked):
-        return Share(float("nan"), float("nan"), float("nan"))
+        return Share(math.nan, math.nan, math.nan)
     p = int(np.count_nonzero(marked)) / len(marked)
     low = large_arrays.corners(places)[0]
 

@@ -28,13 +28,12 @@ def of_independent(values: Floats, sd: Floats, axes: int = 1) -> tuple[float, fl
     The band is widened as for independent errors, which by Sidak's inequality never covers less. ``sd`` (n,) is of the
     value itself, or of each of the ``axes`` of the vector whose length it is.
     """
-    top = int(np.argmax(values))
-    near = values >= values[top] - CLEAR_SD * (sd + sd[top]) - EXACT_MM
-    reach = _sidak_factor(int(near.sum()), axes) * sd[near]
-    return float(values[top]), float((values[near] - reach).max()), float((values[near] + reach).max())
+    return of_extreme(values, sd, 1.0, sign=1, axes=axes)
 
 
-def of_extreme(values: Floats, errors: Floats, sd_per_error: float, sign: int) -> tuple[float, float, float]:
+def of_extreme(
+    values: Floats, errors: Floats, sd_per_error: float, sign: int, axes: int = 1
+) -> tuple[float, float, float]:
     """Greatest (``sign`` 1) or least (-1) of values (n,) that need not fit in memory, and its 95 % interval.
 
     As of :func:`of_independent`, with ``errors`` (n,) in place of standard deviations, which are ``sd_per_error`` times
@@ -48,18 +47,14 @@ def of_extreme(values: Floats, errors: Floats, sd_per_error: float, sign: int) -
         of_near = value >= limit - CLEAR_SD * sd
         return value[of_near], sd[of_near]
 
-    factor = _sidak_factor(sum(len(near(rows)[0]) for rows in blocks(len(values))), axes=1)
+    count = sum(len(near(rows)[0]) for rows in blocks(len(values)))
+    factor = float(np.sqrt(chdtri(axes, 1.0 - 0.95 ** (1.0 / count))))
     low = high = -np.inf
     for rows in blocks(len(values)):
         value, sd = near(rows)
         low = max(low, float((value - factor * sd).max(initial=-np.inf)))
         high = max(high, float((value + factor * sd).max(initial=-np.inf)))
     return (extreme, low, high) if sign > 0 else (extreme, -high, -low)
-
-
-def _sidak_factor(count: int, axes: int) -> float:
-    """Return the number of standard deviations within which ``count`` independent errors stay with 95 %."""
-    return float(np.sqrt(chdtri(axes, 1.0 - 0.95 ** (1.0 / count))))
 
 
 def of_correlated(values: Floats, covariance: Floats, folded: bool = False) -> tuple[float, float, float]:

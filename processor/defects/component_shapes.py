@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,7 +15,6 @@ from processor.defects.deviation_field import Field, component_of_cells
 from processor.defects.scan_statistic import Levels
 from processor.defects.surface_charts import DesignSurface
 from processor.distinct_rows import distinct
-from processor.geometry import mesh_distance
 from processor.model import NORMAL_95, Floats, Ints
 
 BLOCKS_ALONG, BLOCKS_ACROSS = 36, 16  # of a component's largest face, at least
@@ -58,14 +56,6 @@ class SignificantShape:
     z: float
     chance: float  # expected number of false alarms as strong on one mm2
     margin: float  # chi-square of the best fit of another kind less this one's
-
-
-class _Levels(NamedTuple):
-    """How much larger than by the noise of blocks the noise of a component is, and the common errors, one sd, mm."""
-
-    inflation: float
-    common_mm: float
-    systematic_mm: float
 
 
 def fit_all(field: Field, surface: DesignSurface) -> list[ComponentShape]:
@@ -150,8 +140,9 @@ def significant(
         size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
         inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
         for shape in candidates:
-            own_levels = _Levels(inflation, levels.common_mm, levels.systematic_mm)
-            value, own, sd, volume_sd = _errors(fit, shape, surface, field, alignment, own_levels)
+            value, own, noise, shared = _errors(fit, shape, surface, field, alignment, levels)
+            noise = inflation * noise
+            sd = np.hypot(noise, shared)
             top = int(np.argmax(np.abs(value)))
             z = deviate_of_one(float((np.abs(own) / sd).max()), len(shape.factors))
             if z > threshold:
@@ -159,7 +150,7 @@ def significant(
                     shape=shape,
                     peak=float(value[top]),
                     ci95=NORMAL_95 * float(sd[top]),
-                    volume_ci95=NORMAL_95 * volume_sd,
+                    volume_ci95=NORMAL_95 * _volume_sd(fit, shape, surface, field, inflation, shared),
                     z=z,
                     chance=2.0 * float(ndtr(-z)) * len(shape_models.BASES) / area,
                     margin=fit.fitted.margin / inflation**2,
@@ -174,11 +165,11 @@ def _errors(
     surface: DesignSurface,
     field: Field,
     alignment: Alignment,
-    levels: _Levels,
-) -> tuple[Floats, Floats, Floats, float]:
-    """Return a shape's values (n,) at cells and corners, those that its significance is of, and their errors, one sd.
+    levels: Levels,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return a shape's values (n,) at cells and corners, those that its significance is of, and their errors.
 
-    The last number is the standard deviation of the volume that the shape displaces, mm3.
+    These are one sd: by the noise of blocks, and what places have in common.
     """
     rows = cells_of_shape(surface, field, fit, shape)
     points, outward = with_corners(surface, rows)
@@ -188,14 +179,28 @@ def _errors(
         # The error of a pose that was not fitted to the design may be large: it moves, it does not deform.
         own = value - _rigid_part(fit, shape).values(fit.frame, points, outward)
         registration = np.full_like(value, field.stations_sd(rows, free=True))
-    noise = shape.sd(fit.frame, points, outward) * levels.inflation
     shared = np.sqrt(levels.common_mm**2 + levels.systematic_mm**2 + registration**2)
-    moved = swept_cells(surface, field, fit, shape)
-    sides, out = surface.centres[moved], surface.outward[moved]
-    swept = np.sign(shape.values(fit.frame, sides, out)) * cell_areas(surface, moved)
-    swept_sd = levels.inflation * shape.total_sd(fit.frame, sides, out, swept)
-    volume_sd = np.hypot(swept_sd, np.abs(swept).sum() * float(np.sqrt(np.mean(shared**2))))
-    return value, own, np.hypot(noise, shared), float(volume_sd)
+    return value, own, shape.sd(fit.frame, points, outward), shared
+
+
+def _volume_sd(
+    fit: ComponentShape,
+    shape: shape_models.Shape,
+    surface: DesignSurface,
+    field: Field,
+    inflation: float,
+    shared: Floats,
+) -> float:
+    """Return the standard deviation of the volume that a shape displaces, mm3.
+
+    ``shared`` (n,) is what places have in common, one sd, mm; ``inflation`` is how much larger than by the noise of
+    blocks the noise of the component is.
+    """
+    cells = swept_cells(surface, field, fit, shape)
+    points, outward = surface.centres[cells], surface.outward[cells]
+    swept = np.sign(shape.values(fit.frame, points, outward)) * surface.cell_areas[cells]  # 0 where it does not reach
+    noise = inflation * shape.total_sd(fit.frame, points, outward, swept)
+    return float(np.hypot(noise, np.abs(swept).sum() * np.sqrt(np.mean(shared**2))))
 
 
 def _rigid_part(fit: ComponentShape, shape: shape_models.Shape) -> shape_models.Shape:
@@ -271,18 +276,6 @@ def swept_cells(surface: DesignSurface, field: Field, fit: ComponentShape, shape
     inward, outward = ((way * value > 0.0) for way in (-1.0, 1.0))
     larger: Ints = cells[max(inward, outward, key=lambda side: np.abs(value[side]) @ surface.share[cells[side]])]
     return larger
-
-
-def cell_areas(surface: DesignSurface, cells: Ints) -> Floats:
-    """Return the areas (n,) of cells that their face covers by more than half, mm2; their sum is that of the facets.
-
-    Samples of cells at the border give the area of a face to about 1 %.
-    """
-    chart = chart_of_cells(surface)
-    exact = np.bincount(surface.chart_of, 0.5 * mesh_distance.double_areas(surface.vertices, surface.faces)[1])
-    sampled = np.bincount(chart, np.where(surface.share > 0.5, surface.share, 0.0), len(exact))
-    areas: Floats = surface.share[cells] * (exact / np.maximum(sampled, 1e-9))[chart[cells]]
-    return areas
 
 
 def front_of(surface: DesignSurface, component: int, field: Field) -> Ints:

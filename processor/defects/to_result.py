@@ -15,7 +15,6 @@ from processor.defects.classification import Classification
 from processor.defects.component_shapes import (
     ComponentShape,
     SignificantShape,
-    cell_areas,
     cells_of_shape,
     swept_cells,
     with_corners,
@@ -198,7 +197,7 @@ def _shape_defect(search: Search, fit: ComponentShape, rows: Ints, judged: Signi
         beyond = np.abs(value) > max(judged.ci95, STEP_SHARE * abs(judged.peak))
         part = beyond if beyond.any() else part
         extent[int(judged.shape.at[0])] *= 0.5 * (1.0 - judged.shape.at[1])
-    area = cell_areas(surface, rows)
+    area = surface.cell_areas[rows]
     both_ways = kind in ("twist", "waviness")
     volume = on_face = float((np.abs(value) if both_ways else -value) @ area)
     if kind == RIGID:  # what is swept: a round face goes outward on one side and inward on the other
@@ -206,7 +205,7 @@ def _shape_defect(search: Search, fit: ComponentShape, rows: Ints, judged: Signi
         on_face = inward if inward >= outward else -outward
         cells = swept_cells(surface, search.field, fit, judged.shape)
         moved = np.abs(judged.shape.values(frame, surface.centres[cells], surface.outward[cells]))
-        volume = float(np.copysign(moved @ cell_areas(surface, cells), on_face))
+        volume = float(np.copysign(moved @ surface.cell_areas[cells], on_face))
     values = _row(
         classification.of_shape(kind, judged.margin),
         surface.names[component],

@@ -181,9 +181,8 @@ def test_shapes_of_whole_components(kind, inward, depth):
     result = run(scene_of(4, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)))
     assert found(result) == [(kind, "component-2")]
     assert abs(result.defects.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
-    if (
-        kind == "misalignment"
-    ):  # by 2 mm on average; a plate that is wrong by its depth's interval everywhere is so by this
+    if kind == "misalignment":  # by 2 mm on average
+        # A plate that is off by the depth's interval everywhere is off by that of the volume.
         (area,), (volume,), (ci95,) = result.defects.area_mm2, result.defects.volume_mm3, result.defects.volume_ci95
         assert area == pytest.approx(SIDE**2, rel=1e-9)
         assert abs(volume - 2.0 * SIDE**2) < ci95

@@ -211,9 +211,8 @@ def _linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: F
     LsW, Wr = Ls @ W, np.einsum("bij,bj->bi", W, rho)
     Hss = LsW @ Ls.transpose(0, 2, 1)
     Hsp = LsW @ Lp.transpose(0, 2, 1)
-    Hpp = grouped_sums.summed((Lp @ W @ Lp.transpose(0, 2, 1)).reshape(b, 9), blocks.piece, blocks.pieces).reshape(
-        -1, 3, 3
-    )
+    LpWLp = (Lp @ W @ Lp.transpose(0, 2, 1)).reshape(b, 9)
+    Hpp = grouped_sums.summed(LpWLp, blocks.piece, blocks.pieces).reshape(-1, 3, 3)
     gs = np.einsum("bij,bj->bi", Ls, Wr)
     gp = grouped_sums.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
     scale = np.einsum("nii->ni", Hpp)
