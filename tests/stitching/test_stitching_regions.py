@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from processor.model import Scene
 from processor.stitching import step as stitching_step
-from processor.stitching.fine import bundle_adjustment, correspondences
+from processor.stitching.fine import bundle_adjustment, correspondences, normal_equations
 from tests.support.clouds.stitch_clouds import ROOM, four
 
 
@@ -92,7 +92,7 @@ def test_the_variance_of_faces_is_that_of_an_analysis_of_variance():
     for shrunk, expected in ((1.0, np.sqrt(y.var(ddof=1) - 1.0 / a)), (0.2, 0.0)):
         g[faces], g[3] = a * (x - shrunk * y), a * (x - shrunk * y).sum()
         none = np.empty(0)
-        equations = bundle_adjustment._Equations(N=N, spurious=N, g=g, z=none, offset=none, variance=none)
+        equations = normal_equations.Equations(N=N, spurious=N, g=g, z=none, offset=none, variance=none)
         found = bundle_adjustment._estimate_face_sd(equations, np.array([3, 6, 7, *faces]), 1, np.append([0.0, 0.0], x))
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor.model import Floats, Ints
-from processor.stitching.fine import bundle_adjustment, correspondences
+from processor.stitching.fine import bundle_adjustment, correspondences, normal_equations
 from processor.stitching.fine.bundle_adjustment import REJECTION_SIGMAS, Solution
 from processor.stitching.fine.correspondences import FLAT_SIGMAS, KINDS, Blocks, CellTable
 from processor.stitching.planes import extraction, grouped_sums
@@ -69,7 +69,7 @@ def _misfits(blocks: Blocks, solution: Solution) -> _Misfits:
     # Where all faces of a piece but one are outliers, any may be wrong: each is compared with all others.
     left = np.bincount(blocks.piece, weight > bundle_adjustment.LEAST_INLIER_WEIGHT, blocks.pieces)
     weight = np.where(left[blocks.piece] < 2, 1.0, weight)
-    moments = bundle_adjustment.in_world(blocks, solution.T, *solution.of_scans[blocks.scan].T)
+    moments = normal_equations.in_world(blocks, solution.T, *solution.of_scans[blocks.scan].T)
     world = extraction.triangle(moments)
     faces = extraction.planes_of(world)
     weighted = world * weight[:, None]
