@@ -14,8 +14,8 @@ import numpy as np
 
 from designgen.checks import expect
 from designgen.designs import defect_specimens
+from designgen.designs.boxes_and_tubes import Box, Component
 from designgen.designs.parametric_face import Displacement, Patch, outside
-from designgen.designs.structure_bodies import Box, Component
 from processor.model import Bools, Floats, UsageError
 
 CLASSES = (

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from designgen.checks import expect
-from designgen.designs import bolting, prismatic, sections
-from designgen.designs.bolting import Bore
+from designgen.designs import bolt_holes, prismatic_parts, sections
+from designgen.designs.bolt_holes import Bore
 from designgen.designs.parametric_face import Patch
-from designgen.designs.prismatic import End, Girder, Node, Part
+from designgen.designs.prismatic_parts import End, Girder, Node, Part
 from designgen.designs.sections import Section
 from designgen.rigid import rigid
 from processor.model import Floats
@@ -38,7 +38,7 @@ class Params(sections.Params):
         least = 2.0 * self.height_mm
         for key in ("length_mm",) if self.type == "row" else ("length_mm", "stub_mm"):
             expect(getattr(self, key) >= least, f"assembly.{key}", getattr(self, key), f"{least:g} or more")
-        widest = 2.0 * prismatic.PAD_SIZE_MM  # the mark lies on one half of the top
+        widest = 2.0 * prismatic_parts.PAD_SIZE_MM  # the mark lies on one half of the top
         expect(self.width_mm >= widest, "assembly.width_mm", self.width_mm, f"{widest:g} or more")
         box = self.type == "row" or self.section == "box"
         expect(box, "assembly.section", self.section, "box: nodes are made of plain boxes alone")
@@ -66,7 +66,7 @@ class Assembly:
 Shifts = Mapping[str, Floats]  # by girder: by how much each hole as drilled (n, 3) lies off its place, mm
 
 
-def build(params: Params, bolts: bolting.Params | None = None, shifts: Shifts | None = None) -> Assembly:
+def build(params: Params, bolts: bolt_holes.Params | None = None, shifts: Shifts | None = None) -> Assembly:
     """Build an assembly; of I girders with ``bolts`` at their joints, their holes drilled off by ``shifts``."""
     if bolts is not None:
         expect(
@@ -81,7 +81,7 @@ class _Maker:
     """Collects girders and nodes; joints are named by the order in which they are made."""
 
     def __init__(
-        self, params: Params, section: Section, bolts: bolting.Params | None = None, shifts: Shifts | None = None
+        self, params: Params, section: Section, bolts: bolt_holes.Params | None = None, shifts: Shifts | None = None
     ) -> None:
         self.params, self.section, self.bolts, self.shifts = params, section, bolts, shifts or {}
         self.made_of: dict[str, Girder | Node] = {}
@@ -103,16 +103,18 @@ class _Maker:
         )
         edge, mark = (outer[top], np.roll(outer, -1, axis=0)[top]), (0.25 + 0.03 * (number % 6)) * length
         bores = self._bores(name, length, joined)
-        wall, *pad = prismatic.marked(T, 0.0, length, edge, mark)
-        faces = [*bolting.holed(wall, T, length, *edge, bores), *pad]
+        wall, *pad = prismatic_parts.marked(T, 0.0, length, edge, mark)
+        faces = [*bolt_holes.holed(wall, T, length, *edge, bores), *pad]
         others = [k for k in range(len(outer)) if k != top]
-        for k, wall in zip(others, prismatic.walls(T, 0.0, length, outer, skip=[top]), strict=True):
-            faces += bolting.holed(wall, T, length, outer[k], outer[(k + 1) % len(outer)], bores)
-        faces += [bolting.bore_patch(f"bore{k}", T, bore) for k, bore in enumerate(bores)]
+        for k, wall in zip(others, prismatic_parts.walls(T, 0.0, length, outer, skip=[top]), strict=True):
+            faces += bolt_holes.holed(wall, T, length, outer[k], outer[(k + 1) % len(outer)], bores)
+        faces += [bolt_holes.bore_patch(f"bore{k}", T, bore) for k, bore in enumerate(bores)]
         for hole in self.section.outlines[1:]:
-            faces += prismatic.walls(T, 0.0, length, hole, "inner")
-        faces += prismatic.end_face(T, 0.0, self.section, "start") + prismatic.end_face(T, length, self.section, "end")
-        self.faces[name], self.reach[name] = faces, min(prismatic.FADES_MM, 0.4 * length)
+            faces += prismatic_parts.walls(T, 0.0, length, hole, "inner")
+        faces += prismatic_parts.end_face(T, 0.0, self.section, "start") + prismatic_parts.end_face(
+            T, length, self.section, "end"
+        )
+        self.faces[name], self.reach[name] = faces, min(prismatic_parts.FADES_MM, 0.4 * length)
         self.made_of[name] = Girder(T, length, self.section, mark, tuple(bores))
         return T @ _along(length)
 
@@ -120,7 +122,7 @@ class _Maker:
         """Return the holes of a girder as drilled."""
         if self.bolts is None:
             return []
-        bores = bolting.of_girder(self.bolts, self.section, length, joined)
+        bores = bolt_holes.of_girder(self.bolts, self.section, length, joined)
         shifts = self.shifts.get(name, np.zeros((len(bores), 3)))
         return [dataclasses.replace(bore, shift=shift) for bore, shift in zip(bores, shifts, strict=True)]
 
@@ -132,21 +134,25 @@ class _Maker:
             # The web plates of both directions are in one plane, so the upright box is as deep as the chord is high.
             reach = h if number == 0 else h - self.params.flange_mm
             top = TOP if number == 0 else 0
-            faces += prismatic.walls(T, -stub, -reach, outline, f"chord{number}", skip=[top] if number == 0 else [])
-            faces += prismatic.walls(T, -reach, reach, outline, f"middle{number}", skip=[top])
-            faces += prismatic.walls(T, reach, stub, outline, f"chord{number}")
-            faces += prismatic.walls(up, reach, self.upright, outline, f"branch{number}")
-        # Half a turn about the third stub would lay the node on itself but for its mark.
-        outer, mark = self.section.outlines[0], -h - prismatic.PAD_SIZE_MM
-        faces += prismatic.marked(T, -stub, -h, (outer[TOP], outer[TOP + 1]), mark)
-        faces += prismatic.end_face(T, -stub, self.section, "start") + prismatic.end_face(T, stub, self.section, "end")
-        faces += prismatic.end_face(up, self.upright, self.section, "end")
+            faces += prismatic_parts.walls(
+                T, -stub, -reach, outline, f"chord{number}", skip=[top] if number == 0 else []
+            )
+            faces += prismatic_parts.walls(T, -reach, reach, outline, f"middle{number}", skip=[top])
+            faces += prismatic_parts.walls(T, reach, stub, outline, f"chord{number}")
+            faces += prismatic_parts.walls(up, reach, self.upright, outline, f"branch{number}")
+        # Without its mark the node would look the same after half a turn about the third stub.
+        outer, mark = self.section.outlines[0], -h - prismatic_parts.PAD_SIZE_MM
+        faces += prismatic_parts.marked(T, -stub, -h, (outer[TOP], outer[TOP + 1]), mark)
+        faces += prismatic_parts.end_face(T, -stub, self.section, "start") + prismatic_parts.end_face(
+            T, stub, self.section, "end"
+        )
+        faces += prismatic_parts.end_face(up, self.upright, self.section, "end")
         self.faces[name], self.reach[name] = faces, 0.8 * (self.upright - h)
         self.made_of[name] = Node(T, stub, self.upright, self.section, mark)
 
     @property
     def upright(self) -> float:
-        """Length of a node's third stub, from its middle: another than the other two, for its axes to be known."""
+        """Length of a node's third stub, from its middle: unlike the others, so that the axes can be told apart."""
         return 1.15 * self.params.stub_mm
 
     def join(self, left: str, right: str, T: Floats) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from designgen.designs.prismatic import PAD_HEIGHT_MM, PAD_SIZE_MM, Girder, Node
+from designgen.designs.prismatic_parts import PAD_HEIGHT_MM, PAD_SIZE_MM, Girder, Node
 from designgen.designs.sections import Section
 from processor.model import Floats
 

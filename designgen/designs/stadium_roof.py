@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from designgen.checks import expect, expect_positive
-from designgen.designs.structure_bodies import Component, Tube, component
+from designgen.designs.boxes_and_tubes import Component, Tube, component
 from processor.model import Floats, UsageError
 
 ABOUT = "stadium roof: cantilever trusses of tubes around an oval, joined by rings"

@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 from designgen.designs import defect_specimens, stadium_roof, truss_bridge
-from designgen.designs.structure_bodies import Component
+from designgen.designs.boxes_and_tubes import Component
 from designgen.recipe_params import filled
 from processor.model import UsageError
 

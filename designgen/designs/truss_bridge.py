@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from designgen.checks import expect, expect_positive
-from designgen.designs.structure_bodies import Box, Component, component
+from designgen.designs.boxes_and_tubes import Box, Component, component
 from processor.model import Floats
 
 ABOUT = "truss bridge: two trusses of box sections on abutments, with floor beams and bracing"

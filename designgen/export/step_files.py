@@ -13,12 +13,12 @@ from designgen.cad.process import escape
 from designgen.designs import (
     arch_bridge,
     arch_part,
-    bolting,
+    bolt_holes,
+    boxes_and_tubes,
     closed_ring,
     girder_assemblies,
     prismatic_solids,
     space_frame,
-    structure_bodies,
     structure_registry,
 )
 from designgen.export import model_solids
@@ -90,7 +90,7 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
     elif kind == "structure":
         path = folder / "structure.step"
         components = structure_registry.design(recipe)
-        shapes = {component.name: structure_bodies.solid([component]) for component in components}
+        shapes = {component.name: boxes_and_tubes.solid([component]) for component in components}
     elif kind == "assembly":
         path, shapes = folder / "assembly.step", _parts_of_assembly(recipe)
     else:
@@ -101,7 +101,7 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
 
 def _parts_of_assembly(recipe: Mapping[str, Any]) -> dict[str, cq.Shape]:
     """Return the solids of the girders and nodes of an assembly."""
-    bolts = filled(bolting.Params, recipe, "bolts") if "bolts" in recipe else None
+    bolts = filled(bolt_holes.Params, recipe, "bolts") if "bolts" in recipe else None
     parts = girder_assemblies.build(filled(girder_assemblies.Params, recipe, "assembly"), bolts).parts
     return {part.name: prismatic_solids.solid(part.made_of) for part in parts}
 

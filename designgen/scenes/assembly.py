@@ -10,9 +10,9 @@ import numpy as np
 
 from designgen.asbuilt.imperfections import Ledger
 from designgen.checks import expect
-from designgen.designs import bolting
+from designgen.designs import bolt_holes
 from designgen.designs import girder_assemblies as design_of
-from designgen.designs.prismatic import EndErrors, Part
+from designgen.designs.prismatic_parts import EndErrors, Part
 from designgen.randomness import generator, random_pose
 from designgen.recipe_params import filled
 from designgen.rigid import inverse
@@ -50,7 +50,7 @@ class Errors:
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
     """Make the scene of an assembly, a scan of each part in a separate frame, and its truth."""
     sizes = filled(design_of.Params, recipe, "assembly")
-    bolts = filled(bolting.Params, recipe, "bolts") if "bolts" in recipe else None
+    bolts = filled(bolt_holes.Params, recipe, "bolts") if "bolts" in recipe else None
     nominal = design_of.build(sizes, bolts)
     errors = filled(Errors, recipe, "asbuilt")
     ledger = Ledger()

@@ -11,7 +11,7 @@ import numpy as np
 
 from designgen.asbuilt import defects as asbuilt_defects
 from designgen.asbuilt import imperfections
-from designgen.designs import defect_specimens, structure_bodies, structure_registry
+from designgen.designs import boxes_and_tubes, defect_specimens, structure_registry
 from designgen.designs.parametric_face import Displacement, Patch
 from designgen.low_discrepancy import van_der_corput
 from designgen.randomness import generator
@@ -39,7 +39,7 @@ from processor.model import (
 
 NEXT_WINDOW_MM = 9_000.0  # from one scan of a station to the next, of a scanner that does not turn
 TRUTH_STEP_MM = 250.0
-Components = tuple[structure_bodies.Component, ...]
+Components = tuple[boxes_and_tubes.Component, ...]
 PartPatches = list[tuple[int, Patch]]  # the row of the component of each face
 OfDefects = Callable[[Floats, PointLabels], Labels]  # points in the design's frame -> defect of each
 
@@ -76,7 +76,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         if of_defects is not None:
             surveyed = _labelled(surveyed, of_defects)
         scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
-        corners = np.vstack([structure_bodies.mesh_of((one,))[0] for one in components if one.name != "ground"])
+        corners = np.vstack([boxes_and_tubes.mesh_of((one,))[0] for one in components if one.name != "ground"])
         picks = _picks(recipe, scans, station_truth, params, corners + origin, seed)
         if not params.registered:
             scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
@@ -93,7 +93,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         if of_defects is not None:
             label = dataclasses.replace(label, defect=of_defects(cloud.points, label))
         labels = (label,)
-    vertices, faces = structure_bodies.mesh_of(components)
+    vertices, faces = boxes_and_tubes.mesh_of(components)
     scene = Scene(
         name,
         "structure",
@@ -213,7 +213,7 @@ def _as_designed(components: Components) -> PartPatches:
 def _hidden(components: Components) -> Callable[[int, Floats, Floats], Bools]:
     """Return a function that marks the places on the design's faces inside of a body."""
     faces = [patch for _, patch in _as_designed(components)]
-    inside = structure_bodies.covered(components)
+    inside = boxes_and_tubes.covered(components)
     return lambda row, p, q: inside(faces[row].at(p, q))
 
 
@@ -280,6 +280,6 @@ def _truth(components: Components, displacement: Displacement | None, origin: Fl
             points.append(patch.at(p, q))
             normals.append(normal / np.linalg.norm(normal, axis=1)[:, None])
     x = np.vstack(points)
-    visible = ~structure_bodies.covered(components)(x)
+    visible = ~boxes_and_tubes.covered(components)(x)
     x = x[visible]
     return StructureTruth(x + origin, np.vstack(normals)[visible], displacement(x))

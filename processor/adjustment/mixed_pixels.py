@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Bools, Floats, Ints
 
 WINDOW_STEPS = 1.6  # of the scanner, within which a point is a neighbour: those of a square grid and its diagonals

@@ -15,7 +15,7 @@ from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
 from processor.evaluation import evaluate
 from processor.evaluation.evaluate import ErrorReport
-from processor.geometry.parallel import one_blas_thread
+from processor.geometry.thread_ranges import one_blas_thread
 from processor.jobs import tile_cluster
 from processor.language.messages import CODES, messages
 from processor.model import LONGEST_NAME, Metric, Scene, Truth, UsageError, Verdict, worst

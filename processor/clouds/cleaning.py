@@ -18,7 +18,7 @@ from processor.clouds import poses, slabs
 from processor.clouds.earlier_run import Run
 from processor.clouds.poses import Placed
 from processor.deviation.measure import REACH_MM
-from processor.geometry import mesh_distance, neighbors, rigid
+from processor.geometry import mesh_distance, nearest_neighbours, rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Bools, Floats
 from processor.writers.cloud import Block, Cloud
@@ -93,16 +93,16 @@ def _distances(parts: slabs.Slabs, number: int, scanner: Floats | None) -> Float
     if not len(points):
         return np.empty(0)
     if len(parts) > 1:
-        reach = HALO * neighbors.spacing(neighbors.of_spacing(points))
+        reach = HALO * nearest_neighbours.spacing(nearest_neighbours.of_spacing(points))
         low, high = parts.edges[number] - reach, parts.edges[number + 1] + reach
         beside = [slabs.points_of(parts.read(other)) for other in (number - 1, number + 1)]
         beside = [one[(one[:, parts.axis] >= low) & (one[:, parts.axis] <= high)] for one in beside]
         every = np.concatenate([points, *beside])
     else:
         every = points
-    grid = neighbors.of_spacing(every)
+    grid = nearest_neighbours.of_spacing(every)
     mean = np.empty(len(every))
-    mean[grid.order] = neighbors.mean_distances(grid, NEIGHBOURS)
+    mean[grid.order] = nearest_neighbours.mean_distances(grid, NEIGHBOURS)
     mean = mean[: len(points)]
     if scanner is not None:
         mean /= np.maximum(np.linalg.norm(points - scanner, axis=1), LEAST_RANGE_MM)

@@ -17,7 +17,7 @@ from processor.adjustment.distance_summary import Summary
 from processor.compare import core_tiles, diagnosis, units
 from processor.compare import normals_file as scan_folder_normals
 from processor.compare.core_tiles import Lengths
-from processor.geometry import m3c2, neighbors, normal_orientation
+from processor.geometry import m3c2, nearest_neighbours, normal_orientation
 from processor.geometry.m3c2 import CloudNormals, Distances, Scales
 from processor.geometry.normal_orientation import Turned
 from processor.geometry.point_grid import PointGrid
@@ -174,8 +174,8 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     unit = _unit(list(clouds.values()))
     origin = _origin(reference)
     core = clouds.get("core", reference).relative_to(origin)
-    first, second = (neighbors.of_spacing(cloud.relative_to(origin)) for cloud in (reference, compared))
-    tiled = neighbors.of_spacing(core) if "core" in clouds else first
+    first, second = (nearest_neighbours.of_spacing(cloud.relative_to(origin)) for cloud in (reference, compared))
+    tiled = nearest_neighbours.of_spacing(core) if "core" in clouds else first
     used = m3c2.derive_scales(
         first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth
     )

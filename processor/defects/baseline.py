@@ -26,7 +26,8 @@ from processor.defects.result import DefectClass, Result, SurfacePlaces
 from processor.defects.surface_charts import of_mesh
 from processor.defects.to_result import table
 from processor.geometry import mesh_distance, rigid
-from processor.geometry.neighbors import surface_spacing, voxel_means
+from processor.geometry.nearest_neighbours import surface_spacing
+from processor.geometry.thinning import voxel_means
 from processor.model import NORMAL_95, Bools, Floats, Ints, Scene, Status, StructureDesign, reason
 from processor.registration import icp, pfh
 from processor.robust_statistics import robust_sd_about_median

@@ -18,7 +18,7 @@ from numba import njit
 
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import SHARP_COS, CurvedFacets, FacetGrid, square_to
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import put_aside
 from processor.model import Floats, Ints
 

@@ -19,7 +19,7 @@ from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Paper, Params
 from processor.deviation.result import ErrorSource, Result
 from processor.geometry import m3c2, mesh_distance, rigid
-from processor.geometry.neighbors import thinned
+from processor.geometry.thinning import thinned
 from processor.model import Floats, Ints, Scene, Status, StructureDesign, reason
 from processor.registration import icp, principal
 from processor.registration.principal import AMBIGUOUS, CoarsePose

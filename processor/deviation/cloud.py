@@ -11,7 +11,7 @@ from processor import scene_cloud
 from processor.deviation import large_cloud
 from processor.deviation.large_cloud import LargeCloud
 from processor.distinct_rows import distinct
-from processor.geometry import neighbors, rigid
+from processor.geometry import nearest_neighbours, rigid
 from processor.model import Floats, InputError, Ints, Scene
 
 MOST_POINTS = 3_000_000  # of a scan that are held at once; of more an even sample is held
@@ -122,13 +122,13 @@ def _sample(scene: Scene, neighbours: int, ratio: float) -> ScanCloud:
 def _held(scene: Scene, neighbours: int, ratio: float, most: int) -> ScanCloud:
     """Merge the scans of a scene in memory; of ``most`` points or fewer, if that is not 0, every k-th is left."""
     cloud = scene_cloud.merged(scene, with_scanner=True)
-    grid = neighbors.of_spacing(cloud.points)
-    spacing = neighbors.spacing(grid)
+    grid = nearest_neighbours.of_spacing(cloud.points)
+    spacing = nearest_neighbours.spacing(grid)
     if not spacing > 0.0:
         raise InputError(f"{scene.name}: most points of the scan lie at the same place; export it again")
     inlier = np.ones(grid.count, bool)
     if ratio > 0.0:
-        inlier = neighbors.statistical_inliers(grid, neighbours, ratio)
+        inlier = nearest_neighbours.statistical_inliers(grid, neighbours, ratio)
     step = max(1, -(-int(inlier.sum()) // most)) if most else 1
     rows, out = np.flatnonzero(inlier)[::step], np.flatnonzero(~inlier)[::step]
     kept = int(inlier.sum())

@@ -15,7 +15,7 @@ import numpy as np
 
 from processor import tiles
 from processor.deviation.surface_movement import Cloud
-from processor.geometry import neighbors, rigid
+from processor.geometry import nearest_neighbours, rigid
 from processor.large_arrays import allocate, blocks, extremes, release, taken
 from processor.model import Bools, Floats, Ints, Labels, Scan, Scene
 
@@ -232,10 +232,10 @@ class _Near(NamedTuple):
 
 def _near(slab: _Slab) -> _Near:
     """Search for the neighbours of a slab's points."""
-    grid = neighbors.of_spacing(slab.points)
+    grid = nearest_neighbours.of_spacing(slab.points)
     own = np.flatnonzero(grid.order < slab.own)
-    distance = neighbors.mean_distances(grid, slab.neighbours)[own] if slab.neighbours else np.zeros(len(own))
-    farthest, k = neighbors.farthest_distances(grid, own[:: slab.step])
+    distance = nearest_neighbours.mean_distances(grid, slab.neighbours)[own] if slab.neighbours else np.zeros(len(own))
+    farthest, k = nearest_neighbours.farthest_distances(grid, own[:: slab.step])
     return _Near(grid.order[own], distance, farthest, k)
 
 
@@ -263,7 +263,7 @@ def _inliers(slabs: _Slabs, part: _Part, neighbours: int, ratio: float) -> tuple
     limit = mean + ratio * float(np.sqrt(square / n))
     for rows in blocks(n):
         inlier[rows] = distance[rows] <= limit if ratio > 0.0 else True
-    return inlier, neighbors.spacing_of(np.concatenate(farthest), k)
+    return inlier, nearest_neighbours.spacing_of(np.concatenate(farthest), k)
 
 
 def _slabs(slabs: _Slabs, points: Floats, numbers: Sequence[int], neighbours: int) -> Iterator[_Slab]:
@@ -278,7 +278,7 @@ def _with_halo(slabs: _Slabs, points: Floats, slab: int) -> Floats:
     """Return the points of a slab, and after them those about it."""
     own = points[slabs.rows(slab)]
     step = max(1, len(own) // SAMPLE)
-    few = neighbors.spacing(neighbors.of_spacing(own[::step]))
+    few = nearest_neighbours.spacing(nearest_neighbours.of_spacing(own[::step]))
     reach = HALO * few / np.sqrt(step) if few > 0.0 else 0.0
     low, high = slabs.bounds(slab)
     beside = [own]

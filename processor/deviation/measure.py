@@ -22,7 +22,7 @@ from processor.deviation.surface_movement import Cloud
 from processor.geometry import m3c2, mesh_distance, rigid
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
-from processor.geometry.neighbors import thinned
+from processor.geometry.thinning import thinned
 from processor.model import Floats, Reason, Scene, Status, reason
 from processor.registration import surface_registration
 from processor.registration.surface_registration import NEAR_MM, Placed, Registration

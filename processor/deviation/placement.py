@@ -9,7 +9,7 @@ import numpy as np
 from processor.deviation.cloud import ScanCloud
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface
-from processor.geometry.neighbors import thinned
+from processor.geometry.thinning import thinned
 from processor.model import Floats, Ints
 from processor.registration import surface_registration
 from processor.registration.surface_registration import NEAR_MM, NEAR_SHARE, Placed

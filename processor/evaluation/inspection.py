@@ -14,7 +14,7 @@ from processor import scene_cloud
 from processor.adjustment import thermal
 from processor.evaluation.error_statistics import covered
 from processor.geometry import mesh_distance
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.inspection import flat_faces, members, part_geometry, structure_bodies
 from processor.inspection.arch_parts import design_ends
 from processor.inspection.result import InspectedComponent, Quantity, Result

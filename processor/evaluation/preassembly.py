@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls, signed
 from processor.geometry import rigid
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Status, Truth
 from processor.preassembly import assembly_errors, topology
 from processor.preassembly.chain.adjustment import HOLD

@@ -15,10 +15,10 @@ import numpy as np
 from numba import njit
 
 from processor import large_arrays
-from processor.geometry import neighbors, point_grid
+from processor.geometry import nearest_neighbours, point_grid
 from processor.geometry.linalg_small import eigen
-from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
+from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import blocks
 from processor.model import Bools, Floats, InputError, Ints
 
@@ -179,7 +179,7 @@ def derive_scales(
 
     Raises InputError for clouds without a density.
     """
-    spacings = neighbors.spacing(reference), neighbors.spacing(compared)
+    spacings = nearest_neighbours.spacing(reference), nearest_neighbours.spacing(compared)
     projection = projection_diameter_mm or rounded(diameter_for(POINTS_A_CYLINDER, max(spacings)))
     if not (projection > 0.0 and math.isfinite(projection)):
         raise InputError(
@@ -211,7 +211,7 @@ def rounded(value: float) -> float:
 def _normal_diameter(reference: PointGrid, projection: float) -> float:
     """Take NORMAL_TO_ROUGHNESS times the roughness at the scale of the projection, within bounds."""
     places = _scale_sample(reference.cells.points)
-    parts = [normals(reference, places[part], projection) for part in blocks(len(places), neighbors.SEARCHED)]
+    parts = [normals(reference, places[part], projection) for part in blocks(len(places), nearest_neighbours.SEARCHED)]
     roughness = np.concatenate([np.empty(0), *(part.roughness for part in parts)])
     known = roughness[np.isfinite(roughness)]
     wanted = NORMAL_TO_ROUGHNESS * float(np.median(known)) if len(known) else 0.0
@@ -221,7 +221,9 @@ def _normal_diameter(reference: PointGrid, projection: float) -> float:
 def _depth(compared: PointGrid, core: Floats, projection: float) -> float:
     """Take twice the distance of most core points from the other cloud, within bounds; farther ones get no distance."""
     places = _scale_sample(core)
-    parts = [neighbors.nearest(compared, places[part]) for part in blocks(len(places), neighbors.SEARCHED)]
+    parts = [
+        nearest_neighbours.nearest(compared, places[part]) for part in blocks(len(places), nearest_neighbours.SEARCHED)
+    ]
     near = np.concatenate([np.empty(0), *parts])
     far = float(np.quantile(near[np.isfinite(near)], FAR_QUANTILE)) if np.isfinite(near).any() else 0.0
     return min(max(projection, DEPTH_TO_DISTANCE * far), DEEPEST * projection)

@@ -18,8 +18,8 @@ from scipy.sparse.csgraph import connected_components
 from processor.distinct_rows import distinct
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import FacetGrid
-from processor.geometry.neighbors import same_places
-from processor.geometry.parallel import over_ranges
+from processor.geometry.nearest_neighbours import same_places
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Bools, Floats, Ints
 
 WELD_MM = 0.01  # vertices nearer to each other are one
@@ -161,7 +161,7 @@ def closed_bodies(faces: Ints) -> Ints:
 def _inside(grid, body, about, room, places, axis, inside, first, last):  # type: ignore[no-untyped-def]
     """Mark places first to last - 1 from which a ray along an axis leaves more bodies than it enters.
 
-    Bodies with a place in the box ``about`` (b, 2, 3) them count alone, and the ray ends where their boxes do.
+    Only bodies count whose box, ``about`` (b, 2, 3), contains the place. The ray ends where these boxes end.
     """
     low, size, shape = grid.low, grid.size, grid.shape
     u, v = (axis + 1) % 3, (axis + 2) % 3

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.geometry.linalg_small import assign_rows
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Bools, Floats, Ints, Labels
 
 LEAST_AREA = 1e-9  # mm2, twice that of a facet; smaller ones are left out
@@ -33,7 +33,8 @@ EDGE_MM = 1.0  # a foot up to this far outside the edge of its face still counts
 MOST_BULGE_MM = 1.0  # facets with a larger bulge are meant to be flat: no mesh is that coarse
 DESIGN_SAMPLES, DESIGN_SPACING_MM = 1_000_000, (8.0, 40.0)  # samples on a whole design; least and greatest spacing
 MOST_VOXELS, MOST_ENTRIES = 20_000_000, 40_000_000
-FULL, EMPTY, PIECES = 64, 8.0, 64  # voxels of a box that is not halved; of it to those of its facet; largest stack
+FULL, EMPTY = 64, 8.0  # a facet's box is halved if it has more voxels than this, and as many times those of the facet
+PIECES = 64  # size of the stack of halved boxes
 GRAZING_COS = 0.02  # cosine of incidence below which a facet is seen edge-on
 
 

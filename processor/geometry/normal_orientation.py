@@ -18,7 +18,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry.m3c2 import CloudNormals, oriented
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import allocate, blocks, every
 from processor.model import Bools, Floats, Ints
 

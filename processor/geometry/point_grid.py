@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from processor import large_arrays
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import allocate, blocks
 from processor.model import Floats, Ints
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from processor.adjustment import scanner_class_errors
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.inspection import characteristic, part_geometry
 from processor.inspection.characteristic import Characteristic
 from processor.inspection.part_geometry import Value

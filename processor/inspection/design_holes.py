@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from processor.distinct_rows import distinct
 from processor.geometry import circle, rigid
-from processor.geometry.neighbors import same_places
+from processor.geometry.nearest_neighbours import same_places
 from processor.model import Floats, Ints
 
 FEWEST_CORNERS = 8  # of a polygon that is a circle

@@ -50,7 +50,7 @@ class Quantity(Word):
 
 @dataclass(frozen=True)
 class Characteristics(Rows):
-    """The characteristics of one component; NaN = not measured, for the ``reasons`` of the row.
+    """The characteristics of one component; NaN = not measured; ``reasons`` state why.
 
     ``ci95`` is the half-width of the 95 % interval of the deviation, actual less nominal; that of a greatest departure
     is its wider side. ``lower`` and ``upper`` bound the deviation, -inf or inf without a bound, NaN where nothing

@@ -1,6 +1,6 @@
 """Measured values against limits: rows of comparisons with a verdict each.
 
-A step states what it measured as :class:`Measured`, a value with its 95 % interval, and gets a row a comparison. A
+A step states what it measured as :class:`Measured`, a value with its 95 % interval, and gets one row per comparison. A
 value passes where its interval lies within the limit and fails where it lies beyond. Otherwise it is indeterminate, as
 it is where the step flags the value as doubtful or a bound depends on a size that is not known (ISO 14253-1).
 """
@@ -24,7 +24,7 @@ NOT_VERIFIED = "not verified"
 
 @dataclass(frozen=True)
 class JudgedLimits(Rows):
-    """Values compared with limits, a row a comparison.
+    """Values compared with limits, one row per comparison.
 
     ``of`` names what was measured: a component, node, pair of supports, scan. ``ci95`` is the half-width of the 95 %
     interval, NaN where that is open to a side or not known. ``low`` and ``high`` are allowed, -inf and inf without a

@@ -64,7 +64,7 @@ def _given(limit: Limit, value: Floats, source: str) -> Limit:
 
 
 def of_projects() -> tuple[Limit, ...]:
-    """Limits that no standard here has, but possibly a project; their numbers are a place for the project's own.
+    """Limits that no standard here states but a project may; their numbers are placeholders for those of the project.
 
     Two bounds are finite or infinite where a project gives both; a least value alone has a ``low`` alone.
     """

@@ -13,7 +13,7 @@ import numpy as np
 
 from processor import diagnostics
 from processor.geometry import rigid
-from processor.geometry.neighbors import nearest_crops
+from processor.geometry.nearest_neighbours import nearest_crops
 from processor.geometry.sphere import algebraic, ransac
 from processor.language.messages import Text, text
 from processor.model import Floats, FrameDesign, Ints, Reason, reason

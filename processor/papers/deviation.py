@@ -18,7 +18,7 @@ from processor.deviation import baseline, cloud, step
 from processor.deviation.params import Params
 from processor.deviation.result import Result
 from processor.geometry import mesh_distance, rigid
-from processor.geometry.neighbors import thinned
+from processor.geometry.thinning import thinned
 from processor.language.messages import Text, text
 from processor.model import Floats, Reason, reason
 from processor.papers import parameters

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.model import Floats
 
 INTERVAL_MM = 200.0  # of chainage, at which the linear error is taken

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.model import NORMAL_95, ArchDesign, Bools, Floats, Reason, Tolerance, reason
 from processor.preassembly import topology
 from processor.preassembly.assembly_errors import mean_max, splicing_error

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
 from processor.geometry.linalg_small import assign_rows, product
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
 

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.distinct_rows import distinct
-from processor.geometry.neighbors import thinned, voxel_means
+from processor.geometry.thinning import thinned, voxel_means
 from processor.model import Bools, Floats
 from processor.registration import principal
 

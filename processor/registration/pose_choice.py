@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.distinct_rows import distinct
-from processor.geometry import mesh_distance, neighbors, rigid
+from processor.geometry import mesh_distance, nearest_neighbours, rigid, thinning
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
 from processor.model import Bools, Floats, Ints
 
@@ -51,8 +51,8 @@ def choose(points: Floats, surface: MeshSurface, poses: list[Floats], scanner: F
     """
     if len(poses) < 2:
         return Choice(0, ())
-    few = neighbors.thinned(points, SAMPLE)
-    seen_from = None if scanner is None else neighbors.thinned(scanner, SAMPLE)
+    few = thinning.thinned(points, SAMPLE)
+    seen_from = None if scanner is None else thinning.thinned(scanner, SAMPLE)
     group, voxel = _groups(few)
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, REACH_MM)
     distances = np.stack([_means(_distances(few, seen_from, grid, T), group) for T in poses])
@@ -76,7 +76,7 @@ def choose(points: Floats, surface: MeshSurface, poses: list[Floats], scanner: F
 
 def _groups(points: Floats) -> tuple[Ints, Ints]:
     """Return the group (n,) of each point, -1 in a voxel of few points, and the voxel (groups, 3) of each group."""
-    size = GROUP_SPACINGS * max(neighbors.surface_spacing(points), 1e-6)
+    size = GROUP_SPACINGS * max(nearest_neighbours.surface_spacing(points), 1e-6)
     voxel = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     groups = distinct(voxel)
     full = groups.count >= FEWEST_POINTS

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.geometry.neighbors import voxel_means
+from processor.geometry.thinning import voxel_means
 from processor.model import Floats, Ints
 
 ALIKE = 1.25  # ratio of the variances along two axes below which these may be swapped

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
-from processor.geometry.neighbors import thinned, voxel_means
+from processor.geometry.thinning import thinned, voxel_means
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Word
 from processor.registration import icp, main_body, pose_choice, principal
 from processor.registration.principal import CoarsePose, PrincipalAxes

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from processor.geometry import box_girder
+from processor.geometry import box_girder_mesh
 from processor.model import (
     KEY_POINTS,
     SUPPORTS,
@@ -224,15 +224,15 @@ def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floa
     for side, edge in zip(("left", "right"), edges, strict=True):
         if len(edge) < 2 or (np.abs(np.diff(edge, axis=0)).max(axis=1) == 0).any():
             raise InputError(f"{part.where}: expected two points or more in bottom_edge_{side}, none repeated in a row")
-    plate_mm = part.number("plate_mm", box_girder.PLATE_MM, positive=True)
+    plate_mm = part.number("plate_mm", box_girder_mesh.PLATE_MM, positive=True)
     if "mesh" in part.values:
         vertices, faces, _ = read_surface(existing_file_in(folder, part.text("mesh"), part.where), unit)
         return DesignPart(name, vertices, faces, edges[0], edges[1])
     try:
-        vertices, faces = box_girder.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
+        vertices, faces = box_girder_mesh.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
     except InputError as error:
         raise InputError(f"{part.where}: without a mesh: {error}") from None
-    return DesignPart(name, vertices, faces, edges[0], edges[1], source=box_girder.SOURCE)
+    return DesignPart(name, vertices, faces, edges[0], edges[1], source=box_girder_mesh.SOURCE)
 
 
 def _frame(design: Table) -> FrameDesign:

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from processor import large_arrays
-from processor.geometry import scanner_rays
+from processor.geometry import scan_grid_directions
 from processor.model import Floats, Labels
 
 SAMPLE = 50_000  # points that rays are fitted to; random, as every k-th point may be of the same row
@@ -57,7 +57,7 @@ def _is_swept(points: Floats, row: Labels, column: Labels, scanner: Floats) -> b
     sample = np.arange(count) if count <= SAMPLE else np.random.default_rng(0).integers(0, count, SAMPLE)
     r, c = (large_arrays.taken(numbers, sample).astype(np.int64) for numbers in (row, column))
     local = large_arrays.taken(points, sample) - scanner
-    rays = scanner_rays.fitted(local, r, c)
+    rays = scan_grid_directions.fitted(local, r, c)
     if rays is None:
         return False
     u = local / np.maximum(np.linalg.norm(local, axis=1), 1e-9)[:, None]

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
 from processor.model import Bools, Floats, FrameDesign, Ints, Reason, Status, Tolerance, reason
-from processor.space_frame.catalogue import Catalogue
+from processor.space_frame.ball_catalogue import Catalogue
 from processor.space_frame.design import matching
 from processor.space_frame.design.matching import Matching, NodePattern
 from processor.space_frame.design.movement import Movement, movement
@@ -22,7 +22,7 @@ from processor.space_frame.members.member_extraction import Measured
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.result import Flag
-from processor.space_frame.spheres import assessment, ball_presence, fit_all, hidden_or_missing
+from processor.space_frame.spheres import alternating_fit, assessment, ball_joint_classification, hidden_or_missing
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
 from processor.space_frame.stations.control_points import ControlPoints
@@ -173,7 +173,9 @@ def blind(source: Source, params: member_extraction.Params) -> Start | None:
         return None
     rows = np.full(len(graph.nodes), -1, np.int64)
     start = _measured(source, graph.nodes, graph.pairs, rows, params)
-    start = replace(start, balls=ball_presence.nodes_with_ball(source, start.measured, start.positions, params.threads))
+    start = replace(
+        start, balls=ball_joint_classification.nodes_with_ball(source, start.measured, start.positions, params.threads)
+    )
     others = int((~start.balls & member_extraction.meeting(start.measured, params.largest_scatter_mm)).sum())
     return replace(start, reasons=(reason("spheres.other-joints", joints=others),)) if others else start
 
@@ -219,7 +221,7 @@ def _located(
     pattern = NodePattern(seen.nodes.positions, source.origin, node_a=node_a, node_b=node_b)
 
     def sized() -> NodePattern:
-        fitted = fit_all.fit_spheres(source, seen.nodes, seen.members, catalogue)
+        fitted = alternating_fit.fit_spheres(source, seen.nodes, seen.members, catalogue)
         return replace(pattern, radii=fitted.radii, radius_sd=np.sqrt(fitted.covariance[:, 3, 3]))
 
     pose = matching.match(pattern, design, expansion=options.expansion, sized=sized)
@@ -277,7 +279,9 @@ def _fit_spheres(
         expected, disputed = _expected(start, design, source.origin, options.expansion)
         nodes = _with_nominal_places(nodes, start.positions)
     between = None if stations is None else stations.between
-    spheres = fit_all.fit_spheres(source, nodes, measured.members, catalogue, expected, between, limits=options.limits)
+    spheres = alternating_fit.fit_spheres(
+        source, nodes, measured.members, catalogue, expected, between, limits=options.limits
+    )
     smallest = float(catalogue.radii.min()) if len(catalogue.radii) else np.nan
     spheres = assessment.with_ambiguous_design(spheres, disputed)
     return nodes, hidden_or_missing.with_cause_of_absence(spheres, source, smallest)

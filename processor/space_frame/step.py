@@ -16,7 +16,7 @@ from processor.adjustment import scanner_class_errors
 from processor.limits import standards
 from processor.model import InputError, Reason, Scene, Tolerance, reason
 from processor.scene_cloud import merged
-from processor.space_frame import ceiling, to_result
+from processor.space_frame import hanger_lengths, to_result
 from processor.space_frame.params import METHODS, Params
 from processor.space_frame.points.scene_source import PointReader
 from processor.space_frame.result import Balls, Result
@@ -40,7 +40,7 @@ def run(scene: Scene, params: Params, points: PointReader | None = None, answer_
     Raises UsageError for invalid parameters, InputError for a cloud without members that is larger than memory.
     """
     params.check(scene.frame is not None)
-    return ceiling.with_hangers(_spheres(scene, params, points, answer_given), scene)
+    return hanger_lengths.with_hangers(_spheres(scene, params, points, answer_given), scene)
 
 
 def _spheres(scene: Scene, params: Params, points: PointReader | None, answer_given: Result | None) -> Result:

@@ -9,8 +9,8 @@ import numpy as np
 from processor.adjustment import thermal
 from processor.limits import standards
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
-from processor.space_frame import catalogue, supports
-from processor.space_frame.catalogue import Catalogue
+from processor.space_frame import ball_catalogue, supports_and_deflections
+from processor.space_frame.ball_catalogue import Catalogue
 from processor.space_frame.design.matching import Matching
 from processor.space_frame.design.movement import Movement, size_of, verdict_of
 from processor.space_frame.extract import Extracted, Options, extract
@@ -31,7 +31,7 @@ from processor.space_frame.result import (
     Tubes,
 )
 from processor.space_frame.spheres import baselines
-from processor.space_frame.spheres.view_errors import of_tubes
+from processor.space_frame.spheres.unnamed_view_errors import of_tubes
 from processor.space_frame.stations.records import Stations
 from processor.space_frame.stations.sightings import control_of
 
@@ -69,8 +69,8 @@ def _extracted(source: SceneSource, scene: Scene, params: Params) -> Extracted |
 
 def _catalogue(params: Params) -> Catalogue:
     if params.radii_mm:
-        return catalogue.of_radii(params.radii_mm)
-    return catalogue.of_radii(()) if params.catalogue == "none" else catalogue.load(params.catalogue)
+        return ball_catalogue.of_radii(params.radii_mm)
+    return ball_catalogue.of_radii(()) if params.catalogue == "none" else ball_catalogue.load(params.catalogue)
 
 
 def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
@@ -87,7 +87,7 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
         balls = _with_movements(balls, movements, reference.limit, matched is not None and matched.status is Status.OK)
     if scene.frame is not None:
         sure = matched is not None and matched.status is Status.OK
-        judged = supports.judge(balls, scene.frame, standards.default_for(scene.tolerance), sure)
+        judged = supports_and_deflections.judge(balls, scene.frame, standards.default_for(scene.tolerance), sure)
     if matched is not None:
         pose = DesignPose(
             status=matched.status,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.geometry import parallel, rigid
+from processor.geometry import rigid, thread_ranges
 from processor.model import Control, Floats, Ints, Scan
 from processor.stitching import three_point
 from processor.stitching.coarse import network, pairwise
@@ -67,7 +67,7 @@ def stitch(
     these is the only candidate, so that repetitive structures are not ambiguous. Scans that overlap with no other one
     have a pose of NaN.
     """
-    clouds = parallel.each(lambda scan: scan_planes.extract(scan, params.cell_mm), scans)
+    clouds = thread_ranges.each(lambda scan: scan_planes.extract(scan, params.cell_mm), scans)
     patches = _sample_patches(clouds)
     known = control_points.poses_of_scans(control, [cloud.origin for cloud in clouds])
     candidates = _find_candidates(patches, params, picked, known)
@@ -101,7 +101,7 @@ def stitch(
 
 def _sample_patches(clouds: list[Cloud]) -> list[ScanPatches]:
     side = pairwise.cube_side(clouds)
-    return parallel.each(lambda cloud: pairwise.prepare(cloud, side), clouds)
+    return thread_ranges.each(lambda cloud: pairwise.prepare(cloud, side), clouds)
 
 
 def _find_candidates(
@@ -123,7 +123,7 @@ def _find_candidates(
         return poses
 
     keys = list(itertools.combinations(range(len(patches)), 2))
-    return dict(zip(keys, parallel.each(candidates, keys), strict=True))
+    return dict(zip(keys, thread_ranges.each(candidates, keys), strict=True))
 
 
 def _pose_by_picks(a: ScanPatches, b: ScanPatches, in_a: Floats, in_b: Floats) -> list[ScoredPose]:

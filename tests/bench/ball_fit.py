@@ -18,10 +18,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from processor.geometry.sphere import algebraic
-from processor.space_frame import catalogue
+from processor.space_frame import ball_catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.sphere_crops import Crops
-from processor.space_frame.spheres import fit_all
+from processor.space_frame.spheres import alternating_fit
 
 DOWN = np.array([0.0, 0.0, 1.0, -1.0])
 STATIONS = {
@@ -65,9 +65,9 @@ def trial(rng, draws, radius, count, visible, sigma, several, prior=None, likeli
     covariance = np.full((draws, 3, 3), np.nan) if prior is None else np.tile(prior**2 * np.eye(3), (draws, 1, 1))
     moved = Crops(crops.start, points - np.repeat(start, count, axis=0), station)
     nodes = Nodes(start, covariance, np.zeros(draws, np.int64), np.full(draws, np.nan))
-    params = fit_all.RayFitParams(sigma_mm=2.0, process_hole_mm=0.0)
-    got = fit_all.fit_crops(
-        moved, stations, nodes, Members(), catalogue.of_radii([]), None, np.zeros((len(stations), 3, 3)), params
+    params = alternating_fit.RayFitParams(sigma_mm=2.0, process_hole_mm=0.0)
+    got = alternating_fit.fit_crops(
+        moved, stations, nodes, Members(), ball_catalogue.of_radii([]), None, np.zeros((len(stations), 3, 3)), params
     )
     errors = np.column_stack([got.centres, got.radii - radius])
     plain = []

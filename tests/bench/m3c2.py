@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from processor.geometry import m3c2, neighbors, normal_orientation
+from processor.geometry import m3c2, nearest_neighbours, normal_orientation
 from tests.support.clouds.m3c2_clouds import brute
 
 NORMAL_MM, PROJECTION_MM, DEPTH_MM = 110.0, 55.0, 100.0
@@ -105,8 +105,8 @@ def main() -> None:
         report["ratio"] = {"median": statistics.median(ratios), "least": min(ratios)}
         print(f"faster by {report['ratio']['median']:.2f} (least of {given.rounds} rounds {min(ratios):.2f})")
     grid_seconds = time.perf_counter()
-    grid = neighbors.of_spacing(first)
-    neighbors.statistical_inliers(grid, 20, 1.0)
+    grid = nearest_neighbours.of_spacing(first)
+    nearest_neighbours.statistical_inliers(grid, 20, 1.0)
     report["outlier_removal"] = {"processor": time.perf_counter() - grid_seconds}
     report["outlier_removal"]["tree, leaf order"] = leaf_order(first, threads)
     print("outlier removal, K = 20: " + ", ".join(f"{k} {v:.2f} s" for k, v in report["outlier_removal"].items()))

@@ -9,13 +9,13 @@ from designgen.asbuilt import imperfections
 from designgen.designs import (
     arch_bridge,
     arch_part,
+    boxes_and_tubes,
     closed_ring,
     defect_specimens,
     girder_assemblies,
     prismatic_solids,
     space_frame,
     stadium_roof,
-    structure_bodies,
     truss_bridge,
 )
 from designgen.export import folder as export_folder
@@ -194,7 +194,7 @@ def test_rays_meet_structures_where_their_solids_are(components):
     places = [middle + size * np.array([0.3, -0.8, 0.4]), middle + size * np.array([-0.4, 0.9, 0.2])]
     points = hits(builder, places, 4.0)[0]
     assert len(points) > 500
-    shells = shells_of(structure_bodies.solid(components))
+    shells = shells_of(boxes_and_tubes.solid(components))
     picked = np.random.default_rng(2).choice(len(points), 4 * COUNT, replace=False)
     assert departures(points[picked], shells).max() < TOLERANCE_MM
 

@@ -8,7 +8,7 @@ from processor.adjustment import distance_summary
 from processor.cli.main import commands
 from processor.compare import core_tiles
 from processor.compare.compare import Request, compare
-from processor.geometry import m3c2, neighbors, normal_orientation, point_grid
+from processor.geometry import m3c2, nearest_neighbours, normal_orientation, point_grid
 from processor.model import Scan, Scene
 from processor.report import cloud_comparison
 from processor.store import store
@@ -130,11 +130,12 @@ def test_a_grid_in_parts_is_that_of_the_whole(tiny):
         "equal points": np.repeat(wavy(900, 5), 4, axis=0),
     }
     wholes = {
-        name: [neighbors.of_spacing(points), point_grid.of_points(points, 3.0)] for name, points in clouds.items()
+        name: [nearest_neighbours.of_spacing(points), point_grid.of_points(points, 3.0)]
+        for name, points in clouds.items()
     }
     tiny()
     for name, points in clouds.items():
-        parts = neighbors.of_spacing(points), point_grid.of_points(points, 3.0)
+        parts = nearest_neighbours.of_spacing(points), point_grid.of_points(points, 3.0)
         for whole, part in zip(wholes[name], parts, strict=True):
             np.testing.assert_array_equal(points[part.order], part.cells.points)
             np.testing.assert_array_equal(np.sort(part.order), np.arange(len(points)))

@@ -8,7 +8,7 @@ import trimesh
 
 from designgen import recipe_files
 from designgen.asbuilt import defects, imperfections
-from designgen.designs import arch_bridge, arch_part, defect_specimens, stadium_roof, structure_bodies, truss_bridge
+from designgen.designs import arch_bridge, arch_part, boxes_and_tubes, defect_specimens, stadium_roof, truss_bridge
 from designgen.randomness import generator
 from designgen.scanning import sampler
 from designgen.scenes.make import make
@@ -284,7 +284,7 @@ def test_a_structure_moves_by_its_field():
 def test_structures_in_cad_keep_to_the_closed_form(components):
     import cadquery as cq
 
-    solid = structure_bodies.solid(components)
+    solid = boxes_and_tubes.solid(components)
     assert solid.isValid()
     bodies = [body for one in components for body in one.bodies]
     assert solid.Volume() == pytest.approx(sum(_volume(body) for body in bodies), rel=1e-6)
@@ -294,19 +294,19 @@ def test_structures_in_cad_keep_to_the_closed_form(components):
         for patch in body.patches():
             for point in patch.at(rng.uniform(size=3), rng.uniform(size=3)):
                 assert shell.distance(cq.Vertex.makeVertex(*point)) < 0.02
-    vertices, faces = structure_bodies.mesh_of(components)
+    vertices, faces = boxes_and_tubes.mesh_of(components)
     mesh = trimesh.Trimesh(vertices, faces)
     assert mesh.area == pytest.approx(sum(_area(body) for body in bodies), rel=2e-3)
 
 
 def _volume(body):
-    if isinstance(body, structure_bodies.Tube):
+    if isinstance(body, boxes_and_tubes.Tube):
         return np.pi * body.radius**2 * np.linalg.norm(body.end - body.start)
     return float(np.prod(body.size))
 
 
 def _area(body):
-    if isinstance(body, structure_bodies.Tube):
+    if isinstance(body, boxes_and_tubes.Tube):
         return 2.0 * np.pi * body.radius * np.linalg.norm(body.end - body.start)
     a, b, c = body.size
     return 2.0 * (a * b + b * c + c * a)

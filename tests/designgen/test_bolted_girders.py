@@ -6,7 +6,7 @@ import cadquery as cq
 import numpy as np
 import pytest
 
-from designgen.designs import bolting, girder_assemblies, prismatic_solids
+from designgen.designs import bolt_holes, girder_assemblies, prismatic_solids
 from designgen.scenes import make as scenes
 from processor.inspection import bridge_holes, splices
 from processor.model import Status, UsageError
@@ -15,7 +15,7 @@ from processor.preassembly.result import Components
 SIZES = girder_assemblies.Params(
     type="row", section="i", parts=2, length_mm=1400.0, width_mm=420.0, height_mm=600.0, flange_mm=20.0, web_mm=12.0
 )
-BOLTS = bolting.Params()
+BOLTS = bolt_holes.Params()
 HOLES = 12  # of a girder's end: 24 a joint
 TOLERANCE_MM = 0.01
 
@@ -114,7 +114,7 @@ def test_holes_are_drilled_off_their_places_along_their_plates():
 @pytest.mark.parametrize("changes", [{"hole_mm": 200.0}, {"pitch_mm": 20.0}, {"web_bolts": 30}])
 def test_holes_that_do_not_fit_are_refused(changes):
     with pytest.raises(UsageError, match=r"bolts\."):
-        girder_assemblies.build(SIZES, bolting.Params(**changes))
+        girder_assemblies.build(SIZES, bolt_holes.Params(**changes))
 
 
 def test_only_rows_of_i_girders_have_bolts():

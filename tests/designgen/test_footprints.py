@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from designgen.designs import structure_bodies
+from designgen.designs import boxes_and_tubes
 from designgen.scanning import edge_footprints, scanner, survey
 from designgen.scanning import returns as scanning_returns
 from designgen.scanning.ray_kernels import Beam
@@ -126,10 +126,10 @@ def large_faces():
         middle *= rng.uniform(2000.0, 9000.0) / np.linalg.norm(middle)
         axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         size = rng.uniform(150.0, 2500.0, 3)
-        for patch in structure_bodies.Box(middle, axes, size).patches():
+        for patch in boxes_and_tubes.Box(middle, axes, size).patches():
             builder.patch(i, patch)
         builder.sphere(i, "ball", rng.uniform(-5000.0, 5000.0, 3), 120.0, [])
-    for patch in structure_bodies.Box(np.array([30.0, -20.0, 6000.0]), np.eye(3), np.full(3, 900.0)).patches():
+    for patch in boxes_and_tubes.Box(np.array([30.0, -20.0, 6000.0]), np.eye(3), np.full(3, 900.0)).patches():
         builder.patch(40, patch)
     return builder.to_surfaces()
 

@@ -9,7 +9,7 @@ import scipy.stats
 import trimesh
 from scipy.optimize import brentq, minimize_scalar
 
-from designgen.designs import arch_bridge, arch_part, space_frame, structure_bodies
+from designgen.designs import arch_bridge, arch_part, boxes_and_tubes, space_frame
 from designgen.designs.parametric_face import Patch
 from designgen.scanning import clutter, ray_kernels, raycast, scanner, space_frame_surfaces, survey
 from designgen.scanning import returns as scanning_returns
@@ -277,7 +277,7 @@ TUBE = (np.array([3000.0, -2500.0, 1500.0]), np.array([3400.0, 2500.0, 2200.0]),
 
 def tube_of_patches(start, end, radius):
     builder = Builder()
-    for patch in structure_bodies.Tube(start, end, radius).patches():
+    for patch in boxes_and_tubes.Tube(start, end, radius).patches():
         builder.patch(0, patch)
     return builder
 
@@ -422,7 +422,7 @@ def test_only_flat_faces_are_intersected_by_their_nets():
     cases = [(flat, two), (flat, many), (dented, two), (wavy, many), (flat, two)]
     for i, (at, knots) in enumerate(cases):
         builder.patch(i, Patch("face", at, knots, two))
-    for patch in structure_bodies.Tube(*TUBE).patches():
+    for patch in boxes_and_tubes.Tube(*TUBE).patches():
         builder.patch(len(cases), patch)
     surfaces = builder.to_surfaces()
     on_net = [set(surfaces.patch[surfaces.part == i]) == {-1} for i in range(len(cases) + 1)]

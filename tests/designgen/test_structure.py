@@ -5,7 +5,7 @@ import pytest
 
 from designgen import recipe_files
 from designgen.asbuilt import defects
-from designgen.designs import defect_specimens, stadium_roof, structure_bodies, truss_bridge
+from designgen.designs import boxes_and_tubes, defect_specimens, stadium_roof, truss_bridge
 from designgen.scenes.make import make
 
 
@@ -27,7 +27,7 @@ def signed_volume(patches, about):
 def test_boxes_look_outward_in_frames_of_either_hand():
     R, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
     for axes in (R, R * [[-1.0], [1.0], [1.0]]):
-        box = structure_bodies.Box(np.array([100.0, -50.0, 7.0]), axes, np.array([3.0, 5.0, 7.0]))
+        box = boxes_and_tubes.Box(np.array([100.0, -50.0, 7.0]), axes, np.array([3.0, 5.0, 7.0]))
         assert signed_volume(box.patches(), np.zeros(3)) == pytest.approx(105.0)
         knots = tuple(np.array([0.0, 0.3, 1.0]) for _ in range(3))
         assert signed_volume(box.patches(knots), np.zeros(3)) == pytest.approx(105.0)
@@ -107,7 +107,7 @@ def test_no_point_of_the_truth_lies_inside_a_tube():
 
 def inside_by(body, points):
     """How far inside a body points lie, by its corners or its axis alone."""
-    if isinstance(body, structure_bodies.Tube):
+    if isinstance(body, boxes_and_tubes.Tube):
         n = body.end - body.start
         t = (points - body.start) @ n / (n @ n)
         radius = np.linalg.norm(np.cross(points - body.start, n), axis=1) / np.linalg.norm(n)

@@ -10,7 +10,7 @@ from processor.adjustment import mixed_pixels
 from processor.deviation import cloud, large_cloud
 from processor.deviation import step as deviation_step
 from processor.deviation.params import Params
-from processor.geometry import neighbors, rigid
+from processor.geometry import nearest_neighbours, rigid
 from processor.model import Scan, Scene, UsageError
 from tests.support.scenes.bracket_scenes import COUNT, scene_of
 
@@ -120,6 +120,6 @@ def test_points_of_one_place_and_empty_slabs(small):
     points = np.vstack([rng.normal(0.0, 1.0, (4000, 3)), rng.normal(0.0, 1.0, (4000, 3)) + np.array([1e6, 0.0, 0.0])])
     scene = Scene("two", "structure", (Scan("s", points),), units="mm")
     large = cloud.of_scene(scene, 20, 1.0).large
-    grid = neighbors.of_spacing(points)
-    assert large.kept == int(neighbors.statistical_inliers(grid, 20, 1.0).sum())
+    grid = nearest_neighbours.of_spacing(points)
+    assert large.kept == int(nearest_neighbours.statistical_inliers(grid, 20, 1.0).sum())
     assert large.scanners is None

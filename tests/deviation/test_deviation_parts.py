@@ -9,7 +9,7 @@ from processor.adjustment import distance_summary
 from processor.adjustment.point_groups import group_means
 from processor.deviation import cloud as deviation_cloud
 from processor.deviation import local_translation as moving
-from processor.geometry import m3c2, mesh_distance, neighbors, rigid
+from processor.geometry import m3c2, mesh_distance, nearest_neighbours, rigid
 from processor.geometry.m3c2 import Distances
 from processor.model import InputError
 from processor.registration import principal, surface_registration
@@ -21,31 +21,31 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def test_neighbours_are_those_of_a_tree():
     points = np.vstack([wavy(4000, 1), np.random.default_rng(2).uniform(-500.0, 1500.0, (50, 3))])
-    grid = neighbors.of_spacing(points)
+    grid = nearest_neighbours.of_spacing(points)
     tree = cKDTree(points)
     expected = tree.query(points, k=21)[0][:, 1:].mean(axis=1)
-    np.testing.assert_allclose(neighbors.mean_distances(grid, 20), expected[grid.order], rtol=1e-12)
+    np.testing.assert_allclose(nearest_neighbours.mean_distances(grid, 20), expected[grid.order], rtol=1e-12)
     inliers = expected <= expected.mean() + expected.std()
-    np.testing.assert_array_equal(neighbors.statistical_inliers(grid, 20, 1.0), inliers[grid.order])
-    np.testing.assert_array_equal(neighbors.without_outliers(points, 20, 1.0), points[inliers])
+    np.testing.assert_array_equal(nearest_neighbours.statistical_inliers(grid, 20, 1.0), inliers[grid.order])
+    np.testing.assert_array_equal(nearest_neighbours.without_outliers(points, 20, 1.0), points[inliers])
     places = np.random.default_rng(3).uniform(-3000.0, 4000.0, (300, 3))
-    np.testing.assert_allclose(neighbors.nearest(grid, places), tree.query(places)[0], rtol=1e-12)
+    np.testing.assert_allclose(nearest_neighbours.nearest(grid, places), tree.query(places)[0], rtol=1e-12)
 
 
 def test_spacing_is_of_a_plane_with_one_point_a_square():
     rng = np.random.default_rng(4)
     x, y = rng.uniform(0.0, 2000.0, (2, 40_000))
-    spread = neighbors.of_spacing(np.column_stack([x, y, 0.0 * x]))
-    assert neighbors.spacing(spread) == pytest.approx(10.0, rel=0.02)
-    assert np.isnan(neighbors.spacing(neighbors.of_spacing(np.zeros((1, 3)))))
-    assert neighbors.spacing(neighbors.of_spacing(np.zeros((9, 3)))) == 0.0
+    spread = nearest_neighbours.of_spacing(np.column_stack([x, y, 0.0 * x]))
+    assert nearest_neighbours.spacing(spread) == pytest.approx(10.0, rel=0.02)
+    assert np.isnan(nearest_neighbours.spacing(nearest_neighbours.of_spacing(np.zeros((1, 3)))))
+    assert nearest_neighbours.spacing(nearest_neighbours.of_spacing(np.zeros((9, 3)))) == 0.0
 
 
 def test_derived_scales_contain_the_intended_number_of_points():
     assert m3c2.diameter_for(20, np.sqrt(1e6 / 500.0)) == pytest.approx(225.7, abs=0.1)  # 500 points/m2
     assert [m3c2.rounded(x) for x in (0.12345, 225.7, 1e-7, 100.0)] == [0.124, 226.0, 1e-7, 100.0]
     cloud, other = wavy(20_000, 5), wavy(5000, 6, 30.0)
-    grids = [neighbors.of_spacing(one) for one in (cloud, other)]
+    grids = [nearest_neighbours.of_spacing(one) for one in (cloud, other)]
     found = m3c2.derive_scales(*grids, cloud)
     assert found.compared_spacing_mm > 1.8 * found.reference_spacing_mm
     held = 5000 / 1e6 * np.pi / 4.0 * found.projection_diameter_mm**2
@@ -53,7 +53,7 @@ def test_derived_scales_contain_the_intended_number_of_points():
     assert 60.0 <= found.max_depth_mm <= 10.0 * found.projection_diameter_mm
     given = m3c2.derive_scales(*grids, cloud, 7.0, 8.0, 9.0)
     assert (given.normal_diameter_mm, given.projection_diameter_mm, given.max_depth_mm) == (7.0, 8.0, 9.0)
-    same = neighbors.of_spacing(np.zeros((9, 3)))
+    same = nearest_neighbours.of_spacing(np.zeros((9, 3)))
     with pytest.raises(InputError, match="density"):
         m3c2.derive_scales(same, same, cloud)
 
@@ -87,7 +87,7 @@ def planes_compared(seed, off=0.0, error=0.0):
     """Share beyond LOD95 of two noisy scans of one plane, the second ``off`` by so much; scales by density."""
     rng = np.random.default_rng(seed)
     pair = [np.column_stack([*rng.uniform(0.0, 3000.0, (2, 60_000)), rng.normal(0.0, 2.0, 60_000)]) for _ in range(2)]
-    grids = [neighbors.of_spacing(one + k * off * UP) for k, one in enumerate(pair)]
+    grids = [nearest_neighbours.of_spacing(one + k * off * UP) for k, one in enumerate(pair)]
     x, y = (one.ravel() for one in np.meshgrid(*[np.arange(100.0, 2901.0, 40.0)] * 2))
     core = np.column_stack([x, y, 0.0 * x])
     used = m3c2.derive_scales(*grids, core)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from processor.geometry import neighbors, rigid
-from processor.geometry.polyline import Line, Polyline, crossing, fit_line, ransac_line
+from processor.geometry import nearest_neighbours, rigid, thinning
+from processor.geometry.lines_and_polylines import Line, Polyline, crossing, fit_line, ransac_line
 from processor.registration import icp, principal
 from processor.robust_statistics import robust_sd
 
@@ -196,13 +196,13 @@ def test_partners_of_points_that_move_are_those_of_a_plain_search(count):
 def test_spacing_of_a_grid_and_of_random_points():
     x, y = np.meshgrid(np.arange(100.0) * 7.0, np.arange(100.0) * 7.0)
     grid = np.stack([x.ravel(), y.ravel(), 0.0 * x.ravel()], axis=1)
-    assert neighbors.surface_spacing(grid) == pytest.approx(7.0, rel=0.15)
+    assert nearest_neighbours.surface_spacing(grid) == pytest.approx(7.0, rel=0.15)
     rng = np.random.default_rng(4)
     loose = np.column_stack([rng.uniform(0.0, 700.0, (10_000, 2)), np.zeros(10_000)])
-    assert neighbors.surface_spacing(loose) == pytest.approx(7.0, rel=0.10)
-    assert np.isnan(neighbors.surface_spacing(np.zeros((1, 3))))
+    assert nearest_neighbours.surface_spacing(loose) == pytest.approx(7.0, rel=0.10)
+    assert np.isnan(nearest_neighbours.surface_spacing(np.zeros((1, 3))))
     many = np.column_stack([rng.uniform(0.0, 7000.0, 250_000), rng.uniform(0.0, 1750.0, 250_000), np.zeros(250_000)])
-    assert neighbors.surface_spacing(many) == pytest.approx(7.0, rel=0.05)
+    assert nearest_neighbours.surface_spacing(many) == pytest.approx(7.0, rel=0.05)
 
 
 def test_outliers_are_those_of_open3d():
@@ -211,9 +211,9 @@ def test_outliers_are_those_of_open3d():
     points = np.vstack(
         [np.column_stack([rng.uniform(0, 500, (4000, 2)), np.zeros(4000)]), rng.uniform(0, 500, (40, 3))]
     )
-    grid = neighbors.of_spacing(points)
+    grid = nearest_neighbours.of_spacing(points)
     ours = np.zeros(len(points), bool)
-    ours[grid.order] = neighbors.statistical_inliers(grid, 20, 2.0)
+    ours[grid.order] = nearest_neighbours.statistical_inliers(grid, 20, 2.0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     # Open3D counts the point itself as its first neighbour, so its mean is 20/21 of ours; the rule is scale-free.
     theirs = np.zeros(len(points), bool)
@@ -225,14 +225,14 @@ def test_outliers_are_those_of_open3d():
 
 def test_voxel_means_by_hand():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [10.0, 0, 0], [11.0, 2.0, 0], [30.0, 0, 0]])
-    means = neighbors.voxel_means(points, 5.0, least=2)
+    means = thinning.voxel_means(points, 5.0, least=2)
     np.testing.assert_allclose(means, [[0.5, 0, 0], [10.5, 1.0, 0]])
 
 
 def test_voxel_means_do_not_depend_on_how_many_voxels_are_empty():
     points = np.random.default_rng(7).uniform(0.0, 100.0, (500, 3))
-    near = neighbors.voxel_means(points, 10.0)  # 1000 voxels for 500 points
-    far = neighbors.voxel_means(np.vstack([points, np.full((1, 3), 1e5)]), 10.0)  # 10^12 voxels
+    near = thinning.voxel_means(points, 10.0)  # 1000 voxels for 500 points
+    far = thinning.voxel_means(np.vstack([points, np.full((1, 3), 1e5)]), 10.0)  # 10^12 voxels
     np.testing.assert_array_equal(far[:-1], near)
     np.testing.assert_array_equal(far[-1], [1e5, 1e5, 1e5])
 
@@ -241,15 +241,15 @@ def test_the_order_by_cells_does_not_depend_on_that_of_the_file():
     rng = np.random.default_rng(0)
     points = rng.uniform(0.0, 300.0, (2_000, 3)).round(0)  # some coordinates are equal
     shuffled = points[rng.permutation(len(points))]
-    sorted_points = points[neighbors.by_cell(points, 40.0)]
-    np.testing.assert_array_equal(sorted_points, shuffled[neighbors.by_cell(shuffled, 40.0)])
+    sorted_points = points[thinning.by_cell(points, 40.0)]
+    np.testing.assert_array_equal(sorted_points, shuffled[thinning.by_cell(shuffled, 40.0)])
 
 
 @pytest.mark.parametrize("grid_mm", [1e-6, 7.0])
 def test_the_order_by_cells_is_that_of_sorting_by_cell_and_coordinates(grid_mm):
     points = np.round(np.random.default_rng(5).uniform(0.0, 300.0, (3000, 3)) / grid_mm) * grid_mm
     x, y, z = (points - points.min(axis=0)).T // 40.0
-    np.testing.assert_array_equal(neighbors.by_cell(points, 40.0), np.lexsort((*points.T[::-1], z, y, x)))
+    np.testing.assert_array_equal(thinning.by_cell(points, 40.0), np.lexsort((*points.T[::-1], z, y, x)))
 
 
 def test_the_nearest_rotation_is_the_polar_factor_and_never_a_reflection():

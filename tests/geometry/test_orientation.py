@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.geometry import m3c2, neighbors, normal_orientation
+from processor.geometry import m3c2, nearest_neighbours, normal_orientation
 from processor.geometry.m3c2 import oriented
 from processor.geometry.normal_orientation import UP
 from tests.support.clouds.m3c2_clouds import wavy
@@ -29,7 +29,7 @@ def tube(seed, count=12_000, radius=150.0):
 
 def turned(cloud, core=None, scanner=None, across=ACROSS):
     core = cloud if core is None else core
-    found = m3c2.normals(neighbors.of_spacing(cloud), core, across)
+    found = m3c2.normals(nearest_neighbours.of_spacing(cloud), core, across)
     return found, normal_orientation.turned(found, core, across, scanner)
 
 

@@ -43,7 +43,7 @@ from processor.model import (
 )
 from processor.report import headline, limit_comparison_table, verdict_counts
 from processor.scan_folder import folder, tolerance
-from processor.space_frame import supports
+from processor.space_frame import supports_and_deflections
 from processor.space_frame.result import Balls, Evidence, Flag
 from processor.stitching import verdicts as of_network
 from processor.stitching.result import Closures, Scans
@@ -293,7 +293,7 @@ def frame(moved, supports_=(1, 1, 1, 1, 0), deflections=(math.nan,) * 4 + (20.0,
 
 
 def of_frame(balls, design, matched=True, standard="JGJ 7-2010"):
-    found = supports.judge(balls, design, standards.load(standard), matched)
+    found = supports_and_deflections.judge(balls, design, standards.load(standard), matched)
     if found is None:
         return None
     return {(key, of): verdict for key, of, verdict in zip(found.key, found.of, found.verdict, strict=True)}
@@ -345,8 +345,8 @@ def test_the_interval_of_a_deflection_by_draws():
     found = []
     for _ in range(400):
         balls, design = frame(rng.normal(size=(5, 3)))
-        nodes = supports._Nodes(balls, design, True)
-        deflection, sd = supports._below_supports(nodes, np.array([4, 0]))
+        nodes = supports_and_deflections._Nodes(balls, design, True)
+        deflection, sd = supports_and_deflections._below_supports(nodes, np.array([4, 0]))
         found.append((*deflection, *sd))
     values = np.array(found)
     # sd 0.1 is stated in the frame; the draws have 1
@@ -388,7 +388,7 @@ def test_supports_and_deflections_go_through_files(tmp_path):
 def test_the_page_and_the_table_have_the_worst_first_and_name_what_is_not_verified():
     moved = np.zeros((5, 3))
     moved[1, :2] = 0.0, 11.0
-    limits = supports.judge(*frame(moved), standards.load("GB 50205-2020"), True)
+    limits = supports_and_deflections.judge(*frame(moved), standards.load("GB 50205-2020"), True)
     (table,) = limit_comparison_table.limit_table(limits, "x-limits")
     assert [str(row[2]) for row in table.rows] == sorted([str(row[2]) for row in table.rows], key=WORST.index)
     assert "Not verified" not in str(table.note)

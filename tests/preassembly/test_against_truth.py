@@ -7,7 +7,7 @@ import pytest
 
 from processor.evaluation import preassembly
 from processor.geometry import rigid
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.model import ArchTruth, Scene, Truth
 from processor.preassembly.chain import adjustment
 from processor.preassembly.ends import bottom_edges, joint_end

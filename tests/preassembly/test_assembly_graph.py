@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from designgen.designs import girder_assemblies, prismatic
+from designgen.designs import girder_assemblies, prismatic_parts
 from designgen.scenes.make import make
 from processor.evaluation import preassembly as evaluation
 from processor.geometry import rigid
@@ -179,8 +179,8 @@ def test_the_covariance_of_motions_is_that_of_repeated_measurements():
 def test_corners_as_built_are_those_of_the_errors():
     """Corner P1 of an end: length, skews and its own displacement, in the joint's axes; without the other end."""
     (first, second, _) = girder_assemblies.build(girder_assemblies.Params()).parts
-    errors = prismatic.EndErrors(np.array([2.0, 1e-3, -2e-3]), np.arange(12.0).reshape(4, 3))
-    none = prismatic.EndErrors(np.zeros(3), np.zeros((4, 3)))
+    errors = prismatic_parts.EndErrors(np.array([2.0, 1e-3, -2e-3]), np.arange(12.0).reshape(4, 3))
+    none = prismatic_parts.EndErrors(np.zeros(3), np.zeros((4, 3)))
     built = second.with_errors([none, errors])
     corners = built.ends[1].key_points()
     moved = corners + built.displacement(corners)

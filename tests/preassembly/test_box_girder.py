@@ -15,7 +15,7 @@ from designgen import recipe_files
 from designgen.designs import arch_bridge
 from designgen.scenes.make import make as make_scene
 from processor.evaluation import preassembly as preassembly_evaluation
-from processor.geometry import box_girder, rigid
+from processor.geometry import box_girder_mesh, rigid
 from processor.model import InputError, UsageError
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.ends import plate_sides
@@ -35,7 +35,7 @@ def surrogate_of(parts_, i, **options):
     part = parts_[i]
     start = part.key_points(part.s0) if i > 0 else None
     end = part.key_points(part.s1) if i < 4 else None
-    return box_girder.mesh(*part.bottom_edges(), start, end, **options)
+    return box_girder_mesh.mesh(*part.bottom_edges(), start, end, **options)
 
 
 def sections(part, count=400):
@@ -108,7 +108,7 @@ def test_a_height_between_two_joints_is_linear():
     for x, h in ((0.0, 800.0), (4000.0, 1200.0)):
         corners = np.array([[x, 400.0, 0], [x, -400.0, 0], [x, -400.0, h], [x, 400.0, h]])
         ends.append(np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))]))
-    vertices, faces = box_girder.mesh(edge, edge * [1, -1, 1], *ends)
+    vertices, faces = box_girder_mesh.mesh(edge, edge * [1, -1, 1], *ends)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert off(mesh, np.array([[1000.0, 0.0, 900.0], [3000.0, 100.0, 1100.0], [2000.0, 400.0, 990.0]])).max() < 1e-6
 
@@ -117,11 +117,11 @@ def test_edges_and_joints_that_do_not_belong_together():
     rib = parts()[1]
     edges, start, end = rib.bottom_edges(), rib.key_points(rib.s0), rib.key_points(rib.s1)
     with pytest.raises(InputError, match=r"end at P1 and P2 of the joint there, found them \d+ mm away"):
-        box_girder.mesh(*edges, start, start)
+        box_girder_mesh.mesh(*edges, start, start)
     with pytest.raises(InputError, match="above P2 and P1"):
-        box_girder.mesh(*edges[::-1], start[[1, 0, 3, 2, 4, 7, 6, 5]], end[[1, 0, 3, 2, 4, 7, 6, 5]])
+        box_girder_mesh.mesh(*edges[::-1], start[[1, 0, 3, 2, 4, 7, 6, 5]], end[[1, 0, 3, 2, 4, 7, 6, 5]])
     with pytest.raises(InputError, match="a joint at one end"):
-        box_girder.mesh(*edges, None, None)
+        box_girder_mesh.mesh(*edges, None, None)
 
 
 # --- through a folder ------------------------------------------------------------------------------------------------
@@ -155,7 +155,7 @@ def test_a_folder_without_meshes_comes_back(tmp_path):
         low, high = ours.vertices.min(axis=0), ours.vertices.max(axis=0)
         assert (theirs.vertices > low - 50.0).all()
         assert (theirs.vertices < high + 50.0).all()
-        assert (theirs.source, ours.source) == (box_girder.SOURCE, "mesh")
+        assert (theirs.source, ours.source) == (box_girder_mesh.SOURCE, "mesh")
     store.write_scene(tmp_path / "again.h5", back, None, {})
     assert [part.source for part in store.read_scene(tmp_path / "again.h5").arch.parts] == ["curves"] * 5
 

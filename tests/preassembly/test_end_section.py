@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from designgen.designs import girder_assemblies, prismatic
+from designgen.designs import girder_assemblies, prismatic_parts
 from designgen.scanning import sampler
 from processor.geometry import mesh_distance
 from processor.model import Reason
@@ -91,7 +91,7 @@ def test_corners_are_where_the_faces_and_the_end_meet(of):
     held, rms = [], []
     for seed in range(4):
         rng = np.random.default_rng([seed, 7])
-        errors = prismatic.EndErrors(rng.normal(0.0, [2.0, 1e-3, 1e-3]), rng.normal(0.0, 1.0, (4, 3)))
+        errors = prismatic_parts.EndErrors(rng.normal(0.0, [2.0, 1e-3, 1e-3]), rng.normal(0.0, 1.0, (4, 3)))
         end = measured(of, errors, seed)
         off = end.departure - closed_form(errors)
         sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)

@@ -9,7 +9,7 @@ import pytest
 from processor import diagnostics
 from processor.evaluation import preassembly as preassembly_evaluation
 from processor.geometry import rigid
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.model import InputError, Scene, UsageError, Verdict, reason
 from processor.preassembly import assembly_errors
 from processor.preassembly import step as preassembly_step

@@ -13,7 +13,7 @@ from designgen.scanning import sampler
 from designgen.scenes.make import make
 from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
-from processor.geometry.neighbors import by_cell
+from processor.geometry.thinning import by_cell
 from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene, reason
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.ends.joint_frame import joint_frame

@@ -163,7 +163,7 @@ def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     (row,) = of_file(execution, "components-compared")
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
     answered = drawn(execution)["preassemble"]["linear-error.png"]
-    assert "without a band, for they state no uncertainty: line" in str(answered[0])
+    assert "without a band, because they state no uncertainty: line" in str(answered[0])
     line = execution.runs[1]
     linear = line.result.linear
     own = dataclasses.replace(

@@ -16,7 +16,7 @@ from designgen.export import folder as export_folder
 from designgen.export import step_files
 from processor.api import runs
 from processor.cli import main
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.language.messages import messages
 from processor.model import ArchDesign, DesignBodies
 from processor.report.charts import design_picture

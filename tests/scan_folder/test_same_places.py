@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.geometry.neighbors import same_places
+from processor.geometry.nearest_neighbours import same_places
 from processor.scan_folder.shapes.body import welded
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from processor.geometry.linalg_small import inverse_of
-from processor.space_frame import catalogue
+from processor.space_frame import ball_catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.sphere_crops import Crops
-from processor.space_frame.spheres import fit_all
+from processor.space_frame.spheres import alternating_fit
 from processor.space_frame.spheres.gauss_newton import (
     Observations,
     Prior,
@@ -18,7 +18,7 @@ from processor.space_frame.spheres.gauss_newton import (
     solve,
     weight,
 )
-from processor.space_frame.spheres.noise_model import limb_cosine, noise_model, radius_offset, radius_scatter
+from processor.space_frame.spheres.noise_estimation import limb_cosine, noise_model, radius_offset, radius_scatter
 from processor.space_frame.spheres.records import StochasticModel
 from tests.bench import ball_fit
 
@@ -164,8 +164,10 @@ def test_radius_without_rays_is_corrected_by_half_the_noise_bias():
         crops = Crops(np.arange(draws + 1) * count, points, np.full(len(points), -1, np.int32))
         unfixed = np.full((draws, 3, 3), np.nan)
         nodes = Nodes(np.zeros((draws, 3)), unfixed, np.zeros(draws, np.int64), np.full(draws, np.nan))
-        params = fit_all.RayFitParams(sigma_mm=2.0, process_hole_mm=0.0)
-        found = fit_all.fit_crops(crops, np.empty((0, 3)), nodes, Members(), catalogue.of_radii([]), params=params)
+        params = alternating_fit.RayFitParams(sigma_mm=2.0, process_hole_mm=0.0)
+        found = alternating_fit.fit_crops(
+            crops, np.empty((0, 3)), nodes, Members(), ball_catalogue.of_radii([]), params=params
+        )
         return found.radii - radius, (found.covariance - found.views.covariance)[:, 3, 3]
 
     chance = 4.0 * sigma / np.sqrt(draws * count)

@@ -9,7 +9,7 @@ from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline
 from processor.evaluation import space_frame
-from processor.geometry import parallel, rigid
+from processor.geometry import rigid, thread_ranges
 from processor.model import Scan, reason
 from processor.space_frame import step as space_frame_step
 from processor.space_frame import to_result
@@ -106,9 +106,9 @@ def test_a_ball_of_another_size_is_named(roof):
 def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used, monkeypatch):
     scene, _ = roof
     first = space_frame_step.run(scene, space_frame_step.Params())
-    pools, pool = set(), parallel._pool
-    monkeypatch.setattr(parallel, "usable", lambda: threads_used)
-    monkeypatch.setattr(parallel, "_pool", lambda count: (pools.add(count), pool(count))[1])
+    pools, pool = set(), thread_ranges._pool
+    monkeypatch.setattr(thread_ranges, "usable", lambda: threads_used)
+    monkeypatch.setattr(thread_ranges, "_pool", lambda count: (pools.add(count), pool(count))[1])
     monkeypatch.setattr(to_result, "of_scene", lambda *given: dataclasses.replace(of_scene(*given), chunk_size=chunk))
     rng = np.random.default_rng(1)
     scans = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from processor.geometry import linalg_small, parallel
+from processor.geometry import linalg_small, thread_ranges
 from processor.model import reason
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM
 from processor.space_frame.points.line_crops import corridors, gather
@@ -404,10 +404,10 @@ def test_points_without_station_and_tubes_without_points_are_accepted():
 
 def test_same_bytes_on_any_number_of_threads(monkeypatch):
     _, seen, _ = frame(2, per_pair=30)
-    answers, pools, pool = [], set(), parallel._pool
-    monkeypatch.setattr(parallel, "_pool", lambda count: (pools.add(count), pool(count))[1])
+    answers, pools, pool = [], set(), thread_ranges._pool
+    monkeypatch.setattr(thread_ranges, "_pool", lambda count: (pools.add(count), pool(count))[1])
     for count in (1, 2, 3):
-        monkeypatch.setattr(parallel, "usable", lambda count=count: count)
+        monkeypatch.setattr(thread_ranges, "usable", lambda count=count: count)
         answers.append(registered(seen, np.random.default_rng(0)))
     assert pools == {2, 3}  # one thread needs no pool
     for other in answers[1:]:

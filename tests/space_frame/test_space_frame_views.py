@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from processor.space_frame.catalogue import of_radii
+from processor.space_frame.ball_catalogue import of_radii
 from processor.space_frame.members.records import Members
-from processor.space_frame.spheres import fit_all
-from processor.space_frame.spheres.view_errors import of_tubes
+from processor.space_frame.spheres import alternating_fit
+from processor.space_frame.spheres.unnamed_view_errors import of_tubes
 from tests.support.clouds import ball_clouds
 from tests.support.clouds.memory_source import InMemory
 
@@ -26,7 +26,7 @@ def fitted(seed, shift_mm):
     )
     chunk = next(iter(named.chunks()))
     merged = InMemory(chunk.points, np.full(len(chunk.points), -1, np.int32), np.empty((0, 3)))
-    return fit_all.fit_spheres(merged, nodes, members, of_radii(RADII))
+    return alternating_fit.fit_spheres(merged, nodes, members, of_radii(RADII))
 
 
 @pytest.mark.parametrize("shift_mm", [0.0, 0.6])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.space_frame.members import voxel_linearity, voxel_lines
 from processor.space_frame.points import hash_sampling, line_crops, voxels
 from tests.support.clouds.memory_source import InMemory

@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from processor.geometry import parallel
+from processor.geometry import thread_ranges
 from processor.limits import standards
 from processor.model import UsageError, reason
-from processor.space_frame import catalogue
+from processor.space_frame import ball_catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.params import Params
 from processor.space_frame.points import sphere_crops
-from processor.space_frame.spheres import baselines, fit_all
-from processor.space_frame.spheres.fit_all import RayFitParams, fit_spheres
+from processor.space_frame.spheres import alternating_fit, baselines
+from processor.space_frame.spheres.alternating_fit import RayFitParams, fit_spheres
 from processor.space_frame.spheres.records import SizeChoice
 from tests.support.clouds.ball_clouds import frame, grid_of_balls
 from tests.support.clouds.memory_source import InMemory
@@ -33,7 +33,7 @@ def roof():
 @pytest.fixture(scope="module")
 def found(roof):
     _, _, _, source, nodes, tubes = roof
-    return fit_spheres(source, nodes, tubes, catalogue.load())
+    return fit_spheres(source, nodes, tubes, ball_catalogue.load())
 
 
 def same_bytes(a, b):
@@ -64,9 +64,9 @@ def test_fit_spheres_gives_the_same_bytes_for_any_order_chunks_and_threads(roof,
     _, _, _, source, nodes, tubes = roof
     order = np.random.default_rng(1).permutation(source.count)
     mixed = InMemory(source.points[order], source.station[order], source.scanners, chunk_size=3001)
-    assert same_bytes(found, fit_spheres(mixed, nodes, tubes, catalogue.load()))
-    monkeypatch.delattr(parallel, "_pool")  # one thread starts no others
-    alone = fit_spheres(source, nodes, tubes, catalogue.load(), params=RayFitParams(threads=1))
+    assert same_bytes(found, fit_spheres(mixed, nodes, tubes, ball_catalogue.load()))
+    monkeypatch.delattr(thread_ranges, "_pool")  # one thread starts no others
+    alone = fit_spheres(source, nodes, tubes, ball_catalogue.load(), params=RayFitParams(threads=1))
     assert same_bytes(found, alone)
 
 
@@ -74,12 +74,12 @@ def test_origin_of_map_coordinates_does_not_change_the_fit(roof, found):
     """Coordinates travel less an origin: what that origin is does not enter."""
     _, _, _, source, nodes, tubes = roof
     moved = dataclasses.replace(source, origin=np.array([5e8, 4.3e9, 1e5]))
-    assert same_bytes(found, fit_spheres(moved, nodes, tubes, catalogue.load()))
+    assert same_bytes(found, fit_spheres(moved, nodes, tubes, ball_catalogue.load()))
 
 
 def test_a_free_radius_is_found_too(roof):
     centres, radii, _, source, nodes, tubes = roof
-    found = fit_spheres(source, nodes, tubes, catalogue.of_radii([]))
+    found = fit_spheres(source, nodes, tubes, ball_catalogue.of_radii([]))
     good = np.array(found.flag) == "ok"
     assert good.sum() >= 9
     assert np.abs((found.radii - radii) / np.sqrt(found.covariance[:, 3, 3]))[good].max() < 4.0
@@ -90,7 +90,7 @@ def test_wrong_sizes_are_named_and_the_right_ones_are_not(roof):
     _centres, _, sizes, source, nodes, tubes = roof
     nominal = sizes.copy()
     nominal[[2, 7]] += 10.0
-    found = fit_spheres(source, nodes, tubes, catalogue.load(), nominal_mm=nominal)
+    found = fit_spheres(source, nodes, tubes, ball_catalogue.load(), nominal_mm=nominal)
     assert np.flatnonzero(np.array(found.flag) == "wrong-size").tolist() == [2, 7]
     assert found.reasons[2] == (reason("spheres.other-size", size=60.0, nominal=70.0),)
     assert np.array(found.flag)[np.delete(np.arange(12), [2, 7])].tolist() == ["ok"] * 10
@@ -105,7 +105,7 @@ def test_nominal_size_is_kept_against_a_doubtful_other_size():
         second=np.array([55.0, 55.0, 60.0, nan]),
         second_energy=np.array([20.0, 40.0, 20.0, np.inf]),
     )
-    fit_all.keep_nominal(choice, np.array([55.0, 55.0, 55.0, nan]))
+    alternating_fit.keep_nominal(choice, np.array([55.0, 55.0, 55.0, nan]))
     assert choice.sizes.tolist() == [55.0, 50.0, 50.0, 50.0]
     assert choice.states[:, 3].tolist() == [55.0, 50.0, 50.0, 50.0]
     assert choice.second[:3].tolist() == [50.0, 55.0, 60.0]
@@ -114,7 +114,7 @@ def test_nominal_size_is_kept_against_a_doubtful_other_size():
 def test_bias_without_scanner_positions_is_reported(roof):
     centres, radii, _, source, nodes, tubes = roof
     unknown = InMemory(source.points)
-    found = fit_spheres(unknown, nodes, tubes, catalogue.load())
+    found = fit_spheres(unknown, nodes, tubes, ball_catalogue.load())
     assert reason("spheres.orthogonal-distances") in found.messages
     good = np.array(found.flag) == "ok"
     assert good.sum() >= 10
@@ -130,11 +130,11 @@ def test_node_without_points_is_placed_by_its_axes_alone(roof):
         axis_count=np.append(nodes.axis_count, 4),
         scatter=np.append(nodes.scatter, 0.5),
     )
-    found = fit_spheres(source, away, tubes, catalogue.load())
+    found = fit_spheres(source, away, tubes, ball_catalogue.load())
     assert (found.evidence[-1], found.flag[-1]) == ("axes", "low-confidence")
     assert np.isnan(found.radii[-1])
     assert found.reasons[-1][0].code == "spheres.axes-alone"
-    known = fit_spheres(source, away, tubes, catalogue.load(), nominal_mm=np.append(np.full(12, np.nan), 60.0))
+    known = fit_spheres(source, away, tubes, ball_catalogue.load(), nominal_mm=np.append(np.full(12, np.nan), 60.0))
     assert known.radii[-1] == 60.0
     assert known.lowest[-1, 2] == pytest.approx(6000.0 - 60.0)
     assert known.lowest_sd[-1] > 0.5
@@ -147,7 +147,7 @@ def test_a_target_on_a_mount_needs_no_member_and_no_catalogue():
         rng, centre, [70.0], np.array([[0.0, -5000.0, 1500.0]]), 0.8, 1.0, members=np.empty((0, 3)), hole=0.0
     )
     start = Nodes(centre + np.array([3.0, -4.0, 2.0]), np.full((1, 3, 3), np.nan), np.zeros(1, int), np.full(1, np.nan))
-    found = fit_spheres(source, start, Members(), catalogue.of_radii([]))
+    found = fit_spheres(source, start, Members(), ball_catalogue.of_radii([]))
     assert found.evidence == ("ball",)
     assert found.flag == ("ok",)
     error = np.append(found.centres[0] - centre[0], found.radii[0] - 70.0)
@@ -161,11 +161,11 @@ def test_stations_that_moved_are_noticed_and_enter_the_covariance():
     stations = np.vstack([STATIONS, [[0.0, 8000.0, 0.0]]])
     shifts = rng.normal(0.0, 2.0, (4, 3))
     source, nodes, tubes = frame(rng, centres, radii, stations, shifts=shifts)
-    found = fit_spheres(source, nodes, tubes, catalogue.load())
+    found = fit_spheres(source, nodes, tubes, ball_catalogue.load())
     assert 0.7 < found.station_sd < 4.0
     assert "spheres.stations-disagree" in [one.code for one in found.messages]
     pull = (found.lowest[:, 2] - centres[:, 2] + radii) / found.lowest_sd
-    still = fit_spheres(source, nodes, tubes, catalogue.load(), station_covariance=np.zeros((4, 3, 3)))
+    still = fit_spheres(source, nodes, tubes, ball_catalogue.load(), station_covariance=np.zeros((4, 3, 3)))
     assert (still.lowest_sd < 0.6 * found.lowest_sd).mean() > 0.7
     assert np.sqrt(np.mean(pull**2)) < 1.6
 
@@ -246,9 +246,9 @@ def test_on_raw_crops_consensus_is_far_better_than_least_squares(roof, found):
 
 
 def test_catalogues_state_their_verification_and_bad_ones_are_refused():
-    assert catalogue.load().verified is False
-    assert catalogue.of_radii([60, 45.0, 60]).radii.tolist() == [45.0, 60.0]
+    assert ball_catalogue.load().verified is False
+    assert ball_catalogue.of_radii([60, 45.0, 60]).radii.tolist() == [45.0, 60.0]
     with pytest.raises(UsageError, match="plausible"):
-        catalogue.load("nowhere")
+        ball_catalogue.load("nowhere")
     with pytest.raises(UsageError, match="above 0"):
-        catalogue.of_radii([45.0, -1.0])
+        ball_catalogue.of_radii([45.0, -1.0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from processor.geometry.neighbors import nearest_crops
+from processor.geometry.nearest_neighbours import nearest_crops
 from processor.geometry.sphere import (
     Sphere,
     algebraic,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from processor.geometry import scanner_rays
+from processor.geometry import scan_grid_directions
 from processor.stitching.fine import edge_constraints
 from processor.stitching.planes import border_exclusion, face_ends
 from processor.stitching.planes.extraction import Planes
@@ -13,10 +13,10 @@ def test_rays_fitted_to_a_grid_are_the_simulated_ones():
     made = scan("S", pose([0.0, 0.0, 1500.0], 0.0), 1, step_mrad=20.0, sigma_mm=0.0)
     keep = np.arange(len(made.points)) % 3 > 0
     row, column = made.grid_row.astype(np.int64), made.grid_column.astype(np.int64)
-    rays = scanner_rays.fitted(made.points[keep], row[keep], column[keep])
+    rays = scan_grid_directions.fitted(made.points[keep], row[keep], column[keep])
     true = made.points / np.linalg.norm(made.points, axis=1)[:, None]
     np.testing.assert_allclose(rays.of(row, column), true, atol=1e-9)
-    lost = scanner_rays.unanswered(rays, row[keep], column[keep])
+    lost = scan_grid_directions.unanswered(rays, row[keep], column[keep])
     assert len(lost) == (~keep).sum()
     np.testing.assert_allclose(np.sort(lost, axis=0), np.sort(true[~keep], axis=0), atol=1e-9)
 
@@ -38,7 +38,7 @@ def post(width_mm, phase, step=5e-3, range_mm=20_000.0):
     r, c = row.ravel()[hit], column.ravel()[hit]
     piece = np.where(low[hit], -1, 0)
     piece[~low[hit] & (r % 7 > 0)] = -1  # in a planar piece in few rows only
-    rays = scanner_rays.fitted(p[hit], r, c)
+    rays = scan_grid_directions.fitted(p[hit], r, c)
     return face_ends.ends_of(p[hit], r, c, piece, plane, 2.0, rays)
 
 
@@ -106,7 +106,7 @@ def test_far_edges_of_an_inclined_face_are_unbiased():
         )
         r, c = row.ravel()[keep], column.ravel()[keep]
         ends = face_ends.ends_of(
-            p[keep], r, c, np.where(hit[keep], 0, -1), plane, 2.0, scanner_rays.fitted(p[keep], r, c)
+            p[keep], r, c, np.where(hit[keep], 0, -1), plane, 2.0, scan_grid_directions.fitted(p[keep], r, c)
         )
         far = (ends.across[:, 0] > 0.0) & (np.abs(ends.across[:, 1]) < 0.5 * ends.across[:, 0])
         assert far.sum() >= 40

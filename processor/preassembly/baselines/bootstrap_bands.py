@@ -16,8 +16,8 @@ from scipy.special import stdtrit
 
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
-from processor.geometry.neighbors import by_cell
-from processor.geometry.parallel import each
+from processor.geometry.thinning import by_cell
+from processor.geometry.thread_ranges import each
 from processor.model import ArchDesign, Bools, DesignPart, Floats, Ints, Status, reason
 from processor.preassembly import assembly_errors
 from processor.preassembly.baselines import methods

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from processor import diagnostics
 from processor.geometry import rigid
-from processor.geometry.neighbors import without_outliers
-from processor.geometry.polyline import Line, crossing, fit_line, ransac_line
+from processor.geometry.lines_and_polylines import Line, crossing, fit_line, ransac_line
+from processor.geometry.nearest_neighbours import without_outliers
 from processor.model import Floats
 from processor.preassembly.params import BoxParams, SliceParams
 from processor.registration import principal

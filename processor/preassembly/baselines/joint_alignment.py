@@ -13,8 +13,8 @@ import numpy as np
 
 from processor import diagnostics
 from processor.geometry import rigid
-from processor.geometry.neighbors import voxel_means
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
+from processor.geometry.thinning import voxel_means
 from processor.model import Floats, Reason, reason
 from processor.preassembly.params import MatchParams
 from processor.registration import icp, pfh

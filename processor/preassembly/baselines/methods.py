@@ -18,8 +18,8 @@ import numpy as np
 
 from processor import diagnostics
 from processor.geometry import rigid
-from processor.geometry.neighbors import surface_spacing
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
+from processor.geometry.nearest_neighbours import surface_spacing
 from processor.model import ArchDesign, Floats, Reason, Scan, Status, Verdict, reason
 from processor.preassembly import assembly_errors
 from processor.preassembly.baselines import edge_features, joint_alignment

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.geometry.polyline import Polyline
+from processor.geometry.lines_and_polylines import Polyline
 from processor.model import ArchDesign, Floats
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.measure import MeasuredPart

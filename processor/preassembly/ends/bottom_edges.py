@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 
 from processor.adjustment.model_averaging import smooth
 from processor.geometry import mesh_distance, rigid
+from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
-from processor.geometry.polyline import Polyline
 from processor.model import Bools, Floats, Ints
 from processor.preassembly.assembly_errors import INTERVAL_MM
 from processor.preassembly.ends import plate_sides

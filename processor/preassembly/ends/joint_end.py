@@ -210,8 +210,8 @@ def _outer_sides(
 
     A face further in than half its plate, with no second layer, may be the plate's inner side, seen where the outer one
     was not. The end face is between both sides, so its points lie outside of the inner side and inside of the outer
-    one. Where they are too few, the inner side is the more probable one, for a departure by just the plate's thickness
-    is rare. The other side then is within the interval.
+    one. Where they are too few, the inner side is the more probable one, because a departure by just the plate's
+    thickness is rare. The other side then is within the interval.
     """
     outer, either = list(faces), np.zeros(len(faces))
     shown: list[PlateFace] = []

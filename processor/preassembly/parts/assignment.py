@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from processor.geometry import box_girder, rigid
-from processor.geometry.neighbors import thinned
+from processor.geometry import box_girder_mesh, rigid
+from processor.geometry.thinning import thinned
 from processor.model import ArchDesign, Floats, Reason, reason
 from processor.preassembly.parts import attitude, same_shape
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, TELLING_MM, Shapes, Surface
@@ -77,7 +77,7 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
         if _shows_other(few, (shapes[best], T_best), (shapes[other], T)):
             best, T_best = other, T
     # Surfaces made from design curves are not whole: points of the right part lie off them, too.
-    whole = all(part.source != box_girder.SOURCE for part in shapes.design.parts)
+    whole = all(part.source != box_girder_mesh.SOURCE for part in shapes.design.parts)
     if whole and share <= surface_registration.LEAST_SHARE:
         return -1
     if best == index:

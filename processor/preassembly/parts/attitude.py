@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface
-from processor.geometry.neighbors import thinned, voxel_means
-from processor.geometry.parallel import each
+from processor.geometry.thinning import thinned, voxel_means
+from processor.geometry.thread_ranges import each
 from processor.model import ArchDesign, DesignPart, Floats, Reason, Status, reason
 from processor.registration import icp, principal, surface_registration
 

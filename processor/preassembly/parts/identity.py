@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import on_face
-from processor.geometry.neighbors import thinned
+from processor.geometry.thinning import thinned
 from processor.model import Floats, Reason, reason
 from processor.preassembly.parts import attitude, same_shape
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, SAMPLE_SPACING_MM

@@ -10,10 +10,10 @@ import numpy as np
 
 from processor.adjustment import variance_components
 from processor.adjustment.point_groups import joined_numbers
-from processor.geometry import box_girder, rigid
+from processor.geometry import box_girder_mesh, rigid
+from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import MeshSurface, on_face
-from processor.geometry.neighbors import by_cell, thinned
-from processor.geometry.polyline import Polyline
+from processor.geometry.thinning import by_cell, thinned
 from processor.model import DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly import topology
 from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, view_variance
@@ -267,7 +267,7 @@ def _reasons(
             why = scan.rejected or scan.attitude.reasons or scan.doubts or scan.weak
             yield reason("preassemble.scan-not-used", scan=scan.scan.name, reasons=why)
     yield from (*of_ends, *first.weak, *first.doubts)
-    if part.source == box_girder.SOURCE:
+    if part.source == box_girder_mesh.SOURCE:
         yield reason("preassemble.no-mesh")
     # One scan that shows the part's mark is enough.
     if all(scan.identity.open_questions for scan in used):
@@ -400,7 +400,7 @@ def _register(scan: Scan, points: Floats, station: Ints, index: int, shapes: att
     if misfit:
         return replace(placed, rejected=(*misfit, *(_resemblance(points, index, shapes) or RIGHT_PART)))
     # A part without a mesh has approximate surfaces: points of the right part lie off them, too.
-    if registration.used_share < 1.0 - surface_registration.CLUTTER_SHARE and part.source != box_girder.SOURCE:
+    if registration.used_share < 1.0 - surface_registration.CLUTTER_SHARE and part.source != box_girder_mesh.SOURCE:
         # A part of another size fits the design as far as the two are alike; the rest looks like clutter.
         away = 1.0 - registration.used_share
         resemblance = _resemblance(points, index, shapes)

@@ -281,7 +281,7 @@ def _linear_caption(runs: Sequence[StepRun], drawn: Sequence[StepRun]) -> Messag
             )
         )
     if shaded and bare:
-        caption.append(text("without a band, for they state no uncertainty: {methods}", methods=bare))
+        caption.append(text("without a band, because they state no uncertainty: {methods}", methods=bare))
     if missing:
         caption.append(text("without a result, so not drawn: {methods}", methods=missing))
     return text("{parts:;}", parts=caption)

@@ -11,7 +11,7 @@ from processor.model import Verdict
 from processor.report.columns import MM, columns
 from processor.report.style import COLOURS, DIVERGING_STOPS, CaptionedPngs, png
 from processor.report.table import Table, csv_of_rows
-from processor.space_frame.ceiling import clashes
+from processor.space_frame.hanger_lengths import clashes
 from processor.space_frame.result import Flag, Result
 
 PLAN, STAKE_OUT = "hangers.png", "stakeout.csv"

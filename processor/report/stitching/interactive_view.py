@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.geometry import parallel, rigid
+from processor.geometry import rigid, thread_ranges
 from processor.language.messages import text
 from processor.model import NORMAL_95, Floats, Scan, Scene, Status, StepRun
 from processor.report.charts.surface_view import spacing
@@ -40,7 +40,7 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
     first = np.array([rigid.apply(scans.T_project_scan[i], scan.points[:1] + scan.origin)[0] for scan, i in placed])
     origin: Floats = np.round(first.mean(axis=0))
     clouds = [_in_project(scan, scans.T_project_scan[i], origin) for scan, i in placed]
-    trees = parallel.each(cKDTree, clouds)
+    trees = thread_ranges.each(cKDTree, clouds)
     step = max(1, -(-sum(map(len, clouds)) // MOST_POINTS))
     drawn = [cloud[::step] for cloud in clouds]
     distances = [

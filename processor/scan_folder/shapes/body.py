@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from processor.distinct_rows import distinct
-from processor.geometry.neighbors import same_places
+from processor.geometry.nearest_neighbours import same_places
 from processor.model import Floats, Ints
 
 WELD_MM = 1e-4  # vertices nearer to each other are one: far below any edge and far above rounding

@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from processor.geometry.box_girder import Edge
+from processor.geometry.box_girder_mesh import Edge
 from processor.model import Floats
 from processor.scan_folder.shapes.body import Body
 

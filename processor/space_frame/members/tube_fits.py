@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats, Ints
 from processor.space_frame.members.cylinder_fit import COS_BINS, ROUGH_COS, SECTORS, Errors, Limits, fit_roughly, refine
 from processor.space_frame.members.cylinder_model import GRAZING_COS

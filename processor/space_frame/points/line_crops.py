@@ -16,7 +16,7 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.geometry.linalg_small import assign
-from processor.geometry.parallel import over_ranges, usable
+from processor.geometry.thread_ranges import over_ranges, usable
 from processor.model import Floats, Ints, Labels
 from processor.space_frame.points.hash_sampling import REACH, STEPS_PER_MM, WHOLE, hashed
 from processor.space_frame.points.voxels import EMPTY, slot_of

@@ -12,7 +12,7 @@ from numba import njit
 
 from processor import large_arrays
 from processor.geometry import rigid
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats, Labels, Scan, Scene
 from processor.space_frame.points.source import CHUNK_POINTS, UNKNOWN_STATION, Chunk
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats, Ints, Labels, UsageError
 from processor.space_frame.points.hash_sampling import WHOLE, hashed
 from processor.space_frame.points.source import Source

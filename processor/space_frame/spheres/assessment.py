@@ -11,7 +11,7 @@ from processor.adjustment.scanner_class_errors import SHIFT_SD_MM
 from processor.geometry.sphere import BANDS, SECTORS
 from processor.limits import limit_bounds, standards
 from processor.model import NORMAL_95, Bools, Floats, Reason, Tolerance, reason
-from processor.space_frame.catalogue import Catalogue
+from processor.space_frame.ball_catalogue import Catalogue
 from processor.space_frame.members.records import Nodes
 from processor.space_frame.result import Evidence, Flag
 from processor.space_frame.spheres.records import (
@@ -47,10 +47,10 @@ class FitContext:
     """Facts about a whole fit that each sphere is assessed by.
 
     ``radius_offset`` is the mean deviation of radii from their sizes and its standard deviation, mm. It may come from
-    an offset of all ranges or from the beam's width, so it is not removed: it enters the covariances of radii. Seen
-    from below, the surface is not moved by it. ``views`` are the errors of views that a merged cloud does not name,
-    None = views are named. ``limits`` has the tolerance of a sphere's blank, by which a size is
-    wrong where no catalogue decides it.
+    an offset of all ranges or from the beam's width, so it is not removed: it enters the covariances of radii. The
+    lowest point of a ball seen from below is not affected: centre and radius change by the same amount. ``views`` are
+    the errors of views that a merged cloud does not name, None = views are named. ``limits`` has the tolerance of a
+    sphere's blank, by which a size is wrong where no catalogue decides it.
     """
 
     catalogue: Catalogue

@@ -14,7 +14,7 @@ import numpy as np
 
 from processor import diagnostics
 from processor.geometry import rigid
-from processor.geometry.neighbors import nearest_crops
+from processor.geometry.nearest_neighbours import nearest_crops
 from processor.geometry.sphere import Sphere, algebraic, ransac
 from processor.model import Bools, Floats, FrameDesign, Ints, Reason, Tolerance, reason
 from processor.scene_cloud import MergedCloud
@@ -24,10 +24,10 @@ from processor.space_frame.points.source import Source
 from processor.space_frame.points.sphere_crops import Crops, gather
 from processor.space_frame.result import Result
 from processor.space_frame.spheres import sleeve_radii
-from processor.space_frame.spheres.fit_all import RayFitParams
+from processor.space_frame.spheres.alternating_fit import RayFitParams
 from processor.space_frame.spheres.gauss_newton import VISIBLE, SphereMask, select
 from processor.space_frame.spheres.records import Spheres
-from processor.space_frame.spheres.single_fit_results import Row, as_result, assessed, generator, missing
+from processor.space_frame.spheres.single_fit_assessment import Row, as_result, assessed, generator, missing
 
 MARGIN_MM = 8.0  # on both sides of a sphere's surface: about what the ray fit uses with 2 mm of noise
 SLEEVES_MM = 26.0  # beyond a sphere: sleeves are measured there

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numba import njit
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats
 from processor.space_frame.points.sphere_crops import Crops
 from processor.space_frame.spheres.records import CropsWithRays

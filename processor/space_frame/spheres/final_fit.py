@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.linalg_small import assign, assign_rows, inverse_of
-from processor.geometry.parallel import over_ranges
 from processor.geometry.sphere import BANDS, SECTORS
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats
 from processor.space_frame.spheres.gauss_newton import (
     VISIBLE,
@@ -258,7 +258,7 @@ def _cell_of(point, state, shift):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _without_bias(observations, surface, noise, state, covariance):  # type: ignore[no-untyped-def]
-    """Take the bias by curvature off the state, and half of that by unknown rays, whose spread the covariance gets."""
+    """Subtract the bias by curvature and half of that by unknown rays; add the latter's spread to the covariance."""
     off = np.zeros(4)
     curvature_bias(observations, surface, noise, state, covariance, off)
     largest = 0.0

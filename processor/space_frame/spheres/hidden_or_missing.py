@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numba import njit
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats, Ints, reason
 from processor.space_frame.points.source import Source
 from processor.space_frame.result import Evidence, Flag

@@ -13,7 +13,7 @@ from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Flag, Result
 from processor.space_frame.spheres import sphere_detection
 from processor.space_frame.spheres.assessment import DOWN, LARGEST_SCALE
-from processor.space_frame.spheres.single_fit_results import Row, as_result, assessed, generator, missing
+from processor.space_frame.spheres.single_fit_assessment import Row, as_result, assessed, generator, missing
 
 
 def search(cloud: MergedCloud, params: Params) -> Result:

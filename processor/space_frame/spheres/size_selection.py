@@ -1,7 +1,7 @@
 """Compiled selection of a sphere's size: radii are voted for, the best are fitted, and the fit of least energy wins.
 
-A consensus count would choose the largest sphere, for sleeves stand outside of it. The energy of a fit is its
-chi-square with that of its priors, less a reward for each point that it explains.
+A consensus count would choose the largest sphere, because sleeves lie outside of the right one. The energy of a fit is
+its chi-square with that of its priors, less a reward for each point that it explains.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from numba import njit
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Bools
 from processor.space_frame.spheres.gauss_newton import (
     CUT_SD,

@@ -20,7 +20,6 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import point_grid
 from processor.geometry.linalg_small import assign
-from processor.geometry.parallel import over_ranges
 from processor.geometry.sphere import (
     LEAST_SCALE,
     RobustFit,
@@ -30,6 +29,7 @@ from processor.geometry.sphere import (
     sphere_cells,
     visible_fraction,
 )
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD, robust_sd
 
@@ -57,7 +57,7 @@ ROUND = 0.02  # of the radius: nothing but a ball departs from a sphere by less
 NEAR = 1.7  # radii of a proposal: points about its centre that a ball is fitted to
 AROUND = 1.4  # radii of a ball: its surroundings
 LIKELY_MM = 1500.0  # larger balls are searched for only where there is none below
-SMALL = 0.005  # residuals in radii: a ball even if they are its own shape
+SMALL = 0.005  # residuals, in radii, that are accepted even if they are systematic: the shape of the ball
 WHITE = 0.5  # sd of residuals by the differences of neighbours, over that of all
 EXPLAINED = 0.3  # share of the residuals' squares that an ellipsoid may explain
 LEAST_VISIBLE = 0.08  # share of the sphere

@@ -13,8 +13,8 @@ the correlation falls with the distance d as exp(-d / length).
 
 Most of such a field is a shift and a change of radius, which no residual of one ball shows. The rest shows how large
 the field is. Its variance has the prior of the scanner's class, and the likelihood of the residuals with the states of
-all balls eliminated (restricted likelihood, Patterson and Thompson 1971). The mean of the variance over both includes
-its uncertainty, which few views leave large, as the variance of Student's t does.
+all balls eliminated (restricted likelihood, Patterson and Thompson 1971). The posterior mean of the variance is used.
+It includes the uncertainty of the variance, which is large with few views, as in Student's t.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from processor.model import Floats, Ints
 MODES, TAKEN_UP = 16, 4
 # Combinations of modes that only few points at the edge of the visible surface determine are left out.
 LEAST_INFORMATION = 0.02
-SD_MM = np.geomspace(0.01, 5.0, 40)  # a field below the first is nothing, one beyond the last no registered cloud
+SD_MM = np.geomspace(0.01, 5.0, 40)  # a smaller field is negligible, a larger one occurs in no registered cloud
 LENGTHS_MM = np.array([1e3, 2e3, 4e3, 8e3, 16e3, 32e3, np.inf])  # stations are metres to tens of metres away
 
 

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numba import njit
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM
 from processor.space_frame.points.line_crops import FIELD, HALF, Gathered

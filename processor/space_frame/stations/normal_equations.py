@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.linalg_small import assign, cholesky, solve
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats
 from processor.space_frame.stations.residual_kernels import LEAST, STATION, TUBE, Axes, Layout
 
@@ -194,7 +194,7 @@ def _score(M, y, rest, L, weight, off, score):  # type: ignore[no-untyped-def]
     for k in range(TUBE):
         u0 += M[0, k] * rest[k]
         u1 += M[1, k] * rest[k]
-    # the variance of u is N - N A^-1 N, for the observation has a part in the tube's unknowns
+    # the variance of u is N - N A^-1 N, because the observation has a part in the tube's unknowns
     S = solve(L, np.ascontiguousarray(M[:, :2]))
     v00, v01, v11 = M[0, 0], M[0, 1], M[1, 1]
     for k in range(TUBE):

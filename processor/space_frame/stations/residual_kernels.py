@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats, Ints, Labels
 
 TUBE = 8  # unknowns of an observation; a tube has the first seven

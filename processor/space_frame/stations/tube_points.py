@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats, Ints, Labels
 from processor.space_frame.members.records import Members
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM, WHOLE

@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from processor.geometry.neighbors import thinned
+from processor.geometry.thinning import thinned
 from processor.model import Floats, Ints
 from processor.stitching.coarse import candidate_rotations
 from processor.stitching.fine import noise_model

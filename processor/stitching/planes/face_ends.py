@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from numba import njit
 
-from processor.geometry.scanner_rays import Rays
+from processor.geometry.scan_grid_directions import Rays
 from processor.model import Floats, Ints
 from processor.stitching.planes.extraction import Planes
 

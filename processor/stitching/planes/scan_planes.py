@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from processor.distinct_rows import distinct
-from processor.geometry import scanner_rays
+from processor.geometry import scan_grid_directions
 from processor.model import Floats, Ints, Scan
 from processor.stitching.planes import border_exclusion, extraction, grouped_sums
 from processor.stitching.planes.extraction import Planes
@@ -73,10 +73,10 @@ def extract(scan: Scan, cell_mm: float = 0.0) -> Cloud:
     if known:
         planes = _facing_scanner(planes)
     ends, unanswered = Ends(), np.empty((0, 3))
-    rays = scanner_rays.fitted(points, row, column) if on_grid else None
+    rays = scan_grid_directions.fitted(points, row, column) if on_grid else None
     if rays is not None:
         ends = ends_of(points, row, column, piece[of_point], planes, sigma, rays)
-        unanswered = scanner_rays.unanswered(rays, row, column)
+        unanswered = scan_grid_directions.unanswered(rays, row, column)
     return Cloud(
         origin=origin, has_position=known, cell_mm=size, sigma_mm=sigma, sums=merged,
         mean=extraction.scatter(merged)[0], normal=planes.normal[piece_of_merged], planes=planes, ends=ends,

@@ -12,11 +12,11 @@ import numpy as np
 
 from processor.limits import standards
 from processor.model import Floats, Tolerance
-from processor.space_frame.catalogue import Catalogue
+from processor.space_frame.ball_catalogue import Catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.points.sphere_crops import Crops, gather
-from processor.space_frame.spheres import assessment, node_tiles, noise_model, sleeve_radii
+from processor.space_frame.spheres import assessment, node_tiles, noise_estimation, sleeve_radii
 from processor.space_frame.spheres.crop_rays import with_rays
 from processor.space_frame.spheres.final_fit import NodesToFit
 from processor.space_frame.spheres.gauss_newton import CUT_SD, LEAST_COSINE
@@ -33,8 +33,8 @@ from processor.space_frame.spheres.records import (
     StochasticModel,
 )
 from processor.space_frame.spheres.sleeve_radii import AXIS_MM, FLAT_MM, MemberEnds
-from processor.space_frame.spheres.station_scatter import shift_sd
-from processor.space_frame.spheres.view_errors import view_errors
+from processor.space_frame.spheres.station_shift_sd import shift_sd
+from processor.space_frame.spheres.unnamed_view_errors import view_errors
 
 NAN = float("nan")
 MARGIN_MM = 26.0  # of a crop beyond the largest sphere: sleeves are measured there
@@ -144,7 +144,7 @@ def fit_crops(
     offset = (0.0, np.inf)
     if len(catalogue.radii):
         sure = fits.clear
-        offset = noise_model.radius_offset(
+        offset = noise_estimation.radius_offset(
             fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
         )
     views = None
@@ -197,11 +197,11 @@ def _estimated(problem: _Problem, setting: _Setting, fits: Fits, residuals: Resi
     crops, catalogue, threads = problem.crops, problem.catalogue, problem.params.threads
     errors, cosines, weights = residuals
     radii = sleeve_radii.estimated(problem.ends, crops.start, crops.points, fits.states, threads)
-    noise, count = noise_model.noise_model(errors, cosines, crops.ranges, weights, setting.noise)
-    limb = noise_model.limb_cosine(errors, cosines, crops.ranges, weights, noise, setting.least_cosine)
+    noise, count = noise_estimation.noise_model(errors, cosines, crops.ranges, weights, setting.noise)
+    limb = noise_estimation.limb_cosine(errors, cosines, crops.ranges, weights, noise, setting.least_cosine)
     sure, radius_sd, size_weight = fits.clear, setting.radius_sd, setting.size_weight(problem.free)
     if not problem.free:
-        radius_sd = noise_model.radius_scatter(
+        radius_sd = noise_estimation.radius_scatter(
             fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
         )
     # once the fits allow for shifts, their residuals no longer show them

@@ -2,9 +2,9 @@
 
 Two properties of the points about a node distinguish them. A ball's surface lies at one distance from the node, where
 clamps and crossing tubes differ from a sphere by a share of their size. And members of bolted balls narrow to sleeves
-before the ball, so that points lie inside the tube's surface, where a tube that goes on would hide them. Not all frames
-have sleeves: how often nodes of either kind have them is estimated from all nodes. What a node's own points leave open
-is decided by the nodes that its members lead to.
+before the ball: points are found nearer to the axis than the tube's radius, which a continuous tube would hide. Not all
+frames have sleeves: how often nodes of either kind have them is estimated from all nodes. What a node's own points
+leave open is decided by the nodes that its members lead to.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -18,7 +18,7 @@ from numba import njit
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Bools, Floats, Ints
 from processor.space_frame.members.member_extraction import Measured
 from processor.space_frame.points import sphere_crops

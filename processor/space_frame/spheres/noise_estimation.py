@@ -1,7 +1,7 @@
 """Noise of ranges, estimated from the residuals on all spheres, and the scatter of radii about their sizes.
 
-All spheres of a frame are used together, for one sphere has too few points. Values stated for the scanner only start
-the estimate.
+All spheres of a frame are used together, because one sphere has too few points. Values stated for the scanner only
+start the estimate.
 """
 
 from __future__ import annotations
@@ -99,8 +99,9 @@ def limb_cosine(errors: Floats, cosines: Floats, ranges: Floats, weights: Floats
 def radius_scatter(radii: Floats, variances: Floats, sizes: Floats, used_sd: float, stated_sd: float) -> float:
     """Return the most likely standard deviation of radii about their sizes, mm.
 
-    ``radii`` (k,) and ``variances`` (k,) are of fits with a prior of sd ``used_sd``, which is removed first: only the
-    points count. The stated scatter has the weight of ten spheres. Spheres with little information are left out.
+    ``radii`` (k,) and ``variances`` (k,) come from fits with a prior of sd ``used_sd``. The prior is removed first, so
+    that only the points contribute. The stated scatter has the weight of ten spheres. Spheres with little information
+    are left out.
     """
     off, variance = _off_sizes(radii, variances, sizes, used_sd, stated_sd)
     if not len(off):

@@ -1,10 +1,11 @@
 """Supports and deflections of a space frame against the limits of GB 50205 and JGJ 7 (clauses 11.3.6 and 6.11).
 
 Supports are nodes that the design names so. Heights are compared by movement: the difference of two supports' movements
-along z is how much the difference of their heights departs from the design's. Adjacent are two supports if the circle
-over the line between them in plan holds no third one (Gabriel graph), which gives neighbours along an edge as well as
-across a field of columns. A deflection is how far a node has moved down from the plane that fits the supports' own
-movements best, relative to what the design computes for it. Errors of different nodes are taken as independent.
+along z is how much the difference of their heights departs from the design's. Two supports are adjacent if the circle
+whose diameter is the line between them in plan contains no third one (Gabriel graph). This gives neighbours along an
+edge as well as across a field of columns. A deflection is how far a node has moved down from the plane that fits the
+supports' own movements best, relative to what the design computes for it. Errors of different nodes are taken as
+independent.
 """
 
 from __future__ import annotations

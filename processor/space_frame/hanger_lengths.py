@@ -17,8 +17,8 @@ import numpy as np
 from processor.limits import judging, measurands, standards
 from processor.limits.judging import Comparison, JudgedLimits, Measured
 from processor.model import NORMAL_95, Ceiling, Floats, Limit, Scene, Verdict, worst
-from processor.space_frame import plumb_line
-from processor.space_frame.plumb_line import Plan
+from processor.space_frame import mesh_heights
+from processor.space_frame.mesh_heights import Plan
 from processor.space_frame.result import Balls, Evidence, Flag, Hangers, Result, Tubes
 
 PLACES_OF_A_TUBE = 41
@@ -62,7 +62,7 @@ class _Surface:
 
     @classmethod
     def of(cls, ceiling: Ceiling) -> _Surface:
-        return cls(ceiling.level, plumb_line.plan(ceiling.vertices, ceiling.faces) if len(ceiling.faces) else None)
+        return cls(ceiling.level, mesh_heights.plan(ceiling.vertices, ceiling.faces) if len(ceiling.faces) else None)
 
     def heights(self, places: Floats) -> tuple[Floats, Floats]:
         """Height (n,) and slopes (n, 2) at places (n, 2); NaN where there is no ceiling."""

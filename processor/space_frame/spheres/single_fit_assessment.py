@@ -23,7 +23,7 @@ PAPER_RADIUS_ERROR_MM = 3.0  # paper 001, table 2: RANSAC keeps radii within 0-3
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the result, less the cloud's origin; without a sphere it was not found, for the ``reasons``."""
+    """One row of the result, less the cloud's origin; without a sphere it was not found; ``reasons`` state why."""
 
     id: int
     nominal: float

@@ -13,7 +13,7 @@ from functools import cache
 from itertools import pairwise
 from typing import TypeVar
 
-import scipy.linalg  # noqa: F401 - so that its BLAS is limited, too: one that is loaded later is not
+import scipy.linalg  # noqa: F401 - only a BLAS that is loaded already is limited
 from threadpoolctl import threadpool_limits
 
 A = TypeVar("A")

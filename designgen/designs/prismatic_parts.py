@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from designgen.designs.bolting import Bore
+from designgen.designs.bolt_holes import Bore
 from designgen.designs.parametric_face import Patch
 from designgen.designs.sections import Section
 from processor.model import Bools, Floats, Ints
@@ -140,7 +140,7 @@ def walls(
 ) -> list[Patch]:
     """Return walls of a prism along x of T (4, 4) from x0 to x1 over edges of an outline (n, 2), without ``skip``.
 
-    q runs from the end of an edge to its start, for the material lies to the left of an outline.
+    q runs from the end of an edge to its start, because the material lies to the left of an outline.
     """
     p = np.linspace(0.0, 1.0, max(2, int(np.ceil((x1 - x0) / NET_MM)) + 1))
     q, along = np.array([0.0, 1.0]), np.array([x1 - x0, 0.0, 0.0])

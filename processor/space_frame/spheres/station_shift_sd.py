@@ -14,7 +14,7 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.geometry.linalg_small import inverse_of, log_det
-from processor.geometry.parallel import over_ranges
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats
 from processor.space_frame.spheres.gauss_newton import residual, variance
 from processor.space_frame.spheres.records import CropsWithRays, Priors
