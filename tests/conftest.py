@@ -6,6 +6,7 @@ import fcntl
 import gc
 import hashlib
 import json
+import logging
 import os
 import tempfile
 from pathlib import Path
@@ -81,6 +82,19 @@ def bridge(tmp_path):
         write_ply(place / f"design/{name}.ply", (BOX + np.array([4.0 * i, 0, 0])) * 1000.0)
     (place / "design.json").write_text(json.dumps(arch_design()))
     return place
+
+
+@pytest.fixture(autouse=True)
+def log_of_a_command():
+    """Undo what a command that a test has run in this process did to the log: other tests look at its records."""
+    log = logging.getLogger("processor")
+    before = log.propagate, log.level, log.handlers[:]
+    yield
+    for handler in log.handlers[:]:
+        if handler not in before[2]:
+            log.removeHandler(handler)
+            handler.close()
+    log.propagate, log.level = before[:2]
 
 
 @pytest.fixture

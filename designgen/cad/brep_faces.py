@@ -102,8 +102,9 @@ def _frame(position: Any) -> Floats:
     return np.array([*position.Location().Coord(), *(c for direction in directions for c in direction.Coord())])
 
 
-def _sequence(array: Any) -> list[float]:
-    return [array.Value(i) for i in range(array.Lower(), array.Upper() + 1)]
+def _knots(count: int, knot: Callable[[int], float], multiplicity: Callable[[int], int]) -> list[float]:
+    """Return all knots of a spline, one of multiplicity m as m equal ones."""
+    return [knot(i) for i in range(1, count + 1) for _ in range(multiplicity(i))]
 
 
 def _spline(surface: Any) -> Floats:
@@ -113,7 +114,10 @@ def _spline(surface: Any) -> Floats:
         surface.SetUNotPeriodic()
     if surface.IsVPeriodic():
         surface.SetVNotPeriodic()
-    knots = [_sequence(surface.UKnotSequence()), _sequence(surface.VKnotSequence())]
+    knots = [
+        _knots(surface.NbUKnots(), surface.UKnot, surface.UMultiplicity),
+        _knots(surface.NbVKnots(), surface.VKnot, surface.VMultiplicity),
+    ]
     poles = [
         [*(c * surface.Weight(i, j) for c in surface.Pole(i, j).Coord()), surface.Weight(i, j)]
         for i in range(1, surface.NbUPoles() + 1)
@@ -145,7 +149,7 @@ def _curve(adaptor: Any) -> list[float] | None:
             spline = GeomConvert.CurveToBSplineCurve_s(adaptor.Bezier())
         if spline.IsPeriodic():
             spline.SetNotPeriodic()
-        knots = _sequence(spline.KnotSequence())
+        knots = _knots(spline.NbKnots(), spline.Knot, spline.Multiplicity)
         poles = [
             c
             for i in range(1, spline.NbPoles() + 1)

@@ -144,7 +144,7 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[Messag
             np.clip(error, low, high),
             bins=np.linspace(low, high, 31).tolist(),
             histtype="stepfilled",
-            facecolor=(*mpl.colors.to_rgb(COLOURS[k % 4]), 0.35),
+            facecolor=mpl.colors.to_hex((*mpl.colors.to_rgb(COLOURS[k % 4]), 0.35), keep_alpha=True),
             edgecolor=COLOURS[k % 4],
             hatch=HATCHES[k % 4],
             label=run.method,
