@@ -16,6 +16,8 @@ from processor.model import Floats, Ints
 MESH_ERROR_MM = 0.002  # along the curve; the twisted webs of a widening foot are up to twice as far off
 # Corners of a section in order: bottom left and right, top right, two on the edges of the pad, top left.
 OUTER, INNER = 6, 4
+# Strips of facets by the corner that they begin at; those of webs are twisted where the foot widens.
+PADDED_STRIP, OUTER_WEBS, INNER_WEBS = 3, (1, 5), (1, 3)
 
 
 def triangulate(part: ArchPart) -> tuple[Floats, Ints]:
@@ -37,21 +39,22 @@ def triangulate(part: ArchPart) -> tuple[Floats, Ints]:
     n = first_inner + np.arange(len(inner) * INNER).reshape(-1, INNER)
     for k in range(OUTER):
         rows = np.arange(len(outer) - 1)
-        if k == 3:  # the strip that carries the pad
+        if k == PADDED_STRIP:
             rows = np.setdiff1d(rows, padded[:-1])
         after = (k + 1) % OUTER
         corners = (o[rows, k], o[rows, after], o[rows + 1, after], o[rows + 1, k])
-        faces.append(_quads(*corners) if k not in (1, 5) else _twisted(corners, vertices))
+        faces.append(_quads(*corners) if k not in OUTER_WEBS else _twisted(corners, vertices))
     for k in range(INNER):
         after = (k + 1) % INNER
         corners = (n[:-1, k], n[1:, k], n[1:, after], n[:-1, after])
-        faces.append(_quads(*corners) if k not in (1, 3) else _twisted(corners, vertices))
+        faces.append(_quads(*corners) if k not in INNER_WEBS else _twisted(corners, vertices))
     for end, a, b, forward in (("start", o[0], n[0], False), ("end", o[-1], n[-1], True)):
         if part.closed == end:
             faces += [_oriented(_fan(a), forward), _oriented(_fan(b), not forward)]
         else:
             faces.append(_oriented(_ring(a, b), forward))
-    top, pad_faces = _pad(part, out[padded][:, 3:5], o[padded][:, 3:5], sum(map(len, vertices)))
+    under = slice(PADDED_STRIP, PADDED_STRIP + 2)
+    top, pad_faces = _pad(part, out[padded][:, under], o[padded][:, under], sum(map(len, vertices)))
     # In the order above all normals point inward.
     return np.vstack([*vertices, top]), np.vstack([*faces, pad_faces]).astype(np.int64)[:, ::-1]
 

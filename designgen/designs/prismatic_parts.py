@@ -153,34 +153,23 @@ def walls(
 
 def marked(T: Floats, x0: float, x1: float, edge: tuple[Floats, Floats], at: float) -> list[Patch]:
     """Return a wall over an edge at the top of a section, with a pad on its left half at x ``at``."""
-    a, b = edge
-    half = 0.5 * PAD_SIZE_MM
-    middle = np.array([at, a[0] + 0.25 * (b[0] - a[0]), a[1]])
-    a, b = b, a  # as in walls
-    of_pad = (
-        (at + np.array([-half, half]) - x0) / (x1 - x0),
-        np.sort((middle[1] + np.array([-half, half]) - a[0]) / (b[0] - a[0])),
-    )
-    even = np.linspace(0.0, 1.0, max(2, int(np.ceil((x1 - x0) / NET_MM)) + 1))
-    knots = [
-        np.unique([*of[(of < low) | (of > high)], low, high])
-        for of, (low, high) in zip((even, np.array([0.0, 1.0])), of_pad, strict=True)
-    ]
-    inside = [
-        (k[1:] + k[:-1] > 2.0 * low) & (k[1:] + k[:-1] < 2.0 * high)
-        for k, (low, high) in zip(knots, of_pad, strict=True)
-    ]
-    wall = _plane(
-        "top",
-        T,
-        np.array([x0, *a]),
-        np.array([x1 - x0, 0.0, 0.0]),
-        np.array([0.0, *(b - a)]),
-        knots[0],
-        knots[1],
-        ~np.outer(*inside),
-    )
+    b, a = edge  # as in walls
+    half = 0.5 * np.array([-PAD_SIZE_MM, PAD_SIZE_MM])
+    middle = np.array([at, b[0] + 0.25 * (a[0] - b[0]), b[1]])
+    of_pad = ((at + half - x0) / (x1 - x0), np.sort((middle[1] + half - a[0]) / (b[0] - a[0])))
+    along = np.linspace(0.0, 1.0, max(2, int(np.ceil((x1 - x0) / NET_MM)) + 1))
+    p, under_p = _knots_about(along, *of_pad[0])
+    q, under_q = _knots_about(np.array([0.0, 1.0]), *of_pad[1])
+    origin, of_p, of_q = np.array([x0, *a]), np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, *(b - a)])
+    wall = _plane("top", T, origin, of_p, of_q, p, q, ~np.outer(under_p, under_q))
     return [wall, *_pad(T, middle)]
+
+
+def _knots_about(knots: Floats, low: float, high: float) -> tuple[Floats, Bools]:
+    """Return knots with none inside of low to high but these two, and which intervals between knots lie inside."""
+    knots = np.unique([*knots[(knots < low) | (knots > high)], low, high])
+    middle = 0.5 * (knots[1:] + knots[:-1])
+    return knots, (middle > low) & (middle < high)
 
 
 def end_face(T: Floats, x: float, section: Section, name: str) -> list[Patch]:

@@ -400,36 +400,39 @@ def crossings(grid: FacetGrid, starts: Floats, ends: Floats, once: bool) -> tupl
     Lines that start outside of the grid cross none. With ``once``, one crossing of a line is enough. The voxels on a
     line are visited in order (Amanatides and Woo 1987).
     """
+    # Empty lists whose type Numba infers from the element that is not there.
     rows, facets = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
     shares = [0.0 for _ in range(0)]
-    at, step, after, every = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(3)
+    # Of each axis: index of the voxel, its change, share of the line at the voxel's far side, and share per voxel.
+    index, step, leaving, per_voxel = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(3)
     for row in range(len(starts)):
         start, ray = starts[row], ends[row] - starts[row]
-        inside, before, searched = True, 0.0, True
+        inside, entering, searched = True, 0.0, True
         for k in range(3):
             place = (start[k] - grid.low[k]) / grid.size
-            at[k] = int(np.floor(place))
-            inside = inside and 0 <= at[k] < grid.shape[k]
+            index[k] = int(np.floor(place))
+            inside = inside and 0 <= index[k] < grid.shape[k]
             step[k] = 1 if ray[k] > 0.0 else -1
             moves = abs(ray[k]) > 1e-12
-            every[k] = grid.size / abs(ray[k]) if moves else np.inf
-            after[k] = (at[k] + 1 - place if ray[k] > 0.0 else place - at[k]) * every[k] if moves else np.inf
-        while inside and searched and before <= 1.0:
-            voxel = (at[0] * grid.shape[1] + at[1]) * grid.shape[2] + at[2]
-            k = int(np.argmin(after))
-            for index in range(grid.start[voxel], grid.start[voxel + 1]):
-                share = _crossing(grid.corners[grid.facet[index]], start, ray)
-                if 0.0 < share < 1.0 and before <= share < after[k]:  # a facet is in several voxels
+            per_voxel[k] = grid.size / abs(ray[k]) if moves else np.inf
+            to_side = index[k] + 1 - place if ray[k] > 0.0 else place - index[k]
+            leaving[k] = to_side * per_voxel[k] if moves else np.inf
+        while inside and searched and entering <= 1.0:
+            voxel = (index[0] * grid.shape[1] + index[1]) * grid.shape[2] + index[2]
+            k = int(np.argmin(leaving))
+            for entry in range(grid.start[voxel], grid.start[voxel + 1]):
+                share = _crossing(grid.corners[grid.facet[entry]], start, ray)
+                if 0.0 < share < 1.0 and entering <= share < leaving[k]:  # a facet is in several voxels
                     rows.append(row)
-                    facets.append(grid.facet[index])
+                    facets.append(grid.facet[entry])
                     shares.append(share)
                     if once:
                         searched = False
                         break
-            before = after[k]
-            at[k] += step[k]
-            after[k] += every[k]
-            inside = 0 <= at[k] < grid.shape[k]
+            entering = leaving[k]
+            index[k] += step[k]
+            leaving[k] += per_voxel[k]
+            inside = 0 <= index[k] < grid.shape[k]
     return np.array(rows, np.int64), np.array(facets, np.int64), np.array(shares, np.float64)
 
 
