@@ -13,10 +13,9 @@ from functools import cache
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib import font_manager
+from matplotlib import colors, font_manager
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ft2font import FT2Font
 
@@ -29,7 +28,7 @@ HATCHES = ("", "///", "...", "xxx")
 MARKERS = ("o", "^", "s", "D")
 # Orange through grey to blue: safe for colour-blind readers, both ends darker than the middle. The page uses it too.
 DIVERGING_STOPS = ("#7a3300", "#D55E00", "#e4e4e4", "#0072B2", "#00304d")
-DIVERGING = LinearSegmentedColormap.from_list("residual", DIVERGING_STOPS)
+DIVERGING = colors.LinearSegmentedColormap.from_list("residual", DIVERGING_STOPS)
 DECADES_APART = 20.0  # ratio between methods above which the axis is logarithmic
 LEAST_SHOWN_MM = 1e-3
 BEHIND_TEXT = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
@@ -67,6 +66,11 @@ def pdf(pages: Iterable[Figure]) -> bytes:
             document.savefig(page, dpi=DPI)
             page.clear()  # a figure is part of a circle: its points would stay until the next garbage collection
     return out.getvalue()
+
+
+def translucent(colour: str) -> str:
+    """Return a colour for areas that lie on each other, as text: histograms take tuples for a list of colours."""
+    return colors.to_hex((*colors.to_rgb(colour), 0.35), keep_alpha=True)
 
 
 LATIN = "DejaVu Sans"  # comes with Matplotlib

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
 from processor.geometry.m3c2 import Distances
 from processor.language.messages import Message, text
-from processor.report.style import COLOURS, HATCHES, png
+from processor.report.style import COLOURS, HATCHES, png, translucent
 
 
 def histogram(distances: Distances, label: str, unit: str) -> tuple[Message, bytes]:
@@ -26,7 +25,7 @@ def histogram(distances: Distances, label: str, unit: str) -> tuple[Message, byt
         histtype="stepfilled",
         stacked=True,
         label=[f"within the level of detection ({(~beyond).sum()})", f"beyond ({beyond.sum()})"],
-        facecolor=[(*mpl.colors.to_rgb(COLOURS[k]), 0.35) for k in (0, 1)],
+        facecolor=[translucent(COLOURS[k]) for k in (0, 1)],
         edgecolor=COLOURS[:2],
         hatch=HATCHES[:2],
     )

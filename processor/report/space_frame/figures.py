@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
@@ -29,6 +28,7 @@ from processor.report.style import (
     CaptionedPngs,
     png,
     rounded,
+    translucent,
 )
 from processor.robust_statistics import finite_median
 from processor.space_frame.result import LOCATED_FLAGS, Flag, Result
@@ -144,7 +144,7 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[Messag
             np.clip(error, low, high),
             bins=np.linspace(low, high, 31).tolist(),
             histtype="stepfilled",
-            facecolor=mpl.colors.to_hex((*mpl.colors.to_rgb(COLOURS[k % 4]), 0.35), keep_alpha=True),
+            facecolor=translucent(COLOURS[k % 4]),
             edgecolor=COLOURS[k % 4],
             hatch=HATCHES[k % 4],
             label=run.method,
@@ -239,6 +239,6 @@ def _deviations(axes: Axes, sd: Floats, bound: Floats, xlabel: str, ylabel: str)
 
 def _bars(axes: Axes, values: npt.NDArray[np.float64], bins: Floats, label: str, k: int = 0) -> None:
     axes.hist(
-        values, bins=bins.tolist(), histtype="stepfilled", facecolor=(*mpl.colors.to_rgb(COLOURS[k]), 0.35),
+        values, bins=bins.tolist(), histtype="stepfilled", facecolor=translucent(COLOURS[k]),
         edgecolor=COLOURS[k], hatch=HATCHES[k], label=label,
     )  # fmt: skip
