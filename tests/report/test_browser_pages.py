@@ -6,16 +6,12 @@ import pytest
 
 from processor.batch import summary_values
 from processor.report import all_figures, page
-from tests.support.pages import pages
+from tests.support.pages import page_layout, pages
 from tests.support.pages.browser import opened, picture, read_over
 from tests.support.processes.batches import folder, run
 
 BAD = "<script>alert(1)</script>.ply"
 WIDTHS = (1200, 400)
-
-
-def fits(shown):
-    return not shown.evaluate("document.documentElement.scrollWidth > innerWidth")
 
 
 @pytest.mark.parametrize("lang", ["en", "zh"])
@@ -25,7 +21,7 @@ def test_the_index_of_a_batch(tmp_path, lang, width):
     with opened(tmp_path / "index.html", width) as shown:
         assert shown.locator("html").get_attribute("lang") == lang
         assert shown.locator("thead").first.locator("th").count() == 4 + len(summary_values.COLUMNS) - 1
-        assert fits(shown)
+        assert page_layout.faults(shown) == []
 
 
 def test_a_file_named_as_a_script_is_shown_as_text(tmp_path):
@@ -58,7 +54,7 @@ def test_the_pages_of_nights(tmp_path, lang):
         with opened(tmp_path / name, width) as shown:
             assert shown.locator("html").get_attribute("lang") == lang
             assert shown.locator("tbody tr").count() > 2
-            assert fits(shown)
+            assert page_layout.faults(shown) == []
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +71,7 @@ def searched(tmp_path_factory):
 def test_defects_in_space_react(searched, lang, width):
     folder_of, result = searched
     with opened(folder_of / f"{lang}.html", width) as shown:
-        assert fits(shown)
+        assert page_layout.faults(shown) == []
         canvas = shown.locator("canvas.space")
         canvas.scroll_into_view_if_needed()
         first = picture(shown)

@@ -8,6 +8,7 @@ import pytest
 from processor.evaluation.evaluate import ErrorReport
 from processor.report import all_figures, page
 from processor.results import to_json
+from tests.support.pages import page_layout
 from tests.support.pages.browser import opened, picture, read_over
 from tests.support.pages.report_pages import BAD, rendered
 from tests.support.results.ball_results import of_frame
@@ -46,7 +47,7 @@ def test_a_bridge_in_space_reacts(tmp_path, width):
         assert picture(shown) != turned
         names = shown.locator(".live fieldset label").all_text_contents()
         assert [name.strip() for name in names] == [BAD, "rib1", "foot2"]
-        assert not shown.evaluate("document.documentElement.scrollWidth > innerWidth")
+        assert page_layout.faults(shown) == []
 
 
 def test_a_point_of_the_bridge_can_be_read(tmp_path):
@@ -56,6 +57,23 @@ def test_a_point_of_the_bridge_can_be_read(tmp_path):
         shown.locator("canvas.space").scroll_into_view_if_needed()
         picture(shown)
         assert any("mm from the design at" in one for one in read_over(shown, 40, (0.4, 0.5, 0.6)))
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_everything_on_the_page_of_a_frame_can_be_reached(tmp_path, width):
+    path = tmp_path / "r.html"
+    path.write_text(rendered(of_frame()[0]), "utf-8")
+    with opened(path, width) as shown:
+        assert page_layout.faults(shown) == []
+
+
+@pytest.mark.parametrize("rule", ["overflow: hidden", "overflow: visible"])
+def test_a_table_without_a_scroll_bar_is_a_fault_of_the_page(tmp_path, rule):
+    path = tmp_path / "r.html"
+    path.write_text(rendered(of_bridge()), "utf-8")
+    with opened(path, 390) as shown:
+        shown.add_style_tag(content=f".scroll {{ {rule} !important }}")
+        assert page_layout.faults(shown) != []
 
 
 def test_balls_in_space_react_and_their_table_holds_the_results(tmp_path):

@@ -18,6 +18,7 @@ from processor.report import table as report_table
 from processor.results import to_json
 from processor.scan_folder.folder import read_input
 from processor.store import store
+from tests.support.pages import page_layout
 from tests.support.pages.browser import opened
 from tests.support.pages.report_pages import BAD, Page, rendered
 from tests.support.results.bridge_results import of_bridge
@@ -160,7 +161,7 @@ def test_the_first_screen_has_headline_and_verdict(tmp_path, width, height):
             box = shown.locator(at).bounding_box()
             assert box["y"] + box["height"] < 0.6 * height
         assert shown.locator(".banner strong").inner_text() == "FAIL"
-        assert not shown.evaluate("document.documentElement.scrollWidth > innerWidth")
+        assert page_layout.faults(shown) == []
 
 
 # --- characteristics ---
