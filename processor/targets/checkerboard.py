@@ -277,7 +277,9 @@ def _fitted(plane: _Plane, intensity: Floats, start: Floats, side: float) -> Che
     if _goes_on(u, v, intensity, abs(float(fit.x[4])), side) or float(np.sqrt((plane.off[rows] ** 2).mean())) > FLAT_MM:
         return None
     sampling = [_sampling_sd(d, other, spacing, float(fit.x[5])) for d, other in ((u, v), (v, u))]
-    return _placed(plane, plane.off[rows], fit, np.array(sampling), explained)
+    inner_u, inner_v = _lines(at, found)
+    across = _plane_sd(plane.off[rows], inner_u * inner_v > 0.0)
+    return _placed(plane, plane.off[rows], fit, np.array([*sampling, across]), explained)
 
 
 def _inside(at: Floats, centre_turn: Floats, reach: float) -> Bools:
@@ -376,11 +378,24 @@ def _sampling_sd(d: Floats, other: Floats, spacing: float, width: float) -> floa
     return float(np.sqrt(common + misplaced(np.array([spacing]))[0] ** 2 / rows))
 
 
-def _placed(plane: _Plane, off: Floats, fit: Any, sampling: Floats, explained: float) -> Checkerboard | None:
+def _plane_sd(off: Floats, first: Bools) -> float:
+    """Return the sd of the plane's place across it, by distances (m,) of points on the first or the other fields.
+
+    Many scanners measure other ranges to dark fields than to bright ones. The plane lies midway, and which colour is
+    right is not known: half of the difference, as far as it exceeds the noise, counts as a standard deviation.
+    """
+    mean_variance = float((off**2).mean()) / len(off)
+    fields = (off[first], off[~first])
+    noise = sum(float(one.var()) / len(one) for one in fields)
+    difference = float(fields[0].mean() - fields[1].mean())
+    return float(np.sqrt(mean_variance + max(difference**2 - noise, 0.0) / 4.0))
+
+
+def _placed(plane: _Plane, off: Floats, fit: Any, sd: Floats, explained: float) -> Checkerboard | None:
     """Return the target in space; its covariance is that of fit and sampling in the plane, and of the plane across it.
 
-    ``sampling`` (2,) are standard deviations across the two lines. Errors that all points of a view share are not
-    contained, nor is a difference of the ranges to dark and to bright fields.
+    ``sd`` (3,) are standard deviations of the sampling across the two lines, and of the plane. Errors that all points
+    of a view share are not contained.
     """
     J, residual, found = fit.jac, fit.fun, fit.x[:3]
     variance = float(residual @ residual) / max(len(residual) - J.shape[1], 1)
@@ -393,8 +408,8 @@ def _placed(plane: _Plane, off: Floats, fit: Any, sampling: Floats, explained: f
     c, s = np.cos(found[2]), np.sin(found[2])
     across = np.array([[c, s], [-s, c]])
     local = np.zeros((3, 3))
-    local[:2, :2] = in_plane + across.T @ np.diag(sampling**2) @ across
-    local[2, 2] = float((off**2).mean()) / len(off)
+    local[:2, :2] = in_plane + across.T @ np.diag(sd[:2] ** 2) @ across
+    local[2, 2] = sd[2] ** 2
     axes = plane.axes
     centre = plane.middle + found[:2] @ axes[:2] + off.mean() * axes[2]
     return Checkerboard(centre=centre, covariance=axes.T @ local @ axes, points=len(off), fit=explained)

@@ -56,6 +56,21 @@ def test_standard_deviations_agree_with_the_errors_of_targets():
     assert 0.4 < np.mean(squares) / 3.0 < 1.9
 
 
+@pytest.mark.parametrize("longer_mm", [2.0, -3.0])
+def test_a_difference_of_ranges_to_dark_and_bright_fields_is_in_the_interval(longer_mm):
+    """Whichever colour has the right ranges: the centre lies midway, and both planes are within 1.96 sd."""
+    points, intensity, centre = board(np.random.default_rng(7), side=SIDE)
+    dark = intensity < 0.5 * (intensity.min() + intensity.max())
+    (equal,) = boards_in(points, intensity)
+    ranges = np.linalg.norm(points, axis=1)
+    (one,) = boards_in(points * (1.0 + dark * longer_mm / ranges)[:, None], intensity)
+    ray = centre / np.linalg.norm(centre)
+    sd, before = (float(np.sqrt(ray @ found.covariance @ ray)) for found in (one, equal))
+    for plane in (0.0, longer_mm):
+        assert abs(float(ray @ (one.centre - centre)) - plane) < 1.96 * sd
+    assert before < 0.3 < 0.45 * abs(longer_mm) < sd < 0.6 * abs(longer_mm)
+
+
 def test_slopes_of_the_pattern_are_those_of_finite_differences():
     at = np.random.default_rng(4).uniform(-40.0, 40.0, (50, 2))
     x = np.array([3.0, -5.0, 0.4, 0.5, 0.3, 12.0])
