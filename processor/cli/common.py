@@ -37,6 +37,13 @@ def print_error_line(line: str, level: int = logging.INFO) -> None:
     log_line(line, level)
 
 
+def default_output(name: str, quiet: bool = False) -> Path:
+    """Return a folder of the current one for results where -o names none, and print it."""
+    if not quiet:
+        print_error_line(f"results go to {name}, as -o names no folder")
+    return Path(name)
+
+
 def log_line(line: str, level: int = logging.INFO) -> None:
     """Write one line to the log file alone, if there is one."""
     LOG.log(level, "%s", printable(line))

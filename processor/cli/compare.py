@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from processor.cli.common import LANGUAGES, cluster_option, debug_option, print_error_line
+from processor.cli.common import LANGUAGES, cluster_option, debug_option, default_output, print_error_line
 
 LENGTH = click.FloatRange(min=0.0, min_open=True)
 FILE = click.Path(path_type=Path)
@@ -34,7 +34,7 @@ class _Diameters(click.Command):
 @click.command(cls=_Diameters)
 @click.argument("reference", type=FILE)
 @click.argument("compared", type=FILE)
-@click.option("-o", "--output", required=True, type=FILE, help="folder of the results")
+@click.option("-o", "--output", type=FILE, help="folder of the results  [default: REFERENCE-COMPARED-comparison]")
 @click.option("--core", type=FILE, help="cloud of core points  [default: every point of REFERENCE]")
 @click.option("--normal-diameter", type=LENGTH, help="diameter of the sphere in which a normal is fitted")
 @click.option("--projection-diameter", type=LENGTH, help="diameter of the cylinder along the normal")
@@ -50,7 +50,7 @@ class _Diameters(click.Command):
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @click.option("--json", "as_json", is_flag=True, help="print compare.json")
 @debug_option
-def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: bool, **options: Any) -> None:
+def compare(reference: Path, compared: Path, output: Path | None, lang: str, as_json: bool, **options: Any) -> None:
     """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
 
     All lengths are in the unit of the clouds, with --units in that of REFERENCE; those not given are derived from the
@@ -68,6 +68,7 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
     for path in (reference, compared):
         if not path.exists():
             raise missing(path)
+    output = output or default_output(f"{reference.stem}-{compared.stem}-comparison")
     cloud_comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
     address = options.pop("cluster")
     given = {name: value for name, value in options.items() if value is not None}

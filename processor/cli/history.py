@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from processor.cli.common import LANGUAGES, Shown, debug_option, log_line, output_options, print_error_line
+from processor.cli.common import LANGUAGES, Shown, debug_option, default_output, log_line, output_options
 
 
 @click.command()
@@ -29,10 +29,7 @@ def history(root: Path, output: Path | None, lang: str, **options: bool) -> None
     from processor.report.epochs import lines, tables, write
 
     shown = Shown(**options)
-    if output is None:
-        output = Path(f"{root.resolve().name}-history")
-        if not shown.quiet:
-            print_error_line(f"results go to {output}, as -o names no folder")
+    output = output or default_output(f"{root.resolve().name}-history", shown.quiet)
     write.check_output(output, root)
     found = compare.compare(epoch.read(root))
     write.write(output, found, lang)

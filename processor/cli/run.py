@@ -14,6 +14,7 @@ from processor.cli.common import (
     Shown,
     cluster_option,
     debug_option,
+    default_output,
     fail_on_option,
     form_options,
     forms,
@@ -63,10 +64,7 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
     if not input_.exists():
         raise missing(input_)
     further = forms(options["pdf"], options["xlsx"])
-    if output is None:
-        output = _default_output(input_)
-        if not shown.quiet:
-            print_error_line(f"results go to {output}, as -o names no folder")
+    output = output or default_output(_default_name(input_), shown.quiet)
     limits = options.pop("timeout_s"), options.pop("memory_mb")
     if any(limit is not None for limit in limits):
         context.exit(limited_run(input_, output, *limits, _arguments({**options, "fail_on": fail_on})))
@@ -90,15 +88,15 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
     show_results(context, output, results, shown, fail_on)
 
 
-def _default_output(input_: Path) -> Path:
-    """Return the folder of results of an input in the current folder.
+def _default_name(input_: Path) -> str:
+    """Return the name of the folder of results of an input.
 
     Raises UsageError where it holds results of an input of another name.
     """
     name = input_.resolve().name
-    output = Path(f"{Path(name).stem if input_.is_file() else name}-results")
+    output = f"{Path(name).stem if input_.is_file() else name}-results"
     try:
-        made_of = str(json.loads((output / RESULTS_JSON).read_text("utf-8")).get("input", name))
+        made_of = str(json.loads(Path(output, RESULTS_JSON).read_text("utf-8")).get("input", name))
     except (OSError, ValueError, AttributeError):
         return output
     if made_of != name:

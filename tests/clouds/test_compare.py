@@ -173,6 +173,14 @@ def wall(seed, off=0.0, count=6000):
     return np.column_stack([x, off + rng.normal(0.0, 0.002, count), z])
 
 
+def test_results_go_to_a_folder_named_after_both_clouds_if_none_is_named(clouds, tmp_path, monkeypatch, capsys):
+    first, second, core = clouds
+    monkeypatch.chdir(tmp_path)
+    assert called(monkeypatch, first.name, second.name, "--core", core.name) == 0
+    assert (tmp_path / "first-second-comparison/compare.json").is_file()
+    assert "results go to first-second-comparison" in capsys.readouterr().err
+
+
 def test_distances_of_a_moved_upright_wall_have_one_sign(tmp_path, monkeypatch, capsys):
     first, second = written(tmp_path / "a.xyz", wall(1)), written(tmp_path / "b.xyz", wall(2, 0.05))
     assert called(monkeypatch, first, second, "-o", tmp_path / "out") == 0
