@@ -272,13 +272,12 @@ def _fitted(plane: _Plane, intensity: Floats, start: Floats, side: float) -> Che
     u, v = _lines(plane.at, found)
     residual = fit.fun
     explained = 1.0 - float((residual**2).mean() / bright.var())
-    if explained < EXPLAINED or not _has_fields(*_lines(at, found), bright, WITHIN * side, spacing):
+    if explained < EXPLAINED or not _has_fields(u[rows], v[rows], bright, WITHIN * side, spacing):
         return None
     if _goes_on(u, v, intensity, abs(float(fit.x[4])), side) or float(np.sqrt((plane.off[rows] ** 2).mean())) > FLAT_MM:
         return None
     sampling = [_sampling_sd(d, other, spacing, float(fit.x[5])) for d, other in ((u, v), (v, u))]
-    inner_u, inner_v = _lines(at, found)
-    across = _plane_sd(plane.off[rows], inner_u * inner_v > 0.0)
+    across = _plane_sd(plane.off[rows], u[rows] * v[rows] > 0.0)
     return _placed(plane, plane.off[rows], fit, np.array([*sampling, across]), explained)
 
 
