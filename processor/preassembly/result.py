@@ -186,7 +186,7 @@ class Rivals(Rows):
 
 @dataclass(frozen=True)
 class Residuals(Rows):
-    """Points of all components, thinned, on the design, bridge frame, and their distances from its surface, mm."""
+    """Places on all components, bridge frame, and distances from the design there, medians of nearby points, mm."""
 
     points: Floats = column("p", 3, unit="mm")
     distance: Floats = column("p", unit="mm")

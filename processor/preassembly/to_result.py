@@ -209,9 +209,9 @@ def _adjustment(assembly: Assembly) -> Adjustment:
         rivals=Rivals(component=tuple(parts[i].name for i in ambiguous), T_rival_scan=T_rival[ambiguous]),
         budget_sd=_budget(parts, assembly.design, assembly.params.systematic),
         residuals=Residuals(
-            points=np.vstack([part.residual_points for part in parts]),
-            distance=np.concatenate([part.residuals for part in parts]),
-            component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals) for p in parts]),
+            points=np.vstack([part.residuals.places for part in parts]),
+            distance=np.concatenate([part.residuals.distance for part in parts]),
+            component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals.distance) for p in parts]),
         ),
         loops=assembly.loops,
         shapes=tuple(_shapes(parts, assembly.design)),

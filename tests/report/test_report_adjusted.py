@@ -328,6 +328,22 @@ def test_parts_unroll_face_by_face():
     np.testing.assert_allclose(flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0], atol=0.01)
 
 
+def map_of(values):
+    return residual_map.PartMap("rib", None, values, None, None, values.ravel(), np.zeros((values.size, 3)))
+
+
+def test_noise_has_no_colour_on_maps_of_residuals():
+    """Of cells that differ by chance alone 95 % are grey; a slow bow does not widen the grey band."""
+    rng = np.random.default_rng(4)
+    noise, bow = rng.normal(0.0, 0.2, (40, 120)), 3.0 * np.sin(np.linspace(0.0, np.pi, 120))
+    for values in (noise, noise + bow):
+        band = residual_map.scatter_band([map_of(values)])
+        assert (np.abs(noise) < band.high).mean() == pytest.approx(0.95, abs=0.02), "three sds of a MAD of 4,760"
+        assert band.low == -band.high
+    levels = residual_map.colour_steps([map_of(noise)], residual_map.scatter_band([map_of(noise)]))[2]
+    assert levels[-1] > 1.9 * band.high, "colours begin pale"
+
+
 def test_numbers_of_large_gaps_fit_their_frames_and_missing_gaps_are_stated(monkeypatch):
     figures_made = []
 

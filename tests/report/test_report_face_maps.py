@@ -6,8 +6,9 @@ import pytest
 from processor.geometry.m3c2 import Distances
 from processor.language.messages import text
 from processor.model import Limit, Scene, Tolerance
+from processor.report.charts import stepped_colours
+from processor.report.charts.stepped_colours import Band
 from processor.report.deviation import face_maps, section
-from processor.report.deviation.face_maps import Band
 from processor.report.style import default_settings
 
 
@@ -50,16 +51,16 @@ def test_the_two_sides_of_a_plate_are_two_faces_and_a_gap_parts_one():
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_allowed_band_is_one_colour_step_and_the_other_levels_are_round(scale):
     band = Band(-1.0 * scale, 2.0 * scale, text("allowed"))
-    norm, colours, levels = face_maps.steps(scale * np.linspace(-9.0, 9.0, 1001), band)
+    norm, colours, levels = stepped_colours.stepped_colours(scale * np.linspace(-9.0, 9.0, 1001), band)
     assert levels == sorted(levels)
-    assert len(levels) == 2 * (face_maps.STEPS + 1)
+    assert len(levels) == 2 * (stepped_colours.STEPS + 1)
     assert {-1.0 * scale, 2.0 * scale} <= set(levels)
     grey = colours(norm(0.0))
     assert len(set(np.round(grey[:3], 3))) == 1
     assert colours(norm(1.9 * scale)) == grey != colours(norm(2.1 * scale))
     assert colours(norm(-0.9 * scale)) == grey != colours(norm(-1.1 * scale))
     assert 9.0 * scale <= levels[-1] <= 12.0 * scale
-    steps = np.diff(levels[face_maps.STEPS + 2 :]) / scale
+    steps = np.diff(levels[stepped_colours.STEPS + 2 :]) / scale
     np.testing.assert_allclose(steps, steps[0])
     assert np.isclose(steps[0] / 10.0 ** np.floor(np.log10(steps[0])), [1.0, 2.0, 5.0], rtol=1e-6).any()
 

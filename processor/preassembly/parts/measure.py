@@ -12,7 +12,7 @@ from processor.adjustment import variance_components
 from processor.adjustment.point_groups import joined_numbers
 from processor.geometry import box_girder_mesh, rigid
 from processor.geometry.lines_and_polylines import Polyline
-from processor.geometry.mesh_distance import MeshSurface, on_face
+from processor.geometry.mesh_distance import on_face
 from processor.geometry.thinning import by_cell, thinned
 from processor.model import DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly import topology
@@ -26,6 +26,7 @@ from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import assignment, attitude, contradictions, identity, systematic_errors
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.part_in_chain import Member
+from processor.preassembly.parts.part_residuals import PartResiduals, part_residuals
 from processor.registration import icp, main_body, surface_registration
 from processor.robust_statistics import MAD_TO_SD
 
@@ -38,7 +39,6 @@ ACROSS = 0.7  # cosine to the part's axis, below which a normal is of the part's
 LEAST_COVERED = 0.7
 RIGHT_PART = (reason("preassemble.right-part"),)
 AT_PART_MM = 60.0  # of the design, at which points of the ground may be of the part
-RESIDUALS = 4_000  # points of a part whose distances from the design are kept
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,7 @@ class MeasuredPart:
     member: Member
     shrink: float  # lengths at the reference temperature by lengths as scanned
     T_rival: Floats  # (4, 4) of an ambiguous part: the other pose that fits as well; NaN of others
-    residual_points: Floats  # (r, 3) of the scan, thinned, on the design
-    residuals: Floats  # (r,) from the design's surface, outward
+    residuals: PartResiduals
     identities: tuple[ScanParts, ...] = ()  # of its scans
     outer: OuterEnd | None = None  # of the first and the last part of a row
     T_further_scans: tuple[Floats, ...] = ()
@@ -167,7 +166,7 @@ def fit(
         member=Member((None,) * len(joints), edges, part.vertices.mean(axis=0), registered.pose),
         shrink=shrink,
         T_rival=first.attitude.T_rival,
-        **_residuals(registered.points, shape.mesh),
+        residuals=part_residuals(registered.points, shape.mesh),
         identities=_identities(placed, part),
         outer=outer,
         T_further_scans=tuple(scan.registration.T_design_scan for scan in used[1:]),
@@ -453,14 +452,6 @@ def _covered(points: Floats, T: Floats, shape: attitude.Surface) -> float:
     return float((counts > LEAST_OF_TYPICAL * np.median(counts[counts > 0.0])).mean()) if counts.any() else 0.0
 
 
-def _residuals(points: Floats, surface: MeshSurface) -> dict[str, Floats]:
-    """Thinned points (r, 3) and their distances (r,) from the design's surface, as fields of MeasuredPart."""
-    points = thinned(points, RESIDUALS)
-    face, distance, beyond = surface.distances(points, 60.0)
-    near = on_face(face, beyond)
-    return {"residual_points": points[near], "residuals": distance[near]}
-
-
 def _resemblance(points: Floats, index: int, shapes: attitude.Shapes) -> tuple[Reason, ...]:
     """State which parts of the design have the size of the scan, unless the part itself is one."""
     alike = assignment.of_size(points, shapes)
@@ -483,8 +474,7 @@ def _failed(part: DesignPart, joints: Sequence[int | None], placed: Sequence[_Pl
         member=Member((None,) * len(joints), edges, part.vertices.mean(axis=0), np.zeros((6, 6))),
         shrink=shrink,
         T_rival=nowhere,
-        residual_points=np.empty((0, 3)),
-        residuals=np.empty(0),
+        residuals=PartResiduals(np.empty((0, 3)), np.empty(0)),
         identities=_identities(placed, part),
     )
     ends = tuple(None if joint is None else joint_end.unknown(*why) for joint in joints)

@@ -44,13 +44,14 @@ def surface_view_data(
     regions: Sequence[Region] = (),
     region_of: Ints | None = None,
     named: bool = True,
+    grey: float = 0.0,
 ) -> dict[str, Any] | None:
     """Return what the page draws of points (n, 3) with values (n,), mm; None where there are no values.
 
     ``parts`` are names with the rows of their points, which can be switched off; if not ``named`` by files, the names
     are translated. ``marks`` belong to the last part: dicts with name, at (3,), radius and text. Of ``regions`` the
     first are outlined, each with a mark and a tick to switch it; ``region_of`` (n,) is the row of each point's region,
-    -1 = none.
+    -1 = none. Values below ``grey`` may be noise and are drawn without a colour.
     """
     finite = np.isfinite(values)
     if not finite.any():
@@ -72,10 +73,7 @@ def surface_view_data(
         )
     if marks:
         drawn.append({"text": text("defects"), "edges": [], "points": [], "residual": []})
-    shown = [
-        {**mark, "part": len(drawn) - 1, "tone": 1, "at": np.round(np.asarray(mark["at"]) - origin, 1)}
-        for mark in marks
-    ]
+    shown = [_mark(mark, len(drawn) - 1, origin) for mark in marks]
     lines, spots, places = _outlined(regions, origin, len(drawn))
     data = {
         "title": title,
@@ -85,7 +83,8 @@ def surface_view_data(
         "origin": origin,
         "stops": DIVERGING_STOPS,
         "tones": TONES,
-        "limit": colour_limit(values),
+        "limit": max(colour_limit(values), 2.0 * grey),
+        "grey": grey,
         "spacing": spacing(points[finite][::step]),
         "parts": drawn + lines,
         "marks": shown + spots,
@@ -94,6 +93,11 @@ def surface_view_data(
     }
     made: dict[str, Any] = json_ready(data)
     return made
+
+
+def _mark(mark: dict[str, Any], part: int, origin: Floats) -> dict[str, Any]:
+    """Return a mark of the part in row ``part``, about the view's origin."""
+    return {**mark, "part": part, "tone": 1, "at": np.round(np.asarray(mark["at"]) - origin, 1)}
 
 
 def spacing(points: Floats) -> float:

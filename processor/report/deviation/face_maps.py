@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
+from matplotlib.colors import BoundaryNorm, Colormap
 from matplotlib.figure import Figure
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 from scipy.sparse import coo_matrix
@@ -21,7 +21,8 @@ from scipy.spatial import cKDTree
 from processor.geometry.m3c2 import Distances
 from processor.language.messages import Message, text
 from processor.model import Bools, Floats, Ints
-from processor.report.style import DIVERGING, png
+from processor.report.charts.stepped_colours import Band, stepped_colours
+from processor.report.style import png
 
 AXES = "xyz"
 MOST_PANELS, LEAST_SHARE = 8, 0.01  # a panel with less of the core points is not drawn
@@ -31,19 +32,6 @@ NEIGHBOURS, SPARSEST, SAMPLE = 3, 0.9, 5_000  # of spacing: the third neighbour,
 LONG = 0.4  # height by width below which panels are put one below the other
 FEWEST = 12  # core points with a value of a face that is drawn
 OVERLAP = 0.05  # share of a face that may lie over another of its panel
-LEAST_BAND = 1e-3  # of a step of colour
-STEPS = 4  # of colour beyond the band, to either side
-COLOUR_QUANTILE = 0.995
-WITHIN = "#e9e9e9"
-
-
-@dataclass(frozen=True)
-class Band:
-    """Deviations drawn without a colour, from ``low`` to ``high``, and what they are."""
-
-    low: float
-    high: float
-    name: Message
 
 
 @dataclass(frozen=True)
@@ -64,7 +52,7 @@ def face_maps(
     label, unit = labelled
     known = np.isfinite(distances.lod95)
     panels, left_out = _panels(core, normals, known)
-    norm, colours, levels = steps(distances.distance[known], band)
+    norm, colours, levels = stepped_colours(distances.distance[known], band)
     figure, all_axes = _layout(panels, core)
     spots = _extremes(distances.distance, known)
     for axes, panel in zip(all_axes, panels, strict=False):
@@ -99,29 +87,6 @@ def not_sure(distances: Distances, unit: str) -> Band:
     half = float(np.median(known)) if len(known) else 0.0
     name = text("below the median level of detection, {half:.2g}{unit}", half=half, unit=_in(unit))
     return Band(-half, half, name)
-
-
-def steps(values: Floats, band: Band) -> tuple[BoundaryNorm, Colormap, list[float]]:
-    """Return the steps of colour: one for the band, STEPS to either side up to the largest values, and beyond."""
-    sizes = np.abs(values[np.isfinite(values)])
-    largest = float(np.quantile(sizes, COLOUR_QUANTILE)) if len(sizes) else 0.0
-    widest = max(abs(band.low), abs(band.high), 1e-9)
-    wanted = max(largest - widest, widest) / STEPS
-    ten = 10.0 ** np.floor(np.log10(wanted))
-    step = float(next(ten * one for one in (1.0, 2.0, 5.0, 10.0) if ten * one >= wanted * (1.0 - 1e-9)))
-    least = LEAST_BAND * step if band.high - band.low < LEAST_BAND * step else 0.0  # clouds without noise have no band
-    up, down = _multiples(band.high + least, step), [-level for level in _multiples(least - band.low, step)]
-    outer = np.linspace(0.0, 0.42, STEPS + 1), np.linspace(0.58, 1.0, STEPS + 1)
-    colours: Colormap = ListedColormap([*DIVERGING(outer[0][1:]), WITHIN, *DIVERGING(outer[1][:-1])])
-    colours = colours.with_extremes(under=DIVERGING(0.0), over=DIVERGING(1.0))
-    levels = [*reversed(down), *up]
-    return BoundaryNorm(levels, len(levels) - 1), colours, levels
-
-
-def _multiples(bound: float, step: float) -> list[float]:
-    """Return a bound and the next STEPS multiples of ``step`` beyond it, none close to it."""
-    first = np.floor(bound / step + 0.25) + 1.0
-    return [bound, *(float((first + k) * step) for k in range(STEPS))]
 
 
 def spacing(points: Floats) -> float:

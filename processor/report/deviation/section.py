@@ -14,8 +14,8 @@ from processor.language.messages import Message, text
 from processor.model import Ints, Scene, Status, StepRun
 from processor.pipeline import Execution
 from processor.report.charts import surface_view
+from processor.report.charts.stepped_colours import Band
 from processor.report.deviation import core_points_csv, face_maps, figures
-from processor.report.deviation.face_maps import Band
 from processor.report.step_report import StepReport
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table, figures_of
@@ -96,7 +96,13 @@ def _live(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     points = core.points + runs[0].result.origin
     everything: Ints = np.arange(len(points), dtype=np.int64)
     return surface_view.surface_view_data(
-        text("Deviation in space"), runs[0].method, points, core.distance, [("surface", everything)], named=False
+        text("Deviation in space"),
+        runs[0].method,
+        points,
+        core.distance,
+        [("surface", everything)],
+        named=False,
+        grey=face_maps.not_sure(core.distances, "mm").high,
     )
 
 

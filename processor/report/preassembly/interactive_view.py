@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from processor.language.messages import text
 from processor.model import KEY_POINTS, Floats, Scene, StepRun
-from processor.preassembly.result import Residuals, Result
+from processor.preassembly.result import Result
+from processor.report.preassembly import residual_map
 from processor.report.preassembly.part_lines import part_lines
-from processor.report.style import DIVERGING_STOPS, colour_limit
+from processor.report.preassembly.residual_map import PartMap
+from processor.report.style import DIVERGING_STOPS
 from processor.report.table import shown
 from processor.store.json_values import json_ready
 
@@ -26,16 +27,19 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
     if scene.arch is None or not scene.arch.parts:
         return None
     result: Result = runs[0].result
-    residuals = Residuals() if result.adjustment is None else result.adjustment.residuals
+    drawn = residual_map.maps(scene, result)
+    points = sum(len(one.points) for one in drawn)
+    of_name = {one.name: one for one in drawn}
+    band = residual_map.scatter_band(drawn)
     trade = result.trade_off
     view = {
-        "title": text("Gaps and residuals in space") if len(residuals) else text("Gaps in space"),
+        "title": text("Gaps and residuals in space") if drawn else text("Gaps in space"),
         "arrows": text("gaps as arrows"),
         "values": text("residuals"),
         "method": runs[0].method,
         "keys": KEY_POINTS,
         "stops": DIVERGING_STOPS,
-        "parts": [_part(scene, result, residuals, i) for i in range(len(scene.arch.parts))],
+        "parts": [_part(scene, i, of_name, points) for i in range(len(scene.arch.parts))],
         "joints": [
             {
                 "name": shown(name),
@@ -46,7 +50,8 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
             }
             for j, name in enumerate(result.joints.name)
         ],
-        "limit": colour_limit(residuals.distance) if np.isfinite(residuals.distance).any() else 1.0,
+        "limit": residual_map.colour_steps(drawn, band)[2][-1] if drawn else 1.0,
+        "grey": band.high,
         "linear": [
             _linear(run)
             for k, run in enumerate(runs)
@@ -65,25 +70,18 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
     return made
 
 
-def _part(scene: Scene, result: Result, residuals: Residuals, i: int) -> dict[str, Any]:
+def _part(scene: Scene, i: int, drawn: dict[str, PartMap], points: int) -> dict[str, Any]:
+    """Return the lines of a part, and its share of MOST_POINTS of all ``points`` with the medians of their cells."""
     assert scene.arch is not None
-    part = scene.arch.parts[i]
-    step = max(1, -(-len(residuals) // MOST_POINTS))
-    rows = np.flatnonzero(_of_component(result, residuals, part.name))[::step]
-    return {
-        "name": shown(part.name),
-        "edges": [np.round(_thinned(edge), 1) for edge in part_lines(scene.arch, i)],
-        "points": np.rint(residuals.points[rows]).astype(int).ravel(),
-        "residual": np.round(residuals.distance[rows], 3),
+    name = scene.arch.parts[i].name
+    part = {"name": shown(name), "edges": [np.round(_thinned(edge), 1) for edge in part_lines(scene.arch, i)]}
+    if name not in drawn:
+        return part | {"points": [], "residual": []}
+    rows = slice(None, None, max(1, -(-points // MOST_POINTS)))
+    return part | {
+        "points": np.rint(drawn[name].points[rows]).astype(int).ravel(),
+        "residual": np.round(drawn[name].of_points[rows], 3),
     }
-
-
-def _of_component(result: Result, residuals: Residuals, name: str) -> npt.NDArray[np.bool_]:
-    """Mark (p,) the residuals of a part."""
-    if name not in result.components.name:
-        return np.zeros(len(residuals), bool)
-    of_part = residuals.component == result.components.name.index(name)
-    return np.asarray(of_part & np.isfinite(residuals.distance), bool)
 
 
 def _thinned(edge: Floats) -> Floats:

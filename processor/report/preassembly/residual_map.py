@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, Colormap
 from matplotlib.figure import Figure
 
+from processor.geometry.m3c2 import Z95
 from processor.language.messages import Message, text
 from processor.model import DesignPart, Floats, Scene
-from processor.preassembly.result import Residuals, Result
-from processor.report.style import DIVERGING, LEAST_SHOWN_MM, png, printable_name
+from processor.preassembly.result import Result
+from processor.report.charts.stepped_colours import Band, stepped_colours
+from processor.report.style import LEAST_SHOWN_MM, png, printable_name
+from processor.robust_statistics import MAD_TO_SD
 
 FACES = ("bottom", "right", "top", "left")
 MOST_PARTS = 24
@@ -28,6 +33,22 @@ class Unrolled:
     along: Floats
     around: Floats
     edges: Floats  # (5,) where the four faces begin and the last ends
+
+
+@dataclass(frozen=True)
+class PartMap:
+    """Distances of a part from its design: medians ``values`` (rows, columns) of the cells between ``x`` and ``y``, m.
+
+    NaN where no point lies. ``points`` (n, 3) of the part have the medians ``of_points`` (n,) of their cells.
+    """
+
+    name: str
+    flat: Unrolled
+    values: Floats
+    x: Floats
+    y: Floats
+    of_points: Floats
+    points: Floats
 
 
 def unroll(part: DesignPart, points: Floats) -> Unrolled:
@@ -73,8 +94,8 @@ def _heights(along: Floats, up: Floats, length: float) -> Floats:
     return heights
 
 
-def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats]:
-    """Medians (across, along) of the values in cells, NaN where there is none, and the cells' limits."""
+def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Medians (across, along) of values (n,) in cells, NaN where there is none, the cells' limits, and medians (n,)."""
     length, girth = max(float(np.ptp(flat.along)), 1e-6), float(flat.edges[-1])
     total = max(len(values) / POINTS_A_CELL, 16.0)
     columns = int(np.clip(math.sqrt(total * length / girth), 4, 120))
@@ -87,47 +108,71 @@ def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats]:
     )
     from scipy.stats import binned_statistic_2d  # takes long to load, and few reports draw this
 
-    medians = binned_statistic_2d(flat.around, flat.along, values, "median", bins=(y, x)).statistic
-    return medians, x, y
+    found = binned_statistic_2d(flat.around, flat.along, values, "median", bins=(y, x), expand_binnumbers=True)
+    row, column = (np.clip(found.binnumber[k] - 1, 0, found.statistic.shape[k] - 1) for k in range(2))
+    return found.statistic, x, y, found.statistic[row, column]
 
 
-def _can_show(part: DesignPart, residuals: Residuals, i: int) -> bool:
-    finite = (residuals.component == i) & np.isfinite(residuals.distance)
-    return bool(finite.any()) and min(len(part.bottom_edge_left), len(part.bottom_edge_right)) > 1
+def maps(scene: Scene, result: Result) -> list[PartMap]:
+    """Return the maps of the parts whose distances from the design are known."""
+    if scene.arch is None or result.adjustment is None:
+        return []
+    residuals, parts = result.adjustment.residuals, {part.name: part for part in scene.arch.parts}
+    found = []
+    for i, name in enumerate(result.components.name):
+        rows = (residuals.component == i) & np.isfinite(residuals.distance)
+        if not rows.any() or name not in parts or _edge_points(parts[name]) < 2:
+            continue
+        points = residuals.points[rows]
+        flat = unroll(parts[name], points)
+        found.append(PartMap(name, flat, *cells(flat, residuals.distance[rows]), points))
+    return found
+
+
+def _edge_points(part: DesignPart) -> int:
+    return min(len(part.bottom_edge_left), len(part.bottom_edge_right))
+
+
+def scatter_band(drawn: Sequence[PartMap]) -> Band:
+    """Return the band within which the values of maps differ by the scatter between neighbouring cells."""
+    steps = np.concatenate([np.empty(0), *(np.diff(one.values, axis=1).ravel() for one in drawn)])
+    steps = np.abs(steps[np.isfinite(steps)])
+    half = Z95 * MAD_TO_SD * float(np.median(steps)) / math.sqrt(2.0) if len(steps) else 0.0
+    half = max(half, LEAST_SHOWN_MM)
+    return Band(-half, half, text("grey: within the scatter of neighbouring cells, {half:.2g} mm", half=half))
+
+
+def colour_steps(drawn: Sequence[PartMap], band: Band) -> tuple[BoundaryNorm, Colormap, list[float]]:
+    """Return the steps of colour that maps share."""
+    return stepped_colours(np.concatenate([one.values.ravel() for one in drawn]), band)
 
 
 def draw(scene: Scene, result: Result) -> tuple[Message, bytes] | None:
     """Draw the distances from the design's surface, a panel per part, up to MOST_PARTS of them; None without any."""
-    assert scene.arch is not None
-    if result.adjustment is None:
+    known = maps(scene, result)
+    drawn = known[:MOST_PARTS]
+    if not drawn:
         return None
-    residuals, names = result.adjustment.residuals, result.components.name
-    parts = {part.name: part for part in scene.arch.parts}
-    with_points = [i for i, name in enumerate(names) if name in parts and _can_show(parts[name], residuals, i)]
-    shown = with_points[:MOST_PARTS]
-    if not shown:
-        return None
-    down = math.ceil(len(shown) / ACROSS)
+    down = math.ceil(len(drawn) / ACROSS)
     figure = Figure(figsize=(9.0, 2.9 * down + 0.6), layout="constrained")
     panels = figure.subplots(down, ACROSS, squeeze=False).ravel()
-    drawn = []
-    for i in shown:
-        of_part = (residuals.component == i) & np.isfinite(residuals.distance)
-        flat = unroll(parts[names[i]], residuals.points[of_part])
-        drawn.append((i, flat, *cells(flat, residuals.distance[of_part])))
-    everything = np.concatenate([np.abs(values[np.isfinite(values)]) for _, _, values, _, _ in drawn])
-    limit = max(float(np.quantile(everything, 0.99)), LEAST_SHOWN_MM)
-    for axes, (i, flat, values, x, y) in zip(panels, drawn, strict=False):
-        _panel(axes, flat)
-        mesh = axes.pcolormesh(x, y, np.ma.masked_invalid(values), cmap=DIVERGING, vmin=-limit, vmax=limit)
-        axes.set_title(printable_name(names[i], i), fontsize=11)
-    for axes in panels[len(shown) :]:
+    band = scatter_band(drawn)
+    norm, colours, levels = colour_steps(drawn, band)
+    for k, (axes, one) in enumerate(zip(panels, drawn, strict=False)):
+        _panel(axes, one.flat)
+        mesh = axes.pcolormesh(one.x, one.y, np.ma.masked_invalid(one.values), cmap=colours, norm=norm)
+        axes.set_title(printable_name(one.name, k), fontsize=11)
+    for axes in panels[len(drawn) :]:
         axes.set_visible(False)
-    bar = figure.colorbar(mesh, ax=panels.tolist(), location="bottom", shrink=0.6, aspect=40, extend="both", pad=0.02)
+    bar = figure.colorbar(
+        mesh, ax=panels.tolist(), location="bottom", shrink=0.8, aspect=50, extend="both", pad=0.02, ticks=levels,
+        spacing="uniform",
+    )  # fmt: skip
+    bar.ax.set_xticklabels([f"{level:+.3g}" for level in levels], fontsize=8)
     bar.set_label("distance from the design's surface, outward positive, median of a cell, mm")
-    caption = [text("Residuals of each part, its four faces unrolled"), text("hatched: no points")]
-    if len(shown) < len(with_points):
-        caption.append(text("the first {shown} of {count} parts", shown=len(shown), count=len(with_points)))
+    caption = [text("Residuals of each part, its four faces unrolled"), band.name, text("hatched: no points")]
+    if len(drawn) < len(known):
+        caption.append(text("the first {shown} of {count} parts", shown=len(drawn), count=len(known)))
     return text("{parts:;}", parts=caption), png(figure)
 
 

@@ -38,7 +38,8 @@ function reachOf(sizes) { // a square seen from a corner is wider than its side
 
 function spaceView(host, data) {
   const table = colourTable(data.stops, 101);
-  const packed = Uint32Array.from(table, ([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0);
+  const pack = ([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0;
+  const packed = Uint32Array.from(table, pack), unsure = pack([205, 205, 205]), grey = data.grey || 0; // mm: what may be noise
   const parts = data.parts.map((part) => ({ ...part, on: true, points: Float32Array.from(part.points) }));
   const joints = data.joints || [], marks = data.marks || [], regions = data.regions || [], origin = data.origin || [0, 0, 0];
   const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
@@ -160,7 +161,7 @@ function spaceView(host, data) {
     names(at);
     sliderSaid.textContent = ` ${Number(state.times.toPrecision(2)).toLocaleString("en")} ${say("times their size")}`;
     least.textContent = `−${state.limit.toPrecision(2)} mm `;
-    most.textContent = ` +${state.limit.toPrecision(2)} mm ${say(data.side || "outward")}`;
+    most.textContent = ` +${state.limit.toPrecision(2)} mm ${say(data.side || "outward")}${grey ? `; ${say("grey: within")} ±${grey.toPrecision(2)} mm` : ""}`;
   }
   function visible(_, j) { return state.joint < 0 || j === state.joint; }
   function paintPoints(at, pixels) {
@@ -176,7 +177,7 @@ function spaceView(host, data) {
         if (Math.hypot(a - tx, b - ty, c - tz) > near) continue;
         const [x, y, z] = at(a, b, c);
         const share = Math.min(Math.max(residual[i] / state.limit, -1), 1);
-        const colour = packed[Math.round(50 + 50 * share)];
+        const colour = Math.abs(residual[i]) < grey ? unsure : packed[Math.round(50 + 50 * share)];
         const left = Math.round(x - size / 2), top = Math.round(y - size / 2);
         if (left < 0 || top < 0 || left + size >= width || top + size >= height) continue;
         for (let v = top; v < top + size; v++) for (let u = left; u < left + size; u++) {
