@@ -4,7 +4,8 @@ A cloud merged from several stations has errors of range, place and turn of each
 from some of them only. On one face they look like form. But the two sides of a plate are never seen from one place, and
 plates of one thickness are as thick at one end as at another: the variance of their thickness, as measured, is that
 between viewpoints of its two sides together. Waves and bends of a plate are the same on both of its sides and cancel.
-Rolling tolerances are in it as well: they cannot be separated.
+Rolling tolerances are in it as well. One plate of a box that was seen at both of its ends limits them: there the inner
+side is never seen from one place, and half of the variance or more is in the difference of the ends.
 
 The sides do not share it equally. Errors of range act along the ray, on a face that is seen obliquely by the cosine,
 and the inner sides at an end are seen through its opening, obliquely, while the end's ring is seen from ahead. Noise
@@ -102,11 +103,14 @@ def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickn
     return Thickness(solve @ difference[enough], of_terms, (sides[0], sides[1]))
 
 
-def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Variances:
+def variances(
+    plates: Sequence[Thickness], rings: Sequence[float] = (), same: Sequence[tuple[int, int]] = ()
+) -> Variances:
     """Variances between viewpoints by the plates at all ends of a bridge; ``rings`` are the variances of their points.
 
     They are widened for the number of differences they come from, so that 1.96 standard deviations cover what Student's
-    t covers; where levels differ evidently, they include the scanner's class. 0 where no two plates are alike.
+    t covers; where levels differ evidently, they include the scanner's class. 0 where no two plates are alike. ``same``
+    are rows of one plate at both ends of a box.
     """
     if not plates:
         return NONE
@@ -123,6 +127,9 @@ def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Varia
     between = _variance(squares, by_noise, dof)
     if evident:
         between = max(between, _with_class(between, squares, by_noise, dof))
+    most = _limit(value[:, 0], noise[:, 0], same)
+    if most < between:
+        between, evident = most, False
     of_points = np.maximum(np.mean([one.sides for one in plates], axis=0), FLOOR_MM**2)
     outer = of_points[0] / of_points.mean()
     return Variances(
@@ -187,6 +194,19 @@ def _with_class(between: float, squares: float, by_noise: float, dof: int) -> fl
     pairs = dof / OF_PAIR
     both = (between * pairs + VIEW_SD_MM**2 * OF_CLASS) / (pairs + OF_CLASS)
     return min(both, _estimate(squares, by_noise, dof) * pairs / float(chdtri(pairs, 0.95)))
+
+
+def _limit(value: Floats, noise: Floats, same: Sequence[tuple[int, int]]) -> float:
+    """Return the 95 % limit of the variance on one side of a plate, by plates that were measured at two ends.
+
+    The outer sides at both ends may be seen from one place: the difference has the variance of two sides, not of four.
+    """
+    rows = np.array([pair for pair in same if abs(value[pair[0]] - value[pair[1]]) < ALIKE_MM], np.int64).reshape(-1, 2)
+    if not len(rows):
+        return np.inf
+    squares, independent = float((np.diff(value[rows], axis=1) ** 2).sum()), len(rows) / OF_PAIR
+    largest = squares * independent / float(chdtri(independent, 0.95))
+    return max(largest - float(noise[rows].sum()), 0.0) / (2.0 * len(rows))
 
 
 def _variance(squares: float, by_noise: float, dof: int) -> float:

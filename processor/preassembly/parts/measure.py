@@ -16,7 +16,7 @@ from processor.geometry.mesh_distance import on_face
 from processor.geometry.thinning import by_cell, thinned
 from processor.model import DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly import topology
-from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, view_variance
+from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, section, view_variance
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import FittedEnd, JointEnd
 from processor.preassembly.ends.joint_frame import end_place
@@ -224,9 +224,25 @@ def _viewpoint_remarks(part: FittedPart, between: view_variance.Variances) -> It
 
 def _between_viewpoints(parts: Sequence[FittedPart]) -> view_variance.Variances:
     """Variances between viewpoints by the plates of all parts."""
-    ends = [end for part in parts for end in part.ends if isinstance(end, FittedEnd)]
-    plates = [plate for end in ends for plate in end.plates if plate is not None]
-    return view_variance.variances(plates, [end.ring_noise for end in ends if end.plates])
+    plates: list[view_variance.Thickness] = []
+    rings: list[float] = []
+    same: list[tuple[int, int]] = []
+    for part in parts:
+        rows: dict[int, int] = {}  # of the last end's plates, by their faces
+        for end in part.ends:
+            if not isinstance(end, FittedEnd):
+                continue
+            rings += [end.ring_noise] if end.plates else []
+            known = [k for k, plate in enumerate(end.plates) if plate is not None]
+            now = {k: len(plates) + i for i, k in enumerate(known)}
+            same += [
+                (rows[k], now[k])
+                for k in known
+                if k in rows and len(part.ends) == 2 and section.is_box(end.place.section)
+            ]
+            plates += [plate for plate in end.plates if plate is not None]
+            rows = now
+    return view_variance.variances(plates, rings, same)
 
 
 def _as_seen(part: FittedPart, between: view_variance.Variances) -> FittedPart:
