@@ -174,12 +174,13 @@ def read_index(group: Any) -> StoredTiles:
     return StoredTiles(grid, cell, start, count, columns)
 
 
-def read_box(stored: StoredTiles, lower: Floats, upper: Floats) -> Floats:
-    """Return the points (m, 3) of a scan with ``lower <= p <= upper`` (mm).
+def read_box(group: Any, stored: StoredTiles, lower: Floats, upper: Floats) -> Floats:
+    """Return the points (m, 3) of a scan's group with ``lower <= p <= upper`` (mm).
 
-    Only the tiles that the box touches are read.
+    Only the tiles that the box touches in the index ``stored`` are read.
     """
-    grid, cell, start, count, columns = stored
+    grid, cell, start, count, _ = stored
+    columns = [codec.sliced(group["points"][axis]) for axis in AXES]
     low, high = grid.cell_range(lower, upper)
     rows = np.flatnonzero(((cell >= low) & (cell <= high)).all(axis=1))
     pieces = [np.empty((0, 3))]

@@ -83,8 +83,9 @@ class Boxed:
         group, indexed = self.stored.scans[scan], self.stored.indexed
         with _naming_the_file(group):
             if scan not in indexed:
-                indexed[scan] = scan_tiles.read_index(group)
-            return scan_tiles.read_box(indexed[scan], *self.boxes[scan])
+                # Without the datasets: HDF5 holds some chunks of each that is open, of many scans a lot.
+                indexed[scan] = scan_tiles.read_index(group)._replace(columns=[])
+            return scan_tiles.read_box(group, indexed[scan], *self.boxes[scan])
 
 
 @contextmanager
