@@ -85,12 +85,16 @@ def test_points_in_blocks_and_parts_are_those_at_once(monkeypatch, tmp_path):
         pairs = observations.paired(observed, surface)
         by_cell = measures.points_by_cell(observed, surface, alignment.none(surface, 3, 1.0))
         cell_mm = observations.fitting_cell(observed, surface, 12.0, (5.0, 60.0))
-        return (*list(vars(observed).values())[:5], *vars(pairs).values(), by_cell.order, by_cell.cell, cell_mm)
+        aligned = alignment.align(pairs, surface, observed.stations, 1.0)
+        variance = alignment.station_variance(pairs, surface, observed.stations, aligned)
+        of_points = list(vars(observed).values())[:5]
+        return (*of_points, *vars(pairs).values(), by_cell.order, by_cell.cell, cell_mm, variance)
 
     whole = found()
     assert whole[4].any()
     monkeypatch.setattr(observations, "CHUNK", 500)
     monkeypatch.setattr(observations, "PART_POINTS", 300)
+    monkeypatch.setattr(alignment, "PAIRS_AT_ONCE", 70)
     monkeypatch.setattr(mixed_pixels, "AT_ONCE", 400)
     monkeypatch.setattr(mixed_pixels, "BAND_POINTS", 200)
     for name, value in (("BLOCK_ROWS", 333), ("AT_ONCE", 100), ("MEMORY_BYTES", 0), ("LEAST_BYTES", 1)):
