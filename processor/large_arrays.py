@@ -200,6 +200,16 @@ def median(array: Array) -> float:
     return 0.5 * (_of_rank(array, (len(array) - 1) // 2) + _of_rank(array, len(array) // 2))
 
 
+def quantile(array: Array, share: float) -> float:
+    """Return a quantile of an array (n,), n > 0, of finite numbers, to the bit of np.quantile."""
+    if len(array) <= AT_ONCE:
+        return float(np.quantile(array, share))
+    rank = share * (len(array) - 1)
+    below = int(rank)
+    part, low, high = rank - below, _of_rank(array, below), _of_rank(array, min(below + 1, len(array) - 1))
+    return low + (high - low) * part if part < 0.5 else high - (high - low) * (1.0 - part)
+
+
 def _of_rank(array: Array, rank: int) -> float:
     """Return the number of a rank, from 0, by counting the numbers between some of those that may be it."""
     (low, high), below = extremes(array), 0

@@ -9,6 +9,7 @@ variance of every place.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +38,7 @@ FEWEST_COMPONENTS = 3  # to fit the whole by: of fewer, a component that moved c
 ROUNDS = 12
 MOST_ROUNDS, SETTLED = 40, 0.05  # of the stations' variance components, and the relative change of the last round
 CAUCHY = 2.385
+PAIRS_AT_ONCE = 1 << 18  # of cell and station, whose derivatives are in memory together
 MOST_COUPLED = 3_000_000  # blocks times stations, beyond which stations are not fitted
 
 
@@ -164,25 +166,34 @@ def station_variance(
 
     If ``free``, the deviations are those from the best fit of the whole.
     """
-    points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
-    rays = rays_to(points, stations.positions[pairs.station])
-    J = _derivative(points - alignment.centre, outward, rays)
     total = np.maximum(np.bincount(pairs.cell, pairs.count, len(surface.share)), 1.0)
     C, R = alignment.station_covariance, alignment.free_response if free else alignment.response
-    return quadratic_forms(
-        pairs.cell, pairs.station, pairs.count / total[pairs.cell], J, C, C @ R.T, R @ C @ R.T, total
-    )
+    CR, RCR, variance = C @ R.T, R @ C @ R.T, np.zeros(len(surface.share))
+    for rows in _whole_cells(pairs.cell):
+        cell, station = pairs.cell[rows], pairs.station[rows]
+        points, outward = surface.centres[cell], surface.outward[cell]
+        J = _derivative(points - alignment.centre, outward, rays_to(points, stations.positions[station]))
+        quadratic_forms(cell, station, pairs.count[rows] / total[cell], J, C, CR, RCR, variance)
+    return variance
+
+
+def _whole_cells(cell: Ints) -> Iterator[slice]:
+    """Yield slices of about PAIRS_AT_ONCE pairs sorted by cell (n,), all of a cell in one."""
+    start = 0
+    while start < len(cell):
+        end = int(np.searchsorted(cell, cell[min(start + PAIRS_AT_ONCE, len(cell)) - 1], side="right"))
+        yield slice(start, end)
+        start = end
 
 
 @njit(cache=True, nogil=True)
 def quadratic_forms(
-    cell: Ints, station: Ints, weight: Floats, J: Floats, C: Floats, CR: Floats, RCR: Floats, like: Floats
-) -> Floats:
-    """Return (cells,) the form g C g' of each cell, g = sum over its pairs of weight J + the cell's J[:6] R.
+    cell: Ints, station: Ints, weight: Floats, J: Floats, C: Floats, CR: Floats, RCR: Floats, variance: Floats
+) -> None:
+    """Fill the form g C g' of each cell into (cells,), g = sum over its pairs of weight J + the cell's J[:6] R.
 
     ``J`` (n, 7) of pairs sorted by cell; C (7k, 7k) covariance, CR (7k, 6) and RCR (6, 6) its products with R (6, 7k).
     """
-    variance = np.zeros_like(like)
     start, n = 0, len(cell)
     while start < n:
         end = start
@@ -205,7 +216,6 @@ def quadratic_forms(
                 total += J[start, p] * J[start, q] * RCR[p, q]
         variance[cell[start]] = max(total, 0.0)
         start = end
-    return variance
 
 
 def corrected_pose(T_design_project: Floats, alignment: Alignment) -> Floats:

@@ -35,6 +35,7 @@ from processor.defects.regions import Region
 from processor.defects.result import Result
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import mesh_distance, rigid
+from processor.large_arrays import every
 from processor.model import DesignBodies, Floats, InputError, Ints, Reason, Scene, Status, StructureDesign, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
@@ -221,7 +222,7 @@ def _sample(scene: Scene, T_design_project: Floats) -> Floats:
         [
             rigid.apply(
                 T_design_project @ scan.pose,
-                scan.points[::step] + scan.origin,
+                every(scan.points, step) + scan.origin,
             )
             for scan in scene.scans
         ]

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from processor import tiles
 from processor.adjustment import moderated_variances, view_error_from_opposite_sides
-from processor.defects.alignment import Alignment, chart_of_cells, rays_to, station_variance
+from processor.defects.alignment import PAIRS_AT_ONCE, Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
 from processor.model import Bools, Floats, Ints
@@ -66,9 +67,12 @@ class Field:
 def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, inner: Floats) -> Field:
     """Combine the observations of all stations by cell, corrected by the alignment. ``inner`` (cells,): see Field."""
     cells = len(surface.share)
-    points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
-    rays = rays_to(points, stations.positions[pairs.station])
-    correction = alignment.corrections(points, outward, rays, pairs.station)
+    correction = np.empty(len(pairs.cell))
+    for part in tiles.ranges(len(correction), PAIRS_AT_ONCE):
+        cell, station = pairs.cell[part], pairs.station[part]
+        points, outward = surface.centres[cell], surface.outward[cell]
+        rays = rays_to(points, stations.positions[station])
+        correction[part] = alignment.corrections(points, outward, rays, station)
     count = np.bincount(pairs.cell, pairs.count, cells).astype(np.float64)
     divisor = np.maximum(count, 1.0)
     mean = np.bincount(pairs.cell, pairs.count * (pairs.mean - correction), cells) / divisor

@@ -18,6 +18,7 @@ from processor.defects.alignment import chart_of_cells
 from processor.defects.observations import CHUNK, Pairs, Stations, cells_at
 from processor.defects.surface_charts import GRID_SHARE, DesignSurface
 from processor.geometry import mesh_distance, rigid
+from processor.large_arrays import blocks
 from processor.model import Floats, Ints, Scene
 
 LEAST_COS = 0.34  # of incidence
@@ -169,8 +170,7 @@ def _points_of(scene: Scene, T_design_project: Floats, station: int) -> Iterator
         if not scan.position.size and scene.stations is not None and len(scan.point_station):
             count = len(scene.stations.ids) + 1
         if first <= station < first + count:
-            for start in range(0, len(scan.points), CHUNK):
-                rows = slice(start, start + CHUNK)
+            for rows in blocks(len(scan.points), CHUNK):
                 points = scan.points[rows]
                 if count > 1:
                     points = points[scan.point_station[rows] == station - first]

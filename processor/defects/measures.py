@@ -12,10 +12,11 @@ from scipy.spatial import cKDTree
 
 from processor.defects.alignment import Alignment, rays_to
 from processor.defects.deviation_field import Field
-from processor.defects.observations import Observed, cells_of
+from processor.defects.observations import Observed, cells_of, sorted_by_cell
 from processor.defects.places.profiles import PlaceCells
 from processor.defects.regions import Region, unrolled
 from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
+from processor.large_arrays import Array, blocks, release
 from processor.model import NORMAL_95, Bools, Floats, Ints
 
 SMOOTH_SHARE = 0.35  # of a region's radius, over which deviations are averaged to find the deepest place
@@ -88,7 +89,7 @@ class CellPoints:
         index = np.concatenate([[], *(np.arange(a, b) for a, b in zip(first, last, strict=True))]).astype(np.int64)
         points, cell = self.order[index], self.cell[index]
         centres, outward = self.surface.centres[cell], self.surface.outward[cell]
-        station = self.observed.station[points]
+        station = self.observed.station[points].astype(np.int64)
         rays = rays_to(centres, self.observed.stations.positions[station])
         correction = self.alignment.corrections(centres, outward, rays, station)
         return self.observed.uv[points], self.observed.deviation[points] - correction - shape_values[cell]
@@ -96,10 +97,20 @@ class CellPoints:
 
 def points_by_cell(observed: Observed, surface: DesignSurface, alignment: Alignment) -> CellPoints:
     """Sort the points of a scene by their cells."""
-    cell = cells_of(observed, surface)
-    pure = np.flatnonzero(~observed.mixed)
-    order = pure[np.argsort(cell[pure], kind="stable")]
-    return CellPoints(observed, surface, alignment, order, cell[order])
+    count = np.zeros(len(surface.share), np.int64)
+
+    def of_rows(rows: slice) -> tuple[Array, ...]:
+        pure = np.flatnonzero(~observed.mixed[rows])
+        return cells_of(observed, surface, rows)[pure], rows.start + pure
+
+    for rows in blocks(len(observed.chart)):
+        count += np.bincount(of_rows(rows)[0], minlength=len(count))
+    (cell, order), parts = sorted_by_cell(observed, surface, count, of_rows)
+    for part in parts:
+        by_cell = np.argsort(cell[part], kind="stable")
+        order[part], cell[part] = order[part][by_cell], cell[part][by_cell]
+        release()
+    return CellPoints(observed, surface, alignment, order, cell)
 
 
 def measure(

@@ -1,20 +1,30 @@
-"""Observations of the design's surface: points on faces, and their means by cell and station."""
+"""Observations of the design's surface: points on faces, and their means by cell and station.
+
+Points are passed over in blocks; what is kept of each lies in files beside the results where it is much (see
+:mod:`processor.large_arrays`).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from processor import large_arrays
 from processor.adjustment import mixed_pixels
+from processor.adjustment.mixed_pixels import Block
 from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import FacetGrid
-from processor.model import Bools, Floats, InputError, Ints, Scan, Scene
+from processor.large_arrays import Array, allocate, blocks, in_parts
+from processor.model import Bools, Floats, InputError, Ints, Labels, Scan, Scene
 from processor.robust_statistics import MAD_TO_SD
 
 CHUNK = 500_000
+PART_POINTS = 500_000  # that are sorted by their cells in memory
 BEHIND_MM = 4.0  # a face, from which on a beam must have passed through it as designed
 LEAST_COS = 0.2  # of incidence: points at a more oblique one are mostly of beams that hit two surfaces
 GATE_SDS = 4.0  # robust standard deviations from the median of a cell, beyond which a point is stray
@@ -44,9 +54,9 @@ class Observed:
     there, but not where.
     """
 
-    chart: Ints
+    chart: Labels
     uv: Floats  # (n, 2)
-    station: Ints
+    station: Labels
     deviation: Floats
     mixed: Bools
     stations: Stations
@@ -80,67 +90,131 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, reach_mm)
     names: list[str] = []
     positions: list[Floats] = []
-    parts: list[tuple[Ints, Floats, Ints, Floats, Bools]] = []
+    found = _Found.of(sum(len(scan.points) for scan in scene.scans))
     for scan in scene.scans:
         T = T_design_project @ scan.pose
         T = rigid.transform(T[:3, :3], T[:3, :3] @ scan.origin + T[:3, 3])
-        station_of = np.full(len(scan.points), len(names), np.int64)
+        first, merged = len(names), False
         if scan.position.size:
             names.append(scan.name)
             positions.append(rigid.apply(T, scan.position - scan.origin))
         elif scene.stations is not None and len(scan.point_station):
-            row = np.where(scan.point_station < 0, len(scene.stations.ids), scan.point_station)
-            station_of = row + len(names)
+            merged = True
             names += [*scene.stations.ids, f"{scan.name}, unknown"]
             positions += [*rigid.apply(T_design_project, scene.stations.positions), np.full(3, np.nan)]
         else:
             names.append(scan.name)
             positions.append(np.full(3, np.nan))
-        parts.append(_of_scan(scan, T, station_of, np.array(positions), surface, grid))
-    chart, uv, station, deviation, mixed = (np.concatenate(column) for column in zip(*parts, strict=True))
+        found = _of_scan(_Placed(scan, T, first, merged, np.array(positions)), surface, grid, found)
     return Observed(
-        chart=chart,
-        uv=uv,
-        station=station,
-        deviation=deviation,
-        mixed=mixed,
+        chart=found.chart[: found.filled],
+        uv=found.uv[: found.filled],
+        station=found.station[: found.filled],
+        deviation=found.deviation[: found.filled],
+        mixed=found.mixed[: found.filled],
         stations=Stations(tuple(names), np.array(positions)),
-        points=sum(len(scan.points) for scan in scene.scans),
+        points=len(found.chart),
     )
 
 
-def _of_scan(
-    scan: Scan, T: Floats, station_of: Ints, positions: Floats, surface: DesignSurface, grid: FacetGrid
-) -> tuple[Ints, Floats, Ints, Floats, Bools]:
-    """Return chart, place, station, deviation and mixed of the points on faces; ``T`` (4, 4) maps them to the design.
+class _Found(NamedTuple):
+    """Columns of :class:`Observed` with room for all points, of which some are ``filled``."""
 
-    ``station_of`` (n,) are rows of ``positions`` (k, 3).
+    chart: Labels
+    uv: Floats
+    station: Labels
+    deviation: Floats
+    mixed: Bools
+    filled: int
+
+    @classmethod
+    def of(cls, most: int) -> _Found:
+        """Allocate the columns."""
+        return cls(
+            chart=allocate(most, dtype=np.int32),
+            uv=allocate(most, 2),
+            station=allocate(most, dtype=np.int32),
+            deviation=allocate(most),
+            mixed=allocate(most, dtype=np.bool_),
+            filled=0,
+        )
+
+
+class _Placed(NamedTuple):
+    """A scan that T (4, 4) maps to the design. ``first`` is the row of its first station in ``positions`` (k, 3).
+
+    The points of a ``merged`` scan name their stations, the last of which is for those unknown.
     """
-    known, scanners = np.isfinite(positions.sum(axis=1)), np.nan_to_num(positions)
-    facet, deviation = np.full(len(scan.points), -1, np.int64), np.full(len(scan.points), np.nan)
-    points = np.empty((len(scan.points), 3))
-    for start in range(0, len(station_of), CHUNK):
-        rows = slice(start, start + CHUNK)
-        points[rows], of_point = rigid.apply(T, scan.points[rows]), station_of[rows]
-        station = np.where(known[of_point], of_point, -1)
-        facet[rows], deviation[rows] = mesh_distance.nearest_visible(grid, points[rows], scanners, station)
-    near = np.flatnonzero(facet >= 0)
-    places, outward = _sighted(surface, facet[near], points[near], scanners[station_of[near]], known[station_of[near]])
-    arm = scanners[station_of[near]] - points[near]
-    cosine = np.einsum("ni,ni->n", arm, outward) / np.linalg.norm(arm, axis=1)
-    used = ~known[station_of[near]] | (cosine > LEAST_COS)
-    on, places = near[used], places[used]
-    mixed = _at_outline(surface, facet[on], points[on], scanners[station_of[on]])
-    mixed |= _passed_by(surface, grid, facet[on], points[on], deviation[on], scanners[station_of[on]])
-    mixed &= known[station_of[on]]
-    smooth, chart = np.where(facet >= 0, surface.part_of[facet], -1), surface.chart_of[facet[on]]
-    for k in np.unique(station_of[on]):
-        if known[k]:
-            rows = station_of[on] == k
-            of_face = surface.normals[facet[on[rows]]], deviation[on[rows]], smooth[on[rows]]
-            every = points[station_of == k], smooth[station_of == k]
-            mixed[rows] |= mixed_pixels.mark(points[on[rows]], positions[k], *of_face, every)
-    return chart, layout(surface.charts, chart, places), station_of[on], deviation[on], mixed
+
+    scan: Scan
+    T: Floats
+    first: int
+    merged: bool
+    positions: Floats
+
+    def blocks(self) -> Iterator[tuple[slice, Floats, Ints]]:
+        """Pass over rows, points (n, 3) in the design's frame and stations (n,)."""
+        for rows in blocks(len(self.scan.points), CHUNK):
+            points = rigid.apply(self.T, self.scan.points[rows])
+            station = np.full(len(points), self.first, np.int64)
+            if self.merged:
+                named = self.scan.point_station[rows]
+                station = np.where(named < 0, len(self.positions) - 1 - self.first, named) + self.first
+            yield rows, points, station
+
+
+def _of_scan(placed: _Placed, surface: DesignSurface, grid: FacetGrid, found: _Found) -> _Found:
+    """Add what is known of the points of a scan that are on faces."""
+    known, scanners = np.isfinite(placed.positions.sum(axis=1)), np.nan_to_num(placed.positions)
+    nearest = allocate(len(placed.scan.points), dtype=np.int32)
+    used = allocate(len(placed.scan.points), dtype=np.bool_)
+    count = found.filled
+    for rows, points, station in placed.blocks():
+        facet, deviation = mesh_distance.nearest_visible(grid, points, scanners, np.where(known[station], station, -1))
+        near = np.flatnonzero(facet >= 0)
+        of_near = station[near]
+        places, outward = _sighted(surface, facet[near], points[near], scanners[of_near], known[of_near])
+        arm = scanners[of_near] - points[near]
+        cosine = np.einsum("ni,ni->n", arm, outward) / np.linalg.norm(arm, axis=1)
+        steep = ~known[of_near] | (cosine > LEAST_COS)
+        on, places = near[steep], places[steep]
+        mixed = _at_outline(surface, facet[on], points[on], scanners[station[on]])
+        mixed |= _passed_by(surface, grid, facet[on], points[on], deviation[on], scanners[station[on]])
+        chart, part = surface.chart_of[facet[on]], slice(count, count + len(on))
+        found.chart[part], found.uv[part] = chart, layout(surface.charts, chart, places)
+        found.station[part], found.deviation[part] = station[on], deviation[on]
+        found.mixed[part] = mixed & known[station[on]]
+        nearest[rows], used[rows] = facet, False
+        used[rows.start + on] = True
+        count = part.stop
+    if known[placed.first :].any():
+        of_points = _Sights(placed, surface, nearest, used, found.deviation[found.filled : count])
+        beside = mixed_pixels.mark_passes(of_points, placed.positions, surface.normals)
+        for rows in blocks(len(beside)):
+            found.mixed[found.filled : count][rows] |= beside[rows]
+    return found._replace(filled=count)
+
+
+@dataclass(frozen=True)
+class _Sights:
+    """Passes over all points of a scan: ``nearest`` (n,) facets, those ``used`` (n,), and the deviations of these."""
+
+    placed: _Placed
+    surface: DesignSurface
+    nearest: Labels
+    used: Bools
+    deviation: Floats
+
+    def __iter__(self) -> Iterator[Block]:
+        """Pass over all points."""
+        done = 0
+        for rows, points, station in self.placed.blocks():
+            facet, on = self.nearest[rows], np.flatnonzero(self.used[rows])
+            height = np.zeros(len(points))
+            height[on] = self.deviation[done : done + len(on)]
+            done += len(on)
+            smooth = np.where(facet >= 0, self.surface.part_of[facet], -1)
+            yield Block(points, station, smooth, np.where(self.used[rows], facet, -1), height)
 
 
 def _sighted(
@@ -212,16 +286,44 @@ def _passed_by(
 
 def fitting_cell(observed: Observed, surface: DesignSurface, points: float, bounds: tuple[float, float]) -> float:
     """Return the size of cells in mm that hold so many points on the median over the points."""
-    _, count = np.unique(cells_of(observed, surface), return_counts=True)
-    if not len(count):
+    count = np.sort(_counts(observed, surface))
+    ends = np.cumsum(count)
+    if not ends[-1]:
         return bounds[1]
-    density = float(np.median(np.repeat(count, count))) / surface.charts.cell_mm**2
+    middle = count[np.searchsorted(ends, [(ends[-1] - 1) // 2, ends[-1] // 2], side="right")]
+    density = float(middle.mean()) / surface.charts.cell_mm**2
     return float(np.clip(np.round(np.sqrt(points / density), 1), *bounds))
 
 
-def cells_of(observed: Observed, surface: DesignSurface) -> Ints:
-    """Return the cell (n,) of each point; points beyond their face's grid are in the nearest cell."""
-    return _cells(surface, observed.chart, observed.uv)
+def _counts(observed: Observed, surface: DesignSurface) -> Ints:
+    """Return the number of points in each cell (cells,)."""
+    charts = surface.charts
+    count = np.zeros(int(charts.shape.prod(axis=1).sum()), np.int64)
+    for rows in blocks(len(observed.chart)):
+        count += np.bincount(_cells(surface, observed.chart[rows], observed.uv[rows]), minlength=len(count))
+    return count
+
+
+def cells_of(observed: Observed, surface: DesignSurface, rows: slice) -> Ints:
+    """Return the cell (n,) of some of the points; those beyond their face's grid are in the nearest cell."""
+    return _cells(surface, observed.chart[rows], observed.uv[rows])
+
+
+def sorted_by_cell(
+    observed: Observed, surface: DesignSurface, count: Ints, of_rows: Callable[[slice], tuple[Array, ...]]
+) -> tuple[list[Array], list[slice]]:
+    """Return columns of the points by parts that hold whole cells, and the parts' rows; in order within a part.
+
+    ``count`` (cells,) are the points of each cell, ``of_rows`` returns the columns of some points, the first of them
+    the cells; of those that it leaves out the ``count`` is less.
+    """
+    ends = np.cumsum(count)
+    part_of_cell = (ends - count) // PART_POINTS  # by the first of a cell's points: a cell is in one part
+    stops = np.cumsum(np.bincount(part_of_cell, count, int(part_of_cell.max(initial=0)) + 1)).astype(np.int64)
+    passed = (of_rows(rows) for rows in blocks(len(observed.chart)))
+    columns = in_parts(passed, lambda block: part_of_cell[block[0]], stops)
+    starts = [0, *stops[:-1].tolist()]
+    return columns, [slice(start, stop) for start, stop in zip(starts, stops.tolist(), strict=True) if stop > start]
 
 
 def cells_at(surface: DesignSurface, chart: Ints, places: Floats) -> Ints:
@@ -229,7 +331,7 @@ def cells_at(surface: DesignSurface, chart: Ints, places: Floats) -> Ints:
     return _cells(surface, chart, layout(surface.charts, chart, places))
 
 
-def _cells(surface: DesignSurface, chart: Ints, uv: Floats) -> Ints:
+def _cells(surface: DesignSurface, chart: Ints | Labels, uv: Floats) -> Ints:
     charts = surface.charts
     at = np.floor((uv - charts.low[chart]) / charts.cell_mm).astype(np.int64)
     at = np.clip(at, 0, charts.shape[chart] - 1)
@@ -239,39 +341,53 @@ def _cells(surface: DesignSurface, chart: Ints, uv: Floats) -> Ints:
 
 def paired(observed: Observed, surface: DesignSurface) -> Pairs:
     """Sum up the points by cell and station."""
-    cell = cells_of(observed, surface)
-    order = np.argsort(cell * len(observed.stations.names) + observed.station, kind="stable")
-    cell, station, chart = cell[order], observed.station[order], observed.chart[order]
-    deviation, mixed = observed.deviation[order], observed.mixed[order]
-    sd = _robust_sd(off_median(cell, deviation, mixed), station, chart)
-    return Pairs(*pairs(cell, station, deviation, mixed, sd))
+
+    def of_rows(rows: slice) -> tuple[Array, ...]:
+        cell = cells_of(observed, surface, rows)
+        return cell, observed.station[rows], observed.chart[rows], observed.deviation[rows], observed.mixed[rows]
+
+    columns, parts = sorted_by_cell(observed, surface, _counts(observed, surface), of_rows)
+    if not parts:
+        return Pairs(*(np.empty(0, dtype) for dtype in (*[np.int64] * 4, *[np.float64] * 2, np.int64)))
+    cell, station, chart, deviation, mixed = columns
+    off = allocate(len(cell))
+    for part in parts:
+        order = np.argsort(cell[part] * len(observed.stations.names) + station[part], kind="stable")
+        for column in columns:
+            column[part] = column[part][order]
+        off[part] = off_median(np.array(cell[part]), np.array(deviation[part]), np.array(mixed[part]))
+        large_arrays.release()
+    stations, charts = len(observed.stations.names), len(surface.charts.kind)
+    of_face = _medians(off, lambda rows: station[rows].astype(np.int64) * charts + chart[rows], stations * charts)
+    of_station = np.nan_to_num(_medians(off, lambda rows: station[rows], stations))
+    found = []
+    for part in parts:
+        seen_from = station[part].astype(np.int64)
+        own = of_face[seen_from * charts + chart[part]]
+        sd = MAD_TO_SD * np.where(np.isfinite(own), own, of_station[seen_from])
+        found.append(pairs(np.array(cell[part]), seen_from, np.array(deviation[part]), np.array(mixed[part]), sd))
+        large_arrays.release()
+    return Pairs(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _robust_sd(off: Floats, station: Ints, chart: Ints) -> Floats:
-    """Return the robust standard deviation (n,) of the points of each point's station on its face, mm.
+def _medians(off: Floats, group_of: Callable[[slice], Array], groups: int) -> Floats:
+    """Return the median (groups,) of each group's distances, by which robust standard deviations are known.
 
-    ``off`` (n,) are distances from the medians of cells, NaN where a cell has too few points. The points of one cell
-    alone show it badly: of four, the nearest three may agree by chance.
+    ``off`` (n,) are distances from the medians of cells, NaN where a cell has too few points, ``group_of`` returns the
+    groups of some rows. NaN for a group of fewer than FEWEST_OF_FACE. The points of one cell alone show the standard
+    deviation badly: of four, the nearest three may agree by chance.
     """
-    known = np.flatnonzero(np.isfinite(off))
-    of_face, of_station = (
-        medians(off[known], group[known], int(group.max(initial=0)) + 1, FEWEST_OF_FACE)
-        for group in (station * (int(chart.max(initial=0)) + 1) + chart, station)
-    )
-    own = of_face[station * (int(chart.max(initial=0)) + 1) + chart]
-    sd: Floats = MAD_TO_SD * np.where(np.isfinite(own), own, np.nan_to_num(of_station[station]))
-    return sd
 
+    def known() -> Iterator[tuple[Array, ...]]:
+        for rows in blocks(len(off)):
+            finite = np.isfinite(off[rows])
+            yield off[rows][finite], group_of(rows)[finite]
 
-def medians(values: Floats, group: Ints, groups: int, fewest: int) -> Floats:
-    """Return the median (groups,) of the values (n,) of each group; NaN for a group of fewer than ``fewest``."""
-    order = np.lexsort([values, group])
-    count = np.bincount(group, minlength=groups)
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    enough = np.flatnonzero(count >= fewest)
-    median = np.full(groups, np.nan)
-    low, high = (values[order[first[enough] + (count[enough] - k) // 2]] for k in (1, 0))
-    median[enough] = 0.5 * (low + high)
+    count = sum((np.bincount(group, minlength=groups) for _, group in known()), np.zeros(groups, np.int64))
+    ends, median = np.cumsum(count), np.full(groups, np.nan)
+    values = in_parts(known(), lambda block: block[1], ends)[0]
+    for group in np.flatnonzero(count >= FEWEST_OF_FACE):
+        median[group] = large_arrays.median(values[ends[group] - count[group] : ends[group]])
     return median
 
 

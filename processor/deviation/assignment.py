@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor import tiles
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import SHARP_COS, CurvedFacets, FacetGrid, square_to
 from processor.geometry.thread_ranges import over_ranges
@@ -23,6 +24,7 @@ from processor.large_arrays import put_aside
 from processor.model import Floats, Ints
 
 LEAST_RANGE = 5_000  # points per task of a thread
+AT_ONCE = 100_000  # points whose heights are computed together
 # Distance to the next face in standard deviations. The points that noise carries across move the mean of 40 points by
 # less than a quarter of its standard error.
 SEPARATION = 2.5
@@ -78,8 +80,11 @@ class Aside:
 
 
 def _on_surface(points: Floats, facet: Ints, flat: Floats, clearance: Floats, curved: CurvedFacets) -> OnSurface:
-    feet = points - flat[:, None] * curved.surface.normals[facet]
-    return OnSurface(feet, flat - curved.heights(feet, facet), facet, clearance, flat=flat)
+    feet, distance = np.empty(points.shape), np.empty(len(points))
+    for rows in tiles.ranges(len(points), AT_ONCE):  # heights take several times the memory of the points
+        feet[rows] = points[rows] - flat[rows, None] * curved.surface.normals[facet[rows]]
+        distance[rows] = flat[rows] - curved.heights(feet[rows], facet[rows])
+    return OnSurface(feet, distance, facet, clearance, flat=flat)
 
 
 def assigned(points: Floats, scanner: Floats | None, curved: CurvedFacets, grid: FacetGrid) -> OnSurface:

@@ -23,7 +23,7 @@ from processor.deviation.station_offsets import OnFaces, OnPieces, Pieces
 from processor.geometry import m3c2, mesh_bodies, mesh_distance
 from processor.geometry.mesh_distance import CurvedFacets, FacetGrid, Samples
 from processor.large_arrays import put_aside, release
-from processor.model import Bools, Floats, Ints
+from processor.model import Bools, Floats, Ints, Labels
 from processor.tiles import Shared
 
 LEAST_COS = 0.5  # between the normals at a core point and below a scanned point
@@ -149,45 +149,83 @@ def movement(
 
 def _first(passes: _Passes) -> tuple[Movement, float]:
     """Assign all points, put those near the surface aside, and fit movements to them; also the share that is near."""
-    first, near, points = passes.fit.value.sums(), 0, 0
-    for aside, doubtful, part, counts in tiles.mapped(_first_of, passes.clouds, passes.fit):
+    faces, near, points = list[Labels](), 0, 0
+    for aside, doubtful, face, counts in tiles.mapped(_assigned_of, passes.clouds, passes.fit):
         passes.asides.append(aside.put())
         passes.doubtful.append(put_aside(doubtful))
-        first.add_part(part)
+        faces.append(put_aside(face))
         near, points = near + counts[0], points + counts[1]
         release()
+    _mark_mixed(passes, faces)
+    first = passes.fit.value.sums()
+    close = (_Near(cloud.points, cloud.doubtful, aside) for cloud, aside in passes.near())
+    for part in tiles.mapped(_first_of, close, passes.fit):
+        first.add_part(part)
     return first.movement(), near / points
 
 
-def _first_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, Bools, PartSums, tuple[int, int]]:
-    """Return what :func:`_first` needs of a cloud: its points near the surface, which are doubtful, sums, and counts.
+def _assigned_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, Bools, Labels, tuple[int, int]]:
+    """Return the points of a cloud near the surface, which of them are outliers, the faces of all, and counts.
 
-    These are the numbers of points near the surface and of all, outliers left out.
+    These are the numbers of points near the surface and of all, outliers left out. Points on no face have face -1.
     """
     seen = assignment.assigned(cloud.points, cloud.scanner, fit.curved, fit.grid)
     close = np.abs(seen.distance) <= fit.depth
-    doubtful = cloud.doubtful
-    if cloud.scanner is not None:
-        doubtful = doubtful | _mixed(cloud.points, cloud.scanner, seen, close, fit.curved)
-    sure = np.flatnonzero(close & ~doubtful)
-    part = fit.part(fit.sums(), seen.of(sure), seen.distance[sure])
     counts = int((close & ~cloud.doubtful).sum()), int((~cloud.doubtful).sum())
-    return Aside.of(np.flatnonzero(close), seen), doubtful[close], part, counts
+    face = np.where(seen.facet >= 0, fit.curved.surface.part_of[seen.facet], -1).astype(np.int32)
+    return Aside.of(np.flatnonzero(close), seen), cloud.doubtful[close], face, counts
 
 
-def _mixed(points: Floats, scanner: Floats, seen: OnSurface, close: Bools, curved: CurvedFacets) -> Bools:
-    """Mark (n,) the mixed pixels among points (n, 3) that are ``close`` (n,) to the surface, scanner by scanner."""
-    surface = curved.surface
-    face = np.where(seen.facet >= 0, surface.part_of[seen.facet], -1)
-    marked, left = np.zeros(len(points), np.bool_), np.arange(len(points))
+def _first_of(near: _Near, fit: _Fit) -> PartSums:
+    """Return sums over the points of a cloud near the surface, doubtful ones left out."""
+    seen, sure = near.aside.seen(near.points, fit.curved), np.flatnonzero(~near.doubtful)
+    return fit.part(fit.sums(), seen.of(sure), seen.distance[sure])
+
+
+def _mark_mixed(passes: _Passes, faces: Sequence[Labels]) -> None:
+    """Add to what is doubtful the mixed pixels among points near the surface, as all points of their scanner show."""
+    scanners, numbers = list[Floats](), list[Labels]()
+    for cloud in passes.clouds:
+        if cloud.scanner is None:
+            return
+        numbers.append(put_aside(_numbered(cloud.scanner, scanners)))
+    blocks = _Blocks(passes, faces, numbers)
+    mixed, done = mixed_pixels.mark_passes(blocks, np.array(scanners), passes.fit.value.curved.surface.normals), 0
+    for row, doubtful in enumerate(passes.doubtful):
+        passes.doubtful[row] = put_aside(doubtful | mixed[done : done + len(doubtful)])
+        done += len(doubtful)
+        release()
+
+
+def _numbered(scanner: Floats, scanners: list[Floats]) -> Labels:
+    """Return the row (n,) of each scanner (n, 3) in ``scanners``, to which those are added that are not there yet."""
+    number, left, row = np.zeros(len(scanner), np.int32), np.arange(len(scanner)), 0
     while len(left):
-        of_one = np.abs(scanner[left] - scanner[left[0]]).max(axis=1) <= SAME_MM
-        every, left = left[of_one], left[~of_one]
-        rows = every[close[every]]
-        of_face = surface.normals[seen.facet[rows]], seen.distance[rows], face[rows]
-        of_scanner = points[every], face[every]
-        marked[rows] = mixed_pixels.mark(points[rows], scanner[every[0]], *of_face, of_scanner)
-    return marked
+        if row == len(scanners):
+            scanners.append(scanner[left[0]].copy())
+        of_one = np.abs(scanner[left] - scanners[row]).max(axis=1) <= SAME_MM
+        number[left[of_one]] = row
+        left, row = left[~of_one], row + 1
+    return number
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Passes over all points of the clouds with their ``faces`` and the ``numbers`` of their scanners."""
+
+    passes: _Passes
+    faces: Sequence[Labels]
+    numbers: Sequence[Labels]
+
+    def __iter__(self) -> Iterator[mixed_pixels.Block]:
+        """Pass over all points."""
+        asides, curved = self.passes.asides, self.passes.fit.value.curved
+        for cloud, aside, face, number in zip(self.passes.clouds, asides, self.faces, self.numbers, strict=True):
+            facet, height = np.full(len(face), -1, np.int32), np.zeros(len(face))
+            facet[aside.rows] = aside.facet
+            height[aside.rows] = aside.seen(cloud.points[aside.rows], curved).distance
+            yield mixed_pixels.Block(cloud.points, number, face, facet, height)
+            release()
 
 
 def _second(passes: _Passes, around: _Around) -> tuple[list[Ints], Movement, Movement]:

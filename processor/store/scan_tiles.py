@@ -46,7 +46,7 @@ def write_scan(group: Any, scan: Scan) -> Ints:
 
 def read_scan(group: Any) -> Scan:
     """Read a scan. Raises DecodeError also for points that are not finite or lie outside their tile."""
-    stored = _read_tiles(group)
+    stored = read_index(group)
     points = large_arrays.allocate(int(stored.counts.sum()), 3)
     ends, wrong = np.cumsum(stored.counts), 0
     for rows in large_arrays.blocks(len(points)):
@@ -66,7 +66,7 @@ def read_scan(group: Any) -> Scan:
 
 def read_scan_alone(group: Any) -> Scan:
     """Read a scan with empty per-point columns."""
-    _read_tiles(group)
+    read_index(group)
     none = {
         f.name: np.empty(0, f.metadata["dtype"]) for f in dataclasses.fields(Scan) if f.name in per_point_fields(Scan)
     }
@@ -81,7 +81,7 @@ def extreme_stations(group: Any, size: int = 1 << 20) -> Labels:
 
 def count(group: Any) -> int:
     """Return the number of points of a scan's group."""
-    return len(_read_tiles(group).columns[0])
+    return len(read_index(group).columns[0])
 
 
 def shape(group: Any, name: str) -> tuple[int, ...]:
@@ -126,7 +126,7 @@ class PointColumn:
 
 def column(group: Any, name: str) -> Any:
     """Return a per-point column of a scan's group, to be read in slices; one that is absent is empty."""
-    return PointColumn(group.name, _read_tiles(group)) if name == "points" else _column(group, name)
+    return PointColumn(group.name, read_index(group)) if name == "points" else _column(group, name)
 
 
 def pieces(group: Any, name: str, size: int) -> Iterator[Any]:
@@ -146,7 +146,8 @@ class StoredTiles(NamedTuple):
     columns: list[Any]
 
 
-def _read_tiles(group: Any) -> StoredTiles:
+def read_index(group: Any) -> StoredTiles:
+    """Return the index and the coordinates of a scan's group. Raises DecodeError for damage."""
     points = group.get("points")
     where = f"{group.name}/points"
     if not isinstance(points, h5py.Group):
@@ -173,12 +174,13 @@ def _read_tiles(group: Any) -> StoredTiles:
     return StoredTiles(grid, cell, start, count, columns)
 
 
-def read_box(group: Any, lower: Floats, upper: Floats) -> Floats:
+def read_box(group: Any, stored: StoredTiles, lower: Floats, upper: Floats) -> Floats:
     """Return the points (m, 3) of a scan's group with ``lower <= p <= upper`` (mm).
 
-    Only the tiles that the box touches are read.
+    Only the tiles that the box touches in the index ``stored`` are read.
     """
-    grid, cell, start, count, columns = _read_tiles(group)
+    grid, cell, start, count, _ = stored
+    columns = [codec.sliced(group["points"][axis]) for axis in AXES]
     low, high = grid.cell_range(lower, upper)
     rows = np.flatnonzero(((cell >= low) & (cell <= high)).all(axis=1))
     pieces = [np.empty((0, 3))]

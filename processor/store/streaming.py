@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,12 @@ class StoredPoints:
 
     def within(self, boxes: Sequence[tuple[Floats, Floats]]) -> Boxed:
         """Restrict each scan to a box: lower and upper corner (3,), mm, relative to the scan's origin."""
-        return Boxed(self.scans, tuple(boxes))
+        return Boxed(self, tuple(boxes))
+
+    @cached_property
+    def indexed(self) -> dict[int, scan_tiles.StoredTiles]:
+        """The indexes of the scans that were read in boxes, by their numbers: many boxes take the same."""
+        return {}
 
     def pieces(self, scan: int, name: str) -> tuple[tuple[int, ...], Iterator[Any]]:
         """Return the shape of a per-point column and an iterator over it; see :func:`.store.scene_hash`."""
@@ -60,19 +66,26 @@ class StoredPoints:
 class Boxed:
     """Points within a box of each scan, without their stations; only the tiles that a box touches are read."""
 
-    scans: tuple[Any, ...]
+    stored: StoredPoints
     boxes: tuple[tuple[Floats, Floats], ...]
 
     def counts(self) -> tuple[int, ...]:
         """Return the number of points of each scan within its box."""
-        return tuple(len(scan_tiles.read_box(scan, *box)) for scan, box in zip(self.scans, self.boxes, strict=True))
+        return tuple(len(self._points(scan)) for scan in range(len(self.boxes)))
 
     def read(self, scan: int, size: int = PIECE) -> Iterator[tuple[Floats, Labels]]:
         """Yield points (n, 3), relative to the scan's origin, in the order of the file."""
-        with _naming_the_file(self.scans[scan]):
-            points = scan_tiles.read_box(self.scans[scan], *self.boxes[scan])
+        points = self._points(scan)
         for start in range(0, len(points), size):
             yield points[start : start + size], scan_tiles.NO_STATIONS
+
+    def _points(self, scan: int) -> Floats:
+        group, indexed = self.stored.scans[scan], self.stored.indexed
+        with _naming_the_file(group):
+            if scan not in indexed:
+                # Without the datasets: HDF5 holds some chunks of each that is open, of many scans a lot.
+                indexed[scan] = scan_tiles.read_index(group)._replace(columns=[])
+            return scan_tiles.read_box(group, indexed[scan], *self.boxes[scan])
 
 
 @contextmanager

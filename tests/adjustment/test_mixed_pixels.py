@@ -59,6 +59,46 @@ def test_a_dent_or_a_bulge_is_not_marked(depth):
     assert not marked(at, np.ones(len(at), bool), at).any()
 
 
+@pytest.mark.parametrize("rows", [7, 100_000], ids=["blocks", "one block"])
+@pytest.mark.parametrize("at_once", [0, 100_000], ids=["bands", "at once"])
+def test_points_in_blocks_are_marked_as_at_once(rows, at_once, monkeypatch):
+    """Of two scanners and an unknown one, whose points are mixed; those of the post are none of its wall's block."""
+    monkeypatch.setattr(mixed_pixels, "AT_ONCE", at_once)
+    monkeypatch.setattr(mixed_pixels, "BAND_POINTS", 300)
+    monkeypatch.setattr(mixed_pixels.large_arrays, "BLOCK_ROWS", 997)
+    points, wall = scan(noise=0.5)
+    one = marked(points, wall, points)
+    assert one.any()
+    assert not one.all()
+    scanners = np.array([SCANNER, np.full(3, np.nan), SCANNER + np.array([0.0, -2000.0, 300.0])])
+    seen = np.vstack([points, points, points + scanners[2] - SCANNER])
+    number, on = np.repeat([0, 1, 2], len(points)), np.tile(wall, 3)
+    height = np.tile(-points[:, 1], 3)
+    order = np.random.default_rng(0).permutation(len(seen))
+    order = order[np.argsort(on[order] + 2 * (number[order] == 1), kind="stable")]  # posts first
+
+    class Passes:
+        def __iter__(self):
+            for start in range(0, len(order), rows):
+                part = order[start : start + rows]
+                facet = np.where(on[part], 0, -1)
+                yield mixed_pixels.Block(seen[part], number[part], np.where(on[part], 0, 1), facet, height[part])
+
+    found = np.zeros(len(seen), bool)
+    found[order[on[order]]] = mixed_pixels.mark_passes(Passes(), scanners, np.array([[0.0, -1.0, 0.0]]))
+    for scanner, own in enumerate(seen[number == k] for k in range(3)):
+        expected = np.zeros(len(points), bool)
+        if scanner != 1:
+            sorted_as = np.argsort(np.argsort(order)[number == scanner])
+            points_of, wall_of = own[sorted_as], wall[sorted_as]
+            normals, face = np.tile([0.0, -1.0, 0.0], (wall.sum(), 1)), np.zeros(wall.sum(), np.int64)
+            faces = np.where(wall_of, 0, 1)
+            expected[sorted_as[wall_of]] = mixed_pixels.mark(
+                points_of[wall_of], scanners[scanner], normals, -points[sorted_as, 1][wall_of], face, (points_of, faces)
+            )
+        np.testing.assert_array_equal(found[number == scanner], expected)
+
+
 def test_a_few_points_are_no_scan():
     points, wall = scan()
     assert not marked(points[:3], wall[:3], points[:3]).any()

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.defects import observations, surface_charts
+from processor import large_arrays
+from processor.adjustment import mixed_pixels
+from processor.defects import alignment, measures, observations, surface_charts
 from processor.defects.alignment import rays_to
-from processor.model import Scan, Scene
+from processor.model import Scan, Scene, Stations
 
 RADIUS, NOISE = 60.0, 1.0
 SCANNER = np.array([1000.0, -5000.0, 0.0])
@@ -64,3 +66,47 @@ def test_points_of_a_noisy_station_are_not_stray():
     assert (pairs.stray - pairs.mixed).sum() < 0.002 * len(away)  # beyond 4 sd of their cell, which is known by four
     sd = np.sqrt(pairs.square.sum() / (pairs.count - 1.0).clip(0.0).sum())
     assert sd == pytest.approx(NOISE, rel=4.0 / np.sqrt(2.0 * len(away)))
+
+
+def test_points_in_blocks_and_parts_are_those_at_once(monkeypatch, tmp_path):
+    """Of a box seen from two stations and an unknown one, in one merged scan; all arrays in files."""
+    box = trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], [2000.0, 20.0, 1000.0]]))
+    surface = surface_charts.of_mesh(np.array(box.vertices), np.array(box.faces, np.int64), 40.0)
+    ray, rng = rays_through((-50.0, -50.0), (2050.0, 1050.0), 20.0), np.random.default_rng(6)
+    post = np.abs(ray[:, 0] / ray[:, 1] - 0.02) < 0.01  # before the box
+    away = np.where(post, -SCANNER[1] - 400.0, -SCANNER[1]) / ray[:, 1]
+    points = SCANNER + ray * (away + rng.normal(0.0, NOISE, len(away)))[:, None]
+    stations = Stations(("A", "B"), np.array([SCANNER, SCANNER + np.array([300.0, 0.0, 0.0])]))
+    named = rng.integers(-1, 2, len(points)).astype(np.int32)
+    scene = Scene("box", "structure", (Scan("s", points, point_station=named),), stations=stations)
+
+    def found():
+        observed = observations.observe(scene, np.eye(4), surface, 60.0)
+        pairs = observations.paired(observed, surface)
+        by_cell = measures.points_by_cell(observed, surface, alignment.none(surface, 3, 1.0))
+        cell_mm = observations.fitting_cell(observed, surface, 12.0, (5.0, 60.0))
+        aligned = alignment.align(pairs, surface, observed.stations, 1.0)
+        variance = alignment.station_variance(pairs, surface, observed.stations, aligned)
+        of_points = list(vars(observed).values())[:5]
+        return (*of_points, *vars(pairs).values(), by_cell.order, by_cell.cell, cell_mm, variance)
+
+    whole = found()
+    assert whole[4].any()
+    monkeypatch.setattr(observations, "CHUNK", 500)
+    monkeypatch.setattr(observations, "PART_POINTS", 300)
+    monkeypatch.setattr(alignment, "PAIRS_AT_ONCE", 70)
+    monkeypatch.setattr(mixed_pixels, "AT_ONCE", 400)
+    monkeypatch.setattr(mixed_pixels, "BAND_POINTS", 200)
+    for name, value in (("BLOCK_ROWS", 333), ("AT_ONCE", 100), ("MEMORY_BYTES", 0), ("LEAST_BYTES", 1)):
+        monkeypatch.setattr(large_arrays, name, value)
+    with large_arrays.in_files(tmp_path):
+        for ours, theirs in zip(found(), whole, strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-9)
+
+
+def test_a_quantile_in_files_is_that_of_numpy(monkeypatch):
+    values = np.random.default_rng(7).normal(0.0, 1.0, 1001)
+    expected = [np.quantile(values, share) for share in (0.0, 0.05, 0.333, 0.5, 1.0)]
+    monkeypatch.setattr(large_arrays, "AT_ONCE", 10)
+    monkeypatch.setattr(large_arrays, "BLOCK_ROWS", 97)
+    assert [large_arrays.quantile(values, share) for share in (0.0, 0.05, 0.333, 0.5, 1.0)] == expected

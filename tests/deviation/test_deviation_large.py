@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import trimesh
 
 from processor import large_arrays
 from processor.adjustment import mixed_pixels
@@ -11,10 +12,13 @@ from processor.deviation import cloud, large_cloud
 from processor.deviation import step as deviation_step
 from processor.deviation.params import Params
 from processor.geometry import nearest_neighbours, rigid
-from processor.model import Scan, Scene, UsageError
+from processor.model import Scan, Scene, StructureDesign, UsageError
 from tests.support.scenes.bracket_scenes import COUNT, scene_of
 
 EQUAL = {"projection_diameter_mm": 60.0, "core_spacing_mm": 30.0, "max_depth_mm": 40.0}  # not by the density
+
+WALL = [[-700.0, 0.0, -400.0], [700.0, 20.0, 400.0]]
+POST = [[-30.0, -300.0, -400.0], [30.0, -200.0, 400.0]]
 
 
 @pytest.fixture
@@ -74,8 +78,8 @@ def test_a_sample_is_every_kth_inlier(small):
 
 @pytest.mark.parametrize("options", SCENES.values(), ids=SCENES)
 def test_movements_are_those_of_the_whole(options, small, monkeypatch):
-    """But for mixed pixels: those whose nearer neighbour lies in another block are not known as such."""
-    monkeypatch.setattr(mixed_pixels, "mark", lambda points, *_: np.zeros(len(points), np.bool_))
+    monkeypatch.setattr(mixed_pixels, "AT_ONCE", 1_000)
+    monkeypatch.setattr(mixed_pixels, "BAND_POINTS", 500)
     scene, params = scene_of(**options), Params(register="none", **EQUAL)
     blocks = deviation_step.run(scene, params)
     monkeypatch.setattr(cloud, "MOST_POINTS", 10 * COUNT)
@@ -85,6 +89,36 @@ def test_movements_are_those_of_the_whole(options, small, monkeypatch):
     for name in ("distance", "lod95"):
         np.testing.assert_allclose(getattr(blocks.core, name), getattr(whole.core, name), atol=1e-3)
     assert whole.core.n1.sum() > COUNT
+
+
+def test_a_point_beside_a_post_is_a_mixed_pixel_whatever_the_block_of_the_post(small, monkeypatch):
+    """A wall, and a post before it of which no block of the wall's points has any."""
+    boxes = [trimesh.creation.box(bounds=bounds) for bounds in (WALL, POST)]
+    mesh, step = trimesh.util.concatenate(boxes), 2.5e-3
+    turn, rise = (x.ravel() for x in np.meshgrid(np.arange(-0.12, 0.12, step), np.arange(-0.06, 0.06, step)))
+    ray = np.stack([np.sin(turn) * np.cos(rise), np.cos(turn) * np.cos(rise), np.sin(rise)], axis=1)
+    on_post = np.abs(ray[:, 0] / ray[:, 1]) * (5000.0 + POST[0][1]) < POST[1][0]
+    away = (5000.0 + np.where(on_post, POST[0][1], 0.0)) / ray[:, 1]
+    place = np.array([0.0, -5000.0, 0.0])
+    beside = ~on_post & (np.abs(ray[:, 0] / ray[:, 1] * 5000.0) < 1.5 * POST[1][0])
+    assert beside.any()
+    points = place + ray * (away - np.where(beside, 12.0, 0.0))[:, None]  # between the post and the wall
+    scan = Scan("s", points[np.argsort(on_post, kind="stable")], position=place)
+    design = StructureDesign("wall", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    scene = Scene("wall", "structure", (scan,), structure=design, units="mm")
+    monkeypatch.setattr(cloud, "MOST_POINTS", 100)
+    params = Params(register="none", outlier_ratio=0.0, **EQUAL)
+    found = []
+    for size in (100, 997, 10 * COUNT):
+        monkeypatch.setattr(large_cloud, "PASS_POINTS", size)
+        found.append(deviation_step.run(scene, params))
+    *few, whole = (result.core for result in found)
+    for core in few:
+        np.testing.assert_array_equal(core.n1, whole.n1)
+        np.testing.assert_allclose(core.distance, whole.distance, atol=1e-9)
+    on_wall = (whole.normals[:, 1] < -0.9) & (np.abs(whole.points[:, 1] + found[2].origin[1]) < 1.0)
+    assert on_wall.sum() > 100
+    assert np.nanmax(np.abs(whole.distance[on_wall])) < 1.0
 
 
 def test_all_points_are_used_without_a_limit_of_points(small, monkeypatch):

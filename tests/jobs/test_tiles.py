@@ -8,6 +8,7 @@ import pytest
 
 import processor
 from processor import tiles
+from processor.adjustment import mixed_pixels
 from processor.api import runs
 from processor.cli.main import commands
 from processor.compare import core_tiles
@@ -110,6 +111,8 @@ def small(monkeypatch):
     monkeypatch.setattr(cloud, "SAMPLE_POINTS", 4_000)
     monkeypatch.setattr(large_cloud, "SLAB_POINTS", 2_000)
     monkeypatch.setattr(large_cloud, "PASS_POINTS", 2_000)
+    monkeypatch.setattr(mixed_pixels, "AT_ONCE", 1_000)
+    monkeypatch.setattr(mixed_pixels, "BAND_POINTS", 500)
 
 
 @pytest.fixture
@@ -135,7 +138,8 @@ def stored(scene, path, step, cluster):
 def test_a_deviation_has_the_same_bytes_as_here(dask_cluster, small, used, tmp_path):  # noqa: F811
     scene = scene_of(scans=2, count=8_000)
     here, there = (stored(scene, tmp_path / "a.h5", "deviation", one) for one in (None, dask_cluster.address))
-    assert used == {"_near", "_first_of", "_second_of", "_last_of", "_on_pieces_of"}
+    of_mixed = {"_neighbours", "_marks_of"}
+    assert used == {"_near", "_assigned_of", *of_mixed, "_first_of", "_second_of", "_last_of", "_on_pieces_of"}
     assert here == there
 
 

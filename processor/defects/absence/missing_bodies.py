@@ -18,6 +18,7 @@ from processor.defects.observations import Observed, cells_of
 from processor.defects.regions import EMPTY_SHARE, Region, chernoff
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import mesh_bodies, mesh_distance, rigid
+from processor.large_arrays import blocks
 from processor.model import Bools, Floats, Ints
 
 STEP_MM = 2.0  # between places by which contacts are measured
@@ -127,8 +128,11 @@ def _points_on(observed: Observed, surface: DesignSurface, cells: Ints) -> tuple
     charts = surface.charts
     wanted = np.zeros(len(surface.share), np.bool_)
     wanted[cells] = True
-    on = wanted[cells_of(observed, surface)] & (np.abs(observed.deviation) < ON_MM)
-    chart, uv = observed.chart[on], observed.uv[on]
+    parts = [(observed.chart[:0], observed.uv[:0])]
+    for rows in blocks(len(observed.chart)):
+        on = wanted[cells_of(observed, surface, rows)] & (np.abs(observed.deviation[rows]) < ON_MM)
+        parts.append((observed.chart[rows][on], observed.uv[rows][on]))
+    chart, uv = (np.concatenate(column) for column in zip(*parts, strict=True))
     axes = charts.axes[chart]
     return charts.origin[chart] + np.einsum("nk,nkj->nj", uv, axes[:, :2]), axes[:, 2]
 

@@ -39,11 +39,11 @@ def measure(part: RegisteredPart, at: Floats, direction: Floats) -> OuterEnd | N
 
     The variance is of noise and of differences between named stations.
     """
-    face, residual, beyond = part.surface.distances(part.points, REACH_MM)
+    rows = np.flatnonzero(np.abs((part.points - at) @ direction) < NEAR_MM)  # a few of the points of a long part
+    face, residual, beyond = part.surface.distances(part.points[rows], REACH_MM)
     facing = part.surface.normals[face] @ direction
-    offset = part.points - at
-    used = on_face(face, beyond) & (np.abs(facing) > ALONG) & (np.abs(offset @ direction) < NEAR_MM)
-    used &= np.abs(residual) < REACH_MM
+    offset = part.points[rows] - at
+    used = on_face(face, beyond) & (np.abs(facing) > ALONG) & (np.abs(residual) < REACH_MM)
     if used.sum() < LEAST_POINTS:
         return None
     level = np.array([-direction[1], direction[0], 0.0])
@@ -56,7 +56,7 @@ def measure(part: RegisteredPart, at: Floats, direction: Floats) -> OuterEnd | N
     coefficients, rest, inliers = least_squares(basis, np.sign(facing[used]) * residual[used])
     if not len(coefficients):
         return None
-    basis, station = basis[inliers], part.station[used][inliers]
+    basis, station = basis[inliers], part.station[rows][used][inliers]
     noise = max(float(rest @ rest) / (len(rest) - basis.shape[1]), FLOOR_MM**2)
     shared = variance_components.group_covariance(basis, station, part.between_stations)
     variance = noise * float(np.linalg.inv(basis.T @ basis)[0, 0]) + float(shared[0, 0]) + FLOOR_MM**2

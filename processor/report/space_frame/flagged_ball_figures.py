@@ -181,9 +181,10 @@ def _ball(result: Result, i: int, middle: Floats, nominal: Floats, points: Float
         if np.isfinite(balls.radii[i]) and balls.flag[i] is not Flag.NOT_FOUND:
             _circle(axes, np.zeros(3), float(balls.radii[i]), across, COLOURS[0], "-")
         axes.set(
-            xlim=(-reach, reach), ylim=(-reach, reach), title=name,
+            xlim=(-reach, reach), ylim=(-reach, reach),
             xlabel="x less the centre's, mm", ylabel=f"{'xyz'[across[1]]} less the centre's, mm",
         )  # fmt: skip
+        axes.set_title(name, y=1.0)  # a title without a height is placed above all ticks, which are laid out for that
         axes.set_aspect("equal")
         axes.grid(alpha=0.3)
     figure.suptitle("\n".join(lines), fontsize=11, y=1.0 - EDGE_IN / SIZE_IN[1])
