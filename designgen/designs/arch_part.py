@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import cadquery as cq
 
 SECTION_STEP_MM = 250.0
+BUILT_STEP_MM, STRIPS = 50.0, 8  # of a solid as built: sections along it, and strips of each of its sides
 EDGE_STEP_MM = 20.0
 NET_STEP_MM, NET_ACROSS = 250.0, 6  # cells of the nets that rays meet before the surface itself
 PAD_SIZE_MM, PAD_HEIGHT_MM = 200.0, 20.0
@@ -327,32 +328,23 @@ def solid(part: ArchPart) -> cq.Solid:
 
     t = part.plates
     shell: list[cq.Face] = []
-    sides = ((1.0, False), (-1.0, False), (-1.0, True), (1.0, True))
 
-    def edge(start: float, end: float, side: float, top: bool, inner: bool) -> cq.Edge:
-        s = part.chainages(start, end, SECTION_STEP_MM)
-        b, h = part.b(s) - (t.web if inner else 0.0), part.h(s)
-        v = (h - (t.top if inner else 0.0)) if top else np.full_like(s, t.bottom if inner else 0.0)
-        points = part.point(s, side * b, v)
+    def edge(start: float, end: float, corner: int, inner: bool) -> cq.Edge:
+        s = part.chainages(start, end, SECTION_STEP_MM if part.built is None else BUILT_STEP_MM)
+        points = part.point(s, *_around(part, s, inner)[:, corner])
         # All splines have the arc length as parameter, so that a ruling joins points of the same section.
         return cq.Edge.makeSpline([cq.Vector(*p) for p in points], parameters=s.tolist())
 
     for inner, (lo, hi) in ((False, (part.s0, part.s1)), (True, part.cavity)):
         ends = np.concatenate([[lo], part.knots[(part.knots > lo) & (part.knots < hi)], [hi]])
         for start, end in pairwise(ends):
-            corners = [edge(start, end, side, top, inner) for side, top in sides]
-            shell += [cq.Face.makeRuledSurface(corners[i], corners[(i + 1) % 4]) for i in range(4)]
-
-    def corners_of(s: float, inner: bool) -> list[cq.Vector]:
-        b = float(part.b(np.array(s))) - (t.web if inner else 0.0)
-        h = float(part.h(np.array(s)))
-        low, high = (t.bottom, h - t.top) if inner else (0.0, h)
-        corners = part.point(np.full(4, s), np.array([b, -b, -b, b]), np.array([low, low, high, high]))
-        return [cq.Vector(*p) for p in corners]
+            count = _around(part, ends[:1], inner).shape[1]
+            corners = [edge(start, end, corner, inner) for corner in range(count)]
+            shell += [cq.Face.makeRuledSurface(corners[i], corners[(i + 1) % count]) for i in range(count)]
 
     for s, c, end in ((part.s0, part.cavity[0], "start"), (part.s1, part.cavity[1], "end")):
-        outer, inner_ = corners_of(s, False), corners_of(c if part.closed == end else s, True)
-        shell += _cap(outer, inner_, closed=part.closed == end, flat=part.built is None)
+        closed = part.closed == end
+        shell += _cap(part, s, c, closed=closed) if part.built is None else _strips_of_cap(part, s, c, closed=closed)
     box = cq.Solid.makeSolid(cq.Shell.makeShell(shell))
     if box.Volume() < 0.0:  # sewing does not define the orientation of the shell
         box = cq.Solid(box.wrapped.Reversed())
@@ -367,23 +359,54 @@ def solid(part: ArchPart) -> cq.Solid:
     return solids[0]
 
 
-def _cap(outer: list[cq.Vector], inner: list[cq.Vector], *, closed: bool, flat: bool) -> list[cq.Face]:
-    """Return the faces of an end with corners P1 to P4 outside and inside: two if it is closed, else a ring.
+def _divisions(part: ArchPart, s: Floats, inner: bool) -> tuple[Floats, Floats]:
+    """Return u (k, n) and v (l, n), at s (n,), by which the outer or inner side of a section is divided into strips.
 
-    An end that is not ``flat``, as its corners were built off a plane, has ruled faces.
+    As built, sides are slightly curved: they are in strips, and the outer ones divided as the plates are.
     """
+    b, h, t = part.b(s), part.h(s), part.plates
+    low, high = np.full_like(s, t.bottom), h - t.top
+    if part.built is None:
+        return (np.stack([b - t.web, t.web - b]), np.stack([low, high])) if inner else (
+            np.stack([b, -b]), np.stack([np.zeros_like(s), h])
+        )  # fmt: skip
+    share = np.linspace(0.0, 1.0, STRIPS + 1)[:, None]
+    u, v = (b - t.web) * (1.0 - 2.0 * share), low + share * (high - low)
+    return (u, v) if inner else (np.vstack([b, u, -b]), np.vstack([np.zeros_like(s), v, h]))
+
+
+def _around(part: ArchPart, s: Floats, inner: bool) -> Floats:
+    """Return u and v (2, k, n) of the divisions around a section at s (n,): bottom, right, top, left."""
+    u, v = _divisions(part, s, inner)
+    low, high, left, right = (np.broadcast_to(edge, shape.shape) for edge, shape in (
+        (v[0], u), (v[-1], u), (u[0], v), (u[-1], v)
+    ))  # fmt: skip
+    sides = ((u, low), (right, v), (u[::-1], high), (left, v[::-1]))
+    return np.concatenate([np.stack([across, up])[:, :-1] for across, up in sides], axis=1)
+
+
+def _cap(part: ArchPart, s: float, c: float, *, closed: bool) -> list[cq.Face]:
+    """Return the flat faces of an end as designed: if it is closed, outside at s and inside at c, else a ring."""
     import cadquery as cq
 
-    if flat:
-        wires = [cq.Wire.makePolygon(corners, close=True) for corners in (outer, inner)]
-        return (
-            [cq.Face.makeFromWires(wire) for wire in wires] if closed else [cq.Face.makeFromWires(wires[0], wires[1:])]
-        )
+    wires = []
+    for at, inner in ((s, False), (c if closed else s, True)):
+        u, v = _around(part, np.array([at]), inner)[..., 0]
+        wires.append(cq.Wire.makePolygon([cq.Vector(*p) for p in part.point(np.full(4, at), u, v)], close=True))
+    return [cq.Face.makeFromWires(wire) for wire in wires] if closed else [cq.Face.makeFromWires(wires[0], wires[1:])]
 
-    def ruled(a: cq.Vector, b: cq.Vector, c: cq.Vector, d: cq.Vector) -> cq.Face:
-        return cq.Face.makeRuledSurface(cq.Edge.makeLine(a, b), cq.Edge.makeLine(c, d))
 
-    if closed:
-        return [ruled(corners[0], corners[1], corners[3], corners[2]) for corners in (outer, inner)]
-    hole = cq.Wire.makePolygon(inner, close=True)
-    return [ruled(outer[0], outer[1], outer[3], outer[2]).addHole(hole)]
+def _strips_of_cap(part: ArchPart, s: float, c: float, *, closed: bool) -> list[cq.Face]:
+    """Return the faces of an end as built, which are not flat: ruled ones between the divisions of the section."""
+    import cadquery as cq
+
+    faces = []
+    for at, inner in ((s, False), (c, True)) if closed else ((s, False),):
+        u, v = (x[:, 0] for x in _divisions(part, np.array([at]), inner))
+        points = part.point(np.full(len(u) * len(v), at), np.repeat(u, len(v)), np.tile(v, len(u)))
+        grid = [[cq.Vector(*p) for p in row] for row in points.reshape(len(u), len(v), 3)]
+        for i, j in np.ndindex(len(u) - 1, len(v) - 1):
+            if closed or i in (0, len(u) - 2) or j in (0, len(v) - 2):
+                sides = (cq.Edge.makeLine(grid[k][j], grid[k][j + 1]) for k in (i, i + 1))
+                faces.append(cq.Face.makeRuledSurface(*sides))
+    return faces

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -106,17 +107,18 @@ def least_radius(directions: Floats, connection: Connection) -> float:
     return connection.sleeve_corner_radius / math.sin(0.5 * angle)
 
 
-def build(params: Params) -> cq.Shape:
-    """Return the CadQuery solid, centred at the origin."""
+def build(params: Params, bolted: Sequence[bool] = ()) -> cq.Shape:
+    """Return the CadQuery solid, centred at the origin; flats that are not ``bolted`` have no bore. Empty: all are."""
     import cadquery as cq
 
     R, bolt = params.radius_mm, params.connection.bolt
     ball: cq.Shape = cq.Solid.makeSphere(R, cq.Vector(0, 0, 0), cq.Vector(0, 0, 1), -90, 90, 360)
-    for direction in params.directions:
+    for direction, bored in zip(params.directions, bolted or [True] * len(params.directions), strict=True):
         out = cq.Vector(*direction)
         flat = cq.Solid.makeCylinder(2.0 * R, R, out * params.flat_distance, out)
-        bore = cq.Solid.makeCylinder(0.5 * bolt, 0.8 * R, out * (0.3 * R), out)
-        ball = ball.cut(flat).cut(bore)
+        ball = ball.cut(flat)
+        if bored:
+            ball = ball.cut(cq.Solid.makeCylinder(0.5 * bolt, 0.8 * R, out * (0.3 * R), out))
     if params.process_hole:
         hole = cq.Solid.makeCylinder(
             PROCESS_HOLE_RADIUS_MM, PROCESS_HOLE_DEPTH_MM, cq.Vector(0, 0, -R), cq.Vector(0, 0, 1)

@@ -134,6 +134,12 @@ class Frame:
         """Return whether a member's end has its sleeve and bolt."""
         return not (len(self.missing) and self.missing[member, end])
 
+    def bolted(self, node: int) -> list[bool]:
+        """Return whether there is a bolt along each of a node's directions."""
+        return [
+            self.has_sleeve(m, end) for m in range(len(self.members)) for end in (0, 1) if self.members[m, end] == node
+        ]
+
     def ball(self, node: int) -> bolt_ball.Params:
         """Return the design of one ball."""
         return bolt_ball.Params(float(self.radii[node]), self.directions[node], self.connection, self.process_hole)
@@ -192,24 +198,48 @@ def _shaped(nodes: Floats, params: Params) -> Floats:
 
 
 def solid(frame: Frame) -> cq.Compound:
-    """Return the CadQuery compound of all balls, sleeves, cones and tubes."""
+    """Return the CadQuery compound of all balls, sleeves, cones and tubes, as designed or as built.
+
+    Where a bolt is missing the flat has no hole, as in the surface that is scanned.
+    """
     import cadquery as cq
 
     shapes: list[cq.Shape] = [
-        bolt_ball.build(frame.ball(i)).moved(cq.Location(cq.Vector(*centre))) for i, centre in enumerate(frame.centres)
+        bolt_ball.build(frame.ball(i), frame.bolted(i)).moved(cq.Location(cq.Vector(*centre)))
+        for i, centre in enumerate(frame.centres)
     ]
+    for member in range(len(frame.members)):
+        shapes += _member(frame, member)
+    return cq.Compound.makeCompound(shapes)
+
+
+def _member(frame: Frame, member: int) -> list[cq.Shape]:
+    """Return sleeves, cones and tube of a member; its ends without bolt have no sleeve."""
+    import cadquery as cq
+
     connection, tube = frame.connection, 0.5 * frame.connection.tube_diameter
-    for (i, j), stacks in zip(frame.members, frame.stacks, strict=True):
-        span = frame.centres[j] - frame.centres[i]
-        length, unit = float(np.linalg.norm(span)), span / np.linalg.norm(span)
-        for node, out, (sleeve, cone, _) in zip((i, j), (unit, -unit), stacks, strict=True):
-            foot, tip = (frame.centres[node] + start * out for start in (sleeve, cone))
+    begin_of, end_of = frame.ends(member)
+    stacks, span = frame.stacks[member], end_of - begin_of
+    length, unit = float(np.linalg.norm(span)), span / np.linalg.norm(span)
+    shapes: list[cq.Shape] = []
+    for end, (origin, out) in enumerate(((begin_of, unit), (end_of, -unit))):
+        foot, tip = (origin + start * out for start in stacks[end, :2])
+        if frame.has_sleeve(member, end):
             plane = cq.Plane(origin=tuple(foot), xDir=tuple(perpendicular(out)), normal=tuple(out))
             corners = [plane.toWorldCoords(tuple(c)) for c in connection.sleeve_corner_radius * HEXAGON]
             hexagon = cq.Wire.makePolygon(corners, close=True)
             shapes.append(cq.Solid.extrudeLinear(hexagon, [], cq.Vector(*(connection.sleeve_length * out))))
-            radii = connection.cone_radius, tube
-            shapes.append(cq.Solid.makeCone(*radii, connection.cone_length, cq.Vector(*tip), cq.Vector(*out)))
-        begin, size = frame.centres[i] + stacks[0, 2] * unit, length - stacks[:, 2].sum()
-        shapes.append(cq.Solid.makeCylinder(tube, size, cq.Vector(*begin), cq.Vector(*unit)))
-    return cq.Compound.makeCompound(shapes)
+        radii = connection.cone_radius, tube
+        shapes.append(cq.Solid.makeCone(*radii, connection.cone_length, cq.Vector(*tip), cq.Vector(*out)))
+    begin, size = begin_of + stacks[0, 2] * unit, length - stacks[:, 2].sum()
+    if not frame.bow(member).any():
+        return [*shapes, cq.Solid.makeCylinder(tube, size, cq.Vector(*begin), cq.Vector(*unit))]
+    # Circles square to the straight axis, moved along a parabola: three of them determine it.
+    plane = cq.Plane(origin=tuple(begin), xDir=tuple(perpendicular(unit)), normal=tuple(unit))
+    rings = [
+        cq.Wire.makeCircle(
+            tube, cq.Vector(*(begin + q * size * unit + 4.0 * q * (1.0 - q) * frame.bow(member))), plane.zDir
+        )
+        for q in (0.0, 0.5, 1.0)
+    ]
+    return [*shapes, cq.Solid.makeLoft(rings)]

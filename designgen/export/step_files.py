@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from designgen.asbuilt import imperfections
+from designgen.asbuilt.imperfections import Ledger
 from designgen.cad.process import escape
 from designgen.designs import (
     arch_bridge,
@@ -25,6 +26,7 @@ from designgen.export import model_solids
 from designgen.models import body_deviations
 from designgen.randomness import generator
 from designgen.recipe_params import filled
+from designgen.scenes import assembly
 from processor.model import UsageError
 from processor.store.atomic_file import replacing
 
@@ -37,20 +39,33 @@ WRITTEN = "1970-01-01T00:00:00"  # date in every file, so that the same design g
 def write_as_built(recipe: Mapping[str, Any], seed: int, folder: Path) -> list[Path]:
     """Write the solids of what a recipe built otherwise than designed; return the files, none where all is as designed.
 
-    Parts of an arch have their ends, twist, bow, section, corners and plates at the design's temperature, but no waves,
-    dents and missing pieces; bodies of a model are moved and turned or missing, but not bent or dented.
+    Parts of an arch or ring have their ends, twist, bow, section, corners and plates at the design's temperature, but
+    no waves, dents and missing pieces; parts of assemblies and frames have all their errors; bodies of a model are
+    moved and turned or missing, but not bent or dented.
     """
     if "asbuilt" not in recipe:
         return []
     kind, written = recipe.get("kind"), []
-    if kind == "arch-bridge":
-        parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
+    if kind in ("arch-bridge", "ring"):
+        parts = _parts_of_arch(recipe)
         errors = filled(imperfections.ArchParams, recipe, "asbuilt")
         rngs = [generator(seed, f"built {part.name}") for part in parts]
         folder.mkdir(exist_ok=True)
-        for part in imperfections.arch(parts, errors, rngs, imperfections.Ledger()):
+        for part in imperfections.arch(parts, errors, rngs, Ledger()):
             written.append(folder / f"{part.name}.step")
             write_step(written[-1], {part.name: arch_part.solid(part)})
+    elif kind == "assembly":
+        solids = {part.name: prismatic_solids.as_built(part) for part in assembly.built(recipe, seed, Ledger())[1]}
+        written.append(folder / "assembly.step")
+        folder.mkdir(exist_ok=True)
+        write_step(written[-1], solids)
+    elif kind == "space-frame":
+        errors_of_frame = filled(imperfections.FrameParams, recipe, "asbuilt")
+        nominal = space_frame.build(filled(space_frame.Params, recipe, "frame"))
+        frame = imperfections.frame(nominal, errors_of_frame, generator(seed, "built"), Ledger())
+        written.append(folder / "frame.step")
+        folder.mkdir(exist_ok=True)
+        write_step(written[-1], {"frame": space_frame.solid(frame)}, _origin(recipe))
     elif "model" in recipe:
         shapes, model = model_solids.of_recipe(recipe)
         params = body_deviations.params_of(recipe, tuple(shapes))
@@ -61,7 +76,7 @@ def write_as_built(recipe: Mapping[str, Any], seed: int, folder: Path) -> list[P
         }
         folder.mkdir(exist_ok=True)
         written.append(folder / "structure.step")
-        write_step(written[-1], built, recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0)))
+        write_step(written[-1], built, _origin(recipe))
     return written
 
 
@@ -74,10 +89,7 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
     kind = recipe.get("kind")
     shapes: dict[str, cq.Shape]
     if kind in ("arch-bridge", "ring"):
-        if kind == "ring":
-            parts = closed_ring.build(filled(closed_ring.Params, recipe, "ring"))
-        else:
-            parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
+        parts = _parts_of_arch(recipe)
         written = [folder / f"{part.name}.step" for part in parts]
         for path, part in zip(written, parts, strict=True):
             write_step(path, {part.name: arch_part.solid(part)})
@@ -95,8 +107,21 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
         path, shapes = folder / "assembly.step", _parts_of_assembly(recipe)
     else:
         raise UsageError("--step: the scene does not name the recipe it was made from, so its solids are not known")
-    write_step(path, shapes, recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0)))
+    write_step(path, shapes, _origin(recipe))
     return [path]
+
+
+def _origin(recipe: Mapping[str, Any]) -> Sequence[float]:
+    """Return the position (3,) of a design's own origin in the scene's frame, mm."""
+    origin: Sequence[float] = recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0))
+    return origin
+
+
+def _parts_of_arch(recipe: Mapping[str, Any]) -> tuple[arch_part.ArchPart, ...]:
+    """Return the parts of an arch bridge or of a closed ring."""
+    if recipe["kind"] == "ring":
+        return closed_ring.build(filled(closed_ring.Params, recipe, "ring"))
+    return arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
 
 
 def _parts_of_assembly(recipe: Mapping[str, Any]) -> dict[str, cq.Shape]:

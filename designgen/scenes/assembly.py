@@ -49,16 +49,8 @@ class Errors:
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
     """Make the scene of an assembly, a scan of each part in a separate frame, and its truth."""
-    sizes = filled(design_of.Params, recipe, "assembly")
-    bolts = filled(bolt_holes.Params, recipe, "bolts") if "bolts" in recipe else None
-    nominal = design_of.build(sizes, bolts)
-    errors = filled(Errors, recipe, "asbuilt")
     ledger = Ledger()
-    shifts = {
-        part.name: _drilled(part, errors, generator(seed, f"holes {part.name}"), ledger) for part in nominal.parts
-    }
-    drilled = design_of.build(sizes, bolts, shifts).parts
-    parts = [_built(part, errors, generator(seed, f"built {part.name}"), ledger) for part in drilled]
+    nominal, parts = built(recipe, seed, ledger)
     names = tuple(part.name for part in parts)
     scans, labels, poses, ends = [], [], [], []
     surveys: list[Survey] = []
@@ -80,8 +72,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         poses.append(inverse(T))
         for end in part.ends:
             corners = end.key_points()
-            built = corners + part.displacement(corners)
-            ends.append((number, end.joint, end.outward, built @ T[:3, :3].T + T[:3, 3], built))
+            displaced = corners + part.displacement(corners)
+            ends.append((number, end.joint, end.outward, displaced @ T[:3, :3].T + T[:3, 3], displaced))
     stations = survey.joined_truth([one.truth for one in surveys]) if surveys else None
     scene = Scene(
         name,
@@ -102,6 +94,19 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         spacing_mm=scanning.spacing_mm,
         sigma_mm=scanning.sigma_mm,
     )
+
+
+def built(recipe: Mapping[str, Any], seed: int, ledger: Ledger) -> tuple[design_of.Assembly, list[Part]]:
+    """Return the assembly of a recipe as designed, and its parts as built, whose errors are added to the ledger."""
+    sizes = filled(design_of.Params, recipe, "assembly")
+    bolts = filled(bolt_holes.Params, recipe, "bolts") if "bolts" in recipe else None
+    nominal = design_of.build(sizes, bolts)
+    errors = filled(Errors, recipe, "asbuilt")
+    shifts = {
+        part.name: _drilled(part, errors, generator(seed, f"holes {part.name}"), ledger) for part in nominal.parts
+    }
+    drilled = design_of.build(sizes, bolts, shifts).parts
+    return nominal, [_built(part, errors, generator(seed, f"built {part.name}"), ledger) for part in drilled]
 
 
 def _drilled(part: Part, errors: Errors, rng: np.random.Generator, ledger: Ledger) -> Floats:

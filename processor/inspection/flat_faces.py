@@ -38,11 +38,12 @@ MOST_CONDITION = 1e6
 
 @dataclass(frozen=True)
 class FlatFace:
-    """A flat face as designed: outward normal (3,), corners (n, 3) of its facets, area in mm^2."""
+    """A flat face as designed: outward normal (3,), corners (n, 3) of its facets (n / 3,), area in mm^2."""
 
     normal: Floats
     corners: Floats
     area: float
+    facets: Ints
 
     def extent(self, direction: Floats) -> tuple[float, float]:
         """Return where the face begins and ends along a unit direction (3,)."""
@@ -135,7 +136,7 @@ def bodies(design: StructureDesign, seen: Observed, least_mm: float) -> Iterator
     Faces narrower than ``least_mm`` are among those as designed, and without pieces.
     """
     vertices, _ = scene_cloud.local_design(design)
-    names, of_facet = _bodies(design, vertices)
+    names, of_facet = named_bodies(design, vertices)
     cross, double = mesh_distance.double_areas(vertices, design.faces)
     normals = cross / np.maximum(double, 1e-12)[:, None]
     plane = _planes(vertices[design.faces], normals, of_facet)
@@ -151,7 +152,7 @@ def bodies(design: StructureDesign, seen: Observed, least_mm: float) -> Iterator
         holes = design_holes.of_body(vertices, design.faces[own], normals[own], plane[own]) if len(own) else []
         for k in large[of_large[number]]:
             corners = vertices[design.faces[facets[k]]].reshape(-1, 3)
-            faces.append(FlatFace(normals[first[k]], corners, float(area[k])))
+            faces.append(FlatFace(normals[first[k]], corners, float(area[k]), facets[k]))
             wide = _width(faces[-1]) >= least_mm
             pieces.append(_pieces(seen, normals, rows[k] if wide else rows[k][:0]))
         yield Body(name, tuple(faces), tuple(pieces), tuple(holes))
@@ -172,7 +173,7 @@ def _members(group: Ints, count: int = 0) -> list[Ints]:
     return np.split(order, np.cumsum(np.bincount(group, minlength=count))[:-1])
 
 
-def _bodies(design: StructureDesign, vertices: Floats) -> tuple[tuple[str, ...], Ints]:
+def named_bodies(design: StructureDesign, vertices: Floats) -> tuple[tuple[str, ...], Ints]:
     """Return the names of bodies, and the body (f,) of each facet; without names they are the connected pieces.
 
     A piece without a name has that of its component, as in the defects; if others touch it, with a number.

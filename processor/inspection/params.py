@@ -15,7 +15,7 @@ class Params:
 
     method: str = METHODS[0]
     seed: int = 0
-    least_face_mm: float = 60.0  # least width of a face of a body that is inspected
+    least_face_mm: float = 60.0  # least width of a face measured by core points; narrower: by the points on it
 
     def check(self) -> None:
         """Raise UsageError for parameters that make no sense."""

@@ -96,7 +96,7 @@ def test_an_end_that_was_not_seen_has_no_value():
     for id_ in ("length", "end-squareness-over-width"):
         row = found.id.index(id_)
         assert np.isnan(found.actual[row])
-        assert found.reasons[row][0].code == "inspect.face-not-seen"
+        assert found.reasons[row][0].code == "inspect.face-hidden"
     assert np.isfinite(by_id(result)["start-squareness-over-width"][0])
 
 
