@@ -47,6 +47,7 @@ CORNER_SAMPLES = 12  # nearest of the rival's design: some of them on each face 
 # An end plate's two sides are alike to few points: poses that differ by a plate's thickness, up to some 60 mm, along
 # the part are each stable, and are tried from starts nearer to each other than half of the plates that are usual.
 SLIDES_MM = (-60.0, -45.0, -30.0, -15.0, 15.0, 30.0, 45.0, 60.0)
+SLID_KEPT = 2  # of the poses of a tube that differ by a slide along it
 MARKS = 2_000  # samples of marks that the turn of a tube is searched by
 LEAST_EVIDENCE = 10  # samples of distinguishing surface that the scan shows
 SLIDE_RAD = np.radians(45.0)  # a rival turned by less has slid along the part: along an arch it turns a little
@@ -255,19 +256,22 @@ def _of_tube(points: Floats, box: Floats, seeds: Floats, surface: Surface, candi
     turns, identity = turn_about_axis.tested(centre, axes[:, 0]), np.eye(4)
     marks = turn_about_axis.marks(surface.points, [_lacks(surface, identity, surface, turn) for turn in turns])
     poses = [c.T for c in candidates]
+    slid = [candidates[k] for k in turn_about_axis.shifted(poses, centre, axes[:, 0], SLIDE_RAD, SAME_POSE_MM)]
     chosen = [candidates[k] for k in turn_about_axis.in_either_sense(poses, axes[:, 0])]
     if len(marks) >= LEAST_EVIDENCE:
         marks = thinned(marks, MARKS)
         tree = cKDTree(seeds, balanced_tree=False)
+        spacing = float(np.median(tree.query(thinned(seeds, COARSE_POINTS), k=2)[0][:, 1]))
+        reach = max(2.0 * TELLING_MM, 4.0 * spacing)
 
         def count(T: Floats) -> int:
-            near = tree.query(rigid.apply(rigid.invert(T), marks), distance_upper_bound=2.0 * TELLING_MM)[0]
+            near = tree.query(rigid.apply(rigid.invert(T), marks), distance_upper_bound=reach)[0]
             return int(np.isfinite(near).sum())
 
         turned = turn_about_axis.searched(centre, axes[:, 0], axes[:, 1], chosen[0].T, count)
         align = partial(_align, seeds, surface, FINE_GATES_MM)
         chosen = _distinct(chosen + each(align, [_Candidate(T, chosen[0].start) for T in turned]), box)
-    found = _decide(points, box, seeds, surface, chosen)
+    found = _decide(points, box, seeds, surface, _distinct([*chosen, *slid[:SLID_KEPT]], box))
     for turn in turns:
         for_found, for_turned = _evidence(points, surface, found.T_surface, turn @ found.T_surface)
         if for_found < max(LEAST_EVIDENCE, 2 * for_turned):

@@ -447,7 +447,7 @@ def _register(scan: Scan, points: Floats, station: Ints, index: int, shapes: att
 def _plated(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> tuple[Reason, ...]:
     """State at which joints the points (n, 3), placed by T (4, 4), have splice plates; () for none."""
     design = shapes.design
-    placed = rigid.apply(T, points)
+    placed = rigid.apply(T, thinned(points, surface_registration.LAST_POINTS))
     joints = tuple(
         design.joint_names[joint]
         for joint, outward in topology.ends_of(design.joined, index)

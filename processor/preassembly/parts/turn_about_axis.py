@@ -56,3 +56,17 @@ def in_either_sense(candidates: list[Floats], axis: Floats) -> list[int]:
     """Return the numbers of the first of the poses (4, 4) in each sense of the tube, by the first one's axis (3,)."""
     ahead = [float(axis @ T[:3, :3] @ candidates[0][:3, :3].T @ axis) > 0.0 for T in candidates]
     return [ahead.index(sense) for sense in (True, False) if sense in ahead]
+
+
+def shifted(poses: list[Floats], centre: Floats, axis: Floats, most_rad: float, least_mm: float) -> list[int]:
+    """Return the numbers of the poses (4, 4) that lie ``least_mm`` or more along the axis from the first one.
+
+    Poses turned by ``most_rad`` or more against the first are left out.
+    """
+    found = []
+    for k, T in enumerate(poses):
+        between = T @ rigid.invert(poses[0])
+        along = abs(float((rigid.apply(between, centre) - centre) @ axis))
+        if rigid.rotation_angle(between[:3, :3]) < most_rad and along >= least_mm:
+            found.append(k)
+    return found
