@@ -453,7 +453,8 @@ def _key_points(place: EndPlace, coefficients: Floats) -> tuple[Floats, Floats]:
     A corner is where its faces and the ring meet. Each surface is evaluated at the corner as the others place it, by
     fixed-point iteration. The middle of an open side is that of its corners.
     """
-    half, (_, faces, corners, middles) = place.half, place.section
+    half, faces = place.half, place.section.faces
+    corners, middles = place.section.corners, place.section.middles
     ring = _layout(len(faces)).ring
     departure, derivative = np.zeros((8, 3)), np.zeros((8, 3, len(coefficients)))
     for k, (u, v, upright, level) in enumerate(corners):

@@ -45,9 +45,13 @@ def joint_frame(key_points: Floats) -> Floats:
 def end_place(key_points: Floats, outward: float, surface: MeshSurface | None = None) -> EndPlace:
     """Place of the end of a part at a joint with the design's P1..P8 (8, 3).
 
-    Its section is by the design's ``surface``, or a box.
+    Its section is round by its key points, else by the design's ``surface``, or a box.
     """
     frame = joint_frame(key_points)
-    half = 0.5 * np.ptp(rigid.apply(rigid.invert(frame), key_points[:4]), axis=0)
+    local = rigid.apply(rigid.invert(frame), key_points)
+    half = 0.5 * np.ptp(local[:4], axis=0)
+    radius = section.round_radius(local)
+    if radius:
+        return EndPlace(frame, section.of_round(half, radius), outward)
     of_end = section.of_box(half) if surface is None else section.of_surface(half, frame, surface)
     return EndPlace(frame, of_end, outward)

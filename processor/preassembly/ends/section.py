@@ -84,6 +84,7 @@ class Section(NamedTuple):
     faces: tuple[EndFace, ...]
     corners: tuple[Corner, ...]
     middles: tuple[int, ...]
+    radius: float = 0.0  # of a round tube, which has no faces and no corners, mm; else 0
 
 
 SIDES = (  # axis and sense of the normal; P5..P8 are the middles of these
@@ -92,7 +93,27 @@ SIDES = (  # axis and sense of the normal; P5..P8 are the middles of these
     (PlateFace.TOP, 2, 1.0),
     (PlateFace.LEFT, 1, 1.0),
 )
+ANGLES = np.radians([-45.0, -135.0, 135.0, 45.0, -90.0, 180.0, 90.0, 0.0])  # of P1..P8 of a round tube, left to up
+ROUND_SHARE = 0.03  # largest departure of the key points of a round section, by the radius: a mitre makes an ellipse
 PLACES = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))  # u, v of P1..P4
+
+
+def round_radius(local: Floats) -> float:
+    """Radius of the round section that has the key points P1..P8 (8, 3) in the joint's frame, mm; 0 of any other.
+
+    P1..P4 of a round section are at 45 degrees, and P5..P8 as far from its middle as these.
+    """
+    at = local[:, 1:] - local[:4, 1:].mean(axis=0)
+    away = np.linalg.norm(at, axis=1)
+    off = np.angle(np.exp(1j * (np.arctan2(at[:, 1], at[:, 0]) - ANGLES)))
+    radius = float(away.mean())
+    is_round = np.abs(away - radius).max() < ROUND_SHARE * radius and np.abs(off).max() < ROUND_SHARE
+    return radius if is_round else 0.0
+
+
+def of_round(half: Floats, radius: float) -> Section:
+    """Return the section of a round tube."""
+    return Section(half, (), (), (0, 0, 0, 0), radius)
 
 
 def of_box(half: Floats) -> Section:
@@ -110,8 +131,8 @@ def of_surface(half: Floats, T_bridge_joint: Floats, surface: MeshSurface) -> Se
     return _made(half, tuple(closed.tolist()), thickness)
 
 
-def is_box(section: Section) -> bool:
-    """Return whether all four sides are plates: nothing but an open end shows their inner sides."""
+def is_hollow(section: Section) -> bool:
+    """Return whether no side is open: nothing but an open end shows the inner sides of its plates."""
     return all(face >= 0 for face in section.middles)
 
 

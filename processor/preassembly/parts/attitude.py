@@ -17,8 +17,13 @@ from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.thinning import thinned, voxel_means
 from processor.geometry.thread_ranges import each
-from processor.model import ArchDesign, DesignPart, Floats, Reason, Status, reason
+from processor.model import ArchDesign, Bools, DesignPart, Floats, Reason, Status, reason
+from processor.preassembly import topology
+from processor.preassembly.ends import tube_end
+from processor.preassembly.ends.joint_frame import end_place
+from processor.preassembly.parts import turn_about_axis
 from processor.registration import icp, principal, surface_registration
+from processor.registration.principal import PrincipalAxes
 
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.1 m
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
@@ -42,6 +47,8 @@ CORNER_SAMPLES = 12  # nearest of the rival's design: some of them on each face 
 # An end plate's two sides are alike to few points: poses that differ by a plate's thickness, up to some 60 mm, along
 # the part are each stable, and are tried from starts nearer to each other than half of the plates that are usual.
 SLIDES_MM = (-60.0, -45.0, -30.0, -15.0, 15.0, 30.0, 45.0, 60.0)
+SLID_KEPT = 2  # of the poses of a tube that differ by a slide along it
+MARKS = 2_000  # samples of marks that the turn of a tube is searched by
 LEAST_EVIDENCE = 10  # samples of distinguishing surface that the scan shows
 SLIDE_RAD = np.radians(45.0)  # a rival turned by less has slid along the part: along an arch it turns a little
 RIVAL_RATIO = 1.5  # a pose whose misfit is within this factor of the best is a rival
@@ -56,6 +63,7 @@ class Attitude:
     status: Status  # ok | ambiguous | failed
     reasons: tuple[Reason, ...] = ()
     T_rival: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))  # of an ambiguous part: the other pose
+    turn_known: bool = True  # about the axis of a round tube
 
 
 NOWHERE = Attitude(np.full((4, 4), np.nan), np.full((4, 4), np.nan), Status.FAILED)
@@ -74,6 +82,7 @@ class Surface:
     axes: Floats  # (3, 3) principal axes as columns
     size: float  # diagonal of the bounding box
     sizes: Floats  # (3,) along its principal axes, as of a scan
+    tube: PrincipalAxes | None = None  # of the wall of a round tube
 
 
 class Shapes:
@@ -85,11 +94,24 @@ class Shapes:
 
     def __getitem__(self, index: int) -> Surface:
         if index not in self._made:
-            self._made[index] = sample_surface(self.design.parts[index])
+            made = sample_surface(self.design.parts[index])
+            self._made[index] = replace(made, tube=self._tube(index, made.mesh))
         return self._made[index]
 
     def __len__(self) -> int:
         return len(self.design.parts)
+
+    def _tube(self, index: int, mesh: MeshSurface) -> PrincipalAxes | None:
+        """Return the axes of the wall of a part whose ends are all round; None of any other."""
+        places = [
+            end_place(self.design.joint_points[end.joint], end.outward, mesh)
+            for end in topology.ends_of(self.design.joined, index)
+            if end.joint is not None
+        ]
+        if not places or not all(place.section.radius for place in places):
+            return None
+        wall = tube_end.wall_of(mesh, places[0])
+        return principal.of_mesh(mesh.vertices, mesh.faces[wall]) if wall.any() else None
 
 
 @dataclass(frozen=True)
@@ -222,7 +244,41 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
         why = reason("preassemble.no-attitude", distance=best.misfit)
         return Attitude(best.start, best.T, Status.FAILED, (why,))
     rivals = [c for c in candidates if c.misfit <= RIVAL_RATIO * best.misfit + 0.5]
-    return _decide(points, box, seeds, surface, rivals)
+    if surface.tube is None:
+        return _decide(points, box, seeds, surface, rivals)
+    return _of_tube(points, box, seeds, surface, rivals)
+
+
+def _of_tube(points: Floats, box: Floats, seeds: Floats, surface: Surface, candidates: list[_Candidate]) -> Attitude:
+    """Choose the pose of a round tube, and state whether the scan shows its turn about its axis."""
+    assert surface.tube is not None
+    centre, axes = surface.tube.centre, surface.tube.axes
+    turns, identity = turn_about_axis.tested(centre, axes[:, 0]), np.eye(4)
+    marks = turn_about_axis.marks(surface.points, [_lacks(surface, identity, surface, turn) for turn in turns])
+    poses = [c.T for c in candidates]
+    slid = [candidates[k] for k in turn_about_axis.shifted(poses, centre, axes[:, 0], SLIDE_RAD, SAME_POSE_MM)]
+    chosen = [candidates[k] for k in turn_about_axis.in_either_sense(poses, axes[:, 0])]
+    if len(marks) >= LEAST_EVIDENCE:
+        marks = thinned(marks, MARKS)
+        tree = cKDTree(seeds, balanced_tree=False)
+        spacing = float(np.median(tree.query(thinned(seeds, COARSE_POINTS), k=2)[0][:, 1]))
+        reach = max(2.0 * TELLING_MM, 4.0 * spacing)
+
+        def count(T: Floats) -> int:
+            near = tree.query(rigid.apply(rigid.invert(T), marks), distance_upper_bound=reach)[0]
+            return int(np.isfinite(near).sum())
+
+        turned = turn_about_axis.searched(centre, axes[:, 0], axes[:, 1], chosen[0].T, count)
+        align = partial(_align, seeds, surface, FINE_GATES_MM)
+        chosen = _distinct(chosen + each(align, [_Candidate(T, chosen[0].start) for T in turned]), box)
+    found = _decide(points, box, seeds, surface, _distinct([*chosen, *slid[:SLID_KEPT]], box))
+    for turn in turns:
+        for_found, for_turned = _evidence(points, surface, found.T_surface, turn @ found.T_surface)
+        if for_found < max(LEAST_EVIDENCE, 2 * for_turned):
+            rival = found.T_rival if np.isfinite(found.T_rival).all() else turn @ found.T_surface
+            why = (reason("preassemble.turn-unknown"), *found.reasons)
+            return replace(found, status=Status.AMBIGUOUS, reasons=why, T_rival=rival, turn_known=False)
+    return found
 
 
 def rough(points: Floats, part: DesignPart, surface: Surface, *, pieces: bool, kept: int | None = ROUGH_KEPT) -> Floats:
@@ -387,6 +443,12 @@ def only_in(surface: Surface, T: Floats, other: Surface, T_other: Floats) -> tup
 
     ``T`` and ``T_other`` are T_bridge_scan (4, 4) of the two designs, which may be the same.
     """
+    lacking = _lacks(surface, T, other, T_other)
+    return surface.points[lacking], surface.normals[lacking]
+
+
+def _lacks(surface: Surface, T: Floats, other: Surface, T_other: Floats) -> Bools:
+    """Mark the samples (n,) of a design that, placed in the scan, are far from the other design there."""
     samples = rigid.apply(T_other, rigid.apply(rigid.invert(T), surface.points))
     found, distance, beyond = other.mesh.distances(samples, 5.0 * TELLING_MM)
     near = (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)  # False where nothing is in reach: NaN
@@ -400,7 +462,7 @@ def only_in(surface: Surface, T: Floats, other: Surface, T_other: Floats) -> tup
         _, distance, beyond = other.mesh.distances(samples[doubtful], np.inf, face)
         beside |= (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)
     near[doubtful[beside]] = True
-    return surface.points[~near], surface.normals[~near]
+    return ~near
 
 
 def shown(points: Floats, T: Floats, samples: Floats) -> int:

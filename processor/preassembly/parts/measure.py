@@ -14,16 +14,24 @@ from processor.geometry import box_girder_mesh, rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.thinning import by_cell, thinned
-from processor.model import DesignPart, Floats, Ints, Reason, Scan, Status, reason
+from processor.model import ArchDesign, DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly import topology
-from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, section, view_variance
+from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, section, tube_end, view_variance
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import FittedEnd, JointEnd
 from processor.preassembly.ends.joint_frame import end_place
 from processor.preassembly.ends.outer_end import OuterEnd
 from processor.preassembly.ends.outer_faces import RegisteredPart
+from processor.preassembly.ends.tube_end import FittedTube
 from processor.preassembly.params import SystematicParams
-from processor.preassembly.parts import assignment, attitude, contradictions, identity, systematic_errors
+from processor.preassembly.parts import (
+    assignment,
+    attitude,
+    beyond_ends,
+    contradictions,
+    identity,
+    systematic_errors,
+)
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.parts.part_residuals import PartResiduals, part_residuals
@@ -81,7 +89,7 @@ class FittedPart:
 
     part: DesignPart
     measured: MeasuredPart
-    ends: tuple[FittedEnd | JointEnd | None, ...]
+    ends: tuple[FittedEnd | FittedTube | JointEnd | None, ...]
     joints: tuple[str, ...]
     views: _Views = field(default_factory=lambda: _Views(np.zeros((6, 6)), 0.0))
 
@@ -137,10 +145,7 @@ def fit(
     first = usable[0]
     used = [first, *(scan for scan in usable[1:] if scan.sure == (True, True))]
     registered = _registered(used, shape, [design.joint_points[j] for j in joints if j is not None])
-    ends = tuple(
-        None if joint is None else joint_end.fit(registered, end_place(design.joint_points[joint], outward, shape.mesh))
-        for joint, outward in places
-    )
+    ends = tuple(_fit_end(registered, end, design, first.attitude) for end in places)
     edges = _edges(registered, part, first.registration.sigma_mm, systematic)
     known = [
         (design.joint_names[j], end) for end, j in zip(ends, joints, strict=True) if end is not None and j is not None
@@ -177,6 +182,18 @@ def fit(
     return fitted if several else replace(fitted, views=_views(registered, shape))
 
 
+def _fit_end(
+    part: RegisteredPart, end: topology.PartEnd, design: ArchDesign, pose: attitude.Attitude
+) -> FittedEnd | FittedTube | JointEnd | None:
+    """Fit an end of a part; None without a joint."""
+    if end.joint is None:
+        return None
+    place = end_place(design.joint_points[end.joint], end.outward, part.surface)
+    if place.section.radius:
+        return tube_end.fit(part, place, pose.turn_known)
+    return joint_end.fit(part, place)
+
+
 def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[MeasuredPart]:
     """Estimate the ends of all parts together, and add ``systematic`` errors to their covariance."""
     between = _between_viewpoints(parts)
@@ -189,7 +206,15 @@ def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[
     estimated = iter(joint_end.estimate([end for end, _ in fitted], of_ends))
     measured = []
     for part, contradiction in zip(seen, contradicted, strict=True):
-        ends = [next(estimated) if isinstance(end, FittedEnd) else end for end in part.ends]
+        of_tubes = between._replace(level=part.views.left * between.level)
+        ends = [
+            next(estimated)
+            if isinstance(end, FittedEnd)
+            else tube_end.estimate(end, of_tubes)
+            if isinstance(end, FittedTube)
+            else end
+            for end in part.ends
+        ]
         with_systematic = tuple(
             None if end is None else systematic_errors.added_to_end(end, systematic, part.part) for end in ends
         )
@@ -213,7 +238,7 @@ def _examined(part: FittedPart) -> contradictions.Examined:
 
 def _viewpoint_remarks(part: FittedPart, between: view_variance.Variances) -> Iterator[Reason]:
     """Yield what is known of differences between the views of a part whose points' stations are not named."""
-    if any(isinstance(end, FittedEnd) and end.plates for end in part.ends):
+    if any(isinstance(end, FittedEnd | FittedTube) and end.plates for end in part.ends):
         if between.evident:
             yield reason("preassemble.viewpoints-differ", sd=float(np.sqrt(between.level)))
         elif not between.known and between.level > 0.0:
@@ -230,7 +255,7 @@ def _between_viewpoints(parts: Sequence[FittedPart]) -> view_variance.Variances:
     for part in parts:
         rows: dict[int, int] = {}  # of the last end's plates, by their faces
         for end in part.ends:
-            if not isinstance(end, FittedEnd):
+            if not isinstance(end, FittedEnd | FittedTube):
                 continue
             rings += [end.ring_noise] if end.plates else []
             known = [k for k, plate in enumerate(end.plates) if plate is not None]
@@ -238,7 +263,7 @@ def _between_viewpoints(parts: Sequence[FittedPart]) -> view_variance.Variances:
             same += [
                 (rows[k], now[k])
                 for k in known
-                if k in rows and len(part.ends) == 2 and section.is_box(end.place.section)
+                if k in rows and len(part.ends) == 2 and section.is_hollow(end.place.section)
             ]
             plates += [plate for plate in end.plates if plate is not None]
             rows = now
@@ -255,7 +280,7 @@ def _as_seen(part: FittedPart, between: view_variance.Variances) -> FittedPart:
     pose = part.measured.member.pose + between.level * part.views.pose
     edges = bottom_edges.with_errors_of_views(part.measured.member.edges, between.level, between.across)
     measured = replace(part.measured, member=replace(part.measured.member, edges=edges, pose=pose))
-    ends = tuple(replace(end, pose=pose) if isinstance(end, FittedEnd) else end for end in part.ends)
+    ends = tuple(replace(end, pose=pose) if isinstance(end, FittedEnd | FittedTube) else end for end in part.ends)
     return replace(part, measured=measured, ends=ends)
 
 
@@ -389,6 +414,9 @@ def _identified(scan: Scan, points: Floats, station: Ints, index: int, shapes: a
         if there is None or not (there.rejected or there.doubts):
             parts = () if there is None else there.identity.parts(shapes.design.parts[other].name)
             if part.name not in parts:
+                own = _register(scan, points, station, index, shapes)  # with splice plates it is longer than the part
+                if any(one.code == "preassemble.splice-plates" for one in own.rejected):
+                    return replace(own, parts=every)
                 why = (*ScanParts(scan.name, part.name, parts).wrong, *_resemblance(points, index, shapes))
                 return _PlacedScan(scan, points, station, attitude.NOWHERE, rejected=why, parts=parts)
     placed = _register(scan, points, station, index, shapes)
@@ -411,6 +439,9 @@ def _register(scan: Scan, points: Floats, station: Ints, index: int, shapes: att
         return replace(placed, rejected=pose.reasons)
     registration = surface_registration.fine(points, shape.mesh, shape.axes, pose.T_surface)
     placed = replace(placed, registration=registration)
+    plated = _plated(points, registration.T_design_scan, index, shapes)
+    if plated:
+        return replace(placed, rejected=plated)
     misfit = _misfit(registration)
     if misfit:
         return replace(placed, rejected=(*misfit, *(_resemblance(points, index, shapes) or RIGHT_PART)))
@@ -426,6 +457,19 @@ def _register(scan: Scan, points: Floats, station: Ints, index: int, shapes: att
             doubt = reason("preassemble.sides-not-covered", share=away, covered=covered)
             placed = replace(placed, doubts=(doubt, *RIGHT_PART))
     return replace(placed, identity=identity.identify(points, registration.T_design_scan, index, shapes))
+
+
+def _plated(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> tuple[Reason, ...]:
+    """State at which joints the points (n, 3), placed by T (4, 4), have splice plates; () for none."""
+    design = shapes.design
+    placed = rigid.apply(T, thinned(points, surface_registration.LAST_POINTS))
+    joints = tuple(
+        design.joint_names[joint]
+        for joint, outward in topology.ends_of(design.joined, index)
+        if joint is not None
+        and beyond_ends.plates(placed, end_place(design.joint_points[joint], outward, shapes[index].mesh))
+    )
+    return (reason("preassemble.splice-plates", joints=joints),) if joints else ()
 
 
 def _identities(placed: Sequence[_PlacedScan], part: DesignPart) -> tuple[ScanParts, ...]:

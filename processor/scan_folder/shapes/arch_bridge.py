@@ -26,6 +26,7 @@ REACH_SHARE = 0.6  # of a foot's length that its bottom edges have to reach from
 ASIDE_MM = 100.0  # corners of two ends that differ more are not of one section
 UPRIGHT_COS = 0.8  # of the normal of a section that has neither left nor right by Z
 ALIKE = 0.1  # relative difference of the lengths of a part's two bottom edges
+KEY_CORNERS = 4  # P1..P4
 LOWER_LEFT, LOWER_RIGHT = 0, 1  # rows of the lower corners of an end
 
 
@@ -47,9 +48,14 @@ class GuessedArch:
 
 @dataclass(frozen=True)
 class _End:
-    corners: Floats  # P1..P4 (4, 3)
-    outward: Floats  # (4, 3) where the edges lead a mm farther along the normal
+    corners: Floats  # P1..P4 (4, 3); P1..P8 (8, 3) of a round section
+    outward: Floats  # (4, 3) or (8, 3) where the edges lead a mm farther along the normal
     doubt: Reason | None = None
+
+    @property
+    def is_round(self) -> bool:
+        """Whether it is of a round tube."""
+        return len(self.corners) > KEY_CORNERS
 
 
 @dataclass(frozen=True)
@@ -158,6 +164,8 @@ def _joint(found: Assembly, number: int) -> _Joint | Reason:
     doubts += [
         reason("init.of-part", part=part.name, reason=end.doubt) for part, end in ((a, left), (b, right)) if end.doubt
     ]
+    if left.is_round != right.is_round:
+        return reason("init.round-and-other", left=a.name, right=b.name)
     # Edges that are skew to the joint go on across the gap.
     middles = [plane.flat(end.corners + 0.5 * contact.gap_mm * end.outward) for end in (left, right)]
     in_plane = np.abs(middles[0] - middles[1]).max()
@@ -170,11 +178,12 @@ def _joint(found: Assembly, number: int) -> _Joint | Reason:
         doubts.append(reason("init.ends-overlap", mm=-contact.gap_mm))
     if np.ptp(gaps) > SAME_MM:
         doubts.append(reason("init.gap-uneven", least=gaps.min(), most=gaps.max()))
-    four = plane.flat(0.5 * (left.corners + right.corners))
-    size = np.ptp(four, axis=0)
+    places = plane.flat(0.5 * (left.corners + right.corners))
+    size = np.ptp(places, axis=0)
     if not (PLAUSIBLE_MM[0] < size.min() and size.max() < PLAUSIBLE_MM[1]):
         doubts.append(reason("init.section-unusual", width=size[0], height=size[1]))
-    return _Joint(f"J{number + 1}", plane, left, right, points=key_points(plane, four), doubts=tuple(doubts))
+    points = key_points(plane, places[:KEY_CORNERS], places[KEY_CORNERS:] if left.is_round else None)
+    return _Joint(f"J{number + 1}", plane, left, right, points=points, doubts=tuple(doubts))
 
 
 def _normal(contact: Contact, a: Body, b: Body) -> Floats:
@@ -201,16 +210,17 @@ def _end(body: Body, face: PlaneFace, joint: SectionPlane, inward: float, way: F
     found = None if plane is None else corners(plane.flat(face.points), max(STRAIGHT_MM, 2.0 * body.step_mm))
     if plane is None or found is None:
         return None
+    places = np.vstack([found.places, found.middles])
     skin = skin_at_end(body, plane, inward)
-    outward = np.broadcast_to(-inward * normal, (4, 3))
-    if skin is None:
-        return _End(plane.space(found.places), outward, found.doubt or reason("init.other-corners-behind"))
+    outward = np.broadcast_to(-inward * normal, (len(places), 3))
+    if skin is None or len(skin[0]) != len(places):
+        return _End(plane.space(places), outward, found.doubt or reason("init.other-corners-behind"))
     at_end, change = skin
     outward = outward + change[:, :1] * plane.left + change[:, 1:] * plane.up
-    off = float(np.abs(at_end - found.places).max())
+    off = float(np.abs(at_end - places).max())
     if found.doubt or off > SKIN_MM:
         return _End(plane.space(at_end), outward, found.doubt or reason("init.off-outer-faces", mm=off))
-    return _End(plane.space(found.places), outward)
+    return _End(plane.space(places), outward)
 
 
 # --- parts ------------------------------------------------------------------------------------------------------------
@@ -221,6 +231,8 @@ def _part(chain: Assembly, joints: Sequence[_Joint], number: int) -> tuple[Desig
     body = chain.parts[number]
     start = joints[number - 1] if number else None
     end = joints[number] if number < len(joints) else None
+    if any(one is not None and one.left.is_round for one in (start, end)):
+        return _without_edges(body), []
     edges, doubts = [], list[Reason]()
     for k in (LOWER_LEFT, LOWER_RIGHT):
         near, far = (start.right, end.left if end else None) if start else (end.left if end else None, None)

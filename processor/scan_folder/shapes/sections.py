@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -10,11 +10,22 @@ from scipy.spatial import ConvexHull, QhullError
 from processor.model import Floats, Reason, reason
 from processor.scan_folder.shapes.body import Body
 
+COLLINEAR_MM = 1e-3  # the same where sides are to be continued beyond rounded corners
 STRAIGHT_MM = 0.1  # a corner of the hull that is nearer to the line of its neighbours is none
 CHORDS_MM = 1.0  # the same of a section behind the end, which cuts facets of curved faces
 SQUARE_RAD = np.radians(35.0)  # largest departure of a corner from a right angle
 LEVEL_RAD = np.radians(20.0)  # largest slope of the lower and upper edges across the bridge
 DEPTHS_MM = np.array([60.0, 120.0, 180.0])  # of the sections that the skin is followed from to the end
+# Left and up of P1..P8 of a round tube: on its outer edge at 45 degrees, and below, right, above, left of its axis.
+ROUND = np.array([[1, -1], [-1, -1], [-1, 1], [1, 1], [0, -1], [-1, 0], [0, 1], [1, 0]], np.float64)
+ROUND_MM = (
+    0.2  # between an outline and a circle or an ellipse, beyond that by which a side may be off its corners' line
+)
+FEWEST_OF_ROUND, GAP_RAD = 12, np.radians(46.0)  # corners of an outline that may be round, and the angle between two
+OVAL_SHARE = 0.02  # of the radius: more than that of a mitre of 16 degrees
+ROUNDS = 4  # of the fit of a circle
+ROUNDED_SIDES, LONGER = 3, 1.5  # of a rounded corner; a straight side by the longest of these
+ALIKE_MM, MOST_ROUNDED_MM = 2.0, 60.0  # difference of the corners' roundings, and the greatest
 LEFT = np.array([0.0, 1.0, 0.0])  # +Y, to the left of parts that follow each other along X
 LEFT_COS = 0.5  # least cosine between the way to the left and the plane of a section
 
@@ -54,10 +65,14 @@ class SectionPlane:
 
 @dataclass(frozen=True)
 class Corners:
-    """Corners P1..P4 (4, 2) of a section in its plane, left and up; ``doubt``: why they are not clear."""
+    """Corners P1..P4 (4, 2) of a section in its plane, left and up; ``doubt``: why they are not clear.
+
+    ``middles`` (4, 2) are P5..P8 of a round section, whose P1..P4 are at 45 degrees on its edge; (0, 2) of any other.
+    """
 
     places: Floats
     doubt: Reason | None = None
+    middles: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
 
 def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
@@ -71,7 +86,11 @@ def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
         hull = places[ConvexHull(places).vertices]
     except QhullError:
         return None
-    hull = _without_straight(hull, straight_mm)
+    of_round = _round(hull, ROUND_MM + straight_mm)
+    if of_round is not None:
+        return Corners(of_round[:4], middles=of_round[4:])
+    sharp = _of_rounded_corners(_without_straight(hull, COLLINEAR_MM))
+    hull = _without_straight(hull, straight_mm) if sharp is None else sharp
     if len(hull) < 4:
         return None
     size = np.ptp(hull, axis=0)
@@ -81,6 +100,62 @@ def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
     if len(set(chosen.tolist())) < 4:
         return Corners(hull[chosen], reason("init.no-corners-of-box", corners=len(hull)))
     return Corners(hull[chosen], _doubt(hull[chosen], len(hull)))
+
+
+def _round(hull: Floats, tolerance_mm: float) -> Floats | None:
+    """Return P1..P8 (8, 2) of a round tube's outline, a convex polygon (n, 2); None of any other.
+
+    The outline is a circle, or the ellipse in which a mitre cuts a tube.
+    """
+    if len(hull) < FEWEST_OF_ROUND:
+        return None
+    low, high = hull.min(axis=0), hull.max(axis=0)
+    terms, middle = np.empty((0, 0)), 0.5 * (low + high)
+    radii: Floats = np.zeros(5)
+    for _ in range(ROUNDS):
+        off = hull - middle
+        angle, away = np.arctan2(off[:, 1], off[:, 0]), np.linalg.norm(off, axis=1)
+        terms = _harmonics(angle)
+        radii = np.linalg.lstsq(terms, away, rcond=None)[0]
+        middle = middle + radii[1:3]
+    gaps = np.diff(np.sort(angle), append=np.sort(angle)[0] + 2.0 * np.pi)
+    ovality = float(np.linalg.norm(radii[3:]))
+    if gaps.max() > GAP_RAD or ovality > OVAL_SHARE * radii[0] or np.abs(terms @ radii - away).max() > tolerance_mm:
+        return None
+    at = np.arctan2(ROUND[:, 1], ROUND[:, 0])
+    places: Floats = middle + (_harmonics(at) @ radii)[:, None] * np.stack([np.cos(at), np.sin(at)], axis=1)
+    return places
+
+
+def _harmonics(angle: Floats) -> Floats:
+    """Terms (n, 5) of a radius at an angle (n,)."""
+    return np.stack([np.ones_like(angle), *(f(k * angle) for k in (1, 2) for f in (np.cos, np.sin))], axis=1)
+
+
+def _of_rounded_corners(hull: Floats) -> Floats | None:
+    """Return the points (4, 2) in which the sides of a hollow section with rounded corners meet; None of any other.
+
+    Its four corners are rounded alike, each by ROUNDED_SIDES sides of the polygon (n, 2) or more.
+    """
+    if len(hull) < 4 * (ROUNDED_SIDES + 1):
+        return None
+    sides = np.roll(hull, -1, axis=0) - hull
+    length = np.linalg.norm(sides, axis=1)
+    straight = np.sort(np.argsort(-length)[:4])
+    between = np.diff(straight, append=straight[0] + len(hull)) - 1
+    if between.min() < ROUNDED_SIDES or length[straight].min() < LONGER * np.delete(length, straight).max():
+        return None
+    found, rounding = np.zeros((4, 2)), np.zeros((4, 2))
+    for k, (one, other) in enumerate(zip(straight, np.roll(straight, -1), strict=True)):
+        a, b = hull[(one + 1) % len(hull)], hull[other]
+        solved = np.stack([sides[one] / length[one], sides[other] / length[other]], axis=1)
+        if abs(np.linalg.det(solved)) < np.cos(SQUARE_RAD):
+            return None
+        along, back = np.linalg.solve(solved, b - a)
+        found[k], rounding[k] = a + along * solved[:, 0], (along, back)
+    if np.ptp(rounding) > ALIKE_MM or rounding.min() <= 0.0 or rounding.max() > MOST_ROUNDED_MM:
+        return None
+    return found
 
 
 def _without_straight(hull: Floats, straight_mm: float) -> Floats:
@@ -111,9 +186,10 @@ def _doubt(four: Floats, count: int) -> Reason | None:
     return None
 
 
-def key_points(plane: SectionPlane, four: Floats) -> Floats:
-    """Return P1..P8 (8, 3) of the corners P1..P4 (4, 2) in a section's plane."""
-    middles = 0.5 * (four + np.roll(four, -1, axis=0))
+def key_points(plane: SectionPlane, four: Floats, middles: Floats | None = None) -> Floats:
+    """Return P1..P8 (8, 3) of the corners P1..P4 (4, 2) in a section's plane; ``middles`` (4, 2) of a round one."""
+    if middles is None:
+        middles = 0.5 * (four + np.roll(four, -1, axis=0))
     return plane.space(np.vstack([four, middles]))
 
 
@@ -131,12 +207,16 @@ def cut(body: Body, plane: SectionPlane) -> Floats:
 def skin_at_end(body: Body, plane: SectionPlane, inward: float) -> tuple[Floats, Floats] | None:
     """Return P1..P4 (4, 2) at a plane, extrapolated from sections inside, and their change (4, 2) a mm outward.
 
+    Of a round section P1..P8 (8, 2).
+
     None where the sections have no corners. ``inward`` is 1 where the body lies on the side of the plane's normal, else
     -1. A bevel, or a flange around the end, has other corners than the skin.
     """
     inside = [corners(cut(body, plane.moved(inward * depth)), CHORDS_MM) for depth in DEPTHS_MM]
     if any(one is None or one.doubt for one in inside):
         return None
-    places = np.array([one.places for one in inside if one is not None])
+    if len({len(one.middles) for one in inside if one is not None}) > 1:
+        return None
+    places = np.array([np.vstack([one.places, one.middles]) for one in inside if one is not None])
     at_end = 3.0 * places[0] - 3.0 * places[1] + places[2]
     return at_end, (at_end - places[0]) / DEPTHS_MM[0]

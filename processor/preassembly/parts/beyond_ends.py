@@ -1,0 +1,37 @@
+"""Steel in a scan beyond an end of its part that is no more of the part: splice plates bolted to it.
+
+A part that is too long goes on with its own section. Splice plates lie on its faces, a plate's thickness off them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from processor.geometry import rigid
+from processor.geometry.thinning import thinned
+from processor.model import Floats
+from processor.preassembly.ends.joint_frame import EndPlace
+
+AROUND_MM = 60.0  # of the section
+BEYOND_MM = (15.0, 215.0)  # of the end
+SECTION_MM = (300.0, 500.0)  # behind the end, where the part has its section and plates have ended
+OFF_MM = 7.0  # from the section: plates are thicker
+FEWEST, POINTS = 60, 20_000
+OWN_SHARE = 0.05  # of the section's points on as much of its length
+OFF_SHARE = 0.3  # of the points beyond the end: plates have two sides, one of them on the part's face
+
+
+def plates(points: Floats, place: EndPlace) -> bool:
+    """Whether points (n, 3) of a part in the bridge's frame, beyond its end, are of plates on it."""
+    local = rigid.apply(rigid.invert(place.T_bridge_joint), points)
+    out = place.outward * local[:, 0]
+    reach = np.maximum(place.half[1:], place.section.radius) + AROUND_MM
+    near = (np.abs(local[:, 1:]) < reach).all(axis=1)
+    beyond = local[near & (out > BEYOND_MM[0]) & (out < BEYOND_MM[1]), 1:]
+    own = local[near & (-out > SECTION_MM[0]) & (-out < SECTION_MM[1]), 1:]
+    if len(beyond) < FEWEST or len(own) < FEWEST:
+        return False
+    away = cKDTree(thinned(own, POINTS), balanced_tree=False).query(beyond, distance_upper_bound=OFF_MM)[0]
+    off = int((~np.isfinite(away)).sum())
+    return off >= max(FEWEST, OWN_SHARE * len(own), OFF_SHARE * len(beyond))

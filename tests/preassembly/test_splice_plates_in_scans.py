@@ -1,0 +1,92 @@
+"""Splice plates bolted to the end of a scanned part are not taken for the part."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from designgen.scenes import make as scenes
+from processor.geometry import rigid
+from processor.model import Scan, Status
+from processor.preassembly import step
+from processor.preassembly.ends import section
+from processor.preassembly.ends.joint_frame import EndPlace, joint_frame
+from processor.preassembly.parts import beyond_ends
+from tests.support.results.reasons import codes
+
+HALF = np.array([0.0, 210.0, 300.0])
+REACH, WIDTH, PLATE = 180.0, 200.0, 12.0  # of the splice plates, along from the joint, across, and their thickness
+
+
+def sheet(rng, along, across, axis, at, spacing=12.0, sigma=0.5):
+    """Points of a rectangle square to an axis, 1 = left or 2 = up, of a joint's frame."""
+    count = rng.poisson(np.ptp(along) * np.ptp(across) / spacing**2)
+    points = np.zeros((count, 3))
+    points[:, 0], points[:, 3 - axis] = rng.uniform(*along, count), rng.uniform(*across, count)
+    points[:, axis] = at + sigma * rng.standard_normal(count)
+    return points
+
+
+def girder(rng, length, end=0.0, sigma=0.5):
+    """The flanges' outer sides and the web of an I girder that ends at a joint, or beyond it."""
+    span = (-length, end)
+    flanges = [sheet(rng, span, (-HALF[1], HALF[1]), 2, sense * HALF[2], sigma=sigma) for sense in (-1, 1)]
+    web = [sheet(rng, span, (-280.0, 280.0), 1, sense * 6.0, sigma=sigma) for sense in (-1, 1)]
+    return np.vstack([*flanges, *web])
+
+
+def plates(rng, spacing=12.0):
+    """Points of plates on both flanges: the outer side all along, the inner one beyond the end."""
+    sides = [
+        one
+        for sense in (-1, 1)
+        for one in (
+            sheet(rng, (-REACH, REACH), (-WIDTH, WIDTH), 2, sense * (HALF[2] + PLATE), spacing),
+            sheet(rng, (0.0, REACH), (-WIDTH, WIDTH), 2, sense * HALF[2], spacing),
+        )
+    ]
+    return np.vstack(sides)
+
+
+def found(points):
+    return beyond_ends.plates(points, EndPlace(np.eye(4), section.of_box(HALF), 1.0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plates_beyond_an_end_are_told_from_a_part_that_is_too_long(seed):
+    rng = np.random.default_rng(seed)
+    assert found(np.vstack([girder(rng, 1400.0), plates(rng)]))
+    assert not found(girder(rng, 1400.0))
+    assert not found(girder(rng, 1400.0, end=70.0, sigma=2.0))
+    clutter = rng.uniform([20.0, -250.0, -350.0], [200.0, 250.0, 350.0], (50, 3))
+    assert not found(np.vstack([girder(rng, 1400.0), clutter]))
+
+
+def covered(local):
+    """Mark points (n, 3) of a girder that the plates cover."""
+    return (np.abs(local[:, 0]) < REACH) & (np.abs(local[:, 1]) < WIDTH) & (np.abs(local[:, 2]) > HALF[2] - 3.0)
+
+
+def test_a_girder_scanned_with_its_splice_plates_has_no_key_points():
+    recipe = {
+        "kind": "assembly",
+        "assembly": {
+            "type": "row", "section": "i", "parts": 2, "length_mm": 1400.0, "width_mm": 420.0, "height_mm": 600.0,
+            "flange_mm": 20.0, "web_mm": 12.0,
+        },
+        "bolts": {},
+        "scan": {"mode": "surface", "spacing_mm": 8.0, "sigma_mm": 0.5},
+    }  # fmt: skip
+    scene, truth = scenes.make("bolted", recipe, 1)
+    rng, frame = np.random.default_rng(1), joint_frame(scene.arch.joint_points[0])
+    first, second = scene.scans
+    T = rigid.invert(frame) @ truth.arch.T_bridge_scan[0]
+    local = rigid.apply(T, first.points + first.origin)
+    local = np.vstack([local[~covered(local)], plates(rng, spacing=8.0)])
+    plated = Scan(first.name, rigid.apply(rigid.invert(T), local), component=first.component, sigma_mm=first.sigma_mm)
+    result = step.run(replace(scene, scans=(plated, second)), step.Params())
+    assert result.components.status[0] == Status.FAILED
+    assert "preassemble.splice-plates" in codes(result.components.reasons[0])
+    assert np.isnan(result.components.key_points_scan[0]).all()
+    assert np.isfinite(result.components.key_points_scan[1, 0, :4]).all()  # those of the girder without plates
+    assert np.isnan(result.joints.gaps).all()
