@@ -62,6 +62,15 @@ def test_plates_beyond_an_end_are_told_from_a_part_that_is_too_long(seed):
     assert not found(np.vstack([girder(rng, 1400.0), clutter]))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_part_rests_on_is_no_splice_plate(seed):
+    """A beam below the end, wider than it and past it, seen at its top and its front."""
+    rng = np.random.default_rng(seed)
+    top = sheet(rng, (-150.0, 200.0), (-300.0, 300.0), 2, -HALF[2] - 30.0)
+    front = rng.uniform([199.0, -300.0, -HALF[2] - 200.0], [201.0, 300.0, -HALF[2] - 30.0], (700, 3))
+    assert not found(np.vstack([girder(rng, 1400.0), top, front]))
+
+
 def covered(local):
     """Mark points (n, 3) of a girder that the plates cover."""
     return (np.abs(local[:, 0]) < REACH) & (np.abs(local[:, 1]) < WIDTH) & (np.abs(local[:, 2]) > HALF[2] - 3.0)

@@ -1,6 +1,7 @@
 """Steel in a scan beyond an end of its part that is no more of the part: splice plates bolted to it.
 
-A part that is too long goes on with its own section. Splice plates lie on its faces, a plate's thickness off them.
+A part that is too long goes on with its own section. Splice plates lie on its faces, a plate's thickness off them and
+on opposite sides; what the part rests on lies on one side alone.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ OFF_MM = 7.0  # from the section: plates are thicker
 FEWEST, POINTS = 60, 20_000
 OWN_SHARE = 0.05  # of the section's points on as much of its length
 OFF_SHARE = 0.3  # of the points beyond the end: plates have two sides, one of them on the part's face
+SIDE_SHARE = 0.15  # of the points off the section on either of two opposite sides
 
 
 def plates(points: Floats, place: EndPlace) -> bool:
@@ -32,6 +34,10 @@ def plates(points: Floats, place: EndPlace) -> bool:
     own = local[near & (-out > SECTION_MM[0]) & (-out < SECTION_MM[1]), 1:]
     if len(beyond) < FEWEST or len(own) < FEWEST:
         return False
-    away = cKDTree(thinned(own, POINTS), balanced_tree=False).query(beyond, distance_upper_bound=OFF_MM)[0]
-    off = int((~np.isfinite(away)).sum())
-    return off >= max(FEWEST, OWN_SHARE * len(own), OFF_SHARE * len(beyond))
+    own_few = thinned(own, POINTS)
+    away, nearest = cKDTree(own_few, balanced_tree=False).query(beyond)
+    off = (beyond - own_few[nearest])[away > OFF_MM]
+    if len(off) < max(FEWEST, OWN_SHARE * len(own), OFF_SHARE * len(beyond)):
+        return False
+    share = np.stack([(off > OFF_MM).mean(axis=0), (off < -OFF_MM).mean(axis=0)])
+    return bool((share > SIDE_SHARE).all(axis=0).any())
