@@ -191,12 +191,13 @@ def _keys(cells: Ints) -> Ints:
     return keys
 
 
-def pieces(around: Surroundings, face: FlatFace, shift: Shift) -> tuple[Pieces, float] | Reason:
-    """Return what was measured of a face and the error of its level by overhanging beams, or why it was not.
+def pieces(around: Surroundings, face: FlatFace, shift: Shift) -> tuple[Pieces, float, float] | Reason:
+    """Return what was measured of a face, with errors of its level and of its tilt, or why it was not.
 
-    The error is one standard deviation, mm, of class B: in the middle half of a face narrower than four half beams a
-    beam reaches over the rim by up to the difference. What it meets there lies deeper by about as much, and weighs
-    about a quarter. ``shift`` moves the face in its own plane to where its body is as built.
+    Both errors are standard deviations, mm and rad. That of the level is of class B: in the middle half of a face
+    narrower than four half beams a beam reaches over the rim by up to the difference. What it meets there lies deeper
+    by about as much, and weighs about a quarter. ``shift`` moves the face in its own plane to where its body is as
+    built.
     """
     if not around.design.flat[face.facets].all():
         return reason("inspect.face-not-seen")
@@ -211,7 +212,8 @@ def pieces(around: Surroundings, face: FlatFace, shift: Shift) -> tuple[Pieces, 
     used = _of_level(at, seen.off)
     if used.sum() < FEWEST or used.sum() < LEAST_SHARE * len(used):
         return reason("inspect.face-few-points", points=int(used.sum()))
-    return _combined(seen.of(used), at[used], around.shared), OVERHANG_SHARE * (RIM_MM - _margin(shape))
+    combined, tilt = _combined(seen.of(used), at[used], around.shared)
+    return combined, OVERHANG_SHARE * (RIM_MM - _margin(shape)), tilt
 
 
 def _margin(shape: Outline) -> float:
@@ -291,12 +293,13 @@ def _of_level(at: Floats, off: Floats) -> Bools:
     return used
 
 
-def _combined(seen: OnFace, at: Floats, shared: float) -> Pieces:
+def _combined(seen: OnFace, at: Floats, shared: float) -> tuple[Pieces, float]:
     """Combine points of a face, ``at`` places along it, into pieces of neighbours along it.
 
-    Several views may see different lengths of it: what they differ by is taken off, as it would tilt the face.
+    Several views may see different lengths of it: what they differ by is taken off, as it would tilt the face. The
+    error that this leaves in its tilt is returned as well, one standard deviation, rad.
     """
-    rest, by_view = _levelled(seen, at, shared)
+    rest, by_view, tilt = _levelled(seen, at, shared)
     sd = max(robust_sd_about_median(rest), LEAST_NOISE_MM)
     near = np.abs(rest - np.median(rest)) <= CLIP * sd
     points, at, off = seen.points[near], at[near], (seen.off - by_view)[near]
@@ -304,17 +307,22 @@ def _combined(seen: OnFace, at: Floats, shared: float) -> Pieces:
     order = np.argsort(at, kind="stable")
     groups = np.array_split(order, count if count <= SINGLE else int(np.clip(count // A_PIECE, 2, MOST_PIECES)))
     noise = (sd * float(student_factor(count - 1))) ** 2
-    return Pieces(
+    pieces = Pieces(
         places=np.array([points[group].mean(axis=0) for group in groups]),
         value=np.array([off[group].mean() for group in groups]),
         noise=np.array([noise / len(group) for group in groups]) + FLOOR_MM**2,
         shared=shared,
     )
+    return pieces, tilt
 
 
-def _levelled(seen: OnFace, at: Floats, shared: float) -> tuple[Floats, Floats]:
-    """Return what is left (n,) of points' distances less a straight line, and what their views differ by (n,)."""
-    line = np.stack([np.ones_like(at), (at - at.mean()) / max(float(np.ptp(at)), 1.0)], axis=1)
+def _levelled(seen: OnFace, at: Floats, shared: float) -> tuple[Floats, Floats, float]:
+    """Return what is left (n,) of points' distances less a straight line, and what their views differ by (n,).
+
+    Also the error of the line's tilt by the views, one standard deviation, rad.
+    """
+    length = max(float(np.ptp(at)), 1.0)
+    line = np.stack([np.ones_like(at), (at - at.mean()) / length], axis=1)
     line = line[:, : 2 if len(at) > FEWEST else 1]
     views, view = np.unique(seen.source, return_inverse=True)
     several = (view[:, None] == np.arange(len(views))).astype(float)
@@ -323,4 +331,7 @@ def _levelled(seen: OnFace, at: Floats, shared: float) -> tuple[Floats, Floats]:
     prior = np.r_[np.zeros(line.shape[1]), np.full(len(views), (sd / max(shared, LEAST_NOISE_MM)) ** 2)]
     solved = np.linalg.lstsq(terms.T @ terms + np.diag(prior), terms.T @ seen.off, rcond=None)[0]
     by_view: Floats = terms[:, line.shape[1] :] @ solved[line.shape[1] :]
-    return seen.off - terms @ solved, by_view
+    if line.shape[1] < 2:
+        return seen.off - terms @ solved, by_view, 0.0
+    variance = np.linalg.pinv(terms.T @ terms + np.diag(prior))[1, 1] - 1.0 / max(float((line[:, 1] ** 2).sum()), 1e-9)
+    return seen.off - terms @ solved, by_view, sd * float(np.sqrt(max(variance, 0.0))) / length

@@ -270,7 +270,7 @@ def _narrow_side(
             None if found.code == "inspect.face-touches" else edge_counts.level(around, face, shape, broad, across_axis)
         )
         return found if level is None else _of_level(level)
-    pieces, overhang = found
+    pieces, overhang, tilt = found
     x, y = _places(face.normal, pieces.places - middle, axes)
     terms = _terms(x, y)
     counts = [3] if np.std(y) > STRIPS and np.ptp(x) > 1.0 else []
@@ -283,6 +283,8 @@ def _narrow_side(
             fitted.covariance[0, 0] += sum((SLOPE_SD * arm) ** 2 for arm in arms) + overhang**2
             for k in range(1, count):  # the halves of a face may be hit by beams of different stations
                 fitted.covariance[k, k] += (0.5 * overhang) ** 2
+            if count > 1 and own:
+                fitted.covariance[1, 1] += (0.5 * own[0].size * tilt) ** 2
             return Side(pieces, x, y, fitted, narrow=True)
     return reason("inspect.face-few-points", points=len(pieces.value))
 
