@@ -286,9 +286,9 @@ def _of_level(at: Floats, off: Floats) -> Bools:
         rows = np.flatnonzero(part == number)
         level = np.sort(off[rows])
         first, last = np.searchsorted(level, level - GATE_MM), np.searchsorted(level, level + GATE_MM, side="right")
-        best = last - first == (last - first).max()
-        middle = float(level[best].mean())
-        middle = float(np.median(off[rows][np.abs(off[rows] - middle) < GATE_MM])) if len(rows) else middle
+        best = level[last - first == (last - first).max()]
+        middle = best[len(best) // 2]  # levels with as many points may lie far apart
+        middle = float(np.median(level[np.abs(level - middle) < GATE_MM]))
         used[rows] = np.abs(off[rows] - middle) < GATE_MM
     return used
 

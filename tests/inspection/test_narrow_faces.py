@@ -278,10 +278,14 @@ def test_edges_of_scanned_plates_are_measured():
     assert (np.abs(errors[:, 0]) <= errors[:, 1]).sum() >= len(errors) - 3  # 95 % of 16: in 98 of 100 cases
 
 
+def test_one_of_two_levels_with_as_many_points_is_taken():
+    used = narrow_faces._of_level(np.arange(6.0), np.array([0.0, 0.1, 0.2, 9.0, 9.1, 9.2]))
+    assert used.tolist() in ([True] * 3 + [False] * 3, [False] * 3 + [True] * 3)
+
+
 @pytest.mark.slow
-@pytest.mark.xfail(reason="intervals of the squareness of edges are too narrow in some scenes", strict=False)
 def test_intervals_of_scanned_plates_hold():
-    """Ten seeds: 160 values, those of a plate not independent; 92 % of them or more."""
+    """Ten seeds: some 156 values, of which the two tilts of a plate have errors in common; 92 % of them or more."""
     errors = np.concatenate([errors_of(seed)[0] for seed in range(10)])
     assert len(errors) >= 140
     assert np.mean(np.abs(errors[:, 0]) <= errors[:, 1]) >= 0.92
