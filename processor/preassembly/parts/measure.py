@@ -253,20 +253,16 @@ def _between_viewpoints(parts: Sequence[FittedPart]) -> view_variance.Variances:
     rings: list[float] = []
     same: list[tuple[int, int]] = []
     for part in parts:
-        rows: dict[int, int] = {}  # of the last end's plates, by their faces
-        for end in part.ends:
-            if not isinstance(end, FittedEnd | FittedTube):
-                continue
+        fitted = [end for end in part.ends if isinstance(end, FittedEnd | FittedTube)]
+        of_ends: list[dict[int, int]] = []  # the rows of each end's plates, by their faces
+        for end in fitted:
+            known = {k: plate for k, plate in enumerate(end.plates) if plate is not None}
+            of_ends.append({k: len(plates) + i for i, k in enumerate(known)})
+            plates += known.values()
             rings += [end.ring_noise] if end.plates else []
-            known = [k for k, plate in enumerate(end.plates) if plate is not None]
-            now = {k: len(plates) + i for i, k in enumerate(known)}
-            same += [
-                (rows[k], now[k])
-                for k in known
-                if k in rows and len(part.ends) == 2 and section.is_hollow(end.place.section)
-            ]
-            plates += [plate for plate in end.plates if plate is not None]
-            rows = now
+        if len(part.ends) == len(fitted) == 2 and section.is_hollow(fitted[1].place.section):
+            first, last = of_ends
+            same += [(first[k], last[k]) for k in last if k in first]
     return view_variance.variances(plates, rings, same)
 
 

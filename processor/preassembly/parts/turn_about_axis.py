@@ -16,8 +16,6 @@ STEP_RAD = np.radians(5.0)  # of the search: a mark of 200 mm on a tube of 500 m
 TESTED_RAD = np.radians(30.0)  # between turns by which the surface is compared with itself
 MARK_SHARE = 0.5  # of the turns, after which a sample of a mark has no surface beside it
 
-OnlyIn = Callable[[Floats], Floats]  # samples (k, 3) that a design has and the one moved by T (4, 4) has not
-
 
 def about(centre: Floats, axis: Floats, angle: float) -> Floats:
     """Turn by an angle about an axis (3,) through a centre (3,), as (4, 4)."""
