@@ -44,7 +44,6 @@ AXIS_MM = 120.0  # of the end, in which the design's axis is straight
 ACROSS = 0.5  # cosine between a facet's normal and the axis, below which it is of a wall
 HALF_WALL = 0.5  # of the wall's thickness: larger departures may be of its other side
 TURN_BOUND = 2.0 / np.sqrt(3.0)
-SLOPES = slice(5, 10)  # coefficients of the wall that change along it
 SECOND = slice(3, 5)  # coefficients of wall and end face twice round
 
 
