@@ -410,9 +410,10 @@ def _identified(scan: Scan, points: Floats, station: Ints, index: int, shapes: a
         if there is None or not (there.rejected or there.doubts):
             parts = () if there is None else there.identity.parts(shapes.design.parts[other].name)
             if part.name not in parts:
-                own = _register(scan, points, station, index, shapes)  # with splice plates it is longer than the part
-                if any(one.code == "preassemble.splice-plates" for one in own.rejected):
-                    return replace(own, parts=every)
+                if not assignment.of_size(points, shapes):  # with splice plates it is longer than any part
+                    own = _register(scan, points, station, index, shapes)
+                    if any(one.code == "preassemble.splice-plates" for one in own.rejected):
+                        return replace(own, parts=every)
                 why = (*ScanParts(scan.name, part.name, parts).wrong, *_resemblance(points, index, shapes))
                 return _PlacedScan(scan, points, station, attitude.NOWHERE, rejected=why, parts=parts)
     placed = _register(scan, points, station, index, shapes)
