@@ -14,8 +14,8 @@ from processor.clouds import CONTENTS, FORMATS, cleaning, exported_clouds, poses
 from processor.clouds import earlier_run as runs
 from processor.clouds.cleaning import Removed
 from processor.clouds.earlier_run import Run
+from processor.clouds.poisson_disk import sampled
 from processor.clouds.poses import Placed, Poses
-from processor.clouds.thinning import thinned
 from processor.model import Reason, UsageError, reason
 from processor.pipeline import Execution
 from processor.progress import tracked
@@ -90,7 +90,7 @@ def export(
             identity = f"{run.digest} {what} {spacing_mm} {stem}".encode()
             clouds[stem] = replace(cloud, identity=identity)
             if spacing_mm:
-                clouds[stem] = thinned(clouds[stem], spacing_mm, Path(aside))
+                clouds[stem] = sampled(clouds[stem], spacing_mm, Path(aside))
         try:
             return _write(run, replace(content, clouds=clouds), (folder, making), (what, format_))
         except OSError as error:

@@ -22,6 +22,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.special import erf
 
+from processor.geometry.thinning import cell_keys
 from processor.model import Bools, Floats, Ints
 from processor.progress import tracked
 
@@ -137,10 +138,7 @@ def _seeds(points: Floats, intensity: Floats, side: float) -> Iterator[Floats]:
 def _cells(points: Floats, intensity: Floats, side: float, shift: float) -> tuple[Floats, Floats]:
     """Return middles (k, 3) and contrasts (k,) of the cells of a grid that have contrast."""
     cell = np.floor(points / (CELL_SHARE * side) + shift).astype(np.int64)
-    cell -= cell.min(axis=0)
-    extent = cell.max(axis=0) + 1
-    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    _, inverse = np.unique(key, return_inverse=True)
+    _, inverse = np.unique(cell_keys(cell - cell.min(axis=0)), return_inverse=True)
     count = np.bincount(inverse)
     mean = np.bincount(inverse, intensity) / count
     variance = np.bincount(inverse, intensity**2) / count - mean**2

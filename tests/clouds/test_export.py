@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 import processor
 from processor import __main__
 from processor.cli.main import commands
-from processor.clouds import cleaning, slabs, thinning
+from processor.clouds import cleaning, poisson_disk, slabs
 from processor.clouds import export as clouds_export
 from processor.clouds.points import InMemory, Spool
 from processor.model import InputError, Scene, Stations, Status, UsageError
@@ -418,7 +418,7 @@ def collected(some):
 def test_thinned_points_keep_their_distance_and_leave_no_hole(most, spacing, tmp_path, monkeypatch):
     points = RNG.uniform([0.0, -500.0, 1e6], [9000.0, 500.0, 1e6 + 60.0], (7000, 3))
     monkeypatch.setattr(slabs.cut, "__defaults__", (most,))
-    kept, fields = collected(thinning.thinned(cloud(points, row=np.arange(7000)), spacing, tmp_path))
+    kept, fields = collected(poisson_disk.sampled(cloud(points, row=np.arange(7000)), spacing, tmp_path))
     np.testing.assert_array_equal(points[fields["row"]], kept)
     assert len(np.unique(fields["row"])) == len(kept)
     tree = cKDTree(kept)
@@ -429,7 +429,7 @@ def test_thinned_points_keep_their_distance_and_leave_no_hole(most, spacing, tmp
 
 def test_thinning_keeps_the_first_points_of_a_slab(tmp_path):
     points = RNG.uniform(0.0, 1000.0, (3000, 3))
-    kept, _ = collected(thinning.thinned(cloud(points), 90.0, tmp_path))
+    kept, _ = collected(poisson_disk.sampled(cloud(points), 90.0, tmp_path))
     expected = []
     for point in points:
         if not expected or np.linalg.norm(np.array(expected) - point, axis=1).min() >= 90.0:

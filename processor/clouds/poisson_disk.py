@@ -21,7 +21,7 @@ from processor.writers.cloud import Block, Cloud
 FIELD = 21  # bits of a cell's number for each axis; cells that far apart share a number, which costs time alone
 
 
-def thinned(cloud: Cloud, spacing_mm: float, aside: Path) -> Cloud:
+def sampled(cloud: Cloud, spacing_mm: float, aside: Path) -> Cloud:
     """Return a cloud whose points are at least ``spacing_mm`` apart; files are put aside below ``aside``."""
 
     def blocks() -> Iterator[Block]:
