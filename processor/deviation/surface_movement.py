@@ -147,13 +147,24 @@ def movement(
     return last, on_surface, station_offsets.shared_sd(core, last, stations, on_pieces, diameter_mm)
 
 
+class _Faces(NamedTuple):
+    """The faces (n,) of a cloud's points, -1 = none, and how far those near the surface (m,) lie above it, mm."""
+
+    face: Labels
+    height: Floats
+
+    def put(self) -> _Faces:
+        """Return the same, put aside."""
+        return _Faces(put_aside(self.face), put_aside(self.height))
+
+
 def _first(passes: _Passes) -> tuple[Movement, float]:
     """Assign all points, put those near the surface aside, and fit movements to them; also the share that is near."""
-    faces, near, points = list[Labels](), 0, 0
-    for aside, doubtful, face, counts in tiles.mapped(_assigned_of, passes.clouds, passes.fit):
+    faces, near, points = list[_Faces](), 0, 0
+    for aside, doubtful, of_faces, counts in tiles.mapped(_assigned_of, passes.clouds, passes.fit):
         passes.asides.append(aside.put())
         passes.doubtful.append(put_aside(doubtful))
-        faces.append(put_aside(face))
+        faces.append(of_faces.put())
         near, points = near + counts[0], points + counts[1]
         release()
     _mark_mixed(passes, faces)
@@ -164,16 +175,16 @@ def _first(passes: _Passes) -> tuple[Movement, float]:
     return first.movement(), near / points
 
 
-def _assigned_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, Bools, Labels, tuple[int, int]]:
-    """Return the points of a cloud near the surface, which of them are outliers, the faces of all, and counts.
+def _assigned_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, Bools, _Faces, tuple[int, int]]:
+    """Return the points of a cloud near the surface, which of them are outliers, their faces, and counts.
 
-    These are the numbers of points near the surface and of all, outliers left out. Points on no face have face -1.
+    These are the numbers of points near the surface and of all, outliers left out.
     """
     seen = assignment.assigned(cloud.points, cloud.scanner, fit.curved, fit.grid)
     close = np.abs(seen.distance) <= fit.depth
     counts = int((close & ~cloud.doubtful).sum()), int((~cloud.doubtful).sum())
     face = np.where(seen.facet >= 0, fit.curved.surface.part_of[seen.facet], -1).astype(np.int32)
-    return Aside.of(np.flatnonzero(close), seen), cloud.doubtful[close], face, counts
+    return Aside.of(np.flatnonzero(close), seen), cloud.doubtful[close], _Faces(face, seen.distance[close]), counts
 
 
 def _first_of(near: _Near, fit: _Fit) -> PartSums:
@@ -182,7 +193,7 @@ def _first_of(near: _Near, fit: _Fit) -> PartSums:
     return fit.part(fit.sums(), seen.of(sure), seen.distance[sure])
 
 
-def _mark_mixed(passes: _Passes, faces: Sequence[Labels]) -> None:
+def _mark_mixed(passes: _Passes, faces: Sequence[_Faces]) -> None:
     """Add to what is doubtful the mixed pixels among points near the surface, as all points of their scanner show."""
     scanners, numbers = list[Floats](), list[Labels]()
     for cloud in passes.clouds:
@@ -214,16 +225,15 @@ class _Blocks:
     """Passes over all points of the clouds with their ``faces`` and the ``numbers`` of their scanners."""
 
     passes: _Passes
-    faces: Sequence[Labels]
+    faces: Sequence[_Faces]
     numbers: Sequence[Labels]
 
     def __iter__(self) -> Iterator[mixed_pixels.Block]:
         """Pass over all points."""
-        asides, curved = self.passes.asides, self.passes.fit.value.curved
-        for cloud, aside, face, number in zip(self.passes.clouds, asides, self.faces, self.numbers, strict=True):
+        columns = self.passes.clouds, self.passes.asides, self.faces, self.numbers
+        for cloud, aside, (face, above), number in zip(*columns, strict=True):
             facet, height = np.full(len(face), -1, np.int32), np.zeros(len(face))
-            facet[aside.rows] = aside.facet
-            height[aside.rows] = aside.seen(cloud.points[aside.rows], curved).distance
+            facet[aside.rows], height[aside.rows] = aside.facet, above
             yield mixed_pixels.Block(cloud.points, number, face, facet, height)
             release()
 
