@@ -114,7 +114,7 @@ def nearest_rotation(M: Floats) -> Floats:
 
 
 def fit(source: Floats, target: Floats) -> Floats:
-    """Rigid T_target_source (..., 4, 4), no reflection, of least squared distances of paired points (..., n, 3), n >= 3.
+    """Rigid T_target_source (..., 4, 4), no reflection, of least squared distances of pairs (..., n, 3), n >= 3.
 
     Source: the objective of Besl and McKay (paper 000, eq. 5), solved by the SVD of the covariance.
     """
