@@ -17,9 +17,9 @@ from processor.model import VOCABULARIES, Status, reason
 from processor.papers import rows
 from processor.report.columns import COLUMNS
 from processor.validation import change_detection, coverage, curves
+from tests.support import structure
 
 SOURCES = Path(processor.__file__).parent
-GENERATOR = SOURCES.parent / "designgen"
 OTHERS = [code for code in CODES if code != "en"]
 
 
@@ -27,10 +27,7 @@ OTHERS = [code for code in CODES if code != "en"]
 def all_calls():
     """Every call in the sources, with its file."""
     return [
-        (path.name, node)
-        for path in (*sorted(SOURCES.rglob("*.py")), *sorted(GENERATOR.rglob("*.py")))
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
-        if isinstance(node, ast.Call)
+        (path.name, node) for path in structure.SOURCES for node in structure.nodes(path) if isinstance(node, ast.Call)
     ]
 
 

@@ -27,6 +27,24 @@ def tree(path):
 
 
 @cache
+def nodes(path):
+    """Every node of a file's tree but the contexts of names, which say nothing here."""
+    found = [tree(path)]
+    for node in found:  # grows on the way
+        found += _children(node)
+    return found
+
+
+def _children(node):
+    for name in node._fields:
+        value = getattr(node, name, None)
+        if isinstance(value, list):
+            yield from (one for one in value if isinstance(one, ast.AST))
+        elif isinstance(value, ast.AST) and name != "ctx":
+            yield value
+
+
+@cache
 def imports(path):
     """Every module that a file imports, those inside functions too; of `from a import b` both a and a.b.
 
@@ -36,11 +54,11 @@ def imports(path):
     found = set()
     only_types = {
         id(inner)
-        for node in ast.walk(tree(path))
+        for node in nodes(path)
         if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
         for inner in ast.walk(node)
     }
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
         if id(node) in only_types:
             continue
         if isinstance(node, ast.Import):
@@ -112,7 +130,7 @@ def long_functions():
     """Functions with too many lines or arguments."""
     found = []
     for path in SOURCES:
-        for node in ast.walk(tree(path)):
+        for node in nodes(path):
             if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 continue
             lines = node.end_lineno - min([node.lineno, *(one.lineno for one in node.decorator_list)]) + 1
@@ -129,7 +147,7 @@ def positional_records(most=5):
     records = {
         node.name
         for path in SOURCES
-        for node in ast.walk(tree(path))
+        for node in nodes(path)
         if isinstance(node, ast.ClassDef)
         and (
             any("dataclass" in ast.dump(one) for one in node.decorator_list)
@@ -138,7 +156,7 @@ def positional_records(most=5):
     }
     found = []
     for path in SOURCES:
-        for node in ast.walk(tree(path)):
+        for node in nodes(path):
             name = getattr(node.func, "id", getattr(node.func, "attr", "")) if isinstance(node, ast.Call) else ""
             if name in records and len(node.args) > most:
                 found.append(f"{path.relative_to(ROOT)}:{node.lineno} {name}: {len(node.args)} positional arguments")
@@ -233,8 +251,8 @@ def messages_read_again(sources=SOURCES):
     """
     found = []
     for path in sources:
-        calls = [node for node in ast.walk(tree(path)) if isinstance(node, ast.Call)]
-        names = FOR_PEOPLE | _items_for_people(tree(path))
+        calls = [node for node in nodes(path) if isinstance(node, ast.Call)]
+        names = FOR_PEOPLE | _items_for_people(nodes(path))
         found += [
             f"{path.name}:{node.lineno} {ast.unparse(node.func)}"
             for node in calls
@@ -246,11 +264,11 @@ def messages_read_again(sources=SOURCES):
     return found
 
 
-def _items_for_people(parsed):
+def _items_for_people(every):
     """The names of the items of lists of texts for people, in loops over them."""
     return {
         node.target.id
-        for node in ast.walk(parsed)
+        for node in every
         if isinstance(node, ast.For | ast.comprehension) and isinstance(node.target, ast.Name)
         if _for_people(node.iter, FOR_PEOPLE)
     }
