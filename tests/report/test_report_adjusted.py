@@ -162,7 +162,7 @@ def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     execution = of_bridge()
     (row,) = of_file(execution, "components-compared")
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
-    answered = drawn(execution)["preassemble"]["linear-error.png"]
+    answered = drawn(execution)["preassemble"].figures["linear-error.png"]
     assert "without a band, because they state no uncertainty: line" in str(answered[0])
     line = execution.runs[1]
     linear = line.result.linear
@@ -176,7 +176,7 @@ def test_failed_method_is_listed_with_its_reason_and_not_drawn():
         ),
     )
     alone = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=own)))
-    caption, picture = all_figures.draw_figures(alone, ErrorReport())["preassemble"]["linear-error.png"]
+    caption, picture = all_figures.draw_figures(alone, ErrorReport())["preassemble"].figures["linear-error.png"]
     assert "the error of these methods for parts exactly as designed, scanned alike: line" in str(caption)
     assert picture != answered[1]
     (summary,) = (table for table in all_tables.tables_of_run(alone, ErrorReport()) if table.file == "summary")
@@ -184,7 +184,7 @@ def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     nothing = Deviations(deviation=np.full(120, NAN))
     result = dataclasses.replace(line.result, linear=dataclasses.replace(linear, assembled=nothing, best_fit=nothing))
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
-    caption, picture = drawn(silent)["preassemble"]["linear-error.png"]
+    caption, picture = drawn(silent)["preassemble"].figures["linear-error.png"]
     assert "without a result, so not drawn: line" in str(caption)
     assert picture != answered[1]
     data = json.loads(Page(rendered(silent)).scripts[0][1])["steps"]["preassemble"]
@@ -212,7 +212,7 @@ def test_methods_without_intervals_have_no_tables_of_the_adjustment():
     execution = Execution(arch_scene(), runs, PROVENANCE)
     files = {table.file for table in all_tables.tables_of_run(execution, ErrorReport())}
     assert not files & {"what-to-do", "limits", "measures", "span", "budget", "trade-off"}
-    assert not set(drawn(execution)["preassemble"]) & OWN
+    assert not set(drawn(execution)["preassemble"].figures) & OWN
     assert "What limits the accuracy" not in rendered(execution)
 
 
@@ -270,7 +270,7 @@ def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
     execution = of_bridge()
     result = unknown(execution.runs[0].result, list(joints), parts)
     execution = dataclasses.replace(execution, runs=(dataclasses.replace(execution.runs[0], result=result),))
-    found = drawn(execution)["preassemble"]
+    found = drawn(execution)["preassemble"].figures
     assert len({"gap-vectors.png", "residuals.png", "trade-off.png"} & set(found)) == pictures
     parsed = Page(rendered(execution))
     last = parsed.tables["Joints: what to do, method adjustment"][-1]
@@ -286,7 +286,7 @@ def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
 
 
 def test_every_picture_shows_something():
-    found = drawn(of_bridge())["preassemble"]
+    found = drawn(of_bridge())["preassemble"].figures
     assert set(found) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
     for name, (caption, png) in found.items():
         pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
@@ -298,7 +298,7 @@ def test_every_picture_shows_something():
 
 def test_pictures_change_with_their_data_alone():
     """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
-    before = drawn(of_bridge())["preassemble"]
+    before = drawn(of_bridge())["preassemble"].figures
     execution = of_bridge()
     run = execution.runs[0]
     before_of = run.result.adjustment
@@ -306,7 +306,7 @@ def test_pictures_change_with_their_data_alone():
     other = dataclasses.replace(run.result, adjustment=dataclasses.replace(before_of, residuals=residuals, weight=1.0))
     after = all_figures.draw_figures(
         dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
-    )["preassemble"]
+    )["preassemble"].figures
     assert {name for name in OWN if before[name] != after[name]} == {"residuals.png", "trade-off.png"}
 
 

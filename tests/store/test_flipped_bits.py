@@ -84,7 +84,7 @@ def test_parts_of_a_column_read_alone_are_checked(scene_file):
     with h5py.File(scene_file, "r") as file:
         part = file["scene/scans/0000/points/x"].id.get_chunk_info(0)
     with flipped(scene_file, part.byte_offset + part.size // 2, 3), points_of(scene_file) as points:
-        boxed = points.within([(np.full(3, -1e9), np.full(3, 1e9))] * 2)
+        boxed = points.near([(np.full((1, 3), -1e9), np.full((1, 3), 1e9))] * 2)
         with pytest.raises(InputError, match=r"scene\.h5: /scene/scans/0000/points/x: is damaged"):
             list(boxed.read(0))
         with pytest.raises(InputError, match=r"scene\.h5: /scene/scans/0000/points/x: is damaged"):
