@@ -263,6 +263,15 @@ def test_a_drawing_read_back(T):
     assert moved == {tuple(NOMINAL[i]) for i in (0, 1, 3)}
 
 
+def test_entities_are_written_as_the_library_writes_them():
+    data = dxf.drawing(whole())
+    again = io.StringIO(newline="\n")
+    opened(data).write(again)
+    entities = [text.partition("ENTITIES\n")[2].partition("ENDSEC")[0] for text in (data.decode(), again.getvalue())]
+    assert entities[0].count("AcDbEntity") > 10
+    assert entities[0] == entities[1]
+
+
 def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
     code = (
         "import hashlib; from processor.report.space_frame import dxf;"
