@@ -17,7 +17,7 @@ from processor.report import all_tables, characteristics, headline, templates, t
 from processor.report.columns import Column
 from processor.report.reports_of_steps import characteristics_of, step_report
 from processor.report.scripts import page_script
-from processor.report.style import CaptionedPngs
+from processor.report.style import CaptionedPngs, Drawn
 from processor.report.table import Table, groups, headings, numeric, shown, title
 from processor.targets.summary import summary
 
@@ -35,7 +35,7 @@ TONES = {Verdict.PASS: "good", Verdict.FAIL: "bad", Verdict.INDETERMINATE: "open
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
 
-def html(execution: Execution, report: ErrorReport, figures: Mapping[str, CaptionedPngs], lang: str = "en") -> str:
+def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], lang: str = "en") -> str:
     """Render the page, with the figures of each step, in a language of CODES; every text is escaped."""
     environment = templates.environment("report", lang)
     environment.filters["say"] = messages(lang).text
@@ -166,12 +166,13 @@ def _message(run: StepRun, lang: str) -> str:
 
 
 def _sections(
-    execution: Execution, report: ErrorReport, figures: Mapping[str, CaptionedPngs], live: Container[str], lang: str
+    execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live: Container[str], lang: str
 ) -> list[dict[str, Any]]:
     sections = [_section(execution, run, others, report, lang) for run, others in execution.by_step()]
     for section in sections:
         section["live"] = section["step"] in live
-        section["figures"] = _pictures(section["step"], figures.get(section["step"], {}), section["live"])
+        drawn = figures.get(section["step"], Drawn({}))
+        section["figures"] = _pictures(section["step"], drawn.figures, section["live"])
     if report.metrics:
         table = written_table(all_tables.checks_table(report), lang)
         empty: dict[str, Any] = {"message": "", "lead": [], "further": [], "figures": [], "live": False, "step": ""}

@@ -22,7 +22,7 @@ from processor.pipeline import Execution
 from processor.report import characteristics, headline, title_block
 from processor.report.characteristics import Characteristic
 from processor.report.reports_of_steps import characteristics_of
-from processor.report.style import CaptionedPngs, chinese_font, drawable, families, pdf
+from processor.report.style import Drawn, chinese_font, drawable, families, pdf
 from processor.report.table import shown
 
 NAME = "report.pdf"
@@ -51,15 +51,15 @@ class Line:
     colour: str = "black"
 
 
-def document(execution: Execution, figures: Mapping[str, CaptionedPngs], lang: str = "en") -> bytes:
+def document(execution: Execution, figures: Mapping[str, Drawn], lang: str = "en") -> bytes:
     """Write the document; the same run gives the same bytes on systems with the same fonts."""
     with rc_context({"font.family": families()}):
         return _document(execution, figures, messages(lang if lang == "en" or chinese_font() else "en"))
 
 
-def _document(execution: Execution, figures: Mapping[str, CaptionedPngs], say: Messages) -> bytes:
+def _document(execution: Execution, figures: Mapping[str, Drawn], say: Messages) -> bytes:
     pages = [*_front(execution, say), *_characteristics(execution, say)]
-    drawn = [(say.text(caption), png) for of_step in figures.values() for caption, png in of_step.values()]
+    drawn = [(say.text(caption), png) for of_step in figures.values() for caption, png in of_step.figures.values()]
     count = len(pages) + len(drawn)
     head = drawable(" · ".join(filter(None, [*_heads(execution), execution.scene.name])))
     foot = drawable(", ".join(value for _, value in title_block.facts(execution.provenance)))

@@ -10,7 +10,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message
 from processor.model import Scene, StepRun, Verdict
 from processor.pipeline import Execution
-from processor.report.style import CaptionedPngs
+from processor.report.style import Drawn
 from processor.report.table import Table
 
 
@@ -26,7 +26,7 @@ class StepReport:
     title: str | Message
     summary: Callable[[Any], tuple[Any, Any]]  # of a result: the verdict's heading, and the sentences below it
     tables: Callable[[Sequence[StepRun], ErrorReport], list[Table]]
-    figures: Callable[[Execution, Sequence[StepRun], ErrorReport], CaptionedPngs]  # file names are the step's own
+    figures: Callable[[Execution, Sequence[StepRun], ErrorReport], Drawn]  # file names are the step's own
     to_do: Callable[[Any], Iterable[Any]] = lambda _: ()
     why: Callable[[Any], Iterable[Any]] = lambda result: result.reasons
     limits: Callable[[Any], Iterable[Any]] = lambda _: ()

@@ -63,11 +63,13 @@ def write_results(
             for name, data in step_report(run.step).files(execution, run).items():
                 write_bytes(making / name, data)
         drawn = all_figures.draw_figures(execution, report)
-        if any(drawn.values()):
+        if any(of_step.figures for of_step in drawn.values()):
             (making / FIGURES).mkdir()
         for of_step in drawn.values():
-            for name, (_, png) in of_step.items():
+            for name, (_, png) in of_step.figures.items():
                 write_bytes(making / FIGURES / name, png)
+            for name, data in of_step.documents.items():
+                write_bytes(making / name, data)
         write_text(making / REPORT_PAGE, page.html(execution, report, drawn, lang))
         if execution.clouds:
             step_clouds.write(making / STEPS, _of_stages(execution))

@@ -174,19 +174,19 @@ def read_index(group: Any) -> StoredTiles:
     return StoredTiles(grid, cell, start, count, columns)
 
 
-def read_box(group: Any, stored: StoredTiles, lower: Floats, upper: Floats) -> Floats:
-    """Return the points (m, 3) of a scan's group with ``lower <= p <= upper`` (mm).
+def near_boxes(group: Any, lower: Floats, upper: Floats, size: int) -> Iterator[Floats]:
+    """Yield the points (n, 3) of the tiles of a scan's group that boxes touch: corners (k, 3), mm; no other is read.
 
-    Only the tiles that the box touches in the index ``stored`` are read.
+    These hold all points with ``lower <= p <= upper`` of any box, and others.
     """
-    grid, cell, start, count, _ = stored
-    columns = [codec.sliced(group["points"][axis]) for axis in AXES]
-    low, high = grid.cell_range(lower, upper)
-    rows = np.flatnonzero(((cell >= low) & (cell <= high)).all(axis=1))
-    pieces = [np.empty((0, 3))]
-    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
-        if len(run):
-            part = slice(int(start[run[0]]), int(start[run[-1]] + count[run[-1]]))
-            points = grid.millimetres((columns[0][part], columns[1][part], columns[2][part]))
-            pieces.append(points[((points >= lower) & (points <= upper)).all(axis=1)])
-    return np.concatenate(pieces)
+    grid, cell, start, counts, columns = read_index(group)
+    touched = np.zeros(len(cell), np.bool_)
+    for low, high in zip(lower, upper, strict=True):
+        first, last = grid.cell_range(low, high)
+        touched |= ((cell >= first) & (cell <= last)).all(axis=1)
+    rows = np.flatnonzero(touched)
+    for run in filter(len, np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)):
+        end = int(start[run[-1]] + counts[run[-1]])
+        for begin in range(int(start[run[0]]), end, size):
+            x, y, z = (column[begin : min(begin + size, end)] for column in columns)
+            yield grid.millimetres((x, y, z))

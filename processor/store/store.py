@@ -13,6 +13,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -169,6 +171,10 @@ def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, 
             codec.write_record(results.create_group(f"{i:04d}"), run)
 
 
+_SOUND: dict[tuple[int, ...], Mapping[str, str | None]] = {}  # by the state of a file: checksums of its datasets
+SETTLED_S = 2.0  # since a file was written
+
+
 # --- reading ---------------------------------------------------------------------------------------------------------
 
 
@@ -179,11 +185,7 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
         with file_structure_checks.limited_memory():
             file = h5py.File(path, "r", locking=False)
         with file:
-            known: dict[str, str | None] = {}
-            with file_structure_checks.limited_memory():
-                faults = file_structure_checks.problems(
-                    file, path, lambda place, dataset: known.update({place: checksums.stored(dataset)})
-                )
+            known, faults = _structure(file, path)
             faults = faults or _header_problems(file, kinds, known)
             if faults:
                 raise DecodeError(faults)
@@ -205,6 +207,26 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
             f"({_first_line(error)}); make or copy it again",
             path=path,
         ) from error
+
+
+def _structure(file: Any, path: Path) -> tuple[Mapping[str, str | None], list[str]]:
+    """Return the checksums of an open file's datasets by their paths, and the faults of its structure.
+
+    A run opens its input several times: what was found sound is not visited again while the file is as it was. One that
+    was just written may change again within a tick of the disk's clock, so it is not remembered.
+    """
+    status = os.fstat(file.id.get_vfd_handle())
+    state = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+    if state in _SOUND:
+        return _SOUND[state], []
+    known: dict[str, str | None] = {}
+    with file_structure_checks.limited_memory():
+        faults = file_structure_checks.problems(
+            file, path, lambda place, dataset: known.update({place: checksums.stored(dataset)})
+        )
+    if not faults and time.time() - status.st_mtime > SETTLED_S:
+        _SOUND[state] = known
+    return known, faults
 
 
 def _listed(problems: Sequence[str], most: int = 20) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +47,9 @@ class StoredPoints:
         """Return a per-point column of a scan, to be read in slices; one that is absent is empty."""
         return scan_tiles.column(self.scans[scan], name)
 
-    def within(self, boxes: Sequence[tuple[Floats, Floats]]) -> Boxed:
-        """Restrict each scan to a box: lower and upper corner (3,), mm, relative to the scan's origin."""
-        return Boxed(self, tuple(boxes))
-
-    @cached_property
-    def indexed(self) -> dict[int, scan_tiles.StoredTiles]:
-        """The indexes of the scans that were read in boxes, by their numbers: many boxes take the same."""
-        return {}
+    def near(self, boxes: Sequence[tuple[Floats, Floats]]) -> NearBoxes:
+        """Restrict each scan to the tiles about boxes: lower and upper corners (k, 3), mm, less the scan's origin."""
+        return NearBoxes(self, tuple(boxes))
 
     def pieces(self, scan: int, name: str) -> tuple[tuple[int, ...], Iterator[Any]]:
         """Return the shape of a per-point column and an iterator over it; see :func:`.store.scene_hash`."""
@@ -63,29 +57,22 @@ class StoredPoints:
 
 
 @dataclass(frozen=True)
-class Boxed:
-    """Points within a box of each scan, without their stations; only the tiles that a box touches are read."""
+class NearBoxes:
+    """Points of the tiles that boxes of each scan touch, without their stations; other tiles are not read."""
 
     stored: StoredPoints
     boxes: tuple[tuple[Floats, Floats], ...]
 
     def counts(self) -> tuple[int, ...]:
-        """Return the number of points of each scan within its box."""
-        return tuple(len(self._points(scan)) for scan in range(len(self.boxes)))
+        """Return the number of points of each scan in those tiles."""
+        return tuple(sum(len(points) for points, _ in self.read(scan)) for scan in range(len(self.boxes)))
 
     def read(self, scan: int, size: int = PIECE) -> Iterator[tuple[Floats, Labels]]:
         """Yield points (n, 3), relative to the scan's origin, in the order of the file."""
-        points = self._points(scan)
-        for start in range(0, len(points), size):
-            yield points[start : start + size], scan_tiles.NO_STATIONS
-
-    def _points(self, scan: int) -> Floats:
-        group, indexed = self.stored.scans[scan], self.stored.indexed
+        group = self.stored.scans[scan]
         with _naming_the_file(group):
-            if scan not in indexed:
-                # Without the datasets: HDF5 holds some chunks of each that is open, of many scans a lot.
-                indexed[scan] = scan_tiles.read_index(group)._replace(columns=[])
-            return scan_tiles.read_box(group, indexed[scan], *self.boxes[scan])
+            for points in scan_tiles.near_boxes(group, *self.boxes[scan], size):
+                yield points, scan_tiles.NO_STATIONS
 
 
 @contextmanager

@@ -260,7 +260,7 @@ def test_joint_without_a_result_is_not_shown_as_zero():
 
 def figures_of_both():
     drawn = all_figures.draw_figures(of_bridge(), ErrorReport()) | all_figures.draw_figures(*of_frame())
-    return drawn["preassemble"] | drawn["spheres"]
+    return drawn["preassemble"].figures | drawn["spheres"].figures
 
 
 def test_figures_are_the_same_bytes_whatever_the_users_settings():

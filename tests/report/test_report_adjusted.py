@@ -19,7 +19,7 @@ from processor.preassembly.verdicts import joint_measures
 from processor.report import all_figures, all_tables, page
 from processor.report import table as report_table
 from processor.report.preassembly import figures, joint_figures, residual_map
-from processor.report.style import default_settings, rounded
+from processor.report.style import Drawn, default_settings, rounded
 from processor.results import to_json
 from tests.support.pages.report_pages import Page, drawn, rendered
 from tests.support.results.bridge_results import (
@@ -193,7 +193,7 @@ def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     caption, picture = linear_error(silent)
     assert "without a result, so not drawn: line" in str(caption)
     assert picture != answered[1]
-    blank = page.html(silent, ErrorReport(), {"preassemble": {}})
+    blank = page.html(silent, ErrorReport(), {"preassemble": Drawn({})})
     data = json.loads(Page(blank).scripts[0][1])["steps"]["preassemble"]
     assert [one["method"] for one in data["linear"]] == ["adjustment"]
 
@@ -219,7 +219,7 @@ def test_methods_without_intervals_have_no_tables_of_the_adjustment():
     execution = Execution(arch_scene(), runs, PROVENANCE)
     files = {table.file for table in all_tables.tables_of_run(execution, ErrorReport())}
     assert not files & {"what-to-do", "limits", "measures", "span", "budget", "trade-off"}
-    assert not set(drawn(execution)["preassemble"]) & OWN
+    assert not set(drawn(execution)["preassemble"].figures) & OWN
     assert "What limits the accuracy" not in rendered(execution)
 
 
@@ -278,7 +278,7 @@ def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
     execution = of_bridge()
     result = unknown(execution.runs[0].result, list(joints), parts)
     execution = dataclasses.replace(execution, runs=(dataclasses.replace(execution.runs[0], result=result),))
-    found = drawn(execution)["preassemble"]
+    found = drawn(execution)["preassemble"].figures
     assert len({"gap-vectors.png", "residuals.png", "trade-off.png"} & set(found)) == pictures
     parsed = Page(rendered(execution))
     last = parsed.tables["Joints: what to do, method adjustment"][-1]
@@ -294,7 +294,7 @@ def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
 
 
 def test_every_picture_shows_something():
-    found = drawn(of_bridge())["preassemble"]
+    found = drawn(of_bridge())["preassemble"].figures
     assert set(found) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
     for name, (caption, png) in found.items():
         pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
@@ -306,7 +306,7 @@ def test_every_picture_shows_something():
 
 def test_pictures_change_with_their_data_alone():
     """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
-    before = drawn(of_bridge())["preassemble"]
+    before = drawn(of_bridge())["preassemble"].figures
     execution = of_bridge()
     run = execution.runs[0]
     before_of = run.result.adjustment
@@ -314,7 +314,7 @@ def test_pictures_change_with_their_data_alone():
     other = dataclasses.replace(run.result, adjustment=dataclasses.replace(before_of, residuals=residuals, weight=1.0))
     after = all_figures.draw_figures(
         dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
-    )["preassemble"]
+    )["preassemble"].figures
     assert {name for name in OWN if before[name] != after[name]} == {"residuals.png", "trade-off.png"}
 
 

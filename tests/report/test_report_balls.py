@@ -22,9 +22,10 @@ from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, page, write_results
 from processor.report import table as report_table
 from processor.report.columns import columns
-from processor.report.space_frame import dxf, flagged_ball_figures
+from processor.report.space_frame import ball_picture, dxf, flagged_ball_figures
 from processor.report.space_frame import figures as space_frame_figures
 from processor.report.space_frame import tables as space_frame_tables
+from processor.report.style import Drawn
 from processor.results import to_json
 from processor.space_frame.result import (
     ControlDeviations,
@@ -262,6 +263,15 @@ def test_a_drawing_read_back(T):
     assert moved == {tuple(NOMINAL[i]) for i in (0, 1, 3)}
 
 
+def test_entities_are_written_as_the_library_writes_them():
+    data = dxf.drawing(whole())
+    again = io.StringIO(newline="\n")
+    opened(data).write(again)
+    entities = [text.partition("ENTITIES\n")[2].partition("ENDSEC")[0] for text in (data.decode(), again.getvalue())]
+    assert entities[0].count("AcDbEntity") > 10
+    assert entities[0] == entities[1]
+
+
 def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
     code = (
         "import hashlib; from processor.report.space_frame import dxf;"
@@ -321,7 +331,7 @@ def compared():
 
 def test_figures_of_a_frame_and_those_of_balls_to_look_at(compared):
     execution, report, drawn = compared
-    found = drawn["spheres"]
+    found = drawn["spheres"].figures
     assert set(found) == {
         "plan.png", "radius-errors.png", "ball-errors.png", "flagged-ball-11.png", "flagged-ball-12.png",
         "flagged-ball-13.png",
@@ -331,11 +341,11 @@ def test_figures_of_a_frame_and_those_of_balls_to_look_at(compared):
     assert "sd" not in str(found["ball-errors.png"][0])
     assert str(found["flagged-ball-11.png"][0]).startswith("Ball 11, wrong-size")
     with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0}):
-        assert all_figures.draw_figures(execution, report)["spheres"] == found
+        assert all_figures.draw_figures(execution, report)["spheres"] == drawn["spheres"]
 
 
 def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
-    found = all_figures.draw_figures(*of_frame(points=np.empty((0, 3))))["spheres"]
+    found = all_figures.draw_figures(*of_frame(points=np.empty((0, 3))))["spheres"].figures
     assert set(found) == {"plan.png", "ball-errors.png"}
     assert "Standard deviations" in str(found["ball-errors.png"][0])  # there is no truth to compare with
 
@@ -345,13 +355,13 @@ def test_at_most_twelve_balls_have_a_picture_worst_first(monkeypatch):
     monkeypatch.setattr(flagged_ball_figures, "MOST_BALLS", 4)  # of seven, as more take seconds
     made = repeated(whole(), 3)
     drawn = flagged_ball_figures.draw(scene(made), made)
-    captions = [str(caption) for caption, _ in drawn.values()]
-    assert len(drawn) == 4
+    captions = [str(caption) for caption, _ in drawn.figures.values()]
+    assert len(drawn.figures) == 4
     flags = [caption.split(",")[1].split(":")[0].strip() for caption in captions]
     assert flags == [*["wrong-size"] * 3, "not-found"]
     assert "the first 4 of 7" in captions[0]
     every = flagged_ball_figures.flagged_rows(scene(made), made)
-    assert pages_of(flagged_ball_figures.document(scene(made), made)) == len(every) == 7
+    assert pages_of(drawn.documents[flagged_ball_figures.DOCUMENT]) == len(every) == 7
 
 
 def pages_of(pdf):
@@ -362,15 +372,15 @@ def pages_of(pdf):
 def test_a_ball_to_look_at_has_a_page_with_its_numbers():
     made = whole()
     i = made.balls.flag.index("wrong-size")
-    said = dict(flagged_ball_figures._numbers(made.balls, i, np.array([1.0, -2.0, 0.5])))
+    said = dict(ball_picture.numbers(made.balls, i, np.array([1.0, -2.0, 0.5])))
     half = 1.96 * np.sqrt(made.balls.covariance[i, 3, 3])
     assert said["radius"] == f"{made.balls.radii[i]:.2f} ± {half:.2f}"
     assert said["off the design's place, y"] == "2.00"  # found less designed
-    pdf = flagged_ball_figures.document(scene(made), made)
-    assert pages_of(pdf) == 3
-    assert pdf == flagged_ball_figures.document(scene(made), made)
+    drawn = flagged_ball_figures.draw(scene(made), made)
+    assert pages_of(drawn.documents[flagged_ball_figures.DOCUMENT]) == 3
+    assert drawn == flagged_ball_figures.draw(scene(made), made)
     fine = whole(changed={"flag": ("ok",) * 5})
-    assert flagged_ball_figures.document(scene(fine), fine) == b""
+    assert flagged_ball_figures.draw(scene(fine), fine) == Drawn({})
 
 
 def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
@@ -409,8 +419,8 @@ def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
     store.write_scene(tmp_path / "s.h5", one, None, {})
     in_memory = flagged_ball_figures.draw(store.read_scene(tmp_path / "s.h5"), made)
     alone = store.read_scene(tmp_path / "s.h5", points=False)
-    assert len(in_memory) > 1
-    assert flagged_ball_figures.draw(alone, made) == {}
+    assert len(in_memory.figures) > 1
+    assert flagged_ball_figures.draw(alone, made) == Drawn({})
     assert flagged_ball_figures.draw(alone, made, tmp_path / "s.h5") == in_memory
 
 
@@ -476,7 +486,7 @@ def test_the_page_of_a_frame(compared):
         found.tables
     )
     assert found.tables["Nodes against the design (mm)"][1][-3] == "pass"
-    assert len([one for one in found.addresses if one.startswith("data:image/png")]) == len(drawn["spheres"])
+    assert len([one for one in found.addresses if one.startswith("data:image/png")]) == len(drawn["spheres"].figures)
     assert "Nodes against the design" in text[text.index("<h2>") :]
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import time
 
 import numpy as np
 import pytest
 
 from processor import pipeline
 from processor.model import InputError, StepRun
-from processor.store import checksums, store
+from processor.store import checksums, file_structure_checks, store
 from processor.store.streaming import points_of
 from tests.support.files.flipped_files import flipped, unnoticed
 from tests.support.files.old_files import sealed_again, without_checksums
@@ -84,7 +86,7 @@ def test_parts_of_a_column_read_alone_are_checked(scene_file):
     with h5py.File(scene_file, "r") as file:
         part = file["scene/scans/0000/points/x"].id.get_chunk_info(0)
     with flipped(scene_file, part.byte_offset + part.size // 2, 3), points_of(scene_file) as points:
-        boxed = points.within([(np.full(3, -1e9), np.full(3, 1e9))] * 2)
+        boxed = points.near([(np.full((1, 3), -1e9), np.full((1, 3), 1e9))] * 2)
         with pytest.raises(InputError, match=r"scene\.h5: /scene/scans/0000/points/x: is damaged"):
             list(boxed.read(0))
         with pytest.raises(InputError, match=r"scene\.h5: /scene/scans/0000/points/x: is damaged"):
@@ -153,3 +155,19 @@ def test_verify_command_counts_whole_damaged_and_unchecked_files(tmp_path, scene
     (tmp_path / "empty").mkdir()
     assert verify(tmp_path / "empty").returncode == 3
     assert verify(sealed_again(scene_file)).returncode == 0
+
+
+def test_a_file_is_visited_once_while_it_stays_as_it_was(scene_file, monkeypatch):
+    """One that has changed is visited again, and so is one that was just written: it may change within a clock tick."""
+    visits = []
+    visit = file_structure_checks.problems
+    monkeypatch.setattr(file_structure_checks, "problems", lambda *given: visits.append(1) or visit(*given))
+    os.utime(scene_file)
+    for _ in range(2):
+        store.read_provenance(scene_file)
+    assert len(visits) == 2
+    for age_s, expected in ((100.0, 3), (50.0, 4)):
+        os.utime(scene_file, (then := time.time() - age_s, then))
+        for _ in range(2):
+            store.read_provenance(scene_file)
+        assert len(visits) == expected

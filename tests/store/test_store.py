@@ -54,11 +54,12 @@ def lexicographic(points):
 def in_box(path, lower, upper):
     """Points of a file's first scan within a box."""
     with store.points_of(path) as points:
-        whole = (np.full(3, -np.inf), np.full(3, np.inf))
-        boxed = points.within([(np.asarray(lower), np.asarray(upper)), *[whole] * (len(points.scans) - 1)])
+        whole = (np.full((1, 3), -np.inf), np.full((1, 3), np.inf))
+        boxed = points.near([(np.atleast_2d(lower), np.atleast_2d(upper)), *[whole] * (len(points.scans) - 1)])
         pieces = [piece for piece, _ in boxed.read(0)]
         assert boxed.counts()[0] == sum(map(len, pieces))
-    return np.concatenate([np.empty((0, 3)), *pieces])
+    found = np.concatenate([np.empty((0, 3)), *pieces])
+    return found[((found >= lower) & (found <= upper)).all(axis=1)]
 
 
 def same(a, b):

@@ -9,6 +9,7 @@ from processor.language.messages import Message, text
 from processor.model import Status
 from processor.report.defects import figures, interactive_view, tables
 from processor.report.step_report import StepReport
+from processor.report.style import Drawn
 
 
 def _summary(result: Result) -> tuple[Message, Message]:
@@ -38,7 +39,7 @@ REPORT = StepReport(
     title=text("Defects"),
     summary=_summary,
     tables=tables.step_tables,
-    figures=lambda _, runs, __: figures.draw(runs[0].result),
+    figures=lambda _, runs, __: Drawn(figures.draw(runs[0].result)),
     files=lambda _, run: figures.files(run.result),
     interactive_data=interactive_view.interactive_data,
 )

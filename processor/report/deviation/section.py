@@ -17,7 +17,7 @@ from processor.report.charts import surface_view
 from processor.report.charts.stepped_colours import Band
 from processor.report.deviation import core_points_csv, face_maps, figures
 from processor.report.step_report import StepReport
-from processor.report.style import CaptionedPngs
+from processor.report.style import CaptionedPngs, Drawn
 from processor.report.table import Table, figures_of
 
 MAP, HISTOGRAM = "deviation-map.png", "deviation-histogram.png"
@@ -110,7 +110,7 @@ REPORT = StepReport(
     title=text("Deviation"),
     summary=_summary,
     tables=_tables,
-    figures=_figures,
+    figures=lambda *given: Drawn(_figures(*given)),
     files=_files,
     interactive_data=_live,
 )

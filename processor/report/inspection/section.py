@@ -11,6 +11,7 @@ from processor.model import Scene, Status, StepRun, Verdict
 from processor.report.characteristics import Characteristic
 from processor.report.inspection import tables
 from processor.report.step_report import StepReport
+from processor.report.style import Drawn
 
 VERDICTS = {
     Verdict.PASS: text("{count} pass"),
@@ -84,7 +85,7 @@ REPORT = StepReport(
     title=text("Inspection of components"),
     summary=_summary,
     tables=tables.step_tables,
-    figures=lambda *_: {},
+    figures=lambda *_: Drawn({}),
     to_do=_beyond,
     limits=lambda result: [component.characteristics for component in result.components],
     characteristics=_characteristics,

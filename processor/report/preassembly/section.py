@@ -14,6 +14,7 @@ from processor.preassembly.verdicts.joints import ComparedLimits
 from processor.report import verdict_counts
 from processor.report.preassembly import characteristics, figures, interactive_view, tables
 from processor.report.step_report import StepReport
+from processor.report.style import Drawn
 
 VERDICTS = {
     Verdict.PASS: text("{count} pass"),
@@ -139,7 +140,7 @@ REPORT = StepReport(
     title=text("Preassembly"),
     summary=_summary,
     tables=tables.step_tables,
-    figures=lambda execution, runs, _: figures.draw(execution.scene, runs),
+    figures=lambda execution, runs, _: Drawn(figures.draw(execution.scene, runs)),
     further_verdicts=_further,
     to_do=_to_do,
     why=_why,

@@ -26,6 +26,7 @@ from processor.report.style import (
     LEAST_SHOWN_MM,
     MARKERS,
     CaptionedPngs,
+    Drawn,
     png,
     rounded,
     translucent,
@@ -38,7 +39,7 @@ ARROW_SHARE = 0.6  # of the way to the next ball: how long all but the longest a
 PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors.png"
 
 
-def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Path | None = None) -> CaptionedPngs:
+def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Path | None = None) -> Drawn:
     """Draw balls; ``runs`` are the result and those compared with it, ``stored`` the file that still has the points."""
     first: Result = runs[0].result
     figures: CaptionedPngs = {}
@@ -49,9 +50,8 @@ def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Pat
         if first.has_bounds:
             figures[BALL_ERRORS] = _ball_errors(runs[0], report)
     figures |= hanger_report.draw(first)
-    if first.has_bounds:
-        figures |= flagged_ball_figures.draw(scene, first, stored)
-    return figures
+    flagged = flagged_ball_figures.draw(scene, first, stored) if first.has_bounds else Drawn({})
+    return Drawn(figures | flagged.figures, flagged.documents)
 
 
 # --- plan ----------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from processor.language.messages import Message, text
 from processor.model import Status, StepRun
 from processor.pipeline import Execution
-from processor.report.space_frame import dxf, figures, flagged_ball_figures, hanger_report, interactive_view, tables
+from processor.report.space_frame import dxf, figures, hanger_report, interactive_view, tables
 from processor.report.step_report import StepReport
 from processor.report.stitching import targets
 from processor.space_frame.result import Flag, Result
@@ -33,11 +33,7 @@ def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
     files = {"nodes.dxf": dxf.drawing(run.result)} if len(run.result.tubes) or hangers is not None else {}
     if hangers is not None:
         files[hanger_report.STAKE_OUT] = hanger_report.stake_out(run.result)
-    files |= targets.files(execution.scene)
-    if run.result.has_bounds:
-        pages = flagged_ball_figures.document(execution.scene, run.result, execution.stored)
-        files |= {flagged_ball_figures.DOCUMENT: pages} if pages else {}
-    return files
+    return files | targets.files(execution.scene)
 
 
 def _why(result: Result) -> Iterator[Message]:

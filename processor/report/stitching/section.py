@@ -10,6 +10,7 @@ from processor.model import Status, StepRun
 from processor.pipeline import Execution
 from processor.report.step_report import StepReport
 from processor.report.stitching import figures, interactive_view, tables, targets
+from processor.report.style import Drawn
 from processor.stitching.result import Result
 
 
@@ -49,7 +50,7 @@ REPORT = StepReport(
     title=text("Stitching"),
     summary=_summary,
     tables=tables.step_tables,
-    figures=figures.draw,
+    figures=lambda *given: Drawn(figures.draw(*given)),
     files=_files,
     why=_why,
     interactive_data=interactive_view.interactive_data,

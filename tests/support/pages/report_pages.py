@@ -15,12 +15,12 @@ from processor.report import all_figures, page
 BAD = "</script><script>alert(1)</script>"
 
 
-_DRAWN = {}  # by how pictures are written and the bytes of an execution: many tests look at the same one
+_DRAWN = {}  # by how pictures are drawn and the bytes of an execution: many tests look at the same one
 
 
 def drawn(execution):
     """Return the figures of an execution without truth, drawn once by each process."""
-    key = FigureCanvasAgg.print_png, hashlib.sha256(pickle.dumps(execution)).digest()
+    key = FigureCanvasAgg.draw, hashlib.sha256(pickle.dumps(execution)).digest()
     if key not in _DRAWN:
         _DRAWN[key] = all_figures.draw_figures(execution, ErrorReport())
     return copy.deepcopy(_DRAWN[key])
