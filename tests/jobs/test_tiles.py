@@ -58,7 +58,7 @@ def test_tiles_on_a_cluster_come_in_order_from_its_workers(dask_cluster):  # noq
             found = list(tiles.mapped(tile_functions.scaled, iter(TILES), factor))
             assert [int(part[0]) for part, _, _ in found] == [0, 2, 4, 6, 8, 10, 12]
             assert all(writeable for _, writeable, _ in found)
-            assert {pid for *_, pid in found} <= {one.pid for one in dask_cluster.workers.values()}
+            assert {pid for *_, pid in found} <= {one.pid for one in dask_cluster.workers}
         assert [pid for *_, pid in tiles.mapped(tile_functions.scaled, TILES[:1], factor)] == [os.getpid()]
     assert {pid for *_, pid in tiles.mapped(tile_functions.scaled, TILES, factor)} == {os.getpid()}
 

@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,6 +16,13 @@ from tests.support.processes import dask_forks
 
 ROOT = Path(__file__).resolve().parents[3]
 PATIENCE_S = 60.0
+# Dask looks at its processes up to a hundred times a second, whether they work or not.
+QUIET = {
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
+    "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
+    "DASK_DISTRIBUTED__WORKER__MEMORY__MONITOR_INTERVAL": "1s",
+}
 
 
 def free_port():
@@ -69,15 +77,19 @@ class DaskCluster:
         return process
 
 
+def _environment():
+    """That of processes that import the project and its tests."""
+    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    # The libraries' own threads would only take processors from each other.
+    environment = {**os.environ, **QUIET, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    return {**environment, "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "3s"}  # to a worker that ended
+
+
 @contextlib.contextmanager
 def cluster_in(folder):
     """A scheduler without workers, which are added."""
     pytest.importorskip("distributed")
-    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    # The libraries' own threads would only take processors from each other.
-    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    environment["DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT"] = "3s"  # to a worker that ended
-    cluster = DaskCluster(Path(folder), environment)
+    cluster = DaskCluster(Path(folder), _environment())
     try:
         cluster.start()
         yield cluster
@@ -93,7 +105,7 @@ def forked(folder, workers=2, protocol="tcp", environment=os.environ):
     own = ("--host", "127.0.0.1", "--no-dashboard")
     worker = ("worker", address, *own, "--no-nanny", "--nthreads", "1", "--local-directory", str(folder))
     with path.open("w") as log:
-        forks = dask_forks.Forks(log, folder, environment)
+        forks = dask_forks.Forks(log, folder, {**environment, **QUIET})
     try:
         scheduler = forks.start("scheduler", *own, "--protocol", protocol, "--port", address.rpartition(":")[2])
         processes = [scheduler, *(forks.start(*worker) for _ in range(workers))]
@@ -106,10 +118,8 @@ def forked(folder, workers=2, protocol="tcp", environment=os.environ):
         forks.end()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def dask_cluster(tmp_path_factory):
-    """Two workers for all tests that do not end them."""
-    with cluster_in(tmp_path_factory.mktemp("dask")) as cluster:
-        cluster.add_worker("a")
-        cluster.add_worker("b")
-        yield cluster
+    """Two workers for all tests of a file that do not end them: its address, and the process of each."""
+    with forked(tmp_path_factory.mktemp("dask"), environment=_environment()) as (address, (_, *workers)):
+        yield SimpleNamespace(address=address, workers=workers)
