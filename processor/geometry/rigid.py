@@ -114,15 +114,19 @@ def nearest_rotation(M: Floats) -> Floats:
 
 
 def fit(source: Floats, target: Floats) -> Floats:
-    """Rigid T_target_source (4, 4), no reflection, of least squared distances of paired points (n, 3), n >= 3.
+    """Rigid T_target_source (..., 4, 4), no reflection, of least squared distances of pairs (..., n, 3), n >= 3.
 
     Source: the objective of Besl and McKay (paper 000, eq. 5), solved by the SVD of the covariance.
     """
-    centre_source, centre_target = source.mean(axis=0), target.mean(axis=0)
-    U, _, Vt = np.linalg.svd((source - centre_source).T @ (target - centre_target))
-    proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])
-    R = Vt.T @ proper @ U.T
-    return transform(R, centre_target - R @ centre_source)
+    centre_source, centre_target = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
+    U, _, Vt = np.linalg.svd(np.swapaxes(source - centre_source, -1, -2) @ (target - centre_target))
+    V, Ut = np.swapaxes(Vt, -1, -2), np.swapaxes(U, -1, -2)
+    V[..., 2] *= np.sign(np.linalg.det(V @ Ut))[..., None]
+    T = np.zeros((*source.shape[:-2], 4, 4))
+    T[..., 3, 3] = 1.0
+    T[..., :3, :3] = V @ Ut
+    T[..., :3, 3] = (centre_target - centre_source @ np.swapaxes(T[..., :3, :3], -1, -2))[..., 0, :]
+    return T
 
 
 def points_determine_motion(places: Floats, least_share: float, least_mm: float = 0.0) -> bool:

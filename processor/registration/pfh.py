@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from processor.model import Floats, Ints
 
 SAMPLE = 3  # pairs that determine a pose
 BEFORE = np.roll(np.arange(SAMPLE), 1)
+MOST_AT_ONCE = 1 << 16  # points that are moved by poses at once
 
 
 def normals(points: Floats, radius_mm: float) -> Floats:
@@ -123,20 +125,27 @@ def coarse_alignment(
         return best
     points, paired = source[rows], target[match]
     scores = np.linalg.norm(target_histograms[match] - source_histograms[rows], axis=1)
-    for _ in range(iterations):
-        pick = rng.choice(len(points), SAMPLE, replace=False)
-        a, b = points[pick], paired[pick]
-        sides = np.linalg.norm(a - a[BEFORE], axis=1) - np.linalg.norm(b - b[BEFORE], axis=1)
-        if np.abs(sides).max() > tolerance_mm:
-            continue
-        T = rigid.fit(a, b)
-        count = int((np.linalg.norm(rigid.apply(T, points) - paired, axis=1) <= tolerance_mm).sum())
+    for T, count in _poses_of_samples(points, paired, iterations, tolerance_mm, rng):
         if count > best_count and (prior is None or prior.allows(T, source)):
             best, best_count = T, count
     diagnostics.note(
         "histograms", pairs=len(rows), score_median=float(np.median(scores)), trials=iterations, agreeing=best_count
     )
     return best if best is None else _refitted(best, points, paired, source, tolerance_mm, prior)
+
+
+def _poses_of_samples(
+    points: Floats, paired: Floats, iterations: int, tolerance_mm: float, rng: np.random.Generator
+) -> Iterator[tuple[Floats, int]]:
+    """Yield the poses (4, 4) by samples of three pairs whose sides are alike, and how many pairs agree with each."""
+    picks = np.array([rng.choice(len(points), SAMPLE, replace=False) for _ in range(iterations)]).reshape(-1, SAMPLE)
+    for some in np.array_split(picks, max(1, iterations * len(points) // MOST_AT_ONCE)):
+        a, b = points[some], paired[some]
+        sides = np.linalg.norm(a - a[:, BEFORE], axis=2) - np.linalg.norm(b - b[:, BEFORE], axis=2)
+        alike = np.abs(sides).max(axis=1) <= tolerance_mm
+        T = rigid.fit(a[alike], b[alike])
+        moved = points @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        yield from zip(T, (np.linalg.norm(moved - paired, axis=2) <= tolerance_mm).sum(axis=1).tolist(), strict=True)
 
 
 def _refitted(
