@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -194,30 +195,38 @@ class Fault(NamedTuple):
     text: str
 
 
+@functools.cache
+def _declared(record: type) -> tuple[tuple[str, str, Mapping[str, Any]], ...]:
+    """Return name, place in messages and metadata of the fields of a record that are checked when it is made."""
+    return tuple(
+        (field.name, f"{record.__name__}.{field.name}", field.metadata)
+        for field in dataclasses.fields(record)
+        if not field.metadata.keys().isdisjoint(("words", "axis", "reasons", "shape"))
+    )
+
+
 class Checked:
     """Checks the declared fields of a frozen dataclass when it is made; holds no data and no behaviour."""
 
     def __post_init__(self) -> None:
         lengths: dict[str, tuple[int, str]] = {}
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            value, metadata = getattr(self, field.name), field.metadata
-            where = f"{type(self).__name__}.{field.name}"
+        for name, where, metadata in _declared(type(self)):
+            value = getattr(self, name)
             if "words" in metadata and "axis" not in metadata:
-                object.__setattr__(self, field.name, _word(metadata["words"], value, where))
+                object.__setattr__(self, name, _word(metadata["words"], value, where))
             elif "axis" in metadata:
                 kind = metadata.get("words", str)
                 lists = metadata.get("lists", False)
                 value = tuple(tuple(map(str, item)) if lists else _word(kind, item, where) for item in value)
                 _same_length(lengths, metadata["axis"], len(value), where)
-                object.__setattr__(self, field.name, value)
+                object.__setattr__(self, name, value)
             elif "reasons" in metadata:
                 value = tuple(tuple(row) if metadata["reasons"] else row for row in value)
                 if metadata["reasons"]:
                     _same_length(lengths, metadata["reasons"], len(value), where)
-                object.__setattr__(self, field.name, value)
-            elif "shape" in metadata:
-                array = _checked_array(value, metadata, where, lengths)
-                object.__setattr__(self, field.name, array)
+                object.__setattr__(self, name, value)
+            else:
+                object.__setattr__(self, name, _checked_array(value, metadata, where, lengths))
 
     def contradictions(self) -> Iterable[Fault]:
         """Yield what its fields, each possible, contradict."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import cache
 
 from processor.limits import measurands, standards
 from processor.limits.limit_bounds import at_least
@@ -63,6 +64,7 @@ def _given(limit: Limit, value: Floats, source: str) -> Limit:
     )
 
 
+@cache
 def of_projects() -> tuple[Limit, ...]:
     """Limits that no standard here states but a project may; their numbers are placeholders for those of the project.
 
