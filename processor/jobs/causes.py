@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import errno
+import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import Enum
-
-from processor.model import InputError
 
 
 class Cause(Enum):
@@ -35,13 +34,19 @@ def cause_of(error: BaseException | None) -> Cause | None:
     """
     of_input = False
     while error is not None:
-        of_input = of_input or isinstance(error, InputError)
+        of_input = of_input or _is_of_input(error)
         if isinstance(error, MemoryError) and not of_input:
             return Cause.MEMORY
         if isinstance(error, OSError) and error.errno in UNWRITABLE:
             return Cause.OUTPUT
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return None
+
+
+def _is_of_input(error: BaseException) -> bool:
+    """Whether an exception is an InputError; where its module is not loaded there is none, and none is loaded here."""
+    model = sys.modules.get("processor.model")
+    return model is not None and isinstance(error, model.InputError)
 
 
 def of_exit_code(code: int) -> Cause:
