@@ -124,8 +124,10 @@ def _draw_points(candidates: Floats, params: Params, rng: np.random.Generator) -
             break
         points: Floats = candidates[rng.choice(len(candidates), params.points, replace=False)]
         sides = np.linalg.norm(points[:, None] - points, axis=2)[np.triu_indices(params.points, 1)]
+        if sides.min() < params.apart_mm:
+            continue
         # The second singular value is the points' extent across their best line.
         across = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
-        if sides.min() >= params.apart_mm and across > AWAY_FROM_A_LINE * sides.max():
+        if across > AWAY_FROM_A_LINE * sides.max():
             return points
     return None

@@ -68,7 +68,7 @@ def test_the_noise_is_as_asked_for_and_of_the_seed():
 )
 def test_picks_that_cannot_be_made_are_refused(params, said):
     with pytest.raises(UsageError, match=said):
-        picking.pick(*scans_of(points=2000), picking.Params(**params), 0)
+        picking.pick(*scans_of(count=2), picking.Params(**params), 0)  # a pair: each is drawn thousands of times
 
 
 def test_corners_are_picked_where_the_first_scan_saw_them_and_the_second_may():
