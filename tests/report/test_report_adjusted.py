@@ -18,8 +18,8 @@ from processor.preassembly.result import Deviations
 from processor.preassembly.verdicts import joint_measures
 from processor.report import all_figures, all_tables, page
 from processor.report import table as report_table
-from processor.report.preassembly import joint_figures, residual_map
-from processor.report.style import rounded
+from processor.report.preassembly import figures, joint_figures, residual_map
+from processor.report.style import default_settings, rounded
 from processor.results import to_json
 from tests.support.pages.report_pages import Page, drawn, rendered
 from tests.support.results.bridge_results import (
@@ -158,11 +158,17 @@ def test_accuracy_budget_is_written_and_shown_on_the_terminal():
     )
 
 
+def linear_error(execution):
+    """Caption and picture of the linear error alone, of all methods."""
+    with default_settings():
+        return figures._linear_error(execution.scene, execution.runs)
+
+
 def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     execution = of_bridge()
     (row,) = of_file(execution, "components-compared")
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
-    answered = drawn(execution)["preassemble"]["linear-error.png"]
+    answered = linear_error(execution)
     assert "without a band, because they state no uncertainty: line" in str(answered[0])
     line = execution.runs[1]
     linear = line.result.linear
@@ -176,7 +182,7 @@ def test_failed_method_is_listed_with_its_reason_and_not_drawn():
         ),
     )
     alone = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=own)))
-    caption, picture = all_figures.draw_figures(alone, ErrorReport())["preassemble"]["linear-error.png"]
+    caption, picture = linear_error(alone)
     assert "the error of these methods for parts exactly as designed, scanned alike: line" in str(caption)
     assert picture != answered[1]
     (summary,) = (table for table in all_tables.tables_of_run(alone, ErrorReport()) if table.file == "summary")
@@ -184,10 +190,11 @@ def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     nothing = Deviations(deviation=np.full(120, NAN))
     result = dataclasses.replace(line.result, linear=dataclasses.replace(linear, assembled=nothing, best_fit=nothing))
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
-    caption, picture = drawn(silent)["preassemble"]["linear-error.png"]
+    caption, picture = linear_error(silent)
     assert "without a result, so not drawn: line" in str(caption)
     assert picture != answered[1]
-    data = json.loads(Page(rendered(silent)).scripts[0][1])["steps"]["preassemble"]
+    blank = page.html(silent, ErrorReport(), {"preassemble": {}})
+    data = json.loads(Page(blank).scripts[0][1])["steps"]["preassemble"]
     assert [one["method"] for one in data["linear"]] == ["adjustment"]
 
 
@@ -265,6 +272,7 @@ def unknown(result, joints, parts):
     )
 
 
+@pytest.mark.usefixtures("blank_pictures")
 @pytest.mark.parametrize(("joints", "parts", "pictures"), [((1,), (2,), 2), ((0, 1), (0, 1, 2), 0)])
 def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
     execution = of_bridge()

@@ -167,6 +167,7 @@ def test_unclear_corners_are_reported_as_doubts(flaw, code, expected):
     assert code in codes(one.doubts)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_edges_that_are_not_sharp_are_left_out(tmp_path):
     meshes, _ = bridge_parts.bridge(5, 0)
     meshes[2] = chamfered(*meshes[2], steps=8)
@@ -388,6 +389,7 @@ UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4, "ft": 304.8}
 BY_DAY = {("obj", "mm"), ("obj", "inch"), ("stl", "m"), ("stl", "ft"), ("ply", "inch"), ("ply", "m")}
 
 
+@pytest.mark.usefixtures("blank_pictures")
 @pytest.mark.parametrize(
     ("suffix", "unit", "size_mm"),
     [
@@ -418,6 +420,7 @@ def test_the_unit_comes_from_scans_that_state_theirs(tmp_path, suffix, unit, siz
     assert again.units_reason[-1].code == "units.design-guessed"
 
 
+@pytest.mark.usefixtures("blank_pictures")
 @pytest.mark.parametrize(("unit", "size_mm"), [("mm", 1.0), ("m", 1000.0)])
 def test_guessed_unit_of_a_design_is_marked_unsure(tmp_path, unit, size_mm):
     meshes, _ = bridge_parts.bridge()
@@ -431,6 +434,7 @@ def test_guessed_unit_of_a_design_is_marked_unsure(tmp_path, unit, size_mm):
     assert json.loads((tmp_path / "design.json").read_text("utf-8"))["unsure"] == [written]
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_chinese_init_has_no_english_doubts_in_the_design_it_writes(tmp_path):
     meshes, _ = bridge_parts.bridge()
     meshes[1], meshes[2] = bevelled(*meshes[1]), chamfered(*meshes[2], steps=8)
@@ -475,6 +479,7 @@ def test_bodies_of_cad_files_without_a_unit_have_the_guessed_one(tmp_path, monke
     assert np.abs(guessed.design.joint_points - joints).max() < CORNER_MM
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_design_in_inches_is_made_only_with_stated_units(tmp_path):
     meshes, joints = bridge_parts.bridge()
     for name, (vertices, faces) in zip(bridge_parts.names(5), meshes, strict=True):
@@ -487,6 +492,7 @@ def test_design_in_inches_is_made_only_with_stated_units(tmp_path):
     assert np.abs(scan_folder.read_input(tmp_path).arch.joint_points - joints).max() < CORNER_MM
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_two_files_of_one_name_and_a_root_gap(tmp_path):
     meshes, _ = bridge_parts.bridge(5, 0, 6.0)
     for name, mesh in zip(bridge_parts.names(5), meshes, strict=True):
@@ -502,6 +508,7 @@ def test_two_files_of_one_name_and_a_root_gap(tmp_path):
     assert scan_folder.read_input(tmp_path).tolerance.root_gap_mm == pytest.approx(6.0, abs=0.01)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_design_that_is_there_is_not_changed(tmp_path):
     meshes, _ = bridge_parts.bridge()
     for name, mesh in zip(bridge_parts.names(5), meshes, strict=True):
