@@ -210,7 +210,7 @@ class Checked:
 
     def __post_init__(self) -> None:
         lengths: dict[str, tuple[int, str]] = {}
-        for name, where, metadata in _declared(type(self)):
+        for name, where, metadata in _declared(type(self)):  # type: ignore[arg-type]  # classes can be keys
             value = getattr(self, name)
             if "words" in metadata and "axis" not in metadata:
                 object.__setattr__(self, name, _word(metadata["words"], value, where))

@@ -11,11 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from processor import large_arrays
 from processor.model import Floats, Ints
 from processor.stitching.planes.sampled_patches import Patches, facing
 
 LIKE_COS = float(np.cos(np.radians(10.0)))
 MOST_VOTERS = 350  # patches of a scan that face one way
+BLOCK = 64  # patches that are compared with all others at once
 FEW = 20.0  # a direction with fewer patches than about this has less weight in all
 
 
@@ -29,7 +31,9 @@ class WeightedPatches(NamedTuple):
 def weighted(patches: Patches) -> WeightedPatches:
     """Weigh patches by how many have like normals: else a wide ground would outvote a few posts."""
     normals = patches.normals
-    like = (normals @ normals.T > LIKE_COS).sum(axis=1)
+    like = np.empty(len(normals))
+    for some in large_arrays.blocks(len(normals), BLOCK):  # all pairs at once would leave the processor's cache
+        like[some] = (normals[some] @ normals.T > LIKE_COS).sum(axis=1)
     return WeightedPatches(patches, 1.0 / np.sqrt(like + FEW))
 
 
