@@ -221,6 +221,8 @@ def test_of_several_scans_of_a_part_those_that_were_used_are_assembled(tmp_path)
 
 # --- a run of the program, and its folder of results
 
+LEVEL = {"stitch": {"levelled_mrad": 20.0}}  # the same poses as without, by half of the search
+
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
@@ -232,7 +234,7 @@ def room(tmp_path_factory):
         lines = np.column_stack([scan.points / 1000.0, np.arange(len(scan.points)) % 200])
         np.savetxt(place / f"room/scans/{scan.name}.xyz", lines, fmt="%.6f", header="x y z intensity", comments="")
     (place / "room/project.toml").write_text('kind = "structure"\n')
-    results = processor.run(place / "room", place / "out")
+    results = processor.run(place / "room", place / "out", params=LEVEL)
     assert results.steps["stitch"].status is Status.OK
     return place, results
 
@@ -253,7 +255,7 @@ def stored(room, tmp_path_factory):
     """The same scans in a scene file, stitched."""
     place = tmp_path_factory.mktemp("stored")
     store.write_scene(place / "s.h5", room[1].scene, None, {})
-    return place, processor.run(place / "s.h5", place / "out", steps="stitch", seed=0)
+    return place, processor.run(place / "s.h5", place / "out", steps="stitch", seed=0, params=LEVEL)
 
 
 def test_memory_scene_file_and_folder_give_the_same_cloud(room, stored, tmp_path):

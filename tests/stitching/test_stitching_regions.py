@@ -10,6 +10,8 @@ from processor.stitching import step as stitching_step
 from processor.stitching.fine import bundle_adjustment, correspondences, normal_equations
 from tests.support.clouds.stitch_clouds import ROOM, four
 
+LEVEL = stitching_step.Params(levelled_mrad=20.0)  # the same poses as without, by half of the search
+
 
 def bent(scan, mm):
     """Range errors that vary with the direction: common to a wall, and not absorbed by a pose."""
@@ -22,9 +24,7 @@ def test_systematic_range_errors_raise_the_standard_deviations():
     T, scans = (some[:3] for some in four(3, step_mrad=20.0))  # the least that closes a loop
     want = np.linalg.inv(T[0]) @ T
     crooked = (scans[0], *(bent(scan, 8.0) for scan in scans[1:]))
-    good, bad = (
-        stitching_step.run(Scene("room", "structure", some), stitching_step.Params()) for some in (scans, crooked)
-    )
+    good, bad = (stitching_step.run(Scene("room", "structure", some), LEVEL) for some in (scans, crooked))
     off = np.linalg.norm(bad.scans.T_project_scan[1:, :3, 3] - want[1:, :3, 3], axis=1)
     assert off.max() > 0.5  # far more than the noise makes
     assert (bad.scans.position_sd[1:].max(axis=1) > 2.0 * good.scans.position_sd[1:].max(axis=1)).all()
@@ -52,7 +52,7 @@ def test_range_offsets_are_separated_from_the_poses():
     for scan, mm in zip(scans, offsets, strict=True):
         R = np.linalg.norm(scan.points, axis=1)[:, None]
         shifted.append(dataclasses.replace(scan, points=scan.points * (1.0 + mm / R)))
-    result = stitching_step.run(Scene("room", "structure", tuple(shifted)), stitching_step.Params())
+    result = stitching_step.run(Scene("room", "structure", tuple(shifted)), LEVEL)
     assert_covered(result, T)
     off = result.scans.T_project_scan[:, :3, 3] - (np.linalg.inv(T[0]) @ T)[:, :3, 3]
     assert np.abs(off).max() < 0.3
@@ -68,7 +68,7 @@ def test_range_errors_of_walls_are_separated_from_the_poses():
         mm = sum((np.abs(place - end) < 15.0) @ row for end, row in zip(ROOM, errors, strict=True))
         R = np.linalg.norm(scan.points, axis=1)
         shifted.append(dataclasses.replace(scan, points=scan.points * (1.0 + mm / R)[:, None]))
-    result = stitching_step.run(Scene("room", "structure", tuple(shifted)), stitching_step.Params())
+    result = stitching_step.run(Scene("room", "structure", tuple(shifted)), LEVEL)
     assert_covered(result, T)
 
 
@@ -77,7 +77,7 @@ def test_range_error_of_a_scan_with_unknown_rays_is_that_of_the_class():
     _, scans = four(3, step_mrad=20.0, grid=False)
     lost = dataclasses.replace(scans[1], points=scans[1].points + np.array([0.0, 0.0, 1e4]))
     scene = Scene("room", "structure", (scans[0], lost, scans[2]))
-    result = stitching_step.run(scene, stitching_step.Params())
+    result = stitching_step.run(scene, LEVEL)
     stated = [why for why in result.reasons if why.code == "stitch.ranges-by-class"]
     assert [why.values for why in stated] == [{"scans": ("S2",), "sd_mm": 0.5}]
 
@@ -113,7 +113,7 @@ def test_a_board_that_moved_during_one_scan_does_not_bias_its_pose():
     assert board.sum() > 400
     points = (inside + np.where(board, 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0] - T[2][:3, 3]) @ T[2][:3, :3]
     changed = (*scans[:2], dataclasses.replace(scans[2], points=points), scans[3])
-    result = stitching_step.run(Scene("room", "structure", changed), stitching_step.Params())
+    result = stitching_step.run(Scene("room", "structure", changed), LEVEL)
     want = np.linalg.inv(T[0]) @ T
     off = np.abs(result.scans.T_project_scan[1:, :3, 3] - want[1:, :3, 3])
     assert (off < 4.0 * result.scans.position_sd[1:]).all()
@@ -126,7 +126,7 @@ def test_a_wall_that_moved_during_one_scan_is_contradicted_by_the_rejected_faces
     inside = scans[2].points @ T[2][:3, :3].T + T[2][:3, 3]
     shifted = inside + np.where(inside[:, 0] > 6900.0, 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
     wrong = dataclasses.replace(scans[2], points=(shifted - T[2][:3, 3]) @ T[2][:3, :3])
-    result = stitching_step.run(Scene("room", "structure", (*scans[:2], wrong, scans[3])), stitching_step.Params())
+    result = stitching_step.run(Scene("room", "structure", (*scans[:2], wrong, scans[3])), LEVEL)
     off = np.linalg.inv(T[0]) @ T - result.scans.T_project_scan
     assert np.abs(off[2, :3, 3]).max() > 1.0  # else the test would be void
     assert result.scans.status == ("ok", "ok", "weak", "ok")
