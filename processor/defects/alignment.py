@@ -342,7 +342,8 @@ def _normal_equations(
         here = slice(7 * k, 7 * k + 7)
         A[here, here] += wJ.T @ J[rows]
         right[here] += wJ.T @ blocks.mean[rows]
-        np.add.at(coupling[:, here], block[rows], wJ)
+        for column in range(7):  # the same sums as np.add.at, which takes ten times as long
+            coupling[:, 7 * k + column] = np.bincount(block[rows], wJ[:, column], count)
     A -= coupling.T @ (coupling / total[:, None])
     right -= coupling.T @ (np.bincount(block, weight * blocks.mean, count) / total)
     return A, right

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -269,10 +269,16 @@ class CurvedFacets:
     surface: MeshSurface
     slopes: Floats
 
+    @cached_property
+    def curved(self) -> Bools:
+        """Mark the facets (f,) that the smooth surface does not lie in."""
+        marks: Bools = np.asarray(self.slopes.any(axis=(1, 2)), bool)
+        return marks
+
     def heights(self, feet: Floats, facet: Ints) -> Floats:
         """Height (n,) of the smooth surface over facets (n,) at feet (n, 3) on them; 0 where there is no facet."""
         height = np.zeros(len(feet))
-        rows = np.flatnonzero(facet >= 0)
+        rows = np.flatnonzero((facet >= 0) & self.curved[facet])
         at = facet[rows]
         share = np.clip(self.surface.barycentric(feet[rows], at), 0.0, 1.0)
         for k in range(3):
