@@ -43,11 +43,11 @@ def by_cell(points: Floats, size_mm: float) -> Ints:
     if not len(points):
         return np.empty(0, np.int64)
     grid = _grid(points, size_mm)
-    if grid.count > MOST_EMPTY * len(points):
+    if grid.cells > MOST_EMPTY * len(points):
         key = np.empty(len(points), np.int64)
         _number(points, grid.low, size_mm, grid.extent, key)
         return _sorted_by_key(points, key)
-    starts, order = np.zeros(grid.count + 1, np.int32), np.empty(len(points), np.int64)
+    starts, order = np.zeros(grid.cells + 1, np.int32), np.empty(len(points), np.int64)
     _into_cells(points, grid.low, size_mm, grid.extent, starts, order)
     large = _sort_cells(points, starts, order)
     if large:
@@ -74,7 +74,7 @@ def _sorted_by_key(points: Floats, key: Ints) -> Ints:
 def voxel_means(points: Floats, size_mm: float, least: int = 1) -> Floats:
     """Mean (k, 3) of the points in each occupied voxel that holds at least ``least`` points, in voxel order."""
     points, grid = np.ascontiguousarray(points, np.float64), _grid(points, size_mm)
-    if grid.count > MOST_EMPTY * len(points):  # numbers of the occupied voxels alone: these take a sort
+    if grid.cells > MOST_EMPTY * len(points):  # numbers of the occupied voxels alone: these take a sort
         key = np.empty(len(points), np.int64)
         _number(points, grid.low, size_mm, grid.extent, key)
         key = np.unique(key, return_inverse=True)[1].reshape(-1)
@@ -82,7 +82,7 @@ def voxel_means(points: Floats, size_mm: float, least: int = 1) -> Floats:
         full = np.flatnonzero(count >= max(least, 1))
         total = np.stack([np.bincount(key, points[:, i])[full] for i in range(3)], axis=1)
         return np.asarray(total / count[full, None], np.float64)
-    rank = np.zeros(grid.count, np.int32)
+    rank = np.zeros(grid.cells, np.int32)
     means = np.zeros((_rank_full(points, grid.low, size_mm, grid.extent, max(least, 1), rank), 3))
     _add_to_means(points, grid.low, size_mm, grid.extent, rank, means)
     return means
@@ -93,7 +93,7 @@ class _Grid(NamedTuple):
 
     low: Floats
     extent: Ints
-    count: int
+    cells: int
 
 
 def _grid(points: Floats, size_mm: float) -> _Grid:
