@@ -78,13 +78,21 @@ def double_areas(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
 
 def _placed(vertices: Floats, faces: Ints, facet: Ints) -> Floats:
     """Place a point (m, 3) on each of the facets (m,): R2 sequence (plastic number), folded onto the triangle."""
-    i = np.arange(len(facet))
-    u, v = (0.5 + i * 0.7548776662466927) % 1.0, (0.5 + i * 0.5698402909980532) % 1.0
-    fold = u + v > 1.0
-    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
-    a, b, c = (vertices[faces[facet, k]] for k in range(3))
-    points: Floats = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    points = np.empty((len(facet), 3))
+    _fill_placed(vertices, faces, facet, points)
     return points
+
+
+@njit(cache=True, nogil=True)
+def _fill_placed(vertices, faces, facet, points):  # type: ignore[no-untyped-def]
+    for i in range(len(facet)):
+        u, v = (0.5 + i * 0.7548776662466927) % 1.0, (0.5 + i * 0.5698402909980532) % 1.0
+        if u + v > 1.0:
+            u, v = 1.0 - u, 1.0 - v
+        a, b, c = faces[facet[i], 0], faces[facet[i], 1], faces[facet[i], 2]
+        for k in range(3):
+            along = vertices[a, k] + u * (vertices[b, k] - vertices[a, k])
+            points[i, k] = along + v * (vertices[c, k] - vertices[a, k])
 
 
 # --- Distances to the smooth surface

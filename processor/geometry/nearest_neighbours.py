@@ -23,6 +23,8 @@ LEAST_RANGE = 512  # places per task of a thread
 SEARCHED = 256  # places of a sample at once: their neighbours' pages are given back after that
 GROWTH = 1.5  # factor of the search radius where too few points were found
 CROP_CHUNK = 1 << 20
+REACHED_CELL = 2.0  # edge of a cell, in reaches: a point's reach meets eight cells at most
+LEAST_POINTS = 20_000  # points per task of a thread that marks those within reach
 
 
 def of_spacing(points: Floats) -> PointGrid:
@@ -109,6 +111,23 @@ def without_outliers(points: Floats, neighbours: int, ratio: float) -> Floats:
     """Return the points (k, 3) of (n, 3) that statistical outlier removal keeps, in their order."""
     grid = of_spacing(points)
     return points[np.sort(grid.order[statistical_inliers(grid, neighbours, ratio)])]
+
+
+def within_reach(points: Floats, places: Floats, reach: float) -> tuple[Bools, Bools]:
+    """Mark the points (n, 3) that have a place nearer than ``reach``, mm, and the places (m, 3) that have such a point.
+
+    The grid holds the places: points may be many, and in any order.
+    """
+    of_points, of_places = np.zeros(len(points), bool), np.zeros(len(places), bool)
+    if not len(points) or not len(places):
+        return of_points, of_places
+    grid = point_grid.of_points(places, REACHED_CELL * reach)
+    near, points = np.zeros(len(places), bool), np.ascontiguousarray(points, np.float64)
+    over_ranges(
+        lambda a, b: _mark_within(grid.cells, points, reach, of_points, near, a, b), len(points), least=LEAST_POINTS
+    )
+    of_places[grid.order] = near
+    return of_points, of_places
 
 
 def nearest_crops(points: Floats, centres: Floats, reaches: Floats) -> list[Ints]:
@@ -207,6 +226,29 @@ def _nearest(cells, places, own, order, first, last, k, mean, farthest):  # type
         farthest[row] = np.sqrt(best[k - 1])
         if np.isfinite(farthest[row]):
             guess = max(1.2 * (farthest[row] - away), 0.05 * size)
+
+
+@njit(cache=True, nogil=True)
+def _mark_within(cells, points, reach, of_points, of_places, first, last):  # type: ignore[no-untyped-def]
+    """Mark points first to last - 1 with a place of the grid within reach, and the places, in the grid's order."""
+    places, starts = cells.points, cells.starts
+    for row in range(first, last):
+        x, y, z = points[row, 0], points[row, 1], points[row, 2]
+        i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, reach, reach, reach)
+        for bi in range(i0 // SIDE, i1 // SIDE + 1):
+            for bj in range(j0 // SIDE, j1 // SIDE + 1):
+                for bk in range(k0 // SIDE, k1 // SIDE + 1):
+                    block = block_at(cells, bi, bj, bk)
+                    if block < 0:
+                        continue
+                    low, high = max(k0 - SIDE * bk, 0), min(k1 - SIDE * bk, SIDE - 1)
+                    for i in range(max(i0, SIDE * bi), min(i1, SIDE * bi + SIDE - 1) + 1):
+                        for j in range(max(j0, SIDE * bj), min(j1, SIDE * bj + SIDE - 1) + 1):
+                            cell = ((i - SIDE * bi) * SIDE + (j - SIDE * bj)) * SIDE
+                            for p in range(starts[block, cell + low], starts[block, cell + high + 1]):
+                                u, v, w = places[p, 0] - x, places[p, 1] - y, places[p, 2] - z
+                                if u * u + v * v + w * w < reach * reach:
+                                    of_points[row] = of_places[p] = True
 
 
 def same_places(points: Floats, within_mm: float) -> Ints:

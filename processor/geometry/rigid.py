@@ -19,7 +19,8 @@ def transform(rotation: Floats, translation: Floats) -> Floats:
 
 def apply(T: Floats, points: Floats) -> Floats:
     """Map points (..., 3) by T (4, 4)."""
-    mapped: Floats = points @ T[:3, :3].T + T[:3, 3]
+    mapped: Floats = points @ T[:3, :3].T
+    mapped += T[:3, 3]
     return mapped
 
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from processor import large_arrays
 from processor.adjustment import thermal
 from processor.limits import standards
 from processor.model import ArchDesign, Bools, Floats, Scan, Scene, Tolerance
@@ -38,9 +39,10 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
     limits = standards.default_for(scene.tolerance)
     frames = np.array([joint_frame(points) for points in design.joint_points])
     shapes = Shapes(design)
-    fitted = [
-        measure.fit(of_part, index, shapes, shrink, params.systematic) for index, of_part in enumerate(tracked(scans))
-    ]
+    fitted = []
+    for index, of_part in enumerate(tracked(scans)):
+        fitted.append(measure.fit(of_part, index, shapes, shrink, params.systematic))
+        large_arrays.release()  # the points of one part are in memory at a time
     parts = measure.assigned(measure.estimate(fitted, params.systematic))
     curve = _adjust(parts, design, frames, params.adjust.weight)
     adjusted = curve[params.adjust.weight]

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.distinct_rows import distinct
-from processor.geometry.thinning import thinned, voxel_means
+from processor.geometry.thinning import corners, thinned, voxel_means
 from processor.model import Bools, Floats
 from processor.registration import principal
 
@@ -61,7 +61,8 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
 
 def _voxel_size(points: Floats) -> float:
     """Return the size of voxels, mm, so large that those of one surface touch; 0 if no such size divides the scan."""
-    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    low, high = corners(points)
+    diagonal = float(np.linalg.norm(high - low))
     for count in VOXELS:
         step = diagonal / count
         if step > 0.0 and len(voxel_means(points, step)) * PER_VOXEL <= len(points):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.geometry.thinning import voxel_means
+from processor.geometry.thinning import corners, voxel_means
 from processor.model import Floats, Ints
 
 ALIKE = 1.25  # ratio of the variances along two axes below which these may be swapped
@@ -52,7 +52,8 @@ def of_points(points: Floats) -> PrincipalAxes:
 
 def sizes(points: Floats) -> Floats:
     """Sizes (3,) of a surface's points (n, 3) along its principal axes, longest first, without single outliers."""
-    spread = float(np.linalg.norm(np.ptp(points, axis=0)))
+    low, high = corners(points)
+    spread = float(np.linalg.norm(high - low))
     even = voxel_means(points, spread / 150.0, least=2)
     even = even if len(even) >= 50 else points
     size: Floats = np.sort(np.ptp(even @ of_points(even).axes, axis=0))[::-1]

@@ -257,3 +257,21 @@ def test_the_nearest_rotation_is_the_polar_factor_and_never_a_reflection():
     stretch = np.array([[3.0, 0.5, 0.1], [0.5, 2.0, 0.3], [0.1, 0.3, 1.0]])
     np.testing.assert_allclose(rigid.nearest_rotation(R @ stretch), R, atol=1e-14)
     np.testing.assert_allclose(rigid.nearest_rotation(np.diag([3.0, 2.0, -1.0])), np.eye(3), atol=1e-14)
+
+
+def test_a_cell_of_many_points_is_sorted_like_one_of_few():
+    rng = np.random.default_rng(5)
+    points = np.round(rng.uniform(0.0, 39.0, (3_000, 3)))  # of one cell, some of them equal
+    points = np.vstack([points, points[:500], np.full((1, 3), 85.0)])
+    np.testing.assert_array_equal(thinning.by_cell(points, 40.0), np.lexsort(points.T[::-1]))
+
+
+def test_marks_within_reach_are_those_of_all_distances():
+    rng = np.random.default_rng(6)
+    points, places = rng.uniform(0.0, 1000.0, (2_000, 3)), rng.uniform(-200.0, 1200.0, (300, 3))
+    near = np.linalg.norm(points[:, None] - places, axis=2) < 90.0
+    of_points, of_places = nearest_neighbours.within_reach(points, places, 90.0)
+    np.testing.assert_array_equal(of_points, near.any(axis=1))
+    np.testing.assert_array_equal(of_places, near.any(axis=0))
+    assert 0 < of_places.sum() < len(places)
+    assert not any(marks.any() for marks in nearest_neighbours.within_reach(points, places[:0], 90.0))

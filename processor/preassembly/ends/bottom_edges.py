@@ -22,6 +22,7 @@ from processor.adjustment.model_averaging import smooth
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
+from processor.geometry.nearest_neighbours import within_reach
 from processor.model import Bools, Floats, Ints
 from processor.preassembly.assembly_errors import INTERVAL_MM
 from processor.preassembly.ends import plate_sides
@@ -179,9 +180,10 @@ def _faces(
     """Points of the web and of the bottom along an edge, those of the plates' inner sides left out."""
     fine = np.arange(0.0, line.length, 10.0, dtype=np.float64)
     frame = _frame(line, other, fine, sense)
-    near, index = cKDTree(line.at(fine)).query(part.points, distance_upper_bound=1.2 * REACH_MM, workers=-1)
-    rows = np.flatnonzero(np.isfinite(near))
-    points, at = part.points[rows], index[rows]
+    places, reach = line.at(fine), 1.2 * REACH_MM
+    rows = np.flatnonzero(within_reach(part.points, places, reach)[0])
+    points = part.points[rows]
+    at = cKDTree(places).query(points, workers=-1)[1]
     offset = points - line.at(fine[at])
     along, level, up = (np.einsum("ni,ni->n", offset, frame[k][at]) for k in range(3))
     nearest, distance, _ = part.surface.distances(points, REACH_MM)

@@ -23,6 +23,7 @@ from processor.adjustment import kriging, model_averaging, variance_components
 from processor.adjustment.model_averaging import SIZES_MM, Estimate
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
+from processor.geometry.nearest_neighbours import within_reach
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, reason
 from processor.preassembly.ends import end_ring as ends_ring
 from processor.preassembly.ends import outer_faces as ends_faces
@@ -152,6 +153,7 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
 
     The fit is completed by :func:`estimate`; a JointEnd without an answer is final.
     """
+    part = part.only(_about_zone(part.points, place))
     local = rigid.apply(rigid.invert(place.T_bridge_joint), part.points)
     depth = -place.outward * local[:, 0]
     beside = np.abs(local[:, 1:]) < place.half[1:] + REACH_MM
@@ -185,6 +187,13 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
         thickness=thickness,
         ring_noise=robust_sd(on_ring.residual) ** 2,
     )
+
+
+def _about_zone(points: Floats, place: EndPlace) -> Bools:
+    """Mark the points (n, 3) in a sphere about the joint's zone: a few of those of a long part."""
+    sizes = np.array([0.5 * (ZONE_MM + REACH_MM), *(place.half[1:] + REACH_MM)])
+    middle = rigid.apply(place.T_bridge_joint, np.array([[0.5 * place.outward * (REACH_MM - ZONE_MM), 0.0, 0.0]]))
+    return within_reach(points, middle, float(np.linalg.norm(sizes)) + 1.0)[0]
 
 
 def estimate(ends: Sequence[FittedEnd], between: Sequence[Variances] = ()) -> list[JointEnd]:

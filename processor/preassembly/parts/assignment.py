@@ -51,7 +51,7 @@ def of_size(points: Floats, shapes: Shapes) -> list[int]:
     """Return the numbers of the parts that have the size of a scan's points (n, 3)."""
     size = principal.sizes(points)
     limit = principal.SIZE_SHARE * float(size.max())
-    return [k for k in range(len(shapes)) if np.abs(shapes[k].sizes - size).max() < limit]
+    return [k for k in range(len(shapes)) if np.abs(shapes.sizes[k] - size).max() < limit]
 
 
 def rather(points: Floats, index: int, shapes: Shapes) -> int | None:

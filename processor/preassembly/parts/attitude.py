@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface
-from processor.geometry.thinning import thinned, voxel_means
+from processor.geometry.nearest_neighbours import within_reach
+from processor.geometry.thinning import corners, thinned, voxel_means
 from processor.geometry.thread_ranges import each
 from processor.model import ArchDesign, Bools, DesignPart, Floats, Reason, Status, reason
 from processor.preassembly import topology
@@ -81,7 +82,6 @@ class Surface:
     centre: Floats  # (3,) of its area
     axes: Floats  # (3, 3) principal axes as columns
     size: float  # diagonal of the bounding box
-    sizes: Floats  # (3,) along its principal axes, as of a scan
     tube: PrincipalAxes | None = None  # of the wall of a round tube
 
 
@@ -91,6 +91,7 @@ class Shapes:
     def __init__(self, design: ArchDesign) -> None:
         self.design = design
         self._made: dict[int, Surface] = {}
+        self._sizes: list[Floats] = []
 
     def __getitem__(self, index: int) -> Surface:
         if index not in self._made:
@@ -100,6 +101,13 @@ class Shapes:
 
     def __len__(self) -> int:
         return len(self.design.parts)
+
+    @property
+    def sizes(self) -> list[Floats]:
+        """Sizes (3,) of all parts along their principal axes."""
+        if not self._sizes:
+            self._sizes = [principal.sizes(samples_of(part)[0]) for part in self.design.parts]
+        return self._sizes
 
     def _tube(self, index: int, mesh: MeshSurface) -> PrincipalAxes | None:
         """Return the axes of the wall of a part whose ends are all round; None of any other."""
@@ -147,7 +155,6 @@ def sample_surface(part: DesignPart) -> Surface:
         centre=axes.centre,
         axes=axes.axes,
         size=size,
-        sizes=principal.sizes(points),
     )
 
 
@@ -427,7 +434,7 @@ def _misfit(points: Floats, surface: Surface, T: Floats) -> float:
 
 def _corners(points: Floats) -> Floats:
     """Return the corners (8, 3) of the points' bounding box."""
-    return np.array(list(product(*zip(points.min(axis=0), points.max(axis=0), strict=True))))
+    return np.array(list(product(*zip(*corners(points), strict=True))))
 
 
 def _evidence(points: Floats, surface: Surface, best: Floats, rival: Floats) -> tuple[int, int]:
@@ -470,8 +477,4 @@ def shown(points: Floats, T: Floats, samples: Floats) -> int:
     if len(samples) == 0:
         return 0
     placed = rigid.apply(rigid.invert(T), samples)  # few, where the points are many
-    near = ((points > placed.min(axis=0) - TELLING_MM) & (points < placed.max(axis=0) + TELLING_MM)).all(axis=1)
-    if not near.any():
-        return 0
-    distance = cKDTree(points[near], balanced_tree=False).query(placed, distance_upper_bound=TELLING_MM, workers=-1)[0]
-    return int(np.isfinite(distance).sum())
+    return int(within_reach(points, placed, TELLING_MM)[1].sum())

@@ -312,7 +312,8 @@ def _reasons(
 
 def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Sequence[Floats]) -> RegisteredPart:
     """Join the points of the scans used, on the design; ``joints`` are the key points (8, 3) of the part's joints."""
-    points = np.vstack([rigid.apply(scan.registration.T_design_scan, scan.points) for scan in used])
+    placed = [rigid.apply(scan.registration.T_design_scan, scan.points) for scan in used]
+    points = placed[0] if len(placed) == 1 else np.vstack(placed)
     station = joined_numbers([scan.station for scan in used])
     return RegisteredPart(
         points=points,
@@ -372,8 +373,10 @@ def _views(part: RegisteredPart, shape: attitude.Surface) -> _Views:
 
 def _between_stations(points: Floats, station: Ints, shape: attitude.Surface) -> float:
     """Variance between the stations of points (n, 3) on the design, mm^2."""
-    points = thinned(points, surface_registration.LAST_POINTS)
     station = thinned(station, surface_registration.LAST_POINTS)
+    if (station == station[0]).all():
+        return 0.0
+    points = thinned(points, surface_registration.LAST_POINTS)
     face, residual, beyond = shape.mesh.distances(points, 60.0)
     near = on_face(face, beyond) & (np.abs(residual) < surface_registration.GATES_MM[1])
     normals = shape.mesh.normals[face[near]]
@@ -387,7 +390,7 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     order = by_cell(scan.points, CELL_MM)
     points = scan.points[order] * shrink
     station = scan.point_station[order].astype(np.int64) if len(scan.point_station) else np.zeros(len(points), np.int64)
-    of_part = main_body.of_sizes(points, [shapes[k].sizes for k in range(len(shapes))])
+    of_part = main_body.of_sizes(points, shapes.sizes)
     if of_part is None:
         return _identified(scan, points, station, index, shapes)
     placed = _identified(scan, points[of_part], station[of_part], index, shapes)
