@@ -47,6 +47,13 @@ def packed(cells: Ints, group: Ints | None = None) -> Ints:
     return key if group is None else key | (group << (3 * BITS))
 
 
+def unpacked(key: Ints) -> Ints:
+    """Return the cell indices (n, 3) of keys (n,) without a group."""
+    every = (1 << BITS) - 1
+    cells: Ints = np.stack([key >> (2 * BITS), (key >> BITS) & every, key & every], axis=1) - OFFSET
+    return cells
+
+
 def sums_of(points: Floats) -> Floats:
     """Return the moments (n, 10) of single points (n, 3)."""
     x = np.hstack([points, np.ones((len(points), 1))])
