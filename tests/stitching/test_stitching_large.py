@@ -1,6 +1,8 @@
 """Stitching of more points than fit into memory: what is extracted by blocks equals what is extracted at once."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from processor import large_arrays
 from processor.model import Scene
 from processor.stitching import step as stitching_step
 from processor.stitching.planes import grid_bands, scan_planes
+from processor.store import store
 from tests.support.clouds import stitch_clouds
 
 
@@ -70,3 +73,29 @@ def test_more_points_make_no_more_cells(monkeypatch):
         off = np.abs(result.scans.T_project_scan[1:, :3, 3] - want)
         assert (off < 4.0 * result.scans.position_sd[1:]).all()
         assert result.scans.status == ("ok",) * 4
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_points(tmp_path):
+    """Five million points of a scan, with their places in the grid, take 160 MB as arrays, and as much sorted.
+
+    Read and passed over by blocks they take what a band of the grid takes, 64 bytes a point for a million places and
+    as much while they are sorted, and the cells: 400,000 of ten moments, in two copies, with half as much for the
+    larger cubes.
+    """
+    code = (
+        "import re, sys; from pathlib import Path; from processor import large_arrays\n"
+        "from processor.stitching.planes import scan_planes; from processor.store import store\n"
+        "with large_arrays.in_files(Path(sys.argv[1]).parent):\n"
+        "    (scan,) = store.read_scene(Path(sys.argv[1])).scans\n"
+        "    scan_planes.extract(scan, 0.0, scan_planes.points_a_cell(scan, len(scan.points)))\n"
+        "print(int(re.search(r'VmHWM:\\s*(\\d+)', open('/proc/self/status').read())[1]) // 1024)"
+    )
+    peak = []
+    for step_mrad in (12.0, 1.7):
+        scan = stitch_clouds.scan("S", stitch_clouds.pose([0.0, 500.0, 1700.0], 140.0), 1, step_mrad=step_mrad)
+        path = tmp_path / f"{step_mrad}.h5"
+        store.write_scene(path, Scene("room", "structure", (scan,)), None, {})
+        done = subprocess.run([sys.executable, "-c", code, path], check=True, capture_output=True, text=True)
+        peak.append(int(done.stdout))
+    assert peak[1] < peak[0] + 64 + 128 + 96, peak  # MEMORY_BYTES, a band, the cells
