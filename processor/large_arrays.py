@@ -13,6 +13,7 @@ import math
 import mmap
 import os
 import tempfile
+import threading
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -50,6 +51,7 @@ class _Files:
 
 _files: _Files | None = None
 _maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+_maps_lock = threading.Lock()  # a set that another thread adds to cannot be passed over
 _touched = 0
 
 
@@ -127,7 +129,8 @@ def reserve(descriptor: int, size: int, folder: Path) -> None:
 def mapped(descriptor: int, size: int, offset: int = 0) -> mmap.mmap:
     """Map a part of a file; its pages are given back by :func:`release`."""
     memory = mmap.mmap(descriptor, size, offset=offset)
-    _maps.add(memory)
+    with _maps_lock:
+        _maps.add(memory)
     return memory
 
 
@@ -135,7 +138,9 @@ def release() -> None:
     """Give back the pages of all arrays in files; what was written stays in the files."""
     global _touched
     _touched = 0
-    for memory in list(_maps):
+    with _maps_lock:
+        maps = list(_maps)
+    for memory in maps:
         memory.madvise(mmap.MADV_DONTNEED)
 
 
@@ -179,6 +184,14 @@ def corners(points: Array) -> tuple[Array, Array]:
     """Return the least and the greatest number of each column (m,) of an array (n, m), n > 0."""
     parts = [(points[rows].min(axis=0), points[rows].max(axis=0)) for rows in blocks(len(points))]
     return np.min([low for low, _ in parts], axis=0), np.max([high for _, high in parts], axis=0)
+
+
+def centroid(points: Array) -> Array:
+    """Return the mean (m,) of the rows of an array (n, m), n > 0, to the bit of np.mean: rows are added one by one."""
+    sums = np.zeros(points.shape[1:])
+    for rows in blocks(len(points)):
+        sums = np.add.reduce(np.concatenate([sums[None], points[rows]]), axis=0)
+    return sums / len(points)
 
 
 def total(array: Array, of: Callable[[Array], Array] = np.asarray) -> float:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from processor import large_arrays
 from processor.geometry import rigid
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints, Labels
+
+LEAST_POINTS = 100  # on the grid
 
 
 @dataclass(frozen=True)
@@ -34,37 +37,55 @@ class Rays:
         return direction
 
 
-def fitted(points: Floats, row: Ints, column: Ints) -> Rays | None:
+def fitted(points: Floats, row: Labels | Ints, column: Labels | Ints) -> Rays | None:
     """Fit the rays of a scanner to points (n, 3) about it; None for too few points or rows.
 
     The axis of rotation is the direction to which the points of a row have a constant angle.
     """
-    on = np.flatnonzero((row >= 0) & (column >= 0))
-    if len(on) < 100:
+    rows, columns = np.zeros(0, np.int64), np.zeros(0, np.int64)  # points of each
+    for _, r, c in _directions(points, row, column):
+        rows, columns = _counted(rows, r), _counted(columns, c)
+    occupied = rows > 0
+    if rows.sum() < LEAST_POINTS or occupied.sum() < 2:
         return None
-    u = points[on] / np.maximum(np.linalg.norm(points[on], axis=1), 1e-9)[:, None]
-    r, c = row[on], column[on]
-    rows, columns = int(r.max()) + 1, int(c.max()) + 1
-    number = np.bincount(r, minlength=rows)
-    mean = np.stack([np.bincount(r, u[:, i], rows) for i in range(3)], axis=1) / np.maximum(number, 1)[:, None]
-    deviation = u - mean[r]
-    axis = np.linalg.eigh(deviation.T @ deviation)[1][:, 0]
-    occupied = number > 0
-    if occupied.sum() < 2:
-        return None
+    mean = np.zeros((len(rows), 3))
+    for u, r, _ in _directions(points, row, column):
+        mean += np.stack([np.bincount(r, u[:, i], len(rows)) for i in range(3)], axis=1)
+    mean /= np.maximum(rows, 1)[:, None]
+    scatter = np.zeros((3, 3))
+    for u, r, _ in _directions(points, row, column):
+        u -= mean[r]
+        scatter += u.T @ u
+    axis = np.linalg.eigh(scatter)[1][:, 0]
     angles = np.arcsin(np.clip((mean @ axis)[occupied], -1.0, 1.0))  # scanners step by equal angles
-    heights = np.sin(np.interp(np.arange(rows), np.flatnonzero(occupied), angles, left=np.nan, right=np.nan))
+    heights = np.sin(np.interp(np.arange(len(rows)), np.flatnonzero(occupied), angles, left=np.nan, right=np.nan))
     e1, e2 = rigid.axes_across(axis)
-    x, y = np.bincount(c, u @ e1, columns), np.bincount(c, u @ e2, columns)
-    turn = np.where(np.bincount(c, minlength=columns) > 0, np.arctan2(y, x), np.nan)
+    x, y = np.zeros(len(columns)), np.zeros(len(columns))
+    for u, _, c in _directions(points, row, column):
+        x += np.bincount(c, u @ e1, len(columns))
+        y += np.bincount(c, u @ e2, len(columns))
+    turn = np.where(columns > 0, np.arctan2(y, x), np.nan)
     return Rays(np.stack([e1, e2, axis], axis=1), heights, turn)
 
 
-def unanswered(rays: Rays, row: Ints, column: Ints) -> Floats:
-    """Directions (m, 3) of the grid's places without a point: rays without a return."""
-    on = (row >= 0) & (column >= 0)
-    empty: npt.NDArray[np.bool_] = np.ones((len(rays.height), len(rays.turn)), np.bool_)
-    empty[row[on], column[on]] = False
-    empty[:, ~np.isfinite(rays.turn)] = False
-    empty[~np.isfinite(rays.height)] = False
-    return rays.of(*np.nonzero(empty))
+def _directions(points: Floats, row: Labels | Ints, column: Labels | Ints) -> Iterator[tuple[Floats, Ints, Ints]]:
+    """Pass over the unit vectors (m, 3) to the points on the grid, their rows and columns (m,)."""
+    for part in large_arrays.blocks(len(points), large_arrays.AT_ONCE):
+        on = np.flatnonzero((row[part] >= 0) & (column[part] >= 0))
+        u = points[part][on]
+        u /= np.maximum(np.linalg.norm(u, axis=1), 1e-9)[:, None]
+        yield u, row[part][on].astype(np.int64), column[part][on].astype(np.int64)
+
+
+def _counted(count: Ints, numbers: Ints) -> Ints:
+    """Add how often each of some numbers occurs to the counts (m,) of those before."""
+    more = np.bincount(numbers, minlength=len(count))
+    more[: len(count)] += count
+    return more.astype(np.int64, copy=False)
+
+
+def unanswered(rays: Rays, empty: Bools, first: int = 0) -> Floats:
+    """Directions (m, 3) of the ``empty`` places of rows of the grid from row ``first`` on: rays without a return."""
+    known = np.isfinite(rays.height[first : first + len(empty)])[:, None] & np.isfinite(rays.turn)
+    row, column = np.nonzero(empty[: known.shape[0], : known.shape[1]] & known[:, : empty.shape[1]])
+    return rays.of(first + row, column)

@@ -67,7 +67,7 @@ def stitch(
     these is the only candidate, so that repetitive structures are not ambiguous. Scans that overlap with no other one
     have a pose of NaN.
     """
-    clouds = thread_ranges.each(lambda scan: scan_planes.extract(scan, params.cell_mm), scans)
+    clouds = _extract(scans, params.cell_mm)
     patches = _sample_patches(clouds)
     known = control_points.poses_of_scans(control, [cloud.origin for cloud in clouds])
     candidates = _find_candidates(patches, params, picked, known)
@@ -96,6 +96,13 @@ def stitch(
         ),
         links=sorted({*network.links(scores), *itertools.combinations(sorted(known), 2)}),
         groups=network.groups(candidates, len(scans)),
+    )
+
+
+def _extract(scans: Sequence[Scan], cell_mm: float) -> list[Cloud]:
+    count = sum(len(scan.points) for scan in scans)
+    return thread_ranges.each(
+        lambda scan: scan_planes.extract(scan, cell_mm, scan_planes.points_a_cell(scan, count)), scans
     )
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from processor import diagnostics
+from processor import diagnostics, large_arrays
 from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.model import Floats, InputError, Reason, Scan, Scene, UsageError, reason
 from processor.stitching import automatic, three_point, to_result, verdicts
@@ -202,4 +202,4 @@ def _unplaced(
 
 
 def _origin(scan: Scan) -> Floats:
-    return scan.position if scan.position.size else scan.origin + scan.points.mean(axis=0)
+    return scan.position if scan.position.size else scan.origin + large_arrays.centroid(scan.points)

@@ -6,6 +6,7 @@ from processor.geometry import scan_grid_directions
 from processor.stitching.fine import edge_constraints
 from processor.stitching.planes import border_exclusion, face_ends
 from processor.stitching.planes.extraction import Planes
+from processor.stitching.planes.grid_bands import GridBands
 from tests.support.clouds.stitch_clouds import pose, scan
 
 
@@ -16,9 +17,16 @@ def test_rays_fitted_to_a_grid_are_the_simulated_ones():
     rays = scan_grid_directions.fitted(made.points[keep], row[keep], column[keep])
     true = made.points / np.linalg.norm(made.points, axis=1)[:, None]
     np.testing.assert_allclose(rays.of(row, column), true, atol=1e-9)
-    lost = scan_grid_directions.unanswered(rays, row[keep], column[keep])
+    empty = np.ones((row.max() + 1, column.max() + 1), bool)
+    empty[row[keep], column[keep]] = False
+    lost = scan_grid_directions.unanswered(rays, empty)
     assert len(lost) == (~keep).sum()
     np.testing.assert_allclose(np.sort(lost, axis=0), np.sort(true[~keep], axis=0), atol=1e-9)
+
+
+def bands(points, row, column):
+    """The points of a grid, each in a cell of its own."""
+    return GridBands.of(points, row.astype(np.int32), column.astype(np.int32), np.arange(len(points)))
 
 
 def post(width_mm, phase, step=5e-3, range_mm=20_000.0):
@@ -39,7 +47,7 @@ def post(width_mm, phase, step=5e-3, range_mm=20_000.0):
     piece = np.where(low[hit], -1, 0)
     piece[~low[hit] & (r % 7 > 0)] = -1  # in a planar piece in few rows only
     rays = scan_grid_directions.fitted(p[hit], r, c)
-    return face_ends.ends_of(p[hit], r, c, piece, plane, 2.0, rays)
+    return face_ends.ends_of(bands(p[hit], r, c), piece, plane, 2.0, rays)
 
 
 def test_ends_of_a_post_are_unbiased_for_all_phases_of_the_rays():
@@ -105,9 +113,8 @@ def test_far_edges_of_an_inclined_face_are_unbiased():
             np.ones(1), np.array([[0.0, 0.0, -height]]), np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3)), np.eye(3)[None]
         )
         r, c = row.ravel()[keep], column.ravel()[keep]
-        ends = face_ends.ends_of(
-            p[keep], r, c, np.where(hit[keep], 0, -1), plane, 2.0, scan_grid_directions.fitted(p[keep], r, c)
-        )
+        rays = scan_grid_directions.fitted(p[keep], r, c)
+        ends = face_ends.ends_of(bands(p[keep], r, c), np.where(hit[keep], 0, -1), plane, 2.0, rays)
         far = (ends.across[:, 0] > 0.0) & (np.abs(ends.across[:, 1]) < 0.5 * ends.across[:, 0])
         assert far.sum() >= 40
         off += (ends.points[far, 0] - edge).tolist()
@@ -123,19 +130,20 @@ def test_points_next_to_another_face_are_left_out():
     side = y > 0.0
     front[side, 0] += 1.5 * y[side]
     points = np.vstack([front + np.array([0.0, 0.0, 40.0 * i]) for i in range(3)])
-    grid = np.arange(45).reshape(3, 15)
+    grid = bands(points, *np.divmod(np.arange(45), 15))
     piece = np.where(points[:, 1] < 60.0, 0, -1)  # two columns of the side face are in the piece
     plane = Planes(
         np.ones(1), np.array([[5000.0, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.full((1, 3), 4.0), np.eye(3)[None]
     )
-    clear = border_exclusion.inside(points, grid, piece, plane).reshape(3, 15)
+    clear = border_exclusion.inside(points, np.arange(45), grid, piece, plane).reshape(3, 15)
     ends_at = int((y < 0.0).sum())  # the first column there lies 4.5 mm behind the front, within the noise
     assert not clear[:, ends_at:].any()
     assert clear[:, 1:ends_at].all()
     # A bar hit by two columns of rays, with background on both sides, would lose all points: it keeps them.
     bar = np.stack([np.full(8, 5000.0), np.tile([0.0, 40.0], 4), np.repeat(40.0 * np.arange(4), 2)], axis=1)
     behind = np.stack([np.full(8, 5080.0), np.tile([-40.0, 80.0], 4), np.repeat(40.0 * np.arange(4), 2)], axis=1)
-    places = np.stack([np.arange(8, 16, 2), np.arange(0, 8, 2), np.arange(1, 8, 2), np.arange(9, 16, 2)], axis=1)
-    clear = border_exclusion.inside(np.vstack([bar, behind]), places, np.repeat([0, -1], 8), plane)
+    points, row = np.vstack([bar, behind]), np.tile(np.repeat(np.arange(4), 2), 2)
+    grid = bands(points, row, np.concatenate([np.tile([1, 2], 4), np.tile([0, 3], 4)]))
+    clear = border_exclusion.inside(points, np.arange(16), grid, np.repeat([0, -1], 8), plane)
     assert clear[:8].all()
     assert not clear[8:].any()

@@ -86,7 +86,7 @@ def test_points_next_to_the_edge_of_a_bar_are_left_out_without_a_grid():
     piece = np.where(a < 0.0301, 0, -1)  # the cube of the face holds the first points of the side face too
     face = points[~side]
     planes = extraction.planes_of(extraction.sums_of(face).sum(axis=0)[None])
-    clear = border_exclusion.inside(points, None, piece, planes)
+    clear = border_exclusion.inside(points, np.arange(len(points)), None, piece, planes)
     assert not clear[side].any()
     assert not clear[(a > 0.0181) & ~side].any()
     inner = (a < 0.015) & (np.abs(e) < 0.045)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
+from processor.large_arrays import every
 from processor.model import Scene, Status, StepRun
 from processor.pipeline import Execution
 from processor.report.style import COLOURS, CaptionedPngs, png, printable_name
@@ -41,7 +42,7 @@ def _plan(scene: Scene, result: Result) -> tuple[Message, bytes]:
         if i is None or not scans.placed[i] or not len(scan.points):
             continue
         T = scans.T_project_scan[i]
-        points = scan.points[:: max(1, len(scan.points) // PLAN_POINTS)] + scan.origin
+        points = every(scan.points, max(1, len(scan.points) // PLAN_POINTS)) + scan.origin
         points = points @ T[:3, :3].T + T[:3, 3]
         axes.plot(*(1e-3 * points[:, :2].T), ",", color="0.6", zorder=0)
     least = float(np.nanmin(pairs.residual)) if len(pairs) else 0.0

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import rigid, thread_ranges
 from processor.language.messages import text
+from processor.large_arrays import every
 from processor.model import NORMAL_95, Floats, Scan, Scene, Status, StepRun
 from processor.report.charts.surface_view import spacing
 from processor.report.style import DIVERGING_STOPS, colour_limit
@@ -18,7 +19,7 @@ from processor.stitching.result import Result, Scans
 from processor.store.json_values import json_ready
 
 MOST_POINTS = 60_000  # of all scans: about 1.4 MB of the page
-MOST_SEARCHED = 400_000  # of each scan
+MOST_SEARCHED, MOST_SEARCHED_OF_ALL = 400_000, 4_000_000  # of each scan, and of all scans
 NEIGHBOURS = 12
 REACH_MM = 200.0  # of neighbours, at most
 LEAST_FLAT = 4.0  # least ratio of width to thickness of neighbours that are one surface
@@ -39,7 +40,8 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
         return None
     first = np.array([rigid.apply(scans.T_project_scan[i], scan.points[:1] + scan.origin)[0] for scan, i in placed])
     origin: Floats = np.round(first.mean(axis=0))
-    clouds = [_in_project(scan, scans.T_project_scan[i], origin) for scan, i in placed]
+    most = min(MOST_SEARCHED, MOST_SEARCHED_OF_ALL // len(placed))
+    clouds = [_in_project(scan, scans.T_project_scan[i], origin, most) for scan, i in placed]
     trees = thread_ranges.each(cKDTree, clouds)
     step = max(1, -(-sum(map(len, clouds)) // MOST_POINTS))
     drawn = [cloud[::step] for cloud in clouds]
@@ -73,9 +75,9 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
     return data
 
 
-def _in_project(scan: Scan, T: Floats, origin: Floats) -> Floats:
-    """Return points (n, 3) of a scan, at most MOST_SEARCHED, in the project's frame less ``origin``."""
-    points = scan.points[:: max(1, -(-len(scan.points) // MOST_SEARCHED))]
+def _in_project(scan: Scan, T: Floats, origin: Floats, most: int) -> Floats:
+    """Return points (n, 3) of a scan, at most ``most``, in the project's frame less ``origin``."""
+    points = every(scan.points, max(1, -(-len(scan.points) // most)))
     return rigid.apply(rigid.between_origins(T, scan.origin, origin), points[np.isfinite(points).all(axis=1)])
 
 

@@ -157,11 +157,7 @@ def _blocks(cells: CellTable, T: Floats, rows: Ints, piece: Ints) -> Blocks:
     """Sum cells ``rows`` (m,) by piece (m,) and scan; scans with too few points on a piece are left out."""
     scan = cells.scan[rows]
     _, first, inverse = np.unique(piece * MOST_SCANS + scan, return_index=True, return_inverse=True)
-    sums = cells.sums[rows] / cells.variance[rows][:, None]
-    to_ray = ray_maps(cells.mean[rows]) * cells.known[rows, None, None]
-    rays = to_ray @ extraction.square(sums)
-    rays = np.concatenate([rays, rays @ to_ray.transpose(0, 2, 1)], axis=2).reshape(len(rows), 21)
-    weighted = grouped_sums.summed(np.hstack([sums, rays]), inverse.ravel(), len(first))
+    weighted = _weighted_sums(cells, rows, inverse.ravel(), len(first))
     count: Floats = np.bincount(inverse.ravel(), cells.sums[rows, 9], len(first)).astype(np.float64)
     enough = count >= LEAST_POINTS
     _, number = np.unique(piece[first][enough], return_inverse=True)
@@ -176,6 +172,19 @@ def _blocks(cells: CellTable, T: Floats, rows: Ints, piece: Ints) -> Blocks:
         piece=number, scan=of_scan, sums=sums, count=count[enough], kind=np.full(len(number), ON_PIECE), pieces=pieces,
         rays=weighted[:, 10:].reshape(-1, 3, 7), face=_faces(extraction.planes_of(world), cells)[number],
     )  # fmt: skip
+
+
+def _weighted_sums(cells: CellTable, rows: Ints, group: Ints, count: int) -> Floats:
+    """Sum the weighted moments of cells ``rows`` (m,), and those of their rays, by group (m,): (count, 31)."""
+    found = np.zeros((count, 31))
+    for first in range(0, len(rows), extraction.ROWS):
+        own = rows[first : first + extraction.ROWS]
+        sums = cells.sums[own] / cells.variance[own][:, None]
+        to_ray = ray_maps(cells.mean[own]) * cells.known[own, None, None]
+        rays = to_ray @ extraction.square(sums)
+        rays = np.concatenate([rays, rays @ to_ray.transpose(0, 2, 1)], axis=2).reshape(len(own), 21)
+        grouped_sums.add_rows(np.hstack([sums, rays]), group[first : first + extraction.ROWS], found)
+    return found
 
 
 def _faces(planes: Planes, cells: CellTable) -> Ints:

@@ -14,8 +14,10 @@ import numpy.typing as npt
 from numba import njit
 from scipy.spatial import cKDTree
 
-from processor.model import Floats, Ints
+from processor import large_arrays
+from processor.model import Bools, Floats, Ints
 from processor.stitching.planes.extraction import Planes
+from processor.stitching.planes.grid_bands import GridBands
 
 ON_SIGMAS = 3.0  # a point this close to a plane lies on it
 LEAST_SHARE = 0.5  # of a piece's points that must remain
@@ -24,25 +26,34 @@ NEIGHBOURS = 8  # in angle, where there is no grid
 CHUNK = 1 << 18
 
 
-def inside(points: Floats, grid: Ints | None, piece: Ints, planes: Planes) -> npt.NDArray[np.bool_]:
+def inside(points: Floats, cell: Ints, bands: GridBands | None, piece_of_cell: Ints, planes: Planes) -> Bools:
     """Return which points (n,) lie clear of the borders of their planar piece.
 
-    ``points`` (n, 3) are in the scanner's frame, ``grid`` is their scan grid, if known, ``piece`` (n,) a row of
-    ``planes`` or -1. On a grid, a piece that would lose most of its points, such as a bar hit by few rays, keeps them
-    all: the ends of its faces determine the poses. Without a grid there are no ends, and such pieces alone, all biased
-    to one side, would shift a scan by tenths of a millimetre.
+    ``points`` (n, 3) are in the scanner's frame and lie in ``cell`` (n,), ``bands`` are those of their scan grid, if it
+    is known, ``piece_of_cell`` (m,) a row of ``planes`` or -1. On a grid, a piece that would lose most of its points,
+    such as a bar hit by few rays, keeps them all: the ends of its faces determine the poses. Without a grid there are
+    no ends, and such pieces alone, all biased to one side, would shift a scan by tenths of a millimetre.
     """
     limit = ON_SIGMAS * np.sqrt(planes.variance[:, 0])
-    if grid is None:
-        return _clear_in_angle(points, piece, planes, limit)
-    clear = np.zeros(len(points), np.bool_)
-    clear_of_borders(grid, np.ascontiguousarray(points), piece, planes.mean, planes.normal, limit, clear)
-    count = len(planes.count)
-    on_piece = piece >= 0
-    whole = np.bincount(piece[on_piece], minlength=count)
-    few = np.bincount(piece[clear], minlength=count) < LEAST_SHARE * whole
-    selected: npt.NDArray[np.bool_] = clear | (on_piece & few[piece])
-    return selected
+    if bands is None:
+        return _clear_in_angle(points, piece_of_cell[cell], planes, limit)
+    clear = large_arrays.allocate(len(points), dtype=np.bool_)
+    whole, left = np.zeros(len(planes.count), np.int64), np.zeros(len(planes.count), np.int64)
+    for rows in large_arrays.blocks(len(points)):
+        clear[rows] = False
+        piece = piece_of_cell[cell[rows]]
+        whole += np.bincount(piece[piece >= 0], minlength=len(whole))
+    for window in bands.windows():
+        piece, found = piece_of_cell[window.cell], np.zeros(len(window.points), np.bool_)
+        clear_of_borders(window.grid, window.points, piece, planes.mean, planes.normal, limit, found)
+        found &= window.in_band
+        clear[window.number[found]] = True
+        left += np.bincount(piece[found], minlength=len(left))
+    few = left < LEAST_SHARE * whole
+    for rows in large_arrays.blocks(len(points)):
+        piece = piece_of_cell[cell[rows]]
+        clear[rows] |= (piece >= 0) & few[piece]
+    return clear
 
 
 def _clear_in_angle(points: Floats, piece: Ints, planes: Planes, limit: Floats) -> npt.NDArray[np.bool_]:

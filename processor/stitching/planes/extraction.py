@@ -20,6 +20,7 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3),
 _I = np.array([i for i, _ in UPPER])
 _J = np.array([j for _, j in UPPER])
 LEAST_WIDTH = 0.06  # of a cube's side: least standard deviation of a planar piece's points along its narrower axis
+ROWS = 1 << 15  # of moments that are written as matrices at once
 FLATNESS = 25.0  # least ratio of the two smaller variances of a planar piece
 
 
@@ -47,6 +48,13 @@ def packed(cells: Ints, group: Ints | None = None) -> Ints:
     return key if group is None else key | (group << (3 * BITS))
 
 
+def unpacked(key: Ints) -> Ints:
+    """Return the cell indices (n, 3) of keys (n,) without a group."""
+    every = (1 << BITS) - 1
+    cells: Ints = np.stack([key >> (2 * BITS), (key >> BITS) & every, key & every], axis=1) - OFFSET
+    return cells
+
+
 def sums_of(points: Floats) -> Floats:
     """Return the moments (n, 10) of single points (n, 3)."""
     x = np.hstack([points, np.ones((len(points), 1))])
@@ -70,7 +78,12 @@ def triangle(M: Floats) -> Floats:
 
 def transformed(sums: Floats, T: Floats) -> Floats:
     """Return the moments (n, 10) of points transformed by T (4, 4), or by one T each (n, 4, 4)."""
-    return triangle(T @ square(sums) @ np.swapaxes(T, -1, -2))
+    found = np.empty((len(sums), len(UPPER)))
+    for first in range(0, len(sums), ROWS):
+        rows = slice(first, first + ROWS)
+        own = T if T.ndim == 2 else T[rows]
+        found[rows] = triangle(own @ square(sums[rows]) @ np.swapaxes(own, -1, -2))
+    return found
 
 
 def scatter(sums: Floats) -> tuple[Floats, Floats]:
@@ -135,10 +148,11 @@ def flat_pieces(
 def _is_flat(sums: Floats, number: Floats, side_mm: float, limit: Floats, least: float) -> npt.NDArray[np.bool_]:
     flat = np.zeros(len(sums), bool)
     enough = np.flatnonzero(number >= least)
-    if len(enough):
-        variance = np.linalg.eigvalsh(scatter(sums[enough])[1])
-        flat[enough] = (
-            (variance[:, 0] <= limit[enough])
+    for first in range(0, len(enough), ROWS):
+        rows = enough[first : first + ROWS]
+        variance = np.linalg.eigvalsh(scatter(sums[rows])[1])
+        flat[rows] = (
+            (variance[:, 0] <= limit[rows])
             & (variance[:, 1] >= FLATNESS * variance[:, 0])
             & (variance[:, 1] >= (LEAST_WIDTH * side_mm) ** 2)
         )

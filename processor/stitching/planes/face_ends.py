@@ -12,9 +12,11 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from numba import njit
 
+from processor import large_arrays
 from processor.geometry.scan_grid_directions import Rays
 from processor.model import Floats, Ints
 from processor.stitching.planes.extraction import Planes
+from processor.stitching.planes.grid_bands import GridBands, Window
 
 DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # steps in row and column of the scan grid
 JUMP_SIGMAS = 10.0  # least depth step behind an end
@@ -38,48 +40,59 @@ class Ends:
     edge: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
 
-def grid_of(row: Ints, column: Ints) -> Ints:
-    """Return the scan grid: the index of the point at each row and column, -1 = none. Columns close the circle."""
-    on = np.flatnonzero((row >= 0) & (column >= 0))
-    grid = np.full((int(row.max(initial=0)) + 1, int(column.max(initial=0)) + 1), -1, np.int64)
-    grid[row[on], column[on]] = on
-    return grid
-
-
-def ends_of(points: Floats, row: Ints, column: Ints, piece: Ints, planes: Planes, sigma_mm: float, rays: Rays) -> Ends:
-    """Find the ends of the planar pieces of points (n, 3) in the scanner's frame; ``piece`` (n,) is a plane or -1.
+def ends_of(bands: GridBands, piece_of_cell: Ints, planes: Planes, sigma_mm: float, rays: Rays) -> Ends:
+    """Find the ends of the planar pieces of points on a grid; ``piece_of_cell`` (m,) is a row of ``planes`` or -1.
 
     A bar hit by a single ray of a row has two ends in that row as well. Requiring a second ray would reject bars whose
     edges lie far from the rays, and the remaining ones would come out too wide.
     """
-    if not len(row) or not len(planes.count):
+    if not len(planes.count):
         return Ends()
-    grid = grid_of(row, column)
-    on_face = np.where(grid >= 0, piece[grid], -1)
-    d = np.einsum("ni,ni->n", planes.normal, planes.mean)
-    grow(grid, on_face, np.ascontiguousarray(points), planes.normal, d, ON_SIGMAS * sigma_mm)
-    parts = []
-    for number, (row_step, column_step) in enumerate(DIRECTIONS):
-        i, j, face = _last_on_face(grid, on_face, row_step, column_step)
-        ray_i, ray_j = _unit(points[i]), _unit(points[j])
-        n, at = planes.normal[face], planes.mean[face]
-        d = np.einsum("ni,ni->n", n, at)
-        following = np.where((j >= 0)[:, None], ray_j, rays.of(row[i] + row_step, column[i] + column_step))
-        cos_i, cos_j = np.einsum("ni,ni->n", n, ray_i), np.einsum("ni,ni->n", n, following)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            near, far = d / cos_i, d / cos_j
-        on = np.abs(np.einsum("ni,ni->n", n, points[i]) - d) < ON_SIGMAS * sigma_mm
-        a, b = ray_i * near[:, None], following * far[:, None]
-        width = np.linalg.norm(b - a, axis=1)
-        behind = (j < 0) | (np.linalg.norm(points[j], axis=1) - far > np.maximum(JUMP_SIGMAS * sigma_mm, 0.3 * width))
-        good = on & behind & (near > 0.0) & (far > 0.0) & (width < WIDEST * np.linalg.norm(points[i], axis=1))
-        gap = len(DIRECTIONS) * (row[i] if row_step else column[i]) + number
-        # Rays are evenly spaced in angle. On an inclined face the gap beyond an edge is wider than the one before it.
-        a, b, near, far = a[good], b[good], near[good], far[good]
-        middle = 0.5 * (a + b) - (b - a) * (2.0 / 3.0 * (far - near) / (far + near))[:, None]
-        edge = len(DIRECTIONS) * face[good] + number
-        parts.append(Ends(points=middle, across=b - a, normals=n[good], gap=gap[good], edge=edge))
-    return Ends(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Ends)})
+    offset = np.einsum("ni,ni->n", planes.normal, planes.mean)
+    limit = ON_SIGMAS * sigma_mm
+    on_face = large_arrays.allocate(*bands.shape, dtype=np.int64)
+    for window in bands.windows():
+        grid, piece = window.grid[window.own], piece_of_cell[window.cell]
+        on_face[window.rows][window.own] = np.where(grid >= 0, piece[grid], -1) if len(piece) else -1
+    for sweep in range(SWEEPS):
+        for window in bands.windows(backwards=sweep % 2 == 1):
+            own, way = window.own, -1 if sweep % 2 else 1
+            grow(
+                window.grid, on_face[window.rows], window.points, planes.normal, offset, limit, own.start, own.stop, way
+            )
+    parts: list[list[Ends]] = [[] for _ in DIRECTIONS]
+    for window in bands.windows():
+        for number, of_direction in enumerate(parts):
+            of_direction.append(_ends_in(window, on_face[window.rows], number, planes, sigma_mm, rays))
+    found = [part for of_direction in parts for part in of_direction]
+    return Ends(**{f.name: np.concatenate([getattr(part, f.name) for part in found]) for f in fields(Ends)})
+
+
+def _ends_in(window: Window, on_face: Ints, number: int, planes: Planes, sigma_mm: float, rays: Rays) -> Ends:
+    """Return the ends in the band's own rows where rays leave their faces in direction ``number`` of the grid."""
+    row_step, column_step = DIRECTIONS[number]
+    points, row, column = window.points, window.row, window.column
+    i, j, face = _last_on_face(window.grid, on_face, row_step, column_step)
+    own = window.in_band[i]
+    i, j, face = i[own], j[own], face[own]
+    ray_i, ray_j = _unit(points[i]), _unit(points[j])
+    n, at = planes.normal[face], planes.mean[face]
+    d = np.einsum("ni,ni->n", n, at)
+    following = np.where((j >= 0)[:, None], ray_j, rays.of(row[i] + row_step, column[i] + column_step))
+    cos_i, cos_j = np.einsum("ni,ni->n", n, ray_i), np.einsum("ni,ni->n", n, following)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        near, far = d / cos_i, d / cos_j
+    on = np.abs(np.einsum("ni,ni->n", n, points[i]) - d) < ON_SIGMAS * sigma_mm
+    a, b = ray_i * near[:, None], following * far[:, None]
+    width = np.linalg.norm(b - a, axis=1)
+    behind = (j < 0) | (np.linalg.norm(points[j], axis=1) - far > np.maximum(JUMP_SIGMAS * sigma_mm, 0.3 * width))
+    good = on & behind & (near > 0.0) & (far > 0.0) & (width < WIDEST * np.linalg.norm(points[i], axis=1))
+    gap = len(DIRECTIONS) * (row[i] if row_step else column[i]) + number
+    # Rays are evenly spaced in angle. On an inclined face the gap beyond an edge is wider than the one before it.
+    a, b, near, far = a[good], b[good], near[good], far[good]
+    middle = 0.5 * (a + b) - (b - a) * (2.0 / 3.0 * (far - near) / (far + near))[:, None]
+    edge = len(DIRECTIONS) * face[good] + number
+    return Ends(points=middle, across=b - a, normals=n[good], gap=gap[good], edge=edge)
 
 
 def _last_on_face(grid: Ints, on_face: Ints, row_step: int, column_step: int) -> tuple[Ints, Ints, Ints]:
@@ -103,29 +116,28 @@ def _unit(points: Floats) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def grow(grid, on_face, points, normal, offset, limit):  # type: ignore[no-untyped-def]
-    """Add points without a face to the face of a grid neighbour if they lie on its plane.
+def grow(grid, on_face, points, normal, offset, limit, first, last, way):  # type: ignore[no-untyped-def]
+    """Add points of rows first to last - 1 without a face to that of a grid neighbour if they lie on its plane.
 
     Planar pieces need a minimum number of points. Without growing, the number of rays that hit a bar would decide
-    whether its ends are found, and that number depends on where its edges lie between the rays.
+    whether its ends are found, and that number depends on where its edges lie between the rays. ``way`` is 1 for a
+    sweep forwards, -1 for one backwards.
     """
     rows, columns = grid.shape
-    for sweep in range(SWEEPS):
-        way = 1 if sweep % 2 == 0 else -1
-        for a in range(rows):
-            r = a if way > 0 else rows - 1 - a
-            for b in range(-1, columns):
-                c = b % columns if way > 0 else (columns - 1 - b) % columns
-                i = grid[r, c]
-                if i < 0 or on_face[r, c] >= 0:
-                    continue
-                for neighbour in range(2):
-                    u, v = (r, (c - way) % columns) if neighbour == 0 else (r - way, c)
-                    if 0 <= u < rows and on_face[u, v] >= 0:
-                        f = on_face[u, v]
-                        off = -offset[f]
-                        for m in range(3):
-                            off += normal[f, m] * points[i, m]
-                        if abs(off) < limit:
-                            on_face[r, c] = f
-                            break
+    for a in range(last - first):
+        r = first + a if way > 0 else last - 1 - a
+        for b in range(-1, columns):
+            c = b % columns if way > 0 else (columns - 1 - b) % columns
+            i = grid[r, c]
+            if i < 0 or on_face[r, c] >= 0:
+                continue
+            for neighbour in range(2):
+                u, v = (r, (c - way) % columns) if neighbour == 0 else (r - way, c)
+                if 0 <= u < rows and on_face[u, v] >= 0:
+                    f = on_face[u, v]
+                    off = -offset[f]
+                    for m in range(3):
+                        off += normal[f, m] * points[i, m]
+                    if abs(off) < limit:
+                        on_face[r, c] = f
+                        break

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
+from processor import large_arrays
 from processor.model import Floats
 
 PIXELS = 320  # at most along each side of the six faces of the cube: 0.28 degrees
@@ -25,17 +27,19 @@ class FreeSpace:
     near: Floats
 
     @classmethod
-    def from_rays(cls, points: Floats, unanswered: Floats) -> FreeSpace:
-        """Build the range image of points (n, 3) in the scanner's frame and of rays (m, 3) without a return."""
+    def from_rays(cls, points: Floats, unanswered: Iterable[Floats]) -> FreeSpace:
+        """Build the range image of points (n, 3) in the scanner's frame and of parts of the rays without a return."""
         n = PIXELS
         while True:
             near = np.full((6, n, n), np.inf)
-            write_ranges(points, near, n)
+            for rows in large_arrays.blocks(len(points)):
+                write_ranges(points[rows], near, n)
             near[np.isinf(near)] = -1.0
             if n <= FEWEST_PIXELS or filled_share(near, SEEN_NEIGHBOURS) >= FILLED:
                 break
             n = int(n / 1.3)
-        write_unanswered(unanswered, near, n)
+        for rays in unanswered:
+            write_unanswered(rays, near, n)
         return cls(near)
 
     def contains(self, points: Floats, tolerance_mm: float, slope: float = 0.02) -> Floats:

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numba import njit
 
-from processor.model import Floats, Ints
+from processor import large_arrays
+from processor.model import Bools, Floats, Ints
 
 MIX = np.uint64(0x9E3779B97F4A7C15)  # multiplicative hashing: consecutive keys would fill a table in runs
 EMPTY = np.iinfo(np.int64).min
@@ -44,11 +47,39 @@ def summed(values: Floats, group: Ints, count: int) -> Floats:
     return out
 
 
-def sums_of_points(points: Floats, group: Ints, count: int) -> Floats:
-    """Sum the ten moments of points (n, 3) by group (n,): (count, 10), in the order of extraction.UPPER."""
+def sums_of_points(points: Floats, group: Ints, count: int, kept: Bools | None = None) -> Floats:
+    """Sum the ten moments of points (n, 3) by group (n,), of those alone that are ``kept`` (n,), if that is given.
+
+    Returns (count, 10), in the order of extraction.UPPER.
+    """
     out = np.zeros((count, 10))
-    add_points(np.ascontiguousarray(points), np.ascontiguousarray(group), out)
+    for rows in large_arrays.blocks(len(points)):
+        part, own = points[rows], group[rows]
+        if kept is not None:
+            part, own = part[kept[rows]], own[kept[rows]]
+        add_points(np.ascontiguousarray(part), np.ascontiguousarray(own), out)
     return out
+
+
+def number_of_rows(keys: Callable[[slice], Ints], count: int) -> tuple[Ints, Ints]:
+    """Return the distinct ones (k,) of keys, ascending, and the number (count,) of each row.
+
+    ``keys`` returns the keys of a slice of the rows.
+    """
+    parts, held = [np.empty(0, np.int64)], 0
+    for rows in large_arrays.blocks(count):
+        key = keys(rows)
+        parts.append(key[numbered(key)[0]])
+        held += len(parts[-1])
+        if held > max(large_arrays.AT_ONCE, len(parts[0])):
+            parts, held = [np.unique(np.concatenate(parts))], 0
+    distinct = np.unique(np.concatenate(parts))
+    number = large_arrays.allocate(count, dtype=np.int64)
+    for rows in large_arrays.blocks(count):
+        key = keys(rows)
+        first, own = numbered(key)
+        number[rows] = np.searchsorted(distinct, key[first])[own]
+    return distinct, number
 
 
 @njit(cache=True, nogil=True)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from processor import large_arrays
 from processor.distinct_rows import distinct
 from processor.geometry import scan_grid_directions
-from processor.model import Floats, Ints, Scan
+from processor.geometry.scan_grid_directions import Rays
+from processor.model import Floats, Ints, Labels, Scan
 from processor.stitching.planes import border_exclusion, extraction, grouped_sums
 from processor.stitching.planes.extraction import Planes
-from processor.stitching.planes.face_ends import Ends, ends_of, grid_of
+from processor.stitching.planes.face_ends import Ends, ends_of
 from processor.stitching.planes.free_space import FreeSpace
+from processor.stitching.planes.grid_bands import GridBands
 
 POINTS_A_CELL = 5.0
+MOST_CELLS_OF_SCAN, MOST_CELLS = 400_000, 2_400_000  # of one scan and of all, occupied: cells of more points are larger
 LEVELS = 6
 KEPT_BELOW = 2  # cells are kept this many levels finer than the piece they belong to
 LIMIT_SIGMAS = 2.5
@@ -44,56 +49,82 @@ class Cloud:
     free_space: FreeSpace | None  # None where the scanner's position is not known
 
 
-def extract(scan: Scan, cell_mm: float = 0.0) -> Cloud:
-    """Segment a scan into cells and planar pieces; ``cell_mm`` 0 = from the density of its points."""
+def points_a_cell(scan: Scan, of_all: int) -> float:
+    """Return how many points a cell of a scan holds on average, if all scans have ``of_all`` points.
+
+    Cells of large scans hold more, so that the number of cells, and the memory that they take, has a bound.
+    """
+    return max(POINTS_A_CELL, len(scan.points) / MOST_CELLS_OF_SCAN, of_all / MOST_CELLS)
+
+
+def extract(scan: Scan, cell_mm: float = 0.0, a_cell: float = POINTS_A_CELL) -> Cloud:
+    """Segment a scan into cells and planar pieces; ``cell_mm`` 0 = cells of ``a_cell`` points on average."""
     known = bool(scan.position.size) or _seen_from_origin(scan)
     position = scan.position if scan.position.size else np.zeros(3)
-    origin = position if known else scan.origin + scan.points.mean(axis=0)
-    finite = np.isfinite(scan.points).all(axis=1)
-    points = scan.points + (scan.origin - origin)
-    if not finite.all():
-        points = points[finite]
-    size = cell_mm or cell_size(points)
-    cells = extraction.cells_of(points, size)
-    first, of_point = grouped_sums.numbered(extraction.packed(cells))
-    cells, sums = cells[first], grouped_sums.sums_of_points(points, of_point, len(first))
+    origin = position if known else scan.origin + large_arrays.centroid(scan.points)
+    points, row, column = _about(scan, origin)
+    size = cell_mm or cell_size(points, a_cell)
+    keys, of_point = grouped_sums.number_of_rows(
+        lambda rows: extraction.packed(extraction.cells_of(points[rows], size)), len(points)
+    )
+    cells, sums = extraction.unpacked(keys), grouped_sums.sums_of_points(points, of_point, len(keys))
     sigma = _scatter(cells, sums, size, scan.sigma_mm)
     piece, level = extraction.flat_pieces(cells, sums, size, LIMIT_SIGMAS * sigma, LEVELS)
-    on_grid = known and len(scan.grid_row) > 0
-    row, column = np.empty(0, np.int64), np.empty(0, np.int64)
-    if on_grid:
-        row, column = scan.grid_row[finite].astype(np.int64), scan.grid_column[finite].astype(np.int64)
+    bands = GridBands.of(points, row, column, of_point) if known and len(row) else None
     if known:
         on_piece = np.flatnonzero(piece >= 0)
         rough = extraction.planes_of(grouped_sums.summed(sums[on_piece], piece[on_piece], len(level)))
-        clear = border_exclusion.inside(points, grid_of(row, column) if on_grid else None, piece[of_point], rough)
-        sums = grouped_sums.sums_of_points(points[clear], of_point[clear], len(first))
+        clear = border_exclusion.inside(points, of_point, bands, piece, rough)
+        sums = grouped_sums.sums_of_points(points, of_point, len(keys), clear)
     merged, piece_of_merged = _merged(cells, sums, piece, level)
     planes = extraction.planes_of(grouped_sums.summed(merged, piece_of_merged, len(level)))
     if known:
         planes = _facing_scanner(planes)
-    ends, unanswered = Ends(), np.empty((0, 3))
-    rays = scan_grid_directions.fitted(points, row, column) if on_grid else None
-    if rays is not None:
-        ends = ends_of(points, row, column, piece[of_point], planes, sigma, rays)
-        unanswered = scan_grid_directions.unanswered(rays, row, column)
+    ends, rays = Ends(), None
+    if bands is not None and (rays := scan_grid_directions.fitted(points, row, column)) is not None:
+        ends = ends_of(bands, piece, planes, sigma, rays)
     return Cloud(
         origin=origin, has_position=known, cell_mm=size, sigma_mm=sigma, sums=merged,
         mean=extraction.scatter(merged)[0], normal=planes.normal[piece_of_merged], planes=planes, ends=ends,
-        free_space=FreeSpace.from_rays(points, unanswered) if known else None,
+        free_space=FreeSpace.from_rays(points, _unanswered(bands, rays)) if known else None,
     )  # fmt: skip
 
 
-def cell_size(points: Floats) -> float:
-    """Return the side, mm, of cubes that hold POINTS_A_CELL points on average, empty ones not counted."""
-    some = points[:: max(1, len(points) // 400_000)]
+def _about(scan: Scan, origin: Floats) -> tuple[Floats, Labels, Labels]:
+    """Return the finite points (n, 3) of a scan less ``origin`` (3,), and their rows and columns (n,) of its grid."""
+    finite, count = large_arrays.allocate(len(scan.points), dtype=np.bool_), 0
+    for rows in large_arrays.blocks(len(scan.points)):
+        finite[rows] = np.isfinite(scan.points[rows]).all(axis=1)
+        count += np.count_nonzero(finite[rows])
+    points, count = large_arrays.allocate(count, 3), 0
+    for rows in large_arrays.blocks(len(scan.points)):
+        part = scan.points[rows][finite[rows]] + (scan.origin - origin)
+        points[count : count + len(part)] = part
+        count += len(part)
+    if count == len(finite) or not len(scan.grid_row):
+        return points, scan.grid_row, scan.grid_column
+    return points, large_arrays.chosen(scan.grid_row, finite), large_arrays.chosen(scan.grid_column, finite)
+
+
+def _unanswered(bands: GridBands | None, rays: Rays | None) -> Iterator[Floats]:
+    """Yield the directions (m, 3) of rays without a return, band by band."""
+    if bands is not None and rays is not None:
+        for window in bands.windows():
+            yield scan_grid_directions.unanswered(
+                rays, window.grid[window.own] < 0, window.rows.start + window.own.start
+            )
+
+
+def cell_size(points: Floats, a_cell: float = POINTS_A_CELL) -> float:
+    """Return the side, mm, of cubes that hold ``a_cell`` points on average, empty ones not counted."""
+    some = large_arrays.every(points, max(1, len(points) // 400_000))
     share = len(some) / len(points)
     spread = float(np.quantile(np.linalg.norm(some - np.median(some, axis=0), axis=1), 0.9))
     size = max(spread, 1e-6) / 1024.0
     while size < spread:
         # The subsample occupies fewer cells than the whole cloud: its mean count is scaled to that of all points.
         mean_count = len(some) / grouped_sums.distinct_count(extraction.packed(extraction.cells_of(some, size)))
-        if 1.0 + (mean_count - 1.0) / share >= POINTS_A_CELL:
+        if 1.0 + (mean_count - 1.0) / share >= a_cell:
             break
         size *= 2.0**0.5
     return size
@@ -129,7 +160,7 @@ def _facing_scanner(planes: Planes) -> Planes:
 
 def _seen_from_origin(scan: Scan) -> bool:
     """Return whether the points are consistent with a scanner at the frame's origin (SOCS)."""
-    points = scan.points[:: max(1, len(scan.points) // 200_000)] + scan.origin
+    points = large_arrays.every(scan.points, max(1, len(scan.points) // 200_000)) + scan.origin
     R = np.linalg.norm(points, axis=1)
     points, R = points[R > 1e-9], R[R > 1e-9]
     if len(R) < 100:
