@@ -493,3 +493,15 @@ def test_the_page_of_a_frame(compared):
 def test_a_roof_of_thirty_thousand_keeps_the_page_small():
     execution, report = of_frame(repeated(whole(), 6000))
     assert len(page.html(execution, report, {})) < 12_000_000
+
+
+def test_points_of_the_slice_are_painted_over_the_others():
+    pixel = 2.0 * 100.0 / ball_picture.PIXELS
+    points = np.array([[0.1, 50.1], [pixel + 0.1, 50.1], [-99.9, -99.9], [101.0, 0.0], [0.0, -1000.0]])
+    image = ball_picture.painted(points, np.array([0.0, 20.0, -20.0, 0.0, 0.0]), 100.0)
+    middle, row = ball_picture.PIXELS // 2, 3 * ball_picture.PIXELS // 4
+    expected = np.zeros_like(image)
+    expected[row - 1 : row + 2, middle : middle + 3] = ball_picture.BESIDE
+    expected[row - 1 : row + 2, middle - 1 : middle + 2] = ball_picture.WITHIN
+    expected[:2, :2] = ball_picture.BESIDE
+    np.testing.assert_array_equal(image, expected)

@@ -6,9 +6,12 @@ import textwrap
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.text import Text
@@ -20,7 +23,9 @@ from processor.space_frame.result import Balls, Flag, Result
 
 LINE = 0.052  # of the panel's height
 SLICE_MM = 8.0  # on either side of the plane through the centre
-MOST_POINTS = 20_000  # of a panel; more are not visible
+# Points are painted into an image: Matplotlib keeps each page's marks, 13 MB, until a document is complete.
+PIXELS, DOT_PIXELS = 400, 3  # along a panel, and of a point
+NOTHING, BESIDE, WITHIN = 0, 1, 2  # of a pixel: points before and behind the slice, points in it
 # In inches: the figure, and its panels with a heading of one line (left, bottom, width, height).
 SIZE_IN = (12.4, 5.3)
 VIEWS_IN = ((0.72, 0.72, 4.03, 4.03), (5.57, 0.72, 4.03, 4.03))
@@ -63,7 +68,7 @@ class BallPicture:
         members = _members(result, i, middle, reach)
         fitted = np.nan if balls.flag[i] is Flag.NOT_FOUND else float(balls.radii[i])
         for view in self._views:
-            view.show(points, members)
+            view.show(points, members, reach)
             view.nominal.show(nominal[list(view.across)], float(balls.nominal_radii[i]))
             view.fitted.show(np.zeros(2), fitted)
         rows = numbers(balls, i, nominal)
@@ -118,10 +123,10 @@ class _View:
 
     def __init__(self, axes: Axes, name: str, across: tuple[int, int]) -> None:
         self.axes, self.across = axes, across
-        self._before_and_behind, self._in_slice = (
-            axes.plot([], [], ".", markersize=2.0, color=colour, zorder=order, rasterized=True, animated=True)[0]
-            for colour, order in (("0.72", 1.0), ("black", 2.0))
-        )
+        self._points = axes.imshow(
+            np.zeros((PIXELS, PIXELS), np.uint8), cmap=ListedColormap(["#ffffff00", "0.72", "black"]),
+            vmin=NOTHING, vmax=WITHIN, origin="lower", interpolation="none", aspect="auto", zorder=2.0, animated=True,
+        )  # fmt: skip
         (self._members,) = axes.plot([], [], "-.", color=COLOURS[2], linewidth=1.1, zorder=3.0, animated=True)
         self.nominal, self.fitted = _sphere(axes, COLOURS[1], "--"), _sphere(axes, COLOURS[0], "-")
         axes.set(xlabel="x less the centre's, mm", ylabel=f"{'xyz'[across[1]]} less the centre's, mm")
@@ -129,16 +134,14 @@ class _View:
         axes.grid(alpha=0.3)
 
     @property
-    def changing(self) -> tuple[Line2D | Circle, ...]:
+    def changing(self) -> tuple[AxesImage | Line2D | Circle, ...]:
         """What differs from ball to ball, in the order in which it is drawn."""
-        return (self._before_and_behind, self._in_slice, self._members, *self.nominal, *self.fitted)
+        return (self._points, self._members, *self.nominal, *self.fitted)
 
-    def show(self, points: Floats, members: Floats) -> None:
-        """Show points (n, 3) and members (m, 3), lines between rows that are not finite."""
-        depth = np.abs(points[:, 3 - sum(self.across)])
-        for artist, chosen in ((self._before_and_behind, depth > SLICE_MM), (self._in_slice, depth <= SLICE_MM)):
-            few = np.compress(chosen, points, axis=0)
-            artist.set_data(*few[:: max(1, -(-len(few) // MOST_POINTS)), self.across].T)
+    def show(self, points: Floats, members: Floats, reach: float) -> None:
+        """Show points (n, 3) to a distance ``reach``, and members (m, 3), lines between rows that are not finite."""
+        self._points.set_data(painted(points[:, self.across], points[:, 3 - sum(self.across)], reach))
+        self._points.set_extent((-reach, reach, -reach, reach))
         self._members.set_data(*members[:, self.across].T)
 
     def place(self, left: float, bottom: float, wide: float, high: float) -> None:
@@ -146,6 +149,23 @@ class _View:
         self.axes.set_position(_shares(left, bottom, wide, high))
         self.axes.xaxis.set_label_coords(0.5, -X_LABEL_IN / high)
         self.axes.yaxis.set_label_coords(-Y_LABEL_IN / wide, 0.5)
+
+
+def painted(points: Floats, depth: Floats, reach: float) -> npt.NDArray[np.uint8]:
+    """Return an image (PIXELS, PIXELS), rows upwards, of points (n, 2) to a distance ``reach``, mm.
+
+    Those whose ``depth`` (n,) is within SLICE_MM are painted over the others.
+    """
+    half = DOT_PIXELS // 2
+    column, row = np.floor((points.T + reach) * (0.5 * PIXELS / reach)).astype(np.int64) + half
+    shown = (np.minimum(column, row) >= half) & (np.maximum(column, row) < PIXELS + half)
+    within = np.abs(depth) <= SLICE_MM
+    image = np.full((PIXELS + 2 * half, PIXELS + 2 * half), NOTHING, np.uint8)
+    for value, chosen in ((BESIDE, shown & ~within), (WITHIN, shown & within)):
+        for i in range(-half, half + 1):
+            for j in range(-half, half + 1):
+                image[row[chosen] + i, column[chosen] + j] = value
+    return image[half:-half, half:-half]
 
 
 def _sphere(axes: Axes, colour: str, dash: str) -> _Sphere:

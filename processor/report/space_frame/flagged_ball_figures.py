@@ -19,7 +19,7 @@ from processor.store.streaming import StoredPoints, points_of
 
 PREFIX = "flagged-ball-"
 MOST_BALLS = 12  # on the page
-MOST_PAGES = 500
+MOST_PAGES = 100
 DOCUMENT = "flagged-balls.pdf"
 ORDER = (Flag.WRONG_SIZE, Flag.NOT_FOUND, Flag.LOW_CONFIDENCE)  # of what is drawn first
 ROUND_MM = 60.0  # shown about the ball at least
