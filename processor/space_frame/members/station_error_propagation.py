@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor import large_arrays
 from processor.model import Floats
 from processor.space_frame.members.records import Members
 from processor.space_frame.stations.records import Stations
 
 SECTORS = 36  # around a tube
+MEMBERS = 1024  # at once: all sectors of tens of thousands, for all stations, would take a gigabyte
 
 
 def of_axes(members: Members, stations: Stations, along: Floats) -> Floats:
@@ -36,16 +38,26 @@ def of_radii(members: Members, stations: Stations) -> Floats:
     """
     turn = 2.0 * np.pi * np.arange(SECTORS) / SECTORS
     across = np.column_stack([np.cos(turn), np.sin(turn)])
-    normals = across[:, :1] * members.side[:, None] + across[:, 1:] * members.other[:, None]  # (m, sectors, 3)
-    ray = stations.places - members.points[:, None]
+    by_unit, basis = np.empty(len(members.points)), np.stack([members.side, members.other], axis=1)
+    for rows in large_arrays.blocks(len(by_unit), MEMBERS):
+        by_unit[rows] = _by_unit(members.points[rows], basis[rows], across, stations.places)
+    return (stations.shared_offset_sd**2 + stations.shared_offset**2) * by_unit**2
+
+
+def _by_unit(points: Floats, basis: Floats, across: Floats, places: Floats) -> Floats:
+    """Return by how much radii (m,) change where all ranges are 1 mm too long.
+
+    ``basis`` (m, 2, 3) is across the tubes, which scanners at ``places`` (s, 3) see in directions ``across`` (n, 2).
+    """
+    normals = across[:, :1] * basis[:, None, 0] + across[:, 1:] * basis[:, None, 1]  # (m, n, 3)
+    ray = places - points[:, None]
     squared = np.maximum(np.sum(ray**2, axis=2), 1e-300)
     cosine = np.maximum(np.einsum("mni,msi->mns", normals, ray / np.sqrt(squared)[:, :, None]), 0.0)
-    weight = cosine / squared[:, None]  # (m, sectors, s)
-    points = weight.sum(axis=2)
-    moved = np.sum(weight * cosine, axis=2) / np.where(points > 0.0, points, 1.0)
+    weight = cosine / squared[:, None]  # (m, n, s)
+    seen = weight.sum(axis=2)
+    moved = np.sum(weight * cosine, axis=2) / np.where(seen > 0.0, seen, 1.0)
     J = np.column_stack([across, np.ones(SECTORS)])
-    normal = np.einsum("mn,ni,nj->mij", points, J, J)
-    right = np.einsum("mn,ni,mn->mi", points, J, moved)
-    by_unit = np.einsum("mij,mj->mi", np.linalg.pinv(normal, rcond=1e-6, hermitian=True), right)[:, 2]
-    variance: Floats = (stations.shared_offset_sd**2 + stations.shared_offset**2) * by_unit**2
-    return variance
+    normal = np.einsum("mn,ni,nj->mij", seen, J, J)
+    right = np.einsum("mn,ni,mn->mi", seen, J, moved)
+    change: Floats = np.einsum("mij,mj->mi", np.linalg.pinv(normal, rcond=1e-6, hermitian=True), right)[:, 2]
+    return change

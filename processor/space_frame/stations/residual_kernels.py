@@ -216,19 +216,19 @@ def _effect(points, influence, places, covariance, effects, first, last):  # typ
                 rows[number, d, 6] = (x * a + y * b + z * c) / max(np.sqrt(x * x + y * y + z * z), 1e-300)
             stations[number] = s
             number += 1
+        product = np.zeros((d_count, number, STATION))  # of the rows and the covariance
         for p in range(number):
-            for q in range(number):
-                block = covariance[
-                    STATION * stations[p] : STATION * stations[p] + STATION,
-                    STATION * stations[q] : STATION * stations[q] + STATION,
-                ]
+            for i in range(STATION):
+                row = covariance[STATION * stations[p] + i]
                 for d in range(d_count):
-                    for e in range(d_count):
-                        value = 0.0
-                        for i in range(STATION):
-                            for j in range(STATION):
-                                value += rows[p, d, i] * block[i, j] * rows[q, e, j]
-                        effects[k, d, e] += value
+                    for q in range(number):
+                        for j in range(STATION):
+                            product[d, q, j] += rows[p, d, i] * row[STATION * stations[q] + j]
+        for d in range(d_count):
+            for e in range(d_count):
+                for q in range(number):
+                    for j in range(STATION):
+                        effects[k, d, e] += product[d, q, j] * rows[q, e, j]
 
 
 def effect(points: Floats, influence: Floats, places: Floats, covariance: Floats, threads: int = 0) -> Floats:
