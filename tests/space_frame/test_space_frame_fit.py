@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from processor.geometry.linalg_small import inverse_of
+from processor.model import reason
 from processor.space_frame import ball_catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.sphere_crops import Crops
-from processor.space_frame.spheres import alternating_fit
+from processor.space_frame.result import Evidence, Flag
+from processor.space_frame.spheres import alternating_fit, assessment
 from processor.space_frame.spheres.gauss_newton import (
     Observations,
     Prior,
@@ -19,7 +21,7 @@ from processor.space_frame.spheres.gauss_newton import (
     weight,
 )
 from processor.space_frame.spheres.noise_estimation import limb_cosine, noise_model, radius_offset, radius_scatter
-from processor.space_frame.spheres.records import StochasticModel
+from processor.space_frame.spheres.records import Spheres, StochasticModel
 from tests.bench import ball_fit
 
 
@@ -215,3 +217,25 @@ def test_an_offset_that_all_radii_share_is_found_with_its_standard_deviation():
             pulls.append((found - shared) / sd)
     assert 0.88 < np.sqrt(np.mean(np.square(pulls))) < 1.12  # 400 draws: 3.5 %
     assert radius_offset(np.empty(0), np.empty(0), np.empty(0), 0.3, 0.3) == (0.0, np.inf)
+
+
+def test_another_size_is_a_doubt_where_an_error_common_to_all_ranges_may_explain_it():
+    names = "radii", "lowest_sd", "bound_lowest_sd", "visible_fraction", "rms", "scale", "margin", "nominal"
+    names += "sizes", "second_sizes", "efficiency_centre", "efficiency_radius", "efficiency_lowest"
+    numbers = dict.fromkeys(names, np.full(3, 0.3))
+    counts = dict.fromkeys(("points", "stations", "axes"), np.full(3, 9))
+    other = reason("spheres.other-size", size=65.0, nominal=60.0)
+    spheres = Spheres(
+        **numbers, **counts, centres=np.zeros((3, 3)), lowest=np.zeros((3, 3)), covariance=np.zeros((3, 4, 4)),
+        bound=np.zeros((3, 4, 4)), noise=np.zeros(3), evidence=(Evidence.FUSED,) * 3, flag=(Flag.OK, Flag.WRONG_SIZE, Flag.WRONG_SIZE),
+        reasons=((), (other,), (other,)),
+    )  # fmt: skip
+    common = np.zeros((3, 3, 3))
+    common[:2, 2, 2] = 1.8**2
+    found = assessment.with_shared_offset(spheres, common)
+    assert found.flag == (Flag.LOW_CONFIDENCE, Flag.LOW_CONFIDENCE, Flag.WRONG_SIZE)
+    assert [[one.code for one in row] for row in found.reasons] == [
+        ["spheres.common-offset"],
+        ["spheres.common-offset", "spheres.other-size"],
+        ["spheres.other-size"],
+    ]

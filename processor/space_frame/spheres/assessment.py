@@ -279,13 +279,17 @@ def agreements(fits: Fits, nodes: Nodes, radius_sd: float) -> Floats:
 
 
 def with_shared_offset(spheres: Spheres, covariance: Floats) -> Spheres:
-    """Flag spheres whose lowest points are too uncertain with a further covariance (k, 3, 3) of their centres."""
+    """Flag spheres whose lowest points are too uncertain with a further covariance (k, 3, 3) of their centres.
+
+    What moves these moves radii, too: another size than designed is then a doubt, as it is beside any other doubt.
+    """
     sd = np.sqrt(spheres.lowest_sd**2 + covariance[:, 2, 2])
-    rows = [i for i, flag in enumerate(spheres.flag) if flag is Flag.OK and not sd[i] <= LARGEST_LOWEST_SD_MM]
+    sure = (Flag.OK, Flag.WRONG_SIZE)
+    rows = [i for i, flag in enumerate(spheres.flag) if flag in sure and not sd[i] <= LARGEST_LOWEST_SD_MM]
     flags, reasons = list(spheres.flag), list(spheres.reasons)
     for i in rows:
         flags[i] = Flag.LOW_CONFIDENCE
-        reasons[i] = (reason("spheres.common-offset", sd=sd[i]),)
+        reasons[i] = (reason("spheres.common-offset", sd=sd[i]), *reasons[i])
     return replace(spheres, flag=tuple(flags), reasons=tuple(reasons))
 
 
