@@ -227,7 +227,8 @@ def test_another_size_is_a_doubt_where_an_error_common_to_all_ranges_may_explain
     other = reason("spheres.other-size", size=65.0, nominal=60.0)
     spheres = Spheres(
         **numbers, **counts, centres=np.zeros((3, 3)), lowest=np.zeros((3, 3)), covariance=np.zeros((3, 4, 4)),
-        bound=np.zeros((3, 4, 4)), noise=np.zeros(3), evidence=(Evidence.FUSED,) * 3, flag=(Flag.OK, Flag.WRONG_SIZE, Flag.WRONG_SIZE),
+        bound=np.zeros((3, 4, 4)), noise=np.zeros(3), evidence=(Evidence.FUSED,) * 3,
+        flag=(Flag.OK, Flag.WRONG_SIZE, Flag.WRONG_SIZE),
         reasons=((), (other,), (other,)),
     )  # fmt: skip
     common = np.zeros((3, 3, 3))
