@@ -174,6 +174,13 @@ def contiguous(array: npt.ArrayLike, dtype: type) -> Array:
     return copy
 
 
+def read_only(array: Array) -> Array:
+    """Return a view that cannot be written: a kernel that takes no other arrays is compiled once."""
+    view: Array = array.view()
+    view.flags.writeable = False
+    return view
+
+
 def extremes(array: Array) -> tuple[float, float]:
     """Return the least and the greatest number of an array (n, ...), n > 0; NaN where one is NaN."""
     parts = [(array[rows].min(), array[rows].max()) for rows in blocks(len(array))]

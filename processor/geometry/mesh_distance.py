@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry.linalg_small import assign_rows
 from processor.geometry.thread_ranges import over_ranges
+from processor.large_arrays import read_only
 from processor.model import Bools, Floats, Ints, Labels
 
 LEAST_AREA = 1e-9  # mm2, twice that of a facet; smaller ones are left out
@@ -79,7 +80,7 @@ def double_areas(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
 def _placed(vertices: Floats, faces: Ints, facet: Ints) -> Floats:
     """Place a point (m, 3) on each of the facets (m,): R2 sequence (plastic number), folded onto the triangle."""
     points = np.empty((len(facet), 3))
-    _fill_placed(vertices, faces, facet, points)
+    _fill_placed(read_only(vertices), read_only(faces), read_only(facet), points)
     return points
 
 

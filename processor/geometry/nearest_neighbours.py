@@ -122,7 +122,7 @@ def within_reach(points: Floats, places: Floats, reach: float) -> tuple[Bools, B
     if not len(points) or not len(places):
         return of_points, of_places
     grid = point_grid.of_points(places, REACHED_CELL * reach)
-    near, points = np.zeros(len(places), bool), np.ascontiguousarray(points, np.float64)
+    near, points = np.zeros(len(places), bool), large_arrays.read_only(np.ascontiguousarray(points, np.float64))
     over_ranges(
         lambda a, b: _mark_within(grid.cells, points, reach, of_points, near, a, b), len(points), least=LEAST_POINTS
     )

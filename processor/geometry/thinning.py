@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.large_arrays import read_only
 from processor.model import Floats, Ints
 
 T = TypeVar("T", bound=np.generic)
@@ -30,7 +31,7 @@ def corners(points: Floats) -> tuple[Floats, Floats]:
     numpy takes ten times as long where rows are short.
     """
     low, high = np.empty(3), np.empty(3)
-    _corners(np.ascontiguousarray(points, np.float64), low, high)
+    _corners(read_only(np.ascontiguousarray(points, np.float64)), low, high)
     return low, high
 
 
@@ -42,7 +43,7 @@ def by_cell(points: Floats, size_mm: float) -> Ints:
     """
     if not len(points):
         return np.empty(0, np.int64)
-    grid = _grid(points, size_mm)
+    points, grid = read_only(np.ascontiguousarray(points, np.float64)), _grid(points, size_mm)
     if grid.cells > MOST_EMPTY * len(points):
         key = np.empty(len(points), np.int64)
         _number(points, grid.low, size_mm, grid.extent, key)
@@ -73,7 +74,7 @@ def _sorted_by_key(points: Floats, key: Ints) -> Ints:
 
 def voxel_means(points: Floats, size_mm: float, least: int = 1) -> Floats:
     """Mean (k, 3) of the points in each occupied voxel that holds at least ``least`` points, in voxel order."""
-    points, grid = np.ascontiguousarray(points, np.float64), _grid(points, size_mm)
+    points, grid = read_only(np.ascontiguousarray(points, np.float64)), _grid(points, size_mm)
     if grid.cells > MOST_EMPTY * len(points):  # numbers of the occupied voxels alone: these take a sort
         key = np.empty(len(points), np.int64)
         _number(points, grid.low, size_mm, grid.extent, key)

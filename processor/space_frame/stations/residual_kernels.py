@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.thread_ranges import over_ranges
+from processor.large_arrays import read_only
 from processor.model import Floats, Ints, Labels
 
 TUBE = 8  # unknowns of an observation; a tube has the first seven
@@ -234,16 +235,9 @@ def _effect(points, influence, places, covariance, effects, first, last):  # typ
 def effect(points: Floats, influence: Floats, places: Floats, covariance: Floats, threads: int = 0) -> Floats:
     """Covariance (k, d, d) of estimates near points (k, 3) with derivatives ``influence`` (k, s, d, 3) by stations."""
     effects = np.zeros((len(points), influence.shape[2], influence.shape[2]))
-    points, influence, places, covariance = (_frozen(array) for array in (points, influence, places, covariance))
+    points, influence, places, covariance = (read_only(array) for array in (points, influence, places, covariance))
     over_ranges(partial(_effect, points, influence, places, covariance, effects), len(points), threads, LEAST)
     return effects
-
-
-def _frozen(array: Floats) -> Floats:
-    """Return a view that cannot be written: the kernel is compiled for one kind of array only."""
-    view: Floats = array.view()
-    view.flags.writeable = False
-    return view
 
 
 @njit(cache=True, nogil=True)
