@@ -63,9 +63,8 @@ class GridBands:
         ends = np.cumsum(filled)
         columns = large_arrays.in_parts(passed(), lambda block: block[1] // places, ends)
         for first, last in zip(ends - filled, ends, strict=True):
-            order = np.argsort(
-                columns[1][first:last], kind="stable"
-            )  # of several points at a place the last one is on it
+            # Of several points at a place the last one is on the grid.
+            order = np.argsort(columns[1][first:last], kind="stable")
             for one in columns:
                 one[first:last] = one[first:last][order]
             large_arrays.release()
