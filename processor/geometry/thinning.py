@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from processor.large_arrays import read_only
+from processor import large_arrays
 from processor.model import Floats, Ints
 
 T = TypeVar("T", bound=np.generic)
@@ -25,16 +25,6 @@ def thinned(points: npt.NDArray[T], count: int) -> npt.NDArray[T]:
     return points[:: max(1, len(points) // count)]
 
 
-def corners(points: Floats) -> tuple[Floats, Floats]:
-    """Return the least and the greatest coordinates (3,) of points (n, 3), n > 0, all finite.
-
-    numpy takes ten times as long where rows are short.
-    """
-    low, high = np.empty(3), np.empty(3)
-    _corners(read_only(np.ascontiguousarray(points, np.float64)), low, high)
-    return low, high
-
-
 def by_cell(points: Floats, size_mm: float) -> Ints:
     """Rows (n,) of points (n, 3) sorted by cells of ``size_mm``.
 
@@ -43,7 +33,8 @@ def by_cell(points: Floats, size_mm: float) -> Ints:
     """
     if not len(points):
         return np.empty(0, np.int64)
-    points, grid = read_only(np.ascontiguousarray(points, np.float64)), _grid(points, size_mm)
+    points = large_arrays.read_only(np.ascontiguousarray(points, np.float64))
+    grid = _grid(points, size_mm)
     if grid.cells > MOST_EMPTY * len(points):
         key = np.empty(len(points), np.int64)
         _number(points, grid.low, size_mm, grid.extent, key)
@@ -74,7 +65,8 @@ def _sorted_by_key(points: Floats, key: Ints) -> Ints:
 
 def voxel_means(points: Floats, size_mm: float, least: int = 1) -> Floats:
     """Mean (k, 3) of the points in each occupied voxel that holds at least ``least`` points, in voxel order."""
-    points, grid = read_only(np.ascontiguousarray(points, np.float64)), _grid(points, size_mm)
+    points = large_arrays.read_only(np.ascontiguousarray(points, np.float64))
+    grid = _grid(points, size_mm)
     if grid.cells > MOST_EMPTY * len(points):  # numbers of the occupied voxels alone: these take a sort
         key = np.empty(len(points), np.int64)
         _number(points, grid.low, size_mm, grid.extent, key)
@@ -105,18 +97,9 @@ class _Grid(NamedTuple):
 
 
 def _grid(points: Floats, size_mm: float) -> _Grid:
-    low, high = corners(points)
+    low, high = large_arrays.corners(points)
     extent = np.floor((high - low) / size_mm).astype(np.int64) + 1
     return _Grid(low, extent, math.prod(extent.tolist()))
-
-
-@njit(cache=True, nogil=True)
-def _corners(points, low, high):  # type: ignore[no-untyped-def]
-    for i in range(3):
-        low[i] = high[i] = points[0, i]
-    for row in range(len(points)):
-        for i in range(3):
-            low[i], high[i] = min(low[i], points[row, i]), max(high[i], points[row, i])
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.distinct_rows import distinct
-from processor.geometry.thinning import corners, thinned, voxel_means
+from processor.geometry.thinning import thinned, voxel_means
+from processor.large_arrays import corners
 from processor.model import Bools, Floats
 from processor.registration import principal
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.geometry.thinning import corners, voxel_means
+from processor.geometry.thinning import voxel_means
+from processor.large_arrays import corners
 from processor.model import Floats, Ints
 
 ALIKE = 1.25  # ratio of the variances along two axes below which these may be swapped

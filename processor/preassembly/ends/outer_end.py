@@ -39,9 +39,8 @@ def measure(part: RegisteredPart, at: Floats, direction: Floats) -> OuterEnd | N
 
     The variance is of noise and of differences between named stations.
     """
-    rows = np.flatnonzero(
-        np.abs(part.points @ direction - at @ direction) < NEAR_MM
-    )  # a few of the points of a long part
+    # A few of the points of a long part.
+    rows = np.flatnonzero(np.abs(part.points @ direction - at @ direction) < NEAR_MM)
     face, residual, beyond = part.surface.distances(part.points[rows], REACH_MM)
     facing = part.surface.normals[face] @ direction
     offset = part.points[rows] - at

@@ -16,8 +16,9 @@ from scipy.spatial import cKDTree
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.nearest_neighbours import within_reach
-from processor.geometry.thinning import corners, thinned, voxel_means
+from processor.geometry.thinning import thinned, voxel_means
 from processor.geometry.thread_ranges import each
+from processor.large_arrays import corners
 from processor.model import ArchDesign, Bools, DesignPart, Floats, Reason, Status, reason
 from processor.preassembly import topology
 from processor.preassembly.ends import tube_end
