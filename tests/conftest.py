@@ -24,6 +24,7 @@ from tests.support.solids import cad_in_process
 
 _compile = Dispatcher.compile
 _held: set[Path] = set()  # locks of this process: a kernel that calls itself asks for its own
+_LOCKS = Path(tempfile.gettempdir(), f"kernel-locks-{os.getuid()}")
 
 
 @contextlib.contextmanager
@@ -48,7 +49,8 @@ def _compile_once(self: Dispatcher, signature: object) -> object:
         return _compile(self, signature)
     # Numba's own lock of threads first: one of them could wait for a file that another one of this process holds.
     place = hashlib.sha256(f"{cache.cache_path}/{cache._impl.filename_base}".encode()).hexdigest()
-    with global_compiler_lock, _alone(Path(tempfile.gettempdir(), f"kernel-{os.getuid()}-{place[:32]}.lock")):
+    _LOCKS.mkdir(mode=0o700, exist_ok=True)
+    with global_compiler_lock, _alone(_LOCKS / place[:32]):
         return _compile(self, signature)
 
 

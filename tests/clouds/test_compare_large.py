@@ -12,6 +12,7 @@ from processor.geometry import m3c2, nearest_neighbours, normal_orientation, poi
 from processor.model import Scan, Scene
 from processor.report import cloud_comparison
 from processor.store import store
+from tests.support import arrays_in_files
 from tests.support.clouds.m3c2_clouds import wavy
 from tests.support.processes.dask_cluster import cluster_in, dask_cluster  # noqa: F401
 
@@ -49,10 +50,7 @@ def tiny(monkeypatch):
     """A function that makes tiles, blocks and parts tiny and puts every array into a file."""
 
     def make(core_points=137, cloud_points=2500):
-        monkeypatch.setattr(large_arrays, "BLOCK_ROWS", 331)
-        monkeypatch.setattr(large_arrays, "AT_ONCE", 500)
-        monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
-        monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
+        arrays_in_files.limit(monkeypatch, 331, 500)
         monkeypatch.setattr(core_tiles, "CORE_POINTS", core_points)
         monkeypatch.setattr(core_tiles, "CLOUD_POINTS", cloud_points)
 

@@ -22,6 +22,7 @@ from processor.scan_folder import folder
 from processor.store import store
 from processor.writers import e57
 from processor.writers.cloud import of_scan
+from tests.support import arrays_in_files
 from tests.support.files.scan_bytes import las_bytes, put
 from tests.support.scenes.exported_scenes import exported, merged, on_grid, stations_apart
 
@@ -37,9 +38,7 @@ BLOCK = 97  # rows: of few points several blocks
 @pytest.fixture
 def blocks(monkeypatch):
     """All arrays lie in files, and are passed over in blocks of few rows."""
-    monkeypatch.setattr(large_arrays, "BLOCK_ROWS", BLOCK)
-    monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
-    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
+    arrays_in_files.limit(monkeypatch, BLOCK)
 
 
 def full_disk(*_):
@@ -61,10 +60,8 @@ def converted(path, tmp_path, units=None):
 @pytest.mark.parametrize("path", FORMATS, ids=lambda path: path.suffix)
 def test_blocks_give_the_bytes_of_a_whole_reading(path, tmp_path, monkeypatch):
     expected = in_memory(path, tmp_path)
-    monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
-    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
     for size in (1, 7, 199, 200, 201):
-        monkeypatch.setattr(large_arrays, "BLOCK_ROWS", size)
+        arrays_in_files.limit(monkeypatch, size)
         assert converted(path, tmp_path) == expected
 
 
@@ -77,9 +74,7 @@ def test_stations_grids_intensities_and_origins_are_those_of_a_whole_reading(for
     _, out = exported(scene, tmp_path, format_)
     (out / "truth.h5").unlink(missing_ok=True)
     expected = in_memory(out, tmp_path)
-    monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
-    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
-    monkeypatch.setattr(large_arrays, "BLOCK_ROWS", BLOCK)
+    arrays_in_files.limit(monkeypatch, BLOCK)
     assert converted(out, tmp_path) == expected
     back = store.read_scene(tmp_path / "blocks.h5")
     assert [len(scan.points) for scan in back.scans] == [len(scan.points) for scan in scene.scans]
@@ -141,9 +136,7 @@ def test_unit_guessed_by_blocks_equals_that_of_the_whole_scene(tmp_path, monkeyp
     np.savetxt(tmp_path / "a.xyz", np.random.default_rng(3).permutation(points), fmt="%.4f")
     expected = in_memory(tmp_path / "a.xyz", tmp_path)
     monkeypatch.setattr("processor.scan_folder.units.SAMPLE", 500)
-    monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
-    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
-    monkeypatch.setattr(large_arrays, "BLOCK_ROWS", BLOCK)
+    arrays_in_files.limit(monkeypatch, BLOCK)
     assert converted(tmp_path / "a.xyz", tmp_path)
     assert store.read_scene(tmp_path / "blocks.h5").units == "mm"
     monkeypatch.undo()
@@ -316,9 +309,7 @@ def test_a_scene_read_into_files_is_the_same(tmp_path, monkeypatch):
     scene = merged(FAR)
     store.write_scene(tmp_path / "s.h5", scene, None, {})
     whole = store.scene_hash(store.read_scene(tmp_path / "s.h5"))
-    monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
-    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
-    monkeypatch.setattr(large_arrays, "BLOCK_ROWS", BLOCK)
+    arrays_in_files.limit(monkeypatch, BLOCK)
     monkeypatch.setattr("processor.store.checksums.PART_ITEMS", 100)
     with large_arrays.in_files(tmp_path):
         assert store.scene_hash(store.read_scene(tmp_path / "s.h5")) == whole

@@ -9,6 +9,7 @@ from processor.adjustment import mixed_pixels
 from processor.defects import alignment, measures, observations, surface_charts
 from processor.defects.alignment import rays_to
 from processor.model import Scan, Scene, Stations
+from tests.support import arrays_in_files
 
 RADIUS, NOISE = 60.0, 1.0
 SCANNER = np.array([1000.0, -5000.0, 0.0])
@@ -97,8 +98,7 @@ def test_points_in_blocks_and_parts_are_those_at_once(monkeypatch, tmp_path):
     monkeypatch.setattr(alignment, "PAIRS_AT_ONCE", 70)
     monkeypatch.setattr(mixed_pixels, "AT_ONCE", 400)
     monkeypatch.setattr(mixed_pixels, "BAND_POINTS", 200)
-    for name, value in (("BLOCK_ROWS", 333), ("AT_ONCE", 100), ("MEMORY_BYTES", 0), ("LEAST_BYTES", 1)):
-        monkeypatch.setattr(large_arrays, name, value)
+    arrays_in_files.limit(monkeypatch, 333, 100)
     with large_arrays.in_files(tmp_path):
         for ours, theirs in zip(found(), whole, strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-9)

@@ -13,6 +13,7 @@ from processor.deviation import step as deviation_step
 from processor.deviation.params import Params
 from processor.geometry import nearest_neighbours, rigid
 from processor.model import Scan, Scene, StructureDesign, UsageError
+from tests.support import arrays_in_files
 from tests.support.scenes.bracket_scenes import COUNT, scene_of
 
 EQUAL = {"projection_diameter_mm": 60.0, "core_spacing_mm": 30.0, "max_depth_mm": 40.0}  # not by the density
@@ -29,9 +30,7 @@ def small(monkeypatch, tmp_path):
     monkeypatch.setattr(large_cloud, "SLAB_POINTS", 700)
     monkeypatch.setattr(large_cloud, "PASS_POINTS", 600)
     monkeypatch.setattr(large_cloud, "HALO", 80.0)  # the neighbours of the few points that are alone, too
-    monkeypatch.setattr(large_arrays, "BLOCK_ROWS", 997)
-    monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
-    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
+    arrays_in_files.limit(monkeypatch, 997)
     with large_arrays.in_files(tmp_path):
         yield
 

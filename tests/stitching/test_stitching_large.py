@@ -12,15 +12,14 @@ from processor.model import Scene
 from processor.stitching import step as stitching_step
 from processor.stitching.planes import grid_bands, scan_planes
 from processor.store import store
+from tests.support import arrays_in_files
 from tests.support.clouds import stitch_clouds
 
 
 @pytest.fixture
 def small(monkeypatch, tmp_path):
     """Blocks of a few rows, bands of the grid of two, and all arrays in files."""
-    monkeypatch.setattr(large_arrays, "BLOCK_ROWS", 997)
-    monkeypatch.setattr(large_arrays, "MEMORY_BYTES", 0)
-    monkeypatch.setattr(large_arrays, "LEAST_BYTES", 1)
+    arrays_in_files.limit(monkeypatch, 997)
     monkeypatch.setattr(grid_bands, "BAND_PLACES", 700)
     with large_arrays.in_files(tmp_path):
         yield
