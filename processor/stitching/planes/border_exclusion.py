@@ -10,12 +10,11 @@ at the least angles.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
-from scipy.spatial import cKDTree
 
 from processor import large_arrays
 from processor.model import Bools, Floats, Ints
+from processor.stitching.planes.angular_neighbours import neighbourhoods
 from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.grid_bands import GridBands
 
@@ -23,7 +22,6 @@ ON_SIGMAS = 3.0  # a point this close to a plane lies on it
 LEAST_SHARE = 0.5  # of a piece's points that must remain
 BEYOND = 0.05  # of the range: a point this far behind the plane is not on a side face of the same bar
 NEIGHBOURS = 8  # in angle, where there is no grid
-CHUNK = 1 << 18
 
 
 def inside(points: Floats, cell: Ints, bands: GridBands | None, piece_of_cell: Ints, planes: Planes) -> Bools:
@@ -36,7 +34,7 @@ def inside(points: Floats, cell: Ints, bands: GridBands | None, piece_of_cell: I
     """
     limit = ON_SIGMAS * np.sqrt(planes.variance[:, 0])
     if bands is None:
-        return _clear_in_angle(points, piece_of_cell[cell], planes, limit)
+        return _clear_in_angle(points, cell, piece_of_cell, planes, limit)
     clear = large_arrays.allocate(len(points), dtype=np.bool_)
     whole, left = np.zeros(len(planes.count), np.int64), np.zeros(len(planes.count), np.int64)
     for rows in large_arrays.blocks(len(points)):
@@ -56,21 +54,17 @@ def inside(points: Floats, cell: Ints, bands: GridBands | None, piece_of_cell: I
     return clear
 
 
-def _clear_in_angle(points: Floats, piece: Ints, planes: Planes, limit: Floats) -> npt.NDArray[np.bool_]:
+def _clear_in_angle(points: Floats, cell: Ints, piece_of_cell: Ints, planes: Planes, limit: Floats) -> Bools:
     """Mark points (n,) on the plane of their piece whose neighbours in angle lie on it too, or far behind it."""
-    reach = np.linalg.norm(points, axis=1)
-    rays = points / np.maximum(reach, 1e-9)[:, None]
-    tree = cKDTree(rays)
-    clear = np.zeros(len(points), np.bool_)
-    on = np.flatnonzero(piece >= 0)
-    for start in range(0, len(on), CHUNK):
-        rows = on[start : start + CHUNK]
-        near = np.minimum(tree.query(rays[rows], NEIGHBOURS + 1)[1], len(points) - 1)
-        f = piece[rows]
-        off = np.einsum("nki,ni->nk", points[near] - planes.mean[f][:, None], planes.normal[f])
-        own = np.abs(np.einsum("ni,ni->n", points[rows] - planes.mean[f], planes.normal[f])) < limit[f]
-        good = (np.abs(off) < limit[f][:, None]) | (np.abs(off) > BEYOND * reach[rows][:, None])
-        clear[rows] = own & good.all(axis=1)
+    clear = large_arrays.allocate(len(points), dtype=np.bool_)
+    for rows in large_arrays.blocks(len(points)):
+        clear[rows] = False
+    for number, f, there, near in neighbourhoods(points, cell, piece_of_cell, NEIGHBOURS + 1):
+        off = np.einsum("nki,ni->nk", near - planes.mean[f][:, None], planes.normal[f])
+        own = np.abs(np.einsum("ni,ni->n", there - planes.mean[f], planes.normal[f])) < limit[f]
+        behind = BEYOND * np.linalg.norm(there, axis=1)
+        good = (np.abs(off) < limit[f][:, None]) | (np.abs(off) > behind[:, None])
+        clear[number] = own & good.all(axis=1)
     return clear
 
 
