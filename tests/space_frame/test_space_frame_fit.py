@@ -190,6 +190,44 @@ def test_the_limb_is_left_out_where_it_is_biased():
     assert limb_cosine(np.where(c < 0.28, e - 0.5, e), c, ones, ones, unit, 0.15) == pytest.approx(0.35)
 
 
+def seen_by_a_wide_beam(rng, radius, station, beam_mm, step_mm, sigma):
+    """Points (n, 3) of a ball about the origin: a beam that it cuts returns the mean range of the part that is met."""
+    ahead = -station / np.linalg.norm(station)
+    side = np.cross(ahead, [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    up = np.cross(ahead, side)
+    grid = np.arange(-radius - beam_mm, radius + beam_mm, step_mm) + rng.uniform(0.0, step_mm)
+    feet = np.array([(a, b) for a in grid for b in grid])
+    turn, off = 2.0 * np.pi * np.arange(60) * 0.618034, beam_mm * np.sqrt((np.arange(60) + 0.5) / 60.0)
+    parts = feet[:, None] + np.column_stack([off * np.cos(turn), off * np.sin(turn)])
+    under = radius**2 - (parts**2).sum(axis=2)
+    met = under > 0.0
+    kept = met.mean(axis=1) > 0.05
+    depth = np.sqrt(np.where(met, under, 0.0))[kept].sum(axis=1) / met[kept].sum(axis=1)
+    along = -depth + rng.normal(0.0, sigma, len(depth))
+    rays = feet[kept, :1] * side + feet[kept, 1:] * up - station
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    return feet[kept, :1] * side + feet[kept, 1:] * up + along[:, None] * rays
+
+
+def test_a_beam_cut_at_the_limb_does_not_raise_the_size():
+    """A beam of 8 mm makes a ball look wider by up to 8 mm, where the next size of the catalogue is 5 mm larger."""
+    rng = np.random.default_rng(21)
+    true = np.repeat([60.0, 65.0], 30)
+    stations = 2.0 * ball_fit.STATIONS[3]
+    views = [[seen_by_a_wide_beam(rng, r, s, 8.0, 8.0, 2.5) for s in stations] for r in true]
+    start = np.cumsum([0, *(sum(map(len, of_ball)) for of_ball in views)])
+    station = np.concatenate([np.full(len(view), i, np.int32) for of_ball in views for i, view in enumerate(of_ball)])
+    crops = Crops(start, np.concatenate([view for of_ball in views for view in of_ball]), station)
+    covariance = np.tile(0.7**2 * np.eye(3), (len(true), 1, 1))
+    nodes = Nodes(rng.normal(0.0, 0.7, (len(true), 3)), covariance, np.full(len(true), 3), np.full(len(true), 0.5))
+    moved = Crops(start, crops.points - np.repeat(nodes.positions, np.diff(start), axis=0), station)
+    params = alternating_fit.RayFitParams(sigma_mm=2.5, process_hole_mm=0.0)
+    catalogue = ball_catalogue.of_radii([50.0, 55.0, 60.0, 65.0, 70.0, 75.0])
+    found = alternating_fit.fit_crops(moved, stations, nodes, Members(), catalogue, params=params)
+    np.testing.assert_array_equal(found.sizes, true)
+
+
 def test_the_scatter_of_radii_is_that_of_the_balls():
     rng = np.random.default_rng(10)
     sizes = np.resize([45.0, 60.0], 800)

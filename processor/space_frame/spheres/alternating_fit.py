@@ -184,8 +184,9 @@ def _rounds(problem: _Problem, scanners: int, station_covariance: Floats | None)
         if known:
             estimate = replace(estimate, station_sd=0.0, shift=setting.shift)
         noisier = typical_variance(estimate.noise, ranges) > 2.0 * typical_variance(setting.noise, ranges)
-        # sleeves larger than guessed, or shifted stations, may have led to a wrong size
+        # sleeves larger or beams wider than guessed, or shifted stations, may have led to a wrong size
         spoilt = bool((estimate.sleeve_radii > setting.sleeve_radii + AXIS_MM).any())
+        spoilt = spoilt or estimate.least_cosine > setting.least_cosine
         if noisier or spoilt or estimate.station_sd > 1.2 * setting.station_sd:
             fits = None
         setting = estimate

@@ -130,7 +130,7 @@ def _choose_at(k, crops, masks, model, sizes, vote_half_width, first_reach_mm, c
         count += 1
     if count == 0:
         return
-    _compare_alike(k, observations, model.noise, sizes, all_states, all_shifts, radii, codes, energies[:count])
+    _compare_alike(k, observations, mask, model.noise, sizes, all_states, all_shifts, radii, codes, energies[:count])
     best = least_of(energies, count)
     choice.energy[k], choice.sizes[k] = energies[best], all_states[best, 3] if sizes.free else radii[best]
     for i in range(4):
@@ -143,8 +143,12 @@ def _choose_at(k, crops, masks, model, sizes, vote_half_width, first_reach_mm, c
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _compare_alike(k, observations, noise, sizes, states, shifts, radii, codes, energies):  # type: ignore[no-untyped-def]
-    """Compute the energies (m,) again without the points that are masked for any of the sizes near the best."""
+def _compare_alike(k, observations, mask, noise, sizes, states, shifts, radii, codes, energies):  # type: ignore[no-untyped-def]
+    """Compute the energies (m,) again without the points that are masked for any of the sizes near the best.
+
+    Points near the limb of any of these sizes are left out as well: a beam that a sphere cuts in part returns from
+    there also where its centre misses the sphere, and such points fit a sphere that is one size too large.
+    """
     nominal = sizes.nominal[k]
     best = least_of(energies, len(energies))
     comparable = np.ones(codes.shape[1], np.uint8)
@@ -153,6 +157,7 @@ def _compare_alike(k, observations, noise, sizes, states, shifts, radii, codes, 
             for i in range(len(comparable)):
                 if codes[j, i] == MASKED:
                     comparable[i] = 0
+            _leave_out_limb(observations.points, observations.rays, states[j], mask.least_cosine, comparable)
     for j in range(len(energies)):
         for i in range(len(comparable)):
             codes[j, i] *= comparable[i]
@@ -160,6 +165,23 @@ def _compare_alike(k, observations, noise, sizes, states, shifts, radii, codes, 
         energies[j] = energy(observations, codes[j], noise, prior, states[j], shifts[j])
         if not np.isnan(nominal) and radii[j] != nominal:
             energies[j] += sizes.other_size_penalty
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _leave_out_limb(points, rays, state, least_cosine, kept):  # type: ignore[no-untyped-def]
+    """Clear ``kept`` (n,) where a ray passes the limb of a sphere as near as the incidence below ``least_cosine`` does.
+
+    That incidence tells how far inside of the limb a beam is cut; it is cut as far outside.
+    """
+    r = state[3]
+    width = r - r * np.sqrt(1.0 - least_cosine * least_cosine)
+    for i in range(len(points)):
+        ux, uy, uz = rays[i, 0], rays[i, 1], rays[i, 2]
+        x, y, z = points[i, 0] - state[0], points[i, 1] - state[1], points[i, 2] - state[2]
+        along = x * ux + y * uy + z * uz
+        beside = np.sqrt(max(0.0, x * x + y * y + z * z - along * along))
+        if abs(beside - r) < width and (ux != 0.0 or uy != 0.0 or uz != 0.0):
+            kept[i] = 0
 
 
 # --- one fit and its energy ------------------------------------------------------------------------------------------
