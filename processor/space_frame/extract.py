@@ -250,8 +250,12 @@ def _register(source: Source, start: Start, control: ControlPoints | None, optio
     shifted = len(source.scanners) > 1 and measured.station_sd_mm > LEAST_STATION_SD_MM
     if not options.register_stations or not (shifted or control is not None):
         return _Registered(source, measured)
-    on_tubes = tube_points(measured.points, measured.lines, measured.members)
-    stations = registration.register(on_tubes, *measured.axes, source.scanners, control, options.datum_mm)
+    at, along, radii = measured.axes
+    # no name of points on tubes here: they are given back as soon as they are sorted
+    stations = registration.register(
+        tube_points(measured.points, measured.lines, measured.members),
+        at, along, radii, source.scanners, control, options.datum_mm,
+    )  # fmt: skip
     if stations.status not in USABLE:
         return _Registered(source, measured, stations)
     corrected = Corrected(source, stations)

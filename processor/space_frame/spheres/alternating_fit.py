@@ -181,6 +181,7 @@ def _rounds(problem: _Problem, scanners: int, station_covariance: Floats | None)
         if iteration == ROUNDS - 1 or (iteration == 1 and setting.station_sd == 0.0):
             return fits, setting, residuals
         estimate = _estimated(problem, setting, fits, residuals)
+        del residuals  # those of many points take more memory than the fits
         if known:
             estimate = replace(estimate, station_sd=0.0, shift=setting.shift)
         noisier = typical_variance(estimate.noise, ranges) > 2.0 * typical_variance(setting.noise, ranges)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor import tiles
-from processor.model import Bools
+from processor.model import Bools, Floats
 from processor.space_frame.spheres import final_fit, size_selection
 from processor.space_frame.spheres.records import (
     CropsWithRays,
@@ -74,28 +74,27 @@ def _chosen(tile: _ToChoose) -> SizeChoice:
 
 def fit_final(nodes_to_fit: final_fit.NodesToFit) -> Finished:
     """Fit every node whose state is finite; see :func:`processor.space_frame.spheres.final_fit.fit_final`."""
-    parts = list(
-        tiles.mapped(
-            final_fit.fit_final,
-            [
-                nodes_to_fit._replace(
-                    crops=_crops(nodes_to_fit.crops, at),
-                    masks=_masks(nodes_to_fit.masks, at),
-                    priors=Priors(*(column[at] for column in nodes_to_fit.priors)),
-                    states=nodes_to_fit.states[at],
-                )
-                for at in _nodes(len(nodes_to_fit.states))
-            ],
-        )
+    crops, nodes = nodes_to_fit.crops, _nodes(len(nodes_to_fit.states))
+    parts = tiles.mapped(
+        final_fit.fit_final,
+        [
+            nodes_to_fit._replace(
+                crops=_crops(crops, at),
+                masks=_masks(nodes_to_fit.masks, at),
+                priors=Priors(*(column[at] for column in nodes_to_fit.priors)),
+                states=nodes_to_fit.states[at],
+            )
+            for at in nodes
+        ],
     )
-    residuals = zip(*(part.residuals for part in parts), strict=True)
-    return Finished(
-        states=np.concatenate([part.states for part in parts]),
-        covariances=np.concatenate([part.covariances for part in parts]),
-        bounds=np.concatenate([part.bounds for part in parts]),
-        numbers=np.concatenate([part.numbers for part in parts]),
-        residuals=Residuals(*(np.concatenate(column) for column in residuals)),
-    )
+    residuals = Residuals(*(np.empty(len(crops.points)) for _ in Residuals._fields))
+    of_nodes = list[tuple[Floats, ...]]()
+    for at, part in zip(nodes, parts, strict=True):
+        for column, one in zip(residuals, part.residuals, strict=True):
+            column[crops.start[at.start] : crops.start[at.stop]] = one
+        of_nodes.append(part[:-1])
+    states, covariances, bounds, numbers = (np.concatenate(column) for column in zip(*of_nodes, strict=True))
+    return Finished(states, covariances, bounds, numbers, residuals)
 
 
 def _nodes(count: int) -> list[slice]:

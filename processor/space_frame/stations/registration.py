@@ -88,6 +88,7 @@ def register(
             StationStatus.UNKNOWN, reason("spheres.no-common-tube"), scanners, axis_points, axis_directions, radii
         )
     ordered = np.ascontiguousarray(points.points[order])
+    del points, order  # of a frame of many tubes they take a quarter of the memory
     start = np.append(layout.start[layout.of_tube[:-1]], layout.start[-1])
     axes = _axes(ordered, start, axis_points, axis_directions, radii)
     posterior = Posterior(scanners, None, datum_mm)
