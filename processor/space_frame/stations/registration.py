@@ -131,6 +131,7 @@ def _estimated(
         if turn:
             scale = _scales(seen, by_station, bounds, scale, tubes)
         equations = normals.Equations(*kernels.observations(seen, layout, scale, TUKEY), weight, floor)
+        del seen  # before the next turn allocates its own
         geometry = normals.Geometry(axes, places, _prior(axes))
         last = turn == ROUNDS - 1
         if turn and control is not None:  # after the tubes have aligned the stations with each other
