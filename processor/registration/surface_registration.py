@@ -280,13 +280,13 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
 
 def body_of(points: Floats, surface: MeshSurface) -> Bools | None:
     """Return which points (n, 3) are not of the ground or what stands about the structure; None where all are."""
-    return main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
+    return main_body.of_sizes(points, [principal.sizes(surface.samples())])
 
 
 def near_share(points: Floats, surface: MeshSurface, T: Floats) -> float:
     """Share of points (n, 3), placed by T (4, 4), near the design's surface."""
-    near, _ = surface.tree.query(rigid.apply(T, points), distance_upper_bound=NEAR_MM, workers=-1)
-    return float(np.isfinite(near).mean())
+    nearest, _ = surface.nearest(rigid.apply(T, points), NEAR_MM)
+    return float((nearest >= 0).mean())
 
 
 def fits_design(placed: Placed, points: Floats, surface: MeshSurface) -> bool:

@@ -463,10 +463,9 @@ def _lacks(surface: Surface, T: Floats, other: Surface, T_other: Floats) -> Bool
     # Near a corner the nearest sample may be on the other face, from which the search over facets does not get round.
     # Where nothing is in reach, no face is: the most of two poses' samples, and the costly ones to search for.
     doubtful = np.flatnonzero(~near & (found >= 0))
-    around = other.mesh.tree.query(samples[doubtful], k=CORNER_SAMPLES, workers=-1)
-    beside = around[0][:, 0] <= 1.4 * TELLING_MM
-    for k in range(CORNER_SAMPLES):
-        face = other.mesh.sample_face[around[1][:, k]]
+    faces, away = other.mesh.nearest(samples[doubtful], np.inf, CORNER_SAMPLES)
+    beside = away[:, 0] <= 1.4 * TELLING_MM
+    for face in np.ascontiguousarray(faces.T):
         _, distance, beyond = other.mesh.distances(samples[doubtful], np.inf, face)
         beside |= (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)
     near[doubtful[beside]] = True
