@@ -68,10 +68,10 @@ def by_hypotheses(means: Means, at: Floats) -> Hypotheses:
     """Estimate the trend and the process at places (m, 2) by each of HYPOTHESES."""
     apart, to_wanted = _distances(means.place, means.place), _distances(at, means.place)
     among = _distances(at, at)
-    found = []
-    for size, length in HYPOTHESES:
-        covariances = [size**2 * _matern(distance / length) for distance in (apart, to_wanted, among)]
-        found.append(_by_one(means, *covariances))
+    of_length = {
+        length: [_matern(distance / length) for distance in (apart, to_wanted, among)] for length in LENGTHS_MM
+    }
+    found = [_by_one(means, *(size**2 * one for one in of_length[length])) for size, length in HYPOTHESES]
     return Hypotheses(*(np.array(column) for column in zip(*found, strict=True)))
 
 
@@ -135,14 +135,14 @@ def _eliminated(system, count):  # type: ignore[no-untyped-def]
     The covariance becomes its Cholesky factor. LAPACK's own depends, in the last digits, on the number of threads.
     """
     columns = system.shape[1]
-    for k in range(count):
-        scale = 1.0 / np.sqrt(system[k, k])
-        for j in range(k, columns):
-            system[k, j] *= scale
-        for i in range(k + 1, count):
+    for i in range(count):  # row by row: the one that changes stays in the cache
+        for k in range(i):
             factor = system[k, i]
             for j in range(i, columns):
                 system[i, j] -= factor * system[k, j]
+        scale = 1.0 / np.sqrt(system[i, i])
+        for j in range(i, columns):
+            system[i, j] *= scale
     extra = columns - count
     products = np.zeros((extra, extra))
     for k in range(count):
