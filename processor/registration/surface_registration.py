@@ -307,15 +307,12 @@ def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:
 
 def _refined(points: Floats, design: Samples, size: float) -> Callable[[Floats], tuple[float, Floats]]:
     """Return the function that improves a pose (4, 4) of points (n, 3), and returns the rms in mm left with it."""
-    tree = cKDTree(design.points)
-    boxes = icp.boxes_of(tree)
+    tree, boxes = cKDTree(design.points), icp.boxes_of(design.points, design.normals)
     few = thinned(points, COARSE_POINTS)
     gates = tuple(share * size for share in GATE_SHARES)
 
     def refined(start: Floats) -> tuple[float, Floats]:
-        T = icp.point_to_plane(
-            few, boxes, design.normals, start, gates_mm=gates, max_iterations=COARSE_ITERATIONS
-        ).T_target_source
+        T = icp.point_to_plane(few, boxes, start, gates_mm=gates, max_iterations=COARSE_ITERATIONS).T_target_source
         return _rms(few, design, tree, T, gates[-1]), T
 
     return refined

@@ -77,8 +77,7 @@ class Surface:
 
     points: Floats
     normals: Floats
-    tree: cKDTree
-    boxes: icp.SampleBoxes
+    boxes: icp.SampleBoxes  # about the same samples, in another order
     mesh: MeshSurface
     centre: Floats  # (3,) of its area
     axes: Floats  # (3, 3) principal axes as columns
@@ -146,12 +145,10 @@ def sample_surface(part: DesignPart) -> Surface:
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
     mesh = mesh_distance.of_mesh(part.vertices, part.faces)
     axes = principal.of_mesh(part.vertices, part.faces)
-    tree = cKDTree(points, balanced_tree=False)
     return Surface(
         points=points,
         normals=normals,
-        tree=tree,
-        boxes=icp.boxes_of(tree),
+        boxes=icp.boxes_of(points, normals),
         mesh=mesh,
         centre=axes.centre,
         axes=axes.axes,
@@ -343,13 +340,13 @@ def _of_pieces(seeds: Floats, few: Floats, surface: Surface, part: DesignPart) -
         fitted = icp.point_to_plane(
             quick,
             surface.boxes,
-            surface.normals,
             T,
             gates_mm=COARSE_GATES_MM[:1],
             axes=surface.axes,
             max_iterations=PIECE_ITERATIONS,
+            known=(known := icp.nothing_known(len(quick))),
         ).T_target_source
-        return _Candidate(fitted, fitted, _misfit(quick, surface, fitted))
+        return _Candidate(fitted, fitted, _misfit(quick, surface, fitted, known))
 
     best = sorted(each(iterate, piece_hypotheses(seeds, part)), key=lambda c: c.misfit)[:PIECES_KEPT]
     return each(partial(_align, few, surface, COARSE_GATES_MM), [_Candidate(c.T, c.T) for c in best])
@@ -415,19 +412,24 @@ def _rival_reason(best: Floats, rival: Floats, surface: Surface) -> Reason:
 
 def _align(points: Floats, surface: Surface, gates_mm: tuple[float, ...], candidate: _Candidate) -> _Candidate:
     """Align from the pose of a candidate, by a share of the points until the last gate."""
-    T = candidate.T
-    for seeds, gates in ((thinned(points, WIDE_POINTS), gates_mm[:-1]), (points, gates_mm[-1:])):
-        T = icp.point_to_plane(
-            seeds, surface.boxes, surface.normals, T, gates_mm=gates, axes=surface.axes
-        ).T_target_source
-    return _Candidate(T, candidate.start, _misfit(points, surface, T))
+    wide, known = thinned(points, WIDE_POINTS), icp.nothing_known(len(points))
+    of_wide = known if len(wide) == len(points) else icp.nothing_known(len(wide))
+    T = icp.point_to_plane(
+        wide, surface.boxes, candidate.T, gates_mm=gates_mm[:-1], axes=surface.axes, known=of_wide
+    ).T_target_source
+    T = icp.point_to_plane(
+        points, surface.boxes, T, gates_mm=gates_mm[-1:], axes=surface.axes, known=known
+    ).T_target_source
+    return _Candidate(T, candidate.start, _misfit(points, surface, T, known))
 
 
-def _misfit(points: Floats, surface: Surface, T: Floats) -> float:
+def _misfit(points: Floats, surface: Surface, T: Floats, known: icp.Known) -> float:
     """Median distance in mm of the points to the nearest design sample's plane."""
     placed = rigid.apply(T, points)
-    distance, index = surface.tree.query(placed)
-    normal_part = np.abs(np.einsum("ni,ni->n", placed - surface.points[index], surface.normals[index]))
+    icp.find_partners(surface.boxes, placed, np.inf, known, np.empty(len(points), bool))
+    off = placed - surface.boxes.samples[known.first]
+    distance = np.sqrt(np.einsum("ni,ni->n", off, off))
+    normal_part = np.abs(np.einsum("ni,ni->n", off, surface.boxes.normals[known.first]))
     # A point beyond the surface's edge may lie in the plane of its nearest sample and still be far from it.
     spacing = 3.0 * float(np.median(distance))
     return float(np.median(np.where(distance > 100.0 + spacing, distance, normal_part)))
