@@ -71,7 +71,7 @@ def by_hypotheses(means: Means, at: Floats) -> Hypotheses:
     of_length = {
         length: [_matern(distance / length) for distance in (apart, to_wanted, among)] for length in LENGTHS_MM
     }
-    found = [_by_one(means, *(size**2 * one for one in of_length[length])) for size, length in HYPOTHESES]
+    found = [_by_one(means, size**2, *of_length[length]) for size, length in HYPOTHESES]
     return Hypotheses(*(np.array(column) for column in zip(*found, strict=True)))
 
 
@@ -102,15 +102,20 @@ def _shares(found: Hypotheses, weights: Floats) -> Floats:
     return shares
 
 
-def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tuple[Floats, Floats, float, float]:
+def _by_one(
+    means: Means, variance: float, apart: Floats, to_wanted: Floats, among: Floats
+) -> tuple[Floats, Floats, float, float]:
     """Mean (k + m,) and covariance (k + m, k + m) by one hypothesis, its restricted log likelihood and its tail.
 
-    ``apart`` (c, c), ``to_wanted`` (m, c) and ``among`` (m, m) are covariances of the process between patches and
-    wanted places.
+    ``apart`` (c, c), ``to_wanted`` (m, c) and ``among`` (m, m) are correlations of the process, of this ``variance``,
+    between patches and wanted places.
     """
     columns, count = means.trend.shape[1], len(means.value)
-    system = np.hstack([apart + np.diag(means.variance), means.trend, means.value[:, None], to_wanted.T])
-    products = _eliminated(np.ascontiguousarray(system), count)
+    system = np.empty((count, count + columns + 1 + len(among)))
+    np.multiply(apart, variance, out=system[:, :count])
+    system[np.diag_indices(count)] += means.variance
+    system[:, count:] = np.hstack([means.trend, means.value[:, None], variance * to_wanted.T])
+    products = _eliminated(system, count)
     trend, value, wanted = slice(0, columns), columns, slice(columns + 1, None)
     expected = np.broadcast_to(means.trend_mean, columns) / means.trend_sd**2
     precision = products[trend, trend] + np.eye(columns) / means.trend_sd**2
@@ -120,7 +125,7 @@ def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tu
     by_trend = products[wanted, trend]
     rest = products[value, value] + expected @ np.broadcast_to(means.trend_mean, columns) - coefficients @ of_values
     log = -float(np.log(np.diag(system)).sum()) - 0.5 * float(np.linalg.slogdet(precision)[1] + rest)
-    of_process = among - products[wanted, wanted] + by_trend @ inverse @ by_trend.T
+    of_process = variance * among - products[wanted, wanted] + by_trend @ inverse @ by_trend.T
     both = -inverse @ by_trend.T
     covariance = np.block([[inverse, both], [both.T, of_process]])
     process = products[wanted, value] - by_trend @ coefficients
