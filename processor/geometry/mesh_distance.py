@@ -22,6 +22,7 @@ from processor.geometry import nearest_neighbours, point_grid
 from processor.geometry.linalg_small import assign_rows
 from processor.geometry.point_grid import Cells
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner
 from processor.large_arrays import read_only
 from processor.model import Bools, Floats, Ints, Labels
 
@@ -70,6 +71,11 @@ def spread(vertices: Floats, faces: Ints, count_of: Callable[[float], int]) -> S
     count = count_of(0.5 * float(cumulative[-1]))
     facet = np.searchsorted(cumulative, (np.arange(count) + 0.5) / count * cumulative[-1]).astype(np.int64)
     return Samples(_placed(vertices, faces, facet), cross[facet] / double[facet, None], facet)
+
+
+def has_area(vertices: Floats, faces: Ints) -> Bools:
+    """Mark the facets (f,) of a mesh that :func:`of_mesh` does not leave out."""
+    return np.asarray(double_areas(vertices, faces)[1] > LEAST_AREA, bool)
 
 
 def double_areas(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
@@ -474,7 +480,7 @@ def crossings(grid: FacetGrid, starts: Floats, ends: Floats, once: bool) -> tupl
     return np.array(rows, np.int64), np.array(facets, np.int64), np.array(shares, np.float64)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _crossing(corner: Floats, start: Floats, ray: Floats) -> Any:
     """Return the share of a ray (3,) at which it crosses a triangle (3, 3), -1 if it does not."""
     e1x, e1y, e1z = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
@@ -560,7 +566,7 @@ def _facets_of_voxels(
     return count
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _voxels_of(corner: Floats, size: float) -> Any:
     """Return about how many voxels a triangle (3, 3) and its edges meet."""
     rim = 0.0
@@ -572,7 +578,7 @@ def _voxels_of(corner: Floats, size: float) -> Any:
     return 0.5 * np.sqrt(x * x + y * y + z * z) / (size * size) + 3.0 * rim / size
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _halved(stack: Floats, at: int) -> None:
     """Replace the triangle ``at`` of a stack (p, 3, 3) by two: its longest edge is halved."""
     longest, k = -1.0, 0
@@ -589,7 +595,7 @@ def _halved(stack: Floats, at: int) -> None:
         stack[at + 1, a, axis] = middle
 
 
-@njit(cache=True, nogil=True)
+@inner
 def square_to(corner: Floats, p: Floats) -> Any:
     """Return the squared distance of a point (3,) from a triangle (3, 3).
 

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.geometry.linalg_small import assign_rows, product
 from processor.geometry.lines_and_polylines import Polyline
+from processor.inner_kernels import inner
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
 
@@ -150,7 +151,7 @@ def _aligned(boxes, source, T, gate, axes, most, known):  # type: ignore[no-unty
     """
     count = len(source)
     placed, near = np.empty((count, 3)), np.empty(count, np.bool_)
-    p, n, r = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    p, n, r, sizes = np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count)
     rms = np.inf
     for iteration in range(1, most + 1):
         for row in range(count):
@@ -162,18 +163,21 @@ def _aligned(boxes, source, T, gate, axes, most, known):  # type: ignore[no-unty
         pairs = _pairs(boxes, placed, known.first, near, gate, p, n, r)
         if pairs < 6:
             return np.inf, pairs / count, iteration
-        residual = r[:pairs]
-        rms = np.sqrt(np.mean(residual**2))
+        squares = 0.0
+        for k in range(pairs):
+            squares += r[k] * r[k]
+            sizes[k] = abs(r[k])
+        rms = np.sqrt(squares / pairs)
         # On a clean scan the median is close to zero. The few points of an end face, far off while the part still
         # slides along its length, would then lose all their weight: the gate sets a lower bound of the scale.
-        scale = max(MAD_TO_SD * np.median(np.abs(residual)), gate / 12.0)
-        moved = _step(p[:pairs], n[:pairs], residual, HUBER * scale, axes, T)
+        scale = max(MAD_TO_SD * _median(sizes, pairs), gate / 12.0)
+        moved = _step(p, n, r, pairs, HUBER * scale, axes, T)
         if moved < 1e-3 * gate:
             break
     return rms, pairs / count, iteration
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _pairs(boxes, placed, nearest, near, gate, p, n, r):  # type: ignore[no-untyped-def]
     """Write the points, normals and distances of pairs within the gate to the start of p, n and r; return how many."""
     pairs = 0
@@ -191,14 +195,22 @@ def _pairs(boxes, placed, nearest, near, gate, p, n, r):  # type: ignore[no-unty
     return pairs
 
 
-@njit(cache=True, nogil=True)
-def _step(p, n, r, huber, axes, T):  # type: ignore[no-untyped-def]
-    """Move T (4, 4) by one weighted least-squares step of pairs (k,); return by how much it moves the points, mm."""
-    share, group = _balance(n, axes)
-    centre = np.array([p[:, 0].mean(), p[:, 1].mean(), p[:, 2].mean()])
+@inner
+def _step(p, n, r, pairs, huber, axes, T):  # type: ignore[no-untyped-def]
+    """Move T (4, 4) by one weighted least-squares step of pairs, the first of the arrays (k, ...).
+
+    Return by how much it moves the points, mm.
+    """
+    share, group = _balance(n, pairs, axes)
+    centre = np.zeros(3)
+    for k in range(pairs):
+        for i in range(3):
+            centre[i] += p[k, i]
+    for i in range(3):
+        centre[i] /= pairs
     normal, right, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
     reach = 0.0
-    for k in range(len(r)):
+    for k in range(pairs):
         weight = min(1.0, huber / max(abs(r[k]), 1e-12)) * share[group[k]]
         x, y, z = p[k, 0] - centre[0], p[k, 1] - centre[1], p[k, 2] - centre[2]
         reach = max(reach, x * x + y * y + z * z)
@@ -220,32 +232,72 @@ def _step(p, n, r, huber, axes, T):  # type: ignore[no-untyped-def]
         for j in range(3):
             motion[i, 3] -= motion[i, j] * centre[j]
     assign_rows(T, product(motion, T))
-    return np.sqrt(np.sum(step[:3] ** 2)) * np.sqrt(reach) + np.sqrt(np.sum(step[3:] ** 2))
+    turn, shift = 0.0, 0.0
+    for i in range(3):
+        turn += step[i] * step[i]
+        shift += step[3 + i] * step[3 + i]
+    return np.sqrt(turn) * np.sqrt(reach) + np.sqrt(shift)
 
 
-@njit(cache=True, nogil=True)
-def _balance(n, axes):  # type: ignore[no-untyped-def]
-    """Return weights (3,) of groups and the group (k,) of each normal (k, 3), see :func:`balance`; 1 without axes."""
-    group, number = np.zeros(len(n), np.int64), np.zeros(3)
+@inner
+def _median(values, count):  # type: ignore[no-untyped-def]
+    """Return the median of the first values, whose order is changed (Hoare's selection; np.median compiles for 1 s)."""
+    low, high, middle = 0, count - 1, count // 2
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            break
+    if count % 2:
+        return values[middle]
+    below = values[0]
+    for k in range(1, middle):
+        below = max(below, values[k])
+    return (below + values[middle]) / 2.0
+
+
+@inner
+def _balance(n, count, axes):  # type: ignore[no-untyped-def]
+    """Return weights (3,) of groups and the group (k,) of the first normals (k, 3), see :func:`balance`.
+
+    Without axes all are in one group of weight 1.
+    """
+    group, number, share = np.zeros(count, np.int64), np.zeros(3), np.ones(3)
     if axes.shape[1] == 0:
-        return np.ones(3), group
-    for k in range(len(n)):
+        return share, group
+    for k in range(count):
         most = -1.0
         for i in range(3):
             along = abs(n[k, 0] * axes[0, i] + n[k, 1] * axes[1, i] + n[k, 2] * axes[2, i])
             if along > most:
                 most, group[k] = along, i
         number[group[k]] += 1.0
-    return np.minimum(len(n) / (3.0 * np.maximum(number, 1.0)), MOST_WEIGHT), group
+    for i in range(3):
+        share[i] = min(count / (3.0 * max(number[i], 1.0)), MOST_WEIGHT)
+    return share, group
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _solution(normal, right):  # type: ignore[no-untyped-def]
     """Return the shortest solution (6,) of normal equations: motions that the pairs do not determine are not made."""
     values, vectors = np.linalg.eigh(normal)
-    solution = np.zeros(6)
+    solution, most = np.zeros(6), 0.0
     for k in range(6):
-        if abs(values[k]) > RANK * np.abs(values).max():
+        most = max(most, abs(values[k]))
+    for k in range(6):
+        if abs(values[k]) > RANK * most:
             along = 0.0
             for i in range(6):
                 along += vectors[i, k] * right[i]
@@ -254,14 +306,17 @@ def _solution(normal, right):  # type: ignore[no-untyped-def]
     return solution
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _turn(a, b, c):  # type: ignore[no-untyped-def]
     """Return the motion (4, 4) that turns about the origin by a vector, rad (Rodrigues)."""
-    T = np.eye(4)
+    T, K = np.zeros((4, 4)), np.zeros((3, 3))
+    for i in range(4):
+        T[i, i] = 1.0
     angle = np.sqrt(a * a + b * b + c * c)
     if angle == 0.0:
         return T
-    K = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]]) / angle
+    K[1, 0], K[0, 2], K[2, 1] = c / angle, b / angle, a / angle
+    K[0, 1], K[2, 0], K[1, 2] = -c / angle, -b / angle, -a / angle
     K2 = product(K, K)
     for i in range(3):
         for j in range(3):
@@ -376,7 +431,7 @@ def find_partners(boxes, placed, reach, known, within):  # type: ignore[no-untyp
         last = first[row]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _search(boxes, x, y, z, reach, near, squares, stack, away):  # type: ignore[no-untyped-def]
     """Write the samples (NEAR,) nearest to (x, y, z) within ``reach``, -1 for none, and the squares of distances.
 
