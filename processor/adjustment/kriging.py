@@ -68,10 +68,10 @@ def by_hypotheses(means: Means, at: Floats) -> Hypotheses:
     """Estimate the trend and the process at places (m, 2) by each of HYPOTHESES."""
     apart, to_wanted = _distances(means.place, means.place), _distances(at, means.place)
     among = _distances(at, at)
-    found = []
-    for size, length in HYPOTHESES:
-        covariances = [size**2 * _matern(distance / length) for distance in (apart, to_wanted, among)]
-        found.append(_by_one(means, *covariances))
+    of_length = {
+        length: [_matern(distance / length) for distance in (apart, to_wanted, among)] for length in LENGTHS_MM
+    }
+    found = [_by_one(means, size**2, *of_length[length]) for size, length in HYPOTHESES]
     return Hypotheses(*(np.array(column) for column in zip(*found, strict=True)))
 
 
@@ -102,15 +102,20 @@ def _shares(found: Hypotheses, weights: Floats) -> Floats:
     return shares
 
 
-def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tuple[Floats, Floats, float, float]:
+def _by_one(
+    means: Means, variance: float, apart: Floats, to_wanted: Floats, among: Floats
+) -> tuple[Floats, Floats, float, float]:
     """Mean (k + m,) and covariance (k + m, k + m) by one hypothesis, its restricted log likelihood and its tail.
 
-    ``apart`` (c, c), ``to_wanted`` (m, c) and ``among`` (m, m) are covariances of the process between patches and
-    wanted places.
+    ``apart`` (c, c), ``to_wanted`` (m, c) and ``among`` (m, m) are correlations of the process, of this ``variance``,
+    between patches and wanted places.
     """
     columns, count = means.trend.shape[1], len(means.value)
-    system = np.hstack([apart + np.diag(means.variance), means.trend, means.value[:, None], to_wanted.T])
-    products = _eliminated(np.ascontiguousarray(system), count)
+    system = np.empty((count, count + columns + 1 + len(among)))
+    np.multiply(apart, variance, out=system[:, :count])
+    system[np.diag_indices(count)] += means.variance
+    system[:, count:] = np.hstack([means.trend, means.value[:, None], variance * to_wanted.T])
+    products = _eliminated(system, count)
     trend, value, wanted = slice(0, columns), columns, slice(columns + 1, None)
     expected = np.broadcast_to(means.trend_mean, columns) / means.trend_sd**2
     precision = products[trend, trend] + np.eye(columns) / means.trend_sd**2
@@ -120,7 +125,7 @@ def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tu
     by_trend = products[wanted, trend]
     rest = products[value, value] + expected @ np.broadcast_to(means.trend_mean, columns) - coefficients @ of_values
     log = -float(np.log(np.diag(system)).sum()) - 0.5 * float(np.linalg.slogdet(precision)[1] + rest)
-    of_process = among - products[wanted, wanted] + by_trend @ inverse @ by_trend.T
+    of_process = variance * among - products[wanted, wanted] + by_trend @ inverse @ by_trend.T
     both = -inverse @ by_trend.T
     covariance = np.block([[inverse, both], [both.T, of_process]])
     process = products[wanted, value] - by_trend @ coefficients
@@ -135,14 +140,14 @@ def _eliminated(system, count):  # type: ignore[no-untyped-def]
     The covariance becomes its Cholesky factor. LAPACK's own depends, in the last digits, on the number of threads.
     """
     columns = system.shape[1]
-    for k in range(count):
-        scale = 1.0 / np.sqrt(system[k, k])
-        for j in range(k, columns):
-            system[k, j] *= scale
-        for i in range(k + 1, count):
+    for i in range(count):  # row by row: the one that changes stays in the cache
+        for k in range(i):
             factor = system[k, i]
             for j in range(i, columns):
                 system[i, j] -= factor * system[k, j]
+        scale = 1.0 / np.sqrt(system[i, i])
+        for j in range(i, columns):
+            system[i, j] *= scale
     extra = columns - count
     products = np.zeros((extra, extra))
     for k in range(count):

@@ -30,7 +30,16 @@ def joined_numbers(by_part: Sequence[Ints | Labels]) -> Ints:
     """Return the group (n,), from 0, of each of the concatenated points of several parts; no group is of two parts."""
     numbers, before = [np.empty(0, np.int64)], 0
     for group in by_part:
-        number = np.unique(group, return_inverse=True)[1].reshape(-1).astype(np.int64)
+        number = _numbered(group)
         numbers.append(number + before)
         before += int(number.max(initial=-1)) + 1
     return np.concatenate(numbers)
+
+
+def _numbered(group: Ints | Labels) -> Ints:
+    """Return the rank (n,) of each group (n,) among those that there are; small numbers are counted, not sorted."""
+    low, high = int(group.min(initial=0)), int(group.max(initial=-1))
+    if high - low < len(group):
+        rank = np.cumsum(np.bincount(group - low) > 0) - 1
+        return np.asarray(rank[group - low], np.int64)
+    return np.unique(group, return_inverse=True)[1].reshape(-1).astype(np.int64)

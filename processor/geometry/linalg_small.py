@@ -9,18 +9,20 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from processor.inner_kernels import inner
+
 DEFINITE = 1e-12  # least pivot of a positive definite matrix, as a share of its diagonal element
 SWEEPS = 12
 
 
-@njit(cache=True, nogil=True)
+@inner
 def assign(target, source):  # type: ignore[no-untyped-def]
     """Copy the elements of an array (n,) to another: numba takes a second to compile target[:] = source."""
     for i in range(len(source)):
         target[i] = source[i]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def assign_rows(target, source):  # type: ignore[no-untyped-def]
     """Copy the elements of an array (n, m) to another; see :func:`assign`."""
     for i in range(len(source)):

@@ -17,10 +17,12 @@ import numpy as np
 from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from processor.geometry import nearest_neighbours, point_grid
 from processor.geometry.linalg_small import assign_rows
+from processor.geometry.point_grid import Cells
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner
 from processor.large_arrays import read_only
 from processor.model import Bools, Floats, Ints, Labels
 
@@ -28,6 +30,7 @@ LEAST_AREA = 1e-9  # mm2, twice that of a facet; smaller ones are left out
 
 SHARP_COS = 0.94  # facets that meet at more than 20 deg belong to different faces
 WALK_STEPS = 24
+CELL_SPACINGS = 2.0  # edge of the cells of samples, in their mean spacing
 OUTER_SPACING_MM = 40.0  # of samples, for the outer face of a plate alone
 LEAST_RANGE = 5_000  # points per task of a thread
 EDGE_MM = 1.0  # a foot up to this far outside the edge of its face still counts as on it
@@ -70,6 +73,11 @@ def spread(vertices: Floats, faces: Ints, count_of: Callable[[float], int]) -> S
     return Samples(_placed(vertices, faces, facet), cross[facet] / double[facet, None], facet)
 
 
+def has_area(vertices: Floats, faces: Ints) -> Bools:
+    """Mark the facets (f,) of a mesh that :func:`of_mesh` does not leave out."""
+    return np.asarray(double_areas(vertices, faces)[1] > LEAST_AREA, bool)
+
+
 def double_areas(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
     """Return the normals (f, 3) of facets, each as long as twice the facet's area, and these lengths (f,)."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -108,17 +116,46 @@ class Facets(NamedTuple):
     neighbours: Ints
 
 
+class _SampleGrid(NamedTuple):
+    """Samples on a mesh in cells, and the facet (m,) of each in the grid's order."""
+
+    cells: Cells
+    facet: Labels
+
+
 @dataclass(frozen=True)
 class MeshSurface:
-    """A mesh with its facets' unit normals (f, 3), and the facets (f, 3) across each side; -1 across a sharp edge."""
+    """A mesh with its facets' unit normals (f, 3), and the facets (f, 3) across each side; -1 across a sharp edge.
+
+    Searches start from samples on the facets, ``count`` (f,) of each: they are sorted when the first search is made.
+    """
 
     vertices: Floats
     faces: Ints
     normals: Floats
     neighbours: Ints  # opposite to each of a facet's vertices
     part_of: Ints  # (f,) number of the smooth face that a facet belongs to
-    tree: cKDTree  # of samples on the mesh
-    sample_face: Ints  # facet of each sample
+    count: Ints
+
+    def samples(self) -> Floats:
+        """Return the samples (m, 3) on the mesh, facet by facet."""
+        return _placed(self.vertices, self.faces, np.repeat(np.arange(len(self.faces)), self.count))
+
+    @cached_property
+    def _sampled(self) -> _SampleGrid:
+        spacing = np.sqrt(area(self.vertices, self.faces) / self.count.sum())
+        grid = point_grid.of_points(self.samples(), CELL_SPACINGS * float(spacing))
+        facet = np.repeat(np.arange(len(self.faces), dtype=np.int32), self.count)[grid.order]
+        return _SampleGrid(grid.cells, facet)
+
+    def nearest(self, points: Floats, reach: float, count: int = 1) -> tuple[Ints, Floats]:
+        """Facets (n, count) of the samples nearest to points (n, 3), and their distances, mm, the nearest first.
+
+        The facet is -1 and the distance infinite where there is none nearer than ``reach``.
+        """
+        cells, facet = self._sampled
+        row, distance = nearest_neighbours.nearest_rows(cells, points, reach, count)
+        return np.where(row >= 0, facet[row].astype(np.int64), -1), distance
 
     def distances(self, points: Floats, reach: float, before: Ints | None = None) -> tuple[Ints, Floats, Floats]:
         """Facet (n,), signed distance (n,) from it, and how far (n,) the foot lies outside its face's edge; mm.
@@ -127,11 +164,7 @@ class MeshSurface:
         walks over smooth edges to the facet that the foot lies on. Points that moved little since an earlier search
         start at the facet ``before`` (n,) of that search instead.
         """
-        if before is None:
-            gap, sample = self.tree.query(points, distance_upper_bound=reach, workers=-1)
-            start = np.where(np.isfinite(gap), self.sample_face[np.minimum(sample, len(self.sample_face) - 1)], -1)
-        else:
-            start = before
+        start = self.nearest(points, reach)[0][:, 0] if before is None else before
         face = np.full(len(points), -1, np.int64)
         distance, beyond = np.full(len(points), np.nan), np.full(len(points), np.nan)
         facets = Facets(self.vertices, self.faces, self.normals, self.neighbours)
@@ -162,18 +195,14 @@ def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurf
     faces, cross, size = faces[used], cross[used], size[used]
     normals = cross / size[:, None]
     count = np.maximum(1, np.ceil(0.5 * size / spacing_mm**2)).astype(np.int64)
-    sample_face = np.repeat(np.arange(len(faces)), count)
-    samples = _placed(vertices, faces, sample_face)
     neighbours = _neighbours(faces, normals)
-    tree = cKDTree(samples, balanced_tree=False)
     return MeshSurface(
         vertices=vertices,
         faces=faces,
         normals=normals,
         neighbours=neighbours,
         part_of=_smooth_faces(neighbours),
-        tree=tree,
-        sample_face=sample_face,
+        count=count,
     )
 
 
@@ -451,7 +480,7 @@ def crossings(grid: FacetGrid, starts: Floats, ends: Floats, once: bool) -> tupl
     return np.array(rows, np.int64), np.array(facets, np.int64), np.array(shares, np.float64)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _crossing(corner: Floats, start: Floats, ray: Floats) -> Any:
     """Return the share of a ray (3,) at which it crosses a triangle (3, 3), -1 if it does not."""
     e1x, e1y, e1z = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
@@ -537,7 +566,7 @@ def _facets_of_voxels(
     return count
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _voxels_of(corner: Floats, size: float) -> Any:
     """Return about how many voxels a triangle (3, 3) and its edges meet."""
     rim = 0.0
@@ -549,7 +578,7 @@ def _voxels_of(corner: Floats, size: float) -> Any:
     return 0.5 * np.sqrt(x * x + y * y + z * z) / (size * size) + 3.0 * rim / size
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _halved(stack: Floats, at: int) -> None:
     """Replace the triangle ``at`` of a stack (p, 3, 3) by two: its longest edge is halved."""
     longest, k = -1.0, 0
@@ -566,7 +595,7 @@ def _halved(stack: Floats, at: int) -> None:
         stack[at + 1, a, axis] = middle
 
 
-@njit(cache=True, nogil=True)
+@inner
 def square_to(corner: Floats, p: Floats) -> Any:
     """Return the squared distance of a point (3,) from a triangle (3, 3).
 

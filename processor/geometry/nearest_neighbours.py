@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from processor import large_arrays
 from processor.distinct_rows import distinct_points
 from processor.geometry import point_grid
-from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
+from processor.geometry.point_grid import SIDE, Cells, PointGrid, block_at, cells_within
 from processor.geometry.thread_ranges import over_ranges
 from processor.model import Bools, Floats, Ints
 
@@ -24,7 +24,8 @@ SEARCHED = 256  # places of a sample at once: their neighbours' pages are given 
 GROWTH = 1.5  # factor of the search radius where too few points were found
 CROP_CHUNK = 1 << 20
 REACHED_CELL = 2.0  # edge of a cell, in reaches: a point's reach meets eight cells at most
-LEAST_POINTS = 20_000  # points per task of a thread that marks those within reach
+LEAST_POINTS = 20_000  # points per task of a thread that marks those within reach, or searches in a fine grid
+FIRST_CELLS = 0.5  # search radius to begin with, in cells
 
 
 def of_spacing(points: Floats) -> PointGrid:
@@ -85,6 +86,23 @@ def surface_spacing(points: Floats) -> float:
 def nearest(grid: PointGrid, places: Floats) -> Floats:
     """Distance (m,) from places (m, 3), all finite, to the nearest point of a grid; infinite for an empty grid."""
     return _distances(grid, np.ascontiguousarray(places), np.full(len(places), -1), 1)[1]
+
+
+def nearest_rows(cells: Cells, places: Floats, reach: float, count: int = 1) -> tuple[Ints, Floats]:
+    """Rows (m, count), in a grid's order, of its points nearest to places (m, 3), and their distances, mm.
+
+    The nearest comes first, of equally near ones the lower row. The row is -1 and the distance infinite where there is
+    none nearer than ``reach``, and for a place that is not finite. Places are quick to search in an order in which
+    neighbours follow each other.
+    """
+    found, square = np.full((len(places), count), -1, np.int64), np.full((len(places), count), np.inf)
+    places = large_arrays.read_only(np.ascontiguousarray(places, np.float64))
+    if len(cells.points) and reach > 0.0:
+        over_ranges(
+            lambda a, b: _nearest_rows(cells, places, float(reach), found, square, a, b),
+            len(places), least=LEAST_POINTS,
+        )  # fmt: skip
+    return found, np.sqrt(square)
 
 
 def mean_distances(grid: PointGrid, neighbours: int) -> Floats:
@@ -226,6 +244,66 @@ def _nearest(cells, places, own, order, first, last, k, mean, farthest):  # type
         farthest[row] = np.sqrt(best[k - 1])
         if np.isfinite(farthest[row]):
             guess = max(1.2 * (farthest[row] - away), 0.05 * size)
+
+
+@njit(cache=True, nogil=True)
+def _nearest_rows(cells, places, reach, found, square, first, last):  # type: ignore[no-untyped-def]
+    """Fill the rows (n, k) of the nearest points and the squares of their distances, for places first to last - 1.
+
+    The radius of a search grows until it holds k points. That of one point begins at the one found for the last place.
+    """
+    size, xl, yl, tops = cells.size, cells.lower[0], cells.lower[1], SIDE * cells.extent - 1
+    points, starts = cells.points, cells.starts
+    k, previous = found.shape[1], -1
+    for row in range(first, last):
+        x, y, z = places[row, 0], places[row, 1], places[row, 2]
+        if not np.isfinite(x + y + z):
+            continue
+        rows, squares, limit = found[row], square[row], reach * reach
+        if k == 1 and previous >= 0:
+            d = _square(points, previous, x, y, z)
+            if d < limit:
+                rows[0], squares[0], limit = previous, d, d
+        radius = min(FIRST_CELLS * size, np.sqrt(limit))
+        while True:
+            i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, radius, radius, radius)
+            for i in range(i0, i1 + 1):
+                gx = max(abs(xl + (i + 0.5) * size - x) - 0.5 * size, 0.0)
+                for j in range(j0, j1 + 1):
+                    gy = max(abs(yl + (j + 0.5) * size - y) - 0.5 * size, 0.0)
+                    if gx * gx + gy * gy > limit * (1.0 + 1e-9):
+                        continue
+                    cell = (i % SIDE * SIDE + j % SIDE) * SIDE
+                    for bk in range(k0 // SIDE, k1 // SIDE + 1):
+                        block = block_at(cells, i // SIDE, j // SIDE, bk)
+                        if block < 0:
+                            continue
+                        low, high = max(k0 - SIDE * bk, 0), min(k1 - SIDE * bk, SIDE - 1)
+                        for p in range(starts[block, cell + low], starts[block, cell + high + 1]):
+                            d = _square(points, p, x, y, z)
+                            if d > limit or (d == limit and p >= rows[k - 1]):
+                                continue
+                            m = k - 1
+                            while m > 0 and (squares[m - 1] > d or (squares[m - 1] == d and rows[m - 1] > p)):
+                                squares[m], rows[m] = squares[m - 1], rows[m - 1]
+                                m -= 1
+                            squares[m], rows[m] = d, p
+                            limit = min(limit, squares[k - 1])
+            whole = i0 == j0 == k0 == 0 and i1 == tops[0] and j1 == tops[1] and k1 == tops[2]
+            if whole or limit <= radius * radius:
+                break
+            radius = min(2.0 * radius, np.sqrt(limit) * (1.0 + 1e-9))
+            if k > 1:  # they are found again
+                limit = reach * reach
+                for m in range(k):
+                    rows[m], squares[m] = -1, np.inf
+        previous = rows[0]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _square(points, row, x, y, z):  # type: ignore[no-untyped-def]
+    u, v, w = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+    return u * u + v * v + w * w
 
 
 @njit(cache=True, nogil=True)

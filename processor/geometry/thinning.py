@@ -38,9 +38,13 @@ def by_cell(points: Floats, size_mm: float) -> Ints:
     if grid.cells > MOST_EMPTY * len(points):
         key = np.empty(len(points), np.int64)
         _number(points, grid.low, size_mm, grid.extent, key)
-        return _sorted_by_key(points, key)
-    starts, order = np.zeros(grid.cells + 1, np.int32), np.empty(len(points), np.int64)
-    _into_cells(points, grid.low, size_mm, grid.extent, starts, order)
+        order = np.argsort(key, kind="stable").astype(np.int64, copy=False)
+        key = key[order]
+        bounds = np.flatnonzero(key[1:] != key[:-1]) + 1
+        starts = np.concatenate([[0], bounds, [len(key)]]).astype(np.int32)
+    else:
+        starts, order = np.zeros(grid.cells + 1, np.int32), np.empty(len(points), np.int64)
+        _into_cells(points, grid.low, size_mm, grid.extent, starts, order)
     large = _sort_cells(points, starts, order)
     if large:
         of_cell = np.diff(starts)

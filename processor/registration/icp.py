@@ -14,11 +14,13 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.geometry.linalg_small import assign_rows, product
 from processor.geometry.lines_and_polylines import Polyline
+from processor.inner_kernels import inner
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
 
 MOST_WEIGHT = 100.0  # of a point on a face that few points lie on
 LEAF = 8  # samples in a box that holds no other boxes
+NEAR = 3  # samples that a search finds: with fewer there are more searches, with more each takes longer
 STACK = 64  # more than twice the levels of boxes about 2^31 samples
 SURE_MM = 1e-6  # a sample counts as nearer than any other by more than errors of rounding
 HUBER = 1.345  # standard deviations from which a point's weight falls: 95 % efficient for normal errors
@@ -116,24 +118,25 @@ def _iterated(
 def point_to_plane(
     source: Floats,
     boxes: SampleBoxes,
-    normals: Floats,
     start: Floats,
     *,
     gates_mm: tuple[float, ...],
     axes: Floats | None = None,
     max_iterations: int = 15,
+    known: Known | None = None,
 ) -> Alignment:
-    """Align source (n, 3) to a surface given by ``boxes`` about its samples, with their unit normals (m, 3).
+    """Align source (n, 3) to a surface given by ``boxes`` about its samples.
 
     Gauss-Newton on the distances along the normals, Huber-weighted by their median. Pairs beyond the gate are left
     out; the gates are used in turn, from wide to narrow. The rms is that of the last gate's pairs. With ``axes``
-    (3, 3, columns), faces along each axis have the same weight in sum: see :func:`balance`.
+    (3, 3, columns), faces along each axis have the same weight in sum: see :func:`balance`. What is ``known`` of the
+    source's nearest samples is brought up to date.
     """
-    known = nothing_known(len(source))
+    known = nothing_known(len(source)) if known is None else known
     source, axes = np.ascontiguousarray(source), np.ascontiguousarray(np.empty((3, 0)) if axes is None else axes)
     T, rms, share, iterations = start.copy(), np.inf, 0.0, 0
     for gate in gates_mm:
-        rms, share, more = _aligned(boxes, normals, source, T, float(gate), axes, max_iterations, known)
+        rms, share, more = _aligned(boxes, source, T, float(gate), axes, max_iterations, known)
         iterations += more
         if rms == np.inf:
             break
@@ -141,14 +144,14 @@ def point_to_plane(
 
 
 @njit(cache=True, nogil=True)
-def _aligned(boxes, normals, source, T, gate, axes, most, known):  # type: ignore[no-untyped-def]
+def _aligned(boxes, source, T, gate, axes, most, known):  # type: ignore[no-untyped-def]
     """Align with one gate by at most ``most`` iterations from T (4, 4), which becomes the pose reached.
 
     Return the rms of the pairs before the last step, infinite where too few are left, their share, and iterations.
     """
     count = len(source)
     placed, near = np.empty((count, 3)), np.empty(count, np.bool_)
-    p, n, r = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    p, n, r, sizes = np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count)
     rms = np.inf
     for iteration in range(1, most + 1):
         for row in range(count):
@@ -157,46 +160,57 @@ def _aligned(boxes, normals, source, T, gate, axes, most, known):  # type: ignor
                 placed[row, i] = T[i, 0] * x + T[i, 1] * y + T[i, 2] * z + T[i, 3]
         # The nearest sample may lie a sample spacing away along the surface; the gate limits the normal distance.
         find_partners(boxes, placed, 3.0 * gate, known, near)
-        pairs = _pairs(boxes, normals, placed, known.first, near, gate, p, n, r)
+        pairs = _pairs(boxes, placed, known.first, near, gate, p, n, r)
         if pairs < 6:
             return np.inf, pairs / count, iteration
-        residual = r[:pairs]
-        rms = np.sqrt(np.mean(residual**2))
+        squares = 0.0
+        for k in range(pairs):
+            squares += r[k] * r[k]
+            sizes[k] = abs(r[k])
+        rms = np.sqrt(squares / pairs)
         # On a clean scan the median is close to zero. The few points of an end face, far off while the part still
         # slides along its length, would then lose all their weight: the gate sets a lower bound of the scale.
-        scale = max(MAD_TO_SD * np.median(np.abs(residual)), gate / 12.0)
-        moved = _step(p[:pairs], n[:pairs], residual, HUBER * scale, axes, T)
+        scale = max(MAD_TO_SD * _median(sizes, pairs), gate / 12.0)
+        moved = _step(p, n, r, pairs, HUBER * scale, axes, T)
         if moved < 1e-3 * gate:
             break
     return rms, pairs / count, iteration
 
 
-@njit(cache=True, nogil=True)
-def _pairs(boxes, normals, placed, nearest, near, gate, p, n, r):  # type: ignore[no-untyped-def]
+@inner
+def _pairs(boxes, placed, nearest, near, gate, p, n, r):  # type: ignore[no-untyped-def]
     """Write the points, normals and distances of pairs within the gate to the start of p, n and r; return how many."""
     pairs = 0
     for row in range(len(placed)):
         if near[row]:
-            at = boxes.row[nearest[row]]
+            at = nearest[row]
             off = 0.0
             for i in range(3):
-                off += (placed[row, i] - boxes.samples[nearest[row], i]) * normals[at, i]
+                off += (placed[row, i] - boxes.samples[at, i]) * boxes.normals[at, i]
             if abs(off) <= gate:
                 for i in range(3):
-                    p[pairs, i], n[pairs, i] = placed[row, i], normals[at, i]
+                    p[pairs, i], n[pairs, i] = placed[row, i], boxes.normals[at, i]
                 r[pairs] = off
                 pairs += 1
     return pairs
 
 
-@njit(cache=True, nogil=True)
-def _step(p, n, r, huber, axes, T):  # type: ignore[no-untyped-def]
-    """Move T (4, 4) by one weighted least-squares step of pairs (k,); return by how much it moves the points, mm."""
-    share, group = _balance(n, axes)
-    centre = np.array([p[:, 0].mean(), p[:, 1].mean(), p[:, 2].mean()])
+@inner
+def _step(p, n, r, pairs, huber, axes, T):  # type: ignore[no-untyped-def]
+    """Move T (4, 4) by one weighted least-squares step of pairs, the first of the arrays (k, ...).
+
+    Return by how much it moves the points, mm.
+    """
+    share, group = _balance(n, pairs, axes)
+    centre = np.zeros(3)
+    for k in range(pairs):
+        for i in range(3):
+            centre[i] += p[k, i]
+    for i in range(3):
+        centre[i] /= pairs
     normal, right, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
     reach = 0.0
-    for k in range(len(r)):
+    for k in range(pairs):
         weight = min(1.0, huber / max(abs(r[k]), 1e-12)) * share[group[k]]
         x, y, z = p[k, 0] - centre[0], p[k, 1] - centre[1], p[k, 2] - centre[2]
         reach = max(reach, x * x + y * y + z * z)
@@ -218,32 +232,72 @@ def _step(p, n, r, huber, axes, T):  # type: ignore[no-untyped-def]
         for j in range(3):
             motion[i, 3] -= motion[i, j] * centre[j]
     assign_rows(T, product(motion, T))
-    return np.sqrt(np.sum(step[:3] ** 2)) * np.sqrt(reach) + np.sqrt(np.sum(step[3:] ** 2))
+    turn, shift = 0.0, 0.0
+    for i in range(3):
+        turn += step[i] * step[i]
+        shift += step[3 + i] * step[3 + i]
+    return np.sqrt(turn) * np.sqrt(reach) + np.sqrt(shift)
 
 
-@njit(cache=True, nogil=True)
-def _balance(n, axes):  # type: ignore[no-untyped-def]
-    """Return weights (3,) of groups and the group (k,) of each normal (k, 3), see :func:`balance`; 1 without axes."""
-    group, number = np.zeros(len(n), np.int64), np.zeros(3)
+@inner
+def _median(values, count):  # type: ignore[no-untyped-def]
+    """Return the median of the first values, whose order is changed (Hoare's selection; np.median compiles for 1 s)."""
+    low, high, middle = 0, count - 1, count // 2
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            break
+    if count % 2:
+        return values[middle]
+    below = values[0]
+    for k in range(1, middle):
+        below = max(below, values[k])
+    return (below + values[middle]) / 2.0
+
+
+@inner
+def _balance(n, count, axes):  # type: ignore[no-untyped-def]
+    """Return weights (3,) of groups and the group (k,) of the first normals (k, 3), see :func:`balance`.
+
+    Without axes all are in one group of weight 1.
+    """
+    group, number, share = np.zeros(count, np.int64), np.zeros(3), np.ones(3)
     if axes.shape[1] == 0:
-        return np.ones(3), group
-    for k in range(len(n)):
+        return share, group
+    for k in range(count):
         most = -1.0
         for i in range(3):
             along = abs(n[k, 0] * axes[0, i] + n[k, 1] * axes[1, i] + n[k, 2] * axes[2, i])
             if along > most:
                 most, group[k] = along, i
         number[group[k]] += 1.0
-    return np.minimum(len(n) / (3.0 * np.maximum(number, 1.0)), MOST_WEIGHT), group
+    for i in range(3):
+        share[i] = min(count / (3.0 * max(number[i], 1.0)), MOST_WEIGHT)
+    return share, group
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _solution(normal, right):  # type: ignore[no-untyped-def]
     """Return the shortest solution (6,) of normal equations: motions that the pairs do not determine are not made."""
     values, vectors = np.linalg.eigh(normal)
-    solution = np.zeros(6)
+    solution, most = np.zeros(6), 0.0
     for k in range(6):
-        if abs(values[k]) > RANK * np.abs(values).max():
+        most = max(most, abs(values[k]))
+    for k in range(6):
+        if abs(values[k]) > RANK * most:
             along = 0.0
             for i in range(6):
                 along += vectors[i, k] * right[i]
@@ -252,14 +306,17 @@ def _solution(normal, right):  # type: ignore[no-untyped-def]
     return solution
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _turn(a, b, c):  # type: ignore[no-untyped-def]
     """Return the motion (4, 4) that turns about the origin by a vector, rad (Rodrigues)."""
-    T = np.eye(4)
+    T, K = np.zeros((4, 4)), np.zeros((3, 3))
+    for i in range(4):
+        T[i, i] = 1.0
     angle = np.sqrt(a * a + b * b + c * c)
     if angle == 0.0:
         return T
-    K = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]]) / angle
+    K[1, 0], K[0, 2], K[2, 1] = c / angle, b / angle, a / angle
+    K[0, 1], K[2, 0], K[1, 2] = -c / angle, -b / angle, -a / angle
     K2 = product(K, K)
     for i in range(3):
         for j in range(3):
@@ -287,38 +344,40 @@ def balance(group: Ints) -> Floats:
 # --- Nearest samples of a surface to points that move a little at a time
 #
 # A tree's search starts without a bound, and far from a surface, where many samples are about as near, it visits many
-# of them. Here the samples found before, which stay near, are the bound from the start.
+# of them. Here the samples found before, which stay near, are the bound from the start, and one of them mostly is the
+# nearest one again.
 
 
 class SampleBoxes(NamedTuple):
-    """Samples (n, 3) in the order of a tree, and the boxes about them; ``row`` (n,) numbers them in the tree's data.
+    """Samples (n, 3) with unit normals (n, 3), neighbours near each other in their order, and the boxes about them.
 
     Box i holds the boxes 2i and 2i + 1, box 1 all; the last half of the boxes ``low`` and ``high`` (2k, 3) holds LEAF
     samples each, in their order. A box without samples has infinite limits.
     """
 
     samples: Floats
-    row: Ints
+    normals: Floats
     low: Floats
     high: Floats
 
 
 class Known(NamedTuple):
-    """What is known of the two nearest samples of points (n,): numbers -1 where none was found.
+    """What is known of the nearest samples of points (n,), numbers in the boxes' order, -1 where none was found.
 
-    ``other`` (n,) is the least distance of any sample but the ``first`` from where the point was ``searched`` (n, 3).
+    ``first`` (n,) is the nearest one, ``near`` (n, NEAR) those nearest to where the point was ``searched`` (n, 3), and
+    ``other`` (n,) the least distance of any other sample from there.
     """
 
     first: Ints
-    second: Ints
+    near: Ints
     other: Floats
     searched: Floats
 
 
-def boxes_of(tree: cKDTree) -> SampleBoxes:
-    """Put boxes about the samples of a tree, neighbours in the tree's order."""
-    row = np.asarray(tree.indices, np.int64)
-    samples = np.asarray(tree.data)[row]
+def boxes_of(points: Floats, normals: Floats) -> SampleBoxes:
+    """Put boxes about samples (n, 3) with unit normals (n, 3)."""
+    row = np.asarray(cKDTree(points, leafsize=LEAF // 2, balanced_tree=False).indices, np.int64)
+    samples = points[row]
     leaves = 1 << max(int(np.ceil(np.log2(max(len(row) / LEAF, 1.0)))), 0)
     low, high = np.full((2 * leaves, 3), np.inf), np.full((2 * leaves, 3), -np.inf)
     starts = np.arange(0, len(row), LEAF)
@@ -329,65 +388,68 @@ def boxes_of(tree: cKDTree) -> SampleBoxes:
         low[half:leaves] = low[leaves : 2 * leaves].reshape(half, 2, 3).min(axis=1)
         high[half:leaves] = high[leaves : 2 * leaves].reshape(half, 2, 3).max(axis=1)
         leaves = half
-    return SampleBoxes(samples, row, low, high)
+    return SampleBoxes(samples, normals[row], low, high)
 
 
 def nothing_known(count: int) -> Known:
     """Return what is known of ``count`` points before any search."""
-    none = np.full(count, -1, np.int64)
-    return Known(none, none.copy(), np.full(count, -np.inf), np.zeros((count, 3)))
+    return Known(
+        first=np.full(count, -1, np.int64),
+        near=np.full((count, NEAR), -1, np.int64),
+        other=np.full(count, -np.inf),
+        searched=np.zeros((count, 3)),
+    )
 
 
 @njit(cache=True, nogil=True)
-def find_partners(boxes, placed, reach, known, near):  # type: ignore[no-untyped-def]
-    """Bring the nearest samples of points (n, 3) up to date in ``known``; ``near`` (n,) are those within ``reach``.
+def find_partners(boxes, placed, reach, known, within):  # type: ignore[no-untyped-def]
+    """Bring the nearest samples of points (n, 3) up to date in ``known``; ``within`` (n,) marks those in ``reach``.
 
-    A search also finds the second nearest sample. While a point has moved by less than half of what that one is
-    farther away, the nearest one stays (triangle inequality).
+    A search finds some of the nearest samples. While a point has moved by less than any other one is farther away than
+    the nearest of these, that one is the nearest of all (triangle inequality).
     """
-    stack, away = np.empty(STACK, np.int64), np.empty(STACK)
-    samples, (first, second, other, searched) = boxes.samples, known
+    stack, away, squares = np.empty(STACK, np.int64), np.empty(STACK), np.empty(NEAR + 1)
+    samples, (first, near, other, searched) = boxes.samples, known
     last = -1  # neighbours among the points often have the same partner
     for row in range(len(placed)):
         x, y, z = placed[row, 0], placed[row, 1], placed[row, 2]
-        distance = np.inf
-        if first[row] >= 0:
-            distance = np.sqrt(_square(samples, first[row], x, y, z))
+        best, first[row] = np.inf, -1
+        for m in range(NEAR):
+            at = near[row, m]
+            if at >= 0:
+                square = _square(samples, at, x, y, z)
+                if square < best:
+                    best, first[row] = square, at
         left = other[row] - np.sqrt(_square(searched, row, x, y, z)) - SURE_MM
-        if left <= distance and min(left, distance) < reach:
-            guess = first[row] if first[row] >= 0 else last
-            one, two, best, bound = _search(boxes, x, y, z, reach, guess, second[row], stack, away)
-            first[row], second[row], other[row] = one, two, np.sqrt(bound)
+        if left <= np.sqrt(best) and min(left, np.sqrt(best)) < reach:
+            if near[row, 0] < 0:
+                near[row, 0] = last
+            other[row] = _search(boxes, x, y, z, reach, near[row], squares, stack, away)
             searched[row, 0], searched[row, 1], searched[row, 2] = x, y, z
-            distance = np.sqrt(best) if one >= 0 else np.inf
-        near[row] = distance < reach
+            first[row], best = near[row, 0], squares[0] if near[row, 0] >= 0 else np.inf
+        within[row] = np.sqrt(best) < reach
         last = first[row]
 
 
-@njit(cache=True, nogil=True)
-def _search(boxes, x, y, z, reach, guess, other_guess, stack, away):  # type: ignore[no-untyped-def]
-    """Find the two samples nearest to (x, y, z) within ``reach``, and the squares of their distances.
+@inner
+def _search(boxes, x, y, z, reach, near, squares, stack, away):  # type: ignore[no-untyped-def]
+    """Write the samples (NEAR,) nearest to (x, y, z) within ``reach``, -1 for none, and the squares of distances.
 
-    The guesses are the bounds to begin with. The number is -1 and the square that of ``reach`` where there is none.
+    Those given are the bounds to begin with. Return the least distance of any other sample, at most ``reach``.
     """
-    one, two, best, bound = -1, -1, reach * reach, reach * reach
     samples, low, high = boxes.samples, boxes.low, boxes.high
-    if guess >= 0:
-        square = _square(samples, guess, x, y, z)
-        if square < best:
-            one, best = guess, square
-    if other_guess >= 0 and other_guess != guess:
-        square = _square(samples, other_guess, x, y, z)
-        if square < best:
-            one, two, best, bound = other_guess, one, square, best
-        elif square < bound:
-            two, bound = other_guess, square
+    for m in range(NEAR + 1):
+        squares[m] = reach * reach
+    for m in range(NEAR):  # each is put among those before it
+        at, near[m] = near[m], -1
+        if at >= 0:
+            _insert(near, squares, at, _square(samples, at, x, y, z))
     leaves, count = len(low) // 2, len(samples)
     stack[0], away[0], depth = 1, 0.0, 1
     while depth:
         depth -= 1
         box = stack[depth]
-        if away[depth] >= bound:
+        if away[depth] >= squares[NEAR]:
             continue
         while box < leaves:
             left, right = _from_box(low, high, 2 * box, x, y, z), _from_box(low, high, 2 * box + 1, x, y, z)
@@ -395,21 +457,37 @@ def _search(boxes, x, y, z, reach, guess, other_guess, stack, away):  # type: ig
             if right < left:
                 box += 1
                 left, right = right, left
-            if right < bound:
+            if right < squares[NEAR]:
                 stack[depth], away[depth] = box ^ 1, right
                 depth += 1
-            if left >= bound:
+            if left >= squares[NEAR]:
                 break
-        if box < leaves or _from_box(low, high, box, x, y, z) >= bound:
+        if box < leaves or _from_box(low, high, box, x, y, z) >= squares[NEAR]:
             continue
         for at in range((box - leaves) * LEAF, min((box - leaves + 1) * LEAF, count)):
             square = _square(samples, at, x, y, z)
-            if square < bound and at != one and at != two:
-                if square < best:
-                    one, two, best, bound = at, one, square, best
-                else:
-                    two, bound = at, square
-    return one, two, best, bound
+            if square < squares[NEAR]:
+                _insert(near, squares, at, square)
+    return np.sqrt(squares[NEAR])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _insert(near, squares, at, square):  # type: ignore[no-untyped-def]
+    """Put a sample among the nearest (NEAR,) by the square of its distance, if it is not one of them."""
+    for m in range(NEAR):
+        if near[m] == at:
+            return
+    if square >= squares[NEAR]:
+        return
+    m = NEAR
+    while m > 0 and squares[m - 1] > square:
+        squares[m] = squares[m - 1]
+        if m < NEAR:
+            near[m] = near[m - 1]
+        m -= 1
+    squares[m] = square
+    if m < NEAR:
+        near[m] = at
 
 
 @njit(cache=True, nogil=True, inline="always")

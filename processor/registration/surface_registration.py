@@ -280,13 +280,13 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
 
 def body_of(points: Floats, surface: MeshSurface) -> Bools | None:
     """Return which points (n, 3) are not of the ground or what stands about the structure; None where all are."""
-    return main_body.of_sizes(points, [principal.sizes(np.asarray(surface.tree.data))])
+    return main_body.of_sizes(points, [principal.sizes(surface.samples())])
 
 
 def near_share(points: Floats, surface: MeshSurface, T: Floats) -> float:
     """Share of points (n, 3), placed by T (4, 4), near the design's surface."""
-    near, _ = surface.tree.query(rigid.apply(T, points), distance_upper_bound=NEAR_MM, workers=-1)
-    return float(np.isfinite(near).mean())
+    nearest, _ = surface.nearest(rigid.apply(T, points), NEAR_MM)
+    return float((nearest >= 0).mean())
 
 
 def fits_design(placed: Placed, points: Floats, surface: MeshSurface) -> bool:
@@ -307,15 +307,12 @@ def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:
 
 def _refined(points: Floats, design: Samples, size: float) -> Callable[[Floats], tuple[float, Floats]]:
     """Return the function that improves a pose (4, 4) of points (n, 3), and returns the rms in mm left with it."""
-    tree = cKDTree(design.points)
-    boxes = icp.boxes_of(tree)
+    tree, boxes = cKDTree(design.points), icp.boxes_of(design.points, design.normals)
     few = thinned(points, COARSE_POINTS)
     gates = tuple(share * size for share in GATE_SHARES)
 
     def refined(start: Floats) -> tuple[float, Floats]:
-        T = icp.point_to_plane(
-            few, boxes, design.normals, start, gates_mm=gates, max_iterations=COARSE_ITERATIONS
-        ).T_target_source
+        T = icp.point_to_plane(few, boxes, start, gates_mm=gates, max_iterations=COARSE_ITERATIONS).T_target_source
         return _rms(few, design, tree, T, gates[-1]), T
 
     return refined

@@ -122,8 +122,8 @@ def test_point_to_plane_icp_recovers_the_pose_of_a_box():
     normals[np.arange(len(points)), axis] = side
     T_true = rigid.transform(rigid.rotation_from_vector(np.array([0.01, 0.02, -0.01])), np.array([40.0, -30.0, 20.0]))
     source = rigid.apply(rigid.invert(T_true), points[::7]) + rng.normal(0.0, 0.5, (len(points[::7]), 3))
-    boxes = icp.boxes_of(cKDTree(points))
-    found = icp.point_to_plane(source, boxes, normals, np.eye(4), gates_mm=(200.0, 50.0, 10.0))
+    boxes = icp.boxes_of(points, normals)
+    found = icp.point_to_plane(source, boxes, np.eye(4), gates_mm=(200.0, 50.0, 10.0))
     moved = rigid.apply(found.T_target_source @ rigid.invert(T_true), np.array([[3000.0, 900.0, 500.0]]))
     assert np.linalg.norm(moved - [3000.0, 900.0, 500.0]) < 0.2
 
@@ -162,17 +162,17 @@ def test_point_to_plane_by_its_kernel_is_that_by_arrays(turn, sides):
     normals[np.arange(len(points)), axis] = 1.0
     T = rigid.transform(rigid.rotation_from_vector(np.array([turn, -0.02, 0.01])), np.array([60.0, -30.0, 20.0]))
     source = rigid.apply(T, points[::7]) + rng.normal(0.0, 0.5, (len(points[::7]), 3))
-    boxes, gates = icp.boxes_of(cKDTree(points)), (400.0, 150.0, 12.0)
+    boxes, gates = icp.boxes_of(points, normals), (400.0, 150.0, 12.0)
     for axes in (None, rigid.rotation_from_vector(np.array([0.02, 0.01, 0.0]))):
-        found = icp.point_to_plane(source, boxes, normals, np.eye(4), gates_mm=gates, axes=axes).T_target_source
+        found = icp.point_to_plane(source, boxes, np.eye(4), gates_mm=gates, axes=axes).T_target_source
         expected = point_to_plane_by_arrays(source, points, normals, np.eye(4), gates, axes)
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7)
 
 
 def test_point_to_plane_without_pairs_leaves_the_pose():
     points, normals = np.eye(3)[[0, 1, 2, 0, 1, 2, 0]] * 10.0, np.eye(3)[[2, 2, 2, 2, 2, 2, 2]]
-    boxes = icp.boxes_of(cKDTree(points))
-    found = icp.point_to_plane(points + 1e4, boxes, normals, np.eye(4), gates_mm=(50.0, 10.0))
+    boxes = icp.boxes_of(points, normals)
+    found = icp.point_to_plane(points + 1e4, boxes, np.eye(4), gates_mm=(50.0, 10.0))
     assert (found.rms, found.paired_share, found.iterations) == (np.inf, 0.0, 1)
     np.testing.assert_array_equal(found.T_target_source, np.eye(4))
 
@@ -180,8 +180,8 @@ def test_point_to_plane_without_pairs_leaves_the_pose():
 @pytest.mark.parametrize("count", [3, 40, 3000])
 def test_partners_of_points_that_move_are_those_of_a_plain_search(count):
     rng = np.random.default_rng(6)
-    tree = cKDTree(rng.uniform(0.0, 1000.0, (count, 3)))
-    boxes = icp.boxes_of(tree)
+    samples = rng.uniform(0.0, 1000.0, (count, 3))
+    tree, boxes = cKDTree(samples), icp.boxes_of(samples, samples)
     points = rng.uniform(-100.0, 1100.0, (2000, 3))
     known, near = icp.nothing_known(len(points)), np.empty(len(points), np.bool_)
     for step, reach in ((0.0, 90.0), (300.0, 90.0), (20.0, 90.0), (3.0, 90.0), (0.3, 60.0), (0.0, 60.0), (3.0, 200.0)):
@@ -189,8 +189,10 @@ def test_partners_of_points_that_move_are_those_of_a_plain_search(count):
         icp.find_partners(boxes, points, reach, known, near)
         distance, expected = tree.query(points, distance_upper_bound=reach)
         np.testing.assert_array_equal(near, np.isfinite(distance))
-        np.testing.assert_array_equal(boxes.row[known.first[near]], expected[near])
+        np.testing.assert_array_equal(boxes.samples[known.first[near]], samples[expected[near]])
         assert 0 < near.sum() < len(points)
+    icp.find_partners(boxes, points, np.inf, known, near)
+    np.testing.assert_array_equal(boxes.samples[known.first], samples[tree.query(points)[1]])
 
 
 def test_spacing_of_a_grid_and_of_random_points():

@@ -81,6 +81,24 @@ def test_surface_samples_lie_on_the_mesh_and_cover_it_evenly():
     np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1.0)
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_surface_that_one_design_alone_has_does_not_depend_on_the_facets_that_both_have(turned):
+    part = arch_clouds.design().parts[2]
+    whole = part.faces[: -2 * 800]  # the pad is the last face
+    bare = dataclasses.replace(part, faces=whole, vertices=part.vertices[: whole.max() + 1])
+    surface, other = attitude.sample_surface(part), attitude.sample_surface(bare)
+    turn = rigid.rotation_from_vector(np.array([1e-4, -1e-4, np.pi * turned]))
+    T = rigid.transform(turn, surface.centre - turn @ surface.centre)
+    common = attitude._has_facets(surface.mesh, T, other.mesh, np.eye(4))
+    assert turned or (common.any() and not common[len(whole) :].any())
+    found = attitude._lacks(surface, T, other, np.eye(4))
+    with mock.patch.object(attitude, "_has_facets", lambda mesh, *_: np.zeros(len(mesh.faces), bool)):
+        expected = attitude._lacks(surface, T, other, np.eye(4))
+    np.testing.assert_array_equal(found, expected)
+    assert found[surface.facet >= len(whole)].all()
+    assert turned or not found[surface.facet < len(whole)].any()
+
+
 def box_end(spacing=4.0, sigma=0.0, width=900.0, height=1100.0, plate=24.0):
     """A straight box that ends at x = 0, in its joint's frame, sampled on outer, inner and end faces."""
     rng = np.random.default_rng(7)

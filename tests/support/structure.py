@@ -173,7 +173,7 @@ def layer_groups():
 
 STEPS = ("defects", "deviation", "inspection", "preassembly", "space_frame", "stitching")
 LAYERS = (
-    ("version", "plain_text", "large_arrays"),
+    ("version", "plain_text", "large_arrays", "inner_kernels"),
     ("model",),
     ("record_checks", "tiles"),
     ("progress", "diagnostics", "language", "jobs", "robust_statistics", "distinct_rows", "unit_ratio", "user_methods"),
@@ -196,8 +196,9 @@ LAYERS = (
     ("__main__",),
 )
 FOR_STEPS = (
-    "version", "plain_text", "large_arrays", "model", "progress", "diagnostics", "robust_statistics", "distinct_rows",
-    "unit_ratio", "tiles", "geometry", "registration", "scene_cloud", "adjustment", "components", "limits",
+    "version", "plain_text", "large_arrays", "inner_kernels", "model", "progress", "diagnostics", "robust_statistics",
+    "distinct_rows", "unit_ratio", "tiles", "geometry", "registration", "scene_cloud", "adjustment", "components",
+    "limits",
 )  # fmt: skip
 
 

@@ -119,7 +119,8 @@ def adjust(
     # Residuals by observations, after the motion.
     after = np.eye(len(observed.value)) + observed.A @ to_motion
     residual = after @ observed.value
-    covariance = after @ observed.covariance @ after.T
+    # Motions are few: with their covariance with the observations no product of two matrices (n, n) is needed.
+    with_motion = to_motion @ observed.covariance
     gaps, gap_covariance = np.full((len(joint_points), 8, 3), np.nan), np.full((len(joint_points), 24, 24), np.nan)
     for j, row in enumerate(observed.gap_row):
         if row >= 0:
@@ -130,10 +131,13 @@ def adjust(
     for member, rows in zip(members, observed.edge_rows, strict=True):
         departure, variance, at_rest_variance = (np.full(member.edges.departure.shape, np.nan) for _ in range(3))
         known = np.isfinite(member.edges.departure)
-        departure[known], variance[known] = residual[rows], np.diag(covariance)[rows]
+        with_residual = observed.covariance[rows] + observed.A[rows] @ with_motion
+        departure[known], variance[known] = residual[rows], np.einsum("ki,ki->k", with_residual, after[rows])
         # The first part at rest: the inverse of its motion moves every edge.
-        by_first = after[rows] - _edge_motion(member.edges, members[0].centre)[known.ravel()] @ to_motion[:6]
-        at_rest_variance[known] = np.einsum("ki,ij,kj->k", by_first, observed.covariance, by_first, optimize=True)
+        by_first = _edge_motion(member.edges, members[0].centre)[known.ravel()]
+        at_rest_variance[known] = np.einsum(
+            "ki,ki->k", with_residual - by_first @ with_motion[:6], after[rows] - by_first @ to_motion[:6]
+        )
         of_part = np.full((known.size, len(observed.value)), np.nan)
         of_part[known.ravel()] = after[rows]
         to_departures.append(of_part)
@@ -143,7 +147,7 @@ def adjust(
     motions = [_as_motion(x[6 * i : 6 * i + 6], member.centre) for i, member in enumerate(members)]
     return Adjusted(
         motions=np.array(motions),
-        motion_covariance=to_motion @ observed.covariance @ to_motion.T,
+        motion_covariance=with_motion @ to_motion.T,
         motion_with_pose=to_motion @ observed.with_pose,
         gaps=gaps,
         gap_covariance=gap_covariance,

@@ -160,9 +160,8 @@ def _closed(half: Floats, T_bridge_joint: Floats, surface: MeshSurface) -> Bools
     for k, (_, axis, sense) in enumerate(SIDES):
         places[k, :, axis] = sense * half[axis]
         places[k, :, 3 - axis] = half[3 - axis] * np.array([-0.5, 0.0, 0.5])
-    away = surface.tree.query(rigid.apply(T_bridge_joint, places.reshape(-1, 3)))[0].reshape(4, 3)
-    marked: Bools = (away < OFF_STEEL_MM).any(axis=1)
-    return marked
+    nearest = surface.nearest(rigid.apply(T_bridge_joint, places.reshape(-1, 3)), OFF_STEEL_MM)[0].reshape(4, 3)
+    return np.asarray((nearest >= 0).any(axis=1), bool)
 
 
 def _made(half: Floats, closed: tuple[bool, ...], thickness: Floats) -> Section:

@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from processor.geometry import box_girder_mesh, rigid
 from processor.geometry.thinning import thinned
-from processor.model import ArchDesign, Floats, Reason, reason
+from processor.model import Floats, Reason, reason
 from processor.preassembly.parts import attitude, same_shape
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, TELLING_MM, Shapes, Surface
 from processor.registration import principal, surface_registration
@@ -60,7 +60,7 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     Of parts with equal edges, which their marks alone distinguish, it is any: see :mod:`.identity`.
     """
     alike = of_size(points, shapes)
-    others = _other_shapes(index, alike or range(len(shapes)), shapes.design)
+    others = _other_shapes(index, alike or range(len(shapes)), shapes)
     if index in alike and not others:
         return None
     few = thinned(points, POINTS)
@@ -87,11 +87,11 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     return best if _shows_other(few, own, (shapes[best], T_best)) else None
 
 
-def _other_shapes(index: int, numbers: Sequence[int] | range, design: ArchDesign) -> list[int]:
+def _other_shapes(index: int, numbers: Sequence[int] | range, shapes: Shapes) -> list[int]:
     """Return those of the numbers of parts that differ in shape from part ``index``, one of each shape."""
     found = [index]
     for k in numbers:
-        if not any(k == one or same_shape.motions(design.parts[one], design.parts[k]) for one in found):
+        if not any(k == one or same_shape.motions(shapes, one, k) for one in found):
             found.append(k)
     return found[1:]
 
@@ -113,7 +113,7 @@ def _shows_other(points: Floats, part: tuple[Surface, Floats], other: tuple[Surf
 
 def _sparse(surface: Surface, T: Floats) -> tuple[Surface, Floats]:
     points, normals = thinned(surface.points, SAMPLES), thinned(surface.normals, SAMPLES)
-    return replace(surface, points=points, normals=normals), T
+    return replace(surface, points=points, normals=normals, facet=thinned(surface.facet, SAMPLES)), T
 
 
 def solve(scans: Sequence[ScanParts]) -> list[ScanParts]:

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_distance, rigid
-from processor.geometry.mesh_distance import MeshSurface
+from processor.geometry.mesh_distance import MeshSurface, Samples
 from processor.geometry.nearest_neighbours import within_reach
 from processor.geometry.thinning import thinned, voxel_means
 from processor.geometry.thread_ranges import each
 from processor.large_arrays import corners
-from processor.model import ArchDesign, Bools, DesignPart, Floats, Reason, Status, reason
+from processor.model import ArchDesign, Bools, DesignPart, Floats, Ints, Reason, Status, reason
 from processor.preassembly import topology
 from processor.preassembly.ends import tube_end
 from processor.preassembly.ends.joint_frame import end_place
@@ -45,6 +45,7 @@ SHORT_SHARE = 0.1  # of its length, by which a scan of a whole part may be short
 NO_FIT_MM = 25.0  # misfit, about a plate's thickness, beyond which no pose explains the scan
 SAME_POSE_MM = 5.0  # poses are equal where no corner of the part differs by more
 TELLING_MM = 10.0  # distance between two poses' surfaces beyond which the scan can distinguish the poses
+SAME_CORNER_MM = 0.5 * TELLING_MM  # between corners of facets that two poses have in common
 CORNER_SAMPLES = 12  # nearest of the rival's design: some of them on each face that meets at a corner
 # An end plate's two sides are alike to few points: poses that differ by a plate's thickness, up to some 60 mm, along
 # the part are each stable, and are tried from starts nearer to each other than half of the plates that are usual.
@@ -73,12 +74,12 @@ NOWHERE = Attitude(np.full((4, 4), np.nan), np.full((4, 4), np.nan), Status.FAIL
 
 @dataclass(frozen=True)
 class Surface:
-    """Samples (n, 3) of a design part's surface in the bridge's frame with unit normals (n, 3)."""
+    """Samples (n, 3) of a design part's surface in the bridge's frame with unit normals (n, 3) and facets (n,)."""
 
     points: Floats
     normals: Floats
-    tree: cKDTree
-    boxes: icp.SampleBoxes
+    facet: Ints  # of ``mesh``
+    boxes: icp.SampleBoxes  # about the same samples, in another order
     mesh: MeshSurface
     centre: Floats  # (3,) of its area
     axes: Floats  # (3, 3) principal axes as columns
@@ -93,6 +94,7 @@ class Shapes:
         self.design = design
         self._made: dict[int, Surface] = {}
         self._sizes: list[Floats] = []
+        self._axes: dict[int, PrincipalAxes] = {}
 
     def __getitem__(self, index: int) -> Surface:
         if index not in self._made:
@@ -107,8 +109,15 @@ class Shapes:
     def sizes(self) -> list[Floats]:
         """Sizes (3,) of all parts along their principal axes."""
         if not self._sizes:
-            self._sizes = [principal.sizes(samples_of(part)[0]) for part in self.design.parts]
+            self._sizes = [principal.sizes(samples_of(part).points) for part in self.design.parts]
         return self._sizes
+
+    def axes(self, index: int) -> PrincipalAxes:
+        """Return the principal axes of a part's surface."""
+        if index not in self._axes:
+            part = self.design.parts[index]
+            self._axes[index] = principal.of_mesh(part.vertices, part.faces)
+        return self._axes[index]
 
     def _tube(self, index: int, mesh: MeshSurface) -> PrincipalAxes | None:
         """Return the axes of the wall of a part whose ends are all round; None of any other."""
@@ -132,26 +141,24 @@ class _Candidate:
     misfit: float = np.inf
 
 
-def samples_of(part: DesignPart) -> tuple[Floats, Floats]:
-    """Sample the part's surface on a fixed low-discrepancy pattern: points (n, 3) with unit normals (n, 3)."""
-    samples = mesh_distance.spread(
+def samples_of(part: DesignPart) -> Samples:
+    """Sample the part's surface on a fixed low-discrepancy pattern."""
+    return mesh_distance.spread(
         part.vertices, part.faces, lambda area_mm2: int(np.clip(area_mm2 / SAMPLE_SPACING_MM**2, 2_000, 400_000))
     )
-    return samples.points, samples.normals
 
 
 def sample_surface(part: DesignPart) -> Surface:
     """Prepare the part's surface: samples, their tree, and the mesh itself."""
-    points, normals = samples_of(part)
+    samples = samples_of(part)
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
     mesh = mesh_distance.of_mesh(part.vertices, part.faces)
     axes = principal.of_mesh(part.vertices, part.faces)
-    tree = cKDTree(points, balanced_tree=False)
     return Surface(
-        points=points,
-        normals=normals,
-        tree=tree,
-        boxes=icp.boxes_of(tree),
+        points=samples.points,
+        normals=samples.normals,
+        facet=(np.cumsum(mesh_distance.has_area(part.vertices, part.faces)) - 1)[samples.facet],
+        boxes=icp.boxes_of(samples.points, samples.normals),
         mesh=mesh,
         centre=axes.centre,
         axes=axes.axes,
@@ -343,13 +350,13 @@ def _of_pieces(seeds: Floats, few: Floats, surface: Surface, part: DesignPart) -
         fitted = icp.point_to_plane(
             quick,
             surface.boxes,
-            surface.normals,
             T,
             gates_mm=COARSE_GATES_MM[:1],
             axes=surface.axes,
             max_iterations=PIECE_ITERATIONS,
+            known=(known := icp.nothing_known(len(quick))),
         ).T_target_source
-        return _Candidate(fitted, fitted, _misfit(quick, surface, fitted))
+        return _Candidate(fitted, fitted, _misfit(quick, surface, fitted, known))
 
     best = sorted(each(iterate, piece_hypotheses(seeds, part)), key=lambda c: c.misfit)[:PIECES_KEPT]
     return each(partial(_align, few, surface, COARSE_GATES_MM), [_Candidate(c.T, c.T) for c in best])
@@ -415,19 +422,24 @@ def _rival_reason(best: Floats, rival: Floats, surface: Surface) -> Reason:
 
 def _align(points: Floats, surface: Surface, gates_mm: tuple[float, ...], candidate: _Candidate) -> _Candidate:
     """Align from the pose of a candidate, by a share of the points until the last gate."""
-    T = candidate.T
-    for seeds, gates in ((thinned(points, WIDE_POINTS), gates_mm[:-1]), (points, gates_mm[-1:])):
-        T = icp.point_to_plane(
-            seeds, surface.boxes, surface.normals, T, gates_mm=gates, axes=surface.axes
-        ).T_target_source
-    return _Candidate(T, candidate.start, _misfit(points, surface, T))
+    wide, known = thinned(points, WIDE_POINTS), icp.nothing_known(len(points))
+    of_wide = known if len(wide) == len(points) else icp.nothing_known(len(wide))
+    T = icp.point_to_plane(
+        wide, surface.boxes, candidate.T, gates_mm=gates_mm[:-1], axes=surface.axes, known=of_wide
+    ).T_target_source
+    T = icp.point_to_plane(
+        points, surface.boxes, T, gates_mm=gates_mm[-1:], axes=surface.axes, known=known
+    ).T_target_source
+    return _Candidate(T, candidate.start, _misfit(points, surface, T, known))
 
 
-def _misfit(points: Floats, surface: Surface, T: Floats) -> float:
+def _misfit(points: Floats, surface: Surface, T: Floats, known: icp.Known) -> float:
     """Median distance in mm of the points to the nearest design sample's plane."""
     placed = rigid.apply(T, points)
-    distance, index = surface.tree.query(placed)
-    normal_part = np.abs(np.einsum("ni,ni->n", placed - surface.points[index], surface.normals[index]))
+    icp.find_partners(surface.boxes, placed, np.inf, known, np.empty(len(points), bool))
+    off = placed - surface.boxes.samples[known.first]
+    distance = np.sqrt(np.einsum("ni,ni->n", off, off))
+    normal_part = np.abs(np.einsum("ni,ni->n", off, surface.boxes.normals[known.first]))
     # A point beyond the surface's edge may lie in the plane of its nearest sample and still be far from it.
     spacing = 3.0 * float(np.median(distance))
     return float(np.median(np.where(distance > 100.0 + spacing, distance, normal_part)))
@@ -457,20 +469,46 @@ def only_in(surface: Surface, T: Floats, other: Surface, T_other: Floats) -> tup
 
 def _lacks(surface: Surface, T: Floats, other: Surface, T_other: Floats) -> Bools:
     """Mark the samples (n,) of a design that, placed in the scan, are far from the other design there."""
-    samples = rigid.apply(T_other, rigid.apply(rigid.invert(T), surface.points))
-    found, distance, beyond = other.mesh.distances(samples, 5.0 * TELLING_MM)
+    near = _has_facets(surface.mesh, T, other.mesh, T_other)[surface.facet]
+    rest = np.flatnonzero(~near)
+    samples = rigid.apply(T_other, rigid.apply(rigid.invert(T), surface.points[rest]))
+    near[rest] = _on_surface(samples, other.mesh)
+    return ~near
+
+
+def _has_facets(mesh: MeshSurface, T: Floats, other: MeshSurface, T_other: Floats) -> Bools:
+    """Mark the facets (f,) of a mesh, placed in the scan, of which another mesh there has all corners in one facet.
+
+    No point of such a facet is farther from the other mesh than its corners are.
+    """
+    moved = rigid.apply(T_other, rigid.apply(rigid.invert(T), mesh.vertices))
+    corner = cKDTree(other.vertices).query(moved, distance_upper_bound=SAME_CORNER_MM, workers=-1)[1]
+    count = len(other.vertices) + 1  # the last number: none is near
+
+    def numbers(faces: Ints) -> Ints:
+        low, middle, high = np.sort(faces, axis=1).T
+        return np.asarray((low * count + middle) * count + high, np.int64)
+
+    facets = corner[mesh.faces]
+    found = (facets < count - 1).all(axis=1)
+    found[found] = np.isin(numbers(facets[found]), numbers(other.faces))
+    return np.asarray(found, bool)
+
+
+def _on_surface(samples: Floats, mesh: MeshSurface) -> Bools:
+    """Mark the samples (n, 3) of a design that are not far from another one's surface."""
+    found, distance, beyond = mesh.distances(samples, 5.0 * TELLING_MM)
     near = (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)  # False where nothing is in reach: NaN
     # Near a corner the nearest sample may be on the other face, from which the search over facets does not get round.
     # Where nothing is in reach, no face is: the most of two poses' samples, and the costly ones to search for.
     doubtful = np.flatnonzero(~near & (found >= 0))
-    around = other.mesh.tree.query(samples[doubtful], k=CORNER_SAMPLES, workers=-1)
-    beside = around[0][:, 0] <= 1.4 * TELLING_MM
-    for k in range(CORNER_SAMPLES):
-        face = other.mesh.sample_face[around[1][:, k]]
-        _, distance, beyond = other.mesh.distances(samples[doubtful], np.inf, face)
+    faces, away = mesh.nearest(samples[doubtful], np.inf, CORNER_SAMPLES)
+    beside = away[:, 0] <= 1.4 * TELLING_MM
+    for face in np.ascontiguousarray(faces.T):
+        _, distance, beyond = mesh.distances(samples[doubtful], np.inf, face)
         beside |= (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)
     near[doubtful[beside]] = True
-    return ~near
+    return np.asarray(near, bool)
 
 
 def shown(points: Floats, T: Floats, samples: Floats) -> int:

@@ -76,9 +76,9 @@ class _Surroundings(NamedTuple):
 def identify(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> Identity:
     """Compare points (n, 3), placed on part ``index`` by T_bridge_scan (4, 4), with the parts of the same shape."""
     rather, unseen, same = [], [], []
-    part, surface = shapes.design.parts[index], shapes[index]
+    surface = shapes[index]
     for k, other in enumerate(shapes.design.parts):
-        motions = same_shape.motions(part, other) if k != index else []
+        motions = same_shape.motions(shapes, index, k) if k != index else []
         if not motions:
             continue
         # A part that is symmetric but for its mark lies on the other in two ways. Where the marks agree in one of them

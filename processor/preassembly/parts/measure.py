@@ -388,7 +388,8 @@ def _between_stations(points: Floats, station: Ints, shape: attitude.Surface) ->
 def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _PlacedScan:
     """Register one scan, without the ground and what stands about the part, and check that it is of part ``index``."""
     order = by_cell(scan.points, CELL_MM)
-    points = scan.points[order] * shrink
+    points = scan.points[order]
+    points *= shrink
     station = scan.point_station[order].astype(np.int64) if len(scan.point_station) else np.zeros(len(points), np.int64)
     of_part = main_body.of_sizes(points, shapes.sizes)
     if of_part is None:

@@ -1,0 +1,16 @@
+"""How kernels are compiled that only other kernels call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import njit
+
+# Without the wrappers by which Python calls a kernel it takes a fifth less time to compile.
+OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+def inner(kernel: Callable[..., Any]) -> Any:
+    """Compile a kernel that Python never calls."""
+    return njit(**OPTIONS)(kernel)
