@@ -16,9 +16,9 @@ from processor import large_arrays
 from processor.model import Floats, Ints
 
 ROWS = 8192  # of equal polar angle, of which bands are made
-BAND_POINTS = 1 << 20  # of a band, but that it has one row at least
+BAND_POINTS = 1 << 19  # of a band, but that it has one row at least
 HALO_STEPS = 10.0  # mean distances of a band's points, by which it is searched beyond its edges at first
-CHUNK = 1 << 18
+CHUNK = 1 << 15
 
 
 class Neighbourhoods(NamedTuple):
