@@ -88,10 +88,14 @@ class Surface:
 
 
 class Shapes:
-    """The sampled surfaces of a design's parts by their numbers, each made when it is first asked for."""
+    """The sampled surfaces of a design's parts by their numbers, each made when it is first asked for.
 
-    def __init__(self, design: ArchDesign) -> None:
+    ``attitudes`` are those found of whole scans as they are, by the numbers of their parts, for other methods.
+    """
+
+    def __init__(self, design: ArchDesign, attitudes: dict[int, Attitude] | None = None) -> None:
         self.design = design
+        self.attitudes = {} if attitudes is None else attitudes
         self._made: dict[int, Surface] = {}
         self._sizes: list[Floats] = []
         self._axes: dict[int, PrincipalAxes] = {}

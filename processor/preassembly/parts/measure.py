@@ -394,7 +394,10 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     station = scan.point_station[order].astype(np.int64) if len(scan.point_station) else np.zeros(len(points), np.int64)
     of_part = main_body.of_sizes(points, shapes.sizes)
     if of_part is None:
-        return _identified(scan, points, station, index, shapes)
+        placed = _identified(scan, points, station, index, shapes)
+        if shrink == 1.0 and placed.attitude is not attitude.NOWHERE and shapes[index].tube is None:
+            shapes.attitudes[index] = placed.attitude
+        return placed
     placed = _identified(scan, points[of_part], station[of_part], index, shapes)
     if placed.rejected:
         return placed
