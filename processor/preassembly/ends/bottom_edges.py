@@ -23,7 +23,6 @@ from processor.geometry import mesh_distance, rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.nearest_neighbours import within_reach
-from processor.geometry.thread_ranges import each
 from processor.model import Bools, Floats, Ints
 from processor.preassembly.assembly_errors import INTERVAL_MM
 from processor.preassembly.ends import plate_sides
@@ -92,8 +91,7 @@ class _AtEdge(NamedTuple):
 
 def measure(part: RegisteredPart, left: Polyline, right: Polyline, sigma_mm: float) -> EdgeDepartures:
     """Measure both edges of a part; ``left`` and ``right`` are the design's, ``sigma_mm`` the noise of the points."""
-    sides = ("left", left, right), ("right", right, left)
-    edges = each(lambda one: _measure_edge(one[0], part, one[1], one[2], sigma_mm), sides)
+    edges = (_measure_edge("left", part, left, right, sigma_mm), _measure_edge("right", part, right, left, sigma_mm))
     return EdgeDepartures(
         side=edges[0].side + edges[1].side,
         chainage=np.concatenate([edge.chainage for edge in edges]),

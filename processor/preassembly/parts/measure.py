@@ -14,7 +14,6 @@ from processor.geometry import box_girder_mesh, rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.thinning import by_cell, thinned
-from processor.geometry.thread_ranges import each
 from processor.model import ArchDesign, DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly import topology
 from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, section, tube_end, view_variance
@@ -146,7 +145,7 @@ def fit(
     first = usable[0]
     used = [first, *(scan for scan in usable[1:] if scan.sure == (True, True))]
     registered = _registered(used, shape, [design.joint_points[j] for j in joints if j is not None])
-    ends = tuple(each(lambda end: _fit_end(registered, end, design, first.attitude), places))
+    ends = tuple(_fit_end(registered, end, design, first.attitude) for end in places)
     edges = _edges(registered, part, first.registration.sigma_mm, systematic)
     known = [
         (design.joint_names[j], end) for end, j in zip(ends, joints, strict=True) if end is not None and j is not None
