@@ -133,7 +133,7 @@ def _by_one(
     return np.concatenate([coefficients, process]), covariance, log, beyond
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _eliminated(system, count):  # type: ignore[no-untyped-def]
     """Products (m, m) of the columns behind a covariance (n, n) in a ``system`` (n, n + m), weighed by its inverse.
 

@@ -24,7 +24,8 @@ SEARCHED = 256  # places of a sample at once: their neighbours' pages are given 
 GROWTH = 1.5  # factor of the search radius where too few points were found
 CROP_CHUNK = 1 << 20
 REACHED_CELL = 2.0  # edge of a cell, in reaches: a point's reach meets eight cells at most
-LEAST_POINTS = 20_000  # points per task of a thread that marks those within reach, or searches in a fine grid
+LEAST_POINTS = 20_000  # points per task of a thread that marks those within reach
+LEAST_SEARCHES = 5_000  # places per task of a thread that searches in a fine grid
 FIRST_CELLS = 0.5  # search radius to begin with, in cells
 
 
@@ -100,7 +101,7 @@ def nearest_rows(cells: Cells, places: Floats, reach: float, count: int = 1) -> 
     if len(cells.points) and reach > 0.0:
         over_ranges(
             lambda a, b: _nearest_rows(cells, places, float(reach), found, square, a, b),
-            len(places), least=LEAST_POINTS,
+            len(places), least=LEAST_SEARCHES,
         )  # fmt: skip
     return found, np.sqrt(square)
 

@@ -21,7 +21,7 @@ from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
 from processor.preassembly.params import Params, TrimParams
 from processor.preassembly.parts import measure
-from processor.preassembly.parts.attitude import Shapes
+from processor.preassembly.parts.attitude import Attitude, Shapes
 from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.result import Result
 from processor.preassembly.to_result import Assembly, JudgedJoint
@@ -33,12 +33,21 @@ from processor.progress import tracked
 TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)
 
 
-def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, params: Params) -> Result:
-    """Assemble a bridge; ``scans`` are those of each part, in the design's order."""
+def assemble(
+    scans: Sequence[Sequence[Scan]],
+    scene: Scene,
+    design: ArchDesign,
+    params: Params,
+    attitudes: dict[int, Attitude] | None = None,
+) -> Result:
+    """Assemble a bridge; ``scans`` are those of each part, in the design's order.
+
+    The ``attitudes`` found of scans, by the numbers of their parts, are kept for other methods.
+    """
     shrink = 1.0 / thermal.expansion(scene.temperature_C)
     limits = standards.default_for(scene.tolerance)
     frames = np.array([joint_frame(points) for points in design.joint_points])
-    shapes = Shapes(design)
+    shapes = Shapes(design, attitudes)
     fitted = []
     for index, of_part in enumerate(tracked(scans)):
         fitted.append(measure.fit(of_part, index, shapes, shrink, params.systematic))

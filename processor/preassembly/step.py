@@ -31,7 +31,8 @@ KIND = "arch-bridge"
 def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Result:
     """Assemble the bridge of a scene by one of METHODS.
 
-    The features of the parts, common to the paper's three methods, are ``kept`` for the next of them.
+    The attitudes of the scans, and the features of the parts, common to the paper's three methods, are ``kept`` for the
+    next of them.
     Raises InputError without an arch design or with a part that has no scan, UsageError for an unknown method.
     """
     if params.method not in METHODS:
@@ -41,8 +42,10 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
         raise InputError(f"{scene.name}: preassembly needs an arch-bridge design of at least two parts (design.json)")
     scans = scans_in_order(scene, design)
     unused = tuple(scan.name for scan in scene.scans if not any(scan is one for of_part in scans for one in of_part))
+    kept = {} if kept is None else kept
+    attitudes = kept.setdefault("attitudes", {})
     if params.method == "adjustment":
-        result = assemble.assemble(scans, scene, design, params)
+        result = assemble.assemble(scans, scene, design, params, attitudes)
         remarks = (reason("preassemble.scans-without-part", scans=unused),) if unused else ()
         return replace(result, reasons=(*remarks, *result.reasons))
     if not design.in_row:
@@ -57,10 +60,9 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
     several = [part.name for part, of_part in zip(design.parts, scans, strict=True) if len(of_part) > 1]
     if several:
         raise InputError(f"{scene.name}: method {params.method} takes one scan per part, {several[0]} has several")
-    kept = {} if kept is None else kept
     if "parts" not in kept:
         with diagnostics.recording() as kept["notes"]:
-            kept["parts"] = methods.extract([of_part[0] for of_part in scans], design, params)
+            kept["parts"] = methods.extract([of_part[0] for of_part in scans], design, params, attitudes)
         kept["scanned again"] = bootstrap_bands.repeat_scans(kept["parts"], design, params)
     diagnostics.replay(kept["notes"])
     result = methods.assemble(kept["parts"], design, params)

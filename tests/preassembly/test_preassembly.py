@@ -41,6 +41,23 @@ def runs(bridge):
         return found | {"adjustment": preassembly_step.run(scene, preassembly_step.Params())}
 
 
+def test_the_attitude_of_a_scan_is_searched_for_once_for_all_methods():
+    scene, truth = arch_clouds.bridge(spacing_mm=25.0, sigma_mm=1.0, seed=3)
+    alone = preassembly_step.Params(method="corner", repetitions=0)
+    find, kept = mock.Mock(side_effect=known_attitudes.find_by(truth)), {}
+    with mock.patch.object(attitude, "find", find):
+        expected = preassembly_step.run(scene, alone)
+        by_part = {call.args[1].name: call.args[0] for call in find.call_args_list}
+        find.reset_mock()
+        preassembly_step.run(scene, preassembly_step.Params(), kept)
+        assert find.call_count == len(scene.scans)
+        for call in find.call_args_list:  # of the same points in the same order
+            np.testing.assert_array_equal(call.args[0], by_part[call.args[1].name])
+        found = preassembly_step.run(scene, alone, kept)
+        assert find.call_count == len(scene.scans)
+    np.testing.assert_array_equal(found.components.T_bridge_scan, expected.components.T_bridge_scan)
+
+
 @pytest.mark.slow  # by day those of the bridge that every method assembles
 @pytest.mark.parametrize("seed", range(4))
 def test_attitudes_are_right_from_any_pose(seed):

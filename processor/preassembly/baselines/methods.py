@@ -9,7 +9,7 @@ their key points lie on the inner edges of the plates. Source: paper 000.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,14 +20,16 @@ from processor import diagnostics
 from processor.geometry import rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.nearest_neighbours import surface_spacing
-from processor.model import ArchDesign, Floats, Reason, Scan, Status, Verdict, reason
+from processor.geometry.thinning import by_cell
+from processor.model import ArchDesign, DesignPart, Floats, Reason, Scan, Status, Verdict, reason
 from processor.preassembly import assembly_errors
 from processor.preassembly.baselines import edge_features, joint_alignment
 from processor.preassembly.baselines.edge_features import JointEdges
 from processor.preassembly.baselines.joint_alignment import Alignment
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import Params
-from processor.preassembly.parts import attitude
+from processor.preassembly.parts import attitude, measure
+from processor.preassembly.parts.attitude import Attitude
 from processor.preassembly.result import (
     Components,
     Deviations,
@@ -51,7 +53,7 @@ class PartFeatures:
 
     name: str
     scan: Scan
-    attitude: attitude.Attitude
+    attitude: Attitude
     ends: tuple[JointEdges | None, JointEdges | None]  # start, end
     lines: Floats  # (n, 3) along both bottom edges, for the alignment
     edges: assembly_errors.BottomEdges  # the same from thicker slices, for the linear error
@@ -70,12 +72,23 @@ class Assembly:
     best_fit: assembly_errors.LinearError
 
 
-def extract(scans: Sequence[Scan], design: ArchDesign, params: Params) -> list[PartFeatures]:
-    """Extract the features for all methods from every scan, in the design's order."""
+def extract(
+    scans: Sequence[Scan], design: ArchDesign, params: Params, known: Mapping[int, Attitude] | None = None
+) -> list[PartFeatures]:
+    """Extract the features for all methods from every scan, in the design's order.
+
+    Attitudes that are ``known``, by the numbers of the parts, are not searched for again.
+    """
+    known = known or {}
     return [
-        features_of(scan, index, attitude.find(scan.points, design.parts[index]), design, params)
-        for index, scan in enumerate(scans)
+        features_of(scan, k, known[k] if k in known else _attitude(scan, design.parts[k]), design, params)
+        for k, scan in enumerate(scans)
     ]
+
+
+def _attitude(scan: Scan, part: DesignPart) -> Attitude:
+    """Find the attitude of a scan by its points in the order that the adjustment has them in."""
+    return attitude.find(scan.points[by_cell(scan.points, measure.CELL_MM)], part)
 
 
 def assemble(parts: list[PartFeatures], design: ArchDesign, params: Params) -> Result:
@@ -88,7 +101,7 @@ def generator(params: Params, purpose: str) -> np.random.Generator:
     return np.random.default_rng([params.seed, zlib.crc32(purpose.encode())])
 
 
-def features_of(scan: Scan, index: int, pose: attitude.Attitude, design: ArchDesign, params: Params) -> PartFeatures:
+def features_of(scan: Scan, index: int, pose: Attitude, design: ArchDesign, params: Params) -> PartFeatures:
     """Extract the features from the scan of the design's part ``index`` with a known attitude."""
     part = design.parts[index]
     points = scan.points
@@ -157,7 +170,7 @@ def place(parts: list[PartFeatures], design: ArchDesign, params: Params) -> Asse
 
 def _joint_end(
     points: Floats,
-    pose: attitude.Attitude,
+    pose: Attitude,
     design_points: Floats,
     outward: float,
     spacing: float,

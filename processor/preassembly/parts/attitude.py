@@ -88,10 +88,14 @@ class Surface:
 
 
 class Shapes:
-    """The sampled surfaces of a design's parts by their numbers, each made when it is first asked for."""
+    """The sampled surfaces of a design's parts by their numbers, each made when it is first asked for.
 
-    def __init__(self, design: ArchDesign) -> None:
+    ``attitudes`` are those found of whole scans as they are, by the numbers of their parts, for other methods.
+    """
+
+    def __init__(self, design: ArchDesign, attitudes: dict[int, Attitude] | None = None) -> None:
         self.design = design
+        self.attitudes = {} if attitudes is None else attitudes
         self._made: dict[int, Surface] = {}
         self._sizes: list[Floats] = []
         self._axes: dict[int, PrincipalAxes] = {}
@@ -188,13 +192,13 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
     return hypotheses
 
 
-def at_extents(points: Floats, part: DesignPart, T: Floats) -> Floats:
+def at_extents(points: Floats, part: DesignPart, T: Floats, axes: Floats | None = None) -> Floats:
     """Move a T_bridge_scan (4, 4) so that the middle of the scan's extents lies at that of the part's.
 
     Where a scan is denser at one end its centre is not the part's, and a part of even curvature slides along itself
-    from there. A scan that is shorter than the part stays.
+    from there. A scan that is shorter than the part stays. ``axes`` (3, 3) are the part's principal axes, if at hand.
     """
-    axes = principal.of_mesh(part.vertices, part.faces).axes
+    axes = principal.of_mesh(part.vertices, part.faces).axes if axes is None else axes
     whole, placed = part.vertices @ axes, rigid.apply(T, points) @ axes
     low, high = np.quantile(placed, EXTENTS, axis=0)
     if high[0] - low[0] < (1.0 - SHORT_SHARE) * np.ptp(whole[:, 0]):
@@ -335,7 +339,8 @@ def _coarse(
     """Align all hypotheses by a few hundred points, and return the promising ones, the best first."""
     seeds, few = even
     by_axes = principal_hypotheses(points, part)
-    starts = [_Candidate(T, T) for T in by_axes] + [_Candidate(at_extents(seeds, part, T), T) for T in by_axes]
+    starts = [_Candidate(T, T) for T in by_axes]
+    starts += [_Candidate(at_extents(seeds, part, T, surface.axes), T) for T in by_axes]
     coarse = each(partial(_align, few, surface, COARSE_GATES_MM), starts)
     if pieces and min(c.misfit for c in coarse) > PIECE_MM:
         coarse += _of_pieces(seeds, few, surface, part)

@@ -66,7 +66,7 @@ class _Outcome(Enum):
 
 
 class _Surroundings(NamedTuple):
-    """Points (k, 3) on the design away from the marks, its normals (k, 3) there, and departures (k,) outward."""
+    """Points (k, 3) on the design, its normals (k, 3) there, and departures (k,) outward."""
 
     points: Floats
     normals: Floats
@@ -77,13 +77,16 @@ def identify(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> 
     """Compare points (n, 3), placed on part ``index`` by T_bridge_scan (4, 4), with the parts of the same shape."""
     rather, unseen, same = [], [], []
     surface = shapes[index]
+    on_design: _Surroundings | None = None
     for k, other in enumerate(shapes.design.parts):
         motions = same_shape.motions(shapes, index, k) if k != index else []
         if not motions:
             continue
         # A part that is symmetric but for its mark lies on the other in two ways. Where the marks agree in one of them
         # the two parts are the same; a mark that agrees in the other way is the part's own, turned round.
-        outcomes = {_compare(points, T, surface, shapes[k], motion) for motion in motions}
+        if on_design is None:
+            on_design = _on_design(rigid.apply(T, thinned(points, AROUND)), surface)
+        outcomes = {_compare(points, T, surface, shapes[k], motion, on_design) for motion in motions}
         if _Outcome.SAME in outcomes:
             same.append(other.name)
         elif _Outcome.OTHER in outcomes:
@@ -94,9 +97,14 @@ def identify(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> 
 
 
 def _compare(
-    points: Floats, T: Floats, surface: attitude.Surface, other_surface: attitude.Surface, T_part_other: Floats
+    points: Floats,
+    T: Floats,
+    surface: attitude.Surface,
+    other_surface: attitude.Surface,
+    T_part_other: Floats,
+    on_design: _Surroundings,
 ) -> _Outcome:
-    """Compare with another part laid on this one in one way."""
+    """Compare with another part laid on this one in one way; ``on_design`` are some of the points."""
     T_other = rigid.invert(T_part_other) @ T
     of_part = attitude.only_in(surface, T, other_surface, T_other)
     of_other = attitude.only_in(other_surface, T_other, surface, T)
@@ -104,7 +112,7 @@ def _compare(
         return _Outcome.SAME
     of_other = rigid.apply(T_part_other, of_other[0]), of_other[1] @ T_part_other[:3, :3].T
     marks = np.vstack([of_part[0], of_other[0]])  # both in the frame of the part's design
-    around = _around(rigid.apply(T, thinned(points, AROUND)), surface, marks)
+    around = _around(on_design, marks)
     part_count, other_count = (
         attitude.shown(points, T, _as_built(samples, normals, around)) for samples, normals in (of_part, of_other)
     )
@@ -114,11 +122,18 @@ def _compare(
     return _Outcome.PART if part_count > other_count else _Outcome.OTHER
 
 
-def _around(points: Floats, surface: attitude.Surface, marks: Floats) -> _Surroundings:
-    """Points on the design that are away from samples (m, 3) of the marks."""
+def _on_design(points: Floats, surface: attitude.Surface) -> _Surroundings:
+    """Points, of those (n, 3) placed on a part's design, that lie on its faces."""
     face, distance, beyond = surface.mesh.distances(points, REACH_MM)
-    used = on_face(face, beyond) & (cKDTree(marks).query(points)[0] > 1.5 * SAMPLE_SPACING_MM)
+    used = on_face(face, beyond)
     return _Surroundings(points[used], surface.mesh.normals[face[used]], distance[used])
+
+
+def _around(on_design: _Surroundings, marks: Floats) -> _Surroundings:
+    """Points on the design that are away from samples (m, 3) of the marks."""
+    away = 1.5 * SAMPLE_SPACING_MM
+    near = cKDTree(marks).query(on_design.points, distance_upper_bound=np.nextafter(away, np.inf))[0] <= away
+    return _Surroundings(*(of_points[~near] for of_points in on_design))
 
 
 def _as_built(samples: Floats, normals: Floats, around: _Surroundings) -> Floats:

@@ -176,7 +176,7 @@ def fit(
         outer=outer,
         T_further_scans=tuple(scan.registration.T_design_scan for scan in used[1:]),
     )
-    several = len(np.unique(registered.station)) > 1
+    several = bool((registered.station != registered.station[0]).any())
     names = tuple("" if joint is None else design.joint_names[joint] for joint in joints)
     fitted = FittedPart(part, measured, ends, names)
     return fitted if several else replace(fitted, views=_views(registered, shape))
@@ -393,7 +393,10 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     station = scan.point_station[order].astype(np.int64) if len(scan.point_station) else np.zeros(len(points), np.int64)
     of_part = main_body.of_sizes(points, shapes.sizes)
     if of_part is None:
-        return _identified(scan, points, station, index, shapes)
+        placed = _identified(scan, points, station, index, shapes)
+        if shrink == 1.0 and placed.attitude is not attitude.NOWHERE and shapes[index].tube is None:
+            shapes.attitudes[index] = placed.attitude
+        return placed
     placed = _identified(scan, points[of_part], station[of_part], index, shapes)
     if placed.rejected:
         return placed
