@@ -22,7 +22,7 @@ from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import blocks
 from processor.model import Bools, Floats, InputError, Ints
 
-CELLS_PER_DIAMETER = 4.0
+CELLS_PER_DIAMETER = 2.0
 FEWEST_FOR_LOD = 4  # points of either cloud, below which there is no level of detection
 Z95 = 1.96
 LEAST_RANGE = 256  # core points per task of a thread

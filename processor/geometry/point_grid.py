@@ -105,18 +105,18 @@ def _sorted(points: Floats, lower: Floats, size: float, most: int) -> _Part | No
 
     More than AT_ONCE points are put apart by the keys of their blocks first, and sorted part by part.
     """
+    if len(points) <= large_arrays.AT_ONCE:
+        return _part(points, np.arange(len(points)), lower, size, most)
 
     def key_of(places: Floats) -> Ints:
-        return _keys(((places - lower) / size).astype(np.int64))
+        return _keys(((places - lower) / size).astype(np.int64)) >> 6
 
-    if len(points) <= large_arrays.AT_ONCE:
-        return _part(points, np.arange(len(points)), key_of(points), most)
     count = -(-2 * len(points) // large_arrays.AT_ONCE)
-    sample = np.sort(key_of(large_arrays.every(points, -(-len(points) // large_arrays.AT_ONCE))) >> 6)
+    sample = np.sort(key_of(large_arrays.every(points, -(-len(points) // large_arrays.AT_ONCE))))
     bounds = np.unique(sample[np.arange(1, count) * len(sample) // count])
 
     def part_of(block: tuple[Floats, ...]) -> Ints:
-        return np.searchsorted(bounds, key_of(block[0]) >> 6, side="right").astype(np.int64)
+        return np.searchsorted(bounds, key_of(block[0]), side="right").astype(np.int64)
 
     filled = np.zeros(len(bounds) + 1, np.int64)
     for rows in blocks(len(points)):
@@ -129,7 +129,7 @@ def _sorted(points: Floats, lower: Floats, size: float, most: int) -> _Part | No
         if first == last:
             continue
         own = slice(first, last)
-        if (part := _part(placed[own], order[own], key_of(placed[own]), most)) is None:
+        if (part := _part(placed[own], order[own], lower, size, most)) is None:
             return None
         placed[own], order[own] = part.points, part.order
         keys.append(part.keys)
@@ -139,24 +139,27 @@ def _sorted(points: Floats, lower: Floats, size: float, most: int) -> _Part | No
     return _Part(placed, order, np.concatenate(keys), _stacked(starts))
 
 
-def _part(points: Floats, order: Ints, key: Ints, most: int) -> _Part | None:
-    """Sort points (n, 3), rows ``order`` (n,) of a cloud, by keys (n,) and in cells; None beyond ``most`` blocks."""
-    by_key = np.argsort(key)
-    key = key[by_key]
-    block_key = key >> 6
-    begins = block_key[1:] != block_key[:-1]
-    first = np.flatnonzero(np.concatenate([[True], begins]))
-    if len(first) > most:
+def _part(points: Floats, order: Ints, lower: Floats, size: float, most: int) -> _Part | None:
+    """Sort points (n, 3), rows ``order`` (n,) of a cloud, by blocks and in cells; None beyond ``most`` blocks."""
+    points, order = (large_arrays.read_only(np.ascontiguousarray(one)) for one in (points, order))
+    block, cell = np.empty(len(points), np.int32), np.empty(len(points), np.uint8)
+    found = _into_blocks(points, lower, size, min(most, len(points)), _empty_table(most), block, cell)
+    if found is None:
         return None
-    rows = np.ascontiguousarray(points[by_key])
-    block = np.cumsum(np.concatenate([[0], begins]))
-    count = np.bincount(block * SIDE**3 + (key & 63), minlength=len(first) * SIDE**3).reshape(-1, SIDE**3)
-    starts = np.zeros((len(first), SIDE**3 + 1), np.int64)
-    np.cumsum(count, axis=1, out=starts[:, 1:])
-    starts += first[:, None]
-    order = order[by_key].astype(np.int64)
-    over_ranges(lambda a, b: _sort_cells(rows, order, starts, a, b), len(first), least=64)
-    return _Part(rows, order, block_key[first], starts)
+    keys, count = found
+    by_key = np.argsort(keys)
+    first = np.zeros(len(keys) + 1, np.int64)
+    np.cumsum(count[by_key], out=first[1:])
+    place = np.empty(len(keys), np.int64)
+    place[by_key] = first[:-1]
+    rows = np.empty(len(points), np.int32)
+    _place(block, place, rows)
+    part = _Part(
+        points=np.empty((len(points), 3)), order=np.empty(len(points), np.int64), keys=keys[by_key],
+        starts=np.empty((len(keys), SIDE**3 + 1), np.int64),
+    )  # fmt: skip
+    over_ranges(lambda a, b: _into_cells(points, order, rows, cell, first, part, a, b), len(keys), least=64)
+    return part
 
 
 def _stacked(parts: Sequence[Ints]) -> Ints:
@@ -211,10 +214,16 @@ def _blocks_within(grid: PointGrid, low: Floats, high: Floats) -> Ints:
 
 def _table(block_keys: Ints, large: bool = False) -> tuple[Ints, Ints]:
     """Return the hash table of blocks with ``block_keys`` (b,): keys (slots,) and rows (slots,)."""
-    slots = 1 << max(4, int(2 * len(block_keys)).bit_length())
+    keys, rows = _empty_table(len(block_keys), large)
+    _fill(keys, rows, np.ascontiguousarray(block_keys))
+    return keys, rows
+
+
+def _empty_table(count: int, large: bool = False) -> tuple[Ints, Ints]:
+    """Return an empty hash table for ``count`` blocks: a power of two of slots, twice as many as blocks or more."""
+    slots = 1 << max(4, (2 * count).bit_length())
     keys, rows = (allocate(slots, dtype=np.int64) if large else np.empty(slots, np.int64) for _ in range(2))
     keys[:], rows[:] = EMPTY, EMPTY
-    _fill(keys, rows, np.ascontiguousarray(block_keys))
     return keys, rows
 
 
@@ -227,15 +236,20 @@ def _keys(cell: Ints) -> Ints:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def block_at(cells, i, j, k):  # type: ignore[no-untyped-def]
-    """Find the row of a block by its indices along the axes; EMPTY where it holds no point."""
-    key = ((i << FIELD) | j) << FIELD | k
-    mask = np.uint64(len(cells.keys) - 1)
+def _slot(keys, key):  # type: ignore[no-untyped-def]
+    """Find where a block's key is in the hash table, or the free slot where it would be."""
+    mask = np.uint64(len(keys) - 1)
     h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     at = (h ^ (h >> np.uint64(32))) & mask
-    while cells.keys[at] != EMPTY and cells.keys[at] != key:
+    while keys[at] != EMPTY and keys[at] != key:
         at = (at + np.uint64(1)) & mask
-    return cells.blocks[at]
+    return at
+
+
+@njit(cache=True, nogil=True, inline="always")
+def block_at(cells, i, j, k):  # type: ignore[no-untyped-def]
+    """Find the row of a block by its indices along the axes; EMPTY where it holds no point."""
+    return cells.blocks[_slot(cells.keys, ((i << FIELD) | j) << FIELD | k)]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -256,14 +270,66 @@ def cells_within(cells, x, y, z, ex, ey, ez):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _fill(keys, blocks, block_keys):  # type: ignore[no-untyped-def]
     """Enter the rows of blocks with ``block_keys`` (b,) into the hash table."""
-    mask = np.uint64(len(keys) - 1)
     for row in range(len(block_keys)):
-        h = np.uint64(block_keys[row]) * np.uint64(0x9E3779B97F4A7C15)
-        at = (h ^ (h >> np.uint64(32))) & mask
-        while keys[at] != EMPTY:
-            at = (at + np.uint64(1)) & mask
-        keys[at] = block_keys[row]
-        blocks[at] = row
+        at = _slot(keys, block_keys[row])
+        keys[at], blocks[at] = block_keys[row], row
+
+
+@njit(cache=True, nogil=True)
+def _into_blocks(points, lower, size, most, table, block, cell):  # type: ignore[no-untyped-def]
+    """Write the block (n,), numbered as they come, and the cell in it (n,) of each point.
+
+    Return the blocks' keys and numbers of points; None where there are more than ``most``. The ``table`` is empty.
+    """
+    slots, rows = table
+    keys, count = np.empty(most, np.int64), np.zeros(most, np.int64)
+    xl, yl, zl = lower[0], lower[1], lower[2]
+    found, last, number = 0, EMPTY, 0
+    for row in range(len(points)):
+        i, j = int((points[row, 0] - xl) / size), int((points[row, 1] - yl) / size)
+        k = int((points[row, 2] - zl) / size)
+        key = ((i // SIDE << FIELD) | j // SIDE) << FIELD | k // SIDE
+        if key != last:  # neighbours in a scan are often in the same block
+            slot = _slot(slots, key)
+            if slots[slot] == EMPTY:
+                if found == most:
+                    return None
+                slots[slot], rows[slot], keys[found] = key, found, key
+                found += 1
+            last, number = key, rows[slot]
+        block[row], cell[row] = number, ((i % SIDE) * SIDE + j % SIDE) * SIDE + k % SIDE
+        count[number] += 1
+    return keys[:found], count[:found]
+
+
+@njit(cache=True, nogil=True)
+def _place(block, place, rows):  # type: ignore[no-untyped-def]
+    """Write the rows (n,) of points by their ``block`` (n,): block b begins at ``place[b]``, which moves to its end."""
+    for row in range(len(block)):
+        rows[place[block[row]]] = row
+        place[block[row]] += 1
+
+
+@njit(cache=True, nogil=True)
+def _into_cells(points, order, rows, cell, first, part, start, stop):  # type: ignore[no-untyped-def]
+    """Write the points of blocks ``start`` to ``stop`` - 1 to the part, by cells, in each of them sorted by x, y, z."""
+    place = np.empty(SIDE**3 + 1, np.int64)
+    for block in range(start, stop):
+        place[:] = 0
+        for at in range(first[block], first[block + 1]):
+            place[cell[rows[at]] + 1] += 1
+        place[0] = first[block]
+        for c in range(SIDE**3):
+            place[c + 1] += place[c]
+        part.starts[block] = place
+        for at in range(first[block], first[block + 1]):
+            row = rows[at]
+            to = place[cell[row]]
+            place[cell[row]] += 1
+            part.order[to] = order[row]
+            for axis in range(3):
+                part.points[to, axis] = points[row, axis]
+    _sort_cells(part.points, part.order, part.starts, start, stop)
 
 
 @njit(cache=True, nogil=True)
