@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
 from processor.geometry.thinning import thinned, voxel_means
+from processor.geometry.thread_ranges import each
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Word
 from processor.registration import icp, main_body, pose_choice, principal
 from processor.registration.principal import CoarsePose, PrincipalAxes
@@ -228,12 +229,17 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     where it is by ``auto``, and the best fit is only reported. ``scanner`` (n, 3) is the position that each point was
     measured from, if known: it helps to distinguish attitudes. Ground and what stands about the structure is left out.
     """
+    of_body = body_of(points, surface) if how in ("auto", "coarse") else None
+    return place_body(points, surface, given, how, scanner, of_body)
+
+
+def place_body(
+    points: Floats, surface: MeshSurface, given: Floats, how: str, scanner: Floats | None, of_body: Bools | None
+) -> Placed:
+    """Place a scan's points as :func:`place`, those of the structure being known, see :func:`body_of`."""
     axes = principal.of_mesh(surface.vertices, surface.faces)
     few = thinned(points, FINE_POINTS)
     share = near_share(few, surface, given)
-    of_body = None
-    if how in ("auto", "coarse"):
-        of_body = body_of(points, surface)
     if of_body is not None:
         few_of_body = thinned(points[of_body], FINE_POINTS)
         of_body_share = near_share(few_of_body, surface, given)
@@ -245,9 +251,14 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
         registration = Registration.COARSE
         poses = _attitudes(even(points), surface, axes)
         starts = [T for error, T in poses if error <= PROMISING * poses[0][0]]
-        fits = [fine(few, surface, axes.axes, start) for start in starts]
+        first, *further = starts
+        fits = [fine(few, surface, axes.axes, first)]
+        fewer = thinned(points, RIVAL_POINTS)
+        fits += each(lambda start: fine(fewer, surface, axes.axes, start), further)
         choice = pose_choice.choose(points, surface, [fit.T_design_scan for fit in fits], scanner)
         start, fitted = starts[choice.best], fits[choice.best]
+        if choice.best:
+            fitted = fine(few, surface, axes.axes, start)
         rivals = [fits[k].T_design_scan for k in choice.rivals]
         others = [error for k, (error, _) in enumerate(poses) if k != choice.best]
         ambiguity = min(others, default=NAN) / max(poses[choice.best][0], 1e-9)
@@ -334,7 +345,7 @@ def _surely_turned(
     design = _samples(surface)
     refined = _refined(even(points), design, float(np.linalg.norm(np.ptp(design.points, axis=0))))
     turns = _turns(axes, surface)
-    (error, _), *others = [refined(turn @ given.T_design_scan) for turn in turns]
+    (error, _), *others = each(lambda turn: refined(turn @ given.T_design_scan), turns)
     few = thinned(points, RIVAL_POINTS)
     fits, turned_back = [], []
     for turn, (rms, T) in zip(turns[1:], others, strict=True):
@@ -391,7 +402,7 @@ def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> lis
     size = float(np.linalg.norm(np.ptp(design.points, axis=0)))
     first = coarse(points, design, axes)
     refined = _refined(points, design, size)
-    found = [refined(turn @ first.T_target_source) for turn in _turns(axes, surface)]
+    found = each(lambda turn: refined(turn @ first.T_target_source), _turns(axes, surface))
     found.append((first.rms_mm, first.T_target_source))
     if np.isfinite(first.T_rival).all():
         found.append((first.ambiguity * first.rms_mm, first.T_rival))
@@ -400,7 +411,7 @@ def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> lis
     for _ in range(SIDE_ROUNDS):  # plates along several axes may lie on their other sides
         least = distinct[0][0]
         promising = [T for error, T in untried if error <= PROMISING * least]
-        shifted = [refined(start) for T in promising for start in _other_sides(points, design.points, square, T)]
+        shifted = each(refined, [start for T in promising for start in _other_sides(points, design.points, square, T)])
         distinct = _distinct([*distinct, *shifted], centre, size)
         untried = [one for one in distinct if any(one is other for other in shifted)]
         if not distinct[0][0] < least:
