@@ -23,7 +23,7 @@ from processor.geometry import m3c2 as m3c2_distances
 from processor.geometry import mesh_distance, normal_orientation, rigid
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import MeshSurface
-from processor.model import Floats, Reason, Status, reason
+from processor.model import Bools, Floats, Reason, Status, reason
 from processor.registration import surface_registration
 from processor.registration.surface_registration import Placed
 from processor.scene_cloud import MergedCloud
@@ -229,10 +229,13 @@ def register(
     local = cloud - scan_origin
     seen_from = None if scanners is None else positions_of(scanners, "scanners", cloud.shape) - scan_origin
     surface = mesh_distance.of_design(corners - origin, triangles)
-    placed, rival = _placed(local, surface, rigid.transform(np.eye(3), scan_origin - origin), seen_from)
+    of_body = surface_registration.body_of(local, surface)
+    given = rigid.transform(np.eye(3), scan_origin - origin)
+    placed, rival = _placed(local, surface, given, seen_from, of_body)
     determined = bool(np.isfinite(placed.T_best_fit).all())
     T = placed.T_best_fit if determined else placed.T
-    status, reasons = _assessed(local, surface, T, placed, ambiguous=rival is not None)
+    body = local if of_body is None else local[of_body]
+    status, reasons = _assessed(body, surface, T, placed, ambiguous=rival is not None)
     if status is not Status.OK and not 1.0 / LIKE_SIZE < ratio < LIKE_SIZE:
         reasons = (*reasons, _sizes(ratio))
     return Pose(
@@ -245,13 +248,14 @@ def register(
 
 
 def _placed(
-    points: Floats, surface: MeshSurface, given: Floats, scanners: Floats | None
+    points: Floats, surface: MeshSurface, given: Floats, scanners: Floats | None, of_body: Bools | None
 ) -> tuple[Placed, Floats | None]:
     """Place points (n, 3) at a surface; of two poses that fit alike, at that which faces the scanners (n, 3).
 
-    Returns the other pose (4, 4) as well, None where there is none.
+    ``of_body`` (n,) marks those that are not of ground or walls. Returns the other pose (4, 4) as well, None where
+    there is none.
     """
-    placed = surface_registration.place(points, surface, given, "auto")
+    placed = surface_registration.place_body(points, surface, given, "auto", None, of_body)
     if not placed.ambiguous:
         return placed, None
     rival = placed.T_rival
@@ -266,9 +270,7 @@ def _placed(
 def _assessed(
     points: Floats, surface: MeshSurface, T: Floats, placed: Placed, *, ambiguous: bool
 ) -> tuple[Status, tuple[Reason, ...]]:
-    """Return the status of points (n, 3) placed by T (4, 4), without ground and walls, and why it is not ok."""
-    of_body = surface_registration.body_of(points, surface)
-    points = points if of_body is None else points[of_body]
+    """Return the status of points (n, 3), without ground and walls, placed by T (4, 4), and why it is not ok."""
     share = surface_registration.near_share(points, surface, T)
     if share < surface_registration.NEAR_SHARE:
         near_mm = surface_registration.NEAR_MM

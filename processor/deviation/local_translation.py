@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.linalg_small import assign, assign_rows, eigen
-from processor.geometry.m3c2 import FEWEST_FOR_LOD, HALF_DIAGONAL, LEAST_RANGE
-from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
+from processor.geometry.m3c2 import FEWEST_FOR_LOD, LEAST_RANGE
+from processor.geometry.point_grid import HALF_DIAGONAL, SIDE, PointGrid, block_at, cells_within
 from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats, Ints
 from processor.robust_statistics import student_factor

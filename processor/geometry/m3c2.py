@@ -17,12 +17,12 @@ from numba import njit
 from processor import large_arrays
 from processor.geometry import nearest_neighbours, point_grid
 from processor.geometry.linalg_small import eigen
-from processor.geometry.point_grid import SIDE, PointGrid, block_at, cells_within
+from processor.geometry.point_grid import HALF_DIAGONAL, SIDE, PointGrid, block_at, cells_within
 from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import blocks
 from processor.model import Bools, Floats, InputError, Ints
 
-CELLS_PER_DIAMETER = 4.0
+CELLS_PER_DIAMETER = 2.0
 FEWEST_FOR_LOD = 4  # points of either cloud, below which there is no level of detection
 Z95 = 1.96
 LEAST_RANGE = 256  # core points per task of a thread
@@ -236,7 +236,6 @@ def _scale_sample(points: Floats) -> Floats:
 # --- The loops of M3C2 and of normals, compiled. Each place is independent, so that threads do not change results.
 
 
-HALF_DIAGONAL = 0.5 * SIDE * 3.0**0.5 * (1.0 + 1e-9)  # of a block, in cells
 FEWEST_OF_PLANE = 3
 
 

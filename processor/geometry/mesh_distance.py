@@ -39,6 +39,7 @@ DESIGN_SAMPLES, DESIGN_SPACING_MM = 1_000_000, (8.0, 40.0)  # samples on a whole
 MOST_VOXELS, MOST_ENTRIES = 20_000_000, 40_000_000
 FULL, EMPTY = 64, 8.0  # a facet's box is halved if it has more voxels than this, and as many times those of the facet
 PIECES = 64  # size of the stack of halved boxes
+ROUNDING_MM = 1e-6  # more than the errors of rounding of a distance
 GRAZING_COS = 0.02  # cosine of incidence below which a facet is seen edge-on
 
 
@@ -362,6 +363,7 @@ class FacetGrid(NamedTuple):
     facet: Labels
     corners: Floats  # (f, 3, 3)
     normals: Floats
+    balls: Floats  # (f, 4) centre and radius of a ball about each facet
     reach: float
 
 
@@ -384,9 +386,12 @@ def facet_grid(vertices: Floats, faces: Ints, normals: Floats, reach: float) -> 
     np.cumsum(_facets_of_voxels(corners, normals, low, size, shape, reach, *none), out=start[1:])
     facet = np.empty(start[-1], np.int32)
     _facets_of_voxels(corners, normals, low, size, shape, reach, start, facet)
+    centre = corners.mean(axis=1)
+    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1) + ROUNDING_MM
     return FacetGrid(
-        low=low, size=size, shape=shape, start=start, facet=facet, corners=corners, normals=normals, reach=float(reach)
-    )
+        low=low, size=size, shape=shape, start=start, facet=facet, corners=corners, normals=normals,
+        balls=np.column_stack([centre, radius]), reach=float(reach),
+    )  # fmt: skip
 
 
 def _entries(longest: Floats, width: Floats, size: float, reach: float) -> float:
@@ -413,6 +418,7 @@ def nearest_visible(grid: FacetGrid, points: Floats, scanners: Floats, station: 
     low, size, shape = grid.low, grid.size, grid.shape
     nearest = np.full(len(points), -1, np.int64)
     distance = np.full(len(points), np.nan)
+    last = -1  # neighbours among the points often have the same facet: no other one is farther than that
     for row in range(len(points)):
         p = points[row]
         i, j, m = (p[0] - low[0]) / size, (p[1] - low[1]) / size, (p[2] - low[2]) / size
@@ -421,20 +427,31 @@ def nearest_visible(grid: FacetGrid, points: Floats, scanners: Floats, station: 
         voxel = (int(i) * shape[1] + int(j)) * shape[2] + int(m)
         best = grid.reach * grid.reach
         k = station[row]
+        if last >= 0 and (k < 0 or _faces(grid.normals[last], scanners[k], p)):
+            best = min(best, (np.sqrt(square_to(grid.corners[last], p)) + ROUNDING_MM) ** 2)
+        near = np.sqrt(best)
         for at in range(grid.start[voxel], grid.start[voxel + 1]):
             f = grid.facet[at]
+            ball = grid.balls[f]
+            x, y, z, far = p[0] - ball[0], p[1] - ball[1], p[2] - ball[2], ball[3] + near
+            if x * x + y * y + z * z > far * far:
+                continue
             a, n = grid.corners[f, 0], grid.normals[f]
             off = (p[0] - a[0]) * n[0] + (p[1] - a[1]) * n[1] + (p[2] - a[2]) * n[2]
-            if off * off >= best:
+            if off * off >= best or (k >= 0 and not _faces(n, scanners[k], p)):
                 continue
-            if k >= 0:
-                x, y, z = scanners[k, 0] - p[0], scanners[k, 1] - p[1], scanners[k, 2] - p[2]
-                if x * n[0] + y * n[1] + z * n[2] < GRAZING_COS * np.sqrt(x * x + y * y + z * z):
-                    continue
             square = square_to(grid.corners[f], p)
             if square < best:
-                best, nearest[row], distance[row] = square, f, off
+                best, near, nearest[row], distance[row] = square, np.sqrt(square), f, off
+        last = nearest[row]
     return nearest, distance
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _faces(normal, scanner, p):  # type: ignore[no-untyped-def]
+    """Whether a facet with a normal (3,) faces the scanner (3,) as seen from a point (3,)."""
+    x, y, z = scanner[0] - p[0], scanner[1] - p[1], scanner[2] - p[2]
+    return x * normal[0] + y * normal[1] + z * normal[2] >= GRAZING_COS * np.sqrt(x * x + y * y + z * z)
 
 
 @njit(cache=True, nogil=True)

@@ -12,15 +12,19 @@ from scipy.spatial import cKDTree
 from processor import large_arrays
 from processor.distinct_rows import distinct_points
 from processor.geometry import point_grid
-from processor.geometry.point_grid import SIDE, Cells, PointGrid, block_at, cells_within
+from processor.geometry.point_grid import RUNS, SIDE, Cells, PointGrid, block_at, cells_within, runs_near
 from processor.geometry.thread_ranges import over_ranges
 from processor.model import Bools, Floats, Ints
 
 SPACING_NEIGHBOURS, SPACING_SAMPLE = 8, 20_000
 SLICES, SLICE_POINTS, SLICE_SAMPLE = 5, 40_000, 5_000
 CELLS_OF_POINTS = 2.0  # edge of a cell, in spacings
+CROWDED, FINER, FINEST = 2e4, 16.0, 1e-6  # points of a block, factor of the edges; least edge by the cloud's diagonal
 LEAST_RANGE = 512  # places per task of a thread
+LEAST_BLOCKS = 64  # per task of a thread
+MANY = 64  # points of a block, beyond which its cells are searched about one by one
 SEARCHED = 256  # places of a sample at once: their neighbours' pages are given back after that
+WIDER = 1.2  # factor of the distance of the k-th neighbour for the search radius about the next point
 GROWTH = 1.5  # factor of the search radius where too few points were found
 CROP_CHUNK = 1 << 20
 REACHED_CELL = 2.0  # edge of a cell, in reaches: a point's reach meets eight cells at most
@@ -36,8 +40,16 @@ def of_spacing(points: Floats) -> PointGrid:
     low, high = large_arrays.corners(points)
     widest = float(np.linalg.norm(high - low))
     coarse = point_grid.of_points(points, widest / np.sqrt(len(points)))
+    while (finer := coarse.cells.size / FINER) > FINEST * widest and _crowd(coarse) > CROWDED:
+        coarse = point_grid.of_points(points, finer)  # a point far from the others made the cells large
     wanted = CELLS_OF_POINTS * spacing(coarse)
     return point_grid.of_points(points, wanted) if wanted < 0.5 * coarse.cells.size else coarse
+
+
+def _crowd(grid: PointGrid) -> float:
+    """Return the mean number of points in the block of a point."""
+    number = (grid.cells.starts[:, -1] - grid.cells.starts[:, 0]).astype(np.float64)
+    return float(np.sum(number**2)) / grid.count
 
 
 def spacing(grid: PointGrid, rows: Ints | None = None) -> float:
@@ -111,7 +123,13 @@ def mean_distances(grid: PointGrid, neighbours: int) -> Floats:
     k = min(neighbours, grid.count - 1)
     if k < 1:
         return np.zeros(grid.count)
-    return _distances(grid, grid.cells.points, np.arange(grid.count), k)[0]
+    mean, start = np.full(grid.count, np.inf), CELLS_OF_POINTS * grid.cells.size
+    over_ranges(
+        lambda a, b: _means_by_block(grid.cells, a, b, k, start, mean), len(grid.cells.keys), least=LEAST_BLOCKS
+    )
+    few = np.flatnonzero(np.isinf(mean))
+    mean[few] = _distances(grid, grid.cells.points[few], few, k)[0]
+    return mean
 
 
 def statistical_inliers(grid: PointGrid, neighbours: int, ratio: float) -> Bools:
@@ -190,61 +208,143 @@ def _distances(grid: PointGrid, places: Floats, own: Ints, k: int) -> tuple[Floa
 def _nearest(cells, places, own, order, first, last, k, mean, farthest):  # type: ignore[no-untyped-def]
     """Fill mean distance of the k nearest points and that of the k-th, for places order[first] to order[last - 1]."""
     size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
-    tops = SIDE * cells.extent - 1
-    points, starts = cells.points, cells.starts
-    best = np.empty(k)
-    edge = SIDE * size
+    tops = SIDE * cells.extent * size
+    points, runs, squares = cells.points, np.empty((RUNS, 2), np.int64), np.empty(8 * k)
     guess = size
     for at in range(first, last):
         row = order[at]
         skipped = own[row]
         x, y, z = places[row, 0], places[row, 1], places[row, 2]
         # The search about a place outside the grid starts at its distance from the grid.
-        away = max(xl - x, yl - y, zl - z, x - xl - size * (tops[0] + 1), y - yl - size * (tops[1] + 1))
-        away = max(away, z - zl - size * (tops[2] + 1), 0.0)
-        reach = guess + away
+        away = max(xl - x, yl - y, zl - z, x - xl - tops[0], y - yl - tops[1], z - zl - tops[2], 0.0)
+        reach, n = guess + away, 0
         while True:
-            i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, reach, reach, reach)
+            runs, found = runs_near(cells, x, y, z, 0.0, 0.0, 0.0, 0.0, reach, runs)
+            room = 1
+            for run in range(found):
+                room += runs[run, 1] - runs[run, 0]
+            if room > len(squares):
+                squares = np.empty(2 * room)
             n = 0
-            best[:] = np.inf
-            for bi in range(i0 // SIDE, i1 // SIDE + 1):
-                gx = max(xl + bi * edge - x, x - xl - (bi + 1) * edge, 0.0)
-                for bj in range(j0 // SIDE, j1 // SIDE + 1):
-                    gy = max(yl + bj * edge - y, y - yl - (bj + 1) * edge, 0.0)
-                    for bk in range(k0 // SIDE, k1 // SIDE + 1):
-                        gz = max(zl + bk * edge - z, z - zl - (bk + 1) * edge, 0.0)
-                        if gx * gx + gy * gy + gz * gz > best[k - 1] * (1.0 + 1e-9):
-                            continue
-                        block = block_at(cells, bi, bj, bk)
-                        if block < 0:
-                            continue
-                        low, high = max(k0 - SIDE * bk, 0), min(k1 - SIDE * bk, SIDE - 1)
-                        for i in range(max(i0, SIDE * bi), min(i1, SIDE * bi + SIDE - 1) + 1):
-                            for j in range(max(j0, SIDE * bj), min(j1, SIDE * bj + SIDE - 1) + 1):
-                                cell = ((i - SIDE * bi) * SIDE + (j - SIDE * bj)) * SIDE
-                                for p in range(starts[block, cell + low], starts[block, cell + high + 1]):
-                                    u, v, w = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-                                    d = u * u + v * v + w * w
-                                    if d >= best[k - 1] or p == skipped:
-                                        continue
-                                    n += 1
-                                    m = k - 1
-                                    while m > 0 and best[m - 1] > d:
-                                        best[m] = best[m - 1]
-                                        m -= 1
-                                    best[m] = d
-            whole = i0 == 0 and j0 == 0 and k0 == 0 and i1 == tops[0] and j1 == tops[1] and k1 == tops[2]
-            if whole or best[k - 1] <= reach * reach:
+            for run in range(found):
+                for p in range(runs[run, 0], runs[run, 1]):
+                    u, v, w = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                    squares[n] = u * u + v * v + w * w
+                    n += (squares[n] <= reach * reach) & (p != skipped)
+            if n >= k:
                 break
-            # The k-th of any k points is an upper bound of the distance wanted: that search radius is sufficient.
-            reach = np.sqrt(best[k - 1]) * (1.0 + 1e-9) if n >= k else GROWTH * reach + size
-        total = 0.0
-        for m in range(k):
-            total += np.sqrt(best[m])
-        mean[row] = total / k
-        farthest[row] = np.sqrt(best[k - 1])
-        if np.isfinite(farthest[row]):
-            guess = max(1.2 * (farthest[row] - away), 0.05 * size)
+            reach = GROWTH * reach + size
+        mean[row], farthest[row] = _mean_of_least(squares, n, k)
+        # One point far from others says nothing of the next one.
+        guess = max(WIDER * min(farthest[row] - away, guess), 0.05 * size)
+
+
+@njit(cache=True, nogil=True)
+def _means_by_block(cells, first, last, k, reach, mean):  # type: ignore[no-untyped-def]
+    """Fill the mean distance of points in blocks first to last - 1 to the k nearest others, if within a search radius.
+
+    The points about all points of a block, or of a cell of a dense one, are gathered at once: most are near each of
+    them. The radius is that of the points before, ``reach`` at first.
+    """
+    runs, near, squares = np.empty((RUNS, 2), np.int64), np.empty((3, 8 * k)), np.empty(8 * k)
+    for block in range(first, last):
+        starts = cells.starts[block]
+        step = SIDE**3 if starts[-1] - starts[0] <= MANY else 1
+        for cell in range(0, SIDE**3, step):
+            begin, end = starts[cell], starts[cell + step]
+            if begin == end:
+                continue
+            runs, near, count = _gathered(cells, begin, end, reach, runs, near)
+            if count > len(squares):
+                squares = np.empty(2 * count)
+            xs, ys, zs = near[0], near[1], near[2]
+            total, known = 0.0, 0
+            for row in range(begin, end):
+                x, y, z = cells.points[row, 0], cells.points[row, 1], cells.points[row, 2]
+                for i in range(count):
+                    u, v, w = xs[i] - x, ys[i] - y, zs[i] - z
+                    squares[i] = u * u + v * v + w * w
+                n = 0
+                for i in range(count):
+                    squares[n] = squares[i]
+                    n += squares[i] <= reach * reach
+                if n > k:  # the point itself is one of them
+                    squares[_first_zero(squares)] = np.inf
+                    mean[row], farthest = _mean_of_least(squares, n, k)
+                    total, known = total + farthest, known + 1
+            if 2 * known > end - begin:
+                reach = WIDER * total / known
+            elif end - begin > 3:  # one point far from others says nothing of the next ones
+                reach *= GROWTH
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _first_zero(squares):  # type: ignore[no-untyped-def]
+    """Return where the first zero is."""
+    at = 0
+    while squares[at] > 0.0:
+        at += 1
+    return at
+
+
+@njit(cache=True, nogil=True)
+def _gathered(cells, begin, end, reach, runs, near):  # type: ignore[no-untyped-def]
+    """Write the points within ``reach`` of the box about rows begin to end - 1 to ``near`` (3, m); their number."""
+    points, low, high = cells.points, np.empty(3), np.empty(3)
+    for axis in range(3):
+        low[axis], high[axis] = points[begin, axis], points[begin, axis]
+        for row in range(begin + 1, end):
+            low[axis], high[axis] = min(low[axis], points[row, axis]), max(high[axis], points[row, axis])
+    x, y, z = 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), 0.5 * (low[2] + high[2])
+    half = np.sqrt((high[0] - x) ** 2 + (high[1] - y) ** 2 + (high[2] - z) ** 2)
+    runs, found = runs_near(cells, x, y, z, 0.0, 0.0, 0.0, 0.0, (reach + half) * (1.0 + 1e-9), runs)
+    room = 1
+    for run in range(found):
+        room += runs[run, 1] - runs[run, 0]
+    if room > near.shape[1]:
+        near = np.empty((3, 2 * room))
+    count = 0
+    for run in range(found):
+        for p in range(runs[run, 0], runs[run, 1]):
+            square = 0.0
+            for axis in range(3):
+                at = points[p, axis]
+                away = max(low[axis] - at, at - high[axis], 0.0)
+                square += away * away
+                near[axis, count] = at
+            count += square <= reach * reach * (1.0 + 1e-9)
+    return runs, near, count
+
+
+@njit(cache=True, nogil=True)
+def _mean_of_least(squares, n, k):  # type: ignore[no-untyped-def]
+    """Return the mean root of the ``k`` least of ``n`` squares, which are reordered, and the root of the k-th."""
+    low, high = 0, n - 1
+    while low < high and n > 2 * k:  # Hoare's selection: of many, the least come first
+        one, two, three = squares[low], squares[(low + high) // 2], squares[high]
+        pivot = max(min(one, two), min(max(one, two), three))
+        i, j = low, high
+        while i <= j:
+            while squares[i] < pivot:
+                i += 1
+            while squares[j] > pivot:
+                j -= 1
+            if i <= j:
+                squares[i], squares[j] = squares[j], squares[i]
+                i, j = i + 1, j - 1
+        if k - 1 > j and k - 1 < i:
+            break
+        low, high = (low, j) if k - 1 <= j else (i, high)
+    for i in range(1, k if n > 2 * k else n):
+        square = squares[i]
+        while i > 0 and squares[i - 1] > square:
+            squares[i] = squares[i - 1]
+            i -= 1
+        squares[i] = square
+    total = 0.0
+    for i in range(k):
+        total += np.sqrt(squares[i])
+    return total / k, np.sqrt(squares[k - 1])
 
 
 @njit(cache=True, nogil=True)

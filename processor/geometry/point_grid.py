@@ -23,6 +23,9 @@ from processor.model import Floats, Ints
 SIDE = 4  # cells along a block's edge
 FIELD = 19  # bits of a block's number for each axis
 EMPTY = -1
+HALF_DIAGONAL = 0.5 * SIDE * 3.0**0.5 * (1.0 + 1e-9)  # of a block, in cells
+RUNS = 64  # runs of rows that there is room for at first
+LOOKED_UP = 64  # blocks of a box, up to which each is looked for in the table
 ROOM_SHARE = 8  # cells of the table per point at most: the cells of a finer grid are made larger
 
 
@@ -33,8 +36,9 @@ class Cells(NamedTuple):
     """
 
     points: Floats
-    keys: Ints  # (slots,), EMPTY = free
+    slots: Ints  # (slots,) keys of blocks by their hash, EMPTY = free
     blocks: Ints  # (slots,) row of ``starts``
+    keys: Ints  # (b,) of the blocks, ascending
     starts: Ints  # (b, 65)
     lower: Floats  # (3,)
     size: float  # of a cell
@@ -43,11 +47,10 @@ class Cells(NamedTuple):
 
 @dataclass(frozen=True)
 class PointGrid:
-    """The cells, the row (n,) of each of their points in the original cloud, and the keys (b,) of the blocks."""
+    """The cells, and the row (n,) of each of their points in the original cloud."""
 
     cells: Cells
     order: Ints
-    keys: Ints  # ascending, as the rows of ``cells.starts``
 
     @property
     def count(self) -> int:
@@ -83,21 +86,22 @@ def of_points(points: Floats, cell: float) -> PointGrid:
         none = np.zeros((0, SIDE**3 + 1), np.int64)
         empty = np.full(2, EMPTY, np.int64)
         cells = Cells(
-            points=np.zeros((0, 3)), keys=empty, blocks=empty.copy(), starts=none, lower=np.zeros(3), size=1.0,
-            extent=np.ones(3, np.int64),
+            points=np.zeros((0, 3)), slots=empty, blocks=empty.copy(), keys=np.empty(0, np.int64), starts=none,
+            lower=np.zeros(3), size=1.0, extent=np.ones(3, np.int64),
         )  # fmt: skip
-        return PointGrid(cells, np.empty(0, np.int64), np.empty(0, np.int64))
+        return PointGrid(cells, np.empty(0, np.int64))
     lower, upper = large_arrays.corners(points)
     extent = float((upper - lower).max())
     size = max(float(cell), extent / (SIDE * (1 << FIELD) - 2 * SIDE), 1e-300)
     while (whole := _sorted(points, lower, size, (ROOM_SHARE * len(points)) // SIDE**3 + 1)) is None:
         size *= 2.0
-    keys, rows = _table(whole.keys, large=len(points) > large_arrays.AT_ONCE)
+    slots, rows = _table(whole.keys, large=len(points) > large_arrays.AT_ONCE)
     reach = ((upper - lower) / size).astype(np.int64) // SIDE + 1
     cells = Cells(
-        points=whole.points, keys=keys, blocks=rows, starts=whole.starts, lower=lower, size=size, extent=reach
-    )
-    return PointGrid(cells, whole.order, whole.keys)
+        points=whole.points, slots=slots, blocks=rows, keys=whole.keys, starts=whole.starts, lower=lower, size=size,
+        extent=reach,
+    )  # fmt: skip
+    return PointGrid(cells, whole.order)
 
 
 def _sorted(points: Floats, lower: Floats, size: float, most: int) -> _Part | None:
@@ -105,18 +109,18 @@ def _sorted(points: Floats, lower: Floats, size: float, most: int) -> _Part | No
 
     More than AT_ONCE points are put apart by the keys of their blocks first, and sorted part by part.
     """
+    if len(points) <= large_arrays.AT_ONCE:
+        return _part(points, np.arange(len(points)), lower, size, most)
 
     def key_of(places: Floats) -> Ints:
-        return _keys(((places - lower) / size).astype(np.int64))
+        return _keys(((places - lower) / size).astype(np.int64)) >> 6
 
-    if len(points) <= large_arrays.AT_ONCE:
-        return _part(points, np.arange(len(points)), key_of(points), most)
     count = -(-2 * len(points) // large_arrays.AT_ONCE)
-    sample = np.sort(key_of(large_arrays.every(points, -(-len(points) // large_arrays.AT_ONCE))) >> 6)
+    sample = np.sort(key_of(large_arrays.every(points, -(-len(points) // large_arrays.AT_ONCE))))
     bounds = np.unique(sample[np.arange(1, count) * len(sample) // count])
 
     def part_of(block: tuple[Floats, ...]) -> Ints:
-        return np.searchsorted(bounds, key_of(block[0]) >> 6, side="right").astype(np.int64)
+        return np.searchsorted(bounds, key_of(block[0]), side="right").astype(np.int64)
 
     filled = np.zeros(len(bounds) + 1, np.int64)
     for rows in blocks(len(points)):
@@ -129,7 +133,7 @@ def _sorted(points: Floats, lower: Floats, size: float, most: int) -> _Part | No
         if first == last:
             continue
         own = slice(first, last)
-        if (part := _part(placed[own], order[own], key_of(placed[own]), most)) is None:
+        if (part := _part(placed[own], order[own], lower, size, most)) is None:
             return None
         placed[own], order[own] = part.points, part.order
         keys.append(part.keys)
@@ -139,24 +143,27 @@ def _sorted(points: Floats, lower: Floats, size: float, most: int) -> _Part | No
     return _Part(placed, order, np.concatenate(keys), _stacked(starts))
 
 
-def _part(points: Floats, order: Ints, key: Ints, most: int) -> _Part | None:
-    """Sort points (n, 3), rows ``order`` (n,) of a cloud, by keys (n,) and in cells; None beyond ``most`` blocks."""
-    by_key = np.argsort(key)
-    key = key[by_key]
-    block_key = key >> 6
-    begins = block_key[1:] != block_key[:-1]
-    first = np.flatnonzero(np.concatenate([[True], begins]))
-    if len(first) > most:
+def _part(points: Floats, order: Ints, lower: Floats, size: float, most: int) -> _Part | None:
+    """Sort points (n, 3), rows ``order`` (n,) of a cloud, by blocks and in cells; None beyond ``most`` blocks."""
+    points, order = (large_arrays.read_only(np.ascontiguousarray(one)) for one in (points, order))
+    block, cell = np.empty(len(points), np.int32), np.empty(len(points), np.uint8)
+    found = _into_blocks(points, lower, size, min(most, len(points)), _empty_table(most), block, cell)
+    if found is None:
         return None
-    rows = np.ascontiguousarray(points[by_key])
-    block = np.cumsum(np.concatenate([[0], begins]))
-    count = np.bincount(block * SIDE**3 + (key & 63), minlength=len(first) * SIDE**3).reshape(-1, SIDE**3)
-    starts = np.zeros((len(first), SIDE**3 + 1), np.int64)
-    np.cumsum(count, axis=1, out=starts[:, 1:])
-    starts += first[:, None]
-    order = order[by_key].astype(np.int64)
-    over_ranges(lambda a, b: _sort_cells(rows, order, starts, a, b), len(first), least=64)
-    return _Part(rows, order, block_key[first], starts)
+    keys, count = found
+    by_key = np.argsort(keys)
+    first = np.zeros(len(keys) + 1, np.int64)
+    np.cumsum(count[by_key], out=first[1:])
+    place = np.empty(len(keys), np.int64)
+    place[by_key] = first[:-1]
+    rows = np.empty(len(points), np.int32)
+    _place(block, place, rows)
+    part = _Part(
+        points=np.empty((len(points), 3)), order=np.empty(len(points), np.int64), keys=keys[by_key],
+        starts=np.empty((len(keys), SIDE**3 + 1), np.int64),
+    )  # fmt: skip
+    over_ranges(lambda a, b: _into_cells(points, order, rows, cell, first, part, a, b), len(keys), least=64)
+    return part
 
 
 def _stacked(parts: Sequence[Ints]) -> Ints:
@@ -185,11 +192,12 @@ def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
     count = starts[:, -1] - starts[:, 0]
     begin = np.cumsum(count) - count
     rows = np.repeat(starts[:, 0] - begin, count) + np.arange(int(count.sum()))
-    keys, numbers = _table(grid.keys[kept])
+    slots, numbers = _table(cells.keys[kept])
     table = cells._replace(
-        points=cells.points[rows], keys=keys, blocks=numbers, starts=starts + (begin - starts[:, 0])[:, None]
-    )
-    return PointGrid(table, grid.order[rows], grid.keys[kept])
+        points=cells.points[rows], slots=slots, blocks=numbers, keys=cells.keys[kept],
+        starts=starts + (begin - starts[:, 0])[:, None],
+    )  # fmt: skip
+    return PointGrid(table, grid.order[rows])
 
 
 def _blocks_within(grid: PointGrid, low: Floats, high: Floats) -> Ints:
@@ -200,21 +208,27 @@ def _blocks_within(grid: PointGrid, low: Floats, high: Floats) -> Ints:
     first = np.clip(first - 1.0, 0.0, grid.cells.extent).astype(np.int64)
     last = np.clip(last + 1.0, -1.0, grid.cells.extent - 1.0).astype(np.int64)
     along = np.arange(first[0], last[0] + 1)
-    begin = np.searchsorted(grid.keys, ((along << FIELD) + first[1]) << FIELD)
-    end = np.searchsorted(grid.keys, ((along << FIELD) + last[1] + 1) << FIELD)
+    begin = np.searchsorted(grid.cells.keys, ((along << FIELD) + first[1]) << FIELD)
+    end = np.searchsorted(grid.cells.keys, ((along << FIELD) + last[1] + 1) << FIELD)
     count = np.maximum(end - begin, 0)
     rows = np.repeat(begin - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))
-    level = grid.keys[rows] & ((1 << FIELD) - 1)
+    level = grid.cells.keys[rows] & ((1 << FIELD) - 1)
     found: Ints = rows[(level >= first[2]) & (level <= last[2])]
     return found
 
 
 def _table(block_keys: Ints, large: bool = False) -> tuple[Ints, Ints]:
     """Return the hash table of blocks with ``block_keys`` (b,): keys (slots,) and rows (slots,)."""
-    slots = 1 << max(4, int(2 * len(block_keys)).bit_length())
+    keys, rows = _empty_table(len(block_keys), large)
+    _fill(keys, rows, np.ascontiguousarray(block_keys))
+    return keys, rows
+
+
+def _empty_table(count: int, large: bool = False) -> tuple[Ints, Ints]:
+    """Return an empty hash table for ``count`` blocks: a power of two of slots, twice as many as blocks or more."""
+    slots = 1 << max(4, (2 * count).bit_length())
     keys, rows = (allocate(slots, dtype=np.int64) if large else np.empty(slots, np.int64) for _ in range(2))
     keys[:], rows[:] = EMPTY, EMPTY
-    _fill(keys, rows, np.ascontiguousarray(block_keys))
     return keys, rows
 
 
@@ -227,15 +241,20 @@ def _keys(cell: Ints) -> Ints:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def block_at(cells, i, j, k):  # type: ignore[no-untyped-def]
-    """Find the row of a block by its indices along the axes; EMPTY where it holds no point."""
-    key = ((i << FIELD) | j) << FIELD | k
-    mask = np.uint64(len(cells.keys) - 1)
+def _slot(keys, key):  # type: ignore[no-untyped-def]
+    """Find where a block's key is in the hash table, or the free slot where it would be."""
+    mask = np.uint64(len(keys) - 1)
     h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     at = (h ^ (h >> np.uint64(32))) & mask
-    while cells.keys[at] != EMPTY and cells.keys[at] != key:
+    while keys[at] != EMPTY and keys[at] != key:
         at = (at + np.uint64(1)) & mask
-    return cells.blocks[at]
+    return at
+
+
+@njit(cache=True, nogil=True, inline="always")
+def block_at(cells, i, j, k):  # type: ignore[no-untyped-def]
+    """Find the row of a block by its indices along the axes; EMPTY where it holds no point."""
+    return cells.blocks[_slot(cells.slots, ((i << FIELD) | j) << FIELD | k)]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -254,16 +273,169 @@ def cells_within(cells, x, y, z, ex, ey, ez):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def runs_near(cells, x, y, z, a, b, c, half, radius, runs):  # type: ignore[no-untyped-def]
+    """Find the runs of rows whose cells come within ``radius`` of a segment, and their number.
+
+    The segment reaches ``half`` to either side of (x, y, z) along the unit vector (a, b, c). The runs (first row, row
+    after the last), ascending, are written to ``runs`` (r, 2), or to a larger array: that which is returned.
+    """
+    box = cells_within(cells, x, y, z, half * abs(a) + radius, half * abs(b) + radius, half * abs(c) + radius)
+    i0, i1, j0, j1 = box[0] // SIDE, box[1] // SIDE, box[2] // SIDE, box[3] // SIDE
+    k0, k1 = box[4] // SIDE, box[5] // SIDE
+    corner, segment = (cells.lower[0] - x, cells.lower[1] - y, cells.lower[2] - z), (a, b, c, half)
+    if (i1 - i0 + 1) * (j1 - j0 + 1) * (k1 - k0 + 1) > LOOKED_UP:
+        return _runs_of_many(cells, box, corner, segment, radius, runs)
+    found, edge, reach = 0, SIDE * cells.size, radius + HALF_DIAGONAL * cells.size
+    for i in range(i0, i1 + 1):
+        for j in range(j0, j1 + 1):
+            for k in range(k0, k1 + 1):
+                if _square_from(segment, corner, edge, i + 0.5, j + 0.5, k + 0.5) <= reach * reach:
+                    block = block_at(cells, i, j, k)
+                    if block >= 0:
+                        runs, found = _add_runs(cells, block, (i, j, k), box, corner, segment, radius, runs, found)
+    return runs, found
+
+
+@njit(cache=True, nogil=True)
+def _runs_of_many(cells, box, corner, segment, radius, runs):  # type: ignore[no-untyped-def]
+    """Find the runs of a large box of cells, of which most blocks are empty: the others are passed in their order."""
+    keys, mask = cells.keys, (1 << FIELD) - 1
+    i0, i1, j0, j1 = box[0] // SIDE, box[1] // SIDE, box[2] // SIDE, box[3] // SIDE
+    k0, k1 = box[4] // SIDE, box[5] // SIDE
+    found, edge, reach = 0, SIDE * cells.size, radius + HALF_DIAGONAL * cells.size
+    block = _at_or_after(keys, 0, (i0 << FIELD | j0) << FIELD | k0)
+    while block < len(keys) and k0 <= k1:
+        i, j, k = keys[block] >> (2 * FIELD), keys[block] >> FIELD & mask, keys[block] & mask
+        if i > i1:
+            break
+        if j < j0 or (j <= j1 and k < k0):
+            block = _at_or_after(keys, block, (i << FIELD | max(j, j0)) << FIELD | k0)
+        elif j > j1:
+            block = _at_or_after(keys, block, ((i + 1) << FIELD | j0) << FIELD | k0)
+        elif k > k1:
+            block = _at_or_after(keys, block, (i << FIELD | (j + 1)) << FIELD | k0)
+        else:
+            if _square_from(segment, corner, edge, i + 0.5, j + 0.5, k + 0.5) <= reach * reach:
+                runs, found = _add_runs(cells, block, (i, j, k), box, corner, segment, radius, runs, found)
+            block += 1
+    return runs, found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_runs(cells, block, place, box, corner, segment, radius, runs, found):  # type: ignore[no-untyped-def]
+    """Add the runs of the block at ``place``; the grid's ``corner`` is relative to the segment's middle."""
+    size, starts, end = cells.size, cells.starts, -1
+    i0, j0, k0 = SIDE * place[0], SIDE * place[1], SIDE * place[2]
+    low, high = max(box[4] - k0, 0), min(box[5] - k0, SIDE - 1)
+    k, tall = k0 + 0.5 * (low + high + 1), 0.5 * (high - low + 1)
+    reach = radius + np.sqrt(0.5 + tall * tall) * (1.0 + 1e-9) * size
+    for i in range(max(box[0], i0), min(box[1], i0 + SIDE - 1) + 1):
+        for j in range(max(box[2], j0), min(box[3], j0 + SIDE - 1) + 1):
+            cell = ((i - i0) * SIDE + (j - j0)) * SIDE
+            first, last = starts[block, cell + low], starts[block, cell + high + 1]
+            if first == last or _square_from(segment, corner, size, i + 0.5, j + 0.5, k) > reach * reach:
+                continue
+            if first == end:
+                runs[found - 1, 1] = last
+            else:
+                if found == len(runs):
+                    more = np.empty((2 * found, 2), np.int64)
+                    more[:found] = runs
+                    runs = more
+                runs[found, 0], runs[found, 1] = first, last
+                found += 1
+            end = last
+    return runs, found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _square_from(segment, corner, edge, i, j, k):  # type: ignore[no-untyped-def]
+    """Return the square of the distance of a place, (i, j, k) edges from the grid's corner, from a segment."""
+    u, v, w = corner[0] + i * edge, corner[1] + j * edge, corner[2] + k * edge
+    t = abs(u * segment[0] + v * segment[1] + w * segment[2])
+    beyond = max(t - segment[3], 0.0)
+    return u * u + v * v + w * w - t * t + beyond * beyond
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _at_or_after(keys, first, key):  # type: ignore[no-untyped-def]
+    """Return the first row of ascending keys, from row ``first`` on, that is not less than ``key``."""
+    step = 1
+    while first + step <= len(keys) and keys[first + step - 1] < key:
+        first, step = first + step, 2 * step
+    last = min(first + step, len(keys))
+    while first < last:
+        middle = (first + last) // 2
+        if keys[middle] < key:
+            first = middle + 1
+        else:
+            last = middle
+    return first
+
+
+@njit(cache=True, nogil=True)
 def _fill(keys, blocks, block_keys):  # type: ignore[no-untyped-def]
     """Enter the rows of blocks with ``block_keys`` (b,) into the hash table."""
-    mask = np.uint64(len(keys) - 1)
     for row in range(len(block_keys)):
-        h = np.uint64(block_keys[row]) * np.uint64(0x9E3779B97F4A7C15)
-        at = (h ^ (h >> np.uint64(32))) & mask
-        while keys[at] != EMPTY:
-            at = (at + np.uint64(1)) & mask
-        keys[at] = block_keys[row]
-        blocks[at] = row
+        at = _slot(keys, block_keys[row])
+        keys[at], blocks[at] = block_keys[row], row
+
+
+@njit(cache=True, nogil=True)
+def _into_blocks(points, lower, size, most, table, block, cell):  # type: ignore[no-untyped-def]
+    """Write the block (n,), numbered as they come, and the cell in it (n,) of each point.
+
+    Return the blocks' keys and numbers of points; None where there are more than ``most``. The ``table`` is empty.
+    """
+    slots, rows = table
+    keys, count = np.empty(most, np.int64), np.zeros(most, np.int64)
+    xl, yl, zl = lower[0], lower[1], lower[2]
+    found, last, number = 0, EMPTY, 0
+    for row in range(len(points)):
+        i, j = int((points[row, 0] - xl) / size), int((points[row, 1] - yl) / size)
+        k = int((points[row, 2] - zl) / size)
+        key = ((i // SIDE << FIELD) | j // SIDE) << FIELD | k // SIDE
+        if key != last:  # neighbours in a scan are often in the same block
+            slot = _slot(slots, key)
+            if slots[slot] == EMPTY:
+                if found == most:
+                    return None
+                slots[slot], rows[slot], keys[found] = key, found, key
+                found += 1
+            last, number = key, rows[slot]
+        block[row], cell[row] = number, ((i % SIDE) * SIDE + j % SIDE) * SIDE + k % SIDE
+        count[number] += 1
+    return keys[:found], count[:found]
+
+
+@njit(cache=True, nogil=True)
+def _place(block, place, rows):  # type: ignore[no-untyped-def]
+    """Write the rows (n,) of points by their ``block`` (n,): block b begins at ``place[b]``, which moves to its end."""
+    for row in range(len(block)):
+        rows[place[block[row]]] = row
+        place[block[row]] += 1
+
+
+@njit(cache=True, nogil=True)
+def _into_cells(points, order, rows, cell, first, part, start, stop):  # type: ignore[no-untyped-def]
+    """Write the points of blocks ``start`` to ``stop`` - 1 to the part, by cells, in each of them sorted by x, y, z."""
+    place = np.empty(SIDE**3 + 1, np.int64)
+    for block in range(start, stop):
+        place[:] = 0
+        for at in range(first[block], first[block + 1]):
+            place[cell[rows[at]] + 1] += 1
+        place[0] = first[block]
+        for c in range(SIDE**3):
+            place[c + 1] += place[c]
+        part.starts[block] = place
+        for at in range(first[block], first[block + 1]):
+            row = rows[at]
+            to = place[cell[row]]
+            place[cell[row]] += 1
+            part.order[to] = order[row]
+            for axis in range(3):
+                part.points[to, axis] = points[row, axis]
+    _sort_cells(part.points, part.order, part.starts, start, stop)
 
 
 @njit(cache=True, nogil=True)

@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 from processor.distinct_rows import distinct
 from processor.geometry import mesh_distance, nearest_neighbours, rigid, thinning
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
+from processor.geometry.thread_ranges import over_ranges
 from processor.model import Bools, Floats, Ints
 
 ERROR_RATE = 0.05  # probability that one group of points deviates so that it fits the wrong pose
@@ -33,6 +34,7 @@ ON, OFF = 2.0, 4.0  # times the median group's distance: up to ON on the design,
 LEAST_OFF_MM = 1.0  # plates may deviate by as much in thickness (EN 10029), so less distinguishes no pose
 REACH_MM = 60.0  # from the design, the most that the distance of a point counts
 SAMPLE = 200_000
+LEAST_RANGE = 2_000  # points per task of a thread
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,15 @@ def _distances(points: Floats, scanner: Floats | None, grid: FacetGrid, T: Float
         seen_from, station = np.zeros((1, 3)), np.full(len(points), -1, np.int64)
     else:
         seen_from, station = np.ascontiguousarray(rigid.apply(T, scanner)), np.arange(len(points))
-    facet, _ = mesh_distance.nearest_visible(grid, placed, seen_from, station)
-    return to_facets(grid.corners, placed, facet, grid.reach)
+    distance = np.empty(len(points))
+
+    def fill(first: int, last: int) -> None:
+        part = placed[first:last]
+        facet, _ = mesh_distance.nearest_visible(grid, part, seen_from, station[first:last])
+        distance[first:last] = to_facets(grid.corners, part, facet, grid.reach)
+
+    over_ranges(fill, len(points), least=LEAST_RANGE)
+    return distance
 
 
 @njit(cache=True, nogil=True)

@@ -13,6 +13,7 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.geometry.thinning import voxel_means
+from processor.geometry.thread_ranges import each
 from processor.large_arrays import corners
 from processor.model import Floats, Ints
 
@@ -118,10 +119,8 @@ def coarse(
     symmetric structure differ; so ``refined`` first improves each pose T_target_source (4, 4): it returns the rms in mm
     left, and the better pose. Poses that differ by less than a share of the target's ``size`` (mm) count as one.
     """
-    fits = []
-    for turn in possible_turns(target.variances, source.variances):
-        R = target.axes @ turn @ source.axes.T
-        fits.append(refined(rigid.transform(R, target.centre - R @ source.centre)))
+    turned = [target.axes @ turn @ source.axes.T for turn in possible_turns(target.variances, source.variances)]
+    fits = each(refined, [rigid.transform(R, target.centre - R @ source.centre) for R in turned])
     order = sorted(range(len(fits)), key=lambda k: (fits[k][0], k))
     error, best = fits[order[0]]
     rivals = (fits[k] for k in order[1:] if differ(fits[k][1], best, source.centre, size))

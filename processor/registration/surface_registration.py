@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
 from processor.geometry.thinning import thinned, voxel_means
+from processor.geometry.thread_ranges import each
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Word
 from processor.registration import icp, main_body, pose_choice, principal
 from processor.registration.principal import CoarsePose, PrincipalAxes
@@ -66,7 +67,9 @@ class SurfaceFit:
 NOWHERE = SurfaceFit(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), 0.0)
 
 
-def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> SurfaceFit:
+def fine(
+    points: Floats, surface: MeshSurface, axes: Floats, start: Floats, iterations: int = MOST_ITERATIONS
+) -> SurfaceFit:
     """Robust point-to-surface least squares of points (n, 3), scan frame, from ``start`` (4, 4).
 
     First, faces that look along each of the design's principal ``axes`` (3, 3, columns) have the same weight, so that
@@ -75,10 +78,11 @@ def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> S
     residuals, so that what they have in common, form error included, counts once (Liang and Zeger 1986). It is NaN
     where the points seen do not determine the pose.
     """
-    balanced, form = _iterate(thinned(points, POINTS), surface, axes, start, GATES_MM[0], even=True)
+    few, many = thinned(points, POINTS), thinned(points, LAST_POINTS)
+    balanced, form = _iterate(few, surface, axes, start, GATES_MM[0], iterations, even=True)
     if not form < NO_FORM:
         return balanced
-    return _iterate(thinned(points, LAST_POINTS), surface, axes, balanced.T_design_scan, GATES_MM[1], even=False)[0]
+    return _iterate(many, surface, axes, balanced.T_design_scan, GATES_MM[1], iterations, even=False)[0]
 
 
 def fits(fitted: SurfaceFit) -> bool:
@@ -92,13 +96,13 @@ def most_scatter(on_surface: float) -> float:
 
 
 def _iterate(
-    points: Floats, surface: MeshSurface, axes: Floats, start: Floats, gate: float, *, even: bool
+    points: Floats, surface: MeshSurface, axes: Floats, start: Floats, gate: float, iterations: int, *, even: bool
 ) -> tuple[SurfaceFit, float]:
     """Iterate to convergence; also return the ratio of the cells' mean squares to those of chance."""
     T, sigma, covariance, share, form = start.copy(), float("nan"), np.full((6, 6), np.nan), 0.0, float("inf")
     weak: tuple[Motion, ...] = ()
     face: Ints | None = None
-    for iteration in range(MOST_ITERATIONS):
+    for iteration in range(iterations):
         placed = rigid.apply(T, points)
         face, residual, beyond = surface.distances(placed, gate + 60.0, face)
         used = on_face(face, beyond) & (np.abs(residual) < gate)
@@ -122,7 +126,7 @@ def _iterate(
         if iteration >= 3:
             gate = max(GATES_MM[1], 6.0 * sigma)
         move = float(np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.ptp(placed[:, 0]))
-        if iteration == MOST_ITERATIONS - 1 or (move < CONVERGED_MM and (iteration > 4 or not even)):
+        if iteration == iterations - 1 or (move < CONVERGED_MM and (iteration > 4 or not even)):
             cell = cells(placed[used] @ axes, axis, n @ axes)
             form = _form(r, weight > 0.0, cell)
             inverse = np.linalg.inv(normal)
@@ -183,6 +187,7 @@ NEAR_MM = 100.0  # of the design's surface
 NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
 FINE_POINTS = 30_000
 RIVAL_POINTS = 8_000  # enough to tell attitudes apart: the fit of the one that is chosen uses FINE_POINTS
+RIVAL_ITERATIONS = 15
 SIDE_ROUNDS = 3  # one for each axis
 LEAST_SHIFT_MM = 2.0  # thinner plates are not told apart by the side of their surface
 FACE_COS, MOST_AREA, FACE_ROUNDS = 0.9, 0.5, 5  # faces about along an axis, their least share of the area
@@ -228,12 +233,17 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     where it is by ``auto``, and the best fit is only reported. ``scanner`` (n, 3) is the position that each point was
     measured from, if known: it helps to distinguish attitudes. Ground and what stands about the structure is left out.
     """
+    of_body = body_of(points, surface) if how in ("auto", "coarse") else None
+    return place_body(points, surface, given, how, scanner, of_body)
+
+
+def place_body(
+    points: Floats, surface: MeshSurface, given: Floats, how: str, scanner: Floats | None, of_body: Bools | None
+) -> Placed:
+    """Place a scan's points as :func:`place`, those of the structure being known, see :func:`body_of`."""
     axes = principal.of_mesh(surface.vertices, surface.faces)
     few = thinned(points, FINE_POINTS)
     share = near_share(few, surface, given)
-    of_body = None
-    if how in ("auto", "coarse"):
-        of_body = body_of(points, surface)
     if of_body is not None:
         few_of_body = thinned(points[of_body], FINE_POINTS)
         of_body_share = near_share(few_of_body, surface, given)
@@ -245,9 +255,11 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
         registration = Registration.COARSE
         poses = _attitudes(even(points), surface, axes)
         starts = [T for error, T in poses if error <= PROMISING * poses[0][0]]
-        fits = [fine(few, surface, axes.axes, start) for start in starts]
+        fits = _fits(points, few, surface, axes.axes, starts)
         choice = pose_choice.choose(points, surface, [fit.T_design_scan for fit in fits], scanner)
         start, fitted = starts[choice.best], fits[choice.best]
+        if choice.best:
+            fitted = fine(few, surface, axes.axes, start)
         rivals = [fits[k].T_design_scan for k in choice.rivals]
         others = [error for k, (error, _) in enumerate(poses) if k != choice.best]
         ambiguity = min(others, default=NAN) / max(poses[choice.best][0], 1e-9)
@@ -276,6 +288,21 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
         ambiguous=bool(rivals),
         T_rival=rivals[0] if rivals else np.full((4, 4), NAN),
     )
+
+
+def _fits(points: Floats, few: Floats, surface: MeshSurface, axes: Floats, starts: list[Floats]) -> list[SurfaceFit]:
+    """Fit points (n, 3) from the starts (4, 4): ``few`` from the first, of the least error, RIVAL_POINTS from others.
+
+    What the surface does not determine converges slowly, and distinguishes no attitude: RIVAL_ITERATIONS do for these.
+    """
+    fewer = thinned(points, RIVAL_POINTS)
+
+    def fit(number: int) -> SurfaceFit:
+        if number == 0:
+            return fine(few, surface, axes, starts[0])
+        return fine(fewer, surface, axes, starts[number], RIVAL_ITERATIONS)
+
+    return each(fit, range(len(starts)))
 
 
 def body_of(points: Floats, surface: MeshSurface) -> Bools | None:
@@ -331,7 +358,7 @@ def _surely_turned(
     design = _samples(surface)
     refined = _refined(even(points), design, float(np.linalg.norm(np.ptp(design.points, axis=0))))
     turns = _turns(axes, surface)
-    (error, _), *others = [refined(turn @ given.T_design_scan) for turn in turns]
+    (error, _), *others = each(lambda turn: refined(turn @ given.T_design_scan), turns)
     few = thinned(points, RIVAL_POINTS)
     fits, turned_back = [], []
     for turn, (rms, T) in zip(turns[1:], others, strict=True):
@@ -388,7 +415,7 @@ def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> lis
     size = float(np.linalg.norm(np.ptp(design.points, axis=0)))
     first = coarse(points, design, axes)
     refined = _refined(points, design, size)
-    found = [refined(turn @ first.T_target_source) for turn in _turns(axes, surface)]
+    found = each(lambda turn: refined(turn @ first.T_target_source), _turns(axes, surface))
     found.append((first.rms_mm, first.T_target_source))
     if np.isfinite(first.T_rival).all():
         found.append((first.ambiguity * first.rms_mm, first.T_rival))
@@ -397,7 +424,7 @@ def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> lis
     for _ in range(SIDE_ROUNDS):  # plates along several axes may lie on their other sides
         least = distinct[0][0]
         promising = [T for error, T in untried if error <= PROMISING * least]
-        shifted = [refined(start) for T in promising for start in _other_sides(points, design.points, square, T)]
+        shifted = each(refined, [start for T in promising for start in _other_sides(points, design.points, square, T)])
         distinct = _distinct([*distinct, *shifted], centre, size)
         untried = [one for one in distinct if any(one is other for other in shifted)]
         if not distinct[0][0] < least:

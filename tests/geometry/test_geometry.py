@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from processor.geometry import nearest_neighbours, rigid, thinning
+from processor.geometry import nearest_neighbours, point_grid, rigid, thinning
 from processor.geometry.lines_and_polylines import Line, Polyline, crossing, fit_line, ransac_line
 from processor.registration import icp, principal
 from processor.robust_statistics import robust_sd
@@ -205,6 +205,27 @@ def test_spacing_of_a_grid_and_of_random_points():
     assert np.isnan(nearest_neighbours.surface_spacing(np.zeros((1, 3))))
     many = np.column_stack([rng.uniform(0.0, 7000.0, 250_000), rng.uniform(0.0, 1750.0, 250_000), np.zeros(250_000)])
     assert nearest_neighbours.surface_spacing(many) == pytest.approx(7.0, rel=0.05)
+
+
+def test_mean_distances_do_not_depend_on_density_or_on_far_points():
+    """Dense, sparse and equal points, and one as far away as an origin is from a map's coordinates."""
+    rng = np.random.default_rng(6)
+    plane = np.column_stack([rng.uniform(0.0, 1000.0, (20_000, 2)), rng.normal(0.0, 1.0, 20_000)])
+    dense, same = rng.normal(300.0, 1.0, (3000, 3)), np.repeat(rng.uniform(0.0, 1000.0, (40, 3)), 30, axis=0)
+    points = np.vstack([plane, dense, same, rng.uniform(-900.0, 900.0, (50, 3)), [[1e6, 2e6, 1e5]]])
+    grid = nearest_neighbours.of_spacing(points)
+    expected = cKDTree(points).query(points, k=21)[0][:, 1:].mean(axis=1)
+    np.testing.assert_allclose(nearest_neighbours.mean_distances(grid, 20), expected[grid.order], rtol=1e-12, atol=1e-9)
+    assert grid.cells.size < 100.0
+
+
+def test_equal_points_of_a_cell_keep_their_order():
+    points = np.repeat(np.random.default_rng(7).uniform(0.0, 10.0, (500, 3)), 7, axis=0)
+    grid = point_grid.of_points(points, 0.3)
+    np.testing.assert_array_equal(points[grid.order], grid.cells.points)
+    same = (np.diff(grid.cells.points, axis=0) == 0.0).all(axis=1)
+    assert same.sum() == 6 * 500
+    assert (np.diff(grid.order)[same] > 0).all()
 
 
 def test_outliers_are_those_of_open3d():
