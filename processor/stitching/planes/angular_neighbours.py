@@ -95,7 +95,8 @@ def _sorted(points: Floats, cell: Ints, piece_of_cell: Ints) -> _Bands:
 
     there, polar, piece, number = large_arrays.in_parts(passed(), band_of, ends)
     first = np.flatnonzero(np.diff(band_of_row, prepend=-1))
-    return _Bands(there, polar, piece, number, ends, np.append(first, ROWS) * np.pi / ROWS)
+    edges = np.append(first, ROWS) * np.pi / ROWS
+    return _Bands(there, polar, piece, number=number, ends=ends, edges=edges)
 
 
 class _Search:
