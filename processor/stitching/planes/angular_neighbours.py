@@ -126,10 +126,10 @@ class _Search:
         low = np.inf if self._low <= 0.0 else polar - self._low
         high = np.inf if self._high >= np.pi else self._high - polar
         beside = np.minimum(low, high)
-        open_ = distance[:, -1] > np.where(beside < np.pi, 2.0 * np.sin(0.5 * np.minimum(beside, np.pi)), np.inf)
-        if open_.any():
+        unsure = distance[:, -1] > np.where(beside < np.pi, 2.0 * np.sin(0.5 * np.minimum(beside, np.pi)), np.inf)
+        if unsure.any():
             self._widen(4.0 * self._halo)
-            near[open_] = self.nearest(points[open_], count)
+            near[unsure] = self.nearest(points[unsure], count)
         return near
 
 
