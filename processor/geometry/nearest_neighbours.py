@@ -13,6 +13,7 @@ from processor import large_arrays
 from processor.distinct_rows import distinct_points
 from processor.geometry import point_grid
 from processor.geometry.point_grid import RUNS, SIDE, Cells, PointGrid, block_at, cells_within, runs_near
+from processor.geometry.selection import least_first
 from processor.geometry.thread_ranges import over_ranges
 from processor.model import Bools, Floats, Ints
 
@@ -319,22 +320,8 @@ def _gathered(cells, begin, end, reach, runs, near):  # type: ignore[no-untyped-
 @njit(cache=True, nogil=True)
 def _mean_of_least(squares, n, k):  # type: ignore[no-untyped-def]
     """Return the mean root of the ``k`` least of ``n`` squares, which are reordered, and the root of the k-th."""
-    low, high = 0, n - 1
-    while low < high and n > 2 * k:  # Hoare's selection: of many, the least come first
-        one, two, three = squares[low], squares[(low + high) // 2], squares[high]
-        pivot = max(min(one, two), min(max(one, two), three))
-        i, j = low, high
-        while i <= j:
-            while squares[i] < pivot:
-                i += 1
-            while squares[j] > pivot:
-                j -= 1
-            if i <= j:
-                squares[i], squares[j] = squares[j], squares[i]
-                i, j = i + 1, j - 1
-        if k - 1 > j and k - 1 < i:
-            break
-        low, high = (low, j) if k - 1 <= j else (i, high)
+    if n > 2 * k:
+        least_first(squares, n, k - 1)
     for i in range(1, k if n > 2 * k else n):
         square = squares[i]
         while i > 0 and squares[i - 1] > square:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.geometry.linalg_small import assign_rows, product
 from processor.geometry.lines_and_polylines import Polyline
+from processor.geometry.selection import least_first
 from processor.inner_kernels import inner
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
@@ -241,25 +242,9 @@ def _step(p, n, r, pairs, huber, axes, T):  # type: ignore[no-untyped-def]
 
 @inner
 def _median(values, count):  # type: ignore[no-untyped-def]
-    """Return the median of the first values, whose order is changed (Hoare's selection; np.median compiles for 1 s)."""
-    low, high, middle = 0, count - 1, count // 2
-    while low < high:
-        pivot, i, j = values[(low + high) // 2], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if middle <= j:
-            high = j
-        elif middle >= i:
-            low = i
-        else:
-            break
+    """Return the median of the first values, whose order is changed."""
+    middle = count // 2
+    least_first(values, count, middle)
     if count % 2:
         return values[middle]
     below = values[0]

@@ -153,7 +153,7 @@ def samples_of(part: DesignPart) -> Samples:
 
 
 def sample_surface(part: DesignPart) -> Surface:
-    """Prepare the part's surface: samples, their tree, and the mesh itself."""
+    """Prepare the part's surface: samples, boxes about them, and the mesh itself."""
     samples = samples_of(part)
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
     mesh = mesh_distance.of_mesh(part.vertices, part.faces)
