@@ -14,3 +14,8 @@ OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "no_cpython_wrapper": T
 def inner(kernel: Callable[..., Any]) -> Any:
     """Compile a kernel that Python never calls."""
     return njit(**OPTIONS)(kernel)
+
+
+def inner_ieee(kernel: Callable[..., Any]) -> Any:
+    """Compile a kernel that Python never calls; a division by zero gives an infinity or NaN, not an error."""
+    return njit(error_model="numpy", **OPTIONS)(kernel)

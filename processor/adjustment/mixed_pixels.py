@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 
 from processor import large_arrays, tiles
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner
 from processor.large_arrays import Array, allocate, blocks, in_parts, release
 from processor.model import Bools, Floats, Ints, Labels
 from processor.tiles import Shared
@@ -339,7 +340,7 @@ def _mark(points, normals, height, face, scanner, others, marked, first, last): 
                 break
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _any_before(point, normal, of_face, scanner, ray, others, low, high):  # type: ignore[no-untyped-def]
     """Return whether any of the points in bins low to high is a neighbour that stands before a point's face.
 

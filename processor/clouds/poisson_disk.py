@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from processor.clouds import slabs
+from processor.inner_kernels import inner
 from processor.model import Bools, Floats
 from processor.writers.cloud import Block, Cloud
 
@@ -51,7 +52,7 @@ def keep(before: Floats, points: Floats, spacing_mm: float) -> Bools:
     return marked
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _slot(keys, key):  # type: ignore[no-untyped-def]
     """Find the slot of a cell in a hash table, or the free one where it would be."""
     mask = np.uint64(len(keys) - 1)

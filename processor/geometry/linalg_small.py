@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from processor.inner_kernels import inner
+from processor.inner_kernels import inner, inner_ieee
 
 DEFINITE = 1e-12  # least pivot of a positive definite matrix, as a share of its diagonal element
 SWEEPS = 12
@@ -30,7 +30,7 @@ def assign_rows(target, source):  # type: ignore[no-untyped-def]
             target[i, j] = source[i, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def factorise(A, n, least, L):  # type: ignore[no-untyped-def]
     """Write the lower Cholesky factor of the leading (n, n) block of A to L; only the lower halves are used.
 
@@ -60,7 +60,7 @@ def cholesky(A):  # type: ignore[no-untyped-def]
     return L
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def substitute(L, n, x):  # type: ignore[no-untyped-def]
     """Solve L L' x = b in place for the leading (n, n) block of L: ``x`` (n,) holds b and then the solution."""
     for i in range(n):
@@ -120,7 +120,7 @@ def inverse_of(A, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def log_det(A):  # type: ignore[no-untyped-def]
     """Logarithm of the determinant of a symmetric matrix (n, n); NaN where it is not positive definite."""
     n = len(A)
@@ -144,7 +144,7 @@ def product(A, B):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
+@inner
 def eigen(A, V):  # type: ignore[no-untyped-def]
     """Turn a symmetric A (3, 3) into its eigenvalues on the diagonal, V into its vectors as columns (Jacobi)."""
     for i in range(3):

@@ -15,6 +15,7 @@ from processor.geometry import point_grid
 from processor.geometry.point_grid import RUNS, SIDE, Cells, PointGrid, block_at, cells_within, runs_near
 from processor.geometry.selection import least_first
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner
 from processor.model import Bools, Floats, Ints
 
 SPACING_NEIGHBOURS, SPACING_SAMPLE = 8, 20_000
@@ -288,7 +289,7 @@ def _first_zero(squares):  # type: ignore[no-untyped-def]
     return at
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _gathered(cells, begin, end, reach, runs, near):  # type: ignore[no-untyped-def]
     """Write the points within ``reach`` of the box about rows begin to end - 1 to ``near`` (3, m); their number."""
     points, low, high = cells.points, np.empty(3), np.empty(3)
@@ -317,7 +318,7 @@ def _gathered(cells, begin, end, reach, runs, near):  # type: ignore[no-untyped-
     return runs, near, count
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _mean_of_least(squares, n, k):  # type: ignore[no-untyped-def]
     """Return the mean root of the ``k`` least of ``n`` squares, which are reordered, and the root of the k-th."""
     if n > 2 * k:

@@ -17,6 +17,7 @@ from numba import njit
 
 from processor import large_arrays
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner
 from processor.large_arrays import allocate, blocks
 from processor.model import Floats, Ints
 
@@ -272,7 +273,7 @@ def cells_within(cells, x, y, z, ex, ey, ez):  # type: ignore[no-untyped-def]
     return i0, i1, j0, j1, k0, k1
 
 
-@njit(cache=True, nogil=True)
+@inner
 def runs_near(cells, x, y, z, a, b, c, half, radius, runs):  # type: ignore[no-untyped-def]
     """Find the runs of rows whose cells come within ``radius`` of a segment, and their number.
 
@@ -296,7 +297,7 @@ def runs_near(cells, x, y, z, a, b, c, half, radius, runs):  # type: ignore[no-u
     return runs, found
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _runs_of_many(cells, box, corner, segment, radius, runs):  # type: ignore[no-untyped-def]
     """Find the runs of a large box of cells, of which most blocks are empty: the others are passed in their order."""
     keys, mask = cells.keys, (1 << FIELD) - 1

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.inner_kernels import inner
 from processor.model import Floats, Ints
 
 PIECE_BYTES = 4 << 20
@@ -232,7 +233,7 @@ def count_ends(text: npt.NDArray[np.uint8], start: int, stop: int) -> int:
     return count
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _times_power(digits: np.uint64, power: int) -> float:
     """Return digits * 10**power, rounded once: by exact operations, or else in double-double arithmetic (Dekker)."""
     if digits < EXACT and -22 <= power <= 22:  # both exact, so one rounding
@@ -254,7 +255,7 @@ def _times_power(digits: np.uint64, power: int) -> float:
     return float(product + (error + (top * q + rest * p)))
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _decimal(text: npt.NDArray[np.uint8], at: int, size: int, commas: bool) -> tuple[int, bool, np.uint64, int, int]:
     """Parse a decimal number: next byte, sign, digits as a whole number, their count, and the power of ten."""
     digits, count, power = np.uint64(0), 0, 0
@@ -297,20 +298,20 @@ def _decimal(text: npt.NDArray[np.uint8], at: int, size: int, commas: bool) -> t
     return at, negative, digits, count, power
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _is_comment(text: npt.NDArray[np.uint8], at: int, size: int, comments: bool) -> bool:
     c = text[at]
     return c == 35 or (comments and (c == 37 or (c == 47 and at + 1 < size and text[at + 1] == 47)))
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _after_blanks(text: npt.NDArray[np.uint8], at: int, size: int, separator: int) -> int:
     while at < size and (text[at] == 32 or (text[at] == 9 and separator != 9)):
         at += 1
     return at
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _line_end(text: npt.NDArray[np.uint8], at: int, size: int, stop: int) -> int:
     """Return the next position of a line's end or of the byte ``stop``."""
     while at < size and text[at] != 10 and text[at] != 13 and text[at] != stop:
@@ -323,7 +324,7 @@ def _row_ends(text: npt.NDArray[np.uint8], at: int, size: int, comments: bool) -
     return at == size or text[at] == 10 or text[at] == 13 or _is_comment(text, at, size, comments)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _after_row(text: npt.NDArray[np.uint8], at: int, form: Form) -> int:
     """Skip what follows the last column wanted. Returns the start of the next line, -1 for a column too many."""
     separator, _, comments, exact = form
@@ -334,10 +335,10 @@ def _after_row(text: npt.NDArray[np.uint8], at: int, form: Form) -> int:
             at = _after_blanks(text, at + 1, size, separator)
         if not _row_ends(text, at, size, comments):
             return -1
-    return _line_end(text, at, size, 10) + 1
+    return int(_line_end(text, at, size, 10)) + 1
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _cell_end(
     text: npt.NDArray[np.uint8], first: int, at: int, form: Form, wanted: bool
 ) -> tuple[int, int, bool, bool, bool]:

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.linalg_small import assign, assign_rows
+from processor.inner_kernels import inner
 from processor.model import Floats
 from processor.space_frame.members.cylinder_model import (
     ACROSS_MM,
@@ -125,7 +126,7 @@ def fit_roughly(gathered, scanners, inner, spans, limits, rough, first, last):  
         rough.ok[m], rough.lengths[m], rough.radii[m], rough.sigma[m] = True, high - low, p[4], sigma
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _score_incidence(p, h, observations, sigma, cut, by_incidence):  # type: ignore[no-untyped-def]
     """Add to ``by_incidence`` (8, 3) number, sum and sum of squares of distances by the cosine of incidence."""
     P, U, known, bounds = observations
@@ -146,7 +147,7 @@ def _score_incidence(p, h, observations, sigma, cut, by_incidence):  # type: ign
         by_incidence[k, 2] += v * v * cos * cos
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _score_stations(p, h, observations, away, sigma, cut, inverse, scatter):  # type: ignore[no-untyped-def]
     """Fill statistics ``scatter`` (2, 3) from which the variance of the stations' shifts is estimated.
 
@@ -185,7 +186,7 @@ def _score_stations(p, h, observations, away, sigma, cut, inverse, scatter):  # 
                         scatter[side, 2] += term * away[k] ** 2
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _station_equations(p, h, observations, sigma, cut, A, y):  # type: ignore[no-untyped-def]
     """Fill normal equations A (g, 5, 5) and y (g, 5) of each station's points; returns their numbers (g,)."""
     P, U, known, bounds = observations
@@ -271,7 +272,7 @@ def _unknowns(frame, at, observations, scanners, errors):  # type: ignore[no-unt
     return Shifts(np.zeros((groups, 2)), sd), Solution(np.zeros((NP, NP)), np.zeros((groups, NP, 2)))
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _improve(p, h, observations, shifts, errors, sigma, slack, turns, solution):  # type: ignore[no-untyped-def]
     """Gauss-Newton steps of a bowed tube; returns (worked, points used, sigma of the last normal equations, sigma).
 
@@ -294,7 +295,7 @@ def _improve(p, h, observations, shifts, errors, sigma, slack, turns, solution):
     return good, count, assumed, sigma
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _count_around(p, h, observations, cut, around):  # type: ignore[no-untyped-def]
     """Count the points of unknown scanners by sectors from ``side`` to ``other``: those on |z| <= h within the cut."""
     P, U, known, _ = observations
@@ -308,7 +309,7 @@ def _count_around(p, h, observations, cut, around):  # type: ignore[no-untyped-d
             around[int(np.floor(turn * len(around))) % len(around)] += 1.0
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _centre(frame, points, p, h, middle, half):  # type: ignore[no-untyped-def]
     """Move frame, points (n, 3) and parameters from half length ``h`` to ``middle`` on the axis and length ``half``."""
     p[0] += p[2] * middle / h
@@ -322,7 +323,7 @@ def _centre(frame, points, p, h, middle, half):  # type: ignore[no-untyped-def]
         points[i, 2] -= middle
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _store(fits, m, frame, p, h, sigma, solution):  # type: ignore[no-untyped-def]
     """Write line, radius, bow and covariance of tube ``m``."""
     for i in range(3):
@@ -339,7 +340,7 @@ def _store(fits, m, frame, p, h, sigma, solution):  # type: ignore[no-untyped-de
             fits.bow_covariance[m, i, j] = sigma * sigma * solution.inverse[5 + i, 5 + j]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _store_response(response, at, bounds, change, sd, h):  # type: ignore[no-untyped-def]
     """Write the change (s, 4, 2) of offsets and turns by a shift of each station by one standard deviation."""
     scale = np.array([1.0, 1.0, 1.0 / h, 1.0 / h])
@@ -389,7 +390,7 @@ def _move(frame, p, h):  # type: ignore[no-untyped-def]
     _across(direction, side, other)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _bounds_of(stations):  # type: ignore[no-untyped-def]
     """Bounds (g + 1,) of the runs of one station each."""
     groups = 0
@@ -414,7 +415,7 @@ def _thinned(gathered, m, most):  # type: ignore[no-untyped-def]
     return gathered.places[rows][::k].copy(), gathered.stations[rows][::k].copy()  # as slices they compile all anew
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _localised(places, stations, middle, frame, scanners):  # type: ignore[no-untyped-def]
     """Points and rays in the frame (side, other, direction) about its point."""
     n = len(places)

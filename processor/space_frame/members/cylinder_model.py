@@ -19,6 +19,7 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.geometry.linalg_small import DEFINITE, factorise, substitute
+from processor.inner_kernels import inner
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
 
@@ -172,7 +173,7 @@ def step(p, h, observations, shifts, free, weighting, sizes, solution):  # type:
     return n, total, largest, True
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _sum_up(p, h, observations, shifts, free, weighting, sizes, A, y):  # type: ignore[no-untyped-def]
     """Add each group's points to its normal equations A (g, 7, 7), lower half, and y (g, 7); fill their ``sizes``.
 
@@ -220,13 +221,13 @@ def element(A, a, k):  # type: ignore[no-untyped-def]
     return A[a, k] if a >= k else A[k, a]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def spread_of(values, n):  # type: ignore[no-untyped-def]
     """Estimate the standard deviation of normal values by their median absolute size."""
     return MAD_TO_SD * np.median(np.abs(values[:n]))
 
 
-@njit(cache=True, nogil=True)
+@inner
 def circle_along(P, low, high, reach, p, h):  # type: ignore[no-untyped-def]
     """Start ``p`` from an algebraic circle whose centre runs along a line: linear in (a, b, c, d, and the constant)."""
     A, y, x, none = np.zeros((5, 5)), np.zeros(5), np.zeros(5), np.zeros((0, 0))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from processor.inner_kernels import inner
 from processor.model import Floats, Ints
 from processor.space_frame.members.voxel_linearity import HALO, SMALL2, WIDE, Linearity, ball, fill, principal
 from processor.space_frame.points.voxels import SIDE, Voxels
@@ -30,7 +31,7 @@ class Segments:
         return len(self.points)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def root_of(parent, i):  # type: ignore[no-untyped-def]
     """Root of a set, halving the path to it."""
     while parent[i] != i:

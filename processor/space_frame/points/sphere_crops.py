@@ -16,6 +16,7 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner_ieee
 from processor.model import Floats, Ints, Labels, UsageError
 from processor.space_frame.points.hash_sampling import WHOLE, hashed
 from processor.space_frame.points.source import Source
@@ -133,7 +134,7 @@ def _indexed(nodes: Floats, reach: float) -> NodeIndex:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _slot(key, mask):  # type: ignore[no-untyped-def]
     h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64((h >> np.uint64(29)) & np.uint64(mask))

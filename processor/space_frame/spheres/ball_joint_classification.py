@@ -19,6 +19,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner_ieee
 from processor.model import Bools, Floats, Ints
 from processor.space_frame.members.member_extraction import Measured
 from processor.space_frame.points import sphere_crops
@@ -137,7 +138,7 @@ def _evidence(crops, ends, sd, sphere, neck, first, last):  # type: ignore[no-un
             neck[k] += _neck_ratio(points, feet[m], axes[m], tubes[m], max(radius, CLAMP * tubes[m]) + CLEAR_MM, sd)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _beside_members(points, rays, feet, axes, tubes, sd):  # type: ignore[no-untyped-def]
     """Rows of the points that face the scanner and are on no sleeve."""
     rows = np.empty(len(points), np.int64)
@@ -156,7 +157,7 @@ def _beside_members(points, rays, feet, axes, tubes, sd):  # type: ignore[no-unt
     return rows[:n]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _sphere_ratio(points, rays, radius, sd):  # type: ignore[no-untyped-def]
     """Log likelihood ratio of a ball of this radius about the node to a lump of about its size."""
     wide = np.sqrt(sd * sd + (LUMP * radius) ** 2)
@@ -176,7 +177,7 @@ def _sphere_ratio(points, rays, radius, sd):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _neck_ratio(points, foot, axis, tube, beyond, sd):  # type: ignore[no-untyped-def]
     """Log likelihood ratio of a tube that ends in a cone and a sleeve to one that goes on towards the node.
 
@@ -200,14 +201,14 @@ def _neck_ratio(points, foot, axis, tube, beyond, sd):  # type: ignore[no-untype
     return _mean_of(totals)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _mean_of(logs):  # type: ignore[no-untyped-def]
     """Logarithm of the mean of likelihoods by their logarithms."""
     most = logs.max()
     return most + np.log(np.mean(np.exp(logs - most)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _by_axis(point, foot, axis):  # type: ignore[no-untyped-def]
     """Distances of a point along an axis and from it."""
     x, y, z = point[0] - foot[0], point[1] - foot[1], point[2] - foot[2]

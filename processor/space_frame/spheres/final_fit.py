@@ -13,6 +13,7 @@ from numba import njit
 from processor.geometry.linalg_small import assign, assign_rows, inverse_of
 from processor.geometry.sphere import BANDS, SECTORS
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner_ieee
 from processor.model import Floats
 from processor.space_frame.spheres.gauss_newton import (
     VISIBLE,
@@ -112,7 +113,7 @@ def _fit_range(crops, masks, model, model_points, priors, states, first_reach_mm
             _fit_at(k, crops, masks, model, model_points, priors, states[k].copy(), first_reach_mm, finished)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _fit_at(k, crops, masks, model, model_points, priors, state, first_reach_mm, finished):  # type: ignore[no-untyped-def]
     """Fit node ``k`` from ``state``; see :func:`fit_final`."""
     rows, observations = within(crops, k, state[3] - AROUND_MM, state[3] + AROUND_MM)
@@ -187,7 +188,7 @@ def _scaled(observations, surface, noise, local, model_points, prior, unknowns, 
     return used, scale, degrees
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def fill_residuals(observations, surface, noise, unknowns, covariance, residuals):  # type: ignore[no-untyped-def]
     """Fill the residual, cosine and weight of each point on visible surface, and return their sums.
 
@@ -242,7 +243,7 @@ def fill_residuals(observations, surface, noise, unknowns, covariance, residuals
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _cell_of(point, state, shift):  # type: ignore[no-untyped-def]
     """Return the cell that a point lies over; the cells of :func:`~processor.geometry.sphere.sphere_cells`."""
     x, y, z = point[0] - state[0] - shift[0], point[1] - state[1] - shift[1], point[2] - state[2] - shift[2]
@@ -256,7 +257,7 @@ def _cell_of(point, state, shift):  # type: ignore[no-untyped-def]
 # --- bias ------------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _without_bias(observations, surface, noise, state, covariance):  # type: ignore[no-untyped-def]
     """Subtract the bias by curvature and half of that by unknown rays; add the latter's spread to the covariance."""
     off = np.zeros(4)
@@ -275,7 +276,7 @@ def _without_bias(observations, surface, noise, state, covariance):  # type: ign
             covariance[i, j] += off[i] * off[j] / 12.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def curvature_bias(observations, surface, noise, state, covariance, off):  # type: ignore[no-untyped-def]
     """Fill the bias (4,) of least squares by the residuals' curvature, -1/2 C sum J w trace(C H).
 
@@ -319,7 +320,7 @@ def curvature_bias(observations, surface, noise, state, covariance, off):  # typ
             off[p] -= 0.5 * covariance[p, q] * total[q]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def unknown_ray_bias(points, rays, surface, noise, state, covariance, off):  # type: ignore[no-untyped-def]
     """Fill the bias of the state (4,) where rays are unknown, for noise that is the same in all directions.
 

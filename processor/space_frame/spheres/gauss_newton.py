@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.linalg_small import inverse_of
+from processor.inner_kernels import inner_ieee
 from processor.model import Floats, Labels
 
 LEAST_COSINE = 0.15
@@ -151,7 +152,7 @@ def select(points, rays, mask, state, gate, surface):  # type: ignore[no-untyped
 # --- normal equations and their solution -----------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _add_shifted(A, b, T, shift, normal, gain):  # type: ignore[no-untyped-def]
     """Add one station's information A (4, 4) and gradient b (4,), its unknown shift of covariance T eliminated.
 
@@ -189,7 +190,7 @@ def _add_shifted(A, b, T, shift, normal, gain):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _start_from(prior, state, normal):  # type: ignore[no-untyped-def]
     """Set the normal equations to those of the prior alone."""
     H, g = normal.H, normal.g

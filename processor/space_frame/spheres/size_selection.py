@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner_ieee
 from processor.model import Bools
 from processor.space_frame.spheres.gauss_newton import (
     CUT_SD,
@@ -82,7 +83,7 @@ def _choose_range(crops, masks, model, sizes, vote_half_width, first_reach_mm, w
             _choose_at(k, crops, masks, model, sizes, vote_half_width, first_reach_mm, choice)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _choose_at(k, crops, masks, model, sizes, vote_half_width, first_reach_mm, choice):  # type: ignore[no-untyped-def]
     """Choose the size of node ``k``; see :func:`choose`."""
     mask, nominal = mask_of(masks, k), sizes.nominal[k]
@@ -142,7 +143,7 @@ def _choose_at(k, crops, masks, model, sizes, vote_half_width, first_reach_mm, c
         choice.second_energy[k] = energies[runner_up]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _compare_alike(k, observations, mask, noise, sizes, states, shifts, radii, codes, energies):  # type: ignore[no-untyped-def]
     """Compute the energies (m,) again without the points that are masked for any of the sizes near the best.
 
@@ -167,7 +168,7 @@ def _compare_alike(k, observations, mask, noise, sizes, states, shifts, radii, c
             energies[j] += sizes.other_size_penalty
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _leave_out_limb(points, rays, state, least_cosine, kept):  # type: ignore[no-untyped-def]
     """Clear ``kept`` (n,) where a ray passes the limb of a sphere as near as the incidence below ``least_cosine`` does.
 
@@ -187,7 +188,7 @@ def _leave_out_limb(points, rays, state, least_cosine, kept):  # type: ignore[no
 # --- one fit and its energy ------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def fit_one(observations, mask, model, prior, first_reach_mm, tolerance, state, shifts, surface, covariance):  # type: ignore[no-untyped-def]
     """Fit from ``state``: select points, solve, and select again as the cut narrows; returns points used or -1."""
     points, rays, ranges, _ = observations
@@ -298,7 +299,7 @@ def votes(points, rays, mask, tube_off, radii, vote_half_width, count):  # type:
                 count[k] -= 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _worth(tried, vote, order, nominal):  # type: ignore[no-untyped-def]
     """Which radii (m,) have enough votes to be fitted, and the largest of them; the nominal one always is."""
     most = vote[order[0]]
@@ -311,7 +312,7 @@ def _worth(tried, vote, order, nominal):  # type: ignore[no-untyped-def]
     return worth, widest
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def with_nominal(sizes, nominal):  # type: ignore[no-untyped-def]
     """Return the sizes, with the nominal one appended if it is none of them."""
     count = len(sizes)
@@ -324,7 +325,7 @@ def with_nominal(sizes, nominal):  # type: ignore[no-untyped-def]
     return tried[: count + 1] if fresh else tried[:count]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def by_votes(vote):  # type: ignore[no-untyped-def]
     """Return the rows from the most votes to the fewest; equal ones keep their order."""
     order = np.arange(len(vote))
@@ -339,7 +340,7 @@ def by_votes(vote):  # type: ignore[no-untyped-def]
 # --- small parts -----------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def mask_of(masks, k):  # type: ignore[no-untyped-def]
     """Return the mask of node ``k``."""
     ends = slice(masks.start[k], masks.start[k + 1])
@@ -377,14 +378,14 @@ def segments(station):  # type: ignore[no-untyped-def]
     return runs
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def restart(state, shifts, radius):  # type: ignore[no-untyped-def]
     """Set the state to a sphere of this radius at the node, and the shifts to 0."""
     state[0], state[1], state[2], state[3] = 0.0, 0.0, 0.0, radius
     shifts[:] = 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def least_of(values, count):  # type: ignore[no-untyped-def]
     """Return the row of the least of the first values."""
     best = 0

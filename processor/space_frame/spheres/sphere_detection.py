@@ -30,6 +30,7 @@ from processor.geometry.sphere import (
     visible_fraction,
 )
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner_ieee
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD, robust_sd
 
@@ -231,7 +232,7 @@ def _propose(cells, seeds, scale, band, draws, spheres, scores, first, last):  #
                 spheres[s, a] += seeds[s, a]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _patch(cells, place, reach, rows):  # type: ignore[no-untyped-def]
     """Fill the rows of the points within ``reach`` of a place; returns their number."""
     n = 0
@@ -310,7 +311,7 @@ def _through(patch, draw, count):  # type: ignore[no-untyped-def]
     return sphere
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _refine(patch, sphere):  # type: ignore[no-untyped-def]
     """Algebraic fits to the points of a patch near a sphere (x, y, z, r), in place."""
     row = np.empty(4)

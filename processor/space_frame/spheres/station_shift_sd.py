@@ -15,6 +15,7 @@ from numba import njit
 
 from processor.geometry.linalg_small import inverse_of, log_det
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner_ieee
 from processor.model import Floats
 from processor.space_frame.spheres.gauss_newton import residual, variance
 from processor.space_frame.spheres.records import CropsWithRays, Priors
@@ -105,7 +106,7 @@ def _by_station(k, crops, weights, state, noise):  # type: ignore[no-untyped-def
     return A, b, count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_ieee
 def _cost(A, b, count, sd, state, k, priors):  # type: ignore[no-untyped-def]
     """Minus twice the log likelihood of the shifts' ``sd`` by one sphere; NaN where the sphere is not determined."""
     inverse, M, S, gain = np.empty((4, 4)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 5))

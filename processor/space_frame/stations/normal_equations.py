@@ -14,6 +14,7 @@ from numba import njit
 
 from processor.geometry.linalg_small import assign, cholesky, solve
 from processor.geometry.thread_ranges import over_ranges
+from processor.inner_kernels import inner
 from processor.model import Floats
 from processor.space_frame.stations.residual_kernels import LEAST, STATION, TUBE, Axes, Layout
 
@@ -75,7 +76,7 @@ def with_floor(N, b, floor):  # type: ignore[no-untyped-def]
     return M, y
 
 
-@njit(cache=True, nogil=True)
+@inner
 def add_tube(j, equations, layout, geometry, H, g):  # type: ignore[no-untyped-def]
     """Add to the upper half of H, and to g, the stations' equations by the observations of tube ``j``, eliminated."""
     N, b, weight, floor = equations

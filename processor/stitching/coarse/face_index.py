@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.inner_kernels import inner
 from processor.model import Floats, Ints
 from processor.stitching.planes.grouped_sums import EMPTY, place
 from processor.stitching.planes.sampled_patches import Patches
@@ -54,7 +55,7 @@ def build(patches: Patches, size_mm: float) -> FaceIndex:
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _key(x, y, z):  # type: ignore[no-untyped-def]
     return ((x & MASK) << (2 * FIELD)) | ((y & MASK) << FIELD) | (z & MASK)
 
@@ -91,7 +92,7 @@ def copy_table(table, row, keys, rows, shift):  # type: ignore[no-untyped-def]
             keys[slot], rows[slot] = table[i], row[i]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def cell_of(index, x, y, z):  # type: ignore[no-untyped-def]
     """Return the row of ``starts`` of the cell around a point, -1 = no patch near."""
     size = index.size
@@ -160,7 +161,7 @@ def mark_matches(index, T, patches, bound, off, like, out):  # type: ignore[no-u
                 break
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _matches(small, large, T, patches, weight, bound, gate, like):  # type: ignore[no-untyped-def]
     """Find for each patch, transformed by T, the nearest indexed one: place, its normal, distance and weight (m, 8)."""
     points, normals = patches.points, patches.normals
