@@ -29,6 +29,7 @@ from processor.registration.principal import PrincipalAxes
 
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.1 m
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
+COARSE_EVERY, COARSE_LEAST = 16, 2_000  # of the samples, for the coarse gates: one in 0.12 m, and no fewer in all
 FINE_GATES_MM = (50.0, 25.0, 12.0)  # for the promising ones
 COARSE_POINTS, FINE_POINTS = 600, 20_000
 WIDE_POINTS = 4_000  # at all gates but the last
@@ -80,6 +81,7 @@ class Surface:
     normals: Floats
     facet: Ints  # of ``mesh``
     boxes: icp.SampleBoxes  # about the same samples, in another order
+    coarse: icp.SampleBoxes  # about every COARSE_EVERYth of them
     mesh: MeshSurface
     centre: Floats  # (3,) of its area
     axes: Floats  # (3, 3) principal axes as columns
@@ -158,11 +160,13 @@ def sample_surface(part: DesignPart) -> Surface:
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
     mesh = mesh_distance.of_mesh(part.vertices, part.faces)
     axes = principal.of_mesh(part.vertices, part.faces)
+    every = int(np.clip(len(samples.points) // COARSE_LEAST, 1, COARSE_EVERY))
     return Surface(
         points=samples.points,
         normals=samples.normals,
         facet=(np.cumsum(mesh_distance.has_area(part.vertices, part.faces)) - 1)[samples.facet],
         boxes=icp.boxes_of(samples.points, samples.normals),
+        coarse=icp.boxes_of(samples.points[::every], samples.normals[::every]),
         mesh=mesh,
         centre=axes.centre,
         axes=axes.axes,
@@ -354,14 +358,13 @@ def _of_pieces(seeds: Floats, few: Floats, surface: Surface, part: DesignPart) -
     def iterate(T: Floats) -> _Candidate:
         fitted = icp.point_to_plane(
             quick,
-            surface.boxes,
+            surface.coarse,
             T,
             gates_mm=COARSE_GATES_MM[:1],
             axes=surface.axes,
             max_iterations=PIECE_ITERATIONS,
-            known=(known := icp.nothing_known(len(quick))),
         ).T_target_source
-        return _Candidate(fitted, fitted, _misfit(quick, surface, fitted, known))
+        return _Candidate(fitted, fitted, _misfit(quick, surface, fitted))
 
     best = sorted(each(iterate, piece_hypotheses(seeds, part)), key=lambda c: c.misfit)[:PIECES_KEPT]
     return each(partial(_align, few, surface, COARSE_GATES_MM), [_Candidate(c.T, c.T) for c in best])
@@ -427,24 +430,26 @@ def _rival_reason(best: Floats, rival: Floats, surface: Surface) -> Reason:
 
 def _align(points: Floats, surface: Surface, gates_mm: tuple[float, ...], candidate: _Candidate) -> _Candidate:
     """Align from the pose of a candidate, by a share of the points until the last gate."""
+    fine = gates_mm[-1] < COARSE_GATES_MM[-1]
+    boxes = surface.boxes if fine else surface.coarse
     wide, known = thinned(points, WIDE_POINTS), icp.nothing_known(len(points))
     of_wide = known if len(wide) == len(points) else icp.nothing_known(len(wide))
     T = icp.point_to_plane(
-        wide, surface.boxes, candidate.T, gates_mm=gates_mm[:-1], axes=surface.axes, known=of_wide
+        wide, boxes, candidate.T, gates_mm=gates_mm[:-1], axes=surface.axes, known=of_wide
     ).T_target_source
-    T = icp.point_to_plane(
-        points, surface.boxes, T, gates_mm=gates_mm[-1:], axes=surface.axes, known=known
-    ).T_target_source
-    return _Candidate(T, candidate.start, _misfit(points, surface, T, known))
+    T = icp.point_to_plane(points, boxes, T, gates_mm=gates_mm[-1:], axes=surface.axes, known=known).T_target_source
+    return _Candidate(T, candidate.start, _misfit(points, surface, T, known if fine else None))
 
 
-def _misfit(points: Floats, surface: Surface, T: Floats, known: icp.Known) -> float:
-    """Median distance in mm of the points to the nearest design sample's plane."""
+def _misfit(points: Floats, surface: Surface, T: Floats, known: icp.Known | None = None) -> float:
+    """Median distance in mm of the points to the nearest design sample's plane; ``known`` is of ``surface.boxes``."""
+    boxes = surface.boxes
+    known = icp.nothing_known(len(points)) if known is None else known
     placed = rigid.apply(T, points)
-    icp.find_partners(surface.boxes, placed, np.inf, known, np.empty(len(points), bool))
-    off = placed - surface.boxes.samples[known.first]
+    icp.find_partners(boxes, placed, np.inf, known, np.empty(len(points), bool))
+    off = placed - boxes.samples[known.first]
     distance = np.sqrt(np.einsum("ni,ni->n", off, off))
-    normal_part = np.abs(np.einsum("ni,ni->n", off, surface.boxes.normals[known.first]))
+    normal_part = np.abs(np.einsum("ni,ni->n", off, boxes.normals[known.first]))
     # A point beyond the surface's edge may lie in the plane of its nearest sample and still be far from it.
     spacing = 3.0 * float(np.median(distance))
     return float(np.median(np.where(distance > 100.0 + spacing, distance, normal_part)))
