@@ -190,15 +190,25 @@ def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
     """
     cells, kept = grid.cells, _blocks_within(grid, low, high)
     starts = cells.starts[kept]
-    count = starts[:, -1] - starts[:, 0]
-    begin = np.cumsum(count) - count
-    rows = np.repeat(starts[:, 0] - begin, count) + np.arange(int(count.sum()))
+    rows, begin = _rows_of(starts)
     slots, numbers = _table(cells.keys[kept])
     table = cells._replace(
         points=cells.points[rows], slots=slots, blocks=numbers, keys=cells.keys[kept],
         starts=starts + (begin - starts[:, 0])[:, None],
     )  # fmt: skip
     return PointGrid(table, grid.order[rows])
+
+
+def rows_within(grid: PointGrid, low: Floats, high: Floats) -> Ints:
+    """Return the rows, in the grid's order, of the points of the blocks that a box from ``low`` to ``high`` meets."""
+    return _rows_of(grid.cells.starts[_blocks_within(grid, low, high)])[0]
+
+
+def _rows_of(starts: Ints) -> tuple[Ints, Ints]:
+    """Return the rows (n,) of blocks by the starts (b, 65) of their cells, and where each block's rows begin (b,)."""
+    count = starts[:, -1] - starts[:, 0]
+    begin = np.cumsum(count) - count
+    return np.repeat(starts[:, 0] - begin, count) + np.arange(int(count.sum())), begin
 
 
 def _blocks_within(grid: PointGrid, low: Floats, high: Floats) -> Ints:

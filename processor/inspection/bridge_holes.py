@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from processor.components import bridge_parts
-from processor.inspection import flat_faces, holes
+from processor.inspection import design_cloud, flat_faces, holes
 from processor.inspection.bore_fit import Fitted
 from processor.inspection.characteristic import Characteristic
+from processor.inspection.design_cloud import DesignCloud
 from processor.inspection.design_holes import Hole
 from processor.model import ArchDesign, Floats, Scene
 
@@ -43,7 +44,7 @@ def of_parts(scene: Scene, assembled: Any) -> list[DrilledGroup]:
     for placed in bridge_parts.of_bridge(scene, assembled, "inspect") if drilled else ():
         if placed.name in drilled and placed.scene is not None:
             origin, found = drilled[placed.name]
-            cloud = holes.cloud_of(placed.scene, np.eye(4), None, origin)
+            cloud = design_cloud.of_scene(placed.scene, np.eye(4), None, origin)
             groups += _by_joint(scene.arch, placed.name, found, cloud, origin)
     return groups
 
@@ -57,7 +58,7 @@ def characteristics(drilled: Sequence[DrilledGroup]) -> dict[str, list[Character
 
 
 def _by_joint(
-    design: ArchDesign, name: str, found: list[Hole], cloud: holes.Cloud, origin: Floats
+    design: ArchDesign, name: str, found: list[Hole], cloud: DesignCloud, origin: Floats
 ) -> Iterator[DrilledGroup]:
     """Yield the holes at each joint of a part, plate by plate."""
     at = [

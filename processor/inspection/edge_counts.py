@@ -14,10 +14,11 @@ import numpy as np
 
 from processor.geometry import mesh_distance
 from processor.inspection import bore_fit, narrow_faces
+from processor.inspection.design_cloud import SeenPoints
 from processor.inspection.flat_faces import FlatFace
 from processor.inspection.holes import REACH_MM
 from processor.inspection.narrow_faces import RIM_MM, Outline, Shift, Surroundings
-from processor.model import Bools, Floats, Ints
+from processor.model import Bools, Floats
 
 # From the edge as designed inward: points are counted to the first, their density is that up to the second.
 STRIP_MM, BESIDE_MM = 10.0, 25.0
@@ -49,13 +50,12 @@ def level(
     free = narrow_faces.free_places(around, face, shape)
     if not isinstance(free, np.ndarray) or not len(free):
         return None
-    near = around.cloud.tree.query_ball_point(free + shift(free), 2.0 * REACH_MM)
-    rows = np.unique(np.concatenate([np.asarray(few, np.int64) for few in near]).astype(np.int64))
+    seen = around.cloud.near(free + shift(free), 2.0 * REACH_MM)
     found: list[Level] = []
     for beside in faces:
         ends_here = abs(beside.extent(face.normal)[1] - float(shape.origin @ face.normal)) < TOUCHES_MM
         if abs(beside.normal @ face.normal) < SQUARE and ends_here:
-            found += _of_views(around, face, beside, rows, shift)
+            found += _of_views(around, face, beside, seen, shift)
     if not found:
         return None
     value, variance = np.array(found).T
@@ -65,21 +65,23 @@ def level(
     return Level(mean, float(1.0 / (1.0 / variance).sum()) + (0.5 * RIM_MM) ** 2 + around.shared**2)
 
 
-def _of_views(around: Surroundings, face: FlatFace, beside: FlatFace, rows: Ints, shift: Shift) -> Iterator[Level]:
+def _of_views(
+    around: Surroundings, face: FlatFace, beside: FlatFace, seen: SeenPoints, shift: Shift
+) -> Iterator[Level]:
     """Yield the level of an edge by each station's points on the face ``beside`` it."""
-    cloud, out = around.cloud, face.normal
-    points = cloud.points[rows] - shift(cloud.points[rows])
+    out = face.normal
+    points = seen.points - shift(seen.points)
     edge = face.corners[0] @ out
     off, at = points @ out - edge, points @ np.cross(out, beside.normal)
     low, high = face.extent(np.cross(out, beside.normal))
     on = np.abs((points - beside.corners[0]) @ beside.normal) < GATE_MM
-    on &= ~(-cloud.ray[rows] @ beside.normal < bore_fit.LEAST_SLOPE)
+    on &= ~(-seen.ray @ beside.normal < bore_fit.LEAST_SLOPE)
     on &= (at > low + CORNER_MM) & (at < high - CORNER_MM) & (np.abs(off) < BESIDE_MM)
     on[on] = _free(around, face, beside, points[on])
-    for view in np.unique(cloud.source[rows[on]]):
-        own = np.flatnonzero(on & (cloud.source[rows] == view))
+    for view in np.unique(seen.view[on]):
+        own = np.flatnonzero(on & (seen.view == view))
         inner, outer = (off[own] < -STRIP_MM).sum(), (off[own] >= -STRIP_MM).sum()
-        if inner < FEWEST or _hidden(around, points[own], off[own], cloud.ray[rows[own]], (out, beside.normal)):
+        if inner < FEWEST or _hidden(around, points[own], off[own], seen.ray[own], (out, beside.normal)):
             continue
         density = inner / (BESIDE_MM - STRIP_MM)
         # Both counts as of points at random: those of a grid scatter less.

@@ -6,22 +6,20 @@ fit: where the body was moved to or turned is no part of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from processor import scene_cloud
 from processor.adjustment import scanner_class_errors, thermal
-from processor.adjustment.point_groups import joined_numbers
 from processor.geometry import rigid
 from processor.inspection import bore_fit, characteristic
 from processor.inspection.bore_fit import BorePoints, Fitted
 from processor.inspection.characteristic import Characteristic
+from processor.inspection.design_cloud import DesignCloud
 from processor.inspection.design_holes import Hole
 from processor.inspection.result import Quantity
-from processor.model import Bools, Floats, Ints, Scan, Scene, reason
+from processor.model import Bools, Floats, Ints, reason
 
 REACH_MM, PITCH_SHARE = 25.0, 0.4  # of a hole from its designed place, and at most this share of the way to the next
 RING_MM = 15.0  # width of the ring of the face around a hole whose points give the height of its plate
@@ -33,50 +31,11 @@ ROW_MM = 1.0  # across a row, from one hole to the next of it
 FEWEST_PLACED = 3  # holes of a group whose best fit is taken off
 
 
-class Cloud(NamedTuple):
-    """Points (n, 3) in the design's frame, the unit ray (n, 3) to each if known, and the view (n,) of each.
-
-    ``tree`` is of the points.
-    """
-
-    points: Floats
-    ray: Floats
-    source: Ints
-    sources: int
-    tree: cKDTree
-
-
 class Group(NamedTuple):
     """Holes through one plate of a body, row by row, with the axes (2, 3) that their places are stated along."""
 
     holes: tuple[Hole, ...]
     axes: Floats
-
-
-def cloud_of(scene: Scene, T: Floats, stitched: Any, origin: Floats) -> Cloud:
-    """Return all points of a scene in the design's frame less ``origin``, by a pose (4, 4) of the scans as merged."""
-    placed = scene_cloud.stitched(scene, stitched)
-    cloud = scene_cloud.merged(placed, with_scanner=True)
-    points = rigid.apply(rigid.between_origins(T, cloud.origin, origin), cloud.points)
-    source = _views(placed.scans)
-    sources = int(source.max(initial=0)) + 1
-    if cloud.scanner is None:
-        return Cloud(points, np.full(points.shape, np.nan), source, sources, cKDTree(points))
-    ray = points - rigid.apply(T, cloud.scanner + cloud.origin) + origin
-    length = np.linalg.norm(ray, axis=1, keepdims=True)
-    return Cloud(points, ray / np.maximum(length, 1e-9), source, sources, cKDTree(points))
-
-
-def _views(scans: Sequence[Scan]) -> Ints:
-    """Return the number (n,) of the view of each point: a scan, or a station of it; points of no station are one."""
-    return joined_numbers(
-        [
-            scan.point_station
-            if len(scan.point_station) and not scan.position.size
-            else np.zeros(len(scan.points), np.int64)
-            for scan in scans
-        ]
-    )
 
 
 def groups(holes: list[Hole], axes: list[Floats]) -> Iterator[Group]:
@@ -116,7 +75,7 @@ def _rows(across: Floats) -> Ints:
     return row
 
 
-def fitted(cloud: Cloud, group: Group, temperature_C: float = float("nan")) -> Fitted:
+def fitted(cloud: DesignCloud, group: Group, temperature_C: float = float("nan")) -> Fitted:
     """Return the holes of a group as measured.
 
     Lengths are those at the reference temperature, if that of the steel is known.
@@ -126,7 +85,7 @@ def fitted(cloud: Cloud, group: Group, temperature_C: float = float("nan")) -> F
     reach = np.minimum(REACH_MM, PITCH_SHARE * between.min(axis=1))
     bores = [_bore(cloud, group, hole) for hole in group.holes]
     radius = np.array([hole.radius for hole in group.holes])
-    return _referred(bore_fit.fit(bores, radius, reach, cloud.sources), places, radius, temperature_C)
+    return _referred(bore_fit.fit(bores, radius, reach, len(cloud.scanners)), places, radius, temperature_C)
 
 
 def _designed(group: Group) -> Floats:
@@ -144,17 +103,17 @@ def _referred(fitted: Fitted, places: Floats, radius: Floats, temperature_C: flo
     )
 
 
-def _bore(cloud: Cloud, group: Group, hole: Hole) -> BorePoints:
+def _bore(cloud: DesignCloud, group: Group, hole: Hole) -> BorePoints:
     """Return the points that lie in a hole's bore, between its rims."""
     far = float(np.hypot(hole.radius + REACH_MM, 0.5 * hole.depth + REACH_MM))
-    rows = np.sort(np.array(cloud.tree.query_ball_point(hole.middle, far), np.int64))
-    off = cloud.points[rows] - hole.middle
+    seen = cloud.near(hole.middle[None], far)
+    off = seen.points - hole.middle
     height, flat = off @ hole.axis, off @ group.axes.T
     beyond = np.linalg.norm(flat, axis=1) - hole.radius
     height = height - _level(height, beyond, hole)
     rim = min(bore_fit.RIM_MM, bore_fit.RIM_SHARE * hole.depth)
     inside = (np.abs(height) < 0.5 * hole.depth - rim) & (beyond < REACH_MM)
-    return BorePoints(flat[inside], cloud.source[rows][inside], cloud.ray[rows][inside] @ group.axes.T)
+    return BorePoints(flat[inside], seen.view[inside], seen.ray[inside] @ group.axes.T)
 
 
 def _level(height: Floats, beyond: Floats, hole: Hole) -> float:

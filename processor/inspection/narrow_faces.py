@@ -19,8 +19,9 @@ from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import FacetGrid
 from processor.inspection import bore_fit, flat_faces
 from processor.inspection.bore_fit import RIM_SHARE
+from processor.inspection.design_cloud import DesignCloud
 from processor.inspection.flat_faces import FLOOR_MM, FlatFace, Observed, Pieces
-from processor.inspection.holes import REACH_MM, Cloud
+from processor.inspection.holes import REACH_MM
 from processor.model import (
     Bools,
     Floats,
@@ -41,6 +42,7 @@ FEWEST = 4  # points of a face
 LEAST_SHARE = 0.5  # of the points near a face, that are at its level
 SINGLE = 30  # points of a face, up to which each is a piece of its own
 A_PIECE, MOST_PIECES = 6, 60  # points of a piece of other faces, and pieces of a face
+COMPARED = 1_000_000  # places times edges of an outline at once
 CELLS = 2**20  # along each axis, whose numbers differ
 OVERHANG_SHARE = 0.25  # weight of what a beam meets beyond a rim
 PARALLEL = 0.9999  # cosine between the normals of a flat face's facets
@@ -70,7 +72,7 @@ class Surroundings(NamedTuple):
     measured nothing.
     """
 
-    cloud: Cloud
+    cloud: DesignCloud
     design: Facets
     shared: float
 
@@ -80,11 +82,11 @@ class OnFace(NamedTuple):
 
     points: Floats
     off: Floats
-    source: Ints
+    view: Ints
 
     def of(self, rows: Ints | Bools) -> OnFace:
         """Return some of the points."""
-        return OnFace(self.points[rows], self.off[rows], self.source[rows])
+        return OnFace(self.points[rows], self.off[rows], self.view[rows])
 
 
 class Outline(NamedTuple):
@@ -102,6 +104,12 @@ class Outline(NamedTuple):
 
     def clearance(self, at: Floats) -> Floats:
         """Return how far places (n, 2) lie within the outline, mm; less than 0 outside of it."""
+        clearance = np.empty(len(at))
+        for rows in large_arrays.blocks(len(at), 1 + COMPARED // len(self.segments)):
+            clearance[rows] = self._clearance(at[rows])
+        return clearance
+
+    def _clearance(self, at: Floats) -> Floats:
         start, along = self.segments[:, 0], self.segments[:, 1] - self.segments[:, 0]
         off = at[:, None] - start
         share = np.einsum("nmi,mi->nm", off, along) / np.maximum(np.einsum("mi,mi->m", along, along), 1e-12)
@@ -115,7 +123,7 @@ class Outline(NamedTuple):
         return clearance
 
 
-def surroundings(design: StructureDesign, cloud: Cloud, seen: Observed) -> Surroundings:
+def surroundings(design: StructureDesign, cloud: DesignCloud, seen: Observed) -> Surroundings:
     """Return what the narrow faces of a design's bodies are measured in."""
     vertices, _ = scene_cloud.local_design(design)
     names, body = flat_faces.named_bodies(design, vertices)
@@ -260,22 +268,16 @@ def stands_before(around: Surroundings, face: FlatFace, feet: Floats) -> Ints:
 
 def _on_face(around: Surroundings, face: FlatFace, shape: Outline, places: Floats, shift: Shift) -> OnFace:
     """Return the points that may be of a face."""
-    cloud = around.cloud
-    moved = shift(places)
-    radius = float(np.sqrt(3.0) * REACH_MM)
-    found = cloud.tree.query_ball_point(places + moved, radius)
-    rows = np.unique(np.concatenate([np.asarray(few, np.int64) for few in found]).astype(np.int64))
-    points = cloud.points[rows]
-    off = (points - shape.origin) @ face.normal
+    seen = around.cloud.near(places + shift(places), float(np.sqrt(3.0) * REACH_MM))
+    off = (seen.points - shape.origin) @ face.normal
     near = np.abs(off) < REACH_MM
     # Seen from the front, so that the footprint lies on the face; of unknown rays all count.
-    slope = -cloud.ray[rows] @ face.normal
-    near &= ~(slope < bore_fit.LEAST_SLOPE)
-    rows, points, off = rows[near], points[near], off[near]
-    feet = points - np.outer(off, face.normal) - shift(points)
+    near &= ~(-seen.ray @ face.normal < bore_fit.LEAST_SLOPE)
+    seen, off = seen.of(near), off[near]
+    feet = seen.points - np.outer(off, face.normal) - shift(seen.points)
     inside = shape.clearance(shape.flat(feet)) >= _margin(shape)
     inside[inside] = stands_before(around, face, feet[inside]) < 0
-    return OnFace(points, off, cloud.source[rows]).of(inside)
+    return OnFace(seen.points, off, seen.view).of(inside)
 
 
 def _of_level(at: Floats, off: Floats) -> Bools:
@@ -324,7 +326,7 @@ def _levelled(seen: OnFace, at: Floats, shared: float) -> tuple[Floats, Floats, 
     length = max(float(np.ptp(at)), 1.0)
     line = np.stack([np.ones_like(at), (at - at.mean()) / length], axis=1)
     line = line[:, : 2 if len(at) > FEWEST else 1]
-    views, view = np.unique(seen.source, return_inverse=True)
+    views, view = np.unique(seen.view, return_inverse=True)
     several = (view[:, None] == np.arange(len(views))).astype(float)
     terms = np.hstack([line, several - several.mean(axis=0)])
     sd = max(robust_sd_about_median(seen.off), LEAST_NOISE_MM)

@@ -16,10 +16,10 @@ from numpy.polynomial.legendre import legvander
 from processor import scene_cloud
 from processor.adjustment import maximum_interval, scanner_class_errors, thermal
 from processor.geometry import rigid
-from processor.inspection import characteristic, edge_counts, flat_faces, holes, narrow_faces
+from processor.inspection import characteristic, design_cloud, edge_counts, flat_faces, holes, narrow_faces
 from processor.inspection.characteristic import Characteristic
+from processor.inspection.design_cloud import DesignCloud
 from processor.inspection.flat_faces import Body, Fit, FlatFace, Pieces
-from processor.inspection.holes import Cloud
 from processor.inspection.narrow_faces import Surroundings
 from processor.inspection.part_geometry import off_the_chord
 from processor.inspection.result import InspectedComponent, Quantity, Result
@@ -78,7 +78,7 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     origin, placed = scene_cloud.local_design(scene.structure)[1], scene_cloud.stitched(scene, stitched)
     if not any(body.holes for body in found):
         placed = narrow_faces.near(placed, T, origin, _unmeasured(found), deviation.max_depth)
-    cloud = holes.cloud_of(placed, T, None, origin)
+    cloud = design_cloud.of_scene(placed, T, None, origin)
     around = narrow_faces.surroundings(scene.structure, cloud, seen)
     unproven = surface_registration.is_unproven(deviation.reasons)
     doubtful = deviation.status is Status.AMBIGUOUS or unproven
@@ -117,7 +117,7 @@ def _component(body: Body, scene: Scene, around: Surroundings, doubtful: bool) -
     )
 
 
-def _holes(body: Body, cloud: Cloud, temperature_C: float) -> Iterator[Characteristic]:
+def _holes(body: Body, cloud: DesignCloud, temperature_C: float) -> Iterator[Characteristic]:
     """Yield the characteristics of a body's holes, numbered over the whole body."""
     first = 1
     for group in holes.groups(list(body.holes), [axis.direction for axis in body_axes(body)]):

@@ -8,13 +8,12 @@ from functools import cache
 import cadquery as cq
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from processor.inspection import bore_fit, design_holes, flat_faces, holes
+from processor.inspection import bore_fit, design_cloud, design_holes, flat_faces, holes
 from processor.inspection.bore_fit import BorePoints
-from processor.model import Scan, StructureDesign
+from processor.model import StructureDesign
 
 RADIUS, DEPTH = 12.0, 16.0
 PITCH = np.array([80.0, 70.0])
@@ -80,9 +79,10 @@ RAYS = np.array([[0.6, 0.2, -0.77], [-0.5, 0.4, -0.77], [0.1, -0.6, 0.79]])  # o
 
 def bore_cloud(rng, departure, radius=0.0, sigma=0.35, spacing=2.0, mixed=0.0, known=True):
     """Points of bores and faces of the plate at GRID + departure (h, 2), seen from three stations in z."""
-    points, source, ray = [], [], []
+    points, source, scanners = [], [], []
     for s, direction in enumerate(RAYS):
         direction = direction / np.linalg.norm(direction)
+        scanners.append(-1e7 * direction if known else np.full(3, np.nan))
         error = direction * OFFSET_SD * rng.normal() + [*(SHIFT_SD * rng.normal(size=2)), 0.0]
         for centre in GRID + departure:
             toward = np.arctan2(direction[1], direction[0])
@@ -99,9 +99,7 @@ def bore_cloud(rng, departure, radius=0.0, sigma=0.35, spacing=2.0, mixed=0.0, k
             both = np.concatenate([wall, face]) + error
             points.append(both)
             source.append(np.full(len(both), s))
-            ray.append(np.tile(direction if known else [np.nan] * 3, (len(both), 1)))
-    points = np.concatenate(points)
-    return points, np.concatenate(ray), np.concatenate(source)
+    return np.concatenate(points), np.concatenate(source), np.array(scanners)
 
 
 @cache
@@ -109,8 +107,8 @@ def group():
     return next(holes.groups(holes_of(plate(GRID).val()), [np.array([1.0, 0.0, 0.0])]))
 
 
-def measured(points, ray, source):
-    cloud = holes.Cloud(points, ray, source, 3, cKDTree(points))
+def measured(points, source, scanners):
+    cloud = design_cloud.of_points(points, source, scanners)
     return {one.id: one for one in holes.characteristics(group(), holes.fitted(cloud, group()), 1)}
 
 
@@ -152,11 +150,11 @@ def test_intervals_cover_drilled_places_pitches_and_diameters(known):
 def test_a_plate_that_is_moved_and_turned_keeps_its_holes():
     rng = np.random.default_rng(3)
     departure = rng.normal(0.0, 0.7, GRID.shape)
-    points, ray, source = bore_cloud(rng, departure)
-    before = measured(points, ray, source)
+    points, source, scanners = bore_cloud(rng, departure)
+    before = measured(points, source, scanners)
     turn = Rotation.from_rotvec([0.0, 0.0, np.radians(1.0)])
     moved = turn.apply(points) + np.array([14.0, -9.0, 3.0])
-    after = measured(moved, turn.apply(ray), source)
+    after = measured(moved, source, turn.apply(scanners))
     for id_, one in before.items():
         # Motions are linearised: a degree turns departures of 1 mm by 0.02 mm.
         assert after[id_].deviation == pytest.approx(one.deviation, abs=0.05), id_
@@ -201,9 +199,9 @@ def test_mixed_pixels_in_the_bore_do_not_move_it():
 
 def test_a_hole_that_was_not_seen_has_no_value():
     rng = np.random.default_rng(4)
-    points, ray, source = bore_cloud(rng, np.zeros(GRID.shape))
+    points, source, scanners = bore_cloud(rng, np.zeros(GRID.shape))
     hidden = np.linalg.norm(points[:, :2] - GRID[0], axis=1) < 30.0
-    found = measured(points[~hidden], ray[~hidden], source[~hidden])
+    found = measured(points[~hidden], source[~hidden], scanners)
     assert np.isnan(found["hole-1-along"].deviation)
     assert np.isnan(found["hole-1-diameter"].deviation)
     assert [one.code for one in found["hole-1-along"].why] == ["inspect.hole-not-seen"]
@@ -294,20 +292,6 @@ def test_places_and_pitches_have_the_scale_of_the_scanner():
     found = drilled(list(range(6)), sd=0.0, places=places)
     assert found["pitch-1-2"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)
     assert found["hole-1-along"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)
-
-
-def test_each_station_of_each_scan_is_a_view_and_points_of_no_station_are_one():
-    points = np.zeros((4, 3))
-    scans = (
-        Scan("a", points, point_station=[0, 1, 0, -1]),
-        Scan("b", points, point_station=[1, 1, 0, 0]),
-        Scan("c", points, position=np.zeros(3), point_station=[0, 0, 1, 1]),
-    )
-    view = holes._views(scans)
-    apart = [view[[0, 2]], view[[1]], view[[3]], view[4:6], view[6:8], view[8:]]
-    assert all(len(set(one.tolist())) == 1 for one in apart)
-    assert len({int(one[0]) for one in apart}) == len(apart)
-    assert sorted(set(view.tolist())) == list(range(len(apart)))
 
 
 def test_the_adjustment_of_many_holes_needs_no_matrix_of_all_points():

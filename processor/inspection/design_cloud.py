@@ -1,0 +1,114 @@
+"""The points of a scene in the frame of its design, found by their places; those of a large scene lie in files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from processor import large_arrays, scene_cloud
+from processor.distinct_rows import distinct
+from processor.geometry import point_grid, rigid
+from processor.geometry.nearest_neighbours import within_reach
+from processor.geometry.point_grid import PointGrid
+from processor.large_arrays import allocate, blocks
+from processor.model import Floats, Ints, Labels, Scan, Scene
+
+CELL_MM = 25.0  # of the grid
+BOX_MM = 250.0  # about places that are searched together
+
+
+class SeenPoints(NamedTuple):
+    """Points (n, 3) in the design's frame, the unit ray (n, 3) to each, NaN if unknown, and the view (n,) of each."""
+
+    points: Floats
+    ray: Floats
+    view: Ints
+
+    def of(self, rows: Any) -> SeenPoints:
+        """Return some of the points."""
+        return SeenPoints(self.points[rows], self.ray[rows], self.view[rows])
+
+
+@dataclass(frozen=True)
+class DesignCloud:
+    """All points of a scene in the design's frame, and from where each was seen.
+
+    A view is a scan, or a station of it; points of no station are one. ``view`` (n,) is of the points in the grid's
+    order, ``scanners`` (v, 3) are the positions of the views, NaN where that of any is unknown.
+    """
+
+    grid: PointGrid
+    view: Labels
+    scanners: Floats
+
+    def near(self, places: Floats, radius: float) -> SeenPoints:
+        """Return the points nearer than ``radius``, mm, to any of the places (m, 3), in the grid's order."""
+        cells = self.grid.cells
+        found = [np.empty(0, np.int64)]
+        box = np.floor(places / BOX_MM).astype(np.int64)
+        for corner in distinct(box).rows:
+            together = places[(box == corner).all(axis=1)]
+            rows = point_grid.rows_within(self.grid, together.min(axis=0) - radius, together.max(axis=0) + radius)
+            points = cells.points[rows]
+            found.append(rows[within_reach(points, together, radius)[0]])
+            large_arrays.release_after(points.nbytes)
+        rows = np.unique(np.concatenate(found))
+        points, view = cells.points[rows], self.view[rows].astype(np.int64)
+        ray = points - self.scanners[view]
+        return SeenPoints(points, ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9), view)
+
+
+def of_points(points: Floats, view: Labels, scanners: Floats) -> DesignCloud:
+    """Sort points (n, 3) and their views (n,) into a grid."""
+    grid = point_grid.of_points(points, CELL_MM)
+    sorted_view = allocate(len(view), dtype=np.int32)
+    for rows in blocks(len(view)):
+        sorted_view[rows] = view[grid.order[rows]]
+    return DesignCloud(grid, sorted_view, scanners)
+
+
+def of_scene(scene: Scene, T: Floats, stitched: Any, origin: Floats) -> DesignCloud:
+    """Return all points of a scene in the design's frame less ``origin``, by a pose (4, 4) of the scans as merged."""
+    placed = scene_cloud.stitched(scene, stitched)
+    count = sum(len(scan.points) for scan in placed.scans)
+    points, view = allocate(count, 3), allocate(count, dtype=np.int32)
+    scanners, before = [np.empty((0, 3))], 0
+    for scan in placed.scans:
+        T_design_scan = rigid.between_origins(T @ scan.pose, scan.origin, origin)
+        stations, first = _stations(scan), sum(map(len, scanners))
+        for rows in blocks(len(scan.points)):
+            own = slice(before + rows.start, before + rows.stop)
+            points[own] = rigid.apply(T_design_scan, scan.points[rows])
+            view[own] = first + (np.searchsorted(stations, scan.point_station[rows]) if _is_of_stations(scan) else 0)
+        before += len(scan.points)
+        scanners.append(_scanners(placed, scan, stations, T, origin))
+    found = np.concatenate(scanners)
+    return of_points(points, view, found if np.isfinite(found).all() else np.full(found.shape, np.nan))
+
+
+def _is_of_stations(scan: Scan) -> bool:
+    return len(scan.point_station) > 0 and not scan.position.size
+
+
+def _stations(scan: Scan) -> Ints:
+    """Return the numbers (s,) of the stations of a scan, ascending; that of a scan which is one station does not count.
+
+    Points of no station have a number of their own.
+    """
+    if not _is_of_stations(scan):
+        return np.zeros(1 if len(scan.points) else 0, np.int64)
+    parts = [np.unique(scan.point_station[rows]) for rows in blocks(len(scan.points))]
+    return np.unique(np.concatenate(parts)).astype(np.int64)
+
+
+def _scanners(scene: Scene, scan: Scan, stations: Ints, T: Floats, origin: Floats) -> Floats:
+    """Return the positions (s, 3) of the views of a scan in the design's frame less ``origin``, NaN if unknown."""
+    if scan.position.size:
+        at = rigid.apply(rigid.between_origins(T @ scan.pose, scan.origin, origin), scan.position - scan.origin)
+        return np.broadcast_to(at, (len(stations), 3))
+    if scene.stations is None or not _is_of_stations(scan) or stations[0] < 0:
+        return np.full((len(stations), 3), np.nan)
+    positions = scene.stations.positions[stations]
+    return rigid.apply(rigid.between_origins(T, positions[0], origin), positions - positions[0])
