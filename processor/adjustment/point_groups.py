@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from processor.distinct_rows import distinct
+from processor.large_arrays import allocate, blocks, extremes
 from processor.model import Floats, Ints, Labels
 
 
@@ -28,18 +29,23 @@ def group_means(values: Floats, group: Ints) -> Floats:
 
 def joined_numbers(by_part: Sequence[Ints | Labels]) -> Ints:
     """Return the group (n,), from 0, of each of the concatenated points of several parts; no group is of two parts."""
-    numbers, before = [np.empty(0, np.int64)], 0
+    numbers, start, before = allocate(sum(map(len, by_part)), dtype=np.int64), 0, 0
     for group in by_part:
-        number = _numbered(group)
-        numbers.append(number + before)
-        before += int(number.max(initial=-1)) + 1
-    return np.concatenate(numbers)
+        known = distinct_groups(group)
+        for rows in blocks(len(group)):
+            numbers[start + rows.start : start + rows.stop] = before + np.searchsorted(known, group[rows])
+        start, before = start + len(group), before + len(known)
+    return numbers
 
 
-def _numbered(group: Ints | Labels) -> Ints:
-    """Return the rank (n,) of each group (n,) among those that there are; small numbers are counted, not sorted."""
-    low, high = int(group.min(initial=0)), int(group.max(initial=-1))
-    if high - low < len(group):
-        rank = np.cumsum(np.bincount(group - low) > 0) - 1
-        return np.asarray(rank[group - low], np.int64)
-    return np.unique(group, return_inverse=True)[1].reshape(-1).astype(np.int64)
+def distinct_groups(group: Ints | Labels) -> Ints:
+    """Return the groups (g,) that there are among those of points (n,), ascending; small numbers are counted."""
+    if not len(group):
+        return np.empty(0, np.int64)
+    low, high = (int(one) for one in extremes(group))
+    if high - low >= len(group):
+        return np.unique(group).astype(np.int64)
+    count = np.zeros(high - low + 1, np.int64)
+    for rows in blocks(len(group)):
+        count += np.bincount(group[rows] - low, minlength=len(count))
+    return low + np.flatnonzero(count)

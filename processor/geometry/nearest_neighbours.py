@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numba import njit
 from scipy.sparse import coo_array
@@ -161,10 +163,10 @@ def within_reach(points: Floats, places: Floats, reach: float) -> tuple[Bools, B
     if not len(points) or not len(places):
         return of_points, of_places
     grid = point_grid.of_points(places, REACHED_CELL * reach)
-    near, points = np.zeros(len(places), bool), large_arrays.read_only(np.ascontiguousarray(points, np.float64))
-    over_ranges(
-        lambda a, b: _mark_within(grid.cells, points, reach, of_points, near, a, b), len(points), least=LEAST_POINTS
-    )
+    near = np.zeros(len(places), bool)
+    for rows in large_arrays.blocks(len(points), large_arrays.AT_ONCE):
+        some, marks = large_arrays.read_only(np.ascontiguousarray(points[rows], np.float64)), of_points[rows]
+        over_ranges(partial(_mark_within, grid.cells, some, reach, marks, near), len(some), least=LEAST_POINTS)
     of_places[grid.order] = near
     return of_points, of_places
 

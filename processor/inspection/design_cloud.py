@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from processor import large_arrays, scene_cloud
+from processor.adjustment.point_groups import distinct_groups
 from processor.distinct_rows import distinct
 from processor.geometry import point_grid, rigid
 from processor.geometry.nearest_neighbours import within_reach
@@ -99,8 +100,7 @@ def _stations(scan: Scan) -> Ints:
     """
     if not _is_of_stations(scan):
         return np.zeros(1 if len(scan.points) else 0, np.int64)
-    parts = [np.unique(scan.point_station[rows]) for rows in blocks(len(scan.points))]
-    return np.unique(np.concatenate(parts)).astype(np.int64)
+    return distinct_groups(scan.point_station)
 
 
 def _scanners(scene: Scene, scan: Scan, stations: Ints, T: Floats, origin: Floats) -> Floats:

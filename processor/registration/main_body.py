@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from processor.distinct_rows import distinct
 from processor.geometry.thinning import thinned, voxel_means
-from processor.large_arrays import corners
+from processor.large_arrays import blocks, corners
 from processor.model import Bools, Floats
 from processor.registration import principal
 
@@ -55,8 +55,9 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
     best = piece if _misfit(even[piece], sizes) <= _misfit(even[left], sizes) else left
     if best.all():
         return None
-    nearest = cKDTree(even).query(points, distance_upper_bound=2.0 * step, workers=-1)[1]
-    found: Bools = np.append(best, False)[nearest]
+    tree, of_body, found = cKDTree(even), np.append(best, False), np.empty(len(points), bool)
+    for rows in blocks(len(points)):
+        found[rows] = of_body[tree.query(points[rows], distance_upper_bound=2.0 * step, workers=-1)[1]]
     return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from processor.geometry import rigid
 from processor.geometry.thinning import voxel_means
 from processor.geometry.thread_ranges import each
-from processor.large_arrays import corners
+from processor.large_arrays import blocks, centroid, corners
 from processor.model import Floats, Ints
 
 ALIKE = 1.25  # ratio of the variances along two axes below which these may be swapped
@@ -47,9 +47,12 @@ class CoarsePose:
 
 def of_points(points: Floats) -> PrincipalAxes:
     """Principal axes of points (n, 3), every point of equal weight (paper 000, section 2.2)."""
-    centre = points.mean(axis=0)
-    local = points - centre
-    return _from_moments(centre, local.T @ local / len(points))
+    centre = centroid(points)
+    moments = np.zeros((3, 3))
+    for rows in blocks(len(points)):
+        local = points[rows] - centre
+        moments += local.T @ local
+    return _from_moments(centre, moments / len(points))
 
 
 def sizes(points: Floats) -> Floats:

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from processor import large_arrays
 from processor.geometry import nearest_neighbours, point_grid, rigid, thinning
 from processor.geometry.lines_and_polylines import Line, Polyline, crossing, fit_line, ransac_line
 from processor.registration import icp, principal
 from processor.robust_statistics import robust_sd
+from tests.support import arrays_in_files
 
 
 def test_fit_recovers_a_quarter_turn_worked_by_hand():
@@ -264,15 +266,27 @@ def test_the_order_by_cells_does_not_depend_on_that_of_the_file():
     rng = np.random.default_rng(0)
     points = rng.uniform(0.0, 300.0, (2_000, 3)).round(0)  # some coordinates are equal
     shuffled = points[rng.permutation(len(points))]
-    sorted_points = points[thinning.by_cell(points, 40.0)]
-    np.testing.assert_array_equal(sorted_points, shuffled[thinning.by_cell(shuffled, 40.0)])
+    found, other = thinning.by_cell(points, 40.0), thinning.by_cell(shuffled, 40.0)
+    np.testing.assert_array_equal(found.points, points[found.row])
+    np.testing.assert_array_equal(found.points, other.points)
 
 
 @pytest.mark.parametrize("grid_mm", [1e-6, 7.0])
 def test_the_order_by_cells_is_that_of_sorting_by_cell_and_coordinates(grid_mm):
     points = np.round(np.random.default_rng(5).uniform(0.0, 300.0, (3000, 3)) / grid_mm) * grid_mm
     x, y, z = (points - points.min(axis=0)).T // 40.0
-    np.testing.assert_array_equal(thinning.by_cell(points, 40.0), np.lexsort((*points.T[::-1], z, y, x)))
+    np.testing.assert_array_equal(thinning.by_cell(points, 40.0).row, np.lexsort((*points.T[::-1], z, y, x)))
+
+
+def test_many_points_are_sorted_and_averaged_by_cells_through_files_alike(monkeypatch, tmp_path):
+    points = np.random.default_rng(8).normal(0.0, 200.0, (9000, 3)).round(0)
+    whole, means = thinning.by_cell(points, 40.0), thinning.voxel_means(points, 40.0, 2)
+    arrays_in_files.limit(monkeypatch, 700, 1000)
+    with large_arrays.in_files(tmp_path):
+        parts = thinning.by_cell(points, 40.0)
+        np.testing.assert_array_equal(parts.row, whole.row)
+        np.testing.assert_array_equal(parts.points, whole.points)
+        np.testing.assert_array_equal(thinning.voxel_means(points, 40.0, 2), means)
 
 
 def test_the_nearest_rotation_is_the_polar_factor_and_never_a_reflection():
@@ -286,7 +300,7 @@ def test_a_cell_of_many_points_is_sorted_like_one_of_few():
     rng = np.random.default_rng(5)
     points = np.round(rng.uniform(0.0, 39.0, (3_000, 3)))  # of one cell, some of them equal
     points = np.vstack([points, points[:500], np.full((1, 3), 85.0)])
-    np.testing.assert_array_equal(thinning.by_cell(points, 40.0), np.lexsort(points.T[::-1]))
+    np.testing.assert_array_equal(thinning.by_cell(points, 40.0).row, np.lexsort(points.T[::-1]))
 
 
 def test_marks_within_reach_are_those_of_all_distances():

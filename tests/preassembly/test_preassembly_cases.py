@@ -496,7 +496,7 @@ def test_a_rib_of_even_curvature_is_not_laid_half_a_turn_round():
     scene, truth = make("d3", recipe, 1)
     part = scene.arch.parts[2]
     scan = next(scan for scan in scene.scans if scan.component == part.name)
-    found = attitude.find(scan.points[by_cell(scan.points, measure.CELL_MM)], part)
+    found = attitude.find(by_cell(scan.points, measure.CELL_MM).points, part)
     turn = found.T_surface[:3, :3] @ truth.arch.T_bridge_scan[2][:3, :3].T
     assert found.status == "ok"
     assert np.degrees(rigid.rotation_angle(turn)) < 0.1

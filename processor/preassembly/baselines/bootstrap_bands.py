@@ -111,7 +111,7 @@ def bound(vectors: Floats) -> Floats:
 
 def _as_designed(part: PartFeatures, design: DesignPart) -> _AsDesigned:
     """Project the points near the design onto it; unchanged where the part's pose is not known."""
-    points = part.scan.points[by_cell(part.scan.points, CELL_MM)]
+    points = by_cell(part.scan.points, CELL_MM).points
     unchanged = _AsDesigned(part, points, np.zeros(len(points), bool), 0.0, part.attitude.T_surface)
     if part.attitude.status == Status.FAILED:
         return unchanged

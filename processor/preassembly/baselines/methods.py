@@ -88,7 +88,7 @@ def extract(
 
 def _attitude(scan: Scan, part: DesignPart) -> Attitude:
     """Find the attitude of a scan by its points in the order that the adjustment has them in."""
-    return attitude.find(scan.points[by_cell(scan.points, measure.CELL_MM)], part)
+    return attitude.find(by_cell(scan.points, measure.CELL_MM).points, part)
 
 
 def assemble(parts: list[PartFeatures], design: ArchDesign, params: Params) -> Result:

@@ -12,6 +12,7 @@ import numpy as np
 
 from processor.adjustment import variance_components
 from processor.geometry.mesh_distance import on_face
+from processor.large_arrays import blocks
 from processor.model import Floats
 from processor.preassembly.ends.outer_faces import (
     ALONG,
@@ -40,7 +41,8 @@ def measure(part: RegisteredPart, at: Floats, direction: Floats) -> OuterEnd | N
     The variance is of noise and of differences between named stations.
     """
     # A few of the points of a long part.
-    rows = np.flatnonzero(np.abs(part.points @ direction - at @ direction) < NEAR_MM)
+    near = [np.abs(part.points[rows] @ direction - at @ direction) < NEAR_MM for rows in blocks(len(part.points))]
+    rows = np.flatnonzero(np.concatenate(near))
     face, residual, beyond = part.surface.distances(part.points[rows], REACH_MM)
     facing = part.surface.normals[face] @ direction
     offset = part.points[rows] - at

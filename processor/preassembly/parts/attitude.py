@@ -18,7 +18,7 @@ from processor.geometry.mesh_distance import MeshSurface, Samples
 from processor.geometry.nearest_neighbours import within_reach
 from processor.geometry.thinning import thinned, voxel_means
 from processor.geometry.thread_ranges import each
-from processor.large_arrays import corners
+from processor.large_arrays import allocate, blocks, corners, quantile
 from processor.model import ArchDesign, Bools, DesignPart, Floats, Ints, Reason, Status, reason
 from processor.preassembly import topology
 from processor.preassembly.ends import tube_end
@@ -182,7 +182,10 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
     scan = principal.of_points(points)
     design = principal.of_mesh(part.vertices, part.faces)
     rotations = _rotations(scan.axes, design.axes)
-    low, high = np.quantile((points - scan.centre) @ scan.axes[:, 0], [0.01, 0.99])
+    along = allocate(len(points))
+    for rows in blocks(len(points)):
+        along[rows] = (points[rows] - scan.centre) @ scan.axes[:, 0]
+    low, high = quantile(along, 0.01), quantile(along, 0.99)
     whole = (part.vertices - design.centre) @ design.axes[:, 0]
     short = np.ptp(whole) - (high - low)
     shifts = [0.0] if short < SHORT_SHARE * np.ptp(whole) else [0.0, -1.0, 1.0]

@@ -14,6 +14,7 @@ from processor.geometry import box_girder_mesh, rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.thinning import by_cell, thinned
+from processor.large_arrays import allocate, blocks, chosen
 from processor.model import ArchDesign, DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly import topology
 from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, section, tube_end, view_variance
@@ -312,8 +313,12 @@ def _reasons(
 
 def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Sequence[Floats]) -> RegisteredPart:
     """Join the points of the scans used, on the design; ``joints`` are the key points (8, 3) of the part's joints."""
-    placed = [rigid.apply(scan.registration.T_design_scan, scan.points) for scan in used]
-    points = placed[0] if len(placed) == 1 else np.vstack(placed)
+    points, before = allocate(sum(len(scan.points) for scan in used), 3), 0
+    for scan in used:
+        for rows in blocks(len(scan.points)):
+            own = slice(before + rows.start, before + rows.stop)
+            points[own] = rigid.apply(scan.registration.T_design_scan, scan.points[rows])
+        before += len(scan.points)
     station = joined_numbers([scan.station for scan in used])
     return RegisteredPart(
         points=points,
@@ -387,24 +392,25 @@ def _between_stations(points: Floats, station: Ints, shape: attitude.Surface) ->
 
 def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _PlacedScan:
     """Register one scan, without the ground and what stands about the part, and check that it is of part ``index``."""
-    order = by_cell(scan.points, CELL_MM)
-    points = scan.points[order]
-    points *= shrink
-    station = scan.point_station[order].astype(np.int64) if len(scan.point_station) else np.zeros(len(points), np.int64)
+    points, row = by_cell(scan.points, CELL_MM)
+    station = allocate(len(points), dtype=np.int64)
+    for rows in blocks(len(points)):
+        points[rows] *= shrink
+        station[rows] = scan.point_station[row[rows]] if len(scan.point_station) else 0
     of_part = main_body.of_sizes(points, shapes.sizes)
     if of_part is None:
         placed = _identified(scan, points, station, index, shapes)
         if shrink == 1.0 and placed.attitude is not attitude.NOWHERE and shapes[index].tube is None:
             shapes.attitudes[index] = placed.attitude
         return placed
-    placed = _identified(scan, points[of_part], station[of_part], index, shapes)
+    placed = _identified(scan, chosen(points, of_part), chosen(station, of_part), index, shapes)
     if placed.rejected:
         return placed
     # Where the part lies on the ground, points of its lower edge went with the ground.
     rest = np.flatnonzero(~of_part)
     off = shapes[index].mesh.distances(rigid.apply(placed.registration.T_design_scan, points[rest]), AT_PART_MM)
     of_part[rest] = on_face(off[0], off[2]) & (np.abs(off[1]) < AT_PART_MM)
-    return replace(placed, points=points[of_part], station=station[of_part])
+    return replace(placed, points=chosen(points, of_part), station=chosen(station, of_part))
 
 
 def _identified(scan: Scan, points: Floats, station: Ints, index: int, shapes: attitude.Shapes) -> _PlacedScan:
