@@ -23,6 +23,7 @@ from processor.geometry import mesh_distance, rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.nearest_neighbours import within_reach
+from processor.large_arrays import blocks
 from processor.model import Bools, Floats, Ints
 from processor.preassembly.assembly_errors import INTERVAL_MM
 from processor.preassembly.ends import plate_sides
@@ -79,6 +80,37 @@ class _FacePoints(NamedTuple):
     w: Floats
     residual: Floats
     station: Ints
+
+
+class _Candidates(NamedTuple):
+    """Points (n,) beside an edge, as those of a face, how far outward they lie, and which are nearer to another."""
+
+    interval: Ints
+    x: Floats
+    w: Floats
+    residual: Floats
+    station: Ints
+    out: Floats
+    inner: Bools
+
+    def outer(self) -> _FacePoints:
+        """Return those that are not of the plate's inner side."""
+        used = _outer(self.interval, self.out, self.inner)
+        return _FacePoints(self.interval[used], self.x[used], self.w[used], self.residual[used], self.station[used])
+
+
+class _Edge(NamedTuple):
+    """A bottom edge: its line, 1 on the left and -1 on the right, and from what distance points count, mm.
+
+    With the chainages (k,) where it is measured, and finer ones (f,) with the ``frame`` there, see :func:`_frame`.
+    """
+
+    line: Polyline
+    sense: float
+    margin: float
+    chainage: Floats
+    fine: Floats
+    frame: tuple[Floats, Floats, Floats]
 
 
 class _AtEdge(NamedTuple):
@@ -179,12 +211,23 @@ def _faces(
 ) -> tuple[_FacePoints, _FacePoints]:
     """Points of the web and of the bottom along an edge, those of the plates' inner sides left out."""
     fine = np.arange(0.0, line.length, 10.0, dtype=np.float64)
-    frame = _frame(line, other, fine, sense)
-    places, reach = line.at(fine), 1.2 * REACH_MM
-    rows = np.flatnonzero(within_reach(part.points, places, reach)[0])
-    points = part.points[rows]
-    at = cKDTree(places).query(points, workers=-1)[1]
-    offset = points - line.at(fine[at])
+    edge = _Edge(
+        line=line, sense=sense, margin=3.0 * sigma_mm + 2.0, chainage=chainage, fine=fine,
+        frame=_frame(line, other, fine, sense),
+    )  # fmt: skip
+    rows = np.flatnonzero(within_reach(part.points, line.at(fine), 1.2 * REACH_MM)[0])
+    parts = [_near(part, rows[some], edge) for some in (*blocks(len(rows)), slice(0, 0))]
+    web, bottom = (
+        _Candidates(*map(np.concatenate, zip(*of_face, strict=True))) for of_face in zip(*parts, strict=True)
+    )
+    return web.outer(), bottom.outer()
+
+
+def _near(part: RegisteredPart, rows: Ints, edge: _Edge) -> tuple[_Candidates, _Candidates]:
+    """Return those of the points in ``rows`` that lie on the web and on the bottom beside an edge."""
+    points, station, fine, frame = part.points[rows], part.station[rows], edge.fine, edge.frame
+    at = cKDTree(edge.line.at(fine)).query(points, workers=-1)[1]
+    offset = points - edge.line.at(fine[at])
     along, level, up = (np.einsum("ni,ni->n", offset, frame[k][at]) for k in range(3))
     nearest, distance, _ = part.surface.distances(points, REACH_MM)
     face, residual, beyond = part.outer.distances(points, REACH_MM)
@@ -193,21 +236,19 @@ def _faces(
     normals = part.outer.normals[face], part.surface.normals[nearest]
     facing, nearest_facing = ([np.einsum("ni,ni->n", n, frame[k][at]) for k in (1, 2)] for n in normals)
     looks = [(np.abs(facing[k]) > ALONG) & (np.abs(nearest_facing[k]) > ALONG) for k in range(2)]
-    margin = 3.0 * sigma_mm + 2.0
     interval = np.floor((fine[at] + along) / INTERVAL_MM).astype(np.int64)
-    x = fine[at] + along - chainage[np.clip(interval, 0, len(chainage) - 1)]
-    inside = measured & (interval >= 0) & (interval < len(chainage))
-    inward = -sense * level
-    web = inside & looks[0] & (np.abs(level) < plate_sides.REACH_MM) & (up > margin) & (up < REACH_MM)
-    bottom = inside & looks[1] & (np.abs(up) < plate_sides.REACH_MM) & (inward > margin) & (inward < REACH_MM)
-    for used, out in ((web, sense * np.sign(facing[0])), (bottom, -np.sign(facing[1]))):
-        inner = np.abs(distance) < np.abs(residual) - plate_sides.LAYER_MM  # nearer to another face of the design
-        used[used] = _outer(interval[used], (out * residual)[used], inner[used])
-    residuals = [np.sign(looking) * residual for looking in facing]
-    station = part.station[rows]
+    x = fine[at] + along - edge.chainage[np.clip(interval, 0, len(edge.chainage) - 1)]
+    inside = measured & (interval >= 0) & (interval < len(edge.chainage))
+    inward = -edge.sense * level
+    web = inside & looks[0] & (np.abs(level) < plate_sides.REACH_MM) & (up > edge.margin) & (up < REACH_MM)
+    bottom = inside & looks[1] & (np.abs(up) < plate_sides.REACH_MM) & (inward > edge.margin) & (inward < REACH_MM)
+    inner = np.abs(distance) < np.abs(residual) - plate_sides.LAYER_MM  # nearer to another face of the design
+    signs = np.sign(facing[0]), np.sign(facing[1])
+    residuals = signs[0] * residual, signs[1] * residual
+    outs = edge.sense * signs[0] * residual, -signs[1] * residual
     return (
-        _FacePoints(interval[web], x[web], up[web], residuals[0][web], station[web]),
-        _FacePoints(interval[bottom], x[bottom], inward[bottom], residuals[1][bottom], station[bottom]),
+        _Candidates(*(one[web] for one in (interval, x, up, residuals[0], station, outs[0], inner))),
+        _Candidates(*(one[bottom] for one in (interval, x, inward, residuals[1], station, outs[1], inner))),
     )
 
 
