@@ -13,7 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from processor.adjustment import thermal
+from processor.adjustment.point_groups import distinct_groups
 from processor.geometry import rigid
+from processor.large_arrays import allocate, blocks
 from processor.model import (
     DesignBodies,
     DesignPart,
@@ -90,18 +92,22 @@ def _structure(scene: Scene, part: DesignPart, placed: list[_Placed], shrink: fl
     """
     scans, stations, before = [], [], 0
     for one in placed:
-        number = np.unique(one.scan.point_station).astype(np.int64)
+        number = distinct_groups(one.scan.point_station)
         number = number[number >= 0]
         if scene.stations is not None and len(number):
             stations.append(_stations(scene.stations, number, one, shrink, again=before > 0))
-        known = one.scan.point_station >= 0
+        points, station = allocate(*one.scan.points.shape), allocate(len(one.scan.point_station), dtype=np.int32)
+        for rows in blocks(len(points)):
+            points[rows] = one.scan.points[rows] * shrink
+            of_rows = one.scan.point_station[rows]
+            station[rows] = np.where(of_rows >= 0, before + np.searchsorted(number, of_rows), -1)
         scans.append(
             replace(
                 one.scan,
-                points=one.scan.points * shrink,
+                points=points,
                 origin=one.scan.origin * shrink,
                 position=one.scan.position * shrink,
-                point_station=np.where(known, before + np.searchsorted(number, one.scan.point_station), -1),
+                point_station=station,
                 T_project_scan=one.T_bridge_scan,
                 component="",
             )
