@@ -34,6 +34,7 @@ REACH_MM = 200.0  # across each face
 LEAST_POINTS = 30
 LEAST_KEPT = 0.7  # of the points of an interval: on the plane fitted to them
 FLOOR_MM = 0.004
+PASS_POINTS = 50_000  # beside an edge, in memory at once
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ def _faces(
         frame=_frame(line, other, fine, sense),
     )  # fmt: skip
     rows = np.flatnonzero(within_reach(part.points, line.at(fine), 1.2 * REACH_MM)[0])
-    parts = [_near(part, rows[some], edge) for some in (*blocks(len(rows)), slice(0, 0))]
+    parts = [_near(part, rows[some], edge) for some in (*blocks(len(rows), PASS_POINTS), slice(0, 0))]
     web, bottom = (
         _Candidates(*map(np.concatenate, zip(*of_face, strict=True))) for of_face in zip(*parts, strict=True)
     )
