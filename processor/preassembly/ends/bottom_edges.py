@@ -11,6 +11,7 @@ departure follows their errors as its plane does.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.nearest_neighbours import within_reach
 from processor.large_arrays import blocks
-from processor.model import Bools, Floats, Ints
+from processor.model import Bools, Floats, Ints, Labels
 from processor.preassembly.assembly_errors import INTERVAL_MM
 from processor.preassembly.ends import plate_sides
 from processor.preassembly.ends.outer_faces import ALONG, RegisteredPart
@@ -76,28 +77,26 @@ NONE = EdgeDepartures(  # of a part whose design has no bottom edges
 class _FacePoints(NamedTuple):
     """Points (n,) of one face near an edge: interval, distances along and from the edge, residual, station."""
 
-    interval: Ints
+    interval: Labels
     x: Floats
     w: Floats
     residual: Floats
-    station: Ints
+    station: Labels
+
+    def of(self, rows: slice | Bools) -> _FacePoints:
+        """Return some of the points."""
+        return _FacePoints(self.interval[rows], self.x[rows], self.w[rows], self.residual[rows], self.station[rows])
+
+    def basis(self) -> Floats:
+        """Return the terms (n, 3) of a plane."""
+        return np.stack([np.ones_like(self.x), self.x / INTERVAL_MM, self.w / REACH_MM], axis=1)
 
 
 class _Candidates(NamedTuple):
-    """Points (n,) beside an edge, as those of a face, how far outward they lie, and which are nearer to another."""
+    """Points (n,) beside an edge that may be of a face, and which of them are nearer to another face of the design."""
 
-    interval: Ints
-    x: Floats
-    w: Floats
-    residual: Floats
-    station: Ints
-    out: Floats
+    face: _FacePoints
     inner: Bools
-
-    def outer(self) -> _FacePoints:
-        """Return those that are not of the plate's inner side."""
-        used = _outer(self.interval, self.out, self.inner)
-        return _FacePoints(self.interval[used], self.x[used], self.w[used], self.residual[used], self.station[used])
 
 
 class _Edge(NamedTuple):
@@ -218,10 +217,17 @@ def _faces(
     )  # fmt: skip
     rows = np.flatnonzero(within_reach(part.points, line.at(fine), 1.2 * REACH_MM)[0])
     parts = [_near(part, rows[some], edge) for some in (*blocks(len(rows), PASS_POINTS), slice(0, 0))]
-    web, bottom = (
-        _Candidates(*map(np.concatenate, zip(*of_face, strict=True))) for of_face in zip(*parts, strict=True)
-    )
-    return web.outer(), bottom.outer()
+    webs, bottoms = zip(*parts, strict=True)
+    return _outer_side(webs, sense), _outer_side(bottoms, -1.0)
+
+
+def _outer_side(found: Sequence[_Candidates], sense: float) -> _FacePoints:
+    """Join the points of a face, those of the plate's inner side left out; residuals by ``sense`` are outward."""
+    columns = list(zip(*(one.face for one in found), strict=True))
+    interval, residual = np.concatenate(columns[0]), np.concatenate(columns[3])
+    used = _outer(interval, sense * residual, np.concatenate([one.inner for one in found]))
+    x, w, station = (np.concatenate(columns[k])[used] for k in (1, 2, 4))
+    return _FacePoints(interval[used], x, w, residual[used], station)
 
 
 def _near(part: RegisteredPart, rows: Ints, edge: _Edge) -> tuple[_Candidates, _Candidates]:
@@ -244,13 +250,10 @@ def _near(part: RegisteredPart, rows: Ints, edge: _Edge) -> tuple[_Candidates, _
     web = inside & looks[0] & (np.abs(level) < plate_sides.REACH_MM) & (up > edge.margin) & (up < REACH_MM)
     bottom = inside & looks[1] & (np.abs(up) < plate_sides.REACH_MM) & (inward > edge.margin) & (inward < REACH_MM)
     inner = np.abs(distance) < np.abs(residual) - plate_sides.LAYER_MM  # nearer to another face of the design
-    signs = np.sign(facing[0]), np.sign(facing[1])
-    residuals = signs[0] * residual, signs[1] * residual
-    outs = edge.sense * signs[0] * residual, -signs[1] * residual
-    return (
-        _Candidates(*(one[web] for one in (interval, x, up, residuals[0], station, outs[0], inner))),
-        _Candidates(*(one[bottom] for one in (interval, x, inward, residuals[1], station, outs[1], inner))),
-    )
+    numbers, stations = interval.astype(np.int32), station.astype(np.int32)
+    of_web = _FacePoints(numbers, x, up, np.sign(facing[0]) * residual, stations)
+    of_bottom = _FacePoints(numbers, x, inward, np.sign(facing[1]) * residual, stations)
+    return _Candidates(of_web.of(web), inner[web]), _Candidates(of_bottom.of(bottom), inner[bottom])
 
 
 def _frame(line: Polyline, other: Polyline, chainage: Floats, sense: float) -> tuple[Floats, Floats, Floats]:
@@ -281,31 +284,27 @@ def _at_edge(face: _FacePoints, count: int, stations: int) -> _AtEdge:
 
     An interval of which many points lie off its plane shows something else (a trestle beneath the part), and is NaN.
     """
-    basis = np.stack([np.ones_like(face.x), face.x / INTERVAL_MM, face.w / REACH_MM], axis=1)
     used = np.ones(len(face.x), bool)
     value, variance = np.full(count, np.nan), np.full(count, np.nan)
     by_station = np.zeros((count, stations))
     for _ in range(3):
-        interval, B, r = face.interval[used], basis[used], face.residual[used]
-        number = np.bincount(interval, minlength=count)
-        sums = [np.bincount(interval, B[:, i] * B[:, j], count) for i in range(3) for j in range(3)]
-        right = np.stack([np.bincount(interval, B[:, i] * r, count) for i in range(3)], axis=1)
+        number, N, right, of_station = _sums(face, used, count, stations)
         fitted = np.flatnonzero(number >= LEAST_POINTS)
-        N = np.stack(sums, axis=1)[fitted].reshape(-1, 3, 3)
+        N = N[fitted]
         well_posed = np.linalg.cond(N) < 1e6
         fitted, N = fitted[well_posed], N[well_posed]
         solution = np.zeros((count, 3))
         inverse = np.linalg.inv(N)
         solution[fitted] = np.einsum("nij,nj->ni", inverse, right[fitted])
-        rest = face.residual - np.einsum("ni,ni->n", basis, solution[face.interval])
+        rest = np.empty(len(face.x))
+        for rows in blocks(len(rest)):
+            some = face.of(rows)
+            rest[rows] = some.residual - np.einsum("ni,ni->n", some.basis(), solution[some.interval])
         known = np.isin(face.interval, fitted)
         sd = robust_sd(rest[known & used])
         value, variance = np.full(count, np.nan), np.full(count, np.nan)
         value[fitted], variance[fitted] = solution[fitted, 0], sd**2 * inverse[:, 0, 0] + FLOOR_MM**2
-        group = interval * stations + face.station[used]
-        of_station = np.stack([np.bincount(group, B[:, i], count * stations) for i in range(3)], axis=1)
-        of_station = of_station.reshape(count, stations, 3)[fitted]
-        by_station[:], by_station[fitted] = 0.0, np.einsum("ni,nsi->ns", inverse[:, 0], of_station)
+        by_station[:], by_station[fitted] = 0.0, np.einsum("ni,nsi->ns", inverse[:, 0], of_station[fitted])
         now = known & (np.abs(rest) < 4.5 * max(sd, FLOOR_MM))
         if (now == used).all():
             break
@@ -315,3 +314,22 @@ def _at_edge(face: _FacePoints, count: int, stations: int) -> _AtEdge:
     )
     value[~of_face] = np.nan
     return _AtEdge(value, variance, by_station)
+
+
+def _sums(face: _FacePoints, used: Bools, count: int, stations: int) -> tuple[Ints, Floats, Floats, Floats]:
+    """Sum the used points of ``count`` intervals: their number, and the normal equations of their planes.
+
+    These are the matrix (count, 3, 3), the right side (count, 3), and the terms (count, s, 3) of each station's points.
+    """
+    number, N, right = np.zeros(count, np.int64), np.zeros((count, 9)), np.zeros((count, 3))
+    of_station = np.zeros((count * stations, 3))
+    for rows in blocks(len(used)):
+        some = face.of(rows).of(used[rows])
+        B, group = some.basis(), some.interval.astype(np.int64) * stations + some.station
+        number += np.bincount(some.interval, minlength=count)
+        for k in range(3):
+            right[:, k] += np.bincount(some.interval, B[:, k] * some.residual, count)
+            of_station[:, k] += np.bincount(group, B[:, k], count * stations)
+            for m in range(3):
+                N[:, 3 * k + m] += np.bincount(some.interval, B[:, k] * B[:, m], count)
+    return number, N.reshape(count, 3, 3), right, of_station.reshape(count, stations, 3)
