@@ -11,15 +11,18 @@ from designgen import recipe_files
 from designgen.designs import arch_bridge, arch_mesh
 from designgen.scanning import sampler
 from designgen.scenes.make import make
+from processor import large_arrays
 from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
 from processor.geometry.thinning import by_cell
 from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene, reason
 from processor.preassembly import step as preassembly_step
+from processor.preassembly.ends import bottom_edges
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import assignment, attitude, identity, measure
 from processor.registration import principal
+from tests.support import arrays_in_files
 from tests.support.clouds import arch_clouds
 from tests.support.clouds.arch_clouds import random_pose
 
@@ -114,6 +117,22 @@ def assert_found_right(parts, design, points, index=RIB):
 def test_a_square_box_is_not_turned_by_a_quarter():
     parts, design = ribs(dataclasses.replace(SMALL, width_mm=1_000.0, height_mm=1_000.0, plate_web_mm=24.0))
     assert_found_right(parts, design, cloud(parts[1]), 1)
+
+
+def test_a_part_whose_points_lie_in_files_has_the_same_results(monkeypatch, tmp_path):
+    parts, design = ribs()
+    scan, _ = scanned(cloud(parts[1]))
+    whole = measured(design, 1, scan)
+    arrays_in_files.limit(monkeypatch, 10_000, 50_000)
+    monkeypatch.setattr(bottom_edges, "PASS_POINTS", 700)
+    with large_arrays.in_files(tmp_path):
+        found = measured(design, 1, scan)
+    assert len(scan.points) > 150_000
+    np.testing.assert_allclose(found.T_bridge_scan, whole.T_bridge_scan, atol=1e-6)
+    np.testing.assert_allclose(found.member.edges.departure, whole.member.edges.departure, atol=1e-6)
+    np.testing.assert_allclose(found.member.edges.covariance, whole.member.edges.covariance, atol=1e-6)
+    for one, other in zip(found.member.ends, whole.member.ends, strict=True):
+        np.testing.assert_allclose(one.departure, other.departure, atol=1e-6)
 
 
 @pytest.mark.slow
