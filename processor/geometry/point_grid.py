@@ -179,7 +179,7 @@ def _stacked(parts: Sequence[Ints]) -> Ints:
 
 def count_within(grid: PointGrid, low: Floats, high: Floats) -> int:
     """Return the number of points of the blocks that a box from ``low`` (3,) to ``high`` (3,) meets."""
-    starts = grid.cells.starts[_blocks_within(grid, low, high)]
+    starts = grid.cells.starts[_blocks_within(grid.cells, low, high)]
     return int((starts[:, -1] - starts[:, 0]).sum())
 
 
@@ -188,7 +188,7 @@ def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
 
     Searches that do not leave the box find the same points in the same order as in the whole grid.
     """
-    cells, kept = grid.cells, _blocks_within(grid, low, high)
+    cells, kept = grid.cells, _blocks_within(grid.cells, low, high)
     starts = cells.starts[kept]
     rows, begin = _rows_of(starts)
     slots, numbers = _table(cells.keys[kept])
@@ -199,9 +199,9 @@ def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
     return PointGrid(table, grid.order[rows])
 
 
-def rows_within(grid: PointGrid, low: Floats, high: Floats) -> Ints:
+def rows_within(cells: Cells, low: Floats, high: Floats) -> Ints:
     """Return the rows, in the grid's order, of the points of the blocks that a box from ``low`` to ``high`` meets."""
-    return _rows_of(grid.cells.starts[_blocks_within(grid, low, high)])[0]
+    return _rows_of(cells.starts[_blocks_within(cells, low, high)])[0]
 
 
 def _rows_of(starts: Ints) -> tuple[Ints, Ints]:
@@ -211,19 +211,19 @@ def _rows_of(starts: Ints) -> tuple[Ints, Ints]:
     return np.repeat(starts[:, 0] - begin, count) + np.arange(int(count.sum())), begin
 
 
-def _blocks_within(grid: PointGrid, low: Floats, high: Floats) -> Ints:
+def _blocks_within(cells: Cells, low: Floats, high: Floats) -> Ints:
     """Return the rows of the blocks that a box meets: along x and y they are searched for, along z compared."""
-    edge = SIDE * grid.cells.size
+    edge = SIDE * cells.size
     # A block more on each side, for the rounding.
-    first, last = (np.floor((corner - grid.cells.lower) / edge) for corner in (low, high))
-    first = np.clip(first - 1.0, 0.0, grid.cells.extent).astype(np.int64)
-    last = np.clip(last + 1.0, -1.0, grid.cells.extent - 1.0).astype(np.int64)
+    first, last = (np.floor((corner - cells.lower) / edge) for corner in (low, high))
+    first = np.clip(first - 1.0, 0.0, cells.extent).astype(np.int64)
+    last = np.clip(last + 1.0, -1.0, cells.extent - 1.0).astype(np.int64)
     along = np.arange(first[0], last[0] + 1)
-    begin = np.searchsorted(grid.cells.keys, ((along << FIELD) + first[1]) << FIELD)
-    end = np.searchsorted(grid.cells.keys, ((along << FIELD) + last[1] + 1) << FIELD)
+    begin = np.searchsorted(cells.keys, ((along << FIELD) + first[1]) << FIELD)
+    end = np.searchsorted(cells.keys, ((along << FIELD) + last[1] + 1) << FIELD)
     count = np.maximum(end - begin, 0)
     rows = np.repeat(begin - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))
-    level = grid.cells.keys[rows] & ((1 << FIELD) - 1)
+    level = cells.keys[rows] & ((1 << FIELD) - 1)
     found: Ints = rows[(level >= first[2]) & (level <= last[2])]
     return found
 

@@ -22,8 +22,9 @@ MOST_EMPTY = 4  # voxels for each point, up to which the empty ones are counted,
 
 
 def thinned(points: npt.NDArray[T], count: int) -> npt.NDArray[T]:
-    """Every k-th of points (n, ...), with the largest k that leaves ``count`` points or more."""
-    return large_arrays.every(points, max(1, len(points) // count))
+    """Every k-th of points (n, ...), with the largest k that leaves ``count`` points or more; a copy of many points."""
+    step = max(1, len(points) // count)
+    return points[::step] if len(points) <= large_arrays.BLOCK_ROWS else large_arrays.every(points, step)
 
 
 class Sorted(NamedTuple):
@@ -47,19 +48,25 @@ def by_cell(points: Floats, size_mm: float) -> Sorted:
         row = _order(points, grid, size_mm)
         return Sorted(points[row], row)
 
-    def layer_of(block: tuple[Floats, ...]) -> Ints:
-        layer: Ints = ((block[0][:, 0] - grid.low[0]) / size_mm).astype(np.int64)
-        return layer
+    # Cells are numbered along x first, then along y: runs of columns along z are parts whose order is that of all.
+    columns = int(grid.extent[0] * grid.extent[1])
+    along_y = int(grid.extent[1]) if columns <= len(points) else 1
 
-    # Cells are numbered along x first: layers of them are parts whose order is that of all.
-    filled = np.zeros(int(grid.extent[0]), np.int64)
+    def column_of(block: tuple[Floats, ...]) -> Ints:
+        cell = ((block[0][:, :2] - grid.low[:2]) / size_mm).astype(np.int64)
+        column: Ints = cell[:, 0] if along_y == 1 else cell[:, 0] * along_y + cell[:, 1]
+        return column
+
+    filled = np.zeros(int(grid.extent[0]) * along_y, np.int64)
     for rows in large_arrays.blocks(len(points)):
-        filled += np.bincount(layer_of((points[rows],)), minlength=len(filled))
-    part_of_layer = np.cumsum(filled) // large_arrays.AT_ONCE
-    ends = np.cumsum(np.bincount(part_of_layer, filled).astype(np.int64))
+        filled += np.bincount(column_of((points[rows],)), minlength=len(filled))
+    part_of_column = np.cumsum(filled) // large_arrays.AT_ONCE
+    ends = np.cumsum(np.bincount(part_of_column, filled).astype(np.int64))
     passed = ((points[rows], np.arange(rows.start, rows.stop)) for rows in large_arrays.blocks(len(points)))
-    placed, row = large_arrays.in_parts(passed, lambda block: part_of_layer[layer_of(block)], ends)
+    placed, row = large_arrays.in_parts(passed, lambda block: part_of_column[column_of(block)], ends)
     for first, last in pairwise([0, *ends.tolist()]):
+        if first == last:
+            continue
         own, among = placed[first:last], row[first:last]
         order = _order(large_arrays.read_only(own), grid, size_mm)
         own[:], among[:] = own[order], among[order]

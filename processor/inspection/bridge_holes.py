@@ -44,7 +44,7 @@ def of_parts(scene: Scene, assembled: Any) -> list[DrilledGroup]:
     for placed in bridge_parts.of_bridge(scene, assembled, "inspect") if drilled else ():
         if placed.name in drilled and placed.scene is not None:
             origin, found = drilled[placed.name]
-            cloud = design_cloud.of_scene(placed.scene, np.eye(4), None, origin)
+            cloud = design_cloud.of_scene(placed.scene, np.eye(4), origin)
             groups += _by_joint(scene.arch, placed.name, found, cloud, origin)
     return groups
 

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from processor import large_arrays, scene_cloud
+from processor import large_arrays
 from processor.adjustment.point_groups import distinct_groups
 from processor.distinct_rows import distinct
 from processor.geometry import point_grid, rigid
 from processor.geometry.nearest_neighbours import within_reach
-from processor.geometry.point_grid import PointGrid
+from processor.geometry.point_grid import Cells
 from processor.large_arrays import allocate, blocks
 from processor.model import Floats, Ints, Labels, Scan, Scene
 
@@ -21,7 +21,10 @@ BOX_MM = 250.0  # about places that are searched together
 
 
 class SeenPoints(NamedTuple):
-    """Points (n, 3) in the design's frame, the unit ray (n, 3) to each, NaN if unknown, and the view (n,) of each."""
+    """Points (n, 3), mm, in the design's frame less an origin, the unit ray (n, 3) to each, and its view (n,).
+
+    Rays are NaN where they are unknown.
+    """
 
     points: Floats
     ray: Floats
@@ -34,49 +37,46 @@ class SeenPoints(NamedTuple):
 
 @dataclass(frozen=True)
 class DesignCloud:
-    """All points of a scene in the design's frame, and from where each was seen.
+    """All points of a scene in the design's frame less an origin, mm, sorted into cells, and from where each was seen.
 
-    A view is a scan, or a station of it; points of no station are one. ``view`` (n,) is of the points in the grid's
-    order, ``scanners`` (v, 3) are the positions of the views, NaN where that of any is unknown.
+    A view is a scan, or a station of it; points of no station are one. ``view`` (n,) is of the points in the order of
+    the cells. ``scanners`` (v, 3) are the positions of the views, all NaN if one of them is unknown.
     """
 
-    grid: PointGrid
+    cells: Cells
     view: Labels
     scanners: Floats
 
     def near(self, places: Floats, radius: float) -> SeenPoints:
-        """Return the points nearer than ``radius``, mm, to any of the places (m, 3), in the grid's order."""
-        cells = self.grid.cells
+        """Return the points nearer than ``radius``, mm, to any of the places (m, 3), in the order of the cells."""
         found = [np.empty(0, np.int64)]
         box = np.floor(places / BOX_MM).astype(np.int64)
         for corner in distinct(box).rows:
             together = places[(box == corner).all(axis=1)]
-            rows = point_grid.rows_within(self.grid, together.min(axis=0) - radius, together.max(axis=0) + radius)
-            points = cells.points[rows]
-            found.append(rows[within_reach(points, together, radius)[0]])
-            large_arrays.release_after(points.nbytes)
+            rows = point_grid.rows_within(self.cells, together.min(axis=0) - radius, together.max(axis=0) + radius)
+            found.append(rows[within_reach(self.cells.points[rows], together, radius)[0]])
         rows = np.unique(np.concatenate(found))
-        points, view = cells.points[rows], self.view[rows].astype(np.int64)
+        points, view = self.cells.points[rows], self.view[rows].astype(np.int64)
+        large_arrays.release_after(points.nbytes + view.nbytes)
         ray = points - self.scanners[view]
         return SeenPoints(points, ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9), view)
 
 
 def of_points(points: Floats, view: Labels, scanners: Floats) -> DesignCloud:
-    """Sort points (n, 3) and their views (n,) into a grid."""
+    """Sort points (n, 3), mm, and their views (n,) into cells; ``scanners`` (v, 3) are the positions of the views."""
     grid = point_grid.of_points(points, CELL_MM)
     sorted_view = allocate(len(view), dtype=np.int32)
     for rows in blocks(len(view)):
         sorted_view[rows] = view[grid.order[rows]]
-    return DesignCloud(grid, sorted_view, scanners)
+    return DesignCloud(grid.cells, sorted_view, scanners)
 
 
-def of_scene(scene: Scene, T: Floats, stitched: Any, origin: Floats) -> DesignCloud:
-    """Return all points of a scene in the design's frame less ``origin``, by a pose (4, 4) of the scans as merged."""
-    placed = scene_cloud.stitched(scene, stitched)
-    count = sum(len(scan.points) for scan in placed.scans)
+def of_scene(scene: Scene, T: Floats, origin: Floats) -> DesignCloud:
+    """Return all points of a scene in the design's frame less ``origin`` (3,), mm, by a pose (4, 4) of the project."""
+    count = sum(len(scan.points) for scan in scene.scans)
     points, view = allocate(count, 3), allocate(count, dtype=np.int32)
     scanners, before = [np.empty((0, 3))], 0
-    for scan in placed.scans:
+    for scan in scene.scans:
         T_design_scan = rigid.between_origins(T @ scan.pose, scan.origin, origin)
         stations, first = _stations(scan), sum(map(len, scanners))
         for rows in blocks(len(scan.points)):
@@ -84,7 +84,7 @@ def of_scene(scene: Scene, T: Floats, stitched: Any, origin: Floats) -> DesignCl
             points[own] = rigid.apply(T_design_scan, scan.points[rows])
             view[own] = first + (np.searchsorted(stations, scan.point_station[rows]) if _is_of_stations(scan) else 0)
         before += len(scan.points)
-        scanners.append(_scanners(placed, scan, stations, T, origin))
+        scanners.append(_scanners(scene, scan, stations, T, origin))
     found = np.concatenate(scanners)
     return of_points(points, view, found if np.isfinite(found).all() else np.full(found.shape, np.nan))
 
@@ -94,9 +94,9 @@ def _is_of_stations(scan: Scan) -> bool:
 
 
 def _stations(scan: Scan) -> Ints:
-    """Return the numbers (s,) of the stations of a scan, ascending; that of a scan which is one station does not count.
+    """Return the numbers (s,) of the stations of a scan, ascending: -1 of points of no station.
 
-    Points of no station have a number of their own.
+    A scan with a position of its own, or without numbers of stations, is one view, an empty scan none.
     """
     if not _is_of_stations(scan):
         return np.zeros(1 if len(scan.points) else 0, np.int64)

@@ -78,7 +78,7 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     origin, placed = scene_cloud.local_design(scene.structure)[1], scene_cloud.stitched(scene, stitched)
     if not any(body.holes for body in found):
         placed = narrow_faces.near(placed, T, origin, _unmeasured(found), deviation.max_depth)
-    cloud = design_cloud.of_scene(placed, T, None, origin)
+    cloud = design_cloud.of_scene(placed, T, origin)
     around = narrow_faces.surroundings(scene.structure, cloud, seen)
     unproven = surface_registration.is_unproven(deviation.reasons)
     doubtful = deviation.status is Status.AMBIGUOUS or unproven

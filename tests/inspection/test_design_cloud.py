@@ -12,7 +12,7 @@ from processor.inspection import design_cloud
 from processor.model import Scan, Scene, Stations
 from tests.support import arrays_in_files
 
-NOWHERE = np.eye(4), None, np.zeros(3)
+NOWHERE = np.eye(4), np.zeros(3)
 
 
 def along_x(count, first):
@@ -52,7 +52,7 @@ def test_points_near_places_are_those_of_a_search_tree_with_their_rays(large, mo
     if large:
         arrays_in_files.limit(monkeypatch, 500, 2000)
     with large_arrays.in_files(tmp_path):
-        cloud = design_cloud.of_scene(scene, T, None, origin)
+        cloud = design_cloud.of_scene(scene, T, origin)
         places = rng.uniform(-800.0, 800.0, (40, 3)) + rigid.apply(T @ pose, np.zeros(3)) - origin
         seen = cloud.near(places, 180.0)
     placed = rigid.apply(T @ pose, np.concatenate([points, points + 3.0])) - origin

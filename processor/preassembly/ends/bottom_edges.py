@@ -100,17 +100,20 @@ class _Candidates(NamedTuple):
 
 
 class _Edge(NamedTuple):
-    """A bottom edge: its line, 1 on the left and -1 on the right, and from what distance points count, mm.
+    """A bottom edge; lengths in mm.
 
-    With the chainages (k,) where it is measured, and finer ones (f,) with the ``frame`` there, see :func:`_frame`.
+    ``sense`` is 1 of the left edge and -1 of the right one, ``margin`` the least distance of points from it. Departures
+    are measured at ``chainage`` (k,). ``places`` (f, 3) lie at chainages ``fine`` (f,), every 10 mm, with the ``frame``
+    there, see :func:`_frame`, and a ``tree`` of them.
     """
 
-    line: Polyline
     sense: float
     margin: float
     chainage: Floats
     fine: Floats
+    places: Floats
     frame: tuple[Floats, Floats, Floats]
+    tree: cKDTree
 
 
 class _AtEdge(NamedTuple):
@@ -211,12 +214,13 @@ def _faces(
 ) -> tuple[_FacePoints, _FacePoints]:
     """Points of the web and of the bottom along an edge, those of the plates' inner sides left out."""
     fine = np.arange(0.0, line.length, 10.0, dtype=np.float64)
+    places = line.at(fine)
     edge = _Edge(
-        line=line, sense=sense, margin=3.0 * sigma_mm + 2.0, chainage=chainage, fine=fine,
-        frame=_frame(line, other, fine, sense),
+        sense=sense, margin=3.0 * sigma_mm + 2.0, chainage=chainage, fine=fine, places=places,
+        frame=_frame(line, other, fine, sense), tree=cKDTree(places),
     )  # fmt: skip
-    rows = np.flatnonzero(within_reach(part.points, line.at(fine), 1.2 * REACH_MM)[0])
-    parts = [_near(part, rows[some], edge) for some in (*blocks(len(rows), PASS_POINTS), slice(0, 0))]
+    rows = np.flatnonzero(within_reach(part.points, places, 1.2 * REACH_MM)[0])
+    parts = [_near(part, rows[some], edge) for some in blocks(len(rows), PASS_POINTS)] or [_near(part, rows, edge)]
     webs, bottoms = zip(*parts, strict=True)
     return _outer_side(webs, sense), _outer_side(bottoms, -1.0)
 
@@ -233,8 +237,8 @@ def _outer_side(found: Sequence[_Candidates], sense: float) -> _FacePoints:
 def _near(part: RegisteredPart, rows: Ints, edge: _Edge) -> tuple[_Candidates, _Candidates]:
     """Return those of the points in ``rows`` that lie on the web and on the bottom beside an edge."""
     points, station, fine, frame = part.points[rows], part.station[rows], edge.fine, edge.frame
-    at = cKDTree(edge.line.at(fine)).query(points, workers=-1)[1]
-    offset = points - edge.line.at(fine[at])
+    at = edge.tree.query(points, workers=-1)[1]
+    offset = points - edge.places[at]
     along, level, up = (np.einsum("ni,ni->n", offset, frame[k][at]) for k in range(3))
     nearest, distance, _ = part.surface.distances(points, REACH_MM)
     face, residual, beyond = part.outer.distances(points, REACH_MM)
@@ -319,7 +323,8 @@ def _at_edge(face: _FacePoints, count: int, stations: int) -> _AtEdge:
 def _sums(face: _FacePoints, used: Bools, count: int, stations: int) -> tuple[Ints, Floats, Floats, Floats]:
     """Sum the used points of ``count`` intervals: their number, and the normal equations of their planes.
 
-    These are the matrix (count, 3, 3), the right side (count, 3), and the terms (count, s, 3) of each station's points.
+    These are the matrix (count, 3, 3), the right side (count, 3), mm, and the terms (count, s, 3) of each station's
+    points, all in the units of the basis.
     """
     number, N, right = np.zeros(count, np.int64), np.zeros((count, 9)), np.zeros((count, 3))
     of_station = np.zeros((count * stations, 3))

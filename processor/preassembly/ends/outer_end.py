@@ -41,11 +41,14 @@ def measure(part: RegisteredPart, at: Floats, direction: Floats) -> OuterEnd | N
     The variance is of noise and of differences between named stations.
     """
     # A few of the points of a long part.
-    near = [np.abs(part.points[rows] @ direction - at @ direction) < NEAR_MM for rows in blocks(len(part.points))]
-    rows = np.flatnonzero(np.concatenate(near))
-    face, residual, beyond = part.surface.distances(part.points[rows], REACH_MM)
+    near = np.zeros(len(part.points), bool)
+    for some in blocks(len(near)):
+        near[some] = np.abs(part.points[some] @ direction - at @ direction) < NEAR_MM
+    rows = np.flatnonzero(near)
+    points = part.points[rows]
+    face, residual, beyond = part.surface.distances(points, REACH_MM)
     facing = part.surface.normals[face] @ direction
-    offset = part.points[rows] - at
+    offset = points - at
     used = on_face(face, beyond) & (np.abs(facing) > ALONG) & (np.abs(residual) < REACH_MM)
     if used.sum() < LEAST_POINTS:
         return None

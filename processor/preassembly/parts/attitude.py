@@ -28,8 +28,9 @@ from processor.registration import icp, principal, surface_registration
 from processor.registration.principal import PrincipalAxes
 
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.1 m
+COARSE_SPACING_MM = 120.0  # for the coarse gates
+FEWEST_SAMPLES, MOST_SAMPLES = 2_000, 400_000
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
-COARSE_EVERY, COARSE_LEAST = 16, 2_000  # of the samples, for the coarse gates: one in 0.12 m, and no fewer in all
 FINE_GATES_MM = (50.0, 25.0, 12.0)  # for the promising ones
 COARSE_POINTS, FINE_POINTS = 600, 20_000
 WIDE_POINTS = 4_000  # at all gates but the last
@@ -81,7 +82,7 @@ class Surface:
     normals: Floats
     facet: Ints  # of ``mesh``
     boxes: icp.SampleBoxes  # about the same samples, in another order
-    coarse: icp.SampleBoxes  # about every COARSE_EVERYth of them
+    coarse: icp.SampleBoxes  # about fewer samples, for the coarse gates
     mesh: MeshSurface
     centre: Floats  # (3,) of its area
     axes: Floats  # (3, 3) principal axes as columns
@@ -147,10 +148,12 @@ class _Candidate:
     misfit: float = np.inf
 
 
-def samples_of(part: DesignPart) -> Samples:
+def samples_of(part: DesignPart, spacing_mm: float = SAMPLE_SPACING_MM) -> Samples:
     """Sample the part's surface on a fixed low-discrepancy pattern."""
     return mesh_distance.spread(
-        part.vertices, part.faces, lambda area_mm2: int(np.clip(area_mm2 / SAMPLE_SPACING_MM**2, 2_000, 400_000))
+        part.vertices,
+        part.faces,
+        lambda area_mm2: int(np.clip(area_mm2 / spacing_mm**2, FEWEST_SAMPLES, MOST_SAMPLES)),
     )
 
 
@@ -160,13 +163,13 @@ def sample_surface(part: DesignPart) -> Surface:
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
     mesh = mesh_distance.of_mesh(part.vertices, part.faces)
     axes = principal.of_mesh(part.vertices, part.faces)
-    every = int(np.clip(len(samples.points) // COARSE_LEAST, 1, COARSE_EVERY))
+    few = samples_of(part, COARSE_SPACING_MM)
     return Surface(
         points=samples.points,
         normals=samples.normals,
         facet=(np.cumsum(mesh_distance.has_area(part.vertices, part.faces)) - 1)[samples.facet],
         boxes=icp.boxes_of(samples.points, samples.normals),
-        coarse=icp.boxes_of(samples.points[::every], samples.normals[::every]),
+        coarse=icp.boxes_of(few.points, few.normals),
         mesh=mesh,
         centre=axes.centre,
         axes=axes.axes,

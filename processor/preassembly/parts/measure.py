@@ -397,6 +397,7 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     for rows in blocks(len(points)):
         points[rows] *= shrink
         station[rows] = scan.point_station[row[rows]] if len(scan.point_station) else 0
+    del row
     of_part = main_body.of_sizes(points, shapes.sizes)
     if of_part is None:
         placed = _identified(scan, points, station, index, shapes)
@@ -407,9 +408,10 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     if placed.rejected:
         return placed
     # Where the part lies on the ground, points of its lower edge went with the ground.
-    rest = np.flatnonzero(~of_part)
-    off = shapes[index].mesh.distances(rigid.apply(placed.registration.T_design_scan, points[rest]), AT_PART_MM)
-    of_part[rest] = on_face(off[0], off[2]) & (np.abs(off[1]) < AT_PART_MM)
+    for rows in blocks(len(points)):
+        rest = rows.start + np.flatnonzero(~of_part[rows])
+        off = shapes[index].mesh.distances(rigid.apply(placed.registration.T_design_scan, points[rest]), AT_PART_MM)
+        of_part[rest] = on_face(off[0], off[2]) & (np.abs(off[1]) < AT_PART_MM)
     return replace(placed, points=chosen(points, of_part), station=chosen(station, of_part))
 
 
