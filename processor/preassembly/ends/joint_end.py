@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
+from processor import large_arrays
 from processor.adjustment import kriging, model_averaging, variance_components
 from processor.adjustment.model_averaging import SIZES_MM, Estimate
 from processor.geometry import rigid
@@ -49,6 +50,7 @@ BENDS_MM = (0.0, 0.02, *SIZES_MM[1:])
 BEND_WEIGHTS = (0.5, 0.5, *(0.1,) * (len(SIZES_MM) - 1))
 RING = 8  # coefficients of the ring
 PLATE_SD_MM = 0.5  # of a plate's thickness: as delivered within -0.6 and +1.0 mm at 15 to 25 mm (EN 10029, class A)
+PASS_POINTS = 50_000  # of an end whose departures are computed at once
 ITERATIONS = 4  # of a corner's place on its faces
 # Share of a departure, one standard deviation. Terms are taken where the design has the surface, not where the surface
 # is. For a corner 20 mm off, on faces tilted by as much over their width, the difference is 0.5 mm. The coefficients
@@ -254,7 +256,10 @@ def _outer_sides(
 def _inward(local: Floats, face: FaceFit, of_design: EndFace) -> tuple[Floats, Bools]:
     """Distances (n,) of points inward from a face, and a mark of those away from the section's corners."""
     half = of_design.half
-    departure = ends_faces.departures(local[:, 0], of_design.w(local)) @ face.coefficients
+    departure = np.empty(len(local))
+    for rows in large_arrays.blocks(len(local), PASS_POINTS):
+        some = local[rows]
+        departure[rows] = ends_faces.departures(some[:, 0], of_design.w(some)) @ face.coefficients
     wide = np.abs(of_design.from_middle(local)) < half - np.minimum(plate_sides.REACH_MM, 0.5 * half)
     return of_design.offset + departure - of_design.sense * local[:, of_design.axis], wide
 
