@@ -148,7 +148,8 @@ def _part(points: Floats, order: Ints, lower: Floats, size: float, most: int) ->
     """Sort points (n, 3), rows ``order`` (n,) of a cloud, by blocks and in cells; None beyond ``most`` blocks."""
     points, order = (large_arrays.read_only(np.ascontiguousarray(one)) for one in (points, order))
     block, cell = np.empty(len(points), np.int32), np.empty(len(points), np.uint8)
-    found = _into_blocks(points, lower, size, min(most, len(points)), _empty_table(most), block, cell)
+    most = min(most, len(points))
+    found = _into_blocks(points, lower, size, most, _empty_table(most), block, cell)
     if found is None:
         return None
     keys, count = found
