@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,10 +15,10 @@ from processor.geometry import point_grid, rigid
 from processor.geometry.nearest_neighbours import within_reach
 from processor.geometry.point_grid import Cells
 from processor.large_arrays import allocate, blocks
-from processor.model import Floats, Ints, Labels, Scan, Scene
+from processor.model import Bools, Floats, Ints, Labels, Scan, Scene
 
 CELL_MM = 25.0  # of the grid
-BOX_MM = 250.0  # about places that are searched together
+BOX_MM = 150.0  # about places that are searched together
 
 
 class SeenPoints(NamedTuple):
@@ -29,10 +30,6 @@ class SeenPoints(NamedTuple):
     points: Floats
     ray: Floats
     view: Ints
-
-    def of(self, rows: Any) -> SeenPoints:
-        """Return some of the points."""
-        return SeenPoints(self.points[rows], self.ray[rows], self.view[rows])
 
 
 @dataclass(frozen=True)
@@ -47,15 +44,26 @@ class DesignCloud:
     view: Labels
     scanners: Floats
 
-    def near(self, places: Floats, radius: float) -> SeenPoints:
-        """Return the points nearer than ``radius``, mm, to any of the places (m, 3), in the order of the cells."""
+    def near(
+        self,
+        places: Floats,
+        radius: float,
+        keep: Callable[[SeenPoints], Bools] = lambda seen: np.ones(len(seen.view), bool),
+    ) -> SeenPoints:
+        """Return the points nearer than ``radius``, mm, to any of the places (m, 3), in the order of the cells.
+
+        Only those that ``keep`` marks; it is called for some of the points at a time.
+        """
         found = [np.empty(0, np.int64)]
         box = np.floor(places / BOX_MM).astype(np.int64)
         for corner in distinct(box).rows:
             together = places[(box == corner).all(axis=1)]
             rows = point_grid.rows_within(self.cells, together.min(axis=0) - radius, together.max(axis=0) + radius)
-            found.append(rows[within_reach(self.cells.points[rows], together, radius)[0]])
-        rows = np.unique(np.concatenate(found))
+            rows = rows[within_reach(self.cells.points[rows], together, radius)[0]]
+            found += [rows[some][keep(self._seen(rows[some]))] for some in blocks(len(rows))]
+        return self._seen(np.unique(np.concatenate(found)))
+
+    def _seen(self, rows: Ints) -> SeenPoints:
         points, view = self.cells.points[rows], self.view[rows].astype(np.int64)
         large_arrays.release_after(points.nbytes + view.nbytes)
         ray = points - self.scanners[view]

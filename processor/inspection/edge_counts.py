@@ -50,12 +50,20 @@ def level(
     free = narrow_faces.free_places(around, face, shape)
     if not isinstance(free, np.ndarray) or not len(free):
         return None
-    seen = around.cloud.near(free + shift(free), 2.0 * REACH_MM)
+    edge = float(shape.origin @ face.normal)
+    broad = [
+        beside
+        for beside in faces
+        if abs(beside.normal @ face.normal) < SQUARE and abs(beside.extent(face.normal)[1] - edge) < TOUCHES_MM
+    ]
     found: list[Level] = []
-    for beside in faces:
-        ends_here = abs(beside.extent(face.normal)[1] - float(shape.origin @ face.normal)) < TOUCHES_MM
-        if abs(beside.normal @ face.normal) < SQUARE and ends_here:
-            found += _of_views(around, face, beside, seen, shift)
+    for beside in broad:
+
+        def on_face(some: SeenPoints, beside: FlatFace = beside) -> Bools:
+            return _is_on(beside, some.points - shift(some.points))
+
+        seen = around.cloud.near(free + shift(free), 2.0 * REACH_MM, on_face)
+        found += _of_views(around, face, beside, seen, shift)
     if not found:
         return None
     value, variance = np.array(found).T
@@ -74,7 +82,7 @@ def _of_views(
     edge = face.corners[0] @ out
     off, at = points @ out - edge, points @ np.cross(out, beside.normal)
     low, high = face.extent(np.cross(out, beside.normal))
-    on = np.abs((points - beside.corners[0]) @ beside.normal) < GATE_MM
+    on = _is_on(beside, points)
     on &= ~(-seen.ray @ beside.normal < bore_fit.LEAST_SLOPE)
     on &= (at > low + CORNER_MM) & (at < high - CORNER_MM) & (np.abs(off) < BESIDE_MM)
     on[on] = _free(around, face, beside, points[on])
@@ -86,6 +94,12 @@ def _of_views(
         density = inner / (BESIDE_MM - STRIP_MM)
         # Both counts as of points at random: those of a grid scatter less.
         yield Level(outer / density - STRIP_MM, (max(outer, 1) + outer**2 / inner) / density**2)
+
+
+def _is_on(face: FlatFace, points: Floats) -> Bools:
+    """Mark the points (n, 3) that lie in the plane of a face."""
+    on: Bools = np.abs((points - face.corners[0]) @ face.normal) < GATE_MM
+    return on
 
 
 def _free(around: Surroundings, face: FlatFace, beside: FlatFace, points: Floats) -> Bools:

@@ -19,7 +19,7 @@ from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import FacetGrid
 from processor.inspection import bore_fit, flat_faces
 from processor.inspection.bore_fit import RIM_SHARE
-from processor.inspection.design_cloud import DesignCloud
+from processor.inspection.design_cloud import DesignCloud, SeenPoints
 from processor.inspection.flat_faces import FLOOR_MM, FlatFace, Observed, Pieces
 from processor.inspection.holes import REACH_MM
 from processor.model import (
@@ -268,12 +268,14 @@ def stands_before(around: Surroundings, face: FlatFace, feet: Floats) -> Ints:
 
 def _on_face(around: Surroundings, face: FlatFace, shape: Outline, places: Floats, shift: Shift) -> OnFace:
     """Return the points that may be of a face."""
-    seen = around.cloud.near(places + shift(places), float(np.sqrt(3.0) * REACH_MM))
+
+    def in_front(some: SeenPoints) -> Bools:
+        near = np.abs((some.points - shape.origin) @ face.normal) < REACH_MM
+        # Seen from the front, so that the footprint lies on the face; of unknown rays all count.
+        return near & ~(-some.ray @ face.normal < bore_fit.LEAST_SLOPE)
+
+    seen = around.cloud.near(places + shift(places), float(np.sqrt(3.0) * REACH_MM), in_front)
     off = (seen.points - shape.origin) @ face.normal
-    near = np.abs(off) < REACH_MM
-    # Seen from the front, so that the footprint lies on the face; of unknown rays all count.
-    near &= ~(-seen.ray @ face.normal < bore_fit.LEAST_SLOPE)
-    seen, off = seen.of(near), off[near]
     feet = seen.points - np.outer(off, face.normal) - shift(seen.points)
     inside = shape.clearance(shape.flat(feet)) >= _margin(shape)
     inside[inside] = stands_before(around, face, feet[inside]) < 0
