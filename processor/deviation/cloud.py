@@ -83,9 +83,8 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None, 
     count = sum(len(scan.points) for scan in scene.scans)
     if count < scene_cloud.FEWEST_POINTS:
         raise InputError(f"{scene.name}: expected a scan of {scene_cloud.FEWEST_POINTS} points or more, got {count}")
-    cloud = (
-        _sample(scene, neighbours, ratio) if count > MOST_POINTS and not most else _held(scene, neighbours, ratio, most)
-    )
+    merged = _sample if count > MOST_POINTS else _held
+    cloud = merged(scene, neighbours, ratio, most)
     return replace(
         cloud,
         unposed=sum(not scan.T_project_scan.size for scan in scene.scans),
@@ -93,15 +92,19 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None, 
     )
 
 
-def _sample(scene: Scene, neighbours: int, ratio: float) -> ScanCloud:
-    """Sort the scans of a scene into a large cloud, and return a sample of it."""
+def _sample(scene: Scene, neighbours: int, ratio: float, most: int) -> ScanCloud:
+    """Sort the scans of a scene into a large cloud, and return a sample of it.
+
+    If there are more than ``most`` points, and that is not 0, the sample of as many replaces the large cloud.
+    """
     origin = rigid.apply(scene.scans[0].pose, scene.scans[0].origin)
     names = _source_names(scene)
     large = large_cloud.of_scene(scene, origin, len(names) > len(scene.scans), neighbours, ratio)
     if not large.spacing_mm > 0.0:
         raise InputError(f"{scene.name}: most points of the scan lie at the same place; export it again")
     kept = large.kept
-    step = -(-kept // SAMPLE_POINTS)
+    replaced = 0 < most < kept
+    step = -(-kept // (most if replaced else SAMPLE_POINTS))
     points, scanner, source = large.thinned(True, step)
     removed, removed_scanner, removed_source = large.thinned(False, step)
     return ScanCloud(
@@ -115,7 +118,7 @@ def _sample(scene: Scene, neighbours: int, ratio: float) -> ScanCloud:
         kept=kept,
         source=np.concatenate([source, removed_source]),
         sources=names,
-        large=large,
+        large=None if replaced else large,
     )
 
 

@@ -75,6 +75,17 @@ def test_a_sample_is_every_kth_inlier(small):
         np.testing.assert_array_equal(large.thinned(True, step)[0], every[::step])
 
 
+@pytest.mark.parametrize("most", [300, 2 * COUNT])
+def test_of_a_large_cloud_a_sample_is_left_where_fewer_points_are_wanted(most, small):
+    whole = cloud.of_scene(scene_of(), 20, 1.0)
+    found = cloud.of_scene(scene_of(), 20, 1.0, most=most)
+    assert (found.read, found.kept) == (whole.read, whole.kept)
+    assert (found.large is None) == (most < whole.kept)
+    if found.large is None:
+        np.testing.assert_array_equal(found.points, whole.large.thinned(True, -(-whole.kept // most))[0])
+        assert found.spacing_mm == pytest.approx(whole.large.spacing_mm * np.sqrt(whole.kept / len(found.points)))
+
+
 @pytest.mark.parametrize("options", SCENES.values(), ids=SCENES)
 def test_movements_are_those_of_the_whole(options, small, monkeypatch):
     monkeypatch.setattr(mixed_pixels, "AT_ONCE", 1_000)
