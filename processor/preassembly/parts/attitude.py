@@ -18,7 +18,7 @@ from processor.geometry.mesh_distance import MeshSurface, Samples
 from processor.geometry.nearest_neighbours import within_reach
 from processor.geometry.thinning import thinned, voxel_means
 from processor.geometry.thread_ranges import each
-from processor.large_arrays import allocate, blocks, corners, quantile
+from processor.large_arrays import corners
 from processor.model import ArchDesign, Bools, DesignPart, Floats, Ints, Reason, Status, reason
 from processor.preassembly import topology
 from processor.preassembly.ends import tube_end
@@ -42,6 +42,7 @@ SAME_SIZE = 0.05  # relative difference of sizes along an axis that a piece of f
 # right one may have converged some millimetres off.
 PROMISING, PROMISING_MM = 4.0, 10.0
 ROUGH_KEPT = 4  # of the promising hypotheses, for a rough pose
+EXTENT_POINTS = 100_000  # by which the ends of a scan along its longest axis are known
 EXTENTS = (0.002, 0.998)  # quantiles of points, without single outliers
 SHORT_SHARE = 0.1  # of its length, by which a scan of a whole part may be shorter
 NO_FIT_MM = 25.0  # misfit, about a plate's thickness, beyond which no pose explains the scan
@@ -185,10 +186,7 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
     scan = principal.of_points(points)
     design = principal.of_mesh(part.vertices, part.faces)
     rotations = _rotations(scan.axes, design.axes)
-    along = allocate(len(points))
-    for rows in blocks(len(points)):
-        along[rows] = (points[rows] - scan.centre) @ scan.axes[:, 0]
-    low, high = quantile(along, 0.01), quantile(along, 0.99)
+    low, high = np.quantile((thinned(points, EXTENT_POINTS) - scan.centre) @ scan.axes[:, 0], [0.01, 0.99])
     whole = (part.vertices - design.centre) @ design.axes[:, 0]
     short = np.ptp(whole) - (high - low)
     shifts = [0.0] if short < SHORT_SHARE * np.ptp(whole) else [0.0, -1.0, 1.0]
