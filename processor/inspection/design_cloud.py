@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor import large_arrays
-from processor.adjustment.point_groups import distinct_groups
+from processor.adjustment.point_groups import distinct_groups, joined_numbers
 from processor.distinct_rows import distinct
 from processor.geometry import point_grid, rigid
 from processor.geometry.nearest_neighbours import within_reach
@@ -70,7 +70,7 @@ class DesignCloud:
         return SeenPoints(points, ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9), view)
 
 
-def of_points(points: Floats, view: Labels, scanners: Floats) -> DesignCloud:
+def of_points(points: Floats, view: Ints | Labels, scanners: Floats) -> DesignCloud:
     """Sort points (n, 3), mm, and their views (n,) into cells; ``scanners`` (v, 3) are the positions of the views."""
     grid = point_grid.of_points(points, CELL_MM)
     sorted_view = allocate(len(view), dtype=np.int32)
@@ -81,19 +81,13 @@ def of_points(points: Floats, view: Labels, scanners: Floats) -> DesignCloud:
 
 def of_scene(scene: Scene, T: Floats, origin: Floats) -> DesignCloud:
     """Return all points of a scene in the design's frame less ``origin`` (3,), mm, by a pose (4, 4) of the project."""
-    count = sum(len(scan.points) for scan in scene.scans)
-    points, view = allocate(count, 3), allocate(count, dtype=np.int32)
-    scanners, before = [np.empty((0, 3))], 0
-    for scan in scene.scans:
-        T_design_scan = rigid.between_origins(T @ scan.pose, scan.origin, origin)
-        stations, first = _stations(scan), sum(map(len, scanners))
-        for rows in blocks(len(scan.points)):
-            own = slice(before + rows.start, before + rows.stop)
-            points[own] = rigid.apply(T_design_scan, scan.points[rows])
-            view[own] = first + (np.searchsorted(stations, scan.point_station[rows]) if _is_of_stations(scan) else 0)
-        before += len(scan.points)
-        scanners.append(_scanners(scene, scan, stations, T, origin))
-    found = np.concatenate(scanners)
+    poses = [rigid.between_origins(T @ scan.pose, scan.origin, origin) for scan in scene.scans]
+    points = rigid.placed([(pose, scan.points) for pose, scan in zip(poses, scene.scans, strict=True)])
+    stations = [_stations(scan) for scan in scene.scans]
+    view = joined_numbers(stations)
+    of_scans = zip(scene.scans, map(distinct_groups, stations), strict=True)
+    scanners = [_scanners(scene, scan, known, T, origin) for scan, known in of_scans]
+    found = np.concatenate([np.empty((0, 3)), *scanners])
     return of_points(points, view, found if np.isfinite(found).all() else np.full(found.shape, np.nan))
 
 
@@ -101,14 +95,11 @@ def _is_of_stations(scan: Scan) -> bool:
     return len(scan.point_station) > 0 and not scan.position.size
 
 
-def _stations(scan: Scan) -> Ints:
-    """Return the numbers (s,) of the stations of a scan, ascending: -1 of points of no station.
-
-    A scan with a position of its own, or without numbers of stations, is one view, an empty scan none.
-    """
-    if not _is_of_stations(scan):
-        return np.zeros(1 if len(scan.points) else 0, np.int64)
-    return distinct_groups(scan.point_station)
+def _stations(scan: Scan) -> Labels:
+    """Return the station (n,) of each point, -1 of none; 0 of all where the scan is one view."""
+    if _is_of_stations(scan):
+        return scan.point_station
+    return np.broadcast_to(np.int32(0), len(scan.points))
 
 
 def _scanners(scene: Scene, scan: Scan, stations: Ints, T: Floats, origin: Floats) -> Floats:

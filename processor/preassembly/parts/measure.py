@@ -313,12 +313,7 @@ def _reasons(
 
 def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Sequence[Floats]) -> RegisteredPart:
     """Join the points of the scans used, on the design; ``joints`` are the key points (8, 3) of the part's joints."""
-    points, before = allocate(sum(len(scan.points) for scan in used), 3), 0
-    for scan in used:
-        for rows in blocks(len(scan.points)):
-            own = slice(before + rows.start, before + rows.stop)
-            points[own] = rigid.apply(scan.registration.T_design_scan, scan.points[rows])
-        before += len(scan.points)
+    points = rigid.placed([(scan.registration.T_design_scan, scan.points) for scan in used])
     station = joined_numbers([scan.station for scan in used])
     return RegisteredPart(
         points=points,
