@@ -65,11 +65,6 @@ def png(figure: Figure) -> bytes:
     figure.set_dpi(DPI)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()  # Figure.savefig draws a figure with a layout twice
-    return png_of(canvas)
-
-
-def png_of(canvas: Any) -> bytes:
-    """Write what is drawn on a canvas of FigureCanvasAgg as PNG, without a date."""
     out = io.BytesIO()
     pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]  # all is opaque
     Image.fromarray(pixels).save(out, "png", dpi=(DPI, DPI), compress_level=COMPRESSION)

@@ -41,6 +41,19 @@ def test_spacing_is_of_a_plane_with_one_point_a_square():
     assert nearest_neighbours.spacing(nearest_neighbours.of_spacing(np.zeros((9, 3)))) == 0.0
 
 
+def test_cells_fit_a_cloud_with_a_point_far_away_however_its_blocks_are_counted(monkeypatch):
+    rng = np.random.default_rng(9)
+    x, y = rng.uniform(0.0, 2000.0, (2, 40_000))
+    points = np.vstack([np.column_stack([x, y, 0.0 * x]), [[1e7, 0.0, 0.0]]])
+    monkeypatch.setattr(nearest_neighbours, "CROWDED", 500.0)
+    grid = nearest_neighbours.of_spacing(points)
+    assert 10.0 < grid.cells.size < 30.0
+    monkeypatch.setattr(nearest_neighbours, "CROWD_BLOCKS", 3)
+    again = nearest_neighbours.of_spacing(points)
+    assert again.cells.size == grid.cells.size
+    np.testing.assert_array_equal(again.order, grid.order)
+
+
 def test_derived_scales_contain_the_intended_number_of_points():
     assert m3c2.diameter_for(20, np.sqrt(1e6 / 500.0)) == pytest.approx(225.7, abs=0.1)  # 500 points/m2
     assert [m3c2.rounded(x) for x in (0.12345, 225.7, 1e-7, 100.0)] == [0.124, 226.0, 1e-7, 100.0]

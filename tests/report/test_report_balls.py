@@ -364,6 +364,14 @@ def test_at_most_twelve_balls_have_a_picture_worst_first(monkeypatch):
     assert pages_of(drawn.documents[flagged_ball_figures.DOCUMENT]) == len(every) == 7
 
 
+def test_pages_of_a_document_share_the_pixels_of_their_frames():
+    made = repeated(whole(), 3)
+    document = flagged_ball_figures.draw(scene(made), made).documents[flagged_ball_figures.DOCUMENT]
+    wide = round(ball_picture.PAGE_DPI * ball_picture.SIZE_IN[0])
+    assert pages_of(document) == 7
+    assert len(re.findall(rb"/Width %d\b" % wide, document)) == 2  # of balls of two sizes
+
+
 def pages_of(pdf):
     assert pdf.startswith(b"%PDF-")
     return len(re.findall(rb"/Type /Page\b", pdf))

@@ -3,34 +3,37 @@
 from __future__ import annotations
 
 import textwrap
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.text import Text
 
 from processor.language.messages import messages
 from processor.model import NORMAL_95, Floats
-from processor.report.style import COLOURS, DPI, number, png_of, value_or_dash, with_interval, write_beside
+from processor.report.style import COLOURS, DPI, number, png, value_or_dash, with_interval
 from processor.space_frame.result import Balls, Flag, Result
 
-LINE = 0.052  # of the panel's height
+LINE_SPACING = 2.1  # of the numbers
 SLICE_MM = 8.0  # on either side of the plane through the centre
 # Points are painted into an image: Matplotlib keeps each page's marks, 13 MB, until a document is complete.
 PIXELS, DOT_PIXELS = 400, 3  # along a panel, and of a point
 NOTHING, BESIDE, WITHIN = 0, 1, 2  # of a pixel: points before and behind the slice, points in it
-# In inches: the figure, and its panels with a heading of one line (left, bottom, width, height).
-SIZE_IN = (12.4, 5.3)
+PAGE_DPI = 165  # of what the pages of a document share
+# In inches: the figure, and its panels (left, bottom, width, height).
+SIZE_IN = (12.4, 5.65)
 VIEWS_IN = ((0.72, 0.72, 4.03, 4.03), (5.57, 0.72, 4.03, 4.03))
-NUMBERS_IN = (9.73, 0.43, 2.63, 4.59)
-HEADING_IN, EDGE_IN = 0.19, 0.04  # a line of the heading, and the margin of heading and legend
+NUMBERS_IN, NUMBERS_WIDTH_IN = (9.73, 5.02), 2.63  # upper left corner
+HEADING_IN, EDGE_IN = 5.07, 0.04  # lower edge of the heading; margin of the legend
+HEADING_LINES = 3
 X_LABEL_IN, Y_LABEL_IN = 0.29, 0.53  # from a view to the labels of its axes
 VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of each
 
@@ -38,23 +41,25 @@ VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of e
 class BallPicture:
     """One figure, to show ball after ball.
 
-    What is the same for all balls is made once, and of PNGs drawn once a scale and then copied: axes and texts take
-    most of the time. What differs is animated: Matplotlib draws it into documents, and leaves it out of a canvas.
+    Axes, legend and names of numbers take most of the time. They are the same for all balls that are shown to the same
+    distance: drawn once as pixels, they lie under what differs, and pages of a document share them.
     """
 
     def __init__(self) -> None:
-        self.figure = Figure(figsize=SIZE_IN, dpi=DPI)
-        self._canvas: Any = FigureCanvasAgg(self.figure)
-        *panels, self._beside = (self.figure.add_axes((0.0, 0.0, 1.0, 1.0)) for _ in (*VIEWS_IN, NUMBERS_IN))
-        self._views = [_View(axes, *view) for axes, view in zip(panels, VIEWS, strict=True)]
-        self._heading = self._beside.text(
-            0.5, 1.0 - EDGE_IN / SIZE_IN[1], "", fontsize=11, ha="center", va="top", transform=self.figure.transFigure,
-            animated=True,
-        )  # fmt: skip
-        self._values: list[Text] = []
-        self._scale = 0, 0.0  # lines of the heading, and the reach of the views
-        self._backgrounds: dict[tuple[int, float], Any] = {}
-        _put_legend(self.figure)
+        self._figure, self._frame = Figure(figsize=SIZE_IN, dpi=DPI), Figure(figsize=SIZE_IN, dpi=DPI)
+        self._under = _Pixels()
+        self._figure.add_artist(self._under)
+        self._framed = [_framed_view(self._frame, *view) for view in zip(VIEWS_IN, VIEWS, strict=True)]
+        self._views = [
+            _View(self._figure.add_axes(_shares(*place)), across)
+            for place, (_, across) in zip(VIEWS_IN, VIEWS, strict=True)
+        ]
+        self._names = _list(self._frame, NUMBERS_IN[0], "left")
+        self._values = _list(self._figure, NUMBERS_IN[0] + NUMBERS_WIDTH_IN, "right")
+        self._heading = self._figure.text(0.5, HEADING_IN / SIZE_IN[1], "", fontsize=11, ha="center", va="bottom")
+        self._reach = 0.0
+        self._drawn: dict[tuple[float, int], npt.NDArray[np.uint8]] = {}
+        _put_legend(self._frame)
 
     def show(self, result: Result, i: int, middle: Floats, nominal: Floats, points: Floats, reach: float) -> None:
         """Show ball ``i`` about ``middle`` (3,) to a distance ``reach``, mm.
@@ -63,8 +68,7 @@ class BallPicture:
         """
         balls = result.balls
         heading = f"Ball {int(balls.ids[i])}: {balls.flag[i]}. {messages('en').sentences(balls.reasons[i])}"
-        lines = textwrap.wrap(heading, 130)[:3]
-        self._heading.set_text("\n".join(lines))
+        self._heading.set_text("\n".join(textwrap.wrap(heading, 130)[:HEADING_LINES]))
         members = _members(result, i, middle, reach)
         fitted = np.nan if balls.flag[i] is Flag.NOT_FOUND else float(balls.radii[i])
         for view in self._views:
@@ -72,34 +76,53 @@ class BallPicture:
             view.nominal.show(nominal[list(view.across)], float(balls.nominal_radii[i]))
             view.fitted.show(np.zeros(2), fitted)
         rows = numbers(balls, i, nominal)
-        if not self._values:
-            self._values = write_beside(self._beside, rows, LINE, 8.0)
-            for text in self._values:
-                text.set_animated(True)
-        for text, (_, value) in zip(self._values, rows, strict=True):
-            text.set_text(value_or_dash(value))
-        if self._scale != (scale := (len(lines), reach)):
-            self._place(*scale)
-            self._scale = scale
+        self._names.set_text("\n".join(name for name, _ in rows))
+        self._values.set_text("\n".join(value_or_dash(value) for _, value in rows))
+        self._reach = reach
 
     def png(self) -> bytes:
         """Return the picture as PNG."""
-        if self._scale not in self._backgrounds:
-            self._canvas.draw()
-            self._backgrounds[self._scale] = self._canvas.copy_from_bbox(self.figure.bbox)
-        self._canvas.restore_region(self._backgrounds[self._scale])
-        for artist in (*(artist for view in self._views for artist in view.changing), *self._values, self._heading):
-            artist.draw(self._canvas.get_renderer())
-        return png_of(self._canvas)
+        self._under.pixels = self._frame_at(DPI)
+        return png(self._figure)
 
-    def _place(self, lines: int, reach: float) -> None:
-        """Lower the upper edges of the panels by the lines of the heading; views stay squares, and show ``reach``."""
-        lowered = HEADING_IN * (lines - 1)
-        for view, (left, bottom, wide, high) in zip(self._views, VIEWS_IN, strict=True):
-            view.place(left + 0.5 * lowered, bottom, wide - lowered, high - lowered)
-            view.axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
-        left, bottom, wide, high = NUMBERS_IN
-        self._beside.set_position(_shares(left, bottom, wide, high - lowered))
+    def add_to(self, document: Any) -> None:
+        """Add the picture as a page to a document of :func:`processor.report.style.pdf_document`."""
+        self._under.pixels = self._frame_at(PAGE_DPI)
+        document.savefig(self._figure, dpi=PAGE_DPI)
+
+    def _frame_at(self, dpi: int) -> npt.NDArray[np.uint8]:
+        """Return what is the same for all balls, as pixels (h, w, 4) from the lowest row upwards."""
+        key = (self._reach, dpi)
+        if key not in self._drawn:
+            for axes in self._framed:
+                axes.set(xlim=(-self._reach, self._reach), ylim=(-self._reach, self._reach))
+            self._frame.set_dpi(dpi)
+            canvas: Any = FigureCanvasAgg(self._frame)
+            canvas.draw()
+            self._drawn[key] = np.asarray(canvas.buffer_rgba())[::-1].copy()
+        return self._drawn[key]
+
+
+def _list(figure: Figure, x_in: float, side: Literal["left", "right"]) -> Text:
+    """Add a text of many lines beside the views."""
+    x, y = x_in / SIZE_IN[0], NUMBERS_IN[1] / SIZE_IN[1]
+    return figure.text(x, y, "", fontsize=8, linespacing=LINE_SPACING, ha=side, va="top")
+
+
+class _Pixels(Artist):
+    """Pixels of the size of the figure, under all else. A document stores an array that many pages show once."""
+
+    pixels: npt.NDArray[np.uint8]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.set_zorder(-1.0)
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw the pixels (h, w, 4), which have the resolution of the renderer."""
+        gc = renderer.new_gc()
+        renderer.draw_image(gc, 0.0, 0.0, self.pixels)
+        gc.restore()
 
 
 class _Sphere(NamedTuple):
@@ -119,36 +142,35 @@ class _Sphere(NamedTuple):
 
 
 class _View:
-    """The panel of a view ``across`` two axes: to the right and up."""
+    """What is shown in a view ``across`` two axes, to the right and up; :func:`_framed_view` draws these."""
 
-    def __init__(self, axes: Axes, name: str, across: tuple[int, int]) -> None:
-        self.axes, self.across = axes, across
+    def __init__(self, axes: Axes, across: tuple[int, int]) -> None:
+        self._axes, self.across = axes, across
+        axes.axis("off")
         self._points = axes.imshow(
             np.zeros((PIXELS, PIXELS), np.uint8), cmap=ListedColormap(["#ffffff00", "0.72", "black"]),
-            vmin=NOTHING, vmax=WITHIN, origin="lower", interpolation="none", aspect="auto", zorder=2.0, animated=True,
+            vmin=NOTHING, vmax=WITHIN, origin="lower", interpolation="none", aspect="auto", zorder=2.0,
         )  # fmt: skip
-        (self._members,) = axes.plot([], [], "-.", color=COLOURS[2], linewidth=1.1, zorder=3.0, animated=True)
+        (self._members,) = axes.plot([], [], "-.", color=COLOURS[2], linewidth=1.1, zorder=3.0)
         self.nominal, self.fitted = _sphere(axes, COLOURS[1], "--"), _sphere(axes, COLOURS[0], "-")
-        axes.set(xlabel="x less the centre's, mm", ylabel=f"{'xyz'[across[1]]} less the centre's, mm")
-        axes.set_title(name, y=1.0)  # a title without a height is placed above all ticks, which are laid out for that
-        axes.grid(alpha=0.3)
-
-    @property
-    def changing(self) -> tuple[AxesImage | Line2D | Circle, ...]:
-        """What differs from ball to ball, in the order in which it is drawn."""
-        return (self._points, self._members, *self.nominal, *self.fitted)
 
     def show(self, points: Floats, members: Floats, reach: float) -> None:
         """Show points (n, 3) to a distance ``reach``, and members (m, 3), lines between rows that are not finite."""
         self._points.set_data(painted(points[:, self.across], points[:, 3 - sum(self.across)], reach))
         self._points.set_extent((-reach, reach, -reach, reach))
         self._members.set_data(*members[:, self.across].T)
+        self._axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
 
-    def place(self, left: float, bottom: float, wide: float, high: float) -> None:
-        """Place the panel, in inches, and the labels of its axes: Matplotlib lays all ticks out to place them."""
-        self.axes.set_position(_shares(left, bottom, wide, high))
-        self.axes.xaxis.set_label_coords(0.5, -X_LABEL_IN / high)
-        self.axes.yaxis.set_label_coords(-Y_LABEL_IN / wide, 0.5)
+
+def _framed_view(figure: Figure, place: tuple[float, float, float, float], view: tuple[str, tuple[int, int]]) -> Axes:
+    """Add the axes of a view, with labels at fixed places: Matplotlib lays all ticks out to place them."""
+    axes, (name, across) = figure.add_axes(_shares(*place)), view
+    axes.set(xlabel="x less the centre's, mm", ylabel=f"{'xyz'[across[1]]} less the centre's, mm")
+    axes.set_title(name, y=1.0)  # a title without a height is placed above all ticks, which are laid out for that
+    axes.grid(alpha=0.3)
+    axes.xaxis.set_label_coords(0.5, -X_LABEL_IN / place[3])
+    axes.yaxis.set_label_coords(-Y_LABEL_IN / place[2], 0.5)
+    return axes
 
 
 def painted(points: Floats, depth: Floats, reach: float) -> npt.NDArray[np.uint8]:
@@ -170,7 +192,7 @@ def painted(points: Floats, depth: Floats, reach: float) -> npt.NDArray[np.uint8
 
 def _sphere(axes: Axes, colour: str, dash: str) -> _Sphere:
     outline = Circle((0.0, 0.0), 1.0, fill=False, edgecolor=colour, linestyle=dash, linewidth=1.6, zorder=4.0)
-    axes.add_patch(outline).set_animated(True)
+    axes.add_patch(outline)
     (middle,) = axes.plot([], [], "+", color=colour, markersize=9.0, zorder=4.0, animated=True)
     return _Sphere(outline, middle)
 

@@ -12,7 +12,7 @@ from processor.language.messages import Message, text
 from processor.model import Floats, Scene
 from processor.report.space_frame.ball_picture import SLICE_MM, BallPicture
 from processor.report.space_frame.nominal_positions import designed_places
-from processor.report.style import DPI, CaptionedPngs, Drawn, pdf_document
+from processor.report.style import CaptionedPngs, Drawn, pdf_document
 from processor.space_frame.points.scene_source import SceneSource, of_scene
 from processor.space_frame.result import Flag, Result
 from processor.store.streaming import StoredPoints, points_of
@@ -50,7 +50,7 @@ def draw(scene: Scene, result: Result, stored: Path | None = None) -> Drawn:
             picture.show(result, i, centres[i], nominal[i] - centres[i], crops.pop(0), reach[k])
             if k < MOST_BALLS:
                 figures[f"{PREFIX}{int(result.balls.ids[i])}.png"] = _caption(result, i, len(flagged)), picture.png()
-            document.savefig(picture.figure, dpi=DPI)
+            picture.add_to(document)
     return Drawn(figures, {DOCUMENT: out.getvalue()})
 
 
