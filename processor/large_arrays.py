@@ -237,7 +237,9 @@ def _of_rank(array: Array, rank: int) -> float:
     """Return the number of a rank, from 0, by counting the numbers between some of those that may be it."""
     (low, high), below = extremes(array), 0
     while low < high:
-        sample = np.sort(np.concatenate([part[:: max(1, len(part) // 8)] for part in _between(array, low, high)]))
+        # Copies: a view would keep the part that it is of.
+        samples = [part[:: max(1, len(part) // 8)].copy() for part in _between(array, low, high)]
+        sample = np.sort(np.concatenate(samples))
         pivots = np.unique(sample[:: max(1, len(sample) // PIVOTS)])
         count = np.zeros(2 * len(pivots) + 1, np.int64)  # of numbers less than the first, equal to it, between two, ...
         for part in _between(array, low, high):

@@ -1,5 +1,7 @@
 """processor compare by tiles, with all arrays in files: the same bytes as at once, whatever the tiles are."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -166,6 +168,19 @@ def test_statistics_by_blocks_are_those_of_numpy_to_the_bit(monkeypatch):
                 low, high = large_arrays.extremes(values)
                 assert large_arrays.first_of(values, low) == np.argmin(values)
                 assert large_arrays.first_of(values, high) == np.argmax(values)
+
+
+def test_a_median_by_blocks_keeps_none_of_them(monkeypatch):
+    monkeypatch.setattr(large_arrays, "BLOCK_ROWS", 1 << 14)
+    monkeypatch.setattr(large_arrays, "AT_ONCE", 1 << 14)
+    values = np.random.default_rng(0).normal(size=1 << 20)
+    expected = float(np.median(values))
+    tracemalloc.start()
+    try:
+        assert large_arrays.median(values) == expected
+        assert tracemalloc.get_traced_memory()[1] < 0.25 * values.nbytes
+    finally:
+        tracemalloc.stop()
 
 
 def test_columns_are_put_back_in_order(tiny, tmp_path):
