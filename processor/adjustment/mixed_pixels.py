@@ -166,12 +166,11 @@ class _Bands(NamedTuple):
     def of(cls, every: _Columns, scanner: Floats, step: float) -> _Bands | None:
         """Sort the points of a scanner; None where none is to be marked."""
         count = len(every.points)
-        judged = [np.flatnonzero(every.row[rows] >= 0) + rows.start for rows in blocks(count)]
-        ranges, done = allocate(sum(map(len, judged))), 0
-        for rows in judged:
-            ranges[done : done + len(rows)] = np.linalg.norm(every.points[rows] - scanner, axis=1)
-            done += len(rows)
-            release()
+        ranges, done = allocate(sum(int(np.count_nonzero(every.row[rows] >= 0)) for rows in blocks(count))), 0
+        for rows in blocks(count):
+            judged = every.points[rows][every.row[rows] >= 0]
+            ranges[done : done + len(judged)] = np.linalg.norm(judged - scanner, axis=1)
+            done += len(judged)
         if not done:
             return None
         columns = _columns(_window(step, large_arrays.quantile(ranges, NEAREST_SHARE)))
