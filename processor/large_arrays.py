@@ -18,6 +18,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -325,6 +326,14 @@ def in_parts(
             column[rows] = one[order]
         place = place + count
     return found
+
+
+def parts_of(ends: npt.NDArray[np.int64]) -> Iterator[slice]:
+    """Yield the rows of each part of :func:`in_parts` that has any, and give pages back after each."""
+    for start, end in pairwise([0, *ends.tolist()]):
+        if start < end:
+            yield slice(start, end)
+            release()
 
 
 def put_back(values: Array, rows: npt.NDArray[np.int64]) -> Array:

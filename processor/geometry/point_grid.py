@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -130,17 +129,13 @@ def _sorted(points: Floats, lower: Floats, size: float, most: int) -> _Part | No
     ends = np.cumsum(filled)
     placed, order = large_arrays.in_parts(passed, part_of, ends)
     keys, starts = list[Ints](), list[Ints]()
-    for first, last in pairwise([0, *ends.tolist()]):
-        if first == last:
-            continue
-        own = slice(first, last)
+    for own in large_arrays.parts_of(ends):
         if (part := _part(placed[own], order[own], lower, size, most)) is None:
             return None
         placed[own], order[own] = part.points, part.order
         keys.append(part.keys)
-        starts.append(large_arrays.put_aside(part.starts + first))
+        starts.append(large_arrays.put_aside(part.starts + own.start))
         most -= len(part.keys)
-        large_arrays.release()
     return _Part(placed, order, np.concatenate(keys), _stacked(starts))
 
 

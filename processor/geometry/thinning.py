@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -64,13 +63,10 @@ def by_cell(points: Floats, size_mm: float) -> Sorted:
     ends = np.cumsum(np.bincount(part_of_column, filled).astype(np.int64))
     passed = ((points[rows], np.arange(rows.start, rows.stop)) for rows in large_arrays.blocks(len(points)))
     placed, row = large_arrays.in_parts(passed, lambda block: part_of_column[column_of(block)], ends)
-    for first, last in pairwise([0, *ends.tolist()]):
-        if first == last:
-            continue
-        own, among = placed[first:last], row[first:last]
+    for part in large_arrays.parts_of(ends):
+        own, among = placed[part], row[part]
         order = _order(large_arrays.read_only(own), grid, size_mm)
         own[:], among[:] = own[order], among[order]
-        large_arrays.release()
     return Sorted(placed, row)
 
 
