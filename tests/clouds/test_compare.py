@@ -1,6 +1,7 @@
 """processor compare: what it writes, in the inputs' own unit and order, and what it refuses."""
 
 import csv
+import io
 import json
 import re
 import subprocess
@@ -276,6 +277,22 @@ def test_values_without_a_result_are_nan_in_the_csv(tmp_path):
     found = Distances(nan, nan, np.array([0]), np.array([2]), nan, np.array([0.5]))
     text = core_points_csv.csv_text(origin, np.zeros((1, 3)), found, np.full((1, 3), np.nan))
     assert text.splitlines()[1] == "0.0,0.0,0.0,nan,nan,0,0,2,nan,0.5,nan,nan,nan"
+
+
+def test_the_csv_is_that_of_the_csv_module():
+    rng = np.random.default_rng(0)
+    scale = 10.0 ** rng.integers(-9, 18, (6, 400))
+    numbers = rng.normal(size=(6, 400)) * scale
+    counts = rng.integers(0, 9, (2, 400))
+    found = Distances(*numbers[:2], *counts, *numbers[2:4])
+    core, normals = rng.normal(size=(400, 3)), rng.normal(size=(400, 3))
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([column.name for column in COLUMNS])
+    significant = (np.abs(found.distance) > found.lod95).astype(int)
+    columns = (*core.T, *numbers[:2], significant, *counts, *numbers[2:4], *normals.T)
+    writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+    assert core_points_csv.csv_text(np.zeros(3), core, found, normals) == out.getvalue()
 
 
 def test_the_page_may_be_chinese(clouds, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from processor import large_arrays
 from processor.geometry.m3c2 import Distances
 from processor.model import Floats
 from processor.report.columns import columns
-from processor.report.table import csv_lines, csv_of_rows
+from processor.report.table import csv_of_rows
 
 COLUMNS = columns(
     "x", "y", "z", "distance", "lod95", "significant", "n1", "n2", "std1", "std2", "nx", "ny", "nz"
@@ -35,4 +35,6 @@ def parts(origin: Floats, core: Floats, distances: Distances, normals: Floats) -
             *(core[rows] + origin).T, one.distance, one.lod95, one.significant.astype(np.int64), one.n1, one.n2,
             one.std1, one.std2, *normals[rows].T,
         )  # fmt: skip
-        yield csv_lines(zip(*(column.tolist() for column in numbers), strict=True))
+        # As the csv module writes numbers, in two thirds of its time: no number needs quotes.
+        cells = (map(repr, column.tolist()) for column in numbers)
+        yield "\n".join(map(",".join, zip(*cells, strict=True))) + "\n"
