@@ -2,8 +2,9 @@
 
     python -m tests.bench.peers_spheres --output out.json
 
-CloudCompare's RANSAC_SD takes the whole cloud as ours does; pyransac3d fits the crop about every true ball, which is
-easier. A peer that is not installed is left out and named (CloudCompare: Debian's packages cloudcompare and xvfb).
+CloudCompare's RANSAC_SD takes the whole cloud as ours does; pyransac3d and ``processor.fit_sphere`` fit the crop about
+every true ball, which is easier. A peer that is not installed is left out and named (CloudCompare: Debian's packages
+cloudcompare and xvfb).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
+import processor
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.points.scene_source import of_scene
 from tests.bench.bolt_balls import scene_of
@@ -29,6 +31,7 @@ from tests.bench.bolt_balls import scene_of
 NEAR_MM = 10.0
 CROP_MM = 20.0
 TAU_MM = 4.0
+LEAST_POINTS = 10
 
 
 def scored(name, seconds, centres, radii, truth):
@@ -60,16 +63,32 @@ def ours(scene, truth):
     return scored("ray, whole cloud", seconds, result.balls.centres[known], result.balls.radii[known], truth)
 
 
-def crops(scene, truth):
-    """pyransac3d on the crop about every true ball."""
-    import pyransac3d
-
+def crops_of(scene, truth):
+    """Points of the crop about every true ball, of those that have as many as both fits need."""
     source = of_scene(scene)
     points = np.vstack([chunk.points for chunk in source.chunks()]) + source.origin
     rows = cKDTree(points).query_ball_point(truth.centres, truth.radii + CROP_MM)
+    return [points[own] for own in rows if len(own) >= LEAST_POINTS]
+
+
+def fits(crops, truth):
+    """fit_sphere on each crop, compiled code warm."""
+    processor.fit_sphere(crops[0])
+    started = time.monotonic()
+    found = [processor.fit_sphere(crop) for crop in crops]
+    seconds = time.monotonic() - started
+    found = [one for one in found if one.points]
+    centres, radii = np.array([one.centre for one in found]).reshape(-1, 3), np.array([one.radius for one in found])
+    return scored("fit_sphere, crops given", seconds, centres, radii, truth)
+
+
+def ransac(crops, truth):
+    """pyransac3d on each crop."""
+    import pyransac3d
+
     random.seed(1)
     started = time.monotonic()
-    found = [pyransac3d.Sphere().fit(points[own], thresh=TAU_MM, maxIteration=1000)[:2] for own in rows if len(own) > 4]
+    found = [pyransac3d.Sphere().fit(crop, thresh=TAU_MM, maxIteration=1000)[:2] for crop in crops]
     seconds = time.monotonic() - started
     centres = np.array([np.ravel(centre) for centre, _ in found]).reshape(-1, 3)
     return scored("pyransac3d, crops given", seconds, centres, np.array([radius for _, radius in found]), truth)
@@ -109,9 +128,10 @@ def main():
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
     scene, truth = scene_of(arguments.case, 1)
-    rows = [ours(scene, truth.frame)]
+    crops = crops_of(scene, truth.frame)
+    rows = [ours(scene, truth.frame), fits(crops, truth.frame)]
     try:
-        rows.append(crops(scene, truth.frame))
+        rows.append(ransac(crops, truth.frame))
     except ImportError:
         print("pyransac3d is not installed: left out (pip install pyransac3d)")
     if shutil.which("CloudCompare") and shutil.which("xvfb-run"):
@@ -119,7 +139,7 @@ def main():
     else:
         print("CloudCompare is not installed: left out (apt-get install cloudcompare xvfb)")
     for row in rows:
-        row["seconds by ours"] = row["seconds"] / rows[0]["seconds"]
+        row["seconds by whole cloud"], row["seconds by fit"] = (row["seconds"] / one["seconds"] for one in rows[:2])
         print("  ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
