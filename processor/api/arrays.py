@@ -99,7 +99,8 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     A robust search finds the sphere; Gauss-Newton with Tukey's biweight then fits it. The residual is the orthogonal
     distance, or with ``scanner`` the difference of ranges along the ray, which has no bias where a sphere is partly
     seen. The covariance is that of an M-estimator (Huber and Ronchetti 2009, "Robust Statistics", 2nd ed.,
-    Wiley, eq. 6.6).
+    Wiley, eq. 6.6); without ``scanner`` it holds the difference between both residuals, for a sphere that is seen from
+    one side.
 
     Parameters
     ----------

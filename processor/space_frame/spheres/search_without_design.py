@@ -6,14 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from processor.geometry.sphere import Sphere, algebraic, bound
-from processor.model import Status, Tolerance, reason
+from processor.geometry.sphere import RobustFit, Sphere, algebraic, bound, robust_fit
+from processor.model import Floats, Status, Tolerance, reason
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Flag, Result
 from processor.space_frame.spheres import sphere_detection
 from processor.space_frame.spheres.assessment import DOWN, LARGEST_SCALE
 from processor.space_frame.spheres.single_fit_assessment import Row, as_result, assessed, generator, missing
+
+LEAST_ONE_SIDED = 0.2  # length of the mean of normals; 0.5 of half a sphere, 0 of one seen from all around
+FAR_RADII = 1e4
+FIRST_SCALE = 2.0  # of the second fit, in scales of the first: ranges scatter more than distances
 
 
 def search(cloud: MergedCloud, params: Params) -> Result:
@@ -49,7 +53,16 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
         sphere = algebraic(on)
     if sphere is None:
         return missing(id_, NAN, len(on), reason("spheres.no-sphere"))
+    doubts = []
+    if params.method == "ray" and cloud.scanner is None:
+        widened = _widened(cloud.points, candidate.fit, not np.isnan(params.radius_mm))
+        if widened is None:
+            doubts.append(reason("spheres.unknown-side"))
+        else:
+            sphere = replace(sphere, covariance=widened)
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
+    if doubts:
+        row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, *doubts))
     times = candidate.fit.scale / sphere_detection.flat_noise(cloud.points, sphere.radius)
     if times > LARGEST_SCALE:
         row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, reason("spheres.rough", times=times)))
@@ -59,6 +72,29 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     stations = 0 if seen_from is None else len(np.unique(seen_from, axis=0))
     least = bound(cloud.points, candidate.fit, not np.isnan(params.radius_mm), cloud.scanner)
     return replace(row, stations=stations, bound=least)
+
+
+def _widened(points: Floats, fit: RobustFit, radius_held: bool) -> Floats | None:
+    """Covariance (4, 4) of a fit of orthogonal distances to points (n, 3) whose scanner is unknown.
+
+    Beams that a sphere cuts at its limb return from beside it and make it larger; by ranges along the rays such points
+    are left out. So the sphere is fitted again as if it was seen from far away, from the side that its points are on,
+    and what it moves by is one standard deviation. None where that fit does not converge.
+    """
+    ball = fit.sphere
+    off = points[fit.inliers] - ball.centre
+    side = np.mean(off / np.linalg.norm(off, axis=1)[:, None], axis=0)
+    if np.linalg.norm(side) < LEAST_ONE_SIDED:
+        return ball.covariance
+    off = points - ball.centre
+    near = off[(np.linalg.norm(off, axis=1) < sphere_detection.NEAR * ball.radius) & (off @ side > 0.0)]
+    scanner = np.broadcast_to(FAR_RADII * ball.radius / np.linalg.norm(side) * side, near.shape)
+    start = Sphere(np.zeros(3), ball.radius, np.zeros((4, 4)))
+    again = robust_fit(near, start, FIRST_SCALE * fit.scale, ball.radius if radius_held else None, scanner)
+    if again is None or not again.converged:
+        return None
+    moved = np.append(again.sphere.centre, again.sphere.radius - ball.radius)
+    return ball.covariance + np.outer(moved, moved)
 
 
 def _with_bounds(result: Result, rows: list[Row]) -> Result:
