@@ -13,7 +13,8 @@ import designgen
 import processor
 from processor import pipeline
 from processor.geometry import rigid
-from processor.model import InputError, Scene, Status, UsageError, Verdict
+from processor.model import InputError, Scene, Status, UsageError, Verdict, reason
+from processor.space_frame.spheres import search_without_design
 from tests.support.solids.meshes import bracket
 
 FRAME_OF_FOUR = Path(__file__).resolve().parents[2] / "fixtures" / "frame-of-four.toml"
@@ -91,6 +92,13 @@ def test_interval_of_a_sphere_whose_scanner_is_unknown_holds_what_the_limb_adds(
         assert fit.status is Status.OK
         inside += abs(fit.radius - RADIUS) < 1.96 * np.sqrt(fit.covariance[3, 3])
     assert inside >= 24
+
+
+def test_a_sphere_that_no_ranges_fit_is_weak(monkeypatch):
+    monkeypatch.setattr(search_without_design, "robust_fit", lambda *_: None)
+    fit = processor.fit_sphere(seen_by_a_beam(np.random.default_rng(0), 0.0))
+    assert fit.status is Status.WEAK
+    assert fit.reasons == (reason("spheres.unknown-side"),)
 
 
 def test_interval_of_a_sphere_seen_from_all_around_stays_as_it_is():

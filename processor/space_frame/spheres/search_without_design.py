@@ -54,18 +54,18 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     if sphere is None:
         return missing(id_, NAN, len(on), reason("spheres.no-sphere"))
     doubts = []
-    if params.method == "ray" and cloud.scanner is None:
+    if params.method != "least-squares" and cloud.scanner is None:
         widened = _widened(cloud.points, candidate.fit, not np.isnan(params.radius_mm))
         if widened is None:
             doubts.append(reason("spheres.unknown-side"))
         else:
             sphere = replace(sphere, covariance=widened)
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
-    if doubts:
-        row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, *doubts))
     times = candidate.fit.scale / sphere_detection.flat_noise(cloud.points, sphere.radius)
     if times > LARGEST_SCALE:
-        row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, reason("spheres.rough", times=times)))
+        doubts.append(reason("spheres.rough", times=times))
+    if doubts:
+        row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, *doubts))
     if params.method == "least-squares":
         return row
     seen_from = None if cloud.scanner is None else cloud.scanner[candidate.fit.inliers]
