@@ -15,6 +15,8 @@ import ezdxf
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from PIL import Image
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import Scan, Scene, Stations, StepRun, Verdict, reason
@@ -25,7 +27,7 @@ from processor.report.columns import columns
 from processor.report.space_frame import ball_picture, dxf, flagged_ball_figures
 from processor.report.space_frame import figures as space_frame_figures
 from processor.report.space_frame import tables as space_frame_tables
-from processor.report.style import Drawn
+from processor.report.style import COLOURS, DPI, Drawn
 from processor.results import to_json
 from processor.space_frame.result import (
     ControlDeviations,
@@ -362,6 +364,18 @@ def test_at_most_twelve_balls_have_a_picture_worst_first(monkeypatch):
     assert "the first 4 of 7" in captions[0]
     every = flagged_ball_figures.flagged_rows(scene(made), made)
     assert pages_of(drawn.documents[flagged_ball_figures.DOCUMENT]) == len(every) == 7
+
+
+def test_pictures_of_balls_show_the_middle_of_the_design():
+    made = whole()
+    drawn = flagged_ball_figures.draw(scene(made), made)
+    i = made.balls.flag.index("not-found")
+    png = drawn.figures[f"flagged-ball-{made.balls.ids[i]}.png"][1]
+    pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+    left, bottom, wide, high = (DPI * inches for inches in ball_picture.VIEWS_IN[0])
+    column, row = round(left + 0.5 * wide), round(len(pixels) - bottom - 0.5 * high)
+    nominal = np.array(to_rgb(COLOURS[1])) * 255.0
+    assert (np.abs(pixels[row - 3 : row + 4, column - 3 : column + 4] - nominal).max(axis=2) < 10.0).any()
 
 
 def test_pages_of_a_document_share_the_pixels_of_their_frames():

@@ -193,7 +193,7 @@ def painted(points: Floats, depth: Floats, reach: float) -> npt.NDArray[np.uint8
 def _sphere(axes: Axes, colour: str, dash: str) -> _Sphere:
     outline = Circle((0.0, 0.0), 1.0, fill=False, edgecolor=colour, linestyle=dash, linewidth=1.6, zorder=4.0)
     axes.add_patch(outline)
-    (middle,) = axes.plot([], [], "+", color=colour, markersize=9.0, zorder=4.0, animated=True)
+    (middle,) = axes.plot([], [], "+", color=colour, markersize=9.0, zorder=4.0)
     return _Sphere(outline, middle)
 
 
