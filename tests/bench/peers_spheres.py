@@ -24,6 +24,7 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
 import processor
+from processor.api.arrays import LEAST_POINTS
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.points.scene_source import of_scene
 from tests.bench.bolt_balls import scene_of
@@ -31,7 +32,6 @@ from tests.bench.bolt_balls import scene_of
 NEAR_MM = 10.0
 CROP_MM = 20.0
 TAU_MM = 4.0
-LEAST_POINTS = 10
 
 
 def scored(name, seconds, centres, radii, truth):

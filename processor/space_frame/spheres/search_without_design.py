@@ -82,12 +82,12 @@ def _widened(points: Floats, fit: RobustFit, radius_held: bool) -> Floats | None
     and what it moves by is one standard deviation. None where that fit does not converge.
     """
     ball = fit.sphere
-    off = points[fit.inliers] - ball.centre
-    side = np.mean(off / np.linalg.norm(off, axis=1)[:, None], axis=0)
+    off = points - ball.centre
+    distance, on = np.linalg.norm(off, axis=1), fit.inliers
+    side = np.mean(off[on] / distance[on, None], axis=0)
     if np.linalg.norm(side) < LEAST_ONE_SIDED:
         return ball.covariance
-    off = points - ball.centre
-    near = off[(np.linalg.norm(off, axis=1) < sphere_detection.NEAR * ball.radius) & (off @ side > 0.0)]
+    near = off[(distance < sphere_detection.NEAR * ball.radius) & (off @ side > 0.0)]
     scanner = np.broadcast_to(FAR_RADII * ball.radius / np.linalg.norm(side) * side, near.shape)
     start = Sphere(np.zeros(3), ball.radius, np.zeros((4, 4)))
     again = robust_fit(near, start, FIRST_SCALE * fit.scale, ball.radius if radius_held else None, scanner)
