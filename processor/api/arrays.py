@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,8 +29,9 @@ from processor.registration.surface_registration import Placed
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import Params
-from processor.space_frame.result import Flag
-from processor.space_frame.spheres import search_without_design
+from processor.space_frame.result import Flag, Result
+from processor.space_frame.spheres import search_without_design, sphere_detection
+from processor.targets import sphere_of_crop
 
 LEAST_POINTS = 10
 LEAST_SCAN_POINTS = 100
@@ -96,11 +97,12 @@ class Pose:
 def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.ArrayLike | None = None) -> SphereFit:
     """Fit a sphere to the points of one target, some of which may lie on other things.
 
-    A robust search finds the sphere; Gauss-Newton with Tukey's biweight then fits it. The residual is the orthogonal
-    distance, or with ``scanner`` the difference of ranges along the ray, which has no bias where a sphere is partly
-    seen. The covariance is that of an M-estimator (Huber and Ronchetti 2009, "Robust Statistics", 2nd ed.,
-    Wiley, eq. 6.6); without ``scanner`` it holds the difference between both residuals, for a sphere that is seen from
-    one side.
+    Spheres through four points, drawn from all, propose the sphere; where it is a small share of the points, patches
+    of every size do. Gauss-Newton with Tukey's biweight then fits it. The residual is the orthogonal distance, or with
+    ``scanner`` the difference of ranges along the ray, which has no bias where a sphere is partly seen. The covariance
+    is that of an M-estimator (Huber and Ronchetti 2009, "Robust Statistics", 2nd ed., Wiley, eq. 6.6), with what beams
+    add that the sphere cuts at its limb: without ``scanner`` the difference between both residuals, for a sphere that
+    is seen from one side; else the difference from a fit without the rays near the limb.
 
     Parameters
     ----------
@@ -125,7 +127,7 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
         seen_from = positions_of(scanner, "scanner", cloud.shape) - origin
         _check_scanner(cloud - origin, seen_from)
     params = Params(radius_mm=float("nan") if held is None else held, max_balls=1)
-    measured = search_without_design.search(MergedCloud(cloud - origin, origin, seen_from), params)
+    measured = _searched(MergedCloud(cloud - origin, origin, seen_from), params, held)
     balls = measured.balls
     if not len(balls):
         doubt = None if held is None else unit_mistakes.implausible(held)
@@ -150,6 +152,25 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     if seen_from is not None and fitted.status is Status.OK:
         _check_faces(cloud - fitted.centre, seen_from + origin - fitted.centre, fitted)
     return fitted
+
+
+def _searched(cloud: MergedCloud, params: Params, held: float | None) -> Result:
+    """Return the sphere that fills most of a cloud, else the one that is found in it, else one that is only likely."""
+    least = max(params.min_points, sphere_detection.LEAST_POINTS)
+    found = sphere_of_crop.find(cloud.points, least, held, cloud.scanner)
+    if found is None or not found.certain:
+        measured = search_without_design.search(cloud, params)
+        if found is None or len(measured.balls):
+            return measured
+    ball = sphere_detection.Ball(found.fit, found.inlier_share)
+    measured = search_without_design.measured([ball], cloud, params)
+    return measured if found.certain else _doubted(measured)
+
+
+def _doubted(measured: Result) -> Result:
+    """Return the result of one sphere as one that may be another body, or be moved by what touches it."""
+    reasons = (*measured.balls.reasons[0], reason("spheres.not-only-sphere"))
+    return replace(measured, balls=replace(measured.balls, flag=(Flag.LOW_CONFIDENCE,), reasons=(reasons,)))
 
 
 def _radius(radius: Any, extent: float) -> float:
@@ -188,7 +209,8 @@ def _check_faces(points: Floats, scanner: Floats, sphere: SphereFit) -> None:
     on = np.abs(height - sphere.radius) < ON_SPHERE * sphere.rms
     normal, sight = points[on] / height[on, None], (scanner - points)[on]
     cosine = np.einsum("ni,ni->n", normal, sight) / np.linalg.norm(sight, axis=1)
-    away = float((cosine < AWAY_COS).mean()) if on.any() else 0.0
+    limb = AWAY_COS - ON_SPHERE * sphere.rms / sphere.radius  # noise takes points at the limb beyond it
+    away = float((cosine < limb).mean()) if on.any() else 0.0
     if away > MOST_AWAY:
         raise ValueError(
             f"scanner: expected the position in mm in the points' frame from where they were measured, but"

@@ -31,3 +31,16 @@ def least_first(values, count, k):  # type: ignore[no-untyped-def]
             low = i
         else:
             break
+
+
+@inner
+def median(values, count):  # type: ignore[no-untyped-def]
+    """Return the median of the first ``count`` values, one or more, whose order is changed; none may be NaN."""
+    middle = count // 2
+    least_first(values, count, middle)
+    if count % 2:
+        return values[middle]
+    below = values[0]
+    for k in range(1, middle):
+        below = max(below, values[k])
+    return (below + values[middle]) / 2.0

@@ -1,6 +1,6 @@
-"""Fits of one sphere to points: algebraic least squares, random sample consensus, and a robust geometric fit.
+"""Fits of one sphere to points: algebraic least squares and random sample consensus.
 
-The first two are those of paper 001 (Huang et al. 2019), equations 1-4 and 5-15. Every routine subtracts a local origin
+Both are those of paper 001 (Huang et al. 2019), equations 1-4 and 5-15. Every routine subtracts a local origin
 first: in squares of georeferenced coordinates the digits of a ball are lost.
 """
 
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.model import Bools, Floats, Ints
-from processor.robust_statistics import TUKEY, biweight, robust_sd
 
 
 @dataclass(frozen=True)
@@ -188,159 +187,3 @@ def ransac(
     inliers[order] = best
     sphere = algebraic(points[inliers])
     return None if sphere is None else Consensus(sphere, inliers, trials, needed)
-
-
-# --- Robust geometric fit
-
-
-LEAST_SCALE = 1e-8  # of the radius: below any noise, above the rounding of points without noise
-WINDOW = 4.0  # in scales: residuals within it determine the scale
-STEEPEST = 0.3  # cosine of incidence below which the beam is split at the limb, and errors of angles dominate
-ITERATIONS = 100
-FREE_ITERATIONS = 40  # then the scale is fixed and rays that missed the ball stay out, so that the fit converges
-LEAST = 6
-
-
-@dataclass(frozen=True)
-class RobustFit:
-    """The sphere, the points (n,) of weight > 0, the scale (sd) of their residuals and whether the fit converged."""
-
-    sphere: Sphere
-    inliers: Bools
-    scale: float
-    converged: bool
-
-
-def robust_fit(
-    points: Floats,
-    start: Sphere,
-    scale_mm: float,
-    radius_mm: float | None = None,
-    scanner: Floats | None = None,
-) -> RobustFit | None:
-    """Fit a sphere to points (n, 3), of which many lie on something else, by Gauss-Newton with Tukey's biweight.
-
-    The residual is the orthogonal distance or, where the scanner's position is known, the measured range minus the
-    range at which the ray meets the sphere: noise runs along the ray, and only the second is unbiased for a ball seen
-    from one side.
-
-    Parameters
-    ----------
-    points : (n, 3), mm
-    start : initial sphere, within a few scales of the ball; points more than a few ``scale_mm`` off it have weight 0.
-    scale_mm : first scale of the residuals, an upper limit. The scale then follows from the median of the residuals in
-        a window of 4 scales, so that many points off the sphere on one side do not widen it.
-    radius_mm : fixed radius; its variance and covariances are then 0. None = estimated.
-    scanner : (n, 3), the position each point was seen from, in the frame of the points; None = unknown.
-
-    None where fewer than six points remain, or they do not determine a sphere. The covariance is the sandwich
-    A^-1 B A^-1 of an M-estimator (Huber and Ronchetti 2009, eq. 6.6, times n / (n - p)). It assumes independent
-    residuals: errors common to all points (registration, a bias of the scanner) are not included.
-    """
-    origin = start.centre
-    local = points - origin
-    seen_from = None if scanner is None else scanner - origin
-    state = np.append(np.zeros(3), start.radius if radius_mm is None else radius_mm)
-    free = 4 if radius_mm is None else 3
-    scale = scale_mm
-    tiny = LEAST_SCALE * start.radius
-    converged = False
-    considered = np.ones(len(points), bool)
-    for iteration in range(ITERATIONS):
-        residual, J = _linearised(local, state, seen_from)
-        if iteration < FREE_ITERATIONS:
-            scale = min(scale_mm, max(_scale(residual, scale), tiny))
-        else:
-            considered &= np.isfinite(residual)
-        near = considered & (np.abs(residual) < TUKEY * scale)
-        step = _step(residual[near], J[near, :free], scale) if np.count_nonzero(near) >= LEAST else None
-        if step is None:
-            return None
-        largest = float(np.linalg.norm(step))
-        # The step is limited: on a flat cap an unlimited one may leave the ball.
-        step *= min(1.0, 0.2 * state[3] / max(largest, 1e-300))
-        state[:free] += step
-        if not 0.0 < state[3] < 1e3 * start.radius or not np.isfinite(state).all():
-            return None
-        if largest < 1e-10 * state[3]:
-            converged = True
-            break
-    residual, J = _linearised(local, state, seen_from)
-    covariance = np.zeros((4, 4))
-    covariance[:free, :free] = _sandwich(J[:, :free], residual / scale, scale)
-    inliers = np.asarray(np.abs(residual) < TUKEY * scale, bool)
-    return RobustFit(Sphere(origin + state[:3], float(state[3]), covariance), inliers, scale, converged)
-
-
-def bound(points: Floats, fit: RobustFit, radius_held: bool = False, scanner: Floats | None = None) -> Floats:
-    """Cramér-Rao bound (4, 4) of the covariance of an unbiased estimate from the points of a fit.
-
-    Every inlier has full weight and normal noise of the fit's scale; ``points`` (n, 3) and ``scanner`` (n, 3) are those
-    that were fitted. NaN where the points do not determine the sphere.
-    """
-    state = np.append(np.zeros(3), fit.sphere.radius)
-    on = fit.inliers
-    seen_from = None if scanner is None else scanner[on] - fit.sphere.centre
-    residual, J = _linearised(points[on] - fit.sphere.centre, state, seen_from)
-    free = 3 if radius_held else 4
-    J = J[np.isfinite(residual), :free]
-    covariance = np.zeros((4, 4))
-    N = J.T @ J
-    covariance[:free, :free] = fit.scale**2 * np.linalg.inv(N) if np.linalg.cond(N) < 1e12 else np.nan
-    return covariance
-
-
-def _linearised(points: Floats, state: Floats, scanner: Floats | None) -> tuple[Floats, Floats]:
-    """Residuals (n,), measured minus model, and the model's derivatives (n, 4); NaN where the ray misses the sphere."""
-    centre, radius = state[:3], state[3]
-    if scanner is None:
-        out = points - centre
-        distance = np.linalg.norm(out, axis=1)
-        J = np.column_stack([out / np.maximum(distance, 1e-300)[:, None], np.ones(len(points))])
-        return distance - radius, J
-    ray = points - scanner
-    length = np.linalg.norm(ray, axis=1)
-    ray = ray / np.maximum(length, 1e-300)[:, None]
-    to_centre = centre - scanner
-    along = np.einsum("ni,ni->n", ray, to_centre)
-    off = to_centre - along[:, None] * ray
-    under = radius**2 - np.sum(off**2, axis=1)
-    met = under > (STEEPEST * radius) ** 2
-    root = np.sqrt(np.where(met, under, radius**2))
-    J = np.column_stack([ray + off / root[:, None], -radius / root])
-    residual = np.where(met, length - (along - root), np.nan)
-    return residual, J
-
-
-def _step(residual: Floats, J: Floats, scale: float) -> Floats | None:
-    """Gauss-Newton step (p,) with Tukey's weights; None where the points do not determine a sphere."""
-    w = biweight(residual / (TUKEY * scale))
-    N = (J * w[:, None]).T @ J
-    if np.linalg.cond(N) > 1e12:
-        return None
-    step: Floats = np.linalg.solve(N, (J * w[:, None]).T @ residual)
-    return step
-
-
-def _scale(residual: Floats, scale: float) -> float:
-    """Scale by the residuals within 4 scales."""
-    size = np.abs(residual)
-    near = size[size <= WINDOW * scale]
-    return robust_sd(near) if len(near) else scale
-
-
-def _sandwich(J: Floats, u: Floats, scale: float) -> Floats:
-    """Covariance of the estimate from derivatives J (n, p) and residuals u (n,) in scales."""
-    near = np.abs(u) < TUKEY
-    J, u = J[near], u[near]
-    q = 1.0 - (u / TUKEY) ** 2
-    psi, slope = u * q**2, q * (1.0 - 5.0 * (u / TUKEY) ** 2)
-    n, p = J.shape
-    A = (J * slope[:, None]).T @ J
-    B = (J * (psi**2)[:, None]).T @ J
-    if np.linalg.cond(A) > 1e12:
-        return np.full((p, p), np.nan)
-    inverse = np.linalg.inv(A)
-    covariance = scale**2 * n / max(n - p, 1) * inverse @ B @ inverse
-    symmetric: Floats = 0.5 * (covariance + covariance.T)
-    return symmetric

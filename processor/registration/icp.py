@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.geometry.linalg_small import assign_rows, product
 from processor.geometry.lines_and_polylines import Polyline
-from processor.geometry.selection import least_first
+from processor.geometry.selection import median
 from processor.inner_kernels import inner
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
@@ -171,7 +171,7 @@ def _aligned(boxes, source, T, gate, axes, most, known):  # type: ignore[no-unty
         rms = np.sqrt(squares / pairs)
         # On a clean scan the median is close to zero. The few points of an end face, far off while the part still
         # slides along its length, would then lose all their weight: the gate sets a lower bound of the scale.
-        scale = max(MAD_TO_SD * _median(sizes, pairs), gate / 12.0)
+        scale = max(MAD_TO_SD * median(sizes, pairs), gate / 12.0)
         moved = _step(p, n, r, pairs, HUBER * scale, axes, T)
         if moved < 1e-3 * gate:
             break
@@ -238,19 +238,6 @@ def _step(p, n, r, pairs, huber, axes, T):  # type: ignore[no-untyped-def]
         turn += step[i] * step[i]
         shift += step[3 + i] * step[3 + i]
     return np.sqrt(turn) * np.sqrt(reach) + np.sqrt(shift)
-
-
-@inner
-def _median(values, count):  # type: ignore[no-untyped-def]
-    """Return the median of the first values, whose order is changed."""
-    middle = count // 2
-    least_first(values, count, middle)
-    if count % 2:
-        return values[middle]
-    below = values[0]
-    for k in range(1, middle):
-        below = max(below, values[k])
-    return (below + values[middle]) / 2.0
 
 
 @inner

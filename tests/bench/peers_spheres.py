@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 
 import processor
 from processor.api.arrays import LEAST_POINTS
+from processor.model import NORMAL_95, Status
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.points.scene_source import of_scene
 from tests.bench.bolt_balls import scene_of
@@ -77,9 +78,13 @@ def fits(crops, truth):
     started = time.monotonic()
     found = [processor.fit_sphere(crop) for crop in crops]
     seconds = time.monotonic() - started
+    ok = [one for one in found if one.status is Status.OK]
+    near = cKDTree(truth.centres).query(np.array([one.centre for one in ok]).reshape(-1, 3))[1]
+    pulls = [(one.radius - r) / np.sqrt(one.covariance[3, 3]) for one, r in zip(ok, truth.radii[near], strict=True)]
     found = [one for one in found if one.points]
     centres, radii = np.array([one.centre for one in found]).reshape(-1, 3), np.array([one.radius for one in found])
-    return scored("fit_sphere, crops given", seconds, centres, radii, truth)
+    row = scored("fit_sphere, crops given", seconds, centres, radii, truth)
+    return row | {"ok": len(ok), "intervals hold": float(np.mean(np.abs(pulls) < NORMAL_95)) if ok else float("nan")}
 
 
 def ransac(crops, truth):

@@ -9,15 +9,16 @@ from processor.geometry.sphere import (
     Sphere,
     algebraic,
     ransac,
-    robust_fit,
     through_four,
     trials_needed,
     visible_fraction,
 )
+from processor.geometry.sphere_robust_fit import robust_fit
 from processor.model import Scan, Scene
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.spheres.sphere_detection import LEAST_POINTS, find_balls
 from tests.support.clouds import street_clouds
+from tests.support.solids import robust_sphere
 
 NOWHERE = np.zeros((4, 4))
 UTM = np.array([500_000_000.0, 4_300_000_000.0, 50_000.0])
@@ -261,6 +262,21 @@ def test_robust_intervals_cover_and_ranges_take_the_bias_away():
     assert abs(bias["ray"]) < 3.5 * standard_error
     assert bias["orthogonal"] < bias["ray"] - 0.1
     assert 0.88 <= np.mean(covered) <= 0.99
+
+
+@pytest.mark.parametrize("seen_from", [None, (0.0, 0.0, 3000.0)])
+@pytest.mark.parametrize("held", [None, 50.0])
+def test_robust_fit_is_that_of_its_readable_form(seen_from, held):
+    for seed in range(5):
+        points = contaminated(np.random.default_rng(seed))
+        scanner = None if seen_from is None else np.broadcast_to(seen_from, points.shape)
+        start = Sphere(np.array([0.5, -0.5, 0.3]), 50.8, NOWHERE)
+        fit = robust_fit(points, start, 1.0, held, scanner)
+        expected = robust_sphere.fit(points, np.append(start.centre, held or start.radius), 1.0, held is None, scanner)
+        assert fit.converged
+        np.testing.assert_allclose([*fit.sphere.centre, fit.sphere.radius], expected.state, atol=1e-8)
+        assert fit.scale == pytest.approx(expected.scale, rel=1e-9)
+        np.testing.assert_array_equal(fit.inliers, expected.inliers)
 
 
 def test_robust_fit_of_too_few_points_is_none():

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from processor.geometry.sphere import RobustFit, Sphere, algebraic, bound, robust_fit
+from processor.geometry.sphere import Sphere, algebraic
+from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit, bound, robust_fit
 from processor.model import Floats, Status, Tolerance, reason
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import NAN, Params
@@ -17,19 +18,24 @@ from processor.space_frame.spheres.single_fit_assessment import Row, as_result, 
 
 LEAST_ONE_SIDED = 0.2  # length of the mean of normals; 0.5 of half a sphere, 0 of one seen from all around
 FAR_RADII = 1e4
+STEEP_COS = 0.5  # of the incidence of a ray
 FIRST_SCALE = 2.0  # of the second fit, in scales of the first: ranges scatter more than distances
 
 
 def search(cloud: MergedCloud, params: Params) -> Result:
     """Search a cloud for spheres that stand out of it by themselves."""
-    radius = None if np.isnan(params.radius_mm) else params.radius_mm
-    least = max(params.min_points, sphere_detection.LEAST_POINTS)
     # fixed: the result must not depend on the seed
     fixed = generator(replace(params, seed=0), "search")
-    candidates = sphere_detection.find_balls(cloud.points, fixed, params.max_balls, least, radius, cloud.scanner)
-    if not candidates:
+    least = max(params.min_points, sphere_detection.LEAST_POINTS)
+    found = sphere_detection.find_balls(cloud.points, fixed, params.max_balls, least, _held(params), cloud.scanner)
+    return measured(found, cloud, params)
+
+
+def measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Params) -> Result:
+    """Return the result of spheres found in a cloud, fitted by the method."""
+    if not found:
         return Result(Status.FAILED, params.method, (reason("spheres.no-ball", points=len(cloud.points)),))
-    rows = [_searched(id_, candidate, cloud, params) for id_, candidate in enumerate(candidates)]
+    rows = [_searched(id_, candidate, cloud, params) for id_, candidate in enumerate(found)]
     messages = [reason("spheres.searched")]
     if params.method == "least-squares":
         messages.append(reason("spheres.algebraic-fit"))
@@ -37,13 +43,18 @@ def search(cloud: MergedCloud, params: Params) -> Result:
         messages.append(reason("spheres.robust-distances"))
     else:
         messages.append(reason("spheres.robust-ranges"))
+    radius = _held(params)
     if radius is not None:
         messages.append(reason("spheres.radius-held", radius=radius))
-    complete = len(candidates) < params.max_balls
+    complete = len(found) < params.max_balls
     if not complete:
-        messages.append(reason("spheres.most-balls", balls=len(candidates)))
+        messages.append(reason("spheres.most-balls", balls=len(found)))
     result = as_result(rows, cloud.origin, params, tuple(messages), complete)
     return _with_bounds(result, rows) if params.method == "ray" else result
+
+
+def _held(params: Params) -> float | None:
+    return None if np.isnan(params.radius_mm) else params.radius_mm
 
 
 def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, params: Params) -> Row:
@@ -54,14 +65,15 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     if sphere is None:
         return missing(id_, NAN, len(on), reason("spheres.no-sphere"))
     doubts = []
-    if params.method != "least-squares" and cloud.scanner is None:
-        widened = _widened(cloud.points, candidate.fit, not np.isnan(params.radius_mm))
+    if params.method != "least-squares":
+        widened = _widened(cloud, candidate.fit, _held(params) is not None)
         if widened is None:
-            doubts.append(reason("spheres.unknown-side"))
+            doubts.append(reason("spheres.unknown-side" if cloud.scanner is None else "spheres.at-limb"))
         else:
             sphere = replace(sphere, covariance=widened)
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
-    times = candidate.fit.scale / sphere_detection.flat_noise(cloud.points, sphere.radius)
+    noise = sphere_detection.flat_noise(cloud.points, sphere.radius)
+    times = candidate.fit.scale / max(noise, LEAST_SCALE * sphere.radius)  # points without noise have none
     if times > LARGEST_SCALE:
         doubts.append(reason("spheres.rough", times=times))
     if doubts:
@@ -70,27 +82,36 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
         return row
     seen_from = None if cloud.scanner is None else cloud.scanner[candidate.fit.inliers]
     stations = 0 if seen_from is None else len(np.unique(seen_from, axis=0))
-    least = bound(cloud.points, candidate.fit, not np.isnan(params.radius_mm), cloud.scanner)
+    least = bound(cloud.points, candidate.fit, _held(params) is not None, cloud.scanner)
     return replace(row, stations=stations, bound=least)
 
 
-def _widened(points: Floats, fit: RobustFit, radius_held: bool) -> Floats | None:
-    """Covariance (4, 4) of a fit of orthogonal distances to points (n, 3) whose scanner is unknown.
+def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Floats | None:
+    """Covariance (4, 4) of a fit with what beams add that a sphere cuts at its limb.
 
-    Beams that a sphere cuts at its limb return from beside it and make it larger; by ranges along the rays such points
-    are left out. So the sphere is fitted again as if it was seen from far away, from the side that its points are on,
-    and what it moves by is one standard deviation. None where that fit does not converge.
+    They return from beside it and make it larger. So the sphere is fitted again, and what it moves by is one standard
+    deviation. Of orthogonal distances the second fit is one of ranges as seen from far away, from the side that its
+    points are on: rays that miss the sphere are left out. Of ranges it is without rays that meet it at more than 60
+    degrees, where a footprint is over twice as long as wide. None where that fit does not converge.
     """
     ball = fit.sphere
-    off = points - ball.centre
-    distance, on = np.linalg.norm(off, axis=1), fit.inliers
-    side = np.mean(off[on] / distance[on, None], axis=0)
-    if np.linalg.norm(side) < LEAST_ONE_SIDED:
-        return ball.covariance
-    near = off[(distance < sphere_detection.NEAR * ball.radius) & (off @ side > 0.0)]
-    scanner = np.broadcast_to(FAR_RADII * ball.radius / np.linalg.norm(side) * side, near.shape)
-    start = Sphere(np.zeros(3), ball.radius, np.zeros((4, 4)))
-    again = robust_fit(near, start, FIRST_SCALE * fit.scale, ball.radius if radius_held else None, scanner)
+    off = cloud.points - ball.centre
+    distance = np.linalg.norm(off, axis=1)
+    near = distance < sphere_detection.NEAR * ball.radius
+    if cloud.scanner is None:
+        side = np.mean(off[fit.inliers] / distance[fit.inliers, None], axis=0)
+        if np.linalg.norm(side) < LEAST_ONE_SIDED:
+            return ball.covariance
+        near &= off @ side > 0.0
+        far = FAR_RADII * ball.radius / np.linalg.norm(side) * side
+        seen_from: Floats = np.broadcast_to(far, (int(near.sum()), 3))
+    else:
+        seen_from = cloud.scanner - ball.centre
+        across = np.linalg.norm(np.cross(off, seen_from), axis=1) / np.linalg.norm(off - seen_from, axis=1)
+        near &= across < np.sqrt(1.0 - STEEP_COS**2) * ball.radius
+        seen_from = seen_from[near]
+    start = replace(ball, centre=np.zeros(3))
+    again = robust_fit(off[near], start, FIRST_SCALE * fit.scale, ball.radius if radius_held else None, seen_from)
     if again is None or not again.converged:
         return None
     moved = np.append(again.sphere.centre, again.sphere.radius - ball.radius)

@@ -14,25 +14,28 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry import point_grid
 from processor.geometry.linalg_small import assign
-from processor.geometry.sphere import (
-    LEAST_SCALE,
-    RobustFit,
-    Sphere,
-    canonical_order,
-    robust_fit,
-    sphere_cells,
-    visible_fraction,
+from processor.geometry.sphere import Sphere, canonical_order, visible_fraction
+from processor.geometry.sphere_evidence import (
+    BAND,
+    EVIDENCE_CELLS,
+    denser,
+    facing,
+    is_noise,
+    largest_misfit,
+    misfit,
+    redundant,
+    thinned,
 )
+from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit, robust_fit
 from processor.geometry.thread_ranges import over_ranges
 from processor.inner_kernels import inner_ieee
 from processor.model import Floats, Ints
-from processor.robust_statistics import MAD_TO_SD, robust_sd
+from processor.robust_statistics import MAD_TO_SD
 
 LEAST_POINTS = 40  # on a ball; with fewer, balls occur anywhere by chance
 STEP = 1.5  # between scales
@@ -42,7 +45,6 @@ LEAST_CELLS = 24  # of a patch
 MOST_PATCHES = 100_000  # of one scale
 APART = 0.7  # of patches, in their radii
 SETS = 48  # of four points, of each patch
-BAND = 0.1  # half-width of a proposal's surface, in radii
 SMALLEST, LARGEST = 0.6, 1.6  # radius of a proposal, in patch radii
 FLAT = 0.04  # thickness of a patch, in its radii, below which it is a plane or an edge
 REFINED = 40  # best proposals of each scale, which are tried
@@ -50,24 +52,15 @@ REFINEMENTS = 3
 STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
 ROUGHEST = 0.05  # noise over radius, above which a ball is not distinguishable from a cluster of points
 FACING = 0.985  # median cosine between the cloud's own normals and the ball's
-NEIGHBOURHOODS = (0.1, 0.2, 0.4)  # of the ball's points, the least that is no line
-OF_A_LINE = 0.05  # ratio of the variances along and across the neighbourhood of a line
 ROUGHLY_FACING = 0.9  # the same of a proposal
-MISFIT = 0.5  # of the scale: cell means of residuals on a ball are noise alone
-ROUND = 0.02  # of the radius: nothing but a ball departs from a sphere by less
 NEAR = 1.7  # radii of a proposal: points about its centre that a ball is fitted to
 AROUND = 1.4  # radii of a ball: its surroundings
 LIKELY_MM = 1500.0  # larger balls are searched for only where there is none below
-SMALL = 0.005  # residuals, in radii, that are accepted even if they are systematic: the shape of the ball
-WHITE = 0.5  # sd of residuals by the differences of neighbours, over that of all
-EXPLAINED = 0.3  # share of the residuals' squares that an ellipsoid may explain
 LEAST_VISIBLE = 0.08  # share of the sphere
 LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radii
-LARGEST_HALF_SD = 0.15  # the same by half of the points
 RADIUS_BAND = 0.15  # proposals within this share of a fixed radius
 LEAST_FLAT, MOST_FLAT = 8, 2000  # patches that the noise of a cloud rests on
 LEAST_SPREAD = 0.15  # of such a patch across its longest side, in its width: not one line of a scanner
-EVIDENCE_CELLS = 12.0  # of a thinned cloud, in a ball's radius
 
 
 @dataclass(frozen=True)
@@ -137,10 +130,7 @@ def _overlap(a: Sphere, b: Sphere) -> bool:
 
 
 def _in_place(ball: Ball, order: Ints, origin: Floats) -> Ball:
-    inliers = np.zeros(len(order), bool)
-    inliers[order] = ball.fit.inliers
-    sphere = Sphere(ball.fit.sphere.centre + origin, ball.fit.sphere.radius, ball.fit.sphere.covariance)
-    return Ball(RobustFit(sphere, inliers, ball.fit.scale, ball.fit.converged), ball.inlier_share)
+    return Ball(ball.fit.in_place(len(order), order, origin), ball.inlier_share)
 
 
 # --- proposals -------------------------------------------------------------------------------------------------------
@@ -160,14 +150,6 @@ def _scales(cloud: Cloud, radius_mm: float | None) -> Floats:
     count = int(np.log(0.5 * extent / finest) / np.log(STEP)) + 1
     scales: Floats = finest * np.power(STEP, np.arange(count, dtype=np.float64))
     return scales
-
-
-def thinned(points: Floats, cell: float) -> Ints:
-    """Rows of the first point in every cell of a grid of this edge."""
-    lower = points.min(axis=0)
-    size = max(cell, float(np.ptp(points, axis=0).max()) / (1 << 20))  # 21 bits per axis
-    i, j, k = np.floor((points - lower) / size).astype(np.int64).T
-    return np.sort(np.unique(i << 42 | j << 21 | k, return_index=True)[1])
 
 
 def _proposals(
@@ -194,7 +176,7 @@ def _proposals(
         if any(np.linalg.norm(start.centre - other.centre) < 0.3 * start.radius for _, other in found):
             continue
         near = few[np.sort(np.array(tree.query_ball_point(start.centre, 1.5 * start.radius), np.int64))]
-        if _denser(near, start, 0.6 * STANDS_OUT):
+        if denser(near, start, 0.6 * STANDS_OUT):
             found.append((_score(near, start), start))
     return found
 
@@ -362,7 +344,7 @@ def _accepted(cloud: Cloud, start: Sphere, least_points: int, radius_mm: float |
             near = near[thinned(points[near], start.radius / EVIDENCE_CELLS)]
         off = np.abs(start.residuals(points[near]))
         close = off < BAND * start.radius
-        if np.count_nonzero(close) < least // 2 or _facing(points[near], close, start) < ROUGHLY_FACING:
+        if np.count_nonzero(close) < least // 2 or facing(points[near], close, start) < ROUGHLY_FACING:
             return None
         scale = max(2.0 * MAD_TO_SD * float(np.median(off[close])), LEAST_SCALE * start.radius)
         fit = robust_fit(points[near], start, scale, radius_mm, None if scanner is None else scanner[near])
@@ -376,9 +358,7 @@ def _accepted(cloud: Cloud, start: Sphere, least_points: int, radius_mm: float |
         return None
     around = int(np.count_nonzero(fit.sphere.residuals(points[near]) <= 0.4 * fit.sphere.radius))
     share = float(fit.inliers.sum() / max(around, 1))
-    inliers = np.zeros(len(points), bool)
-    inliers[near] = fit.inliers
-    return Ball(RobustFit(fit.sphere, inliers, fit.scale, fit.converged), min(1.0, share))
+    return Ball(fit.in_place(len(points), near, np.zeros(3)), min(1.0, share))
 
 
 def _stands_out(points: Floats, fit: RobustFit, least_points: int) -> bool:
@@ -390,104 +370,17 @@ def _stands_out(points: Floats, fit: RobustFit, least_points: int) -> bool:
         return False
     if not np.sqrt(np.diag(ball.covariance).max()) <= LARGEST_SD * ball.radius:
         return False
-    if not _redundant(points[fit.inliers], fit):
+    if not redundant(points[fit.inliers], fit):
         return False
-    off = ball.residuals(points)
-    departure = _misfit(points[fit.inliers], off[fit.inliers], ball, fit.scale)
-    if departure > max(MISFIT * fit.scale, ROUND * ball.radius):
+    on, residual = points[fit.inliers], fit.residuals[fit.inliers]
+    if misfit(on, residual, ball, fit.scale) > largest_misfit(fit):
         return False
     rows = thinned(points, ball.radius / EVIDENCE_CELLS)
-    if _facing(points[rows], fit.inliers[rows], ball) < FACING:
+    if facing(points[rows], fit.inliers[rows], ball) < FACING:
         return False
-    if not _denser(points[rows], ball, STANDS_OUT, fit.scale):
+    if not denser(points[rows], ball, STANDS_OUT, fit.scale):
         return False
-    on = points[fit.inliers]
-    return _is_noise(on, off[fit.inliers], ball)
-
-
-def _denser(points: Floats, ball: Sphere, times: float, scale: float | None = None) -> bool:
-    """Whether a shell at the surface has some times the points of those of equal width outside and inside it."""
-    off = ball.residuals(points)
-    if scale is None:
-        close = np.abs(off[np.abs(off) < BAND * ball.radius])
-        scale = max(robust_sd(close), LEAST_SCALE * ball.radius)
-    width = 3.0 * scale
-    at = np.count_nonzero(np.abs(off) <= width)
-    outside = np.count_nonzero((off > width) & (off <= 3.0 * width))
-    inside = np.count_nonzero((off < -width) & (off >= -3.0 * width))
-    return bool(at >= max(times * max(outside, inside), 1))
-
-
-def _redundant(points: Floats, fit: RobustFit) -> bool:
-    """Whether either half of the points (n, 3) determines the sphere, whichever way they are parted.
-
-    Two lines of a scanner on any round body lie on a sphere: one line predicts nothing about the other.
-    """
-    ball = fit.sphere
-    radial = (points - ball.centre) / np.linalg.norm(points - ball.centre, axis=1)[:, None]
-    J = np.column_stack([radial, np.ones(len(radial))])[:, : 4 if ball.covariance[3, 3] > 0.0 else 3]
-    least = (fit.scale / (LARGEST_HALF_SD * ball.radius)) ** 2
-    for axis in np.linalg.svd(radial - radial.mean(axis=0), full_matrices=False)[2]:
-        along = radial @ axis
-        middle = float(np.median(along))
-        for half in (J[along <= middle], J[along >= middle]):
-            if np.linalg.eigvalsh(half.T @ half)[0] < least:
-                return False
-    return True
-
-
-def _is_noise(points: Floats, residual: Floats, ball: Sphere) -> bool:
-    """Whether residuals (n,) of points (n, 3) are noise and not the shape of another body, or are small.
-
-    Those of neighbours differ (von Neumann 1941), and an ellipsoid explains little of them.
-    """
-    sd = float(np.sqrt(np.mean(residual**2)))
-    if sd <= SMALL * ball.radius:
-        return True
-    nearest = cKDTree(points).query(points, k=2)[1][:, 1]
-    if np.sqrt(np.mean((residual - residual[nearest]) ** 2) / 2.0) < WHITE * sd:
-        return False
-    x, y, z = ((points - ball.centre) / ball.radius).T
-    A = np.column_stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, y * z, z * x])
-    left = residual - A @ np.linalg.lstsq(A, residual, rcond=None)[0]
-    return bool(np.sum(left**2) >= (1.0 - EXPLAINED) * np.sum(residual**2))
-
-
-def _facing(points: Floats, on: npt.NDArray[np.bool_], ball: Sphere) -> float:
-    """Median cosine between the normals of neighbourhoods of points (n, 3), on the ball or not, and its radii.
-
-    Tubes, edges and volumes that only cross the surface have other normals. A neighbourhood is about a tenth of the
-    ball's points, so that it is wide compared with the noise at any density. Where the ball was scanned in few lines
-    one line has as many, which has no normal: neighbourhoods are then wider.
-    """
-    query = points[on][:: max(1, int(on.sum()) // 200)]
-    if not len(query):
-        return 0.0
-    tree, radial = cKDTree(points), query - ball.centre
-    cosine = np.empty(len(query))
-    left = np.arange(len(query))
-    for share in NEIGHBOURHOODS:
-        k = min(len(points), max(8, int(share * on.sum())))
-        near = points[tree.query(query[left], k=k)[1]]
-        near = near - near.mean(axis=1, keepdims=True)
-        variance, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", near, near))
-        normal = axes[:, :, 0]
-        cosine[left] = np.abs(np.sum(normal * radial[left], axis=1)) / np.linalg.norm(radial[left], axis=1)
-        left = left[variance[:, 1] < OF_A_LINE * variance[:, 2]]
-        if not len(left):
-            break
-    return float(np.median(cosine))
-
-
-def _misfit(points: Floats, residual: Floats, ball: Sphere, scale: float) -> float:
-    """Systematic part in mm of the residuals (n,): means of cells beyond noise, median over the points.
-
-    The median is used because a real scan of a good ball departs from the sphere at the limb.
-    """
-    cell = np.unique(sphere_cells(points, ball.centre), return_inverse=True)[1]
-    count = np.bincount(cell)
-    mean = np.bincount(cell, residual) / count
-    return float(np.median(np.sqrt(np.maximum(mean**2 - scale**2 / count, 0.0))[cell]))
+    return is_noise(on, residual, ball)
 
 
 # --- noise of the cloud ----------------------------------------------------------------------------------------------

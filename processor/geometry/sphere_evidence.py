@@ -1,0 +1,161 @@
+"""Whether points on a fitted sphere are those of a ball: density, normals, systematic residuals, redundancy."""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from scipy.spatial import cKDTree
+
+from processor.geometry.linalg_small import eigen
+from processor.geometry.sphere import Sphere, sphere_cells
+from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit
+from processor.model import Bools, Floats, Ints
+from processor.robust_statistics import robust_sd
+
+BAND = 0.1  # half-width of a proposal's surface, in radii
+NEIGHBOURHOODS = (0.1, 0.2, 0.4)  # of the ball's points, the least that is no line
+MOST_NORMALS = 200  # points of a ball that have normals
+OF_A_LINE = 0.05  # ratio of the variances along and across the neighbourhood of a line
+SMALL = 0.005  # residuals, in radii, that are accepted even if they are systematic: the shape of the ball
+WHITE = 0.5  # sd of residuals by the differences of neighbours, over that of all: those of scanners are correlated
+EXPLAINED = 0.3  # share of the residuals' squares that an ellipsoid may explain
+LARGEST_HALF_SD = 0.15  # of the radius or, where it is fixed, of the centre, in radii, by half of the points
+MISFIT = 0.5  # of the scale: cell means of residuals on a ball are noise alone
+ROUND = 0.02  # of the radius: nothing but a ball departs from a sphere by less
+EVIDENCE_CELLS = 12.0  # of a thinned cloud, in a ball's radius
+
+
+def thinned(points: Floats, cell: float) -> Ints:
+    """Rows of the first point in every cell of a grid of this edge."""
+    lower = points.min(axis=0)
+    size = max(cell, float(np.ptp(points, axis=0).max()) / (1 << 20))  # 21 bits per axis
+    i, j, k = np.floor((points - lower) / size).astype(np.int64).T
+    return np.sort(np.unique(i << 42 | j << 21 | k, return_index=True)[1])
+
+
+def denser(points: Floats, ball: Sphere, times: float, scale: float | None = None) -> bool:
+    """Whether a shell at the surface has some times the points of those of equal width outside and inside it."""
+    off = ball.residuals(points)
+    if scale is None:
+        close = np.abs(off[np.abs(off) < BAND * ball.radius])
+        scale = max(robust_sd(close), LEAST_SCALE * ball.radius)
+    width = 3.0 * scale
+    at = np.count_nonzero(np.abs(off) <= width)
+    outside = np.count_nonzero((off > width) & (off <= 3.0 * width))
+    inside = np.count_nonzero((off < -width) & (off >= -3.0 * width))
+    return bool(at >= max(times * max(outside, inside), 1))
+
+
+def redundant(points: Floats, fit: RobustFit) -> bool:
+    """Whether either half of the points (n, 3) determines the sphere, whichever way they are parted.
+
+    Two lines of a scanner on any round body lie on a sphere: one line predicts nothing about the other.
+    """
+    ball = fit.sphere
+    radial = (points - ball.centre) / np.linalg.norm(points - ball.centre, axis=1)[:, None]
+    J = np.column_stack([radial, np.ones(len(radial))])[:, : 4 if ball.covariance[3, 3] > 0.0 else 3]
+    least = (fit.scale / (LARGEST_HALF_SD * ball.radius)) ** 2
+    off = radial - radial.mean(axis=0)
+    for axis in np.linalg.eigh(off.T @ off)[1].T:
+        along = radial @ axis
+        middle = float(np.median(along))
+        for half in (J[along <= middle], J[along >= middle]):
+            if np.linalg.eigvalsh(half.T @ half)[0] < least:
+                return False
+    return True
+
+
+def is_noise(points: Floats, residual: Floats, ball: Sphere, white: float = WHITE, small: float = SMALL) -> bool:
+    """Whether residuals (n,) of points (n, 3) are noise and not the shape of another body, or are small.
+
+    Those of neighbours differ (von Neumann 1941): their sd is at least ``white`` times that of all. An ellipsoid
+    explains little of them. Below ``small``, in radii, they are accepted whatever they are.
+    """
+    sd = float(np.sqrt(np.mean(residual**2)))
+    if sd <= small * ball.radius:
+        return True
+    # By direction: in space the nearest of several at about one distance is that of the most similar residual.
+    radial = (points - ball.centre) / np.linalg.norm(points - ball.centre, axis=1)[:, None]
+    nearest = cKDTree(radial).query(radial, k=2)[1][:, 1]
+    if np.sqrt(np.mean((residual - residual[nearest]) ** 2) / 2.0) < white * sd:
+        return False
+    x, y, z = radial.T
+    A = np.column_stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, y * z, z * x])
+    left = residual - A @ np.linalg.lstsq(A, residual, rcond=None)[0]
+    return bool(np.sum(left**2) >= (1.0 - EXPLAINED) * np.sum(residual**2))
+
+
+def facing(points: Floats, on: Bools, ball: Sphere) -> float:
+    """Median cosine between the normals of neighbourhoods of points (n, 3), on the ball or not, and its radii.
+
+    Tubes, edges and volumes that only cross the surface have other normals. A neighbourhood is about a tenth of the
+    ball's points, so that it is wide compared with the noise at any density. Where the ball was scanned in few lines
+    one line has as many, which has no normal: neighbourhoods are then wider.
+    """
+    count = int(np.count_nonzero(on))
+    query = points[on][:: max(1, count // MOST_NORMALS)]
+    if not len(query):
+        return 0.0
+    points = np.ascontiguousarray(points)
+    tree = cKDTree(points)
+    cosine, left = np.zeros(len(query)), np.arange(len(query))
+    for share in NEIGHBOURHOODS:
+        k = min(len(points), max(8, int(share * count)))
+        near = tree.query(query[left], k=k)[1].reshape(len(left), k)
+        line = np.zeros(len(left), bool)
+        _cosines(points, near, query, left, ball.centre, cosine, line)
+        left = left[line]
+        if not len(left):
+            break
+    return float(np.median(cosine))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cosines(points, near, places, rows, centre, cosine, line):  # type: ignore[no-untyped-def]
+    """Fill the cosines at some rows of places (m, 3) by neighbours ``near`` (k, j), and whether these are a line (k,).
+
+    The cosine is between the radius and the normal of the neighbours: their direction of least variance.
+    """
+    C, V, mean, order = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3, np.int64)
+    for q in range(len(rows)):
+        for a in range(3):
+            mean[a] = 0.0
+            for row in near[q]:
+                mean[a] += points[row, a] / near.shape[1]
+        for a in range(3):
+            for b in range(a + 1):
+                C[a, b] = 0.0
+                for row in near[q]:
+                    C[a, b] += (points[row, a] - mean[a]) * (points[row, b] - mean[b])
+                C[b, a] = C[a, b]
+        eigen(C, V)
+        for a in range(3):
+            order[a] = a
+        for a in range(1, 3):  # by insertion
+            for b in range(a, 0, -1):
+                if C[order[b], order[b]] < C[order[b - 1], order[b - 1]]:
+                    order[b], order[b - 1] = order[b - 1], order[b]
+        inner_product, length = 0.0, 0.0
+        for a in range(3):
+            out = places[rows[q], a] - centre[a]
+            inner_product += V[a, order[0]] * out
+            length += out * out
+        cosine[rows[q]] = abs(inner_product) / np.sqrt(length)
+        line[q] = C[order[1], order[1]] < OF_A_LINE * C[order[2], order[2]]
+
+
+def misfit(points: Floats, residual: Floats, ball: Sphere, scale: float) -> float:
+    """Systematic part in mm of the residuals (n,): means of cells beyond noise, median over the points.
+
+    The median is used because a real scan of a good ball departs from the sphere at the limb.
+    """
+    cell = np.unique(sphere_cells(points, ball.centre), return_inverse=True)[1]
+    count = np.bincount(cell)
+    mean = np.bincount(cell, residual) / count
+    return float(np.median(np.sqrt(np.maximum(mean**2 - scale**2 / count, 0.0))[cell]))
+
+
+def largest_misfit(fit: RobustFit) -> float:
+    """Return the systematic part of the residuals, mm, up to which a fit is that of a ball."""
+    return max(MISFIT * fit.scale, ROUND * fit.sphere.radius)

@@ -1,0 +1,223 @@
+"""Robust geometric fit of one sphere, by orthogonal distances or by ranges along the rays of a scanner."""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+
+from processor.geometry.linalg_small import DEFINITE, factorise, substitute
+from processor.geometry.selection import median
+from processor.geometry.sphere import Sphere
+from processor.inner_kernels import inner, inner_ieee
+from processor.model import Bools, Floats, Ints
+from processor.robust_statistics import MAD_TO_SD, TUKEY
+
+LEAST_SCALE = 1e-8  # of the radius: below any noise, above the rounding of points without noise
+WINDOW = 4.0  # in scales: residuals within it determine the scale
+STEEPEST = 0.3  # cosine of incidence below which the beam is split at the limb, and errors of angles dominate
+ITERATIONS = 100
+FREE_ITERATIONS = 40  # then the scale is fixed and rays that missed the ball stay out, so that the fit converges
+LEAST = 6
+LONGEST_STEP = 0.2  # of the radius: on a flat cap an unlimited step may leave the ball
+SHORTEST_STEP = 1e-10  # of the radius: converged
+LARGEST_GROWTH = 1e3  # of the radius
+WORST_CONDITION = 1e12
+NO_FIT, FITTED, CONVERGED = range(3)
+
+
+@dataclass(frozen=True)
+class RobustFit:
+    """The sphere, the points (n,) of weight > 0, the scale (sd) of their residuals and whether the fit converged.
+
+    ``residuals`` (n,), mm, are those of the fit: distances or ranges, NaN where a ray misses the sphere.
+    """
+
+    sphere: Sphere
+    inliers: Bools
+    scale: float
+    converged: bool
+    residuals: Floats
+
+    def in_place(self, count: int, rows: Ints, origin: Floats) -> RobustFit:
+        """Return the fit as one to ``count`` points of which it had these rows (n,), less the origin."""
+        inliers, residuals = np.zeros(count, bool), np.full(count, np.nan)
+        inliers[rows], residuals[rows] = self.inliers, self.residuals
+        sphere = replace(self.sphere, centre=self.sphere.centre + origin)
+        return replace(self, sphere=sphere, inliers=inliers, residuals=residuals)
+
+
+def robust_fit(
+    points: Floats,
+    start: Sphere,
+    scale_mm: float,
+    radius_mm: float | None = None,
+    scanner: Floats | None = None,
+) -> RobustFit | None:
+    """Fit a sphere to points (n, 3), of which many lie on something else, by Gauss-Newton with Tukey's biweight.
+
+    The residual is the orthogonal distance or, where the scanner's position is known, the measured range minus the
+    range at which the ray meets the sphere: noise runs along the ray, and only the second is unbiased for a ball seen
+    from one side.
+
+    Parameters
+    ----------
+    points : (n, 3), mm
+    start : initial sphere, within a few scales of the ball; points more than a few ``scale_mm`` off it have weight 0.
+    scale_mm : first scale of the residuals, an upper limit. The scale then follows from the median of the residuals in
+        a window of 4 scales, so that many points off the sphere on one side do not widen it.
+    radius_mm : fixed radius; its variance and covariances are then 0. None = estimated.
+    scanner : (n, 3), the position each point was seen from, in the frame of the points; None = unknown.
+
+    None where fewer than six points remain, or they do not determine a sphere. The covariance is the sandwich
+    A^-1 B A^-1 of an M-estimator (Huber and Ronchetti 2009, eq. 6.6, times n / (n - p)). It assumes independent
+    residuals: errors common to all points (registration, a bias of the scanner) are not included.
+    """
+    origin = start.centre
+    seen_from = np.empty((0, 3)) if scanner is None else np.ascontiguousarray(scanner - origin)
+    state = np.append(np.zeros(3), start.radius if radius_mm is None else radius_mm)
+    free = 4 if radius_mm is None else 3
+    residual, J = np.empty(len(points)), np.empty((len(points), 4))
+    local = np.ascontiguousarray(points - origin)
+    outcome, scale = _iterate(local, seen_from, state, free, scale_mm, start.radius, residual, J)
+    if outcome == NO_FIT:
+        return None
+    covariance = np.zeros((4, 4))
+    covariance[:free, :free] = _sandwich(J[:, :free], residual / scale, scale)
+    inliers = np.asarray(np.abs(residual) < TUKEY * scale, bool)
+    sphere = Sphere(origin + state[:3], float(state[3]), covariance)
+    return RobustFit(sphere, inliers, scale, outcome == CONVERGED, residual)
+
+
+def bound(points: Floats, fit: RobustFit, radius_held: bool = False, scanner: Floats | None = None) -> Floats:
+    """Cramér-Rao bound (4, 4) of the covariance of an unbiased estimate from the points of a fit.
+
+    Every inlier has full weight and normal noise of the fit's scale; ``points`` (n, 3) and ``scanner`` (n, 3) are those
+    that were fitted. NaN where the points do not determine the sphere.
+    """
+    state = np.append(np.zeros(3), fit.sphere.radius)
+    local = points[fit.inliers] - fit.sphere.centre
+    seen_from = np.empty((0, 3)) if scanner is None else scanner[fit.inliers] - fit.sphere.centre
+    residual, J = np.empty(len(local)), np.empty((len(local), 4))
+    _linearise(local, seen_from, state, residual, J)
+    free = 3 if radius_held else 4
+    J = J[np.isfinite(residual), :free]
+    covariance = np.zeros((4, 4))
+    N = J.T @ J
+    covariance[:free, :free] = fit.scale**2 * np.linalg.inv(N) if np.linalg.cond(N) < WORST_CONDITION else np.nan
+    return covariance
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _iterate(points, seen_from, state, free, largest_scale, radius, residual, J):  # type: ignore[no-untyped-def]
+    """Move ``state`` (x, y, z, radius) to the fit; returns the outcome and the scale of the residuals (n,) filled."""
+    scale, tiny = largest_scale, LEAST_SCALE * radius
+    considered, sizes, step = np.ones(len(points), np.bool_), np.empty(len(points)), np.empty(4)
+    outcome = FITTED
+    for iteration in range(ITERATIONS):
+        _linearise(points, seen_from, state, residual, J)
+        if iteration < FREE_ITERATIONS:
+            scale = min(largest_scale, max(_scale(residual, sizes, scale), tiny))
+        else:
+            for i in range(len(points)):
+                considered[i] &= np.isfinite(residual[i])
+        if not _step(residual, J, considered, free, scale, step):
+            return NO_FIT, scale
+        length = 0.0
+        for a in range(free):
+            length += step[a] * step[a]
+        length = np.sqrt(length)
+        share = min(1.0, LONGEST_STEP * state[3] / max(length, 1e-300))
+        for a in range(free):
+            state[a] += share * step[a]
+        if not 0.0 < state[3] < LARGEST_GROWTH * radius:
+            return NO_FIT, scale
+        if length < SHORTEST_STEP * state[3]:
+            outcome = CONVERGED
+            break
+    _linearise(points, seen_from, state, residual, J)
+    return outcome, scale
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _linearise(points, seen_from, state, residual, J):  # type: ignore[no-untyped-def]
+    """Fill residuals (n,), measured minus model, and the model's derivatives (n, 4).
+
+    Without positions ``seen_from`` (n, 3) these are orthogonal distances. NaN where a ray misses the sphere or meets
+    it too steeply.
+    """
+    radius = state[3]
+    for i in range(len(points)):
+        if len(seen_from) == 0:
+            x, y, z = points[i, 0] - state[0], points[i, 1] - state[1], points[i, 2] - state[2]
+            length = np.sqrt(x * x + y * y + z * z)
+            residual[i] = length - radius
+            length = max(length, 1e-300)
+            J[i, 0], J[i, 1], J[i, 2], J[i, 3] = x / length, y / length, z / length, 1.0
+            continue
+        x, y, z = points[i, 0] - seen_from[i, 0], points[i, 1] - seen_from[i, 1], points[i, 2] - seen_from[i, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        least = max(length, 1e-300)
+        x, y, z = x / least, y / least, z / least
+        u, v, w = state[0] - seen_from[i, 0], state[1] - seen_from[i, 1], state[2] - seen_from[i, 2]
+        along = x * u + y * v + z * w
+        u, v, w = u - along * x, v - along * y, w - along * z
+        under = radius * radius - (u * u + v * v + w * w)
+        if not under > (STEEPEST * radius) ** 2:
+            residual[i] = np.nan
+            J[i, 0], J[i, 1], J[i, 2], J[i, 3] = 0.0, 0.0, 0.0, 0.0
+            continue
+        root = np.sqrt(under)
+        residual[i] = length - (along - root)
+        J[i, 0], J[i, 1], J[i, 2], J[i, 3] = x + u / root, y + v / root, z + w / root, -radius / root
+
+
+@inner
+def _scale(residual, sizes, scale):  # type: ignore[no-untyped-def]
+    """Return the standard deviation by the median size of the residuals (n,) within 4 scales."""
+    count = 0
+    for i in range(len(residual)):
+        if abs(residual[i]) <= WINDOW * scale:
+            sizes[count] = abs(residual[i])
+            count += 1
+    return MAD_TO_SD * median(sizes, count) if count else scale
+
+
+@inner_ieee
+def _step(residual, J, considered, free, scale, step):  # type: ignore[no-untyped-def]
+    """Fill the Gauss-Newton step with Tukey's weights; False where the points do not determine a sphere."""
+    N, L, near = np.zeros((4, 4)), np.zeros((4, 4)), 0
+    for a in range(4):
+        step[a] = 0.0
+    for i in range(len(residual)):
+        if not (considered[i] and abs(residual[i]) < TUKEY * scale):
+            continue
+        near += 1
+        weight = (1.0 - (residual[i] / (TUKEY * scale)) ** 2) ** 2
+        for a in range(free):
+            step[a] += weight * J[i, a] * residual[i]
+            for b in range(a + 1):
+                N[a, b] += weight * J[i, a] * J[i, b]
+    if near < LEAST or not factorise(N, free, DEFINITE, L):
+        return False
+    substitute(L, free, step)
+    return True
+
+
+def _sandwich(J: Floats, u: Floats, scale: float) -> Floats:
+    """Covariance of the estimate from derivatives J (n, p) and residuals u (n,) in scales."""
+    near = np.abs(u) < TUKEY
+    J, u = J[near], u[near]
+    q = 1.0 - (u / TUKEY) ** 2
+    psi, slope = u * q**2, q * (1.0 - 5.0 * (u / TUKEY) ** 2)
+    n, p = J.shape
+    A = (J * slope[:, None]).T @ J
+    B = (J * (psi**2)[:, None]).T @ J
+    if np.linalg.cond(A) > WORST_CONDITION:
+        return np.full((p, p), np.nan)
+    inverse = np.linalg.inv(A)
+    covariance = scale**2 * n / max(n - p, 1) * inverse @ B @ inverse
+    symmetric: Floats = 0.5 * (covariance + covariance.T)
+    return symmetric

@@ -1,0 +1,144 @@
+"""The sphere of a crop, among what it stands on and touches, and bodies that are none."""
+
+import numpy as np
+import pytest
+
+import processor
+from processor.model import Status
+from processor.space_frame.spheres import sphere_detection
+from processor.targets import sphere_of_crop
+
+RADIUS = 60.0
+SCANNER = np.array([0.0, 0.0, 12_000.0])
+
+
+def directions(rng, count):
+    """Unit vectors (count, 3), of a sphere alike in all directions."""
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+
+
+def seen(rng, points, normals, noise):
+    """Points (n, 3) whose surface faces the scanner, with noise along their rays."""
+    ray = points - SCANNER
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    facing = np.einsum("ni,ni->n", ray, normals) < 0.0
+    return points[facing] + rng.normal(0.0, noise, (np.count_nonzero(facing), 1)) * ray[facing]
+
+
+def tube(rng, axis, radius, count, length=110.0):
+    """Points and normals (n, 3) of a tube from the middle of the ball, without those within it."""
+    across = np.linalg.svd(axis[None])[2][1:]
+    turn, along = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(0.0, length, count)
+    normals = np.cos(turn)[:, None] * across[0] + np.sin(turn)[:, None] * across[1]
+    points = radius * normals + along[:, None] * axis
+    outside = np.linalg.norm(points, axis=1) > RADIUS
+    return points[outside], normals[outside]
+
+
+def ball_with_tubes(rng, noise, count=1500):
+    """Points (n, 3) of a ball of a space frame and of four tubes, cut 25 mm beyond the ball."""
+    normals = directions(rng, count)
+    bodies = [(RADIUS * normals, normals), *(tube(rng, axis, 25.0, 500) for axis in directions(rng, 4))]
+    points = np.vstack([seen(rng, *body, noise) for body in bodies])
+    return points[np.linalg.norm(points, axis=1) < RADIUS + 25.0]
+
+
+@pytest.mark.parametrize("scanner", [None, SCANNER])
+def test_balls_with_tubes_are_found_and_their_intervals_hold(scanner):
+    """Of 40 intervals of 95 %, 34 or more hold in all but 3 of 1000 series (binomial)."""
+    found, inside = 0, 0
+    for seed in range(40):
+        fit = processor.fit_sphere(ball_with_tubes(np.random.default_rng(seed), 1.5), scanner=scanner)
+        found += fit.status is Status.OK
+        inside += abs(fit.radius - RADIUS) < 1.96 * np.sqrt(fit.covariance[3, 3])
+        assert np.linalg.norm(fit.centre) < 0.05 * RADIUS
+    assert found >= 36
+    assert inside >= 34
+
+
+def test_a_fit_uses_the_noise_of_the_points_and_not_the_width_of_its_band():
+    """Of a ball alone all points agree: the standard deviation is that of a fit to all, by the number of points."""
+    ratios = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        points = (RADIUS + rng.normal(0.0, 1.5, (1000, 1))) * directions(rng, 1000)
+        fit = sphere_of_crop.find(points, 40, None, None).fit
+        ratios.append(np.sqrt(fit.sphere.covariance[3, 3]) / (1.5 / np.sqrt(1000.0)))
+    assert 0.9 < np.median(ratios) < 1.2  # Tukey's weights are 95 % efficient
+
+
+def test_points_in_any_order_and_anywhere_give_one_sphere():
+    rng = np.random.default_rng(3)
+    points = np.round(ball_with_tubes(rng, 1.0), 3)
+    one = processor.fit_sphere(points)
+    other = processor.fit_sphere(points[rng.permutation(len(points))])
+    assert (one.radius, one.points) == (pytest.approx(other.radius, abs=1e-9), other.points)
+    far = np.array([4.0e8, 5.0e9, 3.0e5])
+    moved = processor.fit_sphere(points + far)
+    np.testing.assert_allclose(moved.centre - far, one.centre, atol=1e-4)
+
+
+def test_a_known_radius_is_held():
+    fit = processor.fit_sphere(ball_with_tubes(np.random.default_rng(5), 1.5), radius=RADIUS)
+    assert (fit.status, fit.radius) == (Status.OK, RADIUS)
+    assert np.linalg.norm(fit.centre) < 1.0
+
+
+def flattened(rng):
+    normals = directions(rng, 3000)
+    return seen(rng, RADIUS * normals * [1.0, 0.85, 1.0], normals, 0.5)
+
+
+def cylinder(rng):
+    turn, along = rng.uniform(0.0, 2.0 * np.pi, 3000), rng.uniform(-60.0, 60.0, 3000)
+    normals = np.column_stack([np.zeros(3000), np.cos(turn), np.sin(turn)])
+    return seen(rng, RADIUS * normals + np.column_stack([along, np.zeros((3000, 2))]), normals, 0.5)
+
+
+def corner(rng):
+    sides = [np.insert(rng.uniform(0.0, 100.0, (1000, 2)), axis, 0.0, axis=1) for axis in range(3)]
+    return np.vstack(sides) + rng.normal(0.0, 0.5, (3000, 3))
+
+
+def torus(rng):
+    ring, turn = rng.uniform(0.0, np.pi, 3000), rng.uniform(0.0, 2.0 * np.pi, 3000)
+    out = np.column_stack([np.cos(ring), np.sin(ring), np.zeros(3000)])
+    normals = np.cos(turn)[:, None] * out + np.sin(turn)[:, None] * [0.0, 0.0, 1.0]
+    return seen(rng, 70.0 * out + 40.0 * normals, normals, 0.5)
+
+
+def volume(rng):
+    return rng.uniform(-60.0, 60.0, (800, 3))
+
+
+@pytest.mark.parametrize("body", [flattened, cylinder, corner, torus, volume])
+def test_other_bodies_are_no_sphere_without_a_doubt(body):
+    for seed in range(5):
+        fit = processor.fit_sphere(body(np.random.default_rng(seed)))
+        assert fit.status is not Status.OK
+        assert fit.reasons
+
+
+def test_a_likely_sphere_is_weak_and_states_why():
+    fit = processor.fit_sphere(flattened(np.random.default_rng(1)))
+    assert fit.status is Status.WEAK
+    assert "spheres.not-only-sphere" in [one.code for one in fit.reasons]
+
+
+def test_flat_surfaces_without_noise_do_not_make_a_sphere_rough(monkeypatch):
+    """As of exact points beside a wall: a scale of rounding errors has no ratio to a noise of nothing."""
+    monkeypatch.setattr(sphere_detection, "flat_noise", lambda *_: 0.0)
+    fit = processor.fit_sphere(RADIUS * directions(np.random.default_rng(6), 1500))
+    assert (fit.status, fit.radius) == (Status.OK, pytest.approx(RADIUS, abs=1e-6))
+
+
+def test_noise_at_the_limb_does_not_show_a_wrong_scanner():
+    rng = np.random.default_rng(7)
+    normals = directions(rng, 2000)
+    points = seen(rng, 35.0 * normals, normals, 1.7)
+    turn = rng.uniform(0.0, 2.0 * np.pi, 100)
+    beyond = 35.0 * np.column_stack([0.98 * np.cos(turn), 0.98 * np.sin(turn), np.full(100, -0.2)])  # one sd and a half
+    fit = processor.fit_sphere(np.vstack([points, beyond]), scanner=SCANNER)
+    assert fit.status is Status.OK
+    assert abs(fit.radius - 35.0) < 1.0
