@@ -7,7 +7,7 @@ sorted by block, cell and coordinates, so that results computed from them do not
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -195,16 +195,24 @@ def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
     return PointGrid(table, grid.order[rows])
 
 
-def rows_within(cells: Cells, low: Floats, high: Floats) -> Ints:
-    """Return the rows, in the grid's order, of the points of the blocks that a box from ``low`` to ``high`` meets."""
-    return _rows_of(cells.starts[_blocks_within(cells, low, high)])[0]
+def rows_within(cells: Cells, low: Floats, high: Floats) -> Iterator[Ints]:
+    """Yield the rows, in the grid's order, of the points of the blocks that a box from ``low`` to ``high`` meets.
+
+    They come some at a time: those of a block of a dense cloud are many.
+    """
+    starts = cells.starts[_blocks_within(cells, low, high)]
+    number = np.cumsum(starts[:, -1] - starts[:, 0]) // large_arrays.BLOCK_ROWS
+    for part in large_arrays.parts_of(np.flatnonzero(np.diff(number, append=-1)) + 1):
+        yield _rows_of(starts[part])[0]
 
 
 def _rows_of(starts: Ints) -> tuple[Ints, Ints]:
     """Return the rows (n,) of blocks by the starts (b, 65) of their cells, and where each block's rows begin (b,)."""
     count = starts[:, -1] - starts[:, 0]
     begin = np.cumsum(count) - count
-    return np.repeat(starts[:, 0] - begin, count) + np.arange(int(count.sum())), begin
+    rows = np.repeat(starts[:, 0] - begin, count)
+    rows += np.arange(len(rows))
+    return rows, begin
 
 
 def _blocks_within(cells: Cells, low: Floats, high: Floats) -> Ints:

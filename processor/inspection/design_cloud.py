@@ -58,9 +58,10 @@ class DesignCloud:
         box = np.floor(places / BOX_MM).astype(np.int64)
         for corner in distinct(box).rows:
             together = places[(box == corner).all(axis=1)]
-            rows = point_grid.rows_within(self.cells, together.min(axis=0) - radius, together.max(axis=0) + radius)
-            rows = rows[within_reach(self.cells.points[rows], together, radius)[0]]
-            found += [rows[some][keep(self._seen(rows[some]))] for some in blocks(len(rows))]
+            low, high = together.min(axis=0) - radius, together.max(axis=0) + radius
+            for some in point_grid.rows_within(self.cells, low, high):
+                rows = some[within_reach(self.cells.points[some], together, radius)[0]]
+                found.append(rows[keep(self._seen(rows))])
         return self._seen(np.unique(np.concatenate(found)))
 
     def _seen(self, rows: Ints) -> SeenPoints:

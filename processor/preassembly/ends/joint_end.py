@@ -155,14 +155,10 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
 
     The fit is completed by :func:`estimate`; a JointEnd without an answer is final.
     """
-    part = part.only(_about_zone(part.points, place))
-    local = rigid.apply(rigid.invert(place.T_bridge_joint), part.points)
-    depth = -place.outward * local[:, 0]
-    beside = np.abs(local[:, 1:]) < place.half[1:] + REACH_MM
-    zone = (depth < ZONE_MM) & (depth > -REACH_MM) & beside.all(axis=1)
-    if zone.sum() < 5 * LEAST_POINTS:
+    part = part.only(_in_zone(part.points, place))
+    if len(part.points) < 5 * LEAST_POINTS:
         return unknown(reason("preassemble.few-points-at-joint"))
-    part, local = part.only(zone), local[zone]
+    local = rigid.apply(rigid.invert(place.T_bridge_joint), part.points)
     thickness = _design_thickness(part.surface, place)
     faces = ends_faces.fit(part, local, place, thickness)
     if isinstance(faces, Reason):
@@ -191,11 +187,19 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
     )
 
 
-def _about_zone(points: Floats, place: EndPlace) -> Bools:
-    """Mark the points (n, 3) in a sphere about the joint's zone: a few of those of a long part."""
+def _in_zone(points: Floats, place: EndPlace) -> Bools:
+    """Mark the points (n, 3) in the joint's zone: a few of those of a long part, first those in a sphere about it."""
     sizes = np.array([0.5 * (ZONE_MM + REACH_MM), *(place.half[1:] + REACH_MM)])
     middle = rigid.apply(place.T_bridge_joint, np.array([[0.5 * place.outward * (REACH_MM - ZONE_MM), 0.0, 0.0]]))
-    return within_reach(points, middle, float(np.linalg.norm(sizes)) + 1.0)[0]
+    marked = within_reach(points, middle, float(np.linalg.norm(sizes)) + 1.0)[0]
+    T_joint_bridge = rigid.invert(place.T_bridge_joint)
+    for block in large_arrays.blocks(len(points)):
+        rows = block.start + np.flatnonzero(marked[block])
+        local = rigid.apply(T_joint_bridge, points[rows])
+        depth = -place.outward * local[:, 0]
+        beside = np.abs(local[:, 1:]) < place.half[1:] + REACH_MM
+        marked[rows] = (depth < ZONE_MM) & (depth > -REACH_MM) & beside.all(axis=1)
+    return marked
 
 
 def estimate(ends: Sequence[FittedEnd], between: Sequence[Variances] = ()) -> list[JointEnd]:
