@@ -100,9 +100,9 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     Spheres through four points, drawn from all, propose the sphere; where it is a small share of the points, patches
     of every size do. Gauss-Newton with Tukey's biweight then fits it. The residual is the orthogonal distance, or with
     ``scanner`` the difference of ranges along the ray, which has no bias where a sphere is partly seen. The covariance
-    is that of an M-estimator (Huber and Ronchetti 2009, "Robust Statistics", 2nd ed., Wiley, eq. 6.6), with what beams
-    add that the sphere cuts at its limb: without ``scanner`` the difference between both residuals, for a sphere that
-    is seen from one side; else the difference from a fit without the rays near the limb.
+    is that of an M-estimator (Huber and Ronchetti 2009, "Robust Statistics", 2nd ed., Wiley, eq. 6.6), with what
+    beams at the limb add, of which the sphere takes only a part: without ``scanner`` the difference between both
+    residuals, for a sphere that is seen from one side; else the difference from a fit without the rays near the limb.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
         seen_from = positions_of(scanner, "scanner", cloud.shape) - origin
         _check_scanner(cloud - origin, seen_from)
     params = Params(radius_mm=float("nan") if held is None else held, max_balls=1)
-    measured = _searched(MergedCloud(cloud - origin, origin, seen_from), params, held)
+    measured = _measured(MergedCloud(cloud - origin, origin, seen_from), params, held)
     balls = measured.balls
     if not len(balls):
         doubt = None if held is None else unit_mistakes.implausible(held)
@@ -154,7 +154,7 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     return fitted
 
 
-def _searched(cloud: MergedCloud, params: Params, held: float | None) -> Result:
+def _measured(cloud: MergedCloud, params: Params, held: float | None) -> Result:
     """Return the sphere that fills most of a cloud, else the one that is found in it, else one that is only likely."""
     least = max(params.min_points, sphere_detection.LEAST_POINTS)
     found = sphere_of_crop.find(cloud.points, least, held, cloud.scanner)
@@ -206,7 +206,8 @@ def _check_scanner(points: Floats, scanner: Floats) -> None:
 def _check_faces(points: Floats, scanner: Floats, sphere: SphereFit) -> None:
     """Raise ValueError where many points on a sphere about (0, 0, 0) face away from the positions (n, 3) given."""
     height = np.linalg.norm(points, axis=1)
-    on = np.abs(height - sphere.radius) < ON_SPHERE * sphere.rms
+    # Of what touches the sphere more is seen, as it lies farther out.
+    on = (height < sphere.radius + sphere.rms) & (height > sphere.radius - ON_SPHERE * sphere.rms)
     normal, sight = points[on] / height[on, None], (scanner - points)[on]
     cosine = np.einsum("ni,ni->n", normal, sight) / np.linalg.norm(sight, axis=1)
     limb = AWAY_COS - ON_SPHERE * sphere.rms / sphere.radius  # noise takes points at the limb beyond it

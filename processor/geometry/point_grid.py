@@ -198,7 +198,7 @@ def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
 def rows_within(cells: Cells, low: Floats, high: Floats) -> Iterator[Ints]:
     """Yield the rows, in the grid's order, of the points of the blocks that a box from ``low`` to ``high`` meets.
 
-    They come some at a time: those of a block of a dense cloud are many.
+    Rows of whole blocks come together, about BLOCK_ROWS at a time.
     """
     starts = cells.starts[_blocks_within(cells, low, high)]
     number = np.cumsum(starts[:, -1] - starts[:, 0]) // large_arrays.BLOCK_ROWS

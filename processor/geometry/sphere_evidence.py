@@ -8,7 +8,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry.linalg_small import eigen
-from processor.geometry.sphere import Sphere, sphere_cells
+from processor.geometry.sphere import Sphere, sphere_cells, visible_fraction
 from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit
 from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd
@@ -19,19 +19,43 @@ MOST_NORMALS = 200  # points of a ball that have normals
 OF_A_LINE = 0.05  # ratio of the variances along and across the neighbourhood of a line
 SMALL = 0.005  # residuals, in radii, that are accepted even if they are systematic: the shape of the ball
 WHITE = 0.5  # sd of residuals by the differences of neighbours, over that of all: those of scanners are correlated
+QUADRIC_TERMS, LEAST_F = 9, 4.0  # of the shape of an ellipsoid; chance exceeds 4 less than once in 10,000
+LARGEST_SHAPE = 0.01  # rms of an ellipsoid's part of the residuals, in radii
 EXPLAINED = 0.3  # share of the residuals' squares that an ellipsoid may explain
 LARGEST_HALF_SD = 0.15  # of the radius or, where it is fixed, of the centre, in radii, by half of the points
 MISFIT = 0.5  # of the scale: cell means of residuals on a ball are noise alone
 ROUND = 0.02  # of the radius: nothing but a ball departs from a sphere by less
-EVIDENCE_CELLS = 12.0  # of a thinned cloud, in a ball's radius
+ROUGHEST = 0.05  # noise over radius, above which a ball is not distinguishable from a cluster of points
+LEAST_VISIBLE = 0.08  # share of the sphere
+LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radii
+STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
+ABOUT = 0.4  # of the radius: points up to there outside are about a ball
+RADIUS_BAND = 0.15  # proposals within this share of a fixed radius
+EVIDENCE_CELLS = 12.0  # of a rows_of_cells cloud, in a ball's radius
 
 
-def thinned(points: Floats, cell: float) -> Ints:
+def rows_of_cells(points: Floats, cell: float) -> Ints:
     """Rows of the first point in every cell of a grid of this edge."""
     lower = points.min(axis=0)
     size = max(cell, float(np.ptp(points, axis=0).max()) / (1 << 20))  # 21 bits per axis
     i, j, k = np.floor((points - lower) / size).astype(np.int64).T
     return np.sort(np.unique(i << 42 | j << 21 | k, return_index=True)[1])
+
+
+def determined(points: Floats, fit: RobustFit, least_points: int) -> bool:
+    """Whether a fit to points (n, 3) converged, with enough of them, of the sphere and of certainty."""
+    ball = fit.sphere
+    if not fit.converged or np.count_nonzero(fit.inliers) < least_points:
+        return False
+    if visible_fraction(points[fit.inliers], ball.centre) < LEAST_VISIBLE:
+        return False
+    return bool(np.sqrt(np.diag(ball.covariance).max()) <= LARGEST_SD * ball.radius)
+
+
+def inlier_share(points: Floats, fit: RobustFit) -> float:
+    """Share of the points (n, 3) about a sphere that lie on it."""
+    around = np.count_nonzero(fit.sphere.residuals(points) <= ABOUT * fit.sphere.radius)
+    return min(1.0, float(fit.inliers.sum() / max(around, 1)))
 
 
 def denser(points: Floats, ball: Sphere, times: float, scale: float | None = None) -> bool:
@@ -47,14 +71,14 @@ def denser(points: Floats, ball: Sphere, times: float, scale: float | None = Non
     return bool(at >= max(times * max(outside, inside), 1))
 
 
-def redundant(points: Floats, fit: RobustFit) -> bool:
+def redundant(points: Floats, fit: RobustFit, radius_held: bool) -> bool:
     """Whether either half of the points (n, 3) determines the sphere, whichever way they are parted.
 
     Two lines of a scanner on any round body lie on a sphere: one line predicts nothing about the other.
     """
     ball = fit.sphere
-    radial = (points - ball.centre) / np.linalg.norm(points - ball.centre, axis=1)[:, None]
-    J = np.column_stack([radial, np.ones(len(radial))])[:, : 4 if ball.covariance[3, 3] > 0.0 else 3]
+    radial = _radial(points, ball)
+    J = np.column_stack([radial, np.ones(len(radial))])[:, : 3 if radius_held else 4]
     least = (fit.scale / (LARGEST_HALF_SD * ball.radius)) ** 2
     off = radial - radial.mean(axis=0)
     for axis in np.linalg.eigh(off.T @ off)[1].T:
@@ -76,14 +100,39 @@ def is_noise(points: Floats, residual: Floats, ball: Sphere, white: float = WHIT
     if sd <= small * ball.radius:
         return True
     # By direction: in space the nearest of several at about one distance is that of the most similar residual.
-    radial = (points - ball.centre) / np.linalg.norm(points - ball.centre, axis=1)[:, None]
+    rows = np.unique(points, axis=0, return_index=True)[1]  # of equal points the nearest is no neighbour
+    radial = _radial(points[rows], ball)
     nearest = cKDTree(radial).query(radial, k=2)[1][:, 1]
-    if np.sqrt(np.mean((residual - residual[nearest]) ** 2) / 2.0) < white * sd:
+    if np.sqrt(np.mean((residual[rows] - residual[rows][nearest]) ** 2) / 2.0) < white * sd:
         return False
-    x, y, z = radial.T
+    return bool(_quadric_squares(points, residual, ball) <= EXPLAINED * np.sum(residual**2))
+
+
+def shape(points: Floats, residual: Floats, ball: Sphere) -> float:
+    """Return the rms, mm, of the part of residuals (n,) that is the shape of an ellipsoid; 0 where chance explains it.
+
+    Chance does where the F value of the terms is below LEAST_F. What noise adds to the squares is subtracted.
+    """
+    explained, count = _quadric_squares(points, residual, ball), len(residual)
+    left = max(float(np.sum(residual**2)) - explained, 0.0) / max(count - QUADRIC_TERMS, 1)
+    if explained <= LEAST_F * QUADRIC_TERMS * left:
+        return 0.0
+    return float(np.sqrt(max(explained - QUADRIC_TERMS * left, 0.0) / count))
+
+
+def _quadric_squares(points: Floats, residual: Floats, ball: Sphere) -> float:
+    """Return the part of the sum of squares of residuals (n,) that an ellipsoid explains."""
+    x, y, z = _radial(points, ball).T
     A = np.column_stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, y * z, z * x])
     left = residual - A @ np.linalg.lstsq(A, residual, rcond=None)[0]
-    return bool(np.sum(left**2) >= (1.0 - EXPLAINED) * np.sum(residual**2))
+    return float(np.sum(residual**2) - np.sum(left**2))
+
+
+def _radial(points: Floats, ball: Sphere) -> Floats:
+    """Return the unit vectors (n, 3) from a sphere's centre to points (n, 3)."""
+    out = points - ball.centre
+    radial: Floats = out / np.linalg.norm(out, axis=1)[:, None]
+    return radial
 
 
 def facing(points: Floats, on: Bools, ball: Sphere) -> float:
@@ -94,7 +143,7 @@ def facing(points: Floats, on: Bools, ball: Sphere) -> float:
     one line has as many, which has no normal: neighbourhoods are then wider.
     """
     count = int(np.count_nonzero(on))
-    query = points[on][:: max(1, count // MOST_NORMALS)]
+    query = np.ascontiguousarray(points[on][:: max(1, count // MOST_NORMALS)])
     if not len(query):
         return 0.0
     points = np.ascontiguousarray(points)

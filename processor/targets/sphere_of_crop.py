@@ -11,7 +11,7 @@ sphere that is a small share of the points is searched for as in a whole cloud, 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import chain
 
@@ -20,7 +20,14 @@ from numba import njit
 
 from processor.geometry import sphere_evidence
 from processor.geometry.sphere import MINIMAL, Sphere, canonical_order, through_four, visible_fraction
-from processor.geometry.sphere_evidence import EVIDENCE_CELLS, thinned
+from processor.geometry.sphere_evidence import (
+    EVIDENCE_CELLS,
+    LEAST_VISIBLE,
+    RADIUS_BAND,
+    ROUGHEST,
+    STANDS_OUT,
+    rows_of_cells,
+)
 from processor.geometry.sphere_robust_fit import RobustFit, robust_fit
 from processor.model import Floats, Ints
 
@@ -30,16 +37,14 @@ CELLS, MOST_SCORED = 40, 300  # along the diagonal of a crop, of which one point
 SMALLEST, LARGEST = 0.15, 0.7  # radius of a sphere, in diagonals of the crop
 EACH_BAND, MOST_LOOKED = 2, 300  # spheres tried, of those with the best scores
 APART = 0.2  # of their centres, in radii
-RADIUS_BAND = 0.15  # of a known radius, about it
-LEAST_VISIBLE = 0.08  # share of the sphere
-LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radii
 LIKELY_FACING, LEAST_FACING = 0.9, 0.94  # median cosine between the crop's own normals and the sphere's
-AROUND = 0.4  # of the radius: points up to there outside are about it
-ROUGHEST = 0.05  # noise over radius, above which other round bodies cannot be told from a sphere
-WHITE, SMALL = 0.7, 0.002  # of residuals: no shape is as large as their noise; in radii, rounder than targets are
+WHITE = 0.7  # least sd of neighbours' differences over that of all residuals: a shape as large as the noise has 0.7
+SMALL = 0.002  # residuals below this share of the radius are accepted
+ROUND = 0.005  # rms of an ellipsoid's part of the residuals, in radii
+FLATTEST = 2.2  # rms of residuals of what is likely a sphere, in scales; 2.7 where a volume fills the window evenly
+MOST_FITTED = 20_000  # points that proposals are fitted to; the one taken is fitted to all
 WIDER, LEAST_WIDER = 2.0, 1.05  # times the scale of a fit: allowed to the next one, and reached by it
 CHI2_95 = {3: 7.815, 4: 9.488}  # 95 % of chi-square, by its degrees of freedom
-STANDS_OUT = 3.5  # times as dense at the surface as beside it
 
 
 class Grade(Enum):
@@ -69,60 +74,121 @@ def find(points: Floats, least_points: int, radius_mm: float | None, scanner: Fl
         return None
     order = canonical_order(points)
     origin = points.mean(axis=0)
-    crop = points[order] - origin
-    seen_from = None if scanner is None else scanner[order] - origin
+    crop = _Crop(points[order] - origin, None if scanner is None else scanner[order] - origin, radius_mm, least_points)
+    few = crop.every(len(points) // MOST_FITTED + 1)
+    rng = np.random.default_rng(0)  # fixed: the result must not depend on a seed
     likely = None
-    for start, scale in chain.from_iterable(_starts(crop, sets, radius_mm) for sets in SETS):
-        fit = robust_fit(crop, start, scale, radius_mm, seen_from)
-        grade = Grade.NONE if fit is None else _assessed(crop, fit, least_points)
+    for start, scale in chain.from_iterable(_starts(few.points, rng, sets, radius_mm) for sets in SETS):
+        fit = few.fit(start, scale)
+        grade = Grade.NONE if fit is None else few.grade(fit)
+        if fit is not None and few is not crop and grade is not Grade.NONE:
+            fit = crop.fit(fit.sphere, fit.scale)
+            grade = Grade.NONE if fit is None else crop.grade(fit)
         if fit is None or grade is Grade.NONE:
             continue
         if grade is Grade.CERTAIN:
-            fit, grade = _widest(crop, fit, least_points, radius_mm, seen_from)
+            fit, grade = _widest(crop, fit)
             return _in_place(crop, fit, order, origin, certain=grade is Grade.CERTAIN)
         likely = likely or fit
     return None if likely is None else _in_place(crop, likely, order, origin, certain=False)
 
 
-def _widest(
-    crop: Floats, fit: RobustFit, least_points: int, radius_mm: float | None, seen_from: Floats | None
-) -> tuple[RobustFit, Grade]:
+@dataclass(frozen=True)
+class _Crop:
+    """Points (n, 3) in canonical order, where each was seen from (n, 3), a radius that is held, and the fewest points.
+
+    Without positions and without a known radius these are None.
+    """
+
+    points: Floats
+    scanner: Floats | None
+    radius_mm: float | None
+    least_points: int
+
+    def every(self, step: int) -> _Crop:
+        """Return the crop with every ``step``-th of its points."""
+        if step == 1:
+            return self
+        scanner = None if self.scanner is None else self.scanner[::step]
+        return replace(self, points=self.points[::step], scanner=scanner)
+
+    def fit(self, start: Sphere, scale: float) -> RobustFit | None:
+        """Fit a sphere to the points."""
+        return robust_fit(self.points, start, scale, self.radius_mm, self.scanner)
+
+    def grade(self, fit: RobustFit) -> Grade:
+        """Return NONE, LIKELY (determined, about the crop's own normals, no volume), or CERTAIN: passes every test."""
+        ball, on = fit.sphere, self.points[fit.inliers]
+        if not sphere_evidence.determined(self.points, fit, self.least_points):
+            return Grade.NONE
+        if not sphere_evidence.redundant(on, fit, self.radius_mm is not None):
+            return Grade.NONE
+        rows = rows_of_cells(self.points, ball.radius / EVIDENCE_CELLS)
+        facing = sphere_evidence.facing(self.points[rows], fit.inliers[rows], ball)
+        if not facing >= LIKELY_FACING:
+            return Grade.NONE
+        residual = fit.residuals[fit.inliers]
+        certain = (
+            facing >= LEAST_FACING
+            and fit.scale <= ROUGHEST * ball.radius
+            and sphere_evidence.denser(self.points, ball, STANDS_OUT, fit.scale)
+            and sphere_evidence.misfit(on, residual, ball, fit.scale) <= sphere_evidence.largest_misfit(fit)
+            and sphere_evidence.shape(on, residual, ball) <= ROUND * ball.radius
+            and sphere_evidence.is_noise(on, residual, ball, WHITE, SMALL)
+        )
+        if certain:
+            return Grade.CERTAIN
+        return Grade.LIKELY if np.sqrt(np.mean(residual**2)) <= FLATTEST * fit.scale else Grade.NONE
+
+
+def _widest(crop: _Crop, first: RobustFit) -> tuple[RobustFit, Grade]:
     """Fit a sphere again with more of the points, as long as that changes it by chance alone.
 
     The scale of a fit in a band narrower than the noise is that of the band, and its sphere scatters more than it must.
-    Where other things touch the sphere a wider fit is moved by them: by more than chance allows (Hausman 1978). The
-    grade is only likely if more points agree, but are too rough.
+    Where other things touch the sphere a wider fit is moved by them: by more than chance allows. This is the test of
+    Hausman (1978), but with the covariance of the narrower fit, which is above that of the difference. The covariance
+    of the fit returned holds what it moved by. The grade is only likely if more points agree, but are too rough.
     """
-    free = 4 if radius_mm is None else 3
+    fit, grade, free = first, Grade.CERTAIN, 4 if crop.radius_mm is None else 3
     while True:
-        wider = robust_fit(crop, fit.sphere, WIDER * fit.scale, radius_mm, seen_from)
+        wider = crop.fit(fit.sphere, WIDER * fit.scale)
         if wider is None or wider.scale < LEAST_WIDER * fit.scale:
-            return fit, Grade.CERTAIN
-        moved = np.append(wider.sphere.centre - fit.sphere.centre, wider.sphere.radius - fit.sphere.radius)[:free]
-        if moved @ np.linalg.solve(fit.sphere.covariance[:free, :free], moved) > CHI2_95[free]:
-            return fit, Grade.CERTAIN
-        if _assessed(crop, wider, least_points) is not Grade.CERTAIN:
-            return fit, Grade.LIKELY if wider.scale > ROUGHEST * fit.sphere.radius else Grade.CERTAIN
+            break
+        moved = _moved(fit, wider)[:free]
+        if moved @ np.linalg.pinv(fit.sphere.covariance[:free, :free]) @ moved > CHI2_95[free]:
+            break
+        if crop.grade(wider) is not Grade.CERTAIN:
+            grade = Grade.LIKELY if wider.scale > ROUGHEST * fit.sphere.radius else grade
+            break
         fit = wider
+    moved = _moved(first, fit)
+    covariance = fit.sphere.covariance + np.outer(moved, moved)
+    return replace(fit, sphere=replace(fit.sphere, covariance=covariance)), grade
 
 
-def _in_place(crop: Floats, fit: RobustFit, order: Ints, origin: Floats, *, certain: bool) -> Found:
-    around = np.count_nonzero(fit.sphere.residuals(crop) <= AROUND * fit.sphere.radius)
-    share = min(1.0, float(fit.inliers.sum() / max(around, 1)))
+def _moved(one: RobustFit, other: RobustFit) -> Floats:
+    """Return the difference (4,) of centre and radius of two fits, mm."""
+    return np.append(other.sphere.centre - one.sphere.centre, other.sphere.radius - one.sphere.radius)
+
+
+def _in_place(crop: _Crop, fit: RobustFit, order: Ints, origin: Floats, *, certain: bool) -> Found:
+    share = sphere_evidence.inlier_share(crop.points, fit)
     return Found(fit.in_place(len(order), order, origin), share, certain)
 
 
-def _starts(crop: Floats, sets: int, radius_mm: float | None) -> Iterator[tuple[Sphere, float]]:
-    """Yield spheres of the best scores, each with the first scale of its residuals, those of the narrowest band first.
+def _starts(
+    crop: Floats, rng: np.random.Generator, sets: int, radius_mm: float | None
+) -> Iterator[tuple[Sphere, float]]:
+    """Yield spheres of the best scores, each with the first scale of its residuals; the narrowest band comes first.
 
     Points are scored one per cell, so that places with many weigh no more than others.
     """
     diagonal = float(np.linalg.norm(np.ptp(crop, axis=0)))
-    scored = crop[thinned(crop, diagonal / CELLS)]
+    scored = crop[rows_of_cells(crop, diagonal / CELLS)]
     scored = np.ascontiguousarray(scored[:: len(scored) // MOST_SCORED + 1])
     if len(scored) < MINIMAL:
         return
-    draws = np.random.default_rng(0).random((sets, MINIMAL))  # fixed: the result must not depend on a seed
+    draws = rng.random((sets, MINIMAL))
     centres, radii = through_four(scored[(draws * len(scored)).astype(np.int64)])
     low, high = (SMALLEST * diagonal, LARGEST * diagonal)
     if radius_mm is not None:
@@ -156,28 +222,3 @@ def _score(points, centres, radii, band, scores):  # type: ignore[no-untyped-def
             x, y, z = points[i, 0] - centres[s, 0], points[i, 1] - centres[s, 1], points[i, 2] - centres[s, 2]
             u = (np.sqrt(x * x + y * y + z * z) - radii[s]) / width
             scores[s] += max(1.0 - u * u, 0.0)
-
-
-def _assessed(crop: Floats, fit: RobustFit, least_points: int) -> Grade:
-    """Whether a fit is determined and the crop's own normals are about those of the sphere, and passes all tests.
-
-    These are that it stands out of the crop, that its residuals are noise, and closer normals.
-    """
-    ball, on = fit.sphere, crop[fit.inliers]
-    if not fit.converged or len(on) < least_points or visible_fraction(on, ball.centre) < LEAST_VISIBLE:
-        return Grade.NONE
-    if not np.sqrt(np.diag(ball.covariance).max()) <= LARGEST_SD * ball.radius:
-        return Grade.NONE
-    rows = thinned(crop, ball.radius / EVIDENCE_CELLS)
-    facing = sphere_evidence.facing(crop[rows], fit.inliers[rows], ball)
-    if facing < LIKELY_FACING or not sphere_evidence.redundant(on, fit):
-        return Grade.NONE
-    residual = fit.residuals[fit.inliers]
-    certain = (
-        facing >= LEAST_FACING
-        and fit.scale <= ROUGHEST * ball.radius
-        and sphere_evidence.denser(crop, ball, STANDS_OUT, fit.scale)
-        and sphere_evidence.misfit(on, residual, ball, fit.scale) <= sphere_evidence.largest_misfit(fit)
-        and sphere_evidence.is_noise(on, residual, ball, WHITE, SMALL)
-    )
-    return Grade.CERTAIN if certain else Grade.LIKELY

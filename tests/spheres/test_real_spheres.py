@@ -62,8 +62,7 @@ def test_bound_and_efficiency_are_given_with_the_estimate(name):
     result = space_frame_step.run(scene(name, position=np.zeros(3)), space_frame_step.Params())
     assert result.balls.stations.tolist() == [1]
     assert np.isfinite(result.balls.bound_sd).all()
-    # By the stated intervals: they hold what beams at the limb add, which the bound does not know.
-    assert ((result.balls.efficiency > 0.0) & (result.balls.efficiency < 1.2)).all()
+    assert ((result.balls.efficiency > 0.2) & (result.balls.efficiency < 1.2)).all()
 
 
 @pytest.mark.parametrize("name", PUBLISHED)

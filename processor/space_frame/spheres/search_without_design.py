@@ -73,9 +73,8 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
             sphere = replace(sphere, covariance=widened)
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
     noise = sphere_detection.flat_noise(cloud.points, sphere.radius)
-    times = candidate.fit.scale / max(noise, LEAST_SCALE * sphere.radius)  # points without noise have none
-    if times > LARGEST_SCALE:
-        doubts.append(reason("spheres.rough", times=times))
+    if candidate.fit.scale > LARGEST_SCALE * max(noise, LEAST_SCALE * sphere.radius):  # never of an unknown noise
+        doubts.append(reason("spheres.rough", times=candidate.fit.scale / max(noise, LEAST_SCALE * sphere.radius)))
     if doubts:
         row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, *doubts))
     if params.method == "least-squares":
@@ -83,16 +82,16 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     seen_from = None if cloud.scanner is None else cloud.scanner[candidate.fit.inliers]
     stations = 0 if seen_from is None else len(np.unique(seen_from, axis=0))
     least = bound(cloud.points, candidate.fit, _held(params) is not None, cloud.scanner)
-    return replace(row, stations=stations, bound=least)
+    return replace(row, stations=stations, bound=least, formal=candidate.fit.sphere.covariance)
 
 
 def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Floats | None:
-    """Covariance (4, 4) of a fit with what beams add that a sphere cuts at its limb.
+    """Covariance (4, 4) of a fit with what beams at the limb add, of which the sphere takes only a part.
 
-    They return from beside it and make it larger. So the sphere is fitted again, and what it moves by is one standard
-    deviation. Of orthogonal distances the second fit is one of ranges as seen from far away, from the side that its
-    points are on: rays that miss the sphere are left out. Of ranges it is without rays that meet it at more than 60
-    degrees, where a footprint is over twice as long as wide. None where that fit does not converge.
+    They also return from beside it and make it larger. So the sphere is fitted again, and what it moves by is one
+    standard deviation. Of orthogonal distances the second fit is one of ranges as seen from far away, from the side
+    that its points are on: rays that miss the sphere are left out. Of ranges it is without rays that meet it at more
+    than 60 degrees, where a footprint is over twice as long as wide. None where that fit does not converge.
     """
     ball = fit.sphere
     off = cloud.points - ball.centre
@@ -107,7 +106,9 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Floats | 
         seen_from: Floats = np.broadcast_to(far, (int(near.sum()), 3))
     else:
         seen_from = cloud.scanner - ball.centre
-        across = np.linalg.norm(np.cross(off, seen_from), axis=1) / np.linalg.norm(off - seen_from, axis=1)
+        across = np.linalg.norm(np.cross(off, seen_from), axis=1) / np.maximum(
+            np.linalg.norm(off - seen_from, axis=1), 1e-300
+        )
         near &= across < np.sqrt(1.0 - STEEP_COS**2) * ball.radius
         seen_from = seen_from[near]
     start = replace(ball, centre=np.zeros(3))
@@ -121,11 +122,12 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Floats | 
 def _with_bounds(result: Result, rows: list[Row]) -> Result:
     """Add the Cramér-Rao bounds of each sphere, and the efficiencies."""
     balls, bounds = result.balls, np.array([row.bound for row in rows])
-    variance, least = (np.einsum("kii->ki", C) for C in (balls.covariance, bounds))
-    least_lowest = np.sqrt(np.einsum("i,kij,j->k", DOWN, bounds, DOWN))
+    formal = np.array([row.formal for row in rows])
+    variance, least = (np.einsum("kii->ki", C) for C in (formal, bounds))
+    lowest, least_lowest = (np.sqrt(np.einsum("i,kij,j->k", DOWN, C, DOWN)) for C in (formal, bounds))
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = np.sqrt(least[:, :3].sum(axis=1) / variance[:, :3].sum(axis=1))
-        efficiency = np.stack([centre, np.sqrt(least[:, 3] / variance[:, 3]), least_lowest / balls.lowest_sd], axis=1)
+        efficiency = np.stack([centre, np.sqrt(least[:, 3] / variance[:, 3]), least_lowest / lowest], axis=1)
     balls = replace(
         balls,
         sizes=np.full(len(rows), NAN),

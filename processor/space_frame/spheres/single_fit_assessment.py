@@ -35,6 +35,7 @@ class Row:
     reasons: tuple[Reason, ...] = ()
     stations: int = 0  # number that saw it; 0 = unknown
     bound: Floats = field(default_factory=lambda: np.full((4, 4), NAN))  # Cramér-Rao, of x, y, z, radius
+    formal: Floats = field(default_factory=lambda: np.full((4, 4), NAN))  # covariance by the points alone
 
 
 def generator(params: Params, purpose: str) -> np.random.Generator:

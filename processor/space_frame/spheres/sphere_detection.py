@@ -19,17 +19,24 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import point_grid
 from processor.geometry.linalg_small import assign
-from processor.geometry.sphere import Sphere, canonical_order, visible_fraction
+from processor.geometry.sphere import Sphere, canonical_order
 from processor.geometry.sphere_evidence import (
     BAND,
     EVIDENCE_CELLS,
+    LARGEST_SHAPE,
+    RADIUS_BAND,
+    ROUGHEST,
+    STANDS_OUT,
     denser,
+    determined,
     facing,
+    inlier_share,
     is_noise,
     largest_misfit,
     misfit,
     redundant,
-    thinned,
+    rows_of_cells,
+    shape,
 )
 from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit, robust_fit
 from processor.geometry.thread_ranges import over_ranges
@@ -49,16 +56,11 @@ SMALLEST, LARGEST = 0.6, 1.6  # radius of a proposal, in patch radii
 FLAT = 0.04  # thickness of a patch, in its radii, below which it is a plane or an edge
 REFINED = 40  # best proposals of each scale, which are tried
 REFINEMENTS = 3
-STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
-ROUGHEST = 0.05  # noise over radius, above which a ball is not distinguishable from a cluster of points
 FACING = 0.985  # median cosine between the cloud's own normals and the ball's
 ROUGHLY_FACING = 0.9  # the same of a proposal
 NEAR = 1.7  # radii of a proposal: points about its centre that a ball is fitted to
 AROUND = 1.4  # radii of a ball: its surroundings
 LIKELY_MM = 1500.0  # larger balls are searched for only where there is none below
-LEAST_VISIBLE = 0.08  # share of the sphere
-LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radii
-RADIUS_BAND = 0.15  # proposals within this share of a fixed radius
 LEAST_FLAT, MOST_FLAT = 8, 2000  # patches that the noise of a cloud rests on
 LEAST_SPREAD = 0.15  # of such a patch across its longest side, in its width: not one line of a scanner
 
@@ -156,8 +158,8 @@ def _proposals(
     cloud: Floats, scale: float, rng: np.random.Generator, radius_mm: float | None
 ) -> list[tuple[float, Sphere]]:
     """Spheres of one scale with their scores, the best of each place."""
-    few = cloud[thinned(cloud, scale / CELLS)]
-    seeds = few[thinned(few, APART * scale)]
+    few = cloud[rows_of_cells(cloud, scale / CELLS)]
+    seeds = few[rows_of_cells(few, APART * scale)]
     if len(seeds) > MOST_PATCHES:
         seeds = seeds[np.sort(rng.choice(len(seeds), MOST_PATCHES, replace=False))]
     cells = point_grid.of_points(few, scale).cells
@@ -341,14 +343,14 @@ def _accepted(cloud: Cloud, start: Sphere, least_points: int, radius_mm: float |
         if len(near) < least_points:
             return None
         if fit is None:
-            near = near[thinned(points[near], start.radius / EVIDENCE_CELLS)]
+            near = near[rows_of_cells(points[near], start.radius / EVIDENCE_CELLS)]
         off = np.abs(start.residuals(points[near]))
         close = off < BAND * start.radius
         if np.count_nonzero(close) < least // 2 or facing(points[near], close, start) < ROUGHLY_FACING:
             return None
         scale = max(2.0 * MAD_TO_SD * float(np.median(off[close])), LEAST_SCALE * start.radius)
         fit = robust_fit(points[near], start, scale, radius_mm, None if scanner is None else scanner[near])
-        if fit is None or not _stands_out(points[near], fit, least):
+        if fit is None or not _stands_out(points[near], fit, least, radius_mm is not None):
             return None
         moved = float(np.linalg.norm(fit.sphere.centre - start.centre))
         if moved + AROUND * fit.sphere.radius > NEAR * start.radius:
@@ -356,31 +358,25 @@ def _accepted(cloud: Cloud, start: Sphere, least_points: int, radius_mm: float |
         start = fit.sphere
     if fit is None:
         return None
-    around = int(np.count_nonzero(fit.sphere.residuals(points[near]) <= 0.4 * fit.sphere.radius))
-    share = float(fit.inliers.sum() / max(around, 1))
-    return Ball(fit.in_place(len(points), near, np.zeros(3)), min(1.0, share))
+    return Ball(fit.in_place(len(points), near, np.zeros(3)), inlier_share(points[near], fit))
 
 
-def _stands_out(points: Floats, fit: RobustFit, least_points: int) -> bool:
+def _stands_out(points: Floats, fit: RobustFit, least_points: int, radius_held: bool) -> bool:
     """Whether a fit is a ball: converged, enough of it visible, smooth, round, and far denser than its surroundings."""
     ball = fit.sphere
-    if not fit.converged or np.count_nonzero(fit.inliers) < least_points or fit.scale > ROUGHEST * ball.radius:
+    if not determined(points, fit, least_points) or fit.scale > ROUGHEST * ball.radius:
         return False
-    if visible_fraction(points[fit.inliers], ball.centre) < LEAST_VISIBLE:
-        return False
-    if not np.sqrt(np.diag(ball.covariance).max()) <= LARGEST_SD * ball.radius:
-        return False
-    if not redundant(points[fit.inliers], fit):
+    if not redundant(points[fit.inliers], fit, radius_held):
         return False
     on, residual = points[fit.inliers], fit.residuals[fit.inliers]
     if misfit(on, residual, ball, fit.scale) > largest_misfit(fit):
         return False
-    rows = thinned(points, ball.radius / EVIDENCE_CELLS)
+    rows = rows_of_cells(points, ball.radius / EVIDENCE_CELLS)
     if facing(points[rows], fit.inliers[rows], ball) < FACING:
         return False
     if not denser(points[rows], ball, STANDS_OUT, fit.scale):
         return False
-    return is_noise(on, residual, ball)
+    return is_noise(on, residual, ball) and shape(on, residual, ball) <= LARGEST_SHAPE * ball.radius
 
 
 # --- noise of the cloud ----------------------------------------------------------------------------------------------
@@ -394,7 +390,7 @@ def flat_noise(points: Floats, width: float) -> float:
     """
     cloud = points[canonical_order(points)]
     cloud = cloud - cloud.mean(axis=0)
-    seeds = cloud[thinned(cloud, width)]
+    seeds = cloud[rows_of_cells(cloud, width)]
     seeds = seeds[:: len(seeds) // MOST_FLAT + 1]
     found = []
     for rows in cKDTree(cloud).query_ball_point(seeds, 0.5 * width, return_sorted=True):

@@ -35,7 +35,7 @@ def linearised(points, state, scanner):
 
 
 def fit(points, state, scale, radius_free, scanner):
-    """Gauss-Newton with Tukey's biweight; the scale is that of the residuals within 4 scales, and never grows."""
+    """Gauss-Newton with Tukey's biweight; the scale is that of residuals within 4 scales, at most the first."""
     state, largest = state.copy(), scale
     free = 4 if radius_free else 3
     for iteration in range(200):
