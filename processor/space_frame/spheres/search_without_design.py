@@ -68,7 +68,7 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     if params.method != "least-squares":
         widened = _widened(cloud, candidate.fit, _held(params) is not None)
         if widened is None:
-            doubts.append(reason("spheres.unknown-side" if cloud.scanner is None else "spheres.at-limb"))
+            doubts.append(reason("spheres.unknown-side") if cloud.scanner is None else reason("spheres.at-limb"))
         else:
             sphere = replace(sphere, covariance=widened)
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
