@@ -30,7 +30,7 @@ from processor.scene_cloud import MergedCloud
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import Params
 from processor.space_frame.result import Flag, Result
-from processor.space_frame.spheres import search_without_design, sphere_detection
+from processor.space_frame.spheres import search_without_design
 from processor.targets import sphere_of_crop
 
 LEAST_POINTS = 10
@@ -156,14 +156,12 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
 
 def _measured(cloud: MergedCloud, params: Params, held: float | None) -> Result:
     """Return the sphere that fills most of a cloud, else the one that is found in it, else one that is only likely."""
-    least = max(params.min_points, sphere_detection.LEAST_POINTS)
-    found = sphere_of_crop.find(cloud.points, least, held, cloud.scanner)
+    found = sphere_of_crop.find(cloud.points, search_without_design.fewest_points(params), held, cloud.scanner)
     if found is None or not found.certain:
         measured = search_without_design.search(cloud, params)
         if found is None or len(measured.balls):
             return measured
-    ball = sphere_detection.Ball(found.fit, found.inlier_share)
-    measured = search_without_design.measured([ball], cloud, params)
+    measured = search_without_design.measured([found.ball], cloud, params)
     return measured if found.certain else _doubted(measured)
 
 

@@ -7,7 +7,7 @@ first: in squares of georeferenced coordinates the digits of a ball are lost.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,14 @@ class Sphere:
         """Standard deviation in mm of the lowest point's height, centre z - radius, with the correlation of the two."""
         variance = self.covariance[2, 2] + self.covariance[3, 3] - 2.0 * self.covariance[2, 3]
         return float(np.sqrt(max(variance, 0.0)))
+
+    def moved_to(self, other: Sphere) -> Floats:
+        """Return the difference (4,) in mm of centre and radius of another sphere."""
+        return np.append(other.centre - self.centre, other.radius - self.radius)
+
+    def widened_by(self, moved: Floats) -> Sphere:
+        """Return the sphere whose covariance holds a difference (4,) of centre and radius as one standard deviation."""
+        return replace(self, covariance=self.covariance + np.outer(moved, moved))
 
     def residuals(self, points: Floats) -> Floats:
         """Signed distances (n,) in mm of points (n, 3) from the surface, outside positive."""

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
@@ -17,10 +19,7 @@ BAND = 0.1  # half-width of a proposal's surface, in radii
 NEIGHBOURHOODS = (0.1, 0.2, 0.4)  # of the ball's points, the least that is no line
 MOST_NORMALS = 200  # points of a ball that have normals
 OF_A_LINE = 0.05  # ratio of the variances along and across the neighbourhood of a line
-SMALL = 0.005  # residuals, in radii, that are accepted even if they are systematic: the shape of the ball
-WHITE = 0.5  # sd of residuals by the differences of neighbours, over that of all: those of scanners are correlated
 QUADRIC_TERMS, LEAST_F = 9, 4.0  # of the shape of an ellipsoid; chance exceeds 4 less than once in 10,000
-LARGEST_SHAPE = 0.01  # rms of an ellipsoid's part of the residuals, in radii
 EXPLAINED = 0.3  # share of the residuals' squares that an ellipsoid may explain
 LARGEST_HALF_SD = 0.15  # of the radius or, where it is fixed, of the centre, in radii, by half of the points
 MISFIT = 0.5  # of the scale: cell means of residuals on a ball are noise alone
@@ -31,7 +30,20 @@ LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radi
 STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
 ABOUT = 0.4  # of the radius: points up to there outside are about a ball
 RADIUS_BAND = 0.15  # proposals within this share of a fixed radius
-EVIDENCE_CELLS = 12.0  # of a rows_of_cells cloud, in a ball's radius
+EVIDENCE_CELLS = 12.0  # of a cloud thinned to one point a cell, in a ball's radius
+
+
+class NoiseLimits(NamedTuple):
+    """What residuals must keep to be noise: limits of :func:`is_noise`.
+
+    ``white`` is the least sd by the differences of neighbours, over that of all residuals: 0.7 where a shape is as
+    large as the noise. ``shape`` is the largest rms of an ellipsoid's part of the residuals, in radii. Residuals below
+    ``small``, in radii, are accepted even if they are systematic.
+    """
+
+    white: float
+    shape: float
+    small: float
 
 
 def rows_of_cells(points: Floats, cell: float) -> Ints:
@@ -90,38 +102,30 @@ def redundant(points: Floats, fit: RobustFit, radius_held: bool) -> bool:
     return True
 
 
-def is_noise(points: Floats, residual: Floats, ball: Sphere, white: float = WHITE, small: float = SMALL) -> bool:
+def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: NoiseLimits) -> bool:
     """Whether residuals (n,) of points (n, 3) are noise and not the shape of another body, or are small.
 
-    Those of neighbours differ (von Neumann 1941): their sd is at least ``white`` times that of all. An ellipsoid
-    explains little of them. Below ``small``, in radii, they are accepted whatever they are.
+    Those of neighbours differ (von Neumann 1941), and an ellipsoid explains little of them.
     """
     sd = float(np.sqrt(np.mean(residual**2)))
-    if sd <= small * ball.radius:
+    if sd <= limits.small * ball.radius:
         return True
     # By direction: in space the nearest of several at about one distance is that of the most similar residual.
     rows = np.unique(points, axis=0, return_index=True)[1]  # of equal points the nearest is no neighbour
     radial = _radial(points[rows], ball)
     nearest = cKDTree(radial).query(radial, k=2)[1][:, 1]
-    if np.sqrt(np.mean((residual[rows] - residual[rows][nearest]) ** 2) / 2.0) < white * sd:
+    if np.sqrt(np.mean((residual[rows] - residual[rows][nearest]) ** 2) / 2.0) < limits.white * sd:
         return False
-    return bool(_quadric_squares(points, residual, ball) <= EXPLAINED * np.sum(residual**2))
+    explained, of_all = _explained_squares(points, residual, ball), float(np.sum(residual**2))
+    if explained > EXPLAINED * of_all:
+        return False
+    noise = max(of_all - explained, 0.0) / max(len(residual) - QUADRIC_TERMS, 1)
+    by_chance = explained <= LEAST_F * QUADRIC_TERMS * noise
+    return by_chance or explained - QUADRIC_TERMS * noise <= len(residual) * (limits.shape * ball.radius) ** 2
 
 
-def shape(points: Floats, residual: Floats, ball: Sphere) -> float:
-    """Return the rms, mm, of the part of residuals (n,) that is the shape of an ellipsoid; 0 where chance explains it.
-
-    Chance does where the F value of the terms is below LEAST_F. What noise adds to the squares is subtracted.
-    """
-    explained, count = _quadric_squares(points, residual, ball), len(residual)
-    left = max(float(np.sum(residual**2)) - explained, 0.0) / max(count - QUADRIC_TERMS, 1)
-    if explained <= LEAST_F * QUADRIC_TERMS * left:
-        return 0.0
-    return float(np.sqrt(max(explained - QUADRIC_TERMS * left, 0.0) / count))
-
-
-def _quadric_squares(points: Floats, residual: Floats, ball: Sphere) -> float:
-    """Return the part of the sum of squares of residuals (n,) that an ellipsoid explains."""
+def _explained_squares(points: Floats, residual: Floats, ball: Sphere) -> float:
+    """Return the part of the sum of squares of residuals (n,) that the shape of an ellipsoid explains."""
     x, y, z = _radial(points, ball).T
     A = np.column_stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, y * z, z * x])
     left = residual - A @ np.linalg.lstsq(A, residual, rcond=None)[0]

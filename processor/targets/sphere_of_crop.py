@@ -26,10 +26,12 @@ from processor.geometry.sphere_evidence import (
     RADIUS_BAND,
     ROUGHEST,
     STANDS_OUT,
+    NoiseLimits,
     rows_of_cells,
 )
 from processor.geometry.sphere_robust_fit import RobustFit, robust_fit
 from processor.model import Floats, Ints
+from processor.space_frame.spheres.sphere_detection import Ball
 
 BANDS = (0.02, 0.04, 0.08)  # half-widths about the surface, in radii
 SETS = (1000, 10_000)  # of four points, at first and where these give no certain sphere
@@ -38,9 +40,7 @@ SMALLEST, LARGEST = 0.15, 0.7  # radius of a sphere, in diagonals of the crop
 EACH_BAND, MOST_LOOKED = 2, 300  # spheres tried, of those with the best scores
 APART = 0.2  # of their centres, in radii
 LIKELY_FACING, LEAST_FACING = 0.9, 0.94  # median cosine between the crop's own normals and the sphere's
-WHITE = 0.7  # least sd of neighbours' differences over that of all residuals: a shape as large as the noise has 0.7
-SMALL = 0.002  # residuals below this share of the radius are accepted
-ROUND = 0.005  # rms of an ellipsoid's part of the residuals, in radii
+NOISE_LIMITS = NoiseLimits(white=0.7, shape=0.005, small=0.002)  # no shape is as large as the noise
 FLATTEST = 2.2  # rms of residuals of what is likely a sphere, in scales; 2.7 where a volume fills the window evenly
 MOST_FITTED = 20_000  # points that proposals are fitted to; the one taken is fitted to all
 WIDER, LEAST_WIDER = 2.0, 1.05  # times the scale of a fit: allowed to the next one, and reached by it
@@ -57,10 +57,9 @@ class Grade(Enum):
 
 @dataclass(frozen=True)
 class Found:
-    """A fit to a crop (n, 3), the share of the points about it that lie on it, and whether it passes every test."""
+    """The sphere of a crop, and whether it passes every test."""
 
-    fit: RobustFit
-    inlier_share: float
+    ball: Ball
     certain: bool
 
 
@@ -133,8 +132,7 @@ class _Crop:
             and fit.scale <= ROUGHEST * ball.radius
             and sphere_evidence.denser(self.points, ball, STANDS_OUT, fit.scale)
             and sphere_evidence.misfit(on, residual, ball, fit.scale) <= sphere_evidence.largest_misfit(fit)
-            and sphere_evidence.shape(on, residual, ball) <= ROUND * ball.radius
-            and sphere_evidence.is_noise(on, residual, ball, WHITE, SMALL)
+            and sphere_evidence.is_noise(on, residual, ball, NOISE_LIMITS)
         )
         if certain:
             return Grade.CERTAIN
@@ -154,26 +152,19 @@ def _widest(crop: _Crop, first: RobustFit) -> tuple[RobustFit, Grade]:
         wider = crop.fit(fit.sphere, WIDER * fit.scale)
         if wider is None or wider.scale < LEAST_WIDER * fit.scale:
             break
-        moved = _moved(fit, wider)[:free]
+        moved = fit.sphere.moved_to(wider.sphere)[:free]
         if moved @ np.linalg.pinv(fit.sphere.covariance[:free, :free]) @ moved > CHI2_95[free]:
             break
         if crop.grade(wider) is not Grade.CERTAIN:
             grade = Grade.LIKELY if wider.scale > ROUGHEST * fit.sphere.radius else grade
             break
         fit = wider
-    moved = _moved(first, fit)
-    covariance = fit.sphere.covariance + np.outer(moved, moved)
-    return replace(fit, sphere=replace(fit.sphere, covariance=covariance)), grade
-
-
-def _moved(one: RobustFit, other: RobustFit) -> Floats:
-    """Return the difference (4,) of centre and radius of two fits, mm."""
-    return np.append(other.sphere.centre - one.sphere.centre, other.sphere.radius - one.sphere.radius)
+    return replace(fit, sphere=fit.sphere.widened_by(first.sphere.moved_to(fit.sphere))), grade
 
 
 def _in_place(crop: _Crop, fit: RobustFit, order: Ints, origin: Floats, *, certain: bool) -> Found:
     share = sphere_evidence.inlier_share(crop.points, fit)
-    return Found(fit.in_place(len(order), order, origin), share, certain)
+    return Found(Ball(fit.in_place(len(order), order, origin), share), certain)
 
 
 def _starts(

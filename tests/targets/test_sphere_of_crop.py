@@ -67,7 +67,7 @@ def test_a_fit_uses_the_noise_of_the_points_and_not_the_width_of_its_band():
     for seed in range(10):
         rng = np.random.default_rng(seed)
         points = (RADIUS + rng.normal(0.0, 1.5, (1000, 1))) * directions(rng, 1000)
-        assert sphere_of_crop.find(points, 40, None, None).fit.scale == pytest.approx(1.5, rel=0.15)
+        assert sphere_of_crop.find(points, 40, None, None).ball.fit.scale == pytest.approx(1.5, rel=0.15)
 
 
 def test_points_in_any_order_and_anywhere_give_one_sphere():

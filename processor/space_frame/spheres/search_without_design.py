@@ -26,9 +26,14 @@ def search(cloud: MergedCloud, params: Params) -> Result:
     """Search a cloud for spheres that stand out of it by themselves."""
     # fixed: the result must not depend on the seed
     fixed = generator(replace(params, seed=0), "search")
-    least = max(params.min_points, sphere_detection.LEAST_POINTS)
-    found = sphere_detection.find_balls(cloud.points, fixed, params.max_balls, least, _held(params), cloud.scanner)
+    least, held = fewest_points(params), _held(params)
+    found = sphere_detection.find_balls(cloud.points, fixed, params.max_balls, least, held, cloud.scanner)
     return measured(found, cloud, params)
+
+
+def fewest_points(params: Params) -> int:
+    """Return the fewest points on a sphere."""
+    return max(params.min_points, sphere_detection.LEAST_POINTS)
 
 
 def measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Params) -> Result:
@@ -70,11 +75,14 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
         if widened is None:
             doubts.append(reason("spheres.unknown-side") if cloud.scanner is None else reason("spheres.at-limb"))
         else:
-            sphere = replace(sphere, covariance=widened)
+            sphere = widened
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
-    noise = sphere_detection.flat_noise(cloud.points, sphere.radius)
-    if candidate.fit.scale > LARGEST_SCALE * max(noise, LEAST_SCALE * sphere.radius):  # never of an unknown noise
-        doubts.append(reason("spheres.rough", times=candidate.fit.scale / max(noise, LEAST_SCALE * sphere.radius)))
+    # NaN, if the noise is unknown, stays NaN.
+    times = candidate.fit.scale / np.maximum(
+        sphere_detection.flat_noise(cloud.points, sphere.radius), LEAST_SCALE * sphere.radius
+    )
+    if times > LARGEST_SCALE:
+        doubts.append(reason("spheres.rough", times=float(times)))
     if doubts:
         row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, *doubts))
     if params.method == "least-squares":
@@ -85,8 +93,8 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     return replace(row, stations=stations, bound=least, formal=candidate.fit.sphere.covariance)
 
 
-def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Floats | None:
-    """Covariance (4, 4) of a fit with what beams at the limb add, of which the sphere takes only a part.
+def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Sphere | None:
+    """Return the sphere of a fit with what beams at the limb add to its covariance, of which it takes only a part.
 
     They also return from beside it and make it larger. So the sphere is fitted again, and what it moves by is one
     standard deviation. Of orthogonal distances the second fit is one of ranges as seen from far away, from the side
@@ -100,7 +108,7 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Floats | 
     if cloud.scanner is None:
         side = np.mean(off[fit.inliers] / distance[fit.inliers, None], axis=0)
         if np.linalg.norm(side) < LEAST_ONE_SIDED:
-            return ball.covariance
+            return ball
         near &= off @ side > 0.0
         far = FAR_RADII * ball.radius / np.linalg.norm(side) * side
         seen_from: Floats = np.broadcast_to(far, (int(near.sum()), 3))
@@ -115,8 +123,7 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Floats | 
     again = robust_fit(off[near], start, FIRST_SCALE * fit.scale, ball.radius if radius_held else None, seen_from)
     if again is None or not again.converged:
         return None
-    moved = np.append(again.sphere.centre, again.sphere.radius - ball.radius)
-    return ball.covariance + np.outer(moved, moved)
+    return ball.widened_by(start.moved_to(again.sphere))
 
 
 def _with_bounds(result: Result, rows: list[Row]) -> Result:

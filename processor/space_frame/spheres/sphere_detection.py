@@ -23,10 +23,10 @@ from processor.geometry.sphere import Sphere, canonical_order
 from processor.geometry.sphere_evidence import (
     BAND,
     EVIDENCE_CELLS,
-    LARGEST_SHAPE,
     RADIUS_BAND,
     ROUGHEST,
     STANDS_OUT,
+    NoiseLimits,
     denser,
     determined,
     facing,
@@ -36,7 +36,6 @@ from processor.geometry.sphere_evidence import (
     misfit,
     redundant,
     rows_of_cells,
-    shape,
 )
 from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit, robust_fit
 from processor.geometry.thread_ranges import over_ranges
@@ -44,6 +43,7 @@ from processor.inner_kernels import inner_ieee
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
 
+NOISE_LIMITS = NoiseLimits(white=0.5, shape=0.01, small=0.005)  # residuals of scanners are correlated
 LEAST_POINTS = 40  # on a ball; with fewer, balls occur anywhere by chance
 STEP = 1.5  # between scales
 FINEST = 20  # neighbours of a point within the smallest scale
@@ -376,7 +376,7 @@ def _stands_out(points: Floats, fit: RobustFit, least_points: int, radius_held: 
         return False
     if not denser(points[rows], ball, STANDS_OUT, fit.scale):
         return False
-    return is_noise(on, residual, ball) and shape(on, residual, ball) <= LARGEST_SHAPE * ball.radius
+    return is_noise(on, residual, ball, NOISE_LIMITS)
 
 
 # --- noise of the cloud ----------------------------------------------------------------------------------------------
