@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from processor import diagnostics
 from processor.model import Floats
-
-PAIRS_AT_ONCE = 500_000
 
 
 @dataclass(frozen=True)
@@ -97,12 +96,26 @@ class Polyline:
         squared = np.einsum("mi,mi->m", along, along)
         regular = squared > 0.0
         start, along, squared, arc = start[regular], along[regular], squared[regular], self.arc[:-1][regular]
-        s, offset = np.zeros(len(points)), np.zeros((len(points), 3))
-        for rows in np.array_split(np.arange(len(points)), len(points) * len(start) // PAIRS_AT_ONCE + 1):
-            off = points[rows, None] - start
-            t = np.clip(np.einsum("nmi,mi->nm", off, along) / squared, 0.0, 1.0)
-            off -= t[..., None] * along
-            row, best = np.arange(len(rows)), np.einsum("nmi,nmi->nm", off, off).argmin(axis=1)
-            offset[rows] = off[row, best]
-            s[rows] = arc[best] + t[row, best] * np.sqrt(squared[best])
-        return s, offset
+        segment, t = np.zeros(len(points), np.int64), np.zeros(len(points))
+        _nearest_segments(np.ascontiguousarray(points), start, along, squared, segment, t)
+        offset = points - (start[segment] + t[:, None] * along[segment])
+        return arc[segment] + t * np.sqrt(squared[segment]), offset
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest_segments(points, start, along, squared, segment, t):  # type: ignore[no-untyped-def]
+    """Fill the nearest segment (n,) of points (n, 3), the first of several, and the place (n,) on it from 0 to 1.
+
+    They stay for points that are not finite. Segments go from ``start`` (m, 3) by ``along`` (m, 3), whose squared
+    lengths (m,) are above 0.
+    """
+    for i in range(len(points)):
+        least = np.inf
+        for k in range(len(start)):
+            x, y, z = points[i, 0] - start[k, 0], points[i, 1] - start[k, 1], points[i, 2] - start[k, 2]
+            u, v, w = along[k, 0], along[k, 1], along[k, 2]
+            at = min(max((x * u + y * v + z * w) / squared[k], 0.0), 1.0)
+            x, y, z = x - at * u, y - at * v, z - at * w
+            distance = x * x + y * y + z * z
+            if distance < least:
+                least, segment[i], t[i] = distance, k, at

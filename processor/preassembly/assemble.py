@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from processor import large_arrays
 from processor.adjustment import thermal
 from processor.limits import standards
 from processor.model import ArchDesign, Bools, Floats, Scan, Scene, Tolerance
@@ -22,13 +21,13 @@ from processor.preassembly.ends.joint_frame import end_place, joint_frame
 from processor.preassembly.params import Params, TrimParams
 from processor.preassembly.parts import measure
 from processor.preassembly.parts.attitude import Attitude, Shapes
+from processor.preassembly.parts.each_part import each_part
 from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.result import Result
 from processor.preassembly.to_result import Assembly, JudgedJoint
 from processor.preassembly.verdicts import chain as chain_verdicts
 from processor.preassembly.verdicts import joint_measures, joints, reasons, trim_and_build_up
 from processor.preassembly.verdicts.joints import Conformity
-from processor.progress import tracked
 
 TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)
 
@@ -48,10 +47,7 @@ def assemble(
     limits = standards.default_for(scene.tolerance)
     frames = np.array([joint_frame(points) for points in design.joint_points])
     shapes = Shapes(design, attitudes)
-    fitted = []
-    for index, of_part in enumerate(tracked(scans)):
-        fitted.append(measure.fit(of_part, index, shapes, shrink, params.systematic))
-        large_arrays.release()  # the points of one part are in memory at a time
+    fitted = each_part(lambda k: measure.fit(scans[k], k, shapes, shrink, params.systematic), scans)
     parts = measure.assigned(measure.estimate(fitted, params.systematic))
     curve = _adjust(parts, design, frames, params.adjust.weight)
     adjusted = curve[params.adjust.weight]

@@ -100,6 +100,26 @@ def test_polyline_nearest_by_hand():
     np.testing.assert_allclose(line.at(np.array([15.0])), [[10.0, 5.0, 0.0]])
 
 
+def test_polyline_nearest_beside_all_pairs():
+    rng = np.random.default_rng(5)
+    vertices = np.cumsum(rng.normal(0.0, 20.0, (200, 3)), axis=0)
+    vertices[50] = vertices[51]  # a segment without length
+    points = rng.normal(0.0, 200.0, (300, 3))
+    points[7] = np.nan
+    line = Polyline.through(vertices)
+    start, along = np.delete(vertices[:-1], 50, axis=0), np.delete(np.diff(vertices, axis=0), 50, axis=0)
+    off = points[:, None] - start
+    t = np.clip(np.einsum("nmi,mi->nm", off, along) / np.einsum("mi,mi->m", along, along), 0.0, 1.0)
+    off -= t[..., None] * along
+    best = np.linalg.norm(off, axis=2).argmin(axis=1)
+    s, offset = line.nearest(points)
+    np.testing.assert_allclose(offset, off[np.arange(300), best], atol=1e-9)
+    there = np.arange(300) != 7
+    np.testing.assert_allclose(line.at(s[there]) + offset[there], points[there], atol=1e-9)
+    distances, _ = cKDTree(line.at(np.linspace(0.0, line.length, 400_000))).query(points[there])
+    np.testing.assert_allclose(np.linalg.norm(offset[there], axis=1), distances, atol=0.01)
+
+
 def test_point_to_point_agrees_with_open3d():
     o3d = pytest.importorskip("open3d")
     rng = np.random.default_rng(2)

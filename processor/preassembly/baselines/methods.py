@@ -30,6 +30,7 @@ from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import Params
 from processor.preassembly.parts import attitude, measure
 from processor.preassembly.parts.attitude import Attitude
+from processor.preassembly.parts.each_part import each_part
 from processor.preassembly.result import (
     Components,
     Deviations,
@@ -80,10 +81,12 @@ def extract(
     Attitudes that are ``known``, by the numbers of the parts, are not searched for again.
     """
     known = known or {}
-    return [
-        features_of(scan, k, known[k] if k in known else _attitude(scan, design.parts[k]), design, params)
-        for k, scan in enumerate(scans)
-    ]
+
+    def of_part(k: int) -> PartFeatures:
+        pose = known[k] if k in known else _attitude(scans[k], design.parts[k])
+        return features_of(scans[k], k, pose, design, params)
+
+    return each_part(of_part, [[scan] for scan in scans])
 
 
 def _attitude(scan: Scan, part: DesignPart) -> Attitude:

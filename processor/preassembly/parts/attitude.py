@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import product
+from threading import Lock
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -101,14 +102,16 @@ class Shapes:
         self.design = design
         self.attitudes = {} if attitudes is None else attitudes
         self._made: dict[int, Surface] = {}
+        self._locks = [Lock() for _ in design.parts]  # parts may be fitted on several threads
         self._sizes: list[Floats] = []
         self._axes: dict[int, PrincipalAxes] = {}
 
     def __getitem__(self, index: int) -> Surface:
-        if index not in self._made:
-            made = sample_surface(self.design.parts[index])
-            self._made[index] = replace(made, tube=self._tube(index, made.mesh))
-        return self._made[index]
+        with self._locks[index]:
+            if index not in self._made:
+                made = sample_surface(self.design.parts[index])
+                self._made[index] = replace(made, tube=self._tube(index, made.mesh))
+            return self._made[index]
 
     def __len__(self) -> int:
         return len(self.design.parts)
