@@ -106,8 +106,9 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
 
     Parameters
     ----------
-    points : (n, 3), mm; 10 or more.
-    radius : known radius in mm, held; None = estimated.
+    points : (n, 3), mm; 10 or more, of which fewer than 40 give a failed fit.
+    radius : known radius in mm, held; None = estimated. Where the points have another one the
+        covariance of the centre holds its effect; the status is weak if scanners do not explain it.
     scanner : (3,) position of the scanner, or (n, 3) that of each point, in the points' frame; None = unknown.
 
     Returns

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from processor.report import table as report_table
 from processor.report.reports_of_steps import step_report
 from processor.report.style import default_settings
 from processor.results.file_names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON, STEPS
-from processor.results.to_json import results_json
+from processor.results.to_json import results_json, text_of
 from processor.store import store
 from processor.store.output_checks import check_folder
 from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
@@ -55,7 +54,7 @@ def write_results(
     with replacing_folder(out) as making:
         store.write_results(making / RESULTS_H5, execution.runs, execution.provenance)
         content = results_json(execution, report, headline.of_run(execution))
-        write_text(making / RESULTS_JSON, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+        write_text(making / RESULTS_JSON, text_of(content))
         for table in all_tables.tables_of_run(execution, report):
             if table.file:
                 write_text(making / f"{table.file}.csv", report_table.csv_text(table))

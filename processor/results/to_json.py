@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
@@ -11,6 +13,8 @@ from processor.pipeline import Execution
 from processor.results.fields_to_json import as_object, reason_json
 from processor.results.file_names import FORMAT, FORMAT_VERSION
 from processor.store.json_values import json_ready
+
+ROW_DEPTH = 4  # results, steps, a step, a table: containers about its rows
 
 
 def results_json(execution: Execution, report: ErrorReport, headline: str = "") -> dict[str, Any]:
@@ -50,6 +54,23 @@ def results_json(execution: Execution, report: ErrorReport, headline: str = "") 
     }
     written: dict[str, Any] = json_ready(content)
     return written
+
+
+def text_of(content: Mapping[str, Any]) -> str:
+    """Return results.json as text: members of a step on lines of their own, and each row of a table on one line."""
+    return _lines(content, 0) + "\n"
+
+
+def _lines(value: Any, depth: int) -> str:
+    """Write a value of ``depth`` containers around it. The json module takes ten times as long for indented text."""
+    rows = isinstance(value, list) and any(isinstance(item, dict) for item in value)
+    if depth == ROW_DEPTH or not value or not (rows or isinstance(value, dict)):
+        return json.dumps(value, allow_nan=False, ensure_ascii=False)
+    margin = " " * depth
+    if rows:
+        return f"[\n{margin} " + f",\n{margin} ".join(_lines(item, depth + 1) for item in value) + f"\n{margin}]"
+    items = [f"{json.dumps(key, ensure_ascii=False)}: {_lines(item, depth + 1)}" for key, item in value.items()]
+    return f"{{\n{margin} " + f",\n{margin} ".join(items) + f"\n{margin}}}"
 
 
 def _units(scene: Scene) -> dict[str, Any]:

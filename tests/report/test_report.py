@@ -416,3 +416,29 @@ def test_results_go_through_the_store_unchanged(made, tmp_path):
     store.write_results(tmp_path / "r.h5", [StepRun(step, made.method, "{}", made)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {step: type(made)})
     assert_equal(back.result, made)
+
+
+def test_results_json_has_a_row_of_a_table_on_each_line():
+    balls = [
+        {"id": 1, "centre": [1.5, None, 0.3], "movement": {"ci95": []}},
+        {"id": 2, "reasons": [{"code": "ü"}]},
+    ]
+    content = {"a": 1, "none": {}, "steps": {"spheres": {"balls": balls, "empty": [], "points": [1, 2]}}}
+    text = to_json.text_of(content)
+    assert json.loads(text) == content
+    assert text.splitlines() == [
+        "{",
+        ' "a": 1,',
+        ' "none": {},',
+        ' "steps": {',
+        '  "spheres": {',
+        '   "balls": [',
+        '    {"id": 1, "centre": [1.5, null, 0.3], "movement": {"ci95": []}},',
+        '    {"id": 2, "reasons": [{"code": "ü"}]}',
+        "   ],",
+        '   "empty": [],',
+        '   "points": [1, 2]',
+        "  }",
+        " }",
+        "}",
+    ]

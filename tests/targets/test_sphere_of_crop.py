@@ -87,6 +87,31 @@ def test_a_known_radius_is_held():
     assert np.linalg.norm(fit.centre) < 1.0
 
 
+@pytest.mark.parametrize("scanner", [None, SCANNER])
+@pytest.mark.parametrize("wrong", [-2.0, 1.0, 4.0])
+def test_a_held_radius_that_the_points_have_not_is_stated_and_far_off_never_ok(scanner, wrong):
+    """Scanners make spheres larger or smaller by some 0.5 mm: a difference of 1 mm is in the interval of the centre."""
+    doubted = 0
+    for seed in range(8):
+        fit = processor.fit_sphere(ball_with_tubes(np.random.default_rng(seed), 1.0), RADIUS + wrong, scanner)
+        assert abs(wrong) < 2.0 or fit.status is not Status.OK
+        if fit.status is Status.FAILED:
+            doubted += 1
+            continue
+        assert (fit.radius, fit.covariance[3, 3]) == (RADIUS + wrong, 0.0)
+        assert (np.abs(fit.centre) < NORMAL_95 * np.sqrt(np.diag(fit.covariance))[:3]).all()
+        for doubt in (one.values for one in fit.reasons if one.code == "spheres.other-radius"):
+            doubted += 1
+            assert abs(doubt["radius"] - RADIUS) < 3.0 * doubt["ci95"] / NORMAL_95
+            assert (doubt["held"], doubt["shift"] > 0.5) == (RADIUS + wrong, True)
+    assert doubted >= 6
+
+
+def test_few_points_give_no_sphere_and_the_reason():
+    fit = processor.fit_sphere(RADIUS * directions(np.random.default_rng(0), 39))
+    assert (fit.status, fit.reasons) == (Status.FAILED, (reason("spheres.too-few-for-ball", points=39, least=40),))
+
+
 def flattened(rng, noise):
     normals = directions(rng, 6000)
     return seen(rng, RADIUS * normals * [1.0, 0.85, 1.0], normals, noise)

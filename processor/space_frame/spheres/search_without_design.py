@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.geometry.sphere import Sphere, algebraic
 from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit, bound, robust_fit
-from processor.model import Floats, Status, Tolerance, reason
+from processor.model import NORMAL_95, Floats, Reason, Status, Tolerance, reason
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Flag, Result
@@ -20,6 +21,7 @@ LEAST_ONE_SIDED = 0.2  # length of the mean of normals; 0.5 of half a sphere, 0 
 FAR_RADII = 1e4
 STEEP_COS = 0.5  # of the incidence of a ray
 FIRST_SCALE = 2.0  # of the second fit, in scales of the first: ranges scatter more than distances
+CHANCE = 3.29  # standard deviations: 0.1 % of right radii are farther from a measured one
 
 
 def search(cloud: MergedCloud, params: Params) -> Result:
@@ -39,7 +41,10 @@ def fewest_points(params: Params) -> int:
 def measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Params) -> Result:
     """Return the result of spheres found in a cloud, fitted by the method."""
     if not found:
-        return Result(Status.FAILED, params.method, (reason("spheres.no-ball", points=len(cloud.points)),))
+        count, least = len(cloud.points), fewest_points(params)
+        few = reason("spheres.too-few-for-ball", points=count, least=least)
+        why = few if count < least else reason("spheres.no-ball", points=count)
+        return Result(Status.FAILED, params.method, (why,))
     rows = [_searched(id_, candidate, cloud, params) for id_, candidate in enumerate(found)]
     messages = [reason("spheres.searched")]
     if params.method == "least-squares":
@@ -69,13 +74,18 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
         sphere = algebraic(on)
     if sphere is None:
         return missing(id_, NAN, len(on), reason("spheres.no-sphere"))
-    doubts = []
+    doubts: list[Reason] = []
+    remarks: tuple[Reason, ...] = ()
+    wrong = False
     if params.method != "least-squares":
         widened = _widened(cloud, candidate.fit, _held(params) is not None)
         if widened is None:
             doubts.append(reason("spheres.unknown-side") if cloud.scanner is None else reason("spheres.at-limb"))
         else:
             sphere = widened
+        if _held(params) is not None:
+            moved, remarks, wrong = _by_free_radius(cloud, candidate.fit)
+            sphere = sphere.widened_by(moved)
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
     # NaN, if the noise is unknown, stays NaN.
     times = candidate.fit.scale / np.maximum(
@@ -83,8 +93,9 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     )
     if times > LARGEST_SCALE:
         doubts.append(reason("spheres.rough", times=float(times)))
-    if doubts:
-        row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, *doubts))
+    if doubts or wrong:
+        row = replace(row, flag=Flag.LOW_CONFIDENCE)
+    row = replace(row, reasons=(*row.reasons, *doubts, *remarks))
     if params.method == "least-squares":
         return row
     seen_from = None if cloud.scanner is None else cloud.scanner[candidate.fit.inliers]
@@ -124,6 +135,32 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Sphere | 
     if again is None or not again.converged:
         return None
     return ball.widened_by(start.moved_to(again.sphere))
+
+
+def _by_free_radius(cloud: MergedCloud, fit: RobustFit) -> tuple[Floats, tuple[Reason, ...], bool]:
+    """Return how far points move the centre of a fit with a held radius, (4,), the remark on it, and whether to doubt.
+
+    A radius that is wrong by a little fits as well, with its centre elsewhere. So the radius is also estimated. Where
+    it differs by more than its interval, the difference of the centres is a standard deviation of the held one. By less
+    than what all points of a view have in common, a right radius may differ, too.
+    """
+    ball, nowhere = fit.sphere, np.zeros(4)
+    off = cloud.points - ball.centre
+    near = np.linalg.norm(off, axis=1) < sphere_detection.NEAR * ball.radius
+    seen_from = None if cloud.scanner is None else cloud.scanner[near] - ball.centre
+    crop, start = MergedCloud(off[near], cloud.origin + ball.centre, seen_from), replace(ball, centre=np.zeros(3))
+    free = robust_fit(crop.points, start, FIRST_SCALE * fit.scale, None, seen_from)
+    free_sphere = _widened(crop, free, radius_held=False) if free is not None and free.converged else None
+    if free_sphere is None:
+        return nowhere, (), False
+    moved, sd = start.moved_to(free_sphere), float(np.sqrt(free_sphere.covariance[3, 3]))
+    away = abs(float(moved[3]))
+    if not away > NORMAL_95 * sd:  # also where the points do not determine the radius: NaN
+        return nowhere, (), False
+    centre = np.append(moved[:3], 0.0)
+    shift, measured = float(np.linalg.norm(moved[:3])), free_sphere.radius
+    remark = reason("spheres.other-radius", radius=measured, ci95=NORMAL_95 * sd, held=ball.radius, shift=shift)
+    return centre, (remark,) if away > CHANCE * sd else (), away > CHANCE * float(np.hypot(sd, VIEW_SD_MM))
 
 
 def _with_bounds(result: Result, rows: list[Row]) -> Result:
