@@ -28,7 +28,7 @@ def inspect(scene: Scene, found: Any, method: str) -> Result:
     design = scene.frame
     if design is None or found is None or not len(found.tubes):
         return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-tubes"),))
-    ball = {int(id_): k for k, id_ in enumerate(found.balls.ids)}
+    ball = {int(found.balls.ids[k]): k for k in np.flatnonzero(found.balls.placed).tolist()}
     pairs = zip(found.tubes.a.tolist(), found.tubes.b.tolist(), strict=True)
     tube = {frozenset(pair): m for m, pair in enumerate(pairs) if -1 not in pair}
     doubtful = found.matching is not None and found.matching.status is Status.AMBIGUOUS
@@ -75,13 +75,13 @@ def _length(
 ) -> Characteristic:
     """Distance of the centres of a member's nodes, at the reference temperature if the steel's is known.
 
-    ``rows`` are those of the nodes in the design.
+    ``rows`` are those of the nodes in the design, ``ball`` those of the balls with a centre, by their nodes.
     """
     a, b = (design.centres[row] for row in rows)
     nominal = float(np.linalg.norm(b - a))
     at = [ball.get(node, -1) for node in nodes]
     balls = found.balls
-    if min(at) < 0 or any(str(balls.evidence[k]) not in SEEN or not balls.placed[k] for k in at):
+    if min(at) < 0 or any(str(balls.evidence[k]) not in SEEN for k in at):
         return characteristic.absent("length", Quantity.LENGTH, nominal, reason("inspect.node-not-seen"))
     off = balls.centres[at[1]] - balls.centres[at[0]]
     actual = float(np.linalg.norm(off))
