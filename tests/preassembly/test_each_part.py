@@ -1,6 +1,7 @@
 """Parts on several threads: results, diagnostics and errors as one after the other."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -73,15 +74,19 @@ def test_no_more_parts_at_a_time_than_points_allow(monkeypatch):
     assert most == 2
 
 
-def test_the_first_error_is_raised(monkeypatch):
+def test_the_first_error_is_raised_and_no_further_part_begun(monkeypatch):
     monkeypatch.setattr(parts_in_turn, "usable", lambda: 2)
+    begun = []
 
     def function(k):
-        if k > 1:
+        begun.append(k)
+        if k == 1:
             raise ValueError(f"part {k}")
+        time.sleep(0.05)
 
-    with pytest.raises(ValueError, match="part 2"):
-        each_part(function, scans())
+    with pytest.raises(ValueError, match="part 1"):
+        each_part(function, scans(count=100))
+    assert len(begun) < 50
 
 
 @pytest.mark.slow

@@ -38,7 +38,10 @@ def each_part(function: Callable[[int], T], scans: Sequence[Sequence[Scan]]) -> 
     with ThreadPoolExecutor(threads) as pool:
         # Each part has a copy of the context, which knows whether clouds are kept: a context cannot be entered twice.
         started = [pool.submit(copy_context().run, recorded, part) for part in parts]
-        done = [future.result() for future in tracked(started)]
+        try:
+            done = [future.result() for future in tracked(started)]
+        finally:
+            pool.shutdown(cancel_futures=True)  # after an error, or Ctrl-C, no further part is begun
     for _, notes in done:
         diagnostics.replay(notes)
     return [result for result, _ in done]
