@@ -35,13 +35,12 @@ def each_part(function: Callable[[int], T], scans: Sequence[Sequence[Scan]]) -> 
         with diagnostics.recording() as notes:
             return function(part), notes
 
+    # Each part has a copy of the context, which knows whether clouds are kept: a context cannot be entered twice.
+    contexts = [copy_context() for _ in parts]
     with ThreadPoolExecutor(threads) as pool:
-        # Each part has a copy of the context, which knows whether clouds are kept: a context cannot be entered twice.
-        started = [pool.submit(copy_context().run, recorded, part) for part in parts]
-        try:
-            done = [future.result() for future in tracked(started)]
-        finally:
-            pool.shutdown(cancel_futures=True)  # after an error, or Ctrl-C, no further part is begun
+        # After an error, or Ctrl-C, no further part is begun.
+        results = pool.map(lambda context, part: context.run(recorded, part), contexts, parts)
+        done = [found for _, found in zip(tracked(parts), results, strict=True)]
     for _, notes in done:
         diagnostics.replay(notes)
     return [result for result, _ in done]
