@@ -89,6 +89,24 @@ def used_modules(name):
     return {n for n in own if MODULES[n].name != "__init__.py" or len(tree(MODULES[n]).body) > 1}
 
 
+SHARED_ROOMS = ("model", "plain_text", "store", "writers", "progress", "jobs", "version")
+
+
+def foreign_imports():
+    """Imports over the borders of the packages: CAD in processor, HDF5 outside the store, geometry in designgen."""
+    wrong = []
+    for name, path in MODULES.items():
+        used = imports(path)
+        if within({name}, "processor"):
+            wrong += [(name, each) for each in within(used, "designgen", "cadquery", "OCP")]
+        else:
+            rooms = within(used, *(f"processor.{room}" for room in SHARED_ROOMS)) | {"processor"}
+            wrong += [(name, each) for each in within(used, "processor") - rooms]
+        if not within({name}, "processor.store"):
+            wrong += [(name, each) for each in within(used, "h5py")]
+    return wrong
+
+
 def circles():
     """Groups of modules that import each other, directly or through others (Tarjan)."""
     graph = {name: sorted(used_modules(name)) for name in MODULES}
