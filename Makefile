@@ -10,7 +10,7 @@ DEPENDENCIES ?= newest
 # Modules stay compiled, also where the environment says otherwise: tests and demo start many processes.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-lowest lint docs bench paper nightly weekend lock audit clean system
+.PHONY: demo test test-lowest lint docs bench mutants paper nightly weekend lock audit clean system
 
 demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
@@ -47,6 +47,12 @@ bench: $(VENV)/.test
 	$(BIN)/python -m tests.bench.generator --whole --output $(OUT)/bench-generator.json
 	$(BIN)/python -m tests.bench.readers --speed --output $(OUT)/bench-readers.json
 	$(BIN)/python -m tests.bench.cost --output $(OUT)/bench-cost.json
+
+# Small errors put into the numeric code, one at a time: which of them does no test see? SEED draws others.
+NUMBER ?= 200
+SEED ?= 1
+mutants: $(VENV)/.test
+	$(BIN)/python -m tests.mutation --number $(NUMBER) --seed $(SEED) --jobs $(JOBS) -o $(OUT)/mutants
 
 paper: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/paper

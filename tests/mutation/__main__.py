@@ -1,0 +1,196 @@
+"""Draw mutants of the numeric core, run the nearest tests of each and list those that no test kills.
+
+``python -m tests.mutation --number 200 --seed 1 -o out/mutants``. A survivor is either equivalent to the code, or a
+test is missing. Each verdict is a line of ``OUT/mutants.jsonl``; a further run tries again what was not killed in it.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+from collections import Counter, deque
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from queue import SimpleQueue
+
+from tests.mutation.sites import Site, sites
+from tests.support.structure import MODULES, ROOT, imports, module_name
+
+# Where numbers are made. What reads, writes and shows them is tested by examples of files and pages.
+CORE = (
+    *("geometry", "adjustment", "registration", "limits", "deviation", "defects", "evaluation", "preassembly"),
+    *("space_frame", "stitching", "inspection", "compare", "targets", "epochs"),
+)
+CORE_FOLDERS = (*(f"processor/{name}" for name in CORE), "designgen/scanning", "designgen/designs", "designgen/asbuilt")
+NEAREST_FILES = 8  # of tests, by the distance of imports: beyond these the whole suite would be run for each mutant
+FARTHEST = 3  # imports between a file of tests and the mutant
+LIMIT_S = 600.0  # of one mutant: a loop that no longer ends
+KILLED, SURVIVED, TIMEOUT, NO_TESTS = "killed", "survived", "timeout", "no tests"
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A file of the project, by its path from the root, and one change of it."""
+
+    path: str
+    digest: str  # of the file: what was killed in another state of it says nothing
+    site: Site
+
+    @property
+    def key(self) -> str:
+        return f"{self.path} {self.digest} {self.site.start} {self.site.new}"
+
+    def __str__(self) -> str:
+        old, new = (" ".join(text.split()) for text in (self.site.old, self.site.new))
+        return f"{self.path}:{self.site.line}: {self.site.kind}: {old} -> {new}"
+
+
+def drawn(number: int, seed: int, folders: tuple[str, ...] = CORE_FOLDERS) -> list[Mutant]:
+    """Return mutants: every kind as often as another, then every place of it as often as another."""
+    by_kind: dict[str, list[Mutant]] = {}
+    for folder in folders:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            source = path.read_text("utf-8")
+            digest = hashlib.sha256(source.encode()).hexdigest()[:12]
+            for site in sites(source):
+                mutant = Mutant(path=path.relative_to(ROOT).as_posix(), digest=digest, site=site)
+                by_kind.setdefault(site.kind, []).append(mutant)
+    generator = random.Random(seed)
+    mutants: list[Mutant] = []
+    while len(mutants) < number and by_kind:
+        kind = generator.choice(sorted(by_kind))
+        places = by_kind[kind]
+        mutants.append(places.pop(generator.randrange(len(places))))
+        if not places:
+            del by_kind[kind]
+    return mutants
+
+
+@cache
+def importers() -> dict[str, set[str]]:
+    """Names of modules and of files of tests, by the module that they import."""
+    files = {**MODULES, **{module_name(path): path for path in (ROOT / "tests").rglob("*.py")}}
+    found: dict[str, set[str]] = {}
+    for name, path in files.items():
+        for imported in imports(path):
+            found.setdefault(imported, set()).add(name)
+    return found
+
+
+def distances(module: str) -> dict[str, int]:
+    """Return the number of imports between a module and each of those that use it, directly or through others."""
+    away = {module: 0}
+    waiting = deque([module])
+    while waiting:
+        name = waiting.popleft()
+        for user in sorted(importers().get(name, ())):
+            if user not in away:
+                away[user] = away[name] + 1
+                waiting.append(user)
+    return away
+
+
+def nearest_tests(path: str) -> list[str]:
+    """Return the files of tests that are next to a file by imports, those in folders of its name first."""
+    folders = set(Path(path).parts)
+    away = distances(module_name(ROOT / path))
+    tests = [(steps, name) for name, steps in away.items() if name.rpartition(".")[2].startswith("test_")]
+    order = sorted(tests, key=lambda one: (one[0], not folders & set(one[1].split(".")), one[1]))
+    return [name.replace(".", "/") + ".py" for steps, name in order if steps <= FARTHEST][:NEAREST_FILES]
+
+
+class Copy:
+    """A copy of the project in which one mutant at a time stands."""
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        if not place.exists():
+            skipped = shutil.ignore_patterns(".git", ".venv*", "out", ".mypy_cache", ".ruff_cache", ".pytest_cache")
+            shutil.copytree(ROOT, place, ignore=skipped)
+
+    def verdict(self, mutant: Mutant) -> str:
+        tests = nearest_tests(mutant.path)
+        if not tests:
+            return NO_TESTS
+        path = self.place / mutant.path
+        source = path.read_text("utf-8")
+        kernels = self._compiled(mutant.path)
+        for each in kernels:  # compiled code has the old function in it, also where another file calls it
+            each.rename(each.with_name(each.name + ".kept"))
+        times = path.stat()
+        try:
+            path.write_text(mutant.site.applied(source), "utf-8")
+            return self._run(tests)
+        finally:
+            path.write_text(source, "utf-8")
+            os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # or its kernels would be compiled again
+            for each in self._compiled(mutant.path):
+                each.unlink()
+            for each in kernels:
+                each.with_name(each.name + ".kept").rename(each)
+
+    def _compiled(self, path: str) -> list[Path]:
+        """Return the files of kernels of a module and of all that use it."""
+        found: list[Path] = []
+        for name in distances(module_name(ROOT / path)):
+            source = MODULES.get(name)
+            if source is not None:
+                cache_folder = (self.place / source.relative_to(ROOT)).parent / "__pycache__"
+                found += [*cache_folder.glob(f"{source.stem}.*.nbi"), *cache_folder.glob(f"{source.stem}.*.nbc")]
+        return found
+
+    def _run(self, tests: list[str]) -> str:
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests]
+        env = {**os.environ, "PYTHONPATH": str(self.place), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        try:
+            done = subprocess.run(command, cwd=self.place, env=env, capture_output=True, timeout=LIMIT_S, check=False)
+        except subprocess.TimeoutExpired:
+            return TIMEOUT
+        return SURVIVED if done.returncode == 0 else KILLED
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--number", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "out/mutants")
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    record = options.output / "mutants.jsonl"
+    known = [json.loads(line) for line in record.read_text("utf-8").splitlines()] if record.exists() else []
+    verdicts = {one["key"]: KILLED for one in known if one["verdict"] == KILLED}
+    mutants = drawn(options.number, options.seed)
+    copies: SimpleQueue[Copy] = SimpleQueue()
+    for number in range(options.jobs):
+        copies.put(Copy(options.output / f"copy-{number}"))
+
+    def judge(mutant: Mutant) -> tuple[Mutant, str]:
+        copy = copies.get()
+        try:
+            return mutant, copy.verdict(mutant)
+        finally:
+            copies.put(copy)
+
+    left = [mutant for mutant in mutants if mutant.key not in verdicts]
+    with ThreadPoolExecutor(options.jobs) as threads, record.open("a", encoding="utf-8") as file:
+        for mutant, verdict in threads.map(judge, left):
+            verdicts[mutant.key] = verdict
+            file.write(json.dumps({"key": mutant.key, "mutant": str(mutant), "verdict": verdict}) + "\n")
+            file.flush()
+            print(f"{verdict:9}  {mutant}", flush=True)
+    of_drawn = Counter(verdicts[mutant.key] for mutant in mutants)
+    print(", ".join(f"{verdict}: {count}" for verdict, count in sorted(of_drawn.items())))
+    for mutant in mutants:
+        if verdicts[mutant.key] != KILLED:
+            print(f"{verdicts[mutant.key]}: {mutant}")
+
+
+if __name__ == "__main__":
+    main()
