@@ -47,11 +47,14 @@ LOSSES = {
 }
 
 
-def make_scene(path: Path, name: str, recipe: recipe_files.Recipe, seed: int | None) -> tuple[int, int, int]:
+def make_scene(
+    path: Path, name: str, recipe: recipe_files.Recipe, seed: int | None, folder: str = ""
+) -> tuple[int, int, int]:
     """Make the scene of a recipe with its truth and write it to ``path``; returns seed, number of scans, and of points.
 
-    ``seed`` replaces the recipe's. The same recipe and seed give the same bytes, whatever the time, host and number of
-    processors. Raises UsageError for a recipe that cannot be made, InputError where ``path`` cannot be written.
+    ``seed`` replaces the recipe's. Files that it names are in ``folder``, "": the current one. The same recipe and seed
+    give the same bytes, whatever the time, host and number of processors. Raises UsageError for a recipe that cannot be
+    made, InputError where ``path`` cannot be written.
     """
     from threadpoolctl import threadpool_limits
 
@@ -62,7 +65,7 @@ def make_scene(path: Path, name: str, recipe: recipe_files.Recipe, seed: int | N
     check_file(path)
     # The last bits of BLAS results depend on the number of threads.
     with threadpool_limits(1, user_api="blas"):
-        made, truth = make.make(name, recipe, seed)
+        made, truth = make.make(name, recipe_files.with_files_in(recipe, folder), seed)
         used = recipe.get("seed", 0) if seed is None else seed
         store.write_scene(path, made, truth, _provenance(name, recipe, used, software()))
     return used, len(made.scans), sum(len(scan.points) for scan in made.scans)
@@ -102,6 +105,7 @@ class Job:
     seed: int
     varied: tuple[str, ...]  # values as typed, in the order of their keys
     software: dict[str, str]
+    files_in: str = ""  # the folder of files that the recipe names: the current one of the command
     indexed: Content | None = None  # of the file in the index of an earlier run
 
 
@@ -199,6 +203,7 @@ def plan(
                     seed=seed,
                     varied=combination,
                     software=installed,
+                    files_in=os.getcwd(),
                 )
             )
     return jobs
@@ -225,7 +230,7 @@ def _made_or_kept(job: Job) -> Outcome:
     if isinstance(earlier, Content):
         return Outcome(earlier, made=False)
     try:
-        make_scene(path, job.recipe, job.parameters, job.seed)
+        make_scene(path, job.recipe, job.parameters, job.seed, job.files_in)
         return Outcome(_content(path), replaced=f"{earlier}; made again" if earlier else "")
     except Exception:
         with suppress(OSError):

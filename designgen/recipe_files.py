@@ -50,11 +50,16 @@ def load(name_or_path: str | PathLike[str]) -> tuple[str, Recipe]:
         content = tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: not a readable recipe: {error}") from error
-    model = content.get("model")
-    for key in ("file", "stations"):  # a recipe names files beside it
-        if isinstance(model, dict) and isinstance(model.get(key), str) and model[key]:
-            model[key] = str(path.parent / model[key])
-    return path.stem, content
+    return path.stem, with_files_in(content, path.parent)  # a recipe names files beside it
+
+
+def with_files_in(recipe: Recipe, folder: str | PathLike[str]) -> Recipe:
+    """Return a recipe whose relative paths of files begin with a folder."""
+    model = recipe.get("model")
+    if not isinstance(model, dict):
+        return recipe
+    paths = {key: model[key] for key in ("file", "stations") if isinstance(model.get(key), str) and model[key]}
+    return {**recipe, "model": {**model, **{key: str(Path(folder, path)) for key, path in paths.items()}}}
 
 
 def overridden(recipe: Mapping[str, Any], settings: Sequence[str] | Mapping[str, Any]) -> Recipe:

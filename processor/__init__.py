@@ -9,12 +9,15 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from processor import library_settings
 from processor.version import __version__
 
 if TYPE_CHECKING:
     from processor.api.arrays import CorePoints, Pose, SphereFit, fit_sphere, m3c2, register
     from processor.api.conversion import Converted, convert
     from processor.api.runs import Results, check, export, read, run
+
+library_settings.leave_current_folder_out()
 
 __all__ = [
     "Converted",

@@ -18,6 +18,7 @@ from typing import Any
 
 from processor.model import UsageError
 
+folder: Path | None = None  # that the user is in, where it is not the current one: child processes are elsewhere
 NAME = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*):([A-Za-z_]\w*)", re.ASCII)
 
 
@@ -32,7 +33,7 @@ def shown(method: str) -> str:
 
 
 def load(method: str) -> Callable[..., Any]:
-    """Import ``module:function``: a module that is installed, else a file ``module.py`` in the current folder.
+    """Import ``module:function``: a module that is installed, else a file ``module.py`` in the user's folder.
 
     Raises UsageError where the name, the module or the function is none.
     """
@@ -47,7 +48,7 @@ def load(method: str) -> Callable[..., Any]:
 
 
 def _module(name: str, method: str) -> ModuleType:
-    path = Path.cwd() / f"{name}.py"
+    path = (folder or Path.cwd()) / f"{name}.py"
     try:
         if name not in sys.modules and _is_missing(name) and path.is_file():
             spec = importlib.util.spec_from_file_location(name, path)

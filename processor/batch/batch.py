@@ -147,7 +147,7 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
     token = secrets.token_hex(8)
     replace_text(_token_file(state), token)
     summary.remove(out)  # there is none until all jobs are done: an older one would be of other results
-    run_options = settings.run_options
+    run_options = (*settings.run_options, "--methods-from", str(Path.cwd()))
     if settings.params_toml:
         replace_text(state / "params.toml", settings.params_toml.decode("utf-8"))
         run_options = (*run_options, "--params", str(state / "params.toml"))

@@ -27,9 +27,9 @@ def limited_run(
     """
     part = output.with_name(f"{output.name}.part")
     _remove(part)
-    command = (*process.GUARDED, str(memory_mb or 0), "processor", "run", *arguments, "--so-far", str(part))
+    command = (*process.GUARDED, str(memory_mb or 0), "processor", "run", *arguments, "--so-far", str(part.absolute()))
     ended = process.run(
-        (*command, "-o", str(output), "--", str(input_)),
+        (*command, "--methods-from", str(Path.cwd()), "-o", str(output.absolute()), "--", str(input_.absolute())),
         log=Path("/dev/stderr"),
         stdout=1,
         timeout_s=timeout_s or float("inf"),

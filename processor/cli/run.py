@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from processor import user_methods
 from processor.cli.common import (
     LANGUAGES,
     UNITS,
@@ -48,6 +49,7 @@ from processor.results.file_names import RESULTS_JSON
 @cluster_option
 @click.option("--keep-steps", is_flag=True, help="clouds of the stages of the papers' methods as PLY in OUT/steps")
 @click.option("--so-far", type=click.Path(path_type=Path), hidden=True)
+@click.option("--methods-from", type=click.Path(path_type=Path), hidden=True, help="where a method's module lies")
 @form_options
 @fail_on_option
 @output_options
@@ -65,6 +67,7 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
         raise missing(input_)
     further = forms(options["pdf"], options["xlsx"])
     output = output or default_output(_default_name(input_), shown.quiet)
+    user_methods.folder = options.pop("methods_from")
     limits = options.pop("timeout_s"), options.pop("memory_mb")
     if any(limit is not None for limit in limits):
         context.exit(limited_run(input_, output, *limits, _arguments({**options, "fail_on": fail_on})))
@@ -112,5 +115,6 @@ def _arguments(options: dict[str, Any]) -> list[str]:
         if value is True:
             arguments.append(option)
         elif value not in (None, False, ()):
-            arguments += [option, ",".join(value) if isinstance(value, tuple) else str(value)]
+            text = str(value.absolute() if isinstance(value, Path) else value)
+            arguments += [option, ",".join(value) if isinstance(value, tuple) else text]
     return arguments

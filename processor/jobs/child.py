@@ -1,6 +1,6 @@
 """Child side of a job: limited memory, end with the parent process, jobs served one after another.
 
-``python -m processor.jobs.child MEMORY_MB MODULE ARGUMENT...`` runs a module as ``python -m`` does, or a script where
+:func:`main` with the arguments MEMORY_MB MODULE ARGUMENT... runs a module as ``python -m`` does, or a script where
 MODULE ends in ``.py``, within the limit (0: none); its exit code tells a lack of memory, or of room to write, by the
 codes of :mod:`processor.jobs.causes`. Standard input is a pipe that stays open as long as the parent
 process lives.
@@ -8,6 +8,7 @@ process lives.
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import pickle
 import resource
@@ -107,6 +108,8 @@ def _receive(messages: SimpleQueue[bytes]) -> None:
 def main() -> None:
     """Run the module or script of the command line."""
     garbage_collection.collect_rarely()
+    if os.environ.get("PYTHONFAULTHANDLER"):  # which an isolated interpreter does not look at
+        faulthandler.enable()
     guard(int(sys.argv[1]))
     sys.argv[:] = sys.argv[2:]
     with causes.exiting_by_cause():
@@ -114,7 +117,3 @@ def main() -> None:
             runpy.run_path(sys.argv[0], run_name="__main__")
         else:
             runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,9 +1,13 @@
-"""Child processes: start, limits of time and memory, the end of the whole process group."""
+"""Child processes: start, limits of time and memory, the end of the whole process group.
+
+Every process of this project is started here. Its current folder is the root folder and its interpreter an isolated
+one, so that no file of the folder that the user is in, or of an input, is run as a module. Paths given to it are
+absolute.
+"""
 
 from __future__ import annotations
 
 import atexit
-import json
 import os
 import pickle
 import selectors
@@ -21,6 +25,7 @@ from typing import IO, Any, TypeVar
 
 from processor.jobs.causes import Cause, of_exit_code
 from processor.jobs.child import Loss, Lost
+from processor.library_settings import ROOT
 
 PERIOD_S = 0.05
 LOOK_S = 0.5  # between two looks at what may stop a process, and at the processes that it has started
@@ -30,8 +35,7 @@ TAIL_BYTES = 1 << 14
 MB, KB = 2**20, 2**10
 ATTEMPTS = 2  # at a job whose process dies
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-GUARDED = (sys.executable, "-m", "processor.jobs.child")  # MEMORY_MB MODULE ARGUMENT...
-SAME_PATH = "import json, sys; sys.path[:] = json.loads(sys.argv.pop(1)); "
+PROJECT = Path(__file__).resolve().parents[2]
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -68,8 +72,31 @@ def environment(threads: int, **more: str) -> dict[str, str]:
 
 
 def isolated(code: str, *arguments: str) -> list[str]:
-    """Return the command that runs Python code in an isolated interpreter with the module search path of this one."""
-    return [sys.executable, "-I", "-c", SAME_PATH + code, json.dumps(sys.path), *arguments]
+    """Return the command that runs Python code in an isolated interpreter with the module search path of this one.
+
+    The current folder, and that of the script that this process runs, are no part of the path.
+    """
+    options = ["-I", *(["-B"] if sys.dont_write_bytecode else []), *(["-X", "utf8"] if sys.flags.utf8_mode else [])]
+    set_path = f"import sys; sys.path[:] = dict.fromkeys([*{_search_path()!r}, *sys.path]); "
+    return [sys.executable, *options, "-c", set_path + code, *arguments]
+
+
+def _search_path() -> list[str]:
+    script = getattr(sys.modules.get("__main__"), "__file__", None)
+    left_out = {_identity("."), _identity(os.path.dirname(os.path.abspath(script)) if script else ".")}
+    left_out.discard(_identity(PROJECT))  # a checkout that is not installed
+    return [folder for folder in sys.path if os.path.isabs(folder) and _identity(folder) not in left_out]
+
+
+def _identity(folder: str | Path) -> tuple[int, int] | str:
+    """Return what two paths of one folder have in common; a path that does not exist is like no other."""
+    with suppress(OSError):
+        found = os.stat(folder)
+        return found.st_dev, found.st_ino
+    return str(folder)
+
+
+GUARDED = tuple(isolated("from processor.jobs import child; child.main()"))  # MEMORY_MB MODULE ARGUMENT...
 
 
 def start(
@@ -81,7 +108,7 @@ def start(
     pass_fds: Sequence[int] = (),
     own_group: bool = True,
 ) -> subprocess.Popen[bytes]:
-    """Start a command whose standard input is a pipe, closed by the system when this process dies.
+    """Start a command in the root folder; its standard input is a pipe, which the system closes when this process dies.
 
     With ``own_group`` it leads a session of its own: Ctrl-C does not reach it, and :func:`end` kills all that it has
     started. Without, it is killed with the group of this process.
@@ -92,6 +119,7 @@ def start(
         stdout=stdout,
         stderr=stderr,
         env=env,
+        cwd=ROOT,
         pass_fds=pass_fds,
         start_new_session=own_group,
     )

@@ -15,7 +15,6 @@ import pwd
 import re
 import shutil
 import stat
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -179,9 +178,9 @@ def _own_group(number: int, user: int) -> bool:
 def _designgen(path: Path) -> list[str]:
     """Return the command of designgen: of this installation, or else the one on the search path."""
     if importlib.util.find_spec("designgen") and importlib.util.find_spec("cadquery"):
-        return [sys.executable, "-m", "designgen"]
+        return [*process.GUARDED, "0", "designgen"]
     program = shutil.which("designgen")
-    if program:
+    if program and os.path.isabs(program):  # not one of the current folder
         return [program]
     raise InputError(
         "a CAD file needs designgen with its CAD kernel: pip install 'steel-scan-check[designgen]'", path=path

@@ -70,7 +70,7 @@ def do(
 def _results(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) -> dict[str, Any]:
     """Return results.json of a cell made in a folder. Raises _FailedError if a command fails."""
     scene, results = _scene(spec, folder, command), folder / "results"
-    options = ["--steps", ",".join(spec["steps"])]
+    options = ["--steps", ",".join(spec["steps"]), "--methods-from", os.getcwd()]
     options += ["--method", ",".join(spec["methods"])] if spec["methods"] else []
     if spec["params"]:
         (folder / "params.toml").write_text(toml.document(spec["params"]), "utf-8")
@@ -114,7 +114,7 @@ def cell_runner(cluster: str | None, jobs: int, scratch: Path, say: Callable[[st
     Raises UsageError if there is no cluster at the address ``cluster``; InputError if it is lost on the way.
     """
     threads = max(1, (os.cpu_count() or 1) // jobs)
-    run_cell = do if cluster else partial(do, threads=threads, scratch=str(scratch))
+    run_cell = do if cluster else partial(do, threads=threads, scratch=str(scratch.absolute()))
     with runner.executor(cluster, jobs, say) as executor:
 
         def run(cells: Sequence[Cell]) -> Generator[tuple[Cell, Outcome], None, None]:

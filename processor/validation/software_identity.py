@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-import subprocess
+import tempfile
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from processor.jobs import process
+from processor.jobs.causes import Cause
 from processor.jobs.software import source_digest, versions
 
 PACKAGES = ("processor", "designgen")
@@ -42,17 +44,20 @@ def present() -> Software:
 
 
 def _commit() -> str:
-    folder = Path(__file__).parent
-    env = {**os.environ, "GIT_OPTIONAL_LOCKS": "0"}
+    checkout = Path(__file__).parents[2]
+    if not (checkout / ".git").exists():  # installed, perhaps below a checkout of something else
+        return ""
 
     def git(*words: str) -> str:
-        return subprocess.run(
-            ["git", *words], cwd=folder, env=env, capture_output=True, text=True, check=True, timeout=GIT_S
-        ).stdout
+        with tempfile.TemporaryFile() as output:
+            command = ("git", "-C", str(checkout), *words)
+            ended = process.run(command, env={**os.environ, "GIT_OPTIONAL_LOCKS": "0"}, stdout=output, timeout_s=GIT_S)
+            if ended.cause is not Cause.EXIT or ended.code:
+                raise OSError(ended.last_line)
+            output.seek(0)
+            return output.read().decode().strip()
 
     try:
-        if not git("ls-files", __file__):  # installed below a checkout of something else
-            return ""
-        return git("rev-parse", "HEAD").strip() + ("+" if git("status", "--porcelain", "--", "..").strip() else "")
-    except (OSError, subprocess.SubprocessError):
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", "processor") else "")
+    except OSError:
         return ""

@@ -191,7 +191,7 @@ def layer_groups():
 
 STEPS = ("defects", "deviation", "inspection", "preassembly", "space_frame", "stitching")
 LAYERS = (
-    ("version", "plain_text", "large_arrays", "inner_kernels"),
+    ("version", "plain_text", "large_arrays", "inner_kernels", "library_settings"),
     ("model",),
     ("record_checks", "tiles"),
     ("progress", "diagnostics", "language", "jobs", "robust_statistics", "distinct_rows", "unit_ratio", "user_methods"),

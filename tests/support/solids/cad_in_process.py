@@ -18,13 +18,14 @@ from designgen import __main__
 from designgen.cad import files as cad_files
 from designgen.cad import process as kernel_process
 from processor.jobs.causes import Cause
+from processor.jobs.process import GUARDED
 from processor.scan_folder import cad as scan_folder_cad
 
 
 def read_here(monkeypatch):
     """Let this process do what ``designgen import`` and the process with the CAD kernel do."""
     monkeypatch.setattr(cad_files, "run", _read)
-    monkeypatch.setattr(scan_folder_cad, "process", SimpleNamespace(run=_import, Cause=Cause))
+    monkeypatch.setattr(scan_folder_cad, "process", SimpleNamespace(run=_import, GUARDED=GUARDED))
 
 
 def _read(_command, *, stdout, pass_fds, **_limits):
@@ -35,10 +36,10 @@ def _read(_command, *, stdout, pass_fds, **_limits):
 
 
 def _import(command, **_limits):
-    assert command[:3] == [sys.executable, "-m", "designgen"]
+    assert tuple(command[: len(GUARDED)]) == GUARDED
     err = io.StringIO()
     with (
-        mock.patch.object(sys, "argv", command[2:]),
+        mock.patch.object(sys, "argv", command[len(GUARDED) + 1 :]),
         contextlib.redirect_stdout(io.StringIO()),
         contextlib.redirect_stderr(err),
         pytest.raises(SystemExit) as end,
