@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor import large_arrays, unit_ratio
+from processor.column_names import UNIT_WORDS
 from processor.model import Floats, InputError, Reason, UsageError, reason
 
 MM_PER_UNIT = {
@@ -20,20 +21,6 @@ MM_PER_UNIT = {
 }
 LARGEST_KM = 10.0  # no structure is larger; a scan in mm read as metres is, and would exhaust the memory
 STRAY = 0.01  # share of a scan's points at either end of an axis that may be outliers
-SYNONYMS = {
-    "in": "inch",
-    "inches": "inch",
-    "foot": "ft",
-    "feet": "ft",
-    "metre": "m",
-    "metres": "m",
-    "meter": "m",
-    "meters": "m",
-    "millimetre": "mm",
-    "millimetres": "mm",
-    "millimeter": "mm",
-    "millimeters": "mm",
-}
 # Ratios of a scan's size to the design's that a mistaken unit causes. Of frames and whole structures often only a piece
 # is scanned, or the hall around them, so fewer ratios are certain.
 PART_RATIOS: tuple[float, ...] = (
@@ -54,7 +41,7 @@ RANK_MARGIN = 0.01  # of all points: a sample of SAMPLE points misses a rank by 
 
 def known_unit(text: str) -> str:
     """Return a unit by its name in MM_PER_UNIT. Raises UsageError, which lists the known units, for any other."""
-    unit = SYNONYMS.get(text.strip().lower(), text.strip().lower())
+    unit = UNIT_WORDS.get(text.strip().lower(), text.strip().lower())
     if unit not in MM_PER_UNIT:
         raise UsageError(f"unknown unit {text!r}; expected one of {', '.join(MM_PER_UNIT)}")
     return unit

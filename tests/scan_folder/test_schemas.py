@@ -9,11 +9,11 @@ import pytest
 from designgen import recipe_files
 from designgen.export import folder as export_folder
 from designgen.scenes.make import make
+from processor.column_names import UNIT_WORDS
 from processor.limits import project_limits, standards
 from processor.model import KEY_POINTS, InputError, Tolerance
 from processor.scan_folder import control_points, folder, tolerance
 from processor.scan_folder.folder import read_input
-from processor.scan_folder.units import MM_PER_UNIT, SYNONYMS
 from processor.store import store
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,7 +59,7 @@ def test_the_project_schema_names_every_key_that_is_read():
     assert {*tolerance.KEYS, *project_limits.choice(Tolerance())} == set(definitions["tolerance"]["properties"])
     assert set(definitions["tolerance"]["properties"]["standard"]["enum"]) == set(standards.standards())
     for name in ("project", "design-arch", "design-frame"):
-        assert set(schema(name)["$defs"]["unit"]["enum"]) == {*MM_PER_UNIT, *SYNONYMS}
+        assert set(schema(name)["$defs"]["unit"]["enum"]) == set(UNIT_WORDS)
     assert set(schema("design-arch")["$defs"]["joint"]["properties"]["points"]["required"]) == set(KEY_POINTS)
 
 
