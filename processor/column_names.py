@@ -106,7 +106,7 @@ def coordinates(names: Sequence[str]) -> Coordinates | None:
 def count_known(names: Iterable[str]) -> int:
     """Return how many of the names are of coordinates, polar or geographic ones, colours or the like."""
     known = POLAR | GEOGRAPHIC | OTHERS
-    return sum(bool(meaning(name).axis) or bool(known & set(_words(name)[0])) for name in names)
+    return sum(bool(meaning(name).axis) or known.issuperset(_words(name)[0]) for name in names)
 
 
 def other_kind(names: Iterable[str]) -> str:

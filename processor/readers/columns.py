@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, BinaryIO
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 import processor.readers.pieces as progress_of
-from processor.model import Floats
+from processor import column_names
+from processor.model import Floats, InputError
 
 INTENSITY_NAMES = r"(scalar_)?(intensity|reflectance|reflectivity|amplitude)|i"
 STATION_NAMES = r"(scalar_)?station"
@@ -19,6 +21,29 @@ PIECE_BYTES = 1 << 19  # fits in the cache of a processor core between the passe
 def first_named(columns: Any, pattern: str) -> str | None:
     """Return the first column name that matches a whole pattern, ignoring case; None without one."""
     return next((name for name in columns if re.fullmatch(pattern, name, re.IGNORECASE)), None)
+
+
+class Axes(NamedTuple):
+    """Which columns are x, y and z, counted from 0, and the unit that their names give, "" for none."""
+
+    columns: tuple[int, int, int]
+    unit: str
+
+
+def axes(path: Path, names: Sequence[str]) -> Axes | None:
+    """Return the columns of coordinates by their names, None where these do not name all three.
+
+    Raises InputError for two columns of one axis, and for coordinates in different units.
+    """
+    try:
+        named = column_names.coordinates(names)
+    except column_names.AmbiguousNamesError as error:
+        raise InputError(f"{error}; leave one of them out, or name it otherwise", path=path) from None
+    if named is None:
+        return None
+    if len(set(named.units)) != 1:
+        raise InputError(f"expected x, y, z in one unit, found different units ({', '.join(names)[:120]})", path=path)
+    return Axes(named.columns, named.units[0])
 
 
 def columns_of_records(file: BinaryIO, dtype: Any, wanted: Sequence[str], count: int) -> Iterator[Sequence[Any]]:

@@ -20,12 +20,18 @@ from processor import large_arrays
 from processor.large_arrays import allocate
 from processor.model import Floats, InputError
 from processor.readers.ascii_rows import Rows
-from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, columns_of_records, fill_columns, first_named
+from processor.readers.columns import (
+    INTENSITY_NAMES,
+    STATION_NAMES,
+    axes,
+    columns_of_records,
+    fill_columns,
+    first_named,
+)
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".pcd",)
-UNIT = ""
 HEADER_LIMIT = 65_536
 PIECE = 1 << 15  # points
 LZF_LIMIT = 100  # a match of LZF turns 3 bytes into at most 264
@@ -51,11 +57,11 @@ def read(path: Path) -> list[RawScan]:
     """Read a PCD file as one scan."""
     header = read_header(path)
     names, count = header.names, header.points
-    missing = [name for name in "xyz" if name not in names]
-    if missing:
+    named = axes(path, names)
+    if named is None:
         raise InputError(f"expected FIELDS with x, y, z, found {' '.join(names)}", path=path)
     intensity, station = first_named(names, INTENSITY_NAMES), first_named(names, STATION_NAMES)
-    fields = [names.index(name) for name in (*"xyz", intensity, station) if name]
+    fields = [*named.columns, *(names.index(name) for name in (intensity, station) if name)]
     columns = [allocate(count, 3), *(allocate(count) for _ in fields[3:])]
     with errors_name_the_file(path, "PCD"), path.open("rb") as file:
         file.seek(header.start)
@@ -73,7 +79,7 @@ def read(path: Path) -> list[RawScan]:
             path,
             scan_name(path),
             columns[0][:returns],
-            unit=UNIT,
+            unit=named.unit,
             intensity=columns[1][:returns] if intensity else (),
             station=columns[-1][:returns] if station else (),
             single=header.data != "ascii" and header.types[fields[0]] == "<f4",

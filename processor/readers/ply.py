@@ -16,12 +16,18 @@ from processor.model import InputError
 from processor.readers.ascii_rows import Rows
 from processor.readers.colours import coloured
 from processor.readers.colours import named as colours_named
-from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, columns_of_records, fill_columns, first_named
+from processor.readers.columns import (
+    INTENSITY_NAMES,
+    STATION_NAMES,
+    axes,
+    columns_of_records,
+    fill_columns,
+    first_named,
+)
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".ply",)
-UNIT = ""
 HEADER_LIMIT = 65_536
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -58,13 +64,14 @@ def read(path: Path) -> list[RawScan]:
     header = read_header(path)
     vertex = next((element for element in header.elements if element.name == "vertex"), _Element("vertex", 0))
     before = header.elements[: header.elements.index(vertex)] if vertex in header.elements else []
-    missing = [name for name in "xyz" if name not in vertex.types]
-    if missing:
-        raise InputError(f"expected vertices with x, y, z, found {', '.join(vertex.types) or 'none'}", path=path)
+    names = list(vertex.types)
+    named = axes(path, names)
+    if named is None:
+        raise InputError(f"expected vertices with x, y, z, found {', '.join(names) or 'none'}", path=path)
     if vertex.list_counts or (header.order and any(element.list_counts for element in before)):
         raise InputError("expected vertices only, found lists before or within them; export points only", path=path)
     intensity, station = first_named(vertex.types, INTENSITY_NAMES), first_named(vertex.types, STATION_NAMES)
-    wanted = [*"xyz", *(name for name in (intensity, station) if name)]
+    wanted = [*(names[i] for i in named.columns), *(name for name in (intensity, station) if name)]
     columns = [allocate(vertex.count, 3), *(allocate(vertex.count) for _ in wanted[3:])]
     colours = [name for name in colours_named(vertex.types) if name not in wanted]
     colour = [allocate(vertex.count, dtype=np.float32) for _ in colours]
@@ -80,16 +87,15 @@ def read(path: Path) -> list[RawScan]:
             rows = Rows(file)
             for _ in range(sum(element.count for element in before)):
                 rows.skip_line()
-            names = list(vertex.types)
             fill_columns(every, rows.pieces([names.index(name) for name in read], vertex.count, len(names)))
     scan = build_scan(
         path,
         scan_name(path),
         columns[0],
-        unit=UNIT,
+        unit=named.unit,
         intensity=columns[1] if intensity else (),
         station=columns[-1] if station else (),
-        single=bool(header.order) and vertex.types["x"] == "f4",
+        single=bool(header.order) and vertex.types[wanted[0]] == "f4",
     )
     return [coloured(scan, colour)]
 

@@ -17,31 +17,25 @@ from typing import BinaryIO
 import numpy as np
 
 import processor.readers.pieces as pieces
-from processor import large_arrays
+from processor import column_names, large_arrays
 from processor.large_arrays import allocate
 from processor.model import Floats, InputError
 from processor.readers.ascii_rows import Rows
 from processor.readers.colours import coloured
 from processor.readers.colours import named as colours_named
-from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, first_named
+from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, axes, first_named
 from processor.readers.encoding import decoded
 from processor.readers.file_checks import check_declared_points, check_last_row, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".asc", ".csv", ".pts", ".txt", ".xyz")
-UNIT = ""
 SNIFFED = 65_536
 SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
 COMMENTS = ("#", "//", "%")
 COUNTED = 5  # rows by which a column of row numbers is recognised
 SAMPLED = 200  # rows
 MOST_OTHERS = 0.1  # share of sampled rows of another width that are errors, not a habit of the file
-AXES = {
-    "x": "x|easting|east",
-    "y": "y|northing|north",
-    "z": "z|elevation|height|altitude",
-}
-UNIT_AFTER = r"[\s_\[(]*(?P<unit>mm|cm|m|ft|in)?[\])]?"
+GRID_HEAD = r"(ncols|nrows|[xy]ll(corner|center)|cellsize|nodata_value)\s+\S+"  # of ESRI ASCII grids
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,8 @@ class Layout:
 
     skip: int = 0  # lines before the first row
     declared: int = -1  # number of points, -1 where no line declares it
-    header: tuple[str, ...] = ()
+    header: tuple[str, ...] = ()  # cells of the line that names the columns, else of the last line before the first row
+    remark: bool = False  # whether that line begins as a comment and names no coordinates
     separator: str | None = None  # None: blanks
     decimal_comma: bool = False
     columns: int = 0
@@ -158,25 +153,17 @@ def sniff(path: Path) -> Layout:
     """Determine the format of a table from its first lines. Raises InputError if none of them is a row of numbers."""
     with path.open("rb") as file:
         head = file.read(SNIFFED)
-    encoding = (
-        "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig" if head[:3] == b"\xef\xbb\xbf" else ""
-    )
-    if not encoding and b"\0" in head:
-        raise InputError("expected a table of numbers as text, found binary data", path=path)
-    text = head.decode(encoding, "replace") if encoding else decoded(head)
-    encoding = encoding or "latin-1"  # never fails, and only numbers are decoded
+    encoding, text = _text(path, head)
     lines = text.splitlines()
-    declared, header = -1, ""
+    declared, before = -1, _Before()
     for number, line in enumerate(lines):
         stripped = line.strip()
-        comment = stripped.startswith(COMMENTS)
-        if declared < 0 and not header and re.fullmatch(r"\d+", stripped):
+        if declared < 0 and (before.coordinates or not before.last) and re.fullmatch(r"\d+", stripped):
             declared = int(stripped)
             continue
         separator, comma = _separator(stripped)
         cells = _cells(stripped, separator, comma)
-        names = tuple(_cells(header, *_separator(header))) if header else ()
-        if stripped and not comment and len(cells) >= 3 and _is_row(cells, names):
+        if stripped and not stripped.startswith(COMMENTS) and len(cells) >= 3 and before.is_row(cells):
             _check_passed_over(path, lines[:number], len(cells))
             whole = lines[number:-1] if len(head) == SNIFFED else lines[number:]
             rows = [row.strip() for row in whole[:SAMPLED] if row.strip()] or [stripped]
@@ -185,7 +172,8 @@ def sniff(path: Path) -> Layout:
             return Layout(
                 skip=number,
                 declared=declared,
-                header=names,
+                header=before.coordinates or before.last,
+                remark=before.remark and not before.coordinates,
                 separator=separator,
                 decimal_comma=comma,
                 columns=len(cells),
@@ -194,12 +182,72 @@ def sniff(path: Path) -> Layout:
                 sample=tuple(tuple(_cells(row, separator, comma)) for row in rows if not row.startswith(COMMENTS)),
             )
         if stripped:
-            header = re.sub(r"^(#|//|%)+\s*", "", stripped)
-    raise InputError(
-        f"{path}: expected rows of at least three numbers x y z, found {lines[0][:60]!r}"
-        if lines
-        else f"{path}: expected rows of numbers, found none"
-    )
+            before.add(path, stripped)
+    raise InputError(_no_rows(lines, before), path=path)
+
+
+def _text(path: Path, head: bytes) -> tuple[str, str]:
+    """Return the encoding in which a table is opened and the text of its first bytes."""
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16", head.decode("utf-16", "replace")
+    if b"\0" in head:
+        raise InputError("expected a table of numbers as text, found binary data", path=path)
+    if len(head) == SNIFFED:
+        head = head[: head.rfind(b"\n") + 1] or head  # a cut within a character would look like another encoding
+    # Latin-1 never fails, and only numbers are decoded.
+    return "utf-8-sig" if head[:3] == b"\xef\xbb\xbf" else "latin-1", decoded(head)
+
+
+@dataclass
+class _Before:
+    """The lines before the first row, of which one may be a header."""
+
+    last: tuple[str, ...] = ()  # cells of the last line
+    remark: bool = False  # whether it begins as a comment
+    coordinates: tuple[str, ...] = ()  # cells of the last line that names x, y and z
+    axes: tuple[int, ...] = ()  # of it, the columns of x, y and z
+    mixed: tuple[str, ...] = ()  # cells of the first line of three numbers and texts
+
+    def add(self, path: Path, line: str) -> None:
+        """Add a line. Raises InputError for the head of a grid of heights, and for two columns of one axis."""
+        if re.fullmatch(GRID_HEAD, line, re.IGNORECASE):
+            raise InputError(
+                "expected rows of points, found a grid of heights (ESRI ASCII: ncols, nrows, cellsize); convert it to "
+                "points, for example by gdal_translate -of XYZ",
+                path=path,
+            )
+        text = re.sub(r"^(#|//|%)+\s*", "", line)
+        self.remark, self.last = text != line, _header_cells(text)
+        if not (self.mixed or self.remark) and sum(map(_is_number, self.last)) >= 3:
+            self.mixed = self.last
+        # Bytes that are not UTF-8 were read as Chinese.
+        latin = () if text.isascii() else _header_cells(text.encode("gb18030", "replace").decode("latin-1"))
+        for names in (self.last, latin):
+            if named := axes(path, names):
+                self.coordinates, self.axes = names, named.columns
+                return
+
+    def is_row(self, cells: Sequence[str]) -> bool:
+        """Whether all cells are numbers, or at least the coordinates by a header: other cells may be text."""
+        wanted = self.axes if len(self.coordinates) == len(cells) else ()
+        return all(map(_is_number, [cells[axis] for axis in wanted] or cells))
+
+
+def _no_rows(lines: Sequence[str], before: _Before) -> str:
+    """Return why none of the lines is a row of numbers."""
+    if not lines:
+        return "expected rows of numbers, found none"
+    number = next((i for i, cell in enumerate(before.mixed) if not _is_number(cell)), 0)
+    if before.mixed:
+        return (
+            f"column {number + 1} is text ({before.mixed[number][:40]!r}), so it is not known which are x, y, z; "
+            "name the columns in a first line (such as name x y z), or leave the text out"
+        )
+    return f"expected rows of at least three numbers x y z, found {lines[0][:60]!r}"
+
+
+def _header_cells(text: str) -> tuple[str, ...]:
+    return tuple(re.sub(r"[\"']", "", cell).strip() for cell in _cells(text, *_separator(text)))
 
 
 def _check_passed_over(path: Path, lines: Sequence[str], width: int) -> None:
@@ -236,23 +284,6 @@ def _cells(line: str, separator: str | None, decimal_comma: bool) -> list[str]:
     return [cell.replace(",", ".") for cell in cells] if decimal_comma else cells
 
 
-def _is_row(cells: Sequence[str], names: Sequence[str]) -> bool:
-    """Whether all cells are numbers, or at least the coordinates by a header: other cells may be names of points."""
-    axes = _axes(names) if len(names) == len(cells) else []
-    return all(map(_is_number, [cells[axis] for axis in axes] or cells))
-
-
-def _axes(header: Sequence[str]) -> list[int]:
-    """Return the columns that a header names x, y and z; none unless it names all three."""
-    names = [_bare(name) for name in header]
-    axes = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
-    return [names.index(name) for name in axes if name is not None] if all(axes) else []
-
-
-def _bare(name: str) -> str:
-    return re.sub(r'["\']', "", name).strip()
-
-
 def _is_number(cell: str) -> bool:
     try:
         float(cell)
@@ -266,29 +297,30 @@ class _Columns:
     axes: Sequence[int]
     intensity: int | None = None
     station: int | None = None
-    unit: str = UNIT
+    unit: str = ""
     colour: Sequence[int] = ()
 
 
 def _columns(path: Path, layout: Layout) -> _Columns:
     """Return the columns of coordinates, intensity and station, and the unit that a header names."""
-    names = [_bare(name) for name in layout.header]
-    axes = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
-    if len(names) == layout.columns and all(axes):
-        matches = [re.search(rf"{UNIT_AFTER}$", name or "", re.IGNORECASE) for name in axes]
-        units = {(match.group("unit") or "").lower() for match in matches if match}
-        if len(units) != 1:
-            raise InputError(
-                f"expected x, y, z in one unit, found different units ({', '.join(layout.header)})", path=path
-            )
+    names = layout.header
+    named = axes(path, names)
+    if named and len(names) == layout.columns:
         others = [first_named(names, pattern) for pattern in (INTENSITY_NAMES, STATION_NAMES)]
         intensity, station = (names.index(name) if name else None for name in others)
-        wanted = [names.index(name) for name in axes if name is not None]
         colour = [names.index(name) for name in colours_named(names)]
-        return _Columns(wanted, intensity, station, units.pop(), colour)
-    if sum(map(bool, axes)) > 1 and len(names) != layout.columns:
+        return _Columns(named.columns, intensity, station, named.unit, colour)
+    # A line of other words is a title or a remark.
+    likely = 2 * column_names.count_known(names) > len(names) > 1
+    if len(names) != layout.columns and (named or likely):
         raise InputError(
             f"the header names {len(names)} columns ({' '.join(names)[:80]}), but rows have {layout.columns}", path=path
+        )
+    if len(names) == layout.columns and (likely or not layout.remark):
+        kind = column_names.other_kind(names)
+        advice = f", which are {kind}; export Cartesian coordinates" if kind else "; correct the line of names"
+        raise InputError(
+            f"expected columns x, y, z or Easting, Northing, Height, found {', '.join(names)[:120]}{advice}", path=path
         )
     _check_plain(path, layout)
     return _Columns([0, 1, 2], 3 if layout.columns in (4, 7) else None, colour=(4, 5, 6) if layout.columns == 7 else ())
@@ -303,11 +335,22 @@ def _check_plain(path: Path, layout: Layout) -> None:
             "separate by semicolons, or name the columns in a first line",
             path=path,
         )
-    counts = [row[0] for row in rows]
-    counting = len(counts) >= COUNTED and counts[0].isdecimal() and layout.columns >= 4
-    if counting and counts == [str(int(counts[0]) + i) for i in range(len(counts))]:
+    leading = _leading_numbers(rows, layout.columns)
+    if leading:
+        first = ", ".join(" ".join(row[:leading]) for row in rows[:3])
         raise InputError(
-            f"expected coordinates, found row numbers in the first column ({', '.join(counts[:3])}, ...); "
-            "name the columns in a first line (id x y z), or leave the row numbers out",
+            f"expected coordinates, found row numbers in the first column{'s' * (leading > 1)} ({first}, ...); "
+            f"name the columns in a first line ({'row column' if leading > 1 else 'id'} x y z), or leave them out",
             path=path,
         )
+
+
+def _leading_numbers(rows: Sequence[Sequence[str]], columns: int) -> int:
+    """Return how many columns count rows: by one from row to row, or whole numbers before three with decimals."""
+    if len(rows) < COUNTED or columns < 4 or any(len(row) != columns for row in rows):
+        return 0
+    counts = [row[0] for row in rows]
+    if counts[0].isdecimal() and counts == [str(int(counts[0]) + i) for i in range(len(counts))]:
+        return 1
+    whole = [all(re.fullmatch(r"[+-]?\d+", row[i]) for row in rows) for i in range(columns)]
+    return next((n for n in (2, 1) if columns >= n + 3 and all(whole[:n]) and not any(whole[n : n + 3])), 0)

@@ -100,6 +100,60 @@ def test_columns_are_recognised_by_surveying_names(tmp_path):
     assert scan.unit == "m"
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '"Intensity","Points:0","Points:1","Points:2"\n9,1,2,3\n',
+        "Point.X,Point.Y,Point.Z,Scan\n1,2,3,S1\n",
+        "//X Y Z R G B\n1\n1 2 3 0 0 0\n",
+        "X Y Z\n# written by hand\n1 2 3\n",
+        "# range x\nrow col x y z i\n0 1 1 2 3 9\n",
+        "Hochwert;Rechtswert;Höhe\n2,0;1,0;3,0\n".encode("latin-1"),
+        "点号,北坐标,东坐标,高程\n甲,2,1,3\n".encode("gb18030"),
+        "".join(
+            ["点号,北,东,高\n", *("甲" * k + ",2,1,3\n" for k in range(1, 300))]
+        ).encode(),  # beyond 64 KB
+    ],
+)
+def test_a_header_is_read_by_the_meaning_of_its_names(tmp_path, text):
+    (scan,) = read(tmp_path, "a.csv", text)
+    assert scan.points[0].tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("range,theta,phi\n1,2,3\n", "found range, theta, phi, which are polar; export Cartesian"),
+        ("# range theta phi\n1 2 3\n", "which are polar"),
+        ("range,theta,phi\n1,2,3,4\n", "the header names 3 columns .* rows have 4"),
+        ("lon,lat,height\n1,2,3\n", "which are geographic"),
+        ("A,B,C\n1,2,3\n", "found A, B, C; correct"),
+        ("X,Y,Z,Easting,Northing,Height\n1,2,3,1,2,3\n", "one column each of x, y, z"),
+        ("".join(f"{i // 9} {i % 9} {i / 7:.2f} 2.5 3.5 7\n" for i in range(20)), r"first columns \(0 0, 0 1, 0 2"),
+        ("".join(f"{3 * i} {i / 7:.2f} 2.5 3.5\n" for i in range(20)), r"first column \(0, 3, 6, ...\)"),
+        ("P1,10.5,20.5,1.5\nP2,11.5,21.5,1.5\n", r"column 1 is text \('P1'\)"),
+        ("10.5 20.5 1.5 S1\n11.5 21.5 1.5 S1\n", "column 4 is text"),
+        ("ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3\n4 5 6\n", "grid of heights"),
+    ],
+)
+def test_columns_that_are_not_known_to_be_coordinates_are_refused_by_name(tmp_path, text, why):
+    with pytest.raises(InputError, match=why):
+        read(tmp_path, "a.asc", text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# made by hand\n1 2 3\n4 5 6\n",
+        "".join(f"{x} {y} 0.5 9\n" for x in range(3) for y in range(3)),  # a profile in whole millimetres
+        "".join(f"{x} {y} 1 0.5 0.5 7\n" for x in range(3) for y in range(3)),
+    ],
+)
+def test_the_first_three_columns_count_where_nothing_speaks_against_it(tmp_path, text):
+    (scan,) = read(tmp_path, "a.xyz", text)
+    assert len(scan.points) == text.count("\n") - text.count("#")
+
+
 def test_decimal_commas_after_whole_numbers(tmp_path):
     for text in ("1;2;3\n1,5;2,5;3,5\n", "1 2 3\n1,5 2,5 3,5\n"):
         assert read(tmp_path, "a.csv", text)[0].points.tolist() == [[1, 2, 3], [1.5, 2.5, 3.5]]
