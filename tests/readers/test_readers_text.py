@@ -110,9 +110,7 @@ def test_columns_are_recognised_by_surveying_names(tmp_path):
         "# range x\nrow col x y z i\n0 1 1 2 3 9\n",
         "Hochwert;Rechtswert;Höhe\n2,0;1,0;3,0\n".encode("latin-1"),
         "点号,北坐标,东坐标,高程\n甲,2,1,3\n".encode("gb18030"),
-        "".join(
-            ["点号,北,东,高\n", *("甲" * k + ",2,1,3\n" for k in range(1, 300))]
-        ).encode(),  # beyond 64 KB
+        "".join(["点号,北,东,高\n", *("甲" * k + ",2,1,3\n" for k in range(1, 300))]).encode(),  # beyond 64 KB
     ],
 )
 def test_a_header_is_read_by_the_meaning_of_its_names(tmp_path, text):
