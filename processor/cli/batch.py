@@ -12,12 +12,12 @@ import click
 
 from processor.cli.common import (
     LANGUAGES,
-    UNITS,
     check_jobs,
     debug_option,
     fail_on_option,
     print_error_line,
     split_names,
+    units_option,
 )
 from processor.jobs.exit_codes import DONE, IN_PART, LIMIT_MISSED, VERDICT, is_refused
 
@@ -65,7 +65,7 @@ class BatchOptions:
 @click.option("--steps", callback=split_names, metavar="A,B", help="steps, as in `processor run`")
 @click.option("--method", "methods", callback=split_names, metavar="NAME[,NAME]", help="as in `processor run`")
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="a TOML file of parameters")
-@click.option("--units", type=click.Choice(UNITS), help="unit of the scans; scene files contain theirs")
+@units_option("unit of the scans; scene files contain theirs")
 @click.option("--seed", type=click.IntRange(min=0), help="seed of all randomness")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of all pages")
 @fail_on_option

@@ -24,6 +24,18 @@ LANGUAGES = ("en", "zh")
 UNITS = ("m", "mm", "cm", "dm", "km", "inch", "ft", "us-ft")
 
 
+def _known_units(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
+    parts = (value or UNITS[0]).split("/")
+    if len(parts) > 2 or not set(parts) <= set(UNITS):
+        raise click.BadParameter(f"{value!r} is none of {', '.join(UNITS)}, or two of them as m/us-ft", ctx, param)
+    return value
+
+
+def units_option(about: str) -> Callable[[Any], Any]:
+    """Return the option ``--units``: a unit of coordinates, or that of x and y, a slash and that of the heights."""
+    return click.option("--units", metavar="U[/V]", callback=_known_units, help=f"{about}; V: unit of heights")
+
+
 fail_on_option = click.option(
     "--fail-on", type=click.Choice(tuple(FAIL_ON)), help="exit code 5 where a verdict is so, or worse"
 )

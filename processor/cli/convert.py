@@ -7,13 +7,13 @@ from pathlib import Path
 
 import click
 
-from processor.cli.common import UNITS, debug_option
+from processor.cli.common import debug_option, units_option
 
 
 @click.command()
 @click.argument("input_", metavar="INPUT", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="scene file (.h5)")
-@click.option("--units", type=click.Choice(UNITS), help="unit of the scans' coordinates, whatever the format states")
+@units_option("unit of the scans, whatever the file states")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @debug_option
 def convert(input_: Path, output: Path, units: str | None, as_json: bool) -> None:

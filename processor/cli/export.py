@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from processor.cli.common import UNITS, debug_option, print_error_line
+from processor.cli.common import debug_option, print_error_line, units_option
 from processor.clouds import CONTENTS, FORMATS
 
 
@@ -22,7 +22,7 @@ from processor.clouds import CONTENTS, FORMATS
     type=click.FloatRange(min=0.0, min_open=True),
     help="least distance of two points; others are left out",
 )
-@click.option("--units", type=click.Choice(UNITS), help="unit of the scans, as given to the run")
+@units_option("unit of the scans, as given to the run")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @debug_option
 def export(

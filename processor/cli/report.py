@@ -8,20 +8,20 @@ import click
 
 from processor.cli.common import (
     LANGUAGES,
-    UNITS,
     Shown,
     debug_option,
     form_options,
     forms,
     output_options,
     show_results,
+    units_option,
 )
 
 
 @click.command()
 @click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("input_", metavar="[INPUT]", required=False, type=click.Path(path_type=Path))
-@click.option("--units", type=click.Choice(UNITS), help="unit of the scans, as given to the run")
+@units_option("unit of the scans, as given to the run")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @form_options
 @output_options

@@ -11,7 +11,6 @@ import click
 from processor import user_methods
 from processor.cli.common import (
     LANGUAGES,
-    UNITS,
     Shown,
     cluster_option,
     debug_option,
@@ -24,6 +23,7 @@ from processor.cli.common import (
     print_error_line,
     show_results,
     split_names,
+    units_option,
 )
 from processor.cli.help_text import RunCommand
 from processor.cli.limited_run import limited_run
@@ -41,7 +41,7 @@ from processor.results.file_names import RESULTS_JSON
     "--method", "methods", callback=split_names, metavar="NAME[,NAME]", help="further ones are run for comparison"
 )
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, one table per step")
-@click.option("--units", type=click.Choice(UNITS), help="unit of the scans' coordinates, whatever the format states")
+@units_option("unit of the scans, whatever the file states")
 @click.option("--seed", type=click.IntRange(min=0), help="seed of all randomness  [default: 0, or the parameters']")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="language of the page")
 @click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), help="end the run after so long")

@@ -25,8 +25,8 @@ from processor.language.messages import messages
 from processor.large_arrays import allocate, blocks, put_back
 from processor.model import Floats, InputError, Reason, Scan, UsageError, reason
 from processor.readers import RawScan
-from processor.readers.raw_scan import FAR, ORIGIN_STEP
-from processor.scan_folder.units import MM_PER_UNIT
+from processor.readers.raw_scan import FAR, ORIGIN_STEP, summed
+from processor.scan_folder.units import MM_PER_UNIT, FileUnit
 from processor.store import checksums
 
 CLOUDS = ("reference", "compared", "core")
@@ -70,11 +70,13 @@ class Comparison:
     hashes: dict[str, str]
     normals_from: Reason
     turned: Turned | None  # None: the normals were given with their signs
+    read: tuple[Reason, ...] = ()  # how the files were read
 
     @property
     def notes(self) -> tuple[Reason, ...]:
-        """Notes on the unit, then on the normals."""
-        return self.normals_notes if self.unit_note is None else (self.unit_note, *self.normals_notes)
+        """Notes on the files, on the unit, then on the normals."""
+        unit = () if self.unit_note is None else (self.unit_note,)
+        return (*self.read, *unit, *self.normals_notes)
 
     @property
     def unit_note(self) -> Reason | None:
@@ -145,6 +147,18 @@ class _Cloud:
             for scan in self.scans
         ]
 
+    def otherwise(self, given: FileUnit) -> Reason | None:
+        """Return what the file states of its unit, None where that is the unit ``given`` or nothing."""
+        stated = next((scan.unit for scan in self.scans if scan.unit), "")
+        if stated and stated != str(given):
+            return reason("units.file-states", unit=stated)
+        return self.fault
+
+    @property
+    def fault(self) -> Reason | None:
+        """Why the unit that the file states cannot be used."""
+        return next((scan.unit_fault for scan in self.scans if scan.unit_fault), None)
+
     def _placed(self, origin: Floats) -> Iterator[Floats]:
         for scan in self.scans:
             for rows in blocks(len(scan.points), large_arrays.AT_ONCE):
@@ -169,7 +183,7 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     :mod:`processor.geometry.normal_orientation`. ``log`` receives one line a message. Raises InputError for a file that
     cannot be used, and where no core point has a distance.
     """
-    clouds = _read_clouds(request)
+    clouds, read = _read_clouds(request)
     reference, compared = clouds["reference"], clouds["compared"]
     unit = _unit(list(clouds.values()))
     origin = _origin(reference)
@@ -213,17 +227,28 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
         hashes={name: cloud.sha256 for name, cloud in clouds.items()} | given,
         normals_from=source,
         turned=turned,
+        read=read,
     )
     _log_warnings(comparison, log)
     return comparison
 
 
-def _read_clouds(request: Request) -> dict[str, _Cloud]:
-    """Read the clouds of CLOUDS; without a core file there is no "core"."""
+def _read_clouds(request: Request) -> tuple[dict[str, _Cloud], tuple[Reason, ...]]:
+    """Read the clouds of CLOUDS, and return how; without a core file there is no "core"."""
     files = {name: path for name in CLOUDS if (path := getattr(request, name)) is not None}
     stated = units.of_files(request.units, tuple(files))
     clouds = {name: _read(path) for name, path in files.items()}
+    remarks = summed(remark for cloud in clouds.values() for scan in cloud.scans for remark in scan.remarks)
+    for cloud in () if stated else clouds.values():
+        if cloud.fault is not None:
+            why = messages("en").text(cloud.fault)
+            raise InputError(f"{why}; state the unit by --units (m, or m/us-ft with that of heights)", path=cloud.path)
     if stated:
+        other = {name: cloud.otherwise(stated[name]) for name, cloud in clouds.items()}
+        said = tuple(
+            reason("compare.file", name=files[name].name, stated=one) for name, one in other.items() if one is not None
+        )
+        remarks = (*remarks, reason("compare.over-files", files=said)) if said else remarks
         into = MM_PER_UNIT[stated["reference"].horizontal]
         for name, unit in stated.items():
             scale = np.array([MM_PER_UNIT[axis] for axis in (unit.horizontal, unit.horizontal, unit.vertical)]) / into
@@ -234,7 +259,7 @@ def _read_clouds(request: Request) -> dict[str, _Cloud]:
                 f"{cloud.path}: holds {cloud.count} point{'s' * (cloud.count > 1)}; expected "
                 f"{m3c2.FEWEST_FOR_LOD} or more, which a level of detection needs"
             )
-    return clouds
+    return clouds, remarks
 
 
 def _distances(
@@ -290,7 +315,10 @@ def _read(path: Path) -> _Cloud:
     if path.suffix.lower() == ".h5" and path.is_file():
         scans = [_bare(scan, "mm") for scan in store.read_scene(path).scans]
     else:
-        scans = [_bare(scan, scan.unit) for scan in readers.read(path)]
+        scans = [
+            replace(_bare(scan, scan.unit), unit_fault=scan.unit_fault, remarks=scan.remarks)
+            for scan in readers.read(path)
+        ]
     if not sum(len(scan.points) for scan in scans):
         raise InputError(f"{path}: expected points, found none")
     return _Cloud(path, [scan for scan in scans if len(scan.points)], checksums.of_file(path))

@@ -21,7 +21,7 @@ from processor.large_arrays import allocate
 from processor.model import Codes, Floats, InputError, Labels
 from processor.readers.colours import scaled
 from processor.readers.file_checks import errors_name_the_file
-from processor.readers.raw_scan import RawScan, build_scan, scan_name
+from processor.readers.raw_scan import RawScan, build_scan, scan_name, without_empty
 
 SUFFIXES = (".e57",)
 UNIT = "m"
@@ -57,7 +57,9 @@ def read(path: Path) -> list[RawScan]:
             if not count:
                 raise InputError("expected scans, found none", path=path)
             scan_names = names(scan_name(path), [_stored_name(file.get_header(i)) for i in range(count)])
-            return [_read_scan(path, file, i, scan_names) for i in range(count)]
+            scans = [_read_scan(path, file, i, scan_names) for i in range(count)]
+            empty = [name for name, scan in zip(scan_names, scans, strict=True) if scan is None]
+            return without_empty(path, [scan for scan in scans if scan is not None], empty)
         finally:
             file.close()
 
@@ -123,10 +125,13 @@ def _stored_name(header: Any) -> str:
         return ""
 
 
-def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> RawScan:
+def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> RawScan | None:
+    """Return a scan of a file, None where it has no points, or none that is valid."""
     name = scan_names[index]
     header = file.get_header(index)
     declared = int(header.point_count)
+    if not declared:  # the library refuses to read it
+        return None
     if declared > 8 * path.stat().st_size:  # less than a bit a point
         raise InputError(
             f"scan {index + 1} declares {declared} points, more than the file can hold; copy or export it again",
@@ -140,6 +145,8 @@ def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> 
         )
     axes = CARTESIAN if cartesian else SPHERICAL
     points, intensity, cells, colour = _read_points(path, name, file, header, axes)
+    if not len(points):
+        return None
     pose = _pose(path, name, header) if header.has_pose() else np.empty(0)
     # Writers give single and merged clouds an identity pose too, so it is no evidence of a scanner's position.
     posed = pose.size > 0 and (len(scan_names) > 1 or bool((pose != np.eye(4)).any()))
@@ -188,7 +195,7 @@ def _read_points(
     cells = [allocate(declared, dtype=np.int32) for _ in grid]
     reader = header.points.reader(buffers)
     read = count = 0
-    while declared and (rows := reader.read()):
+    while rows := reader.read():
         read += rows
         if read > declared:
             break
@@ -217,8 +224,6 @@ def _read_points(
         raise InputError(
             f"expected {declared} points in scan {name!r} as declared, found {read}; copy it again", path=path
         )
-    if declared and not count:
-        raise InputError(f"scan {name!r} holds no returns: all of its {declared} points are marked invalid", path=path)
     return points[:count], intensity[:count], [lines[:count] for lines in cells], colour[:count]
 
 

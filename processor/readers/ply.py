@@ -6,10 +6,14 @@ Points are parsed here and not by plyfile, which for 5 million points takes 1.0 
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+import numpy.typing as npt
+from numba import njit
 
 from processor.large_arrays import allocate
 from processor.model import InputError
@@ -29,6 +33,7 @@ from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".ply",)
 HEADER_LIMIT = 65_536
+SKIPPED_BYTES = 4 << 20  # that are read at once of elements before the vertices
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -68,8 +73,8 @@ def read(path: Path) -> list[RawScan]:
     named = axes(path, names)
     if named is None:
         raise InputError(f"expected vertices with x, y, z, found {', '.join(names) or 'none'}", path=path)
-    if vertex.list_counts or (header.order and any(element.list_counts for element in before)):
-        raise InputError("expected vertices only, found lists before or within them; export points only", path=path)
+    if vertex.list_counts:
+        raise InputError("expected vertices without lists, found lists within them; export points only", path=path)
     intensity, station = first_named(vertex.types, INTENSITY_NAMES), first_named(vertex.types, STATION_NAMES)
     wanted = [*(names[i] for i in named.columns), *(name for name in (intensity, station) if name)]
     columns = [allocate(vertex.count, 3), *(allocate(vertex.count) for _ in wanted[3:])]
@@ -80,8 +85,8 @@ def read(path: Path) -> list[RawScan]:
         file.seek(header.start)
         if header.order:
             dtype = np.dtype([(name, header.order + code) for name, code in vertex.types.items()])
-            skipped = sum(e.count * sum(int(code[1]) for code in e.types.values()) for e in before)
-            file.seek(header.start + skipped)
+            for element in before:
+                _skip(file, element, header.order)
             fill_columns(every, columns_of_records(file, dtype, read, vertex.count))
         else:
             rows = Rows(file)
@@ -98,6 +103,57 @@ def read(path: Path) -> list[RawScan]:
         single=bool(header.order) and vertex.types[wanted[0]] == "f4",
     )
     return [coloured(scan, colour)]
+
+
+def _skip(file: BinaryIO, element: _Element, order: str) -> None:
+    """Move behind the records of an element of a binary file. Raises ValueError where the file ends before."""
+    start, size = file.tell(), os.fstat(file.fileno()).st_size
+    if not element.list_counts:
+        file.seek(element.count * sum(int(code[1]) for code in element.types.values()), os.SEEK_CUR)
+        return
+    fields = [(element.list_counts.get(name, ""), code) for name, code in element.types.items()]
+    if any(count[0] == "f" for count, _ in fields if count):
+        raise ValueError("expected lists whose number of values is whole")
+    # Of each field: bytes of the number of values (0: no list), whether it has a sign, and bytes of a value.
+    layout = np.array([(int(c[1]) if c else 0, c[:1] == "i", int(code[1])) for c, code in fields], np.int64)
+    left, room = element.count, SKIPPED_BYTES
+    while left:
+        file.seek(start)
+        text = np.frombuffer(file.read(room), np.uint8)
+        records, end = behind_records(text, left, layout, order == ">")
+        if start + end > size or (not records and len(text) < room):
+            raise ValueError(f"the file ends within the element {element.name}")
+        left, start, room = left - records, start + end, room if records else 2 * room
+    file.seek(start)
+
+
+@njit(cache=True, nogil=True)
+def behind_records(
+    text: npt.NDArray[np.uint8], most: int, layout: npt.NDArray[np.int64], big_endian: bool
+) -> tuple[int, int]:
+    """Count records of lists whose numbers of values lie in ``text``, at most ``most``, and the bytes up to their end.
+
+    ``layout`` has a row a field: bytes of the number of values, 0 for a single value, whether it has a sign, and bytes
+    of a value. The last record may end behind ``text``.
+    """
+    records, end = 0, 0
+    while records < most:
+        at = end
+        for i in range(len(layout)):
+            width, signed, item = layout[i]
+            values = 1
+            if width > 0:
+                if at + width > len(text):
+                    return records, end
+                values = 0
+                for k in range(width):
+                    values = values * 256 + np.int64(text[at + k if big_endian else at + width - 1 - k])
+                if signed and values >= 1 << (8 * width - 1):
+                    values = 0  # a list of less than no values
+                at += width
+            at += values * item
+        records, end = records + 1, at
+    return records, end
 
 
 def read_header(path: Path) -> Header:

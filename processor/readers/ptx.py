@@ -15,10 +15,10 @@ from numba import njit
 
 import processor.readers.pieces as pieces
 from processor.large_arrays import allocate
-from processor.model import Codes, Floats, InputError, Labels
+from processor.model import Codes, Floats, InputError, Labels, reason
 from processor.readers.ascii_rows import Rows
 from processor.readers.file_checks import check_declared_points, check_last_row, errors_name_the_file
-from processor.readers.raw_scan import RawScan, build_scan, scan_name
+from processor.readers.raw_scan import RawScan, build_scan, scan_name, without_empty
 
 SUFFIXES = (".ptx",)
 UNIT = "m"
@@ -29,7 +29,7 @@ RIGID_TOLERANCE = 1e-3  # of R^T R - I: matrices are often written with few digi
 
 def read(path: Path) -> list[RawScan]:
     """Read every grid of a PTX file as a scan."""
-    scans: list[RawScan] = []
+    scans, empty = list[RawScan](), list[str]()
     size = path.stat().st_size
     check_last_row(path, "PTX")
     with path.open("rb") as file:
@@ -37,17 +37,28 @@ def read(path: Path) -> list[RawScan]:
         with errors_name_the_file(path, "PTX"):
             first = rows.line()
         while first is not None:
-            scans.append(_read_grid(path, rows, first, len(scans) + 1, size))
+            number = len(scans) + len(empty) + 1
+            scan = _read_grid(path, rows, first, number, size)
+            if scan is None:
+                empty.append(f"{scan_name(path)}-{number}")
+            else:
+                scans.append(scan)
             with errors_name_the_file(path, "PTX"):
                 first = rows.line()
-    if not scans:
+    if not scans and not empty:
         raise InputError("expected scans, found none", path=path)
-    if len(scans) == 1:
-        return scans
-    return [dataclasses.replace(scan, name=f"{scan_name(path)}-{i}") for i, scan in enumerate(scans, 1)]
+    if len(scans) + len(empty) == 1:
+        scans, empty = [_renamed(scan, scan_name(path)) for scan in scans], [scan_name(path) for _ in empty]
+    return without_empty(path, scans, empty)
 
 
-def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> RawScan:
+def _renamed(scan: RawScan, name: str) -> RawScan:
+    remarks = tuple(reason(one.code, count=1, scans=(name,)) for one in scan.remarks)
+    return dataclasses.replace(scan, name=name, remarks=remarks)
+
+
+def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> RawScan | None:
+    """Read a grid and its header, whose first line is ``first``; None where no cell has a return."""
     widths = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
     with errors_name_the_file(path, "PTX"):
         head = [first, *(rows.line() or "" for _ in range(9))]
@@ -68,7 +79,9 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
             f"expected a grid of 1 x 1 cells or more, found {columns} x {lines} in scan {number}", path=path
         )
     check_declared_points(path, "PTX", cells, SHORTEST_ROW, size)
-    T_project_scan = _rigid(path, number, np.array(numbers[6:]).T)
+    matrix = np.array(numbers[6:])
+    for_columns = _is_for_columns(matrix)
+    T_project_scan = _rigid(path, number, matrix if for_columns else matrix.T)
     with errors_name_the_file(path, "PTX"):
         width = rows.width()
         wide = width in (4, 7)
@@ -85,19 +98,38 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
     if read != cells:
         raise InputError(f"expected {cells} cells in scan {number}, found {read}; copy or export it again", path=path)
     if not count:
-        raise InputError(f"scan {number} holds no returns, only cells of 0 0 0", path=path)
-    position = T_project_scan[:3, :3].T @ (np.array(numbers[2]) - T_project_scan[:3, 3])
+        return None
+    name = f"{scan_name(path)}-{number}"
     scan = build_scan(
         path,
-        scan_name(path),
+        name,
         points[:count],
         unit=UNIT,
         intensity=intensity[: count if wide else 0],
-        position=position,
+        position=_scanner(np.array(numbers[2]), T_project_scan),
         T_project_scan=T_project_scan,
         grid=(row[:count], column[:count]) if gridded else None,
     )
-    return dataclasses.replace(scan, colour=colour[:count]) if len(colour) else scan
+    remarks = (reason("read.matrix-for-columns", count=1, scans=(name,)),) if for_columns else ()
+    return dataclasses.replace(scan, colour=colour[:count] if len(colour) else scan.colour, remarks=remarks)
+
+
+def _is_for_columns(matrix: Floats) -> bool:
+    """Whether a matrix (4, 4) as written has its translation in the last column, and not in the last row."""
+    return bool(
+        np.abs(matrix[3] - [0, 0, 0, 1]).max() < RIGID_TOLERANCE and np.abs(matrix[:3, 3]).max() > RIGID_TOLERANCE
+    )
+
+
+def _scanner(stated: Floats, T_project_scan: Floats) -> Floats:
+    """Return the scanner's position (3,) in the scan's frame from that of the header, in the project's frame.
+
+    A header of 0 0 0 above a matrix with a translation says nothing: points are in the scanner's frame.
+    """
+    if not stated.any():
+        return np.zeros(3)
+    position: Floats = T_project_scan[:3, :3].T @ (stated - T_project_scan[:3, 3])
+    return position
 
 
 def _rigid(path: Path, number: int, T: Floats) -> Floats:

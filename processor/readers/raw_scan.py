@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from processor import large_arrays
-from processor.model import Checked, Codes, Floats, InputError, Ints, Labels, column, optional
+from processor.model import Checked, Codes, Floats, InputError, Ints, Labels, Reason, column, optional, reason
 from processor.readers.encoding import file_name_as_text
 
 FAR = 10_000.0  # units; an origin is subtracted from coordinates beyond this
 ORIGIN_STEP = 1_000.0
+MOST_NAMED = 5  # scans in a remark
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class RawScan(Checked):
     position: Floats = optional(3)  # of the scanner, in the scan's frame
     T_project_scan: Floats = optional(4, 4)
     unit: str = ""  # "" = not given by the format
+    unit_fault: Reason | None = None  # why the unit that the file states cannot be used
+    remarks: tuple[Reason, ...] = ()  # on how the file was read, see :func:`summed`
     station: Ints = column("n", dtype=np.int64)  # station that saw the point, from 1; 0 = unknown
     grid_row: Labels = column("n", dtype=np.int32)  # as stored; see scan_folder.scanner_grid
     grid_column: Labels = column("n", dtype=np.int32)
@@ -96,11 +100,37 @@ def build_scan(
     )
 
 
-def scaled_in_place(raw: RawScan, factor: float) -> Floats:
-    """Return the points times a factor, in the record's memory; the record must not be used afterwards."""
+def without_empty(path: Path, scans: Sequence[RawScan], empty: Sequence[str]) -> list[RawScan]:
+    """Return the scans of a file, the first of which names those without points.
+
+    Raises InputError where all are ``empty``.
+    """
+    if not scans:
+        listed = ", ".join(map(repr, empty[:5]))
+        raise InputError(f"expected points, found none in scan{'s' * (len(empty) > 1)} {listed}", path=path)
+    if not empty:
+        return list(scans)
+    remark = reason("read.scans-without-points", count=len(empty), scans=tuple(empty))
+    return [dataclasses.replace(scans[0], remarks=(*scans[0].remarks, remark)), *scans[1:]]
+
+
+def summed(remarks: Iterable[Reason]) -> tuple[Reason, ...]:
+    """Return one remark of each code, in order, of remarks with a ``count`` and the names of the ``scans``."""
+    sums: dict[str, Reason] = {}
+    for one in remarks:
+        count, scans = one.values["count"], tuple(one.values["scans"])
+        if one.code in sums:
+            count, scans = sums[one.code].values["count"] + count, (*sums[one.code].values["scans"], *scans)
+        sums[one.code] = reason(one.code, count=count, scans=scans[:MOST_NAMED])
+    return tuple(sums.values())
+
+
+def scaled_in_place(raw: RawScan, factors: Floats) -> Floats:
+    """Return the points times factors (3,), in the record's memory; the record must not be used afterwards."""
     points: Floats = raw.points
     points.flags.writeable = True
-    if factor != 1.0:
-        for rows in large_arrays.blocks(len(points)):
-            points[rows] *= factor
+    # One factor is much faster than three along rows of three.
+    one = (factors == factors[0]).all()
+    for rows in large_arrays.blocks(len(points) if not one or factors[0] != 1.0 else 0):
+        points[rows] *= factors[0] if one else factors
     return points

@@ -35,7 +35,7 @@ from processor import large_arrays, progress
 from processor.jobs import address_space
 from processor.jobs.child import end_with_parent
 from processor.jobs.process import end, isolated, start
-from processor.model import InputError
+from processor.model import InputError, Reason
 from processor.readers.raw_scan import RawScan
 
 SLACK_BYTES = 1 << 30
@@ -178,7 +178,9 @@ def _scans(answer: dict[str, Any], descriptor: int, in_file: bool) -> list[RawSc
             key: np.frombuffer(shared, dtype, math.prod(shape), offset).reshape(shape) if 0 not in shape else ()
             for key, (offset, shape, dtype) in scan["arrays"].items()
         }
-        scans.append(RawScan(scan["name"], unit=scan["unit"], step=scan["step"], scanned=scan["scanned"], **arrays))
+        given = {key: scan[key] for key in ("unit", "step", "scanned")}
+        fault, *remarks = [one and Reason(*one) for one in scan["reasons"]]
+        scans.append(RawScan(scan["name"], unit_fault=fault, remarks=tuple(remarks), **given, **arrays))
     return scans
 
 
@@ -341,7 +343,7 @@ def _answer(path: Path, module: str, shared: _Shared) -> dict[str, Any]:
         for key in ARRAYS:
             array = getattr(scan, key)
             arrays[key] = (shared.place(array), array.shape, array.dtype.str)
-        records.append(
-            {"name": scan.name, "unit": scan.unit, "step": scan.step, "scanned": scan.scanned, "arrays": arrays}
-        )
+        given = {key: getattr(scan, key) for key in ("name", "unit", "step", "scanned")}
+        reasons = [one and (one.code, one.values) for one in (scan.unit_fault, *scan.remarks)]
+        records.append({**given, "reasons": reasons, "arrays": arrays})
     return {"scans": records}

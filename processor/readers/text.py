@@ -1,7 +1,8 @@
 """Tables of numbers: XYZ, TXT, ASC, CSV, PTS. Any separator, header or none, decimal point or comma.
 
-Without a header the first three columns are x, y, z; the fourth is the intensity of tables with four or seven columns,
-the last three of seven are the colour. A first line of one whole number is the number of points.
+A header names the columns, see :mod:`processor.column_names`. Without one the first three are x, y, z; the fourth is
+the intensity of tables with four or seven columns, the last three of seven are the colour. A line of one whole number
+before the rows is the number of points.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from processor.model import Floats, InputError, UsageError, did_you_mean
-from processor.scan_folder.units import known_unit
+from processor.scan_folder.units import FileUnit, file_unit, known_unit
 
 LOG = logging.getLogger("processor.input")
 MOST_NAMED = 6  # unknown keys
@@ -79,6 +79,14 @@ class Table:
         text = self.text(key, default)
         try:
             return known_unit(text) if text else text
+        except UsageError as error:
+            raise InputError(f"{self.where}: {error}") from None
+
+    def file_unit(self, key: str) -> FileUnit | None:
+        """Return the units of a file's coordinates, as ``m`` or ``m/us-ft``; None where they are not given."""
+        text = self.text(key, "")
+        try:
+            return file_unit(text) if text else None
         except UsageError as error:
             raise InputError(f"{self.where}: {error}") from None
 

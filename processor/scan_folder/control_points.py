@@ -12,7 +12,7 @@ from processor.model import Control, Floats, InputError, Scan, Stations
 from processor.scan_folder.checked_table import Table, existing_file_in
 from processor.scan_folder.files import CONTROL
 from processor.scan_folder.text_files import csv_rows
-from processor.scan_folder.units import MM_PER_UNIT
+from processor.scan_folder.units import MM_PER_UNIT, FileUnit
 
 KEYS = ("name", "position", "sd_mm", "scan", "seen", "seen_sd_mm")
 COLUMNS = ("name", "scan", "x", "y", "z", "sd_mm")
@@ -99,7 +99,7 @@ def _from_csv(path: Path) -> list[Measured]:
 def control_points(
     measured: Sequence[Measured],
     scans: Sequence[Scan],
-    units: Sequence[str],
+    units: Sequence[FileUnit],
     stations: Stations | None,
     unit: str,
     searched: bool = False,
@@ -141,7 +141,7 @@ def control_points(
         point=point,
         scan=scan,
         station=station,
-        seen=np.array([target.position * MM_PER_UNIT[units[s]] for target, s in zip(seen, scan, strict=True)]).reshape(
+        seen=np.array([target.position * units[s].factors for target, s in zip(seen, scan, strict=True)]).reshape(
             -1, 3
         ),
         seen_sd=np.array([target.sd_mm for target in seen]),

@@ -28,13 +28,14 @@ from processor.model import (
     StructureDesign,
     TitleBlock,
     Tolerance,
+    UsageError,
     did_you_mean,
     reason,
 )
 from processor.progress import tracked
 from processor.readers import RawScan
 from processor.readers.encoding import file_name_as_text
-from processor.readers.raw_scan import scaled_in_place, scan_name
+from processor.readers.raw_scan import scaled_in_place, scan_name, summed
 from processor.scan_folder import guess, mesh_faults, scanner_grid, units
 from processor.scan_folder.checked_table import Table, existing_file_in
 from processor.scan_folder.clips import FEWEST_POINTS, Clipper, read_boxes
@@ -61,7 +62,7 @@ from processor.scan_folder.shapes import surface_files
 from processor.scan_folder.text_files import read_text
 from processor.scan_folder.title_block import read_title_block
 from processor.scan_folder.tolerance import check_components, read_tolerance
-from processor.scan_folder.units import MM_PER_UNIT, known_unit
+from processor.scan_folder.units import MM_PER_UNIT, FileUnit, file_unit, known_unit
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -72,8 +73,12 @@ KEYS = (
     "name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control", "report",
     "clip", "ceiling", "targets",
 )  # fmt: skip
-SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
+SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position", "units")
 FLOAT_STEP_MM = 1.0
+UNIT_ADVICE = (
+    "state its unit by --units, or by 'units' of its [[scan]] in project.toml (m, or m/us-ft where the heights have "
+    "another), or export it in metres"
+)
 NAN = float("nan")
 
 Design = ArchDesign | FrameDesign | StructureDesign
@@ -90,6 +95,8 @@ class _Entry:
     pose: Floats | None = None
     position: Floats | None = None
     sigma_mm: float = NAN
+    units: FileUnit | None = None  # that count before those of the file
+    units_by: Reason = reason("units.by-option")  # who gives them
 
 
 @dataclass(frozen=True)
@@ -125,21 +132,28 @@ def as_read(scan: Scan) -> Scan:
 def read_input(path: Path, units: str | None = None, keep: Keep = as_read) -> Scene:
     """Read a scan folder, a single scan file or a scene file.
 
-    ``units`` is the unit of the scans' coordinates and overrides that of their format. Without it the unit of the
-    format applies, then that of the project file, then metres; ``Scene.units_reason`` gives the source. ``keep``
-    receives each scan once it is read, before the next, and returns it as the scene is to hold it: without its points
-    where they are too many for the memory.
+    ``units`` is the unit of the scans' coordinates and overrides that of their format; of a scan file also ``m/us-ft``,
+    with a unit of the heights. Without it the unit that the project file gives the scan applies, then that of the
+    format, then that of the project, then metres; ``Scene.units_reason`` gives the source. ``keep`` receives each scan
+    once it is read, before the next, and returns it as the scene is to hold it: without its points where they are too
+    many for the memory.
 
     Raises InputError for input that cannot be used, UsageError for an unknown unit.
     """
-    option = known_unit(units) if units else ""
+    option = file_unit(units) if units else None
     if not path.exists():
         raise missing(path)
     if path.is_dir() and not readers.is_closed(path):
-        return _read_folder(path, option, keep)
+        if option and option.vertical != option.horizontal:
+            raise UsageError(
+                f"--units {units}: expected one unit for a folder; give a scan a unit of its heights by 'units' in its "
+                f"[[scan]] of {PROJECT}"
+            )
+        return _read_folder(path, option.horizontal if option else "", keep)
     if path.suffix.lower() == ".h5":
         return store.read_scene(path)
-    return record_checks.check(_scene(_Project(scan_name(path), (_Entry(path),)), None, option, keep=keep), str(path))
+    entry = _Entry(path, units=option)
+    return record_checks.check(_scene(_Project(scan_name(path), (entry,)), None, "", keep=keep), str(path))
 
 
 def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
@@ -289,6 +303,8 @@ def _entry(folder: Path, scan: Table) -> _Entry:
         pose=pose,
         position=scan.array("position", 3) if "position" in scan.values else None,
         sigma_mm=scan.number("sigma_mm", NAN, positive=True),
+        units=scan.file_unit("units"),
+        units_by=reason("units.by-scan", file=PROJECT),
     )
 
 
@@ -327,7 +343,8 @@ def _scene(
         raise InputError(f"{project.design}: expected a design of kind {project.kind} by {PROJECT}, found {kind}")
     parts = {part.name for part in arch.parts} if arch else set()
     scans: list[Scan] = []
-    scan_units: list[str] = []
+    scan_units: list[FileUnit] = []
+    remarks: list[Reason] = []
     days: set[str] = set()
     reasons: dict[str, Reason] = {}  # why a unit was taken, by units
     clipper = Clipper(read_boxes(project.table, MM_PER_UNIT[project.units or option or "m"]), project.table.where)
@@ -337,9 +354,10 @@ def _scene(
                 f"the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}", path=entry.path
             )
         for raw in _read_raws(entry, scans):
-            unit, why = _unit(raw, entry.path, project, option)
+            unit, why = _unit(raw, entry, project, option)
             days |= {raw.scanned} - {""}
-            reasons.setdefault(unit, why)
+            reasons.setdefault(str(unit), why)
+            remarks += raw.remarks
             scan = clipper.clip(_scan(raw, entry, unit, parts, stations))
             if any(scan.name == other.name for other in scans):
                 raise InputError(f"a second scan named {scan.name!r}; rename one of the files", path=entry.path)
@@ -348,7 +366,7 @@ def _scene(
             scan_units.append(unit)
     where = stations or _stations(scans)
     search = read_search(project.table)
-    unit = project.units or option or "m"
+    of_project = project.units or option or "m"
     return Scene(
         project.name,
         kind,
@@ -358,10 +376,10 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason=(*_different(reasons.values()), *_said(project)),
+        units_reason=(*_different(reasons.values()), *_said(project), *summed(remarks)),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
-        control=control_points(project.control, scans, scan_units, where, unit, search is not None),
+        control=control_points(project.control, scans, scan_units, where, of_project, search is not None),
         target_search=search,
         title_block=project.title_block,
         clips=clipper.record(),
@@ -396,37 +414,56 @@ def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
         yield raw
 
 
-def _unit(raw: RawScan, path: Path, project: _Project, option: str) -> tuple[str, Reason]:
-    if option:
-        return option, reason("units.by-option")
-    if raw.unit:
-        return known_unit(raw.unit), reason("units.by-format", format=path.suffix.lower()[1:])
+def _unit(raw: RawScan, entry: _Entry, project: _Project, option: str) -> tuple[FileUnit, Reason]:
+    """Return the unit of a scan and who gives it: the user for it, its file, the user for all, or the convention."""
+    stated = FileUnit(known_unit(raw.unit), known_unit(raw.unit)) if raw.unit else None
+    fault, file_format = raw.unit_fault, entry.path.suffix.lower()[1:]
+    if option or entry.units:
+        unit, by = entry.units or FileUnit(option, option), entry.units_by
+        if option:
+            unit, by = FileUnit(option, option), reason("units.by-option")
+        if stated and stated != unit:
+            fault = reason("units.file-states", unit=str(stated))
+        return unit, by if fault is None else reason("units.over-file", by=by, format=file_format, file=fault)
+    if stated:
+        return stated, reason("units.by-format", format=file_format)
+    # The unit of a project does not say which of two units of a file is wrong.
+    if fault is not None and (not project.units or fault.code == "units.file-in-two"):
+        raise InputError(f"{messages('en').text(fault)}; {UNIT_ADVICE}", path=entry.path)
     if project.units:
-        return project.units, (reason("units.by-size") if project.guessed else reason("units.by-project", file=PROJECT))
+        by = reason("units.by-size") if project.guessed else reason("units.by-project", file=PROJECT)
+        by = by if fault is None else reason("units.over-file", by=by, format=file_format, file=fault)
+        return FileUnit(project.units, project.units), by
     if project.design is None and project.guessed is None and (why := units.not_metres(raw.points)):
-        return "mm", why
-    return "m", reason("units.as-scanners-write")
+        return FileUnit("mm", "mm"), why
+    return FileUnit("m", "m"), reason("units.as-scanners-write")
 
 
-def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Stations | None) -> Scan:
+def _scan(raw: RawScan, entry: _Entry, unit: FileUnit, parts: set[str], stations: Stations | None) -> Scan:
     if len(raw.points) < FEWEST_POINTS:
         raise InputError(
             f"scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more", path=entry.path
         )
-    scale = MM_PER_UNIT[unit]
-    if raw.step * scale > FLOAT_STEP_MM:
+    scale = unit.factors
+    step_mm = raw.step * float(scale.max())
+    if step_mm > FLOAT_STEP_MM:
         raise InputError(
             f"the coordinates of scan {raw.name!r} are in 32 bits, which so far from their origin have "
-            f"steps of {raw.step * scale:.3g} mm; export it in double precision, or nearer to its origin",
+            f"steps of {step_mm:.3g} mm; export it in double precision, or nearer to its origin",
             path=entry.path,
         )
     pose = np.array(raw.T_project_scan if entry.pose is None else entry.pose)
     if pose.size:
+        if unit.vertical != unit.horizontal:
+            raise InputError(
+                f"expected one unit of a scan with a pose, found {unit}; export it in one", path=entry.path
+            )
         pose[:3, 3] *= scale
     position = raw.position if entry.position is None else entry.position
     station = raw.station if stations is not None else raw.station[:0]
     if stations is not None and not position.size and not station.any():
-        position = _named_position(entry.station or raw.name, stations, pose) / scale
+        position = _named_position(entry.station or raw.name, stations, pose)
+        position = position / scale[: position.size]
         station = station[:0] if position.size else station
     if stations is not None and len(station):
         least, most = map(int, large_arrays.extremes(raw.station))
@@ -448,7 +485,7 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
         grid_column=column,
         component=entry.component or (raw.name if raw.name in parts else ""),
         station=entry.station,
-        position=position * scale,
+        position=position * scale[: position.size],
         T_project_scan=pose,
         sigma_mm=entry.sigma_mm,
         colour=raw.colour,
@@ -481,7 +518,7 @@ def _stations(scans: list[Scan]) -> Stations | None:
     return Stations(tuple(positions), np.array(list(positions.values()))) if positions else None
 
 
-def _check_unit(path: Path, scan: Scan, unit: str, source: str, design: Design | None) -> None:
+def _check_unit(path: Path, scan: Scan, unit: FileUnit, source: str, design: Design | None) -> None:
     """Raise InputError if a scan's size shows that its unit is wrong, by itself or beside its design."""
     nominal, ratios = np.empty((0, 3)), units.STRUCTURE_RATIOS
     if isinstance(design, ArchDesign):
@@ -492,5 +529,7 @@ def _check_unit(path: Path, scan: Scan, unit: str, source: str, design: Design |
     elif design is not None:
         nominal = design.vertices
     what, advice = f"{path}: scan {scan.name!r}", f"give its unit by --units or in {PROJECT}"
-    units.check_ratio(what, scan.points, nominal, ratios, unit, source, f"{advice}, or correct the design's units")
-    units.check_extent(what, scan.points, unit, source, advice, units.STRAY)
+    units.check_ratio(
+        what, scan.points, nominal, ratios, unit.horizontal, source, f"{advice}, or correct the design's units"
+    )
+    units.check_extent(what, scan.points, unit.horizontal, source, advice, units.STRAY)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -19,6 +21,7 @@ MM_PER_UNIT = {
     "ft": 304.8,
     "us-ft": 1_200_000.0 / 3937.0,
 }
+VERTICAL = "/"  # before the unit of heights
 LARGEST_KM = 10.0  # no structure is larger; a scan in mm read as metres is, and would exhaust the memory
 STRAY = 0.01  # share of a scan's points at either end of an axis that may be outliers
 # Ratios of a scan's size to the design's that a mistaken unit causes. Of frames and whole structures often only a piece
@@ -45,6 +48,29 @@ def known_unit(text: str) -> str:
     if unit not in MM_PER_UNIT:
         raise UsageError(f"unknown unit {text!r}; expected one of {', '.join(MM_PER_UNIT)}")
     return unit
+
+
+class FileUnit(NamedTuple):
+    """Units of the coordinates of a file along x and y, and along z."""
+
+    horizontal: str
+    vertical: str
+
+    @property
+    def factors(self) -> Floats:
+        """The factors (3,) to mm of x, y and z."""
+        return np.array([MM_PER_UNIT[unit] for unit in (self.horizontal, self.horizontal, self.vertical)])
+
+    def __str__(self) -> str:
+        return self.horizontal if self.vertical == self.horizontal else VERTICAL.join(self)
+
+
+def file_unit(text: str) -> FileUnit:
+    """Return the units that ``m``, or with a unit of the heights ``m/us-ft``, states. Raises UsageError for others."""
+    horizontal, slash, vertical = text.partition(VERTICAL)
+    if slash and not vertical.strip():
+        raise UsageError(f"expected a unit of the heights after the slash, as in m/us-ft, found {text!r}")
+    return FileUnit(known_unit(horizontal), known_unit(vertical or horizontal))
 
 
 def radius(points: Floats) -> float:

@@ -355,6 +355,39 @@ def test_units_of_each_file_and_of_heights(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "c/compare.json").read_text())["unit"] == "m"
 
 
+def las_in_feet(path, points):
+    """A LAS file whose coordinate system has x and y in m and z in US survey feet (NAVD88 height, EPSG:6360)."""
+    import laspy
+    from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct
+
+    las = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
+    las.header.scales = np.full(3, 1e-6)
+    las.x, las.y, las.z = points.T
+    vlr = GeoKeyDirectoryVlr()
+    vlr.geo_keys = [GeoKeyEntryStruct(key, 0, 1, value) for key, value in ((1024, 1), (3072, 25832), (4096, 6360))]
+    vlr.geo_keys_header.number_of_keys = len(vlr.geo_keys)
+    las.header.vlrs.append(vlr)
+    las.write(str(path))
+    return path
+
+
+def test_stated_units_count_before_those_of_the_files(tmp_path):
+    """Files that state two units are refused until the user states one; then one remark says so."""
+    first, second = wavy(3000, 1) / 1000.0, wavy(3000, 2, 5.0) / 1000.0
+    files = [las_in_feet(tmp_path / f"{k}.las", one) for k, one in enumerate((first, second))]
+    lengths = {"normal_diameter": 0.08, "projection_diameter": 0.05, "max_depth": 0.04}
+    with pytest.raises(InputError, match=r"0\.las: .*x and y are in m, z is in us-ft; state the unit by --units"):
+        compare.compare(Request(*files, **lengths))
+    plain = [written(tmp_path / f"{k}.xyz", one) for k, one in enumerate((first.round(6), second.round(6)))]
+    for units, name in (("m", "m"), ("m/us-ft", "m/us-ft")):
+        found = compare.compare(Request(*files, units=units, **lengths))
+        expected = compare.compare(Request(*plain, units=name, **lengths))
+        np.testing.assert_allclose(found.distances.distance, expected.distances.distance, atol=1e-9)
+        (note,) = [one for one in found.notes if one.code == "compare.over-files"]
+        assert [one.values["name"] for one in note.values["files"]] == ["0.las", "1.las"]
+    assert not [one for one in expected.notes if one.code == "compare.over-files"]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -72,7 +72,7 @@ CASES = {
     "PTX of 1e12 cells": ("a.ptx", "1000000\n1000000\n" + TURNED + "1 2 3 4\n", "declares 10{12} points"),
     "PTX cut off": ("a.ptx", "2\n2\n" + TURNED + "1.0000 2.0000 3.0000 4\n" * 3, "expected 4 cells .* found 3"),
     "PTX too long": ("a.ptx", "1\n2\n" + TURNED + "1 2 3 4\n" * 3, "more cells than declared"),
-    "PTX of no returns": ("a.ptx", "1\n2\n" + TURNED + "0 0 0 0.5\n" * 2, "no returns"),
+    "PTX of no returns": ("a.ptx", "1\n2\n" + TURNED + "0 0 0 0.5\n" * 2, "expected points, found none in scan 'a'"),
     "PTX with NaN": ("a.ptx", "1\n2\n" + TURNED + "1 2 3 4\n1 nan 3 4\n", "1 of 2 points"),
     "text of words": ("a.xyz", "hello world and more\n" * 10, "three numbers x y z, found 'hello"),
     "text of two columns": ("a.xyz", "1 2\n3 4\n", "three numbers"),

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from processor import readers
-from processor.model import InputError, Scan
+from processor.model import InputError, Scan, reason
+from processor.readers import ply
 from processor.readers.e57 import cartesian_from_spherical
 from processor.writers import e57
 from processor.writers.cloud import of_scan
-from tests.support.files.scan_bytes import DATA, TURNED, las_bytes, needs_data, pcd_header, ply_header, put
+from tests.support.files.scan_bytes import DATA, POSE_ROWS, TURNED, las_bytes, needs_data, pcd_header, ply_header, put
 
 POINTS = np.array([[1.5, -2.25, 3.0], [0.1, 0.2, 0.3], [-7.0, 8.0, 1e-3]])
 
@@ -50,6 +51,25 @@ def test_ply_with_a_property_after_a_list_in_later_elements(tmp_path):
     more = "element face 2\nproperty list uchar double w\nproperty uchar flag\n"
     content = ply_header("binary_little_endian", "double", more) + POINTS.astype("<f8").tobytes() + bytes(4)
     assert np.array_equal(one(put(tmp_path / "a.ply", content)).points, POINTS)
+
+
+@pytest.mark.parametrize(("form", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
+@pytest.mark.parametrize("room", [1, 64, 1 << 20])
+def test_ply_with_elements_before_the_vertices(tmp_path, monkeypatch, form, order, room):
+    """Lists of any length, of several types and with single values beside them; also longer than is read at once."""
+    monkeypatch.setattr(ply, "SKIPPED_BYTES", room)
+    head = (
+        f"ply\nformat {form} 1.0\nelement face 40\nproperty uchar flag\nproperty list uchar int vertex_indices\n"
+        "property list ushort double w\nelement other 2\nproperty float a\nelement vertex 3\n"
+    ).encode()
+    head += b"".join(f"property double {axis}\n".encode() for axis in "xyz") + b"end_header\n"
+    faces = b"".join(
+        struct.pack(f"{order}BB{k % 7}iH{k % 3}d", 9, k % 7, *range(k % 7), k % 3, *range(k % 3)) for k in range(40)
+    )
+    content = head + faces + bytes(8) + POINTS.astype(f"{order}f8").tobytes()
+    assert np.array_equal(one(put(tmp_path / "a.ply", content)).points, POINTS)
+    with pytest.raises(InputError, match="not a readable PLY file"):
+        readers.read(put(tmp_path / "a.ply", content[: len(head) + len(faces) - 9]))
 
 
 def test_far_points_keep_their_precision(tmp_path):
@@ -105,11 +125,103 @@ def test_ptx_poses_and_no_returns(tmp_path):
     assert scans[1].points.tolist() == [[7, 8, 9]]
 
 
-def test_ptx_scaled_or_mirrored_is_refused(tmp_path):
-    for rows, why in (("1 0 0 0\n0 1 0 0\n0 0 2 0\n", "determinant 2"), ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n", "-1")):
-        text = "1\n1\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n" + rows + "0 0 0 1\n7 8 9 0.1\n"
-        with pytest.raises(InputError, match=f"not a rotation.*{why}"):
-            readers.read(put(tmp_path / "a.ptx", text))
+def ptx_of(rows, position="0 0 0"):
+    return f"1\n1\n{position}\n1 0 0\n0 1 0\n0 0 1\n" + rows + "7 8 9 0.1\n"
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        "1 0 0 0\n0 1 0 0\n0 0 2 0\n0 0 0 1\n",
+        "0.5 0 0 0\n0 0.5 0 0\n0 0 0.5 0\n0 0 0 1\n",  # R^T R is below the identity
+        "1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n",
+        "1 0.5 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n",
+        "0 0 0 0\n0 0 0 0\n0 0 0 0\n0 0 0 1\n",
+        "nan 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n",
+        "1 0 0 0\n0 1 0 0\n0 0 1 0\n10 inf 30 1\n",
+        "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 2\n",
+        "1 0 0 9\n0 1 0 0\n0 0 1 0\n10 20 30 1\n",  # translations in the last row and in the last column
+    ],
+)
+def test_a_ptx_matrix_that_is_no_pose_is_refused(tmp_path, rows):
+    with pytest.raises(InputError, match="the matrix of scan 1 is not a rotation and a translation"):
+        readers.read(put(tmp_path / "a.ptx", ptx_of(rows)))
+
+
+def test_a_ptx_matrix_for_column_vectors_is_read_with_the_translation_of_its_last_column(tmp_path):
+    scan = one(put(tmp_path / "a.ptx", ptx_of("0 -1 0 10\n1 0 0 20\n0 0 1 30\n0 0 0 1\n", "10 20 30")))
+    # By hand: (1, 2, 3) turned by a quarter about z is (-2, 1, 3), moved (8, 21, 33).
+    np.testing.assert_allclose(scan.T_project_scan @ [1, 2, 3, 1], [8, 21, 33, 1], atol=1e-12)
+    np.testing.assert_allclose(scan.position, 0.0, atol=1e-12)
+    assert [(x.code, x.values["scans"]) for x in scan.remarks] == [("read.matrix-for-columns", ("a",))]
+
+
+@pytest.mark.parametrize(
+    ("position", "rows", "expected"),
+    [
+        ("0 0 0", POSE_ROWS, [0, 0, 0]),  # says nothing: points are in the scanner's frame
+        ("10 20 30", POSE_ROWS, [0, 0, 0]),
+        ("10 20 35", POSE_ROWS, [0, 0, 5]),
+        ("5 6 7", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", [5, 6, 7]),  # a cloud in the project's frame
+    ],
+)
+def test_the_scanner_of_a_ptx_grid(tmp_path, position, rows, expected):
+    scan = one(put(tmp_path / "a.ptx", ptx_of(rows, position)))
+    np.testing.assert_allclose(scan.position, expected, atol=1e-12)
+
+
+def test_scans_without_points_are_named_and_the_others_read(tmp_path):
+    grid = "1\n1\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n{} 1\n"
+    scans = readers.read(put(tmp_path / "a.ptx", grid.format("1 2 3") + grid.format("0 0 0") + grid.format("4 5 6")))
+    assert [(scan.name, scan.points.tolist()) for scan in scans] == [("a-1", [[1, 2, 3]]), ("a-3", [[4, 5, 6]])]
+    assert scans[0].remarks[0].values == {"count": 1, "scans": ("a-2",)}
+    with pytest.raises(InputError, match="found none in scan 'a'"):
+        readers.read(put(tmp_path / "a.ptx", grid.format("0 0 0")))
+
+
+def e57_of(path, counts, invalid=()):
+    """Scans A, B, ... of some points each, those of the scans ``invalid`` all marked so."""
+    from pye57 import libe57
+
+    file = libe57.ImageFile(str(path), "w")
+    root = file.root()
+    root.set("formatName", libe57.StringNode(file, "ASTM E57 3D Imaging Data File"))
+    root.set("guid", libe57.StringNode(file, "{0}"))
+    for key in ("versionMajor", "versionMinor"):
+        root.set(key, libe57.IntegerNode(file, key == "versionMajor"))
+    scans = libe57.VectorNode(file, True)
+    root.set("data3D", scans)
+    for k, count in enumerate(counts):
+        node, prototype = libe57.StructureNode(file), libe57.StructureNode(file)
+        node.set("guid", libe57.StringNode(file, f"{{{k + 1}}}"))
+        node.set("name", libe57.StringNode(file, "ABC"[k]))
+        names = [f"cartesian{axis}" for axis in "XYZ"]
+        for name in names:
+            prototype.set(name, libe57.FloatNode(file, 0.0))
+        prototype.set("cartesianInvalidState", libe57.IntegerNode(file, 0, 0, 2))
+        points = libe57.CompressedVectorNode(file, prototype, libe57.VectorNode(file, True))
+        node.set("points", points)
+        scans.append(node)
+        if count:
+            columns = [*POINTS[:count].T.copy(), np.full(count, 2.0 * (k in invalid))]
+            buffers = libe57.VectorSourceDestBuffer()
+            for name, column in zip([*names, "cartesianInvalidState"], columns, strict=True):
+                buffers.append(libe57.SourceDestBuffer(file, name, column, count, True, True))
+            writer = points.writer(buffers)
+            writer.write(count)
+            writer.close()
+    file.close()
+    return path
+
+
+@pytest.mark.parametrize(("counts", "invalid"), [((3, 0, 2), ()), ((3, 2, 2), (1,))])
+def test_e57_scans_without_points_are_named_and_the_others_read(tmp_path, counts, invalid):
+    scans = readers.read(e57_of(tmp_path / "a.e57", counts, invalid))
+    assert [scan.name for scan in scans] == ["A", "C"]
+    np.testing.assert_array_equal(scans[1].points, POINTS[:2])
+    assert scans[0].remarks == (reason("read.scans-without-points", count=1, scans=["B"]),)
+    with pytest.raises(InputError, match="expected points, found none in scan"):
+        readers.read(e57_of(tmp_path / "b.e57", (0,)))
 
 
 # --- text ----------------------------------------------------------------------------------------------------------

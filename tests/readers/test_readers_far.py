@@ -6,13 +6,14 @@ import json
 import struct
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from processor import readers
-from processor.model import InputError, Scan
-from processor.readers import ascii_rows
+from processor.model import InputError, Scan, UsageError
+from processor.readers import ascii_rows, coordinate_system, epsg_units
 from processor.scan_folder import folder
 from processor.writers import e57
 from processor.writers.cloud import of_scan
@@ -144,15 +145,114 @@ def las_in(tmp_path, points, scale=0.001, **keys):
     return tmp_path / "a.las"
 
 
-def test_las_units_of_its_coordinate_system(tmp_path):
-    assert readers.read(las_in(tmp_path, NEAR, keys={1024: 1, 3076: 9002}))[0].unit == "ft"
-    assert readers.read(las_in(tmp_path, NEAR, keys={1024: 1, 3076: 9001, 4099: 9001}))[0].unit == "m"
-    with pytest.raises(InputError, match=r"x and y .*in m, z in ft"):
-        readers.read(las_in(tmp_path, NEAR, keys={1024: 1, 3076: 9001, 4099: 9002}))
-    with pytest.raises(InputError, match="longitude and latitude"):
-        readers.read(las_in(tmp_path, NEAR, scale=1e-7, keys={1024: 2, 2048: 4326}))
-    # Whatever it says, these are no degrees.
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({1024: 1, 3076: 9002}, "ft"),
+        ({1024: 1, 3076: 9001, 4099: 9001}, "m"),
+        ({1024: 1, 3072: 2225}, "us-ft"),  # NAD83 / California zone 1 (ftUS)
+        ({1024: 1, 3072: 2222, 4052: 9001}, "ft"),  # NAD83 / Arizona East (ft); the other unit is of its ellipsoid
+        ({1024: 1, 3072: 25832}, "m"),
+        ({1024: 1, 3072: 9999, 3076: 9003}, "us-ft"),
+        ({1024: 1, 3072: 19999}, "it names EPSG:19999, whose unit is not known here"),
+        ({1024: 1, 3072: 4326}, "EPSG:4326"),
+        ({1024: 1, 3076: 9005}, "EPSG:9005"),  # Clarke's foot
+        ({1024: 1, 3076: 9001, 4099: 9002}, "x and y are in m, z is in ft"),
+        ({1024: 1, 3072: 25832, 4096: 6360}, "x and y are in m, z is in us-ft"),  # NAVD88 height (ftUS)
+        ({1024: 2, 2048: 4326}, "longitude and latitude"),
+    ],
+)
+def test_the_unit_of_a_las_file_is_that_of_its_coordinate_system(tmp_path, keys, expected):
+    path = las_in(tmp_path, NEAR, scale=1e-7, keys=keys)
+    (raw,) = readers.read(path)
+    if raw.unit:
+        assert (raw.unit, raw.unit_fault) == (expected, None)
+        return
+    with pytest.raises(InputError, match=f"{expected}.*--units") as refused:
+        folder.read_input(path)
+    assert refused.value.path == path
+    # What the user states counts, with one remark that says over what.
+    scene = folder.read_input(path, units="m/us-ft")
+    np.testing.assert_allclose(scene.scans[0].points, NEAR * [1e3, 1e3, 1_200_000 / 3937], atol=1e-3)
+    (said,) = scene.units_reason
+    assert (scene.units, said.code, said.values["file"]) == ("m/us-ft", "units.over-file", raw.unit_fault)
+
+
+def test_degrees_that_the_coordinates_exceed_are_a_mistake_of_the_writer(tmp_path):
     assert readers.read(las_in(tmp_path, 1e4 * NEAR, scale=0.01, keys={1024: 2, 2048: 4326}))[0].unit == "m"
+
+
+GEOGCS = 'GEOGCS["NAD83",UNIT["degree",0.0174532925199433]]'
+
+
+@pytest.mark.parametrize(
+    ("wkt", "expected"),
+    [
+        (f'PROJCS["p",{GEOGCS},UNIT["US survey foot",0.3048006096012192]]', "us-ft"),
+        (f'PROJCS["p",{GEOGCS},UNIT["Foot_US",0.304801]]', "us-ft"),
+        (f'PROJCS["p",{GEOGCS},UNIT["foot",0.3048]]', "ft"),
+        ('LOCAL_CS["site",UNIT["foot",0.3048]]', "ft"),
+        ('ENGCRS["site",EDATUM["d"],CS[Cartesian,3],AXIS["x",east],LENGTHUNIT["millimetre",0.001]]', "mm"),
+        ('PROJCRS["p",BASEGEOGCRS["b",ELLIPSOID["e",6378137,298,LENGTHUNIT["metre",1]]],CONVERSION["c",PARAMETER["k",'
+         '1,SCALEUNIT["unity",1]]],CS[Cartesian,2],AXIS["x",east],LENGTHUNIT["foot",0.3048]]', "ft"),
+        (f'PROJCS["p",{GEOGCS},AUTHORITY["EPSG","2225"]]', "us-ft"),
+        (f'PROJCS["p",{GEOGCS}]', "units.file-unit-missing"),
+        (f'PROJCS["p",{GEOGCS},UNIT["Clarke\'s foot",0.3047972654]]', "units.file-size-unknown"),
+        (f'COMPD_CS["c",PROJCS["p",{GEOGCS},UNIT["metre",1]],VERT_CS["v",UNIT["US survey foot",0.304800609601219]]]',
+         "units.file-in-two"),
+        (f'COMPD_CS["c",{GEOGCS},VERT_CS["v",UNIT["metre",1]]]', "units.file-in-degrees"),
+    ],
+)  # fmt: skip
+def test_the_unit_of_a_system_as_text(wkt, expected):
+    unit, fault = coordinate_system.unit([SimpleNamespace(string=wkt)], fits_degrees=True)
+    assert (unit or fault.code) == expected
+
+
+# By the names of the EPSG dataset: Arizona East in feet, California 1, New York and Hawaii in US survey feet,
+# Switzerland and UTM; Tobago in links, degrees, codes of nobody.
+@pytest.mark.parametrize(("code", "unit"), {2222: "ft", 2225: "us-ft", 2263: "us-ft", 3759: "us-ft", 2056: "m",
+                         32633: "m", 2066: "", 4326: "", 12000: "", 32767: "", -1: ""}.items())  # fmt: skip
+def test_units_of_codes(code, unit):
+    assert epsg_units.horizontal(code) == unit
+
+
+@pytest.mark.parametrize("point_format", [3, 6])
+def test_withheld_points_are_left_out_and_counted(tmp_path, point_format):
+    import laspy
+
+    las = laspy.LasData(laspy.LasHeader(point_format=point_format, version="1.4"))
+    las.header.scales = np.full(3, 1e-6)
+    las.x, las.y, las.z = NEAR.T
+    las.intensity = np.arange(50)
+    las.withheld = np.arange(50) % 5 == 0
+    las.synthetic = np.arange(50) < 3
+    las.write(str(tmp_path / "a.las"))
+    (scan,) = readers.read(tmp_path / "a.las")
+    kept = np.flatnonzero(np.arange(50) % 5)
+    np.testing.assert_allclose(scan.points, NEAR[kept], atol=1e-9)
+    assert scan.intensity.tolist() == kept.tolist()
+    assert [(one.code, one.values["count"]) for one in scan.remarks] == [
+        ("read.withheld-points", 10),
+        ("read.synthetic-points", 3),
+    ]
+    las.withheld = np.ones(50, bool)
+    las.write(str(tmp_path / "a.las"))
+    with pytest.raises(InputError, match="all of its 50 points are flagged as withheld"):
+        readers.read(tmp_path / "a.las")
+
+
+def test_units_of_one_scan_in_a_project(tmp_path):
+    for name in ("b", "a"):
+        las_in(tmp_path, NEAR, scale=1e-6, keys={1024: 1, 3072: 2225}).rename(tmp_path / f"{name}.las")
+    scans = '[[scan]]\nfile = "a.las"\nunits = "m/ft"\n[[scan]]\nfile = "b.las"\n'
+    (tmp_path / "project.toml").write_text(scans)
+    scene = folder.read_input(tmp_path)
+    factors = [[1e3, 1e3, 304.8], [1_200_000 / 3937] * 3]
+    for scan, factor in zip(scene.scans, factors, strict=True):
+        np.testing.assert_allclose(scan.origin + scan.points, NEAR * factor, atol=1e-2)
+    assert [one.code for one in scene.units_reason] == ["units.over-file", "units.by-format"]
+    with pytest.raises(UsageError, match="expected one unit for a folder"):
+        folder.read_input(tmp_path, units="m/ft")
 
 
 def test_las_that_declares_fewer_points_than_it_holds(tmp_path):
