@@ -94,6 +94,7 @@ def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterat
         if small:
             file.flush()
             temporary.write_bytes(file.id.get_file_image())
+    file_structure_checks.remember(path)
 
 
 def write_scene(path: Path, scene: Scene, truth: Truth | None, provenance: Mapping[str, object]) -> None:
@@ -171,7 +172,7 @@ def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, 
             codec.write_record(results.create_group(f"{i:04d}"), run)
 
 
-_SOUND: dict[tuple[int, ...], Mapping[str, str | None]] = {}  # by the state of a file: checksums of its datasets
+_SOUND: dict[file_structure_checks.State, file_structure_checks.Structure] = {}  # by the state of a file
 SETTLED_S = 2.0  # since a file was written
 
 
@@ -182,11 +183,17 @@ SETTLED_S = 2.0  # since a file was written
 def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
     """Open a file of one of ``kinds`` whose structure is safe to read. Raises InputError for any other, or damage."""
     try:
+        structure = _structure(path)
+        if structure.error:
+            raise OSError(structure.error)
+        if structure.faults or structure.known is None:
+            raise DecodeError([*structure.faults])
         with file_structure_checks.limited_memory():
             file = h5py.File(path, "r", locking=False)
         with file:
-            known, faults = _structure(file, path)
-            faults = faults or _header_problems(file, kinds, known)
+            if file_structure_checks.state_of(os.fstat(file.id.get_vfd_handle())) != structure.state:
+                raise DecodeError(["was changed while it was read; wait until it is written, and run again"])
+            faults = _header_problems(file, kinds, structure.known)
             if faults:
                 raise DecodeError(faults)
             yield file
@@ -209,24 +216,21 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
         ) from error
 
 
-def _structure(file: Any, path: Path) -> tuple[Mapping[str, str | None], list[str]]:
-    """Return the checksums of an open file's datasets by their paths, and the faults of its structure.
+def _structure(path: Path) -> file_structure_checks.Structure:
+    """Return what is known of the structure of a file, which is looked at once while it is as it was.
 
-    A run opens its input several times: what was found sound is not visited again while the file is as it was. One that
-    was just written may change again within a tick of the disk's clock, so it is not remembered.
+    A run opens its input several times. A file that was just written may change again within a tick of the disk's
+    clock, so it is not remembered.
     """
-    status = os.fstat(file.id.get_vfd_handle())
-    state = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+    status = path.stat()
+    state = file_structure_checks.state_of(status)
     if state in _SOUND:
-        return _SOUND[state], []
-    known: dict[str, str | None] = {}
-    with file_structure_checks.limited_memory():
-        faults = file_structure_checks.problems(
-            file, path, lambda place, dataset: known.update({place: checksums.stored(dataset)})
-        )
-    if not faults and time.time() - status.st_mtime > SETTLED_S:
-        _SOUND[state] = known
-    return known, faults
+        return _SOUND[state]
+    structure = file_structure_checks.of_file(path)
+    sound = structure.known is not None and not structure.faults
+    if sound and structure.state == state and time.time() - status.st_mtime > SETTLED_S:
+        _SOUND[state] = structure
+    return structure
 
 
 def _listed(problems: Sequence[str], most: int = 20) -> str:

@@ -160,8 +160,8 @@ def test_verify_command_counts_whole_damaged_and_unchecked_files(tmp_path, scene
 def test_a_file_is_visited_once_while_it_stays_as_it_was(scene_file, monkeypatch):
     """One that has changed is visited again, and so is one that was just written: it may change within a clock tick."""
     visits = []
-    visit = file_structure_checks.problems
-    monkeypatch.setattr(file_structure_checks, "problems", lambda *given: visits.append(1) or visit(*given))
+    visit = file_structure_checks.of_file
+    monkeypatch.setattr(file_structure_checks, "of_file", lambda *given: visits.append(1) or visit(*given))
     os.utime(scene_file)
     for _ in range(2):
         store.read_provenance(scene_file)
