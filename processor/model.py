@@ -82,13 +82,19 @@ LONGEST_TEXT = 1 << 20
 class Meaning:
     """What the values of a field must be beyond type and shape; :mod:`processor.record_checks` checks it at input.
 
-    Numbers: ``finite``, else NaN stands for unknown; from ``least`` to ``most``, beyond ``above``; ``rows_of`` names
-    what they are row numbers of, from ``lowest_row`` on (-1 = none). Names and numbers: ``among`` names the values
+    Numbers: ``finite``, else NaN stands for unknown; from ``least`` to ``most``, beyond ``above``; infinite only where
+    they are ``infinite``; ``rows_of`` names what they are row numbers of, from ``lowest_row`` on (-1 = none).
+    Matrices: a ``pose`` (NaN where unknown), which may be ``scaled``; a ``covariance``, symmetric, without a negative
+    variance. Names and numbers: ``among`` names the values
     that they may have; ``unique``; ``unlike`` names a column that has another value in each row. Texts: one of
     ``words``; at most ``longest`` characters. A reference is a field of the record, or one of the scene after a "/".
     """
 
     finite: bool = False
+    infinite: bool = False
+    pose: bool = False
+    scaled: bool = False
+    covariance: bool = False
     least: float = float("-inf")
     most: float = float("inf")
     above: float = float("-inf")
@@ -105,6 +111,20 @@ PLACE = Meaning(finite=True, least=-LARGEST_MM, most=LARGEST_MM)
 SIZE = Meaning(finite=True, above=0.0, most=LARGEST_MM)
 DEVIATION = Meaning(finite=True, least=0.0, most=LARGEST_MM)  # one standard deviation
 BOUND = Meaning()  # NaN = none; never infinite
+# Of results and truths; NaN where unknown.
+NUMBER = Meaning()  # of any sign
+COORDINATE = Meaning(least=-LARGEST_MM, most=LARGEST_MM)
+RADIUS = Meaning(above=0.0, most=LARGEST_MM)
+AMOUNT = Meaning(least=0.0)  # a standard deviation, half-width, distance, area
+RATIO = Meaning(least=0.0, infinite=True)  # infinite over nothing
+SHARE = Meaning(least=0.0, most=1.0 + 1e-9)  # a quotient of sums may be rounded up
+DIRECTION = Meaning(least=-1.0 - 1e-9, most=1.0 + 1e-9)
+COUNT = Meaning(least=0.0)
+END = Meaning(least=-1.0)  # the id of a node, -1 = none
+OPEN = Meaning(infinite=True)  # -inf or inf: without a bound
+POSE = Meaning(pose=True)
+SCALED_POSE = Meaning(pose=True, scaled=True)
+COVARIANCE = Meaning(covariance=True)
 NAMES = Meaning(unique=True)
 LONG = Meaning(longest=LONGEST_TEXT)
 LARGEST_GRID, GRID_CELLS_PER_POINT = 1 << 28, 1024  # cells of a scanner's grid; of the open sky few have returns
@@ -756,13 +776,15 @@ class PointLabels(Checked):
 
     scan: str
     part_names: tuple[str, ...] = ()
-    part: Labels = column("n", dtype=np.int32)  # -1 = none
-    source: Codes = column("n", dtype=np.uint8)
+    part: Labels = column("n", dtype=np.int32, means=Meaning(rows_of="part_names", lowest_row=-1))  # -1 = none
+    source: Codes = column("n", dtype=np.uint8, means=Meaning(most=2.0))
     surface_names: tuple[str, ...] = ()
-    surface: Labels = column("n", dtype=np.int32)  # -1 = none
-    range_error_mm: Shorts = column("n", dtype=np.float32)
-    incidence_cos: Shorts = column("n", dtype=np.float32)
-    defect: Labels = column("n", dtype=np.int32, newer=True)  # id of the defect that displaced the surface, -1 = none
+    surface: Labels = column("n", dtype=np.int32, means=Meaning(rows_of="surface_names", lowest_row=-1))  # -1 = none
+    range_error_mm: Shorts = column("n", dtype=np.float32, means=COORDINATE)
+    incidence_cos: Shorts = column("n", dtype=np.float32, means=NUMBER)
+    defect: Labels = column(
+        "n", dtype=np.int32, newer=True, means=Meaning(least=-1)
+    )  # id of the defect that displaced the surface, -1 = none
 
 
 SOURCES = ("surface", "mixed", "outlier")  # the footprint on one surface; on several, or past an edge; a stray return
@@ -777,14 +799,14 @@ class ArchTruth(Checked):
     """
 
     names: tuple[str, ...] = names("c")
-    T_bridge_scan: Floats = column("c", 4, 4)
-    key_points_scan: Floats = column("c", 2, 8, 3)
-    key_points_bridge: Floats = column("c", 2, 8, 3)
-    edges_bridge: Floats = column("c", 2, "e", 3)
-    branch_component: Ints = column("b", dtype=np.int64, newer=True)  # row of names
-    branch_joint: Ints = column("b", dtype=np.int64, newer=True)  # row of the design's joints
-    branch_scan: Floats = column("b", 8, 3, newer=True)
-    branch_bridge: Floats = column("b", 8, 3, newer=True)
+    T_bridge_scan: Floats = column("c", 4, 4, means=POSE)
+    key_points_scan: Floats = column("c", 2, 8, 3, means=COORDINATE)
+    key_points_bridge: Floats = column("c", 2, 8, 3, means=COORDINATE)
+    edges_bridge: Floats = column("c", 2, "e", 3, means=COORDINATE)
+    branch_component: Ints = column("b", dtype=np.int64, newer=True, means=Meaning(rows_of="names"))  # row of names
+    branch_joint: Ints = column("b", dtype=np.int64, newer=True, means=COUNT)  # row of the design's joints
+    branch_scan: Floats = column("b", 8, 3, newer=True, means=COORDINATE)
+    branch_bridge: Floats = column("b", 8, 3, newer=True, means=COORDINATE)
 
 
 @dataclass(frozen=True)
@@ -795,10 +817,10 @@ class FrameTruth(Checked):
     hole cuts that point away.
     """
 
-    ids: Ints = column("k", dtype=np.int64)
-    centres: Floats = column("k", 3)
-    radii: Floats = column("k")
-    lowest: Floats = column("k", 3)
+    ids: Ints = column("k", dtype=np.int64, means=NAMES)
+    centres: Floats = column("k", 3, means=COORDINATE)
+    radii: Floats = column("k", means=RADIUS)
+    lowest: Floats = column("k", 3, means=COORDINATE)
 
 
 @dataclass(frozen=True)
@@ -806,10 +828,10 @@ class StationTruth(Checked):
     """Where the scanners really stood, and the systematic errors each had; both axes of ``tilt`` in rad."""
 
     ids: tuple[str, ...] = names("k")
-    T_project_station: Floats = column("k", 4, 4)
-    zero_offset_mm: Floats = column("k")
-    scale_ppm: Floats = column("k")
-    tilt: Floats = column("k", 2)
+    T_project_station: Floats = column("k", 4, 4, means=POSE)
+    zero_offset_mm: Floats = column("k", means=COORDINATE)
+    scale_ppm: Floats = column("k", means=NUMBER)
+    tilt: Floats = column("k", 2, means=NUMBER)
 
 
 @dataclass(frozen=True)
@@ -818,7 +840,7 @@ class AsBuilt(Checked):
 
     what: tuple[str, ...] = names("i")
     where: tuple[str, ...] = names("i")
-    value: Floats = column("i")
+    value: Floats = column("i", means=NUMBER)
     unit: tuple[str, ...] = names("i")
 
 
@@ -831,9 +853,9 @@ class BodyTruth(Checked):
     """
 
     names: tuple[str, ...] = names("b")
-    of_point: Labels = column("m", dtype=np.int32)
-    shift: Floats = column("b", 3)  # mm
-    turn: Floats = column("b", 3)  # rad
+    of_point: Labels = column("m", dtype=np.int32, means=Meaning(rows_of="names", lowest_row=-1))
+    shift: Floats = column("b", 3, means=COORDINATE)  # mm
+    turn: Floats = column("b", 3, means=NUMBER)  # rad
 
     @property
     def moved(self) -> Bools:
@@ -850,9 +872,9 @@ class StructureTruth(Checked):
     ``bodies`` are None where the structure is no model of named bodies.
     """
 
-    points: Floats = column("m", 3)
-    normals: Floats = column("m", 3)
-    displacement: Floats = column("m", 3)
+    points: Floats = column("m", 3, means=COORDINATE)
+    normals: Floats = column("m", 3, means=DIRECTION)
+    displacement: Floats = column("m", 3, means=COORDINATE)
     bodies: BodyTruth | None = newer()
 
     def __post_init__(self) -> None:
@@ -868,13 +890,13 @@ class StructureTruth(Checked):
 class DefectTruth(Checked):
     """The defects of a structure, in the design's frame; a depth inward is positive."""
 
-    ids: Ints = column("k", dtype=np.int64)
+    ids: Ints = column("k", dtype=np.int64, means=NAMES)
     classes: tuple[str, ...] = names("k")
     components: tuple[str, ...] = names("k")
-    centres: Floats = column("k", 3)
-    area_mm2: Floats = column("k")
-    depth_max_mm: Floats = column("k")
-    volume_mm3: Floats = column("k")
+    centres: Floats = column("k", 3, means=COORDINATE)
+    area_mm2: Floats = column("k", means=AMOUNT)
+    depth_max_mm: Floats = column("k", means=COORDINATE)
+    volume_mm3: Floats = column("k", means=NUMBER)
 
 
 @dataclass(frozen=True)
@@ -885,8 +907,8 @@ class PoseTruth(Checked):
     like, which no method can distinguish from a movement of the whole.
     """
 
-    T_design_project: Floats = column(4, 4)
-    covariance: Floats = optional(6, 6, newer=True)
+    T_design_project: Floats = column(4, 4, means=POSE)
+    covariance: Floats = optional(6, 6, newer=True, means=COVARIANCE)
 
 
 @dataclass(frozen=True)
@@ -895,7 +917,7 @@ class TargetTruth(Checked):
 
     ids: tuple[str, ...] = names("k")
     kinds: tuple[str, ...] = names("k")
-    positions: Floats = column("k", 3)
+    positions: Floats = column("k", 3, means=COORDINATE)
 
 
 @dataclass(frozen=True)
@@ -905,8 +927,8 @@ class Truth(Checked):
     labels: tuple[PointLabels, ...] = ()
     arch: ArchTruth | None = None
     frame: FrameTruth | None = None
-    spacing_mm: float = float("nan")
-    sigma_mm: float = float("nan")
+    spacing_mm: float = described(float("nan"), means=AMOUNT)
+    sigma_mm: float = described(float("nan"), means=AMOUNT)
     structure: StructureTruth | None = None
     defects: DefectTruth | None = None
     stations: StationTruth | None = None
@@ -1007,7 +1029,7 @@ class Diagnostics(Checked):
     stage: tuple[str, ...] = names("k")
     place: tuple[str, ...] = names("k", means=LONG)
     quantity: tuple[str, ...] = names("k")
-    value: Floats = column("k")
+    value: Floats = column("k", means=OPEN)
 
 
 @dataclass(frozen=True)

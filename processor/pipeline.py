@@ -423,7 +423,11 @@ def read_runs(results: Path) -> tuple[tuple[StepRun, ...], dict[str, Any]]:
     missing = {"input", "input_sha256", "seed", "software"} - set(provenance)
     if missing:
         raise InputError(f"{results}: does not say its {', '.join(sorted(missing))}; run processor run again")
-    provenance["parameters"] = _parameters(runs)  # the store sorts names, a run's parameters keep their order
+    try:
+        # The store sorts names, a run's parameters keep their order.
+        provenance["parameters"] = _parameters(runs)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise InputError(f"{results}: expected the parameters of a step as JSON ({error})") from error
     return runs, provenance
 
 

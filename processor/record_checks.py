@@ -18,6 +18,7 @@ from processor import large_arrays
 from processor.model import LARGEST_MM, Checked, Fault, InputError, Meaning, Word
 
 POSE_TOLERANCE = 1e-3  # of R^T R - I
+COVARIANCE_TOLERANCE = 1e-6  # of correlations: sums of products of float64 are good to 1e-9 and better
 SHOWN = 60  # characters of a value
 UNDECLARED = Meaning()  # of a field without a declaration
 
@@ -82,8 +83,10 @@ def _faults(field: dataclasses.Field[Any], value: Any, meaning: Meaning, record:
         if all(isinstance(item, str) and not isinstance(item, Word) for item in value):
             yield from _of_texts(value, meaning, record, root)
     elif isinstance(value, np.ndarray) and value.size and value.dtype.kind in "iuf":
-        if field.name.startswith("T_") and value.shape[-2:] == (4, 4):
+        if meaning.pose or (field.name.startswith("T_") and value.shape[-2:] == (4, 4)):
             yield from _of_poses(value, meaning)
+        elif meaning.covariance:
+            yield from _of_covariances(value)
         else:
             yield from _of_numbers(value, meaning, record, root)
     elif isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -136,7 +139,7 @@ def _of_numbers(values: Array, meaning: Meaning, record: Any, root: Any) -> Iter
     real = values.dtype.kind == "f"
     if meaning.finite and real:
         yield from _first(values, ~np.isfinite(values), "expected finite numbers")
-    elif real and meaning is not UNDECLARED:
+    elif real and not meaning.infinite:
         yield from _first(values, np.isinf(values), "expected finite numbers, or NaN where unknown")
     low, high = meaning.least, meaning.most
     if meaning.rows_of:
@@ -199,6 +202,10 @@ def _first(values: Array, bad: Array, expected: str) -> Iterator[str]:
 def _of_poses(values: Array, meaning: Meaning) -> Iterator[str]:
     poses = values.reshape(-1, 4, 4)
     unknown = np.zeros(len(poses), bool) if meaning.finite else np.isnan(poses).any(axis=(1, 2))
+    if meaning.scaled:
+        poses = poses.copy()
+        with np.errstate(all="ignore"):
+            poses[:, :3, :3] /= np.cbrt(np.abs(np.linalg.det(poses[:, :3, :3])))[:, None, None]
     bad = ~are_poses(poses) & ~unknown
     if bad.any():
         row = int(bad.argmax())
@@ -206,6 +213,27 @@ def _of_poses(values: Array, meaning: Meaning) -> Iterator[str]:
         yield (
             f"{place}: expected a rotation and a finite translation above a row of 0, 0, 0, 1, found "
             f"[{'; '.join(', '.join(f'{x:.6g}' for x in line) for line in poses[row].tolist())}]"
+        )
+
+
+def _of_covariances(values: Array) -> Iterator[str]:
+    """Yield the first matrix (..., n, n) that is none of a covariance; unknown rows of one are NaN."""
+    size = values.shape[-1]
+    matrices = values.reshape(-1, size, size)
+    with np.errstate(all="ignore"):
+        variance = np.diagonal(matrices, axis1=1, axis2=2)
+        sd = np.where(variance > 0.0, np.sqrt(variance), 1.0)
+        correlation = matrices / sd[:, :, None] / sd[:, None, :]
+        lopsided = np.abs(correlation - np.swapaxes(correlation, 1, 2)) > COVARIANCE_TOLERANCE
+        bad = np.any(lopsided | np.isinf(matrices) | (variance < 0.0)[:, :, None], axis=(1, 2))
+        whole = np.isfinite(correlation).all(axis=(1, 2)) & ~bad
+        bad[whole] = np.linalg.eigvalsh(correlation[whole])[:, 0] < -COVARIANCE_TOLERANCE * size
+    if bad.any():
+        row = int(bad.argmax())
+        place = f", row {row}" if values.ndim > 2 else ""
+        yield (
+            f"{place}: expected a symmetric matrix without a negative or infinite variance, found the variances "
+            f"{_shown(', '.join(f'{x:.6g}' for x in variance[row].tolist()))}"
         )
 
 

@@ -26,18 +26,23 @@ def check(context: click.Context, output: Path, as_json: bool) -> None:
     from processor.report import table as report_table
 
     results = _read_results(output)
-    metrics = tuple(
-        Metric(
-            c["step"],
-            c["quantity"],
-            _number(c["value"]),
-            Statistic(c["statistic"]),
-            unit=c["unit"],
-            limit=_number(c["limit"]),
-            method=c["method"],
+    try:
+        metrics = tuple(
+            Metric(
+                str(c["step"]),
+                str(c["quantity"]),
+                _number(c["value"]),
+                Statistic(c["statistic"]),
+                unit=str(c["unit"]),
+                limit=_number(c["limit"]),
+                method=str(c["method"]),
+            )
+            for c in results["checks"]
         )
-        for c in results["checks"]
-    )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{output / RESULTS_JSON}: a row of checks cannot be read ({error!r}); run processor run again"
+        ) from error
     report = ErrorReport(metrics)
     if as_json:
         click.echo(json.dumps({"passed": report.passed, "checks": results["checks"]}, ensure_ascii=False))
@@ -56,8 +61,8 @@ def _read_results(output: Path) -> dict[str, Any]:
     path = output / RESULTS_JSON
     try:
         results: dict[str, Any] = json.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: no readable results ({error}); run processor run again") from error
-    if results.get("format") != FORMAT or not isinstance(results.get("checks"), list):
+    if not isinstance(results, dict) or results.get("format") != FORMAT or not isinstance(results.get("checks"), list):
         raise InputError(f"{path}: expected results of processor, found something else")
     return results

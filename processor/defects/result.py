@@ -10,11 +10,23 @@ import numpy.typing as npt
 
 from processor.limits.judging import JudgedLimits
 from processor.model import (
+    AMOUNT,
+    COORDINATE,
+    COUNT,
+    COVARIANCE,
+    DIRECTION,
+    NAMES,
+    NUMBER,
+    OPEN,
+    POSE,
+    RATIO,
+    SHARE,
     Checked,
     Codes,
     Floats,
     Ints,
     Labels,
+    Meaning,
     Reason,
     Rows,
     Shorts,
@@ -55,9 +67,9 @@ class DefectClass(Word):
 class Curve(Checked):
     """A deflection curve, mm: distance along the component, displacement outward, half-width of its 95 % interval."""
 
-    along: Floats = column("c", optional=True)
-    displacement: Floats = column("c", optional=True)
-    ci95: Floats = column("c", optional=True)
+    along: Floats = column("c", optional=True, means=COORDINATE)
+    displacement: Floats = column("c", optional=True, means=COORDINATE)
+    ci95: Floats = column("c", optional=True, means=AMOUNT)
 
 
 @dataclass(frozen=True)
@@ -69,29 +81,32 @@ class Picture(Checked):
     """
 
     low: Floats = dataclasses.field(
-        default_factory=lambda: np.zeros(2), metadata={"shape": (2,), "dtype": np.float64, "unit": "mm"}
+        default_factory=lambda: np.zeros(2),
+        metadata={"shape": (2,), "dtype": np.float64, "unit": "mm", "means": COORDINATE},
     )
-    cell: float = described(NAN, unit="mm")
-    deviation: Shorts = column("u", "v", dtype=np.float32, unit="mm")
-    part: Codes = column("u", "v", dtype=np.uint8)
+    cell: float = described(NAN, unit="mm", means=AMOUNT)
+    deviation: Shorts = column("u", "v", dtype=np.float32, unit="mm", means=COORDINATE)
+    part: Codes = column("u", "v", dtype=np.uint8, means=Meaning(most=1.0))
 
 
 @dataclass(frozen=True)
 class Windows(Rows):
     """Sizes of search window: the least mean depth that is found, and how much window means scatter beyond noise."""
 
-    side: Floats = column("s", unit="mm")
-    depth: Floats = column("s", unit="mm")
-    noise_inflation: Floats = column("s")
+    side: Floats = column("s", unit="mm", means=AMOUNT)
+    depth: Floats = column("s", unit="mm", means=AMOUNT)
+    noise_inflation: Floats = column("s", means=AMOUNT)
 
 
 @dataclass(frozen=True)
 class SurfacePlaces(Rows):
     """Places spread over the scanned surface, few enough to be drawn, and all places of small defects."""
 
-    points: Floats = column("t", 3, unit="mm")
-    deviation: Shorts = column("t", dtype=np.float32, unit="mm")  # outward positive
-    defect: Labels = column("t", dtype=np.int32)  # row of the defect, -1 = none
+    points: Floats = column("t", 3, unit="mm", means=COORDINATE)
+    deviation: Shorts = column("t", dtype=np.float32, unit="mm", means=COORDINATE)  # outward positive
+    defect: Labels = column(
+        "t", dtype=np.int32, means=Meaning(rows_of="/result.defects.id", lowest_row=-1)
+    )  # row of the defect, -1 = none
 
 
 @dataclass(frozen=True)
@@ -103,25 +118,27 @@ class Defects(Rows):
     false alarms as strong on 100 m2.
     """
 
-    id: Ints = column("k", dtype=np.int64)
+    id: Ints = column("k", dtype=np.int64, means=NAMES)
     defect_class: tuple[DefectClass, ...] = words("k", DefectClass, json="class")
-    confidence: Floats = column("k")
+    confidence: Floats = column("k", means=SHARE)
     otherwise: tuple[DefectClass, ...] = words("k", DefectClass)
     component: tuple[str, ...] = names("k")
-    centre: Floats = column("k", 3, unit="mm")
-    area_mm2: Floats = column("k")
-    depth_max: Floats = column("k", unit="mm")
-    depth_ci95: Floats = column("k", unit="mm")
-    depth_mean: Floats = column("k", unit="mm")
-    volume_mm3: Floats = column("k")
-    volume_ci95: Floats = column("k", unit="mm3")
-    axes: Floats = column("k", 3, 3)
-    extent: Floats = column("k", 2, unit="mm")
-    edge_distance: Floats = column("k", unit="mm")  # from the centre to the border of the face
-    curvature_per_m: Floats = column("k")  # largest principal curvature of the deviation at the deepest place
-    lod95: Floats = column("k", unit="mm")  # of a mean over the defect
-    z: Floats = column("k")  # deviation by its standard deviation
-    chance: Floats = column("k", json="by_chance_on_100_m2")
+    centre: Floats = column("k", 3, unit="mm", means=COORDINATE)
+    area_mm2: Floats = column("k", means=AMOUNT)
+    depth_max: Floats = column("k", unit="mm", means=COORDINATE)
+    depth_ci95: Floats = column("k", unit="mm", means=RATIO)
+    depth_mean: Floats = column("k", unit="mm", means=COORDINATE)
+    volume_mm3: Floats = column("k", means=NUMBER)
+    volume_ci95: Floats = column("k", unit="mm3", means=RATIO)
+    axes: Floats = column("k", 3, 3, means=DIRECTION)
+    extent: Floats = column("k", 2, unit="mm", means=AMOUNT)
+    edge_distance: Floats = column("k", unit="mm", means=COORDINATE)  # from the centre to the border of the face
+    curvature_per_m: Floats = column(
+        "k", means=NUMBER
+    )  # largest principal curvature of the deviation at the deepest place
+    lod95: Floats = column("k", unit="mm", means=AMOUNT)  # of a mean over the defect
+    z: Floats = column("k", means=OPEN)  # deviation by its standard deviation
+    chance: Floats = column("k", json="by_chance_on_100_m2", means=RATIO)
     doubtful: npt.NDArray[np.bool_] = column("k", dtype=np.bool_)  # chance above DOUBTFUL, or an ambiguous pose
     reasons: tuple[tuple[Reason, ...], ...] = reasons("k")
     deflection: tuple[Curve, ...] = ()  # empty curves where a defect has none
@@ -139,13 +156,13 @@ class PartPoses(Rows):
     name: tuple[str, ...] = names("p")
     status: tuple[Status, ...] = words("p", Status)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("p")
-    T_design_project: Floats = column("p", 4, 4)
-    covariance: Floats = column("p", 6, 6)
-    noise: Floats = column("p", unit="mm")
-    lod95: Floats = column("p", unit="mm")
-    examined_mm2: Floats = column("p")
-    expected_mm2: Floats = column("p")
-    defects: Ints = column("p", dtype=np.int64)
+    T_design_project: Floats = column("p", 4, 4, means=POSE)
+    covariance: Floats = column("p", 6, 6, means=COVARIANCE)
+    noise: Floats = column("p", unit="mm", means=AMOUNT)
+    lod95: Floats = column("p", unit="mm", means=AMOUNT)
+    examined_mm2: Floats = column("p", means=AMOUNT)
+    expected_mm2: Floats = column("p", means=AMOUNT)
+    defects: Ints = column("p", dtype=np.int64, means=COUNT)
 
 
 @dataclass(frozen=True)
@@ -162,16 +179,16 @@ class Result(Checked):
     status: Status = described(words=Status)
     method: str = described()
     reasons: tuple[Reason, ...] = reasons()
-    T_design_project: Floats = optional(4, 4)
-    covariance: Floats = optional(6, 6)
-    registration_error: float = described(NAN, unit="mm")  # one standard deviation
-    cell: float = described(NAN, unit="mm")
-    noise: float = described(NAN, unit="mm")  # one standard deviation
-    lod95: float = described(NAN, unit="mm")
-    examined_mm2: float = NAN
-    expected_mm2: float = NAN
-    points: int = 0
-    points_used: int = 0
+    T_design_project: Floats = optional(4, 4, means=POSE)
+    covariance: Floats = optional(6, 6, means=COVARIANCE)
+    registration_error: float = described(NAN, unit="mm", means=AMOUNT)  # one standard deviation
+    cell: float = described(NAN, unit="mm", means=AMOUNT)
+    noise: float = described(NAN, unit="mm", means=AMOUNT)  # one standard deviation
+    lod95: float = described(NAN, unit="mm", means=AMOUNT)
+    examined_mm2: float = described(NAN, means=AMOUNT)
+    expected_mm2: float = described(NAN, means=AMOUNT)
+    points: int = described(0, means=COUNT)
+    points_used: int = described(0, means=COUNT)
     least_depth: Windows = dataclasses.field(default_factory=Windows)
     defects: Defects = dataclasses.field(default_factory=Defects)
     pictures: tuple[Picture, ...] = described((), json="")

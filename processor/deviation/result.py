@@ -10,10 +10,20 @@ import numpy as np
 from processor.geometry.m3c2 import Distances
 from processor.limits.judging import JudgedLimits
 from processor.model import (
+    AMOUNT,
+    COORDINATE,
+    COUNT,
+    COVARIANCE,
+    DIRECTION,
+    PLACE,
+    POSE,
+    RATIO,
+    SHARE,
     Checked,
     Floats,
     Ints,
     Labels,
+    Meaning,
     Reason,
     Rows,
     Status,
@@ -49,15 +59,17 @@ class CorePoints(Rows):
     were compared with, and ``std1`` / sqrt(``n1``) the standard deviation of what stations have in common.
     """
 
-    points: Floats = column("k", 3, unit="mm")
-    normals: Floats = column("k", 3)
-    distance: Floats = column("k", unit="mm")
-    lod95: Floats = column("k", unit="mm")
-    n1: Ints = column("k", dtype=np.int64)
-    n2: Ints = column("k", dtype=np.int64)
-    std1: Floats = column("k", unit="mm")
-    std2: Floats = column("k", unit="mm")
-    body: Labels = column("k", dtype=np.int32, newer=True)  # row of the result's bodies, -1 = of none
+    points: Floats = column("k", 3, unit="mm", means=COORDINATE)
+    normals: Floats = column("k", 3, means=DIRECTION)
+    distance: Floats = column("k", unit="mm", means=COORDINATE)
+    lod95: Floats = column("k", unit="mm", means=AMOUNT)
+    n1: Ints = column("k", dtype=np.int64, means=COUNT)
+    n2: Ints = column("k", dtype=np.int64, means=COUNT)
+    std1: Floats = column("k", unit="mm", means=AMOUNT)
+    std2: Floats = column("k", unit="mm", means=AMOUNT)
+    body: Labels = column(
+        "k", dtype=np.int32, newer=True, means=Meaning(rows_of="/result.bodies", lowest_row=-1)
+    )  # row of the result's bodies, -1 = of none
 
     @property
     def distances(self) -> Distances:
@@ -78,16 +90,16 @@ class PartFits(Rows):
     status: tuple[Status, ...] = words("p", Status)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("p")
     registration: tuple[Registration, ...] = words("p", Registration)
-    T_design_scan: Floats = column("p", 4, 4)
-    covariance: Floats = column("p", 6, 6)
-    registration_error: Floats = column("p", unit="mm")
-    core_points: Ints = column("p", dtype=np.int64)
-    core_points_measured: Ints = column("p", dtype=np.int64)
-    mean: Floats = column("p", unit="mm")
-    sd: Floats = column("p", unit="mm")
-    min: Floats = column("p", unit="mm")
-    max: Floats = column("p", unit="mm")
-    lod95_median: Floats = column("p", unit="mm")
+    T_design_scan: Floats = column("p", 4, 4, means=POSE)
+    covariance: Floats = column("p", 6, 6, means=COVARIANCE)
+    registration_error: Floats = column("p", unit="mm", means=AMOUNT)
+    core_points: Ints = column("p", dtype=np.int64, means=COUNT)
+    core_points_measured: Ints = column("p", dtype=np.int64, means=COUNT)
+    mean: Floats = column("p", unit="mm", means=COORDINATE)
+    sd: Floats = column("p", unit="mm", means=AMOUNT)
+    min: Floats = column("p", unit="mm", means=COORDINATE)
+    max: Floats = column("p", unit="mm", means=COORDINATE)
+    lod95_median: Floats = column("p", unit="mm", means=AMOUNT)
 
 
 @dataclass(frozen=True)
@@ -104,48 +116,58 @@ class Result(Checked):
     status: Status = described(words=Status)
     method: str = described()
     reasons: tuple[Reason, ...] = reasons()
-    T_design_scan: Floats = optional(4, 4)
+    T_design_scan: Floats = optional(4, 4, means=POSE)
     registration: Registration = described(Registration.AS_GIVEN, words=Registration, heading="registration")
-    registration_error: float = described(NAN, unit="mm", heading="registration error, one sd")
+    registration_error: float = described(NAN, unit="mm", heading="registration error, one sd", means=AMOUNT)
     registration_error_from: ErrorSource = described(ErrorSource.UNKNOWN, words=ErrorSource, heading="from")
-    covariance: Floats = optional(6, 6)
-    ambiguity: float = described(NAN, unit="times", heading="ambiguity: error of the next best attitude")
-    T_best_fit: Floats = optional(4, 4, json="best_fit.T_design_scan")
-    best_fit_shift: Floats = optional(3, json="best_fit.shift", unit="mm")  # of the scan's middle, from T_design_scan
-    best_fit_turn: float = described(NAN, json="best_fit.turn", unit="rad")
-    best_fit_area: float = described(NAN, json="best_fit.area", unit="m2", heading="best fit: area it rests on")
-    T_stable_fit: Floats = optional(4, 4, json="stable_fit.T_design_scan")
-    stable_fit_shift: Floats = optional(3, json="stable_fit.shift", unit="mm")
-    stable_fit_turn: float = described(NAN, json="stable_fit.turn", unit="rad")
-    stable_fit_area: float = described(NAN, json="stable_fit.area", unit="m2", heading="stable fit: area it rests on")
-    stable_fit_share: float = described(
-        NAN, json="stable_fit.area_share", percent=True, heading="stable fit: share of the area measured"
+    covariance: Floats = optional(6, 6, means=COVARIANCE)
+    ambiguity: float = described(NAN, unit="times", heading="ambiguity: error of the next best attitude", means=RATIO)
+    T_best_fit: Floats = optional(4, 4, json="best_fit.T_design_scan", means=POSE)
+    best_fit_shift: Floats = optional(
+        3, json="best_fit.shift", unit="mm", means=COORDINATE
+    )  # of the scan's middle, from T_design_scan
+    best_fit_turn: float = described(NAN, json="best_fit.turn", unit="rad", means=AMOUNT)
+    best_fit_area: float = described(
+        NAN, json="best_fit.area", unit="m2", heading="best fit: area it rests on", means=AMOUNT
     )
-    stable_fit_limit: float = described(NAN, json="stable_fit.limit", unit="mm", heading="stable fit: agreement within")
-    core_points: int = described(0, heading="core points")
-    core_points_measured: int = described(0, heading="core points measured")
-    significant_share: float = described(NAN, percent=True, heading="beyond LOD95")
-    significant_share_ci95: Floats = optional(2, percent=True, heading="beyond LOD95, 95 % interval")
-    within_10mm_share: float = described(NAN, percent=True, heading="within 10 mm")
-    mean: float = described(NAN, unit="mm", heading="mean")
-    mean_ci95: Floats = optional(2, unit="mm", heading="mean, 95 % interval")
-    median: float = described(NAN, unit="mm", heading="median")
-    sd: float = described(NAN, unit="mm", heading="standard deviation")
-    min: float = described(NAN, unit="mm", heading="least")
-    min_ci95: Floats = optional(2, unit="mm", heading="least, 95 % interval")
-    max: float = described(NAN, unit="mm", heading="greatest")
-    max_ci95: Floats = optional(2, unit="mm", heading="greatest, 95 % interval")
-    lod95_median: float = described(NAN, unit="mm", heading="LOD95, median")
-    points_read: int = described(0, json="points.read", heading="points read")
-    points_kept: int = described(0, json="points.kept", heading="points kept by the outlier removal")
-    on_surface_share: float = described(NAN, json="points.on_surface", percent=True, heading="points on the surface")
-    spacing: float = described(NAN, unit="mm", heading="spacing of the scan")
-    sigma: float = described(NAN, unit="mm", heading="sd of a point from the surface")
-    normal_diameter: float = described(NAN, unit="mm", heading="normal diameter")
-    projection_diameter: float = described(NAN, unit="mm", heading="projection diameter")
-    max_depth: float = described(NAN, unit="mm", heading="depth to either side")
+    T_stable_fit: Floats = optional(4, 4, json="stable_fit.T_design_scan", means=POSE)
+    stable_fit_shift: Floats = optional(3, json="stable_fit.shift", unit="mm", means=COORDINATE)
+    stable_fit_turn: float = described(NAN, json="stable_fit.turn", unit="rad", means=AMOUNT)
+    stable_fit_area: float = described(
+        NAN, json="stable_fit.area", unit="m2", heading="stable fit: area it rests on", means=AMOUNT
+    )
+    stable_fit_share: float = described(
+        NAN, json="stable_fit.area_share", percent=True, heading="stable fit: share of the area measured", means=SHARE
+    )
+    stable_fit_limit: float = described(
+        NAN, json="stable_fit.limit", unit="mm", heading="stable fit: agreement within", means=AMOUNT
+    )
+    core_points: int = described(0, heading="core points", means=COUNT)
+    core_points_measured: int = described(0, heading="core points measured", means=COUNT)
+    significant_share: float = described(NAN, percent=True, heading="beyond LOD95", means=SHARE)
+    significant_share_ci95: Floats = optional(2, percent=True, heading="beyond LOD95, 95 % interval", means=SHARE)
+    within_10mm_share: float = described(NAN, percent=True, heading="within 10 mm", means=SHARE)
+    mean: float = described(NAN, unit="mm", heading="mean", means=COORDINATE)
+    mean_ci95: Floats = optional(2, unit="mm", heading="mean, 95 % interval", means=COORDINATE)
+    median: float = described(NAN, unit="mm", heading="median", means=COORDINATE)
+    sd: float = described(NAN, unit="mm", heading="standard deviation", means=AMOUNT)
+    min: float = described(NAN, unit="mm", heading="least", means=COORDINATE)
+    min_ci95: Floats = optional(2, unit="mm", heading="least, 95 % interval", means=COORDINATE)
+    max: float = described(NAN, unit="mm", heading="greatest", means=COORDINATE)
+    max_ci95: Floats = optional(2, unit="mm", heading="greatest, 95 % interval", means=COORDINATE)
+    lod95_median: float = described(NAN, unit="mm", heading="LOD95, median", means=AMOUNT)
+    points_read: int = described(0, json="points.read", heading="points read", means=COUNT)
+    points_kept: int = described(0, json="points.kept", heading="points kept by the outlier removal", means=COUNT)
+    on_surface_share: float = described(
+        NAN, json="points.on_surface", percent=True, heading="points on the surface", means=SHARE
+    )
+    spacing: float = described(NAN, unit="mm", heading="spacing of the scan", means=AMOUNT)
+    sigma: float = described(NAN, unit="mm", heading="sd of a point from the surface", means=AMOUNT)
+    normal_diameter: float = described(NAN, unit="mm", heading="normal diameter", means=AMOUNT)
+    projection_diameter: float = described(NAN, unit="mm", heading="projection diameter", means=AMOUNT)
+    max_depth: float = described(NAN, unit="mm", heading="depth to either side", means=AMOUNT)
     origin: Floats = dataclasses.field(
-        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64, "json": ""}
+        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64, "json": "", "means": PLACE}
     )
     core: CorePoints = dataclasses.field(default_factory=CorePoints, metadata={"json": ""})
     limits: JudgedLimits | None = newer()

@@ -8,6 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from processor.model import (
+    AMOUNT,
+    COORDINATE,
+    NUMBER,
+    OPEN,
     Bools,
     Checked,
     Floats,
@@ -59,12 +63,12 @@ class Characteristics(Rows):
 
     id: tuple[str, ...] = names("r")
     quantity: tuple[Quantity, ...] = words("r", Quantity)
-    nominal: Floats = column("r")
-    actual: Floats = column("r")
-    deviation: Floats = column("r")
-    ci95: Floats = column("r")
-    lower: Floats = column("r")
-    upper: Floats = column("r")
+    nominal: Floats = column("r", means=NUMBER)
+    actual: Floats = column("r", means=NUMBER)
+    deviation: Floats = column("r", means=NUMBER)
+    ci95: Floats = column("r", means=AMOUNT)
+    lower: Floats = column("r", means=OPEN)
+    upper: Floats = column("r", means=OPEN)
     unit: tuple[str, ...] = names("r")
     verdict: tuple[Verdict, ...] = words("r", Verdict)
     limit: tuple[str, ...] = names("r")
@@ -80,11 +84,11 @@ class AxisDepartures(Rows):
     ``chainage`` is from the component's start; ``sideways`` is positive to the left, ``up`` upward.
     """
 
-    chainage: Floats = column("a", unit="mm")
-    sideways: Floats = column("a", unit="mm")
-    sideways_ci95: Floats = column("a", unit="mm")
-    up: Floats = column("a", unit="mm")
-    up_ci95: Floats = column("a", unit="mm")
+    chainage: Floats = column("a", unit="mm", means=COORDINATE)
+    sideways: Floats = column("a", unit="mm", means=COORDINATE)
+    sideways_ci95: Floats = column("a", unit="mm", means=AMOUNT)
+    up: Floats = column("a", unit="mm", means=COORDINATE)
+    up_ci95: Floats = column("a", unit="mm", means=AMOUNT)
 
 
 @dataclass(frozen=True)

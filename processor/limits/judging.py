@@ -17,7 +17,21 @@ import numpy as np
 
 from processor.limits import limit_bounds
 from processor.limits.decision_rule import decide
-from processor.model import Bools, Floats, Limit, Rows, Tolerance, Verdict, column, names, words, worst
+from processor.model import (
+    AMOUNT,
+    NUMBER,
+    OPEN,
+    Bools,
+    Floats,
+    Limit,
+    Rows,
+    Tolerance,
+    Verdict,
+    column,
+    names,
+    words,
+    worst,
+)
 
 NOT_VERIFIED = "not verified"
 
@@ -34,10 +48,10 @@ class JudgedLimits(Rows):
     key: tuple[str, ...] = names("v", json="limit")
     what: tuple[str, ...] = names("v")
     of: tuple[str, ...] = names("v")
-    value: Floats = column("v")
-    ci95: Floats = column("v")
-    low: Floats = column("v")
-    high: Floats = column("v")
+    value: Floats = column("v", means=NUMBER)
+    ci95: Floats = column("v", means=AMOUNT)
+    low: Floats = column("v", means=OPEN)
+    high: Floats = column("v", means=OPEN)
     unit: tuple[str, ...] = names("v")
     verdict: tuple[Verdict, ...] = words("v", Verdict)
     clause: tuple[str, ...] = names("v")

@@ -9,11 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.model import (
+    AMOUNT,
+    COORDINATE,
+    COVARIANCE,
     ENDS,
     KEY_POINTS,
+    NUMBER,
+    POSE,
     Checked,
     Floats,
     Labels,
+    Meaning,
     Reason,
     Rows,
     Status,
@@ -59,8 +65,8 @@ class AtJoints(Rows):
     """The key points P1..P8 of one component at each of its joints, in the frame of its scan."""
 
     joint: tuple[str, ...] = names("e")
-    key_points_scan: Floats = column("e", 8, 3, axes=(KEY_POINTS,), unit="mm")
-    key_points_sd: Floats = column("e", 8, 3, axes=(KEY_POINTS,), unit="mm")
+    key_points_scan: Floats = column("e", 8, 3, axes=(KEY_POINTS,), unit="mm", means=COORDINATE)
+    key_points_sd: Floats = column("e", 8, 3, axes=(KEY_POINTS,), unit="mm", means=AMOUNT)
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ class ScanPoses(Rows):
     """The scans that were used of one component, each with its pose as assembled."""
 
     name: tuple[str, ...] = names("s")
-    T_bridge_scan: Floats = column("s", 4, 4)
+    T_bridge_scan: Floats = column("s", 4, 4, means=POSE)
 
 
 @dataclass(frozen=True)
@@ -85,10 +91,10 @@ class Components(Rows):
     status: tuple[Status, ...] = words("c", Status)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("c")
     scans: tuple[str, ...] = names("c")
-    T_bridge_scan: Floats = column("c", 4, 4)
-    covariance: Floats = column("c", 6, 6)
-    key_points_scan: Floats = column("c", 2, 8, 3, axes=(ENDS, KEY_POINTS))
-    key_points_sd: Floats = column("c", 2, 8, 3, axes=(ENDS, KEY_POINTS))
+    T_bridge_scan: Floats = column("c", 4, 4, means=POSE)
+    covariance: Floats = column("c", 6, 6, means=COVARIANCE)
+    key_points_scan: Floats = column("c", 2, 8, 3, axes=(ENDS, KEY_POINTS), means=COORDINATE)
+    key_points_sd: Floats = column("c", 2, 8, 3, axes=(ENDS, KEY_POINTS), means=AMOUNT)
     at_joints: tuple[AtJoints, ...] = dataclasses.field(
         default=(), metadata={"json": "joints", "by": "joint", "newer": True}
     )
@@ -113,8 +119,8 @@ class Joints(Rows):
     name: tuple[str, ...] = names("j")
     left: tuple[str, ...] = names("j")
     right: tuple[str, ...] = names("j")
-    gaps: Floats = column("j", 8, 3, json="points.*.gap", keys=KEY_POINTS, unit="mm")
-    gap_ci95: Floats = column("j", 8, 3, json="points.*.ci95", keys=KEY_POINTS, unit="mm")
+    gaps: Floats = column("j", 8, 3, json="points.*.gap", keys=KEY_POINTS, unit="mm", means=COORDINATE)
+    gap_ci95: Floats = column("j", 8, 3, json="points.*.ci95", keys=KEY_POINTS, unit="mm", means=AMOUNT)
     verdict: tuple[Verdict, ...] = words("j", Verdict)
 
 
@@ -122,9 +128,9 @@ class Joints(Rows):
 class MeanMax(Checked):
     """Mean and largest error, mm, with half-widths that cover both with 95 % or more, where a method states them."""
 
-    mean: float = described(NAN, unit="mm")
-    max: float = described(NAN, unit="mm")
-    ci95: Floats = optional(2, json="*_ci95", keys=MEAN_MAX, unit="mm")
+    mean: float = described(NAN, unit="mm", means=AMOUNT)
+    max: float = described(NAN, unit="mm", means=AMOUNT)
+    ci95: Floats = optional(2, json="*_ci95", keys=MEAN_MAX, unit="mm", means=AMOUNT)
 
 
 @dataclass(frozen=True)
@@ -132,8 +138,8 @@ class Deviations(Checked):
     """Distances of the bottom edges from the design's, at the chainages of the linear error, mm."""
 
     error: MeanMax = dataclasses.field(default_factory=MeanMax, metadata={"json": "."})
-    deviation: Floats = column("s", unit="mm")
-    ci95: Floats = column("b", unit="mm")  # half-width that holds 95 % or more; of some methods empty
+    deviation: Floats = column("s", unit="mm", means=COORDINATE)
+    ci95: Floats = column("b", unit="mm", means=AMOUNT)  # half-width that holds 95 % or more; of some methods empty
 
 
 @dataclass(frozen=True)
@@ -144,7 +150,7 @@ class Linear(Checked):
     """
 
     gauge: Gauge = described(Gauge.UNKNOWN, words=Gauge)
-    chainage: Floats = column("s", json="stations", unit="mm")
+    chainage: Floats = column("s", json="stations", unit="mm", means=COORDINATE)
     edge: tuple[EdgeSide, ...] = words("s", EdgeSide)
     assembled: Deviations = dataclasses.field(default_factory=Deviations, metadata={"json": "."})
     best_fit: Deviations = dataclasses.field(default_factory=Deviations, metadata={"json": "foot1_best_fit"})
@@ -154,11 +160,11 @@ class Linear(Checked):
 class TradeOff(Rows):
     """Errors over the weight lambda of the design's curve, mm."""
 
-    weight: Floats = column("t", json="lambda")
-    splicing_mean: Floats = column("t", unit="mm")
-    splicing_max: Floats = column("t", unit="mm")
-    linear_mean: Floats = column("t", unit="mm")
-    linear_max: Floats = column("t", unit="mm")
+    weight: Floats = column("t", json="lambda", means=AMOUNT)
+    splicing_mean: Floats = column("t", unit="mm", means=AMOUNT)
+    splicing_max: Floats = column("t", unit="mm", means=AMOUNT)
+    linear_mean: Floats = column("t", unit="mm", means=AMOUNT)
+    linear_max: Floats = column("t", unit="mm", means=AMOUNT)
 
     @property
     def figures(self) -> Floats:
@@ -181,16 +187,18 @@ class Rivals(Rows):
     """The other pose of each ambiguous component."""
 
     component: tuple[str, ...] = names("r")
-    T_rival_scan: Floats = column("r", 4, 4)
+    T_rival_scan: Floats = column("r", 4, 4, means=POSE)
 
 
 @dataclass(frozen=True)
 class Residuals(Rows):
     """Places on all components, bridge frame, and distances from the design there, medians of nearby points, mm."""
 
-    points: Floats = column("p", 3, unit="mm")
-    distance: Floats = column("p", unit="mm")
-    component: Labels = column("p", dtype=np.int32)  # row of the components
+    points: Floats = column("p", 3, unit="mm", means=COORDINATE)
+    distance: Floats = column("p", unit="mm", means=COORDINATE)
+    component: Labels = column(
+        "p", dtype=np.int32, means=Meaning(rows_of="/result.components.name", lowest_row=-1)
+    )  # row of the components
 
 
 @dataclass(frozen=True)
@@ -203,8 +211,8 @@ class Loops(Rows):
 
     joint: tuple[str, ...] = names("l")
     joints: tuple[tuple[str, ...], ...] = name_lists("l")
-    closure: Floats = column("l", 2, 3, json="closure.*", keys=("mm", "mrad"))
-    closure_ci95: Floats = column("l", 2, 3, json="closure.ci95_*", keys=("mm", "mrad"))
+    closure: Floats = column("l", 2, 3, json="closure.*", keys=("mm", "mrad"), means=NUMBER)
+    closure_ci95: Floats = column("l", 2, 3, json="closure.ci95_*", keys=("mm", "mrad"), means=AMOUNT)
 
 
 @dataclass(frozen=True)
@@ -218,14 +226,14 @@ class PartShape(Checked):
     """
 
     name: str = described("")
-    ends: Floats = column(2, 8, 3)
-    ends_covariance: Floats = column(48, 48)
+    ends: Floats = column(2, 8, 3, means=COORDINATE)
+    ends_covariance: Floats = column(48, 48, means=COVARIANCE)
     edge: tuple[EdgeSide, ...] = words("k", EdgeSide)
-    chainage: Floats = column("k")  # from the component's start
-    departure: Floats = column("k", 2)
-    departure_covariance: Floats = column(2, "k", "k")
-    outer: float = described(NAN)
-    outer_variance: float = described(NAN)
+    chainage: Floats = column("k", means=COORDINATE)  # from the component's start
+    departure: Floats = column("k", 2, means=COORDINATE)
+    departure_covariance: Floats = column(2, "k", "k", means=COVARIANCE)
+    outer: float = described(NAN, means=COORDINATE)
+    outer_variance: float = described(NAN, means=AMOUNT)
 
 
 @dataclass(frozen=True)
@@ -238,21 +246,23 @@ class Adjustment(Checked):
     about them (mrad). ``budget_sd`` are standard deviations of an end of the longest part.
     """
 
-    weight: float = described(NAN, json="lambda")
+    weight: float = described(NAN, json="lambda", means=AMOUNT)
     joints: JudgedJoints = dataclasses.field(default_factory=JudgedJoints, metadata={"json": "joint_measures"})
     chain: tuple[Conformity, ...] = described((), json="chain_limits")
     unused_limits: tuple[str, ...] = names("u", json="limits_not_held")
     unused_limits_what: tuple[str, ...] = names("u", json="")
-    span_departure: float = described(NAN, json="span.departure", unit="mm")
-    span_ci95: float = described(NAN, json="span.ci95", unit="mm")
-    linear_offset: Floats = column("o", 2, json="linear_offset.left_up", unit="mm")
-    linear_offset_ci95: Floats = column("o", 2, json="linear_offset.ci95", unit="mm")
-    closure: Floats = optional(2, 3, json="closure.*", keys=("mm", "mrad"))
-    closure_ci95: Floats = optional(2, 3, json="closure.ci95_*", keys=("mm", "mrad"))
+    span_departure: float = described(NAN, json="span.departure", unit="mm", means=COORDINATE)
+    span_ci95: float = described(NAN, json="span.ci95", unit="mm", means=AMOUNT)
+    linear_offset: Floats = column("o", 2, json="linear_offset.left_up", unit="mm", means=COORDINATE)
+    linear_offset_ci95: Floats = column("o", 2, json="linear_offset.ci95", unit="mm", means=AMOUNT)
+    closure: Floats = optional(2, 3, json="closure.*", keys=("mm", "mrad"), means=NUMBER)
+    closure_ci95: Floats = optional(2, 3, json="closure.ci95_*", keys=("mm", "mrad"), means=AMOUNT)
     rivals: Rivals = dataclasses.field(default_factory=Rivals, metadata={"json": "ambiguous", "by": "component"})
     limiting: tuple[Reason, ...] = reasons()
     advice: tuple[Reason, ...] = reasons()
-    budget_sd: Floats = optional(len(BudgetSource), json="budget_sd.*", keys=tuple(BudgetSource), unit="mm")
+    budget_sd: Floats = optional(
+        len(BudgetSource), json="budget_sd.*", keys=tuple(BudgetSource), unit="mm", means=AMOUNT
+    )
     residuals: Residuals = dataclasses.field(default_factory=Residuals, metadata={"json": ""})
     loops: Loops | None = newer()
     shapes: tuple[PartShape, ...] = described((), json="")

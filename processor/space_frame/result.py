@@ -10,6 +10,15 @@ import numpy.typing as npt
 
 from processor.limits.judging import JudgedLimits
 from processor.model import (
+    AMOUNT,
+    COORDINATE,
+    COUNT,
+    COVARIANCE,
+    END,
+    NAMES,
+    POSE,
+    RADIUS,
+    SHARE,
     Checked,
     Floats,
     Ints,
@@ -79,29 +88,29 @@ class Balls(Rows):
     lowest point. Movements are in the design's frame; ``verdict`` compares them with the limit.
     """
 
-    ids: Ints = column("k", dtype=np.int64, json="id")
-    centres: Floats = column("k", 3, json="centre", unit="mm")
-    radii: Floats = column("k", json="radius", unit="mm")
-    lowest: Floats = column("k", 3, unit="mm")
-    lowest_sd: Floats = column("k", unit="mm")  # of the lowest point's z
-    covariance: Floats = column("k", 4, 4, unit="mm2")  # of centre x, y, z and radius
-    points: Ints = column("k", dtype=np.int64)  # used by the estimate
-    visible_fraction: Floats = column("k")  # of the sphere's surface that has points
-    rms: Floats = column("k", unit="mm")  # of the residuals of those points
-    nominal_radii: Floats = column("k", json="nominal_radius", unit="mm")  # from the design, NaN without
+    ids: Ints = column("k", dtype=np.int64, json="id", means=NAMES)
+    centres: Floats = column("k", 3, json="centre", unit="mm", means=COORDINATE)
+    radii: Floats = column("k", json="radius", unit="mm", means=RADIUS)
+    lowest: Floats = column("k", 3, unit="mm", means=COORDINATE)
+    lowest_sd: Floats = column("k", unit="mm", means=AMOUNT)  # of the lowest point's z
+    covariance: Floats = column("k", 4, 4, unit="mm2", means=COVARIANCE)  # of centre x, y, z and radius
+    points: Ints = column("k", dtype=np.int64, means=COUNT)  # used by the estimate
+    visible_fraction: Floats = column("k", means=SHARE)  # of the sphere's surface that has points
+    rms: Floats = column("k", unit="mm", means=AMOUNT)  # of the residuals of those points
+    nominal_radii: Floats = column("k", json="nominal_radius", unit="mm", means=RADIUS)  # from the design, NaN without
     evidence: tuple[Evidence, ...] = words("k", Evidence)
     flag: tuple[Flag, ...] = words("k", Flag)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("k")  # for the flag and the evidence
-    sizes: Floats = column("k", json="size", unit="mm")  # radii of the catalogue
-    axes: Ints = column("k", dtype=np.int64)  # number of members that meet at the node
-    stations: Ints = column("k", dtype=np.int64)  # number that saw the ball
-    bound_sd: Floats = column("k", 5, json="bound_sd.*", keys=BOUNDED, unit="mm")
-    efficiency: Floats = column("k", 3, json="efficiency.*", keys=EFFICIENT)
-    movement: Floats = column("k", 3, json="movement.vector", where="movement", unit="mm")
-    movement_ci95: Floats = column("k", 3, json="movement.ci95", where="movement", unit="mm")
-    movement_covariance: Floats = column("k", 3, 3, json="")
-    movement_size: Floats = column("k", json="movement.size", where="movement", unit="mm")
-    movement_size_ci95: Floats = column("k", json="movement.size_ci95", where="movement", unit="mm")
+    sizes: Floats = column("k", json="size", unit="mm", means=RADIUS)  # radii of the catalogue
+    axes: Ints = column("k", dtype=np.int64, means=COUNT)  # number of members that meet at the node
+    stations: Ints = column("k", dtype=np.int64, means=COUNT)  # number that saw the ball
+    bound_sd: Floats = column("k", 5, json="bound_sd.*", keys=BOUNDED, unit="mm", means=AMOUNT)
+    efficiency: Floats = column("k", 3, json="efficiency.*", keys=EFFICIENT, means=AMOUNT)
+    movement: Floats = column("k", 3, json="movement.vector", where="movement", unit="mm", means=COORDINATE)
+    movement_ci95: Floats = column("k", 3, json="movement.ci95", where="movement", unit="mm", means=AMOUNT)
+    movement_covariance: Floats = column("k", 3, 3, json="", means=COVARIANCE)
+    movement_size: Floats = column("k", json="movement.size", where="movement", unit="mm", means=AMOUNT)
+    movement_size_ci95: Floats = column("k", json="movement.size_ci95", where="movement", unit="mm", means=AMOUNT)
     verdict: tuple[Verdict, ...] = words("k", Verdict, json="movement.verdict", where="movement")
 
     @property
@@ -121,16 +130,16 @@ class Tubes(Rows):
     Half-widths of 95 % intervals are of the radius, of the axis across at both ends, along x, y and z, and of the bow.
     """
 
-    a: Ints = column("m", dtype=np.int64)  # -1 = none
-    b: Ints = column("m", dtype=np.int64)
-    start: Floats = column("m", 3, unit="mm")
-    end: Floats = column("m", 3, unit="mm")
-    radii: Floats = column("m", json="radius", unit="mm")
-    bow: Floats = column("m", unit="mm")  # largest distance of the axis from a straight line
-    radius_ci95: Floats = column("m", unit="mm")
-    start_ci95: Floats = column("m", 3, unit="mm")
-    end_ci95: Floats = column("m", 3, unit="mm")
-    bow_ci95: Floats = column("m", unit="mm", newer=True)
+    a: Ints = column("m", dtype=np.int64, means=END)  # -1 = none
+    b: Ints = column("m", dtype=np.int64, means=END)
+    start: Floats = column("m", 3, unit="mm", means=COORDINATE)
+    end: Floats = column("m", 3, unit="mm", means=COORDINATE)
+    radii: Floats = column("m", json="radius", unit="mm", means=RADIUS)
+    bow: Floats = column("m", unit="mm", means=AMOUNT)  # largest distance of the axis from a straight line
+    radius_ci95: Floats = column("m", unit="mm", means=AMOUNT)
+    start_ci95: Floats = column("m", 3, unit="mm", means=AMOUNT)
+    end_ci95: Floats = column("m", 3, unit="mm", means=AMOUNT)
+    bow_ci95: Floats = column("m", unit="mm", newer=True, means=AMOUNT)
 
 
 @dataclass(frozen=True)
@@ -141,11 +150,11 @@ class Hangers(Rows):
     clearance and greatest length.
     """
 
-    ids: Ints = column("k", dtype=np.int64, json="id")
-    top: Floats = column("k", 3, unit="mm")
-    bottom: Floats = column("k", 3, unit="mm")
-    length: Floats = column("k", unit="mm")
-    ci95: Floats = column("k", unit="mm")
+    ids: Ints = column("k", dtype=np.int64, json="id", means=NAMES)
+    top: Floats = column("k", 3, unit="mm", means=COORDINATE)
+    bottom: Floats = column("k", 3, unit="mm", means=COORDINATE)
+    length: Floats = column("k", unit="mm", means=COORDINATE)
+    ci95: Floats = column("k", unit="mm", means=AMOUNT)
     verdict: tuple[Verdict, ...] = words("k", Verdict)
 
 
@@ -154,7 +163,7 @@ class StationCorrections(Rows):
     """Corrections of the stations: ``T`` (s, 4, 4) map places as registered to corrected places."""
 
     names: tuple[str, ...] = names("s", json="name")
-    T: Floats = column("s", 4, 4)
+    T: Floats = column("s", 4, 4, means=POSE)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("s")
 
 
@@ -164,7 +173,7 @@ class ControlDeviations(Rows):
 
     points: tuple[str, ...] = names("c", json="name")
     scans: tuple[str, ...] = names("c", json="scan")
-    off: Floats = column("c", 3, unit="mm")  # known place minus sighting
+    off: Floats = column("c", 3, unit="mm", means=COORDINATE)  # known place minus sighting
     used: npt.NDArray[np.bool_] = column("c", dtype=np.bool_)  # False = left out: it contradicts the others
 
 
@@ -173,9 +182,9 @@ class DesignPose(Checked):
     """Pose of the design, its covariance, and other poses ``rivals`` (r, 4, 4) that explain the nodes as well."""
 
     status: Status = described(words=Status)
-    T_design_scan: Floats = column(4, 4)
-    covariance: Floats = column(6, 6)
-    rivals: Floats = column("r", 4, 4)
+    T_design_scan: Floats = column(4, 4, means=POSE)
+    covariance: Floats = column(6, 6, means=COVARIANCE)
+    rivals: Floats = column("r", 4, 4, means=POSE)
 
 
 @dataclass(frozen=True)
@@ -183,7 +192,7 @@ class MovementReference(Checked):
     """What movements are relative to, and the limit of their size; NaN = none."""
 
     gauge: MovementGauge = described(words=MovementGauge)
-    limit: float = described(NAN, json="movement_limit.mm", unit="mm")
+    limit: float = described(NAN, json="movement_limit.mm", unit="mm", means=AMOUNT)
     limit_source: str = described("", json="movement_limit.source")  # name of the file or standard
 
 

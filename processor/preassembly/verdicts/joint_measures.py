@@ -16,7 +16,22 @@ import numpy as np
 
 from processor.adjustment import maximum_interval
 from processor.geometry import rigid
-from processor.model import KEY_POINTS, NORMAL_95, Checked, Floats, Ints, Rows, Word, column, names, words
+from processor.model import (
+    AMOUNT,
+    COORDINATE,
+    COVARIANCE,
+    KEY_POINTS,
+    NORMAL_95,
+    NUMBER,
+    Checked,
+    Floats,
+    Ints,
+    Rows,
+    Word,
+    column,
+    names,
+    words,
+)
 
 RAYLEIGH_95 = 2.447747  # radius that holds 95 % of a round normal distribution in the plane, in standard deviations
 
@@ -51,10 +66,10 @@ class MeasuredQuantities(Rows):
     """Values with their 95 % intervals ``low`` to ``high``, NaN where the gaps are not known."""
 
     name: tuple[JointQuantity, ...] = words("m", JointQuantity)
-    value: Floats = column("m")
-    ci95: Floats = column("m")  # the wider side of low..high
-    low: Floats = column("m")
-    high: Floats = column("m")
+    value: Floats = column("m", means=NUMBER)
+    ci95: Floats = column("m", means=AMOUNT)  # the wider side of low..high
+    low: Floats = column("m", means=NUMBER)
+    high: Floats = column("m", means=NUMBER)
     unit: tuple[str, ...] = names("m")  # mm | mrad
 
 
@@ -68,12 +83,12 @@ class Measures(Checked):
     quantities: MeasuredQuantities = field(
         default_factory=MeasuredQuantities, metadata={"json": "measures", "by": "name"}
     )
-    points: Floats = column(8, 3, json="")
-    gaps: Floats = column(8, 3, json="gaps_joint_axes.*", keys=KEY_POINTS)
-    gaps_ci95: Floats = column(8, 3, json="gaps_joint_axes_ci95.*", keys=KEY_POINTS)
-    covariance: Floats = column(24, 24, json="")
-    misalignment_at: Floats = column(8, json="")
-    misalignment_at_ci95: Floats = column(8, json="")
+    points: Floats = column(8, 3, json="", means=COORDINATE)
+    gaps: Floats = column(8, 3, json="gaps_joint_axes.*", keys=KEY_POINTS, means=COORDINATE)
+    gaps_ci95: Floats = column(8, 3, json="gaps_joint_axes_ci95.*", keys=KEY_POINTS, means=AMOUNT)
+    covariance: Floats = column(24, 24, json="", means=COVARIANCE)
+    misalignment_at: Floats = column(8, json="", means=AMOUNT)
+    misalignment_at_ci95: Floats = column(8, json="", means=AMOUNT)
 
     @property
     def known(self) -> bool:

@@ -19,6 +19,10 @@ from processor.limits import limit_bounds
 from processor.limits.decision_rule import decide
 from processor.limits.judging import clause_of
 from processor.model import (
+    AMOUNT,
+    NUMBER,
+    OPEN,
+    SHARE,
     Bools,
     Checked,
     Floats,
@@ -58,12 +62,12 @@ class ComparedLimits(Rows):
 
     key: tuple[str, ...] = names("v", json="limit")
     what: tuple[str, ...] = names("v")
-    value: Floats = column("v")
-    ci95: Floats = column("v")
-    low: Floats = column("v")
-    high: Floats = column("v")
+    value: Floats = column("v", means=NUMBER)
+    ci95: Floats = column("v", means=AMOUNT)
+    low: Floats = column("v", means=OPEN)
+    high: Floats = column("v", means=OPEN)
     verdict: tuple[Verdict, ...] = words("v", Verdict)
-    probability: Floats = column("v")
+    probability: Floats = column("v", means=SHARE)
     clause: tuple[str, ...] = names("v")
     edition: tuple[str, ...] = names("v")
     source: tuple[str, ...] = names("v")
@@ -80,7 +84,7 @@ class Conformity(Checked):
     """Verdict on a joint or the chain, its comparison with each limit, and why a verdict is not possible."""
 
     verdict: Verdict = described(Verdict.INDETERMINATE, words=Verdict)
-    probability: float = float("nan")  # that all limits are kept
+    probability: float = described(float("nan"), means=SHARE)  # that all limits are kept
     limits: ComparedLimits = field(default_factory=ComparedLimits)
     reasons: tuple[Reason, ...] = reasons()
 

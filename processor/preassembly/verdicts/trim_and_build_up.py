@@ -29,7 +29,11 @@ from scipy.optimize import linprog
 from processor.adjustment import normal_draws
 from processor.limits import limit_bounds
 from processor.model import (
+    AMOUNT,
+    COORDINATE,
     KEY_POINTS,
+    NUMBER,
+    SHARE,
     Bools,
     Checked,
     Floats,
@@ -114,17 +118,17 @@ class Proposal(Checked):
     """
 
     action: Work = described(Work.UNKNOWN, words=Work)
-    cut: Floats = column(8, json="cut.*", keys=KEY_POINTS)
-    build_up: Floats = column(8, json="build_up.*", keys=KEY_POINTS)
-    plane: Floats = column(3, json="")
-    gap_before: Floats = column(8, json="")
-    gap_after: Floats = column(8, json="")
-    wanted_gap: float = described(float("nan"), json="")
-    probability: float = float("nan")
-    probability_as_is: float = float("nan")
-    groove_probability: float = described(float("nan"), json="")
-    misalignment_probability: float = described(float("nan"), json="")
-    misaligned_by: Floats = column(8, json="")
+    cut: Floats = column(8, json="cut.*", keys=KEY_POINTS, means=AMOUNT)
+    build_up: Floats = column(8, json="build_up.*", keys=KEY_POINTS, means=AMOUNT)
+    plane: Floats = column(3, json="", means=NUMBER)
+    gap_before: Floats = column(8, json="", means=COORDINATE)
+    gap_after: Floats = column(8, json="", means=COORDINATE)
+    wanted_gap: float = described(float("nan"), json="", means=COORDINATE)
+    probability: float = described(float("nan"), means=SHARE)
+    probability_as_is: float = described(float("nan"), means=SHARE)
+    groove_probability: float = described(float("nan"), json="", means=SHARE)
+    misalignment_probability: float = described(float("nan"), json="", means=SHARE)
+    misaligned_by: Floats = column(8, json="", means=AMOUNT)
     reasons: tuple[Reason, ...] = reasons(sentence="sentence")
 
 
