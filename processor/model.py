@@ -555,16 +555,35 @@ class StructureDesign(Checked):
             yield Fault(("bodies", "of_facet"), text)
 
 
+# What each step compares with limits, as ``Limit.measure`` names it; of single parts, "part " and a quantity.
+MEASURES: Mapping[str, tuple[str, ...]] = {
+    "preassemble": (
+        "misalignment", "groove_gap", "eccentricity", "span", "unit_length", "inner_arc", "lateral_axis", "elevation",
+    ),
+    "spheres": (
+        "node_place", "ball_size", "support_centre", "support_height", "adjacent_support_height",
+        "multi_point_support_height", "deflection", "ceiling",
+    ),
+    "stitch": ("closure", "control_point", "scan_position"),
+    "deviation": ("deviation", "deviation_share"),
+    "defects": ("defect_depth", "defect_area"),
+    "inspect": (
+        "part length", "part width", "part height", "part diagonal", "part diagonal-difference", "part twist",
+        "part sweep", "part camber", "part flatness", "part squareness", "part thickness", "part hole-position",
+        "part hole-pitch", "part pass-through", "part hole-diameter", "part diameter", "part bow",
+    ),
+}  # fmt: skip
+LIMITED_SIZES = ("length", "height", "thickness", "diameter", "spacing", "depth")
+
+
 @dataclass(frozen=True)
 class Limit(Checked):
     """One row of a standard: what it limits, from ``low`` to ``high`` (NaN = no bound), and where that stands.
 
     ``low_ratio`` and ``high_ratio`` are multiples of the size named by ``of``; by ``rule`` the smaller of number and
-    multiple counts, or their sum. The row is for sizes above ``above_mm`` up to ``up_to_mm``. ``measure`` is what of a
-    joint is compared with it: misalignment | groove_gap | eccentricity; or of a whole chain: span | unit_length |
-    inner_arc | lateral_axis | elevation; or another of ``processor/limits/measurands.py``; or "part " and a
-    quantity of step inspect; or nothing. ``component`` is a pattern of the names of those that a project gives it for,
-    None of all.
+    multiple counts, or their sum. The row is for sizes above ``above_mm`` up to ``up_to_mm``. ``measure`` is what is
+    compared with it, one of MEASURES or nothing. ``component`` is a pattern of the names of those that a project gives
+    it for, None of all.
     """
 
     key: str
@@ -574,11 +593,11 @@ class Limit(Checked):
     high: float = described(float("nan"), means=BOUND)
     low_ratio: float = described(float("nan"), means=BOUND)
     high_ratio: float = described(float("nan"), means=BOUND)
-    of: str = ""  # length | height | thickness | diameter | spacing | depth
-    rule: str = ""  # smaller | sum
+    of: str = described("", means=Meaning(words=("", *LIMITED_SIZES)))
+    rule: str = described("", means=Meaning(words=("", "smaller", "sum")))
     above_mm: float = described(float("nan"), means=Meaning(least=0.0))
     up_to_mm: float = described(float("nan"), means=Meaning(least=0.0))
-    measure: str = ""
+    measure: str = described("", means=Meaning(words=("", *(name for step in MEASURES.values() for name in step))))
     clause: str = described("", means=LONG)
     verified: bool = False  # the number was compared with the published text
     source: str = described("", means=LONG)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor import large_arrays
-from processor.model import LARGEST_MM, Checked, Fault, InputError, Meaning, Word
+from processor.model import LARGEST_MM, Checked, Fault, InputError, Meaning, Word, did_you_mean
 
 POSE_TOLERANCE = 1e-3  # of R^T R - I
 COVARIANCE_TOLERANCE = 1e-6  # of correlations: sums of products of float64 are good to 1e-9 and better
@@ -100,7 +100,8 @@ def _of_text(value: str, meaning: Meaning, record: Any, root: Any) -> Iterator[s
     if len(value) > meaning.longest:
         yield f": expected at most {meaning.longest} characters, found {len(value)}: {_shown(value)}"
     elif meaning.words and value not in meaning.words:
-        yield f": expected one of {', '.join(filter(None, meaning.words))}, found {_shown(value)}"
+        like = did_you_mean(value, filter(None, meaning.words))
+        yield f": expected one of {', '.join(filter(None, meaning.words))}, found {_shown(value)}{like}"
     elif meaning.among and value and value not in _referred(meaning.among, record, root):
         yield f": expected one of {meaning.among.strip('/')}, found {_shown(value)}"
 

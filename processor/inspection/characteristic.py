@@ -10,7 +10,7 @@ import numpy as np
 
 from processor.adjustment import maximum_interval
 from processor.inspection.result import Characteristics, Quantity
-from processor.limits import judging, limit_bounds, standards
+from processor.limits import judging, limit_bounds, measurands
 from processor.limits.judging import Comparison, Measured
 from processor.model import NORMAL_95, Floats, Reason, Tolerance, Verdict
 
@@ -107,7 +107,7 @@ def _compared(
     if tolerance is None:
         return None
     own = {**sizes, "spacing": one.nominal} if one.quantity is Quantity.HOLE_PITCH else sizes
-    measure = standards.PART + one.quantity
+    measure = measurands.PART + one.quantity
     limits = judging.limits_for(tolerance, measure, component)
     fitting = [limit for limit in limits if limit_bounds.applies(limit, own.get(limit.of, NAN))]
     if not fitting:

@@ -1,7 +1,7 @@
-"""What limits are compared with: the measures of each step, as ``Limit.measure`` names them.
+"""What limits are compared with: names of ``processor.model.MEASURES`` that several modules use.
 
 A row of a standard names the measure that a step compares with it, or under ``needs`` the measurement that would have
-to be made first. Measures of single parts, by step ``inspect``, begin with "part ".
+to be made first.
 """
 
 from __future__ import annotations
@@ -15,16 +15,8 @@ DEVIATION, DEVIATION_SHARE = "deviation", "deviation_share"
 DEFECT_DEPTH, DEFECT_AREA = "defect_depth", "defect_area"
 CEILING = "ceiling"
 CLOSURE, CONTROL_POINT, SCAN_POSITION = "closure", "control_point", "scan_position"
+PART = "part "  # before the quantity of a single part, by step inspect
 
-MEASURES = {
-    "preassemble": (
-        "misalignment", "groove_gap", "eccentricity", "span", "unit_length", "inner_arc", "lateral_axis", "elevation",
-    ),
-    "spheres": ("node_place", "ball_size", SUPPORT_CENTRE, SUPPORT_HEIGHT, ADJACENT, MULTI_POINT, DEFLECTION),
-    "stitch": (CLOSURE, CONTROL_POINT, SCAN_POSITION),
-    "deviation": (DEVIATION, DEVIATION_SHARE),
-    "defects": (DEFECT_DEPTH, DEFECT_AREA),
-}  # fmt: skip
 DEFECT_CLASSES = (
     "dent", "bulge", "bend", "twist", "waviness", "edge-loss", "missing-part", "pit", "crack", "step", "misalignment",
     "unknown",

@@ -11,6 +11,7 @@ from functools import lru_cache
 from importlib import resources
 from typing import Any
 
+from processor import record_checks
 from processor.limits import measurands
 from processor.model import InputError, Limit, Tolerance, did_you_mean
 
@@ -23,19 +24,22 @@ DEFAULT = "GB 50205-2020"
 NAN = float("nan")
 NODE_PLACE = measurands.NODE_PLACE
 NOT_OF_LIMITS = ("class", "needs")  # keys of rows that are no fields of a limit
-PART = "part "  # before the quantity of step inspect, in ``Limit.measure`` of what is compared with a single part
 
 
 @lru_cache(maxsize=1)
 def standards() -> Mapping[str, Tolerance]:
-    """Return all standards by name; one with classes is both ``NAME`` (its class 1) and ``NAME class N``."""
+    """Return all standards by name; one with classes is both ``NAME`` (its class 1) and ``NAME class N``.
+
+    Raises InputError for a file that states what no limit can be, such as a measure that no step gives.
+    """
     tolerances: dict[str, Tolerance] = {}
     for content in files():
         name, rows = content["standard"], content["limit"]
         classes = sorted({row["class"] for row in rows if "class" in row})
         for suffix, number in [("", 1), *((f" class {n}", n) for n in classes)]:
             limits = tuple(_limit(row) for row in rows if row.get("class", number) == number)
-            tolerances[name + suffix] = Tolerance(name + suffix, content["edition"], limits)
+            tolerance = Tolerance(name + suffix, content["edition"], limits)
+            tolerances[name + suffix] = record_checks.check(tolerance, f"limits of {name}")
     return tolerances
 
 

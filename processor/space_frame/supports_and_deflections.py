@@ -34,7 +34,7 @@ def judge(balls: Balls, design: FrameDesign, tolerance: Tolerance, matched: bool
     rows: list[Comparison] = []
     nodes = _Nodes(balls, design, matched)
     for limit in tolerance.limits:
-        measured = _QUANTITIES.get(limit.measure)
+        measured = QUANTITIES.get(limit.measure)
         if measured is not None:
             rows += (judging.compare(limit, one) for one in measured(nodes))
     return judging.judged(rows, tolerance)
@@ -162,7 +162,7 @@ def _known(movement: Floats) -> Bools:
     return np.asarray(np.isfinite(movement).all(axis=1))
 
 
-_QUANTITIES: Mapping[str, Callable[[_Nodes], Iterator[Measured]]] = {
+QUANTITIES: Mapping[str, Callable[[_Nodes], Iterator[Measured]]] = {
     measurands.SUPPORT_CENTRE: _centres,
     measurands.SUPPORT_HEIGHT: _heights,
     measurands.ADJACENT: partial(_adjacent, kind=PERIMETER),

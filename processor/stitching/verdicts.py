@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -15,17 +15,12 @@ from processor.stitching.result import Result
 def judge(scene: Scene, result: Result) -> JudgedLimits | None:
     """Compare a network with the limits of a scene; None where none is given."""
     tolerance = standards.default_for(scene.tolerance)
-    quantities = {
-        measurands.CLOSURE: _closures,
-        measurands.CONTROL_POINT: _control_points,
-        measurands.SCAN_POSITION: _positions,
-    }
     return judging.judged(
         (
             judging.compare(limit, measured)
             for limit in tolerance.limits
-            if limit.measure in quantities
-            for measured in quantities[limit.measure](result)
+            if limit.measure in QUANTITIES
+            for measured in QUANTITIES[limit.measure](result)
         ),
         tolerance,
     )
@@ -57,3 +52,10 @@ def _positions(result: Result) -> Iterator[Measured]:
         if name != result.reference or result.by_control:
             half = NORMAL_95 * float(sd.max())
             yield Measured.within(name, half, 0.0, doubtful=status in (Status.FAILED, Status.AMBIGUOUS))
+
+
+QUANTITIES: Mapping[str, Callable[[Result], Iterator[Measured]]] = {
+    measurands.CLOSURE: _closures,
+    measurands.CONTROL_POINT: _control_points,
+    measurands.SCAN_POSITION: _positions,
+}

@@ -33,6 +33,21 @@ def turned(cloud, core=None, scanner=None, across=ACROSS):
     return found, normal_orientation.turned(found, core, across, scanner)
 
 
+@pytest.mark.parametrize(
+    ("normal", "towards", "expected"),
+    [
+        ([0, 0.6, 0.8], [0, 0, 1], [0, 0.6, 0.8]),
+        ([0, 0.6, -0.8], [0, 0, 1], [0, -0.6, 0.8]),
+        ([0.6, 0, 0.8], [0, 0, -1], [-0.6, 0, -0.8]),
+        ([0.6, 0, -0.8], [0, 1, 0], [-0.6, 0, 0.8]),  # square to the direction: along +z
+        ([0.6, -0.8, 0], [0, 0, 1], [-0.6, 0.8, 0]),  # along +y
+        ([-1, 0, 0], [0, 1, 0], [1, 0, 0]),  # along +x
+    ],
+)
+def test_a_normal_is_turned_along_its_direction_and_square_to_it_upwards(normal, towards, expected):
+    np.testing.assert_array_equal(oriented(np.array([normal], float), np.array(towards, float)), [expected])
+
+
 def test_normals_of_level_surfaces_equal_those_oriented_upwards_bit_for_bit():
     cloud = wavy(20_000, 1)
     found, got = turned(cloud)

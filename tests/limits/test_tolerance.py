@@ -8,14 +8,15 @@ import math
 import numpy as np
 import pytest
 
+from processor.inspection.result import Quantity
 from processor.limits import limit_bounds, measurands, standards
-from processor.model import InputError, Limit, Scan, Scene, Tolerance
+from processor.model import MEASURES, InputError, Limit, Scan, Scene, Tolerance
 from processor.preassembly.verdicts import chain, joints
 from processor.scan_folder import folder
+from processor.space_frame import supports_and_deflections
 from processor.space_frame.spheres import assessment
+from processor.stitching import verdicts as network
 from processor.store import store
-
-MEASURES = ("", *(measure for of_step in measurands.MEASURES.values() for measure in of_step))
 
 
 def limit(standard, key):
@@ -36,7 +37,6 @@ def test_every_limit_has_a_meaning_source_and_measure():
         for row in standard.limits:
             assert row.what, row.key
             assert row.source, row.key
-            assert row.measure in MEASURES or row.measure.startswith("part ")
             assert row.key.endswith({"mm": "_mm", "arcmin": "_arcmin", "1": "_ratio"}[row.unit])
             assert (row.rule in ("smaller", "sum")) == (not math.isnan(row.high_ratio) and not math.isnan(row.high)), (
                 row.key
@@ -49,8 +49,36 @@ def test_every_limit_has_a_meaning_source_and_measure():
             assert not (row.verified and not row.clause), "a verified row has its clause"
 
 
-def test_measures_are_those_of_the_bridges_steps():
-    assert (*joints.MEASURES, *chain.MEASURES) == measurands.MEASURES["preassemble"]
+def test_measures_are_those_that_the_steps_give():
+    assert (*joints.MEASURES, *chain.MEASURES) == MEASURES["preassemble"]
+    assert tuple(f"{measurands.PART}{quantity}" for quantity in Quantity) == MEASURES["inspect"]
+    of_nodes = {"node_place", "ball_size", measurands.CEILING}  # compared node by node, and hanger by hanger
+    assert {*supports_and_deflections.QUANTITIES, *of_nodes} == set(MEASURES["spheres"])
+    assert set(network.QUANTITIES) == set(MEASURES["stitch"])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "like"),
+    [
+        ("measure", "part twsit", "part twist"),
+        ("measure", "support_hieght", "support_height"),
+        ("of", "lenght", "length"),
+        ("rule", "smaler", "smaller"),
+    ],
+)
+def test_a_limit_of_what_no_step_gives_is_refused_with_the_nearest_name(tmp_path, monkeypatch, key, value, like):
+    row = {"key": "twist_mm", "what": "twist", "high": 3.0, "of": "length", "measure": "part twist", "source": "x"}
+    content = {"standard": "S 1", "edition": "1", "limit": [{**row, key: value}]}
+    monkeypatch.setattr(standards, "files", lambda: iter([content]))
+    said = f"limits of S 1: limits.0000.{key}: expected one of .*found '{value}' \\(did you mean '{like}'"
+    with pytest.raises(InputError, match=said):
+        standards.standards.__wrapped__()
+    scene = Scene(
+        "s", "structure", (Scan("s", np.eye(3)),), tolerance=Tolerance(limits=(Limit(**{**row, key: value}),))
+    )
+    store.write_scene(tmp_path / "s.h5", scene, None, {})
+    with pytest.raises(InputError, match=f"expected one of .*found '{value}' \\(did you mean '{like}'"):
+        store.read_scene(tmp_path / "s.h5")
 
 
 def test_only_limits_checked_in_print_are_verified():

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from processor.defects import baseline
 from processor.geometry import rigid
 from processor.registration import pfh
 
@@ -89,6 +90,14 @@ def test_normals_of_a_plate_point_across_it():
     rng = np.random.default_rng(2)
     plate = np.column_stack([rng.uniform(0.0, 100.0, (400, 2)), np.zeros(400)])
     assert np.abs(pfh.normals(plate, 20.0)[:, 2]).min() > 0.999
+
+
+@pytest.mark.parametrize("normals", [lambda points: pfh.normals(points, 25.0), baseline._normals])
+@pytest.mark.parametrize("centre", [[0.0, 0, 0], [5e5, -3e5, 100.0]])
+def test_normals_of_a_sphere_point_outward(normals, centre):
+    on = np.random.default_rng(4).normal(size=(1500, 3))
+    on /= np.linalg.norm(on, axis=1)[:, None]
+    assert np.einsum("ni,ni->n", normals(100.0 * on + centre), on).min() > 0.95
 
 
 def test_coarse_alignment_on_a_shape_with_corners():

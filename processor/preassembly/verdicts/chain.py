@@ -15,12 +15,11 @@ from scipy.special import ndtr
 
 from processor.adjustment import maximum_interval
 from processor.limits import limit_bounds
-from processor.limits import standards as limits_of
 from processor.limits.decision_rule import decide
+from processor.model import MEASURES as OF_STEPS
 from processor.model import NORMAL_95, Floats, Limit, Reason, Tolerance, Verdict, reason, worst
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.part_in_chain import Member
-from processor.preassembly.verdicts.joints import MEASURES as OF_JOINTS
 from processor.preassembly.verdicts.joints import (
     Comparison,
     Conformity,
@@ -88,9 +87,8 @@ def judge(measured: Quantities, tolerance: Tolerance, span_mm: float, doubts: tu
 
 def unused_limits(tolerance: Tolerance) -> list[Limit]:
     """Return the limits given by a project that apply to nothing of a bridge."""
-    of_chain = (*OF_JOINTS, *MEASURES)
-    unused = [limit for limit in tolerance.limits if of_project(limit) and limit.measure not in of_chain]
-    return [limit for limit in unused if not limit.measure.startswith(limits_of.PART)]
+    compared = (*OF_STEPS["preassemble"], *OF_STEPS["inspect"])
+    return [limit for limit in tolerance.limits if of_project(limit) and limit.measure not in compared]
 
 
 def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, doubtful: bool) -> Comparison:
