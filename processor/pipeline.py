@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import Any
 
 from processor import diagnostics, user_methods
-from processor.model import InputError, Scan, Scene, Status, StepRun, UsageError, did_you_mean, reason
+from processor.model import InputError, Reason, Scan, Scene, Status, StepRun, UsageError, did_you_mean, reason
 from processor.progress import stage
 from processor.store import epoch
 from processor.store.json_values import json_ready
@@ -32,6 +32,7 @@ else:
     import tomli as tomllib
 
 PIECEWISE_POINTS = 5_000_000
+SAMPLED_TILES = 64  # of all scans of a scene file, a million points: where these are used once, all are
 SOFTWARE = ("numpy", "scipy", "h5py")
 
 
@@ -131,13 +132,19 @@ def read(
 
 
 def is_large(path: Path) -> bool:
-    """Whether a scene file holds more points than are read into memory at once where that is not needed."""
+    """Whether a scene file holds more points than are read into memory at once where that is not needed.
+
+    Points of which some coincide are read at once, as they are to count once.
+    """
+    from processor.geometry import coincident_points
     from processor.store.streaming import points_of
 
     if not (path.is_file() and path.suffix.lower() == ".h5"):
         return False
     with points_of(path) as points:
-        return sum(points.counts()) > PIECEWISE_POINTS
+        if sum(points.counts()) <= PIECEWISE_POINTS:
+            return False
+        return not any(coincident_points.used_once(sample) is not None for sample in points.samples(SAMPLED_TILES))
 
 
 def streams(jobs: Sequence[Job]) -> bool:
@@ -320,6 +327,7 @@ def execute(
         kept: dict[str, dict[str, Any]] = {}
         clouds: list[StepCloud] = []
         digest = store.scene_hash(scene, None if points is None else points.pieces)
+        scene, coincident = _with_points_once(scene, log)
         scene = _with_targets(scene, log)
         for job in jobs:
             if so_far is not None:
@@ -337,11 +345,23 @@ def execute(
                 needs["kept"] = kept.setdefault(job.step, {})
             with diagnostics.recording() as notes:
                 done = _run(path, scene, job, {**given, **needs}, log)
-            runs.append(dataclasses.replace(done, diagnostics=notes.table()))
+            result = dataclasses.replace(done.result, reasons=(*done.result.reasons, *coincident))
+            runs.append(dataclasses.replace(done, result=result, diagnostics=notes.table()))
             clouds += [StepCloud(job.step, job.method, cloud) for cloud in notes.clouds]
-            answers.setdefault(job.step, runs[-1].result)
+            answers.setdefault(job.step, done.result)
         whole = _execution(path, scene, runs, digest, piecewise)
         return dataclasses.replace(whole, clouds=tuple(clouds))
+
+
+def _with_points_once(scene: Scene, log: Callable[[str], None] = lambda _: None) -> tuple[Scene, tuple[Reason, ...]]:
+    """Return the scene without coincident points, and what was left out; its hash is that of what was read."""
+    from processor import scene_cloud
+    from processor.language.messages import messages
+
+    scene, reasons = scene_cloud.with_points_once(scene)
+    for one in reasons:
+        log(messages("en").text(one))
+    return scene, reasons
 
 
 def _with_targets(scene: Scene, log: Callable[[str], None] = lambda _: None) -> Scene:
@@ -452,7 +472,12 @@ def read_execution(results: Path, path: Path, units: str | None) -> Execution:
         digest = store.scene_hash(scene, None if points is None else points.pieces)
     check_same_input(results, provenance, path, digest)
     provenance["epoch"] = epoch.facts(scene)  # the title block may have changed
-    return Execution(scene if piecewise else _with_targets(scene), runs, provenance, path if piecewise else None)
+    return Execution(
+        scene if piecewise else _with_targets(_with_points_once(scene)[0]),
+        runs,
+        provenance,
+        path if piecewise else None,
+    )
 
 
 def find_input(results: Path) -> Path:

@@ -8,8 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from processor.geometry import mesh_distance, rigid
-from processor.model import Floats, InputError, Reason, Scene, Status, StructureDesign, reason
+from processor import large_arrays
+from processor.geometry import coincident_points, mesh_distance, rigid
+from processor.model import (
+    Floats,
+    InputError,
+    Reason,
+    Scan,
+    Scene,
+    Status,
+    StructureDesign,
+    per_point_fields,
+    reason,
+)
 
 ORIGIN_STEP_MM = 1000.0
 UNPLACED = (Status.FAILED, Status.AMBIGUOUS)  # of a scan: its pose may be wrong
@@ -47,6 +58,44 @@ def merged(scene: Scene, with_scanner: bool) -> MergedCloud:
         else:
             known = False
     return MergedCloud(np.concatenate(points), origin, np.concatenate(scanners) if known else None)
+
+
+def with_points_once(scene: Scene) -> tuple[Scene, tuple[Reason, ...]]:
+    """Return a scene in which coincident points count once, with what was left out of each scan.
+
+    Scans in one frame, of one component, are one cloud: exports may overlap. Raises InputError for a scan whose points
+    are nearly all those of others.
+    """
+    frames: dict[tuple[str, bytes], list[int]] = {}
+    for number, scan in enumerate(scene.scans):
+        frames.setdefault((scan.component, scan.T_project_scan.tobytes()), []).append(number)
+    scans, reasons = list(scene.scans), []
+    for numbers in frames.values():
+        of_frame = [scans[number] for number in numbers]
+        offsets = [scan.origin - of_frame[0].origin for scan in of_frame]
+        used = coincident_points.used_once_of([scan.points for scan in of_frame], offsets)
+        for number, scan, kept in zip(numbers, of_frame, used or [], strict=used is not None):
+            left = int(np.count_nonzero(kept))
+            if left == len(kept):
+                continue
+            if left < min(FEWEST_POINTS, len(kept) // 2):
+                raise InputError(
+                    f"scan {scan.name!r}: {len(kept) - left} of its {len(kept)} points are those of "
+                    f"{', '.join(one.name for one in of_frame if one is not scan)}; leave one of the files out"
+                )
+            columns: dict[str, Any] = {
+                name: large_arrays.chosen(getattr(scan, name), kept)
+                for name in per_point_fields(Scan)
+                if len(getattr(scan, name)) == len(kept)
+            }
+            scans[number] = replace(scan, **columns)
+            reasons.append(coincident(len(kept) - left, len(kept), scan.name))
+    return (replace(scene, scans=tuple(scans)) if reasons else scene), tuple(reasons)
+
+
+def coincident(left_out: int, count: int, cloud: str) -> Reason:
+    """Return the reason that of the points of a cloud some coincide with others and do not count."""
+    return reason("points.coincident", cloud=cloud, left_out=left_out, count=count, share=100.0 * left_out / count)
 
 
 def stitched(scene: Scene, result: Any) -> Scene:

@@ -118,7 +118,7 @@ def _write(
         lines.append(f"design = {as_toml(design)}")
     if np.isfinite(scene.temperature_C):
         lines.append(f"temperature_C = {scene.temperature_C!r}")
-    named = list(zip(project.stems(scene.scans), scene.scans, strict=True))
+    named = list(zip(project.stems(scan.name for scan in scene.scans), scene.scans, strict=True))
     written = formats.write_all(folder / "scans", format_, named, scene.stations, labels, spherical=spherical)
     if labels and format_ in formats.LABELLED:
         first = labels[0]

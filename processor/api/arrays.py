@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from processor import unit_ratio
+from processor import scene_cloud, unit_ratio
 from processor.api.argument_checks import (
     MOST_RATIO,
     extent_of,
@@ -19,8 +19,8 @@ from processor.api.argument_checks import (
     positions_of,
 )
 from processor.deviation import measure as deviation_measure
+from processor.geometry import coincident_points, mesh_distance, normal_orientation, rigid
 from processor.geometry import m3c2 as m3c2_distances
-from processor.geometry import mesh_distance, normal_orientation, rigid
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Bools, Floats, Reason, Status, reason
@@ -69,10 +69,14 @@ class SphereFit:
 
 @dataclass(frozen=True)
 class CorePoints(Distances):
-    """M3C2 at core points: ``core`` and ``normals`` (k, 3) beside the columns of :class:`Distances`."""
+    """M3C2 at core points: ``core`` and ``normals`` (k, 3) beside the columns of :class:`Distances`.
+
+    ``reasons`` state which clouds have coincident points, which count once.
+    """
 
     core: Floats
     normals: Floats
+    reasons: tuple[Reason, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -120,12 +124,13 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     ValueError : wrong shape, NaN, too few points, points that coincide, coordinates that seem to be in metres, a radius
         that no target has or the cloud cannot hold, a scanner that cannot have measured the points.
     """
-    cloud = points_of(points, "points", LEAST_POINTS)
+    every = points_of(points, "points", LEAST_POINTS)
+    cloud, used, coincident = _once(every, "points")
     held = None if radius is None else _radius(radius, extent_of(cloud))
     origin = cloud.mean(axis=0)
     seen_from = None
     if scanner is not None:
-        seen_from = positions_of(scanner, "scanner", cloud.shape) - origin
+        seen_from = positions_of(scanner, "scanner", every.shape)[used] - origin
         _check_scanner(cloud - origin, seen_from)
     params = Params(radius_mm=float("nan") if held is None else held, max_balls=1)
     measured = _measured(MergedCloud(cloud - origin, origin, seen_from), params, held)
@@ -137,7 +142,7 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
             radius=float("nan"),
             covariance=np.full((4, 4), np.nan),
             status=Status.FAILED,
-            reasons=measured.reasons if doubt is None else (*measured.reasons, doubt),
+            reasons=(*measured.reasons, *(() if doubt is None else (doubt,)), *coincident),
             points=0,
             rms=float("nan"),
         )
@@ -146,13 +151,22 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
         radius=float(balls.radii[0]),
         covariance=balls.covariance[0],
         status=Status.OK if balls.flag[0] is Flag.OK else Status.WEAK,
-        reasons=balls.reasons[0],
+        reasons=(*balls.reasons[0], *coincident),
         points=int(balls.points[0]),
         rms=float(balls.rms[0]),
     )
     if seen_from is not None and fitted.status is Status.OK:
         _check_faces(cloud - fitted.centre, seen_from + origin - fitted.centre, fitted)
     return fitted
+
+
+def _once(points: Floats, name: str) -> tuple[Floats, Bools | slice, tuple[Reason, ...]]:
+    """Return the points (m, 3) that count once, which of those given (n, 3) they are, and how many were left out."""
+    used = coincident_points.used_once(points)
+    if used is None:
+        return points, slice(None), ()
+    left_out = len(used) - int(np.count_nonzero(used))
+    return points[used], used, (scene_cloud.coincident(left_out, len(used), name),)
 
 
 def _measured(cloud: MergedCloud, params: Params, held: float | None) -> Result:
@@ -243,14 +257,15 @@ def register(
     ValueError : wrong shapes, NaN, too few points, faces that name no vertex or have no area, points and mesh in
         different units.
     """
-    cloud, corners = points_of(points, "points", LEAST_SCAN_POINTS), points_of(vertices, "vertices", 3)
+    every, corners = points_of(points, "points", LEAST_SCAN_POINTS), points_of(vertices, "vertices", 3)
+    cloud, used, coincident = _once(every, "points")
     triangles = faces_of(faces, corners, mesh_distance.LEAST_AREA)
     ratio = extent_of(cloud) / extent_of(corners[np.unique(triangles)])
     if not 1.0 / MOST_RATIO < ratio < MOST_RATIO:
         raise ValueError(f"points: {ratio:.3g} times as large as the mesh; expected both in mm")
     scan_origin, origin = cloud.mean(axis=0), corners.mean(axis=0)
     local = cloud - scan_origin
-    seen_from = None if scanners is None else positions_of(scanners, "scanners", cloud.shape) - scan_origin
+    seen_from = None if scanners is None else positions_of(scanners, "scanners", every.shape)[used] - scan_origin
     surface = mesh_distance.of_design(corners - origin, triangles)
     of_body = surface_registration.body_of(local, surface)
     given = rigid.transform(np.eye(3), scan_origin - origin)
@@ -266,7 +281,7 @@ def register(
         covariance=rigid.about_origin(placed.covariance, origin),
         status=status,
         rival=None if rival is None else deviation_measure.global_pose(rival, scan_origin, origin),
-        reasons=reasons,
+        reasons=(*reasons, *coincident),
     )
 
 
@@ -372,6 +387,8 @@ def m3c2(
     error = length_of(registration_error, "registration_error", zero=True, unit="")
     given = None if normals is None else normals_of(normals, places.shape)
     _check_units(first, second, places, scales.projection_diameter)
+    first, _, of_first = _once(first, "reference")
+    second, _, of_second = _once(second, "compared")
     origin = first.mean(axis=0)
     directions = _fitted_normals(first - origin, places - origin, scales.normal_diameter) if given is None else given
     measured = m3c2_distances.distances(
@@ -384,7 +401,7 @@ def m3c2(
         registration_error_mm=error,
     )
     _check_reach(measured)
-    return CorePoints(**vars(measured), core=places, normals=directions)
+    return CorePoints(**vars(measured), core=places, normals=directions, reasons=(*of_first, *of_second))
 
 
 class _Scales(NamedTuple):

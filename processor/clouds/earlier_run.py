@@ -33,9 +33,10 @@ class Run:
     def step(self, name: str, what: str) -> Any:
         """Return the result of a step. Raises UsageError where it was not run."""
         if name not in self.steps:
+            steps = ",".join((*self.steps, name))
             raise UsageError(
-                f"{what} needs the step {name}, which was not run on {self.name}: "
-                f"processor run {self.name} -o OUT --steps {name}"
+                f"{what} needs the step {name}, which was not run on {self.name}: run it with the others by "
+                f"processor run {self.name} -o OUT --steps {steps}, then export again"
             )
         return self.steps[name]
 

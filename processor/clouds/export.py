@@ -140,7 +140,7 @@ def _registered(run: Run, aside: Path) -> _Content:
 
 
 def _scans(run: Run, placed: Poses) -> _Content:
-    stems = project.stems([one.scan for one in placed.scans])
+    stems = project.stems(one.scan.name for one in placed.scans)
     clouds = {
         f"{SCANS}/{stem}": exported_clouds.scan_cloud(run, one) for stem, one in zip(stems, placed.scans, strict=True)
     }
@@ -165,9 +165,7 @@ def _merged(run: Run, aside: Path) -> _Content:
 
 def _assembled(run: Run, aside: Path) -> _Content:
     placed = poses.in_bridge(run)
-    stems = project.stems(
-        [replace(one.scan, name=name) for one, name in zip(placed.scans, _numbered(placed), strict=True)]
-    )
+    stems = project.stems(_numbered(placed))
     clouds = {
         f"{SCANS}/{stem}": exported_clouds.part_cloud(run, one) for stem, one in zip(stems, placed.scans, strict=True)
     }

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from processor import large_arrays, readers, store
+from processor import large_arrays, readers, scene_cloud, store
 from processor.adjustment import distance_summary
 from processor.adjustment.distance_summary import Summary
 from processor.compare import core_tiles, diagnosis, units
 from processor.compare import normals_file as scan_folder_normals
 from processor.compare.core_tiles import Lengths
-from processor.geometry import m3c2, nearest_neighbours, normal_orientation
+from processor.geometry import coincident_points, m3c2, nearest_neighbours, normal_orientation
 from processor.geometry.m3c2 import CloudNormals, Distances, Scales
 from processor.geometry.normal_orientation import Turned
 from processor.geometry.point_grid import PointGrid
@@ -70,7 +70,7 @@ class Comparison:
     hashes: dict[str, str]
     normals_from: Reason
     turned: Turned | None  # None: the normals were given with their signs
-    read: tuple[Reason, ...] = ()  # how the files were read
+    read: tuple[Reason, ...] = ()  # how the files were read, and which points of them coincide
 
     @property
     def notes(self) -> tuple[Reason, ...]:
@@ -114,6 +114,7 @@ class _Cloud:
     sha256: str
     stated: str = ""  # unit that the command line gives the file
     scale: Floats = field(default_factory=lambda: np.ones(3))  # to the unit of the comparison, along x, y, z
+    left_out: int = 0  # points that coincide with others
 
     @property
     def unit(self) -> str:
@@ -227,7 +228,14 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
         hashes={name: cloud.sha256 for name, cloud in clouds.items()} | given,
         normals_from=source,
         turned=turned,
-        read=read,
+        read=(
+            *read,
+            *(
+                scene_cloud.coincident(cloud.left_out, cloud.left_out + cloud.count, cloud.path.name)
+                for cloud in (reference, compared)
+                if cloud.left_out
+            ),
+        ),
     )
     _log_warnings(comparison, log)
     return comparison
@@ -253,6 +261,8 @@ def _read_clouds(request: Request) -> tuple[dict[str, _Cloud], tuple[Reason, ...
         for name, unit in stated.items():
             scale = np.array([MM_PER_UNIT[axis] for axis in (unit.horizontal, unit.horizontal, unit.vertical)]) / into
             clouds[name] = replace(clouds[name], stated=stated["reference"].horizontal, scale=scale)
+    for name in CLOUDS[:2]:  # rows of core points stay those of their file
+        clouds[name] = _once(clouds[name])
     for cloud in (clouds["reference"], clouds["compared"]):
         if cloud.count < m3c2.FEWEST_FOR_LOD:
             raise InputError(
@@ -322,6 +332,20 @@ def _read(path: Path) -> _Cloud:
     if not sum(len(scan.points) for scan in scans):
         raise InputError(f"{path}: expected points, found none")
     return _Cloud(path, [scan for scan in scans if len(scan.points)], checksums.of_file(path))
+
+
+def _once(cloud: _Cloud) -> _Cloud:
+    """Return a cloud in which coincident points count once; scans with one pose are one."""
+    scans, left_out = list(cloud.scans), 0
+    for pose in {scan.T_project_scan.tobytes(): None for scan in scans}:
+        rows = [row for row, scan in enumerate(scans) if scan.T_project_scan.tobytes() == pose]
+        offsets = [scans[row].origin - scans[rows[0]].origin for row in rows]
+        for row, kept in zip(
+            rows, coincident_points.used_once_of([scans[row].points for row in rows], offsets) or (), strict=False
+        ):
+            left_out += len(kept) - int(np.count_nonzero(kept))
+            scans[row] = replace(scans[row], points=large_arrays.chosen(scans[row].points, kept))
+    return replace(cloud, scans=[scan for scan in scans if len(scan.points)], left_out=left_out)
 
 
 def _bare(scan: Scan | RawScan, unit: str) -> RawScan:

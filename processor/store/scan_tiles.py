@@ -174,6 +174,16 @@ def read_index(group: Any) -> StoredTiles:
     return StoredTiles(grid, cell, start, count, columns)
 
 
+def some_tiles(group: Any, count: int) -> Floats:
+    """Return the points (n, 3) of ``count`` tiles of a scan's group, every k-th of them."""
+    grid, _, start, counts, columns = read_index(group)
+    parts = [np.empty((0, 3))]
+    for tile in range(0, len(start), max(1, len(start) // count)):
+        x, y, z = (column[int(start[tile]) : int(start[tile] + counts[tile])] for column in columns)
+        parts.append(grid.millimetres((x, y, z)))
+    return np.concatenate(parts)
+
+
 def near_boxes(group: Any, lower: Floats, upper: Floats, size: int) -> Iterator[Floats]:
     """Yield the points (n, 3) of the tiles of a scan's group that boxes touch: corners (k, 3), mm; no other is read.
 

@@ -47,6 +47,12 @@ class StoredPoints:
         """Return a per-point column of a scan, to be read in slices; one that is absent is empty."""
         return scan_tiles.column(self.scans[scan], name)
 
+    def samples(self, tiles: int) -> Iterator[Floats]:
+        """Yield the points (n, 3) of some whole tiles of each scan, spread evenly over it; ``tiles`` of all scans."""
+        for scan in self.scans:
+            with _naming_the_file(scan):
+                yield scan_tiles.some_tiles(scan, max(1, tiles // len(self.scans)))
+
     def near(self, boxes: Sequence[tuple[Floats, Floats]]) -> NearBoxes:
         """Restrict each scan to the tiles about boxes: lower and upper corners (k, 3), mm, less the scan's origin."""
         return NearBoxes(self, tuple(boxes))

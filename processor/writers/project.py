@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,8 @@ import numpy as np
 from processor.model import KEY_POINTS, SUPPORTS, ArchDesign, FrameDesign, Scan, Scene
 from processor.writers.ply import write_mesh
 from processor.writers.toml import as_toml
+
+LONGEST_STEM = 200  # bytes: with a suffix and a number less than the 255 that file systems take
 
 
 def scan_lines(scan: Scan, scale: float, *, with_pose: bool) -> list[str]:
@@ -35,16 +37,31 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def stems(scans: Sequence[Scan]) -> list[str]:
-    """Return unique file stems: each scan's name if it is a plain file name, else a number."""
-    plain = {scan.name for scan in scans if scan.name.replace("-", "").replace("_", "").isalnum()}
-    stems = []
-    for number, scan in enumerate(scans):
-        stem = scan.name if scan.name in plain else f"scan{number}"
-        while scan.name not in plain and stem in plain:
-            stem += "-"
-        stems.append(stem)
-    return stems
+def stems(names: Iterable[str]) -> list[str]:
+    """Return a file stem for each name: the name itself where it is a plain one, and no two that differ in case alone.
+
+    Names that are plain keep theirs whatever others become.
+    """
+    every = list(names)
+    plain = [name for name in every if name == _plain(name)]
+    taken = {name.casefold() for name in plain}
+    found, kept = [], set[str]()
+    for name in every:
+        stem = name
+        if name not in plain or name.casefold() in kept:
+            stem, number = _plain(name), 2
+            while stem.casefold() in taken:
+                stem, number = f"{_plain(name)}-{number}", number + 1
+        kept.add(stem.casefold())
+        taken.add(stem.casefold())
+        found.append(stem)
+    return found
+
+
+def _plain(name: str) -> str:
+    """Return a name of letters, digits, - and _ alone, that any file system takes."""
+    plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "scan"
+    return plain.encode("utf-8")[:LONGEST_STEM].decode("utf-8", "ignore")
 
 
 def write_design(scene: Scene, folder: Path, scale: float, *, with_meshes: bool) -> str:
@@ -66,10 +83,10 @@ def write_design(scene: Scene, folder: Path, scale: float, *, with_meshes: bool)
 def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
     """Return the design as JSON, and write its meshes to ``folder`` unless it is None."""
     components: dict[str, dict[str, Any]] = {}
-    for part in design.parts:
+    for part, stem in zip(design.parts, stems(part.name for part in design.parts), strict=True):
         component = components[part.name] = {}
         if folder is not None and part.source == "mesh":
-            component["mesh"] = f"design/{part.name}.ply"
+            component["mesh"] = f"design/{stem}.ply"
             (folder / "design").mkdir(exist_ok=True)
             write_mesh(folder / component["mesh"], part.vertices, part.faces)
         if len(part.bottom_edge_left):

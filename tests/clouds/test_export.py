@@ -29,6 +29,7 @@ from processor.model import InputError, Scene, Stations, Status, UsageError
 from processor.preassembly.result import ScanPoses
 from processor.scan_folder import folder
 from processor.store import store
+from processor.writers import project
 from processor.writers.cloud import Block, Cloud
 from tests.support.clouds import stitch_clouds
 from tests.support.files.e57_fields import e57_field
@@ -313,13 +314,23 @@ def test_an_input_that_changed_is_refused(room, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("what", "step"), [("assembled", "preassemble"), ("deviation", "deviation")]
+    ("what", "step"), [("assembled", "stitch,preassemble"), ("deviation", "stitch,deviation")]
 )  # fmt: skip
 def test_a_step_that_is_missing_is_named(room, what, step, tmp_path):
     place, _ = room
-    with pytest.raises(UsageError, match=f"{what} needs the step {step}, which was not run on room.*--steps {step}"):
+    with pytest.raises(UsageError, match=f"{what} needs the step {step[7:]}, .* on room.*--steps {step},"):
         processor.export(place / "out", tmp_path / "x", what=what, format="ply")
     assert not list(tmp_path.iterdir())
+
+
+def test_names_of_files_show_the_names_of_parts_and_are_unique():
+    names = ["AR-01 springing W", "AR-01_springing_W", "A/../b", "a/../B", "拱肋 1", "", "x" * 300, "scan0"]
+    stems = project.stems(names)
+    assert stems[:6] == ["AR-01_springing_W-2", "AR-01_springing_W", "A____b", "a____B-2", "拱肋_1", "scan"]
+    assert stems[7] == "scan0"
+    assert len({stem.casefold() for stem in stems}) == len(stems)
+    assert max(len(stem.encode()) for stem in stems) <= 204
+    assert project.stems(["S1", "s1", "S1"]) == ["S1", "s1-2", "S1-3"]
 
 
 def test_scans_without_poses_need_stitching(tmp_path):

@@ -4,9 +4,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import processor
 from processor.evaluation import space_frame
 from processor.model import FrameDesign, FrameTruth, Scan, Scene, Stations, Truth, UsageError, reason
 from processor.space_frame import step as space_frame_step
+from processor.space_frame.design import unit_mistakes
 from processor.space_frame.result import Balls
 from processor.space_frame.step import Params
 
@@ -259,6 +261,36 @@ def test_implausible_radius_lowers_confidence_and_names_the_unit(scale, factor):
     (doubt,) = (one for one in result.balls.reasons[0] if "radius" in one.values)
     assert doubt.code == ("spheres.unit-mistake" if factor else "spheres.implausible-radius")
     assert doubt.values.get("factor", "") == factor
+
+
+@pytest.mark.parametrize(
+    ("radius", "factor", "scaled"),
+    [
+        (19050.0, "1/1000", 19.05),
+        (19.05 * 304.8, "1/304.8", 19.05),
+        (72.5 / 25.4, "25.4", 72.5),
+        (0.145, "1000", 145.0),
+    ],
+)
+def test_a_unit_that_gives_a_usual_size_of_balls_is_preferred(radius, factor, scaled):
+    doubt = unit_mistakes.implausible(radius)
+    assert (doubt.code, doubt.values["factor"]) == ("spheres.unit-mistake", factor)
+    assert doubt.values["scaled"] == pytest.approx(scaled)
+
+
+def test_coordinates_rounded_so_that_no_ball_is_seen_are_the_reason():
+    # A ball before a wall, with a point each 7 mm; rounding to 0.1 ft leaves layers of points.
+    rng = np.random.default_rng(7)
+    flat = np.column_stack([np.zeros(8_000), rng.uniform(-300.0, 300.0, (8_000, 2))])
+    height = 72.5**2 - np.square(flat[:, 1:]).sum(axis=1)
+    flat[:, 0] = np.where(height > 0.0, -200.0 - np.sqrt(np.maximum(height, 0.0)), 0.0) + rng.normal(0.0, 0.6, 8_000)
+    step = 30.48
+    rounded = np.round((flat @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + [4000.0, 5000.0, 300.0]) / step) * step
+    result = space_frame_step.run(Scene("t", "structure", (Scan("s", rounded),)), Params())
+    assert [(one.code, one.values) for one in result.reasons] == [
+        ("spheres.coordinates-rounded", {"step": pytest.approx(step)})
+    ]
+    assert processor.fit_sphere(rounded).reasons[0].code == "spheres.coordinates-rounded"
 
 
 def test_search_reports_an_early_stop_and_an_empty_result():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from processor.adjustment.scanner_class_errors import VIEW_SD_MM
+from processor.geometry import coincident_points
 from processor.geometry.sphere import Sphere, algebraic
 from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit, bound, robust_fit
 from processor.model import NORMAL_95, Floats, Reason, Status, Tolerance, reason
@@ -17,6 +18,7 @@ from processor.space_frame.spheres import sphere_detection
 from processor.space_frame.spheres.assessment import DOWN, LARGEST_SCALE
 from processor.space_frame.spheres.single_fit_assessment import Row, as_result, assessed, generator, missing
 
+COARSE_MM = 1.0  # rounding to it adds noise of 0.3 mm, as much as that of a good scanner
 LEAST_ONE_SIDED = 0.2  # length of the mean of normals; 0.5 of half a sphere, 0 of one seen from all around
 FAR_RADII = 1e4
 STEEP_COS = 0.5  # of the incidence of a ray
@@ -42,8 +44,11 @@ def measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Par
     """Return the result of spheres found in a cloud, fitted by the method."""
     if not found:
         count, least = len(cloud.points), fewest_points(params)
-        few = reason("spheres.too-few-for-ball", points=count, least=least)
-        why = few if count < least else reason("spheres.no-ball", points=count)
+        why = reason("spheres.no-ball", points=count)
+        if count < least:
+            why = reason("spheres.too-few-for-ball", points=count, least=least)
+        elif (step := float(coincident_points.lattice_of(cloud.points).step.max())) >= COARSE_MM:
+            why = reason("spheres.coordinates-rounded", step=step)
         return Result(Status.FAILED, params.method, (why,))
     rows = [_searched(id_, candidate, cloud, params) for id_, candidate in enumerate(found)]
     messages = [reason("spheres.searched")]
