@@ -180,7 +180,8 @@ def described(default: Any = dataclasses.MISSING, **shown: Any) -> Any:
     ``words``: the vocabulary of a single word.
     ``unit``: of its numbers. ``heading``: its English name in tables; the field's name without one. ``json``: its key
     in results.json, "a.b" for a key b within a, "" where it is not written; the field's name without one. A star in
-    the key stands for the names in ``keys``, which the items of an array (of a column: of its rows) are for. ``axes``:
+    the key stands for the names in ``keys``, which the items of an array (of a column: of its rows) are for. A tuple
+    of keys: the value is written under each. ``axes``:
     names along several axes, written as nested objects. ``by``: the column of a nested table by which its rows are
     named in an object. ``sentence``: the key of the English text of reasons. ``optional``: not written where it is
     empty. ``where``: a column is written in rows where the column of this name is finite. ``joined``: HDF5 holds the
@@ -195,13 +196,13 @@ def per_point_fields(record: type) -> tuple[str, ...]:
     return tuple(field.name for field in fields if field.metadata.get("shape", ("",))[0] == "n")
 
 
-def newer(hashed: bool = True) -> Any:
-    """Declare a record that came to the schema later: absent, it changes no scene's hash.
+def newer(hashed: bool = True, **shown: Any) -> Any:
+    """Declare a record or a text that came to the schema later: absent, it changes no scene's hash.
 
     A column with ``newer`` in its metadata is of this kind too: where it is empty it is not stored. Not ``hashed``, it
     never changes the hash: no step reads it, so results stay those of the scene whatever it says.
     """
-    return dataclasses.field(default=None, metadata={"newer": True, "hashed": hashed})
+    return dataclasses.field(default=None, metadata={"newer": True, "hashed": hashed, **shown})
 
 
 class Fault(NamedTuple):
@@ -238,7 +239,8 @@ class Checked:
                 kind = metadata.get("words", str)
                 lists = metadata.get("lists", False)
                 value = tuple(tuple(map(str, item)) if lists else _word(kind, item, where) for item in value)
-                _same_length(lengths, metadata["axis"], len(value), where)
+                if value or not metadata.get("newer"):
+                    _same_length(lengths, metadata["axis"], len(value), where)
                 object.__setattr__(self, name, value)
             elif "reasons" in metadata:
                 value = tuple(tuple(row) if metadata["reasons"] else row for row in value)
@@ -490,9 +492,15 @@ class ArchDesign(Checked):
         return bool(np.array_equal(self.joined, np.stack([count, count + 1], axis=1)))
 
 
+DESIGN_FRAMES = ("project", "own")  # of a frame's nodes: the project's, which the scans are in, or another one
+
+
 @dataclass(frozen=True)
 class FrameDesign(Checked):
-    """A space frame: nodes and the members between them, mm."""
+    """A space frame: nodes and the members between them, mm.
+
+    ``coordinates`` is one of DESIGN_FRAMES where the project states it.
+    """
 
     ids: Ints = column("k", dtype=np.int64, means=NAMES)
     centres: Floats = column("k", 3, means=PLACE)
@@ -506,6 +514,7 @@ class FrameDesign(Checked):
     deflections: Floats = column(
         "k", newer=True, means=Meaning(least=-LARGEST_MM, most=LARGEST_MM)
     )  # computed, downward; NaN = not stated
+    coordinates: str | None = newer(means=Meaning(words=DESIGN_FRAMES))
 
 
 SUPPORTS = ("perimeter", "multi-point")  # of a node: of a frame supported along its edges, or at single points

@@ -33,6 +33,8 @@ def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str],
     design = project.write_design(scene, folder, scale, with_meshes=True)
     if design:
         lines.append(f"design = {as_toml(design)}")
+    if scene.frame is not None and scene.frame.coordinates:
+        lines.append(f"design_frame = {as_toml(scene.frame.coordinates)}")
     if np.isfinite(scene.temperature_C) and what != "assembled":  # the assembled parts have their reference lengths
         lines.append(f"temperature_C = {scene.temperature_C!r}")
     lines += _tolerance(scene.tolerance)

@@ -26,10 +26,12 @@ def series(results: Sequence[Result | None]) -> Iterator[Series]:
     """Yield place or movement along x, y and z, and the radius of each ball."""
     gauges = _gauges(results)
     names, rows = _by_id(results) if gauges else _by_place(results)
+    fitted = len(gauges) > 1 and _all_fitted(results)
     places, half, radii, radius_half, doubtful = (np.stack(columns, axis=1) for columns in zip(
-        *(_columns(result, rows[:, e], bool(gauges)) for e, result in enumerate(results)), strict=True
+        *(_columns(result, rows[:, e], bool(gauges), fitted) for e, result in enumerate(results)), strict=True
     ))  # fmt: skip
-    unsure = doubtful | (len(gauges) > 1)  # of places: a movement against another datum is another quantity
+    # A movement against another datum is another quantity.
+    unsure = doubtful | (len(gauges) > 1 and not fitted)
     for k, name in enumerate(names):
         for axis, letter in enumerate("xyz"):
             quantity: Message = text("movement {axis}", axis=letter) if gauges else text("centre {axis}", axis=letter)
@@ -48,7 +50,9 @@ def remarks(results: Sequence[Result | None]) -> Iterator[Reason]:
     gauges = _gauges(results)
     if sum(result is not None for result in results) < 2:
         return
-    if len(gauges) > 1:
+    if len(gauges) > 1 and _all_fitted(results):
+        yield reason("epochs.gauges-differ-fitted")
+    elif len(gauges) > 1:
         yield reason("epochs.gauges-differ")
     elif MovementGauge.BEST_FIT in gauges:
         yield reason("epochs.gauge-best-fit")
@@ -67,6 +71,11 @@ def _gauges(results: Sequence[Result | None]) -> set[MovementGauge]:
     references = [one.movement_reference for one in results if one is not None]
     found = {one.gauge for one in references if one is not None}
     return set() if None in references else found
+
+
+def _all_fitted(results: Sequence[Result | None]) -> bool:
+    """Whether all epochs with movements have those by a best fit too, which are comparable."""
+    return all(one is None or len(one.balls.best_fit_movement) > 0 for one in results)
 
 
 def _by_id(results: Sequence[Result | None]) -> tuple[list[str], Ints]:
@@ -112,8 +121,13 @@ def _nearest_of_both(known: Floats, radii: Floats, found: Floats) -> tuple[Ints,
     return rows, theirs[rows]
 
 
-def _columns(result: Result | None, rows: Ints, moved: bool) -> tuple[Floats, Floats, Floats, Floats, Bools]:
-    """Return places (k, 3), radii (k,), their half-widths, and which (k,) are doubtful, of rows (k,) of the balls."""
+def _columns(
+    result: Result | None, rows: Ints, moved: bool, fitted: bool
+) -> tuple[Floats, Floats, Floats, Floats, Bools]:
+    """Return places (k, 3), radii (k,), their half-widths, and which (k,) are doubtful, of rows (k,) of the balls.
+
+    Places are movements where balls ``moved``, relative to a best fit where all are ``fitted``.
+    """
     k = len(rows)
     if result is None or not len(result.balls):
         nothing = np.full((k, 3), np.nan)
@@ -122,6 +136,8 @@ def _columns(result: Result | None, rows: Ints, moved: bool) -> tuple[Floats, Fl
     variance = np.einsum("kii->ki", balls.covariance)
     half = NORMAL_95 * np.sqrt(np.where(variance >= 0.0, variance, np.nan))
     place, place_half = (balls.movement, balls.movement_ci95) if moved else (balls.centres, half[:, :3])
+    if fitted:
+        place, place_half = balls.best_fit_movement, balls.best_fit_ci95
     doubtful = ~np.array([flag is Flag.OK for flag in balls.flag], np.bool_)
     if moved and result.matching is not None and result.matching.status is not Status.OK:
         doubtful[:] = True  # a movement is against the pose of the design

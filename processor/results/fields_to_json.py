@@ -47,10 +47,14 @@ def reason_json(reason: Reason) -> dict[str, Any]:
 
 def _put_field(target: dict[str, Any], field: dataclasses.Field[Any], value: Any) -> None:
     """Set the value of a field, or its value in one row, by the metadata of the field."""
-    key, metadata = field.metadata.get("json", field.name), field.metadata
-    if not key:
-        return
-    if "keys" in metadata:
+    keys, metadata = field.metadata.get("json", field.name), field.metadata
+    for key in (keys,) if isinstance(keys, str) else keys:
+        if key:
+            _put_by_key(target, key, value, metadata)
+
+
+def _put_by_key(target: dict[str, Any], key: str, value: Any, metadata: Mapping[str, Any]) -> None:
+    if "*" in key:
         for name, item in zip(metadata["keys"], value, strict=True):
             null = metadata.get("nullable") and np.isnan(item).all()
             _put(target, key.replace("*", str(name)), None if null else _value(item))

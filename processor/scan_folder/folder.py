@@ -14,6 +14,7 @@ from processor import large_arrays, readers, record_checks, store
 from processor.geometry import rigid
 from processor.language.messages import messages
 from processor.model import (
+    DESIGN_FRAMES,
     KINDS,
     ArchDesign,
     Floats,
@@ -71,7 +72,7 @@ else:
 
 KEYS = (
     "name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control", "report",
-    "clip", "ceiling", "targets",
+    "clip", "ceiling", "targets", "design_frame",
 )  # fmt: skip
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position", "units")
 FLOAT_STEP_MM = 1.0
@@ -169,6 +170,7 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
         else:
             design = read_design(folder, project.design, unit)
         record_checks.check(design, str(project.design))  # before scans are compared with it
+    design = _in_stated_frame(design, project.table)
     check_components(str(folder / PROJECT), project.tolerance, _component_names(design))
     unit = project.units or option or "m"
     scene = _scene(project, design, option, _read_stations(folder, unit), keep)
@@ -187,6 +189,21 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     )
     files |= dict.fromkeys(("tolerance", "temperature_C", "name", "ceiling", "target_search"), PROJECT)
     return record_checks.check(scene, str(folder), {field: str(folder / file) for field, file in files.items()})
+
+
+def _in_stated_frame(design: Design | None, table: Table) -> Design | None:
+    """Add what project.toml states of the frame that a design's coordinates are in."""
+    stated = table.text("design_frame", "")
+    if not stated:
+        return design
+    if stated not in DESIGN_FRAMES:
+        raise InputError(
+            f"{table.where}: expected one of {', '.join(DESIGN_FRAMES)} as 'design_frame', found {stated!r}"
+            f"{did_you_mean(stated, DESIGN_FRAMES)}"
+        )
+    if not isinstance(design, FrameDesign):
+        raise InputError(f"{table.where}: 'design_frame' is for the nodes of a space frame; take it out")
+    return dataclasses.replace(design, coordinates=stated)
 
 
 def _with_picks(folder: Path, scene: Scene) -> Scene:

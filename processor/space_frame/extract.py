@@ -7,12 +7,14 @@ each nominal node.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
-from processor.model import Bools, Floats, FrameDesign, Ints, Reason, Status, Tolerance, reason
+from processor.model import DESIGN_FRAMES, Bools, Floats, FrameDesign, Ints, Reason, Status, Tolerance, reason
 from processor.space_frame.ball_catalogue import Catalogue
 from processor.space_frame.design import matching
 from processor.space_frame.design.matching import Matching, NodePattern
@@ -21,7 +23,7 @@ from processor.space_frame.members import junctions, member_extraction
 from processor.space_frame.members.member_extraction import Measured
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
-from processor.space_frame.result import Flag
+from processor.space_frame.result import NAN, Flag, MovementGauge
 from processor.space_frame.spheres import alternating_fit, assessment, ball_joint_classification, hidden_or_missing
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
@@ -60,6 +62,8 @@ class Extracted:
     Rows are nodes: found blind, or those of the design in its order and then further ones found. ``design_row`` (k,)
     is the row of the design, -1 = none. ``datum`` (k, 3, 3) is the part of a centre's covariance that is common to all
     nodes; the spheres' own covariance excludes it. ``source`` has the points with the stations' corrections.
+    ``movement_otherwise`` is by the other gauge, where there is one; ``georeference_sd``, mm, is that of a shift of all
+    nodes along an axis of the project's frame.
     """
 
     source: Source
@@ -71,6 +75,8 @@ class Extracted:
     stations: Stations | None = None
     matching: Matching | None = None
     movement: Movement | None = None
+    movement_otherwise: Movement | None = None
+    georeference_sd: float = NAN
     reasons: tuple[Reason, ...] = ()
 
 
@@ -141,9 +147,10 @@ def extract(
     shared_offset = registered.shared_offset_at(spheres.centres)
     if registered.stations is not None:
         spheres = assessment.with_shared_offset(spheres, shared_offset)
-    matched = movements = None
+    matched, georeference_sd = None, NAN
+    compared: list[Movement] = []
     if design is not None and (start.design_row >= 0).any():
-        matched, movements = _compare(registered, spheres, shared_offset, design, start.pose, options)
+        matched, compared, georeference_sd = _compare(registered, spheres, shared_offset, design, start.pose, options)
         if matched.status is Status.AMBIGUOUS:
             listed = start.pose is not None and len(start.pose.rivals) > 0
             spheres = assessment.with_ambiguous_matching(spheres, start.design_row >= 0, listed)
@@ -157,7 +164,9 @@ def extract(
         datum=registered.datum_at(spheres.centres, options.datum_mm) + shared_offset,
         stations=registered.stations,
         matching=matched,
-        movement=movements,
+        movement=compared[0] if compared else None,
+        movement_otherwise=compared[1] if len(compared) > 1 else None,
+        georeference_sd=georeference_sd,
         reasons=(*start.reasons, *of_stations),
     )
 
@@ -228,7 +237,7 @@ def _located(
     if pose.status is Status.FAILED:
         return replace(start, reasons=(*start.reasons, reason("spheres.design-not-found", reasons=pose.reasons)))
     nominal, middle = matching.expanded(design, options.expansion)
-    positions = rigid.apply(rigid.invert(pose.T_design_scan), nominal + middle) - source.origin
+    positions = rigid.apply(rigid.invert(pose.T_best_fit), nominal + middle) - source.origin
     # Found nodes are where they were found, the others where the design has them.
     extra = pose.assignment < 0
     positions[pose.assignment[~extra]] = seen.nodes.positions[~extra]
@@ -296,7 +305,7 @@ def _expected(start: Start, design: FrameDesign, origin: Floats, expansion: floa
     rows = start.design_row
     expected = np.where(rows >= 0, design.radii[np.maximum(rows, 0)], np.nan)
     disputed = np.zeros(len(rows), bool)
-    if start.pose is None or start.pose.status is Status.OK:
+    if start.pose is None or start.pose.status in (Status.OK, Status.WEAK):
         return expected, disputed
     if not len(start.pose.rivals):  # the pose is contradicted, and the true one is unknown
         return np.full(len(rows), np.nan), rows >= 0
@@ -329,21 +338,54 @@ def _compare(
     design: FrameDesign,
     pose: Matching | None,
     options: Options,
-) -> tuple[Matching, Movement]:
-    """Match the fitted spheres with the design, and return the movement of each from its nominal place."""
+) -> tuple[Matching, list[Movement], float]:
+    """Match the fitted spheres with the design, and return the movement of each from its nominal place.
+
+    Movements are those of the answer, then by the other gauge where there is one. The last is the standard deviation,
+    mm, of the place of all nodes along an axis of the project's frame.
+    """
     rows = np.flatnonzero(np.array([flag is not Flag.NOT_FOUND for flag in spheres.flag], bool))
     pattern = _pattern(spheres, rows, registered.measured.members, registered.source.origin)
     matched = _matched(pattern, design, pose, options.expansion)
     at, stations = pattern.positions.mean(axis=0), registered.trusted
-    common = np.diag([0.0, 0.0, 0.0, *3 * [options.datum_mm**2]]) if stations is None else stations.common(at)
+    common = _georeference(registered, spheres, pattern, options) if stations is None else stations.common(at)
     covariance = spheres.covariance[rows, :3, :3] + shared_offset[rows]
     shared = None if spheres.views is None else spheres.views.shared[rows, :3]
     if shared is not None:
         covariance = covariance - shared @ np.swapaxes(shared, 1, 2)
-    movements = movement(matched, pattern, covariance, design, common, at, shared, expansion=options.expansion)
+    answer = partial(movement, matched, pattern, covariance, design, common, at, shared, expansion=options.expansion)
+    gauges = [MovementGauge.BEST_FIT, *([MovementGauge.DESIGN] if matched.nearby else [])]
+    if matched.relation is matching.FrameRelation.SAME:
+        gauges.reverse()
+    movements = [answer(gauge=gauge) for gauge in gauges]
     assignment, weight = np.full(len(spheres.radii), -1, np.int64), np.zeros(len(spheres.radii))
     assignment[rows], weight[rows] = matched.assignment, matched.weight
-    return replace(matched, assignment=assignment, weight=weight), replace(movements, found=rows[movements.found])
+    shift = np.trace(common[3:, 3:]) / 3.0
+    georeference_sd = float(np.sqrt(shift if shared is None else shift + scanner_class_errors.SHIFT_SD_MM**2))
+    return (
+        replace(matched, assignment=assignment, weight=weight),
+        [replace(one, found=rows[one.found]) for one in movements],
+        georeference_sd,
+    )
+
+
+def _georeference(registered: _Registered, spheres: Spheres, pattern: NodePattern, options: Options) -> Floats:
+    """Covariance (6, 6) of the nodes' common motion in the project's frame, about their middle; mm, rad.
+
+    Where stations were not registered on the tubes: of several stations that of the mean of independent errors of the
+    size by which they disagree, else by the scanner's class. Errors of unnamed views have the shift already.
+    """
+    around = pattern.positions - pattern.positions.mean(axis=0)
+    common = scanner_class_errors.pose_covariance(around)
+    count, stations = len(registered.source.scanners), registered.stations
+    if count > 1 and (stations is None or stations.status is not StationStatus.UNKNOWN):
+        arm = max(0.5 * float(np.linalg.norm(np.ptp(around, axis=0))), 1.0)
+        mean = registered.measured.station_sd_mm**2 / count
+        common = np.diag(np.repeat([mean / arm**2, mean], 3))
+    elif spheres.views is not None:
+        common[3:, 3:] = 0.0
+    common[3:, 3:] += options.datum_mm**2 * np.eye(3)
+    return common
 
 
 def _pattern(spheres: Spheres, rows: Ints, joined: Members, origin: Floats) -> NodePattern:
@@ -364,15 +406,20 @@ def _matched(pattern: NodePattern, design: FrameDesign, pose: Matching | None, e
     """Match the nodes with the design; where its pose is known from the search it is only refined."""
     if pose is None:
         return matching.match(pattern, design, expansion=expansion)
-    T = pose.T_design_scan
+    # The frames of the two are the same to a few centimetres from here on.
+    T = pose.T_best_fit
     there = replace(pattern, positions=pattern.positions @ T[:3, :3].T, origin=T[:3, :3] @ pattern.origin + T[:3, 3])
-    refined = matching.match(there, design, expansion=expansion)
+    refined = matching.match(there, replace(design, coordinates=DESIGN_FRAMES[1]), expansion=expansion)
+    best = refined.T_best_fit @ T
+    same = pose.relation is matching.FrameRelation.SAME
     return replace(
         refined,
-        relation=matching.FrameRelation.REGISTERED,
+        relation=pose.relation,
         status=pose.status,
         rivals=pose.rivals,
         reasons=pose.reasons,
-        T_design_scan=refined.T_best_fit @ T,
-        T_best_fit=refined.T_best_fit @ T,
+        nearby=pose.nearby,
+        T_design_scan=pose.T_design_scan if same else best,
+        covariance=pose.covariance if same else refined.covariance,
+        T_best_fit=best,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,7 @@ from processor.model import (
     Checked,
     Floats,
     Ints,
+    Meaning,
     Reason,
     Rows,
     Status,
@@ -31,6 +33,7 @@ from processor.model import (
     described,
     names,
     newer,
+    optional,
     reasons,
     words,
     worst,
@@ -38,6 +41,7 @@ from processor.model import (
 
 BOUNDED = ("x", "y", "z", "radius", "lowest")  # columns of ``bound_sd``
 EFFICIENT = ("centre", "radius", "lowest")  # columns of ``efficiency``
+DISPLACEMENT = ("dx", "dy", "dz")
 NAN = float("nan")
 
 
@@ -64,8 +68,23 @@ class Evidence(Word):
 class MovementGauge(Word):
     """The datum that movements of nodes are relative to."""
 
-    DESIGN_FRAME = "design frame"
-    BEST_FIT = "best fit"
+    DESIGN = "design-coordinates"  # differences of coordinates
+    BEST_FIT = "best-fit"  # of all nodes: what moved as a whole is not in them
+
+    @classmethod
+    def _missing_(cls, value: object) -> MovementGauge | None:
+        """Return the gauge by its word in files of before version 2.4 of results."""
+        return {"design frame": cls.DESIGN, "best fit": cls.BEST_FIT}.get(str(value))
+
+
+class GaugeBasis(Word):
+    """Why movements are relative to their datum."""
+
+    STATED = "stated"  # by design_frame of the project
+    CONTROL = "control"  # control points, and the nodes are at the design's places in their frame
+    STATIONS = "stations"  # positions or poses of the scans, and the nodes are at the design's places in their frame
+    AGREEMENT = "agreement"  # the nodes are at the design's places in the scans' coordinates; nothing states the frame
+    PATTERN = "pattern"  # the pattern of the nodes alone relates scan and design
 
 
 class StationMotion(Word):
@@ -77,6 +96,12 @@ class StationMotion(Word):
     SHIFT_X = "shift along x"
     SHIFT_Y = "shift along y"
     SHIFT_Z = "shift along z"
+
+
+def _of_gauge(gauge: MovementGauge, key: str, means: Meaning, **shown: Any) -> Any:
+    """Declare a column (k, 3) of movements by a gauge, mm."""
+    where = "design_movement" if gauge is MovementGauge.DESIGN else "best_fit_movement"
+    return column("k", 3, json=f"movements.{gauge}.{key}", where=where, unit="mm", newer=True, means=means, **shown)
 
 
 @dataclass(frozen=True)
@@ -106,12 +131,28 @@ class Balls(Rows):
     stations: Ints = column("k", dtype=np.int64, means=COUNT)  # number that saw the ball
     bound_sd: Floats = column("k", 5, json="bound_sd.*", keys=BOUNDED, unit="mm", means=AMOUNT)
     efficiency: Floats = column("k", 3, json="efficiency.*", keys=EFFICIENT, means=AMOUNT)
-    movement: Floats = column("k", 3, json="movement.vector", where="movement", unit="mm", means=COORDINATE)
+    movement: Floats = column(
+        "k",
+        3,
+        json=("movement.vector", "movement.*"),
+        keys=DISPLACEMENT,
+        where="movement",
+        unit="mm",
+        means=COORDINATE,
+    )
     movement_ci95: Floats = column("k", 3, json="movement.ci95", where="movement", unit="mm", means=AMOUNT)
     movement_covariance: Floats = column("k", 3, 3, json="", means=COVARIANCE)
     movement_size: Floats = column("k", json="movement.size", where="movement", unit="mm", means=AMOUNT)
     movement_size_ci95: Floats = column("k", json="movement.size_ci95", where="movement", unit="mm", means=AMOUNT)
     verdict: tuple[Verdict, ...] = words("k", Verdict, json="movement.verdict", where="movement")
+    movement_gauge: tuple[MovementGauge, ...] = words(
+        "k", MovementGauge, json="movement.gauge", where="movement", newer=True
+    )
+    # By each gauge; one of the two is ``movement``.
+    design_movement: Floats = _of_gauge(MovementGauge.DESIGN, "*", COORDINATE, keys=DISPLACEMENT)
+    design_ci95: Floats = _of_gauge(MovementGauge.DESIGN, "ci95", AMOUNT)
+    best_fit_movement: Floats = _of_gauge(MovementGauge.BEST_FIT, "*", COORDINATE, keys=DISPLACEMENT)
+    best_fit_ci95: Floats = _of_gauge(MovementGauge.BEST_FIT, "ci95", AMOUNT)
 
     @property
     def placed(self) -> npt.NDArray[np.bool_]:
@@ -197,6 +238,26 @@ class MovementReference(Checked):
 
 
 @dataclass(frozen=True)
+class Gauges(Checked):
+    """Movements by both gauges, mm: which one is the answer, why, and how they differ.
+
+    ``georeference_sd`` is that of a shift of all nodes in the design's coordinates along an axis, in the intervals of
+    this gauge. ``difference`` (3,) is the mean of design coordinates minus best fit, ``largest_difference`` the largest
+    at a node. A gauge without a mean has no movements: the scan is not in the design's coordinates.
+    """
+
+    gauge: MovementGauge = described(words=MovementGauge)
+    basis: GaugeBasis = described(words=GaugeBasis)
+    georeference_sd: float = described(NAN, unit="mm", means=AMOUNT)
+    difference: Floats = optional(3, unit="mm", means=COORDINATE)
+    largest_difference: float = described(NAN, unit="mm", means=AMOUNT)
+    design_mean: Floats = optional(3, json=f"{MovementGauge.DESIGN}.mean", unit="mm", means=COORDINATE)
+    design_largest: float = described(NAN, json=f"{MovementGauge.DESIGN}.largest", unit="mm", means=AMOUNT)
+    best_fit_mean: Floats = optional(3, json=f"{MovementGauge.BEST_FIT}.mean", unit="mm", means=COORDINATE)
+    best_fit_largest: float = described(NAN, json=f"{MovementGauge.BEST_FIT}.largest", unit="mm", means=AMOUNT)
+
+
+@dataclass(frozen=True)
 class Result(Checked):
     """The spheres of a scene; only method ``ray`` has tubes, stations and movements."""
 
@@ -212,6 +273,7 @@ class Result(Checked):
     control: ControlDeviations = dataclasses.field(default_factory=ControlDeviations, metadata={"optional": True})
     limits: JudgedLimits | None = newer()  # all but those of movements of nodes, which are in ``balls``
     hangers: Hangers | None = newer()
+    gauges: Gauges | None = newer(json="movements")
 
     @property
     def has_bounds(self) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +13,7 @@ from processor.limits import standards
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
 from processor.space_frame import ball_catalogue, supports_and_deflections
 from processor.space_frame.ball_catalogue import Catalogue
-from processor.space_frame.design.matching import Matching
+from processor.space_frame.design.matching import FrameRelation, Matching
 from processor.space_frame.design.movement import Movement, size_of, verdict_of
 from processor.space_frame.extract import Extracted, Options, extract
 from processor.space_frame.members import station_error_propagation
@@ -25,6 +27,9 @@ from processor.space_frame.result import (
     DesignPose,
     Evidence,
     Flag,
+    GaugeBasis,
+    Gauges,
+    MovementGauge,
     MovementReference,
     Result,
     StationCorrections,
@@ -77,14 +82,16 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
     balls = _balls(extracted, source.origin, scene)
     matched, movements, stations = extracted.matching, extracted.movement, extracted.stations
     limit = standards.find(standards.default_for(scene.tolerance), standards.NODE_PLACE)
-    reference = pose = judged = None
-    if movements is not None:
+    reference = pose = judged = gauges = None
+    if movements is not None and matched is not None:
         reference = MovementReference(
             gauge=movements.gauge,
             limit=NAN if limit is None else limit.high,
             limit_source="" if limit is None else limit.source,
         )
-        balls = _with_movements(balls, movements, reference.limit, matched is not None and matched.status is Status.OK)
+        balls = _with_movements(balls, movements, reference.limit, matched.status is Status.OK)
+        balls = _by_gauge(balls, [movements, extracted.movement_otherwise])
+        gauges = _gauges(balls, extracted, scene)
     if scene.frame is not None:
         sure = matched is not None and matched.status is Status.OK
         judged = supports_and_deflections.judge(balls, scene.frame, standards.default_for(scene.tolerance), sure)
@@ -98,7 +105,7 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
     return Result(
         status=_status(balls, matched),
         method="ray",
-        reasons=_reasons(extracted, scene),
+        reasons=(*_reasons(extracted, scene), *_why(gauges)),
         balls=balls,
         movement_reference=reference,
         matching=pose,
@@ -107,6 +114,7 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
         datum=() if stations is None else stations.datum,
         control=ControlDeviations() if stations is None else _control(stations),
         limits=judged,
+        gauges=gauges,
     )
 
 
@@ -175,6 +183,70 @@ def _with_movements(balls: Balls, movements: Movement, limit: float, matched: bo
             for length, half, evidence in zip(size.tolist(), size_ci95.tolist(), balls.evidence, strict=True)
         ),
     )
+
+
+def _by_gauge(balls: Balls, movements: Sequence[Movement | None]) -> Balls:
+    """Add the movements of nodes by each gauge, the answer's first."""
+    columns: dict[str, Any] = {}
+    for one in movements:
+        if one is not None:
+            name = "design" if one.gauge is MovementGauge.DESIGN else "best_fit"
+            for column, values in ((f"{name}_movement", one.vector), (f"{name}_ci95", one.ci95)):
+                columns[column] = np.full((len(balls), 3), np.nan)
+                columns[column][one.found] = values
+            columns.setdefault("movement_gauge", (one.gauge,) * len(balls))
+    return replace(balls, **columns)
+
+
+def _gauges(balls: Balls, extracted: Extracted, scene: Scene) -> Gauges | None:
+    """Return which gauge is the answer and why, and how the two differ; None without the movement of a node."""
+    if not np.isfinite(balls.movement).any():
+        return None
+    made: dict[str, Any] = {}
+    for name, vector in (("design", balls.design_movement), ("best_fit", balls.best_fit_movement)):
+        if len(vector):
+            made[f"{name}_mean"] = np.nanmean(vector, axis=0)
+            made[f"{name}_largest"] = float(np.nanmax(np.linalg.norm(vector, axis=1)))
+    if len(balls.design_movement):
+        difference = balls.design_movement - balls.best_fit_movement
+        made["difference"] = np.nanmean(difference, axis=0)
+        made["largest_difference"] = float(np.nanmax(np.linalg.norm(difference, axis=1)))
+        made["georeference_sd"] = extracted.georeference_sd
+    return Gauges(gauge=balls.movement_gauge[0], basis=_basis(extracted, scene), **made)
+
+
+def _basis(extracted: Extracted, scene: Scene) -> GaugeBasis:
+    """Return why the scan is in the design's coordinates, or that only the pattern of the nodes relates them."""
+    matched, stations = extracted.matching, extracted.stations
+    if scene.frame is not None and scene.frame.coordinates:
+        return GaugeBasis.STATED
+    if matched is None or matched.relation is FrameRelation.REGISTERED:
+        return GaugeBasis.PATTERN
+    if stations is not None and stations.control_used.any():
+        return GaugeBasis.CONTROL
+    posed = any(scan.T_project_scan.size or scan.position.size for scan in scene.scans)
+    return GaugeBasis.STATIONS if posed or scene.stations is not None else GaugeBasis.AGREEMENT
+
+
+def _why(gauges: Gauges | None) -> Iterator[Reason]:
+    """Yield why movements are by their gauge, and how far the other gauge is from it."""
+    if gauges is None:
+        return
+    if gauges.gauge is MovementGauge.DESIGN:
+        sd = gauges.georeference_sd
+        yield {
+            GaugeBasis.STATED: reason("spheres.design-coordinates-stated", sd=sd),
+            GaugeBasis.CONTROL: reason("spheres.design-coordinates-control", sd=sd),
+            GaugeBasis.STATIONS: reason("spheres.design-coordinates-stations", sd=sd),
+            GaugeBasis.AGREEMENT: reason("spheres.design-coordinates-agreement", sd=sd),
+        }[gauges.basis]
+        yield reason("spheres.best-fit-differs", largest=gauges.largest_difference)
+        return
+    stated = gauges.basis is GaugeBasis.STATED
+    yield reason("spheres.best-fit-stated") if stated else reason("spheres.best-fit-pattern")
+    if len(gauges.difference):
+        size = float(np.linalg.norm(gauges.difference))
+        yield reason("spheres.coordinates-differ", largest=gauges.largest_difference, mean=size)
 
 
 def _tubes(extracted: Extracted, ids: Ints, origin: Floats) -> Tubes:

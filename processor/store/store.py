@@ -48,8 +48,8 @@ from processor.store.codec import DecodeError
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
 FORMAT_VERSION = "1.5"  # of scenes and truths
 READABLE = ("1.2", "1.3", "1.4", FORMAT_VERSION)  # fields added since may be absent
-RESULTS_VERSION = "2.3"
-RESULTS_READABLE = ("2.0", "2.1", "2.2", RESULTS_VERSION)
+RESULTS_VERSION = "2.4"
+RESULTS_READABLE = ("2.0", "2.1", "2.2", "2.3", RESULTS_VERSION)
 WITHOUT_CHECKSUMS = ("1.2", "1.3", "2.0")
 RESULTS_HISTORY = [
     "1.0 to 1.3: one flat record a step",
@@ -57,6 +57,7 @@ RESULTS_HISTORY = [
     "2.1: checksums",
     "2.2: diagnostics of a step",
     "2.3: the components of an inspection as tables",
+    "2.4: movements of nodes by both gauges",
 ]
 HISTORY = [
     "1.0: first",
@@ -458,7 +459,8 @@ def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int =
             item = getattr(value, field.name)
             if field.metadata.get("hashed_as_text"):
                 item = messages("en").text(item)
-            if not newer or (item is not None and not (isinstance(item, np.ndarray) and item.size == 0)):
+            absent = item is None or (isinstance(item, np.ndarray | tuple) and not np.size(item))
+            if not newer or not absent:
                 _feed(digest, field.name, item, pieces)
         digest.update(b")")
     elif isinstance(value, tuple):

@@ -166,13 +166,24 @@ def test_balls_without_a_design_are_matched_by_position():
 
 
 def test_movements_against_different_datums_are_doubtful():
-    first, later = whole(), whole(changed={"movement": whole().balls.movement + 9.0})
+    one_gauge = {"best_fit_movement": np.empty(0), "best_fit_ci95": np.empty(0)}  # as of an earlier version
+    first = whole(changed=one_gauge)
+    later = whole(changed={"movement": whole().balls.movement + 9.0, **one_gauge})
     fitted = dataclasses.replace(
-        later, movement_reference=dataclasses.replace(later.movement_reference, gauge="best fit")
+        later, movement_reference=dataclasses.replace(later.movement_reference, gauge="best-fit")
     )
     assert findings(space_frame, first, later)["10"].finding is Finding.CHANGED
     assert findings(space_frame, first, fitted)["10"].finding is Finding.DOUBTFUL
     assert codes(space_frame, first, fitted) == ["epochs.gauges-differ"]
+
+
+def test_movements_by_both_gauges_are_compared_by_the_best_fit_that_all_epochs_have():
+    first, later = whole(), whole(changed={"movement": whole().balls.movement + 9.0})
+    fitted = dataclasses.replace(
+        later, movement_reference=dataclasses.replace(later.movement_reference, gauge="best-fit")
+    )
+    assert findings(space_frame, first, fitted)["10"].finding is Finding.WITHIN
+    assert codes(space_frame, first, fitted) == ["epochs.gauges-differ-fitted"]
 
 
 def test_balls_of_epochs_without_movements_are_matched_by_position():

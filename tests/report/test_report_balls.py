@@ -19,18 +19,19 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import Scan, Scene, Stations, StepRun, Verdict, reason
+from processor.model import RecordError, Scan, Scene, Stations, StepRun, Verdict, reason
 from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, page, write_results
 from processor.report import table as report_table
 from processor.report.columns import columns
-from processor.report.space_frame import ball_picture, dxf, flagged_ball_figures
+from processor.report.space_frame import ball_picture, dxf, flagged_ball_figures, section
 from processor.report.space_frame import figures as space_frame_figures
 from processor.report.space_frame import tables as space_frame_tables
 from processor.report.style import COLOURS, DPI, Drawn
 from processor.results import to_json
 from processor.space_frame.result import (
     ControlDeviations,
+    MovementReference,
     Result,
     StationCorrections,
     Tubes,
@@ -120,7 +121,16 @@ def test_results_json_of_a_whole_frame():
     assert second["movement"]["size"] == 12.0
     assert "movement" not in lost
     assert "movement" not in extra
-    assert step["gauge"] == "design frame"
+    assert step["gauge"] == "design-coordinates"
+    assert [first["movement"][key] for key in ("gauge", "dx", "dy", "dz")] == ["design-coordinates", 3.0, 4.0, 0.0]
+    assert set(first["movements"]) == {"design-coordinates", "best-fit"}
+    assert [first["movements"]["best-fit"][key] for key in ("dx", "dy", "dz")] == [3.0, 4.0, 2.0]
+    assert first["movements"]["design-coordinates"]["ci95"] == first["movement"]["ci95"]
+    assert "movements" not in lost
+    movements = step["movements"]
+    assert (movements["gauge"], movements["basis"]) == ("design-coordinates", "stations")
+    assert (movements["difference"], movements["largest_difference"]) == ([0.0, 0.0, -2.0], 2.0)
+    assert movements["best-fit"]["largest"] == 10.0
     assert step["movement_limit"] == {"mm": 10.0, "source": "project.toml"}
     assert step["matching"]["status"] == "ok"
     assert step["matching"]["T_design_scan"] == np.eye(4).tolist()
@@ -150,7 +160,7 @@ def test_results_json_has_no_keys_of_absent_results():
     assert set(step) == {"status", "method", "reasons", "balls", "verdict"}
     assert "size" not in step["balls"][0]
     blind = written(without_design(whole()))
-    assert not {"gauge", "matching", "movement_limit"} & set(blind)
+    assert not {"gauge", "matching", "movement_limit", "movements"} & set(blind)
     assert "tubes" in blind
     assert "movement" not in blind["balls"][0]
 
@@ -160,6 +170,22 @@ def test_the_result_goes_through_the_store_unchanged(tmp_path):
     store.write_results(tmp_path / "r.h5", [StepRun("spheres", "ray", "{}", made)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {"spheres": Result})
     assert_equal(back.result, made)
+
+
+def test_results_of_earlier_versions_are_read_with_the_gauge_that_they_have():
+    assert MovementReference(gauge="design frame").gauge == "design-coordinates"
+    assert MovementReference(gauge="best fit").gauge == "best-fit"
+    with pytest.raises(RecordError, match="'other' is no MovementGauge"):
+        MovementReference(gauge="other")
+
+
+def test_the_headline_says_which_gauge_the_movements_are_by_and_how_far_the_other_is():
+    made = whole()
+    english = str(section.REPORT.summary(made)[0])
+    assert "movements of nodes as differences of coordinates: up to 12.0 mm (node 11)" in english
+    assert "a best fit differs by up to 2.0 mm" in english
+    assumed = dataclasses.replace(made, gauges=dataclasses.replace(made.gauges, basis="agreement"))
+    assert "differences of coordinates (assumed)" in str(section.REPORT.summary(assumed)[0])
 
 
 # --- tables --------------------------------------------------------------------------------------------------------
@@ -184,6 +210,9 @@ def test_csv_of_balls_and_of_lowest_points():
 def test_csv_of_nodes_tubes_and_stations():
     nodes = by_file("nodes")
     assert (nodes[0]["dx_mm"], nodes[0]["dy_mm"], nodes[0]["movement_mm"]) == ("3.0", "4.0", "5.0")
+    assert (nodes[0]["gauge"], nodes[0]["design_dz_mm"], nodes[0]["best_fit_dz_mm"]) == (
+        "design-coordinates", "0.0", "2.0",
+    )  # fmt: skip
     assert [row["verdict"] for row in nodes] == ["pass", "indeterminate", "", "pass", ""]
     assert {row["limit_mm"] for row in nodes} == {"10.0"}
     one, open_end = by_file("tubes")

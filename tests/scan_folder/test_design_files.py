@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
+from processor import store
 from processor.model import InputError
 from processor.scan_folder import folder
 from tests.support.files.scan_folders import BOX, TRIANGLES, arch_design, part, surface, write_ply, write_xyz
@@ -64,6 +66,20 @@ def test_the_projects_unit_precedes_that_of_the_command_for_a_table(tmp_path):
     )
     (tmp_path / "project.toml").write_text('units = "mm"\n')
     assert folder.read_input(tmp_path, "m").frame.radii.tolist() == [75, 75, 75]
+
+
+def test_the_project_states_the_frame_of_the_design(tmp_path):
+    write_xyz(tmp_path / "hall.xyz", surface())
+    (tmp_path / "design.json").write_text(json.dumps(FRAME))
+    assert folder.read_input(tmp_path).frame.coordinates is None
+    (tmp_path / "project.toml").write_text('design_frame = "own"\n')
+    scene = folder.read_input(tmp_path)
+    assert scene.frame.coordinates == "own"
+    store.write_scene(tmp_path / "a.h5", scene, None, {})
+    assert store.read_scene(tmp_path / "a.h5").frame.coordinates == "own"
+    assert store.scene_hash(scene) != store.scene_hash(
+        dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, coordinates=None))
+    )
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".obj"])

@@ -255,6 +255,8 @@ PROJECTS = {
     "absolute design": ("design = '/etc/passwd'", "leads out of the folder"),
     "zero": ('design = "a\\u0000b"', "leads out of the folder"),
     "STEP": ('kind = "arch-bridge"\ndesign = "scans/a.step"', "alone is a design of kind structure"),
+    "frame of a bridge": ('design = "design.json"\ndesign_frame = "own"', "is for the nodes of a space frame"),
+    "unknown frame": ('design_frame = "projct"', r"one of project, own as 'design_frame', .* \(did you mean 'project'"),
     "other design": ('design = "scans/foot1.xyz"', "expected a design as .json or .csv"),
 }
 

@@ -10,7 +10,7 @@ from designgen.scenes.make import make
 from processor import pipeline
 from processor.evaluation import space_frame
 from processor.geometry import rigid, thread_ranges
-from processor.model import Scan, reason
+from processor.model import FrameDesign, Scan, reason
 from processor.space_frame import step as space_frame_step
 from processor.space_frame import to_result
 from processor.space_frame.design.movement import verdict_of
@@ -49,7 +49,7 @@ def test_rows_are_the_designs_nodes_in_its_order(roof):
     scene, truth = roof
     result = space_frame_step.run(scene, space_frame_step.Params())
     assert result.balls.ids.tolist() == scene.frame.ids.tolist()
-    assert result.movement_reference.gauge == "design frame"
+    assert result.movement_reference.gauge == "design-coordinates"
     assert errors(result, truth).max() < 1.5
     true = truth.frame.centres - scene.frame.centres
     pull = (result.balls.movement - true) / (result.balls.movement_ci95 / 1.96)
@@ -62,12 +62,34 @@ def test_a_design_of_another_frame_is_found(roof):
     moved = dataclasses.replace(scene.frame, centres=scene.frame.centres @ R.T + t)
     result = space_frame_step.run(dataclasses.replace(scene, frame=moved), space_frame_step.Params())
     assert result.matching.status == "ok"
-    assert result.movement_reference.gauge == "best fit"
+    assert result.movement_reference.gauge == "best-fit"
     assert errors(result, truth).max() < 1.5
     turn = result.matching.T_design_scan[:3, :3] @ R.T
     assert np.degrees(rigid.rotation_angle(turn)) < 0.1  # nodes move by 5 mm over 12 m
     back = rigid.apply(result.matching.T_design_scan, result.balls.centres) - moved.centres
     assert np.linalg.norm(back, axis=1).max() < 30.0
+
+
+@pytest.mark.parametrize("stated", [None, "own"])
+def test_a_list_of_nodes_in_coordinates_of_the_site_gives_the_sag_and_the_best_fit_beside_it(roof, stated):
+    scene, truth = roof
+    share = (truth.frame.centres - truth.frame.centres.min(axis=0)) / np.ptp(truth.frame.centres, axis=0)
+    sag = np.column_stack([np.zeros((len(share), 2)), -4.0 - 42.0 * share[:, 0] ** 2 * share[:, 1]])
+    listed = FrameDesign(scene.frame.ids, truth.frame.centres - sag, scene.frame.radii, coordinates=stated)
+    result = space_frame_step.run(dataclasses.replace(scene, frame=listed), space_frame_step.Params())
+    row = {number: k for k, number in enumerate(result.balls.ids.tolist())}
+    rows = [row[number] for number in listed.ids.tolist()]
+    by_design, by_fit = result.balls.design_movement[rows], result.balls.best_fit_movement[rows]
+    assert np.abs(by_design - sag).max() < 0.5
+    assert result.gauges.largest_difference == pytest.approx(np.linalg.norm(by_design - by_fit, axis=1).max())
+    assert result.gauges.largest_difference > 4.0
+    answer = {None: by_design, "own": by_fit}[stated]
+    np.testing.assert_array_equal(result.balls.movement[rows], answer)
+    gauge, basis = {None: ("design-coordinates", "stations"), "own": ("best-fit", "stated")}[stated]
+    assert (result.gauges.gauge, result.gauges.basis, result.movement_reference.gauge) == (gauge, basis, gauge)
+    (matched,) = [one for one in result.reasons if one.code == "spheres.matched"]
+    assert (matched.values["frame"] == "same frame") == (gauge == "design-coordinates")
+    assert {f"spheres.{gauge}-{basis}"} < set(codes(result.reasons))
 
 
 def test_unbuilt_node_is_not_found_and_undesigned_node_is_extra(roof):

@@ -1,5 +1,7 @@
 """Nodes against a design: matching in any frame, ambiguous matchings, and movements of nodes."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -267,7 +269,7 @@ def test_movements_in_the_designs_own_frame():
     matched = match(found, shifted)
     assert matched.relation == "same frame"
     out = movement(matched, found, covariance, shifted)
-    assert out.gauge == "design frame"
+    assert out.gauge == "design-coordinates"
     np.testing.assert_array_equal(out.design, cloud.truth[out.found])
     np.testing.assert_allclose(out.vector, (cloud.moved + noise)[out.found], atol=1e-5)
     np.testing.assert_allclose(out.ci95, np.tile(1.96 * sd, (len(out.found), 1)), rtol=1e-3)
@@ -279,6 +281,67 @@ def test_movements_in_the_designs_own_frame():
     np.testing.assert_allclose(
         wider.covariance[:, 0, 0], sd[0] ** 2 + 0.4**2 + 1e-8 * (arm[:, 1] ** 2 + arm[:, 2] ** 2), rtol=1e-6
     )
+
+
+def sagged(d, most=42.0):
+    """Displacements of a roof that settled at one corner and sagged between its other edges."""
+    share = (d.centres - d.centres.min(axis=0)) / np.ptp(d.centres, axis=0)
+    down = 5.0 + most * share[:, 0] ** 2 * share[:, 1]
+    return np.column_stack([np.zeros((len(d.ids), 2)), -down])
+
+
+def at_the_site(d, origin, shift=(0.0, 0.0, 0.0)):
+    """A design in coordinates of the site, the movements of its nodes, and the nodes as found there."""
+    listed = dataclasses.replace(d, centres=d.centres + origin)
+    moved = sagged(d) + shift
+    return listed, moved, NodePattern(d.centres + moved, np.array(origin))
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (5.12e8, 3.39e9, 3.8e4)])
+def test_a_roof_that_sagged_in_coordinates_of_its_site_moved_by_the_difference_of_coordinates(origin):
+    listed, moved, found = at_the_site(design(nx=6, ny=7), origin)
+    matched = match(found, listed)
+    covariance = np.tile(0.04 * np.eye(3), (len(moved), 1, 1))
+    np.testing.assert_allclose(movement(matched, found, covariance, listed).vector, moved, atol=1e-5)
+    fit = movement(matched, found, covariance, listed, gauge=MovementGauge.BEST_FIT)
+    turn, _ = Rotation.align_vectors(
+        listed.centres - np.average(listed.centres, axis=0, weights=matched.weight),
+        found.positions - np.average(found.positions, axis=0, weights=matched.weight),
+        weights=matched.weight,
+    )
+    away = found.positions - np.average(found.positions, axis=0, weights=matched.weight)
+    nominal = listed.centres - np.average(listed.centres, axis=0, weights=matched.weight)
+    np.testing.assert_allclose(fit.vector, turn.apply(away) - nominal, atol=1e-4)
+    assert fit.vector[:, 2].min() > moved[:, 2].min() + 5.0  # the fit takes up what the whole settled by
+
+
+@pytest.mark.parametrize(
+    ("stated", "shift", "relation", "status", "nearby", "code"),
+    [
+        (None, 0.0, "same frame", "ok", True, ""),
+        ("project", 0.0, "same frame", "ok", True, ""),
+        ("own", 0.0, "registered", "ok", True, ""),
+        (None, 400.0, "registered", "ok", True, ""),
+        ("project", 400.0, "same frame", "weak", True, "spheres.frame-contradicted"),
+        (None, 90_000.0, "registered", "ok", False, ""),
+        ("project", 90_000.0, "same frame", "weak", True, "spheres.frame-contradicted"),
+    ],
+)
+def test_what_the_project_states_of_the_frame_decides_and_a_contradiction_is_flagged(
+    stated, shift, relation, status, nearby, code
+):
+    listed, moved, found = at_the_site(design(nx=6, ny=7), (0.0, 0.0, 0.0), (shift, 0.0, 0.0))
+    listed = dataclasses.replace(listed, coordinates=stated)
+    matched = match(found, listed)
+    assert (matched.relation, matched.status, matched.nearby) == (relation, status, nearby)
+    assert code in ("", *(one.code for one in matched.reasons))
+    np.testing.assert_array_equal(matched.assignment, np.arange(len(moved)))
+    if relation == "same frame":
+        out = movement(matched, found, np.zeros((len(moved), 3, 3)), listed)
+        np.testing.assert_allclose(out.vector, moved, atol=1e-6)
+        assert not matched.covariance.any()
+    else:
+        assert matched.covariance.any()
 
 
 def test_intervals_of_movements_after_a_best_fit_cover():
@@ -297,7 +360,7 @@ def test_intervals_of_movements_after_a_best_fit_cover():
         matched = match(found, d)
         assert matched.relation == "registered"
         out = movement(matched, found, covariance, d)
-        assert out.gauge == "best fit"
+        assert out.gauge == "best-fit"
         true, nominal = cloud.positions[out.found], d.centres[out.design]
         turn, _ = Rotation.align_vectors(
             nominal - np.average(nominal, axis=0, weights=matched.weight[out.found]),

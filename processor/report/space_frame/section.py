@@ -5,13 +5,15 @@ from __future__ import annotations
 import collections
 from collections.abc import Iterator
 
+import numpy as np
+
 from processor.language.messages import Message, text
 from processor.model import Status, StepRun
 from processor.pipeline import Execution
 from processor.report.space_frame import dxf, figures, hanger_report, interactive_view, tables
 from processor.report.step_report import StepReport
 from processor.report.stitching import targets
-from processor.space_frame.result import Flag, Result
+from processor.space_frame.result import Flag, GaugeBasis, Gauges, MovementGauge, Result
 
 
 def _summary(result: Result) -> tuple[Message, Message | str]:
@@ -25,7 +27,27 @@ def _summary(result: Result) -> tuple[Message, Message | str]:
         count=flags[Flag.OK],
         balls=len(result.balls),
     )
+    if result.gauges is not None:
+        head = text("{head}; {movements}", head=head, movements=_movements(result, result.gauges))
     return head, text("Flagged: {counts}.", counts=counts) if counts else ""
+
+
+def _movements(result: Result, gauges: Gauges) -> Message:
+    """Say by which gauge the movements are, how large, and how far the other gauge is from it."""
+    size = result.balls.movement_size
+    node, largest = result.balls.ids[int(np.nanargmax(size))], float(np.nanmax(size))
+    if gauges.gauge is MovementGauge.DESIGN:
+        agreed = gauges.basis is GaugeBasis.AGREEMENT
+        what = text("differences of coordinates (assumed)") if agreed else text("differences of coordinates")
+        other = text("a best fit differs")
+    else:
+        what, other = text("what a best fit leaves"), text("differences of coordinates differ")
+    by = text(
+        "movements of nodes as {what}: up to {largest:.1f} mm (node {node})", what=what, largest=largest, node=node
+    )
+    if not len(gauges.difference):
+        return by
+    return text("{by}, {other} by up to {difference:.1f} mm", by=by, other=other, difference=gauges.largest_difference)
 
 
 def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:

@@ -13,7 +13,7 @@ import numpy as np
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import NORMAL_95, Floats, Status, StepRun, Verdict
-from processor.report.columns import MM, XYZ, columns
+from processor.report.columns import MM, XYZ, columns, under
 from processor.report.space_frame import hanger_report
 from processor.report.table import NAN, Table
 from processor.robust_statistics import finite_median
@@ -21,6 +21,9 @@ from processor.space_frame.result import Balls, Evidence, Flag, Result
 from processor.space_frame.spheres.baselines import SAME
 
 COORDINATES = tuple(f"{axis}_mm" for axis in XYZ)
+BY_GAUGE = tuple(
+    f"{half}{gauge}_d{axis}_mm" for gauge in ("design", "best_fit") for half in ("", "ci95_") for axis in XYZ
+)
 
 
 def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
@@ -254,7 +257,53 @@ def _nodes(result: Result) -> list[Table]:
         "limit_mm", "verdict", "flag", "remark",
     )  # fmt: skip
     title, note = text("Nodes against the design"), _nodes_note(result)
-    return [Table(title, header, rows, "nodes", note, units=MM, on_terminal=False)]
+    if result.gauges is None:  # of an earlier version
+        return [Table(title, header, rows, "nodes", note, units=MM, on_terminal=False)]
+    by_gauge = [_by_gauge(result, i) for i in range(len(balls))]
+    full = Table(
+        title, (*header, *columns("gauge", *BY_GAUGE)),
+        tuple((*row, *more) for row, more in zip(rows, by_gauge, strict=True)),
+        "nodes", note, units=MM, on_page=False, on_terminal=False,
+    )  # fmt: skip
+    return [Table(title, header, rows, note=note, units=MM, on_terminal=False), *_gauges(result), full]
+
+
+def _by_gauge(result: Result, i: int) -> tuple[Any, ...]:
+    """Return the gauge of a node's movement, and the movement with its intervals by each gauge."""
+    balls = result.balls
+    numbers = [
+        column[i].tolist() if len(column) else [NAN] * 3
+        for column in (balls.design_movement, balls.design_ci95, balls.best_fit_movement, balls.best_fit_ci95)
+    ]
+    return (balls.movement_gauge[i], *(number for three in numbers for number in three))
+
+
+def _gauges(result: Result) -> list[Table]:
+    """Movements by both gauges beside each other, and how far they differ; none where there is one gauge."""
+    balls, gauges = result.balls, result.gauges
+    if gauges is None or not len(balls.design_movement):
+        return []
+    difference = np.linalg.norm(balls.design_movement - balls.best_fit_movement, axis=1)
+    rows = tuple(
+        (ball, *balls.design_movement[i].tolist(), *balls.best_fit_movement[i].tolist(), float(difference[i]))
+        for i, ball in enumerate(balls.ids.tolist())
+        if np.isfinite(difference[i])
+    )
+    axes = ("dx_mm", "dy_mm", "dz_mm")
+    header = (
+        *columns("id"),
+        *under(text("differences of coordinates"), *axes),
+        *under(text("relative to a best fit"), *axes),
+        *columns("difference_mm"),
+    )
+    note = text(
+        "The answer is by {gauge}. The two differ by a motion of the whole: {mean:.2f} mm on average, {largest:.2f} mm "
+        "at most.",
+        gauge=gauges.gauge,
+        mean=float(np.linalg.norm(gauges.difference)),
+        largest=gauges.largest_difference,
+    )
+    return [Table(text("Movements by both gauges"), header, rows, note=note, units=MM, on_terminal=False)]
 
 
 def _nodes_note(result: Result) -> Message:
@@ -272,9 +321,12 @@ def _nodes_note(result: Result) -> Message:
     doubt: Message | str = ""
     if matching is not None and matching.status is not Status.OK:
         doubt = text(" The assignment of the nodes is not certain (matching {status}).", status=matching.status)
+    gauge: Message = reference.gauge
+    if result.gauges is not None:
+        gauge = text("{gauge} ({basis})", gauge=reference.gauge, basis=result.gauges.basis)
     return text(
-        "Found minus nominal, axes of the design; relative to: {gauge}. {limit}{doubt}",
-        gauge=reference.gauge,
+        "Found minus nominal, axes of the design; gauge: {gauge}. {limit}{doubt}",
+        gauge=gauge,
         limit=limit,
         doubt=doubt,
     )

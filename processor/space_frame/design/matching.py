@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
 from processor.model import (
+    DESIGN_FRAMES,
     Checked,
     Floats,
     FrameDesign,
@@ -77,8 +78,8 @@ class Matching(Checked):
 
     ``T_design_scan`` maps coordinates of the scan (the origin added) to the design's frame; its ``covariance`` (turn
     about the design frame's axes, translation; T = exp(xi) T) treats the nodes' movements as random. It is 0 where the
-    frame is the design's own, for then nothing was estimated. ``T_best_fit`` is the best fit over all matched nodes in
-    either case.
+    frame is the same, for then nothing was estimated. ``T_best_fit`` is the best fit over all matched nodes in either
+    case.
     """
 
     status: Status = described(words=Status)  # ok | ambiguous | failed
@@ -88,6 +89,7 @@ class Matching(Checked):
     covariance: Floats = column(6, 6)
     T_best_fit: Floats = column(4, 4)
     assignment: Ints = column("k", dtype=np.int64)  # row of the design of each found node, -1 = extra
+    nearby: bool = False  # in the scan's own coordinates most nodes are nearest to the design node they are matched to
     weight: Floats = column("k")  # of each node in the best fit
     missing: Ints = column("d", dtype=np.int64)  # rows of the design without a node
     rivals: Floats = column("r", 4, 4)  # other T_design_scan that explain as much
@@ -143,7 +145,9 @@ def match(
 ) -> Matching:
     """Match found nodes with a design's, each being up to about ``tolerance_mm`` off its nominal place.
 
-    ``expansion`` is the factor of all lengths by temperature. Up to half of the nodes may be missing or extra.
+    ``expansion`` is the factor of all lengths by temperature. Up to half of the nodes may be missing or extra. A design
+    whose coordinates are stated to be its own is registered, one that is stated to be in the project's frame is not:
+    where its nodes are not at their places there, the status is ``weak``.
     ``sized`` returns the same nodes with their spheres' radii, where ``nodes`` has none: it is called once at most,
     where the pattern of the nodes is like itself elsewhere.
     """
@@ -161,7 +165,7 @@ def match(
     if same is not None:
         few = min(1.0 - same.matched / d, 1.0 - same.matched / k) <= DOUBTFUL_SHARE or k < 4
         if few or not _better_nearby(to_design, same.matched, problem):
-            return _answer(same, [], FrameRelation.SAME, problem, ())
+            return _answer(same, [], _relation(design), problem, ())
     candidates = _searched(problem) if k >= 4 and d >= 4 else []
     candidates = [candidate for candidate in candidates if candidate.matched >= max(least, 4)]
     every = _with_radii([same, *candidates] if same is not None else candidates, problem, sized)
@@ -172,14 +176,42 @@ def match(
             if rival.odds < same.odds - DECISIVE and not _alike(rival.T, to_design, nodes.positions, 5.0 * tolerance_mm)
         ]  # fmt: skip
         doubts = (reason("spheres.better-pose"),) if rivals else ()
-        return _answer(same, rivals[:1], FrameRelation.SAME, problem, doubts)
+        return _answer(same, rivals[:1], _relation(design), problem, doubts)
     if not every:
         return _failed(k, d, reason("spheres.no-pose"))
     best = _best(every, problem)
+    if design.coordinates == DESIGN_FRAMES[0]:
+        best = _as_stated(best, problem)
     leftover = min(len(best.missing), int((best.assignment < 0).sum()))
     if sized is not None and len(every) > 1 and leftover and sizes_contradict(sized(), design, best.assignment):
         return replace(best, status=Status.AMBIGUOUS, reasons=(*best.reasons, reason("spheres.sizes-contradict")))
     return best
+
+
+def _relation(design: FrameDesign) -> FrameRelation:
+    """Return the relation of frames whose nodes have the same coordinates."""
+    return FrameRelation.REGISTERED if design.coordinates == DESIGN_FRAMES[1] else FrameRelation.SAME
+
+
+def _as_stated(registered: Matching, problem: _Problem) -> Matching:
+    """Return a matching in the project's frame, as the project states it against the nodes' places."""
+    nodes = problem.nodes
+    on = registered.assignment >= 0
+    off = rigid.apply(registered.T_best_fit, nodes.positions[on] + nodes.origin) - nodes.positions[on] - nodes.origin
+    contradiction = reason(
+        "spheres.frame-contradicted",
+        distance=float(np.median(np.linalg.norm(off, axis=1))),
+        turn=1000.0 * rigid.rotation_angle(registered.T_best_fit[:3, :3]),
+    )
+    return replace(
+        registered,
+        status=Status.WEAK if registered.status is Status.OK else registered.status,
+        relation=FrameRelation.SAME,
+        reasons=(*registered.reasons, contradiction),
+        T_design_scan=np.eye(4),
+        covariance=np.zeros((6, 6)),
+        nearby=True,
+    )
 
 
 # --- candidates ------------------------------------------------------------------------------------------------------
@@ -370,6 +402,8 @@ def _best(candidates: list[_Candidate], problem: _Problem) -> Matching:
     candidates = sorted(candidates, key=lambda candidate: candidate.odds)
     level = [candidate for candidate in candidates if candidate.odds < candidates[0].odds + DECISIVE]
     doubts: tuple[Reason, ...] = ()
+    if problem.design.coordinates == DESIGN_FRAMES[0]:
+        level = [candidate for candidate in level if _is_nearby(candidate, problem)] or level
     upright = [candidate for candidate in level if candidate.T[2, 2] > UPRIGHT_COS]
     if upright and len(upright) < len(level):
         doubts = (reason("spheres.turned-over"),)
@@ -377,6 +411,13 @@ def _best(candidates: list[_Candidate], problem: _Problem) -> Matching:
     if len(level) > 1:
         doubts = (reason("spheres.equal-poses", poses=len(level)),)
     return _answer(level[0], level[1:], FrameRelation.REGISTERED, problem, doubts)
+
+
+def _is_nearby(candidate: _Candidate, problem: _Problem) -> bool:
+    """Whether in the scan's own coordinates most nodes are nearest to the design's nodes they are assigned to."""
+    on, to_design = candidate.assignment >= 0, problem.nodes.origin - problem.middle
+    nearest = problem.tree.query(problem.nodes.positions[on] + to_design)[1]
+    return bool(np.mean(nearest == candidate.assignment[on]) > LEAST_SHARE)
 
 
 def _answer(
@@ -413,6 +454,7 @@ def _answer(
         covariance=covariance,
         T_best_fit=_full(best, nodes.origin, middle),
         assignment=chosen.assignment,
+        nearby=_is_nearby(chosen, problem),
         weight=chosen.weight,
         missing=missing,
         rivals=np.array([_full(rival.T, nodes.origin, middle) for rival in rivals]).reshape(-1, 4, 4),

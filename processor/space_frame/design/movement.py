@@ -1,9 +1,11 @@
 """Movement of every node from its nominal place, with its uncertainty.
 
-A movement is found minus nominal in the design's frame, relative to a datum. Where the scan is in the design's own
-frame the datum is this frame, and its uncertainty is part of every interval. Where the scan had to be registered the
-datum is the best fit over all matched nodes: a movement common to all is removed, and the uncertainty of the fit, which
-comes from the nodes it rests on, is part of every interval (Teunissen 2000, S-transformations).
+A movement is found minus nominal in the design's frame, relative to a datum (gauge). In the design's coordinates it is
+the difference of coordinates, and the uncertainty of the scan's place in this frame is part of every interval. By a
+best fit over all matched nodes a movement common to all is removed, and the uncertainty of the fit, which comes from
+the nodes it rests on, is part of every interval (Teunissen 2000, S-transformations). Where the scan had to be
+registered there is the best fit alone. Both are rigid motions of each other: what a node moved relative to its
+neighbours is the same in both, how far the whole moved is in the design's coordinates alone.
 """
 
 from __future__ import annotations
@@ -58,12 +60,12 @@ def movement(
     """
     if gauge is None:
         same = matching.relation is FrameRelation.SAME
-        gauge = MovementGauge.DESIGN_FRAME if same else MovementGauge.BEST_FIT
-    in_frame = gauge is MovementGauge.DESIGN_FRAME
+        gauge = MovementGauge.DESIGN if same else MovementGauge.BEST_FIT
+    in_frame = gauge is MovementGauge.DESIGN
     rows = np.flatnonzero(matching.assignment >= 0)
     assigned = matching.assignment[rows]
     nominal, middle = expanded(design, expansion)
-    T = matching.T_design_scan if in_frame else matching.T_best_fit
+    T = np.eye(4) if in_frame else matching.T_best_fit
     R = T[:3, :3]
     # offset less offset first: adding either to the nodes would lose digits
     positions = nodes.positions[rows] @ R.T + (R @ nodes.origin + T[:3, 3] - middle)

@@ -20,12 +20,14 @@ UNITS = {"mm", "km", "mrad", "ci", "ci95"}
 METHODS = {"adjustment", "corner", "line", "design", "aided", "ray", "ransac", "least", "squares"}
 STANDARDS = {"GB", "Cram", "rao"}  # Cramér-Rao, the name of a bound
 IN_FILES = {
+    "design_frame",
+    "project",
+    "own",
     "foot1",
     "rib1",
     "foot2",
     "bridge",
     "frame",
-    "project",
     "toml",
     "balls",
     "results",

@@ -21,6 +21,7 @@ from processor.space_frame.design import movement
 from processor.space_frame.result import (
     Balls,
     DesignPose,
+    Gauges,
     MovementReference,
     Result,
     StationCorrections,
@@ -58,6 +59,8 @@ NAN = float("nan")
 NOMINAL = np.array([[0.0, 0, 6000], [3000, 0, 6000], [0, 4000, 6000], [3000, 4000, 6000], [1500, 2000, 8000]])
 
 MOVED = np.array([[3.0, 4, 0], [0, 0, -12.0], [NAN] * 3, [0.3, 0, 0.4], [NAN] * 3])
+
+SETTLED = np.array([0.0, 0.0, 2.0])  # less in the movements after a best fit
 
 FLAG = ("ok", "wrong-size", "not-found", "low-confidence", "ok")
 
@@ -112,6 +115,11 @@ def whole(limit=10.0, T=None, matching="ok", changed=None, **changes):
         "movement": MOVED,
         "movement_ci95": 1.96 * np.sqrt(np.einsum("kii->ki", moved_covariance)),
         "movement_covariance": moved_covariance,
+        "movement_gauge": ("design-coordinates",) * 5,
+        "design_movement": MOVED,
+        "design_ci95": 1.96 * np.sqrt(np.einsum("kii->ki", moved_covariance)),
+        "best_fit_movement": MOVED + SETTLED,
+        "best_fit_ci95": np.sqrt(np.einsum("kii->ki", moved_covariance)),
         **(changed or {}),
     }
     size, ci95 = movement.size_of(np.asarray(columns["movement"]), np.asarray(columns["movement_covariance"]))
@@ -125,7 +133,18 @@ def whole(limit=10.0, T=None, matching="ok", changed=None, **changes):
         reasons=(reason("spheres.ranges"),),
         balls=Balls(**columns, movement_size=size, movement_size_ci95=ci95, verdict=verdict),
         movement_reference=MovementReference(
-            gauge="design frame", limit=limit, limit_source="" if math.isnan(limit) else "project.toml"
+            gauge="design-coordinates", limit=limit, limit_source="" if math.isnan(limit) else "project.toml"
+        ),
+        gauges=Gauges(
+            gauge="design-coordinates",
+            basis="stations",
+            georeference_sd=0.3,
+            difference=-SETTLED,
+            largest_difference=2.0,
+            design_mean=np.nanmean(MOVED, axis=0),
+            design_largest=12.0,
+            best_fit_mean=np.nanmean(MOVED + SETTLED, axis=0),
+            best_fit_largest=10.0,
         ),
         matching=DesignPose(status=matching, T_design_scan=T, covariance=np.zeros((6, 6)), rivals=np.empty((0, 4, 4))),
         tubes=Tubes(
@@ -151,9 +170,14 @@ def whole(limit=10.0, T=None, matching="ok", changed=None, **changes):
 def without_design(result):
     """The same balls as found without a design: no movements."""
     none = np.empty(0)
-    names = ("movement", "movement_ci95", "movement_covariance", "movement_size", "movement_size_ci95")
-    found = dataclasses.replace(result.balls, **dict.fromkeys(names, none), verdict=("none",) * len(result.balls))
-    return dataclasses.replace(result, balls=found, movement_reference=None, matching=None)
+    names = (
+        "movement", "movement_ci95", "movement_covariance", "movement_size", "movement_size_ci95", "design_movement",
+        "design_ci95", "best_fit_movement", "best_fit_ci95",
+    )  # fmt: skip
+    found = dataclasses.replace(
+        result.balls, **dict.fromkeys(names, none), movement_gauge=(), verdict=("none",) * len(result.balls)
+    )
+    return dataclasses.replace(result, balls=found, movement_reference=None, matching=None, gauges=None)
 
 
 def repeated(result, times):
