@@ -228,14 +228,7 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
         hashes={name: cloud.sha256 for name, cloud in clouds.items()} | given,
         normals_from=source,
         turned=turned,
-        read=(
-            *read,
-            *(
-                scene_cloud.coincident(cloud.left_out, cloud.left_out + cloud.count, cloud.path.name)
-                for cloud in (reference, compared)
-                if cloud.left_out
-            ),
-        ),
+        read=read,
     )
     _log_warnings(comparison, log)
     return comparison
@@ -262,7 +255,10 @@ def _read_clouds(request: Request) -> tuple[dict[str, _Cloud], tuple[Reason, ...
             scale = np.array([MM_PER_UNIT[axis] for axis in (unit.horizontal, unit.horizontal, unit.vertical)]) / into
             clouds[name] = replace(clouds[name], stated=stated["reference"].horizontal, scale=scale)
     for name in CLOUDS[:2]:  # rows of core points stay those of their file
-        clouds[name] = _once(clouds[name])
+        cloud = clouds[name] = _once(clouds[name])
+        if cloud.left_out:
+            count = cloud.left_out + cloud.count
+            remarks = (*remarks, scene_cloud.coincident(cloud.left_out, count, cloud.path.name))
     for cloud in (clouds["reference"], clouds["compared"]):
         if cloud.count < m3c2.FEWEST_FOR_LOD:
             raise InputError(

@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import processor.readers.epsg_units as epsg_units
 from processor.model import Reason, reason
-from processor.readers import epsg_units
 
 UNIT = "m"
 # Keys of GeoTIFF 1.1.

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+import processor.readers.coordinate_system as coordinate_system
 import processor.readers.pieces as pieces
 from processor.large_arrays import allocate
 from processor.model import InputError, reason
-from processor.readers import coordinate_system
 from processor.readers.colours import coloured
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
