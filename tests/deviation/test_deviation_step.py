@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 from designgen import recipe_files
 from designgen.scenes.make import make
@@ -339,6 +340,11 @@ def test_method_paper_reports_points_without_level_at_its_scales(tmp_path):
     assert result.registration_error < 0.01  # of a clone: repeatability alone
     assert np.isnan(result.core.lod95[np.minimum(result.core.n1, result.core.n2) < 4]).all()
     assert "deviation.paper-scales" in codes(result)
+    mesh = trimesh.Trimesh(scene.structure.vertices, scene.structure.faces, process=False)
+    surface, face = trimesh.sample.sample_surface(mesh, 20_000, seed=0)
+    nearest = face[cKDTree(surface).query(result.core.points + result.origin)[1]]
+    outward = np.einsum("ni,ni->n", result.core.normals, mesh.face_normals[nearest])
+    assert np.nanmean(outward > 0.0) > 0.99
     known = np.isfinite(result.core.lod95)
     expected = 1.96 * (
         np.sqrt(result.core.std1**2 / result.core.n1 + result.core.std2**2 / result.core.n2)[known]
