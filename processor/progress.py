@@ -1,9 +1,10 @@
-"""Progress on a terminal: a line on standard error for every stage that takes more than two seconds."""
+"""Progress of stages on standard error: a line that is refreshed on a terminal, one every half minute in a file."""
 
 from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from processor.plain_text import printable
 Item = TypeVar("Item")
 PATIENCE_S = 2.0
 REFRESH_S = 0.25
+FIRST_LINE_S, LINE_S = 10.0, 30.0  # off a terminal: a log is read afterwards, or by somebody who waits
 COUNTED = "{desc}: {n_fmt} of {total_fmt} |{bar}| {elapsed}, {remaining} left"
 UNCOUNTED = "{desc}: {elapsed}"
 IN_PARTS = "{desc}: {percentage:3.0f} % |{bar}| {elapsed}, {remaining} left"
@@ -28,17 +30,30 @@ class _Stage:
 
 
 _stages: list[_Stage] = []
+_in_lines = False
+
+
+@contextmanager
+def in_lines(wanted: bool = True) -> Iterator[None]:
+    """Print lines about long stages where standard error is no terminal, as long as the context lasts."""
+    global _in_lines
+    before, _in_lines = _in_lines, wanted
+    try:
+        yield
+    finally:
+        _in_lines = before
 
 
 @contextmanager
 def stage(title: str) -> Iterator[None]:
     """Show a title with the time elapsed while the block runs, and the progress of :func:`tracked` within it."""
-    if not sys.stderr.isatty():
+    terminal = sys.stderr.isatty()
+    if not (terminal or _in_lines):
         yield
         return
     # A title may hold the name of a file, which a terminal must not obey.
     ended, current = threading.Event(), _Stage(printable(title))
-    display = threading.Thread(target=_show, args=(current, ended), daemon=True)
+    display = threading.Thread(target=_show if terminal else _print_lines, args=(current, ended), daemon=True)
     _stages.append(current)
     display.start()
     try:
@@ -77,3 +92,11 @@ def _show(current: _Stage, ended: threading.Event) -> None:
             bar.bar_format = UNCOUNTED if not current.total else IN_PARTS if current.share else COUNTED
             bar.n = current.done + current.share if current.share else current.done
             bar.refresh()
+
+
+def _print_lines(current: _Stage, ended: threading.Event) -> None:
+    started, wait = time.monotonic(), FIRST_LINE_S
+    while not ended.wait(wait):
+        of = f", {current.done} of {current.total}" if current.total else ""
+        print(f"{current.title}: {time.monotonic() - started:.0f} s{of}", file=sys.stderr, flush=True)
+        wait = LINE_S

@@ -71,10 +71,10 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
     limits = options.pop("timeout_s"), options.pop("memory_mb")
     if any(limit is not None for limit in limits):
         context.exit(limited_run(input_, output, *limits, _arguments({**options, "fail_on": fail_on})))
-    from processor import diagnostics
+    from processor import diagnostics, progress
     from processor.api import runs  # in two seconds, which the process that waits for a limited run spares
 
-    with diagnostics.with_clouds(options["keep_steps"]):
+    with diagnostics.with_clouds(options["keep_steps"]), progress.in_lines(not shown.quiet):
         results = runs.compute(
             input_,
             output,

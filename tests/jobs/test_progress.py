@@ -29,6 +29,21 @@ def test_long_stage_is_shown_on_a_terminal_alone(monkeypatch, terminal, lasts):
     assert not progress._stages
 
 
+@pytest.mark.parametrize("wanted", [True, False])
+def test_a_command_prints_lines_of_a_long_stage_off_a_terminal(monkeypatch, wanted):
+    shown = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", shown)
+    monkeypatch.setattr(progress, "FIRST_LINE_S", 0.02)
+    monkeypatch.setattr(progress, "LINE_S", 0.02)
+    with progress.in_lines(wanted), progress.stage("measuring"):
+        for _ in progress.tracked("abc"):
+            time.sleep(0.1)
+    assert ("measuring: 0 s, 1 of 3\n" in shown.getvalue()) is wanted
+    with progress.stage("later"):
+        time.sleep(0.05)
+    assert "later" not in shown.getvalue()
+
+
 def test_errors_within_a_stage_are_raised(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     with pytest.raises(ValueError, match="no"), progress.stage("measuring"):
