@@ -345,7 +345,9 @@ def execute(
                 needs["kept"] = kept.setdefault(job.step, {})
             with diagnostics.recording() as notes:
                 done = _run(path, scene, job, {**given, **needs}, log)
-            result = dataclasses.replace(done.result, reasons=(*done.result.reasons, *coincident))
+            result = done.result
+            if coincident:
+                result = dataclasses.replace(result, reasons=(*result.reasons, *coincident))
             runs.append(dataclasses.replace(done, result=result, diagnostics=notes.table()))
             clouds += [StepCloud(job.step, job.method, cloud) for cloud in notes.clouds]
             answers.setdefault(job.step, done.result)

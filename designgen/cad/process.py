@@ -21,6 +21,7 @@ from designgen.cad.bodies import Body, CadFile
 from designgen.cad.face_surfaces import Form, Forms, surface_of
 from processor.jobs.child import end_with_parent
 from processor.model import InputError, UsageError
+from processor.plain_text import decoded
 
 
 def serve() -> None:
@@ -175,17 +176,13 @@ def parse(
 
 
 def escaped(content: bytes) -> bytes:
-    """Return a file's text in ASCII with all other characters escaped by ISO 10303-21, from UTF-8 or else GB 18030.
+    """Return a file's text in ASCII with all other characters escaped by ISO 10303-21.
 
     Many programs write names unescaped, against the standard; the kernels take them for Latin letters or drop them.
     """
     if content.isascii():
         return content
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError:
-        text = content.decode("gb18030", errors="replace")
-    return escape(text.removeprefix("\ufeff")).encode("ascii")
+    return escape(decoded(content)).encode("ascii")
 
 
 def escape(text: str) -> str:

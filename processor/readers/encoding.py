@@ -4,15 +4,7 @@ from __future__ import annotations
 
 import os
 
-
-def decoded(data: bytes) -> str:
-    """Decode bytes as UTF-8, or else as GB18030, or else as UTF-8 with replacement characters."""
-    for encoding in ("utf-8-sig", "gb18030"):
-        try:
-            return data.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-    return data.decode("utf-8", "replace")
+from processor.plain_text import decoded
 
 
 def file_name_as_text(name: str) -> str:

@@ -21,11 +21,11 @@ import processor.readers.pieces as pieces
 from processor import column_names, large_arrays
 from processor.large_arrays import allocate
 from processor.model import Floats, InputError
+from processor.plain_text import decoded
 from processor.readers.ascii_rows import Rows
 from processor.readers.colours import coloured
 from processor.readers.colours import named as colours_named
 from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, axes, first_named
-from processor.readers.encoding import decoded
 from processor.readers.file_checks import check_declared_points, check_last_row, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 

@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from processor.model import InputError
-from processor.readers.encoding import decoded
+from processor.plain_text import decoded
 from processor.readers.file_checks import errors_name_the_file
 
 

