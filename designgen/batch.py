@@ -38,7 +38,6 @@ MOST_SEED = 2**63
 SOFTWARE = ("h5py", "numba", "numpy", "scipy")  # packages that a scene's bytes depend on; CAD solids are no part of it
 SCENE_FILE = re.compile(r".+-\d{5}-seed\d+\.h5")
 OF_SET = (INDEX, card.CARD_JSON, card.CARD_PAGE)
-LEFTOVER = re.compile(rf"\.({SCENE_FILE.pattern}|{'|'.join(map(re.escape, OF_SET))})\.\d+-[0-9a-f]{{8}}\.tmp")
 LOSSES = {
     Loss.DIED: "the process that made it died twice (out of memory?); run again, with fewer jobs at a time",
     Loss.STOPPED: "stopped",
@@ -62,7 +61,7 @@ def make_scene(
     from processor.store import store
     from processor.store.output_checks import check_file
 
-    check_file(path)
+    check_file(path, ".h5", "a scene")
     # The last bits of BLAS results depend on the number of threads.
     with threadpool_limits(1, user_api="blas"):
         made, truth = make.make(name, recipe_files.with_files_in(recipe, folder), seed)
@@ -286,6 +285,7 @@ def make_many(
     InputError if the cluster is lost on the way or the folder cannot be written.
     """
     from processor.store.atomic_file import replace_text
+    from processor.store.making import remove_leftovers
 
     _make_folder(folder)
     busy = f"{folder}: another designgen is making scenes here; wait for it or stop it"
@@ -299,7 +299,7 @@ def make_many(
             # There is no index until all is done: an older one would list scenes that are being replaced.
             for name in OF_SET:
                 (folder / name).unlink(missing_ok=True)
-            _remove_leftovers(folder)
+            remove_leftovers(folder)
             _report_strangers(folder, jobs)
             jobs = [replace(job, indexed=indexed.get(job.file)) for job in jobs]
             try:
@@ -307,7 +307,7 @@ def make_many(
                     outcomes = _outcomes(results, len(jobs))
             finally:
                 process.POOL.close()
-                _remove_leftovers(folder)
+                remove_leftovers(folder)
             outcomes = _present(folder, outcomes)
             index = _index(jobs, list(varied), outcomes)
             made = _card(folder, jobs, recipe, varied, outcomes, index)
@@ -369,13 +369,6 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise UsageError(f"{folder}: many scenes need a folder, and there is a file of this name") from None
-
-
-def _remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files of runs that were killed."""
-    for path in folder.iterdir():
-        if LEFTOVER.fullmatch(path.name):
-            path.unlink(missing_ok=True)
 
 
 def _report_strangers(folder: Path, jobs: Sequence[Job]) -> None:

@@ -485,13 +485,14 @@ def read_execution(results: Path, path: Path, units: str | None) -> Execution:
 def find_input(results: Path) -> Path:
     """Return the input that results were made from: the file of its name beside their folder, or in the current one.
 
-    Raises UsageError where there is none.
+    Their folder may also lie in the input. Raises UsageError where there is none.
     """
     from processor import store
 
     name = str(store.read_provenance(results).get("input", ""))
-    folders = (results.absolute().parent.parent, Path.cwd())
-    found = next((folder / name for folder in folders if name and (folder / name).exists()), None)
+    folders = (results.resolve().parent.parent, Path.cwd())
+    around = [folder for folder in results.resolve().parents[1:] if folder.name == name]
+    found = next((path for path in (*(folder / name for folder in folders), *around) if name and path.exists()), None)
     if found is None:
         where = " or ".join(map(str, dict.fromkeys(folders)))
         raise UsageError(f"{results}: expected its input {name!r} in {where}, found none; name INPUT")

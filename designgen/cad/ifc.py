@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from designgen.cad.bodies import ANGLE_RAD, NO_UNIT, UNITS_MM, Body, CadFile, finest_mm, is_closed, unit_name
 from processor.model import Floats, InputError, Ints, UsageError
+from processor.store.making import beside
 
 MOST_TRIANGLES = 100_000  # of a body; the library's time grows with the square of the number
 BEYOND = 1.5  # largest deviation in units of the requested one; measured on spheres: 1.37
@@ -77,8 +76,8 @@ def _exact(path: str, product: Any, to_mm: float) -> list[Any]:
     try:
         element = ifcopenshell.geom.create_shape(settings, product)  # kept, as the geometry is a part of its memory
         text = element.geometry.brep_data
-        with tempfile.TemporaryDirectory() as folder:  # the kernel reads it from a file alone
-            file = Path(folder, "product.brep")
+        with beside() as folder:  # the kernel reads it from a file alone
+            file = folder / "product.brep"
             file.write_text(text, "ascii")
             if not BRepTools.Read_s(shape, str(file), BRep_Builder()):
                 return []

@@ -50,11 +50,9 @@ def convert(input_: str | Path, output: str | Path, units: str | None = None) ->
     path, out = files.existing(path_of(input_, "input_")), path_of(output, "output")
     if path.is_file() and path.suffix.lower() == ".h5":
         raise UsageError(f"{path}: is a scene file already; name a scan folder or a scan file")
-    if out.suffix.lower() != ".h5":
-        raise UsageError(f"{out}: expected a scene file (.h5), found {out.suffix or 'no suffix'}; name one with -o")
     if out.name == files.TRUTH and out.resolve().parent == path.resolve():
         raise UsageError(f"{out}: is where the truth of the input lies; name another file with -o")
-    output_checks.check_file(out)
+    output_checks.check_file(out, ".h5", "a scene file")
     before = fingerprint.signature(path.resolve(), out.resolve())
     with large_arrays.in_files(out.absolute().parent):
         with stage(f"reading {path.name}"):

@@ -14,6 +14,7 @@ from processor.jobs.exit_codes import BAD_INPUT, ENDED_BY_LIMIT, WITH_RESULTS
 from processor.jobs.process import Ended
 from processor.model import InputError
 from processor.results.file_names import RESULTS_H5
+from processor.store.making import remove_leftovers
 
 MORE = "raise --timeout-s or --memory-mb, or run fewer --steps"
 
@@ -28,13 +29,16 @@ def limited_run(
     part = output.with_name(f"{output.name}.part")
     _remove(part)
     command = (*process.GUARDED, str(memory_mb or 0), "processor", "run", *arguments, "--so-far", str(part.absolute()))
-    ended = process.run(
-        (*command, "--methods-from", str(Path.cwd()), "-o", str(output.absolute()), "--", str(input_.absolute())),
-        log=Path("/dev/stderr"),
-        stdout=1,
-        timeout_s=timeout_s or float("inf"),
-        memory_mb=memory_mb or float("inf"),
-    )
+    try:
+        ended = process.run(
+            (*command, "--methods-from", str(Path.cwd()), "-o", str(output.absolute()), "--", str(input_.absolute())),
+            log=Path("/dev/stderr"),
+            stdout=1,
+            timeout_s=timeout_s or float("inf"),
+            memory_mb=memory_mb or float("inf"),
+        )
+    finally:
+        remove_leftovers(output.absolute().parent)
     why = _why(ended, timeout_s, memory_mb)
     if why:
         print_error_line(f"error: {input_}: {why}; {_what_is_done(part, input_)}")

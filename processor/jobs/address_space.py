@@ -38,6 +38,12 @@ def limited(more: int) -> Iterator[None]:
         _set(soft)
 
 
+def room() -> float:
+    """Return the bytes that this process may still have; infinite without a limit."""
+    soft, has = resource.getrlimit(resource.RLIMIT_AS)[0], _size()
+    return float("inf") if soft == resource.RLIM_INFINITY or has is None else float(soft - has)
+
+
 def _size() -> int | None:
     """Return the bytes of address space of this process."""
     pages = Path("/proc/self/statm")

@@ -35,7 +35,8 @@ def cause_of(error: BaseException | None) -> Cause | None:
     of_input = False
     while error is not None:
         of_input = of_input or _is_of_input(error)
-        if isinstance(error, MemoryError) and not of_input:
+        lacks = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+        if lacks and not of_input:
             return Cause.MEMORY
         if isinstance(error, OSError) and error.errno in UNWRITABLE:
             return Cause.OUTPUT

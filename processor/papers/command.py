@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from processor.papers.measuring import PAPERS
 from processor.papers.rows import Row
 from processor.plain_text import printable
 from processor.report import write_results
+from processor.store.making import beside
 from processor.store.replaced_folder import replacing_folder, write_text
 
 FORMAT, FORMAT_VERSION = "processor-papers", "1.0"
@@ -56,7 +56,8 @@ def run(
     papers = [number for number in PAPERS if not only or number in only]
     wanted = [one for number in papers for seed in range(seeds) for one in measuring.module_of(number).data_sets(seed)]
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".papers-", dir=out.absolute().parent) as scratch:
+    with beside(out.absolute().parent) as folder:
+        scratch = str(folder)
         steps = Path(scratch, STEPS)
         measured = _measured(wanted, jobs, scratch, str(steps) if keep_steps else "")
         return _written(out, papers, measured, seeds, lang, steps)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ from processor.jobs.child import Loss, Lost
 from processor.jobs.make_scene_command import scene_command
 from processor.papers import bolt_balls, defects, deviation, preassembly, stitching
 from processor.papers.data_sets import DataSet, Measured
+from processor.store.making import beside
 from processor.writers import step_clouds
 
 PAPERS: dict[str, tuple[str, Any]] = {  # name and module
@@ -61,8 +61,8 @@ def make_and_measure(
     Either child process is ended at its limit of time.
     """
     started = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="set-", dir=scratch, ignore_cleanup_errors=True) as made:
-        scene = Path(made) / "scene.h5"
+    with beside(Path(scratch)) as made:
+        scene = made / "scene.h5"
         words = scene_command(data_set.recipe, scene, data_set.seed, data_set.settings)
         ended = process.run(
             (*process.GUARDED, "0", *words), env=process.environment(1), timeout_s=MAKING_S, stopped=stopped

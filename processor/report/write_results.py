@@ -16,7 +16,7 @@ from processor.results.file_names import FIGURES, JOB_RECORD, REPORT_PAGE, RESUL
 from processor.results.to_json import results_json, text_of
 from processor.store import store
 from processor.store.output_checks import check_folder
-from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
+from processor.store.replaced_folder import is_log, replacing_folder, write_bytes, write_text
 from processor.writers import step_clouds
 
 # The record of a batch's job is replaced with its results: without it, the batch does the job again.
@@ -26,7 +26,7 @@ FURTHER = ("pdf", "xlsx")  # forms of the report that are written on request
 
 
 def check_output(out: Path, source: Path | None, mark: str = RESULTS_JSON, names: Collection[str] = OWN_NAMES) -> None:
-    """Raise UsageError for a folder with anything but earlier results, as it will be replaced as a whole.
+    """Raise UsageError for a folder with anything but earlier results and logs, as it will be replaced as a whole.
 
     Earlier results are recognised by the file ``mark`` among files of the ``names`` of results.
     """
@@ -34,7 +34,7 @@ def check_output(out: Path, source: Path | None, mark: str = RESULTS_JSON, names
         raise UsageError(f"{out}: is a file; name a folder for the results")
     if source is not None and source.resolve().is_relative_to(out.resolve()):
         raise UsageError(f"{out}: holds the input {source}, which the results would replace; name another folder")
-    inside = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+    inside = sorted(path.name for path in out.iterdir() if not is_log(path)) if out.is_dir() else []
     if inside and mark not in inside:
         raise UsageError(f"{out}: is not empty and holds no earlier results; name another folder")
     others = [name for name in inside if name not in names and not name.endswith(OWN_ENDINGS)]

@@ -15,7 +15,6 @@ import pwd
 import re
 import shutil
 import stat
-import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -29,6 +28,7 @@ from processor.jobs.causes import Cause
 from processor.model import DesignBodies, Floats, InputError, Ints
 from processor.scan_folder.meshes import CAD_SUFFIXES as SUFFIXES
 from processor.scan_folder.meshes import read_mesh
+from processor.store.making import beside
 from processor.version import __version__
 
 __all__ = ["SUFFIXES", "read"]
@@ -149,8 +149,8 @@ def _cache() -> Iterator[Path]:
             if os.access(place, os.W_OK) and _is_private(place):
                 yield place
                 return
-    with tempfile.TemporaryDirectory() as temporary:
-        yield Path(temporary)
+    with beside() as temporary:
+        yield temporary
 
 
 def _is_private(place: Path) -> bool:
@@ -191,23 +191,18 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
     """Make the meshes in a temporary folder and rename it to ``meshes``, so that they are complete there."""
     command = _designgen(path)
     try:
-        making = Path(tempfile.mkdtemp(prefix=".making-", dir=cache))
+        with beside(cache) as making:
+            # A copy of the hashed bytes, under a name that cannot be mistaken for an option.
+            source = making / f"{SOURCE}{path.suffix.lower()}"
+            source.write_bytes(content)
+            _run(command, source, making / "meshes", unit, path)
+            (making / "meshes" / CHECKSUM).write_text(_sha256(making / "meshes"), "ascii")
+            with suppress(OSError):  # another process has made them meanwhile
+                os.replace(making / "meshes", meshes)
+            if not meshes.is_dir():
+                raise InputError("expected meshes from designgen import, found none; run again", path=path)
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror or error})", path=cache) from error
-    try:
-        # A copy of the hashed bytes, under a name that cannot be mistaken for an option.
-        source = making / f"{SOURCE}{path.suffix.lower()}"
-        source.write_bytes(content)
-        _run(command, source, making / "meshes", unit, path)
-        (making / "meshes" / CHECKSUM).write_text(_sha256(making / "meshes"), "ascii")
-        with suppress(OSError):  # another process has made them meanwhile
-            os.replace(making / "meshes", meshes)
-        if not meshes.is_dir():
-            raise InputError("expected meshes from designgen import, found none; run again", path=path)
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror or error})", path=cache) from error
-    finally:
-        shutil.rmtree(making, ignore_errors=True)
 
 
 def _run(command: list[str], source: Path, out: Path, unit: str, path: Path) -> None:

@@ -32,10 +32,10 @@ def missing(path: Path) -> InputError:
 
 
 def existing(path: Path) -> Path:
-    """Return a path that leads to something. Raises InputError as :func:`missing` has it."""
+    """Return a path that leads to something, and has a name: not ``.``. Raises InputError as :func:`missing` has it."""
     if not path.exists():
         raise missing(path)
-    return path
+    return path if path.name not in ("", "..") else path.resolve()
 
 
 def scan_files(folder: Path, excluded: Collection[Path | None]) -> list[Path]:

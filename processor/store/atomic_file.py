@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from processor.model import InputError
+from processor.store.making import beside
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, and replace ``path`` by it once its content is on the disk.
+    """Yield a temporary path, and replace ``path`` by it once its content is on the disk.
 
     Raises InputError where the file cannot be written. On any error the temporary file is removed and ``path`` stays
     unchanged.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    if path.exists() and not path.is_file():
+        raise InputError("is a folder, device or pipe; name a file", path=path)
     try:
-        yield temporary
-        sync(temporary)
-        os.replace(temporary, path)
-        sync(path.parent)
+        with beside(path.parent) as folder:
+            yield folder / path.name
+            sync(folder / path.name)
+            os.replace(folder / path.name, path)
+            sync(path.parent)
     except (OSError, RuntimeError) as error:
         system_error = _system_error(error)
         if system_error is None:
@@ -32,8 +34,6 @@ def replacing(path: Path) -> Iterator[Path]:
         reason = system_error.strerror or system_error
         message = f"cannot be written ({reason}); free the disk or choose another folder"
         raise InputError(message, path=path) from system_error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _system_error(error: OSError | RuntimeError) -> OSError | None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from processor.model import InputError, UsageError
 from processor.store.atomic_file import sync
+from processor.store.making import beside
 from processor.store.output_checks import check_folder
 
 
@@ -27,24 +26,20 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
     Raises InputError where it cannot be written, as on a full disk.
     """
-    making: Path | None = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-        yield making
-        for written in (*making.rglob("*"), making):
-            sync(written)
-        if folder.exists():
-            folder.rmdir()
-        os.chmod(making, 0o755)
-        os.replace(making, folder)
-        sync(folder.parent)
-    except BaseException as error:
-        if making is not None:
-            shutil.rmtree(making, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise unwritable(folder, error) from error
-        raise
+        with beside(folder.parent) as place:
+            making = place / "new"
+            making.mkdir()
+            yield making
+            for written in (*making.rglob("*"), making):
+                sync(written)
+            if folder.exists():
+                folder.rmdir()
+            os.replace(making, folder)
+            sync(folder.parent)
+    except OSError as error:
+        raise unwritable(folder, error) from error
 
 
 def unwritable(folder: Path, error: OSError) -> InputError:

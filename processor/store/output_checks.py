@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
-from processor.model import InputError
+from processor.model import InputError, UsageError
+from processor.store.making import beside
 
 
 def check_folder(out: Path) -> None:
@@ -22,10 +21,17 @@ def existing_parent(out: Path) -> Path:
     return place
 
 
-def check_file(path: Path) -> None:
-    """Raise InputError where a file cannot be written, also for the lack of its folder."""
-    if path.is_dir():
-        raise InputError("is a folder; name a file", path=path)
+def check_file(path: Path, suffix: str, what: str) -> None:
+    """Raise InputError where a file cannot be written, also for the lack of its folder.
+
+    Raises UsageError for another suffix, and for what is there and no plain file: it would be replaced. ``what`` is
+    what the file is.
+    """
+    if path.suffix.lower() != suffix:
+        raise UsageError(f"{path}: expected {what} ({suffix}), found {path.suffix or 'no suffix'}; name one with -o")
+    if path.exists() and not path.is_file():
+        kind = "folder" if path.is_dir() else "device or pipe"
+        raise UsageError(f"{path}: is a {kind}; name a file for {what}")
     if not path.absolute().parent.exists():
         raise InputError(f"cannot be written: there is no folder {path.parent}; make it first", path=path)
     _try(path, path.absolute().parent)
@@ -35,7 +41,8 @@ def _try(path: Path, place: Path) -> None:
     if not place.is_dir():
         raise InputError(f"cannot be written: {place} is a file; name another place", path=path)
     try:
-        os.rmdir(tempfile.mkdtemp(prefix=".trial-", dir=place))
+        with beside(place):
+            pass
     except OSError as error:
         why = error.strerror or error
         raise InputError(f"cannot be written ({why}); nothing was done: name another place", path=path) from error

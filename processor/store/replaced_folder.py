@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from processor.model import InputError
+from processor.store.making import OLD, beside
+
+NEW = "new"
 
 
 @contextmanager
@@ -18,24 +20,22 @@ def replacing_folder(out: Path) -> Iterator[Path]:
 
     Raises InputError where it cannot be written.
     """
-    out = out.absolute()
+    out = Path(os.path.abspath(out))
+    new = out
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        making = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+        with beside(out.parent) as folder:
+            new = folder / NEW
+            new.mkdir()
+            yield new
+            _replace(new, out, folder / OLD)
     except OSError as error:
         raise _unwritable(out, error) from error
-    try:
-        os.chmod(making, 0o755)
-        yield making
-        _replace(making, out)
-    except BaseException as error:
-        shutil.rmtree(making, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise _unwritable(out, error) from error
-        if isinstance(error, InputError) and error.path is not None and error.path.is_relative_to(making):
-            # The file was in the folder that is removed: the message names the place that it was for.
-            raise InputError(error.problem, path=out / error.path.relative_to(making)) from error
-        raise
+    except InputError as error:
+        if error.path is None or not error.path.is_relative_to(new):
+            raise
+        # The file was in the folder that is removed: the message names the place that it was for.
+        raise InputError(error.problem, path=out / error.path.relative_to(new)) from error
 
 
 def _unwritable(out: Path, error: OSError) -> InputError:
@@ -65,17 +65,29 @@ def _write(path: Path, parts: Iterable[bytes]) -> None:
         os.fsync(file.fileno())
 
 
-def _replace(made: Path, out: Path) -> None:
-    """Move a folder into the place of another, which is removed only after that."""
-    if not out.exists():
-        os.replace(made, out)
-        return
-    old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
-    os.replace(out, old / "old")
+def _replace(made: Path, out: Path, old: Path) -> None:
+    """Move a folder into the place of another, which is moved to the folder ``old`` before; its logs stay."""
+    if out.exists():
+        for log in filter(is_log, out.iterdir()):
+            _link(log, made / log.name)
+        old.mkdir()
+        os.replace(out, old / out.name)
     try:
         os.replace(made, out)
     except OSError:
-        os.replace(old / "old", out)
-        os.rmdir(old)
+        if old.exists():
+            os.replace(old / out.name, out)
         raise
-    shutil.rmtree(old, ignore_errors=True)
+
+
+def is_log(path: Path) -> bool:
+    """Whether a file in a folder of results is a log, as of the command that writes them."""
+    return (path.suffix == ".log" or path.name == "log") and path.is_file() and not path.is_symlink()
+
+
+def _link(file: Path, place: Path) -> None:
+    """Give a file a second name, so that what is still written to it is there as well; else copy it."""
+    try:
+        os.link(file, place)
+    except OSError:
+        shutil.copy2(file, place)

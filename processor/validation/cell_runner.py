@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -19,6 +18,7 @@ from processor.jobs.exit_codes import WITH_RESULTS
 from processor.jobs.make_scene_command import scene_command
 from processor.jobs.process import Ended
 from processor.results.file_names import RESULTS_JSON
+from processor.store.making import beside
 from processor.validation.cells import Cell, Origin, Outcome
 from processor.writers import toml
 
@@ -58,10 +58,10 @@ def do(
             raise _FailedError(f"took longer than {timeout_s:g} s")
         return ended
 
-    with tempfile.TemporaryDirectory(prefix="cell-", dir=scratch, ignore_cleanup_errors=True) as made:
+    with beside(None if scratch is None else Path(scratch)) as made:
         failed, results = "", {}
         try:
-            results = _results(cell.spec(), Path(made), command)
+            results = _results(cell.spec(), made, command)
         except _FailedError as error:
             failed = str(error)
         return Outcome(failed, results, time.monotonic() - started, peak_mb)

@@ -248,10 +248,12 @@ def test_foreign_index_is_replaced_without_changing_scenes(made, tmp_path, text)
 
 def test_leftovers_are_removed_and_other_files_are_not(made, tmp_path):
     folder = copied(made, tmp_path / "set")
-    for name in (".frame-small-00001-seed7.h5.123-0a1b2c3d.tmp", ".index.csv.9-00000000.tmp", "mine.tmp", ".notes.tmp"):
-        (folder / name).write_text("half")
+    for name in (f".{'0a' * 8}.steel-scan-check", ".notes.steel-scan-check"):
+        (folder / name).mkdir()
+        (folder / name / "index.csv").write_text("half")
+    (folder / "mine.tmp").write_text("half")
     run("-o", folder, "--count", 3, "--seed", 7)
-    assert set(os.listdir(folder)) - set(os.listdir(made)) == {"mine.tmp", ".notes.tmp"}
+    assert set(os.listdir(folder)) - set(os.listdir(made)) == {"mine.tmp", ".notes.steel-scan-check"}
 
 
 # --- stopped and killed -----------------------------------------------------------------------------------------------
@@ -326,8 +328,8 @@ def test_killed_at_random_and_run_again(whole, tmp_path, kills):
         for name in scenes(folder):  # no half file under a final name
             assert (folder / name).read_bytes() == (whole / name).read_bytes()
         assert not (folder / "index.csv").exists()
-        leftover = folder / ".frame-small-00007-seed7.h5.77-01234567.tmp"
-        leftover.write_bytes(b"half")
+        leftover = folder / f".{'0a' * 8}.steel-scan-check"
+        leftover.mkdir(exist_ok=True)
     kept = times(folder)
     run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, "--jobs", 2, command=LONG)
     assert digests(folder) == digests(whole)
