@@ -14,7 +14,6 @@ from processor.jobs.exit_codes import BAD_INPUT, ENDED_BY_LIMIT, WITH_RESULTS
 from processor.jobs.process import Ended
 from processor.model import InputError
 from processor.results.file_names import RESULTS_H5
-from processor.store.making import remove_leftovers
 
 MORE = "raise --timeout-s or --memory-mb, or run fewer --steps"
 
@@ -26,6 +25,8 @@ def limited_run(
 
     Steps that were done are kept in the folder OUTPUT.part, which is removed when the run comes to its end.
     """
+    from processor.store.making import remove_leftovers
+
     part = output.with_name(f"{output.name}.part")
     _remove(part)
     command = (*process.GUARDED, str(memory_mb or 0), "processor", "run", *arguments, "--so-far", str(part.absolute()))

@@ -8,7 +8,6 @@ from typing import Any
 
 import click
 
-from processor import user_methods
 from processor.cli.common import (
     LANGUAGES,
     Shown,
@@ -60,6 +59,7 @@ def run(context: click.Context, /, input_: Path, output: Path | None, fail_on: s
 
     A run that a limit ends leaves OUT as it was, and the steps that were done in OUT.part; it exits with 3.
     """
+    from processor import user_methods
     from processor.scan_folder.files import missing
 
     shown = Shown(options["as_json"], options["verbose"], options["quiet"])

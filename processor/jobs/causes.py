@@ -50,6 +50,11 @@ def _is_of_input(error: BaseException) -> bool:
     return model is not None and isinstance(error, model.InputError)
 
 
+def one_line(error: BaseException) -> str:
+    """Return type and message of an exception on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
 def of_exit_code(code: int) -> Cause:
     """Return the cause of an exit code."""
     return next((cause for cause, known in EXIT_CODES.items() if known == code), Cause.EXIT)

@@ -44,11 +44,6 @@ class Lost:
     error: str = ""
 
 
-def one_line(error: BaseException) -> str:
-    """Return type and message of an exception on one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
-
-
 def end_with_parent() -> None:
     """Let this process end when the other end of standard input is closed, as it is after any death of the parent."""
     threading.Thread(target=_wait_for_parent, daemon=True).start()
@@ -92,7 +87,7 @@ def serve() -> None:
             function, job = pickle.loads(message)
             result = function(job)
         except Exception as error:
-            result = Lost(Loss.NOT_RUN, one_line(error))
+            result = Lost(Loss.NOT_RUN, causes.one_line(error))
         pickle.dump(result, results)
         results.flush()
 

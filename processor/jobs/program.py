@@ -15,8 +15,7 @@ from typing import NoReturn
 import click
 
 from processor.jobs import address_space, garbage_collection
-from processor.jobs.causes import Cause, cause_of
-from processor.jobs.child import one_line
+from processor.jobs.causes import Cause, cause_of, one_line
 from processor.model import InputError, UsageError
 
 WRONG_USAGE, BAD_INPUT = 2, 3

@@ -17,7 +17,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
-from processor.jobs.child import Loss, Lost, one_line
+from processor.jobs.causes import one_line
+from processor.jobs.child import Loss, Lost
 from processor.model import InputError, UsageError
 
 CONNECT_S = 10

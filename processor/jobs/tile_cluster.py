@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 
 from processor import tiles
 from processor.jobs import runner
-from processor.jobs.child import one_line
+from processor.jobs.causes import one_line
 from processor.jobs.software import OtherSoftwareError, check_same, source_digest, versions
 from processor.model import InputError, UsageError
 from processor.tiles import Shared
