@@ -536,11 +536,15 @@ class DesignBodies(Checked):
 
 @dataclass(frozen=True)
 class DesignFaults(Checked):
-    """What was wrong with a structure's mesh: facets that were ``turned`` outward, and open edges of so many parts."""
+    """What was wrong with a structure's mesh: facets that were ``turned`` outward, and open edges of so many parts.
+
+    ``repeated`` facets were left out, None for none: others have their corners, in the same order or in the other one.
+    """
 
     turned: int = described(0, means=Meaning(least=0))
     open_edges: int = described(0, means=Meaning(least=0))
     open_parts: int = described(0, means=Meaning(least=0))
+    repeated: int | None = described(None, newer=True, hashed=True, means=Meaning(least=0))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""Text that a terminal or a spreadsheet shows and does not obey; processor and designgen share it."""
+"""Text of unknown encoding, and text that a terminal or a spreadsheet shows and does not obey.
+
+processor and designgen share it.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +22,28 @@ def spreadsheet_text(characters: str) -> str:
 
 
 def decoded(data: bytes) -> str:
-    """Decode bytes as UTF-8, else as GB18030 or Windows-1252, whichever they look like.
-
-    Letters of Western languages beyond ASCII stand alone between others; Chinese ones are pairs of bytes in a row.
-    """
+    """Decode bytes as UTF-8, or else as GB18030 or Latin-1 (as of Windows), by the look of the bytes beyond ASCII."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         pass
-    runs = [len(run) for run in re.findall(rb"[\x80-\xff]+", data)]
-    western = 2 * runs.count(1) > len(runs)
+    if not _is_latin(data):
+        try:
+            return data.decode("gb18030")
+        except UnicodeDecodeError:
+            pass
     try:
-        return data.decode("cp1252" if western else "gb18030")
+        return data.decode("cp1252")
     except UnicodeDecodeError:
-        return data.decode("latin-1" if western else "utf-8", "replace")
+        return data.decode("utf-8", "replace")
+
+
+def _is_latin(data: bytes) -> bool:
+    """Whether most bytes beyond ASCII are single letters, as of European words.
+
+    Chinese characters of everyday use (GB 2312) are two such bytes each, and no small Latin letter stands beside them:
+    a run of an odd number of such bytes, or one beside a small letter, is of a European word. Both are valid GB18030.
+    """
+    runs = re.findall(rb"([a-z]?)([\x80-\xff]+)(?=([a-z]?))", data)
+    latin = sum(len(run) % 2 == 1 or bool(before and after) for before, run, after in runs)
+    return 2 * latin > len(runs)

@@ -11,6 +11,7 @@ import numpy as np
 from processor import large_arrays
 from processor.geometry import coincident_points, mesh_distance, rigid
 from processor.model import (
+    DesignFaults,
     Floats,
     InputError,
     Reason,
@@ -118,9 +119,10 @@ def stitched(scene: Scene, result: Any) -> Scene:
     return replace(scene, scans=scans)
 
 
-def design_faults(design: StructureDesign) -> Iterator[Reason]:
+def design_faults(faults: DesignFaults | None) -> Iterator[Reason]:
     """Yield what was wrong with the design's mesh."""
-    faults = design.faults
+    if faults is not None and faults.repeated:
+        yield reason("design.repeated", repeated=faults.repeated)
     if faults is not None and faults.turned:
         yield reason("design.turned", turned=faults.turned)
     if faults is not None and faults.open_edges:

@@ -35,13 +35,13 @@ NameOf = Callable[[Any], str]  # face -> its name, "" for none
 def facets_and_forms(shape: Any, name_of: NameOf) -> tuple[Floats, Ints, float, Forms]:
     """Return vertices (v, 3), triangles (f, 3), the kernel's deviation, and the forms of a meshed shape's faces, mm.
 
-    Vertices shared by faces are merged. Raises ValueError for a face without a mesh.
+    Vertices shared by faces are merged. Faces without a mesh are passed over.
     """
     points, triangles, uv, owner, described = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], [], []
     deviation, count = 0.0, 0
     for row, (face, mesh, location) in enumerate(meshes(shape)):
         if mesh is None:
-            raise ValueError("a face cannot be meshed")
+            continue
         T = location.Transformation()
         nodes = range(1, mesh.NbNodes() + 1)
         of_face = np.array([mesh.Node(i).Transformed(T).Coord() for i in nodes], np.float64).reshape(-1, 3)

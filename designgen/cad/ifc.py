@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from designgen.cad.bodies import ANGLE_RAD, NO_UNIT, UNITS_MM, Body, CadFile, finest_mm, is_closed, unit_name
+from processor.meshes.faults import mended
 from processor.model import Floats, InputError, Ints, UsageError
 from processor.store.making import beside
 
@@ -127,8 +128,8 @@ def _body(path: str, product: Any, to_mm: float) -> Body | None:
 
 
 def _measured(name: str, vertices: Floats, faces: Ints, deviation_mm: float) -> Body:
-    points, inverse = np.unique(vertices, axis=0, return_inverse=True)
-    triangles: Ints = inverse.reshape(-1)[faces].astype(np.int64)
+    whole = mended(vertices, faces)  # where an opening is cut, corners differ in their last bits
+    points, triangles = whole.points, whole.corners[whole.part >= 0]
     a, b, c = (points[triangles[:, i]] - points.mean(axis=0) for i in range(3))
     across = np.cross(b - a, c - a)
     area, volume = 0.5 * float(np.linalg.norm(across, axis=1).sum()), float(np.sum(a * across)) / 6.0

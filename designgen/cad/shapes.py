@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -93,6 +93,21 @@ def _mesh(path: str, name: str, shape: Any, scale: float, size: float, exact: bo
     return finest_mm(path, name, size, MOST_TRIANGLES, mesh)
 
 
+def _unmeshed(name: str, empty: Sequence[tuple[int, Any]], scale: float, face_name: Callable[[Any], str] | None) -> str:
+    """Return the problem of a body with faces that no algorithm could mesh, as ``empty``: the first, and its place."""
+    row, face = empty[0]
+    box = Bnd_Box()
+    BRepBndLib.Add_s(face, box, False)
+    place = ""
+    if not box.IsVoid():
+        low, high = box.CornerMin(), box.CornerMax()
+        middle = (0.5 * scale * (a + b) for a, b in zip(low.Coord(), high.Coord(), strict=True))
+        place = " at " + " ".join(f"{x:.1f}" for x in middle) + " mm"
+    label = (face_name(face) if face_name else "") or f"face {row}"
+    more = f" and {len(empty) - 1} more faces" if len(empty) > 1 else ""
+    return f"{name!r}: {label}{place}{more} cannot be meshed, so that the body is left out"
+
+
 def body_of(
     path: str,
     name: str,
@@ -127,13 +142,12 @@ def body_of(
     BRepGProp.VolumeProperties_s(shape, volumes)
     BRepGProp.SurfaceProperties_s(shape, areas)
     forms = None
-    try:
-        if face_name is None:
-            vertices, faces, measured = tessellation.facets(shape)
-        else:
-            vertices, faces, measured, forms = brep_faces.facets_and_forms(shape, face_name)
-    except ValueError:
-        return f"{name!r} has faces that cannot be meshed and is left out"
+    if empty := tessellation.empty_faces(shape):
+        return _unmeshed(name, empty, scale, face_name)
+    if face_name is None:
+        vertices, faces, measured = tessellation.facets(shape)
+    else:
+        vertices, faces, measured, forms = brep_faces.facets_and_forms(shape, face_name)
     vertices = scale * vertices
     numbers = np.array([volumes.Mass(), areas.Mass(), measured]) * [scale**3, scale**2, scale]
     if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(numbers).all():

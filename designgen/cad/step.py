@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from io import BytesIO
 from typing import Any
 
 from OCP.IFSelect import IFSelect_RetDone
-from OCP.StepBasic import StepBasic_SiUnitAndLengthUnit, StepBasic_SiUnitName
+from OCP.StepBasic import StepBasic_ProductDefinition, StepBasic_SiUnitAndLengthUnit, StepBasic_SiUnitName
 from OCP.STEPConstruct import STEPConstruct_UnitContext
 from OCP.STEPControl import STEPControl_Reader
 from OCP.StepData import StepData_Factors
@@ -20,8 +21,9 @@ from OCP.StepRepr import (
 )
 from OCP.StepShape import StepShape_FaceSurface, StepShape_ManifoldSolidBrep, StepShape_ShapeDefinitionRepresentation
 from OCP.TColStd import TColStd_SequenceOfAsciiString
-from OCP.TopAbs import TopAbs_FACE, TopAbs_SOLID
+from OCP.TopAbs import TopAbs_COMPOUND, TopAbs_FACE, TopAbs_SOLID
 from OCP.TopLoc import TopLoc_Location
+from OCP.TopoDS import TopoDS_Iterator
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from designgen.cad.bodies import NO_UNIT, UNITS_MM, Body, CadFile, unit_name
@@ -132,10 +134,15 @@ def _lost(reader: Any, entities: list[Any], names: _Names) -> list[str]:
 
 
 class _Names:
-    """Names of shapes: of the solid, else of its occurrence in an assembly, else of its product."""
+    """Names of shapes: of the solid, else of its occurrence in an assembly, else of its product.
+
+    Those of the assemblies around it come before it, as in "left rib/web", but for the one that is the whole file.
+    """
 
     def __init__(self, reader: Any, entities: list[Any]) -> None:
         self._transfers = reader.WS().TransferReader()
+        self._placed, self._paths = TopTools_IndexedMapOfShape(), list[tuple[str, ...]]()
+        self._by_place: dict[tuple[Any, ...], str] = {}  # names of occurrences by product and place in their assembly
         self._bare_shapes, self._items = TopTools_IndexedMapOfShape(), list[Any]()
         products: dict[Any, str] = {}  # of representations
         pairs = []
@@ -155,16 +162,52 @@ class _Names:
             if representation is not None:
                 for i in range(1, representation.NbItems() + 1):  # OCP 7.8 does not read the array of them
                     self._products.setdefault(representation.ItemsValue(i), name)
+        roots = [reader.Shape(i) for i in range(1, reader.NbShapes() + 1)]
+        for store in (False, True):  # an occurrence may come before the one that has its name
+            for root in roots:
+                if root.ShapeType() == TopAbs_COMPOUND:
+                    self._walk(root, (), store=store)
+
+    def _walk(self, shape: Any, path: tuple[str, ...], *, store: bool) -> None:
+        """Go through an assembly, below assemblies of the names ``path``; ``store`` the names of its parts."""
+        placed, bare = TopoDS_Iterator(shape), TopoDS_Iterator(shape, True, False)
+        while placed.More():
+            part, occurrence = placed.Value(), self._occurrence(bare.Value())
+            below = path if occurrence is None else (*path, occurrence)
+            if part.ShapeType() == TopAbs_COMPOUND:
+                self._walk(part, below, store=store)
+            elif store and not self._placed.Contains(part):
+                self._placed.Add(part)
+                self._paths.append(below)
+            placed.Next()
+            bare.Next()
+
+    def _occurrence(self, shape: Any) -> str | None:
+        """Return the name of an occurrence by its place in its assembly, of its product without one; None for none.
+
+        Some programs name the parts of a sub-assembly once, where it is placed several times. So an occurrence without
+        a name has that of another one of its product in the same place of its assembly.
+        """
+        entity = self._transfers.EntityFromShapeResult(shape, 1)
+        if isinstance(entity, StepBasic_ProductDefinition):  # placed where it was modelled
+            return _text_by(entity, ("Formation", "OfProduct"))
+        if not isinstance(entity, StepRepr_NextAssemblyUsageOccurrence):
+            return None
+        T = shape.Location().Transformation()
+        place = tuple(round(T.Value(i, k), 6) for i in (1, 2, 3) for k in (1, 2, 3, 4))
+        key, name = (self.item(shape), *place), _text(entity)
+        if name:
+            return self._by_place.setdefault(key, name) and name
+        return self._by_place.get(key) or _text_by(entity, ("RelatedProductDefinition", "Formation", "OfProduct"))
 
     def of(self, shape: Any) -> str:
         """Return the name of a shape in the file, "" for none."""
         item = self.item(shape)
         name = _text(item) if isinstance(item, StepRepr_RepresentationItem) else ""
-        if name:
-            return name
-        occurrence = None if shape.Location().IsIdentity() else self._transfers.EntityFromShapeResult(shape, 1)
-        name = _text(occurrence) if isinstance(occurrence, StepRepr_NextAssemblyUsageOccurrence) else ""
-        return name or (self._products.get(item, "") if item is not None else "")
+        row = self._placed.FindIndex(shape)
+        path = self._paths[row - 1] if row else ()
+        name = name or (path[-1] if path else "") or (self._products.get(item, "") if item is not None else "")
+        return "/".join(filter(None, (*path[:-1], name))) if name else ""
 
     def item(self, shape: Any) -> Any:
         """Return the entity from which a shape was made, regardless of its location; None where it is unknown."""
@@ -177,8 +220,13 @@ class _Names:
 
 def _product(representation: Any) -> str:
     """Return the name of a representation's product, "" where a damaged file lacks a link of the chain to it."""
-    entity = representation
-    for link in ("Definition", "PropertyDefinition", "Definition", "ProductDefinition", "Formation", "OfProduct"):
+    links = ("Definition", "PropertyDefinition", "Definition", "ProductDefinition", "Formation", "OfProduct")
+    return _text_by(representation, links)
+
+
+def _text_by(entity: Any, links: Sequence[str]) -> str:
+    """Return the name of what an entity leads to by links, "" where one of them is missing."""
+    for link in links:
         entity = getattr(entity, link)() if hasattr(entity, link) else None
     return _text(entity)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from OCP.TopTools import TopTools_IndexedMapOfShape
 from designgen.cad.bodies import ANGLE_RAD, EDGE_SHARE
 from processor.model import Floats, Ints
 
+FINER = 0.1  # of the deviation aimed at: a face that no mesh could be made for may have one with more points
+
 
 def mesh_faces(shape: Any, tolerance_mm: float, *, large: bool = False) -> int:
     """Mesh every face of a shape, in place of any earlier mesh; return the number of triangles.
@@ -38,24 +40,46 @@ def mesh_edges_finer(shape: Any, tolerance_mm: float, finer: Callable[[Any], boo
     The kernel keeps the edges of faces that have been meshed, so the other faces have finer edges, too.
     """
     BRepTools.Clean_s(shape)
-    first, builder = TopoDS_Compound(), BRep_Builder()
-    builder.MakeCompound(first)
-    for face, _, _ in meshes(shape):
-        if finer(face):
-            builder.Add(first, face)
-    _mesh(first, EDGE_SHARE * tolerance_mm, large)
+    _mesh(_compound(face for face, _, _ in meshes(shape) if finer(face)), EDGE_SHARE * tolerance_mm, large)
     _mesh(shape, tolerance_mm, large)
     return _triangles(shape)
 
 
 def _mesh(shape: Any, tolerance_mm: float, large: bool) -> None:
-    if large:
+    """Mesh a shape; faces that one algorithm leaves empty go to the other one, and again more finely.
+
+    Delabella leaves curved extrusions of a large size empty, Watson now and then a face with a short edge. The kernel
+    keeps the points on edges of faces that have a mesh, so that neighbours still meet.
+    """
+    kinds = IMeshTools_MeshAlgoType
+    delabella, watson = kinds.IMeshTools_MeshAlgoType_Delabella, kinds.IMeshTools_MeshAlgoType_Watson
+    first, second = (delabella, watson) if large else (watson, delabella)
+    for algorithm, share in ((first, 1.0), (second, 1.0), (first, FINER), (second, FINER)):
         parameters = IMeshTools_Parameters()
-        parameters.Deflection, parameters.Angle = tolerance_mm, ANGLE_RAD
-        parameters.MeshAlgo = IMeshTools_MeshAlgoType.IMeshTools_MeshAlgoType_Delabella
+        parameters.Deflection, parameters.Angle = share * tolerance_mm, ANGLE_RAD
+        parameters.MeshAlgo = algorithm
         BRepMesh_IncrementalMesh(shape, parameters, Message_ProgressRange())
-    else:
-        BRepMesh_IncrementalMesh(shape, tolerance_mm, False, ANGLE_RAD, False)
+        empty = [face for face, mesh, _ in meshes(shape) if _is_empty(mesh)]
+        if not empty:
+            return
+        shape = _compound(empty)
+
+
+def _compound(faces: Iterable[Any]) -> Any:
+    builder, compound = BRep_Builder(), TopoDS_Compound()
+    builder.MakeCompound(compound)
+    for face in faces:
+        builder.Add(compound, face)
+    return compound
+
+
+def _is_empty(mesh: Any) -> bool:
+    return mesh is None or not mesh.NbTriangles()
+
+
+def empty_faces(shape: Any) -> list[tuple[int, Any]]:
+    """Return the faces of a meshed shape that have no triangles, each with its number from 1."""
+    return [(row, face) for row, (face, mesh, _) in enumerate(meshes(shape), 1) if _is_empty(mesh)]
 
 
 def _triangles(shape: Any) -> int:
@@ -65,13 +89,13 @@ def _triangles(shape: Any) -> int:
 def facets(shape: Any) -> tuple[Floats, Ints, float]:
     """Return vertices (v, 3), triangles (f, 3) and the kernel's figure of the deviation of a meshed shape.
 
-    Vertices shared by faces are merged, so that the mesh of a closed solid is closed; normals point outward. Raises
-    ValueError for a face without a mesh.
+    Vertices shared by faces are merged, so that the mesh of a closed solid is closed; normals point outward. Faces
+    without a mesh are passed over.
     """
     points, triangles, deviation, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0.0, 0
     for face, mesh, location in meshes(shape):
         if mesh is None:
-            raise ValueError("a face cannot be meshed")
+            continue
         of_face = np.array([mesh.Node(i).Coord() for i in range(1, mesh.NbNodes() + 1)], np.float64).reshape(-1, 3)
         if not location.IsIdentity():
             T = location.Transformation()

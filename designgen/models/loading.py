@@ -12,8 +12,10 @@ import numpy as np
 
 from designgen.cad import faults, files
 from designgen.cad.bodies import Body, is_closed
-from designgen.models import cadquery_objects, mesh_bodies, mesh_files
+from designgen.models import cadquery_objects, mesh_bodies
 from designgen.models.model import Model, ModelBody, of_cad, unique_names, with_normals_reversed
+from processor.meshes import mesh_files
+from processor.meshes.mesh_files import Piece
 from processor.model import Floats, InputError, Ints, UsageError
 
 PYTHON = ".py"
@@ -36,7 +38,7 @@ def load(model: Any, units: str = "", name: str = "model") -> Model:
         raise UsageError("units: expected none for an object, whose lengths are in mm")
     if isinstance(model, tuple | list) and len(model) == 2:
         vertices, faces = _arrays(model)
-        bodies, notes = mesh_bodies.bodies_of(name, [("", vertices, faces)], name)
+        bodies, notes = mesh_bodies.bodies_of(name, [Piece("", vertices, faces)], name)
         return Model(name, tuple(bodies), tuple(notes))
     if isinstance(model, tuple | list | np.ndarray):
         raise InputError(f"model: expected vertices (v, 3) and faces (f, 3), found {len(model)} arrays or rows")
@@ -77,7 +79,7 @@ def _of_file(path: Path, units: str) -> tuple[Sequence[Body | ModelBody], list[s
         return cadquery_objects.bodies_of(str(path), cadquery_objects.run(path), path.stem)
     if suffix in mesh_files.SUFFIXES:
         unit_mm = files.unit_mm(units or "mm")
-        pieces = [(name, unit_mm * vertices, faces) for name, vertices, faces in mesh_files.read(path)]
+        pieces = [piece._replace(vertices=unit_mm * piece.vertices) for piece in mesh_files.read(path)]
         bodies, notes = mesh_bodies.bodies_of(str(path), pieces, path.stem)
         if not units:
             ends = np.array([[body.vertices.min(axis=0), body.vertices.max(axis=0)] for body in bodies])

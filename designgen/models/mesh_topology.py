@@ -13,11 +13,6 @@ def edges_of(triangles: Ints) -> Ints:
     return edges
 
 
-def count_open_edges(triangles: Ints) -> int:
-    """Count the edges of triangles (f, 3) that an odd number of them has; 0 where the mesh is closed."""
-    return int((np.unique(edges_of(triangles), axis=0, return_counts=True)[1] % 2).sum())
-
-
 def shared_edges(triangles: Ints) -> tuple[Ints, Ints, Ints]:
     """Return the rows (k,), (k,) of triangles (f, 3) with a common edge, and the vertices (k, 2) of the edge."""
     edges = edges_of(triangles)

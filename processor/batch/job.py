@@ -42,7 +42,6 @@ PACKAGES = (
     "pye57",
     "python-neo-lzf",
     "scipy",
-    "trimesh",
 )
 # By the exit code of `processor run`.
 STATUS = {

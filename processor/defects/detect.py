@@ -100,7 +100,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         reasons=(
             *pose.reasons,
             *_of_names(design.bodies),
-            *scene_cloud.design_faults(design),
+            *scene_cloud.design_faults(design.faults),
             *_of_views(search),
             *result.reasons,
         ),

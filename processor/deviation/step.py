@@ -68,7 +68,7 @@ def _of_structure(scene: Scene, params: Params, stitched: Any) -> Result:
     scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio, stitched, params.most_points)
     method = baseline.measure if params.method == "paper" else measure.measure
     result = method(scene, scan, vertices, origin, params)
-    result = replace(result, reasons=(*result.reasons, *scene_cloud.design_faults(scene.structure)))
+    result = replace(result, reasons=(*result.reasons, *scene_cloud.design_faults(scene.structure.faults)))
     if scan.unplaced:
         first = reason("deviation.scans-unplaced", scans=", ".join(scan.unplaced))
         status = Status.WEAK if result.status is Status.OK else result.status

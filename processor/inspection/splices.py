@@ -21,6 +21,8 @@ from processor.model import ArchDesign, Floats, Ints, reason
 
 DETERMINED = 1e-9  # least singular value of a motion that the holes determine, by the largest
 FEWEST_SEEN = 2  # holes of a plate on each side of the joint
+# Largest distance of a bolt from the end of its plate, the larger of the two (EN 1993-1-8, table 3.3).
+END_DISTANCE_MM, END_DISTANCE_THICKNESSES = 125.0, 8.0
 SAME_PLANE = 0.5  # of the thinner plate: distance of the middles of two plates that one splice plate covers
 
 
@@ -60,7 +62,7 @@ def of_joints(design: ArchDesign, drilled: Sequence[DrilledGroup]) -> dict[str, 
 def _plates(design: ArchDesign, joint: int, drilled: Sequence[DrilledGroup]) -> Iterator[Splice]:
     """Yield the groups of both parts at a joint that lie in one plane."""
     left, right = (
-        [group for group in drilled if group.joint == joint and group.part == part]
+        [group for group in drilled if group.joint == joint and group.part == part and _at_joint(design, group)]
         for part in (design.joint_left[joint], design.joint_right[joint])
     )
     taken: list[DrilledGroup] = []
@@ -71,6 +73,19 @@ def _plates(design: ArchDesign, joint: int, drilled: Sequence[DrilledGroup]) -> 
             taken.append(other)
             yield Splice(one, other)
             break
+
+
+def _at_joint(design: ArchDesign, drilled: DrilledGroup) -> bool:
+    """Whether holes are those of bolts at their joint: several, and as near to it as bolts are to the end of a plate.
+
+    A lifting lug has one bore, some metres away.
+    """
+    p1, p2, p3, p4 = design.joint_points[drilled.joint, :4]
+    along = np.cross(p4 - p2, p3 - p1)
+    middles = np.array([hole.middle for hole in drilled.group.holes]) + drilled.origin
+    off = np.abs((middles - 0.25 * (p1 + p2 + p3 + p4)) @ along) / np.linalg.norm(along)
+    thickness = drilled.group.holes[0].depth
+    return len(middles) >= FEWEST_SEEN and bool(off.min() <= max(END_DISTANCE_MM, END_DISTANCE_THICKNESSES * thickness))
 
 
 def _in_one_plane(left: DrilledGroup, right: DrilledGroup) -> bool:

@@ -1,4 +1,4 @@
-"""Text of unknown encoding: content and names of files."""
+"""Names of files of unknown encoding."""
 
 from __future__ import annotations
 

@@ -25,9 +25,9 @@ import numpy as np
 
 from processor.jobs import process
 from processor.jobs.causes import Cause
+from processor.meshes.mesh_files import read_whole
 from processor.model import DesignBodies, Floats, InputError, Ints
-from processor.scan_folder.meshes import CAD_SUFFIXES as SUFFIXES
-from processor.scan_folder.meshes import read_mesh
+from processor.scan_folder.files import CAD_SUFFIXES as SUFFIXES
 from processor.store.making import beside
 from processor.version import __version__
 
@@ -72,7 +72,7 @@ def read_design(path: Path, unit: str) -> CadDesign:
             shutil.rmtree(meshes, ignore_errors=True)
             _import(path, content, unit, cache, meshes)
         record, stated = _record(meshes, path)
-        bodies = [read_mesh(meshes / mesh) for _, mesh in record]
+        bodies = [read_whole(meshes / mesh) for _, mesh in record]
     counts = np.cumsum([0, *(len(vertices) for vertices, _ in bodies)])
     faces = [faces + first for (_, faces), first in zip(bodies, counts.tolist(), strict=False)]
     named = _named([name for name, _ in record], [len(triangles) for _, triangles in bodies])

@@ -29,6 +29,11 @@ def plain(name: str) -> str:
     return " ".join(text.split())
 
 
+def _spaced(name: str) -> str:
+    """Return a name with spaces for what stands for them in names of files."""
+    return " ".join(re.split(r"[\s_./-]+", name))
+
+
 def _latin_digits(name: str) -> str:
     """Return a name in lower case, with Chinese numbers up to 99 as digits."""
     text = unicodedata.normalize("NFKC", name).casefold()
@@ -48,7 +53,7 @@ def components(stem: str, names: Sequence[str]) -> list[str]:
     alone. A number alone refers to none: scans are numbered as they were made.
     """
     text = plain(stem)
-    exact = [name for name in names if plain(name) == text]
+    exact = [name for name in names if _spaced(plain(name)) == _spaced(text)]
     if exact:
         return exact
     by_number, by_word = [], []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,11 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from processor.geometry import box_girder_mesh
+from processor.language.messages import messages
+from processor.meshes import faults
+from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
+from processor.meshes.mesh_files import read_whole
 from processor.model import (
     KEY_POINTS,
     SUPPORTS,
     ArchDesign,
     DesignBodies,
+    DesignFaults,
     DesignPart,
     Floats,
     FrameDesign,
@@ -26,10 +32,10 @@ from processor.model import (
     did_you_mean,
 )
 from processor.scan_folder import cad
-from processor.scan_folder.checked_table import Table, existing_file_in, ignore_unknown
-from processor.scan_folder.meshes import MESH_SUFFIXES, read_mesh
+from processor.scan_folder.checked_table import LOG, Table, existing_file_in, ignore_unknown
 from processor.scan_folder.text_files import csv_rows, read_text
 from processor.scan_folder.units import MM_PER_UNIT, known_unit
+from processor.scene_cloud import design_faults
 
 TEXT_LIMIT = 256 * 2**20
 
@@ -218,21 +224,28 @@ def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floa
     scale = MM_PER_UNIT[unit]
     part.only(("mesh", "bottom_edge_left", "bottom_edge_right", "plate_mm"))
     if "mesh" in part.values and not any(f"bottom_edge_{side}" in part.values for side in ("left", "right")):
-        vertices, faces, _ = read_surface(existing_file_in(folder, part.text("mesh"), part.where), unit)
-        return DesignPart(name, vertices, faces)
+        return DesignPart(name, *_mesh(folder, part, unit))
     edges = [part.array(f"bottom_edge_{side}", -1, 3) * scale for side in ("left", "right")]
     for side, edge in zip(("left", "right"), edges, strict=True):
         if len(edge) < 2 or (np.abs(np.diff(edge, axis=0)).max(axis=1) == 0).any():
             raise InputError(f"{part.where}: expected two points or more in bottom_edge_{side}, none repeated in a row")
     plate_mm = part.number("plate_mm", box_girder_mesh.PLATE_MM, positive=True)
     if "mesh" in part.values:
-        vertices, faces, _ = read_surface(existing_file_in(folder, part.text("mesh"), part.where), unit)
-        return DesignPart(name, vertices, faces, edges[0], edges[1])
+        return DesignPart(name, *_mesh(folder, part, unit), edges[0], edges[1])
     try:
         vertices, faces = box_girder_mesh.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
     except InputError as error:
         raise InputError(f"{part.where}: without a mesh: {error}") from None
     return DesignPart(name, vertices, faces, edges[0], edges[1], source=box_girder_mesh.SOURCE)
+
+
+def _mesh(folder: Path, part: Table, unit: str) -> tuple[Floats, Ints]:
+    """Read a component's mesh; what was mended is logged, but for open edges: ends may be left open."""
+    path = existing_file_in(folder, part.text("mesh"), part.where)
+    surface = read_surface(path, unit)
+    for found in design_faults(surface.faults and replace(surface.faults, open_edges=0)):
+        LOG.warning("%s: %s", path, messages("en").text(found))
+    return surface.vertices, surface.faces
 
 
 def _frame(design: Table) -> FrameDesign:
@@ -335,12 +348,34 @@ def is_surface(path: Path) -> bool:
     return path.suffix.lower() in (*MESH_SUFFIXES, *cad.SUFFIXES)
 
 
-def read_surface(path: Path, unit: str) -> tuple[Floats, Ints, DesignBodies | None]:
-    """Return vertices (v, 3) in mm and triangles (f, 3) of a mesh, or of a CAD file with its bodies.
+class Surface(NamedTuple):
+    """Vertices (v, 3) in mm and facets (f, 3) with outward normals, the bodies of a CAD file, and what was mended."""
+
+    vertices: Floats
+    faces: Ints
+    bodies: DesignBodies | None
+    faults: DesignFaults | None
+
+
+def read_surface(path: Path, unit: str) -> Surface:
+    """Read a mesh, or a CAD file with its bodies, and mend its facets.
 
     ``unit`` is that of a mesh, and of a CAD file that has none.
     """
     if path.suffix.lower() in cad.SUFFIXES:
-        return cad.read(path, unit)
-    vertices, faces = read_mesh(path)
-    return vertices * MM_PER_UNIT[unit], faces, None
+        vertices, faces, bodies = cad.read(path, unit)
+    else:
+        vertices, faces = read_whole(path)
+        vertices, bodies = vertices * MM_PER_UNIT[unit], None
+    mended = faults.mended(vertices, faces, None if bodies is None else bodies.of_facet)
+    if not (mended.repeated or mended.turned or mended.open_edges):
+        return Surface(vertices, faces, bodies, None)
+    if bodies is not None and mended.repeated:
+        bodies = replace(bodies, of_facet=bodies.of_facet[mended.rows])
+    found = DesignFaults(
+        turned=mended.turned,
+        open_edges=mended.open_edges,
+        open_parts=mended.open_parts,
+        repeated=mended.repeated or None,
+    )
+    return Surface(vertices, mended.faces, bodies, found)

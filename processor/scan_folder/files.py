@@ -7,7 +7,6 @@ from pathlib import Path
 
 from processor import readers
 from processor.model import InputError, did_you_mean
-from processor.scan_folder.meshes import CAD_SUFFIXES
 
 PROJECT = "project.toml"
 TRUTH = "truth.h5"
@@ -16,6 +15,7 @@ PICKS = "picks.csv"
 CONTROL = "control.csv"
 DESIGNS = ("design.json", "design.csv")
 SCANS = "scans"
+CAD_SUFFIXES = (".step", ".stp", ".ifc")  # made into meshes first, see :mod:`processor.scan_folder.cad`
 NOT_SCANS = ("design.csv", PICKS, "deviation.csv", CONTROL, "index.csv")
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from processor import large_arrays, readers, record_checks, store
 from processor.geometry import rigid
 from processor.language.messages import messages
+from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
 from processor.model import (
     DESIGN_FRAMES,
     KINDS,
@@ -37,7 +38,7 @@ from processor.progress import tracked
 from processor.readers import RawScan
 from processor.readers.encoding import file_name_as_text
 from processor.readers.raw_scan import scaled_in_place, scan_name, summed
-from processor.scan_folder import guess, mesh_faults, scanner_grid, units
+from processor.scan_folder import guess, scanner_grid, units
 from processor.scan_folder.checked_table import Table, existing_file_in
 from processor.scan_folder.clips import FEWEST_POINTS, Clipper, read_boxes
 from processor.scan_folder.control_points import Measured, control_points, read_control
@@ -55,7 +56,6 @@ from processor.scan_folder.files import (
     scan_files,
 )
 from processor.scan_folder.guess import Guess
-from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
 from processor.scan_folder.project_tables.ceiling import read_ceiling
 from processor.scan_folder.project_tables.targets import read_search
@@ -164,9 +164,7 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     if project.design is not None:
         unit = project.design_units or project.units or option or "m"
         if is_surface(project.design) and project.kind in ("", "structure"):
-            vertices, faces, bodies = read_surface(project.design, unit)
-            faces, found = mesh_faults.mended(vertices, faces)
-            design = StructureDesign(scan_name(project.design), vertices, faces, bodies, found)
+            design = StructureDesign(scan_name(project.design), *read_surface(project.design, unit))
         else:
             design = read_design(folder, project.design, unit)
         record_checks.check(design, str(project.design))  # before scans are compared with it

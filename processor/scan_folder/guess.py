@@ -16,14 +16,14 @@ from scipy.optimize import linear_sum_assignment
 from processor import large_arrays, readers
 from processor.geometry import mesh_distance
 from processor.language.messages import Text, messages, text
+from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints, Reason, reason
 from processor.readers import RawScan
 from processor.registration import main_body, principal
 from processor.scan_folder import component_names
 from processor.scan_folder.checked_table import existing_file_in
-from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
+from processor.scan_folder.design import read_design, read_json, read_surface
 from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, scan_files, scan_files_below
-from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.shapes import guess_design, surface_files
 from processor.scan_folder.shapes.guess_design import GuessedDesign
 from processor.scan_folder.units import MM_PER_UNIT, known_unit, radius
@@ -151,7 +151,7 @@ def _shown_design(
         project.design, project.design_reasons = str(paths[0].relative_to(folder)), (reason("init.only-candidate"),)
         # The unit of one surface of the whole is that of 'design_units', which has a doubt of its own.
         project.doubts += [doubt for one in without for doubt in one.other_doubts]
-        return _read_design(folder, paths[0], project)
+        return _read_surface(folder, paths[0], project)  # an error ends here: of what kind it is, nothing else shows
     if not paths:
         project.doubts.append(reason("init.no-design"))
         return None
@@ -176,13 +176,10 @@ def _has_kind(path: Path) -> bool:
         return False
 
 
-def _read_design(folder: Path, path: Path, project: Guess) -> ArchDesign | FrameDesign | Surface | None:
-    """Read the design; if it cannot be read, a doubt is added and the guess continues without."""
+def _read_design(folder: Path, path: Path, project: Guess) -> ArchDesign | FrameDesign | None:
+    """Read design.json or a table of nodes; if it cannot be read, a doubt is added and the guess continues without."""
     try:
         existing_file_in(folder, str(path.relative_to(folder)), str(folder))
-        if is_surface(path):
-            project.kind, project.kind_reasons = "structure", (reason("init.one-surface", file=project.design),)
-            return read_surface(path, "mm")[:2]
         design = read_design(folder, path, "m")
     except InputError as error:
         project.doubts.append(reason("init.design-unreadable", error=str(error)))
@@ -190,6 +187,14 @@ def _read_design(folder: Path, path: Path, project: Guess) -> ArchDesign | Frame
     project.kind = "arch-bridge" if isinstance(design, ArchDesign) else "space-frame"
     project.kind_reasons = (reason("init.kind-of-design", file=project.design),)
     return design
+
+
+def _read_surface(folder: Path, path: Path, project: Guess) -> Surface:
+    """Read the surface of a whole structure. Raises InputError."""
+    existing_file_in(folder, str(path.relative_to(folder)), str(folder))
+    surface = read_surface(path, "mm")[:2]
+    project.kind, project.kind_reasons = "structure", (reason("init.one-surface", file=project.design),)
+    return surface
 
 
 def _sizes(design: ArchDesign | FrameDesign | Surface | None) -> list[float]:

@@ -13,8 +13,7 @@ from designgen import __main__
 from designgen.cad import faults
 from designgen.models import loading
 from processor.deviation import step as deviation_step
-from processor.model import DesignFaults
-from processor.scan_folder import folder, mesh_faults
+from processor.scan_folder import folder
 
 BOX = trimesh.creation.box((400.0, 300.0, 200.0))
 
@@ -88,51 +87,6 @@ def test_mesh_without_a_unit_is_reported_with_its_size_in_mm(tmp_path):
 
 
 # --- a design's mesh, as processor reads it ---------------------------------------------------------------------------
-
-
-def _apart(mesh):
-    """The mesh with vertices of its own for each facet, as STL has them."""
-    return mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3)
-
-
-def _turned(faces, rows):
-    faces = np.array(faces)
-    faces[rows] = faces[rows, ::-1]
-    return faces
-
-
-HOLLOW = trimesh.util.concatenate([trimesh.creation.icosphere(2, 500.0), trimesh.creation.box((90.0, 80.0, 70.0))])
-CAVITY = _turned(HOLLOW.faces, slice(len(HOLLOW.faces) - 12, None))
-
-
-@pytest.mark.parametrize("apart", [False, True], ids=["shared vertices", "vertices apart"])
-@pytest.mark.parametrize(
-    ("mesh", "faces", "found"),
-    [
-        (BOX, BOX.faces, None),
-        (BOX, BOX.faces[:, ::-1], DesignFaults(turned=12)),
-        (BOX, _turned(BOX.faces, [2, 7]), DesignFaults(turned=2)),
-        (BOX, _turned(BOX.faces, [0, 1, 2, 4, 5, 6, 8, 9, 10]), DesignFaults(turned=9)),
-        (BOX, BOX.faces[1:], DesignFaults(open_edges=3, open_parts=1)),
-        (BOX, _turned(BOX.faces[1:], [4]), DesignFaults(turned=1, open_edges=3, open_parts=1)),
-        (HOLLOW, CAVITY, None),
-        (HOLLOW, CAVITY[:, ::-1], DesignFaults(turned=len(CAVITY))),
-    ],
-    ids=["sound", "inside out", "two", "most", "hole", "hole and one", "cavity", "cavity inside out"],
-)
-def test_facets_of_a_design_are_turned_outward(mesh, faces, found, apart):
-    vertices = mesh.vertices
-    if apart:
-        vertices, faces = _apart(trimesh.Trimesh(vertices, faces, process=False))
-    mended, told = mesh_faults.mended(np.asarray(vertices), np.asarray(faces, np.int64))
-    if mesh is HOLLOW and found is not None:
-        assert trimesh.Trimesh(vertices, mended, process=False).volume > 0.0
-        return
-    assert told == found
-    whole = trimesh.Trimesh(vertices, mended, process=False)
-    outward = np.einsum("ni,ni->n", whole.face_normals, whole.triangles_center)
-    if mesh is BOX:
-        assert (outward > 0.0).all()
 
 
 def test_inverted_design_gives_the_same_deviations_with_a_message(tmp_path):

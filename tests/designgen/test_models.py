@@ -462,7 +462,7 @@ def test_bodies_of_one_name_are_numbered(tmp_path, caplog):
         ("a.stl", "solid a\nendsolid a\n", "expected a mesh with faces, found none"),
         ("a.stl", mesh_text([[0, 0, 1]]), "expected triangles with an area, found none"),
         ("a.stl", mesh_text(SIDES)[:500], "is cut off"),
-        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "is damaged"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "has no PLY header"),
         ("a.txt", "", "expected a model"),
         ("a.py", "x = 1\n\nx / 0\n", "ended with an error in line 3 (ZeroDivisionError"),
         ("a.py", "x = 1\n", "in the variable result, which it does not set"),
@@ -473,7 +473,7 @@ def test_bodies_of_one_name_are_numbered(tmp_path, caplog):
         ("a.obj", "v 0 0 0\n", "expected a mesh with faces"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "expected triangles with an area"),
         ("a.obj", "v 0 0 0\nf 1 2 9\n", "finite vertices"),
-        ("a.ply", "no ply", "is damaged"),
+        ("a.ply", "no ply", "has no PLY header"),
         ("a.ifczip", "no zip", "is no zip file"),
     ],
 )

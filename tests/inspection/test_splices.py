@@ -13,7 +13,8 @@ from processor.inspection.bridge_holes import DrilledGroup
 from processor.inspection.design_holes import Hole
 
 X, Y, Z = np.eye(3)
-JOINT = SimpleNamespace(joint_names=("J1",), joint_left=("west",), joint_right=("east",))
+SECTION = np.array([[0.0, y, z] for y, z in ((300, -300), (-300, -300), (-300, 300), (300, 300))] + 4 * [[np.nan] * 3])
+JOINT = SimpleNamespace(joint_names=("J1",), joint_left=("west",), joint_right=("east",), joint_points=SECTION[None])
 ROW = np.array([[0.0, 0.0], [60.0, 0.0]])
 GRID = np.array([[u, v] for u in (0.0, 70.0) for v in (-80.0, 0.0, 80.0)])
 
@@ -136,6 +137,17 @@ def test_holes_that_are_not_seen_may_pass_or_not():
     assert (one.low, one.high) == pytest.approx((10.0 / 12.0 - 1.0, 0.0))
     right.fitted.departure[1:] = np.nan
     assert [reason.code for reason in shares(left, right)["splice-pass-through"].why] == ["inspect.few-holes-of-splice"]
+
+
+@pytest.mark.parametrize(
+    ("west", "east", "places", "splice"),
+    [(-100.0, 100.0, ROW, True), (-100.0, 100.0, ROW[:1], False), (-100.0, 2000.0, ROW, False)],
+    ids=["bolts", "one bore each, as of lugs", "bores of a lug far from the joint"],
+)
+def test_bores_of_lifting_lugs_are_no_splice(west, east, places, splice):
+    none = np.zeros((len(places), 2))
+    groups = [drilled(part, [x, 0.0, 0.0], [X, Y], places, none) for part, x in (("west", west), ("east", east))]
+    assert bool(splices.of_joints(JOINT, groups)) == splice
 
 
 def test_plates_in_different_planes_are_no_splice():

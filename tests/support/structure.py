@@ -89,7 +89,7 @@ def used_modules(name):
     return {n for n in own if MODULES[n].name != "__init__.py" or len(tree(MODULES[n]).body) > 1}
 
 
-SHARED_ROOMS = ("model", "plain_text", "store", "writers", "progress", "jobs", "version")
+SHARED_ROOMS = ("model", "plain_text", "meshes", "store", "writers", "progress", "jobs", "version")
 
 
 def foreign_imports():
@@ -210,6 +210,7 @@ LAYERS = (
     ("adjustment",),
     ("components", "limits", "store"),
     ("readers", "writers"),
+    ("meshes",),
     ("scan_folder",),
     STEPS,
     ("targets",),

@@ -39,5 +39,5 @@ def read_ceiling(folder: Path, project: Table, unit: str, surface_unit: str) -> 
         level = table.number("level") * MM_PER_UNIT[unit]
         return Ceiling(level=level, clearance_mm=clearance, longest_mm=longest)
     path = existing_file_in(folder, table.text("surface"), f"{table.where}: surface")
-    vertices, faces, _ = read_surface(path, surface_unit)
+    vertices, faces = read_surface(path, surface_unit)[:2]
     return Ceiling(vertices=vertices, faces=faces, clearance_mm=clearance, longest_mm=longest)

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
+from processor.meshes.mesh_files import read_whole
 from processor.model import DesignBodies, Floats, InputError, Ints, Reason, reason
 from processor.scan_folder import cad
 from processor.scan_folder.checked_table import existing_file_in
-from processor.scan_folder.files import SCANS, belongs
-from processor.scan_folder.meshes import CAD_SUFFIXES, MESH_SUFFIXES, read_mesh
+from processor.scan_folder.files import CAD_SUFFIXES, SCANS, belongs
 from processor.scan_folder.units import MM_PER_UNIT
 
 MADE = "design-parts"  # folder of the meshes that `processor init` writes
@@ -89,7 +90,7 @@ def read(folder: Path, path: Path, unit: str) -> Surface:
         if design.unit_stated:
             return Surface(path, design.vertices, design.faces, design.bodies, "mm")
         return Surface(path, design.vertices / MM_PER_UNIT[unit], design.faces, design.bodies, "")
-    vertices, faces = read_mesh(path)
+    vertices, faces = read_whole(path)
     if len(faces) < 4:
         raise InputError(f"expected a mesh of a body, found {len(faces)} faces", path=path)
     return Surface(path, vertices, faces, None, "")

@@ -6,7 +6,7 @@ import numpy as np
 
 BOX = np.array([[x, y, z] for x in (0.0, 4.0) for y in (-0.4, 0.4) for z in (0.0, 0.9)])  # a part in metres
 
-TRIANGLES = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [2, 3, 7]]
+TRIANGLES = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [1, 0, 5], [2, 3, 7]]
 
 
 def surface(seed=0, n=4_000):
