@@ -240,10 +240,10 @@ def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floa
 
 
 def _mesh(folder: Path, part: Table, unit: str) -> tuple[Floats, Ints]:
-    """Read a component's mesh; what was mended is logged, but for open edges: ends may be left open."""
+    """Read a component's mesh; facets given several times are logged. Ends may be left open, and normals any."""
     path = existing_file_in(folder, part.text("mesh"), part.where)
     surface = read_surface(path, unit)
-    for found in design_faults(surface.faults and replace(surface.faults, open_edges=0)):
+    for found in design_faults(surface.faults and replace(surface.faults, turned=0, open_edges=0)):
         LOG.warning("%s: %s", path, messages("en").text(found))
     return surface.vertices, surface.faces
 
