@@ -499,7 +499,8 @@ DESIGN_FRAMES = ("project", "own")  # of a frame's nodes: the project's, which t
 class FrameDesign(Checked):
     """A space frame: nodes and the members between them, mm.
 
-    ``coordinates`` is one of DESIGN_FRAMES where the project states it.
+    ``coordinates`` is one of DESIGN_FRAMES where the project states it. ``labels`` are the ids as the design has them,
+    where these are no whole numbers; then ``ids`` are 1, 2, ... in its order, and nothing outside shows them.
     """
 
     ids: Ints = column("k", dtype=np.int64, means=NAMES)
@@ -515,6 +516,17 @@ class FrameDesign(Checked):
         "k", newer=True, means=Meaning(least=-LARGEST_MM, most=LARGEST_MM)
     )  # computed, downward; NaN = not stated
     coordinates: str | None = newer(means=Meaning(words=DESIGN_FRAMES))
+    labels: tuple[str, ...] = names("k", newer=True, means=NAMES)
+
+    @property
+    def names(self) -> list[int | str]:
+        """The ids of the nodes, as the design has them."""
+        return list(self.labels) or self.ids.tolist()
+
+    @property
+    def name_of(self) -> dict[int, int | str]:
+        """The name of each node, by its number in ``ids``."""
+        return dict(zip(self.ids.tolist(), self.names, strict=True))
 
 
 SUPPORTS = ("perimeter", "multi-point")  # of a node: of a frame supported along its edges, or at single points

@@ -102,7 +102,7 @@ def _balls(design: FrameDesign, found: Any) -> dict[str, Mesh]:
         axis = axis / np.linalg.norm(axis)
         for node, out in ((int(tubes.a[m]), axis), (int(tubes.b[m]), -axis)):
             axes.setdefault(node, []).append((out, float(tubes.radii[m])))
-    radius = dict(zip(design.ids.tolist(), design.radii.tolist(), strict=True))
+    radius, name_of = dict(zip(design.ids.tolist(), design.radii.tolist(), strict=True)), design.name_of
     meshes = {}
     for k, node in enumerate(found.balls.ids.tolist()):
         if node not in radius or str(found.balls.evidence[k]) not in SEEN or not found.balls.placed[k]:
@@ -115,14 +115,15 @@ def _balls(design: FrameDesign, found: Any) -> dict[str, Mesh]:
             off = np.linalg.norm(middle - along[:, None] * out, axis=1)
             hidden |= (along > 0.0) & (off < CLEAR_SHARE * tube + CLEAR_MM)
         if not hidden.all():
-            meshes[f"node {node}"] = unit * radius[node] + found.balls.centres[k], facets[~hidden]
+            meshes[f"node {name_of[node]}"] = unit * radius[node] + found.balls.centres[k], facets[~hidden]
     return meshes
 
 
 def _tubes(design: FrameDesign, found: Any) -> dict[str, Mesh]:
     """Return a straight tube of nominal diameter along each axis that was measured, as far as the tube was seen."""
+    name_of = design.name_of
     diameter = {
-        frozenset((int(a), int(b))): (float(d), f"{a}-{b}")
+        frozenset((int(a), int(b))): (float(d), f"{name_of[int(a)]}-{name_of[int(b)]}")
         for a, b, d in zip(design.member_a, design.member_b, design.tube_diameters, strict=True)
     }
     meshes, tubes = {}, found.tubes

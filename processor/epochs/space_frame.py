@@ -80,7 +80,7 @@ def _all_fitted(results: Sequence[Result | None]) -> bool:
 
 def _by_id(results: Sequence[Result | None]) -> tuple[list[str], Ints]:
     """Return the names of the balls of a design, and the row (k, e) of each at each epoch; NO_ROW = none."""
-    tables = [{} if one is None else {ball: i for i, ball in enumerate(one.balls.ids.tolist())} for one in results]
+    tables = [{} if one is None else {ball: i for i, ball in enumerate(one.balls.names)} for one in results]
     ids = list(dict.fromkeys(ball for table in tables for ball in table))
     rows = [[table.get(ball, NO_ROW) for table in tables] for ball in ids]
     return [str(ball) for ball in ids], np.array(rows, np.int64).reshape(-1, len(results))
@@ -102,7 +102,7 @@ def _by_place(results: Sequence[Result | None]) -> tuple[list[str], Ints]:
         rows[known, e] = here[found]
         last[known] = balls.centres[here[found]]
         new = np.setdiff1d(here, here[found])
-        for ball in balls.ids[new].tolist():
+        for ball in (balls.names[row] for row in new.tolist()):
             names.append(str(ball) if str(ball) not in names else f"{ball} ({e + 1})")
         first = np.full((len(new), len(results)), NO_ROW, np.int64)
         first[:, e] = new

@@ -43,7 +43,8 @@ def inspect(scene: Scene, found: Any, method: str) -> Result:
 
 def name_of(design: FrameDesign, member: int) -> str:
     """Name a member by its nodes."""
-    return f"{design.member_a[member]}-{design.member_b[member]}"
+    name_of = design.name_of
+    return f"{name_of[int(design.member_a[member])]}-{name_of[int(design.member_b[member])]}"
 
 
 def _member(
@@ -92,7 +93,7 @@ def _length(
         "length", Quantity.LENGTH, nominal, deviation, of_balls + scanner_class_errors.scale_variance(actual)
     )
     flagged = [k for k in at if str(balls.flag[k]) != CERTAIN]
-    why = tuple(reason("inspect.node-flagged", node=int(balls.ids[k]), flag=balls.flag[k]) for k in flagged)
+    why = tuple(reason("inspect.node-flagged", node=balls.names[k], flag=balls.flag[k]) for k in flagged)
     return replace(length, doubtful=bool(flagged), why=why)
 
 

@@ -105,11 +105,11 @@ class Table:
             raise self._error(key, "a number above 0" if positive else "a finite number")
         return number
 
-    def integer(self, key: str) -> int:
-        """Return a whole number of at most 53 bits."""
+    def integer(self, key: str, expected: str = "a whole number") -> int:
+        """Return a whole number of at most 53 bits; ``expected`` is for the error."""
         value = self.values.get(key)
         if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= 2**53:
-            raise self._error(key, "a whole number")
+            raise self._error(key, expected)
         return value
 
     def array(self, key: str, *shape: int) -> Floats:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -28,13 +27,12 @@ from processor.model import (
     FrameDesign,
     InputError,
     Ints,
-    UsageError,
     did_you_mean,
 )
-from processor.scan_folder import cad
+from processor.scan_folder import cad, node_list
 from processor.scan_folder.checked_table import LOG, Table, existing_file_in, ignore_unknown
-from processor.scan_folder.text_files import csv_rows, read_text
-from processor.scan_folder.units import MM_PER_UNIT, known_unit
+from processor.scan_folder.text_files import read_text
+from processor.scan_folder.units import MM_PER_UNIT
 from processor.scene_cloud import design_faults
 
 TEXT_LIMIT = 256 * 2**20
@@ -46,8 +44,8 @@ def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | Frame
     Raises InputError for missing, unknown or inconsistent entries.
     """
     suffix = path.suffix.lower()
-    if suffix == ".csv":
-        return _read_nodes(path, table_unit)
+    if suffix in node_list.SUFFIXES:
+        return node_list.read_node_list(path, table_unit).design
     if is_surface(path):
         raise InputError(
             f"a {suffix[1:].upper()} file alone is a design of kind structure; an arch bridge or a space frame "
@@ -257,32 +255,43 @@ def _frame(design: Table) -> FrameDesign:
     ignore_unknown(f"{design.where}: nodes", nodes, ("id", "centre", "radius", "support", "deflection"))
     ignore_unknown(f"{design.where}: members", members, ("a", "b", "tube_diameter"))
     for node in nodes:
-        ids.append(node.integer("id"))
+        ids.append(_name(node, "id"))
         supports.append(_support(node))
         deflections.append(node.number("deflection", float("nan"), positive=True) * scale)
         centres.append(node.array("centre", 3) * scale)
         radii.append(node.number("radius", positive=True) * scale)
-    _check_ids(design.where, ids)
-    known = set(ids)
+    node_list.check_names(design.where, ids)
+    numbers, labels = node_list.numbered_names(ids)
+    number_of = dict(zip(ids, numbers.tolist(), strict=True))
     a, b, diameters = [], [], []
     for member in members:
-        ends = (member.integer("a"), member.integer("b"))
-        if not known.issuperset(ends) or ends[0] == ends[1]:
+        ends = (_name(member, "a"), _name(member, "b"))
+        if not number_of.keys() >= set(ends) or ends[0] == ends[1]:
             raise InputError(
                 f"{member.where}: expected ids of two different nodes, found a member from {ends[0]} to {ends[1]}"
             )
-        a.append(ends[0])
-        b.append(ends[1])
+        a.append(number_of[ends[0]])
+        b.append(number_of[ends[1]])
         diameters.append(member.number("tube_diameter", positive=True) * scale)
     return FrameDesign(
-        np.array(ids, np.int64),
+        numbers,
         np.array(centres),
         np.array(radii),
+        labels=labels,
         member_a=np.array(a, np.int64),
         member_b=np.array(b, np.int64),
         tube_diameters=np.array(diameters),
         supports=np.array(supports, np.uint8) if any(supports) else np.empty(0, np.uint8),
         deflections=np.array(deflections) if np.isfinite(deflections).any() else np.empty(0),
+    )
+
+
+def _name(table: Table, key: str) -> str:
+    """Return an id, a whole number or a text, as a text."""
+    return (
+        table.text(key)
+        if isinstance(table.values.get(key), str)
+        else str(table.integer(key, "a whole number or a text"))
     )
 
 
@@ -295,52 +304,6 @@ def _support(node: Table) -> int:
             f"{did_you_mean(kind, SUPPORTS)}"
         )
     return SUPPORTS.index(kind) + 1 if kind else 0
-
-
-def _check_ids(where: str, ids: list[int]) -> None:
-    if not ids:
-        raise InputError(f"{where}: expected nodes, found none")
-    repeated = sorted({i for i in ids if ids.count(i) > 1}) if len(set(ids)) != len(ids) else []
-    if repeated:
-        raise InputError(f"{where}: id {repeated[0]} is given more than once; give each node its own")
-
-
-def _read_nodes(path: Path, table_unit: str) -> FrameDesign:
-    """Read a table of nodes: columns id, x, y, z, radius in any order, named by a header (``x_mm`` gives a unit)."""
-    lines = [line for line in _text(path).splitlines() if line.strip()]
-    first = lines[0] if lines else ""
-    separator = next((mark for mark in (";", "\t", ",") if mark in first), ",")
-    rows = csv_rows(path, separator)
-    header = [name.strip().lower() for name in rows[0][1]] if rows else []
-    columns, units = {}, set()
-    for i, name in enumerate(header):
-        match = re.fullmatch(r"(x|y|z|radius)[\s_\[(]*([a-z-]*)[\])]?|id", name)
-        if match:
-            columns[match.group(1) or "id"] = i
-            if match.group(1):
-                units.add(match.group(2))
-    if set(columns) != {"id", "x", "y", "z", "radius"} or len(units) != 1:
-        raise InputError(f"expected columns id,x,y,z,radius of one unit, found {first.strip()[:80]!r}", path=path)
-    try:
-        unit = known_unit(units.pop() or table_unit)
-    except UsageError as error:
-        raise InputError(str(error), path=path) from None
-    ids, numbers = [], []
-    for line, row in rows[1:]:
-        if len(row) > len(header) and any(cell.strip() for cell in row[len(header) :]):
-            raise InputError(f"line {line}: expected {len(header)} cells, found {len(row)}: {row}", path=path)
-        try:
-            cells = [row[columns[key]].strip() for key in ("x", "y", "z", "radius")]
-            values = [float(cell.replace(",", ".") if separator != "," else cell) for cell in cells]
-            ids.append(int(row[columns["id"]]))
-        except (ValueError, IndexError):
-            raise InputError(f"line {line}: expected id,x,y,z,radius, found {row}", path=path) from None
-        if not np.isfinite(values).all() or values[3] <= 0 or abs(ids[-1]) >= 2**53:
-            raise InputError(f"line {line}: expected finite numbers and a radius above 0, found {row}", path=path)
-        numbers.append(values)
-    _check_ids(str(path), ids)
-    table = np.array(numbers) * MM_PER_UNIT[unit]
-    return FrameDesign(np.array(ids, np.int64), table[:, :3], table[:, 3])
 
 
 def is_surface(path: Path) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from processor import readers
 from processor.model import InputError, did_you_mean
+from processor.scan_folder import node_list
 
 PROJECT = "project.toml"
 TRUTH = "truth.h5"
@@ -23,6 +24,25 @@ def only_cad_file(folder: Path) -> str:
     """Return the name of the one CAD file of a folder, which no scan can be; "" where there is none or several."""
     found = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in CAD_SUFFIXES and path.is_file()]
     return found[0] if len(found) == 1 else ""
+
+
+def node_list_in(folder: Path, excluded: Collection[Path | None]) -> str:
+    """Return the name of the one list of a frame's nodes in a folder, by the headings of its columns; "" without one.
+
+    Raises InputError for several.
+    """
+    excluded = {*excluded, *(folder / name for name in NOT_SCANS)}
+    found = [
+        path.name
+        for path in sorted(folder.iterdir())
+        if path not in excluded and not path.name.startswith(".") and node_list.is_node_list(path)
+    ]
+    if len(found) > 1:
+        raise InputError(
+            f"{folder}: {' and '.join(found[:3])} are lists of a frame's nodes; state the one that is the design by "
+            f"'design' in {PROJECT}, and the scans by [[scan]]"
+        )
+    return found[0] if found else ""
 
 
 def missing(path: Path) -> InputError:

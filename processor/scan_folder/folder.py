@@ -38,7 +38,7 @@ from processor.progress import tracked
 from processor.readers import RawScan
 from processor.readers.encoding import file_name_as_text
 from processor.readers.raw_scan import scaled_in_place, scan_name, summed
-from processor.scan_folder import guess, scanner_grid, units
+from processor.scan_folder import guess, node_list, scanner_grid, units
 from processor.scan_folder.checked_table import Table, existing_file_in
 from processor.scan_folder.clips import FEWEST_POINTS, Clipper, read_boxes
 from processor.scan_folder.control_points import Measured, control_points, read_control
@@ -52,6 +52,7 @@ from processor.scan_folder.files import (
     STATIONS,
     TRUTH,
     missing,
+    node_list_in,
     only_cad_file,
     scan_files,
 )
@@ -161,10 +162,13 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     project = _read_project(folder)
     made = project.guessed.made if project.guessed else None
     design: Design | None = made.design if made else None
+    remarks: tuple[Reason, ...] = ()
     if project.design is not None:
         unit = project.design_units or project.units or option or "m"
         if is_surface(project.design) and project.kind in ("", "structure"):
             design = StructureDesign(scan_name(project.design), *read_surface(project.design, unit))
+        elif project.design.suffix.lower() in node_list.SUFFIXES:
+            design, remarks = node_list.read_node_list(project.design, unit)
         else:
             design = read_design(folder, project.design, unit)
         record_checks.check(design, str(project.design))  # before scans are compared with it
@@ -172,6 +176,7 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     check_components(str(folder / PROJECT), project.tolerance, _component_names(design))
     unit = project.units or option or "m"
     scene = _scene(project, design, option, _read_stations(folder, unit), keep)
+    scene = dataclasses.replace(scene, units_reason=(*scene.units_reason, *remarks))
     ceiling = read_ceiling(folder, project.table, unit, project.design_units or unit)
     scene = dataclasses.replace(scene, ceiling=ceiling) if ceiling is not None else scene
     if scene.structure is not None and project.design is not None and project.design.suffix.lower() in MESH_SUFFIXES:
@@ -270,14 +275,16 @@ def _read_project(folder: Path) -> _Project:
     named = table.text("design", "") or found
     if not named and guessed is None and not path.exists():
         named = only_cad_file(folder)
-    design = existing_file_in(folder, named, str(path)) if named else None
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
+    control, control_file = read_control(folder, table)
+    if not named and guessed is None and kind in ("", "space-frame"):
+        named = node_list_in(folder, (*(entry.path for entry in entries), control_file))
+    design = existing_file_in(folder, named, str(path)) if named else None
     if guessed:
         gap = guessed.made.root_gap_mm if guessed.made else 0.0
         table = Table(str(path), {"tolerance": {"root_gap_mm": gap}} if gap > 0.0 else {})
         components = {folder / scan.file: scan.component for scan in guessed.scans}
         entries = [_Entry(scan, component=components[scan]) for scan in _open_scans(folder, list(components))]
-    control, control_file = read_control(folder, table)
     return _Project(
         name=table.text("name", file_name_as_text(folder.resolve().name)),
         kind=kind,

@@ -23,7 +23,7 @@ from processor.registration import main_body, principal
 from processor.scan_folder import component_names
 from processor.scan_folder.checked_table import existing_file_in
 from processor.scan_folder.design import read_design, read_json, read_surface
-from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, scan_files, scan_files_below
+from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, node_list_in, scan_files, scan_files_below
 from processor.scan_folder.shapes import guess_design, surface_files
 from processor.scan_folder.shapes.guess_design import GuessedDesign
 from processor.scan_folder.units import MM_PER_UNIT, known_unit, radius
@@ -119,6 +119,9 @@ def _written_design(folder: Path, project: Guess) -> Path | None:
         if (folder / name).is_file():
             project.design, project.design_reasons = name, (reason("init.by-file-name"),)
             return folder / name
+    if listed := node_list_in(folder, ()):
+        project.design, project.design_reasons = listed, (reason("init.node-list"),)
+        return folder / listed
     tables = [path for path in sorted(folder.glob("*.json")) if path.name != STATIONS and _has_kind(path)]
     if len(tables) == 1:
         project.design, project.design_reasons = tables[0].name, (reason("init.only-candidate"),)

@@ -42,6 +42,7 @@ def with_hangers(result: Result, scene: Scene) -> Result:
     ]
     hangers = Hangers(
         ids=balls.ids,
+        labels=balls.labels,
         top=balls.lowest,
         bottom=bottom,
         length=length,
@@ -90,7 +91,7 @@ def _limits(ceiling: Ceiling) -> list[Limit]:
 
 def _measured(balls: Balls, row: int, length: float, sd: float) -> Measured:
     doubtful = balls.flag[row] is not Flag.OK or balls.evidence[row] is Evidence.AXES
-    return Measured.within(f"ball {int(balls.ids[row])}", length, NORMAL_95 * sd, doubtful=doubtful)
+    return Measured.within(f"ball {balls.names[row]}", length, NORMAL_95 * sd, doubtful=doubtful)
 
 
 def _lengths(balls: Balls, surface: _Surface) -> tuple[Floats, Floats, Floats]:
@@ -112,7 +113,7 @@ def _lengths(balls: Balls, surface: _Surface) -> tuple[Floats, Floats, Floats]:
 def _of_tubes(tubes: Tubes, surface: _Surface, clearance: Limit) -> list[Comparison]:
     """Compare the lowest line of each tube with the clearance, where it is nearest to the ceiling."""
     share = np.linspace(0.0, 1.0, PLACES_OF_A_TUBE)[:, None]
-    rows = []
+    rows, ends = [], tubes.ends
     for k in range(len(tubes)):
         axis = tubes.start[k] + share * (tubes.end[k] - tubes.start[k])
         along = tubes.end[k] - tubes.start[k]
@@ -130,16 +131,17 @@ def _of_tubes(tubes: Tubes, surface: _Surface, clearance: Limit) -> list[Compari
         of_axis = (1.0 - at) * tubes.start_ci95[k] + at * tubes.end_ci95[k]
         of_height = of_axis[2] + np.abs(slopes[nearest]) @ of_axis[:2]
         half = float(np.hypot(of_height, tubes.radius_ci95[k])) + float(np.nan_to_num(tubes.bow[k]))
-        name = _name(k, int(tubes.a[k]), int(tubes.b[k]))
+        name = _name(k, *ends[k])
         rows.append(judging.compare(clearance, Measured.within(name, float(above[nearest]), half)))
     return rows
 
 
-def _name(tube: int, a: int, b: int) -> str:
-    """Name a tube by its row and the balls at its ends; -1 = none there."""
-    if min(a, b) >= 0:
+def _name(tube: int, a: int | str, b: int | str) -> str:
+    """Name a tube by its row and the balls at its ends; "" = none there."""
+    balls = [ball for ball in (a, b) if ball != ""]
+    if len(balls) == 2:
         return f"tube {tube}, balls {a} and {b}"
-    return f"tube {tube}, ball {max(a, b)} and a free end" if max(a, b) >= 0 else f"tube {tube}, no balls"
+    return f"tube {tube}, ball {balls[0]} and a free end" if balls else f"tube {tube}, no balls"
 
 
 def _joined(first: JudgedLimits | None, second: JudgedLimits | None) -> JudgedLimits | None:

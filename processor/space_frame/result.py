@@ -114,6 +114,7 @@ class Balls(Rows):
     """
 
     ids: Ints = column("k", dtype=np.int64, json="id", means=NAMES)
+    labels: tuple[str, ...] = names("k", json="id", newer=True)  # ids that are no whole numbers
     centres: Floats = column("k", 3, json="centre", unit="mm", means=COORDINATE)
     radii: Floats = column("k", json="radius", unit="mm", means=RADIUS)
     lowest: Floats = column("k", 3, unit="mm", means=COORDINATE)
@@ -155,6 +156,11 @@ class Balls(Rows):
     best_fit_ci95: Floats = _of_gauge(MovementGauge.BEST_FIT, "ci95", AMOUNT)
 
     @property
+    def names(self) -> list[int | str]:
+        """The ids, as the design has them."""
+        return list(self.labels) or self.ids.tolist()
+
+    @property
     def placed(self) -> npt.NDArray[np.bool_]:
         """Whether each sphere (k,) has a centre."""
         return np.asarray(np.isfinite(self.centres).all(axis=1))
@@ -173,6 +179,8 @@ class Tubes(Rows):
 
     a: Ints = column("m", dtype=np.int64, means=END)  # -1 = none
     b: Ints = column("m", dtype=np.int64, means=END)
+    label_a: tuple[str, ...] = names("m", json="a", newer=True)  # ids that are no whole numbers; "" = none
+    label_b: tuple[str, ...] = names("m", json="b", newer=True)
     start: Floats = column("m", 3, unit="mm", means=COORDINATE)
     end: Floats = column("m", 3, unit="mm", means=COORDINATE)
     radii: Floats = column("m", json="radius", unit="mm", means=RADIUS)
@@ -181,6 +189,14 @@ class Tubes(Rows):
     start_ci95: Floats = column("m", 3, unit="mm", means=AMOUNT)
     end_ci95: Floats = column("m", 3, unit="mm", means=AMOUNT)
     bow_ci95: Floats = column("m", unit="mm", newer=True, means=AMOUNT)
+
+    @property
+    def ends(self) -> list[tuple[int | str, int | str]]:
+        """The ids of the spheres at both ends of each tube, as the design has them; "" = none."""
+        if len(self.label_a):
+            return list(zip(self.label_a, self.label_b, strict=True))
+        a, b = (["" if id_ < 0 else id_ for id_ in ids.tolist()] for ids in (self.a, self.b))
+        return list(zip(a, b, strict=True))
 
 
 @dataclass(frozen=True)
@@ -192,11 +208,17 @@ class Hangers(Rows):
     """
 
     ids: Ints = column("k", dtype=np.int64, json="id", means=NAMES)
+    labels: tuple[str, ...] = names("k", json="id", newer=True)  # ids that are no whole numbers
     top: Floats = column("k", 3, unit="mm", means=COORDINATE)
     bottom: Floats = column("k", 3, unit="mm", means=COORDINATE)
     length: Floats = column("k", unit="mm", means=COORDINATE)
     ci95: Floats = column("k", unit="mm", means=AMOUNT)
     verdict: tuple[Verdict, ...] = words("k", Verdict)
+
+    @property
+    def names(self) -> list[int | str]:
+        """The ids of the spheres, as the design has them."""
+        return list(self.labels) or self.ids.tolist()
 
 
 @dataclass(frozen=True)

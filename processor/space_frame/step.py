@@ -9,12 +9,13 @@ about every node that it found.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 
 from processor.adjustment import scanner_class_errors
 from processor.limits import standards
-from processor.model import InputError, Reason, Scene, Tolerance, reason
+from processor.model import FrameDesign, InputError, Reason, Scene, Tolerance, reason
 from processor.scene_cloud import merged
 from processor.space_frame import hanger_lengths, to_result
 from processor.space_frame.params import METHODS, Params
@@ -40,7 +41,25 @@ def run(scene: Scene, params: Params, points: PointReader | None = None, answer_
     Raises UsageError for invalid parameters, InputError for a cloud without members that is larger than memory.
     """
     params.check(scene.frame is not None)
-    return hanger_lengths.with_hangers(_spheres(scene, params, points, answer_given), scene)
+    result = labelled(_spheres(scene, params, points, answer_given), scene.frame)
+    return hanger_lengths.with_hangers(result, scene)
+
+
+def labelled(result: Result, design: FrameDesign | None) -> Result:
+    """Name spheres as the design does where its ids are no whole numbers; further ones are extra-1, extra-2, ..."""
+    if design is None or not design.labels:
+        return result
+    label_of = dict(zip(design.ids.tolist(), design.labels, strict=True))
+    names = (f"extra-{number}" for number in count(1))
+    free = (name for name in names if name not in design.labels)
+    label_of |= {id_: next(free) for id_ in result.balls.ids.tolist() if id_ not in label_of}
+    tubes, balls = result.tubes, result.balls
+    ends = {end: tuple(label_of.get(id_, "") for id_ in getattr(tubes, end).tolist()) for end in ("a", "b")}
+    return replace(
+        result,
+        balls=replace(balls, labels=tuple(label_of[id_] for id_ in balls.ids.tolist())),
+        tubes=replace(tubes, label_a=ends["a"], label_b=ends["b"]),
+    )
 
 
 def _spheres(scene: Scene, params: Params, points: PointReader | None, answer_given: Result | None) -> Result:

@@ -65,7 +65,7 @@ class _Nodes:
         return np.flatnonzero(stated == kind) if kind else np.flatnonzero(stated > 0)
 
     def name(self, row: int) -> str:
-        return str(int(self.design.ids[row]))
+        return str(self.design.names[row])
 
 
 def _centres(nodes: _Nodes) -> Iterator[Measured]:

@@ -106,8 +106,8 @@ def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
 
 def _frame_design(design: FrameDesign) -> dict[str, Any]:
     nodes: list[dict[str, Any]] = [
-        {"id": int(i), "centre": centre.tolist(), "radius": float(radius)}
-        for i, centre, radius in zip(design.ids, design.centres, design.radii, strict=True)
+        {"id": name, "centre": centre.tolist(), "radius": float(radius)}
+        for name, centre, radius in zip(design.names, design.centres, design.radii, strict=True)
     ]
     for node, support in zip(nodes, design.supports.tolist(), strict=False):
         if support:
@@ -115,8 +115,9 @@ def _frame_design(design: FrameDesign) -> dict[str, Any]:
     for node, deflection in zip(nodes, design.deflections.tolist(), strict=False):
         if deflection > 0.0:
             node["deflection"] = deflection
+    name_of = design.name_of
     members = [
-        {"a": int(a), "b": int(b), "tube_diameter": float(d)}
+        {"a": name_of[int(a)], "b": name_of[int(b)], "tube_diameter": float(d)}
         for a, b, d in zip(design.member_a, design.member_b, design.tube_diameters, strict=True)
     ]
     return {"units": "mm", "kind": "space-frame", "nodes": nodes, "members": members}

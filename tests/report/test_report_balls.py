@@ -19,7 +19,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import RecordError, Scan, Scene, Stations, StepRun, Verdict, reason
+from processor.model import FrameDesign, RecordError, Scan, Scene, Stations, StepRun, Verdict, reason
 from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, page, write_results
 from processor.report import table as report_table
@@ -29,6 +29,7 @@ from processor.report.space_frame import figures as space_frame_figures
 from processor.report.space_frame import tables as space_frame_tables
 from processor.report.style import COLOURS, DPI, Drawn
 from processor.results import to_json
+from processor.space_frame import step
 from processor.space_frame.result import (
     ControlDeviations,
     MovementReference,
@@ -170,6 +171,27 @@ def test_the_result_goes_through_the_store_unchanged(tmp_path):
     store.write_results(tmp_path / "r.h5", [StepRun("spheres", "ray", "{}", made)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {"spheres": Result})
     assert_equal(back.result, made)
+
+
+def test_ids_that_are_texts_stand_in_results_tables_and_drawing():
+    design = FrameDesign(np.arange(1, 5), NOMINAL[:4], np.full(4, 50.0), labels=("N001", "=N2", "extra-1", "N004"))
+    made = whole(changed={"ids": np.array([1, 2, 3, 4, 5])})
+    made = dataclasses.replace(made, tubes=dataclasses.replace(made.tubes, a=np.array([1, 4]), b=np.array([2, -1])))
+    made = step.labelled(made, design)
+    names = ["N001", "=N2", "extra-1", "N004", "extra-2"]
+    assert made.balls.names == names
+    result = written(made)
+    assert [ball["id"] for ball in result["balls"]] == names
+    assert [(tube["a"], tube["b"]) for tube in result["tubes"]] == [("N001", "=N2"), ("N004", "")]
+    safe = [name if name != "=N2" else "'=N2" for name in names]
+    for file in ("balls", "nodes", "lowest"):
+        assert [row["id"] for row in by_file(file, made)] == safe
+    assert [(row["ball_a"], row["ball_b"]) for row in by_file("tubes", made)] == [("N001", "'=N2"), ("N004", "")]
+    drawing = ezdxf.read(io.StringIO(dxf.drawing(made).decode()))
+    texts = [one.dxf.text for one in drawing.modelspace().query('TEXT[layer=="IDS"]')]
+    assert texts == [name for name, there in zip(names, made.balls.placed, strict=True) if there]
+    assert "(node =N2)" in str(section.REPORT.summary(made)[0])
+    assert step.labelled(whole(), dataclasses.replace(design, labels=())).balls.names == [10, 11, 12, 13, 14]
 
 
 def test_results_of_earlier_versions_are_read_with_the_gauge_that_they_have():

@@ -167,7 +167,7 @@ def test_mistakes_in_a_design(bridge, case):
 FRAMES = {
     "no nodes": (change(["nodes"], []), "expected nodes, found none"),
     "radius": (change(["nodes", 1, "radius"], 0), "nodes 2: expected a number above 0 as 'radius', found 0"),
-    "id": (change(["nodes", 1, "id"], "a"), "a whole number as 'id', found 'a'"),
+    "id": (change(["nodes", 1, "id"], 1.5), "a whole number or a text as 'id', found 1.5"),
     "id twice": (change(["nodes", 1, "id"], 4), "id 4 is given more than once"),
     "member": (change(["members", 0, "a"], 9), "a member from 9 to 2"),
     "member to itself": (change(["members", 0, "a"], 2), "a member from 2 to 2"),

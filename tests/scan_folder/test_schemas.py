@@ -91,7 +91,7 @@ def frame(**changes):
         frame(nodes=[]),
         frame(nodes=[{"id": 0, "centre": [0, 0], "radius": 60.0}]),
         frame(nodes=[{"id": 0, "centre": [0, 0, 0], "radius": -1.0}]),
-        frame(nodes=[{"id": "a", "centre": [0, 0, 0], "radius": 1.0}]),
+        frame(nodes=[{"id": 1.5, "centre": [0, 0, 0], "radius": 1.0}]),
         frame(members=[{"a": 0, "b": 1}]),
         frame(bolts=[]),
     ],

@@ -74,7 +74,7 @@ def _draw_frame(axes: Axes, design: FrameDesign, view: Floats) -> None:
     ]
     _draw_lines(axes, np.array(pairs).reshape(-1, 2, 2), MEMBER)
     axes.plot(*(1e-3 * centres.T), "o", markersize=4, color=SURE, zorder=3)
-    for i, place in zip(design.ids, 1e-3 * centres, strict=True) if len(design.ids) <= MOST_NAMED else ():
+    for i, place in zip(design.names, 1e-3 * centres, strict=True) if len(design.ids) <= MOST_NAMED else ():
         _name(axes, place, str(i), "black", (3, 3))
 
 

@@ -67,7 +67,7 @@ class BallPicture:
         ``points`` (n, 3) and the place ``nominal`` (3,) are less the middle; one that is not finite is not shown.
         """
         balls = result.balls
-        heading = f"Ball {int(balls.ids[i])}: {balls.flag[i]}. {messages('en').sentences(balls.reasons[i])}"
+        heading = f"Ball {balls.names[i]}: {balls.flag[i]}. {messages('en').sentences(balls.reasons[i])}"
         self._heading.set_text("\n".join(textwrap.wrap(heading, 130)[:HEADING_LINES]))
         members = _members(result, i, middle, reach)
         fitted = np.nan if balls.flag[i] is Flag.NOT_FOUND else float(balls.radii[i])

@@ -3,7 +3,7 @@
 Layers: NODES has a circle of each ball's radius and a point at its centre, AXES a line a tube, MOVEMENTS a line from
 each node's nominal place to where it was found (true to scale), IDS the ids, LOWEST a point at each ball's lowest
 place. With a ceiling HANGERS has a line from there to the ceiling and its length, CLASHES a circle about each hanger
-that fails. No text from outside is in it.
+that fails. Ids are printable texts; no other text from outside is in it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from processor.model import Verdict
+from processor.plain_text import printable
 from processor.report.space_frame.nominal_positions import nominal_places
 from processor.space_frame.result import Hangers, Result
 
@@ -60,7 +61,7 @@ def _draw(space: Any, result: Result) -> None:
         if np.isfinite(balls.radii[i]):
             aside = float(balls.radii[i])
             space.add_circle(centre, aside, dxfattribs=on_nodes)
-        text = space.add_text(str(int(balls.ids[i])), height=TEXT_HEIGHT_MM, dxfattribs=on_ids)
+        text = space.add_text(printable(str(balls.names[i])), height=TEXT_HEIGHT_MM, dxfattribs=on_ids)
         text.set_placement((centre[0] + aside, centre[1] + aside, centre[2]))
         if np.isfinite(nominal[i]).all():
             space.add_line(nominal[i].tolist(), centre, dxfattribs={"layer": "MOVEMENTS"})

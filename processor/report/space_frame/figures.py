@@ -86,7 +86,7 @@ def _plan(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
         axes.scatter(x, y, s=36.0, marker="x", color="black", label=label)
     flagged = np.flatnonzero(~balls.flagged(Flag.OK) & np.isfinite(where).all(axis=1))[:MOST_LABELS]
     for i in flagged.tolist():
-        axes.annotate(str(balls.ids[i]), where[i, :2] / 1000.0, xytext=(5, 4), textcoords="offset points", fontsize=8)
+        axes.annotate(str(balls.names[i]), where[i, :2] / 1000.0, xytext=(5, 4), textcoords="offset points", fontsize=8)
     axes.set(xlabel="x, m", ylabel="y, m")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)

@@ -61,7 +61,7 @@ def _caption(result: Result, i: int, flagged: int) -> Message:
     return text(
         "Ball {id}, {flag}: the points about it{stations}; dark are those within {slice:g} mm of the plane through its "
         "centre{more}",
-        id=int(result.balls.ids[i]),
+        id=result.balls.names[i],
         flag=result.balls.flag[i],
         stations=text(", each station as registered") if len(result.stations) else "",
         slice=SLICE_MM,

@@ -36,7 +36,7 @@ def tables(result: Result) -> list[Table]:
             float(hangers.bottom[i, 2]),
             result.balls.flag[i],
         )
-        for i, ball in enumerate(hangers.ids.tolist())
+        for i, ball in enumerate(hangers.names)
     )
     header = columns("id", "verdict", "length_mm", "ci95_mm", "x_mm", "y_mm", "z_mm", "ceiling_z_mm", "flag")
     note = text(
@@ -52,7 +52,7 @@ def stake_out(result: Result) -> bytes:
     hangers = result.hangers
     assert hangers is not None
     rows = []
-    for i, ball in enumerate(hangers.ids.tolist()):
+    for i, ball in enumerate(hangers.names):
         if result.balls.flag[i] is Flag.OK and np.isfinite(hangers.length[i]):
             for letter, place, code in (("L", hangers.top[i], LOWEST), ("C", hangers.bottom[i], CEILING)):
                 rows.append((f"{letter}{ball}", *np.round(place / 1000.0, 4).tolist(), code))
@@ -79,7 +79,7 @@ def draw(result: Result) -> CaptionedPngs:
                 x, y, s=130.0, facecolors="none", edgecolors=colour, linestyles=style, label=f"{label} ({len(rows)})"
             )
     for row in failed[:MOST_NAMED]:
-        label = f"{int(hangers.ids[row])}: {hangers.length[row]:.0f}"
+        label = f"{hangers.names[row]}: {hangers.length[row]:.0f}"
         at = (float(hangers.top[row, 0]) / 1000.0, float(hangers.top[row, 1]) / 1000.0)
         axes.annotate(label, at, xytext=(7, 5), textcoords="offset points", fontsize=8)
     axes.set(xlabel="x, m", ylabel="y, m")

@@ -57,7 +57,7 @@ def _mark(result: Result, i: int, origin: Floats, used: Sequence[Flag]) -> dict[
     mark = {
         "part": used.index(flag),
         "tone": LOCATED_FLAGS.index(flag),
-        "name": f"{balls.ids[i]}",
+        "name": f"{balls.names[i]}",
         "at": np.round(balls.centres[i] - origin, 2),
         "radius": round(float(balls.radii[i]), 2),
         "text": text(

@@ -35,7 +35,7 @@ def _summary(result: Result) -> tuple[Message, Message | str]:
 def _movements(result: Result, gauges: Gauges) -> Message:
     """Say by which gauge the movements are, how large, and how far the other gauge is from it."""
     size = result.balls.movement_size
-    node, largest = result.balls.ids[int(np.nanargmax(size))], float(np.nanmax(size))
+    node, largest = result.balls.names[int(np.nanargmax(size))], float(np.nanmax(size))
     if gauges.gauge is MovementGauge.DESIGN:
         agreed = gauges.basis is GaugeBasis.AGREEMENT
         what = text("differences of coordinates (assumed)") if agreed else text("differences of coordinates")
@@ -66,7 +66,7 @@ def _why(result: Result) -> Iterator[Message]:
     for flag in (Flag.NOT_FOUND, Flag.WRONG_SIZE, Flag.LOW_CONFIDENCE):
         rows = [row for row, one in enumerate(balls.flag) if one is flag]
         if rows:
-            ball = int(balls.ids[rows[0]])
+            ball = balls.names[rows[0]]
             yield text(
                 "{count} {flag}, e.g. ball {ball}: {reasons}",
                 count=len(rows), flag=flag, ball=ball, reasons=balls.reasons[rows[0]],

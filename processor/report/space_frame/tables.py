@@ -64,7 +64,7 @@ def _formal(run: StepRun, true: Floats, file: str, first: StepRun) -> Table:
             balls.flag[i],
             balls.reasons[i],
         )
-        for i, ball in enumerate(balls.ids.tolist())
+        for i, ball in enumerate(balls.names)
     )
     header = columns(
         "id", *COORDINATES, "radius_mm", "formal_ci95_radius_mm", "true_radius_mm", "radius_error_mm", "lowest_z_mm",
@@ -106,7 +106,7 @@ def _with_bounds(run: StepRun, true: Floats, file: str) -> Table:
             balls.flag[i],
             balls.reasons[i],
         )
-        for i, ball in enumerate(balls.ids.tolist())
+        for i, ball in enumerate(balls.names)
     )
     header = columns(
         "id", *COORDINATES, *(f"ci95_{name}" for name in COORDINATES), "radius_mm", "ci95_radius_mm", "size_mm",
@@ -134,7 +134,7 @@ def _brief(result: Result, method: str) -> Table:
             balls.evidence[i],
             balls.flag[i],
         )
-        for i, ball in enumerate(balls.ids.tolist())
+        for i, ball in enumerate(balls.names)
     )
     header = columns(
         "id", *COORDINATES, "radius_mm", "ci95_radius_mm", "size_mm", "lowest_z_mm", "ci95_lowest_z_mm", "evidence",
@@ -149,7 +149,7 @@ def _flagged(result: Result, method: str) -> list[Table]:
     balls = result.balls
     rows = tuple(
         (ball, balls.flag[i], balls.reasons[i], *balls.centres[i].tolist(), float(balls.radii[i]))
-        for i, ball in enumerate(balls.ids.tolist())
+        for i, ball in enumerate(balls.names)
         if balls.flag[i] is not Flag.OK
     )
     header = columns("id", "flag", "remark", *COORDINATES, "radius_mm")
@@ -185,7 +185,7 @@ def _sd(balls: Balls) -> Floats:
 def _lowest(balls: Balls) -> Table:
     rows = tuple(
         (ball, *balls.lowest[i].tolist(), NORMAL_95 * float(balls.lowest_sd[i]), float(balls.radii[i]), balls.flag[i])
-        for i, ball in enumerate(balls.ids.tolist())
+        for i, ball in enumerate(balls.names)
     )
     header = columns("id", *COORDINATES, "ci95_z_mm", "radius_mm", "flag")
     note = text(
@@ -250,7 +250,7 @@ def _nodes(result: Result) -> list[Table]:
             balls.flag[i],
             balls.reasons[i],
         )
-        for i, ball in enumerate(balls.ids.tolist())
+        for i, ball in enumerate(balls.names)
     )
     header = columns(
         "id", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm", "movement_mm", "ci95_movement_mm",
@@ -286,7 +286,7 @@ def _gauges(result: Result) -> list[Table]:
     difference = np.linalg.norm(balls.design_movement - balls.best_fit_movement, axis=1)
     rows = tuple(
         (ball, *balls.design_movement[i].tolist(), *balls.best_fit_movement[i].tolist(), float(difference[i]))
-        for i, ball in enumerate(balls.ids.tolist())
+        for i, ball in enumerate(balls.names)
         if np.isfinite(difference[i])
     )
     axes = ("dx_mm", "dy_mm", "dz_mm")
@@ -336,12 +336,11 @@ def _tubes(result: Result) -> list[Table]:
     tubes = result.tubes
     if not len(tubes):
         return []
-    length = np.linalg.norm(tubes.end - tubes.start, axis=1)
+    length, ends = np.linalg.norm(tubes.end - tubes.start, axis=1), tubes.ends
     rows = tuple(
         (
             i,
-            int(tubes.a[i]) if tubes.a[i] >= 0 else "",
-            int(tubes.b[i]) if tubes.b[i] >= 0 else "",
+            *ends[i],
             *tubes.start[i].tolist(),
             *tubes.end[i].tolist(),
             float(length[i]),
