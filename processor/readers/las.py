@@ -25,6 +25,8 @@ LEAST_HEADER, HEADER_1_4 = 227, 375
 VERSION_MINOR_AT, COUNTS_AT, POINT_FORMAT_AT, EXTENDED_AT = 25, 96, 104, 235
 VLR_HEADER, EVLR_HEADER = 54, 60
 PIECE = 1_000_000
+# Field of the flags, its bits for synthetic and withheld points: of point formats 0 to 5, and of later ones (table 16).
+FLAGS, LAST_OLD_FORMAT = (("raw_classification", 0x20, 0x80), ("classification_flags", 0x01, 0x04)), 5
 COLOURS = ("red", "green", "blue")
 PACKED = 0xC0  # bits of the point format
 LAZ_LIMIT = 2_000  # compression ratio that no real file exceeds
@@ -58,14 +60,15 @@ def read(path: Path) -> list[RawScan]:
             )
         points, intensity = allocate(declared, 3), allocate(declared)
         station = allocate(declared, dtype=np.uint16)
+        flags_name, synthetic_bit, withheld_bit = FLAGS[header.point_format.id > LAST_OLD_FORMAT]
         colours = COLOURS if set(COLOURS) <= set(header.point_format.dimension_names) else ()
         colour = [allocate(declared, dtype=np.uint16) for _ in colours]
         for piece in file.chunk_iterator(PIECE):
             read += len(piece)
-            synthetic += int(np.count_nonzero(piece["synthetic"]))
-            withheld = np.asarray(piece["withheld"], np.bool_)
-            if withheld.any():
-                piece = piece[~withheld]
+            flags = piece.array[flags_name]
+            if np.bitwise_or.reduce(flags, initial=0) & (synthetic_bit | withheld_bit):  # rare
+                synthetic += int(np.count_nonzero(flags & synthetic_bit))
+                piece = piece[flags & withheld_bit == 0]
             rows = slice(count, count + len(piece))
             for i, axis in enumerate("XYZ"):
                 coordinate = points[rows, i]
@@ -86,13 +89,16 @@ def read(path: Path) -> list[RawScan]:
     stations = station[:count] if named else ()
     name = scan_name(path)
     scan = build_scan(path, name, points[:count], unit=unit, intensity=intensity[:count], station=stations)
-    remarks = [("read.withheld-points", read - count), ("read.synthetic-points", synthetic)]
+    remarks = [
+        reason("read.withheld-points", count=read - count, scans=(name,)),
+        reason("read.synthetic-points", count=synthetic, scans=(name,)),
+    ]
     return [
         dataclasses.replace(
             coloured(scan, [column[:count] for column in colour]),
             scanned=day,
             unit_fault=fault,
-            remarks=tuple(reason(code, count=number, scans=(name,)) for code, number in remarks if number),
+            remarks=tuple(one for one in remarks if one.values["count"]),
         )
     ]
 
