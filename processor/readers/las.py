@@ -44,8 +44,7 @@ def read(path: Path) -> list[RawScan]:
     import laspy
 
     _check_header(path)
-    read = count = synthetic = 0
-    named = False
+    read, count, synthetic, named = 0, 0, 0, False
     with errors_name_the_file(path, "LAS"), laspy.open(str(path)) as file:
         header = file.header
         fits_degrees = bool((np.abs([header.mins, header.maxs])[:, :2] <= [180.0, 90.0]).all())
@@ -86,8 +85,7 @@ def read(path: Path) -> list[RawScan]:
     if read and not count:
         raise InputError(f"all of its {read} points are flagged as withheld, which means deleted", path=path)
     # 0 in all points: the stations are unknown.
-    stations = station[:count] if named else ()
-    name = scan_name(path)
+    name, stations = scan_name(path), station[:count] if named else ()
     scan = build_scan(path, name, points[:count], unit=unit, intensity=intensity[:count], station=stations)
     remarks = [
         reason("read.withheld-points", count=read - count, scans=(name,)),
