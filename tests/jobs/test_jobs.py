@@ -9,7 +9,7 @@ from contextlib import closing
 
 import pytest
 
-from processor.jobs import causes, process, runner
+from processor.jobs import causes, process, program, runner
 from processor.jobs.causes import Cause
 from processor.jobs.child import Loss, Lost
 from processor.model import InputError, UsageError
@@ -180,3 +180,12 @@ def test_lock_is_refused_while_it_is_taken(tmp_path, name):
         pass
     with runner.locked(tmp_path / name, "busy"):
         pass
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError(12, "Cannot allocate memory"), MemoryError((3,), "float64")])
+def test_lack_of_memory_is_one_line(error, monkeypatch):
+    assert program._line(error).startswith("not enough memory (")
+    assert "internal error" in program._line(SystemError("NULL"))
+    monkeypatch.setattr(program.address_space, "room", lambda: 1e6)
+    assert program._line(SystemError("NULL")).startswith("not enough memory (")
+    assert program._line(InputError("damaged")) == "damaged"
