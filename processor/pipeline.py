@@ -350,8 +350,8 @@ def execute(
                 result = dataclasses.replace(result, reasons=(*result.reasons, *coincident))
             runs.append(dataclasses.replace(done, result=result, diagnostics=notes.table()))
             clouds += [StepCloud(job.step, job.method, cloud) for cloud in notes.clouds]
-            answers.setdefault(job.step, done.result)
-        whole = _execution(path, scene, runs, digest, piecewise)
+            answers.setdefault(job.step, runs[-1].result)
+        whole = _execution(path, scene, _completed(runs, answers), digest, piecewise)
         return dataclasses.replace(whole, clouds=tuple(clouds))
 
 
@@ -390,6 +390,17 @@ def _execution(path: Path, scene: Scene, runs: Sequence[StepRun], digest: str, p
         "epoch": epoch.facts(scene),
     }
     return Execution(scene, tuple(runs), provenance, path if piecewise else None)
+
+
+def _completed(runs: Sequence[StepRun], answers: Mapping[str, Any]) -> list[StepRun]:
+    """Return the runs, the answers completed by what later steps say of them."""
+    modules, completed = step_modules(), []
+    for run in runs:
+        by_others: Callable[[Any, Mapping[str, Any]], Any] | None = getattr(modules[run.step], "completed", None)
+        if by_others is not None and run.result is answers[run.step]:
+            run = dataclasses.replace(run, result=by_others(run.result, answers))
+        completed.append(run)
+    return completed
 
 
 def _stopping(job: Job, answers: Mapping[str, Any]) -> str:

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls, signed
 from processor.geometry import rigid
 from processor.geometry.lines_and_polylines import Polyline
-from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Status, Truth
+from processor.model import NORMAL_95, ArchDesign, ArchTruth, Bools, Floats, Metric, Scene, Statistic, Status, Truth
 from processor.preassembly import assembly_errors, topology
 from processor.preassembly.chain.adjustment import HOLD
 from processor.preassembly.chain.span_and_closure import design_span
@@ -258,8 +258,9 @@ def by_objective(design: ArchDesign, key_points: Sequence[Floats], edges: Floats
     """Minimise the sum of squared gaps plus ``weight`` times that of the edges' departures over the parts' motions.
 
     ``key_points`` (e, 8, 3) of each part's ends and ``edges`` (c, 2, e, 3) of the parts are near their places in the
-    design, in the bridge's frame. Joints and edges with NaN have no weight; parts are then constrained along their
-    chords as in the adjustment. Parts without edges have the departures of their key points across the joints.
+    design, in the bridge's frame. Joints and edges with NaN have no weight; parts are then constrained as in the
+    adjustment: along their chords, in pieces wholly. Parts without edges have the departures of their key points
+    across the joints.
     """
     lines = [(Polyline.through(p.bottom_edge_left), Polyline.through(p.bottom_edge_right)) for p in design.parts]
     with_edges = [len(p.bottom_edge_left) > 0 for p in design.parts]
@@ -281,8 +282,7 @@ def by_objective(design: ArchDesign, key_points: Sequence[Floats], edges: Floats
         for side in both
         if not with_edges[side.part] and np.isfinite(key_points[side.part][side.end]).all()
     ]
-    chords = np.array([_chord(design, i) for i in range(len(lines))])
-    hold = 0.0 if joined.all() and design.in_row else np.sqrt(HOLD)
+    held = _held(design, middles, joined)
 
     def placed(x: Floats, i: int, points: Floats) -> Floats:
         return rigid.apply(_motion(x, i, middles[i]), points)
@@ -296,10 +296,9 @@ def by_objective(design: ArchDesign, key_points: Sequence[Floats], edges: Floats
         return np.vstack([np.zeros((0, 3)), *vectors])
 
     def objective(x: Floats) -> Floats:
-        along = np.einsum("ci,ci->c", chords, x.reshape(-1, 6)[:, 3:])
         off = [((placed(x, i, points) - at) @ axes).ravel() for i, points, at, axes in across]
         line = np.sqrt(weight) * np.concatenate([departures(x).ravel(), *off])
-        return np.concatenate([gaps(x)[joined].ravel(), line, hold * along])
+        return np.concatenate([gaps(x)[joined].ravel(), line, np.sqrt(HOLD) * held(x)])
 
     solution = least_squares(objective, np.zeros(6 * len(lines)), xtol=1e-12, ftol=1e-12, gtol=1e-12).x
     before = np.cumsum([[0.0, 0.0], *([left.length, right.length] for left, right in lines)], axis=0)
@@ -332,6 +331,35 @@ def _chord(design: ArchDesign, i: int) -> Floats:
         chord = middles[-1] - middles[-2]
     unit: Floats = chord / np.linalg.norm(chord)
     return unit
+
+
+def _held(design: ArchDesign, middles: Sequence[Floats], joined: Bools) -> Callable[[Floats], Floats]:
+    """Return what of the parts' movements has the weight HOLD, where the joints (j,) that have one do not suffice."""
+    chords = np.array([_chord(design, i) for i in range(len(middles))])
+    places = [_places(design, i, middle) for i, middle in enumerate(middles)]
+    complete = bool(joined.all()) and design.in_row
+
+    def along_chords(x: Floats) -> Floats:
+        along: Floats = np.einsum("ci,ci->c", chords, x.reshape(-1, 6)[:, 3:])
+        return 0.0 * along if complete else along
+
+    def of_pieces(x: Floats) -> Floats:
+        moved = (rigid.apply(_motion(x, i, middles[i]), at) - at for i, at in enumerate(places))
+        return np.concatenate([by.ravel() / np.sqrt(len(by)) for by in moved])
+
+    return of_pieces if topology.pieces(design.joined, joined, len(middles)).any() else along_chords
+
+
+def _places(design: ArchDesign, i: int, middle: Floats) -> Floats:
+    """Return the points (n, 3) at which a part of a piece is held: key points, edges, and these mirrored."""
+    part = design.parts[i]
+    edges = (
+        [line.at(_chainages(line)) for line in map(Polyline.through, (part.bottom_edge_left, part.bottom_edge_right))]
+        if len(part.bottom_edge_left)
+        else []
+    )
+    points = np.vstack([*design.joint_points[(design.joined == i).any(axis=1)], *edges, middle])
+    return np.vstack([points, 2.0 * middle - points])
 
 
 def _motion(x: Floats, i: int, middle: Floats) -> Floats:

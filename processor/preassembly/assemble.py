@@ -7,18 +7,20 @@ gaps of imperfect parts depend on: the weight lambda of the design's curve again
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from processor.adjustment import thermal
+from processor.geometry import rigid
 from processor.limits import standards
-from processor.model import ArchDesign, Bools, Floats, Scan, Scene, Tolerance
+from processor.model import ArchDesign, Bools, Floats, Reason, Scan, Scene, Tolerance, Verdict, reason
 from processor.preassembly import to_result, topology
 from processor.preassembly.chain import adjustment, assembled_parts, linear_error, loop_closure, span_and_closure
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
-from processor.preassembly.params import Params, TrimParams
+from processor.preassembly.params import AdjustParams, Params, TrimParams
 from processor.preassembly.parts import measure
 from processor.preassembly.parts.attitude import Attitude, Shapes
 from processor.preassembly.parts.each_part import each_part
@@ -49,23 +51,25 @@ def assemble(
     shapes = Shapes(design, attitudes)
     fitted = each_part(lambda k: measure.fit(scans[k], k, shapes, shrink, params.systematic), scans)
     parts = measure.assigned(measure.estimate(fitted, params.systematic))
-    curve = _adjust(parts, design, frames, params.adjust.weight)
+    curve = _adjust(parts, design, frames, params.adjust)
     adjusted = curve[params.adjust.weight]
     placed = assembled_parts.place(parts, adjusted, design, frames, _on_steel(shapes, design))
+    in_pieces = reasons.of_pieces(adjusted, design, params.adjust.place_sd_mm)
     figures = span_and_closure.measure(parts, adjusted, design, frames)
     assembly = Assembly(
         design=design,
         params=params,
         limits=limits,
         temperature_corrected=shrink != 1.0,
-        parts=parts,
+        parts=reasons.placed_by_design(parts, in_pieces),
+        in_pieces=in_pieces,
         adjusted=adjusted,
         trade_off={weight: curve[weight] for weight in TRADE_OFF},
         placement=placed,
         edges=linear_error.along_bridge(parts, adjusted, design),
         figures=figures,
         loops=loop_closure.measure([part.member for part in parts], design, frames),
-        joints=_judge_joints(parts, placed.gaps, adjusted, design, frames, limits, params.trim),
+        joints=_judge_joints(parts, placed.gaps, adjusted, design, frames, limits, params.trim, in_pieces),
         chain=_judge_chain(parts, adjusted, figures, design, limits),
     )
     return to_result.to_result(assembly)
@@ -80,12 +84,15 @@ def _on_steel(shapes: Shapes, design: ArchDesign) -> Bools:
     return np.array(marks, bool).reshape(-1, 8)
 
 
-def _adjust(parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats, weight: float) -> dict[float, Adjusted]:
-    """Adjust the chain with lambda = ``weight`` and with each of TRADE_OFF."""
+def _adjust(
+    parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats, params: AdjustParams
+) -> dict[float, Adjusted]:
+    """Adjust the chain with lambda = ``params.weight`` and with each of TRADE_OFF."""
     members = [part.member for part in parts]
     sides = topology.sides_of(design.joined)
     return {
-        value: adjustment.adjust(members, design.joint_points, frames, value, sides) for value in {*TRADE_OFF, weight}
+        weight: adjustment.adjust(members, design.joint_points, frames, weight, sides, params.place_sd_mm)
+        for weight in {*TRADE_OFF, params.weight}
     }
 
 
@@ -97,17 +104,53 @@ def _judge_joints(
     frames: Floats,
     limits: Tolerance,
     trim: TrimParams,
+    in_pieces: tuple[Reason, ...],
 ) -> list[JudgedJoint]:
-    """Measure every joint by its gaps (8, 3), compare it with the limits, and propose work on it."""
+    """Measure every joint by its gaps (8, 3), compare it with the limits, and propose work on it.
+
+    ``in_pieces`` is the reason of an assembly in pieces: there a joint that closes only by moving its parts is open.
+    """
     judged = []
+    judges_places = span_and_closure.has_span(design) or not design.in_row
     for j, sides in enumerate(topology.sides_of(design.joined)):
         measures = joint_measures.measure(gaps[j], adjusted.gap_covariance[j], frames[j], design.joint_points[j])
         left, right = (parts[side.part] for side in sides)
         doubts, weak = reasons.of_joint(parts, sides), reasons.weak_parts(left, right)
-        conformity = joints.left_open(joints.judge(measures, limits), doubts)
-        proposal = trim_and_build_up.propose(measures, limits, trim, doubts=doubts, weak_parts=weak)
+        conformity = joints.judge(measures, limits)
+        moved: tuple[Reason, ...] = ()
+        if (adjusted.in_pieces or not judges_places) and conformity.verdict is Verdict.PASS:
+            moved = _closes_by_moving(parts, adjusted, design, frames, limits, j)
+        doubts += moved if adjusted.in_pieces else ()
+        conformity = joints.left_open(conformity, doubts)
+        proposal = trim_and_build_up.propose(measures, limits, trim, doubts=doubts, weak_parts=weak, moved=moved)
+        if in_pieces and measures.known:
+            remark = reason("preassemble.joint-of-piece", joints=in_pieces[0].values["joints"])
+            proposal = replace(proposal, reasons=(*proposal.reasons, remark))
         judged.append(JudgedJoint(measures, conformity, proposal))
     return judged
+
+
+def _closes_by_moving(
+    parts: Sequence[MeasuredPart],
+    adjusted: Adjusted,
+    design: ArchDesign,
+    frames: Floats,
+    limits: Tolerance,
+    joint: int,
+) -> tuple[Reason, ...]:
+    """State by how much the parts of a joint were moved where it does not surely pass with both at their places."""
+    ends = [parts[side.part].member.ends[side.end] for side in topology.sides_of(design.joined)[joint]]
+    left, right = (np.full((8, 3), np.nan) if end is None else end.departure for end in ends)
+    gaps = (right - left) @ frames[joint][:3, :3].T
+    unmoved = joint_measures.measure(gaps, adjusted.gap_covariance[joint], frames[joint], design.joint_points[joint])
+    if joints.judge(unmoved, limits).verdict is Verdict.PASS:
+        return ()
+    points = [np.vstack([parts[i].member.centre, design.joint_points[joint]]) for i in design.joined[joint]]
+    moves = [
+        np.linalg.norm(rigid.apply(adjusted.motions[i], at) - at, axis=1).max()
+        for i, at in zip(design.joined[joint], points, strict=True)
+    ]
+    return (reason("preassemble.closes-by-moving", move=float(max(moves)), gap=float(np.abs(gaps).max())),)
 
 
 def _judge_chain(

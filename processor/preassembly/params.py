@@ -16,10 +16,14 @@ class AdjustParams:
     """Parameters of the adjustment."""
 
     weight: float = 0.1  # lambda: of a squared departure of the edges from the design, against a squared gap
+    # Half of 1/3000 of 60 m, the limit of an erected arch rib in height (processor/limits/jtg-arch-rib.toml).
+    place_sd_mm: float = 10.0  # of the place in the design, each axis, of what no measured joint ties to the rest
 
     def __post_init__(self) -> None:
         if not self.weight > 0.0:
             raise UsageError(f"preassemble.adjust.weight: expected a number above 0, got {self.weight!r}")
+        if not 0.0 < self.place_sd_mm < math.inf:
+            raise UsageError(f"preassemble.adjust.place_sd_mm: expected a number above 0, got {self.place_sd_mm!r}")
 
 
 @dataclass(frozen=True)

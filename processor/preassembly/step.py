@@ -7,6 +7,7 @@ see :mod:`processor.preassembly.assemble`. The paper's methods are baselines, se
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from processor.preassembly import assemble
 from processor.preassembly.baselines import bootstrap_bands, methods
 from processor.preassembly.params import METHODS, Params
 from processor.preassembly.result import Result
+from processor.preassembly.verdicts import part_failures
 
 __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "run"]
 
@@ -72,6 +74,12 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
         remark = reason("preassemble.temperature-not-corrected", temperature=scene.temperature_C)
         result = replace(result, reasons=(*result.reasons, remark))
     return result
+
+
+def completed(result: Result, answers: Mapping[str, Any]) -> Result:
+    """Return a result whose proposals name the parts beside the joint that fail limits of their own."""
+    inspected = answers.get("inspect")
+    return result if inspected is None else part_failures.named_at_joints(result, inspected.components)
 
 
 def scans_in_order(scene: Scene, design: ArchDesign) -> list[list[Scan]]:

@@ -63,6 +63,7 @@ class Assembly:
     limits: Tolerance
     temperature_corrected: bool
     parts: Sequence[MeasuredPart]
+    in_pieces: tuple[Reason, ...]
     adjusted: Adjusted
     trade_off: Mapping[float, Adjusted]
     placement: Placement
@@ -283,6 +284,7 @@ def _reasons(assembly: Assembly) -> Iterator[Reason]:
     """Yield the remarks on the whole assembly."""
     limits = assembly.limits
     yield from of_assignment(assembly.parts)
+    yield from assembly.in_pieces
     yield reason("preassemble.weight", weight=assembly.params.adjust.weight)
     if assembly.temperature_corrected:
         yield reason("preassemble.temperature-corrected")

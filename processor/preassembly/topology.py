@@ -1,4 +1,4 @@
-"""Which parts are joined where: the ends of each part, and the closed loops of parts.
+"""Which parts are joined where: the ends of each part, the closed loops of parts, and the pieces of an assembly.
 
 A part ends at the joints whose left part it is, and starts at those whose right part it is. A part of a row or a ring
 has one start and one end at most. Any other is a branch: its ends have no other names than those of their joints.
@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from processor.model import Ints
+from processor.model import Bools, Ints
 
 
 class PartEnd(NamedTuple):
@@ -66,6 +68,19 @@ def sides_of(joined: Ints) -> Sides:
 def row(parts: int) -> Ints:
     """Left and right parts (parts - 1, 2) of the joints of parts in a row."""
     return np.stack([np.arange(parts - 1), np.arange(1, parts)], axis=1).astype(np.int64)
+
+
+def pieces(joined: Ints, measured: Bools, parts: int) -> Ints:
+    """Return the number of the piece (parts,) that each part is of: parts that ``measured`` joints (j,) connect.
+
+    Pieces are numbered from 0 in the order of their first parts.
+    """
+    left, right = joined[measured].T
+    number: Ints = connected_components(coo_array((np.ones(len(left)), (left, right)), (parts, parts)), directed=False)[
+        1
+    ]
+    first = np.unique(number, return_index=True)[1]
+    return np.argsort(np.argsort(first))[number]
 
 
 def loops(joined: Ints, parts: int) -> list[Loop]:

@@ -115,7 +115,13 @@ def test_unused_limits_are_reported():
     assert [limit.key for limit in chain.unused_limits(mixed)] == ["bow_mm"]
     params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=SimpleNamespace(known=True))
     assembly = SimpleNamespace(
-        params=params, limits=mixed, temperature_corrected=False, parts=(), joints=[], chain=joints.Conformity()
+        params=params,
+        limits=mixed,
+        temperature_corrected=False,
+        parts=(),
+        in_pieces=(),
+        joints=[],
+        chain=joints.Conformity(),
     )
     assert reason("preassemble.unused-limits", limits=("bow_mm",)) in to_result._reasons(assembly)
 

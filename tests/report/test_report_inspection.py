@@ -103,5 +103,6 @@ def test_the_page_is_in_chinese_but_for_names(execution):
     english = page.html(execution, ErrorReport(), {})
     assert "Limits not checked against the standard: verdicts are provisional." in english
     assert headline.of_run(execution) == (
-        "Inspection of components: partial, 3 of 4 characteristics of 2 components measured"
+        "Inspection of components: partial, 3 of 4 characteristics of 2 components measured; "
+        "1 of 3 limits is not kept: rib1 sweep; 1 indeterminate; 1 passes"
     )

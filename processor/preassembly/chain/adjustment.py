@@ -8,9 +8,11 @@ minimises
 over gaps of eight pairs per joint along three axes, and departures sideways and up at regular chainages of both edges.
 The joints may form any graph: a row, a closed ring, branches. A part without bottom edges has the departures of its key
 points across its joints in their place.
-The error of a part's registration moves both its ends and its edges, and the adjustment removes it. Parts beside a
-joint without an answer could slide along themselves, and a ring could turn within itself: there, and wherever the
-joints form no row, the square of every part's movement along its chord is added with a weight of HOLD. The gaps of
+The error of a part's registration moves both its ends and its edges, and the adjustment removes it. A ring could turn
+within itself: wherever the joints form no row, and where a joint has no answer, the square of every part's movement
+along its chord is added with a weight of HOLD. Where the joints with an answer leave the assembly in pieces, nothing
+that was measured places one piece against another. Then the mean square of the movement of every part, whole, has that
+weight, and the design alone places each piece: see :mod:`processor.preassembly.chain.design_places`. The gaps of
 imperfect parts depend on lambda, so it is stated, and the curve over lambda is part of the result. All is linear in the
 measurements, and their covariance is propagated.
 """
@@ -18,7 +20,7 @@ measurements, and their covariance is propagated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -28,12 +30,13 @@ from scipy.linalg import block_diag
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.preassembly import topology
+from processor.preassembly.chain import design_places
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.topology import Side, Sides
 
-HOLD = 1e-3  # weight of a part's movement along its chord
+HOLD = 1e-3  # weight of a part's movement along its chord, or of its whole movement; small against gaps and edges
 
 
 class Solution(NamedTuple):
@@ -59,6 +62,8 @@ class Adjusted:
     ``gaps`` (j, 8, 3) at these motions in bridge axes, with covariance (j, 24, 24). ``departures`` (k, 2) a part,
     sideways and up, are after the adjustment, with variances (k, 2). ``at_rest_variance`` (k, 2) are those with the
     whole bridge moved so that the first part lies where its registration has it.
+    ``piece`` (c,) numbers the pieces that the joints with an answer leave; one of several is placed by the design
+    alone, which adds ``placing_covariance`` (c, 6, 6), of motions about the parts' centres, to its poses and edges.
     """
 
     motions: Floats
@@ -70,6 +75,13 @@ class Adjusted:
     departure_variance: tuple[Floats, ...]
     at_rest_variance: tuple[Floats, ...]
     solution: Solution
+    piece: Ints
+    placing_covariance: Floats
+
+    @property
+    def in_pieces(self) -> bool:
+        """Whether the joints with an answer leave more than one piece."""
+        return bool(self.piece.any())
 
 
 class _Rows(NamedTuple):
@@ -91,8 +103,9 @@ class _Observations:
     """All observations: derivative A (n, p) by the parts' motions, values (n,), and their covariance (n, n).
 
     ``with_pose`` (n, p) is their covariance with the parts' registrations. Rows are the gaps of joints with an answer,
-    24 each, the edges' departures, those of the key points of parts without edges, and each part's movement along its
-    chord. ``gap_row`` is -1 of joints without an answer, ``edge_rows`` are those of each part.
+    24 each, the edges' departures, those of the key points of parts without edges, and the ``held`` last ones, of the
+    parts' movements. ``gap_row`` is -1 of joints without an answer, ``edge_rows`` are those of each part, ``piece``
+    (c,) its number.
     """
 
     A: Floats
@@ -101,20 +114,27 @@ class _Observations:
     with_pose: Floats
     gap_row: Ints
     edge_rows: tuple[slice, ...]
+    held: int
+    piece: Ints
     in_row: bool
 
 
 def adjust(
-    members: Sequence[Member], joint_points: Floats, joint_frames: Floats, weight: float, sides: Sides | None = None
+    members: Sequence[Member],
+    joint_points: Floats,
+    joint_frames: Floats,
+    weight: float,
+    sides: Sides | None = None,
+    place_sd_mm: float = 0.0,
 ) -> Adjusted:
     """Adjust an assembly; ``joint_points`` (j, 8, 3) are the design's, ``joint_frames`` (j, 4, 4) T_bridge_joint.
 
     ``weight`` is lambda; ``sides`` of each joint, None for parts in a row. Joints with an unknown end have no
-    observations; their gaps are NaN.
+    observations; their gaps are NaN. A piece's place in the design has the standard deviation ``place_sd_mm``.
     """
-    of_row = topology.sides_of(topology.row(len(members)))
-    observed = _observations(members, joint_points, joint_frames, of_row if sides is None else sides)
-    to_motion = _solve(observed, weight, len(members))
+    sides = topology.sides_of(topology.row(len(members))) if sides is None else sides
+    observed = _observations(members, joint_points, joint_frames, sides)
+    to_motion = _solve(observed, weight)
     x = to_motion @ observed.value
     # Residuals by observations, after the motion.
     after = np.eye(len(observed.value)) + observed.A @ to_motion
@@ -144,9 +164,8 @@ def adjust(
         departures.append(departure)
         variances.append(variance)
         at_rest.append(at_rest_variance)
-    motions = [_as_motion(x[6 * i : 6 * i + 6], member.centre) for i, member in enumerate(members)]
-    return Adjusted(
-        motions=np.array(motions),
+    adjusted = Adjusted(
+        motions=np.array([_as_motion(x[6 * i : 6 * i + 6], member.centre) for i, member in enumerate(members)]),
         motion_covariance=with_motion @ to_motion.T,
         motion_with_pose=to_motion @ observed.with_pose,
         gaps=gaps,
@@ -155,6 +174,31 @@ def adjust(
         departure_variance=tuple(variances),
         at_rest_variance=tuple(at_rest),
         solution=Solution(to_motion, tuple(to_departures), observed.covariance, observed.with_pose),
+        piece=observed.piece,
+        placing_covariance=np.zeros((len(members), 6, 6)),
+    )
+    places = [design_places.places(members, i, sides, joint_points) for i in range(len(members))]
+    return _placed_by_design(adjusted, members, x, places, place_sd_mm) if adjusted.in_pieces else adjusted
+
+
+def _placed_by_design(
+    adjusted: Adjusted, members: Sequence[Member], x: Floats, places: Sequence[Floats], sd_mm: float
+) -> Adjusted:
+    """Add the covariance of the pieces' places in the design, to which the parts' motions x (6 c,) belong."""
+    placing = design_places.covariances(x.reshape(-1, 6), places, members, adjusted.piece, sd_mm)
+    variances, at_rest = [], []
+    for i, member in enumerate(members):
+        own, first = (_edge_motion(member.edges, members[k].centre) for k in (i, 0))
+        by_own, by_first = (
+            np.einsum("ki,ij,kj->k", motion, placing[k], motion).reshape(-1, 2) for motion, k in ((own, i), (first, 0))
+        )
+        variances.append(adjusted.departure_variance[i] + by_own)
+        at_rest.append(adjusted.at_rest_variance[i] + by_own + by_first)
+    return replace(
+        adjusted,
+        departure_variance=tuple(variances),
+        at_rest_variance=tuple(at_rest),
+        placing_covariance=placing,
     )
 
 
@@ -168,20 +212,18 @@ def left_open(
         return np.full((8, 3), np.nan), np.full((24, 24), np.nan)
     rows = slice(start, start + 24)
     # The constraint along the chord has the joints' weight, so that it does not restrain them.
-    to_motion = _solve(observed, weight, len(members), hold=weight, without=rows)
+    to_motion = _solve(observed, weight, hold=weight, without=rows)
     after = np.eye(len(observed.value))[rows] + observed.A[rows] @ to_motion
     return (after @ observed.value).reshape(8, 3), after @ observed.covariance @ after.T
 
 
-def _solve(
-    observed: _Observations, weight: float, parts: int, hold: float = HOLD, without: slice = slice(0, 0)
-) -> Floats:
+def _solve(observed: _Observations, weight: float, hold: float = HOLD, without: slice = slice(0, 0)) -> Floats:
     """Matrix (p, n) from observations to the motions of least weighted squares; some rows may be left out."""
     root = np.ones(len(observed.value))
-    root[24 * int((observed.gap_row >= 0).sum()) : -parts] = np.sqrt(weight)
+    root[24 * int((observed.gap_row >= 0).sum()) : -observed.held] = np.sqrt(weight)
     # A chain without a break is free to slide: a constraint would change its gaps by hundredths of a mm.
     broken = (observed.gap_row < 0).any() or not len(observed.gap_row)
-    root[-parts:] = np.sqrt(hold) if broken or not observed.in_row else 0.0
+    root[-observed.held :] = np.sqrt(hold) if broken or not observed.in_row else 0.0
     root[without] = 0.0
     weighted = observed.A * root[:, None]
     # Turns and translations differ in scale by thousands: unit columns keep the digits of the solution.
@@ -207,7 +249,10 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
         for side, sign in zip(both, (-1.0, 1.0), strict=True)
         if not len(members[side.part].edges.points) and _known(members, side) is not None
     ]
-    blocks += [*edges, *(line[0] for line in lines), _chord_rows(members, sides, joint_points)]
+    joined = np.array([[side.part for side in both] for both in sides], np.int64).reshape(-1, 2)
+    piece = topology.pieces(joined, gap_row >= 0, len(members))
+    held = (_place_rows if piece.any() else _chord_rows)(members, sides, joint_points)
+    blocks += [*edges, *(line[0] for line in lines), held]
     A, value = np.vstack([rows.A for rows in blocks]), np.concatenate([rows.value for rows in blocks])
     by_pose = np.vstack([rows.by_pose for rows in blocks])
     with_pose = by_pose @ block_diag(*(member.pose for member in members))
@@ -228,6 +273,8 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
         with_pose=with_pose,
         gap_row=gap_row,
         edge_rows=edge_rows,
+        held=len(held.value),
+        piece=piece,
         in_row=sides == topology.sides_of(topology.row(len(members))),
     )
 
@@ -296,6 +343,18 @@ def _chord_rows(members: Sequence[Member], sides: Sides, joint_points: Floats) -
         A[i, i, 3:] = chord / max(float(np.linalg.norm(chord)), 1e-12)
     zeros = np.zeros((count, 6 * count))
     return _Rows(A.reshape(count, 6 * count), np.zeros(count), np.zeros((count, count)), zeros)
+
+
+def _place_rows(members: Sequence[Member], sides: Sides, joint_points: Floats) -> _Rows:
+    """Movement of each part's places in the design, which is to be zero: their sum of squares is the mean of a part."""
+    blocks = []
+    for i, member in enumerate(members):
+        places = design_places.places(members, i, sides, joint_points)
+        A = np.zeros((3 * len(places), 6 * len(members)))
+        A[:, 6 * i : 6 * i + 6] = rigid.motion(places - member.centre).reshape(-1, 6) / np.sqrt(len(places))
+        blocks.append(A)
+    count = sum(map(len, blocks))
+    return _Rows(np.vstack(blocks), np.zeros(count), np.zeros((count, count)), np.zeros((count, 6 * len(members))))
 
 
 def _edge_motion(edges: EdgeDepartures, centre: Floats) -> Floats:

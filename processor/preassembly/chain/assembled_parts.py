@@ -80,6 +80,8 @@ def _covariances(parts: Sequence[MeasuredPart], adjusted: Adjusted, poses: Float
         if np.isfinite(poses[i]).all():
             rows = slice(6 * i, 6 * i + 6)
             of_motion = adjusted.motion_covariance[rows, rows]
+            if adjusted.in_pieces:
+                of_motion = of_motion + adjusted.placing_covariance[i]
             covariances[i] = rigid.about_origin(of_motion, part.member.centre)
     return covariances
 

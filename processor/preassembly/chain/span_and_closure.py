@@ -212,16 +212,24 @@ def _missing(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesi
     others = tuple(part.name for part in parts if part.of_others)
     if others:
         return (reason("preassemble.assign-scans", parts=others),)
-    joints: dict[tuple[str, ...], list[str]] = {}
-    for name, gaps, beside in zip(design.joint_names, adjusted.gaps, design.joined.tolist(), strict=True):
-        if not np.isfinite(gaps).all():
-            failed = tuple(parts[i].name for i in beside if parts[i].status == Status.FAILED)
-            joints.setdefault(failed, []).append(name)
-    return tuple(
-        reason("preassemble.scan-failed-parts", joints=tuple(names), parts=failed)
-        if failed
-        else reason("preassemble.scan-both-ends", joints=tuple(names))
-        for failed, names in joints.items()
+    failed: dict[tuple[str, ...], list[str]] = {}
+    unmeasured: dict[tuple[str, ...], list[str]] = {}
+    sides_of = topology.sides_of(design.joined)
+    for name, gaps, sides in zip(design.joint_names, adjusted.gaps, sides_of, strict=True):
+        if np.isfinite(gaps).all():
+            continue
+        beside = [(parts[side.part], parts[side.part].member.ends[side.end]) for side in sides]
+        of_failed = tuple(part.name for part, _ in beside if part.status == Status.FAILED)
+        unknown = tuple(part.name for part, end in beside if end is None or not np.isfinite(end.departure).all())
+        (failed.setdefault(of_failed, []) if of_failed else unmeasured.setdefault(unknown, [])).append(name)
+    return (
+        *(reason("preassemble.scan-failed-parts", joints=tuple(at), parts=names) for names, at in failed.items()),
+        *(
+            reason("preassemble.scan-both-ends", joints=tuple(at))
+            if len(names) > 1
+            else reason("preassemble.scan-end", joints=tuple(at), parts=names)
+            for names, at in unmeasured.items()
+        ),
     )
 
 

@@ -170,12 +170,14 @@ def propose(
     params: TrimParams | None = None,
     doubts: tuple[Reason, ...] = (),
     weak_parts: tuple[Reason, ...] = (),
+    moved: tuple[Reason, ...] = (),
 ) -> Proposal:
     """Propose work on a joint after which it keeps the limits of ``tolerance``.
 
     ``doubts`` are reasons why the gaps may be wrong altogether: then nothing is proposed. ``weak_parts`` are stated
-    with the proposal. Probabilities are shares of draws of the gaps and of the cut's errors, NaN where a limit depends
-    on an unknown size. Without a limit of the groove gap nothing is cut.
+    with the proposal, and ``moved`` in place of the work where the joint closes by moving its parts alone.
+    Probabilities are shares of draws of the gaps and of the cut's errors, NaN where a limit depends on an unknown size.
+    Without a limit of the groove gap nothing is cut.
     """
     params = params or TrimParams()
     if doubts:
@@ -214,7 +216,7 @@ def propose(
         proposal,
         reasons=(
             *((reason("preassemble.weak-parts", parts=weak_parts),) if weak_parts else ()),
-            *_work_reasons(proposal, "groove_gap" in limits),
+            *(moved or _work_reasons(proposal, "groove_gap" in limits)),
             _probability_reason(proposal, params.cut_sd_mm),
             *_misalignment_reasons(proposal, measures, limits.get("misalignment")),
         ),

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from processor.inspection.result import Result
 from processor.language.messages import Message, Text, label, text
 from processor.model import Scene, Status, StepRun, Verdict
+from processor.report import verdict_counts
 from processor.report.characteristics import Characteristic
 from processor.report.inspection import tables
 from processor.report.step_report import StepReport
@@ -32,6 +33,16 @@ def _summary(result: Result) -> tuple[Message, Message]:
         number=sum(len(found) for found in rows),
         components=len(result.components),
     )
+    if counts[Verdict.FAIL]:
+        compared = [
+            (f"{component.name} {of}", verdict)
+            for component, found in zip(result.components, rows, strict=True)
+            for of, verdict in zip(found.id, found.verdict, strict=True)
+            if verdict is not Verdict.NONE
+        ]
+        named, judged = zip(*compared, strict=True)
+        limits = verdict_counts.summary(verdict_counts.LIMITS, named, judged)
+        head = text("{head}; {verdicts}", head=head, verdicts=limits)
     verdicts = [Text(said.template, {"count": counts[name]}) for name, said in VERDICTS.items() if counts[name]]
     body: list[Message] = [text("Limits: {verdicts}.", verdicts=verdicts)] if verdicts else []
     if any(verdict is not Verdict.NONE and not known for found in rows for verdict, known in _compared(found)):

@@ -22,9 +22,13 @@ VERDICTS = {
     Verdict.INDETERMINATE: text("{count} indeterminate"),
 }
 
+# Reasons by which a joint that passes is not all there is to do.
+NOT_DONE = ("preassemble.part-fails", "preassemble.joint-of-piece", "preassemble.closes-by-moving")
+
 
 def _summary(result: Result) -> tuple[Message, Message]:
-    placed = sum(status != Status.FAILED for status in result.components.status)
+    in_pieces = [one for one in result.reasons if one.code == "preassemble.in-pieces"]
+    placed = 0 if in_pieces else sum(status != Status.FAILED for status in result.components.status)
     counts = collections.Counter(result.joints.verdict)
     verdicts = [
         Text(verdict_text.template, {"count": counts[name]}) for name, verdict_text in VERDICTS.items() if counts[name]
@@ -35,6 +39,8 @@ def _summary(result: Result) -> tuple[Message, Message]:
         placed=placed,
         parts=len(result.components),
     )
+    if in_pieces:
+        head = text("{head} by measured joints; {reasons}", head=head, reasons=in_pieces)
     linear = result.linear.assembled.error
     body = [
         text("Splicing error {errors}.", errors=_mean_max(result.splicing)),
@@ -107,12 +113,12 @@ def _with_ci95(value: float, ci95: float) -> Text:
 
 
 def _to_do(result: Result) -> Iterator[Message]:
-    """Yield the work at the joints that do not pass, then the scan that would help."""
+    """Yield the work at the joints that do not pass or are not all there is to do, then the scan that would help."""
     if result.adjustment is None:
         return
     joints = result.adjustment.joints
     for name, verdict, proposal in zip(joints.name, result.joints.verdict, joints.proposal, strict=True):
-        if verdict is not Verdict.PASS:
+        if verdict is not Verdict.PASS or any(one.code in NOT_DONE for one in proposal.reasons):
             sentence = text("{reasons:.}", reasons=proposal.reasons)
             yield text("joint {joint} ({verdict}): {sentence}", joint=name, verdict=verdict, sentence=sentence)
     yield from result.adjustment.advice[:1]
