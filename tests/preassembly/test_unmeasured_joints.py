@@ -7,8 +7,10 @@ import pytest
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
+from processor.inspection.result import Characteristics, InspectedComponent, Quantity
+from processor.inspection.result import Result as Inspection
 from processor.language.messages import CODES, messages
-from processor.model import Status, reason
+from processor.model import Status, Verdict, reason
 from processor.preassembly import step, topology
 from processor.preassembly.chain import adjustment, design_places, span_and_closure
 from processor.preassembly.ends import bottom_edges, joint_end
@@ -17,7 +19,6 @@ from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.verdicts import reasons, trim_and_build_up
 from processor.report import terminal
 from processor.report.preassembly import section
-from tests.report.test_report_inspection import result as inspected  # noqa: F401  # a fixture
 from tests.support.clouds import arch_clouds
 from tests.support.results import bridge_results
 
@@ -61,6 +62,18 @@ def as_built(seed):
                 off[:, 0] = rng.normal(0.0, 3.0) + local[:, 1:] @ rng.normal(0.0, 1.5e-3, 2)
                 drawn[i, e] = off
     return lambda part, end: drawn[part, end] + rng.normal(0.0, NOISE_MM, (8, 3))
+
+
+@pytest.fixture(scope="module")
+def inspected():
+    """Part rib1 whose sweep fails its limit."""
+    found = Characteristics(
+        id=("sweep",), quantity=(Quantity.SWEEP,), nominal=[0.0], actual=[-2.0], deviation=[-2.0], ci95=[0.3],
+        lower=[-1.0], upper=[1.0], unit=("mm",), verdict=(Verdict.FAIL,), limit=("part_sweep_mm",), clause=("GB",),
+        verified=[False], reasons=((),),
+    )  # fmt: skip
+    component = InspectedComponent(name="rib1", characteristics=found)
+    return Inspection(status="ok", method="default", components=(component,))
 
 
 @pytest.mark.parametrize(
@@ -195,7 +208,7 @@ def test_the_headline_counts_no_part_placed_by_the_design(lang):
     assert "± 20 mm" in head
 
 
-def test_a_part_that_fails_a_limit_of_its_own_is_in_the_to_do_of_its_joints(inspected):  # noqa: F811
+def test_a_part_that_fails_a_limit_of_its_own_is_in_the_to_do_of_its_joints(inspected):
     result = bridge_results.adjusted()
     found = step.completed(result, {"inspect": inspected})
     for name, left, right, before, after in zip(
@@ -211,7 +224,7 @@ def test_a_part_that_fails_a_limit_of_its_own_is_in_the_to_do_of_its_joints(insp
     assert step.completed(result, {}) is result
 
 
-def test_the_terminal_names_the_part_that_fails(inspected):  # noqa: F811
+def test_the_terminal_names_the_part_that_fails(inspected):
     execution = bridge_results.of_bridge()
     first, *others = execution.runs
     run = dataclasses.replace(first, result=step.completed(first.result, {"inspect": inspected}))
