@@ -74,6 +74,11 @@ def reason(code: str, /, **values: Any) -> Reason:
 
 
 LARGEST_MM = 1e11  # a length beyond it, 100,000 km, is none of a structure; float64 has steps of 0.00002 mm there
+SMALLEST_MM = 1e-4  # points are stored in steps of it: no size or noise below it is one
+WIDEST_MM = 1e7  # 10 km: no structure is larger; what is made of cells or profiles of one would fill the memory
+FARTHEST_MM = 1e6  # 1 km: no structure is measured by a scanner that is farther from all of its points
+SAMPLED_POINTS = 1_000  # of a scan, to be compared with its scanner
+MOST_NODES, MOST_MEMBERS, MOST_PARTS = 100_000, 400_000, 1_000  # a hundred times those of the largest known
 LONGEST_NAME = 256
 LONGEST_TEXT = 1 << 20
 
@@ -108,7 +113,7 @@ class Meaning:
 
 
 PLACE = Meaning(finite=True, least=-LARGEST_MM, most=LARGEST_MM)
-SIZE = Meaning(finite=True, above=0.0, most=LARGEST_MM)
+SIZE = Meaning(finite=True, above=SMALLEST_MM, most=LARGEST_MM)
 DEVIATION = Meaning(finite=True, least=0.0, most=LARGEST_MM)  # one standard deviation
 BOUND = Meaning()  # NaN = none; never infinite
 # Of results and truths; NaN where unknown.
@@ -416,7 +421,7 @@ class Scan(Checked):
         4, 4, means=PLACE
     )  # absent: the scan is in the project's frame already, or its pose is unknown
     # range noise, one standard deviation; NaN = unknown
-    sigma_mm: float = described(float("nan"), means=Meaning(least=0.0, most=LARGEST_MM))
+    sigma_mm: float = described(float("nan"), means=Meaning(least=0.0, most=1_000.0))
     colour: Codes = column("n", 3, dtype=np.uint8, newer=True)  # red, green, blue
 
     @property
@@ -425,7 +430,12 @@ class Scan(Checked):
         return self.T_project_scan if self.T_project_scan.size else np.eye(4)
 
     def contradictions(self) -> Iterable[Fault]:
-        """Yield that a few points claim a grid that fills the memory."""
+        """Yield that a few points claim a grid that fills the memory, noise of no scanner, and a scanner far away."""
+        if 0.0 < self.sigma_mm < SMALLEST_MM:
+            text = f": expected 0, or {SMALLEST_MM:g} mm or more, found {self.sigma_mm:.3g}"
+            yield Fault(("sigma_mm",), text)
+        if self.position.size and len(self.points):
+            yield from _far(("position",), "", self.position - self.origin, self)
         if len(self.grid_row) and len(self.grid_column):
             rows, columns = (int(large_arrays.extremes(n)[1]) + 1 for n in (self.grid_row, self.grid_column))
             most = LARGEST_GRID + GRID_CELLS_PER_POINT * len(self.grid_row)
@@ -475,8 +485,13 @@ class ArchDesign(Checked):
     joint_points: Floats = column("j", 8, 3, means=PLACE)
 
     def contradictions(self) -> Iterable[Fault]:
-        """Yield parts of one name."""
+        """Yield parts of one name, too many parts, and a bridge larger than any."""
+        yield from _many("parts", len(self.parts), MOST_PARTS)
+        yield from _many("joint_points", len(self.joint_points), 2 * MOST_PARTS)
         yield from _repeated("parts", tuple(part.name for part in self.parts))
+        corners = [part.vertices.min(axis=0) for part in self.parts if len(part.vertices)]
+        corners += [part.vertices.max(axis=0) for part in self.parts if len(part.vertices)]
+        yield from _wide("joint_points", np.concatenate([np.reshape(corners, (-1, 3)), *self.joint_points]))
 
     @property
     def joined(self) -> Ints:
@@ -528,6 +543,27 @@ class FrameDesign(Checked):
         """The name of each node, by its number in ``ids``."""
         return dict(zip(self.ids.tolist(), self.names, strict=True))
 
+    def contradictions(self) -> Iterable[Fault]:
+        """Yield a frame larger than any, a second member of two nodes, and a tube that is wider than its ball."""
+        yield from _many("ids", len(self.ids), MOST_NODES)
+        yield from _many("member_a", len(self.member_a), MOST_MEMBERS)
+        yield from _wide("centres", self.centres)
+        ends = np.sort(np.column_stack([self.member_a, self.member_b]), axis=1)
+        second = np.ones(len(ends), bool)
+        second[np.unique(ends, axis=0, return_index=True)[1]] = False
+        if second.any():
+            row = int(second.argmax())
+            a, b = ends[row].tolist()
+            yield Fault(("member_b",), f", row {row}: expected one member of two nodes, found a second of {a} and {b}")
+        order = np.argsort(self.ids)
+        balls = 2.0 * self.radii[order[np.searchsorted(self.ids, ends, sorter=order)]]
+        wide = (self.tube_diameters[:, None] > balls).any(axis=1)
+        if wide.any():
+            row = int(wide.argmax())
+            tube, ball = self.tube_diameters[row], balls[row].min()
+            text = f"expected a tube not wider than its ball of {ball:.6g} mm, found {tube:.6g} mm"
+            yield Fault(("tube_diameters",), f", row {row}: {text}; give diameters of tubes and radii of balls")
+
 
 SUPPORTS = ("perimeter", "multi-point")  # of a node: of a frame supported along its edges, or at single points
 
@@ -573,7 +609,8 @@ class StructureDesign(Checked):
     faults: DesignFaults | None = newer()
 
     def contradictions(self) -> Iterable[Fault]:
-        """Yield that bodies are not given for each facet."""
+        """Yield a structure larger than any, and that bodies are not given for each facet."""
+        yield from _wide("vertices", self.vertices)
         given = len(self.faces) if self.bodies is None else len(self.bodies.of_facet)
         if given != len(self.faces):
             text = f": expected a row for each of {len(self.faces)} faces, found {given}"
@@ -791,13 +828,60 @@ class Scene(Checked):
     scanned: tuple[str, ...] = names("days", newer=True, hashed=False)
 
     def contradictions(self) -> Iterable[Fault]:
-        """Yield scans of one name, and parts that the design does not have."""
+        """Yield scans of one name or station, scanners far away, and parts that the design does not have."""
         yield from _repeated("scans", tuple(scan.name for scan in self.scans))
+        seen: set[tuple[str, str]] = set()
+        for i, scan in enumerate(self.scans):
+            if scan.station and (scan.component, scan.station) in seen:
+                text = f": expected another station for each scan, found {scan.station!r} a second time"
+                yield Fault(("scans", f"{i:04d}", "station"), text)
+            seen.add((scan.component, scan.station))
+            for row, position in self._stations_of(scan):
+                place = (position - scan.pose[:3, 3]) @ scan.pose[:3, :3] - scan.origin
+                yield from _far(("stations", "positions"), f", row {row}", place, scan)
         parts = {part.name for part in self.arch.parts} if self.arch else set()
         for i, scan in enumerate(self.scans):
             if parts and scan.component and scan.component not in parts:
                 text = f": expected a part of the design, found {scan.component!r}"
                 yield Fault(("scans", f"{i:04d}", "component"), text)
+
+    def _stations_of(self, scan: Scan) -> list[tuple[int, Floats]]:
+        """Return the stations that a scan's points name, or all if it is the only scan: rows and positions (3,)."""
+        if self.stations is None or not len(scan.points):
+            return []
+        positions = dict(enumerate(self.stations.positions))
+        if len(scan.point_station):
+            named = np.unique(_sample(scan.point_station)).tolist()
+            return [(row, positions[row]) for row in named if row in positions]
+        return list(positions.items()) if len(self.scans) == 1 else []
+
+
+def _sample(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return rows[:: max(1, len(rows) // SAMPLED_POINTS)]
+
+
+def _far(path: tuple[str, ...], row: str, position: Floats, scan: Scan) -> Iterator[Fault]:
+    """Yield that a scanner's position, relative to the scan's origin, is far from all points of the scan."""
+    away = float(np.linalg.norm(_sample(scan.points) - position, axis=1).min())
+    if away > FARTHEST_MM:
+        text = f"expected a scanner at most {FARTHEST_MM / 1e6:g} km from the points of scan {scan.name!r}"
+        yield Fault(path, f"{row}: {text}, found {away / 1e6:.4g} km; is its unit that of the scans?")
+
+
+def _wide(field: str, points: Floats) -> Iterator[Fault]:
+    """Yield that points (n, 3) of a design extend farther than any structure."""
+    if not len(points):
+        return
+    extent = float((points.max(axis=0) - points.min(axis=0)).max())
+    if extent > WIDEST_MM:
+        row = int(np.abs(points - np.median(points, axis=0)).max(axis=1).argmax())
+        text = f"expected a design of at most {WIDEST_MM / 1e6:g} km across, found {extent / 1e6:.4g} km"
+        yield Fault((field,), f", row {row}: {text}; correct the place or the unit")
+
+
+def _many(field: str, count: int, most: int) -> Iterator[Fault]:
+    if count > most:
+        yield Fault((field,), f": expected at most {most}, found {count}")
 
 
 def _repeated(field: str, names: tuple[str, ...]) -> Iterator[Fault]:
@@ -820,10 +904,10 @@ class PointLabels(Checked):
 
     scan: str
     part_names: tuple[str, ...] = ()
-    part: Labels = column("n", dtype=np.int32, means=Meaning(rows_of="part_names", lowest_row=-1))  # -1 = none
+    part: Labels = column("n", dtype=np.int32, means=Meaning(least=-1))  # -1 = none
     source: Codes = column("n", dtype=np.uint8, means=Meaning(most=2.0))
     surface_names: tuple[str, ...] = ()
-    surface: Labels = column("n", dtype=np.int32, means=Meaning(rows_of="surface_names", lowest_row=-1))  # -1 = none
+    surface: Labels = column("n", dtype=np.int32, means=Meaning(least=-1))  # -1 = none
     range_error_mm: Shorts = column("n", dtype=np.float32, means=COORDINATE)
     incidence_cos: Shorts = column("n", dtype=np.float32, means=NUMBER)
     defect: Labels = column(

@@ -35,6 +35,7 @@ SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
 COMMENTS = ("#", "//", "%")
 COUNTED = 5  # rows by which a column of row numbers is recognised
 SAMPLED = 200  # rows
+MOST_COLUMNS = 1_000  # exports of the trade have some twenty
 MOST_OTHERS = 0.1  # share of sampled rows of another width that are errors, not a habit of the file
 GRID_HEAD = r"(ncols|nrows|[xy]ll(corner|center)|cellsize|nodata_value)\s+\S+"  # of ESRI ASCII grids
 
@@ -164,6 +165,10 @@ def sniff(path: Path) -> Layout:
             continue
         separator, comma = _separator(stripped)
         cells = _cells(stripped, separator, comma)
+        if len(cells) > MOST_COLUMNS:
+            raise InputError(
+                f"line {number + 1}: expected at most {MOST_COLUMNS} columns, found {len(cells)}", path=path
+            )
         if stripped and not stripped.startswith(COMMENTS) and len(cells) >= 3 and before.is_row(cells):
             _check_passed_over(path, lines[:number], len(cells))
             whole = lines[number:-1] if len(head) == SNIFFED else lines[number:]

@@ -15,6 +15,7 @@ from processor.scan_folder.checked_table import Table
 
 KEYS = ("box", "keep", "scan")
 FEWEST_POINTS = 4
+MOST_BOXES = 100  # each is compared with every point
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,10 @@ class Box:
 def read_boxes(project: Table, mm: float) -> tuple[Box, ...]:
     """Read [[clip]] of a project whose unit is ``mm`` millimetres. Raises InputError for a box that holds nothing."""
     boxes = []
-    for table in project.tables("clip"):
+    tables = project.tables("clip")
+    if len(tables) > MOST_BOXES:
+        raise InputError(f"{project.where}: expected at most {MOST_BOXES} of [[clip]], found {len(tables)}")
+    for table in tables:
         table.only(KEYS)
         low, high = table.array("box", 2, 3) * mm
         if not (low < high).all():

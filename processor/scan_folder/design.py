@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -34,8 +35,6 @@ from processor.scan_folder.checked_table import LOG, Table, existing_file_in, ig
 from processor.scan_folder.text_files import read_text
 from processor.scan_folder.units import MM_PER_UNIT
 from processor.scene_cloud import design_faults
-
-TEXT_LIMIT = 256 * 2**20
 
 
 def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | FrameDesign:
@@ -70,19 +69,21 @@ def read_json(path: Path) -> Table:
 
 def read_json_value(path: Path) -> Any:
     """Read a JSON file that holds any value. Raises InputError for a file that is not JSON."""
-    text = _text(path)
+    text = read_text(path)
+
+    def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        table = dict(pairs)
+        if len(table) < len(pairs):
+            twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+            raise InputError(f"expected each key once, found {twice!r} a second time", path=path)
+        return table
+
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=distinct)
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise InputError(f"not readable JSON: {error}", path=path) from None
-
-
-def _text(path: Path) -> str:
-    if path.stat().st_size > TEXT_LIMIT:
-        raise InputError(
-            f"expected at most {TEXT_LIMIT} bytes, found {path.stat().st_size}; is it the right file?", path=path
-        )
-    return read_text(path)
 
 
 def _arch(folder: Path, design: Table) -> ArchDesign:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,15 +60,10 @@ from processor.scan_folder.picks import read_picks
 from processor.scan_folder.project_tables.ceiling import read_ceiling
 from processor.scan_folder.project_tables.targets import read_search
 from processor.scan_folder.shapes import surface_files
-from processor.scan_folder.text_files import read_text
+from processor.scan_folder.text_files import read_toml
 from processor.scan_folder.title_block import read_title_block
 from processor.scan_folder.tolerance import check_components, read_tolerance
 from processor.scan_folder.units import MM_PER_UNIT, FileUnit, file_unit, known_unit
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 KEYS = (
     "name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control", "report",
@@ -167,6 +161,11 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
         unit = project.design_units or project.units or option or "m"
         if is_surface(project.design) and project.kind in ("", "structure"):
             design = StructureDesign(scan_name(project.design), *read_surface(project.design, unit))
+            if project.design.suffix.lower() in MESH_SUFFIXES:
+                named = project.design_units or project.units
+                source = f"given in {PROJECT}" if named else "given by --units" if option else "not given, so metres"
+                advice = f"give the unit by 'design_units' or 'units' in {PROJECT}"
+                units.check_extent(f"{project.design}: the design", design.vertices, unit, source, advice)
         elif project.design.suffix.lower() in node_list.SUFFIXES:
             design, remarks = node_list.read_node_list(project.design, unit)
         else:
@@ -179,11 +178,6 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     scene = dataclasses.replace(scene, units_reason=(*scene.units_reason, *remarks))
     ceiling = read_ceiling(folder, project.table, unit, project.design_units or unit)
     scene = dataclasses.replace(scene, ceiling=ceiling) if ceiling is not None else scene
-    if scene.structure is not None and project.design is not None and project.design.suffix.lower() in MESH_SUFFIXES:
-        named = project.design_units or project.units
-        source = f"given in {PROJECT}" if named else "given by --units" if option else "not given, so metres"
-        advice = f"give the unit by 'design_units' or 'units' in {PROJECT}"
-        units.check_extent(f"{project.design}: the design", scene.structure.vertices, unit, source, advice)
     if (folder / PICKS).exists():
         scene = _with_picks(folder, scene)
     files = {"stations": STATIONS, "picks": PICKS, "control": CONTROL if (folder / CONTROL).exists() else PROJECT}
@@ -261,10 +255,7 @@ def _read_project(folder: Path) -> _Project:
     table = Table(str(path), {})
     if path.exists():
         existing_file_in(folder, PROJECT, str(folder))
-        try:
-            table = Table.of(str(path), tomllib.loads(read_text(path)))
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise InputError(f"not readable TOML: {error}", path=path) from None
+        table = Table.of(str(path), read_toml(path))
     guessed = None if path.exists() else _guess(folder)
     table.only(KEYS)
     kind = table.text("kind", "")

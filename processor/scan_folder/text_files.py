@@ -3,16 +3,47 @@
 from __future__ import annotations
 
 import csv
+import re
+import sys
 from pathlib import Path
+from typing import Any
 
 from processor.model import InputError
 from processor.plain_text import decoded
 from processor.readers.file_checks import errors_name_the_file
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
-def read_text(path: Path) -> str:
-    """Return the text of a file in UTF-8 or GB18030. Raises InputError if it cannot be read."""
+
+TEXT_BYTES = 32 * 2**20  # a design of 100,000 nodes has a third of it; JSON of empty lists takes 25 times as much
+TOML_BYTES = 4 * 2**20
+MOST_KEYS = 32  # of a dotted key of TOML: each part becomes a table, and the reader takes their square in memory
+STRINGS_AND_REMARKS = re.compile(r'"""[\s\S]*?"""|"(?:[^"\\\n]|\\.)*"|#[^\n]*|' + r"'''[\s\S]*?'''|'[^'\n]*'")
+
+
+def read_toml(path: Path) -> Any:
+    """Return the values of a TOML file. Raises InputError if it is none, or nested or large beyond any use."""
+    text = read_text(path, TOML_BYTES)
+    bare = STRINGS_AND_REMARKS.sub("s", text)
+    deepest = max((part.count(".") for part in re.split(r"[=\n\[\]{},]", bare)), default=0)
+    if deepest >= MOST_KEYS:
+        raise InputError(f"expected keys of at most {MOST_KEYS} parts, found one of {deepest + 1}", path=path)
     try:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"not readable TOML: {error}", path=path) from None
+
+
+def read_text(path: Path, most: int = TEXT_BYTES) -> str:
+    """Return the text of a file in UTF-8 or GB18030. Raises InputError if it cannot be read, or has too many bytes."""
+    try:
+        if path.stat().st_size > most:
+            raise InputError(
+                f"expected at most {most} bytes, found {path.stat().st_size}; is it the right file?", path=path
+            )
         return decoded(path.read_bytes())
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", path=path) from None

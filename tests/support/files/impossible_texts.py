@@ -18,11 +18,13 @@ DESIGN = {
     "nodes/2/id": {"twice": 0, "text": "x", "fraction": 1.5, "list": [], "NaN": NAN},
     "nodes/2/centre/0": NO_NUMBER,
     "nodes/2/centre": {"two numbers": [1.0, 2.0], "number": 1.0, "text": "x"},
-    "nodes/2/radius": NO_SIZE,
+    "nodes/2/centre/2": {"6,000,000 km": 6e9},
+    "nodes/2/radius": {**NO_SIZE, "tiny": 1e-300},
     "nodes": {"none": [], "text": "x", "object": {}},
     "members/1/a": {"unknown": 99, "negative": -1, "itself": 2, "text": "x", "fraction": 1.5, "list": []},
     "members/1/b": {"unknown": 99, "itself": 1, "text": "x"},
-    "members/1/tube_diameter": NO_SIZE,
+    "members/1": {"a second time": {"a": 1, "b": 0, "tube_diameter": 0.06}},
+    "members/1/tube_diameter": {**NO_SIZE, "as wide as a hall": 6.0, "wider than its ball": 0.101},
     "members": {"text": "x", "object": {}, "number": 5},
     "units": {**NO_TEXT, "unknown": "parsec"},
     "kind": {**NO_TEXT, "unknown": "tower"},
@@ -41,8 +43,14 @@ PROJECT = {
     "temperature_C": {"NaN": "nan", "infinite": "inf", "cold": "-300.0", "molten": "1e6", "text": '"x"', "list": "[]"},
     "file": {"none": '"none.xyz"', "outside": '"../a.xyz"', "absolute": '"/etc/passwd"', "number": "5"},
     "station": {"number": "5", "list": "[]", "long": f'"{LONG}"'},
-    "sigma_mm": {"NaN": "nan", "infinite": "inf", "negative": "-1.0", "text": '"x"', "list": "[]"},
-    "position": {"two numbers": "[1.0, 2.0]", "NaN": "[nan, 0.0, 0.0]", "huge": "[1e300, 0.0, 0.0]", "text": '"x"'},
+    "sigma_mm": {"NaN": "nan", "infinite": "inf", "negative": "-1.0", "text": '"x"', "list": "[]", "tiny": "1e-300"},
+    "position": {
+        "two numbers": "[1.0, 2.0]",
+        "NaN": "[nan, 0.0, 0.0]",
+        "huge": "[1e300, 0.0, 0.0]",
+        "text": '"x"',
+        "1,000 km": "[1e6, 0.0, 0.0]",
+    },
     "pose": {"mirrored": str(MIRRORED), "scaled": str(SCALED), "rows": str(MIRRORED[:3]), "number": "1.0"},
     "standard": {"unknown": '"none"', "number": "5"},
     "root_gap_mm": {"NaN": "nan", "infinite": "inf", "text": '"x"'},
@@ -65,6 +73,25 @@ PICKS = {
     "0/xa": CSV_NUMBER,
     "0/zb": CSV_NUMBER,
 }
+
+
+MORE = {
+    "design.json a key twice": ("design.json", '"units": "m",', '"units": "m", "units": "mm",', "units"),
+    "stations.json a key twice": ("stations.json", '"S2"', '"S1"', "S1"),
+    "project.toml a station twice": ("project.toml", 'file = "b.xyz"', 'file = "b.xyz"\nstation = "S1"', "station"),
+    "project.toml a key of 20,000 parts": ("project.toml", "[tolerance]", f"{'a.' * 20_000}a = 1\n[tolerance]", "parts"),  # noqa: E501
+    "project.toml a table of 20,000 parts": ("project.toml", "[tolerance]", f"[{'a . ' * 20_000}a]\n[tolerance]", "parts"),  # noqa: E501
+    "project.toml 5,001 boxes": (
+        "project.toml", "[tolerance]", "[[clip]]\nbox = [[0, 0, 0], [1, 1, 1]]\n" * 5_001 + "[tolerance]", "[[clip]]",
+    ),
+    "project.toml of 5 MB": ("project.toml", "[tolerance]", "# \n" * 1_700_000 + "[tolerance]", "bytes"),
+    "design.json of 40 MB": ("design.json", '"m"', f'"m", "x": [{"[]," * 14_000_000}0]', "bytes"),
+    "design.json 100,001 nodes": (
+        "design.json", '"nodes": [', '"nodes": [' + "".join(
+            f'{{"id": {k}, "centre": [0, 0, 0], "radius": 0.05}},' for k in range(10, 100_011)
+        ), "ids",
+    ),
+}  # fmt: skip
 
 
 def _in_json(text, path, value):
@@ -93,6 +120,9 @@ def _in_csv(text, path, value):
 
 def impossible_texts(files):
     """Yield the name of each case, the file, its text, and the field and the value, one of which the error names."""
+    for name, (file, old, new, named) in MORE.items():
+        assert old in files[file], name
+        yield name, file, files[file].replace(old, new, 1), (named,)
     for file, fields, change in (
         ("design.json", DESIGN, _in_json),
         ("stations.json", STATIONS, _in_json),
