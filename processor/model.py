@@ -76,7 +76,7 @@ def reason(code: str, /, **values: Any) -> Reason:
 LARGEST_MM = 1e11  # a length beyond it, 100,000 km, is none of a structure; float64 has steps of 0.00002 mm there
 SMALLEST_MM = 1e-4  # points are stored in steps of it: no size or noise below it is one
 WIDEST_MM = 1e7  # 10 km: no structure is larger; what is made of cells or profiles of one would fill the memory
-FARTHEST_MM = 1e6  # 1 km: no structure is measured by a scanner that is farther from all of its points
+FARTHEST_MM = 2e6  # 2 km: no structure is measured from farther; of scans in mm read as metres the scanners are
 SAMPLED_POINTS = 1_000  # of a scan, to be compared with its scanner
 MOST_NODES, MOST_MEMBERS, MOST_PARTS = 100_000, 400_000, 1_000  # a hundred times those of the largest known
 LONGEST_NAME = 256

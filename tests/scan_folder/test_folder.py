@@ -204,7 +204,7 @@ def test_a_scan_larger_than_any_structure_has_a_wrong_unit(tmp_path):
     write_ply(tmp_path / "scans/hall.ply", surface() * 10_000.0)
     text = 'kind = "structure"\nunits = "{}"\ndesign = "design.ply"\n[[scan]]\nfile = "scans/hall.ply"\n'
     project(tmp_path, text.format("m"))
-    why = r"hall\.ply: scan 'hall': .* km .*read as m \(given in project\.toml\).* m if it were mm: give"
+    why = r"design\.ply: the design: .* km .*read as m \(given in project\.toml\).* m if it were mm: give"
     with pytest.raises(InputError, match=why):
         folder.read_input(tmp_path)
     project(tmp_path, text.format("mm"))

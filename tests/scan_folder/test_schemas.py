@@ -12,7 +12,7 @@ from designgen.scenes.make import make
 from processor.column_names import UNIT_WORDS
 from processor.limits import project_limits, standards
 from processor.model import KEY_POINTS, InputError, Tolerance
-from processor.scan_folder import control_points, folder, tolerance
+from processor.scan_folder import control_points, folder, text_files, tolerance
 from processor.scan_folder.folder import read_input
 from processor.store import store
 
@@ -36,7 +36,7 @@ def problems(name, content):
 
 
 def problems_of_folder(path):
-    found = problems("project", folder.tomllib.loads((path / "project.toml").read_text("utf-8")))
+    found = problems("project", text_files.tomllib.loads((path / "project.toml").read_text("utf-8")))
     if (path / "design.json").exists():
         design = json.loads((path / "design.json").read_text("utf-8"))
         found += problems({"arch-bridge": "design-arch", "space-frame": "design-frame"}[design["kind"]], design)
@@ -121,7 +121,7 @@ def test_what_the_frame_schema_refuses_is_refused_by_the_reader(design, tmp_path
     ],
 )
 def test_what_the_project_schema_refuses_is_refused_by_the_reader(text, tmp_path):
-    assert problems("project", folder.tomllib.loads(text))
+    assert problems("project", text_files.tomllib.loads(text))
     (tmp_path / "project.toml").write_text(text)
     (tmp_path / "scan.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n0 0 1\n")
     with pytest.raises(InputError):

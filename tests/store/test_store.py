@@ -105,7 +105,7 @@ def test_a_scene_comes_back(written):
 
 def test_a_space_frame_comes_back(tmp_path):
     path = tmp_path / "f.h5"
-    frame = FrameDesign([3, 4], np.eye(3)[:2], [1.0, 2.0], [3], [4], [60.0])
+    frame = FrameDesign([3, 4], np.eye(3)[:2], [1.0, 2.0], [3], [4], [1.5])
     truth = Truth(frame=FrameTruth([3, 4], np.eye(3)[:2], [1.0, 2.0], np.zeros((2, 3))), spacing_mm=5.0)
     scene = Scene("f", "space-frame", (Scan("s", np.eye(3)),), frame=frame)
     store.write_scene(path, scene, truth, {})

@@ -46,9 +46,11 @@ def a_scene(n=50_000):
         ),
         Scan("s2", points[:10] + 1.0),
     )
-    stations = Stations(tuple(f"S{k}" for k in range(2_001)), np.arange(6_003.0).reshape(-1, 3))
+    stations = Stations(
+        tuple(f"S{k}" for k in range(2_001)), np.arange(6_003.0).reshape(-1, 3) - np.array([5e8, 4e8, 0.0])
+    )
     scene = Scene("桥", "arch-bridge", scans, arch, None, stations, 21.5, "m", (reason("units.by-option"),))
-    labels = PointLabels("s1", ("肋1", "b"), np.floor(points[:, 2]).astype(np.int64), np.arange(n) % 3)
+    labels = PointLabels("s1", ("肋1", "b"), np.floor(np.abs(points[:, 2])).astype(np.int64) % 2, np.arange(n) % 3)
     ends, edges = np.full((1, 2, 8, 3), np.nan), np.zeros((1, 2, 5, 3))
     truth = Truth((labels,), ArchTruth(("肋1",), [np.eye(4)], ends, np.zeros((1, 2, 8, 3)), edges))
     return scene, truth
