@@ -15,13 +15,13 @@ from numba import njit
 
 import processor.readers.pieces as pieces
 from processor.large_arrays import allocate
-from processor.model import Codes, Floats, InputError, Labels, reason
+from processor.model import FARTHEST_MM, SAMPLED_POINTS, Codes, Floats, InputError, Labels, reason
 from processor.readers.ascii_rows import Rows
 from processor.readers.file_checks import check_declared_points, check_last_row, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name, without_empty
 
 SUFFIXES = (".ptx",)
-UNIT = "m"
+UNIT, MM_PER_UNIT = "m", 1000.0
 SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
 MOST_LINES = 2**31 - 1  # rows or columns of a grid: they are stored as int32
 RIGID_TOLERANCE = 1e-3  # of R^T R - I: matrices are often written with few digits
@@ -106,7 +106,7 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
         points[:count],
         unit=UNIT,
         intensity=intensity[: count if wide else 0],
-        position=_scanner(np.array(numbers[2]), T_project_scan),
+        position=_scanner(np.array(numbers[2]), T_project_scan, points[:count]),
         T_project_scan=T_project_scan,
         grid=(row[:count], column[:count]) if gridded else None,
     )
@@ -121,13 +121,16 @@ def _is_for_columns(matrix: Floats) -> bool:
     )
 
 
-def _scanner(stated: Floats, T_project_scan: Floats) -> Floats:
+def _scanner(stated: Floats, T_project_scan: Floats, points: Floats) -> Floats:
     """Return the scanner's position (3,) in the scan's frame from that of the header, in the project's frame.
 
-    A header of 0 0 0 above a matrix with a translation says nothing: points are in the scanner's frame.
+    A header of 0 0 0 above a matrix with a translation says nothing: points are in the scanner's frame. Where that
+    cannot be, as of points on a map, the position is unknown: (0,).
     """
     if not stated.any():
-        return np.zeros(3)
+        sample = points[:: max(1, len(points) // SAMPLED_POINTS)]
+        near = np.linalg.norm(sample, axis=1).min() * MM_PER_UNIT < FARTHEST_MM
+        return np.zeros(3 if near else 0)
     position: Floats = T_project_scan[:3, :3].T @ (stated - T_project_scan[:3, 3])
     return position
 

@@ -11,7 +11,7 @@ import processor
 from processor.evaluation import evaluate
 from processor.geometry import rigid
 from processor.model import InputError, Status, Truth, UsageError, reason
-from processor.scan_folder import design
+from processor.scan_folder import design, text_files
 from processor.store import store
 from tests.support.solids.meshes import bracket
 
@@ -290,7 +290,7 @@ def test_error_raised_with_an_open_scene_file_is_not_replaced(tmp_path):
 
 
 def test_a_file_that_is_too_large_is_not_called_unreadable_json(tmp_path, monkeypatch):
-    monkeypatch.setattr(design, "TEXT_LIMIT", 10)
+    monkeypatch.setattr(text_files.read_text, "__defaults__", (10,))
     (tmp_path / "design.json").write_text('{"kind": "space-frame"}')
     with pytest.raises(InputError, match=r"^[^:]*design\.json: expected at most 10 bytes, found 23"):
         design.read_json(tmp_path / "design.json")

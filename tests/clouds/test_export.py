@@ -115,7 +115,7 @@ def test_columns_of_a_merged_cloud(hall, tmp_path):
 def test_registered_scans_keep_pose_grid_intensity_and_colour(hall, tmp_path):
     scans, poses, results = hall
     done = processor.export(results, tmp_path / "r")
-    assert list(done.files) == ["scans/S1.e57", "scans/scan1.e57"]  # a blank is no part of a file's name
+    assert list(done.files) == ["scans/S1.e57", "scans/S_2.e57"]  # a blank is no part of a file's name
     for file, scan, T in zip(done.files, scans, poses, strict=True):
         e57 = pye57.E57(str(tmp_path / "r" / file))
         header, raw = e57.get_header(0), e57.read_scan_raw(0)
