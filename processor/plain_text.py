@@ -39,11 +39,12 @@ def decoded(data: bytes) -> str:
 
 
 def _is_latin(data: bytes) -> bool:
-    """Whether most bytes beyond ASCII are single letters, as of European words.
+    """Whether most runs of bytes beyond ASCII are letters of European words.
 
     Chinese characters of everyday use (GB 2312) are two such bytes each, and no small Latin letter stands beside them:
-    a run of an odd number of such bytes, or one beside a small letter, is of a European word. Both are valid GB18030.
+    a run of an odd number of bytes is of a European word, and so is one of letters alone between small letters. Both
+    are valid GB18030.
     """
     runs = re.findall(rb"([a-z]?)([\x80-\xff]+)(?=([a-z]?))", data)
-    latin = sum(len(run) % 2 == 1 or bool(before and after) for before, run, after in runs)
+    latin = sum(len(run) % 2 == 1 or bool(before and after and min(run) >= 0xC0) for before, run, after in runs)
     return 2 * latin > len(runs)

@@ -85,6 +85,7 @@ def _joined(cores: Sequence[CorePoints], shifts: Sequence[Floats]) -> CorePoints
         for field in fields(CorePoints)
         if field.name != "points"
     }
+    columns["body"] = np.full_like(columns["body"], -1)  # rows of one part's bodies, which the whole does not name
     points = np.concatenate([core.points + shift for core, shift in zip(cores, shifts, strict=True)])
     return CorePoints(points=points, **columns)
 

@@ -44,7 +44,8 @@ def plate(columns=24, rows=12, side=50.0):
 
 def scene(names=("S1",), name="site"):
     points, design = plate()
-    scans = tuple(Scan(one, points, np.zeros(3), T_project_scan=np.eye(4)) for one in names)
+    # No two scans measure the very same places, else one would be a copy of the other.
+    scans = tuple(Scan(one, points + 1e-3 * k, np.zeros(3), T_project_scan=np.eye(4)) for k, one in enumerate(names))
     return Scene(
         name,
         "structure",
