@@ -38,7 +38,7 @@ def inputs(tmp_path):
     places = site(1, 0.0), site(2, 5.0)
     scans = []
     for part, scanner in zip(np.array_split(places[0], 3), ([0.3, -4.0, 2.0], [0.5, 6.0, 2.0], None), strict=True):
-        position = () if scanner is None else 1000.0 * np.array(scanner)
+        position = () if scanner is None else 1000.0 * (UTM + scanner)
         scans.append(Scan(f"S{len(scans)}", 1000.0 * (part - UTM), origin=1000.0 * UTM, position=position))
     store.write_scene(tmp_path / "scans.h5", Scene("a", "structure", tuple(scans), units="mm"), None, {})
     for name, points in (("a.xyz", places[0]), ("b.xyz", places[1]), ("core.xyz", places[0][::7] + 0.003)):

@@ -377,7 +377,7 @@ def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
         replace = os.replace
 
         def failing(source, target):
-            if os.fspath(target) == os.fspath(out) and not os.fspath(source).endswith("old"):
+            if os.fspath(target) == os.fspath(out) and os.fspath(source).endswith("new"):
                 raise OSError(28, "No space left on device")
             replace(source, target)
 
