@@ -20,7 +20,7 @@ def path(tmp_path):
             rng.uniform(-5e3, 5e3, (70_000, 3)),
             origin=np.array([5e8, 4e9, 0.0]),
             intensity=rng.uniform(size=70_000),
-            position=np.zeros(3),
+            position=np.array([5e8, 4e9, 0.0]),
             T_project_scan=turn,
         ),
         Scan(
