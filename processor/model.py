@@ -76,6 +76,9 @@ def reason(code: str, /, **values: Any) -> Reason:
 LARGEST_MM = 1e11  # a length beyond it, 100,000 km, is none of a structure; float64 has steps of 0.00002 mm there
 SMALLEST_MM = 1e-4  # points are stored in steps of it: no size or noise below it is one
 WIDEST_MM = 1e7  # 10 km: no structure is larger; what is made of cells or profiles of one would fill the memory
+TUBE_PER_BALL = (
+    3.0  # diameters: cones taper tubes to their bolts, so a tube of 245 mm may end at a ball of 80 mm, no more
+)
 FARTHEST_MM = 2e6  # 2 km: no structure is measured from farther; of scans in mm read as metres the scanners are
 SAMPLED_POINTS = 1_000  # of a scan, to be compared with its scanner
 MOST_NODES, MOST_MEMBERS, MOST_PARTS = 100_000, 400_000, 1_000  # a hundred times those of the largest known
@@ -544,7 +547,7 @@ class FrameDesign(Checked):
         return dict(zip(self.ids.tolist(), self.names, strict=True))
 
     def contradictions(self) -> Iterable[Fault]:
-        """Yield a frame larger than any, a second member of two nodes, and a tube that is wider than its ball."""
+        """Yield a frame larger than any, a second member of two nodes, and a tube far wider than its ball."""
         yield from _many("ids", len(self.ids), MOST_NODES)
         yield from _many("member_a", len(self.member_a), MOST_MEMBERS)
         yield from _wide("centres", self.centres)
@@ -557,11 +560,12 @@ class FrameDesign(Checked):
             yield Fault(("member_b",), f", row {row}: expected one member of two nodes, found a second of {a} and {b}")
         order = np.argsort(self.ids)
         balls = 2.0 * self.radii[order[np.searchsorted(self.ids, ends, sorter=order)]]
-        wide = (self.tube_diameters[:, None] > balls).any(axis=1)
+        wide = (self.tube_diameters[:, None] > TUBE_PER_BALL * balls).any(axis=1)
         if wide.any():
             row = int(wide.argmax())
             tube, ball = self.tube_diameters[row], balls[row].min()
-            text = f"expected a tube not wider than its ball of {ball:.6g} mm, found {tube:.6g} mm"
+            most = f"{TUBE_PER_BALL:g} times the diameter of its ball, {ball:.6g} mm"
+            text = f"expected a tube of at most {most}, found {tube:.6g} mm"
             yield Fault(("tube_diameters",), f", row {row}: {text}; give diameters of tubes and radii of balls")
 
 

@@ -82,6 +82,11 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
         say(f"{name}: left out: {messages('en').text(why)}")
     if not inputs.inputs:
         raise InputError(f"{settings.root}: expected scan folders, scenes or scans in it, found none")
+    around = next((each for each in inputs.inputs if out.is_relative_to(each.path)), None)
+    if around is not None:  # its own state and logs would be files of the input, which change while it is processed
+        raise UsageError(
+            f"{settings.out}: lies in the scan folder {around.path}; name a folder outside for the results"
+        )
     with (
         runner.executor(settings.cluster, settings.at_a_time, say) as executor,
         runner.stoppable() as check_stop,

@@ -604,6 +604,9 @@ def test_roots_and_outputs_refused(tmp_path):
     folder(tmp_path / "root/a")
     with pytest.raises(InputError, match="is a file"):
         batch.run(batch.Settings(tmp_path / "root", tmp_path / "file"), print, print)
+    (tmp_path / "root/a/project.toml").touch()
+    with pytest.raises(UsageError, match="lies in the scan folder"):
+        batch.run(batch.Settings(tmp_path / "root/a", tmp_path / "root/a/out"), print, print)
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------

@@ -38,10 +38,9 @@ def hostile(tmp_path):
         (folder / f"{name}.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'a').write(__file__ + '\\n')\n")
     for name, text in SETTINGS.items():
         (folder / name).write_text(text)
-    directions = np.random.default_rng(1).normal(size=(400, 3)) * [1.0, 1.0, 0.3] + [0.0, 0.0, 2.0]
-    sphere = directions / np.linalg.norm(directions, axis=1)[:, None] * 0.075
-    for name in ("a.xyz", "b.xyz"):
-        np.savetxt(folder / name, sphere, fmt="%.5f")
+    for seed, name in enumerate(("a.xyz", "b.xyz")):
+        directions = np.random.default_rng(seed).normal(size=(400, 3)) * [1.0, 1.0, 0.3] + [0.0, 0.0, 2.0]
+        np.savetxt(folder / name, directions / np.linalg.norm(directions, axis=1)[:, None] * 0.075, fmt="%.5f")
     return folder
 
 
@@ -86,7 +85,7 @@ COMMANDS = (
     "processor init .",
     "processor run . -o R",
     "processor run . -o limited --timeout-s 100 --memory-mb 4000",
-    "processor batch . -o B --steps spheres",
+    "processor batch . -o ../B --steps spheres",
     "processor compare a.xyz b.xyz -o C --normal-diameter 0.1 --projection-diameter 0.05 --max-depth 0.05",
     "processor convert . -o scene.h5",
     "processor report R",
@@ -119,6 +118,7 @@ SOLID = "solid a\n" + "".join(
         ((0, 0, 0), (0, 0, 900), (0, 900, 0)),
     )
 )
+SOLID += "endsolid a\n"
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ DESIGN = {
     "members/1/a": {"unknown": 99, "negative": -1, "itself": 2, "text": "x", "fraction": 1.5, "list": []},
     "members/1/b": {"unknown": 99, "itself": 1, "text": "x"},
     "members/1": {"a second time": {"a": 1, "b": 0, "tube_diameter": 0.06}},
-    "members/1/tube_diameter": {**NO_SIZE, "as wide as a hall": 6.0, "wider than its ball": 0.101},
+    "members/1/tube_diameter": {**NO_SIZE, "as wide as a hall": 6.0, "four times as wide as its ball": 0.4},
     "members": {"text": "x", "object": {}, "number": 5},
     "units": {**NO_TEXT, "unknown": "parsec"},
     "kind": {**NO_TEXT, "unknown": "tower"},
