@@ -15,8 +15,12 @@ from processor.store.replaced_folder import replacing_folder
 
 PROGRAM = """
 import sys, time
+import signal
 from pathlib import Path
 import click
+# A shell lets what it starts in the background ignore SIGINT, and so do the tests and what they start.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, 0), (signal.SIGHUP, 0)):
+    signal.signal(number, handler)
 from processor.jobs import program
 from processor.store.new_folder import new_folder
 from processor.store.replaced_folder import replacing_folder
