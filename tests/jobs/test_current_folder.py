@@ -94,6 +94,7 @@ COMMANDS = (
     "processor export R -o X --what merged --format ply",
     "processor history . -o H",
     "processor validate matrix.toml -o V",
+    "processor papers -o P --only 004 --seeds 1",
     "designgen list",
     "designgen make frame-small -o F.h5",
     "designgen make frame-small -o set --count 1",

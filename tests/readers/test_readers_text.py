@@ -210,3 +210,9 @@ def test_many_grids_in_one_ptx_are_separated_for_any_block_size(tmp_path):
     assert len(found) == len(grids)
     for scan, grid in zip(found, grids, strict=True):
         np.testing.assert_allclose(scan.points + scan.origin, 1e3 * grid[:, :3] if scan.unit == "mm" else grid[:, :3])
+
+
+def test_a_row_of_more_columns_than_any_export_has_is_refused(tmp_path):
+    (tmp_path / "a.xyz").write_text("1 " * 1_000_000 + "\n")
+    with pytest.raises(InputError, match=r"a\.xyz: line 1: expected at most 1000 columns, found \d+"):
+        readers.read(tmp_path / "a.xyz")
