@@ -126,5 +126,6 @@ def test_a_bridge_of_wrong_scans_is_not_assembled(order):
     for i, (name, k) in enumerate(zip(NAMES, order, strict=True)):
         assert set(matching[f"Scan_{i + 1:03d}"].split(" / ")) == (ribs if name in ribs else {name})
         right = name == NAMES[k] or {name, NAMES[k]} == ribs
-        assert result.components.status[k] == ("ok" if right else "failed")
+        # No joint to a wrong scan is measured: what is right is placed by the design alone.
+        assert result.components.status[k] == ("weak" if right else "failed")
     assert [one.code for one in result.adjustment.advice] == ["preassemble.assign-scans"]
