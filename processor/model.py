@@ -842,7 +842,10 @@ class Scene(Checked):
             seen.add((scan.component, scan.station))
             for row, position in self._stations_of(scan):
                 place = (position - scan.pose[:3, 3]) @ scan.pose[:3, :3] - scan.origin
-                yield from _far(("stations", "positions"), f", row {row}", place, scan)
+                far = list(_far(("stations", "positions"), f", row {row}", place, scan))
+                if far:  # one names the mistake: a wrong unit concerns every row
+                    yield far[0]
+                    break
         parts = {part.name for part in self.arch.parts} if self.arch else set()
         for i, scan in enumerate(self.scans):
             if parts and scan.component and scan.component not in parts:
