@@ -1,4 +1,4 @@
-"""Joints of which an end was not measured: pieces that nothing measured ties together, and what is said of them."""
+"""Joints of which an end was not measured: pieces that nothing measured ties together, their status and reasons."""
 
 import dataclasses
 

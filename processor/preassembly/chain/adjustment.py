@@ -177,8 +177,10 @@ def adjust(
         piece=observed.piece,
         placing_covariance=np.zeros((len(members), 6, 6)),
     )
+    if not adjusted.in_pieces:
+        return adjusted
     places = [design_places.places(members, i, sides, joint_points) for i in range(len(members))]
-    return _placed_by_design(adjusted, members, x, places, place_sd_mm) if adjusted.in_pieces else adjusted
+    return _placed_by_design(adjusted, members, x, places, place_sd_mm)
 
 
 def _placed_by_design(
