@@ -177,16 +177,14 @@ def adjust(
         piece=observed.piece,
         placing_covariance=np.zeros((len(members), 6, 6)),
     )
-    if not adjusted.in_pieces:
-        return adjusted
-    places = [design_places.places(members, i, sides, joint_points) for i in range(len(members))]
-    return _placed_by_design(adjusted, members, x, places, place_sd_mm)
+    return _placed_by_design(adjusted, members, x, sides, joint_points, place_sd_mm) if adjusted.in_pieces else adjusted
 
 
 def _placed_by_design(
-    adjusted: Adjusted, members: Sequence[Member], x: Floats, places: Sequence[Floats], sd_mm: float
+    adjusted: Adjusted, members: Sequence[Member], x: Floats, sides: Sides, joint_points: Floats, sd_mm: float
 ) -> Adjusted:
     """Add the covariance of the pieces' places in the design, to which the parts' motions x (6 c,) belong."""
+    places = [design_places.places(members, i, sides, joint_points) for i in range(len(members))]
     placing = design_places.covariances(x.reshape(-1, 6), places, members, adjusted.piece, sd_mm)
     variances, at_rest = [], []
     for i, member in enumerate(members):
