@@ -10,17 +10,21 @@ DEPENDENCIES ?= newest
 # Modules stay compiled, also where the environment says otherwise: tests and demo start many processes.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-lowest lint docs bench mutants paper nightly weekend lock audit clean system
+.PHONY: demo test test-lowest lint docs bench mutants profile paper nightly weekend lock audit clean system
 
 demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
 
 # All tests but the slow ones; weekend runs these, too. The types are checked beside them: that takes one core.
+# FOLDER=spheres: those of tests/spheres alone.
+FOLDER ?=
+TESTS = tests/$(patsubst tests/%,%,$(FOLDER))
+PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 test: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	@$(BIN)/mypy >$(VENV)/mypy.log 2>&1 & types=$$!; \
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"; tests=$$?; \
+	$(PYTEST) $(TESTS); tests=$$?; \
 	wait $$types; types=$$?; cat $(VENV)/mypy.log; exit $$((tests || types))
 
 # All tests but the slow ones with the oldest versions that pyproject.toml allows. Those warn of what is new since.
@@ -53,6 +57,12 @@ NUMBER ?= 200
 SEED ?= 1
 mutants: $(VENV)/.test
 	$(BIN)/python -m tests.mutation --number $(NUMBER) --seed $(SEED) --jobs $(JOBS) -o $(OUT)/mutants
+
+# Processor time of the tests by folder, file, test and fixture.
+profile: $(VENV)/.test
+	rm -rf $(OUT)/suite-times
+	SUITE_TIMES=$(OUT)/suite-times $(PYTEST) -q -p tests.bench.suite $(TESTS)
+	SUITE_TIMES=$(OUT)/suite-times $(BIN)/python -m tests.bench.suite
 
 paper: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/paper

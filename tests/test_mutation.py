@@ -2,7 +2,8 @@
 
 import ast
 
-from tests.mutation.__main__ import drawn, nearest_tests
+from tests.mutation.__main__ import drawn
+from tests.mutation.nearest import nearest_files
 from tests.mutation.sites import sites
 from tests.support.structure import ROOT
 
@@ -44,5 +45,5 @@ def test_drawn_mutants_are_programs_of_many_kinds_and_the_same_for_a_seed():
 
 
 def test_the_nearest_tests_import_the_file():
-    nearest = nearest_tests("processor/limits/judging.py")
+    nearest = nearest_files("processor/limits/judging.py")
     assert nearest[0].startswith("tests/limits/")

@@ -1,7 +1,9 @@
 """Draw mutants of the numeric core, run the nearest tests of each and list those that no test kills.
 
 ``python -m tests.mutation --number 200 --seed 1 -o out/mutants``. A survivor is either equivalent to the code, or a
-test is missing. Each verdict is a line of ``OUT/mutants.jsonl``; a further run tries again what was not killed in it.
+test is missing. The first run records which lines each test runs, in ``OUT/record``; remove that after a change of
+tests. Each verdict is a line of ``OUT/mutants.jsonl`` with the test that killed the mutant; a further run tries again
+what was not killed, and with ``--again`` what was: by the test that did it, if that is still there.
 """
 
 import argparse
@@ -12,15 +14,15 @@ import random
 import shutil
 import subprocess
 import sys
-from collections import Counter, deque
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
 
+from tests.mutation.nearest import Record, distances, record
 from tests.mutation.sites import Site, sites
-from tests.support.structure import MODULES, ROOT, imports, module_name
+from tests.support.structure import MODULES, ROOT, module_name
 
 # Where numbers are made. What reads, writes and shows them is tested by examples of files and pages.
 CORE = (
@@ -28,8 +30,6 @@ CORE = (
     *("space_frame", "stitching", "inspection", "compare", "targets", "epochs"),
 )
 CORE_FOLDERS = (*(f"processor/{name}" for name in CORE), "designgen/scanning", "designgen/designs", "designgen/asbuilt")
-NEAREST_FILES = 8  # of tests, by the distance of imports: beyond these the whole suite would be run for each mutant
-FARTHEST = 3  # imports between a file of tests and the mutant
 LIMIT_S = 600.0  # of one mutant: a loop that no longer ends
 KILLED, SURVIVED, TIMEOUT, NO_TESTS = "killed", "survived", "timeout", "no tests"
 
@@ -72,52 +72,25 @@ def drawn(number: int, seed: int, folders: tuple[str, ...] = CORE_FOLDERS) -> li
     return mutants
 
 
-@cache
-def importers() -> dict[str, set[str]]:
-    """Names of modules and of files of tests, by the module that they import."""
-    files = {**MODULES, **{module_name(path): path for path in (ROOT / "tests").rglob("*.py")}}
-    found: dict[str, set[str]] = {}
-    for name, path in files.items():
-        for imported in imports(path):
-            found.setdefault(imported, set()).add(name)
-    return found
-
-
-def distances(module: str) -> dict[str, int]:
-    """Return the number of imports between a module and each of those that use it, directly or through others."""
-    away = {module: 0}
-    waiting = deque([module])
-    while waiting:
-        name = waiting.popleft()
-        for user in sorted(importers().get(name, ())):
-            if user not in away:
-                away[user] = away[name] + 1
-                waiting.append(user)
-    return away
-
-
-def nearest_tests(path: str) -> list[str]:
-    """Return the files of tests that are next to a file by imports, those in folders of its name first."""
-    folders = set(Path(path).parts)
-    away = distances(module_name(ROOT / path))
-    tests = [(steps, name) for name, steps in away.items() if name.rpartition(".")[2].startswith("test_")]
-    order = sorted(tests, key=lambda one: (one[0], not folders & set(one[1].split(".")), one[1]))
-    return [name.replace(".", "/") + ".py" for steps, name in order if steps <= FARTHEST][:NEAREST_FILES]
-
-
 class Copy:
     """A copy of the project in which one mutant at a time stands."""
 
-    def __init__(self, place: Path) -> None:
+    def __init__(self, place: Path, known: Record) -> None:
         self.place = place
+        self.known = known
         if not place.exists():
             skipped = shutil.ignore_patterns(".git", ".venv*", "out", ".mypy_cache", ".ruff_cache", ".pytest_cache")
             shutil.copytree(ROOT, place, ignore=skipped)
 
-    def verdict(self, mutant: Mutant) -> str:
-        tests = nearest_tests(mutant.path)
+    def verdict(self, mutant: Mutant, killer: str) -> tuple[str, str]:
+        """Return the verdict on a mutant and the test that killed it; ``killer`` did so before, or is empty."""
+        site = mutant.site
+        tests = self.known.tests(mutant.path, range(site.line, site.line + site.old.count("\n") + 1))
+        tests = tests or self.known.of_imports(mutant.path)
+        if killer in self.known.seconds:
+            tests = [killer, *(name for name in tests if name != killer)]
         if not tests:
-            return NO_TESTS
+            return NO_TESTS, ""
         path = self.place / mutant.path
         source = path.read_text("utf-8")
         kernels = self._compiled(mutant.path)
@@ -145,14 +118,21 @@ class Copy:
                 found += [*cache_folder.glob(f"{source.stem}.*.nbi"), *cache_folder.glob(f"{source.stem}.*.nbc")]
         return found
 
-    def _run(self, tests: list[str]) -> str:
+    def _run(self, tests: list[str]) -> tuple[str, str]:
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests]
         env = {**os.environ, "PYTHONPATH": str(self.place), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         try:
-            done = subprocess.run(command, cwd=self.place, env=env, capture_output=True, timeout=LIMIT_S, check=False)
+            done = subprocess.run(
+                command, cwd=self.place, env=env, capture_output=True, text=True, timeout=LIMIT_S, check=False
+            )
         except subprocess.TimeoutExpired:
-            return TIMEOUT
-        return SURVIVED if done.returncode == 0 else KILLED
+            return TIMEOUT, ""
+        if done.returncode == 0:
+            return SURVIVED, ""
+        if "ERROR: not found" in done.stdout + done.stderr:
+            raise SystemExit(f"{self.known.place}: the tests have changed since the record was made; remove it")
+        failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+        return KILLED, failed[0].split(" ", 1)[1].split(" - ")[0] if failed else ""
 
 
 def main() -> None:
@@ -161,35 +141,40 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "out/mutants")
+    parser.add_argument("--again", action="store_true", help="also what was killed before")
     options = parser.parse_args()
-    options.output.mkdir(parents=True, exist_ok=True)
-    record = options.output / "mutants.jsonl"
-    known = [json.loads(line) for line in record.read_text("utf-8").splitlines()] if record.exists() else []
-    verdicts = {one["key"]: KILLED for one in known if one["verdict"] == KILLED}
+    place = options.output / "record"
+    if not place.exists():
+        record(place)
+    verdicts = options.output / "mutants.jsonl"
+    lines = [json.loads(line) for line in verdicts.read_text("utf-8").splitlines()] if verdicts.exists() else []
+    killers = {one["key"]: one["killer"] for one in lines if one["verdict"] == KILLED}
     mutants = drawn(options.number, options.seed)
+    known = {} if options.again else dict.fromkeys(killers, KILLED)
     copies: SimpleQueue[Copy] = SimpleQueue()
     for number in range(options.jobs):
-        copies.put(Copy(options.output / f"copy-{number}"))
+        copies.put(Copy(options.output / f"copy-{number}", Record(place)))
 
-    def judge(mutant: Mutant) -> tuple[Mutant, str]:
+    def judge(mutant: Mutant) -> tuple[Mutant, str, str]:
         copy = copies.get()
         try:
-            return mutant, copy.verdict(mutant)
+            return mutant, *copy.verdict(mutant, killers.get(mutant.key, ""))
         finally:
             copies.put(copy)
 
-    left = [mutant for mutant in mutants if mutant.key not in verdicts]
-    with ThreadPoolExecutor(options.jobs) as threads, record.open("a", encoding="utf-8") as file:
-        for mutant, verdict in threads.map(judge, left):
-            verdicts[mutant.key] = verdict
-            file.write(json.dumps({"key": mutant.key, "mutant": str(mutant), "verdict": verdict}) + "\n")
+    left = [mutant for mutant in mutants if mutant.key not in known]
+    with ThreadPoolExecutor(options.jobs) as threads, verdicts.open("a", encoding="utf-8") as file:
+        for mutant, verdict, killer in threads.map(judge, left):
+            known[mutant.key] = verdict
+            one = {"key": mutant.key, "mutant": str(mutant), "verdict": verdict, "killer": killer}
+            file.write(json.dumps(one) + "\n")
             file.flush()
-            print(f"{verdict:9}  {mutant}", flush=True)
-    of_drawn = Counter(verdicts[mutant.key] for mutant in mutants)
+            print(f"{verdict:9}  {mutant}  {killer}", flush=True)
+    of_drawn = Counter(known[mutant.key] for mutant in mutants)
     print(", ".join(f"{verdict}: {count}" for verdict, count in sorted(of_drawn.items())))
     for mutant in mutants:
-        if verdicts[mutant.key] != KILLED:
-            print(f"{verdicts[mutant.key]}: {mutant}")
+        if known[mutant.key] != KILLED:
+            print(f"{known[mutant.key]}: {mutant}")
 
 
 if __name__ == "__main__":
