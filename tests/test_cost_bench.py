@@ -42,7 +42,8 @@ def test_exponent_of_a_power_law_is_its_power(power):
     sizes = np.array([1.0, 2.0, 4.0, 8.0]) * 1e6
     assert cost.exponent(sizes, 3.0 * sizes**power) == pytest.approx(power)
     scattered = 3.0 * sizes**power * np.array([1.02, 0.98, 0.98, 1.02])
-    assert cost.exponent(sizes, scattered) == pytest.approx(power, abs=0.05)
+    # A scatter of 2 % over an eightfold range shifts a slope by at most 0.04 / ln 8 = 0.02.
+    assert cost.exponent(sizes, scattered) == pytest.approx(power, abs=0.02)
 
 
 def test_exponent_of_one_size_is_no_number():
@@ -64,14 +65,14 @@ def test_timed_adds_the_processor_seconds_of_every_call():
     assert work(1_000_000) == 499_999_500_000
     once = seconds["step"]
     work(1_000_000)
-    assert 0.0 < once < seconds["step"] < 5.0
+    assert 0.0 < once < seconds["step"] < 5.0  # 0.04 s of work, with room for a busy machine
 
 
 def test_measured_returns_seconds_and_memory_of_a_child_process(tmp_path):
     run = [sys.executable, "-S", "-c", "x = bytearray(60_000_000); t = sum(range(3_000_000))"]
     found = cost.measured(run, tmp_path)
-    assert 60.0 < found["mb"] < 150.0
-    assert 0.01 < found["cpu"] < 5.0
+    assert 60.0 < found["mb"] < 150.0  # the array, and an interpreter of some 10 MB
+    assert 0.01 < found["cpu"] < 5.0  # 0.1 s of work, with room for a busy machine
     with pytest.raises(RuntimeError, match="exit code 3"):
         cost.measured([sys.executable, "-S", "-c", "raise SystemExit(3)"], tmp_path)
 

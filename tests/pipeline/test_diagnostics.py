@@ -53,6 +53,7 @@ def test_clouds_are_in_the_outermost_frame():
         diagnostics.keep("cloud", points)
     (kept,) = notes.clouds
     assert kept.frame == "bridge"
+    # Two products of the same matrices: rounding of float64.
     np.testing.assert_allclose(kept.points, rigid.apply(outer, rigid.apply(inner, points)), atol=1e-12)
 
 

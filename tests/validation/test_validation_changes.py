@@ -82,7 +82,7 @@ def test_the_paired_test_is_a_t_test_of_log_ratios():
     (change,) = found.changes
     expected = stats.ttest_1samp(np.log(after / before), math.log(1.02), alternative="greater").pvalue
     assert (change.kind, change.test, change.cases) == ("regression", "paired", 5)
-    assert change.p == pytest.approx(2.0 * expected, rel=1e-9)  # by one of two tests
+    assert change.p == pytest.approx(2.0 * expected, rel=1e-9)  # by one of two tests; tails of SciPy agree to 1e-10
     assert str(change.message) == "20 % worse"
     (back,) = change_detection.find(rows("2026-01-02", after) + rows("2026-01-03", before), "2026-01-03", {}).changes
     assert (back.kind, str(back.message)) == ("improvement", "20 % better")
@@ -153,6 +153,7 @@ def test_the_rank_test_is_exact():
     scores = [np.rint(64 * stats.norm.ppf(stats.rankdata(own) / 7)) for own in table]
     seen = sum(own[0] for own in scores)
     sums = np.array([sum(one) for one in itertools.product(*scores)])
+    # Counts of whole numbers: rounding of one quotient.
     assert test.p_worse == pytest.approx((sums >= seen).mean(), abs=1e-12)
     assert test.p_better == pytest.approx((sums <= seen).mean(), abs=1e-12)
 
@@ -239,6 +240,7 @@ def test_an_estimator_20_percent_worse_is_reported_the_first_night(earlier, monk
     found = change_detection.find(given + one_night(earlier), night_name(earlier), {})
     worse = {one.name[2]: one for one in found.of("regression")}
     assert {"radii, standard deviation", "centres, standard deviation"} <= set(worse)
+    # A standard deviation of 16 x 180 coordinates scatters by 1 / sqrt(2 x 2880) = 1.3 %, two of them by 2 %: three.
     assert math.expm1(worse["centres, standard deviation"].size) == pytest.approx(0.2, abs=0.06)
     assert not found.of("improvement")
 
