@@ -25,7 +25,7 @@ from processor.cli.main import commands
 from processor.clouds import cleaning, poisson_disk, slabs
 from processor.clouds import export as clouds_export
 from processor.clouds.points import InMemory, Spool
-from processor.model import InputError, Scene, Stations, Status, UsageError
+from processor.model import InputError, Scene, Stations, UsageError
 from processor.preassembly.result import ScanPoses
 from processor.scan_folder import folder
 from processor.store import store
@@ -40,8 +40,10 @@ from tests.support.solids.meshes import bracket
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 RNG = np.random.default_rng(8)
-LAS_MM = 0.05 + 1e-4  # half a step of LAS
-TEXT_MM = 0.5e-4 + 1e-6
+DOUBLE_MM = 2e-6  # coordinates of a national grid, 3.5e9 mm, have steps of 5e-7 mm as float64; each is rounded twice
+LAS_MM = 0.05 + 1e-4  # half a step of LAS, and the rounding of its offset
+TEXT_MM = 0.5e-4 + DOUBLE_MM  # half of the last digit
+ROTATION = 1e-12  # products of rotations keep 1e-15; quaternions of E57 and rows of text lose some digits of it
 
 
 def in_project(scan, T):
@@ -83,7 +85,7 @@ def test_merged_scans_lie_where_their_poses_put_them(hall, format_, tmp_path):
     expected = np.concatenate([in_project(scan, T) for scan, T in zip(scans, poses, strict=True)])
     assert done.files == {f"merged.{format_}": len(expected)}
     found = cloud_of(tmp_path / f"m/merged.{format_}")
-    limit = {"las": LAS_MM, "laz": LAS_MM, "xyz": TEXT_MM}.get(format_, 2e-6)  # of 3.5e9 mm a double has steps of 5e-7
+    limit = {"las": LAS_MM, "laz": LAS_MM, "xyz": TEXT_MM}.get(format_, DOUBLE_MM)
     assert np.abs(found - expected).max() < limit
 
 
@@ -119,9 +121,9 @@ def test_registered_scans_keep_pose_grid_intensity_and_colour(hall, tmp_path):
     for file, scan, T in zip(done.files, scans, poses, strict=True):
         e57 = pye57.E57(str(tmp_path / "r" / file))
         header, raw = e57.get_header(0), e57.read_scan_raw(0)
-        np.testing.assert_allclose(header.rotation_matrix, T[:3, :3], atol=1e-12)
-        np.testing.assert_allclose(1000.0 * header.translation, T[:3, 3], rtol=1e-14)
-        np.testing.assert_allclose(cloud_of(tmp_path / "r" / file), scan.points, atol=1e-9)
+        np.testing.assert_allclose(header.rotation_matrix, T[:3, :3], atol=ROTATION)
+        np.testing.assert_allclose(1000.0 * header.translation, T[:3, 3], rtol=1e-14)  # one product
+        np.testing.assert_allclose(cloud_of(tmp_path / "r" / file), scan.points, atol=1e-9)  # of 3e4 mm: 1e2 roundings
         np.testing.assert_array_equal(raw["rowIndex"], scan.grid_row)
         np.testing.assert_array_equal(raw["columnIndex"], scan.grid_column)
         np.testing.assert_array_equal(raw["intensity"], scan.intensity)
@@ -136,8 +138,8 @@ def test_a_registered_folder_is_read_with_the_same_poses(hall, format_, tmp_path
     scene = processor.read(tmp_path / "r")
     assert (scene.name, scene.kind, len(scene.scans)) == ("hall", "structure", 2)
     for back, scan, T in zip(scene.scans, scans, poses, strict=True):
-        np.testing.assert_allclose(back.T_project_scan[:3, :3], T[:3, :3], atol=1e-12)
-        np.testing.assert_allclose(back.T_project_scan[:3, 3], T[:3, 3], atol=2e-6)
+        np.testing.assert_allclose(back.T_project_scan[:3, :3], T[:3, :3], atol=ROTATION)
+        np.testing.assert_allclose(back.T_project_scan[:3, 3], T[:3, 3], atol=DOUBLE_MM)
         np.testing.assert_allclose(back.points + back.origin, scan.points, atol=LAS_MM)
         assert back.sigma_mm == scan.sigma_mm
         np.testing.assert_array_equal(back.colour, scan.colour)
@@ -168,11 +170,13 @@ def test_free_scale_is_applied_to_exported_points(hall, tmp_path):
     processor.export(results, tmp_path / "r")
     processor.export(results, tmp_path / "m", what="merged", format="ply")
     back = processor.read(tmp_path / "r").scans[1]
-    assert abs(np.linalg.det(back.T_project_scan[:3, :3]) - 1.0) < 1e-9
+    assert abs(np.linalg.det(back.T_project_scan[:3, :3]) - 1.0) < 1e-9  # what a pose is checked for is 1e-3
     expected = in_project(scans[1], scaled[1])
-    np.testing.assert_allclose(in_project(back, back.T_project_scan).astype(float), expected.astype(float), atol=2e-6)
     np.testing.assert_allclose(
-        cloud_of(tmp_path / "m/merged.ply")[len(scans[0].points) :], expected.astype(float), atol=2e-6
+        in_project(back, back.T_project_scan).astype(float), expected.astype(float), atol=DOUBLE_MM
+    )
+    np.testing.assert_allclose(
+        cloud_of(tmp_path / "m/merged.ply")[len(scans[0].points) :], expected.astype(float), atol=DOUBLE_MM
     )
 
 
@@ -186,7 +190,7 @@ def test_parts_are_assembled_at_the_reference_temperature(tmp_path):
             done = processor.export(results, target, what="assembled", format=format_)
             for file, scan, T in zip(done.files, scans, poses, strict=True):
                 reduced = (scan.points + scan.origin) / (1.0 + alpha * (45.0 - 20.0))
-                np.testing.assert_allclose(cloud_of(target / file), reduced @ T[:3, :3].T + T[:3, 3], atol=1e-6)
+                np.testing.assert_allclose(cloud_of(target / file), reduced @ T[:3, :3].T + T[:3, 3], atol=DOUBLE_MM)
     assert [scan.component for scan in processor.read(target).scans] == ["foot1", "foot2"]
     assert np.isnan(processor.read(target).temperature_C)
 
@@ -202,7 +206,7 @@ def test_stations_of_a_merged_cloud(tmp_path):
         np.testing.assert_array_equal(laspy.read(tmp_path / what / f"{name}.laz").point_source_id, station + 1)
         back = processor.read(tmp_path / what)
         np.testing.assert_array_equal(back.scans[0].point_station, station)
-        np.testing.assert_allclose(back.stations.positions, stations.positions, atol=1e-6)
+        np.testing.assert_allclose(back.stations.positions, stations.positions, atol=DOUBLE_MM)
     done = processor.export(results, tmp_path / "e57")
     assert [remark.code for remark in done.remarks] == ["export.stations-lost"]
 
@@ -215,64 +219,65 @@ def test_of_several_scans_of_a_part_those_that_were_used_are_assembled(tmp_path)
     done = processor.export(results, tmp_path / "a", what="assembled", format="ply")
     for file, k, T in (("foot1.ply", 0, pose(6)), ("foot1-2.ply", 1, pose(5))):
         np.testing.assert_allclose(
-            cloud_of(tmp_path / "a/scans" / file), scans[k].points @ T[:3, :3].T + T[:3, 3], atol=1e-6
+            cloud_of(tmp_path / "a/scans" / file), scans[k].points @ T[:3, :3].T + T[:3, 3], atol=DOUBLE_MM
         )
     assert [(r.code, r.values["scans"]) for r in done.remarks] == [("export.further-scans", ("foot1, moved",))]
 
 
 # --- a run of the program, and its folder of results
 
-LEVEL = {"stitch": {"levelled_mrad": 20.0}}  # the same poses as without, by half of the search
-
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """A scan folder of four stations without poses, stitched."""
+    """A scan folder of four stations without poses, and results as if they had been stitched."""
     place = tmp_path_factory.mktemp("room")
-    _, scans = stitch_clouds.four(seed=2, step_mrad=16.0)
-    (place / "room/scans").mkdir(parents=True)
-    for scan in scans:
+    write_room(place / "room", 40.0)
+    return place, stitched_in(place, "room")
+
+
+def write_room(folder_, step_mrad):
+    (folder_ / "scans").mkdir(parents=True)
+    for scan in stitch_clouds.four(seed=2, step_mrad=step_mrad)[1]:
         lines = np.column_stack([scan.points / 1000.0, np.arange(len(scan.points)) % 200])
-        np.savetxt(place / f"room/scans/{scan.name}.xyz", lines, fmt="%.6f", header="x y z intensity", comments="")
-    (place / "room/project.toml").write_text('kind = "structure"\n')
-    results = processor.run(place / "room", place / "out", params=LEVEL)
-    assert results.steps["stitch"].status is Status.OK
-    return place, results
+        np.savetxt(folder_ / f"scans/{scan.name}.xyz", lines, fmt="%.6f", header="x y z intensity", comments="")
+    (folder_ / "project.toml").write_text('kind = "structure"\n')
 
 
-def test_an_exported_folder_is_stitched_to_the_same_poses(room, tmp_path):
-    place, results = room
-    processor.export(place / "out", tmp_path / "again", what="registered", format="e57")
-    again = processor.run(tmp_path / "again").steps["stitch"]
-    for table in (results.steps["stitch"].scans, again.scans):
-        assert table.name == ("S1", "S2", "S3", "S4")
-    first, second = results.steps["stitch"].scans, again.scans
-    half = 1.96 * np.sqrt(np.array([np.diag(one)[3:] for one in first.covariance]))
-    assert (np.abs(first.T_project_scan[:, :3, 3] - second.T_project_scan[:, :3, 3]) <= half + 1e-3).all()
+def stitched_in(place, name):
+    """Results of an input in a folder, written there as ``out``."""
+    scene = processor.read(place / name)
+    results = exported_runs.stitched(scene.scans, [pose(i) for i in range(4)], scene=scene)
+    (place / "out").mkdir()
+    made_from = {**results.execution.provenance, "input": name}
+    store.write_results(place / "out/results.h5", results.execution.runs, made_from)
+    return results
 
 
-@pytest.fixture(scope="module")
-def stored(room, tmp_path_factory):
-    """The same scans in a scene file, stitched."""
-    place = tmp_path_factory.mktemp("stored")
-    store.write_scene(place / "s.h5", room[1].scene, None, {})
-    return place, processor.run(place / "s.h5", place / "out", steps="stitch", seed=0, params=LEVEL)
-
-
-def test_memory_scene_file_and_folder_give_the_same_cloud(room, stored, tmp_path):
+def test_memory_scene_file_and_folder_give_the_same_cloud(room, tmp_path):
     place, results = room
     processor.export(results, tmp_path / "a", what="merged", format="ply", spacing_mm=150.0)
     processor.export(place / "out", tmp_path / "b", what="merged", format="ply", spacing_mm=150.0)
     assert (tmp_path / "a/merged.ply").read_bytes() == (tmp_path / "b/merged.ply").read_bytes()
-    place, results = stored
-    processor.export(place / "out", tmp_path / "c", what="merged", format="ply")
-    expected = np.concatenate(
-        [
-            in_project(scan, T).astype(float)
-            for scan, T in zip(results.scene.scans, results.steps["stitch"].scans.T_project_scan, strict=True)
-        ]
-    )
-    np.testing.assert_allclose(cloud_of(tmp_path / "c/merged.ply"), expected, atol=1e-6)
+    store.write_scene(tmp_path / "s.h5", results.scene, None, {})
+    results = stitched_in(tmp_path, "s.h5")
+    processor.export(tmp_path / "out", tmp_path / "c", what="merged", format="ply")
+    poses = results.steps["stitch"].scans.T_project_scan
+    expected = [in_project(scan, T).astype(float) for scan, T in zip(results.scene.scans, poses, strict=True)]
+    np.testing.assert_allclose(cloud_of(tmp_path / "c/merged.ply"), np.concatenate(expected), atol=DOUBLE_MM)
+
+
+@pytest.mark.slow
+def test_an_exported_folder_is_stitched_to_the_same_poses(tmp_path):
+    """Half of the search is enough for scans that are level."""
+    write_room(tmp_path / "room", 16.0)
+    found = processor.run(tmp_path / "room", tmp_path / "out", params={"stitch": {"levelled_mrad": 20.0}})
+    first = found.steps["stitch"].scans
+    processor.export(tmp_path / "out", tmp_path / "again", what="registered", format="e57")
+    second = processor.run(tmp_path / "again").steps["stitch"].scans
+    assert first.name == second.name == ("S1", "S2", "S3", "S4")
+    half = 1.96 * np.sqrt(np.array([np.diag(one)[3:] for one in first.covariance]))
+    off = np.abs(first.T_project_scan[:, :3, 3] - second.T_project_scan[:, :3, 3])
+    assert (off <= half + 1e-3).all()  # the reference has no interval; a micron is the rounding of both searches
 
 
 def test_export_command_lists_the_files_that_it_writes(room, tmp_path, monkeypatch):
@@ -376,13 +381,13 @@ def assert_nothing_written(code, err, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def exporting(stored, format_, tmp_path):
-    return ["export", str(stored[0] / "out"), "-o", str(tmp_path / "x"), "--what", "merged", "--format", format_]
+def exporting(room, format_, tmp_path):
+    return ["export", str(room[0] / "out"), "-o", str(tmp_path / "x"), "--what", "merged", "--format", format_]
 
 
 @pytest.mark.parametrize("format_", [one for one in clouds_export.FORMATS if one != "laz"])
-def test_a_full_disk_leaves_nothing_behind(stored, format_, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["processor", *exporting(stored, format_, tmp_path)])
+def test_a_full_disk_leaves_nothing_behind(room, format_, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["processor", *exporting(room, format_, tmp_path)])
     with files_of_at_most(200_000), pytest.raises(SystemExit) as end:
         __main__.main()
     assert_nothing_written(end.value.code, capsys.readouterr().err, tmp_path)
@@ -397,10 +402,10 @@ main()
 """
 
 
-def test_a_full_disk_leaves_nothing_behind_of_laz(stored, tmp_path):
+def test_a_full_disk_leaves_nothing_behind_of_laz(room, tmp_path):
     """The library that packs holds a file open that it could not finish: this takes a process of its own."""
     done = subprocess.run(
-        [sys.executable, "-c", LIMITED, *exporting(stored, "laz", tmp_path)],
+        [sys.executable, "-c", LIMITED, *exporting(room, "laz", tmp_path)],
         capture_output=True, text=True, cwd=Path(processor.__file__).parents[1],
     )  # fmt: skip
     assert_nothing_written(done.returncode, done.stderr, tmp_path)
@@ -494,10 +499,10 @@ def measured(tmp_path_factory):
     design = trimesh.util.concatenate([mesh, other])
     (place / "bodies/scans").mkdir(parents=True)
     design.export(place / "bodies/design.ply")
-    points, facet = trimesh.sample.sample_surface(design, 150_000, seed=4)
+    points, facet = trimesh.sample.sample_surface(design, 40_000, seed=4)
     moved = np.where((facet >= len(mesh.faces))[:, None], 4.0 * design.face_normals[facet], 0.0)
     points = points + moved + np.random.default_rng(5).normal(0.0, 0.5, points.shape)
-    clutter = np.random.default_rng(6).uniform([-3000.0, 1000.0, 900.0], [3000.0, 3500.0, 1000.0], (9000, 3))
+    clutter = np.random.default_rng(6).uniform([-3000.0, 1000.0, 900.0], [3000.0, 3500.0, 1000.0], (2500, 3))
     np.savetxt(place / "bodies/scans/S1.xyz", np.concatenate([points, clutter]), fmt="%.4f")
     (place / "bodies/project.toml").write_text('units = "mm"\ndesign = "design.ply"\n')
     results = processor.run(
@@ -527,7 +532,7 @@ def test_core_points_carry_deviation_lod_and_component(measured, tmp_path):
     assert (component[is_other] == component.max()).all()  # the last body of the mesh
     assert (component[~is_other] < component.max()).all()
     other = vertex["deviation_mm"][is_other]
-    assert np.nanmedian(other) == pytest.approx(4.0, abs=0.3)
+    assert np.nanmedian(other) == pytest.approx(4.0, abs=0.3)  # each has an interval of some tenths at this density
 
 
 def test_a_clean_scan_has_no_clutter(measured, tmp_path):
@@ -540,7 +545,7 @@ def test_a_clean_scan_has_no_clutter(measured, tmp_path):
     gone = kept.query(scan.points + scan.origin)[0] > 1e-6
     assert gone[count:].all()  # the clutter is 100 mm and more from any surface
     assert gone[:count].mean() < 0.02
-    assert remark.values["clutter"] == 9000
+    assert remark.values["clutter"] == 2500
     assert remark.values["outliers"] == gone[:count].sum()
     assert processor.read(tmp_path / "c").structure is not None
 
@@ -573,8 +578,8 @@ def test_colours_change_no_hash_where_there_are_none(tmp_path):
         store.write_scene(tmp_path / "s.h5", scene, None, {})
         back = store.read_scene(tmp_path / "s.h5")
         rows = np.lexsort(back.scans[0].points.T), np.lexsort(scene.scans[0].points.T)
-        np.testing.assert_array_equal(
-            back.scans[0].colour[rows[0]] if len(back.scans[0].colour) else back.scans[0].colour,
-            scene.scans[0].colour[rows[1]] if len(scene.scans[0].colour) else scene.scans[0].colour,
-        )
+        found, given = (one.scans[0].colour for one in (back, scene))
+        assert len(found) == len(given)
+        if len(given):
+            np.testing.assert_array_equal(found[rows[0]], given[rows[1]])
     assert folder.as_read(scan) is scan

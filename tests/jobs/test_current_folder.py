@@ -136,13 +136,6 @@ def run(program, folder, command):
     return subprocess.run([*program(name), *words], cwd=folder, capture_output=True, text=True, check=False)
 
 
-def test_a_run_with_limits_executes_nothing_in_its_input(hostile, program):
-    done = run(program, hostile, "processor run a.xyz -o ../R --steps spheres --timeout-s 100")
-    assert done.returncode in (0, 1), done.stderr
-    assert executed(hostile) == []
-    assert (hostile.parent / "R/results.json").exists()
-
-
 @pytest.mark.slow
 def test_no_command_executes_a_file_of_its_folder(hostile, program):
     (hostile / "matrix.toml").write_text(MATRIX)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
 from processor import pipeline
@@ -25,8 +22,8 @@ def site(tmp_path):
 
 
 def run(*arguments):
-    command = [sys.executable, "-m", "processor", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    """The command line in this process; a run with limits has one of its own."""
+    return commands.here("processor", *arguments)
 
 
 def ended(cause, code=0, last_line=""):

@@ -18,6 +18,9 @@ from tests.support.files.scan_bytes import DATA, POSE_ROWS, TURNED, las_bytes, n
 POINTS = np.array([[1.5, -2.25, 3.0], [0.1, 0.2, 0.3], [-7.0, 8.0, 1e-3]])
 
 
+ROUNDING = 1e-12  # a few products of numbers below 100 in float64
+
+
 def one(path):
     scans = readers.read(path)
     assert len(scans) == 1
@@ -30,7 +33,7 @@ def one(path):
 @pytest.mark.parametrize(
     ("form", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")], ids=["little", "big"]
 )
-@pytest.mark.parametrize(("kind", "code"), [("float", "f"), ("double", "d"), ("float64", "d")])
+@pytest.mark.parametrize(("kind", "code"), [("float", "f"), ("float64", "d")])
 def test_ply_binary(tmp_path, form, order, kind, code):
     rows = b"".join(struct.pack(f"{order}3{code}H", *row, 7 * i) for i, row in enumerate(POINTS))
     scan = one(put(tmp_path / "a.ply", ply_header(form, kind, "property ushort intensity\n") + rows))
@@ -47,14 +50,8 @@ def test_ply_ascii_with_faces(tmp_path):
     assert scan.intensity.tolist() == [9, 8, 7]
 
 
-def test_ply_with_a_property_after_a_list_in_later_elements(tmp_path):
-    more = "element face 2\nproperty list uchar double w\nproperty uchar flag\n"
-    content = ply_header("binary_little_endian", "double", more) + POINTS.astype("<f8").tobytes() + bytes(4)
-    assert np.array_equal(one(put(tmp_path / "a.ply", content)).points, POINTS)
-
-
 @pytest.mark.parametrize(("form", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
-@pytest.mark.parametrize("room", [1, 64, 1 << 20])
+@pytest.mark.parametrize("room", [1, 1 << 20])
 def test_ply_with_elements_before_the_vertices(tmp_path, monkeypatch, form, order, room):
     """Lists of any length, of several types and with single values beside them; also longer than is read at once."""
     monkeypatch.setattr(ply, "SKIPPED_BYTES", room)
@@ -113,20 +110,23 @@ def test_pcd_against_another_library(name):
 
 def test_ptx_poses_and_no_returns(tmp_path):
     grid = "2\n2\n" + TURNED + "1 2 3 0.5 9 9 9\n0 0 0 0.5 0 0 0\n4 5 6 0.25 9 9 9\n0 0 7 1 9 9 9\n"
-    second = "1\n1\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n7 8 9 0.1\n\n"
-    scans = readers.read(put(tmp_path / "a.ptx", grid + second))
+    scans = readers.read(put(tmp_path / "a.ptx", grid + ptx_of() + "\n"))
     assert [scan.name for scan in scans] == ["a-1", "a-2"]
     assert scans[0].points.tolist() == [[1, 2, 3], [4, 5, 6], [0, 0, 7]]
     assert scans[0].intensity.tolist() == [0.5, 0.25, 1.0]
     assert scans[0].unit == "m"
     # By hand: (1, 2, 3) turned is (-2, 1, 3), moved (8, 21, 33).
-    assert np.allclose(scans[0].T_project_scan @ [1, 2, 3, 1], [8, 21, 33, 1], atol=1e-12)
-    assert np.allclose(scans[0].position, 0.0, atol=1e-12)
+    assert np.allclose(scans[0].T_project_scan @ [1, 2, 3, 1], [8, 21, 33, 1], atol=ROUNDING)
+    assert np.allclose(scans[0].position, 0.0, atol=ROUNDING)
     assert scans[1].points.tolist() == [[7, 8, 9]]
 
 
-def ptx_of(rows, position="0 0 0"):
-    return f"1\n1\n{position}\n1 0 0\n0 1 0\n0 0 1\n" + rows + "7 8 9 0.1\n"
+IDENTITY = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+
+
+def ptx_of(rows=IDENTITY, position="0 0 0", point="7 8 9"):
+    """A grid of one cell."""
+    return f"1\n1\n{position}\n1 0 0\n0 1 0\n0 0 1\n{rows}{point} 0.1\n"
 
 
 @pytest.mark.parametrize(
@@ -151,8 +151,8 @@ def test_a_ptx_matrix_that_is_no_pose_is_refused(tmp_path, rows):
 def test_a_ptx_matrix_for_column_vectors_is_read_with_the_translation_of_its_last_column(tmp_path):
     scan = one(put(tmp_path / "a.ptx", ptx_of("0 -1 0 10\n1 0 0 20\n0 0 1 30\n0 0 0 1\n", "10 20 30")))
     # By hand: (1, 2, 3) turned by a quarter about z is (-2, 1, 3), moved (8, 21, 33).
-    np.testing.assert_allclose(scan.T_project_scan @ [1, 2, 3, 1], [8, 21, 33, 1], atol=1e-12)
-    np.testing.assert_allclose(scan.position, 0.0, atol=1e-12)
+    np.testing.assert_allclose(scan.T_project_scan @ [1, 2, 3, 1], [8, 21, 33, 1], atol=ROUNDING)
+    np.testing.assert_allclose(scan.position, 0.0, atol=ROUNDING)
     assert [(x.code, x.values["scans"]) for x in scan.remarks] == [("read.matrix-for-columns", ("a",))]
 
 
@@ -162,21 +162,21 @@ def test_a_ptx_matrix_for_column_vectors_is_read_with_the_translation_of_its_las
         ("0 0 0", POSE_ROWS, [0, 0, 0]),  # says nothing: points are in the scanner's frame
         ("10 20 30", POSE_ROWS, [0, 0, 0]),
         ("10 20 35", POSE_ROWS, [0, 0, 5]),
-        ("5 6 7", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", [5, 6, 7]),  # a cloud in the project's frame
+        ("5 6 7", IDENTITY, [5, 6, 7]),  # a cloud in the project's frame
     ],
 )
 def test_the_scanner_of_a_ptx_grid(tmp_path, position, rows, expected):
     scan = one(put(tmp_path / "a.ptx", ptx_of(rows, position)))
-    np.testing.assert_allclose(scan.position, expected, atol=1e-12)
+    np.testing.assert_allclose(scan.position, expected, atol=ROUNDING)
 
 
 def test_scans_without_points_are_named_and_the_others_read(tmp_path):
-    grid = "1\n1\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n{} 1\n"
-    scans = readers.read(put(tmp_path / "a.ptx", grid.format("1 2 3") + grid.format("0 0 0") + grid.format("4 5 6")))
+    grids = [ptx_of(point=point) for point in ("1 2 3", "0 0 0", "4 5 6")]
+    scans = readers.read(put(tmp_path / "a.ptx", "".join(grids)))
     assert [(scan.name, scan.points.tolist()) for scan in scans] == [("a-1", [[1, 2, 3]]), ("a-3", [[4, 5, 6]])]
     assert scans[0].remarks[0].values == {"count": 1, "scans": ("a-2",)}
     with pytest.raises(InputError, match="found none in scan 'a'"):
-        readers.read(put(tmp_path / "a.ptx", grid.format("0 0 0")))
+        readers.read(put(tmp_path / "a.ptx", grids[1]))
 
 
 def e57_of(path, counts, invalid=()):
@@ -283,7 +283,7 @@ def test_las_by_the_specification(tmp_path):
     raw = np.array([[123, 456, -789], [2_000_000, 3, 4]])
     scan = one(put(tmp_path / "a.las", las_bytes(raw, 0.001, [500_000.0, 4_400_000.0, 100.0])))
     expected = [[500_000.123, 4_400_000.456, 99.211], [502_000.0, 4_400_000.003, 100.004]]
-    assert np.allclose(scan.origin + scan.points, expected, rtol=0, atol=1e-9)
+    assert np.allclose(scan.origin + scan.points, expected, rtol=0, atol=1e-9)  # a step at 4e6 m as float64
     assert scan.intensity.tolist() == [100, 101]
     assert scan.unit == "m"
 
@@ -327,7 +327,9 @@ def test_spherical_points_by_hand():
     points = cartesian_from_spherical(
         np.array([2.0, 2.0, 2.0, 2.0]), np.array([0, quarter, 0, quarter]), np.array([0, 0, quarter, np.pi / 6])
     )
-    assert np.allclose(points, [[2, 0, 0], [0, 2, 0], [0, 0, 2], [0, np.sqrt(3), 1]], atol=1e-15)
+    assert np.allclose(
+        points, [[2, 0, 0], [0, 2, 0], [0, 0, 2], [0, np.sqrt(3), 1]], atol=1e-15
+    )  # the sine and cosine of pi as float64
 
 
 # --- real files ----------------------------------------------------------------------------------------------------
@@ -387,16 +389,17 @@ def test_real_files_of_one_cloud_agree():
     las, laz = one(DATA / "las/simple.las"), one(DATA / "las/simple.laz")
     assert np.array_equal(las.points, laz.points)
     double, integer = one(DATA / "e57/bunnyDouble.e57"), one(DATA / "e57/bunnyInt32.e57")
-    assert np.abs(double.points - integer.points).max() < 1e-6
+    assert np.abs(double.points - integer.points).max() < 1e-6  # half a step of the scaled integers
     assert one(DATA / "las/autzen_trim.laz").unit == "ft"  # from its coordinate system
     ptx, pts = one(DATA / "ptx_pts/1.2-with-color.ptx"), one(DATA / "las/simple.las")
-    assert np.abs((ptx.origin + ptx.points) - (pts.origin + pts.points)).max() < 1e-6
+    assert np.abs((ptx.origin + ptx.points) - (pts.origin + pts.points)).max() < 1e-6  # digits of the text
 
 
 @needs_data
 def test_real_sphere_lies_where_it_was_published():
     points = one(DATA / "spheres/SPH101.xyz").points
     distance = np.linalg.norm(points - [-5.895833, 3.628939, -1.561255], axis=1)
+    # A millimetre, the scanner's noise: the ball is about half of the crop, its foot the rest.
     assert 0.4 < np.mean(np.abs(distance - 0.05) < 0.001) < 0.8
 
 

@@ -1,4 +1,4 @@
-"""A sample of damaged files of every format, read in watched processes; tests.bench.readers takes thousands."""
+"""A few damaged files of every format, read in watched processes; tests.bench.readers takes thousands by night."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from processor.writers.cloud import of_scan
 from tests.support.files.damaged_files import damaged, good_files, with_check_sums
 from tests.support.processes import watched_reading
 
-SAMPLE = 25
+SAMPLE = 10  # each kind of damage about once for every format
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_damaged_files_are_read_or_refused(process, tmp_path, format_):
         what, said = process.read(path)
         came_to.append(what)
         assert what in ("read", "refused"), f"{format_} {number}: {what} {said}"
-    assert came_to.count("refused") >= 5
+    assert came_to.count("refused") >= 2
 
 
 @pytest.mark.parametrize("format_", [name for name in good_files() if name != "h5"])

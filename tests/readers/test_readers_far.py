@@ -17,7 +17,7 @@ from processor.readers import ascii_rows, coordinate_system, epsg_units
 from processor.scan_folder import folder
 from processor.writers import e57
 from processor.writers.cloud import of_scan
-from tests.support.files.scan_bytes import las_bytes, ply_header, put
+from tests.support.files.scan_bytes import las_bytes, las_with_keys, ply_header, put
 from tests.support.files.scan_folders import BOX, arch_design, surface, write_ply, write_xyz
 
 BASE = np.array([512_000.0, 4_423_000.0, 1_000.0])  # whole numbers: differences from them are exact
@@ -107,7 +107,7 @@ def test_map_coordinates_come_back_to_a_micron(tmp_path, case):
     T = scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
     base_mm = BASE * 1_000.0
     turned = scan.points @ T[:3, :3].T + (T[:3, 3] + T[:3, :3] @ scan.origin - base_mm)
-    assert np.abs(turned - NEAR * 1_000.0).max() < 1e-3
+    assert np.abs(turned - NEAR * 1_000.0).max() < 1e-3  # files have 1e-6 m; a micron is what is promised
     assert np.abs(scan.points).max() < 2e6  # near their origin, where steps calculate
 
 
@@ -130,19 +130,8 @@ def test_map_coordinates_in_32_bits_are_refused(tmp_path, suffix):
 # --- LAS: counts and coordinate systems -----------------------------------------------------------------------------
 
 
-def las_in(tmp_path, points, scale=0.001, **keys):
-    import laspy
-    from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct
-
-    las = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
-    las.header.scales = np.full(3, scale)
-    las.x, las.y, las.z = points.T
-    vlr = GeoKeyDirectoryVlr()
-    vlr.geo_keys = [GeoKeyEntryStruct(key, 0, 1, value) for key, value in sorted(keys["keys"].items())]
-    vlr.geo_keys_header.number_of_keys = len(vlr.geo_keys)
-    las.header.vlrs.append(vlr)
-    las.write(str(tmp_path / "a.las"))
-    return tmp_path / "a.las"
+def las_in(tmp_path, points, keys, scale=0.001):
+    return las_with_keys(tmp_path / "a.las", points, keys, scale)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +162,9 @@ def test_the_unit_of_a_las_file_is_that_of_its_coordinate_system(tmp_path, keys,
     assert refused.value.path == path
     # What the user states counts, with one remark that says over what.
     scene = folder.read_input(path, units="m/us-ft")
-    np.testing.assert_allclose(scene.scans[0].points, NEAR * [1e3, 1e3, 1_200_000 / 3937], atol=1e-3)
+    np.testing.assert_allclose(
+        scene.scans[0].points, NEAR * [1e3, 1e3, 1_200_000 / 3937], atol=1e-3
+    )  # half a step of the file, 5e-5 mm, and a micron
     (said,) = scene.units_reason
     assert (scene.units, said.code, said.values["file"]) == ("m/us-ft", "units.over-file", raw.unit_fault)
 
@@ -229,7 +220,7 @@ def test_withheld_points_are_left_out_and_counted(tmp_path, point_format):
     las.write(str(tmp_path / "a.las"))
     (scan,) = readers.read(tmp_path / "a.las")
     kept = np.flatnonzero(np.arange(50) % 5)
-    np.testing.assert_allclose(scan.points, NEAR[kept], atol=1e-9)
+    np.testing.assert_allclose(scan.points, NEAR[kept], atol=1e-9)  # whole steps of 1e-6
     assert scan.intensity.tolist() == kept.tolist()
     assert [(one.code, one.values["count"]) for one in scan.remarks] == [
         ("read.withheld-points", 10),
@@ -249,7 +240,7 @@ def test_units_of_one_scan_in_a_project(tmp_path):
     scene = folder.read_input(tmp_path)
     factors = [[1e3, 1e3, 304.8], [1_200_000 / 3937] * 3]
     for scan, factor in zip(scene.scans, factors, strict=True):
-        np.testing.assert_allclose(scan.origin + scan.points, NEAR * factor, atol=1e-2)
+        np.testing.assert_allclose(scan.origin + scan.points, NEAR * factor, atol=1e-3)
     assert [one.code for one in scene.units_reason] == ["units.over-file", "units.by-format"]
     with pytest.raises(UsageError, match="expected one unit for a folder"):
         folder.read_input(tmp_path, units="m/ft")
@@ -271,7 +262,7 @@ def test_reading_takes_little_more_than_the_points(tmp_path, monkeypatch, suffix
 
     monkeypatch.setattr(ascii_rows, "PIECE_BYTES", 1 << 18)
     monkeypatch.setattr(ascii_rows, "PIECE_ROWS", 1 << 13)
-    points, intensity = bench.cloud(100_000)
+    points, intensity = bench.cloud(60_000)
     path = tmp_path / f"a.{suffix}"
     {"pcd": bench.write_packed_pcd}.get(suffix, getattr(bench, f"write_{suffix}"))(path, points, intensity)
     readers.read(path)  # compiles
@@ -281,8 +272,8 @@ def test_reading_takes_little_more_than_the_points(tmp_path, monkeypatch, suffix
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert len(scan.points) == 100_000
-    assert np.abs(scan.points - points).max() < 1e-6
+    assert len(scan.points) == 60_000
+    assert np.abs(scan.points - points).max() < 1e-6  # the digits of the text
     assert peak < 2.5 * scan.points.nbytes + (3 << 20)  # and a few pieces
 
 

@@ -34,9 +34,10 @@ from processor.space_frame.result import Balls
 from processor.store import checksums, codec
 from processor.store.replaced_folder import replacing_folder
 from tests.support.files.old_files import sealed_again
+from tests.support.results.records import assert_equal
 from tests.support.scenes.store_scenes import a_scene, surface_points
 
-HALF_STEP = 0.5e-4 * (1.0 + 1e-6)  # mm: points are kept to 0.0001 mm
+HALF_STEP = 0.5e-4 * (1.0 + 1e-6)  # mm: points are kept to 0.0001 mm; the rest is the rounding of float64 at 20 m
 
 
 @pytest.fixture
@@ -62,31 +63,16 @@ def in_box(path, lower, upper):
     return found[((found >= lower) & (found <= upper)).all(axis=1)]
 
 
-def same(a, b):
-    """Whether two records hold the same, NaN equal to NaN."""
-    if isinstance(a, np.ndarray):
-        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=True)
-    if dataclasses.is_dataclass(a):
-        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
-    if isinstance(a, tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    return type(a) is type(b) and (a == b or (a != a and b != b))
-
-
 def test_a_scene_comes_back(written):
     scene, truth = a_scene()
     back = store.read_scene(written)
-    assert same(back.arch, scene.arch)
-    assert same(back.stations, scene.stations)
-    assert (back.name, back.kind, back.units_reason, back.temperature_C) == (
-        "桥",
-        "arch-bridge",
-        scene.units_reason,
-        21.5,
-    )
+    assert_equal(back.arch, scene.arch)
+    assert_equal(back.stations, scene.stations)
+    kept = back.name, back.kind, back.units_reason, back.temperature_C
+    assert kept == ("桥", "arch-bridge", scene.units_reason, 21.5)
     assert back.frame is None
     given, found = scene.scans[0], back.scans[0]
-    assert same(
+    assert_equal(
         dataclasses.replace(found, points=[], intensity=[], point_station=[]),
         dataclasses.replace(given, points=[], intensity=[], point_station=[]),
     )
@@ -98,7 +84,7 @@ def test_a_scene_comes_back(written):
     labels = store.read_truth(written).labels[0]
     assert np.array_equal(labels.part[order], truth.labels[0].part[given_order])
     assert np.array_equal(labels.source[order], truth.labels[0].source[given_order])
-    assert same(store.read_truth(written).arch, truth.arch)
+    assert_equal(store.read_truth(written).arch, truth.arch)
     assert store.read_provenance(written) == {"seed": 1, "α": [1.5, None]}
     assert store.problems(written) == []
 
@@ -109,21 +95,15 @@ def test_a_space_frame_comes_back(tmp_path):
     truth = Truth(frame=FrameTruth([3, 4], np.eye(3)[:2], [1.0, 2.0], np.zeros((2, 3))), spacing_mm=5.0)
     scene = Scene("f", "space-frame", (Scan("s", np.eye(3)),), frame=frame)
     store.write_scene(path, scene, truth, {})
-    assert same(store.read_scene(path).frame, frame)
-    assert same(store.read_truth(path), truth)
+    assert_equal(store.read_scene(path).frame, frame)
+    assert_equal(store.read_truth(path), truth)
 
 
-def test_points_that_come_back_stay_as_they_are(written, tmp_path):
-    scene, truth = store.read_scene(written), store.read_truth(written)
-    again = tmp_path / "again.h5"
-    store.write_scene(again, scene, truth, store.read_provenance(written))
-    assert again.read_bytes() == written.read_bytes()
-
-
-def test_same_content_same_bytes(written, tmp_path):
-    other = tmp_path / "renamed.h5"
+def test_same_content_has_the_same_bytes_also_when_it_comes_back(written, tmp_path):
+    again, other = tmp_path / "again.h5", tmp_path / "renamed.h5"
+    store.write_scene(again, store.read_scene(written), store.read_truth(written), store.read_provenance(written))
     store.write_scene(other, *a_scene(), {"α": [1.5, None], "seed": 1})
-    assert other.read_bytes() == written.read_bytes()
+    assert again.read_bytes() == other.read_bytes() == written.read_bytes()
 
 
 def test_bytes_do_not_depend_on_how_long_objects_live(written, tmp_path, monkeypatch):
@@ -158,11 +138,7 @@ def test_hash_is_of_the_scene_alone(written, tmp_path):
     bare = tmp_path / "bare.h5"
     store.write_scene(bare, scene, None, {"other": 2})
     first = store.read_scene(written)
-    assert (
-        store.scene_hash(first)
-        == store.scene_hash(store.read_scene(written))
-        == store.scene_hash(store.read_scene(bare))
-    )
+    assert store.scene_hash(first) == store.scene_hash(store.read_scene(bare))
     points = first.scans[0].points.copy()
     points[7, 1] = np.nextafter(points[7, 1], np.inf)
     moved = dataclasses.replace(first, scans=(dataclasses.replace(first.scans[0], points=points), first.scans[1]))
@@ -224,7 +200,7 @@ def test_precision_follows_the_extent(tmp_path, size_mm, steps):
     store.write_scene(path, Scene("w", "structure", (Scan("s", points, intensity=points[:, 0]),)), None, {})
     back = store.read_scene(path).scans[0]
     off = np.abs(back.points[np.argsort(back.intensity)] - points[np.argsort(points[:, 0])]).max()
-    assert off <= 0.5 * steps * (1 + 1e-4)
+    assert off <= 0.5 * steps * (1 + 1e-4)  # and the rounding of float64 at 4 km, 5e-10 mm
     lower, upper = points.min(axis=0) + 100.0, points.max(axis=0) - [size_mm / 2, 200.0, 0.0]
     inside = back.points[((back.points >= lower) & (back.points <= upper)).all(axis=1)]
     assert np.array_equal(lexicographic(in_box(path, lower, upper)), lexicographic(inside))
@@ -243,7 +219,7 @@ def test_one_point_and_points_in_one_place(tmp_path):
 def test_boxes_match_a_plain_cut(written):
     points = store.read_scene(written).scans[0].points
     rng = np.random.default_rng(3)
-    for _ in range(40):
+    for _ in range(10):  # corners in and between some of the tiles of each axis
         lower = rng.uniform([-500, -500, -500], [18_000, 1_500, 2_500])
         upper = lower + rng.uniform(0.0, [9_000, 2_000, 2_000])
         plain = points[((points >= lower) & (points <= upper)).all(axis=1)]
@@ -254,7 +230,7 @@ def test_boxes_match_a_plain_cut(written):
 
 def test_a_box_reads_only_its_tiles(tmp_path):
     path = tmp_path / "large.h5"
-    points = surface_points(300_000)
+    points = surface_points(150_000)
     store.write_scene(path, Scene("l", "structure", (Scan("s", points),)), None, {})
     with h5py.File(path) as file:
         x = file["scene/scans/0000/points/x"]
@@ -276,7 +252,7 @@ def test_a_box_reads_only_its_tiles(tmp_path):
 def test_truth_is_copied_to_a_file_of_its_own(written, tmp_path):
     alone = tmp_path / "truth.h5"
     assert store.copy_truth(written, alone)
-    assert same(store.read_truth(alone), store.read_truth(written))
+    assert_equal(store.read_truth(alone), store.read_truth(written))
     with pytest.raises(InputError, match="expected format processor-scene, found processor-truth"):
         store.read_scene(alone)
     bare, none = tmp_path / "bare.h5", tmp_path / "none.h5"
@@ -307,24 +283,15 @@ def test_results_come_back(tmp_path):
     path = tmp_path / "results.h5"
     inner = Inner(("a", "", "长"), [[1, 2], [3, np.nan], [5, 6]])
     outer = Outer("ok", False, -(2**40), inner, None, (inner, Inner()), float("-inf"))
-    balls = space_frame_step.Result(
-        "partial",
-        "ransac",
-        (reason("two.lines", text="two lines\nof text"),),
-        Balls(
-            ids=[1],
-            centres=np.ones((1, 3)),
-            radii=[75.0],
-            evidence=["ball"],
-            flag=["ok"],
-            reasons=[()],
-            verdict=["none"],
-        ),
+    ball = Balls(
+        ids=[1], centres=np.ones((1, 3)), radii=[75.0], evidence=["ball"], flag=["ok"], reasons=[()], verdict=["none"]
     )
+    said = (reason("two.lines", text="two lines\nof text"),)
+    balls = space_frame_step.Result("partial", "ransac", said, ball)
     runs = (StepRun("outer", "m", json.dumps({"seed": 1}), outer), StepRun("spheres", "ransac", "{}", balls))
     classes = {"spheres": space_frame_step.Result, "outer": Outer}
     store.write_results(path, runs, {})
-    assert same(store.read_results(path, classes), runs)
+    assert_equal(store.read_results(path, classes), runs)
     assert store.problems(path) == []
     with pytest.raises(InputError, match="unknown step 'outer'"):
         store.read_results(path, {"spheres": space_frame_step.Result})

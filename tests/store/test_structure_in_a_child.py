@@ -34,10 +34,19 @@ def foreign(tmp_path):
     return shutil.copy(tmp_path / "own.h5", tmp_path / "a.h5") and tmp_path / "a.h5"
 
 
-@pytest.mark.parametrize("way_in", WAYS_IN)
-def test_a_file_that_crashes_the_library_is_an_error_that_names_it(foreign, monkeypatch, way_in):
+def test_a_file_that_crashes_the_library_is_an_error_that_names_it(foreign, monkeypatch):
     monkeypatch.setattr(file_structure_checks, "look_quietly", crash)
     with pytest.raises(InputError, match=r"a\.h5: the library that reads it \(HDF5\) crashed; the file is damaged"):
+        store.read_scene(foreign)
+
+
+@pytest.mark.parametrize("way_in", WAYS_IN)
+def test_every_way_in_has_the_structure_looked_at_first(foreign, monkeypatch, way_in):
+    def crashed(path):
+        raise InputError("crashed", path=path)
+
+    monkeypatch.setattr(file_structure_checks, "of_file", crashed)
+    with pytest.raises(InputError, match=r"a\.h5: crashed"):
         WAYS_IN[way_in](foreign)
 
 

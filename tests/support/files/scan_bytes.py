@@ -47,3 +47,19 @@ def las_bytes(raw, scale, offset):
     )  # fmt: skip
     rows = b"".join(struct.pack("<3iHBBbBH", *row, 100 + i, 0x11, 0, 0, 0, 0) for i, row in enumerate(raw))
     return header + rows
+
+
+def las_with_keys(path, points, keys, scale):
+    """Write a LAS file by another library, with the keys of a coordinate system: EPSG codes by their GeoTIFF keys."""
+    import laspy
+    from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct
+
+    las = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
+    las.header.scales = np.full(3, scale)
+    las.x, las.y, las.z = points.T
+    vlr = GeoKeyDirectoryVlr()
+    vlr.geo_keys = [GeoKeyEntryStruct(key, 0, 1, value) for key, value in sorted(keys.items())]
+    vlr.geo_keys_header.number_of_keys = len(vlr.geo_keys)
+    las.header.vlrs.append(vlr)
+    las.write(str(path))
+    return path

@@ -56,8 +56,8 @@ def execution(scene, step, result, params=None):
     return Execution(scene, (StepRun(step, result.method, json.dumps(params or {}), result),), provenance)
 
 
-def stitched(scans, poses, statuses=None, *, scale="fixed"):
-    """Return the results of a run that stitched scans by these poses (k, 4, 4)."""
+def stitched(scans, poses, statuses=None, *, scale="fixed", scene=None):
+    """Return the results of a run that stitched scans, of a scene or alone, by these poses (k, 4, 4)."""
     k = len(scans)
     table = Scans(
         name=[scan.name for scan in scans], status=statuses or [Status.OK] * k, reasons=((),) * k,
@@ -66,7 +66,7 @@ def stitched(scans, poses, statuses=None, *, scale="fixed"):
         rivalry=np.zeros(k), T_rival_scan=np.full((k, 4, 4), np.nan), from_frame=["scan"] * k, to_frame=["project"] * k,
     )  # fmt: skip
     result = Stitched(status=Status.OK, method="automatic", reference=scans[0].name, scans=table)
-    scene = Scene("hall", "structure", tuple(scans))
+    scene = scene or Scene("hall", "structure", tuple(scans))
     return Results(execution(scene, "stitch", result, {"scale": scale}))
 
 

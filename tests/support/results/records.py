@@ -16,4 +16,6 @@ def assert_equal(actual, expected):
         for one, other in zip(actual, expected, strict=True):
             assert_equal(one, other)
     else:
+        if isinstance(expected, np.ndarray):
+            assert actual.dtype == expected.dtype
         np.testing.assert_array_equal(actual, expected)

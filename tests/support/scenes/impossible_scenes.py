@@ -62,14 +62,14 @@ def possible():
     )  # fmt: skip
 
 
-def _with(record, path, change):
+def with_value(record, path, change):
     """Return a record in which the value at a path of fields and numbers is changed by a function."""
     if not path:
         return change(record)
     if isinstance(record, tuple):
         at = int(path[0])
-        return (*record[:at], _with(record[at], path[1:], change), *record[at + 1 :])
-    return dataclasses.replace(record, **{path[0]: _with(getattr(record, path[0]), path[1:], change)})
+        return (*record[:at], with_value(record[at], path[1:], change), *record[at + 1 :])
+    return dataclasses.replace(record, **{path[0]: with_value(getattr(record, path[0]), path[1:], change)})
 
 
 def _item(value):
@@ -169,13 +169,13 @@ def impossible_scenes():
     whole = possible()
     for path, values in COLUMNS.items():
         for name, value in values.items():
-            yield f"{path}: {name}", _with(whole, path.split("/"), _item(value)), _place(path)
+            yield f"{path}: {name}", with_value(whole, path.split("/"), _item(value)), _place(path)
     for path, values in VALUES.items():
         for name, value in values.items():
-            yield f"{path}: {name}", _with(whole, path.split("/"), lambda _, value=value: value), _place(path)
+            yield f"{path}: {name}", with_value(whole, path.split("/"), lambda _, value=value: value), _place(path)
     for path in ("scans/0/T_project_scan", "stations/T_project_station"):
         for name, matrix in POSES.items():
-            yield f"{path}: {name}", _with(whole, path.split("/"), _pose(matrix)), _place(path)
+            yield f"{path}: {name}", with_value(whole, path.split("/"), _pose(matrix)), _place(path)
 
 
 def _place(path):

@@ -44,7 +44,7 @@ def columns_of(path, index=0):
     return {name: e57_field(path, f"ssc:{name}", index) for name in COLUMNS}
 
 
-@pytest.mark.parametrize("format_", ["ply", "las", "laz", "e57"])
+@pytest.mark.parametrize("format_", ["ply", "laz", "e57"])
 def test_files_have_the_labels_of_the_truth(plates, format_, tmp_path):
     invoke("export", plates, "-o", tmp_path / "out", "--format", format_)
     truth = store.read_truth(tmp_path / "out/truth.h5")
