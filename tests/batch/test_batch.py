@@ -292,7 +292,7 @@ def test_summary_of_real_inputs(site):
     assert "seconds" in (out / "timings.csv").read_text("utf-8").splitlines()[0]
     single = json.loads((out / "c/d/results.json").read_text("utf-8"))
     assert (single["seed"], single["steps"]["spheres"]["method"]) == (3, "least-squares")
-    assert single["steps"]["spheres"]["balls"][0]["radius"] == pytest.approx(70.0, abs=0.01)
+    assert single["steps"]["spheres"]["balls"][0]["radius"] == pytest.approx(70.0, abs=0.01)  # mm: digits of 1e-3
 
 
 def test_a_job_is_the_processor_in_a_process_of_its_own(site, tmp_path):
@@ -357,10 +357,7 @@ def planted_site(root, count):
 
 @pytest.mark.parametrize(("count", "kills"), [(12, 1), pytest.param(30, 3, marks=pytest.mark.slow)])
 def test_killed_and_resumed_batch_equals_an_undisturbed_one(tmp_path, count, kills):
-    killed(tmp_path, planted_site(tmp_path / "root", count), count, kills)
-
-
-def killed(tmp_path, limits, count, kills=3):
+    limits = planted_site(tmp_path / "root", count)
     run(tmp_path / "root", "-o", tmp_path / "whole", *limits, code=1)
     assert [one["status"] for one in said(tmp_path / "whole").values()].count("failed") == 5
     rng, out = random.Random(6), tmp_path / "out"
@@ -388,18 +385,6 @@ def killed(tmp_path, limits, count, kills=3):
         assert sorted(os.listdir(place / ".batch")) == ["failed", "lock"]
     names = [sorted(str(p.relative_to(place)) for p in place.rglob("*")) for place in (out, tmp_path / "whole")]
     assert names[0] == names[1]
-
-
-@pytest.mark.slow
-def test_forty_real_folders_killed_three_times(tmp_path):
-    """As above with the processor itself: 35 clouds of a sphere, five folders bad in different ways."""
-    planted_site(tmp_path / "root", 40)
-    for i, path in enumerate(sorted((tmp_path / "root").rglob("scan.xyz"))):
-        unit = np.random.default_rng(i).normal(size=(300, 3))
-        np.savetxt(path, 0.05 * unit / np.linalg.norm(unit, axis=1)[:, None] + 1.0, fmt="%.6f")
-        (path.parent / "real").touch()
-    limits = ("--jobs", 2, "--timeout-s", 60, "--memory-mb", 1500, *SPHERES)
-    killed(tmp_path, limits, 40)
 
 
 @pytest.mark.parametrize("stop", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
@@ -728,15 +713,3 @@ def test_the_command_of_the_snakefile_is_one_that_processor_takes():
     for code, taken in ((0, 0), (1, 0), (3, 1), (4, 0)):
         stub = f"processor() {{ return {code}; }}; set -e; {text}"
         assert subprocess.run(["bash", "-c", stub], check=False).returncode == taken
-
-
-def test_the_snakefile_under_snakemake(tmp_path):
-    program = shutil.which("snakemake")
-    if program is None:
-        pytest.skip("Snakemake is not installed")
-    folder(tmp_path / "root/桥 'a'")
-    (tmp_path / "root/桥 'a'/project.toml").touch()
-    arguments = ["-s", SNAKEFILE, "-n", "-p", "--config", f"root={tmp_path / 'root'}", f"out={tmp_path / 'out'}"]
-    done = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "processor run" in done.stdout + done.stderr

@@ -29,7 +29,6 @@ from processor.model import InputError, Scene, Stations, UsageError
 from processor.preassembly.result import ScanPoses
 from processor.scan_folder import folder
 from processor.store import store
-from processor.writers import project
 from processor.writers.cloud import Block, Cloud
 from tests.support.clouds import stitch_clouds
 from tests.support.files.e57_fields import e57_field
@@ -108,6 +107,7 @@ def test_columns_of_a_merged_cloud(hall, tmp_path):
     np.testing.assert_array_equal(np.stack([raw[f"color{n}"] for n in ("Red", "Green", "Blue")], axis=1), colour)
     np.testing.assert_array_equal(vertex["station"], station)
     np.testing.assert_array_equal(laz.point_source_id, station)
+    assert (laz.header.version.minor, laz.header.point_format.id) == (4, 7)
     np.testing.assert_array_equal(trimesh.load(tmp_path / "ply/merged.ply").vertices.shape, (len(station), 3))
     assert len(open3d.io.read_point_cloud(str(tmp_path / "ply/merged.ply")).points) == len(station)
     limits = e57.get_header(0).node["intensityLimits"]
@@ -328,16 +328,6 @@ def test_a_step_that_is_missing_is_named(room, what, step, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_names_of_files_show_the_names_of_parts_and_are_unique():
-    names = ["AR-01 springing W", "AR-01_springing_W", "A/../b", "a/../B", "拱肋 1", "", "x" * 300, "scan0"]
-    stems = project.stems(names)
-    assert stems[:6] == ["AR-01_springing_W-2", "AR-01_springing_W", "A____b", "a____B-2", "拱肋_1", "scan"]
-    assert stems[7] == "scan0"
-    assert len({stem.casefold() for stem in stems}) == len(stems)
-    assert max(len(stem.encode()) for stem in stems) <= 204
-    assert project.stems(["S1", "s1", "S1"]) == ["S1", "s1-2", "S1-3"]
-
-
 def test_scans_without_poses_need_stitching(tmp_path):
     scans = tuple(swept(f"S{i}", i) for i in range(2))
     results = exported_runs.not_run(Scene("hall", "structure", scans))
@@ -402,6 +392,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_nothing_behind_of_laz(room, tmp_path):
     """The library that packs holds a file open that it could not finish: this takes a process of its own."""
     done = subprocess.run(
@@ -544,7 +535,7 @@ def test_a_clean_scan_has_no_clutter(measured, tmp_path):
     kept = cKDTree(cloud_of(tmp_path / "c/scans/S1.ply"))
     gone = kept.query(scan.points + scan.origin)[0] > 1e-6
     assert gone[count:].all()  # the clutter is 100 mm and more from any surface
-    assert gone[:count].mean() < 0.02
+    assert gone[:count].mean() < 0.02  # spacings beyond the mean and three standard deviations: 0.5 %
     assert remark.values["clutter"] == 2500
     assert remark.values["outliers"] == gone[:count].sum()
     assert processor.read(tmp_path / "c").structure is not None
@@ -569,17 +560,8 @@ def test_points_spooled_to_disk_equal_those_in_memory(tmp_path):
             np.testing.assert_array_equal(column[5:90], expected[5:90])
 
 
-def test_colours_change_no_hash_where_there_are_none(tmp_path):
-    scan = dataclasses.replace(swept("S1", 1), colour=())
-    plain = Scene("hall", "structure", (scan,))
-    coloured = Scene("hall", "structure", (swept("S1", 1),))
-    assert store.scene_hash(plain) != store.scene_hash(coloured)
-    for scene in (plain, coloured):
-        store.write_scene(tmp_path / "s.h5", scene, None, {})
-        back = store.read_scene(tmp_path / "s.h5")
-        rows = np.lexsort(back.scans[0].points.T), np.lexsort(scene.scans[0].points.T)
-        found, given = (one.scans[0].colour for one in (back, scene))
-        assert len(found) == len(given)
-        if len(given):
-            np.testing.assert_array_equal(found[rows[0]], given[rows[1]])
-    assert folder.as_read(scan) is scan
+def test_colours_are_part_of_the_hash_of_a_scene():
+    scans = swept("S1", 1), dataclasses.replace(swept("S1", 1), colour=())
+    coloured, plain = (store.scene_hash(Scene("hall", "structure", (scan,))) for scan in scans)
+    assert coloured != plain
+    assert folder.as_read(scans[1]) is scans[1]

@@ -87,8 +87,9 @@ def test_points_of_a_defect_are_those_off_the_plate(plates):
             # A plane through the rest: the error of the station's tilt is common to all points.
             plane = np.column_stack([at[rows][:, [0, 2]], np.ones(len(rows))])
             rest = at[rows, 1] - plane @ np.linalg.lstsq(plane[~marked], at[rows, 1][~marked], rcond=None)[0]
-            assert (np.abs(rest[~marked]) < 0.05).mean() > 0.999
-            assert np.median(np.abs(rest[marked])) > 0.05
+            # Labels begin at 0.01 mm; range errors as float32 and the tilt leave up to 0.005 mm (seeds 3, 4, 5).
+            assert np.abs(rest[~marked]).max() < 0.02
+            assert np.abs(rest[marked]).min() > 0.005
             seen[number] += int(marked.sum())
         assert (label.defect[(label.part != 1) & (label.part != 2)] == -1).all()
     assert min(seen.values()) >= 10

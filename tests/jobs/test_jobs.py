@@ -35,6 +35,13 @@ def alive(pid):
         return False
 
 
+def ends_soon(pid):
+    deadline = time.monotonic() + 10.0
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return not alive(pid)
+
+
 @pytest.mark.parametrize("group", ["own", "parent's"])
 def test_a_child_ends_with_its_parent(group):
     parent = subprocess.Popen([sys.executable, "-c", PARENT, group], stdout=subprocess.PIPE, text=True)
@@ -42,10 +49,7 @@ def test_a_child_ends_with_its_parent(group):
     assert alive(child)
     parent.kill()
     parent.communicate()
-    deadline = time.monotonic() + 10.0
-    while alive(child) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not alive(child)
+    assert ends_soon(child)
 
 
 def test_end_of_a_command_has_cause_exit_code_and_last_line():
@@ -116,11 +120,7 @@ def test_all_descendants_of_a_command_are_ended(tmp_path):
     )
     ended = process.run([sys.executable, "-c", code, str(tmp_path / "pid")])
     assert ended.cause is Cause.EXIT
-    inner = int((tmp_path / "pid").read_text())
-    deadline = time.monotonic() + 10.0
-    while alive(inner) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not alive(inner)
+    assert ends_soon(int((tmp_path / "pid").read_text()))
 
 
 def fail(_):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from processor import pipeline
@@ -60,13 +61,15 @@ def test_limits_end_a_run(tmp_path, site):
         assert not out.exists()
 
 
-def test_a_run_within_its_limits_is_as_without(tmp_path, site):
-    out = tmp_path / "out"
-    ended = run("run", site, "-o", out, "--steps", "deviation", "--timeout-s", 500, "--memory-mb", 4_000)
+def test_a_run_within_its_limits_is_as_without(tmp_path):
+    out, unit = tmp_path / "out", np.random.default_rng(0).normal(size=(300, 3))
+    np.savetxt(tmp_path / "ball.xyz", 0.05 * unit / np.linalg.norm(unit, axis=1)[:, None], fmt="%.5f")
+    limits = ("--timeout-s", 500, "--memory-mb", 4_000)
+    ended = run("run", tmp_path / "ball.xyz", "-o", out, "--steps", "spheres", *limits)
     assert ended.returncode in (0, 1), ended.stderr
     assert (out / "results.json").is_file()
     assert not (tmp_path / "out.part").exists()
-    bad = run("run", tmp_path / "absent", "-o", out, "--timeout-s", 500)
+    bad = run("run", tmp_path / "absent", "-o", out, *limits)
     assert (bad.returncode, "no such file" in bad.stderr) == (3, True)
 
 

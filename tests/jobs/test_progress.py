@@ -44,12 +44,9 @@ def test_a_command_prints_lines_of_a_long_stage_off_a_terminal(monkeypatch, want
     assert "later" not in shown.getvalue()
 
 
-def test_errors_within_a_stage_are_raised(monkeypatch):
+def test_errors_within_a_stage_are_raised_and_items_without_one_are_returned(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     with pytest.raises(ValueError, match="no"), progress.stage("measuring"):
         raise ValueError("no")
     assert not progress._stages
-
-
-def test_tracked_items_are_returned_without_a_stage():
     assert list(progress.tracked([1, 2])) == [1, 2]

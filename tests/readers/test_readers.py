@@ -75,7 +75,7 @@ def test_far_points_keep_their_precision(tmp_path):
     scan = one(put(tmp_path / "a.ply", content))
     assert scan.origin.tolist() == [500_000.0, 4_400_000.0, 0.0]
     assert np.array_equal(scan.origin + scan.points, far)
-    assert np.abs(scan.points).max() < 2_000.0
+    assert np.abs(scan.points).max() < 2_000.0  # m: the origin is rounded to thousands
 
 
 # --- PCD -----------------------------------------------------------------------------------------------------------
@@ -327,9 +327,8 @@ def test_spherical_points_by_hand():
     points = cartesian_from_spherical(
         np.array([2.0, 2.0, 2.0, 2.0]), np.array([0, quarter, 0, quarter]), np.array([0, 0, quarter, np.pi / 6])
     )
-    assert np.allclose(
-        points, [[2, 0, 0], [0, 2, 0], [0, 0, 2], [0, np.sqrt(3), 1]], atol=1e-15
-    )  # the sine and cosine of pi as float64
+    # The sine and cosine of pi as float64.
+    assert np.allclose(points, [[2, 0, 0], [0, 2, 0], [0, 0, 2], [0, np.sqrt(3), 1]], atol=1e-15)
 
 
 # --- real files ----------------------------------------------------------------------------------------------------
@@ -381,7 +380,7 @@ def test_every_real_file(path):
     assert ([len(scan.points) for scan in scans], scans[0].unit) == EXPECTED[path.name]
     for scan in scans:
         assert np.isfinite(scan.points).all()
-        assert np.abs(scan.points).max() < 20_000.0
+        assert np.abs(scan.points).max() < 20_000.0  # the widest of them: near their origin all the same
 
 
 @needs_data

@@ -162,9 +162,8 @@ def test_the_unit_of_a_las_file_is_that_of_its_coordinate_system(tmp_path, keys,
     assert refused.value.path == path
     # What the user states counts, with one remark that says over what.
     scene = folder.read_input(path, units="m/us-ft")
-    np.testing.assert_allclose(
-        scene.scans[0].points, NEAR * [1e3, 1e3, 1_200_000 / 3937], atol=1e-3
-    )  # half a step of the file, 5e-5 mm, and a micron
+    # Half a step of the file, 5e-5 mm, and a micron.
+    np.testing.assert_allclose(scene.scans[0].points, NEAR * [1e3, 1e3, 1_200_000 / 3937], atol=1e-3)
     (said,) = scene.units_reason
     assert (scene.units, said.code, said.values["file"]) == ("m/us-ft", "units.over-file", raw.unit_fault)
 

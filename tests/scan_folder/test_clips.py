@@ -5,12 +5,11 @@ import re
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-import processor.cli.main
 from processor.model import InputError, Scan
 from processor.scan_folder.clips import Box, Clipper
 from processor.scan_folder.folder import read_input
+from tests.support.processes import commands
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 SHIFT = np.array([7.0, -3.0, 0.5])
@@ -42,9 +41,7 @@ pose = {np.block([[TURN, SHIFT[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]).
 
 @pytest.mark.parametrize(("units", "mm"), [("m", 1000.0), ("mm", 1.0)])
 def test_boxes_are_in_the_frame_and_units_of_the_project(tmp_path, units, mm):
-    toml = (
-        POSED
-        + """
+    boxes = """
 [[clip]]
 box = [[-2, -3, -4], [4, 3, 4]]
 [[clip]]
@@ -54,8 +51,7 @@ scan = "s2"
 box = [[0, 0, 0], [3, 3, 3]]
 keep = false
 """
-    )
-    scene = read_input(folder_of(tmp_path, toml, units=units))
+    scene = read_input(folder_of(tmp_path, POSED + boxes, units=units))
     first, second = cloud(1), cloud(2)
     moved = second @ TURN.T + SHIFT
     keep1 = within(first, [-2, -3, -4], [4, 3, 4]) & ~within(first, 0, 3)
@@ -63,7 +59,7 @@ keep = false
     assert 0 < keep1.sum() < len(first)
     assert 0 < keep2.sum() < len(second)
     for scan, wanted in zip(scene.scans, (first[keep1], second[keep2]), strict=True):
-        np.testing.assert_allclose(scan.points + scan.origin, mm * wanted, atol=1e-6 * mm)
+        np.testing.assert_allclose(scan.points + scan.origin, mm * wanted, atol=1e-6 * mm)  # of 10 m: 1e-12
     clips = scene.clips
     inside = [
         within(first, [-2, -3, -4], [4, 3, 4]).sum() + within(moved, [-2, -3, -4], [4, 3, 4]).sum(),
@@ -136,24 +132,18 @@ def test_clipped_points_are_counted_and_absent_from_exports(tmp_path):
     ball = 0.05 * direction / np.linalg.norm(direction, axis=1)[:, None] + rng.normal(0.0, 2e-4, (4000, 3))
     clutter = rng.uniform(0.4, 0.6, (500, 3))
     np.savetxt(place / "s1.xyz", np.concatenate([ball, clutter]), fmt="%.5f")
-    (place / "project.toml").write_text(
-        'units = "m"\n[[clip]]\nbox = [[0.3, 0.3, 0.3], [0.7, 0.7, 0.7]]\nkeep = false\n'
-    )
-    done = CliRunner().invoke(
-        processor.cli.main.commands, ["run", str(place), "-o", str(tmp_path / "out"), "--steps", "spheres", "--pdf"]
-    )
-    assert "500 of 4,500 points clipped by 1 box" in done.stderr, done.output
+    box = "box = [[0.3, 0.3, 0.3], [0.7, 0.7, 0.7]]"
+    (place / "project.toml").write_text(f'units = "m"\n[[clip]]\n{box}\nkeep = false\n')
+    done = commands.here("processor", "run", place, "-o", tmp_path / "out", "--steps", "spheres", "--pdf")
+    assert "500 of 4,500 points clipped by 1 box" in done.stderr, done.stdout
     found = json.loads((tmp_path / "out/results.json").read_text("utf-8"))["clip"]
     assert (found["points_read"], found["points_clipped"]) == (4500, 500)
-    assert found["boxes"] == [
-        {"box": [[300.0] * 3, [700.0] * 3], "keep": False, "scan": None, "points": 500},
-    ]
+    assert found["boxes"] == [{"box": [[300.0] * 3, [700.0] * 3], "keep": False, "scan": None, "points": 500}]
     assert (tmp_path / "out/report.pdf").read_bytes().startswith(b"%PDF")
-    out = tmp_path / "clean"
-    arguments = ["export", str(tmp_path / "out"), "-o", str(out), "--what", "clean", "--format", "xyz"]
-    made = CliRunner().invoke(processor.cli.main.commands, arguments)
-    assert made.exit_code == 0, made.output
-    (written,) = list(out.rglob("*.xyz"))
+    exported = ("export", tmp_path / "out", "-o", tmp_path / "clean", "--what", "clean", "--format", "xyz")
+    done = commands.here("processor", *exported)
+    assert done.returncode == 0, done.stderr
+    (written,) = (tmp_path / "clean").rglob("*.xyz")
     text = [line.split()[:3] for line in written.read_text().splitlines() if line[:1] in "-0123456789"]
-    assert np.array(text, float).max() < 200.0
+    assert np.array(text, float).max() < 200.0  # mm: the ball is of 50 mm, the clutter 400 mm away
     assert len(text) > 3000

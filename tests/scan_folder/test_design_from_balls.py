@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from designgen.designs import space_frame
-from designgen.export import step_files
 from processor.cli import main
 from processor.model import FrameDesign
 from processor.report.charts import design_picture
@@ -15,10 +13,16 @@ from processor.scan_folder import folder as scan_folder
 from processor.scan_folder import guess
 from processor.scan_folder.shapes import space_frame as frame_shapes
 from processor.scan_folder.shapes.body import stacked, welded
+from tests.support.made import made
 from tests.support.results.reasons import codes, values
-from tests.support.solids import bridge_parts, frame_solids
+from tests.support.solids import bridge_parts, frame_solids, step_bridges
 
-NODE_MM = 0.01
+NODE_MM = 0.01  # vertices are exact but for the digits of their file, 1e-3 mm; the mean of hundreds has less
+
+
+def whole(bodies):
+    """All bodies as one mesh."""
+    return welded("all", *frame_solids.joined(bodies))
 
 
 def compare(design, truth):
@@ -38,16 +42,14 @@ def compare(design, truth):
     )
 
 
-@pytest.mark.parametrize("hollow", [False, True])
-@pytest.mark.parametrize("fused", [False, True])
-def test_all_nodes_and_members_are_found(hollow, fused):
-    for seed in range(3):
-        bodies, truth = frame_solids.solids(seed, hollow=hollow)
-        one = frame_shapes.find(
-            welded("all", *frame_solids.joined(bodies)) if fused else stacked("all", [welded(*body) for body in bodies])
-        )
-        assert one.doubts == ()
-        assert max(compare(one.design, truth)) < NODE_MM
+@pytest.mark.parametrize(
+    ("hollow", "fused", "seed"), [(False, False, 0), (True, False, 1), (False, True, 2), (True, True, 3)]
+)
+def test_all_nodes_and_members_are_found(hollow, fused, seed):
+    bodies, truth = frame_solids.solids(seed, hollow=hollow)
+    one = frame_shapes.find(whole(bodies) if fused else stacked("all", [welded(*body) for body in bodies]))
+    assert one.doubts == ()
+    assert max(compare(one.design, truth)) < NODE_MM
 
 
 @pytest.mark.parametrize(("step_mm", "limit_mm"), [(0.01, 0.01), (0.1, 0.05)])
@@ -55,51 +57,45 @@ def test_rounded_coordinates(step_mm, limit_mm):
     """Rounding has an sd of 0.29 steps a coordinate, and a ball has hundreds of them."""
     bodies, truth = frame_solids.solids(1)
     vertices, faces = frame_solids.joined(bodies)
-    assert (
-        max(compare(frame_shapes.find(welded("all", np.round(vertices / step_mm) * step_mm, faces)).design, truth))
-        < limit_mm
-    )
+    one = frame_shapes.find(welded("all", np.round(vertices / step_mm) * step_mm, faces))
+    assert max(compare(one.design, truth)) < limit_mm
 
 
 def test_hollow_balls_and_coarse_ones():
     bodies, truth = frame_solids.solids(2)
     shells = [frame_solids.ball(c, r - 8.0) for c, r in zip(truth[0], truth[1], strict=True)]
-    one = frame_shapes.find(welded("all", *frame_solids.joined([*bodies, *(("shell", *mesh) for mesh in shells)])))
+    one = frame_shapes.find(whole([*bodies, *(("shell", *mesh) for mesh in shells)]))
     assert max(compare(one.design, truth)) < NODE_MM
     coarse = [(f"ball {k}", *frame_solids.ball(c, r, 1)) for k, (c, r) in enumerate(zip(*truth[:2], strict=True))]
-    one = frame_shapes.find(welded("all", *frame_solids.joined([*coarse, *bodies[len(coarse) :]])))
+    one = frame_shapes.find(whole([*coarse, *bodies[len(coarse) :]]))
     assert max(compare(one.design, truth)) < NODE_MM
 
 
 def test_uncertain_balls_and_tubes_are_reported_as_doubts():
     bodies, (centres, radii, _, _) = frame_solids.solids(0)
     lone = ("lone", *frame_solids.ball(centres[0] + [0.0, 0.0, 3000.0], 60.0))
-    pole = (
-        "pole",
-        *frame_solids.lathe(
-            [(0.0, 30.0), (3000.0, 30.0)], centres[0] - [900.0, 0.0, 3000.0], np.array([0.0, 0.0, 1.0])
-        ),
-    )
+    up, profile = np.array([0.0, 0.0, 1.0]), [(0.0, 30.0), (3000.0, 30.0)]
+    pole = ("pole", *frame_solids.lathe(profile, centres[0] - [900.0, 0.0, 3000.0], up))
     cut = bodies[4][1][bodies[4][2]].mean(axis=1)[:, 2] > centres[4, 2] + 0.85 * radii[4]
     cap = ("cap", bodies[4][1], bodies[4][2][cut])
-    one = frame_shapes.find(welded("all", *frame_solids.joined([*bodies[:4], cap, *bodies[5:], lone, pole])))
+    one = frame_shapes.find(whole([*bodies[:4], cap, *bodies[5:], lone, pole]))
     assert len(one.design.ids) == len(centres) + 1
     assert values(one.doubts, "init.doubtful-balls")["nodes"] == (4,)
     assert "init.nodes-alone" in codes(one.doubts)
     assert values(one.doubts, "init.tubes-left-out")["tubes"] == 1
     place = {unsure.name: unsure.place for unsure in one.unsure}
     assert len(place) == 2
-    assert np.linalg.norm(place["4"] - centres[4]) < 1.0
+    assert np.linalg.norm(place["4"] - centres[4]) < 1.0  # a cap of 15 % of the radius: its centre is weak
     assert any(np.linalg.norm(at - centres[0] - [0.0, 0.0, 3000.0]) < NODE_MM for at in place.values())
     start, end = next(v for name, v, _ in bodies if name == "tube 3").reshape(2, 24, 3)
     bent = np.vstack([start, 0.5 * (start + end) + np.array([0.0, 0.0, 200.0]), end])
-    _, faces = frame_solids.lathe([(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)], np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    _, faces = frame_solids.lathe([(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)], np.zeros(3), up)
     others = [body for body in bodies if body[0] != "tube 3"]
-    one = frame_shapes.find(welded("all", *frame_solids.joined([*others, ("bent", bent, faces)])))
+    one = frame_shapes.find(whole([*others, ("bent", bent, faces)]))
     assert "init.surface-aside" in codes(one.doubts)
     off = np.array([0.0, 0.0, 9.0])
     aside = [(name, vertices + off * (name == "tube 0"), faces) for name, vertices, faces in bodies]
-    one = frame_shapes.find(welded("all", *frame_solids.joined(aside)))
+    one = frame_shapes.find(whole(aside))
     assert "init.eccentric-members" in codes(one.doubts)
     assert len(one.unsure) == 1
     assert design_picture.draw(one.design, one.unsure).startswith(b"\x89PNG")
@@ -109,7 +105,7 @@ def test_bodies_without_balls_are_no_frame():
     meshes, _ = bridge_parts.bridge()
     assert frame_shapes.find(stacked("all", [welded("part", *mesh) for mesh in meshes])) is None
     bodies, _ = frame_solids.solids()
-    assert frame_shapes.find(welded("all", *frame_solids.joined([b for b in bodies if "ball" not in b[0]]))) is None
+    assert frame_shapes.find(whole([b for b in bodies if "ball" not in b[0]])) is None
 
 
 def write_scan(place, centres, header="x_m,y_m,z_m"):
@@ -144,13 +140,11 @@ def test_a_file_for_each_ball_and_tube(tmp_path):
 @pytest.mark.usefixtures("cad_here")
 def test_our_own_frame_as_step(tmp_path):
     """Balls with flats, bores and process holes, hexagonal sleeves, cones and tubes."""
-    design = space_frame.build(
-        space_frame.Params(nodes_x=2, nodes_y=2, spacing_mm=1200.0, depth_mm=900.0, radii_mm=(45.0, 60.0))
-    )
-    step_files.write_step(tmp_path / "frame.step", {"frame": space_frame.solid(design)})
+    content, design = made(step_bridges.our_frame)
+    (tmp_path / "frame.step").write_bytes(content)
     write_scan(tmp_path, design.centres)
-    made = guess.guess(tmp_path).made
-    assert isinstance(made.design, FrameDesign)
-    assert made.doubts == ()
+    one = guess.guess(tmp_path).made
+    assert isinstance(one.design, FrameDesign)
+    assert one.doubts == ()
     truth = design.centres, design.radii, design.members, np.full(len(design.members), 60.0)
-    assert max(compare(made.design, truth)) < NODE_MM
+    assert max(compare(one.design, truth)) < NODE_MM

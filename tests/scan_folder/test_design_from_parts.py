@@ -25,7 +25,7 @@ from processor.scan_folder.units import MM_PER_UNIT
 from tests.support.files.scan_folders import write_ply
 from tests.support.made import made
 from tests.support.results.reasons import codes, values
-from tests.support.solids import bridge_parts, step_bridges
+from tests.support.solids import bridge_parts, frame_solids, step_bridges
 
 CORNER_MM = 0.05  # edges between rows are chords of curves: their planes are off by less
 ROUNDING_MM = 1e-6  # planes through exact points, solved for corners at 1e4 mm: 1e5 roundings
@@ -46,9 +46,7 @@ def order(design):
 
 def joined(*meshes):
     """Several meshes as one."""
-    first = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
-    faces = [faces + k for (_, faces), k in zip(meshes, first, strict=False)]
-    return np.vstack([vertices for vertices, _ in meshes]), np.vstack(faces)
+    return frame_solids.joined([("", *mesh) for mesh in meshes])
 
 
 @pytest.mark.parametrize(("parts", "gap", "seed"), [(2, 0.0, 0), (5, 0.0, 1), (7, 8.0, 0), (11, 55.0, 1)])
@@ -100,14 +98,16 @@ def test_names_numbered_against_the_order_of_parts_are_reported():
     assert codes(one.doubts) == ["init.numbered-backwards"]
 
 
+# Triangles between two loops of four corners.
+SIDES = [q for k in range(4) for q in ((k, (k + 1) % 4, (k + 1) % 4 + 4), (k, (k + 1) % 4 + 4, k + 4))]
+
+
 def slab(plane, scale, thickness):
     """An end plate on a plane, larger than the section by a factor."""
     four = bridge_parts.section(*plane)[:4]
     four = four.mean(axis=0) + scale * (four - four.mean(axis=0))
-    sides = [q for k in range(4) for q in ((k, (k + 1) % 4, (k + 1) % 4 + 4), (k, (k + 1) % 4 + 4, k + 4))]
-    return np.vstack([four, four + thickness * plane[1]]), np.array(
-        [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6), *sides]
-    )
+    ends = [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6)]
+    return np.vstack([four, four + thickness * plane[1]]), np.array([*ends, *SIDES])
 
 
 def bevelled(vertices, faces):
@@ -191,10 +191,9 @@ def ring_parts(count):
         outer, inner = (
             np.vstack([corners(p, w, 5e3 + t, 6e3 - t) for p in (a, b)]) for w, t in ((400.0, 0.0), (380.0, 20.0))
         )
-        sides = [q for k in range(4) for q in ((k, (k + 1) % 4, (k + 1) % 4 + 4), (k, (k + 1) % 4 + 4, k + 4))]
         rings = [(e + k, e + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
         rings += [(e + (k + 1) % 4, e + 8 + (k + 1) % 4, e + 8 + k) for e in (0, 4) for k in range(4)]
-        return np.vstack([outer, inner]), np.array([*sides, *((i + 8, j + 8, k + 8) for i, j, k in sides), *rings])
+        return np.vstack([outer, inner]), np.array([*SIDES, *((i + 8, j + 8, k + 8) for i, j, k in SIDES), *rings])
 
     return [segment(*pair) for pair in pairwise(angles)], np.array([corners(a, 400.0, 5e3, 6e3) for a in angles[1:]])
 
@@ -292,9 +291,7 @@ def i_beam(start, end):
 
 
 def test_sections_of_i_beams():
-    one = found(
-        [i_beam(-9000.0, -3000.0), i_beam(-3000.0, 0.0), i_beam(0.0, 3000.0), i_beam(3000.0, 9000.0)], list("abcd")
-    )
+    one = found([i_beam(*ends) for ends in pairwise((-9000.0, -3000.0, 0.0, 3000.0, 9000.0))], list("abcd"))
     assert one.doubts == ()
     w, h = I_WIDTH / 2, I_HEIGHT
     four = [[w, 0.0], [-w, 0.0], [-w, h], [w, h], [0.0, 0.0], [-w, h / 2], [0.0, h], [w, h / 2]]

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from processor.model import InputError, Scan, Scene, Truth, UsageError, reason
+from processor.model import InputError, Truth, UsageError, reason
 from processor.plain_text import decoded
 from processor.scan_folder import folder
 from processor.store import store
@@ -26,7 +26,7 @@ def test_a_bridge_without_a_project_file(bridge):
     assert (scene.name, scene.kind, scene.units) == ("bridge", "arch-bridge", "m")
     assert [one.code for one in scene.units_reason] == ["units.as-scanners-write"]
     assert [(scan.name, scan.component) for scan in scene.scans] == [("foot1", "foot1"), ("rib1", "rib1")]
-    assert np.allclose(scene.scans[0].points, surface(0) * 1000.0, rtol=0, atol=0.001)
+    assert np.allclose(scene.scans[0].points, surface(0) * 1000.0, rtol=0, atol=0.001)  # mm, the digits of the file
     arch = scene.arch
     assert [one.name for one in arch.parts] == ["foot1", "rib1"]
     assert np.array_equal(arch.parts[1].vertices, (BOX + np.array([4, 0, 0])) * 1000.0)
@@ -85,7 +85,7 @@ def test_a_scan_named_like_a_station_was_seen_from_there(tmp_path):
     project(tmp_path, 'kind = "structure"\nunits = "m"\n' + files + posed)
     scans = {scan.name: scan for scan in folder.read_input(tmp_path).scans}
     assert scans["S1"].position.tolist() == [1000.0, 2000.0, 3000.0]
-    # The pose maps (2, 3, 3) to (10 - 3, 20 + 2, 30 + 3).
+    # The pose maps (2, 3, 3) to (10 - 3, 20 + 2, 30 + 3); float64 has steps of 1e-12 there.
     assert np.allclose(scans["S2"].position, [2000.0, 3000.0, 3000.0], rtol=0, atol=1e-9)
     assert not scans["S3"].position.size
 
@@ -183,18 +183,19 @@ def test_a_wrong_unit_is_noticed(bridge, units, factor):
         folder.read_input(bridge)
 
 
-def test_a_part_on_a_wide_floor_is_no_wrong_unit(bridge):
-    part = surface()
-    size = np.linalg.norm(np.ptp(part, axis=0))
-    rng = np.random.default_rng(3)
-    wide = np.column_stack([rng.uniform(-1.0, 1.0, (4 * len(part), 2)) * 1.2 * size, np.zeros(4 * len(part))])
-    write_xyz(bridge / "scans/foot1.xyz", np.vstack([part, part.mean(axis=0) + wide]))
-    assert len(folder.read_input(bridge).scans) == 2
+def on_a_wide_floor(part):
+    size, rng = np.linalg.norm(np.ptp(part, axis=0)), np.random.default_rng(3)
+    wide = np.column_stack([rng.uniform(-1.2, 1.2, (4 * len(part), 2)) * size, np.zeros(4 * len(part))])
+    return np.vstack([part, part.mean(axis=0) + wide])
 
 
-def test_a_turned_part_is_no_wrong_unit(bridge):
-    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
-    write_xyz(bridge / "scans/foot1.xyz", surface() @ turn.T + 50.0)
+def turned(part):
+    return part @ np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0].T + 50.0
+
+
+@pytest.mark.parametrize("scanned", [on_a_wide_floor, turned])
+def test_a_part_that_looks_larger_is_no_wrong_unit(bridge, scanned):
+    write_xyz(bridge / "scans/foot1.xyz", scanned(surface()))
     assert len(folder.read_input(bridge).scans) == 2
 
 
@@ -239,6 +240,7 @@ def test_a_wrong_unit_of_a_frame_is_noticed(tmp_path):
 # --- mistakes ------------------------------------------------------------------------------------------------------
 
 SCAN = '[[scan]]\nfile = "scans/foot1.xyz"\n'
+# What impossible_texts has, values out of their range, is not repeated here.
 PROJECTS = {
     "key": ("colour = 1", "unknown key 'colour'; known are name, kind, units"),
     "scan key": (SCAN + "weight = 1", r"scan 1: unknown key 'weight'; known are file, component"),
@@ -246,9 +248,6 @@ PROJECTS = {
     "other kind": ('kind = "space-frame"', "expected a design of kind space-frame by project.toml, found arch-bridge"),
     "unit": ('units = "furlong"', "unknown unit 'furlong'; expected one of mm"),
     "type": ("name = 3", "expected a text as 'name', found 3"),
-    "number": ('temperature_C = "warm"', "expected a number as 'temperature_C', found 'warm'"),
-    "nan": ("temperature_C = nan", "expected a finite number"),
-    "sigma": (SCAN + "sigma_mm = -1", "expected a number above 0"),
     "TOML": ("name = ", "not readable TOML"),
     "scan list": ("scan = 3", "expected a list as 'scan', found 3"),
     "scan table": ("scan = [3]", "scan 1: expected a table"),
@@ -256,16 +255,11 @@ PROJECTS = {
     "absent": ("[[scan]]\nfile = 'scans/foot9.xyz'", "there is no file 'scans/foot9.xyz'"),
     "component": (SCAN + "component = 'foot9'", "no component 'foot9'; it has foot1, rib1"),
     "twice": (SCAN + SCAN, "a second scan named 'foot1'"),
-    "pose shape": (SCAN + "pose = [1, 2]", "numbers of shape 4 x 4 as 'pose', found a list"),
-    "pose scale": (SCAN + "pose = [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]", "not a rotation and a translation"),
-    "pose mirror": (SCAN + "pose = [[1,0,0,0],[0,1,0,0],[0,0,-1,0],[0,0,0,1]]", "not a rotation and a translation"),
-    "position": (SCAN + "position = [1, 2, 'c']", "numbers of shape 3 as 'position'"),
     "above": ("[[scan]]\nfile = '../a.xyz'", "'../a.xyz' leads out of the folder"),
     "above in the middle": ("[[scan]]\nfile = 'scans/../../a.xyz'", "leads out of the folder"),
     "windows": ("[[scan]]\nfile = 'C:\\\\a.xyz'", "leads out of the folder"),
     "windows above": ("[[scan]]\nfile = '..\\\\a.xyz'", "leads out of the folder"),
     "absolute": ("[[scan]]\nfile = '/etc/passwd'", "leads out of the folder"),
-    "absolute design": ("design = '/etc/passwd'", "leads out of the folder"),
     "zero": ('design = "a\\u0000b"', "leads out of the folder"),
     "STEP": ('kind = "arch-bridge"\ndesign = "scans/a.step"', "alone is a design of kind structure"),
     "frame of a bridge": ('design = "design.json"\ndesign_frame = "own"', "is for the nodes of a space frame"),
@@ -300,10 +294,9 @@ def test_folders_without_scans(tmp_path):
     with pytest.raises(InputError, match="no such file or folder"):
         folder.read_input(tmp_path / "absent")
     (tmp_path / "scan.fls").mkdir()
-    with pytest.raises(InputError, match="export the scan to E57"):
-        folder.read_input(tmp_path)
-    with pytest.raises(InputError, match="export the scan to E57"):
-        folder.read_input(tmp_path / "scan.fls")
+    for place in (tmp_path, tmp_path / "scan.fls"):
+        with pytest.raises(InputError, match="export the scan to E57"):
+            folder.read_input(place)
 
 
 def test_too_few_points_and_one_pose_for_two_scans(tmp_path):
@@ -317,11 +310,3 @@ def test_too_few_points_and_one_pose_for_two_scans(tmp_path):
     project(tmp_path, "[[scan]]\nfile = 'b.ptx'\nposition = [0, 0, 0]")
     with pytest.raises(InputError, match="holds 2 scans, so one 'pose' or 'position'"):
         folder.read_input(tmp_path)
-
-
-def test_a_scene_file_is_checked(tmp_path):
-    path = tmp_path / "scene.h5"
-    store.write_scene(path, Scene("s", "structure", (Scan("a", np.eye(3)),)), None, {})
-    path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(InputError, match="damaged"):
-        folder.read_input(path)

@@ -43,15 +43,13 @@ def listed(tmp_path, text, name="nodes.csv"):
     ],
 )
 def test_columns_of_a_list_are_known_by_the_names_of_the_trade(tmp_path, header, row, separator):
-    rows = [
-        row.format(
-            id=f"N{k:03}", x=x / 1e3, y=y / 1e3, z=z / 1e3, r=r, d=2 * r, dm=2e-3 * r, rm=1e-3 * r, xm=x, ym=y, zm=z
-        )
-        for k, ((x, y, z), r) in enumerate(zip(PLACES, RADII, strict=True), 1)
-    ]
+    rows = []
+    for k, ((x, y, z), r) in enumerate(zip(PLACES, RADII, strict=True), 1):
+        metres = {"x": x / 1e3, "y": y / 1e3, "z": z / 1e3, "dm": 2e-3 * r, "rm": 1e-3 * r}
+        rows.append(row.format(id=f"N{k:03}", xm=x, ym=y, zm=z, r=r, d=2 * r, **metres))
     design = listed(tmp_path, "\n".join([header, *rows]) + "\n").design
     assert design.labels == ("N001", "N002", "N003")
-    np.testing.assert_allclose(design.centres, PLACES, atol=1e-6)
+    np.testing.assert_allclose(design.centres, PLACES, atol=1e-6)  # of 3e9 mm: two steps
     np.testing.assert_allclose(design.radii, RADII)
 
 
@@ -124,9 +122,8 @@ def test_ids_of_members_in_a_design_may_be_texts(tmp_path):
     write_xyz(tmp_path / "hall.xyz", surface())
     nodes = [{"id": name, "centre": [4 * k, 8 * k, 0.5], "radius": 0.075} for k, name in enumerate(("N1", "N2", 3))]
     members = [{"a": "N1", "b": 3, "tube_diameter": 0.06}]
-    (tmp_path / "design.json").write_text(
-        json.dumps({"units": "m", "kind": "space-frame", "nodes": nodes, "members": members})
-    )
+    design = {"units": "m", "kind": "space-frame", "nodes": nodes, "members": members}
+    (tmp_path / "design.json").write_text(json.dumps(design))
     frame = folder.read_input(tmp_path).frame
     assert frame.names == ["N1", "N2", "3"]
     assert (frame.member_a.tolist(), frame.member_b.tolist()) == ([1], [3])

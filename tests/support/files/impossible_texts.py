@@ -6,7 +6,7 @@ import copy
 import json
 import re
 
-LONG = "n" * 2_000_000
+LONG = "n" * 200_000  # more than a cell of a table may have, 131,072
 NAN, INF = float("nan"), float("inf")
 NO_NUMBER = {"NaN": NAN, "infinite": INF, "minus infinite": -INF, "huge": 1e300, "text": "x", "list": [], "object": {}}
 NO_SIZE = {**NO_NUMBER, "zero": 0.0, "negative": -0.05}

@@ -6,17 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from processor.model import (
-    ArchDesign,
-    ArchTruth,
-    DesignPart,
-    PointLabels,
-    Scan,
-    Scene,
-    Stations,
-    Truth,
-    reason,
-)
+from processor.model import ArchDesign, ArchTruth, DesignPart, PointLabels, Scan, Scene, Stations, Truth, reason
 
 
 def surface_points(n, seed=0, size=(20_000.0, 2_000.0, 3_000.0)):
@@ -35,17 +25,12 @@ def a_scene(n=50_000):
     scans = (
         # Columns that tell from which point a row came, whatever place it takes.
         Scan(
-            "s1",
-            points,
-            origin=[5e8, 4e8, 0],
-            intensity=points[:, 0] * 2.0,
+            "s1", points, origin=[5e8, 4e8, 0], intensity=points[:, 0] * 2.0, component="肋1", sigma_mm=2.0,
             point_station=np.clip(np.floor(points[:, 1]), -1, 2_000).astype(np.int64),
-            component="肋1",
             T_project_scan=np.diag([-1.0, -1.0, 1.0, 1.0]),
-            sigma_mm=2.0,
         ),
         Scan("s2", points[:10] + 1.0),
-    )
+    )  # fmt: skip
     stations = Stations(
         tuple(f"S{k}" for k in range(2_001)), np.arange(6_003.0).reshape(-1, 3) - np.array([5e8, 4e8, 0.0])
     )

@@ -1,4 +1,4 @@
-"""STEP files of bridges: ribs of ours in one file, lofted parts of nobody's, girders with splice plates and bolts."""
+"""STEP files: ribs and a frame of ours, lofted parts of nobody's, girders with splice plates and bolts."""
 
 import tempfile
 from pathlib import Path
@@ -7,7 +7,7 @@ import cadquery as cq
 import numpy as np
 
 from designgen.curves import make as make_curve
-from designgen.designs import arch_rib
+from designgen.designs import arch_rib, space_frame
 from designgen.designs.arch_part import Plates, solid
 from designgen.export import step_files
 from tests.support.solids import bridge_parts
@@ -114,3 +114,10 @@ def lofted_parts(seed):
         )
         files[name] = _bytes({name: outer.cut(inner)})
     return files, np.array([outer for outer, _ in cuts[1:-1]])
+
+
+def our_frame():
+    """Return a file of a frame of two nodes by two, and its design."""
+    params = space_frame.Params(nodes_x=2, nodes_y=2, spacing_mm=1200.0, depth_mm=900.0, radii_mm=(45.0, 60.0))
+    design = space_frame.build(params)
+    return _bytes({"frame": space_frame.solid(design)}), design
