@@ -37,11 +37,18 @@ from tests.support.results.bridge_results import (
 )
 
 NAN = float("nan")
+CSV, PAGE = 1e-6, 5e-4  # what rounding leaves of a number in tables of files (6 decimals) and of the page (3)
 
 
 def of_file(execution, file):
     (table,) = [one for one in all_tables.tables_of_run(execution, ErrorReport()) if one.file == file]
     return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
+
+
+def bridge_and_step():
+    """An adjusted bridge, and its step in results.json."""
+    execution = of_bridge()
+    return execution, to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
 
 
 def number(text):
@@ -53,35 +60,30 @@ def number(text):
 
 @pytest.mark.usefixtures("blank_pictures")
 def test_table_what_to_do_has_the_numbers_of_results_json():
-    execution = of_bridge()
-    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    execution, step = bridge_and_step()
     on_page = Page(rendered(execution)).tables["Joints: what to do, method adjustment"][2:]
     rows = of_file(execution, "what-to-do")
     assert [row["joint"] for row in rows] == ["J1", "J2"]
     for row, shown, joint, verdict in zip(rows, on_page, step["joint_measures"], step["joints"], strict=True):
         assert row["verdict"] == verdict["verdict"] == "fail"
         assert row["proposal"] == shown[2] == joint["proposal"]["sentence"]
-        wanted = [
-            joint["measures"][name][part]
-            for name in ("misalignment", "groove_gap_least", "groove_gap_greatest")
-            for part in ("value", "ci95")
-        ]
-        assert [float(cell) for cell in list(row.values())[3:9]] == pytest.approx(wanted, abs=1e-6)
-        assert [float(cell) for cell in shown[3:9]] == pytest.approx(wanted, abs=5e-4)
-        turns = {axis: joint["measures"][f"rotation_{axis}"] for axis in "xyz"}
-        assert max(abs(one["value"]) for one in turns.values()) == pytest.approx(
-            abs(float(row["rotation_mrad"])), abs=1e-6
-        )
-        assert turns[row["rotation_about"]]["ci95"] == pytest.approx(float(row["rotation_ci95_mrad"]), abs=1e-6)
-        assert number(row["probability_now"]) == pytest.approx(joint["probability"], abs=1e-6)
-        assert number(row["probability_after"]) == pytest.approx(joint["proposal"]["probability"], abs=1e-6)
+        measures = joint["measures"]
+        names = ("misalignment", "groove_gap_least", "groove_gap_greatest")
+        wanted = [measures[name][part] for name in names for part in ("value", "ci95")]
+        assert [float(cell) for cell in list(row.values())[3:9]] == pytest.approx(wanted, abs=CSV)
+        assert [float(cell) for cell in shown[3:9]] == pytest.approx(wanted, abs=PAGE)
+        turns = {axis: measures[f"rotation_{axis}"] for axis in "xyz"}
+        largest = max(abs(one["value"]) for one in turns.values())
+        assert largest == pytest.approx(abs(float(row["rotation_mrad"])), abs=CSV)
+        assert turns[row["rotation_about"]]["ci95"] == pytest.approx(float(row["rotation_ci95_mrad"]), abs=CSV)
+        assert number(row["probability_now"]) == pytest.approx(joint["probability"], abs=CSV)
+        assert number(row["probability_after"]) == pytest.approx(joint["proposal"]["probability"], abs=CSV)
     assert float(rows[0]["greatest_groove_gap_mm"]) == 3.5
     assert float(rows[1]["least_groove_gap_mm"]) == -1.75
 
 
 def test_table_of_limits_has_clause_and_verification():
-    execution = of_bridge()
-    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    execution, step = bridge_and_step()
     rows = of_file(execution, "limits")
     wanted = [limit for joint in step["joint_measures"] for limit in joint["limits"]]
     assert len(rows) == len(wanted) == 4
@@ -89,7 +91,7 @@ def test_table_of_limits_has_clause_and_verification():
         assert (row["limit"], row["verdict"], row["clause"]) == (limit["what"], limit["verdict"], limit["clause"])
         cells = [number(row[f"{name}_mm"]) for name in ("value", "ci95", "least", "greatest")]
         for cell, name in zip(cells, ("value", "ci95", "low", "high"), strict=True):
-            assert cell == (None if limit[name] is None else pytest.approx(limit[name], abs=1e-6))
+            assert cell == (None if limit[name] is None else pytest.approx(limit[name], abs=CSV))
     assert {limit["verified"] for limit in wanted} == {True, False}
     page = rendered(execution)
     assert "NOT VERIFIED" not in page
@@ -99,15 +101,13 @@ def test_table_of_limits_has_clause_and_verification():
 
 
 def test_limits_of_the_chain_stand_beside_those_of_joints():
-    execution = of_bridge()
-    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    execution, step = bridge_and_step()
     (chain,) = step["chain_limits"]
     (limit,) = chain["limits"]
     (row,) = of_file(execution, "limits-chain")
     assert chain["verdict"] == row["verdict"] == limit["verdict"] == "indeterminate"
-    assert (limit["limit"], limit["source"], limit["edition"], limit["verified"]) == (
-        "span_mm", "project.toml", "1", False,
-    )  # fmt: skip
+    stated = [limit[key] for key in ("limit", "source", "edition", "verified")]
+    assert stated == ["span_mm", "project.toml", "1", False]
     assert [float(row[f"{name}_mm"]) for name in ("value", "least", "greatest")] == [-1.25, -1.0, 1.0]
     assert row["source"] == "project.toml"
     parsed = Page(rendered(execution))
@@ -124,20 +124,16 @@ def test_limits_of_the_chain_stand_beside_those_of_joints():
 
 
 def test_gaps_have_intervals_in_the_joints_axes_too():
-    execution = of_bridge()
-    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    execution, step = bridge_and_step()
     rows = of_file(execution, "gaps")
     assert list(rows[0])[:8] == ["joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm"]
     for j, joint in enumerate(step["joint_measures"]):
         for k, key in enumerate(f"P{i}" for i in range(1, 9)):
-            assert joint["gaps_joint_axes_ci95"][key] == pytest.approx([0.196] * 3, abs=1e-4)
-            row = rows[8 * j + k]
-            assert [float(row[f"{one}_mm"]) for one in ("along", "left", "up")] == pytest.approx(
-                joint["gaps_joint_axes"][key], abs=1e-6
-            )
-            assert [float(row[f"ci95_{one}_mm"]) for one in ("along", "left", "up")] == pytest.approx(
-                joint["gaps_joint_axes_ci95"][key], abs=1e-6
-            )
+            gap, half = joint["gaps_joint_axes"][key], joint["gaps_joint_axes_ci95"][key]
+            assert half == pytest.approx([1.96 * 0.1] * 3, rel=1e-4)  # 1.95996: of a gap of sd 0.1
+            for one, value, ci95 in zip(("along", "left", "up"), gap, half, strict=True):
+                assert float(rows[8 * j + k][f"{one}_mm"]) == pytest.approx(value, abs=CSV)
+                assert float(rows[8 * j + k][f"ci95_{one}_mm"]) == pytest.approx(ci95, abs=CSV)
     assert len(of_file(execution, "gaps-line")[0]) == 8
 
 
@@ -229,19 +225,11 @@ def test_a_pass_is_marked_as_good_only_by_limits_that_are_verified(verified, ton
     assert page._tone(StepRun("preassemble", "adjustment", "{}", result)) == tone
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_page_has_verdict_then_actions_then_pictures():
     text = rendered(of_bridge())
-    places = [
-        text.index(one)
-        for one in (
-            "2 of 2 joints fail",
-            "verdicts are provisional",
-            "-1.250 ± 0.500",
-            "J1 P1: ±",
-            "A scan of rib1",
-            "<h2>",
-        )
-    ]
+    actions = ("verdicts are provisional", "-1.250 ± 0.500", "J1 P1: ±", "A scan of rib1")
+    places = [text.index(one) for one in ("2 of 2 joints fail", *actions, "<h2>")]
     assert places == sorted(places)
     assert text.index("Joints: what to do") < text.index("data:image/png")
     assert '<li class="bad">' in text
@@ -293,25 +281,20 @@ def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
 # --- pictures ------------------------------------------------------------------------------------------------------
 
 
-def test_every_picture_shows_something():
-    found = drawn(of_bridge())["preassemble"].figures
-    assert set(found) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
-    for name, (caption, png) in found.items():
-        pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
-        dark = (pixels.min(axis=2) < 0.9).mean()
-        assert 0.005 < dark < 0.9, name
-        assert caption
-    assert "95 %" in str(found["linear-error.png"][0])
-
-
-def test_pictures_change_with_their_data_alone():
-    """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
-    before = drawn(of_bridge())["preassemble"].figures
+def test_pictures_show_something_and_change_with_their_data_alone():
+    """Pictures of other residuals or weights are other pictures; the rest stay as they are."""
     execution = of_bridge()
+    before = drawn(execution)["preassemble"].figures
+    assert set(before) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
+    for name, (caption, png) in before.items():
+        pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
+        assert 0.005 < (pixels.min(axis=2) < 0.9).mean() < 0.9, name  # neither a blank nor a black picture
+        assert caption
+    assert "95 %" in str(before["linear-error.png"][0])
     run = execution.runs[0]
-    before_of = run.result.adjustment
-    residuals = dataclasses.replace(before_of.residuals, distance=-3.0 * np.abs(before_of.residuals.distance))
-    other = dataclasses.replace(run.result, adjustment=dataclasses.replace(before_of, residuals=residuals, weight=1.0))
+    given = run.result.adjustment
+    residuals = dataclasses.replace(given.residuals, distance=-3.0 * np.abs(given.residuals.distance))
+    other = dataclasses.replace(run.result, adjustment=dataclasses.replace(given, residuals=residuals, weight=1.0))
     after = all_figures.draw_figures(
         dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
     )["preassemble"].figures
@@ -331,9 +314,12 @@ def test_parts_unroll_face_by_face():
     corners = [[x, y, z] for x in np.linspace(50.0, 3950.0, 40) for y in (0.0, 450.0) for z in (0.0, 1100.0)]
     middles = [[1000.0, 225, 0], [1000, 0, 550], [1000, 225, 1100], [1000, 450, 550], [3000, 450, 100]]
     flat = residual_map.unroll(part, np.array(corners + middles))
-    np.testing.assert_allclose(flat.edges, [0.0, 0.45, 1.55, 2.0, 3.1], atol=0.01)
-    np.testing.assert_allclose(flat.around[-5:], [0.225, 1.0, 1.775, 2.55, 3.0], atol=0.01)
-    np.testing.assert_allclose(flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0], atol=0.01)
+    expected = [
+        (flat.edges, [0.0, 0.45, 1.55, 2.0, 3.1]), (flat.around[-5:], [0.225, 1.0, 1.775, 2.55, 3.0]),
+        (flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0]),
+    ]  # fmt: skip
+    for found, wanted in expected:
+        np.testing.assert_allclose(found, wanted, atol=0.01)  # a pixel of the map is 10 mm
 
 
 def map_of(values):
@@ -346,10 +332,10 @@ def test_noise_has_no_colour_on_maps_of_residuals():
     noise, bow = rng.normal(0.0, 0.2, (40, 120)), 3.0 * np.sin(np.linspace(0.0, np.pi, 120))
     for values in (noise, noise + bow):
         band = residual_map.scatter_band([map_of(values)])
-        assert (np.abs(noise) < band.high).mean() == pytest.approx(0.95, abs=0.02), "three sds of a MAD of 4,760"
+        assert (np.abs(noise) < band.high).mean() == pytest.approx(0.95, abs=0.02)  # three sds of a MAD of 4,760
         assert band.low == -band.high
     levels = residual_map.colour_steps([map_of(noise)], residual_map.scatter_band([map_of(noise)]))[2]
-    assert levels[-1] > 1.9 * band.high, "colours begin pale"
+    assert levels[-1] > 1.9 * band.high  # colours begin pale
 
 
 def test_numbers_of_large_gaps_fit_their_frames_and_missing_gaps_are_stated(monkeypatch):
@@ -373,9 +359,7 @@ def test_numbers_of_large_gaps_fit_their_frames_and_missing_gaps_are_stated(monk
     frame = shown.get_window_extent()
     for one in numbers:
         box = one.get_window_extent()
-        assert frame.x0 <= box.x0, one.get_text()
-        assert box.x1 <= frame.x1, one.get_text()
-        assert frame.y0 <= box.y0, one.get_text()
-        assert box.y1 <= frame.y1, one.get_text()
+        inside = frame.x0 <= box.x0 < box.x1 <= frame.x1 and frame.y0 <= box.y0 < box.y1 <= frame.y1
+        assert inside, one.get_text()
     assert [one.get_text() for one in silent.texts] == ["no gaps computed"]
     assert silent.get_title() == "J2: INDETERMINATE"

@@ -12,7 +12,6 @@ import subprocess
 import sys
 
 import ezdxf
-import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
@@ -30,13 +29,7 @@ from processor.report.space_frame import tables as space_frame_tables
 from processor.report.style import COLOURS, DPI, Drawn
 from processor.results import to_json
 from processor.space_frame import step
-from processor.space_frame.result import (
-    ControlDeviations,
-    MovementReference,
-    Result,
-    StationCorrections,
-    Tubes,
-)
+from processor.space_frame.result import ControlDeviations, MovementReference, StationCorrections, Tubes
 from processor.store import store
 from tests.support.pages.report_pages import TablesOfPage
 from tests.support.results.ball_results import (
@@ -53,7 +46,9 @@ from tests.support.results.ball_results import (
     without_design,
 )
 from tests.support.results.bridge_results import PROVENANCE
-from tests.support.results.records import assert_equal
+
+Z95 = 1e-4  # 1.96 here is 1.95996 in the program
+CSV = 1e-4  # of a half-width of 0.2 mm written with six decimals, and 1.96 for 1.95996
 
 
 def by_file(file, *args):
@@ -68,7 +63,7 @@ def test_verdicts_by_hand():
     found = whole().balls
     # 3-4-0: along (0.6, 0.8, 0) the variance is 0.36 * 0.25 + 0.64 * 1 = 0.73; 12 down: 4; 0.3-0-0.4: 0.36/4 + 0.64 * 4
     np.testing.assert_allclose(found.movement_size[[0, 1, 3]], [5.0, 12.0, 0.5])
-    np.testing.assert_allclose(found.movement_size_ci95[[0, 1, 3]], 1.96 * np.sqrt([0.73, 4.0, 2.65]), rtol=1e-4)
+    np.testing.assert_allclose(found.movement_size_ci95[[0, 1, 3]], 1.96 * np.sqrt([0.73, 4.0, 2.65]), rtol=Z95)
     assert np.isnan(found.movement_size[[2, 4]]).all()
     assert found.verdict == ("pass", "indeterminate", "none", "pass", "none")
     assert whole(limit=8.0).balls.verdict[1] == "fail"
@@ -77,15 +72,11 @@ def test_verdicts_by_hand():
     assert whole(limit=NAN).balls.verdict == ("none",) * 5
 
 
-def test_the_worst_verdict_is_that_of_the_result():
-    assert whole().overall is Verdict.INDETERMINATE
-    assert whole(limit=8.0).overall is Verdict.FAIL
-    assert whole(limit=NAN).overall is Verdict.NONE
-
-
-@pytest.mark.parametrize("matching", ["ambiguous", "failed"])
-def test_nodes_have_no_pass_while_their_matching_is_uncertain(matching):
-    assert set(whole(matching=matching).balls.verdict) == {"indeterminate", "none"}
+def test_the_worst_verdict_is_that_of_the_result_and_none_passes_while_the_matching_is_uncertain():
+    limits = {10.0: Verdict.INDETERMINATE, 8.0: Verdict.FAIL, NAN: Verdict.NONE}
+    assert [whole(limit=limit).overall for limit in limits] == list(limits.values())
+    for matching in ("ambiguous", "failed"):
+        assert set(whole(matching=matching).balls.verdict) == {"indeterminate", "none"}
 
 
 def test_a_ball_that_was_not_seen_neither_passes_nor_fails():
@@ -143,13 +134,9 @@ def test_results_json_of_a_whole_frame():
     assert step["stations"][0]["reasons"] == []
     assert step["stations"][1]["reasons"][0]["code"] == "spheres.weak-motions"
     assert first["reasons"] == []
-    assert second["reasons"] == [
-        {
-            "code": "spheres.other-size",
-            "values": {"size": 60.0, "nominal": 50.0},
-            "text": "size 60 mm instead of 50 mm",
-        }
-    ]
+    values = {"size": 60.0, "nominal": 50.0}
+    (why,) = second["reasons"]
+    assert why == {"code": "spheres.other-size", "values": values, "text": "size 60 mm instead of 50 mm"}
     assert [one["code"] for one in step["reasons"]] == ["spheres.ranges"]
     assert np.shape(step["stations"][1]["T"]) == (4, 4)
 
@@ -164,13 +151,6 @@ def test_results_json_has_no_keys_of_absent_results():
     assert not {"gauge", "matching", "movement_limit", "movements"} & set(blind)
     assert "tubes" in blind
     assert "movement" not in blind["balls"][0]
-
-
-def test_the_result_goes_through_the_store_unchanged(tmp_path):
-    made = whole()
-    store.write_results(tmp_path / "r.h5", [StepRun("spheres", "ray", "{}", made)], {})
-    (back,) = store.read_results(tmp_path / "r.h5", {"spheres": Result})
-    assert_equal(back.result, made)
 
 
 def test_ids_that_are_texts_stand_in_results_tables_and_drawing():
@@ -215,8 +195,8 @@ def test_the_headline_says_which_gauge_the_movements_are_by_and_how_far_the_othe
 
 def test_csv_of_balls_and_of_lowest_points():
     first, second, lost, *_ = by_file("balls", None, with_truth()[0])
-    assert float(first["ci95_x_mm"]) == pytest.approx(0.196, abs=1e-4)
-    assert float(first["ci95_radius_mm"]) == pytest.approx(0.098, abs=1e-4)
+    assert float(first["ci95_x_mm"]) == pytest.approx(0.196, abs=CSV)
+    assert float(first["ci95_radius_mm"]) == pytest.approx(0.098, abs=CSV)
     assert (first["size_mm"], first["nominal_radius_mm"], first["radius_error_mm"]) == ("45.0", "45.0", "0.1")
     assert (first["bound_sd_z_mm"], first["efficiency_lowest_z"], first["evidence"]) == ("0.24", "0.95", "fused")
     assert (second["flag"], second["remark"]) == ("wrong-size", "size 60 mm instead of 50 mm")
@@ -225,7 +205,7 @@ def test_csv_of_balls_and_of_lowest_points():
     crew = by_file("lowest")
     assert list(crew[0]) == ["id", "x_mm", "y_mm", "z_mm", "ci95_z_mm", "radius_mm", "flag"]
     assert (crew[0]["x_mm"], crew[0]["z_mm"], crew[0]["radius_mm"]) == ("3.0", "5954.9", "45.1")
-    assert float(crew[1]["ci95_z_mm"]) == pytest.approx(0.392, abs=1e-4)
+    assert float(crew[1]["ci95_z_mm"]) == pytest.approx(0.392, abs=CSV)
     assert (crew[2]["z_mm"], crew[2]["flag"]) == ("", "not-found")
 
 
@@ -254,8 +234,9 @@ def test_shift_of_a_station_is_stated_at_the_middle_of_the_balls():
     middle = np.nanmean(centres, axis=0)
     T = np.array([pose(), pose(R, middle - R @ middle + [0.0, 0.0, 2.0])])
     _, moved = by_file("stations", moved_to(made, centres, T))
+    # Rounding of float64 at 4e9 mm is 1e-6, of a turned frame some times that.
     assert [float(moved[name]) for name in ("dx_mm", "dy_mm", "dz_mm")] == pytest.approx([0.0, 0.0, 2.0], abs=2e-5)
-    assert float(moved["turn_z_mrad"]) == pytest.approx(0.5, abs=1e-6)
+    assert float(moved["turn_z_mrad"]) == pytest.approx(0.5, abs=1e-6)  # written with six decimals
 
 
 def moved_to(result, centres, T):
@@ -281,7 +262,7 @@ def test_terminal_shows_summary_flagged_balls_and_stations():
     ]  # fmt: skip
     values = {str(row[0]): row[1] for row in shown[0].rows}
     assert (values["balls"], values["flag ok"], values["flag not-found"]) == (5, 2, 1)
-    assert values["95 % half-width of the radius, median"] == pytest.approx(0.098, abs=1e-4)
+    assert values["95 % half-width of the radius, median"] == pytest.approx(0.098, abs=CSV)
     assert (values["movement of a node, largest"], values["nodes, verdict pass"]) == (12.0, 2)
     assert [row[0] for row in shown[1].rows] == [11, 12, 13]
 
@@ -326,7 +307,9 @@ def test_entities_are_written_as_the_library_writes_them():
 
 
 def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
+    """The order of sets differs there; and until something is drawn, the program has loaded no drawing library."""
     code = (
+        "import sys, processor.cli.main, processor.report.write_results; assert 'ezdxf' not in sys.modules\n"
         "import hashlib; from processor.report.space_frame import dxf;"
         "from tests.support.results.ball_results import whole;"
         "print(hashlib.sha256(dxf.drawing(whole())).hexdigest())"
@@ -334,40 +317,23 @@ def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
     data = dxf.drawing(whole())
     assert not ezdxf.options.write_fixed_meta_data_for_testing
     done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "PYTHONHASHSEED": "7"},  # the order of sets differs
-    )
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONHASHSEED": "7"},
+    )  # fmt: skip
     assert done.stdout.strip() == hashlib.sha256(data).hexdigest()
     assert b"S2" not in data
     assert b"determined" not in data
-
-
-def test_starting_the_program_loads_no_drawing_library():
-    code = "import sys, processor.cli.main, processor.report.write_results; assert 'ezdxf' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.usefixtures("blank_pictures")
 def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
     execution, report = of_frame()
     write_results.write_results(tmp_path / "out", execution, report)
-    found = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {
-        "nodes.dxf",
-        "flagged-balls.pdf",
-        "balls.csv",
-        "lowest.csv",
-        "nodes.csv",
-        "tubes.csv",
-        "stations.csv",
-    } <= found
+    tables = {f"{name}.csv" for name in ("balls", "lowest", "nodes", "tubes", "stations")}
+    assert tables | {"nodes.dxf", "flagged-balls.pdf"} <= {path.name for path in (tmp_path / "out").iterdir()}
     write_results.check_output(tmp_path / "out", tmp_path / "b.h5")
-    write_results.write_results(
-        tmp_path / "out", Execution(execution.scene, (StepRun("spheres", "ransac", "{}", balls()),), PROVENANCE), report
-    )
+    other = Execution(execution.scene, (StepRun("spheres", "ransac", "{}", balls()),), PROVENANCE)
+    write_results.write_results(tmp_path / "out", other, report)
     assert not {"nodes.dxf", "lowest.csv", "nodes.csv"} & {path.name for path in (tmp_path / "out").iterdir()}
 
 
@@ -383,8 +349,7 @@ def compared():
 
 
 def test_figures_of_a_frame_and_those_of_balls_to_look_at(compared):
-    execution, report, drawn = compared
-    found = drawn["spheres"].figures
+    found = compared[2]["spheres"].figures
     assert set(found) == {
         "plan.png", "radius-errors.png", "ball-errors.png", "flagged-ball-11.png", "flagged-ball-12.png",
         "flagged-ball-13.png",
@@ -393,8 +358,6 @@ def test_figures_of_a_frame_and_those_of_balls_to_look_at(compared):
     assert "minus truth" in str(found["ball-errors.png"][0])
     assert "sd" not in str(found["ball-errors.png"][0])
     assert str(found["flagged-ball-11.png"][0]).startswith("Ball 11, wrong-size")
-    with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0}):
-        assert all_figures.draw_figures(execution, report)["spheres"] == drawn["spheres"]
 
 
 def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
@@ -403,38 +366,33 @@ def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
     assert "Standard deviations" in str(found["ball-errors.png"][0])  # there is no truth to compare with
 
 
-def test_at_most_twelve_balls_have_a_picture_worst_first(monkeypatch):
+def test_few_balls_have_a_picture_worst_first_and_pages_share_the_pixels_of_their_frames(monkeypatch):
     assert flagged_ball_figures.MOST_BALLS == 12
-    monkeypatch.setattr(flagged_ball_figures, "MOST_BALLS", 4)  # of seven, as more take seconds
+    monkeypatch.setattr(flagged_ball_figures, "MOST_BALLS", 2)  # of seven, as more take seconds
     made = repeated(whole(), 3)
     drawn = flagged_ball_figures.draw(scene(made), made)
     captions = [str(caption) for caption, _ in drawn.figures.values()]
-    assert len(drawn.figures) == 4
     flags = [caption.split(",")[1].split(":")[0].strip() for caption in captions]
-    assert flags == [*["wrong-size"] * 3, "not-found"]
-    assert "the first 4 of 7" in captions[0]
-    every = flagged_ball_figures.flagged_rows(scene(made), made)
-    assert pages_of(drawn.documents[flagged_ball_figures.DOCUMENT]) == len(every) == 7
+    assert flags == ["wrong-size"] * 2
+    assert "the first 2 of 7" in captions[0]
+    every = [made.balls.flag[i] for i in flagged_ball_figures.flagged_rows(scene(made), made)]
+    assert every == ["wrong-size"] * 3 + ["not-found"] + ["low-confidence"] * 3
+    document = drawn.documents[flagged_ball_figures.DOCUMENT]
+    assert pages_of(document) == len(every)
+    wide = round(ball_picture.PAGE_DPI * ball_picture.SIZE_IN[0])
+    assert len(re.findall(rb"/Width %d\b" % wide, document)) == 2  # of balls of two sizes
 
 
-def test_pictures_of_balls_show_the_middle_of_the_design():
+def test_pictures_of_balls_show_the_middle_of_the_design(compared):
     made = whole()
-    drawn = flagged_ball_figures.draw(scene(made), made)
-    i = made.balls.flag.index("not-found")
-    png = drawn.figures[f"flagged-ball-{made.balls.ids[i]}.png"][1]
+    png = compared[2]["spheres"].figures["flagged-ball-12.png"][1]
+    assert made.balls.flag[2] == "not-found"
     pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
     left, bottom, wide, high = (DPI * inches for inches in ball_picture.VIEWS_IN[0])
     column, row = round(left + 0.5 * wide), round(len(pixels) - bottom - 0.5 * high)
     nominal = np.array(to_rgb(COLOURS[1])) * 255.0
-    assert (np.abs(pixels[row - 3 : row + 4, column - 3 : column + 4] - nominal).max(axis=2) < 10.0).any()
-
-
-def test_pages_of_a_document_share_the_pixels_of_their_frames():
-    made = repeated(whole(), 3)
-    document = flagged_ball_figures.draw(scene(made), made).documents[flagged_ball_figures.DOCUMENT]
-    wide = round(ball_picture.PAGE_DPI * ball_picture.SIZE_IN[0])
-    assert pages_of(document) == 7
-    assert len(re.findall(rb"/Width %d\b" % wide, document)) == 2  # of balls of two sizes
+    near = pixels[row - 3 : row + 4, column - 3 : column + 4]
+    assert (np.abs(near - nominal).max(axis=2) < 10.0).any()  # anti-aliasing mixes in up to 4 % of another colour
 
 
 def pages_of(pdf):
@@ -442,16 +400,16 @@ def pages_of(pdf):
     return len(re.findall(rb"/Type /Page\b", pdf))
 
 
-def test_a_ball_to_look_at_has_a_page_with_its_numbers():
+def test_a_ball_to_look_at_has_a_page_with_its_numbers(compared):
     made = whole()
     i = made.balls.flag.index("wrong-size")
     said = dict(ball_picture.numbers(made.balls, i, np.array([1.0, -2.0, 0.5])))
     half = 1.96 * np.sqrt(made.balls.covariance[i, 3, 3])
     assert said["radius"] == f"{made.balls.radii[i]:.2f} ± {half:.2f}"
     assert said["off the design's place, y"] == "2.00"  # found less designed
-    drawn = flagged_ball_figures.draw(scene(made), made)
-    assert pages_of(drawn.documents[flagged_ball_figures.DOCUMENT]) == 3
-    assert drawn == flagged_ball_figures.draw(scene(made), made)
+    first = compared[2]["spheres"].documents[flagged_ball_figures.DOCUMENT]
+    assert pages_of(first) == 3
+    assert first == flagged_ball_figures.draw(scene(made), made).documents[flagged_ball_figures.DOCUMENT]
     fine = whole(changed={"flag": ("ok",) * 5})
     assert flagged_ball_figures.draw(scene(fine), fine) == Drawn({})
 
@@ -472,7 +430,9 @@ def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
     ):
         away = np.linalg.norm(points + origin - centre, axis=1)
         assert len(crop) == (away <= far).sum() > 0
-        np.testing.assert_allclose(np.sort(np.linalg.norm(crop, axis=1)), np.sort(away[away <= far]), atol=1e-5)
+        np.testing.assert_allclose(
+            np.sort(np.linalg.norm(crop, axis=1)), np.sort(away[away <= far]), atol=1e-5
+        )  # at 3e9 mm
 
 
 def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
@@ -498,15 +458,9 @@ def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
 
 
 def test_control_points_have_a_table_and_their_place_in_results_json():
-    made = whole(
-        datum=(reason("spheres.datum-control", points=2),),
-        control=ControlDeviations(
-            points=("T1", "T2"),
-            off=[[0.3, 0.0, -0.4], [30.0, 0.0, 0.0]],
-            used=[True, False],
-            scans=("S1", "S2"),
-        ),
-    )
+    off = [[0.3, 0.0, -0.4], [30.0, 0.0, 0.0]]
+    control = ControlDeviations(points=("T1", "T2"), off=off, used=[True, False], scans=("S1", "S2"))
+    made = whole(datum=(reason("spheres.datum-control", points=2),), control=control)
     (table,) = (one for one in space_frame_tables.step_tables([StepRun("spheres", "ray", "{}", made)], ErrorReport())
                 if one.file == "control")  # fmt: skip
     assert table.columns[0].name == "control_point"
@@ -516,10 +470,8 @@ def test_control_points_have_a_table_and_their_place_in_results_json():
     assert str(table.rows[1][-2]).startswith("no, ")
     step = written(made)
     assert [one["text"] for one in step["datum"]] == ["2 control points"]
-    assert [(one["name"], one["scan"], one["used"]) for one in step["control"]] == [
-        ("T1", "S1", True),
-        ("T2", "S2", False),
-    ]
+    rows = [(one["name"], one["scan"], one["used"]) for one in step["control"]]
+    assert rows == [("T1", "S1", True), ("T2", "S2", False)]
     assert not {"datum", "control"} & set(written(whole()))
 
 
@@ -537,7 +489,7 @@ def test_targets_without_members_have_lowest_points_and_bounds():
 def test_expected_distribution_integrates_to_the_number_of_errors():
     x = np.linspace(-5.0, 5.0, 1001)
     y = space_frame_figures._mixture(x, np.array([0.2, 0.5, NAN, 0.0]), 0.1)
-    assert y.sum() * (x[1] - x[0]) / 0.1 == pytest.approx(2.0, abs=1e-6)
+    assert y.sum() * (x[1] - x[0]) / 0.1 == pytest.approx(2.0, abs=1e-6)  # a smooth density in steps of sd / 20
     assert y[500] == pytest.approx(0.1 * (1 / 0.2 + 1 / 0.5) / math.sqrt(2.0 * math.pi))
     assert space_frame_figures._mixture(x, np.array([NAN]), 0.1) is None
 
@@ -545,10 +497,9 @@ def test_expected_distribution_integrates_to_the_number_of_errors():
 def test_designed_places_are_transformed_into_the_scan():
     T = pose(TURN, (7e5, -2e5, 100.0))
     made = whole(T=T)
-    np.testing.assert_allclose(
-        flagged_ball_figures.designed_places(scene(made), made)[:4] @ T[:3, :3].T + T[:3, 3], NOMINAL[:4], atol=1e-6
-    )
-    assert np.isnan(flagged_ball_figures.designed_places(scene(made), made)[4]).all()
+    found = flagged_ball_figures.designed_places(scene(made), made)
+    np.testing.assert_allclose(found[:4] @ T[:3, :3].T + T[:3, 3], NOMINAL[:4], atol=1e-6)  # float64 at 1 km: 1e-10
+    assert np.isnan(found[4]).all()
 
 
 def test_the_page_of_a_frame(compared):
@@ -563,9 +514,13 @@ def test_the_page_of_a_frame(compared):
     assert "Nodes against the design" in text[text.index("<h2>") :]
 
 
-def test_a_roof_of_thirty_thousand_keeps_the_page_small():
-    execution, report = of_frame(repeated(whole(), 6000))
-    assert len(page.html(execution, report, {})) < 12_000_000
+@pytest.mark.parametrize("times", [500, pytest.param(6000, marks=pytest.mark.slow)])
+def test_a_roof_of_many_balls_keeps_the_page_small(times):
+    """12 MB for 30,000 balls are a third of a kilobyte a ball, and 2 MB of tables of 2,000 rows each."""
+    execution, report = of_frame(repeated(whole(), times))
+    text = page.html(execution, report, {})
+    assert len(text) < 2_000_000 + 5 * times * 1_000 / 3
+    assert f"The first 2000 of {5 * times} rows" in text
 
 
 def test_points_of_the_slice_are_painted_over_the_others():

@@ -6,15 +6,20 @@ import io
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.report import all_figures, page
 from processor.results import to_json
 from tests.support.pages import page_layout
-from tests.support.pages.browser import opened, picture, read_over
+from tests.support.pages.browser import dragged, opened, picture, read_over
 from tests.support.pages.report_pages import BAD, rendered
 from tests.support.results.ball_results import of_frame
 from tests.support.results.bridge_results import of_bridge
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
+
+
+def written(folder, text, name="r.html"):
+    path = folder / name
+    path.write_text(text, "utf-8")
+    return path
 
 
 def cells_below(shown, title):
@@ -29,19 +34,13 @@ def cells_below(shown, title):
 
 @pytest.mark.parametrize("width", [1200, 500])
 def test_a_bridge_in_space_reacts(tmp_path, width):
-    path = tmp_path / "<script>alert(1)<script>.html"
-    path.write_text(rendered(of_bridge(names=(BAD, "rib1", "foot2"))), "utf-8")
+    path = written(tmp_path, rendered(of_bridge(names=(BAD, "rib1", "foot2"))), "<script>alert(1)<script>.html")
     with opened(path, width) as shown:
         assert shown.locator("canvas").count() == 4
         first = picture(shown)
-        box = shown.locator("canvas.space").bounding_box()
         shown.locator("canvas.space").scroll_into_view_if_needed()
-        box = shown.locator("canvas.space").bounding_box()
-        shown.mouse.move(box["x"] + 100, box["y"] + 100)
-        shown.mouse.down()
-        shown.mouse.move(box["x"] + 180, box["y"] + 130, steps=3)
-        shown.mouse.up()
-        turned = picture(shown)
+        assert any("mm from the design at" in one for one in read_over(shown, 20, (0.4, 0.5, 0.6)))
+        turned = dragged(shown, 80, 30)
         assert turned != first
         shown.locator(".live fieldset input").first.uncheck()
         assert picture(shown) != turned
@@ -50,36 +49,22 @@ def test_a_bridge_in_space_reacts(tmp_path, width):
         assert page_layout.faults(shown) == []
 
 
-def test_a_point_of_the_bridge_can_be_read(tmp_path):
-    path = tmp_path / "r.html"
-    path.write_text(rendered(of_bridge()), "utf-8")
-    with opened(path) as shown:
-        shown.locator("canvas.space").scroll_into_view_if_needed()
-        picture(shown)
-        assert any("mm from the design at" in one for one in read_over(shown, 40, (0.4, 0.5, 0.6)))
-
-
 @pytest.mark.parametrize("width", [1400, 390])
 def test_everything_on_the_page_of_a_frame_can_be_reached(tmp_path, width):
-    path = tmp_path / "r.html"
-    path.write_text(rendered(of_frame()[0]), "utf-8")
-    with opened(path, width) as shown:
+    with opened(written(tmp_path, rendered(of_frame()[0])), width) as shown:
         assert page_layout.faults(shown) == []
 
 
 @pytest.mark.parametrize("rule", ["overflow: hidden", "overflow: visible"])
 def test_a_table_without_a_scroll_bar_is_a_fault_of_the_page(tmp_path, rule):
-    path = tmp_path / "r.html"
-    path.write_text(rendered(of_bridge()), "utf-8")
-    with opened(path, 390) as shown:
+    with opened(written(tmp_path, rendered(of_bridge())), 390) as shown:
         shown.add_style_tag(content=f".scroll {{ {rule} !important }}")
         assert page_layout.faults(shown) != []
 
 
 def test_balls_in_space_react_and_their_table_holds_the_results(tmp_path):
     execution, report = of_frame()
-    path = tmp_path / "r.html"
-    path.write_text(page.html(execution, report, all_figures.draw_figures(execution, report)), "utf-8")
+    path = written(tmp_path, rendered(execution))
     step = to_json.results_json(execution, report)["steps"]["spheres"]
     with opened(path) as shown:
         first = picture(shown)
@@ -97,8 +82,7 @@ def test_balls_in_space_react_and_their_table_holds_the_results(tmp_path):
 
 def test_tables_hold_the_results_and_can_be_copied(tmp_path):
     execution = of_bridge()
-    path = tmp_path / "r.html"
-    path.write_text(rendered(execution), "utf-8")
+    path = written(tmp_path, rendered(execution))
     step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     with opened(path) as shown:
         shown.context.grant_permissions(["clipboard-read"])
@@ -118,9 +102,7 @@ def test_tables_hold_the_results_and_can_be_copied(tmp_path):
 
 @pytest.mark.parametrize("width", [1200, 400])
 def test_a_table_has_the_whole_width_and_shows_all_its_rows(tmp_path, width):
-    path = tmp_path / "r.html"
-    path.write_text(rendered(of_bridge()), "utf-8")
-    with opened(path, width) as shown:
+    with opened(written(tmp_path, rendered(of_bridge())), width) as shown:
         tables = shown.evaluate(
             "[...document.querySelectorAll('.scroll')].map((scroll) => ({"
             " width: scroll.offsetWidth, section: scroll.closest('section').clientWidth,"
@@ -136,9 +118,8 @@ def test_a_table_has_the_whole_width_and_shows_all_its_rows(tmp_path, width):
 
 
 def test_no_other_script_runs(tmp_path):
-    path = tmp_path / "r.html"
-    path.write_text(rendered(of_bridge()).replace("</body>", "<script>document.title = 'run'</script></body>"), "utf-8")
-    titles = []
+    script = "<script>document.title = 'run'</script>"
+    path, titles = written(tmp_path, rendered(of_bridge()).replace("</body>", f"{script}</body>")), []
     with pytest.raises(AssertionError, match="Content Security Policy"), opened(path) as shown:
         titles.append(shown.title())
     assert titles != ["run"]

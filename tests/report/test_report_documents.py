@@ -33,6 +33,7 @@ def written(execution):
         return pdf_report.document(execution, drawn(execution))
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_document_has_a_page_a_figure_and_the_same_bytes_again():
     execution = signed()
     first = written(execution)
@@ -98,12 +99,11 @@ def test_document_is_chinese_if_a_font_is_installed(a_chinese_font):
     execution = signed()
     seen = texts_of(front(execution, "zh"))
     assert any("桥 Meyer" in one for one in seen)
-    assert any(one.startswith("批准：") or one.startswith("批准") for one in seen)
+    assert any(one.startswith("批准") for one in seen)
     assert not any("?" in one for one in seen)
     with default_settings():
         data = pdf_report.document(execution, {}, "zh")
     assert b"LastResort" in data
-    assert data != written(execution)
 
 
 def test_document_without_a_font_is_english_with_question_marks(monkeypatch):

@@ -56,7 +56,7 @@ def test_the_page_runs_its_own_script_alone_and_loads_nothing():
 
 
 def test_many_points_keep_the_page_small():
-    text = rendered(of_bridge(per_part=100_000))
+    text = rendered(of_bridge(per_part=preassembly_data.MOST_POINTS))  # three times as many
     assert len(text.encode()) < 3_000_000
     data = json.loads(Page(text).scripts[0][1])["steps"]["preassemble"]
     assert sum(len(part["residual"]) for part in data["parts"]) <= preassembly_data.MOST_POINTS

@@ -21,7 +21,7 @@ from processor.store import store
 from tests.support.pages import page_layout
 from tests.support.pages.browser import opened
 from tests.support.pages.report_pages import BAD, Page, rendered
-from tests.support.results.bridge_results import of_bridge
+from tests.support.results.bridge_results import PROVENANCE, of_bridge
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
@@ -69,7 +69,7 @@ def test_a_logo_is_kept_as_it_is(tmp_path, format_):
     (tmp_path / "logo.any").write_bytes(picture(format_))
     scene = read_input(folder_of(tmp_path, '[report]\nlogo = "logo.any"\n'))
     assert scene.title_block.logo.tobytes() == picture(format_)
-    assert title_block.of(scene, of_bridge().provenance)["logo"].startswith(f"data:image/{format_.lower()};base64,")
+    assert title_block.of(scene, PROVENANCE)["logo"].startswith(f"data:image/{format_.lower()};base64,")
 
 
 def test_title_block_does_not_change_the_hash_of_a_scene(tmp_path):
@@ -140,7 +140,7 @@ def test_every_text_of_the_title_block_is_text(tmp_path):
 
 
 def test_without_a_title_block_there_are_no_signatures():
-    found = title_block.of(of_bridge().scene, of_bridge().provenance)
+    found = title_block.of(of_bridge().scene, PROVENANCE)
     assert (found["company"], found["logo"], found["signatures"]) == ("", "", [])
     assert [value for _, value in found["rows"]] == ["b.h5, SHA-256 00", "processor 0"]
 
@@ -171,12 +171,10 @@ def test_characteristics_are_those_of_results_json_worst_first():
     execution = of_bridge()
     step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     wanted = {}
-    for place, of_place in [
-        *((joint["name"], joint) for joint in step["joint_measures"]),
-        *(("chain", chain) for chain in step["chain_limits"]),
-    ]:
+    for of_place in (*step["joint_measures"], *step["chain_limits"]):
         for limit in of_place["limits"]:
-            wanted[f"{place} {limit['limit'].removesuffix('_mm').replace('_', ' ')}"] = limit
+            what = limit["limit"].removesuffix("_mm").replace("_", " ")
+            wanted[f"{of_place.get('name', 'chain')} {what}"] = limit
     (table,) = [t for t in all_tables.tables_of_run(execution, ErrorReport()) if t.file == "characteristics"]
     rows = [dict(zip((column.name for column in table.columns), row, strict=True)) for row in table.rows]
     assert {str(row["id"]) for row in rows} == set(wanted)

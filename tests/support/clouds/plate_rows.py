@@ -26,7 +26,7 @@ def design_of(count):
     return StructureDesign("plates", np.vstack([corners for corners, _ in parts]), np.vstack(faces))
 
 
-def scene_of(count, inward, missing=lambda x, z: x < -1e9, seed=1, sigma=0.4, clutter=None, spacing=5.5):
+def scene_of(count, inward, missing=lambda x, z: x < -1e9, seed=1, sigma=0.4, clutter=None, spacing=8.0):
     """Scans of a row of plates from two stations; ``inward`` and ``missing`` are functions of x and z.
 
     ``clutter``: x, y, z and radius of a ball between the stations and the plates.

@@ -76,3 +76,13 @@ def read_over(page, across, downs):
             page.mouse.move(box["x"] + column / across * box["width"], box["y"] + down * box["height"])
             read.add(said.text_content())
     return read
+
+
+def dragged(page, right, down):
+    """What the view in space shows after it was dragged by so many pixels."""
+    box = page.locator("canvas.space").bounding_box()
+    page.mouse.move(box["x"] + 100, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 100 + right, box["y"] + 100 + down, steps=3)
+    page.mouse.up()
+    return picture(page)

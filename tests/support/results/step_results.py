@@ -1,13 +1,17 @@
 """Results of stitching and of the search for defects, made by hand: all that they say, and no numbers that count."""
 
+import dataclasses
+
 import numpy as np
 
 from processor.defects.result import Curve, DefectClass, Defects, Picture, SurfacePlaces, Windows
 from processor.defects.result import Result as DefectsResult
-from processor.model import Scan, Scene, StepRun, StructureDesign, reason
+from processor.inspection.result import AxisDepartures, Characteristics, InspectedComponent, Quantity
+from processor.inspection.result import Result as Inspection
+from processor.model import Scan, Scene, StepRun, StructureDesign, Verdict, reason
 from processor.pipeline import Execution
 from processor.stitching.common_point_checks import UnitSlip
-from processor.stitching.result import Closures, Pairs, Scans
+from processor.stitching.result import Closures, ControlPoints, ControlSightings, Pairs, Scans
 from processor.stitching.result import Result as Stitching
 
 PROVENANCE = {"input": "site", "input_sha256": "0" * 64, "seed": 0, "software": {}, "parameters": []}
@@ -87,6 +91,39 @@ def stitching(names=("S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "S9")):
         status="partial", method="automatic", reasons=reasons, reference=names[0], scans=scans, pairs=pairs,
         closures=Closures(loop=(loop,), mm=np.array([0.4]), mrad=np.array([0.1]), ratio=np.array([1.1])),
     )  # fmt: skip
+
+
+def stitched_with_control():
+    """The same, with control points and the frame of a site."""
+    sightings = ControlSightings(
+        point=("P1", "=P2"), scan=("S1", "S2"), off=np.ones((2, 3)), sd=np.ones((2, 3)), share=np.ones(2),
+        used=[True, False],
+    )  # fmt: skip
+    control = ControlPoints(holds=True, redundancy=3, ratio=0.9, sightings=sightings)
+    return dataclasses.replace(stitching(), control=control, frame="GLCS", T_GLCS_PRCS=np.eye(4))
+
+
+def inspection():
+    """Two components: of one four characteristics, one not measured, and an axis; the other not registered."""
+    nan = float("nan")
+    found = Characteristics(
+        id=("length", "twist", "sweep", "end-squareness-over-width"),
+        quantity=(Quantity.LENGTH, Quantity.TWIST, Quantity.SWEEP, Quantity.SQUARENESS),
+        nominal=[12000.0, 0.0, 0.0, 0.0], actual=[12003.5, 1.25, -2.0, nan], deviation=[3.5, 1.25, -2.0, nan],
+        ci95=[0.5, 0.2, 0.3, nan], lower=[-4.8, nan, -6.0, -2.0], upper=[4.8, nan, 6.0, 2.0], unit=("mm",) * 4,
+        verdict=(Verdict.PASS, Verdict.NONE, Verdict.FAIL, Verdict.INDETERMINATE),
+        limit=("part_length_mm", "", "part_sweep_mm", "part_squareness_mm"), clause=("GB", "", "GB", "GB"),
+        verified=[False, False, False, False],
+        reasons=((), (), (), (reason("inspect.end-not-measured", ends=("end",)),)),
+    )  # fmt: skip
+    axis = AxisDepartures(
+        chainage=[100.0, 300.0], sideways=[0.0, -2.0], sideways_ci95=[0.1, 0.3], up=[0.0, 1.0], up_ci95=[0.1, 0.2]
+    )
+    parts = (
+        InspectedComponent(name="rib1", characteristics=found, axis=axis),
+        InspectedComponent(name="rib2", status="failed", reasons=(reason("inspect.not-registered"),)),
+    )
+    return Inspection(status="partial", method="default", components=parts)
 
 
 CLASSES = tuple(DefectClass)
