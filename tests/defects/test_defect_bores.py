@@ -7,6 +7,7 @@ import trimesh
 from processor.defects import alignment, observations, surface_charts
 from processor.defects import step as defects_step
 from processor.model import Scan, Scene, StructureDesign
+from tests.support.scenes.at_design import AT_DESIGN
 
 INNER, OUTER, LENGTH = 400.0, 412.0, 1500.0
 STATIONS = {"S1": np.array([300.0, -4000.0, 100.0]), "S2": np.array([1200.0, -4500.0, -200.0])}
@@ -27,16 +28,16 @@ def half_pipe():
     mesh = trimesh.Trimesh(vertices, np.vstack([sides, caps[:, ::-1], caps + n]), process=False)
     mesh.fix_normals()
     assert mesh.is_watertight
-    assert mesh.volume == pytest.approx(0.5 * np.pi * (OUTER**2 - INNER**2) * LENGTH, rel=1e-3)
+    assert mesh.volume == pytest.approx(0.5 * np.pi * (OUTER**2 - INNER**2) * LENGTH, rel=1e-3)  # of 180 chords
     return np.array(mesh.vertices), np.array(mesh.faces, np.int64)
 
 
-def scene_of(offset_mm, seed=1, dent=DENT):
+def scene_of(offset_mm, dent=DENT):
     """Scans of the inner face, pushed into its steel by a dent at its middle; the ranges of S2 have an offset."""
     vertices, faces = half_pipe()
-    rng, scans = np.random.default_rng(seed), []
+    rng, scans = np.random.default_rng(1), []
     for name, position in STATIONS.items():
-        n = 60_000
+        n = 30_000
         x, angle = rng.uniform(0.0, LENGTH, n), rng.uniform(-0.45 * np.pi, 0.45 * np.pi, n)
         away = (x - 0.5 * LENGTH) ** 2 + (INNER * angle) ** 2
         radius = INNER + dent * np.maximum(1.0 - away / WIDE**2, 0.0) ** 2
@@ -82,8 +83,8 @@ def test_the_offset_of_a_station_that_saw_a_hollow_face():
 
 
 def test_a_dent_of_a_hollow_face_is_found():
-    result = defects_step.run(scene_of(0.3), defects_step.Params())
+    result = defects_step.run(scene_of(0.3), defects_step.Params(), AT_DESIGN)
     assert result.examined_mm2 > 0.8 * 0.9 * np.pi * INNER * LENGTH
     assert [str(kind) for kind in result.defects.defect_class] == ["dent"]
     assert abs(abs(result.defects.depth_max[0]) - DENT) < max(0.4, result.defects.depth_ci95[0])
-    np.testing.assert_allclose(result.defects.centre[0], [0.5 * LENGTH, INNER, 0.0], atol=20.0)
+    np.testing.assert_allclose(result.defects.centre[0], [0.5 * LENGTH, INNER, 0.0], atol=20.0)  # about a cell

@@ -6,83 +6,39 @@ import pytest
 import trimesh
 from scipy.stats import poisson
 
-import designgen
 from processor.defects import component_shapes, detect, shape_models, step, surface_charts
 from processor.defects.component_shapes import ComponentShape, SignificantShape
 from processor.defects.movement import moved_bodies
-from processor.model import DesignBodies, Scene
+from processor.model import DesignBodies
 from processor.scan_folder import cad
+from tests.support.made import made
+from tests.support.scenes.at_design import AT_DESIGN
+from tests.support.scenes.portal_scenes import box, portal_scene
 
-FINE, COARSE = {"scan.step_mrad": 2.5}, {"scan.step_mrad": 3.5}
-DENT = {"asbuilt.beam.dent_at_mm": [800.0, -75.0, 2115.0], "asbuilt.beam.dent_radius_mm": 70.0}
-
-
-def box(x, y, z, a, b, c):
-    return cq.Solid.makeBox(a, b, c, cq.Vector(x, y, z))
-
-
-def section(width, height, web, flange):
-    """A rolled I section's outline, as flange, web, flange."""
-    whole = cq.Workplane().rect(height - 2.0 * flange, web)
-    whole = whole.extrude(2000.0)
-    for side in (-1.0, 1.0):
-        whole = whole.union(
-            cq.Workplane().center(side * 0.5 * (height - flange), 0.0).rect(flange, width).extrude(2000.0)
-        )
-    return whole
-
-
-def portal(gap):
-    """Base plate, column, cap, stiffener, beam and tube; they lie ``gap`` mm apart, or overlap."""
-    bodies = {
-        "base": box(-200, -200, -20, 400, 400, 20),
-        "column": section(200, 200, 8, 12).translate((0, 0, gap)).val(),
-        "cap": box(-150, -150, 2000 + 2 * gap, 300, 300, 15),
-        "stiffener": box(-88 + gap, 4 + gap, 900, 176 - 2 * gap, 90, 12),
-        "beam": box(-250, -75, 2015 + 3 * gap, 1500, 150, 200),
-        "tube": cq.Solid.makeCylinder(60, 1200, cq.Vector(100 + gap, 0, 1200), cq.Vector(1, 0, 0)),
-    }
-    whole = cq.Assembly(name="portal")
-    for name, shape in bodies.items():
-        whole.add(shape, name=name)
-    return whole
-
-
-def scanned(gap, seed, built=None):
-    settings = {**FINE, **built} if built else COARSE
-    return designgen.scan(portal(gap), stations=5, seed=seed, settings=settings)
-
-
-def found(scene: Scene):
-    return step.run(scene, step.Params())
+COARSE, MOVE = {"scan.step_mrad": 3.5}, 10.0
+DAMAGED = {
+    "scan.step_mrad": 2.5, "asbuilt.tube.move_mm": [0.0, 0.0, MOVE], "asbuilt.beam.dent_mm": 5.0,
+    "asbuilt.beam.dent_at_mm": [800.0, -75.0, 2115.0], "asbuilt.beam.dent_radius_mm": 70.0,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("gap", [0.0, -0.1])
 def test_bodies_in_contact_as_designed_have_no_defects(gap):
-    scene, _ = scanned(gap, 1)
-    result = found(scene)
+    result = step.run(made(portal_scene, gap, COARSE), step.Params(), AT_DESIGN if gap else {})
     assert result.examined_mm2 > 1.0e6
     # One false alarm on 100 m2 is asked for: the limit has a chance of 0.1 %.
     assert len(result.defects) <= poisson.ppf(0.999, result.examined_mm2 / 1e8)
 
 
-@pytest.mark.parametrize("move", [10.0])
-def test_moved_body_is_reported_once_by_name_without_false_defects(move):
-    built = {"asbuilt.tube.move_mm": [0.0, 0.0, move], "asbuilt.beam.dent_mm": 5.0, **DENT}
-    scene, _ = scanned(0.0, 1, built)
-    defects = found(scene).defects
-    sure = {
-        (name, kind.value): k
-        for k, (name, kind, doubtful) in enumerate(
-            zip(defects.component, defects.defect_class, defects.doubtful, strict=True)
-        )
-        if not doubtful
-    }
+def test_moved_body_is_reported_once_by_name_without_false_defects():
+    defects = step.run(made(portal_scene, 0.0, DAMAGED), step.Params(), AT_DESIGN).defects
+    rows = zip(defects.component, defects.defect_class, defects.doubtful, strict=True)
+    sure = {(name, kind.value): k for k, (name, kind, doubtful) in enumerate(rows) if not doubtful}
     assert set(sure) == {("tube", "misalignment"), ("beam", "pit")}
     assert len(sure) == int((~defects.doubtful).sum()), "one report a body"
     row = sure["tube", "misalignment"]
-    assert abs(abs(defects.depth_max[row]) - move) < 1.5 * defects.depth_ci95[row]  # 99.7 %
-    swept = 120.0 * 1200.0 * move  # what a tube sweeps across its axis
+    assert abs(abs(defects.depth_max[row]) - MOVE) < 1.5 * defects.depth_ci95[row]  # 99.7 %
+    swept = 120.0 * 1200.0 * MOVE  # what a tube sweeps across its axis
     assert abs(abs(defects.volume_mm3[row]) - swept) < 1.5 * defects.volume_ci95[row] < 0.1 * swept
 
 
@@ -98,7 +54,7 @@ def test_a_body_is_moved_as_its_shape_states():
     arm = surface.vertices - frame.origin
     turned = np.stack([arm[:, 0] * np.cos(angle) - arm[:, 1] * np.sin(angle),
                        arm[:, 0] * np.sin(angle) + arm[:, 1] * np.cos(angle), arm[:, 2]], axis=1)  # fmt: skip
-    assert design.vertices == pytest.approx(turned + frame.origin + [1.0, -2.0, 3.0], abs=1e-9)
+    assert design.vertices == pytest.approx(turned + frame.origin + [1.0, -2.0, 3.0], abs=1e-9)  # float64
     assert design.bodies.names == ("box",)
 
 
@@ -142,16 +98,17 @@ def test_bodies_of_one_name_and_without_a_name_are_numbered_and_counted():
 def test_uncertainty_of_a_movement_at_an_unseen_corner_equals_its_scatter():
     """Of a beam of which a third was seen, the fitted movement of the far end is turned by the noise of that third."""
     frame = shape_models.Frame(np.zeros(3), np.eye(3), np.array([1500.0, 150.0, 6.0]), 150.0)
-    rng, sigma = np.random.default_rng(4), 0.2
+    rng, sigma, trials = np.random.default_rng(4), 0.2, 300
     places = np.stack([rng.uniform(-1500.0, -500.0, 80), rng.uniform(-150.0, 150.0, 80), np.full(80, 6.0)], axis=1)
     up, weight = np.tile([0.0, 0.0, 1.0], (80, 1)), np.full(80, sigma**-2)
     corners, z, beyond = np.array([[1500.0, 150.0, 6.0], [-1000.0, 0.0, 6.0]]), [], 0
-    for _ in range(400):
+    for _ in range(trials):
         blocks = shape_models.Blocks(places, up, rng.normal(0.0, sigma, 80), weight, 50.0)
         seen = shape_models.Observations(blocks, frame, places, up)
         (shape,) = seen.shapes([(shape_models.RIGID, ())])
         z.append(shape.values(frame, corners, up[:2]) / shape.sd(frame, corners, up[:2]))
         everywhere = np.abs(shape.values(frame, places, up)) / shape.sd(frame, places, up)
         beyond += component_shapes.deviate_of_one(float(everywhere.max()), len(shape.factors)) > 1.96
-    np.testing.assert_allclose(np.sqrt(np.mean(np.square(z), axis=0)), 1.0, atol=4.0 / np.sqrt(800.0))
-    assert beyond < 0.05 * 400 + 3.0 * np.sqrt(0.05 * 400)  # a bound, for the three factors that are seen of six
+    # Four sds of a root mean square; and a bound, for the three factors that are seen of six.
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(z), axis=0)), 1.0, atol=4.0 / np.sqrt(2.0 * trials))
+    assert beyond < 0.05 * trials + 3.0 * np.sqrt(0.05 * trials)

@@ -33,6 +33,9 @@ def run(scene, **params):
     return defects_step.run(scene, defects_step.Params(**params), AT_DESIGN)
 
 
+DEEP = 0.1  # of a depth: a fit by noisy cells of a tenth of the radius, over which the middle is 1 % less deep
+
+
 def found(result):
     return list(zip(result.defects.defect_class, result.defects.component, strict=True))
 
@@ -65,7 +68,7 @@ def test_chance_detections_are_flagged_doubtful():
 def from_behind(scene, inward, count, seed):
     """The scene with a scan of the plates' backs, which ``inward`` (x, z) moves as it does the fronts."""
     rng, station = np.random.default_rng(seed), np.array([0.5 * count * (SIDE + GAP), 4000.0, 600.0])
-    n = int((SIDE / 5.5) ** 2)
+    n = int((SIDE / 8.0) ** 2)
     parts = []
     for i in range(count):
         x, z = i * (SIDE + GAP) + rng.uniform(0.0, SIDE, n), rng.uniform(0.0, SIDE, n)
@@ -85,33 +88,30 @@ def test_a_plate_dented_through_is_one_defect_though_both_sides_show_it(depth):
     assert sorted(name for _, name in found(result)) == ["component-1", "component-2"]
     kind, _ = next(row for row in found(result) if row[1] == "component-1")
     assert kind in ("dent", "bulge")
-    assert abs(result.defects.depth_max[result.defects.component.index("component-1")]) == pytest.approx(4.0, rel=0.1)
+    assert abs(result.defects.depth_max[result.defects.component.index("component-1")]) == pytest.approx(4.0, rel=DEEP)
 
 
 def test_a_dent_a_bulge_and_a_pit_are_measured():
-    dent, bulge, pit = (
-        bump(3.0, 90.0, (250.0, 300.0)),
-        bump(-2.0, 80.0, (1250.0, 350.0)),
-        bump(4.0, 16.0, (2100.0, 200.0)),
-    )
-    scene = scene_of(3, lambda x, z: dent(x, z) + bulge(x, z) + pit(x, z), spacing=3.0)
+    bumps = {"dent": (3.0, 90.0, (250.0, 300.0)), "bulge": (-2.0, 80.0, (1250.0, 350.0)),
+             "pit": (4.0, 16.0, (2100.0, 200.0))}  # fmt: skip
+    scene = scene_of(3, lambda x, z: sum(bump(*one)(x, z) for one in bumps.values()), spacing=3.0)
     result = run(scene)
     assert sorted(found(result)) == [("bulge", "component-2"), ("dent", "component-1"), ("pit", "component-3")]
     assert not result.defects.doubtful.any()
-    for kind, depth, radius, at in (("dent", 3.0, 90.0, (250.0, 300.0)), ("bulge", -2.0, 80.0, (1250.0, 350.0)),
-                                    ("pit", 4.0, 16.0, (2100.0, 200.0))):  # fmt: skip
+    for kind, (depth, radius, at) in bumps.items():
         k = result.defects.defect_class.index(kind)
-        assert abs(result.defects.depth_max[k] - depth) < max(0.1 * abs(depth), 2.0 * result.defects.lod95[k])
-        assert abs(result.defects.depth_max[k] - depth) < 2.5 * result.defects.depth_ci95[k]
+        off = abs(result.defects.depth_max[k] - depth)
+        assert off < max(DEEP * abs(depth), 2.0 * result.defects.lod95[k])
+        assert off < 2.5 * result.defects.depth_ci95[k]
         np.testing.assert_allclose(result.defects.centre[k], [at[0], 0.0, at[1]], atol=0.1 * radius + 1.0)
         assert result.defects.confidence[k] > 0.9
         deep = np.linalg.norm(result.surface.points - [at[0], 0.0, at[1]], axis=1) < 0.1 * radius + result.cell
         assert set(result.surface.defect[deep].tolist()) in ({k}, {-1, k})
         if kind != "pit":  # outward positive, and nearly as deep as its middle
             assert np.median(result.surface.deviation[deep]) == pytest.approx(-depth, rel=0.15)
-        # A third of the cylinder about a bump (1 - r^2 / R^2)^2.
-        if kind != "pit":
+            # A third of the cylinder about a bump (1 - r^2 / R^2)^2; its foot is lost in the noise.
             assert result.defects.volume_mm3[k] == pytest.approx(np.pi * radius**2 * depth / 3.0, rel=0.05)
+            # Of the middle alone; over a cell of a sixth of the radius a twentieth is lost, and noise counts twice.
             curvature = 4.0 * abs(depth) / radius**2 * 1000.0
             assert result.defects.curvature_per_m[k] == pytest.approx(curvature, rel=0.35)
 
@@ -129,6 +129,7 @@ def test_missing_corners_edges_and_holes_are_named():
     ]  # fmt: skip
     np.testing.assert_allclose(result.defects.depth_max, THICK)
     area = dict(zip(result.defects.component, result.defects.area_mm2, strict=True))
+    # Half a cell of 6 mm at either border of a size.
     assert area["component-1"] == pytest.approx(90.0**2, rel=0.15)
     assert area["component-2"] == pytest.approx(80.0 * 50.0, rel=0.2)
     assert area["component-3"] == pytest.approx(np.pi * 50.0**2, rel=0.15)
@@ -177,7 +178,7 @@ def test_surface_in_the_shadow_of_clutter_is_not_missing():
     ],
 )
 def test_shapes_of_whole_components(kind, inward, depth):
-    """On the second of four plates; the others determine the pose of the whole."""
+    """On the second of four plates; the others determine the pose of the whole, to 0.05 mm."""
     result = run(scene_of(4, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)))
     assert found(result) == [(kind, "component-2")]
     assert abs(result.defects.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
@@ -188,21 +189,10 @@ def test_shapes_of_whole_components(kind, inward, depth):
         assert abs(volume - 2.0 * SIDE**2) < ci95
         assert 0.5 < ci95 / SIDE**2 / result.defects.depth_ci95[0] <= 1.0
     curve = result.defects.deflection[0]
-    assert len(curve.displacement) == (40 if kind == "bend" else 0)
+    assert (len(curve.displacement) > 25) == (kind == "bend")
     if kind == "bend":
         at = curve.along
-        np.testing.assert_allclose(curve.displacement, -3.0 * np.cos(np.pi * at / SIDE), atol=0.06)
-
-
-def test_stations_that_are_off_are_no_defect():
-    """Each station has its range zero wrong by half a millimetre, the other way each."""
-    scene = scene_of(3, flat)
-    scans = []
-    for scan, off in zip(scene.scans, (0.5, -0.5), strict=True):
-        ray = scan.points - scan.position
-        scans.append(dataclasses.replace(scan, points=scan.points + off * ray / np.linalg.norm(ray, axis=1)[:, None]))
-    result = run(dataclasses.replace(scene, scans=tuple(scans)))
-    assert found(result) == []
+        np.testing.assert_allclose(curve.displacement, -3.0 * np.cos(np.pi * at / SIDE), atol=0.06)  # 2 % of 3 mm
 
 
 def test_unsettled_alignment_gives_the_same_pose_as_a_settled_one(monkeypatch):
@@ -211,8 +201,9 @@ def test_unsettled_alignment_gives_the_same_pose_as_a_settled_one(monkeypatch):
     settled = run(scene)
     monkeypatch.setattr(detect, "AGAIN_MM", 0.0)
     again = run(scene)
+    # Plates fix y: noise of 0.4 mm, 40,000 points, and a prior of 1 mm for the pose, which draws it by 1 %.
     assert settled.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
-    np.testing.assert_allclose(again.T_design_project[1], settled.T_design_project[1], atol=0.01)  # plates fix y
+    np.testing.assert_allclose(again.T_design_project[1], settled.T_design_project[1], atol=0.01)
     assert again.covariance.shape == (6, 6)
     assert 0.0 < np.sqrt(again.covariance[4, 4]) < 1.0
 
@@ -221,7 +212,7 @@ def test_no_defect_is_sure_where_another_attitude_fits_as_well():
     """A dent in a box that looks the same from four sides, scanned in a frame of its own."""
     vertices, faces = box((0.0, 0.0, 0.0), (2000.0, 600.0, 400.0))
     solid = trimesh.Trimesh(vertices, faces, process=False)
-    points, facet = trimesh.sample.sample_surface(solid, 60_000, seed=1)
+    points, facet = trimesh.sample.sample_surface(solid, 40_000, seed=1)
     depth = bump(9.0, 150.0, (700.0, 300.0))(points[:, 0], points[:, 1]) * (solid.face_normals[facet][:, 2] > 0.5)
     points = points - [0.0, 0.0, 1.0] * depth[:, None] + np.random.default_rng(1).normal(0.0, 0.3, points.shape)
     T = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 2.0])), np.array([5e4, -3e4, 2e3]))
@@ -247,7 +238,7 @@ def test_the_order_of_points_and_the_place_in_the_world_do_not_matter(dented):
     mixed = [dataclasses.replace(s, points=np.random.default_rng(5).permutation(s.points)) for s in scene.scans]
     again = run(dataclasses.replace(scene, scans=tuple(mixed)))
     assert found(again) == found(first)
-    np.testing.assert_allclose(again.defects.depth_max, first.defects.depth_max, atol=1e-6)
+    np.testing.assert_allclose(again.defects.depth_max, first.defects.depth_max, atol=1e-6)  # sums in other orders
     np.testing.assert_allclose(again.defects.centre, first.defects.centre, atol=1e-6)
     far = np.array([4.5e8, 3.2e9, 1e5])
     T = np.eye(4)
@@ -256,8 +247,9 @@ def test_the_order_of_points_and_the_place_in_the_world_do_not_matter(dented):
         "far", "structure", tuple(dataclasses.replace(s, T_project_scan=T) for s in scene.scans),
         structure=StructureDesign("far", scene.structure.vertices + far, scene.structure.faces),
     )  # fmt: skip
-    there = defects_step.run(moved, defects_step.Params())
+    there = run(moved)
     assert found(there) == found(first)
+    # Coordinates of 3e9 mm are known to 5e-7 mm; poses about their middle to some 1e-4 of a cell.
     np.testing.assert_allclose(there.defects.depth_max, first.defects.depth_max, atol=1e-3)
     np.testing.assert_allclose(there.defects.centre - far, first.defects.centre, atol=1e-2)
 
@@ -267,8 +259,8 @@ def test_the_papers_chain_finds_a_dent_and_is_seeded():
     params = defects_step.Params(method="paper", paper=baseline.Paper(trials=60, feature_points=80))
     result = defects_step.run(scene, params)
     assert set(result.defects.defect_class) == {"unknown"}
-    np.testing.assert_allclose(result.defects.centre[0], [250.0, 2.0, 300.0], atol=12.0)
-    assert result.defects.depth_max[0] == pytest.approx(5.0, abs=1.2)
+    np.testing.assert_allclose(result.defects.centre[0], [250.0, 2.0, 300.0], atol=12.0)  # a tenth of its radius
+    assert result.defects.depth_max[0] == pytest.approx(5.0, abs=1.2)  # three sds of the noise, of single points
     assert len(result.defects.deflection[0].along) > 5
     again = defects_step.run(scene, params)
     np.testing.assert_array_equal(again.defects.depth_max, result.defects.depth_max)
@@ -284,14 +276,12 @@ def test_defects_in_results_json_have_the_documented_keys(dented):
 
 def test_scene_without_design_or_points_and_bad_parameters_are_refused():
     scene = scene_of(2, flat, spacing=20.0)
-    with pytest.raises(InputError, match="design"):
-        defects_step.run(dataclasses.replace(scene, structure=None), defects_step.Params())
-    with pytest.raises(InputError, match="points"):
-        defects_step.run(dataclasses.replace(scene, scans=()), defects_step.Params())
-    with pytest.raises(UsageError, match="reach_mm"):
-        defects_step.run(scene, defects_step.Params(reach_mm=0.0))
-    with pytest.raises(UsageError, match="method"):
-        defects_step.run(scene, defects_step.Params(method="magic"))
+    for changed, name in (({"structure": None}, "design"), ({"scans": ()}, "points")):
+        with pytest.raises(InputError, match=name):
+            defects_step.run(dataclasses.replace(scene, **changed), defects_step.Params())
+    for params in ({"reach_mm": 0.0}, {"method": "magic"}):
+        with pytest.raises(UsageError, match=next(iter(params))):
+            defects_step.run(scene, defects_step.Params(**params))
 
 
 # --- parts of it ---------------------------------------------------------------------------------------------------
@@ -362,31 +352,10 @@ def test_covariance_of_station_shifts_includes_undetermined_directions():
     assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
-def test_facets_are_the_nearest_that_a_scanner_can_see():
-    vertices, faces = box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0))
-    normals = np.array(trimesh.Trimesh(vertices, faces, process=False).face_normals)  # writeable, as the step has them
-    rng = np.random.default_rng(3)
-    points = rng.uniform([-30.0, -30.0, -30.0], [330.0, 42.0, 230.0], (2000, 3))
-    grid = mesh_distance.facet_grid(vertices, faces, normals, 60.0)
-    facet, distance = mesh_distance.nearest_visible(grid, points, np.zeros((1, 3)), np.full(2000, -1))
-    _, true, _ = trimesh.proximity.closest_point_naive(trimesh.Trimesh(vertices, faces, process=False), points)
-    corner = vertices[faces[facet, 0]]
-    np.testing.assert_allclose(distance, np.einsum("ni,ni->n", points - corner, normals[facet]), atol=1e-9)
-    nearest = np.array([trimesh.triangles.closest_point(vertices[faces[f]][None], p[None])[0]
-                        for f, p in zip(facet, points, strict=True)])  # fmt: skip
-    np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), true, atol=1e-9)
-    # Deep in the plate, nearer to its back, but seen from the front.
-    deep = np.array([[150.0, 9.0, 100.0]])
-    facet, distance = mesh_distance.nearest_visible(
-        grid, deep, np.array([[150.0, -4000.0, 100.0]]), np.zeros(1, np.int64)
-    )
-    assert distance[0] == pytest.approx(-9.0)
-    np.testing.assert_allclose(normals[facet[0]], [0.0, -1.0, 0.0])
-
-
 def test_cells_cover_the_area_of_a_design():
     plate = surface_charts.of_mesh(*box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0)), 5.0)
     area = 2.0 * (300.0 * 200.0 + 300.0 * 12.0 + 200.0 * 12.0)
+    # Cells at borders have the share of their samples that is on the body: 1 / 20 of a cell at a border is not known.
     assert plate.area_mm2 == pytest.approx(area, rel=0.02)
     assert len(plate.names) == 1
     assert thickness_at(plate, np.array([100.0, 0.0, 90.0]), np.array([0.0, -1.0, 0.0]), 0) == pytest.approx(12.0)
@@ -466,6 +435,7 @@ def test_shape_of_a_deformed_plate_is_identified_and_a_flat_plate_has_none(kind,
     assert [one.kind for one in fitted.shapes] == ([kind] if kind else [])
     if kind:
         value = fitted.shapes[0].values(frame, points, outward)
+        # Two sds of the noise; a step's own line lies within half a cell of where it is.
         np.testing.assert_allclose(value, height(points), atol=0.06 if kind != "step" else 0.7)
 
 
@@ -497,86 +467,55 @@ def test_pieces_in_line_with_a_crack_are_joined_and_others_are_not():
 # --- what should have been seen ------------------------------------------------------------------------------------
 
 
-def plates_on_a_wall(gone, gap=0.0):
-    """Expected and missing places of a wall with two plates on it, the points from one station in front of it."""
-    wall = box((0.0, 0.0, 0.0), (2000.0, 20.0, 1000.0))
+@pytest.mark.parametrize("gap", [-0.1, 0.0, 0.1])
+def test_faces_that_touch_another_body_are_not_missing(gap):
+    """A wall with two plates on it, the points from one station in front of it."""
     plates = [box((x, -10.0 - gap, 300.0), (x + 400.0, -gap, 700.0)) for x in (300.0, 1300.0)]
-    solids = [wall, *plates]
-    vertices = np.vstack([corners for corners, _ in solids])
-    faces = np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)])
-    built = solids[:-1] if gone else solids
+    design = design_of_solids(box((0.0, 0.0, 0.0), (2000.0, 20.0, 1000.0)), *plates)
     rng = np.random.default_rng(1)
-    station = np.array([1000.0, -4000.0, 500.0])
-    x, z = rng.uniform(0.0, 2000.0, 80_000), rng.uniform(0.0, 1000.0, 80_000)
+    x, z = rng.uniform(0.0, 2000.0, 25_000), rng.uniform(0.0, 1000.0, 25_000)
     y = np.zeros(len(x))
-    for corners, _ in built[1:]:
+    for corners, _ in plates:
         low, high = corners.min(axis=0), corners.max(axis=0)
         y = np.where((x > low[0]) & (x < high[0]) & (z > low[2]) & (z < high[2]), low[1], y)
     points = np.stack([x, y + rng.normal(0.0, 0.3, len(x)), z], axis=1)
-    scene = Scene(
-        "wall", "structure", (Scan("S1", points, position=station, T_project_scan=np.eye(4)),),
-        structure=StructureDesign("wall", vertices, faces),
-    )  # fmt: skip
-    return run(scene, align=False, registration_error_mm=0.01)
+    scan = Scan("S1", points, position=np.array([1000.0, -4000.0, 500.0]), T_project_scan=np.eye(4))
+    scene = Scene("wall", "structure", (scan,), structure=design)
+    assert found(run(scene, align=False, registration_error_mm=0.01)) == []
 
 
-@pytest.mark.parametrize("gap", [-0.1, 0.0, 0.1])
-def test_faces_that_touch_another_body_are_not_missing(gap):
-    assert found(plates_on_a_wall(gone=False, gap=gap)) == []
-
-
-def test_lines_of_sight_end_at_facets():
-    """Lines from a wide plate to a far place cross a narrow plate 600 mm before it, or pass beside it."""
-    near, far = box((0.0, 0.0, 0.0), (1000.0, 10.0, 1000.0)), box((-500.0, 600.0, -500.0), (1500.0, 610.0, 1500.0))
-    vertices, faces = np.vstack([near[0], far[0]]), np.vstack([near[1], far[1] + 8])
-    surface = surface_charts.of_mesh(vertices, faces, 100.0)
-    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 30.0)
-    rng = np.random.default_rng(3)
-    starts = np.stack([rng.uniform(-450, 1450, 400), np.full(400, 599.0), rng.uniform(-450, 1450, 400)], axis=1)
-    ends = np.repeat([[500.0, -6000.0, 450.0]], 400, axis=0)
-    shares = {y: (599.0 - y) / 6599.0 for y in (10.0, 0.0)}
-    at = [starts + share * (ends - starts) for share in shares.values()]
-    crossed = np.array([((p[:, [0, 2]] > 0.0) & (p[:, [0, 2]] < 1000.0)).all(axis=1) for p in at])
-    row, _, share = mesh_distance.crossings(grid, starts, ends, False)
-    across = np.array([np.isclose(share, expected) for expected in shares.values()])
-    for k in range(2):
-        assert 0 < crossed[k].sum() < 400
-        np.testing.assert_array_equal(np.sort(row[across[k]]), np.flatnonzero(crossed[k]))
-    sides = crossed.any(axis=0)
-    assert set(mesh_distance.crossings(grid, starts, ends, True)[0]) >= set(np.flatnonzero(sides).tolist())
+def design_of_solids(*solids):
+    vertices = np.vstack([corners for corners, _ in solids])
+    return StructureDesign("solids", vertices, np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)]))
 
 
 def girder_with_brackets(gone):
     """A web with brackets standing off it, seen from two stations above and below; the last bracket may be gone."""
     solids = [box((0.0, 0.0, 0.0), (3000.0, 14.0, 1400.0))]
     solids += [box((x, -140.0, 700.0), (x + 400.0, 0.0, 714.0)) for x in (300.0, 1300.0, 2300.0)]
-    vertices = np.vstack([corners for corners, _ in solids])
-    faces = np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)])
     built = trimesh.util.concatenate(
         [trimesh.Trimesh(corners, own, process=False) for corners, own in (solids[:-1] if gone else solids)]
     )
+    surface = surface_charts.of_mesh(np.asarray(built.vertices), np.asarray(built.faces).astype(np.int64), 100.0)
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 50.0)
     scans = []
     for seed, station in enumerate(([1500.0, -3500.0, 2500.0], [1500.0, -3500.0, -1200.0])):
         position = np.array(station)
-        points, facet = trimesh.sample.sample_surface(built, 80_000, seed=seed)
+        points, facet = trimesh.sample.sample_surface(built, 50_000, seed=seed)
         points, normal = np.asarray(points), np.asarray(built.face_normals)[facet]
         front = np.einsum("ni,ni->n", position - points, normal) > 0.0
         points, normal = points[front], normal[front]
-        surface = surface_charts.of_mesh(np.asarray(built.vertices), np.asarray(built.faces).astype(np.int64), 100.0)
-        grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 50.0)
         hidden = mesh_distance.crossings(grid, points + normal, np.repeat(position[None], len(points), axis=0), True)[0]
         points = np.delete(points, hidden, axis=0)
         ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
         points = points + np.random.default_rng(seed).normal(0.0, 0.3, len(points))[:, None] * ray
         scans.append(Scan(f"S{seed}", points, position=position, T_project_scan=np.eye(4)))
-    design = StructureDesign("girder", vertices, faces)
-    return Scene("girder", "structure", tuple(scans), structure=design)
+    return Scene("girder", "structure", tuple(scans), structure=design_of_solids(*solids))
 
 
 def test_a_part_that_is_gone_is_missing_where_scanners_see_through_it():
-    params = defects_step.Params(align=False, registration_error_mm=0.01)
-    whole = defects_step.run(girder_with_brackets(gone=False), params, AT_DESIGN)
-    assert found(whole) == []
-    result = defects_step.run(girder_with_brackets(gone=True), params)
+    settings = {"align": False, "registration_error_mm": 0.01}
+    assert found(run(girder_with_brackets(gone=False), **settings)) == []
+    result = run(girder_with_brackets(gone=True), **settings)
     assert result.defects.defect_class == ("missing-part",)
-    np.testing.assert_allclose(result.defects.centre[0], [2500.0, -70.0, 707.0], atol=60.0)
+    np.testing.assert_allclose(result.defects.centre[0], [2500.0, -70.0, 707.0], atol=60.0)  # two to three cells

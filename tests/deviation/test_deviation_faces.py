@@ -8,7 +8,7 @@ import trimesh
 
 from processor.deviation import assignment
 from processor.deviation import step as deviation_step
-from processor.geometry import mesh_bodies, mesh_distance
+from processor.geometry import mesh_distance
 from processor.model import Scan, Scene, StructureDesign
 from tests.support.clouds.plate_clouds import AS_IT_LIES, SIGMA, STATIONS, plate
 
@@ -20,12 +20,13 @@ def from_edge(core, thickness):
     return distance.min(axis=1)
 
 
-@pytest.mark.parametrize("thickness", [5.0, 20.0])
-@pytest.mark.parametrize("positions", [False, True])
-@pytest.mark.parametrize("sides", [1, 2])
+@pytest.mark.parametrize(
+    ("thickness", "positions", "sides"),
+    [(5.0, True, 2), (5.0, False, 2), (5.0, False, 1), (20.0, True, 1), (20.0, False, 2)],  # all pairs
+)
 def test_a_plate_as_designed_deviates_nowhere(thickness, positions, sides):
     """Of one of the plates the step itself finds that no other attitude fits better."""
-    scene = plate(thickness, 3, STATIONS[:sides], positions)
+    scene = plate(thickness, 3, STATIONS[:sides], positions, count=40_000)
     params = deviation_step.Params() if (thickness, positions, sides) == (5.0, True, 2) else AS_IT_LIES
     core = deviation_step.run(scene, params).core
     known = np.isfinite(core.lod95)
@@ -44,10 +45,10 @@ def test_a_plate_as_designed_deviates_nowhere(thickness, positions, sides):
 
 
 def test_a_plate_thinner_than_its_noise_has_no_answer_without_positions():
-    scene = plate(1.0, 4, STATIONS, positions=False)
+    scene = plate(1.0, 4, STATIONS, positions=False, count=30_000)
     core = deviation_step.run(scene, AS_IT_LIES).core
     assert np.isfinite(core.lod95).mean() < 0.01
-    scene = plate(1.0, 4, STATIONS, positions=True)
+    scene = plate(1.0, 4, STATIONS, positions=True, count=30_000)
     core = deviation_step.run(scene, AS_IT_LIES).core
     known = np.isfinite(core.lod95)
     assert known.mean() > 0.9
@@ -73,58 +74,12 @@ def test_the_nearest_face_is_taken_and_its_clearance_is_the_distance_of_the_next
     assert not np.isfinite(below.clearance[2])
 
 
-def test_points_inside_or_in_contact_with_another_body_are_enclosed():
-    def box(size, at):
-        return trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
-
-    hollow = box((300, 300, 300), (0, 3000, 0))
-    hollow.invert()  # the cavity of the next
-    bodies = [box((2000, 100, 100), (0, 0, 0)), box((100, 100, 900), (0, 0, 430)), box((200, 100, 20), (900, 0, 60)),
-              box((320, 320, 320), (0, 3000, 0)), hollow]  # fmt: skip
-    mesh = trimesh.util.concatenate(bodies)
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, np.int64)
-    surface = mesh_distance.of_design(vertices, faces)
-    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 20.0)
-    points = np.array(
-        [[0, 0, 50], [500, 0, 50], [0, 50, 0], [0, 0, -20], [900, 0, 50], [900, 0, 50], [900, 0, 70], [150, 3000, 0]],
-        float,
-    )
-    normals = np.array(
-        [[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 0, -1], [0, 0, 1], [0, 0, -1], [0, 0, 1], [-1, 0, 0]], float
-    )
-    inside = mesh_bodies.enclosed(points, normals, grid, mesh_bodies.closed_bodies(surface.faces))
-    # Of the beam below the post; beside it; its side; the post's end; beam and plate in contact; the plate; the cavity.
-    np.testing.assert_array_equal(inside, [True, False, False, True, True, True, False, False])
-    opened = surface.faces[1:]  # a beam without one facet is no body
-    assert (mesh_bodies.closed_bodies(opened)[:11] < 0).all()
-    assert (mesh_bodies.closed_bodies(opened)[11:] >= 0).all()
-
-
-def test_enclosed_by_any_of_many_bodies():
-    """Boxes of any size and place, some within others: what lies in one is computed from their corners."""
-    rng = np.random.default_rng(11)
-    low = rng.uniform(-2000.0, 2000.0, (150, 3))
-    high = low + rng.uniform(5.0, 1500.0, (150, 3)) * rng.choice([1.0, 1.0, 1.0, 0.02], (150, 3))
-    meshes = [trimesh.creation.box(bounds=np.array(corners)) for corners in zip(low, high, strict=True)]
-    mesh = trimesh.util.concatenate(meshes)
-    surface = mesh_distance.of_design(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
-    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 50.0)
-    points, facet = trimesh.sample.sample_surface(mesh, 20_000, seed=1)
-    normals = mesh.face_normals[facet]
-    place = points + mesh_bodies.OUTSIDE_MM * normals
-    gap = np.maximum(low[None] - place[:, None], place[:, None] - high[None]).max(axis=2)  # negative within a box
-    sure = np.abs(gap).min(axis=1) > 0.01
-    inside = mesh_bodies.enclosed(points, normals, grid, mesh_bodies.closed_bodies(surface.faces))
-    assert 0.1 < inside[sure].mean() < 0.9
-    np.testing.assert_array_equal(inside[sure], (gap.min(axis=1) < 0.0)[sure])
-
-
 @pytest.mark.parametrize("offset", [0.0, 0.3])
 def test_stations_that_differ_widen_the_level_of_detection(offset):
     """Five stations see both of a box's large faces from one side; the truth is that of a box as designed."""
     rng = np.random.default_rng(8)
     mesh = trimesh.creation.box((600.0, 600.0, 300.0))
-    points, facet = trimesh.sample.sample_surface(mesh, 40_000, seed=8)
+    points, facet = trimesh.sample.sample_surface(mesh, 20_000, seed=8)
     normals = mesh.face_normals[facet]
     stations, scans = rng.integers(0, 5, len(points)), []
     for k in range(5):

@@ -35,7 +35,7 @@ from processor.model import (
     StructureTruth,
     Truth,
     UsageError,
-)
+)  # fmt: skip
 from processor.pipeline import Execution
 from processor.report import write_results
 from processor.report.deviation import section
@@ -67,6 +67,18 @@ def scene_of(seed, move=field, T_design_scan=None, origin=0.0, count=15_000):
     return Scene("bracket", "structure", (scan,), structure=design, units="mm"), truth
 
 
+def still(points):
+    return 0.0 * points
+
+
+def pose(turn, shift):
+    return rigid.transform(rigid.rotation_from_vector(np.array(turn)), np.array(shift))
+
+
+def run(scene, **params):
+    return deviation_step.run(scene, deviation_step.Params(**params))
+
+
 def codes(result):
     return [reason.code for reason in result.reasons]
 
@@ -77,7 +89,7 @@ def metrics(scene, result, truth):
 
 def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_bad_frame():
     scene, truth = scene_of(1, origin=FAR, count=60_000)
-    result = deviation_step.run(scene, deviation_step.Params())
+    result = run(scene)
     assert (result.status, result.registration) == ("ok", "as given")
     np.testing.assert_array_equal(result.T_design_scan, np.eye(4))
     found = metrics(scene, result, truth)["core points farther from the truth than their LOD95"]
@@ -91,21 +103,14 @@ def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_b
     assert low < result.significant_share < high
     assert "deviation.best-fit-would-move" in codes(result)
     assert 3.0 < result.best_fit_shift @ [0.0, -1.0, 0.0] < 5.0  # as the scan lies 4 mm to +y
-    fitted = deviation_step.run(scene, deviation_step.Params(register="fine"))
+    fitted = run(scene, register="fine")
     assert fitted.registration == "fine"
     assert abs(np.nanmean(fitted.core.distance[result.core.normals[:, 1] > 0.9])) < 0.7  # the best fit has it
-    assert codes(fitted) == [
-        "deviation.no-stable-half",  # it is bent all along
-        "deviation.stable-fit",
-        "deviation.views-by-class",
-    ]
+    # It is bent all along.
+    assert codes(fitted) == ["deviation.no-stable-half", "deviation.stable-fit", "deviation.views-by-class"]
     assert fitted.status == "weak"
-    best = deviation_step.run(scene, deviation_step.Params(register="fine", fit="all"))
-    assert codes(best)[1:] == [
-        "deviation.best-fit",
-        "deviation.stable-fit-would-move",
-        "deviation.views-by-class",
-    ]
+    best = run(scene, register="fine", fit="all")
+    assert codes(best)[1:] == ["deviation.best-fit", "deviation.stable-fit-would-move", "deviation.views-by-class"]
     assert np.linalg.norm(best.best_fit_shift) < 0.05
     assert metrics(scene, fitted, truth)["core points farther from the truth than their LOD95"].value < 5.0
 
@@ -115,29 +120,28 @@ def test_a_structure_that_is_bent_all_over_is_laid_on_all_its_points():
     scene, _ = scene_of(
         2, lambda p: 80.0 * np.column_stack([0.0 * p[:, :2], (p[:, :2] ** 2).sum(axis=1) / 4e6]), count=20_000
     )
-    result = deviation_step.run(scene, deviation_step.Params(register="fine"))
+    result = run(scene, register="fine")
     assert result.status == "weak"
     assert codes(result)[:2] == ["deviation.no-stable-half", "deviation.best-fit"]
     assert np.isfinite(result.registration_error)
 
 
-@pytest.mark.parametrize("sigma", [0.8, 1.0])
-def test_a_thin_plate_seen_from_one_side_is_not_surely_registered(sigma, monkeypatch):
-    monkeypatch.setattr(plate_clouds, "SIGMA", sigma)
+def test_a_thin_plate_seen_from_one_side_is_not_surely_registered(monkeypatch):
+    monkeypatch.setattr(plate_clouds, "SIGMA", 0.8)
     scene = plate_clouds.plate(3.0, 1, plate_clouds.STATIONS[:1], positions=False)
-    result = deviation_step.run(scene, deviation_step.Params(register="fine"))
+    result = run(scene, register="fine")
     assert result.status == "weak"
     assert codes(result)[0] == "deviation.registration-uncertain"
     thick = plate_clouds.plate(8.0, 1, plate_clouds.STATIONS[:1], positions=False)
-    assert deviation_step.run(thick, deviation_step.Params(register="fine")).status == "ok"
+    assert run(thick, register="fine").status == "ok"
 
 
 @pytest.mark.parametrize(("sigma", "proven"), [(3.0, True), (12.0, False)])
 def test_a_pose_about_which_points_scatter_is_not_proven(sigma, proven, monkeypatch):
     """From any attitude, a pose is one of the design's only if points lie at its surface: within 10 mm (one sd)."""
     monkeypatch.setattr("tests.deviation.test_deviation_step.SIGMA", sigma)
-    scene, _ = scene_of(3, lambda p: 0.0 * p, count=20_000)
-    result = deviation_step.run(scene, deviation_step.Params(register="coarse"))
+    scene, _ = scene_of(3, still, count=8_000)
+    result = run(scene, register="coarse")
     assert 0.6 * sigma < result.sigma < 1.4 * sigma
     assert (codes(result)[0] == "deviation.no-fit") is not proven
     assert result.status == ("ok" if proven else "weak")
@@ -146,9 +150,9 @@ def test_a_pose_about_which_points_scatter_is_not_proven(sigma, proven, monkeypa
 
 
 def test_a_scan_in_another_frame_is_registered_whatever_its_order():
-    T = rigid.transform(rigid.rotation_from_vector(np.array([0.4, -1.1, 2.0])), np.array([9e3, -4e3, 700.0]))
-    scene, _ = scene_of(2, lambda p: 0.0 * p, T)
-    result = deviation_step.run(scene, deviation_step.Params())
+    T = pose([0.4, -1.1, 2.0], [9e3, -4e3, 700.0])
+    scene, _ = scene_of(2, still, T, count=8_000)
+    result = run(scene)
     assert (result.status, result.registration) == ("ok", "coarse")
     off = result.T_design_scan @ rigid.invert(T)
     sd = np.sqrt(np.diag(result.covariance))
@@ -158,42 +162,24 @@ def test_a_scan_in_another_frame_is_registered_whatever_its_order():
     assert result.significant_share < 0.06
     points = np.random.default_rng(3).permutation(scene.scans[0].points)
     mixed = Scene("bracket", "structure", (Scan("scan", points),), structure=scene.structure, units="mm")
-    again = deviation_step.run(mixed, deviation_step.Params())
-    np.testing.assert_allclose(again.core.distance, result.core.distance, atol=1e-9)
+    again = run(mixed)
+    np.testing.assert_allclose(again.core.distance, result.core.distance, atol=1e-9)  # sums in another order
     np.testing.assert_array_equal(again.core.n2, result.core.n2)
 
 
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.slow)])
 def test_an_undamaged_structure_is_a_twentieth_beyond_where_the_frame_is_sure(seed):
-    scene, _ = scene_of(seed, lambda p: 0.0 * p, count=60_000)
-    result = deviation_step.run(scene, deviation_step.Params(register="none", registration_error_mm=0.0))
+    scene, _ = scene_of(seed, still, count=40_000)
+    result = run(scene, register="none", registration_error_mm=0.0)
     assert 0.035 < result.significant_share < 0.065
-    cautious = deviation_step.run(scene, deviation_step.Params())
+    cautious = run(scene)
     assert cautious.registration_error > 0.0
     assert cautious.significant_share < result.significant_share
 
 
-def test_side_of_a_thin_plate_is_decided_by_the_scanner_position():
-    """A plate 10 mm thick, seen from the front, that moved back by 7 mm: nearer to its own back."""
-    mesh = trimesh.creation.box((1500.0, 10.0, 1000.0))
-    rng = np.random.default_rng(6)
-    points = np.column_stack(
-        [rng.uniform(-740, 740, 40_000), rng.normal(-2.0, 0.5, 40_000), rng.uniform(-490, 490, 40_000)]
-    )
-    scan = Scan("scan", points, position=np.array([0.0, 5000.0, 0.0]))
-    design = StructureDesign("plate", np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    station = Stations(("S1",), np.array([[0.0, 5000.0, 0.0]]))
-    scene = Scene("plate", "structure", (scan,), stations=station, structure=design, units="mm")
-    result = deviation_step.run(scene, deviation_step.Params())
-    front = np.isfinite(result.core.lod95) & (result.core.normals[:, 1] > 0.9)
-    assert front.sum() > 100
-    assert np.nanmedian(result.core.distance[front]) == pytest.approx(-7.0, abs=0.1)
-    assert not np.isfinite(result.core.lod95[result.core.normals[:, 1] < -0.9]).any()
-
-
 def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not():
-    scene, _ = scene_of(10, lambda p: 0.0 * p)
-    T = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, 1.0])), np.array([500.0, 0.0, 0.0]))
+    scene, _ = scene_of(10, still, count=8_000)
+    T = pose([0.0, 0.0, 1.0], [500.0, 0.0, 0.0])
     points = scene.scans[0].points
     scans = (
         Scan("a", points[::2]), Scan("b", rigid.apply(rigid.invert(T), points[1::2])), Scan("c", points + 3000.0),
@@ -211,7 +197,7 @@ def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not
     assert codes(result)[0] == "deviation.scans-unplaced"
     assert result.reasons[0].values["scans"] == "c"
     assert abs(np.nanmean(result.core.distance)) < 0.05
-    assert "deviation.unposed-scans" in codes(deviation_step.run(several, deviation_step.Params(register="none")))
+    assert "deviation.unposed-scans" in codes(run(several, register="none"))
 
 
 @pytest.mark.parametrize(
@@ -220,9 +206,9 @@ def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not
 )
 def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
     """Of three scans as they stand, of a third of the points each, one or two are in frames of their own."""
-    scene, _ = scene_of(11, lambda p: 0.0 * p)
+    scene, _ = scene_of(11, still, count=9_000)
     points = scene.scans[0].points
-    frame = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, 0.5])), np.array([30_000.0, 0.0, 0.0]))
+    frame = pose([0.0, 0.0, 0.5], [30_000.0, 0.0, 0.0])
     common = frame if elsewhere else np.eye(4)  # the other scans are at the design, or together in another frame
     scans = []
     for k in range(3):
@@ -230,15 +216,14 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
         T = rigid.transform(rigid.rotation_from_vector(angle), shift) if k < wrong else common
         scans.append(Scan(f"scan-{k}", rigid.apply(T, points[k::3])))
     several = Scene("bracket", "structure", tuple(scans), structure=scene.structure, units="mm")
-    result = deviation_step.run(several, deviation_step.Params())
+    result = run(several)
+    assert codes(result)[0] == "deviation.scans-elsewhere"
     if elsewhere and wrong == 2:
         assert result.status != "ok"  # nothing says which of three scans is right
-        assert codes(result)[0] == "deviation.scans-elsewhere"
         return
     assert result.status == "weak"
-    assert codes(result)[0] == "deviation.scans-elsewhere"
     assert result.reasons[0].values["scans"] == ", ".join(f"scan-{k}" for k in range(wrong))
-    assert result.reasons[0].values["points"] == pytest.approx(5_000 * wrong, rel=0.01)
+    assert result.reasons[0].values["points"] == pytest.approx(3_000 * wrong, rel=0.01)  # less the outliers
     assert result.registration == ("coarse" if elsewhere else "as given")
     assert result.significant_share < 0.07
     assert np.isfinite(result.core.lod95).mean() > 0.9
@@ -246,12 +231,12 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
 
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_a_scan_with_more_points_of_the_ground_than_of_the_structure_is_placed_right(elsewhere):
-    scene, _ = scene_of(12, lambda p: 0.0 * p)
+    scene, _ = scene_of(12, still, count=6_000)
     points, rng = scene.scans[0].points, np.random.default_rng(12)
     low, high = points.min(axis=0) - 1_000.0, points.max(axis=0) + 1_000.0
     ground = rng.uniform(low, high, (3 * len(points), 3))
     ground[:, 2] = low[2] + rng.normal(0.0, 2.0, len(ground))
-    T = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, 0.5])), np.array([30_000.0, 0.0, 0.0]))
+    T = pose([0.0, 0.0, 0.5], [30_000.0, 0.0, 0.0])
     scan = Scan("all", rigid.apply(T if elsewhere else np.eye(4), np.vstack([points, ground])))
     result = deviation_step.run(dataclasses.replace(scene, scans=(scan,)), deviation_step.Params())
     assert result.status == "ok"
@@ -261,10 +246,10 @@ def test_a_scan_with_more_points_of_the_ground_than_of_the_structure_is_placed_r
 
 
 def test_a_station_of_a_merged_scan_is_named_too():
-    scene, _ = scene_of(15, lambda p: 0.0 * p, count=30_000)
+    scene, _ = scene_of(15, still, count=15_000)
     points = scene.scans[0].points.copy()
     station = (np.arange(len(points)) % 3).astype(np.int32)
-    T = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 0.8])), np.array([300.0, 200.0, 500.0]))
+    T = pose([0.1, -0.2, 0.8], [300.0, 200.0, 500.0])
     points[station == 1] = rigid.apply(T, points[station == 1])
     merged = Scan("merged", points, point_station=station)
     stations = Stations(("S1", "S2", "S3"), np.array([[9e3, 9e3, 9e3], [-9e3, 9e3, -9e3], [0.0, -9e3, 9e3]]))
@@ -273,30 +258,28 @@ def test_a_station_of_a_merged_scan_is_named_too():
     )
     assert result.status == "weak"
     assert result.reasons[0].values["scans"] == "S2"
-    assert result.points_kept < 21_000
+    assert result.points_kept < 10_500
 
 
 def test_a_scan_of_something_else_fails():
-    scene, _ = scene_of(13, lambda p: 0.0 * p, count=20_000)
-    T = rigid.transform(rigid.rotation_from_vector(np.array([0.3, 0.2, 1.0])), np.array([90_000.0, 0.0, 0.0]))
+    scene, _ = scene_of(13, still, count=8_000)
+    T = pose([0.3, 0.2, 1.0], [90_000.0, 0.0, 0.0])
     rng = np.random.default_rng(1)
-    ground = np.column_stack(
-        [rng.uniform(-9e3, 9e3, 20_000), rng.uniform(-6e3, 6e3, 20_000), rng.uniform(0, 3e3, 20_000)]
-    )
+    ground = rng.uniform([-9e3, -6e3, 0.0], [9e3, 6e3, 3e3], (8_000, 3))
     other = dataclasses.replace(scene, scans=(Scan("yard", rigid.apply(T, ground)),))
-    result = deviation_step.run(other, deviation_step.Params())
+    result = run(other)
     assert result.status == "failed"
     assert codes(result)[0] == "deviation.not-at-design"
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_after_a_stitch_that_failed_later_steps_do_not_run(tmp_path, monkeypatch):
     scene, _ = scene_of(12, count=5000)
     jobs = pipeline.plan(("stitch", "deviation", "defects"), (), {}, 0)
     stitching = jobs[0].module
     for status in (Status.FAILED, Status.AMBIGUOUS):
-        monkeypatch.setattr(
-            stitching, "run", lambda *_, status=status: stitching.Result(status=status, method="automatic")
-        )
+        answer = stitching.Result(status=status, method="automatic")
+        monkeypatch.setattr(stitching, "run", lambda *_, answer=answer: answer)
         found = pipeline.execute(tmp_path / "scene.h5", scene, jobs)
         for run in found.runs[1:]:
             assert run.result.status == "failed"
@@ -313,20 +296,16 @@ def test_deviation_without_design_or_with_too_few_points_is_refused():
     assert deviation_step.applies(scene)
     assert not deviation_step.applies(without)
     with pytest.raises(InputError, match="needs a design"):
-        deviation_step.run(without, deviation_step.Params())
-    few = Scene("bracket", "structure", (Scan("scan", np.eye(3)),), structure=scene.structure, units="mm")
-    with pytest.raises(InputError, match="100 points"):
-        deviation_step.run(few, deviation_step.Params())
+        run(without)
     flat = StructureDesign("line", np.eye(3), np.array([[0, 0, 1]]))
-    with pytest.raises(InputError, match="surface"):
-        deviation_step.run(Scene("b", "structure", scene.scans, structure=flat, units="mm"), deviation_step.Params())
+    for changed, said in (({"scans": (Scan("scan", np.eye(3)),)}, "100 points"), ({"structure": flat}, "surface")):
+        with pytest.raises(InputError, match=said):
+            run(dataclasses.replace(scene, **changed))
     for bad in ({"register": "sideways"}, {"method": "magic"}, {"max_depth_mm": -1.0}, {"neighbours": 0}):
         with pytest.raises(UsageError):
-            deviation_step.run(scene, deviation_step.Params(**bad))
-    elsewhere = Scene(
-        "b", "structure", (Scan("scan", scene.scans[0].points, FAR),), structure=scene.structure, units="mm"
-    )
-    lost = deviation_step.run(elsewhere, deviation_step.Params(register="none"))
+            run(scene, **bad)
+    elsewhere = dataclasses.replace(scene, scans=(Scan("scan", scene.scans[0].points, FAR),))
+    lost = run(elsewhere, register="none")
     assert lost.status == "failed"
     assert codes(lost) == ["deviation.no-core-point"]
     assert lost.reasons[0].values["share"] == 0.0
@@ -335,7 +314,7 @@ def test_deviation_without_design_or_with_too_few_points_is_refused():
 
 def test_method_paper_reports_points_without_level_at_its_scales(tmp_path):
     scene, truth = scene_of(8, count=20_000)
-    result = deviation_step.run(scene, deviation_step.Params(method="paper", register="fine"))
+    result = run(scene, method="paper", register="fine")
     assert (result.normal_diameter, result.projection_diameter) == (110.541, 55.270)
     assert result.registration_error < 0.01  # of a clone: repeatability alone
     assert np.isnan(result.core.lod95[np.minimum(result.core.n1, result.core.n2) < 4]).all()
@@ -354,7 +333,7 @@ def test_method_paper_reports_points_without_level_at_its_scales(tmp_path):
     assert all(np.isnan(one.limit) for one in metrics(scene, result, truth).values())
 
 
-def arch(seed=11, count=20_000):
+def arch(seed=11, count=10_000):
     """A portal that looks the same half a turn on, but for a block of 35 mm on one foot."""
     boxes = [((4000, 300, 300), (0, 0, 0)), ((300, 1200, 900), (1850, 0, -600)), ((300, 1200, 900), (-1850, 0, -600)),
              ((35, 300, 300), (2017.5, 0, -900))]  # fmt: skip
@@ -371,12 +350,12 @@ def arch(seed=11, count=20_000):
 
 def test_the_papers_attitude_is_called_ambiguous_where_another_fits_as_well():
     scene, _ = arch()
-    result = deviation_step.run(scene, deviation_step.Params(method="paper", register="coarse"))
+    result = run(scene, method="paper", register="coarse")
     assert result.status == "ambiguous"
     assert 1.0 <= result.ambiguity < 1.3
     assert {"deviation.ambiguous", "deviation.paper-ambiguous"} & set(codes(result))
-    bracket_scene, _ = scene_of(12, lambda p: 0.0 * p, count=20_000)
-    sure = deviation_step.run(bracket_scene, deviation_step.Params(method="paper", register="coarse"))
+    bracket_scene, _ = scene_of(12, still, count=10_000)
+    sure = run(bracket_scene, method="paper", register="coarse")
     assert sure.status == "ok"
     assert sure.ambiguity > 2.0
     assert rigid.rotation_angle(sure.T_design_scan[:3, :3]) < 0.01
@@ -385,28 +364,19 @@ def test_the_papers_attitude_is_called_ambiguous_where_another_fits_as_well():
 @pytest.mark.parametrize(("width", "knob"), [(1980, (500, -900)), (1700, (0, 900))])
 def test_cases_are_compared_after_they_were_refined_and_alike_axes_are_swapped(width, knob):
     """Seen more in two corners, a plate nearly as wide as long has other axes than its design."""
-    plate, pin = (
-        trimesh.creation.box((2000, width, 20)),
-        trimesh.creation.box((80, 80, 300), np.eye(4) + _at(*knob, 160)),
-    )
-    mesh = trimesh.util.concatenate([plate, pin])
+    pin = trimesh.creation.box((80, 80, 300), pose([0.0] * 3, [*knob, 160.0]))
+    mesh = trimesh.util.concatenate([trimesh.creation.box((2000, width, 20)), pin])
     target, seen = (np.asarray(trimesh.sample.sample_surface(mesh, 15_000, seed=seed)[0]) for seed in (1, 2))
-    T = rigid.transform(rigid.rotation_from_vector(np.array([0.3, -0.2, 1.5])), np.array([500.0, -80.0, 7.0]))
+    T = pose([0.3, -0.2, 1.5], [500.0, -80.0, 7.0])
     kept = np.random.default_rng(1).random(len(seen)) < np.where(seen[:, 0] * seen[:, 1] > 0.0, 1.0, 0.8)
-    pose = baseline.coarse(rigid.apply(rigid.invert(T), seen[kept]), target)
-    assert rigid.rotation_angle(pose.T_target_source[:3, :3] @ T[:3, :3].T) < 0.15
-    assert pose.ambiguity > 1.3
-
-
-def _at(x, y, z):
-    shift = np.zeros((4, 4))
-    shift[:3, 3] = x, y, z
-    return shift
+    found = baseline.coarse(rigid.apply(rigid.invert(T), seen[kept]), target)
+    assert rigid.rotation_angle(found.T_target_source[:3, :3] @ T[:3, :3].T) < 0.15
+    assert found.ambiguity > 1.3
 
 
 def test_ambiguous_pose_other_than_the_true_one_is_not_compared_with_the_truth():
     scene, truth = arch()
-    result = deviation_step.run(scene, deviation_step.Params(register="none"))
+    result = run(scene, register="none")
     half = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, np.pi])), np.zeros(3))
     turned = dataclasses.replace(result, T_design_scan=half, status="ambiguous")
     (said,) = deviation_evaluation.check(scene, turned, truth)
@@ -418,8 +388,8 @@ def test_ambiguous_pose_other_than_the_true_one_is_not_compared_with_the_truth()
 
 
 def test_the_least_and_the_greatest_have_their_intervals(tmp_path):
-    scene, _ = scene_of(14, count=20_000)
-    result = deviation_step.run(scene, deviation_step.Params(register="none"))
+    scene, _ = scene_of(14, count=10_000)
+    result = run(scene, register="none")
     written = fields_to_json.as_object(result)
     known = np.isfinite(result.core.lod95)
     for end, row in (("min", np.argmin(result.core.distance[known])), ("max", np.argmax(result.core.distance[known]))):
@@ -432,8 +402,7 @@ def test_the_least_and_the_greatest_have_their_intervals(tmp_path):
         body = section.REPORT.summary(result)[1]
         assert f"{value:.3f} mm (95 %: {low:.3f} to {high:.3f})" in str(body)
         assert "至" in messages("zh").text(body)
-    run = StepRun("deviation", "default", "{}", result)
-    (table,) = section.REPORT.tables([run], ErrorReport())
+    (table,) = section.REPORT.tables([StepRun("deviation", "default", "{}", result)], ErrorReport())
     rows = {str(row[0]): row[1] for row in table.rows}
     low, high = written["mean_ci95"]
     assert (low + high) / 2.0 == pytest.approx(result.mean)
@@ -466,18 +435,17 @@ def test_interval_of_the_mean_includes_common_and_separate_range_errors():
     ranges = rng.normal(0.0, 0.5, (4000, 6)) + rng.normal(0.0, 0.2, (4000, 1))
     share = np.bincount(station, cosine[station, rows], 6) / len(points)
     assert np.std(ranges @ share) == pytest.approx(sd, rel=0.05)
-    pose = scanner_class_errors.pose_covariance(points)
-    assert mean_uncertainty.mean_sd(scan, np.eye(4), core, moved, pose, 1.0) == pytest.approx(sd, rel=0.02), (
-        "all around"
-    )
+    of_pose = scanner_class_errors.pose_covariance(points)
+    assert mean_uncertainty.mean_sd(scan, np.eye(4), core, moved, of_pose, 1.0) == pytest.approx(sd, rel=0.02)
     front = Samples(points[normals[:, 0] > 0.5], normals[normals[:, 0] > 0.5], rows)
     few = Movement(*(value[: len(front.points)] for value in vars(moved).values()))
-    alone = mean_uncertainty.mean_sd(scan, np.eye(4), front, few, pose, 1.0)
-    assert alone > np.hypot(0.2, 0.2), "of one face the pose itself is in the mean"
+    alone = mean_uncertainty.mean_sd(scan, np.eye(4), front, few, of_pose, 1.0)
+    assert alone > np.hypot(0.2, 0.2)  # of one face the pose itself is in the mean
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_deviation_in_results_json_has_the_keys_of_the_interface(tmp_path):
-    scene, truth = scene_of(9, count=20_000)
+    scene, truth = scene_of(9, count=8_000)
     jobs = pipeline.plan(("deviation",), (), {}, 0)
     found = pipeline.execute(tmp_path / "scene.h5", scene, jobs)
     report = ErrorReport(tuple(deviation_evaluation.check(scene, found.runs[0].result, truth)))
@@ -504,7 +472,7 @@ def test_deviation_in_results_json_has_the_keys_of_the_interface(tmp_path):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_roof_that_moved_is_measured_within_its_level_of_detection(seed):
     scene, truth = make("roof", recipe_files.overridden(recipe_files.load("stadium-roof")[1], [f"seed={seed}"]))
-    result = deviation_step.run(scene, deviation_step.Params())
+    result = run(scene)
     assert all(one.passed for one in deviation_evaluation.check(scene, result, truth))
     assert np.isfinite(result.core.lod95).mean() > 0.95
     assert np.nanmedian(result.core.lod95) < 2.0

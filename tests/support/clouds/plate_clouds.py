@@ -11,11 +11,11 @@ SIGMA = 0.5
 AS_IT_LIES = deviation_step.Params(register="none")  # as by default, but for the search for other attitudes
 
 
-def plate(thickness, seed, stations, positions):
+def plate(thickness, seed, stations, positions, count=60_000):
     """A plate as designed, with noise along the rays of the stations that see each place, one scan a station."""
     mesh = trimesh.creation.box((300.0, 300.0, thickness))
     rng = np.random.default_rng(seed)
-    points, facet = trimesh.sample.sample_surface(mesh, 60_000, seed=seed)
+    points, facet = trimesh.sample.sample_surface(mesh, count, seed=seed)
     points, normals = np.asarray(points), mesh.face_normals[facet]
     sees = np.einsum("nki,ni->nk", stations - points[:, None], normals) > 0.0
     chosen = np.argmax(sees * rng.random(sees.shape), axis=1)
