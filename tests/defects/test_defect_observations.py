@@ -66,7 +66,7 @@ def test_points_of_a_noisy_station_are_not_stray():
     pairs = observations.paired(observations.observe(scene, np.eye(4), surface, 60.0), surface)
     assert (pairs.stray - pairs.mixed).sum() < 0.002 * len(away)  # beyond 4 sd of their cell, which is known by four
     sd = np.sqrt(pairs.square.sum() / (pairs.count - 1.0).clip(0.0).sum())
-    assert sd == pytest.approx(NOISE, rel=4.0 / np.sqrt(2.0 * len(away)))
+    assert sd == pytest.approx(NOISE, rel=4.0 / np.sqrt(2.0 * len(away)))  # four sds of a standard deviation
 
 
 def test_points_in_blocks_and_parts_are_those_at_once(monkeypatch, tmp_path):
@@ -101,7 +101,7 @@ def test_points_in_blocks_and_parts_are_those_at_once(monkeypatch, tmp_path):
     arrays_in_files.limit(monkeypatch, 333, 100)
     with large_arrays.in_files(tmp_path):
         for ours, theirs in zip(found(), whole, strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-9)
+            np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-9)  # sums of blocks in another order
 
 
 def test_a_quantile_in_files_is_that_of_numpy(monkeypatch):

@@ -62,7 +62,7 @@ def test_the_nearest_face_is_taken_and_its_clearance_is_the_distance_of_the_next
     curved = mesh_distance.of_surface(surface)
     points = np.array([[97.0, 0.0, 9.5], [99.5, 0.0, 7.0], [0.0, 0.0, 8.0], [0.0, 0.0, -50.0], [101.0, 0.0, 12.0]])
     seen = assignment.assigned(points, None, curved, grid)
-    np.testing.assert_allclose(seen.distance[:3], [-0.5, -0.5, -2.0], atol=1e-9)
+    np.testing.assert_allclose(seen.distance[:3], [-0.5, -0.5, -2.0], atol=1e-9)  # float64
     np.testing.assert_allclose(surface.normals[seen.facet[:3]], [[0, 0, 1], [1, 0, 0], [0, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(seen.clearance[:3], [3.0, 3.0, 10.0], atol=1e-9)  # half of the thickness
     assert seen.facet[3] == -1

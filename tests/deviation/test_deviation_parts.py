@@ -45,7 +45,7 @@ def test_movement_along_the_normal_is_that_of_the_body_for_any_point_normals():
     expected = np.linalg.lstsq(
         normals[near := np.linalg.norm(feet - place[0], axis=1) <= 75.0][:, :2], distance[near], rcond=None
     )[0]
-    np.testing.assert_allclose(found.vector[0], [*expected, 0.0], atol=1e-9)
+    np.testing.assert_allclose(found.vector[0], [*expected, 0.0], atol=1e-9)  # float64
     assert found.count[0] == near.sum()
     assert np.isnan(found.along[2])
     assert found.count[2] == 0

@@ -140,7 +140,7 @@ def test_a_thin_plate_seen_from_one_side_is_not_surely_registered(monkeypatch):
 def test_a_pose_about_which_points_scatter_is_not_proven(sigma, proven, monkeypatch):
     """From any attitude, a pose is one of the design's only if points lie at its surface: within 10 mm (one sd)."""
     monkeypatch.setattr("tests.deviation.test_deviation_step.SIGMA", sigma)
-    scene, _ = scene_of(3, still, count=8_000)
+    scene, _ = scene_of(3, still, count=3_000)
     result = run(scene, register="coarse")
     assert 0.6 * sigma < result.sigma < 1.4 * sigma
     assert (codes(result)[0] == "deviation.no-fit") is not proven
@@ -151,7 +151,7 @@ def test_a_pose_about_which_points_scatter_is_not_proven(sigma, proven, monkeypa
 
 def test_a_scan_in_another_frame_is_registered_whatever_its_order():
     T = pose([0.4, -1.1, 2.0], [9e3, -4e3, 700.0])
-    scene, _ = scene_of(2, still, T, count=8_000)
+    scene, _ = scene_of(2, still, T, count=5_000)
     result = run(scene)
     assert (result.status, result.registration) == ("ok", "coarse")
     off = result.T_design_scan @ rigid.invert(T)
@@ -206,7 +206,7 @@ def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not
 )
 def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
     """Of three scans as they stand, of a third of the points each, one or two are in frames of their own."""
-    scene, _ = scene_of(11, still, count=9_000)
+    scene, _ = scene_of(11, still, count=6_000)
     points = scene.scans[0].points
     frame = pose([0.0, 0.0, 0.5], [30_000.0, 0.0, 0.0])
     common = frame if elsewhere else np.eye(4)  # the other scans are at the design, or together in another frame
@@ -223,7 +223,7 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
         return
     assert result.status == "weak"
     assert result.reasons[0].values["scans"] == ", ".join(f"scan-{k}" for k in range(wrong))
-    assert result.reasons[0].values["points"] == pytest.approx(3_000 * wrong, rel=0.01)  # less the outliers
+    assert result.reasons[0].values["points"] == pytest.approx(2_000 * wrong, rel=0.01)  # less the outliers
     assert result.registration == ("coarse" if elsewhere else "as given")
     assert result.significant_share < 0.07
     assert np.isfinite(result.core.lod95).mean() > 0.9
@@ -329,7 +329,7 @@ def test_method_paper_reports_points_without_level_at_its_scales(tmp_path):
         np.sqrt(result.core.std1**2 / result.core.n1 + result.core.std2**2 / result.core.n2)[known]
         + result.registration_error
     )
-    np.testing.assert_allclose(result.core.lod95[known], expected, rtol=1e-12)
+    np.testing.assert_allclose(result.core.lod95[known], expected, rtol=1e-12)  # float64
     assert all(np.isnan(one.limit) for one in metrics(scene, result, truth).values())
 
 
@@ -434,8 +434,10 @@ def test_interval_of_the_mean_includes_common_and_separate_range_errors():
     sd = mean_uncertainty.mean_sd(scan, np.eye(4), core, moved, np.zeros((6, 6)), 1.0)
     ranges = rng.normal(0.0, 0.5, (4000, 6)) + rng.normal(0.0, 0.2, (4000, 1))
     share = np.bincount(station, cosine[station, rows], 6) / len(points)
+    # 4000 draws: 1.1 % of a standard deviation, and cosines that differ within a face.
     assert np.std(ranges @ share) == pytest.approx(sd, rel=0.05)
     of_pose = scanner_class_errors.pose_covariance(points)
+    # All around: a pose has no part in the mean.
     assert mean_uncertainty.mean_sd(scan, np.eye(4), core, moved, of_pose, 1.0) == pytest.approx(sd, rel=0.02)
     front = Samples(points[normals[:, 0] > 0.5], normals[normals[:, 0] > 0.5], rows)
     few = Movement(*(value[: len(front.points)] for value in vars(moved).values()))
@@ -462,6 +464,7 @@ def test_deviation_in_results_json_has_the_keys_of_the_interface(tmp_path):
     data = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
     known = np.isfinite(data[:, 4])
     spread = np.sqrt(data[known, 8] ** 2 / data[known, 6] + data[known, 9] ** 2 / data[known, 7])
+    # Written with all digits.
     np.testing.assert_allclose(data[known, 4], 1.96 * (spread + written["registration_error"]), rtol=1e-9)
     np.testing.assert_array_equal(data[:, 5], np.abs(data[:, 3]) > data[:, 4])
     assert (tmp_path / "out" / "figures" / "deviation-map.png").exists()

@@ -113,4 +113,5 @@ def test_where_no_block_agrees_there_is_no_stable_motion_but_a_best_one(bend_mm)
     assert np.isnan(found.stable.error_mm)
     assert not found.determined
     mean = (found.best.motion[:3, :3] @ core.points.T).T + found.best.motion[:3, 3] - core.points
+    # A rigid motion: its tilt has no mean, but points lie unevenly.
     assert mean[:, 2].mean() == pytest.approx(u[:, 2].mean(), rel=0.05)

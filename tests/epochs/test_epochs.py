@@ -99,13 +99,6 @@ def test_of_components_that_do_not_change_five_percent_are_called_changed():
     assert alone / trials > 0.7
 
 
-def test_interval_of_the_strongest_of_many_is_widened_for_their_number():
-    one, of_many = (change.of_component("d", "c", [of_values([0.0, 1.2], [0.7, 0.7], chosen_from=n)]) for n in (1, 900))
-    assert one.finding is Finding.CHANGED
-    assert of_many.finding is Finding.WITHIN
-    assert of_many.leading.ci95 > one.leading.ci95
-
-
 def test_an_epoch_without_an_interval_does_not_hide_the_others():
     found = change.of_component("i", "c", [of_values([7.0, 1.0, 9.0], [np.nan, 0.1, 0.1])])
     assert found.finding is Finding.CHANGED
@@ -126,10 +119,7 @@ def test_widening_of_a_value_does_not_depend_on_the_number_behind_another():
     for _ in range(trials):
         values = rng.normal(0.0, 0.5, (n, 2))
         k = np.abs(values[:, 1] - values[:, 0]).argmax()
-        both = [
-            of_values(values[0], np.full(2, 0.98)),
-            of_values(values[k], np.full(2, 0.98), chosen_from=n),
-        ]
+        both = [of_values(values[0], np.full(2, 0.98)), of_values(values[k], np.full(2, 0.98), chosen_from=n)]
         called += change.of_component("d", "c", both).finding is Finding.CHANGED
     assert 0 < called / trials < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / trials)
 
@@ -166,10 +156,7 @@ def test_balls_without_a_design_are_matched_by_position():
     order = [1, 0, 2]
     there = first.balls
     swapped = dataclasses.replace(
-        there,
-        ids=np.array([70, 71, 72]),
-        centres=there.centres[order] + [0.0, 0.0, 4.0],
-        radii=there.radii[order],
+        there, ids=np.array([70, 71, 72]), centres=there.centres[order] + [0.0, 0.0, 4.0], radii=there.radii[order]
     )
     found = findings(space_frame, first, dataclasses.replace(first, balls=swapped))
     assert set(found) == {"7", "8"}
@@ -324,7 +311,7 @@ def test_a_body_that_moved_has_a_movement_though_its_mean_deviation_stays():
     by_name = {str(one.series.quantity): one for one in found.changes}
     assert abs(by_name["mean deviation"].value) < 1e-9
     for axis, along in zip("xyz", shift, strict=True):
-        assert by_name[f"movement {axis}"].value == pytest.approx(along, abs=1e-9)
+        assert by_name[f"movement {axis}"].value == pytest.approx(along, abs=1e-9)  # float64
         # Errors that are the same at all core points of a face pair, with the worst sign: no less than one level
         assert by_name[f"movement {axis}"].series.ci95.min() >= 0.4 - 1e-9
     assert str(found.leading.series.quantity) == "movement y"

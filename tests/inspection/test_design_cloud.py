@@ -45,10 +45,8 @@ def test_points_near_places_are_those_of_a_search_tree_with_their_rays(large, mo
         Scan("b", points + 3.0, position=own, T_project_scan=pose),
     )
     scene = Scene("x", "structure", scans, stations=Stations(ids=("1", "2", "3"), positions=positions))
-    T, origin = (
-        rigid.transform(rigid.rotation_from_vector(np.array([0.2, 0.0, 0.0])), np.array([50.0, 60.0, 70.0])),
-        np.full(3, 1e6),
-    )
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.2, 0.0, 0.0])), np.array([50.0, 60.0, 70.0]))
+    origin = np.full(3, 1e6)
     if large:
         arrays_in_files.limit(monkeypatch, 500, 2000)
     with large_arrays.in_files(tmp_path):
@@ -61,9 +59,9 @@ def test_points_near_places_are_those_of_a_search_tree_with_their_rays(large, mo
     rows = np.flatnonzero(cKDTree(places).query(placed)[0] < 180.0)
     rows = rows[np.lexsort(placed[rows].T)]
     order = np.lexsort(seen.points.T)
-    np.testing.assert_allclose(seen.points[order], placed[rows], atol=1e-6)
+    np.testing.assert_allclose(seen.points[order], placed[rows], atol=1e-6)  # float64 at 1e6
     expected = ray[rows] / np.linalg.norm(ray[rows], axis=1, keepdims=True)
-    np.testing.assert_allclose(seen.ray[order], expected, atol=1e-9)
+    np.testing.assert_allclose(seen.ray[order], expected, atol=1e-9)  # of rays of some metres
     assert set(cloud.near(places + 1e5, 180.0).view.tolist()) == set()
 
 

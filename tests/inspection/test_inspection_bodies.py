@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import trimesh
 
-import processor
 from processor.defects import surface_charts
 from processor.deviation import step as deviation_step
 from processor.evaluation import inspection as evaluation
@@ -18,11 +17,11 @@ from processor.inspection import step as inspection_step
 from processor.inspection.flat_faces import Body, Pieces
 from processor.inspection.result import Quantity
 from processor.limits import standards
-from processor.model import InputError, Scene, Status, StructureDesign, StructureTruth, Tolerance, Truth, Verdict
+from processor.model import InputError, Scene, Status, StructureDesign, StructureTruth, Truth, Verdict
 from tests.support.clouds import beam_clouds
 from tests.support.clouds.beam_clouds import SIZE, Built
 
-SEEDS = 5
+SEEDS, COUNT = 5, 40_000
 
 
 def by_id(result, name=None):
@@ -57,7 +56,7 @@ def runs():
     found = []
     for seed in range(SEEDS):
         built = Built(*(rng.standard_normal(6) * np.array([2.5, 1.5, 3.0, 2.0, 4e-3, 2e-3])))
-        scene = beam_clouds.beam(built, seed, count=40_000)
+        scene = beam_clouds.beam(built, seed, count=COUNT)
         found.append((scene, built, inspected(scene)))
     return found
 
@@ -80,35 +79,23 @@ def test_intervals_cover_the_deviations_as_built(runs):
 
 def test_a_box_that_is_moved_and_turned_as_a_whole_has_no_defect_by_that():
     T = rigid.transform(rigid.rotation_from_vector(np.array([1e-3, -1.5e-3, 2e-3])), np.array([3.0, -4.0, 2.0]))
-    found = by_id(inspected(beam_clouds.beam(Built(), 3, sigma=0.3, registration=0.0, count=40_000, T=T)))
+    found = by_id(inspected(beam_clouds.beam(Built(), 3, sigma=0.3, registration=0.0, count=COUNT, T=T)))
     for id_, (deviation, ci95) in found.items():
         assert abs(deviation) <= max(ci95, 0.1), id_
 
 
 def test_an_end_that_was_not_seen_has_no_value():
-    scene = beam_clouds.beam(Built(), 4, count=40_000)
-    hidden = tuple(
-        processor.model.Scan(scan.name, scan.points[scan.points[:, 0] < 0.5 * SIZE[0] - 20.0], position=scan.position)
-        for scan in scene.scans
-    )
-    result = inspected(Scene("beam", "structure", hidden, structure=scene.structure, units="mm"))
+    scene = beam_clouds.beam(Built(), 4, count=COUNT)
+    hidden = [
+        dataclasses.replace(scan, points=scan.points[scan.points[:, 0] < 0.5 * SIZE[0] - 20.0]) for scan in scene.scans
+    ]
+    result = inspected(dataclasses.replace(scene, scans=tuple(hidden)))
     found = result.components[0].characteristics
     for id_ in ("length", "end-squareness-over-width"):
         row = found.id.index(id_)
         assert np.isnan(found.actual[row])
         assert found.reasons[row][0].code == "inspect.face-hidden"
     assert np.isfinite(by_id(result)["start-squareness-over-width"][0])
-
-
-def test_verdicts_are_given_where_the_project_names_limits(runs):
-    scene, _, result = runs[0]
-    assert set(result.components[0].characteristics.verdict) == {Verdict.NONE}
-    limits = standards.load("GB 50205-2020")
-    named = Scene("beam", "structure", scene.scans, structure=scene.structure, units="mm", tolerance=limits)
-    verdicts = inspected(named).components[0].characteristics
-    assert verdicts.verdict[verdicts.id.index("length")] is not Verdict.NONE
-    assert verdicts.upper[verdicts.id.index("length")] == pytest.approx(3000.0 / 2500.0)
-    assert isinstance(limits, Tolerance)
 
 
 def test_the_truth_is_measured_by_the_same_definitions(runs):
@@ -119,7 +106,7 @@ def test_the_truth_is_measured_by_the_same_definitions(runs):
     truth = Truth(structure=StructureTruth(points, mesh.face_normals[facet], beam_clouds.moved(points, built) - points))
     (true,) = evaluation._of_bodies(scene.structure, truth.structure).values()
     for id_, value in true_values(built).items():
-        assert abs(true[id_]) == pytest.approx(abs(value), abs=0.05), id_
+        assert abs(true[id_]) == pytest.approx(abs(value), abs=0.05), id_  # by 20,000 places; second order
     coverage = {
         one.quantity: one.value for one in evaluation.check(scene, result, truth) if one.statistic == "coverage"
     }
@@ -132,12 +119,17 @@ def test_bodies_of_a_mesh_without_names_are_named_as_the_components_of_defects()
         for x, z in ((5000.0, 0.0), (0.0, 0.0), (100.0, 200.0))
     )
     mesh = trimesh.util.concatenate([apart, touching, upon])
-    design = StructureDesign("three.ply", mesh.vertices, mesh.faces)
-    none = np.empty(0)
-    seen = flat_faces.Observed(np.empty((0, 3)), np.empty(0, np.int64), none, none, none, side=50.0)
-    names = [body.name for body in flat_faces.bodies(design, seen, 60.0)]
+    names = [body.name for body in bodies_of(mesh)]
     assert names == ["component-1", "component-2 body 1", "component-2 body 2"]
     assert surface_charts.of_mesh(mesh.vertices, mesh.faces, 50.0).names == ("component-1", "component-2")
+
+
+def bodies_of(mesh, shift=(0.0, 0.0, 0.0)):
+    """Bodies of a mesh of which nothing was seen."""
+    design = StructureDesign("mesh", np.asarray(mesh.vertices) + np.array(shift), np.asarray(mesh.faces))
+    none = np.empty(0)
+    seen = flat_faces.Observed(np.empty((0, 3)), np.empty(0, np.int64), none, none, none, side=50.0)
+    return list(flat_faces.bodies(design, seen, 60.0))
 
 
 def flat_plate(wave, noise, seed):
@@ -147,13 +139,7 @@ def flat_plate(wave, noise, seed):
     form = wave * np.cos(2.0 * np.pi * x / 500.0)
     places = np.stack([x, y, np.zeros_like(x)], axis=1)
     value = form + 3.0 + 1e-3 * x + noise * rng.standard_normal(len(x))
-    mesh = trimesh.creation.box((1000.0, 800.0, 12.0))
-    design = StructureDesign(
-        "plate", np.asarray(mesh.vertices) + np.array([500.0, 400.0, -6.0]), np.asarray(mesh.faces)
-    )
-    none = np.empty(0)
-    seen = flat_faces.Observed(np.empty((0, 3)), np.empty(0, np.int64), none, none, none, side=50.0)
-    (body,) = flat_faces.bodies(design, seen, 60.0)
+    (body,) = bodies_of(trimesh.creation.box((1000.0, 800.0, 12.0)), (500.0, 400.0, -6.0))
     pieces = list(body.pieces)
     top = next(k for k, face in enumerate(body.faces) if face.normal[2] > 0.9)
     pieces[top] = Pieces(places, value, np.full(len(x), noise**2 + 1e-6), 0.0)
@@ -164,12 +150,12 @@ def flat_plate(wave, noise, seed):
 def test_flatness_is_not_the_spread_of_the_noise(wave, noise):
     """320 pieces of 0.2 mm noise spread over 1.2 mm by noise alone."""
     true, held, values = 2.0 * wave * np.cos(np.pi / 10.0), 0, []  # of the middles of pieces
-    for seed in range(60):
+    for seed in range(30):
         one = flat_plate(wave, noise, seed)["flatness-thickness+"]
         held += one.low <= true <= one.high
         values.append(one.deviation)
-    assert held >= 57
-    assert np.mean(values) == pytest.approx(true, abs=3.0 * noise)
+    assert held >= 26  # of 30 with 95 %: in 98 of 100 cases
+    assert np.mean(values) == pytest.approx(true, abs=3.0 * noise)  # the two extremes by 20 pieces in a row each
 
 
 def test_a_plate_has_a_thickness_and_no_height():
@@ -189,26 +175,29 @@ def test_scene_without_design_or_deviation_is_not_inspected_with_a_reason():
     assert inspection_step.run(scene, inspection_step.Params()).reasons[0].code == "inspect.no-deviation"
 
 
-def test_verdicts_are_indeterminate_where_another_attitude_fits_as_well(runs):
-    scene, *_ = runs[0]
+def test_verdicts_are_given_by_the_limits_and_indeterminate_where_another_attitude_fits_as_well(runs):
+    scene, _, result = runs[0]
+    assert set(result.components[0].characteristics.verdict) == {Verdict.NONE}
     named = dataclasses.replace(scene, tolerance=standards.load("GB 50205-2020"))
     measured = deviation_step.run(named, deviation_step.Params(register="none"))
     ambiguous = dataclasses.replace(measured, status=Status.AMBIGUOUS)
     for status, given in ((False, measured), (True, ambiguous)):
         result = inspection_step.run(named, inspection_step.Params(), {"deviation": given})
-        verdicts = set(result.components[0].characteristics.verdict) - {Verdict.NONE}
-        assert (verdicts == {Verdict.INDETERMINATE}) is status
+        found = result.components[0].characteristics
+        assert found.upper[found.id.index("length")] == pytest.approx(3000.0 / 2500.0)
+        assert found.verdict[found.id.index("length")] is not Verdict.NONE
+        assert (set(found.verdict) - {Verdict.NONE} == {Verdict.INDETERMINATE}) is status
     assert result.status is Status.OK
 
 
 def test_sizes_of_a_warm_body_are_those_at_the_reference_temperature():
     """A box as designed, 40 K warmer than its design: 12e-6 a kelvin longer (EN 1993-1-1)."""
     longer = 12e-6 * 40.0 * SIZE
-    scene = beam_clouds.beam(Built(longer=longer[0], wider=longer[1]), 6, sigma=0.2, registration=0.0, count=40_000)
+    scene = beam_clouds.beam(Built(longer=longer[0], wider=longer[1]), 6, sigma=0.2, registration=0.0, count=COUNT)
     warm = by_id(inspected(dataclasses.replace(scene, temperature_C=60.0)))
     plain = by_id(inspected(scene))
     for name, size in (("length", longer[0]), ("width", longer[1])):
-        assert plain[name][0] - warm[name][0] == pytest.approx(size, rel=2e-3)
+        assert plain[name][0] - warm[name][0] == pytest.approx(size, rel=2e-3)  # the expansion itself: 5e-4 of a size
         assert abs(warm[name][0]) <= warm[name][1]
 
 
@@ -232,15 +221,11 @@ def test_the_step_is_partial_if_a_body_was_not_seen_and_failed_if_none_was(runs)
 
 def test_twist_interval_of_a_half_hidden_flange_covers():
     """Three stations see one strip each, with a shift and a turn of .35 mm over half the length."""
-    mesh = trimesh.creation.box((6000.0, 300.0, 20.0))
-    design = StructureDesign("flange", np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    none = np.empty(0)
-    seen = flat_faces.Observed(np.empty((0, 3)), np.empty(0, np.int64), none, none, none, side=50.0)
-    (body,) = flat_faces.bodies(design, seen, 60.0)
+    (body,), none = bodies_of(trimesh.creation.box((6000.0, 300.0, 20.0))), np.empty(0)
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-2975.0, 3000.0, 50.0), np.arange(-125.0, 150.0, 50.0)))
     shared, noise = 0.35, 0.05
     held = 0
-    for seed in range(100):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         pieces = []
         for face in body.faces:
@@ -255,4 +240,4 @@ def test_twist_interval_of_a_half_hidden_flange_covers():
         measured = structure_bodies.measured(Body("flange", body.faces, tuple(pieces)))[0]
         (twist,) = (one for one in measured if one.quantity is Quantity.TWIST)
         held += twist.low <= 0.0 <= twist.high
-    assert held >= 90
+    assert held >= 34  # of 40 with 95 %: in 99 of 100 cases

@@ -48,9 +48,10 @@ def test_holes_of_a_solid_are_found_with_their_sizes():
     assert len(found) == len(GRID)
     places = np.array([turn.inv().apply(hole.middle) for hole in found])
     places = places[np.lexsort((places[:, 0], np.round(places[:, 1])))]
+    sizes = [[hole.radius, hole.depth] for hole in found]
+    # Vertices lie on the circle: float64.
     np.testing.assert_allclose(places, np.column_stack([GRID, np.zeros(len(GRID))]), atol=1e-6)
-    np.testing.assert_allclose([hole.radius for hole in found], RADIUS, atol=1e-6)
-    np.testing.assert_allclose([hole.depth for hole in found], DEPTH, atol=1e-6)
+    np.testing.assert_allclose(sizes, [[RADIUS, DEPTH]] * len(GRID), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -70,8 +71,7 @@ def test_only_round_holes_through_a_plate_are_holes(what, count):
 
 
 def test_bore_of_a_tube_is_not_a_hole():
-    tube = cq.Workplane().circle(60.0).circle(52.0).extrude(2000.0)
-    assert holes_of(tube.val()) == []
+    assert holes_of(cq.Workplane().circle(60.0).circle(52.0).extrude(2000.0).val()) == []
 
 
 RAYS = np.array([[0.6, 0.2, -0.77], [-0.5, 0.4, -0.77], [0.1, -0.6, 0.79]])  # of three stations, into the bores
@@ -124,7 +124,7 @@ def without_motion(departure):
 @pytest.mark.parametrize("known", [True, False])
 def test_intervals_cover_drilled_places_pitches_and_diameters(known):
     held: dict[str, list[bool]] = {"along": [], "across": [], "pitch": [], "diameter": []}
-    for seed in range(15):
+    for seed in range(10):
         rng = np.random.default_rng(seed)
         departure, radius = rng.normal(0.0, 0.7, GRID.shape), 0.2 * rng.normal()
         found = measured(*bore_cloud(rng, departure, radius, known=known))
@@ -133,7 +133,7 @@ def test_intervals_cover_drilled_places_pitches_and_diameters(known):
             for a, name in enumerate(("along", "across")):
                 one = found[f"hole-{k + 1}-{name}"]
                 held[name].append(one.low <= true[k, a] <= one.high)
-                assert one.nominal == pytest.approx(GRID[k, a], abs=1e-6)
+                assert one.nominal == pytest.approx(GRID[k, a], abs=1e-6)  # float64
             one = found[f"hole-{k + 1}-diameter"]
             held["diameter"].append(one.low <= 2.0 * radius <= one.high)
         for one in (one for id_, one in found.items() if id_.startswith("pitch")):
@@ -163,32 +163,30 @@ def test_a_plate_that_is_moved_and_turned_keeps_its_holes():
 @pytest.mark.parametrize(("off", "share"), [(0.0, 1.0), (0.8, 1.0), (3.0, 5.0 / 6.0)])
 def test_a_gauge_pin_passes_holes_that_are_less_than_its_play_off(off, share):
     """A pin 1 mm thinner than two holes passes them if they are less than 1 mm off each other."""
+    # The best fit of the group takes a sixth of it, and turns with none as it is in the middle.
     departure = np.zeros(GRID.shape)
-    departure[1] = [
-        0.0,
-        off,
-    ]  # the best fit of the group takes a sixth of it, and turns with none as it is in the middle
+    departure[1] = [0.0, off]
     one = measured(*bore_cloud(np.random.default_rng(1), departure, sigma=0.1))["holes-1-6-pass-through"]
-    assert 1.0 + one.deviation == pytest.approx(share, abs=0.02)
+    assert 1.0 + one.deviation == pytest.approx(share, abs=0.02)  # an eighth of a hole of six: none is unsure
     assert one.low <= share - 1.0 <= one.high
     assert one.unit == "1"
 
 
 def test_the_share_that_a_pin_passes_is_unsure_where_the_play_is_used_up():
     found = []
-    for off in (0.9, 1.1, 1.15, 1.2, 1.25, 1.3, 1.35, 1.6):  # five sixths of it are left by the best fit
+    for off in (0.9, 1.15, 1.2, 1.25, 1.6):  # five sixths of it are left by the best fit
         departure = np.zeros(GRID.shape)
         departure[1] = [0.0, off]
         found.append(measured(*bore_cloud(np.random.default_rng(1), departure))["holes-1-6-pass-through"])
     shares, widths = np.array([(one.deviation, one.high - one.low) for one in found]).T
     assert (np.diff(shares) <= 1e-6).all()
-    np.testing.assert_allclose(shares[[0, -1]], [0.0, -1.0 / 6.0], atol=1e-3)
+    np.testing.assert_allclose(shares[[0, -1]], [0.0, -1.0 / 6.0], atol=1e-3)  # chances beyond three sds
     assert widths[[0, -1]].max() < 1e-6 < 0.1 < widths.max()
 
 
 def test_mixed_pixels_in_the_bore_do_not_move_it():
     errors = []
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         departure = rng.normal(0.0, 0.7, GRID.shape)
         found = measured(*bore_cloud(rng, departure, mixed=0.15))
@@ -217,13 +215,9 @@ def test_few_points_on_one_side_of_a_bore_are_no_hole():
 
 
 def test_bodies_of_a_design_have_their_holes():
-    vertices, faces = mesh_of(plate(GRID).val())
-    design = StructureDesign("plate", vertices, faces)
-    seen = flat_faces.Observed(
-        places=np.empty((0, 3)), facet=np.empty(0, np.int64), deviation=np.empty(0), noise=np.empty(0),
-        shared=np.empty(0), side=50.0,
-    )  # fmt: skip
-    (body,) = flat_faces.bodies(design, seen, 60.0)
+    none = np.empty(0)
+    seen = flat_faces.Observed(np.empty((0, 3)), np.empty(0, np.int64), none, none, none, side=50.0)
+    (body,) = flat_faces.bodies(StructureDesign("plate", *mesh_of(plate(GRID).val())), seen, 60.0)
     assert len(body.holes) == len(GRID)
 
 
@@ -270,12 +264,8 @@ def test_rows_do_not_depend_on_the_last_digit_of_a_coordinate():
     made = [design_holes.Hole(place, np.array([0.0, 0.0, 1.0]), RADIUS, DEPTH) for place in middle]
     (group,) = holes.groups(made, [np.array([1.0, 0.0, 0.0])])
     assert [hole.middle[0] for hole in group.holes] == [0.0, 70.0, 140.0, 0.0]
-    pitches = {
-        id_
-        for id_ in drilled([0, 1, 2, 3], places=np.array([hole.middle[:2] for hole in group.holes]))
-        if "pitch" in id_
-    }
-    assert pitches == {"pitch-1-2", "pitch-2-3", "pitch-1-4"}
+    found = drilled([0, 1, 2, 3], places=np.array([hole.middle[:2] for hole in group.holes]))
+    assert {id_ for id_ in found if "pitch" in id_} == {"pitch-1-2", "pitch-2-3", "pitch-1-4"}
 
 
 def test_lengths_of_warm_steel_are_those_at_the_reference_temperature():
@@ -283,14 +273,14 @@ def test_lengths_of_warm_steel_are_those_at_the_reference_temperature():
     larger = 12e-6 * 30.0 * np.column_stack([GRID - GRID.mean(axis=0), np.full(len(GRID), RADIUS)])
     every = list(range(len(GRID)))
     for one in drilled(every, departure=larger, temperature_C=50.0).values():
-        assert one.deviation == pytest.approx(0.0, abs=1e-4)
+        assert one.deviation == pytest.approx(0.0, abs=1e-4)  # of second order: 3.6e-4 of 0.05 mm
     assert drilled(every, departure=larger)["pitch-1-2"].deviation == pytest.approx(12e-6 * 30.0 * PITCH[0])
 
 
 def test_places_and_pitches_have_the_scale_of_the_scanner():
     places = 50.0 * GRID
     found = drilled(list(range(6)), sd=0.0, places=places)
-    assert found["pitch-1-2"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)
+    assert found["pitch-1-2"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)  # 1.96 for 1.95996
     assert found["hole-1-along"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)
 
 

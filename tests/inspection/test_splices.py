@@ -46,12 +46,9 @@ def girder(rng, sd_mm):
     """Groups of two flanges and a web on either side of a joint, each hole drilled off its place."""
     groups = []
     for part, x in (("west", -140.0), ("east", 80.0)):
-        for middle, axes in (
-            ([x, 0.0, 290.0], [X, Y]),
-            ([x, 0.0, -290.0], [X, -Y]),
-            ([x, 0.0, 0.0], [X, Z] if part == "west" else [X, -Z]),
-        ):
-            groups.append(drilled(part, middle, axes, GRID, sd_mm * rng.standard_normal((len(GRID), 2))))
+        for z, across in ((290.0, Y), (-290.0, -Y), (0.0, Z if part == "west" else -Z)):
+            departure = sd_mm * rng.standard_normal((len(GRID), 2))
+            groups.append(drilled(part, [x, 0.0, z], [X, across], GRID, departure))
     return groups
 
 
@@ -88,16 +85,11 @@ def test_the_misfit_is_that_of_a_search_over_rigid_motions():
     groups = girder(np.random.default_rng(4), 0.8)
     true = best_fit(groups)
     found = shares(*groups)
-    assert list(found) == [
-        "plate-1-pass-through",
-        "plate-2-pass-through",
-        "plate-3-pass-through",
-        "splice-pass-through",
-    ]
+    assert list(found) == [*(f"plate-{k}-pass-through" for k in (1, 2, 3)), "splice-pass-through"]
     seen = splices._seen([splices.Splice(groups[k], groups[k + 3]) for k in range(3)])
     off = np.linalg.norm(splices.misfit(seen)[0].reshape(-1, 2), axis=1)
     order = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in (0, 3, 1, 4, 2, 5)])
-    np.testing.assert_allclose(off, true[order], atol=0.01)
+    np.testing.assert_allclose(off, true[order], atol=0.01)  # second order: turns of 0.01 by departures of 1 mm
     assert found["splice-pass-through"].deviation + 1.0 == pytest.approx(np.mean(true <= 1.0))
 
 
@@ -115,7 +107,7 @@ def test_a_part_that_was_moved_and_turned_passes():
 
 def test_intervals_cover_the_share_of_the_true_places():
     held = []
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         groups = girder(rng, 0.7)
         true = float(np.mean(best_fit(groups) <= 1.0))
@@ -126,7 +118,7 @@ def test_intervals_cover_the_share_of_the_true_places():
             measured.append(drilled(group.part, group.origin, group.group.axes, GRID, departure, sd=0.15))
         one = shares(*measured)["splice-pass-through"]
         held.append(one.low - 1e-9 <= true - 1.0 <= one.high + 1e-9)
-    assert np.mean(held) >= 0.88  # of 60 at 95 %: less than 53 in one of 100
+    assert sum(held) >= 26  # of 30 at 95 %: fewer in two of 100 cases
 
 
 def test_holes_that_are_not_seen_may_pass_or_not():

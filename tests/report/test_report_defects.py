@@ -114,6 +114,8 @@ def test_every_defect_has_a_page():
     assert figures.files(Result(status="failed", method="default")) == {}
 
 
-def test_a_deflection_is_written_where_it_was_measured():
+def test_results_json_has_the_documented_keys_and_a_deflection_where_it_was_measured():
     first, second, *_ = as_object(step_results.defects())["defects"]
-    assert (first["deflection"]["along"][0], second["deflection"]) == (-200.0, None)
+    assert (first["deflection"]["along"][0], second["deflection"], first["class"]) == (-200.0, None, "dent")
+    keys = {"id", "class", "confidence", "component", "centre", "area_mm2", "depth_max", "depth_ci95", "volume_mm3"}
+    assert keys <= set(first)

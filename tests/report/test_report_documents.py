@@ -65,6 +65,7 @@ def test_a_workbook_holds_the_tables_as_numbers_and_text():
             for cell, value in zip(cells, wanted, strict=True):
                 assert cell.data_type != "f"
                 if isinstance(value, float | np.floating):
+                    # Six decimals are written.
                     assert cell.value == (pytest.approx(value, abs=1e-6) if math.isfinite(value) else None)
                 elif isinstance(value, str) and value in FORMULAS:
                     assert (cell.value, cell.data_type) == (value, "s")

@@ -62,7 +62,7 @@ def test_allowed_band_is_one_colour_step_and_the_other_levels_are_round(scale):
     assert 9.0 * scale <= levels[-1] <= 12.0 * scale
     steps = np.diff(levels[stepped_colours.STEPS + 2 :]) / scale
     np.testing.assert_allclose(steps, steps[0])
-    assert np.isclose(steps[0] / 10.0 ** np.floor(np.log10(steps[0])), [1.0, 2.0, 5.0], rtol=1e-6).any()
+    assert np.isclose(steps[0] / 10.0 ** np.floor(np.log10(steps[0])), [1.0, 2.0, 5.0], rtol=1e-6).any()  # float64
 
 
 def test_the_map_keeps_a_dent_and_evens_out_noise():
@@ -79,6 +79,7 @@ def test_the_map_keeps_a_dent_and_evens_out_noise():
     assert only_noise.std() < 0.6 * 0.3  # less than a mean of 3 points has
     smooth, _ = face_maps._smooth(at, (dent + noise)[panel.rows], shape)
     low = np.unravel_index(np.argmin(smooth), shape)
+    # The lowest of cells about a flat bottom.
     np.testing.assert_allclose((np.array(low) + 0.5) * panel.cell, [300.0, 600.0], atol=2.0 * panel.cell)
     assert -6.5 < smooth.min() < -4.8  # the kernel evens out a fifth of a dent of 100 mm; noise of 0.18 mm beside it
 

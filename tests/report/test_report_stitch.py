@@ -78,8 +78,7 @@ def test_many_scans_keep_the_page_small(made):
 
 
 @pytest.mark.parametrize(
-    ("lang", "unit"),
-    [("en", "mm from the other scans at"), pytest.param("zh", "相对其他扫描", marks=pytest.mark.slow)],
+    ("lang", "unit"), [("en", "mm from the other scans at"), pytest.param("zh", "相对其他扫描", marks=pytest.mark.slow)]
 )
 def test_scans_in_space_react(made, tmp_path, lang, unit):
     report = ErrorReport()

@@ -59,9 +59,9 @@ def plates(departures):
     return whole
 
 
-def plate_scene(seed, sd_mm):
+def plate_scene(seed, sd_mm, step_mrad=1.2):
     """A scan of plates whose corners are off by ``sd_mm``, with the design as it should be, and the departures."""
     departures = np.random.default_rng(seed).normal(0.0, sd_mm, (len(THICK), 4, 2))
-    built, _ = designgen.scan(plates(departures), stations=6, seed=seed, settings={"scan.step_mrad": 1.2})
+    built, _ = designgen.scan(plates(departures), stations=6, seed=seed, settings={"scan.step_mrad": step_mrad})
     designed, _ = designgen.scan(plates(0.0 * departures), stations=1, seed=1, settings={"scan.step_mrad": 20.0})
     return dataclasses.replace(built, structure=designed.structure), departures
