@@ -89,8 +89,8 @@ def test_movements_are_those_of_the_whole(options, small, monkeypatch):
     assert (blocks.status, blocks.points_read, blocks.points_kept) == (whole.status, COUNT, whole.points_kept)
     np.testing.assert_array_equal(blocks.core.n1, whole.core.n1)
     for name in ("distance", "lod95"):
-        # Sums in float32 of distances of 40 mm.
-        np.testing.assert_allclose(getattr(blocks.core, name), getattr(whole.core, name), atol=1e-3)
+        # Sums in another order: 1e-14 came with these seeds.
+        np.testing.assert_allclose(getattr(blocks.core, name), getattr(whole.core, name), atol=1e-9)
     assert whole.core.n1.sum() > COUNT
 
 
@@ -145,7 +145,7 @@ def test_scans_that_lie_elsewhere_are_left_out_of_all_points(small):
     assert "deviation.scans-elsewhere" in [reason.code for reason in result.reasons]
     assert 0.9 < result.points_kept / (bracket_scenes.COUNT / 2) < 1.0
     alone = deviation_step.run(dataclasses.replace(scene, scans=scene.scans[:1]), Params())
-    assert result.mean == pytest.approx(alone.mean, abs=0.05)  # three sds: noise of 1 mm, 6,000 points twice
+    assert result.mean == pytest.approx(alone.mean, abs=0.05)  # other core points of the same scan: 0.015 came
 
 
 def test_a_whole_number_of_points_is_asked_for():

@@ -68,7 +68,9 @@ def test_mixed_pixels_and_other_steel_do_not_move_an_edge():
     tail[:, 0] += rng.uniform(-20.0, 20.0, len(tail))
     pieces, *_ = measured(design(box(PLATE)), np.concatenate([on_end(rng), tail]))
     # Five sds of 100 points of 0.3 mm.
-    assert np.average(pieces.value, weights=1.0 / pieces.noise) == pytest.approx(1.5, abs=0.15)
+    assert np.average(pieces.value, weights=1.0 / pieces.noise) == pytest.approx(
+        1.5, abs=0.12
+    )  # four sds of 100 points of 0.3 mm
 
 
 def test_points_near_the_rims_are_left_out():
@@ -101,7 +103,9 @@ def test_an_edge_of_which_half_is_free_is_measured_by_that_half():
     pieces, *_ = measured(design(box(PLATE), flange), points)
     assert pieces.places[:, 1].max() < 0.0
     # Five sds of 200 points of 0.3 mm.
-    assert np.average(pieces.value, weights=1.0 / pieces.noise) == pytest.approx(0.8, abs=0.1)
+    assert np.average(pieces.value, weights=1.0 / pieces.noise) == pytest.approx(
+        0.8, abs=0.1
+    )  # four sds of 150 points of 0.3 mm
 
 
 @pytest.mark.parametrize(("direction", "code"), [((-1, 0, 0), "inspect.face-hidden"), ((1, 0, 0), None)])
@@ -160,9 +164,8 @@ def counted(structure, points):
 def test_an_edge_is_where_the_points_of_the_broad_face_end(off):
     """Mean over grids of 3 mm: the error of one is below a spacing over the root of its lines."""
     levels = [counted(design(box(PLATE)), on_top(200.0 + off, first=first)) for first in np.linspace(0.0, 3.0, 5)]
-    # A spacing of 3 mm over the root of 36 lines that end at any place.
-    np.testing.assert_allclose([level.value for level in levels], off, atol=0.5)
-    # Half of that over the root of the grids.
+    # A line of points ends at any place of its spacing, 0.87 mm: 100 lines, four sds; and the root of five grids.
+    np.testing.assert_allclose([level.value for level in levels], off, atol=0.35)
     assert np.mean([level.value for level in levels]) == pytest.approx(off, abs=0.15)
     assert all(level.variance > (0.5 * narrow_faces.RIM_MM) ** 2 for level in levels)  # half a beam is not known
 

@@ -23,7 +23,7 @@ from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, page, write_results
 from processor.report import table as report_table
 from processor.report.columns import columns
-from processor.report.space_frame import ball_picture, dxf, flagged_ball_figures, section
+from processor.report.space_frame import ball_picture, dxf, flagged_ball_figures, interactive_view, section
 from processor.report.space_frame import figures as space_frame_figures
 from processor.report.space_frame import tables as space_frame_tables
 from processor.report.style import COLOURS, DPI, Drawn
@@ -515,8 +515,10 @@ def test_the_page_of_a_frame(compared):
 
 
 @pytest.mark.parametrize("times", [500, pytest.param(6000, marks=pytest.mark.slow)])
-def test_a_roof_of_many_balls_keeps_the_page_small(times):
+def test_a_roof_of_many_balls_keeps_the_page_small(times, monkeypatch):
     """12 MB for 30,000 balls are a third of a kilobyte a ball, and 2 MB of tables of 2,000 rows each."""
+    assert interactive_view.MOST_BALLS == 5000
+    monkeypatch.setattr(interactive_view, "MOST_BALLS", 5 * times // 6)
     execution, report = of_frame(repeated(whole(), times))
     text = page.html(execution, report, {})
     assert len(text) < 2_000_000 + 5 * times * 1_000 / 3
