@@ -520,6 +520,8 @@ def test_a_roof_of_many_balls_keeps_the_page_small(times, monkeypatch):
     assert interactive_view.MOST_BALLS == 5000
     monkeypatch.setattr(interactive_view, "MOST_BALLS", 5 * times // 6)
     execution, report = of_frame(repeated(whole(), times))
+    marks = interactive_view.interactive_data(execution.scene, execution.runs)["marks"]
+    assert len(marks) == 2 * times + 1  # all that are flagged and placed, which are more than enough, and one other
     text = page.html(execution, report, {})
     assert len(text) < 2_000_000 + 5 * times * 1_000 / 3
     assert f"The first 2000 of {5 * times} rows" in text
