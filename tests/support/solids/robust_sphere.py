@@ -1,4 +1,4 @@
-"""The robust fit of a sphere in its readable form, in NumPy."""
+"""Points on spheres, and the robust fit of a sphere in its readable form, in NumPy."""
 
 from typing import NamedTuple
 
@@ -13,6 +13,15 @@ class Fit(NamedTuple):
     state: np.ndarray
     scale: float
     inliers: np.ndarray
+
+
+def cap(rng, n, radius=45.0, share=0.45, view=(0.0, 0.0, 1.0)):
+    """Directions evenly over the share of the sphere that faces ``view``, times the radius."""
+    view = np.asarray(view) / np.linalg.norm(view)
+    height, turn = rng.uniform(1.0 - 2.0 * share, 1.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
+    across = np.linalg.svd(view[None])[2][1:]
+    ring = np.sqrt(1.0 - height**2)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    return radius * (height[:, None] * view + ring @ across)
 
 
 def linearised(points, state, scanner):
