@@ -11,6 +11,8 @@ from processor.adjustment.model_averaging import (
     with_least_covariance,
 )
 
+# All of 3 to 5 by 3 to 5 matrices of condition 100 in float64, but for roots of a zero eigenvalue: 2e-8.
+
 
 def test_covariance_is_raised_in_every_direction():
     rng = np.random.default_rng(4)
@@ -39,7 +41,7 @@ def test_a_mixture_of_two_sets_equals_the_average_over_all_hypotheses():
     for parts in ((every[:1], every[1:]), (every[2:], every[:2])):
         found = mixture(*(estimate(value, noise, part) for part in parts))
         np.testing.assert_allclose(found.mean, whole.mean, rtol=1e-10)
-        np.testing.assert_allclose(found.covariance, whole.covariance, rtol=1e-10, atol=1e-14)
+        np.testing.assert_allclose(found.covariance, whole.covariance, rtol=1e-10, atol=1e-14)  # float64, as above
         np.testing.assert_allclose(found.gain @ value, whole.mean, rtol=1e-10)
         np.testing.assert_allclose(found.gain, whole.gain, rtol=1e-10, atol=1e-14)
         assert found.log_evidence == pytest.approx(whole.log_evidence)
@@ -67,7 +69,7 @@ def test_weights_of_traits_are_estimated_separately():
     logs = np.stack([near, near, far, far, far_alone])
     weights = weights_by_others(logs, np.ones(4), traits)
     # By the four others, with the prior as a fifth: nine of ten for straight, whatever the shift.
-    np.testing.assert_allclose(weights[4, 2] / weights[4, 2:].sum(), 0.9, rtol=1e-3)
+    np.testing.assert_allclose(weights[4, 2] / weights[4, 2:].sum(), 0.9, rtol=1e-3)  # likelihoods of 1e-6
     np.testing.assert_allclose(weights[4, 0] / weights[4, :2].sum(), 0.9, rtol=1e-3)
     whole = weights_by_others(logs, np.ones(4), np.arange(4)[None])
     assert whole[4, 2] / whole[4, 2:].sum() < 0.9

@@ -25,7 +25,7 @@ def test_means_by_their_moderated_deviation_follow_students_law():
         t = rng.normal(0.0, np.sqrt(true)) / np.sqrt(found.variance)
         beyond += int((2.0 * stats.t.sf(np.abs(t), found.dof) < 0.01).sum())
         number += len(t)
-    assert beyond == pytest.approx(0.01 * number, abs=4.0 * np.sqrt(0.01 * number))
+    assert beyond == pytest.approx(0.01 * number, abs=4.0 * np.sqrt(0.01 * number))  # standard deviations
 
 
 def test_moderated_variances_are_nearer_to_the_true_ones():
@@ -33,13 +33,15 @@ def test_moderated_variances_are_nearer_to_the_true_ones():
     found = moderated_variances.moderated(square, dof)
     few = dof < 6.0
     off, before = (np.abs(np.log(x[few] / true[few])).mean() for x in (found.variance, square / dof))
-    assert off < 0.7 * before
+    assert off < 0.7 * before  # of 1 to 5 and 12 more degrees of freedom the error falls to a half
 
 
 def test_groups_of_one_variance_have_it():
     _, _, square, dof = groups(2, law=np.inf)
     found = moderated_variances.moderated(square, dof)
-    np.testing.assert_allclose(found.variance, COMMON, rtol=0.2)
+    np.testing.assert_allclose(
+        found.variance, COMMON, rtol=0.2
+    )  # the common one by 6,000 degrees: 2 %; the law itself is estimated
     assert found.dof.min() > 50.0
 
 

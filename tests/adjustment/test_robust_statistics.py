@@ -8,10 +8,11 @@ from processor import robust_statistics
 
 
 def test_scale_of_normal_residuals_is_their_standard_deviation_despite_outliers():
+    # The median of 100,000 sizes is known to 0.4 %; of 1 % outliers it is that of a share of 0.505: 1.3 % more.
     residual = 0.3 * np.random.default_rng(4).standard_normal(100_000)
     assert robust_statistics.robust_sd(residual) == pytest.approx(0.3, rel=0.01)
     assert robust_statistics.robust_sd(np.append(residual, np.full(1000, 1e6))) == pytest.approx(0.3, rel=0.03)
-    assert robust_statistics.robust_sd_about_median(5.0 + residual) == pytest.approx(0.3, rel=0.01)
+    assert robust_statistics.robust_sd_about_median(5.0 + residual) == pytest.approx(0.3, rel=0.01)  # 0.4 %
 
 
 def test_scale_has_a_lower_bound_and_exists_without_residuals():
@@ -22,7 +23,7 @@ def test_scale_has_a_lower_bound_and_exists_without_residuals():
 
 def test_biweight_is_one_at_zero_and_zero_from_its_limit():
     weight = robust_statistics.biweight(np.array([0.0, 0.5, -0.5, 1.0, 3.0]))
-    np.testing.assert_allclose(weight, [1.0, 0.5625, 0.5625, 0.0, 0.0], rtol=1e-15)
+    np.testing.assert_allclose(weight, [1.0, 0.5625, 0.5625, 0.0, 0.0], rtol=1e-15)  # float64: exact in halves
 
 
 def test_biweight_mean_is_ninety_five_percent_efficient():
@@ -31,10 +32,12 @@ def test_biweight_mean_is_ninety_five_percent_efficient():
     p = stats.norm.pdf(z) * (z[1] - z[0])
     psi = z * robust_statistics.biweight(z / robust_statistics.TUKEY)
     slope = np.gradient(psi, z)
-    assert (p @ slope) ** 2 / (p @ psi**2) == pytest.approx(0.95, abs=1e-3)
+    assert (p @ slope) ** 2 / (p @ psi**2) == pytest.approx(
+        0.95, abs=1e-3
+    )  # the constant 4.685 is given to four figures
 
 
 def test_widened_standard_deviations_cover_as_students_t():
     for dof in (1.0, 4.0, 30.0):
         reach = 1.959964 * robust_statistics.student_factor(dof)
-        assert 2.0 * stats.t.cdf(reach, dof) - 1.0 == pytest.approx(0.95, abs=1e-6)
+        assert 2.0 * stats.t.cdf(reach, dof) - 1.0 == pytest.approx(0.95, abs=1e-6)  # the figures of 1.959964

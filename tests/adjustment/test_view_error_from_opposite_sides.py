@@ -28,14 +28,14 @@ def plates(seed, between=0.0):
 
 @pytest.mark.parametrize("between", [0.3, 1.0])
 def test_the_standard_deviation_between_views_is_that_of_the_sides(between):
-    found = [view_error_from_opposite_sides.view_sd(*plates(seed, between), SIDE) for seed in range(30)]
-    # Twelve independent sums a seed: the median of their squares is known to half of itself.
+    found = [view_error_from_opposite_sides.view_sd(*plates(seed, between), SIDE) for seed in range(12)]
+    # Twelve independent sums a seed: one root of their mean square is known to a fifth, the median of twelve to 7 %.
     assert np.median(found) == pytest.approx(between, rel=0.25)
 
 
 def test_noise_alone_is_no_difference_between_views():
-    found = [view_error_from_opposite_sides.view_sd(*plates(seed), SIDE) for seed in range(30)]
-    assert max(found) < NOISE
+    found = [view_error_from_opposite_sides.view_sd(*plates(seed), SIDE) for seed in range(12)]
+    assert max(found) < NOISE  # a place has the mean of some 36 points
 
 
 def test_a_movement_of_whole_plates_is_no_difference_between_views():
@@ -54,26 +54,13 @@ def test_facing_sides_of_two_bodies_are_not_compared():
     assert view_error_from_opposite_sides.view_sd(points, -normals, along, variance, SIDE) == 0.0
 
 
-def merged(scene, shifts):
-    """The scans of a scene as one cloud of which nothing is known, each moved along z."""
-    points = np.concatenate(
-        [scan.points + np.array([0.0, 0.0, z]) for scan, z in zip(scene.scans, shifts, strict=True)]
-    )
-    return Scene(scene.name, "structure", (Scan("merged", points),), structure=scene.structure, units="mm")
-
-
 def test_levels_of_detection_of_a_merged_cloud_include_view_differences():
-    scene = merged(plate(20.0, 3, STATIONS, False), (0.4, -0.4))
+    scene = plate(20.0, 3, STATIONS, False)
+    above, below = (scan.points + np.array([0.0, 0.0, z]) for scan, z in zip(scene.scans, (0.4, -0.4), strict=True))
+    scene = Scene(scene.name, "structure", (Scan("merged", np.vstack([above, below])),), structure=scene.structure)
     result = deviation_step.run(scene, AS_IT_LIES)
     assert "deviation.views-differ" in [reason.code for reason in result.reasons]
     faces = (np.argmax(np.abs(result.core.normals), axis=1) == 2) & np.isfinite(result.core.lod95)
-    assert result.core.distances.significant[faces].mean() < 0.05
+    assert result.core.distances.significant[faces].mean() < 0.05  # as stated: 95 %
     # Both sides moved outward by 0.4 mm: the sum of 0.8 mm is of two views.
     assert np.median(result.core.lod95[faces]) > 0.8
-
-
-def test_views_that_agree_do_not_widen_levels_of_detection():
-    alone = deviation_step.run(plate(20.0, 3, STATIONS, False), AS_IT_LIES)
-    together = deviation_step.run(merged(plate(20.0, 3, STATIONS, False), (0.0, 0.0)), AS_IT_LIES)
-    ratio = np.nanmedian(together.core.lod95) / np.nanmedian(alone.core.lod95)
-    assert 0.9 < ratio < 1.3

@@ -7,7 +7,7 @@ from processor.adjustment import scanner_class_errors
 from processor.preassembly.ends import view_variance
 
 
-def plate(rng, apart, thick=24.0, waves=0.0, off=None, count=3_000):
+def plate(rng, apart, thick=24.0, waves=0.0, off=None, count=1_500):
     """Points on both sides of a plate of 500 by 900 mm; each side is ``off``, or by a draw of ``apart`` mm."""
     heights, places, inner = [], [], []
     off = apart * rng.standard_normal(2) if off is None else off
@@ -25,6 +25,7 @@ def plate(rng, apart, thick=24.0, waves=0.0, off=None, count=3_000):
 def test_waves_of_a_plate_do_not_change_its_thickness():
     rng = np.random.default_rng(0)
     found = np.array([plate(rng, 0.0, waves=3.0).value for _ in range(20)])
+    # 1 mm by 1,500 points on either side and three terms: 0.04 each, 0.01 of twenty; waves of 3 mm alone make 0.5.
     assert np.abs(found[:, 0].mean() - 24.0) < 0.03
     assert found[:, 0].std() < 0.1
 
@@ -32,7 +33,7 @@ def test_waves_of_a_plate_do_not_change_its_thickness():
 def pair(rng, apart, thick=24.0):
     """Two opposite plates of an end, seen from the same two sides: shifts of views point outward on one alone."""
     off = apart * rng.standard_normal(2)
-    return [plate(rng, apart, thick, off=one, count=1_500) for one in (off, -off[::-1])]
+    return [plate(rng, apart, thick, off=one) for one in (off, -off[::-1])]
 
 
 # Of 12 pairs of opposite plates less 3 means of equal thickness 9 are left. By Student's t they are widened by
@@ -47,6 +48,7 @@ def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart, wid
         )
         for _ in range(60)
     ]
+    # By 9 degrees of freedom a variance is known to 47 %, the mean of 60 to 6 %.
     assert np.mean([one.level for one in found]) == pytest.approx(wider * apart**2, rel=0.2)
     assert all(one.evident for one in found)
 
@@ -54,16 +56,16 @@ def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart, wid
 def box(rng, apart, rolled, one_outer):
     """Plates of both ends of a box of two nominal thicknesses, and rows of the same plates; ``rolled``: sd by plate."""
     thick = np.array([24.0, 24.0, 30.0, 30.0]) + rolled * rng.standard_normal(4)
-    outer = apart * rng.standard_normal(4)
-    ends = []
+    outer, ends = apart * rng.standard_normal(4), []
     for _ in range(2):
         outer = outer if one_outer else apart * rng.standard_normal(4)
         inner = apart * rng.standard_normal(4)
-        ends += [plate(rng, apart, t, off=off, count=1_500) for t, *off in zip(thick, outer, inner, strict=True)]
+        ends += [plate(rng, apart, t, off=off) for t, *off in zip(thick, outer, inner, strict=True)]
     return ends, [(k, 4 + k) for k in range(4)]
 
 
 def of_boxes(rng, apart, rolled, one_outer):
+    """Variances of the plates of three boxes."""
     plates, same = [], []
     for _ in range(3):
         ends, rows = box(rng, apart, rolled, one_outer)
@@ -84,9 +86,9 @@ def test_plates_that_were_rolled_differently_are_no_difference_between_views():
 def test_views_that_differ_are_not_taken_for_rolling(one_outer):
     """Also where the outer sides at both ends were seen from one place, nineteen in twenty limits hold the truth."""
     rng = np.random.default_rng(7)
-    found = [of_boxes(rng, 0.3, 0.0, one_outer) for _ in range(60)]
+    found = [of_boxes(rng, 0.3, 0.0, one_outer) for _ in range(30)]
     assert np.mean([one.level for one in found]) > 0.3**2
-    assert np.mean([one.evident for one in found]) > 0.9
+    assert np.mean([one.evident for one in found]) > 0.9  # of 30
 
 
 def test_opposite_plates_of_one_end_show_no_difference_between_views():
@@ -99,16 +101,16 @@ def test_opposite_plates_of_one_end_show_no_difference_between_views():
 def test_ends_that_differ_as_others_do_contradict_as_rarely_as_stated():
     """Tails of plates that differ as their model has it are uniform, also of few ends."""
     rng = np.random.default_rng(5)
-    tails = [view_variance.tails([pair(rng, 0.3) + pair(rng, 0.3, 30.0) for _ in range(4)]) for _ in range(60)]
+    tails = [view_variance.tails([pair(rng, 0.3) + pair(rng, 0.3, 30.0) for _ in range(4)]) for _ in range(40)]
     assert np.isfinite(tails).all()
-    assert np.mean(np.array(tails) < 0.05) < 0.08  # of 240, correlated: 0.05 + 2 standard deviations of 0.015
+    assert np.mean(np.array(tails) < 0.05) < 0.08  # of 160, correlated: 0.05 + 2 standard deviations of 0.017
 
 
 def test_noise_alone_is_no_difference_between_viewpoints():
     rng = np.random.default_rng(2)
-    found = [view_variance.variances([plate(rng, 0.0) for _ in range(16)]) for _ in range(20)]
+    found = [view_variance.variances([plate(rng, 0.0) for _ in range(16)]) for _ in range(10)]
     assert not any(one.evident for one in found)
-    assert np.sqrt(np.mean([one.level for one in found])) < 0.02
+    assert np.sqrt(np.mean([one.level for one in found])) < 0.03  # less than the noise of a thickness: 0.04
 
 
 def test_a_plate_of_which_one_side_was_seen_has_no_thickness():
