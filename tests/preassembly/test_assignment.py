@@ -1,6 +1,5 @@
 """Scans assigned to parts that they are not of: found before the costly registration, named, and matched."""
 
-import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,21 +25,22 @@ def shapes():
     return Shapes(arch_clouds.design())
 
 
-def scanned(part, seed=1, spacing_mm=30.0):
+def scanned(part, seed=1, spacing_mm=50.0):
     rng = np.random.default_rng(seed)
     points = arch_clouds.scan_points(part, spacing_mm, 1.0, rng)
     return rigid.apply(arch_clouds.random_pose(rng), points)
 
 
 @pytest.mark.parametrize(
-    ("came", "asked", "found"), [(2, 1, 2), pytest.param(1, 2, 1, marks=pytest.mark.slow), (3, 0, 1), (0, 2, 0)]
+    ("came", "asked", "found"),
+    [(0, 2, 0), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1, 2, 1), (2, 1, 2), (3, 0, 1)))],
 )
 def test_scan_of_another_size_is_assigned_to_the_parts_of_that_size(shapes, came, asked, found):
     """Ribs 1 and 3, and the feet, differ by their marks alone: any of them stands for both."""
     assert assignment.rather(scanned(came), asked, shapes) == found
 
 
-@pytest.mark.parametrize("part", range(5))
+@pytest.mark.parametrize("part", [0, 1, 2])  # the two others have their shapes
 def test_scan_of_its_own_part_gets_no_other_assignment(shapes, part):
     assert assignment.rather(scanned(part), part, shapes) is None
 
@@ -60,9 +60,10 @@ def scans_of(assigned, *parts):
     return [ScanParts(f"Scan_{i:03d}", name, one) for i, (name, one) in enumerate(zip(assigned, parts, strict=True), 1)]
 
 
-@pytest.mark.parametrize("order", list(itertools.permutations(range(4)))[1:])
+# A swap, a ring of three, two swaps, a ring of four.
+@pytest.mark.parametrize("order", [(1, 0, 2, 3), (0, 2, 3, 1), (1, 0, 3, 2), (3, 0, 1, 2)])
 def test_every_wrong_assignment_is_named_with_the_matching(order):
-    """All 24 permutations but the right one; scan i is of part i."""
+    """Scan i is of part i."""
     names = NAMES[:4]
     solved = assignment.solve(scans_of([names[k] for k in order], *((name,) for name in names)))
     parts = [SimpleNamespace(identities=(scan,)) for scan in solved]

@@ -8,7 +8,6 @@ import pytest
 
 from processor.geometry import rigid
 from processor.model import Scan
-from processor.preassembly import assembly_errors
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import bootstrap_bands, methods
 from processor.preassembly.params import PAPER_METHODS
@@ -30,13 +29,6 @@ def extracted(scene, truth):
 def bridge():
     """A bridge and the features of its parts."""
     scene, truth = arch_clouds.bridge(spacing_mm=35.0, sigma_mm=1.0, seed=3)
-    return scene.arch, extracted(scene, truth)
-
-
-@pytest.fixture(scope="module")
-def dense():
-    """The same with as many points as the methods need at every joint."""
-    scene, truth = arch_clouds.bridge(spacing_mm=15.0, sigma_mm=1.0, seed=3)
     return scene.arch, extracted(scene, truth)
 
 
@@ -78,38 +70,15 @@ def test_points_of_a_part_as_built_are_projected_onto_its_design():
         name="rib2", scan=scan, attitude=found, ends=(None, None), lines=np.empty((0, 3)), edges=None, reasons=()
     )
     laid = bootstrap_bands._as_designed(part, design)
-    assert laid.sigma_mm == pytest.approx(0.5, rel=0.2)
+    assert laid.sigma_mm == pytest.approx(0.5, rel=0.2)  # and some of the bow of 5 mm, which the model follows
     assert (~laid.near).sum() == 50
     there = rigid.apply(laid.T_bridge_scan, laid.points)
     # Open3D's distances are float32: hundredths of a millimetre, about the part's middle.
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(np.float32(design.vertices - middle), np.uint32(design.faces))
     assert scene.compute_distance(np.float32(there[laid.near] - middle)).numpy().max() < 0.01
+    # The part is 6 mm longer and bowed by 5 mm to one side, of which its pose has the mean.
     assert np.abs(rigid.apply(laid.T_bridge_scan @ T, middle[None]) - middle).max() < 3.0
-
-
-# Corner is held to its bands over bridges, below: its errors along one bridge are a single rotation.
-@pytest.mark.parametrize("method", ["design-aided", "line"])
-@pytest.mark.slow
-def test_band_covers_the_errors_of_a_bridge_as_designed(dense, method):
-    """All deviations of this bridge are errors of the method: its parts are exactly as designed."""
-    result = banded(*dense, method)
-    borders = np.cumsum([0.0, *(part.edges.design_left.length for part in dense[1])])
-    assert result.bands_as_designed
-    for said, band in (
-        (result.linear.assembled.deviation, result.linear.assembled.ci95),
-        (result.linear.best_fit.deviation, result.linear.best_fit.ci95),
-    ):
-        # The last intervals of a part may have points in some repetitions only.
-        apart = np.isfinite(band) != np.isfinite(said)
-        assert apart.sum() <= len(borders)
-        assert (
-            (np.abs(borders[:, None] - result.linear.chainage[apart]) < assembly_errors.INTERVAL_MM).any(axis=0).all()
-        )
-        known = np.isfinite(said) & np.isfinite(band)
-        assert (said <= band)[known].mean() > 0.9
-    figures = [value for error in result.errors for value in (error.mean, error.max)]
-    assert (figures <= result.errors_ci95).sum() >= 5
 
 
 @pytest.mark.slow
@@ -120,12 +89,17 @@ def test_bands_cover_the_errors_over_several_bridges():
         parts = extracted(scene, truth)
         for method, own in held.items():
             result = banded(scene.arch, parts, method, seed=seed)
-            of = result.linear.assembled
-            known = np.isfinite(of.ci95) & np.isfinite(of.deviation)
-            own.append((of.deviation <= of.ci95)[known].mean())
+            figures = [value for error in result.errors for value in (error.mean, error.max)]
+            shares = [np.mean(figures <= result.errors_ci95)]
+            for of in (result.linear.assembled, result.linear.best_fit):
+                known = np.isfinite(of.ci95) & np.isfinite(of.deviation)
+                # The last intervals of a part may have points in some repetitions only.
+                assert known.sum() >= np.isfinite(of.deviation).sum() - len(parts) - 1
+                shares.append((of.deviation <= of.ci95)[known].mean())
+            own.append(shares)
     # Errors along one bridge are correlated: 8 bridges determine the mean share to some per cent.
     for own in held.values():
-        assert np.mean(own) > 0.9
+        assert (np.mean(own, axis=0) > 0.9).all()
 
 
 def test_where_the_chain_is_broken_there_is_no_band(bridge):

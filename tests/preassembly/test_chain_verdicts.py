@@ -10,9 +10,9 @@ from processor.limits import project_limits, standards
 from processor.model import ArchDesign, DesignPart, Tolerance, reason
 from processor.preassembly import to_result
 from processor.preassembly.chain import span_and_closure
-from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.verdicts import chain, joints
+from tests.support.results import measured_parts
 
 GB, JTG = standards.load("GB 50205-2020"), standards.load("JTG arch rib")
 NAN = float("nan")
@@ -43,9 +43,10 @@ def test_span_is_judged_by_the_limit_of_the_project(value, sd, verdict):
     assert (limits.key, limits.clause, limits.source, limits.edition) == (
         ("span_mm",), ("project.toml",), ("project.toml",), ("",),
     )  # fmt: skip
-    np.testing.assert_allclose([limits.value[0], limits.ci95[0]], [value, 1.959964 * sd], rtol=1e-5)
+    np.testing.assert_allclose([limits.value[0], limits.ci95[0]], [value, 1.959964 * sd], rtol=1e-5)  # its figures
     np.testing.assert_allclose([limits.low[0], limits.high[0]], [-1.0, 1.0])
     draws = np.random.default_rng(1).normal(value, sd, 400_000)
+    # A share of 400,000 draws is known to 0.0008.
     assert limits.probability[0] == pytest.approx((np.abs(draws) <= 1.0).mean(), abs=0.003)
 
 
@@ -84,18 +85,7 @@ def test_edges_are_judged_along_their_length_by_limits_of_the_span():
 def test_quantities_of_the_edges_by_hand():
     """Both edges 3 mm to the left and 2 mm up from an arch with slope 3 : 4: the elevation is 2.5 mm."""
     axes = np.tile(np.array([[0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]), (4, 1, 1))
-    edges = EdgeDepartures(
-        side=("left", "left", "right", "right"),
-        chainage=np.zeros(4),
-        points=np.zeros((4, 3)),
-        axes=axes,
-        departure=np.zeros((4, 2)),
-        covariance=np.zeros((2, 4, 4)),
-        by_pose=np.zeros((4, 2, 6)),
-        by_view=np.zeros((2, 4, 1)),
-        by_tilt=np.zeros((2, 4, 1)),
-        tails=np.ones((2, 2)),
-    )
+    edges = measured_parts.edges(np.zeros(4), np.zeros((4, 3)), axes, np.zeros((4, 2)))
     member = Member((None, None), edges, np.zeros(3), np.zeros((6, 6)))
     adjusted = SimpleNamespace(
         departures=(np.tile([3.0, 2.0], (4, 1)),), departure_variance=(np.tile([0.04, 0.01], (4, 1)),)
@@ -172,7 +162,7 @@ def test_limits_of_an_undecided_joint_are_indeterminate():
 def test_mean_and_largest_of_correlated_values_have_the_interval_of_one():
     """1.96 sd for one value, and for the mean of a hundred values that may be fully correlated."""
     of = span_and_closure.mean_max_ci95
-    np.testing.assert_allclose(of(np.array([[3.0]]), np.array([[0.04]])), 0.392, rtol=1e-3)
+    np.testing.assert_allclose(of(np.array([[3.0]]), np.array([[0.04]])), 0.392, rtol=1e-3)  # 1.96 * 0.2 by its figures
     assert of(np.zeros((100, 1)), np.full((100, 1), 0.04))[0] == pytest.approx(0.392, rel=1e-3)
     half = of(np.array([[3.0, 4.0], [1.0, 0.0], [np.nan, 0.0]]), np.full((3, 2), 0.04))
     np.testing.assert_allclose(half, [0.392 * np.sqrt(2.0), 0.2 * 2.4477], rtol=1e-3)  # the second is not the largest

@@ -9,8 +9,8 @@ from processor.geometry import mesh_distance
 from processor.model import Reason
 from processor.preassembly.ends import joint_end, outer_faces, section
 from processor.preassembly.ends.joint_frame import end_place
-from processor.preassembly.ends.outer_faces import RegisteredPart
 from processor.preassembly.ends.section import PlateFace
+from tests.support.results import measured_parts
 
 B, H, FLANGE, WEB = 250.0, 500.0, 30.0, 14.0
 SIZES = {"width_mm": 2 * B, "height_mm": 2 * H, "flange_mm": FLANGE, "web_mm": WEB, "length_mm": 2500.0, "parts": 2}
@@ -31,6 +31,7 @@ def test_box_section_has_four_faces_with_any_inner_plates(of):
     assert [face.name for face in place.section.faces] == list(PlateFace)
     assert place.section.middles == (0, 1, 2, 3)
     assert section.on_steel([place.section] * 2).all()
+    # float64, as below
     np.testing.assert_allclose(joint_end._design_thickness(surface, place), [FLANGE, WEB, FLANGE, WEB], atol=1e-9)
 
 
@@ -69,10 +70,7 @@ def measured(of, errors, seed, spacing_mm=8.0, sigma_mm=1.0):
     patches = [(0, patch) for patch in part.built()]
     settings = sampler.Params(spacing_mm=spacing_mm, sigma_mm=sigma_mm)
     points = sampler.scan_patches(patches, settings, np.random.default_rng(seed)).points
-    registered = RegisteredPart(
-        points=points, station=np.zeros(len(points), np.int64), between_stations=0.0, pose=np.zeros((6, 6)),
-        surface=surface, outer=outer_faces.outer_faces(surface, [key_points]),
-    )  # fmt: skip
+    registered = measured_parts.registered(points, surface, outer_faces.outer_faces(surface, [key_points]))
     fitted = joint_end.fit(registered, end_place(key_points, 1.0, surface))
     assert not isinstance(fitted, Reason | joint_end.JointEnd), fitted
     return joint_end.estimate([fitted])[0]
@@ -86,10 +84,10 @@ def closed_form(errors):
     return np.vstack([own, *([0.5 * (own[a] + own[b])] for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)))])
 
 
-@pytest.mark.parametrize("of", ["box", "stiffened-box", "i"])
+@pytest.mark.parametrize("of", ["box", pytest.param("stiffened-box", marks=pytest.mark.slow), "i"])
 def test_corners_are_where_the_faces_and_the_end_meet(of):
     held, rms = [], []
-    for seed in range(4):
+    for seed in range(3):
         rng = np.random.default_rng([seed, 7])
         errors = prismatic_parts.EndErrors(rng.normal(0.0, [2.0, 1e-3, 1e-3]), rng.normal(0.0, 1.0, (4, 3)))
         end = measured(of, errors, seed)
@@ -98,8 +96,8 @@ def test_corners_are_where_the_faces_and_the_end_meet(of):
         held.append(np.abs(off) < 1.96 * sd)
         rms.append(np.sqrt(np.mean(off**2)))
         assert (np.abs(off) < 4.5 * np.hypot(sd, 0.05)).all()  # an end by itself learns from no other
-    assert np.mean(held) > 0.75  # some eight independent coordinates an end
-    assert np.mean(rms) < 0.35
+    assert np.mean(held) > 0.75  # of some 24 independent coordinates 95 % have a standard deviation of 4.4 %
+    assert np.mean(rms) < 0.35  # of ends that are off by 2 mm; points 8 mm apart on plates of 14 mm
 
 
 @pytest.mark.parametrize("radius_mm", [1_500.0, 3_000.0])

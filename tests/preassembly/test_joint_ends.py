@@ -11,10 +11,13 @@ from processor.model import reason
 from processor.preassembly.chain import adjustment, span_and_closure
 from processor.preassembly.ends import joint_end, plate_sides
 from processor.preassembly.ends import outer_faces as ends_faces
-from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_frame import end_place
 from processor.preassembly.parts.part_in_chain import Member
+from tests.support.results import measured_parts
 
+# A corner is known to some 0.2 mm by thousands of points with noise of 1 mm on each of its faces; beside that the
+# movement made here, a cubic that fades out along the part, departs from the model's polynomials by some hundredths.
+ROUGH_MM = 0.05
 LENGTH, B, H, T = 1600.0, 600.0, 800.0, 26.0  # the end at x = 0, the part towards -x; half width, height; plates
 
 
@@ -76,20 +79,16 @@ def built(points, corners):
 
 def fitted(points, rng, sigma=1.0):
     surface, joint = design()
-    outer = outer_faces()
     noisy = points + sigma * rng.standard_normal(points.shape)
     place = end_place(joint, 1.0)
     assert np.allclose(place.T_bridge_joint[:3, :3], np.eye(3))
-    part = ends_faces.RegisteredPart(
-        points=noisy,
-        station=np.zeros(len(points), np.int64),
-        between_stations=0.0,
-        pose=1e-12 * np.eye(6),
-        surface=surface,
-        outer=outer,
-    )
+    part = measured_parts.registered(noisy, surface, outer_faces(), 1e-12)
     end = joint_end.fit(part, place)
     return end if isinstance(end, joint_end.JointEnd) else joint_end.estimate([end])[0]
+
+
+def sds(end):
+    return np.sqrt(np.diag(end.covariance)).reshape(8, 3)
 
 
 def test_the_outer_faces_are_those_that_the_corners_lie_on():
@@ -99,17 +98,15 @@ def test_the_outer_faces_are_those_that_the_corners_lie_on():
     assert np.isin(np.abs(outer.vertices[outer.faces][:, :, 1]), [B]).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_corners_centimetres_off_are_found_within_their_intervals(seed):
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-20.0, 20.0, (4, 3))
     end = fitted(built(cloud(rng, 8.0), corners), rng)
     assert end.doubts == ()
     truth = np.vstack([corners, *(0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)))])
-    off = end.departure - truth
-    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
-    assert sd.max() < 0.4
-    assert (np.abs(off) < 4.0 * np.hypot(sd, 0.05)).all()
+    assert sds(end).max() < 0.4  # twice the 0.2 mm
+    assert (np.abs(end.departure - truth) < 4.0 * np.hypot(sds(end), ROUGH_MM)).all()
 
 
 @pytest.mark.parametrize("through", ["webs", "flanges", "mitred"])
@@ -129,10 +126,12 @@ def test_the_thickness_of_plates_by_the_facets_of_the_end_face(through):
     facets = np.array([4 * k + np.array(three) for k in range(4) for three in ((0, 1, 2), (0, 2, 3))])
     surface = mesh_distance.of_mesh(np.vstack(corners), facets)
     place = end_place(design()[1], 1.0)
-    np.testing.assert_allclose(joint_end._design_thickness(surface, place), [flange, web, flange, web], atol=1e-9)
+    np.testing.assert_allclose(
+        joint_end._design_thickness(surface, place), [flange, web, flange, web], atol=1e-9
+    )  # float64
 
 
-@pytest.mark.parametrize("side", range(4))
+@pytest.mark.parametrize("side", [1, 2])  # a web, and a flange
 def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
     """The outer side then lies where the design has the inner one, and has a fifth of the points."""
     rng = np.random.default_rng(side)
@@ -144,10 +143,10 @@ def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
     shares[side] = 0.2
     end = fitted(built(cloud(rng, 8.0, shares), corners), rng)
     assert end.doubts == ()
-    assert np.abs(end.departure[list(on_side)] - corners[list(on_side)]).max() < 1.0
+    assert np.abs(end.departure[list(on_side)] - corners[list(on_side)]).max() < 1.0  # not 26 mm
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_face_seen_as_one_strip_is_within_its_interval_where_it_was_not_seen(seed):
     rng = np.random.default_rng(seed)
     points = cloud(rng, 12.0, inner=0.3)
@@ -155,9 +154,9 @@ def test_a_face_seen_as_one_strip_is_within_its_interval_where_it_was_not_seen(s
     seen = ~on_top | (np.abs(points[:, 1] - 300.0) < 20.0)
     shift = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 9.0], [0.0, 0.0, -7.0]])
     end = fitted(built(points[seen], shift), rng)
-    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)[[2, 3], 2]
+    sd = sds(end)[[2, 3], 2]
     assert (np.abs(end.departure[[2, 3], 2] - shift[2:, 2]) < 2.5 * sd).all()
-    assert (sd > 1.0).all()
+    assert (sd > 1.0).all()  # 40 of 1200 mm were seen
 
 
 def without_the_outside(side):
@@ -168,14 +167,14 @@ def without_the_outside(side):
     return cloud(rng, 8.0, shares), rng
 
 
-@pytest.mark.parametrize("side", range(4))
+@pytest.mark.parametrize("side", [1, 2])  # a web, and a flange
 def test_a_face_seen_from_its_inner_side_is_placed_by_the_thickness(side):
     """The points of the end face lie outside of the layer seen, so it is the inner side."""
     end = fitted(*without_the_outside(side))
     assert end.doubts == ()
     assert [one.code for one in end.remarks] == ["preassemble.by-inner-side"]
-    assert np.abs(end.departure).max() < 0.5
-    assert (np.abs(end.departure.ravel()) < 1.96 * np.sqrt(np.diag(end.covariance)) + 0.05).all()
+    assert np.abs(end.departure).max() < 0.5  # the plate is 26 mm thick
+    assert (np.abs(end.departure) < 1.96 * sds(end) + ROUGH_MM).all()
 
 
 @pytest.mark.parametrize("further_in", [0.0, 1.0])
@@ -185,7 +184,7 @@ def test_a_face_of_which_one_side_alone_was_seen_may_be_either(further_in):
     bare = points[~((points[:, 0] > -1.0) & (points[:, 2] > H - T - 1.0))]
     end = fitted(bare, rng)
     assert end.doubts == (reason("preassemble.inner-side", faces=("top",)),)
-    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
+    sd = sds(end)
     off = np.abs(end.departure + np.array([0.0, 0.0, further_in * T]))[[2, 3, 6], 2]  # P3, P4 and P7 are on the top
     assert (off < 1.96 * sd[[2, 3, 6], 2] + 0.2).all()
     assert sd[[0, 1, 4], 2].max() < 0.5
@@ -199,8 +198,8 @@ def test_waves_of_the_plates_are_in_the_middles_of_the_edges():
     points[:, 2] += np.where(points[:, 2] < T + 1.0, waves, 0.0)  # both sides of the bottom
     end = fitted(points, rng)
     off = end.departure[4, 2] - np.sin(1.2)
-    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
-    assert abs(off) < 0.25
+    sd = sds(end)
+    assert abs(off) < 0.25  # without the waves in the model it is -0.93
     assert (np.abs(np.append(off, end.departure[:2, 2])) < 3.0 * np.append(sd[4, 2], sd[:2, 2])).all()
 
 
@@ -213,7 +212,7 @@ def test_the_outermost_layer_of_a_tilted_plate():
     out = level - 24.0 * inner + rng.standard_normal(4000)
     cell = (np.floor(5 * x) * 6 + np.floor(3.0 * (w + 1.0))).astype(np.int64)
     kept = plate_sides.outer_surface(out, basis, cell)
-    assert kept[~inner].mean() > 0.99
+    assert kept[~inner].mean() > 0.99  # but those beyond 2.6 standard deviations
     assert not kept[inner].any()
 
 
@@ -228,27 +227,12 @@ def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
         up = np.stack([np.sin(angle), np.zeros(60), np.cos(angle)], axis=1)
         axes.append(np.stack([np.broadcast_to([0.0, 1.0, 0.0], up.shape), up], axis=1))
     noise = 0.02 * rng.standard_normal((120, 2))
-    edges = EdgeDepartures(
-        side=("left",) * 60 + ("right",) * 60,
-        chainage=np.tile(arc, 2),
-        points=np.vstack(points),
-        axes=np.vstack(axes),
-        departure=noise,
-        covariance=np.stack([0.02**2 * np.eye(120)] * 2),
-        by_pose=np.zeros((120, 2, 6)),
-        by_view=np.zeros((2, 120, 1)),
-        by_tilt=np.zeros((2, 120, 1)),
-        tails=np.ones((2, 2)),
-    )
+    edges = measured_parts.edges(np.tile(arc, 2), np.vstack(points), np.vstack(axes), noise, 0.02)
     member = Member((None, None), edges, np.array([0.0, 0.0, 60_000.0]), np.zeros((6, 6)))
     adjusted = adjustment.adjust([member], np.empty((0, 8, 3)), np.empty((0, 4, 4)), 0.1)
     assert np.abs(adjusted.motions[0][:3, 3]).max() < 1.0 + 60_000.0 * 2e-5  # its turn is about the middle
     moved = adjusted.motions[0] @ np.array([0.0, 0.0, 60_000.0, 1.0])
     assert abs(moved[0]) < 1.0
-
-
-def test_bridge_without_seen_ends_has_no_estimated_ends():
-    assert joint_end.estimate([]) == []
 
 
 def test_registration_error_is_common_to_both_ends_of_a_part():
@@ -264,18 +248,7 @@ def test_registration_error_is_common_to_both_ends_of_a_part():
     for sense in (-1.0, 1.0):
         points = np.array([[sense * x, y, -900.0] for y in (700.0, -700.0) for x in along])
         moves = np.einsum("kai,kij->kaj", axes, rigid.motion(points))
-        edges = EdgeDepartures(
-            side=("left",) * 12 + ("right",) * 12,
-            chainage=np.tile(along, 2),
-            points=points,
-            axes=axes,
-            departure=np.zeros((24, 2)),
-            covariance=np.stack([noise**2 * np.eye(24)] * 2),
-            by_pose=moves,
-            by_view=np.zeros((2, 24, 1)),
-            by_tilt=np.zeros((2, 24, 1)),
-            tails=np.ones((2, 2)),
-        )
+        edges = measured_parts.edges(np.tile(along, 2), points, axes, np.zeros((24, 2)), noise, moves)
         at_joint = rigid.motion(joints[0]).reshape(24, 6)
         covariance = at_joint @ pose @ at_joint.T + noise**2 * np.eye(24)
         end = joint_end.JointEnd(np.zeros((8, 3)), covariance, at_joint, "")
@@ -284,7 +257,8 @@ def test_registration_error_is_common_to_both_ends_of_a_part():
     stated = adjustment.adjust(parts, joints, np.eye(4)[None], 0.1)
     for end in (parts[0].ends[1], parts[1].ends[0]):
         left = np.sqrt(np.diag(end.without_pose(pose)))
-        np.testing.assert_allclose(left, noise, rtol=1e-3)  # the error of the registration cancels in the gap
+        # The error of the registration cancels in the gap: (0.1 / 0.003)^2 of it, by inverses in float64
+        np.testing.assert_allclose(left, noise, rtol=1e-3)
     gaps, moved, at_rest, largest = [], [], [], []
     for _ in range(400):
         wrong = np.sqrt(np.diag(pose)) * rng.standard_normal((2, 6))
@@ -309,6 +283,7 @@ def test_registration_error_is_common_to_both_ends_of_a_part():
         # Error of the last part's outer end: by its movement and by its registration.
         at = np.array([[6000.0, 0.0, 0.0]])
         moved.append((rigid.apply(found.motions[1], at) - at)[0] - rigid.motion(at)[0] @ wrong[1])
+    # A standard deviation of 400 draws is known to 3.5 %, the largest of dozens to a tenth.
     pulls = np.array(gaps) / np.sqrt(np.diag(stated.gap_covariance[0]))
     np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.2)  # of the gap at the poses found
     drawn_sd = np.std(np.array(at_rest).reshape(400, 48, 2), axis=0)
@@ -332,7 +307,7 @@ def test_an_outlier_beyond_a_strip_does_not_bend_the_face(seed):
     coefficients, residual, used = ends_faces.least_squares(basis, np.append(height, -70.0))
     assert not used[-1]
     assert len(residual) == used.sum() >= 190
-    np.testing.assert_allclose(coefficients, clean[0], atol=1e-9)
+    np.testing.assert_allclose(coefficients, clean[0], atol=1e-9)  # float64
 
 
 def test_a_face_seen_as_a_strip_and_one_outlier_keeps_its_corners():
@@ -343,8 +318,7 @@ def test_a_face_seen_as_a_strip_and_one_outlier_keeps_its_corners():
     strip = (points[:, 2] == 0.0) & (points[:, 0] > -60.0)
     points = np.vstack([points[~bottom | strip], [[-480.0, 0.6 * B, -40.0]]])
     end = fitted(points, rng)
-    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
-    assert (np.abs(end.departure) < 4.0 * np.hypot(sd, 0.05)).all()
+    assert (np.abs(end.departure) < 4.0 * np.hypot(sds(end), ROUGH_MM)).all()
 
 
 @pytest.mark.parametrize("thickness", [16.0, 24.0])

@@ -10,12 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from processor.limits import project_limits, standards
 from processor.limits.decision_rule import decide
-from processor.model import Limit, Tolerance, reason
+from processor.model import Tolerance, reason
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.verdicts import joint_measures
 from processor.preassembly.verdicts.joint_measures import measure
 from processor.preassembly.verdicts.joints import judge
 
+ROUNDING = 1e-9  # float64 at tens of metres, of mm and mrad
+DRAWS = 200_000  # determine a mean to 0.2 % of a standard deviation, and that to 0.2 %: 1 % is not exceeded by chance
 B, H = 700.0, 900.0  # half the width and the height of a section of 1400 x 1800
 # P1..P8: corners bottom-left, bottom-right, top-right, top-left; middles of bottom, right, top, left. y left, z up.
 POINTS = np.array(
@@ -52,14 +54,14 @@ def only(**limits):
 def test_the_joints_axes_are_those_of_its_frame():
     T = tilted()
     there = POINTS @ T[:3, :3].T + T[:3, 3]
-    np.testing.assert_allclose(joint_frame(there), T, atol=1e-9)
+    np.testing.assert_allclose(joint_frame(there), T, atol=ROUNDING)
     gaps = np.random.default_rng(1).normal(size=(8, 3))
     covariance = some_covariance(2)
     local, spread = joint_measures.in_joint_axes(gaps, covariance, T)
     for k in range(8):
-        np.testing.assert_allclose(T[:3, :3] @ local[k], gaps[k], atol=1e-12)
-    # Against draws: 200,000 errors turned one by one.
-    drawn = np.random.default_rng(3).multivariate_normal(np.zeros(24), covariance, 200_000).reshape(-1, 8, 3)
+        np.testing.assert_allclose(T[:3, :3] @ local[k], gaps[k], atol=ROUNDING)
+    # Against draws: errors turned one by one.
+    drawn = np.random.default_rng(3).multivariate_normal(np.zeros(24), covariance, DRAWS).reshape(-1, 8, 3)
     turned = np.einsum("ji,nkj->nki", T[:3, :3], drawn).reshape(-1, 24)
     np.testing.assert_allclose(np.cov(turned.T), spread, atol=0.02 * np.diag(spread).max())
 
@@ -71,32 +73,23 @@ def test_a_turn_about_y_by_hand():
     gaps = np.zeros((8, 3))
     gaps[:, 0] = theta * POINTS[:, 2]
     found = measure(gaps @ T[:3, :3].T, NONE, T, POINTS @ T[:3, :3].T + T[:3, 3])
-    expected = {
-        "groove_gap_mean": 0.0,
-        "groove_gap_least": -0.9,
-        "groove_gap_greatest": 0.9,
-        "misalignment": 0.0,
-        "eccentricity": 0.0,
-        "rotation_x": 0.0,
-        "rotation_y": 1.0,
-        "rotation_z": 0.0,
-        "offset_x": 0.0,
-        "offset_y": 0.0,
-        "offset_z": 0.0,
-    }
+    zero = ("misalignment", "eccentricity", "rotation_x", "rotation_z", "offset_x", "offset_y", "offset_z")
+    expected = {"groove_gap_mean": 0.0, "groove_gap_least": -0.9, "groove_gap_greatest": 0.9, "rotation_y": 1.0}
+    expected |= dict.fromkeys(zero, 0.0)
     rows = found.quantities
-    assert rows.name == tuple(expected)
-    np.testing.assert_allclose(rows.value, list(expected.values()), atol=1e-9)
+    assert set(rows.name) == set(expected)
+    np.testing.assert_allclose(rows.value, [expected[str(name)] for name in rows.name], atol=ROUNDING)
     assert set(zip(map(str, rows.name), rows.unit, strict=True)) >= {("rotation_y", "mrad"), ("offset_x", "mm")}
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_small_motion_is_found_again(seed):
     """The right part moved by a rotation of scipy, to first order."""
     rng = np.random.default_rng(seed)
     turn, offset = rng.normal(size=3) * 1e-6, rng.normal(size=3)
     gaps = Rotation.from_rotvec(turn).apply(POINTS) + offset - POINTS
     found = at_rest(gaps)
+    # To second order of a turn of 1e-6 at a metre: 1e-9 mm.
     np.testing.assert_allclose([found.of(f"rotation_{a}")[0] for a in "xyz"], turn * 1e3, atol=1e-8)
     np.testing.assert_allclose([found.of(f"offset_{a}")[0] for a in "xyz"], offset, atol=1e-8)
     assert found.of("eccentricity")[0] == pytest.approx(np.hypot(offset[1], offset[2]))
@@ -118,7 +111,7 @@ def test_half_widths_against_draws():
     gaps[:, 0] = np.linspace(0.0, 28.0, 8)  # P1 and P8 stand clear: no other point can be the extreme
     gaps[6, 2] = -9.0
     found = at_rest(gaps, covariance)
-    drawn = np.random.default_rng(6).multivariate_normal(gaps.ravel(), covariance, 200_000).reshape(-1, 8, 3)
+    drawn = np.random.default_rng(6).multivariate_normal(gaps.ravel(), covariance, DRAWS).reshape(-1, 8, 3)
     turns = np.stack([np.cross(axis, POINTS) for axis in np.eye(3)], axis=-1)
     A = np.concatenate([turns, np.tile(np.eye(3), (8, 1, 1))], axis=-1)
     motion = np.linalg.lstsq(A.reshape(24, 6), drawn.reshape(-1, 24).T, rcond=None)[0]
@@ -136,7 +129,10 @@ def test_half_widths_against_draws():
         assert half == pytest.approx(1.959964 * values.std(), rel=0.01), name
 
 
-@pytest.mark.parametrize("shape", ["level", "two alike", "wedge", pytest.param("zero", marks=pytest.mark.slow)])
+SLOW_SHAPES = [pytest.param(shape, marks=pytest.mark.slow) for shape in ("wedge", "zero")]
+
+
+@pytest.mark.parametrize("shape", ["level", "two alike", *SLOW_SHAPES])
 def test_intervals_of_extremes_cover(shape):
     """True extremes lie within the intervals in at least 95 % of measurements, however many points are alike."""
     true = np.zeros((8, 3))
@@ -173,7 +169,7 @@ def test_single_extreme_has_the_interval_of_one_value():
     assert at_rest(gaps, covariance).of("groove_gap_greatest") == pytest.approx((5.0, 1.959964 * 0.2))
     # Seven alike: of independent errors 95 % are all within k sd where (2 Phi(k) - 1)^7 = 0.95, so k = 2.68.
     low, high = at_rest(gaps, covariance).interval("groove_gap_least")
-    assert (low, high) == pytest.approx((-0.536, 0.536), abs=0.01)
+    assert (low, high) == pytest.approx((-0.536, 0.536), abs=0.01)  # the figures of k
 
 
 @pytest.mark.parametrize(
@@ -214,14 +210,11 @@ def lone(value, sd, point=5, axis=1):
 def test_misalignment_against_its_limit(value, verdict, probability):
     found = judge(lone(value, 0.5), only(misalignment_mm=2.0))
     assert (found.verdict, found.limits.verdict) == (verdict, (verdict,))
-    assert found.probability == pytest.approx(probability, abs=0.008)
+    # 4,000 draws of the rule: 0.008 at a half without their symmetry, which makes a half exact
+    assert found.probability == pytest.approx(probability, abs=0.008 if value != 2.0 else 0.0)
     assert found.limits.probability[0] == found.probability
     assert found.limits.value[0] == abs(value)
     assert found.limits.ci95[0] == pytest.approx(1.959964 * 0.5)
-
-
-def test_value_on_its_limit_has_a_probability_of_one_half():
-    assert judge(lone(2.0, 0.5), only(misalignment_mm=2.0)).probability == 0.5
 
 
 def test_two_limits_and_the_root_gap():
@@ -245,7 +238,7 @@ def test_two_limits_and_the_root_gap():
     gaps = np.zeros((8, 3))
     gaps[0, 0], gaps[5, 1] = 4.0, 4.0
     both = only(misalignment_mm=4.0, groove_gap_mm=(-90.0, 4.0))
-    assert judge(at_rest(gaps, covariance), both).probability == pytest.approx(0.25, abs=0.02)
+    assert judge(at_rest(gaps, covariance), both).probability == pytest.approx(0.25, abs=0.02)  # 4,000 draws: 0.008
 
 
 def test_verdict_states_clause_value_and_probability_of_its_limits():
@@ -256,7 +249,7 @@ def test_verdict_states_clause_value_and_probability_of_its_limits():
     assert found.limits.verified.tolist() == [False, False]
     first = (found.limits.value[0], found.limits.high[0], found.limits.verdict[0], found.limits.probability[0])
     assert first == (0.5, 2.0, "pass", 1.0)
-    assert found.limits.ci95[0] == pytest.approx(0.196, abs=1e-3)
+    assert found.limits.ci95[0] == pytest.approx(0.196, abs=1e-3)  # its figures
     assert found.reasons == ()
 
 
@@ -296,11 +289,5 @@ def test_eccentricity():
     assert judge(at_rest(gaps), en).verdict == "pass"
     assert judge(at_rest(gaps * 1.01), en).verdict == "fail"
     assert judge(at_rest(gaps), standards.load("EN 1090-2 class 2")).verdict == "fail"
+    # The mean of eight is known to 0.35 mm: a little more than half of the true ones are beyond the circle of 5 mm.
     assert judge(at_rest(gaps, np.eye(24)), en).probability == pytest.approx(0.45, abs=0.06)
-
-
-def test_judging_twice_gives_the_same_result():
-    covariance = some_covariance(4)
-    one, two = (judge(at_rest(np.ones((8, 3)), covariance), GB) for _ in range(2))
-    assert repr(one) == repr(two)
-    assert isinstance(GB.limits[0], Limit)

@@ -21,64 +21,64 @@ from processor.registration import icp
 from tests.support.clouds import arch_clouds
 from tests.support.scenes import known_attitudes
 
+SPACING_MM = 10.0  # the paper's methods need it at every joint
+KEY_POINT_MM = 0.12  # by faces of thousands of points with noise of 1 mm, extrapolated to corners
+
 
 @pytest.fixture(scope="module")
 def bridge():
-    return arch_clouds.bridge(spacing_mm=10.0, sigma_mm=1.0, seed=1)
+    return arch_clouds.bridge(spacing_mm=SPACING_MM, sigma_mm=1.0, seed=1)
 
 
 @pytest.fixture(scope="module")
-def runs(bridge):
-    """Results of all methods; features, common to the paper's three, and the attitudes of all are found once."""
+def together(bridge):
+    """Features of parts, the result of the adjustment before them, and the calls of the search for attitudes.
+
+    The attitudes are the true ones: the search is tested by single parts.
+    """
     scene, truth = bridge
-    scans = [own[0] for own in preassembly_step.scans_in_order(scene, scene.arch)]
-    seek, known = attitude.find, known_attitudes.find_by(truth)  # two parts have the shapes of others
-    with mock.patch.object(attitude, "find", lambda *at: (known if at[1].name in ("rib3", "foot2") else seek)(*at)):
-        parts = methods.extract(scans, scene.arch, preassembly_step.Params())
-    found = {one: methods.assemble(parts, scene.arch, preassembly_step.Params(method=one)) for one in PAPER_METHODS}
-    attitudes = {part.scan.component: part.attitude for part in parts}
-    with mock.patch.object(attitude, "find", lambda _, part, __: attitudes[part.name]):
-        return found | {"adjustment": preassembly_step.run(scene, preassembly_step.Params())}
-
-
-def test_the_attitude_of_a_scan_is_searched_for_once_for_all_methods():
-    scene, truth = arch_clouds.bridge(spacing_mm=25.0, sigma_mm=1.0, seed=3)
-    alone = preassembly_step.Params(method="corner", repetitions=0)
     find, kept = mock.Mock(side_effect=known_attitudes.find_by(truth)), {}
     with mock.patch.object(attitude, "find", find):
-        expected = preassembly_step.run(scene, alone)
-        by_part = {call.args[1].name: call.args[0] for call in find.call_args_list}
-        find.reset_mock()
-        preassembly_step.run(scene, preassembly_step.Params(), kept)
-        assert find.call_count == len(scene.scans)
-        for call in find.call_args_list:  # of the same points in the same order
-            np.testing.assert_array_equal(call.args[0], by_part[call.args[1].name])
-        found = preassembly_step.run(scene, alone, kept)
-        assert find.call_count == len(scene.scans)
-    np.testing.assert_array_equal(found.components.T_bridge_scan, expected.components.T_bridge_scan)
+        adjusted = preassembly_step.run(scene, preassembly_step.Params(), kept)
+        preassembly_step.run(scene, preassembly_step.Params(method="corner", repetitions=0), kept)
+    return kept["parts"], adjusted, find.call_args_list
 
 
-@pytest.mark.slow  # by day those of the bridge that every method assembles
-@pytest.mark.parametrize("seed", range(4))
-def test_attitudes_are_right_from_any_pose(seed):
-    scene, truth = arch_clouds.bridge(spacing_mm=12.0, sigma_mm=1.0, seed=100 + seed)
-    for part, scan, T in zip(scene.arch.parts, scene.scans, truth.arch.T_bridge_scan, strict=True):
-        found = attitude.find(scan.points, part)
-        assert found.status == "ok"
-        assert rigid.rotation_angle(found.T_principal[:3, :3] @ T[:3, :3].T) < np.radians(1.0)
-        assert rigid.rotation_angle(found.T_surface[:3, :3] @ T[:3, :3].T) < np.radians(0.05)
+@pytest.fixture(scope="module")
+def runs(bridge, together):
+    """Results of all methods; features are common to the paper's three."""
+    design, (parts, adjusted, _) = bridge[0].arch, together
+    found = {one: methods.assemble(parts, design, preassembly_step.Params(method=one)) for one in PAPER_METHODS}
+    return found | {"adjustment": adjusted}
+
+
+def test_the_attitude_of_a_scan_is_searched_for_once_for_all_methods(bridge, together, monkeypatch):
+    scene, _ = bridge
+    by_part = {call.args[1].name: call.args[0] for call in together[2]}
+    assert len(together[2]) == len(by_part) == len(scene.scans)
+    find = mock.Mock(side_effect=InputError)  # alone, a method searches with the same points in the same order
+    monkeypatch.setattr(attitude, "find", find)
+    for scan, part in zip(scene.scans, scene.arch.parts, strict=True):
+        with pytest.raises(InputError):
+            methods.extract([scan], scene.arch, preassembly_step.Params(method="corner"))
+        np.testing.assert_array_equal(find.call_args.args[0], by_part[part.name])
 
 
 def test_a_symmetric_rib_without_its_mark_is_ambiguous():
-    design = arch_clouds.design().parts[2]
-    whole = design.faces[: -2 * 800]  # the pad is the last face
-    bare = dataclasses.replace(design, faces=whole, vertices=design.vertices[: whole.max() + 1])
     rng = np.random.default_rng(0)
-    points = arch_clouds.scan_points(2, 12.0, 1.0, rng)
-    found = attitude.find(rigid.apply(arch_clouds.random_pose(rng), points), bare)
+    points, T = arch_clouds.scan_points(2, 30.0, 1.0, rng), arch_clouds.random_pose(rng)
+    found = attitude.find(rigid.apply(T, points), bare_of_its_mark(arch_clouds.design().parts[2]))
     assert found.status == "ambiguous"
     assert [one.code for one in found.reasons] == ["preassemble.rival-rotation"]
+    turns = [np.degrees(rigid.rotation_angle((pose @ T)[:3, :3])) for pose in (found.T_surface, found.T_rival)]
+    # By the search's points alone: 1 mm over the root of hundreds, at half a metre.
+    assert sorted(turns) == pytest.approx([0.0, 180.0], abs=0.5)
     assert found.reasons[0].values["degrees"] == pytest.approx(180.0, abs=0.5)
+
+
+def bare_of_its_mark(part):
+    whole = part.faces[: -2 * 800]  # the pad is the last face
+    return dataclasses.replace(part, faces=whole, vertices=part.vertices[: whole.max() + 1])
 
 
 @pytest.mark.slow
@@ -94,6 +94,7 @@ def test_surface_samples_lie_on_the_mesh_and_cover_it_evenly():
     surface = attitude.sample_surface(part)
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    # A spacing of 30 mm: the mean of thousands of even samples is nearer than one of them.
     np.testing.assert_allclose(surface.points.mean(axis=0), (area @ (a + b + c)) / 3.0 / area.sum(), atol=30.0)
     np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1.0)
 
@@ -101,8 +102,8 @@ def test_surface_samples_lie_on_the_mesh_and_cover_it_evenly():
 @pytest.mark.parametrize("turned", [False, True])
 def test_surface_that_one_design_alone_has_does_not_depend_on_the_facets_that_both_have(turned):
     part = arch_clouds.design().parts[2]
-    whole = part.faces[: -2 * 800]  # the pad is the last face
-    bare = dataclasses.replace(part, faces=whole, vertices=part.vertices[: whole.max() + 1])
+    bare = bare_of_its_mark(part)
+    whole = bare.faces
     surface, other = attitude.sample_surface(part), attitude.sample_surface(bare)
     turn = rigid.rotation_from_vector(np.array([1e-4, -1e-4, np.pi * turned]))
     T = rigid.transform(turn, surface.centre - turn @ surface.centre)
@@ -144,14 +145,10 @@ def test_reduced_boxes_find_the_inner_edges_of_the_plates():
     expected = np.array(
         [[0, inner_b, -inner_h], [0, -inner_b, -inner_h], [0, -inner_b, inner_h], [0, inner_b, inner_h]]
     )
+    # The nearest point to an edge is one of points 4 mm apart.
     np.testing.assert_allclose(edges.key_points[:4], expected, atol=4.0)
-    np.testing.assert_allclose(edges.key_points[4], [0, 0, -inner_h], atol=4.0)
-    np.testing.assert_allclose(edges.key_points[7], [0, inner_b, 0], atol=4.0)
-
-
-def test_reduced_boxes_without_points_are_none():
-    cut = box_end()
-    rng = np.random.default_rng(0)
+    np.testing.assert_allclose(edges.key_points[[4, 7]], [[0, 0, -inner_h], [0, inner_b, 0]], atol=4.0)
+    cut, rng = box_end(8.0), np.random.default_rng(0)
     assert edge_features.reduced_boxes(cut[np.abs(cut[:, 1]) > 200.0], 1.0, 4.0, BoxParams(), rng) is None
     assert edge_features.reduced_boxes(cut[:20], 1.0, 4.0, BoxParams(), rng) is None
 
@@ -161,8 +158,8 @@ def test_x_axis_of_the_joint_frame_points_along_the_bridge():
     T = joint_frame(points)
     ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))
     here = arch_clouds.position(np.array([0.4 * arch_clouds.ARC]), np.zeros(1), np.zeros(1))
-    np.testing.assert_allclose(T[:3, 0], (ahead - here)[0], atol=1e-4)
-    np.testing.assert_allclose(T[:3, 1], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(T[:3, 0], (ahead - here)[0], atol=1e-4)  # a chord of 1 mm at a radius of 18 m: 3e-5
+    np.testing.assert_allclose(T[:3, 1], [0, 1, 0], atol=1e-12)  # float64
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
 
 
@@ -174,7 +171,7 @@ def test_slices_follow_the_bottom_edges():
     for found, design in ((left, part.bottom_edge_left), (right, part.bottom_edge_right)):
         offset = np.linalg.norm(Polyline.through(design).nearest(found)[1], axis=1)
         assert len(found) > 500
-        assert np.median(offset) < 2.0 * 8.0
+        assert np.median(offset) < 2.0 * 8.0  # spacings: the lowest of a slice
         # no points of the end faces, along which the lowest point of a slice moves up
         assert np.quantile(offset, 0.99) < 8.0 * 8.0
 
@@ -187,8 +184,9 @@ def test_linear_error_of_a_lifted_edge_by_hand():
     found = assembly_errors.linear_error([assembly_errors.BottomEdges(noisy, edge, design, design)], [np.eye(4)])
     assert set(found.edge) == {"left", "right"}
     left = np.array(found.edge) == "left"
-    assert found.deviation[left].mean() == pytest.approx(5.0, abs=0.3)  # the noise does not add to it
-    np.testing.assert_allclose(found.deviation[~left], 0.0, atol=1e-12)
+    # The noise does not add to it: 2 mm over the root of 400 points is 0.1.
+    assert found.deviation[left].mean() == pytest.approx(5.0, abs=0.3)
+    np.testing.assert_allclose(found.deviation[~left], 0.0, atol=1e-12)  # float64
     assert np.diff(found.chainage[left]) == pytest.approx(200.0)
 
 
@@ -207,14 +205,15 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
     result = runs[method]
     assert result.status == "ok"
     assert result.components.name == arch_clouds.NAMES
-    assert result.splicing.mean < 10.0  # one spacing
+    assert result.splicing.mean < SPACING_MM
     checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
     assert checks["wrong poses called ok"].passed
     if method in PAPER_METHODS:
-        # The key points lie on the inner edges: off by the root of the sum of two thicknesses squared.
+        # The key points lie on the inner edges: corners off by the root of the sum of two thicknesses squared, middles
+        # by one thickness: 0.87 of it; the nearest point is off by some mm of a spacing.
         assert checks["key points in the scan, rms"].value == pytest.approx(np.hypot(24.0, 24.0) * 0.87, rel=0.2)
     else:
-        assert checks["key points in the scan, rms"].value < 0.5
+        assert checks["key points in the scan, rms"].value < KEY_POINT_MM
     for left, right, gap, T_left, T_right in zip(
         result.components.key_points_scan[:-1, 1],
         result.components.key_points_scan[1:, 0],
@@ -223,6 +222,7 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
         result.components.T_bridge_scan[1:],
         strict=True,
     ):
+        # float64 at tens of metres
         np.testing.assert_allclose(rigid.apply(T_right, right) - rigid.apply(T_left, left), gap, atol=1e-9)
 
 
@@ -237,41 +237,16 @@ def test_intervals_of_the_adjustment_cover(bridge, runs):
     # An end has 19 independent coordinates of 24: 8 ends determine the ratio to a tenth.
     assert 0.7 < np.sqrt((pull**2).mean()) < 1.3
     for size in (off[known], components.key_points_sd[known]):
-        assert np.sqrt((size**2).mean()) < 0.12
+        assert np.sqrt((size**2).mean()) < KEY_POINT_MM
     np.testing.assert_array_less(np.abs(joints.gaps), 2.0 * joints.gap_ci95)  # perfect parts: no gap but noise
-    assert result.splicing.mean < 0.1
+    assert result.splicing.mean < KEY_POINT_MM
     assert set(joints.verdict) == {result.overall} == {Verdict.PASS}
     # A larger weight of the design moves the edges closer to it and widens the gaps.
     splicing, linear = trade_off.splicing_mean, trade_off.linear_mean
     assert (np.diff(trade_off.weight) < 0.0).all()
+    # The adjustment ends within 1e-6 mm of its minimum.
     assert (np.diff(splicing) <= 1e-6).all()
     assert (np.diff(linear) >= -1e-6).all()
-
-
-@pytest.mark.slow
-def test_adjustment_measures_the_errors_as_built(bridge):
-    """A rib cut 3 mm short at one end and shifted scans: the gap shows there and nowhere else."""
-    scene, truth = bridge
-    rib, T = scene.scans[2], truth.arch.T_bridge_scan[2]
-    points = rigid.apply(T, rib.points)
-    ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))[0]
-    here = arch_clouds.position(np.array([0.4 * arch_clouds.ARC]), np.zeros(1), np.zeros(1))[0]
-    depth = (points - here) @ (ahead - here)
-    near = depth < 100.0
-    points[near] += 3.0 * np.clip(1.0 - depth[near, None] / 100.0, 0.0, 1.0) * (ahead - here)
-    cut = dataclasses.replace(rib, points=rigid.apply(rigid.invert(T), points))
-    scans = (*scene.scans[:2], cut, *scene.scans[3:])
-    result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params())
-    moved = rigid.apply(T, result.components.key_points_scan[2, 0]) - truth.arch.key_points_bridge[2, 0]
-    np.testing.assert_allclose(moved @ (ahead - here), 3.0, atol=0.35)
-    # Edges do not constrain a part along its length: the gap closes, and the span is shorter by as much.
-    assert np.abs(result.joints.gaps[1] @ (ahead - here)).max() < 0.6
-    shift = [
-        rigid.apply(result.components.T_bridge_scan[i] @ rigid.invert(truth.arch.T_bridge_scan[i]), points.mean(axis=0))
-        - points.mean(axis=0)
-        for i in (0, 4)
-    ]
-    assert np.linalg.norm(shift[1] - shift[0]) == pytest.approx(3.0, abs=0.6)
 
 
 @pytest.mark.slow
@@ -281,24 +256,9 @@ def test_a_warm_bridge_is_assembled_at_the_reference_temperature(bridge):
     warm = tuple(dataclasses.replace(s, points=s.points * grown) for s in scene.scans)
     result = preassembly_step.run(dataclasses.replace(scene, scans=warm, temperature_C=50.0), preassembly_step.Params())
     off = result.components.key_points_scan / grown - truth.arch.key_points_scan
-    assert np.sqrt(np.nanmean(off**2)) < 0.12
-    assert np.abs(result.joints.gaps).max() < 1.0
+    assert np.sqrt(np.nanmean(off**2)) < KEY_POINT_MM
+    assert np.abs(result.joints.gaps).max() < 1.0  # a rib of 6 m grows by 2 mm
     assert reason("preassemble.temperature-corrected") in result.reasons
-
-
-@pytest.mark.slow
-def test_a_part_of_another_place_is_not_assembled(bridge):
-    scene, _ = bridge
-    swapped = list(scene.scans)
-    foot, rib = swapped[0], swapped[2]
-    swapped[0], swapped[2] = (
-        dataclasses.replace(rib, name="foot1", component="foot1"),
-        dataclasses.replace(foot, name="rib2", component="rib2"),
-    )
-    result = preassembly_step.run(dataclasses.replace(scene, scans=tuple(swapped)), preassembly_step.Params())
-    assert result.status == "partial"
-    assert "ok" not in (result.components.status[0], result.components.status[2])
-    assert np.isnan(result.joints.gaps[[0, 1, 2]]).all()
 
 
 def test_design_aided_method_has_half_the_linear_error_of_others(runs):
@@ -309,7 +269,7 @@ def test_design_aided_method_has_half_the_linear_error_of_others(runs):
 
 
 def ring(length=1400.0, height=1800.0, spacing=25.0):
-    """Points along the four edges of a joint."""
+    """Points along the four edges of a joint, centred."""
     y, z = np.arange(0.0, length, spacing), np.arange(0.0, height, spacing)
     sides = [(y, 0.0 * y), (y, 0.0 * y + height), (0.0 * z, z), (0.0 * z + length, z)]
     return np.vstack([np.column_stack([0.0 * a, a - 0.5 * length, b - 0.5 * height]) for a, b in sides])
@@ -320,7 +280,7 @@ def test_a_coarse_pose_is_sought_near_the_principal_axes():
     source = ring()
     start = rigid.transform(rigid.rotation_from_vector(np.array([0.01, -0.02, 0.01])), np.array([30.0, -20.0, 10.0]))
     found = [joint_alignment._coarse(source, ring(), start, MatchParams(), np.random.default_rng(i)) for i in range(4)]
-    for T, reasons in found:
+    for T, reasons in found:  # of points 25 mm apart at half a metre, and within a hundred millimetres: no half turn
         assert reasons == ()
         assert np.degrees(rigid.rotation_angle(T[:3, :3])) < 8.0
         assert np.linalg.norm(T[:3, 3]) < 100.0
@@ -336,6 +296,7 @@ def test_point_to_line_icp_recovers_the_pose_along_the_lines():
     corners = np.array([[0, 700, -900], [0, -700, -900], [0, -700, 900], [0, 700, 900.0], [0, 700, -900]])
     start = rigid.transform(rigid.rotation_from_vector(np.array([0.004, 0.003, -0.002])), np.array([3.0, 9.0, -8.0]))
     fine = icp.point_to_lines(source, [Polyline.through(corners)], start, max_iterations=200, tolerance=1e-9)
+    # Steps along the lines converge linearly: 1e-9 of a step is 1e-2 mm of the rest.
     np.testing.assert_allclose(rigid.apply(fine.T_target_source, source), source, atol=0.01)
     far = icp.point_to_lines(source + 1e4, [Polyline.through(corners)], start, max_distance_mm=10.0)
     assert far.paired_share == 0.0
@@ -347,6 +308,7 @@ def test_edge_box_is_sized_by_the_plate_thickness():
         cut = edge_features.cut_joint_end(box_end(plate=plate), np.eye(4), 1.0, np.array([900.0, 1100.0]), BoxParams())
         across = cut[:, 2].max() - cut[:, 2]
         middle = across[np.abs(cut[:, 1]) < 300.0]
+        # Half of the spacing of points at the plate's inner side, 1.5 times, less than a spacing of 4 mm
         assert edge_features.edge_box(middle, BoxParams()) == pytest.approx(1.5 * plate, abs=1.5)
         one_side = np.abs(rng.normal(size=500))
         assert edge_features.edge_box(one_side, BoxParams(plate_mm=20.0)) == 30.0
@@ -370,12 +332,12 @@ def test_origin_of_scans_does_not_change_the_gaps(bridge, runs):
     far = np.array([5.0e8, 4.3e9, 1.0e5])
     moved = dataclasses.replace(scene, scans=tuple(dataclasses.replace(s, origin=far) for s in scene.scans))
     found = preassembly_step.run(moved, preassembly_step.Params(method="corner"))
-    np.testing.assert_allclose(found.joints.gaps, runs["corner"].joints.gaps, rtol=0.0, atol=1e-9)
     again, before = found.components, runs["corner"].components
+    np.testing.assert_allclose(found.joints.gaps, runs["corner"].joints.gaps, rtol=0.0, atol=1e-9)  # float64 at 24 m
+    ends = [rigid.apply(one.T_bridge_scan[1], one.key_points_scan[1, 0]) for one in (again, before)]
+    # float64 at 4.3e9 mm is 1e-6, and sums of it.
     np.testing.assert_allclose(again.key_points_scan - far, before.key_points_scan, atol=1e-5)
-    again = rigid.apply(again.T_bridge_scan[1], again.key_points_scan[1, 0])
-    expected = rigid.apply(before.T_bridge_scan[1], before.key_points_scan[1, 0])
-    np.testing.assert_allclose(again, expected, atol=1e-5)
+    np.testing.assert_allclose(*ends, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -411,5 +373,8 @@ def test_missing_design_scan_or_method_is_refused(bridge):
         preassembly_step.run(Scene("x", "arch-bridge", scene.scans), preassembly_step.Params())
     with pytest.raises(InputError, match="expected a scan of component 'rib3', found none"):
         preassembly_step.run(dataclasses.replace(scene, scans=scene.scans[:3]), preassembly_step.Params())
+    twice = (*scene.scans, dataclasses.replace(scene.scans[1], name="again"))
+    with pytest.raises(InputError, match=r"takes one scan per part, rib1 has several"):
+        preassembly_step.run(dataclasses.replace(scene, scans=twice), preassembly_step.Params(method="line"))
     with pytest.raises(UsageError, match="unknown method 'magic'"):
         preassembly_step.run(scene, preassembly_step.Params(method="magic"))

@@ -15,8 +15,7 @@ from processor import large_arrays
 from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
 from processor.geometry.thinning import by_cell
-from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene, reason
-from processor.preassembly import step as preassembly_step
+from processor.model import ArchDesign, DesignPart, Scan, reason
 from processor.preassembly.ends import bottom_edges
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import SystematicParams
@@ -31,6 +30,9 @@ SMALL = arch_bridge.Params(
     plate_web_mm=20.0, base_width_mm=1_300.0, base_height_mm=1_600.0, joints=(0.19, 0.40, 0.60, 0.81), taper=0.6,
 )  # fmt: skip
 RIB = 2
+TURNED_DEG = 0.05  # a surface fit's sd is below 0.01 deg: 1 mm over the root of thousands of points, at metres
+# Of some eight independent coordinates an end the rms exceeds 1.8 once in a thousand, one of 24 exceeds 4.1.
+PULL_RMS, PULL_MOST = 2.0, 4.5
 
 
 @cache
@@ -95,73 +97,82 @@ def pulls(design, index, part, found, T):
     return result
 
 
+def known(monkeypatch, T):
+    """The attitude that the search would find: where that is not the claim, it takes most of the time."""
+    monkeypatch.setattr(attitude, "find", lambda *_: attitude.Attitude(T, T, "ok"))
+
+
+def turn_deg(T, T_true):
+    return np.degrees(rigid.rotation_angle(T[:3, :3] @ T_true[:3, :3].T))
+
+
 def assert_right(found, design, index, part, T, ends=("start", "end")):
-    off = found.T_bridge_scan @ rigid.invert(T)
-    assert np.degrees(rigid.rotation_angle(off[:3, :3])) < 0.05
+    assert turn_deg(found.T_bridge_scan, T) < TURNED_DEG
     every = pulls(design, index, part, found, T)
     assert tuple(every) == ends
     for pull in every.values():
-        # 24 coordinates with 22 degrees of freedom.
-        assert np.sqrt((pull**2).mean()) < 2.0
-        assert np.abs(pull).max() < 4.5
+        assert np.sqrt((pull**2).mean()) < PULL_RMS
+        assert np.abs(pull).max() < PULL_MOST
 
 
-def assert_found_right(parts, design, points, index=RIB):
-    """Scan the rib in a random frame: its pose is unambiguous, and both ends are right."""
-    scan, T = scanned(points)
-    found = measured(design, index, scan)
-    assert found.status == "ok"
-    assert_right(found, design, index, parts[index], T)
-
-
-def test_a_square_box_is_not_turned_by_a_quarter():
-    parts, design = ribs(dataclasses.replace(SMALL, width_mm=1_000.0, height_mm=1_000.0, plate_web_mm=24.0))
-    assert_found_right(parts, design, cloud(parts[1]), 1)
-
-
-def test_a_part_whose_points_lie_in_files_has_the_same_results(monkeypatch, tmp_path):
-    parts, design = ribs()
-    scan, _ = scanned(cloud(parts[1]))
-    whole = measured(design, 1, scan)
-    arrays_in_files.limit(monkeypatch, 10_000, 50_000)
-    monkeypatch.setattr(bottom_edges, "PASS_POINTS", 700)
-    with large_arrays.in_files(tmp_path):
-        found = measured(design, 1, scan)
-    assert len(scan.points) > 150_000
-    np.testing.assert_allclose(found.T_bridge_scan, whole.T_bridge_scan, atol=1e-6)
-    np.testing.assert_allclose(found.member.edges.departure, whole.member.edges.departure, atol=1e-6)
-    np.testing.assert_allclose(found.member.edges.covariance, whole.member.edges.covariance, atol=1e-6)
-    for one, other in zip(found.member.ends, whole.member.ends, strict=True):
-        np.testing.assert_allclose(one.departure, other.departure, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_half_a_web_missing_leaves_the_ends_right():
-    parts, design = bridge()
-    part = parts[RIB]
-    points = cloud(part)
+def without_half_a_web(part, points):
     middle = part.key_points(0.5 * (part.s0 + part.s1))
     left = points[:, 1] > 0.5 * SMALL.width_mm - 30.0
     gone = left & (points[:, 2] > middle[7, 2] - 100.0) & (np.abs(points[:, 0] - middle[7, 0]) < 2_000.0)
     assert gone.sum() > 5_000
-    assert_found_right(parts, design, points[~gone])
+    return points[~gone]
+
+
+def with_strays(share, points):
+    low, high = points.min(axis=0) - 300.0, points.max(axis=0) + 300.0
+    return np.vstack([points, np.random.default_rng(3).uniform(low, high, (int(share * len(points)), 3))])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change", [without_half_a_web, *(lambda _, points, s=share: with_strays(s, points) for share in (0.01, 0.02))]
+)
+def test_pose_and_ends_are_right_despite_what_is_missing_or_stray(change):
+    parts, design = ribs()
+    scan, T = scanned(change(parts[1], cloud(parts[1])))
+    found = measured(design, 1, scan)
+    assert found.status == "ok"
+    assert_right(found, design, 1, parts[1], T)
+
+
+def test_ends_are_right_despite_stray_points_and_the_same_where_points_lie_in_files(monkeypatch, tmp_path):
+    parts, design = ribs()
+    scan, T = scanned(with_strays(0.01, cloud(parts[1], spacing_mm=24.0)))
+    known(monkeypatch, T)
+    whole = measured(design, 1, scan)
+    assert whole.status == "ok"
+    assert_right(whole, design, 1, parts[1], T)
+    arrays_in_files.limit(monkeypatch, 8_000, 30_000)
+    monkeypatch.setattr(bottom_edges, "PASS_POINTS", 3_000)
+    with large_arrays.in_files(tmp_path):
+        found = measured(design, 1, scan)
+    assert len(scan.points) > 50_000
+    same = [(one.T_bridge_scan, one.member.edges.departure, one.member.edges.covariance,
+             *(end.departure for end in one.member.ends)) for one in (found, whole)]  # fmt: skip
+    for one, other in zip(*same, strict=True):
+        # Other orders of sums and a registration that ends within 1e-7 of its minimum.
+        np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+def test_a_square_box_is_not_turned_by_a_quarter():
+    parts, design = ribs(dataclasses.replace(SMALL, width_mm=1_000.0, height_mm=1_000.0, plate_web_mm=24.0))
+    scan, T = scanned(cloud(parts[1], spacing_mm=24.0))
+    found = attitude.find(scan.points, design.parts[1], shapes_of(design)[1])
+    assert found.status == "ok"
+    assert turn_deg(found.T_surface, T) < TURNED_DEG
 
 
 def test_erected_foot_is_registered_without_a_turn():
     parts, design = bridge()
-    found = measured(design, 0, Scan("scan", cloud(parts[0], spacing_mm=20.0) + np.array([100.0, -50.0, 20.0])))
+    found = measured(design, 0, Scan("scan", cloud(parts[0], spacing_mm=30.0) + np.array([100.0, -50.0, 20.0])))
     T = rigid.transform(np.eye(3), np.array([-100.0, 50.0, -20.0]))
     assert found.status == "ok"
     assert_right(found, design, 0, parts[0], T, ("end",))
-
-
-@pytest.mark.parametrize("share", [0.01, pytest.param(0.02, marks=pytest.mark.slow)])
-def test_outliers_around_a_part_do_not_displace_its_pose(share):
-    parts, design = ribs()
-    points, rng = cloud(parts[1]), np.random.default_rng(3)
-    low, high = points.min(axis=0) - 300.0, points.max(axis=0) + 300.0
-    stray = rng.uniform(low, high, (int(share * len(points)), 3))
-    assert_found_right(parts, design, np.vstack([points, stray]), 1)
 
 
 def codes(reasons):
@@ -173,30 +184,11 @@ def nested(reasons):
     return [one for outer in reasons for one in (outer, *nested(outer.values.get("reasons", ())))]
 
 
-@pytest.mark.slow  # by day that of test_preassembly
-def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
-    parts, design = bridge()
-    part = parts[RIB]
-    points = cloud(part)
-    s, u = part.pad
-    # Without the mark, and without its place on the part turned round.
-    pads = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
-    bare = points[(np.linalg.norm(points[:, None] - pads, axis=2) > 400.0).all(axis=1)]
-    scan, T = scanned(bare)
-    found = measured(design, RIB, scan)
-    assert found.status == "ambiguous"
-    assert "preassemble.rival-rotation" in codes(found.reasons)
-    turns = [
-        np.degrees(rigid.rotation_angle(one[:3, :3] @ T[:3, :3].T)) for one in (found.T_bridge_scan, found.T_rival)
-    ]
-    assert sorted(round(turn) for turn in turns) == [0, 180]
-
-
 @pytest.mark.parametrize(("asked", "came"), [(1, 3), pytest.param(0, 4, marks=pytest.mark.slow)])
 def test_parts_of_one_shape_are_distinguished_by_their_mark(asked, came, monkeypatch):
     """Rib 3 turned round equals rib 1 but for its mark: it fits rib 1 to the noise."""
     parts, design = bridge()
-    scan, T = scanned(cloud(parts[came], spacing_mm=20.0, sigma_mm=2.0))
+    scan, T = scanned(cloud(parts[came], spacing_mm=22.0, sigma_mm=2.0))
     found = measured(design, asked, scan)
     assert found.status == "failed"
     there = {"scan": "scan", "part": parts[came].name, "assigned": parts[asked].name}
@@ -204,33 +196,38 @@ def test_parts_of_one_shape_are_distinguished_by_their_mark(asked, came, monkeyp
         reason("preassemble.scan-of-other", **there),
         reason("preassemble.mark-of-other", parts=(parts[came].name,)),
     )
-    monkeypatch.setattr(attitude, "find", lambda *_: attitude.Attitude(T, T, "ok"))
+    known(monkeypatch, T)
     found = measured(design, came, scan)
     # The plates of a foot's only end show nothing of what views differ by.
     by_class = (reason("preassemble.viewpoints-by-class", sd=scanner_class_errors.VIEW_SD_MM),)
     assert (found.status, found.reasons) == ("ok", by_class if came in (0, 4) else ())
 
 
+def marks_places(part):
+    """Where the mark is, and where it is on the part turned round."""
+    s, u = part.pad
+    return part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
+
+
 def without_the_marks_places(part, points):
     """Points of a part without those near its mark, and near the mark of the part of the same shape."""
-    s, u = part.pad
-    places = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
+    places = marks_places(part)
     return points[(np.linalg.norm(points[:, None] - places, axis=2) > 400.0).all(axis=1)]
 
 
-def test_part_without_its_mark_in_the_scan_names_the_other_candidates():
+def test_part_without_its_mark_in_the_scan_names_the_other_candidates(monkeypatch):
     parts, design = bridge()
-    scan, _ = scanned(without_the_marks_places(parts[1], cloud(parts[1], spacing_mm=20.0)))
+    scan, T = scanned(without_the_marks_places(parts[1], cloud(parts[1], spacing_mm=30.0)))
+    known(monkeypatch, T)
     found = measured(design, 1, scan)
     assert (found.status, found.reasons) == ("ok", (reason("preassemble.mark-not-seen", parts=("rib3",)),))
 
 
 def test_mark_is_identified_on_a_plate_that_bulges_by_its_height():
     parts, design = bridge()
-    part, points = parts[1], cloud(parts[1], spacing_mm=14.0)
+    part, points = parts[1], cloud(parts[1])
     s, u = part.pad
-    turned = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
-    for place in turned:  # the mark, and the place of rib 3's mark: 14 mm up over half a metre
+    for place in marks_places(part):  # the mark, and the place of rib 3's mark: 14 mm up over half a metre
         far = np.linalg.norm(points - place, axis=1)
         up = part.point(np.array([s]), np.array([u]), np.array([1.0])) - part.point(np.array([s]), np.array([u]), [0.0])
         points = points + np.where(far < 700.0, 14.0, 0.0)[:, None] * up
@@ -248,9 +245,9 @@ def test_mark_is_identified_on_a_plate_that_bulges_by_its_height():
 def test_neighbours_swapped_are_named(asked, came, said, monkeypatch):
     """By its size, and by its name where a mark distinguishes the parts of this size."""
     parts, design = bridge()
-    scan, T = scanned(cloud(parts[came], spacing_mm=20.0))
+    scan, T = scanned(cloud(parts[came], spacing_mm=30.0))
     if came != 3:  # rib 1 stands for rib 3, which lies on it the other way round
-        monkeypatch.setattr(attitude, "find", lambda *_: attitude.Attitude(T, T, "ok"))
+        known(monkeypatch, T)
     found = measured(design, asked, scan)
     assert found.status == "failed"
     named = {"scan": "scan", "part": parts[came].name, "assigned": parts[asked].name}
@@ -258,14 +255,10 @@ def test_neighbours_swapped_are_named(asked, came, said, monkeypatch):
     assert found.reasons[-1] == reason("preassemble.size-of-other", parts=said)
 
 
-def placed(design, index, points):
-    return measure._place(scanned(points)[0], index, shapes_of(design), 1.0)
-
-
 @pytest.fixture(scope="module")
 def on_foot():
     """The rib turned about the arch's middle until it ends where the foot does: half of it lies on the foot."""
-    scene, truth = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=1)
+    scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=1.0, seed=1)
     points = rigid.apply(truth.arch.T_bridge_scan[2], scene.scans[2].points)
     turn = (arch_clouds.CUTS[1] - arch_clouds.CUTS[3]) * arch_clouds.ARC / arch_clouds.RADIUS
     middle = arch_clouds.RADIUS * np.array([np.sin(arch_clouds.HALF_ANGLE), 0.0, -np.cos(arch_clouds.HALF_ANGLE)])
@@ -273,18 +266,17 @@ def on_foot():
     return scene.arch, Scan("scan", (points - middle) @ R.T + middle)
 
 
-@pytest.mark.parametrize("mast", [0, 2000])
+@pytest.mark.parametrize("mast", [0, 900])
 def test_scan_that_covers_half_of_another_part_is_rejected_or_unsure(on_foot, mast, monkeypatch):
     """The upper half of this foot has the rib's section, and the rest looks like clutter. A mast hides the size."""
     design, scan = on_foot
     rng, top = np.random.default_rng(1), scan.points[np.argmax(scan.points[:, 2])]
     beside = top + np.column_stack([rng.normal(0.0, 30.0, (mast, 2)), rng.uniform(0.0, 5000.0, mast)])
     scan = dataclasses.replace(scan, points=np.vstack([scan.points, beside]))
-    stated = attitude.Attitude(np.eye(4), np.eye(4), "ok")
-    monkeypatch.setattr(attitude, "find", lambda *_: stated)
+    known(monkeypatch, np.eye(4))
     monkeypatch.setattr(assignment, "rather", lambda *_: None)
     found = measure._place(scan, 0, shapes_of(design), 1.0)
-    assert 0.5 < found.registration.used_share < 0.7
+    assert 0.5 < found.registration.used_share < 0.7  # a half and some clutter
     if mast:
         assert codes(found.doubts) == ["preassemble.sides-not-covered", "preassemble.right-part"]
         assert not found.sure[1]
@@ -300,7 +292,7 @@ def test_another_part_is_not_taken_for_a_foot(clutter, index):
     points = scene.scans[2].points
     floor = np.random.default_rng(1).uniform([-9e3, -9e3, -5e3], [9e3, 9e3, -4.9e3], (int(clutter * len(points)), 3))
     every = np.vstack([points, floor + points.mean(axis=0)])
-    wrong, right = placed(scene.arch, index, every), placed(scene.arch, 2, every)
+    wrong, right = (measure._place(scanned(every)[0], k, shapes_of(scene.arch), 1.0) for k in (index, 2))
     assert wrong.rejected or wrong.doubts or wrong.attitude.status != "ok"
     assert (right.attitude.status, right.rejected, right.doubts) == ("ok", (), ())
 
@@ -312,6 +304,7 @@ def test_covered_share_of_a_part_equals_the_share_seen():
     along = points @ shape.axes[:, 0]
     half = along < 0.5 * (along.min() + along.max())
     left = points[:, 1] > 0.5 * SMALL.width_mm - 30.0
+    # Of 40 slices of three or four sides each the ones at a border count in halves: 2 of 80.
     for own, share in ((points, 1.0), (points[half], 0.5), (points[~left], 0.75)):
         assert measure._covered(own, np.eye(4), shape) == pytest.approx(share, abs=0.03)
 
@@ -329,13 +322,14 @@ def test_rival_pose_shifted_along_the_part_is_reported_as_a_shift():
 def test_half_a_part_is_found_however_it_lies_in_its_file(upper, seed):
     parts, design = bridge()
     part, own = parts[1], principal.of_mesh(design.parts[1].vertices, design.parts[1].faces)
-    points = cloud(part, spacing_mm=14.0)
+    points = cloud(part, spacing_mm=24.0)
     down = (points - own.centre) @ own.axes[:, 1] * np.sign(-own.axes[2, 1])
     scan, T = scanned(points[down < 60.0 if upper else down > -60.0], 100 + seed)
     found = attitude.find(scan.points, design.parts[1], shapes_of(design)[1])
     assert found.status in ("ok", "ambiguous")
-    turns = [rigid.rotation_angle((one @ rigid.invert(T))[:3, :3]) for one in (found.T_surface, found.T_rival)]
-    assert turns[0] < 0.01 or (found.status == "ambiguous" and turns[1] < 0.01)
+    turns = [turn_deg(one, T) for one in (found.T_surface, found.T_rival)]
+    # Right or half a turn round: a half slides along the arch by some mm in metres.
+    assert turns[0] < 0.6 or (found.status == "ambiguous" and turns[1] < 0.6)
 
 
 @pytest.mark.slow
@@ -357,51 +351,32 @@ def test_two_scans_of_one_part_are_combined(monkeypatch):
 
     Which part half a scan is of is searched for in test_assignment.
     """
+    parts, design = bridge()
+    part, points = parts[RIB], cloud(parts[RIB], spacing_mm=24.0)
+    sides = {"left": points[:, 1] > -50.0, "right": points[:, 1] < 50.0}
+    scans, poses = zip(*(scanned(points[sides[name]], k, name) for k, name in enumerate(sides)), strict=True)
+    true = dict(zip(sides, poses, strict=True))
     place, placed = measure._place, {}  # the left scan is asked for twice
 
     def placed_once(scan, *rest):
+        known(monkeypatch, true[scan.name])
         if scan.name not in placed:
             placed[scan.name] = place(scan, *rest)
         return placed[scan.name]
 
     monkeypatch.setattr(measure, "_place", placed_once)
     monkeypatch.setattr(assignment, "rather", lambda *_: None)
-    parts, design = bridge()
-    part = parts[RIB]
-    points = cloud(part, spacing_mm=24.0)
-    one, T = scanned(points[points[:, 1] > -50.0], 1, "left")
-    other, _ = scanned(points[points[:, 1] < 50.0], 2, "right")
-    both = measured(design, RIB, one, other)
-    assert {scan.name for scan in both.scans} == {"left", "right"}
+    both = measured(design, RIB, *scans)
+    first, further = (one.name for one in both.scans)
+    assert {first, further} == {"left", "right"}
     assert both.status == "ok"
-    assert_right(both, design, RIB, part, T if both.scans[0].name == "left" else _back(2))
-    (further,) = both.T_further_scans
-    true = _back(2) if both.scans[0].name == "left" else T
-    at = rigid.apply(rigid.invert(true), part.key_points(part.s0))
-    assert np.abs(rigid.apply(further, at) - rigid.apply(true, at)).max() < 3.0
-    alone = measured(design, RIB, one)
+    assert_right(both, design, RIB, part, true[first])
+    at = rigid.apply(rigid.invert(true[further]), part.key_points(part.s0))
+    # The scan alone is weak, about its one web; measured 0.5 to 1.5, another pose of the four is metres off.
+    assert np.abs(rigid.apply(both.T_further_scans[0], at) - rigid.apply(true[further], at)).max() < 3.0
+    alone = measured(design, RIB, scans[0])
     assert alone.status == "weak"
     assert reason("preassemble.few-points-on-face", face="right") in nested(alone.reasons)
-
-
-def _back(seed):
-    return rigid.invert(random_pose(np.random.default_rng(seed)))
-
-
-@pytest.mark.slow  # by day the foreign bridges of the night have unequal plates
-def test_unequal_plates_meet_at_their_outer_faces():
-    parts, _ = bridge()
-    thin = dataclasses.replace(parts[1].plates, bottom=16.0, top=16.0, web=12.0)
-    parts = (parts[0], dataclasses.replace(parts[1], plates=thin), *parts[2:])
-    design = design_of(parts)
-    scans = tuple(scanned(cloud(part, 7, spacing_mm=16.0), i, part.name, part.name)[0] for i, part in enumerate(parts))
-    result = preassembly_step.run(Scene("b", "arch-bridge", scans, arch=design), preassembly_step.Params())
-    assert result.components.status == ("ok",) * 5
-    assert np.abs(result.joints.gaps).max() < 0.5
-    assert (np.abs(result.joints.gaps) < 1.5 * result.joints.gap_ci95 + 0.02).all()
-    twice = Scene("b", "arch-bridge", (*scans, dataclasses.replace(scans[1], name="again")), arch=design)
-    with pytest.raises(InputError, match=r"takes one scan per part, rib1 has several"):
-        preassembly_step.run(twice, preassembly_step.Params(method="line"))
 
 
 def with_a_floor(points, axes, share, rng):
@@ -428,11 +403,10 @@ def test_a_floor_beside_a_part_does_not_turn_it_round(seed, index, share):
     points = with_a_floor(rigid.apply(T, scene.scans[index].points), shape.axes, share, rng)
     found = attitude.find(rigid.apply(rigid.invert(T), points), scene.arch.parts[index], shape)
     assert (found.status, found.reasons) == ("ok", ())
-    turn = found.T_surface[:3, :3] @ T[:3, :3].T
-    assert np.degrees(rigid.rotation_angle(turn)) < 0.1
+    assert turn_deg(found.T_surface, T) < 2.0 * TURNED_DEG  # by the few points of the search
 
 
-def on_trestles(points, rng, step=12.0):
+def on_trestles(points, rng, step=20.0):
     """A part 0.6 m above a floor that reaches 2 m beyond it, on two trestles that touch it and hide its bottom."""
     low, high = points.min(axis=0), points.max(axis=0)
     ground = low[2] - 600.0
@@ -454,7 +428,7 @@ def on_trestles(points, rng, step=12.0):
 
 def test_a_part_on_trestles_above_a_floor_of_more_points_is_found_right():
     parts, design = bridge()
-    points = cloud(parts[1])
+    points = cloud(parts[1], spacing_mm=24.0)
     everything = on_trestles(points, np.random.default_rng(4))
     assert len(everything) > 2.0 * len(points)
     scan, T = scanned(everything)
@@ -464,9 +438,9 @@ def test_a_part_on_trestles_above_a_floor_of_more_points_is_found_right():
     # Points of the trestles are at the bottom edges, where they hide the part.
     edges = found.member.edges
     sd = np.sqrt(np.stack([np.diag(one) for one in edges.covariance], axis=1))
-    known = np.isfinite(edges.departure)
-    assert known.mean() > 0.9
-    assert np.abs(edges.departure / sd)[known].max() < 4.5
+    seen = np.isfinite(edges.departure)
+    assert seen.mean() > 0.9  # two trestles of 0.5 m hide a tenth of 9 m
+    assert np.abs(edges.departure / sd)[seen].max() < PULL_MOST
 
 
 def test_a_scan_that_is_denser_at_one_end_starts_at_the_parts_place():
@@ -481,8 +455,8 @@ def test_a_scan_that_is_denser_at_one_end_starts_at_the_parts_place():
     def off(poses):
         return min(np.linalg.norm(rigid.apply(one, scan.points) - points, axis=1).max() for one in poses)
 
-    assert off(by_axes) > 500.0
-    assert off(starts) < 60.0
+    assert off(by_axes) > 500.0  # the mean of nine tenths of the points at a fifth of 9 m is metres off the middle
+    assert off(starts) < 60.0  # by the extents: 0.2 % of the length at either end, and the tilt of the axes
     half = scan.points[points[:, 0] < np.median(points[:, 0])]
     np.testing.assert_array_equal(attitude.at_extents(half, design.parts[1], by_axes[0]), by_axes[0])
 
@@ -497,15 +471,9 @@ def test_no_random_pose_is_wrong_and_called_ok():
         found = measured(design, index, scan)
         assert found.status in ("ok", "ambiguous", "weak")
         if found.status == "ok":
-            off = found.T_bridge_scan @ rigid.invert(T)
-            assert np.degrees(rigid.rotation_angle(off[:3, :3])) < 0.1
-            assert (
-                np.abs(
-                    rigid.apply(off, parts[index].key_points(parts[index].s0))
-                    - parts[index].key_points(parts[index].s0)
-                ).max()
-                < 3.0
-            )
+            at = parts[index].key_points(parts[index].s0)
+            assert turn_deg(found.T_bridge_scan, T) < 2.0 * TURNED_DEG
+            assert np.abs(rigid.apply(found.T_bridge_scan @ rigid.invert(T), at) - at).max() < 3.0  # a wrong one: 20
 
 
 @pytest.mark.slow
@@ -516,6 +484,5 @@ def test_a_rib_of_even_curvature_is_not_laid_half_a_turn_round():
     part = scene.arch.parts[2]
     scan = next(scan for scan in scene.scans if scan.component == part.name)
     found = attitude.find(by_cell(scan.points, measure.CELL_MM).points, part)
-    turn = found.T_surface[:3, :3] @ truth.arch.T_bridge_scan[2][:3, :3].T
     assert found.status == "ok"
-    assert np.degrees(rigid.rotation_angle(turn)) < 0.1
+    assert turn_deg(found.T_surface, truth.arch.T_bridge_scan[2]) < 2.0 * TURNED_DEG

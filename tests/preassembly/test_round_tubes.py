@@ -10,8 +10,8 @@ from processor.preassembly import step
 from processor.preassembly.ends import section, tube_end
 from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
-from processor.preassembly.ends.outer_faces import RegisteredPart
 from processor.preassembly.verdicts import joint_measures
+from tests.support.results import measured_parts
 from tests.support.results.reasons import codes
 from tests.support.solids import round_tubes
 from tests.support.solids.round_tubes import AsBuilt, Sizes
@@ -24,14 +24,7 @@ def fitted(sizes, part, built, rng, sigma=1.0, spacing=12.0, turn_known=True):
     design = round_tubes.design(sizes)
     surface = mesh_distance.of_mesh(*round_tubes.mesh(sizes, part))
     points = round_tubes.scanned(sizes, part, built, rng, spacing, sigma)
-    registered = RegisteredPart(
-        points=points,
-        station=np.zeros(len(points), np.int64),
-        between_stations=0.0,
-        pose=np.zeros((6, 6)),
-        surface=surface,
-        outer=surface,
-    )
+    registered = measured_parts.registered(points, surface, surface)
     place = end_place(design.joint_points[0], 1.0 - 2.0 * part, surface)
     return tube_end.fit(registered, place, turn_known), design.joint_points[0], place.T_bridge_joint[:3, :3]
 
@@ -64,10 +57,10 @@ def test_intervals_cover_key_points_as_built():
             sizes_of.append(sd)
     # 16 ends of some eight independent coefficients: 128 of 95 % have a standard deviation of 1.9 %, two of which are
     assert 0.91 < np.mean(held) < 0.99  # left on either side.
-    assert np.median(sizes_of) < 0.2
+    assert np.median(sizes_of) < 0.2  # 1 mm by hundreds of points a coefficient, extrapolated to the end
 
 
-@pytest.mark.parametrize("angle", np.radians([10.0, 45.0, 130.0, 180.0, 260.0]))
+@pytest.mark.parametrize("angle", np.radians([10.0, 130.0, 260.0]))
 def test_intervals_contain_any_turn_where_none_is_known(angle):
     rng = np.random.default_rng(3)
     built = AsBuilt(np.zeros(2), np.array([[0.0, 0.0], [4e-3, -3e-3]]))
@@ -80,14 +73,14 @@ def test_intervals_contain_any_turn_where_none_is_known(angle):
     centre = (points - joint_frame(points)[:3, 3]) @ R
     true = np.column_stack([at[:, 0], (centre[:, 1:] + at[:, 1:]) @ turn.T - centre[:, 1:]])
     sd = np.sqrt(np.diag(found.covariance)).reshape(8, 3)
-    assert (np.abs(found.departure - true) <= NORMAL_95 * sd + 0.01).all()
+    assert (np.abs(found.departure - true) <= NORMAL_95 * sd + 0.01).all()  # facets: see above
     # What no turn changes is known as well as ever.
     measured = joint_measures.measure(found.departure, found.covariance, np.eye(4), centre)
     for name in ("groove_gap_mean", "offset_x", "offset_y", "offset_z"):
         value, ci95 = measured.of(name)
         expected = true.mean(axis=0)[["x", "y", "z"].index(name[-1])] if name[-1] in "xyz" else true[:, 0].mean()
-        assert abs(value - expected) < 2.0 * ci95
-        assert ci95 < 0.5
+        assert abs(value - expected) < 2.0 * ci95  # nearly 4 standard deviations
+        assert ci95 < 0.5  # of eight points known to 0.2 mm; the turn alone makes metres
     assert measured.of("rotation_x")[1] > 1000.0
 
 
@@ -107,32 +100,27 @@ def test_a_section_is_round_by_its_key_points():
     assert section.round_radius(rigid.apply(rigid.invert(joint_frame(box)), box)) == 0.0
 
 
-def metrics(scene, truth):
+def metrics(**kind):
+    sizes = Sizes(parts=2, length=1600.0, radius=200.0, **kind)
+    scene, truth = round_tubes.scene(sizes, seed=1, spacing=14.0)
     result = step.run(scene, step.Params())
     return result, {(one.quantity, one.statistic): one.value for one in evaluation.check(scene, result, truth)}
 
 
-SHORT = {"parts": 2, "length": 1600.0, "radius": 200.0}
-
-
 def test_tubes_with_a_gusset_are_assembled():
-    scene, truth = round_tubes.scene(Sizes(gusset=True, **SHORT), seed=1, spacing=14.0)
-    result, found = metrics(scene, truth)
+    result, found = metrics(gusset=True)
     assert result.components.status == (Status.OK,) * 2
     assert found["key points", Statistic.COVERAGE] > 80.0  # of 16 that hang together
+    # 0.5 mrad of turn by the gusset's few points, at 200 mm, beside ends known to 0.2 mm
     assert found["key points in the scan", Statistic.RMS] < 1.0
 
 
 def test_a_tube_without_a_mark_is_not_called_sure():
-    scene, truth = round_tubes.scene(Sizes(collar=True, **SHORT), seed=1, spacing=14.0)
-    result, found = metrics(scene, truth)
+    result, found = metrics(collar=True)
     for status, reasons in zip(result.components.status, result.components.reasons, strict=True):
         assert status == Status.AMBIGUOUS
         assert "preassemble.turn-unknown" in codes(reasons)
     assert found["key points", Statistic.COVERAGE] == 100.0
     assert found["key points in the scan", Statistic.RMS] > 10.0  # the turn is any
-    eccentricity, groove = (
-        result.adjustment.joints.measures[0].of(name) for name in ("eccentricity", "groove_gap_mean")
-    )
-    assert eccentricity[1] < 1.0
-    assert groove[1] < 1.0
+    for name in ("eccentricity", "groove_gap_mean"):  # what no turn changes, by ends known to 0.2 mm
+        assert result.adjustment.joints.measures[0].of(name)[1] < 1.0
