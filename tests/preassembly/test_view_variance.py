@@ -39,7 +39,7 @@ def pair(rng, apart, thick=24.0):
 # Of 12 pairs of opposite plates less 3 means of equal thickness 9 are left. By Student's t they are widened by
 # 1.33 = (2.26 / 1.96)^2. The class counts for 2 more: (9 * 1.33 * 0.3^2 + 2 * 0.5^2) / 11 = 1.59 * 0.3^2. Of 0.1 mm
 # the 95 % limit is less than that: 9 / 3.33 = 2.71, by the 5 % quantile of chi-square.
-@pytest.mark.parametrize(("apart", "wider"), [(0.1, 2.71), (0.3, 1.59)])
+@pytest.mark.parametrize(("apart", "wider"), [pytest.param(0.1, 2.71, marks=pytest.mark.slow), (0.3, 1.59)])
 def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart, wider):
     rng = np.random.default_rng(1)
     found = [
@@ -82,7 +82,7 @@ def test_plates_that_were_rolled_differently_are_no_difference_between_views():
     assert np.mean([one.level for one in found]) < 0.1 * 0.5 * 0.3**2
 
 
-@pytest.mark.parametrize("one_outer", [False, True])
+@pytest.mark.parametrize("one_outer", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_views_that_differ_are_not_taken_for_rolling(one_outer):
     """Also where the outer sides at both ends were seen from one place, nineteen in twenty limits hold the truth."""
     rng = np.random.default_rng(7)
