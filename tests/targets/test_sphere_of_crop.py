@@ -44,30 +44,32 @@ def ball_with_tubes(rng, noise, count=1500):
     return points[np.linalg.norm(points, axis=1) < RADIUS + 25.0]
 
 
-@pytest.mark.parametrize("noise", [1.0, 2.0])
-@pytest.mark.parametrize("held", [None, RADIUS])
-@pytest.mark.parametrize("scanner", [None, SCANNER])
+@pytest.mark.parametrize(
+    ("scanner", "held", "noise"), [(None, None, 1.0), (SCANNER, None, 2.0), (None, RADIUS, 2.0), (SCANNER, RADIUS, 1.0)]
+)
 def test_balls_with_tubes_are_found_and_their_intervals_hold(scanner, held, noise):
-    """Of 40 intervals of 95 %, 34 or more hold in all but 3 of 1000 series (binomial)."""
+    """Of 20 intervals of 95 %, 16 or more hold in all but 3 of 1000 series, of 60 53 (binomial)."""
     found, inside, centres = 0, 0, 0
-    for seed in range(40):
+    for seed in range(20):
         fit = processor.fit_sphere(ball_with_tubes(np.random.default_rng(seed), noise), held, scanner)
         found += fit.status is Status.OK
         sd = np.sqrt(np.diag(fit.covariance))
         inside += held is not None or abs(fit.radius - RADIUS) < NORMAL_95 * sd[3]
         centres += np.count_nonzero(np.abs(fit.centre) < NORMAL_95 * sd[:3])
-        assert np.linalg.norm(fit.centre) < 0.05 * RADIUS
-    assert found >= 34
-    assert inside >= 34
-    assert centres >= 3 * 34
+        assert fit.radius == held or held is None
+        assert np.linalg.norm(fit.centre) < 0.05 * RADIUS  # far from every tube
+    assert found >= 16
+    assert inside >= 16
+    assert centres >= 52
 
 
 def test_a_fit_uses_the_noise_of_the_points_and_not_the_width_of_its_band():
-    """Of a ball alone all points agree: the scale is their noise, to some 1 / sqrt(n)."""
-    for seed in range(10):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         points = (RADIUS + rng.normal(0.0, 1.5, (1000, 1))) * directions(rng, 1000)
-        assert sphere_of_crop.find(points, 40, None, None).ball.fit.scale == pytest.approx(1.5, rel=0.15)
+        scale = sphere_of_crop.find(points, 40, None, None).ball.fit.scale
+        # Of a ball alone all points agree: sd of a robust scale of 1000 points 4 %, four of them.
+        assert scale == pytest.approx(1.5, rel=0.15)
 
 
 def test_points_in_any_order_and_anywhere_give_one_sphere():
@@ -75,24 +77,17 @@ def test_points_in_any_order_and_anywhere_give_one_sphere():
     points = np.round(ball_with_tubes(rng, 1.0), 3)
     one = processor.fit_sphere(points)
     other = processor.fit_sphere(points[rng.permutation(len(points))])
-    assert (one.radius, one.points) == (pytest.approx(other.radius, abs=1e-9), other.points)
+    assert (one.radius, one.points) == (pytest.approx(other.radius, abs=1e-9), other.points)  # float64
     far = np.array([4.0e8, 5.0e9, 3.0e5])
     moved = processor.fit_sphere(points + far)
-    np.testing.assert_allclose(moved.centre - far, one.centre, atol=1e-4)
+    np.testing.assert_allclose(moved.centre - far, one.centre, atol=1e-4)  # float64 at 5000 km: 1e-6
 
 
-def test_a_known_radius_is_held():
-    fit = processor.fit_sphere(ball_with_tubes(np.random.default_rng(5), 1.5), radius=RADIUS)
-    assert (fit.status, fit.radius) == (Status.OK, RADIUS)
-    assert np.linalg.norm(fit.centre) < 1.0
-
-
-@pytest.mark.parametrize("scanner", [None, SCANNER])
-@pytest.mark.parametrize("wrong", [-2.0, 1.0, 4.0])
+@pytest.mark.parametrize(("wrong", "scanner"), [(-2.0, SCANNER), (1.0, None), (4.0, SCANNER), (4.0, None)])
 def test_a_held_radius_that_the_points_have_not_is_stated_and_far_off_never_ok(scanner, wrong):
     """Scanners make spheres larger or smaller by some 0.5 mm: a difference of 1 mm is in the interval of the centre."""
     doubted = 0
-    for seed in range(8):
+    for seed in range(4):
         fit = processor.fit_sphere(ball_with_tubes(np.random.default_rng(seed), 1.0), RADIUS + wrong, scanner)
         assert abs(wrong) < 2.0 or fit.status is not Status.OK
         if fit.status is Status.FAILED:
@@ -102,9 +97,9 @@ def test_a_held_radius_that_the_points_have_not_is_stated_and_far_off_never_ok(s
         assert (np.abs(fit.centre) < NORMAL_95 * np.sqrt(np.diag(fit.covariance))[:3]).all()
         for doubt in (one.values for one in fit.reasons if one.code == "spheres.other-radius"):
             doubted += 1
-            assert abs(doubt["radius"] - RADIUS) < 3.0 * doubt["ci95"] / NORMAL_95
+            assert abs(doubt["radius"] - RADIUS) < 3.0 * doubt["ci95"] / NORMAL_95  # 3 sd
             assert (doubt["held"], doubt["shift"] > 0.5) == (RADIUS + wrong, True)
-    assert doubted >= 6
+    assert doubted >= 3
 
 
 def test_few_points_give_no_sphere_and_the_reason():
@@ -139,17 +134,18 @@ def torus(rng, noise):
     return seen(rng, 70.0 * out + 40.0 * normals, normals, noise)
 
 
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 5), marks=pytest.mark.slow)], ids=["one", "more"])
 @pytest.mark.parametrize("noise", [0.5, 2.0])
 @pytest.mark.parametrize("body", [flattened, cylinder, short_cylinder, corner, torus])
-def test_other_bodies_are_no_sphere_without_a_doubt(body, noise):
-    for seed in range(4):
+def test_other_bodies_are_no_sphere_without_a_doubt(body, noise, seeds):
+    for seed in seeds:
         fit = processor.fit_sphere(body(np.random.default_rng(seed), noise))
         assert fit.status is not Status.OK
         assert fit.reasons
 
 
 def test_a_volume_of_points_is_no_sphere():
-    points = np.random.default_rng(0).uniform(-60.0, 60.0, (40_000, 3))
+    points = np.random.default_rng(0).uniform(-60.0, 60.0, (10_000, 3))
     assert processor.fit_sphere(points).status is Status.FAILED
 
 
@@ -166,7 +162,7 @@ def test_points_of_several_stations_have_a_position_each():
     stations = np.vstack([np.tile(SCANNER, (len(points), 1)), np.tile(-SCANNER, (len(points), 1))])
     fit = processor.fit_sphere(np.vstack([points, others]), scanner=stations)
     assert fit.status is Status.OK
-    assert abs(fit.radius - RADIUS) < 0.3
+    assert abs(fit.radius - RADIUS) < 0.3  # of 3000 points of 1 mm: sd 0.03, of a scanner of some tenths
 
 
 def test_a_fit_that_fails_without_the_limb_is_a_doubt(monkeypatch):
@@ -185,7 +181,7 @@ def test_flat_surfaces_without_noise_do_not_make_a_sphere_rough(monkeypatch):
     """As of exact points beside a wall: a scale of rounding errors has no ratio to a noise of nothing."""
     monkeypatch.setattr(sphere_detection, "flat_noise", lambda *_: 0.0)
     fit = processor.fit_sphere(RADIUS * directions(np.random.default_rng(6), 1500))
-    assert (fit.status, fit.radius) == (Status.OK, pytest.approx(RADIUS, abs=1e-6))
+    assert (fit.status, fit.radius) == (Status.OK, pytest.approx(RADIUS, abs=1e-6))  # of exact points
 
 
 def test_noise_at_the_limb_does_not_show_a_wrong_scanner():
@@ -196,4 +192,4 @@ def test_noise_at_the_limb_does_not_show_a_wrong_scanner():
     beyond = 35.0 * np.column_stack([0.98 * np.cos(turn), 0.98 * np.sin(turn), np.full(100, -0.2)])  # one sd and a half
     fit = processor.fit_sphere(np.vstack([points, beyond]), scanner=SCANNER)
     assert fit.status is Status.OK
-    assert abs(fit.radius - 35.0) < 1.0
+    assert abs(fit.radius - 35.0) < 1.0  # less than the noise of one point

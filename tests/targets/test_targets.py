@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.stats
 
 import designgen
 from processor.geometry import rigid
@@ -33,12 +34,13 @@ def found_in(seed, **settings):
 
 
 @pytest.mark.parametrize(
-    ("step", "median_mm", "most_mm"), [(0.3e-3, 0.1, 0.3), pytest.param(0.6e-3, 0.3, 0.6, marks=pytest.mark.slow)]
+    ("step", "count", "median_mm", "most_mm"),
+    [(0.6e-3, 12, 0.3, 0.6), pytest.param(0.3e-3, 20, 0.1, 0.3, marks=pytest.mark.slow)],
 )
-def test_centres_at_ten_metres(step, median_mm, most_mm):
-    """Footprints drawn ray by ray, apart from the model that is fitted; median and most of twenty boards."""
+def test_centres_at_ten_metres(step, count, median_mm, most_mm):
+    """Footprints drawn ray by ray, apart from the model that is fitted; a tenth of the step at most, as is usual."""
     errors = []
-    for seed in range(20):
+    for seed in range(count):
         boards, centre = found_in(seed, distance=10_000.0, step=step)
         assert len(boards) == 1
         errors.append(float(np.linalg.norm(boards[0].centre - centre)))
@@ -47,13 +49,14 @@ def test_centres_at_ten_metres(step, median_mm, most_mm):
 
 
 def test_standard_deviations_agree_with_the_errors_of_targets():
-    """Of three coordinates of thirty boards at all turns: 90 errors; the bounds hold 99.9 % of such sets."""
+    """Of three coordinates of twenty boards at all turns: 60 errors; the bounds hold 99.9 % of such sets."""
     squares = []
-    for seed in range(30):
+    for seed in range(20):
         (one,), centre = found_in(100 + seed, distance=8_000.0, step=0.8e-3)
         off = one.centre - centre
         squares.append(float(off @ np.linalg.solve(one.covariance, off)))
-    assert 0.4 < np.mean(squares) / 3.0 < 1.9
+    low, high = scipy.stats.chi2.ppf([5e-4, 1.0 - 5e-4], 60) / 60.0
+    assert low < np.mean(squares) / 3.0 < high
 
 
 @pytest.mark.parametrize("longer_mm", [2.0, -3.0])
@@ -96,7 +99,7 @@ def test_no_checkerboard_is_found_without_intensities_contrast_or_points():
     assert boards_in(points, rng.uniform(0.0, 1.0, len(points))) == []
 
 
-def painted(colour, seed=0, step=6.0, half=400.0):
+def painted(colour, seed=0, step=6.0, half=280.0):
     """A wall with intensities by a function of u and v, mm, 5 m from the scanner."""
     rng = np.random.default_rng(seed)
     u, v = (one.ravel() for one in np.meshgrid(*[np.arange(-half, half, step)] * 2))
@@ -126,7 +129,7 @@ DECOYS = {
 
 @pytest.mark.parametrize("name", DECOYS)
 def test_similar_patterns_are_no_target(name):
-    half = 280.0 if name == "chess" else 400.0  # its crossings are tried one by one: there are fifty of them
+    half = 170.0 if name == "chess" else 280.0  # its crossings are tried one by one: there are 25 of them
     assert boards_in(*painted(DECOYS[name], half=half)) == []
 
 
@@ -243,8 +246,8 @@ def test_control_points_without_sightings_are_accepted_with_a_target_search(tmp_
     assert len(scene.control.point) == 0
 
 
-@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_room_with_targets_and_decoys(seed):
     """Every target with enough points is found and named, without false ones, and places are within 0.3 mm and 4 sd."""
     settings = {"scan.step_mrad": 4.0, "room.spheres": 0, "room.checkerboard_mm": 300.0, "room.decoys": 8}
@@ -313,21 +316,13 @@ def test_interval_of_a_target_includes_the_common_range_error_of_a_view():
     """The class of scanners: 0.5 mm, one standard deviation, for the ranges of one view."""
     scene, _ = scene_of_board()
     found = find.with_targets(scene)
-    points, intensity = scene.scans[0].points, scene.scans[0].intensity
-    (one,) = boards_in(points, intensity)
+    (one,) = boards_in(scene.scans[0].points, scene.scans[0].intensity)
     assert found.targets.sd[0] == pytest.approx(np.hypot(0.5, max(one.sd, find.LEAST_SD_MM)))
     assert found.control.seen_sd[0] == found.targets.sd[0]
 
 
 def spread_targets(seed=4, count=6):
     return np.random.default_rng(seed).uniform(0.0, 12_000.0, (count, 3))
-
-
-def test_a_shifted_target_of_a_posed_scan_has_no_name():
-    known = spread_targets()
-    seen = known + np.array([30.0, -20.0, 10.0])  # of an approximate pose
-    seen[2, 2] += 40.0
-    assert naming.by_pose(seen, known).tolist() == [0, 1, -1, 3, 4, 5]
 
 
 def test_two_targets_of_a_posed_scan_have_names_if_their_distance_agrees():
@@ -342,7 +337,7 @@ def test_two_targets_of_a_posed_scan_have_names_if_their_distance_agrees():
 
 def test_contradicting_targets_are_reported():
     known = spread_targets()
-    seen = known.copy()
+    seen = known + np.array([30.0, -20.0, 10.0])  # of an approximate pose
     seen[2, 2] += 40.0
     control = Control(tuple(f"K{i}" for i in range(6)), positions=known, sd=np.full(6, 0.5))
     found = [
