@@ -90,7 +90,7 @@ def test_each_part_is_compared_at_its_own_best_fit(compared):
     assert len(found.core) == found.parts.core_points.sum()
     assert np.abs(found.parts.mean).max() < 0.2  # a dent of 8 mm moves the mean of 5 m2 by less
     left = found.core.distance[: found.parts.core_points[0]]
-    assert np.nanmax(np.abs(left)) < 2.0
+    assert np.nanmax(np.abs(left)) < 2.0  # four sd of a point
 
 
 def test_dent_is_found_on_its_part_without_false_defects(compared):
@@ -100,7 +100,7 @@ def test_dent_is_found_on_its_part_without_false_defects(compared):
     assert str(found.defect_class[0]) in ("dent", "pit")  # a block has no other side that tells them apart
     assert abs(found.depth_max[0] - DENT_MM) < found.depth_ci95[0]
     middle = np.array([0.5 * SIZE[0], 0.0, SIZE[2]])  # of the top of the right part, as designed
-    assert np.linalg.norm(found.centre[0] - middle) < 0.5 * DENT_RADIUS
+    assert np.linalg.norm(found.centre[0] - middle) < 0.5 * DENT_RADIUS  # the dent, not a neighbour
     assert result.parts.defects.tolist() == [0, 1]
 
 
@@ -119,18 +119,6 @@ def test_parts_need_preassembly(bridge):
     assert deviation.needed(bridge[0]) == ("preassemble",)
     assert defects.needed(bridge[0]) == ("preassemble", "deviation")
     assert not deviation.applies(bridge[0])  # by itself a bridge is assembled alone
-
-
-def test_warm_steel_is_compared_at_the_reference_temperature(bridge):
-    scene, assembled = bridge
-    grown = 1.0 + 12e-6 * 30.0
-    warm = Scene(
-        "warm", "arch-bridge",
-        tuple(Scan(s.name, s.points * grown, component=s.component) for s in scene.scans),
-        arch=scene.arch, temperature_C=50.0,
-    )  # fmt: skip
-    for cold, part in zip(scene.scans, bridge_parts.of_bridge(warm, assembled, "deviation"), strict=True):
-        np.testing.assert_allclose(part.scene.scans[0].points, cold.points, atol=1e-6)
 
 
 def test_every_scan_of_a_part_lies_where_preassembly_placed_it():
@@ -153,6 +141,7 @@ def test_every_scan_of_a_part_lies_where_preassembly_placed_it():
     assert [scan.name for scan in part.scene.scans] == ["s0", "s2"]
     assert [(one.code, one.values["scans"]) for one in part.reasons] == [("parts.scans-not-used", ("s1",))]
     cloud = scene_cloud.merged(part.scene, with_scanner=True)
+    # Float64 at 1 km, twice turned.
     np.testing.assert_allclose(cloud.points + cloud.origin, np.vstack([on_part[0], on_part[2]]), atol=1e-5)
     np.testing.assert_allclose(cloud.scanner + cloud.origin, np.tile([-900.0, 4e3, 1.5e3], (len(cloud.points), 1)),
                                atol=1e-5)  # fmt: skip
@@ -172,12 +161,11 @@ def test_stations_of_two_scans_of_a_part_lie_where_each_scan_was_placed():
     )
     part = next(bridge_parts.of_bridge(scene, SimpleNamespace(components=table, method="adjustment"), "defects"))
     assert part.scene.stations.ids == ("S1", "S2", "S1, s1", "S2, s1")
-    np.testing.assert_allclose(
-        part.scene.stations.positions, np.vstack([places + lifts[0, :3, 3], places + lifts[1, :3, 3]]), atol=1e-9
-    )
+    lifted = np.vstack([places + lift[:3, 3] for lift in lifts])
+    np.testing.assert_allclose(part.scene.stations.positions, lifted, atol=1e-9)  # float64
     cloud = scene_cloud.merged(part.scene, with_scanner=True)
     lift = np.repeat([3.0, 5.0], len(points))[:, None] * [0, 0, 1.0]
-    np.testing.assert_allclose(cloud.scanner + cloud.origin, np.tile(places[seen], (2, 1)) + lift, atol=1e-9)
+    np.testing.assert_allclose(cloud.scanner + cloud.origin, np.tile(places[seen], (2, 1)) + lift, atol=1e-9)  # float64
 
 
 def test_balls_and_tubes_lie_where_they_were_measured():
@@ -207,7 +195,7 @@ def test_balls_and_tubes_lie_where_they_were_measured():
         off = corners[own].reshape(-1, 3) - (moved[0] if centre is None else centre)
         if centre is None:
             off = off - (off @ axis)[:, None] * axis
-        np.testing.assert_allclose(np.linalg.norm(off, axis=1), radius, atol=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(off, axis=1), radius, atol=1e-9)  # float64
         assert (np.einsum("fi,fi->f", normal[own], off.reshape(-1, 3, 3).mean(axis=1)) > 0.0).all()
     # The ball is open where the member's sleeve hides it.
     own = corners[made.bodies.of_facet == 0].mean(axis=1) - moved[0]
@@ -243,4 +231,4 @@ def test_points_of_a_merged_scan_are_corrected_station_by_station():
     scene = Scene("frame", "space-frame", (scan,), stations=Stations(ids=("S1", "S2"), positions=np.zeros((2, 3))))
     found = SimpleNamespace(stations=SimpleNamespace(names=("S1", "S2"), T=corrections))
     cloud = scene_cloud.merged(frame_members._corrected(scene, found), with_scanner=False)
-    np.testing.assert_allclose(cloud.points + cloud.origin, true, atol=1e-6)
+    np.testing.assert_allclose(cloud.points + cloud.origin, true, atol=1e-6)  # float64 at 4 km, twice turned

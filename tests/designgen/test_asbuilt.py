@@ -4,11 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-import trimesh
 
 from designgen import recipe_files
 from designgen.asbuilt import defects, imperfections
-from designgen.designs import arch_bridge, arch_part, boxes_and_tubes, defect_specimens, stadium_roof, truss_bridge
+from designgen.designs import arch_bridge, arch_part, stadium_roof
 from designgen.randomness import generator
 from designgen.scanning import sampler
 from designgen.scenes.make import make
@@ -16,6 +15,7 @@ from processor.model import UsageError
 
 NONE = {wall: imperfections._Wave(0.0, 0.0, 1000.0) for wall in ("bottom", "top", "left", "right")}
 RIB = arch_bridge.build(arch_bridge.Params())[2]
+ROUNDING_MM = 1e-9  # float64 at 60 m: 1e-11
 
 
 def built(**errors):
@@ -30,16 +30,16 @@ def frames(s):
 
 def test_part_without_errors_equals_its_design():
     for s in (RIB.s0, RIB.s1):
-        np.testing.assert_allclose(built().key_points(s), RIB.key_points(s), atol=1e-9)
+        np.testing.assert_allclose(built().key_points(s), RIB.key_points(s), atol=ROUNDING_MM)
     p, q = np.random.default_rng(0).uniform(size=(2, 200))
     for ours, design in zip(arch_part.faces(built(), 500.0), arch_part.faces(RIB, 500.0), strict=True):
-        np.testing.assert_allclose(ours.at(p, q), design.at(p, q), atol=1e-9)
+        np.testing.assert_allclose(ours.at(p, q), design.at(p, q), atol=ROUNDING_MM)
 
 
 def test_a_length_error_moves_one_end_along_the_curve():
     longer = built(ends=np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
-    np.testing.assert_allclose(longer.key_points(RIB.s0), RIB.key_points(RIB.s0), atol=1e-9)
-    np.testing.assert_allclose(longer.key_points(RIB.s1), RIB.key_points(RIB.s1 + 3.0), atol=1e-9)
+    np.testing.assert_allclose(longer.key_points(RIB.s0), RIB.key_points(RIB.s0), atol=ROUNDING_MM)
+    np.testing.assert_allclose(longer.key_points(RIB.s1), RIB.key_points(RIB.s1 + 3.0), atol=ROUNDING_MM)
 
 
 def test_a_skew_turns_the_end_face():
@@ -52,7 +52,7 @@ def test_a_skew_turns_the_end_face():
     expected = (
         1e-3 * 450.0 * np.array([1, -1, -1, 1, 0, -1, 0, 1]) * (1.0 + RIB.curve.curvature(np.array(RIB.s1)) * height)
     )
-    np.testing.assert_allclose(off, expected, atol=1e-4)
+    np.testing.assert_allclose(off, expected, atol=1e-4)  # the second order of 0.45 mm on a curve of 60 m
 
 
 def test_a_twist_turns_the_ends_against_each_other():
@@ -64,17 +64,19 @@ def test_a_twist_turns_the_ends_against_each_other():
         u, v = arm[:, 1], arm @ normal
         turned = twisted.key_points(s) - middle
         angle = 1e-3 * sign
-        np.testing.assert_allclose(turned[:, 1], u * np.cos(angle) - v * np.sin(angle), atol=1e-9)
-        np.testing.assert_allclose(turned @ normal, u * np.sin(angle) + v * np.cos(angle), atol=1e-9)
+        np.testing.assert_allclose(turned[:, 1], u * np.cos(angle) - v * np.sin(angle), atol=ROUNDING_MM)
+        np.testing.assert_allclose(turned @ normal, u * np.sin(angle) + v * np.cos(angle), atol=ROUNDING_MM)
 
 
 def test_a_bow_is_at_the_middle_and_a_wider_section_everywhere():
     bowed = built(bow=(4.0, -3.0))
     for s in (RIB.s0, RIB.s1):
-        np.testing.assert_allclose(bowed.key_points(s), RIB.key_points(s), atol=1e-9)
+        np.testing.assert_allclose(bowed.key_points(s), RIB.key_points(s), atol=ROUNDING_MM)
     s = 0.5 * (RIB.s0 + RIB.s1)
     _, _, normal = frames(s)
-    np.testing.assert_allclose(bowed.key_points(s) - RIB.key_points(s), [[0, 4, 0] - 3.0 * normal] * 8, atol=1e-9)
+    np.testing.assert_allclose(
+        bowed.key_points(s) - RIB.key_points(s), [[0, 4, 0] - 3.0 * normal] * 8, atol=ROUNDING_MM
+    )
     wide = built(section=(2.0, 5.0)).key_points(RIB.s1)
     assert np.linalg.norm(wide[0] - wide[1]) == pytest.approx(902.0)
     assert np.linalg.norm(wide[0] - wide[3]) == pytest.approx(1105.0)
@@ -84,23 +86,24 @@ def test_corners_of_an_end_move_each_on_its_own():
     corners = np.zeros((2, 4, 3))
     corners[1, 0], corners[1, 2] = [5.0, 0.0, 0.0], [0.0, 7.0, -3.0]
     off = built(corners=corners)
-    np.testing.assert_allclose(off.key_points(RIB.s0), RIB.key_points(RIB.s0), atol=1e-9)
+    np.testing.assert_allclose(off.key_points(RIB.s0), RIB.key_points(RIB.s0), atol=ROUNDING_MM)
     _, tangent, normal = frames(RIB.s1)
     moved = off.key_points(RIB.s1) - RIB.key_points(RIB.s1)
     np.testing.assert_allclose(moved @ tangent, [5, 0, 0, 0, 2.5, 0, 0, 2.5], atol=0.15)  # longer above the soffit
-    np.testing.assert_allclose(moved[:, 1], [0, 0, 7, 0, 0, 3.5, 3.5, 0], atol=1e-9)
+    np.testing.assert_allclose(moved[:, 1], [0, 0, 7, 0, 0, 3.5, 3.5, 0], atol=ROUNDING_MM)
+    # Turned with the curve over 5 mm.
     np.testing.assert_allclose(moved @ normal, [0, 0, -3, 0, 0, -1.5, -1.5, 0], atol=2e-2)
     far = off.key_points(RIB.s1 - imperfections.CORNER_REACH_MM)
-    np.testing.assert_allclose(far, RIB.key_points(RIB.s1 - imperfections.CORNER_REACH_MM), atol=1e-9)
+    np.testing.assert_allclose(far, RIB.key_points(RIB.s1 - imperfections.CORNER_REACH_MM), atol=ROUNDING_MM)
 
 
-@pytest.mark.parametrize("name", ["arch-east", "arch-west"])
+@pytest.mark.parametrize("name", ["arch-east-sampled", "arch-west-sampled"])
 def test_real_bridges_gape_as_in_the_source_paper(name):
     """Tables 4 to 7 of paper 000: the mean of |d| is 15 to 17 mm, the largest 58."""
-    scene, truth = make(name, recipe_files.overridden(recipe_files.load(name)[1], ["scan.step_mrad=40"]))
+    scene, truth = make(name, recipe_files.overridden(recipe_files.load(name)[1], ["scan.spacing_mm=400"]))
     gaps = np.abs(truth.arch.key_points_bridge[1:, 0] - truth.arch.key_points_bridge[:-1, 1])
-    assert 10.0 < gaps.mean() < 22.0
-    assert 35.0 < gaps.max() < 85.0
+    assert 10.0 < gaps.mean() < 22.0  # the paper's 15 to 17, of 48 numbers drawn
+    assert 35.0 < gaps.max() < 85.0  # the largest of 48: 58 there
     assert all(len(scan.points) for scan in scene.scans)
 
 
@@ -126,29 +129,19 @@ def test_dents_waves_and_missing_pieces_are_at_the_places_of_the_truth():
     (hole,) = [h for p in made for h in p.holes]
     owner = next(p for p in made if p.holes)
     cloud = sampler.scan_part(owner, 0, sampler.Params(spacing_mm=20.0, sigma_mm=0.0), generator(0, "x"))
-    middle = owner.point(
-        *(
-            np.array([x])
-            for x in (0.5 * (hole.s0 + hole.s1), 450.0 if hole.wall == "left" else -450.0, 0.5 * (hole.c0 + hole.c1))
-        )
-    )
+    u, middle = 450.0 if hole.wall == "left" else -450.0, (0.5 * (hole.s0 + hole.s1), 0.5 * (hole.c0 + hole.c1))
+    middle = owner.point(*(np.array([x]) for x in (middle[0], u, middle[1])))
     away = np.linalg.norm(cloud.points - middle, axis=1)
     assert 100.0 < away.min() < 130.0  # 125 to the edge; the plate's cut faces reach a little inward
-    waves = imperfections.fabricate(
-        RIB,
-        imperfections.ArchErrors(
-            np.zeros((2, 3)), 0.0, (0.0, 0.0), (0.0, 0.0), {w: imperfections._Wave(1.5, 0.0, 1500.0) for w in NONE}
-        ),
-        RIB.plates,
-    )
+    waves = built(waves={wall: imperfections._Wave(1.5, 0.0, 1500.0) for wall in NONE})
     p, q = np.random.default_rng(0).uniform(size=(2, 20_000))
     off = {
         f.name: f.at(p, q) - g.at(p, q)
         for f, g in zip(arch_part.faces(waves, 500.0), arch_part.faces(RIB, 500.0), strict=True)
     }
-    assert np.linalg.norm(off["outer-left"], axis=1).max() == pytest.approx(1.5, abs=0.02)
-    np.testing.assert_allclose(off["ring-end"], 0.0, atol=1e-9)
-    np.testing.assert_allclose(waves.key_points(RIB.s1), RIB.key_points(RIB.s1), atol=1e-9)
+    assert np.linalg.norm(off["outer-left"], axis=1).max() == pytest.approx(1.5, abs=0.02)  # 20,000 places drawn
+    np.testing.assert_allclose(off["ring-end"], 0.0, atol=ROUNDING_MM)
+    np.testing.assert_allclose(waves.key_points(RIB.s1), RIB.key_points(RIB.s1), atol=ROUNDING_MM)
 
 
 def test_the_truth_of_a_warm_bridge_maps_back_to_the_design():
@@ -158,9 +151,8 @@ def test_the_truth_of_a_warm_bridge_maps_back_to_the_design():
     grown = 1.0 + 12e-6 * 25.0
     for i in range(5):
         T = truth.arch.T_bridge_scan[i]
-        np.testing.assert_allclose(
-            truth.arch.key_points_scan[i] / grown @ T[:3, :3].T + T[:3, 3], truth.arch.key_points_bridge[i], atol=1e-8
-        )
+        back = truth.arch.key_points_scan[i] / grown @ T[:3, :3].T + T[:3, 3]
+        np.testing.assert_allclose(back, truth.arch.key_points_bridge[i], atol=1e-8)  # float64 at 1 km
     width = truth.arch.key_points_scan[1, 0, 0] - truth.arch.key_points_scan[1, 0, 1]
     assert np.linalg.norm(width) == pytest.approx(900.0 * grown)
     gaps = truth.arch.key_points_bridge[1:, 0] - truth.arch.key_points_bridge[:-1, 1]
@@ -169,6 +161,7 @@ def test_the_truth_of_a_warm_bridge_maps_back_to_the_design():
         if what == "length error" and where in wanted:
             wanted[where] = value
     # At the joint of rib1 and rib2 the gap along the curve is what both ends are long, one after the other.
+    # It is the chord of that: 2e-3 mm less at most.
     assert np.linalg.norm(gaps[1, 4]) == pytest.approx(abs(wanted["rib2 start"] - wanted["rib1 end"]), abs=2e-3)
 
 
@@ -185,7 +178,7 @@ def test_dents_and_missing_pieces_keep_apart():
             p, q = (grid.ravel() for grid in np.meshgrid(x, x))
             s, v = hole.s0 + p * (hole.s1 - hole.s0), hole.c0 + q * (hole.c1 - hole.c0)
             u = np.full_like(s, 1.0 if hole.wall == "left" else -1.0) * 450.0
-            np.testing.assert_allclose(part.point(s, u, v, wall=hole.wall), design.point(s, u, v), atol=1e-9)
+            np.testing.assert_allclose(part.point(s, u, v, wall=hole.wall), design.point(s, u, v), atol=ROUNDING_MM)
         for one in part.holes:
             others = [o for o in part.holes if o is not one and o.wall == one.wall]
             assert all(abs(one.s0 - o.s0) >= 250.0 or abs(one.c0 - o.c0) >= 250.0 for o in others)
@@ -229,33 +222,40 @@ def test_plates_that_vary_a_little_are_built():
         parts, imperfections.ArchParams(plate_mm=1.0, section_mm=3.0), rngs, imperfections.Ledger()
     )
     thick = np.array([dataclasses.astuple(part.plates) for part in made])
-    assert 0.3 < np.std(thick - [24.0, 24.0, 20.0]) < 2.0
+    assert 0.3 < np.std(thick - [24.0, 24.0, 20.0]) < 2.0  # sd 1 of 15 numbers: chi-squared
 
 
 # --- structures ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("setting", ["asbuilt.sag_mm=5", "asbuilt.nonsense=5", "asbuilt=5"])
-@pytest.mark.parametrize("name", ["arch-s1", "frame-small", "truss-bridge", "plates-defects", "stadium-roof"])
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        *((name, "asbuilt.sag_mm=5") for name in ("arch-s1", "frame-small", "truss-bridge", "plates-defects")),
+        ("stadium-roof", "asbuilt.nonsense=5"),
+        ("stadium-roof", "asbuilt=5"),
+    ],
+)
 def test_errors_unsupported_by_a_kind_of_structure_are_refused(name, setting):
     recipe = {key: value for key, value in recipe_files.load(name)[1].items() if key != "asbuilt"}
-    recipe = recipe_files.overridden(recipe, [setting])
-    if (name, setting) == ("stadium-roof", "asbuilt.sag_mm=5"):
-        settings = ["asbuilt.ripples=2", "structure.trusses=4", "scan.spacing_mm=500"]
-        truth = make("x", recipe_files.overridden(recipe, settings))[1].as_built
-        assert truth.what == ("sag at the middle", "lean at the top", "ripple at the middle", "ripples around")
-        np.testing.assert_array_equal(truth.value, [5.0, 12.0, 8.0, 2.0])
-        return
     with pytest.raises(UsageError, match=r"^asbuilt"):
-        make("x", recipe)
+        make("x", recipe_files.overridden(recipe, [setting]))
+
+
+def test_a_roof_sags_leans_and_ripples_as_asked_for():
+    settings = ["asbuilt.sag_mm=5", "asbuilt.ripples=2", "structure.trusses=4", "scan.spacing_mm=500"]
+    truth = make("x", recipe_files.overridden(recipe_files.load("stadium-roof")[1], settings))[1].as_built
+    assert truth.what == ("sag at the middle", "lean at the top", "ripple at the middle", "ripples around")
+    np.testing.assert_array_equal(truth.value, [5.0, 12.0, 8.0, 2.0])
 
 
 def test_a_structure_moves_by_its_field():
     recipe = recipe_files.overridden(recipe_files.load("stadium-roof")[1], ["scan.sigma_mm=0", "structure.trusses=4"])
     scene, truth = make("x", recipe)
     field = truth.structure
+    # Lean, sag and ripples are 12, 30 and 8 mm.
     assert 20.0 < np.linalg.norm(field.displacement, axis=1).max() < 60.0
-    np.testing.assert_allclose(np.linalg.norm(field.normals, axis=1), 1.0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(field.normals, axis=1), 1.0, atol=ROUNDING_MM)
     components = stadium_roof.build(stadium_roof.Params(trusses=4))
     move = defects.movement(defects.MovementParams(), components)
     # Points of the scan, moved back, lie on the design's tubes.
@@ -270,46 +270,6 @@ def test_a_structure_moves_by_its_field():
         off = np.linalg.norm(design - tube.start - np.outer(share, axis), axis=1) - tube.radius
         nearest = np.minimum(nearest, np.abs(off))
     assert nearest.max() < 0.05  # two steps of the inverse leave that
-
-
-@pytest.mark.parametrize(
-    "components",
-    [
-        stadium_roof.build(stadium_roof.Params()),
-        truss_bridge.build(truss_bridge.Params()),
-        defect_specimens.build(defect_specimens.Params(form="girder", components=("none", "step"))),
-    ],
-    ids=["stadium", "truss", "girders"],
-)
-def test_structures_in_cad_keep_to_the_closed_form(components):
-    import cadquery as cq
-
-    solid = boxes_and_tubes.solid(components)
-    assert solid.isValid()
-    bodies = [body for one in components for body in one.bodies]
-    assert solid.Volume() == pytest.approx(sum(_volume(body) for body in bodies), rel=1e-6)
-    rng = np.random.default_rng(0)
-    for body in bodies[:: max(1, len(bodies) // 12)]:
-        shell = cq.Shell(body.solid().Shells()[0].wrapped)
-        for patch in body.patches():
-            for point in patch.at(rng.uniform(size=3), rng.uniform(size=3)):
-                assert shell.distance(cq.Vertex.makeVertex(*point)) < 0.02
-    vertices, faces = boxes_and_tubes.mesh_of(components)
-    mesh = trimesh.Trimesh(vertices, faces)
-    assert mesh.area == pytest.approx(sum(_area(body) for body in bodies), rel=2e-3)
-
-
-def _volume(body):
-    if isinstance(body, boxes_and_tubes.Tube):
-        return np.pi * body.radius**2 * np.linalg.norm(body.end - body.start)
-    return float(np.prod(body.size))
-
-
-def _area(body):
-    if isinstance(body, boxes_and_tubes.Tube):
-        return 2.0 * np.pi * body.radius * np.linalg.norm(body.end - body.start)
-    a, b, c = body.size
-    return 2.0 * (a * b + b * c + c * a)
 
 
 def test_nine_scans_of_a_truss_come_from_six_stations():
@@ -333,7 +293,8 @@ def test_a_table_of_gaps_opens_the_joints_by_it():
         _, along, up = (axis for axis in after.curve.frame(np.array([after.s0])))
         off = (after.key_points(after.s0) - before.key_points(before.s1))[:4]
         # along the tangent and the normal of the axis; left is +Y. Above the axis the arc is longer by its curvature.
-        np.testing.assert_allclose(off[:, 1], gaps[:, 1], atol=1e-9)
+        np.testing.assert_allclose(off[:, 1], gaps[:, 1], atol=ROUNDING_MM)
+        # Turned with the curve over 10 mm; longer above the axis.
         np.testing.assert_allclose(off @ up[0], gaps[:, 2], atol=0.02)
         np.testing.assert_allclose(off @ along[0], gaps[:, 0], rtol=0.1, atol=0.02)
     assert ("gap P2, left", f"{parts[1].name} start", table[0, 1, 1], "mm") in ledger.rows

@@ -37,7 +37,8 @@ def test_the_mesh_of_a_girder_encloses_the_volume_of_its_solid():
         # Bores are polygons in the mesh: of 64 corners, smaller than the circle by 1.6 parts in a thousand.
         bores = sum(np.pi * b.radius**2 * np.linalg.norm(b.end - b.start) for b in part.girder.bores)
         solid = prismatic_solids.solid(part.made_of).Volume()
-        assert volume - solid == pytest.approx(bores * (1.0 - np.sin(2 * np.pi / 64) * 64 / (2 * np.pi)), rel=1e-3)
+        # Differences of volumes of 1e8 mm3 in float64.
+        assert volume - solid == pytest.approx(bores * (1.0 - np.sin(2 * np.pi / 64) * 64 / (2 * np.pi)), rel=1e-8)
 
 
 @pytest.mark.parametrize("mode", ["surface", "rays"])
@@ -57,15 +58,15 @@ def test_scanned_points_of_a_girder_lie_on_its_drilled_solid(mode):
             along = (points - middle) @ axis / depth
             off = np.linalg.norm(points - middle - along[:, None] * axis / depth, axis=1)
             in_bore |= (np.abs(along) < 0.5 * depth - 0.1) & (off < bore.radius + 0.5)
-        assert in_bore.sum() > 30
+        assert in_bore.sum() > 12
         for rows in (np.flatnonzero(in_bore), np.flatnonzero(~in_bore)):
-            few = points[rng.choice(rows, min(len(rows), 40), replace=False)]
+            few = points[rng.choice(rows, min(len(rows), 12), replace=False)]
             assert max(cq.Vertex.makeVertex(*p).distance(solid) for p in few) < TOLERANCE_MM
 
 
 QUIET = {
     "scanner": "plain-2mm",
-    "step_mrad": 2.0,
+    "step_mrad": 3.0,
     "stations": [4],
     "distance_mm": 1500.0,
     "sub_rays": 1,
@@ -105,7 +106,7 @@ def test_holes_are_drilled_off_their_places_along_their_plates():
     _, _, shifts = made(seed=5, scan={"spacing_mm": 200.0})
     for part in girder_assemblies.build(SIZES, BOLTS).parts:
         for bore, shift in zip(part.girder.bores, shifts[part.name], strict=True):
-            assert shift @ np.array([0.0, *(bore.end - bore.start)]) == pytest.approx(0.0, abs=1e-12)
+            assert shift @ np.array([0.0, *(bore.end - bore.start)]) == pytest.approx(0.0, abs=1e-12)  # float64
     drawn = np.concatenate([np.concatenate(list(made(s, {"spacing_mm": 500.0})[2].values())) for s in range(6)])
     across = np.linalg.norm(drawn, axis=1) ** 2
     assert across.mean() == pytest.approx(2.0, rel=0.35)  # two coordinates of 1 mm each, 144 draws
@@ -163,9 +164,10 @@ def test_holes_of_girders_are_measured_where_they_were_drilled():
                 continue
             one, other = by_id[f"hole-{k}-along"], by_id[f"hole-{k}-across"]
             # Along is that of the girder; across may look either way.
+            # Nominal places are those of polygons of 64 corners.
             sign = 1.0 if np.isclose(centred, [one.nominal, other.nominal], atol=0.01).all(axis=1).any() else -1.0
             row = int(np.argmin(np.linalg.norm(centred - [one.nominal, sign * other.nominal], axis=1)))
-            np.testing.assert_allclose(centred[row], [one.nominal, sign * other.nominal], atol=0.01)
+            np.testing.assert_allclose(centred[row], [one.nominal, sign * other.nominal], atol=0.01)  # the same
             held.append(one.low <= true[row, 0] <= one.high)
             assert abs(one.deviation - true[row, 0]) < 2.3 * one.ci95  # 4.5 standard deviations
             assert one.ci95 < 0.25  # some 35 points of 0.3 mm a bore

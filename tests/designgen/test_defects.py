@@ -77,8 +77,8 @@ def missing(component, built):
     return area.sum(), (design.at(pp, qq) * area[:, None]).sum(axis=0) / area.sum(), lost
 
 
-@pytest.mark.parametrize("seed", [1, 2, 5])
-@pytest.mark.parametrize("size", [0.4, 1.0, 1.5])
+@pytest.mark.parametrize("seed", [1, 5])
+@pytest.mark.parametrize("size", [0.4, 1.5])
 @pytest.mark.parametrize("row", ROWS)
 def test_the_truth_of_every_defect_is_that_of_the_faces(row, size, seed):
     components, patches, truth = row_of(ROWS[row], defects.CLASSES, {"size": size}, seed)
@@ -90,34 +90,35 @@ def test_the_truth_of_every_defect_is_that_of_the_faces(row, size, seed):
         area, depth, lost = truth.area_mm2[part], truth.depth_max_mm[part], truth.volume_mm3[part]
         if kind in ("edge-loss", "missing-part", "crack"):
             found, centre, gone = missing(component, built)
-            assert area == pytest.approx(found, rel=1e-6), kind
-            np.testing.assert_allclose(truth.centres[part], centre, atol=1e-3, err_msg=kind)
-            assert lost == pytest.approx(gone, rel=1e-5), kind
+            assert area == pytest.approx(found, rel=1e-6), kind  # float64: cells of the net
+            np.testing.assert_allclose(truth.centres[part], centre, atol=1e-3, err_msg=kind)  # a micrometre
+            assert lost == pytest.approx(gone, rel=1e-5), kind  # differences of volumes of 1e7 mm3
             assert depth == ROWS[row].get("plate_mm", 12.0)
             continue
         at, inward, areas = moved(component, built)
         touched = np.abs(inward) > 1e-9
-        assert area == pytest.approx(areas[touched].sum(), rel=0.01), kind
+        assert area == pytest.approx(areas[touched].sum(), rel=0.01), kind  # whole cells of a rim
         centre = (at * areas[:, None])[touched].sum(axis=0) / areas[touched].sum()
-        np.testing.assert_allclose(truth.centres[part], centre, atol=0.5, err_msg=kind)
+        np.testing.assert_allclose(truth.centres[part], centre, atol=0.5, err_msg=kind)  # the same
         largest = inward[np.argmax(np.abs(inward))]
         both_ways = kind in ("twist", "waviness")
+        # The largest of points beside the middle.
         assert depth == pytest.approx(abs(largest) if both_ways else largest, rel=0.02), kind
         integral = (np.abs(inward) * areas).sum() if both_ways else (inward * areas).sum()
-        assert lost == pytest.approx(integral, rel=2e-3), kind
+        assert lost == pytest.approx(integral, rel=2e-3), kind  # four points of Gauss in a cell
 
 
 def test_numbers_by_hand():
     _, _, truth = row_of({"form": "plate"}, ("waviness", "misalignment", "twist", "bend", "bulge"), {"tilt_mrad": 24.0})
     # 1000 mm are 6 half waves of 150 mm and 50 mm at either end: 3 * 500 * (6 * 95.493 + 2 * 23.873) = 931056.
-    assert truth.volume_mm3[0] == pytest.approx(931_056.0, abs=50.0)
+    assert truth.volume_mm3[0] == pytest.approx(931_056.0, abs=50.0)  # five digits by hand
     assert truth.depth_max_mm[0] == 3.0
     # 6 mm in, tilted by 12 mm over half the height: (18^2 + 6^2) / 2 / 24 mm per m = 7.5 mm on average.
-    assert truth.volume_mm3[1] == pytest.approx(7.5e6, rel=1e-3)
-    assert truth.depth_max_mm[1] == pytest.approx(18.0, abs=2e-3)
+    assert truth.volume_mm3[1] == pytest.approx(7.5e6, rel=1e-3)  # tan of 24 mrad
+    assert truth.depth_max_mm[1] == pytest.approx(18.0, abs=2e-3)  # the same
     # 6 mrad at either end: 3 mm at the corners, a quarter of it on average.
-    assert truth.depth_max_mm[2] == pytest.approx(3.0, abs=1e-4)
-    assert truth.volume_mm3[2] == pytest.approx(0.75e6, rel=1e-4)
+    assert truth.depth_max_mm[2] == pytest.approx(3.0, abs=1e-4)  # the same of 6 mrad
+    assert truth.volume_mm3[2] == pytest.approx(0.75e6, rel=1e-4)  # the same
     assert truth.volume_mm3[3] == pytest.approx(8.0e6 * 2.0 / np.pi)
     assert (truth.depth_max_mm[4], truth.volume_mm3[4]) == pytest.approx((-6.0, -np.pi * 120.0**2 * 2.0))
 
@@ -130,6 +131,7 @@ def test_waves_of_any_length(length, depth):
     components, patches, truth = row_of(row, ("waviness",), {})
     _, inward, areas = moved(components[0], [patch for _, patch in patches])
     assert truth.depth_max_mm[0] == pytest.approx(depth)
+    # Four points of Gauss in a cell.
     assert truth.volume_mm3[0] == pytest.approx((np.abs(inward) * areas).sum(), rel=2e-3)
 
 
@@ -154,7 +156,7 @@ def test_the_flanges_stay_where_a_web_waves():
     p, q = np.random.default_rng(0).uniform(size=(2, 200))
     for _, patch in patches:
         if patch.name[0] in "12":
-            np.testing.assert_allclose(patch.at(p, q), designed[patch.name].at(p, q), atol=1e-9)
+            np.testing.assert_allclose(patch.at(p, q), designed[patch.name].at(p, q), atol=1e-9)  # float64
 
 
 @pytest.mark.parametrize(
@@ -191,7 +193,7 @@ def test_a_dent_near_its_limit_lies_on_the_plate_whole():
         components, patches, truth = row_of(row, ("dent",), {}, seed)
         _, inward, areas = moved(components[0], [patch for _, patch in patches])
         assert truth.area_mm2[0] == pytest.approx(np.pi * 120.0**2)
-        assert truth.volume_mm3[0] == pytest.approx((inward * areas).sum(), rel=2e-3)
+        assert truth.volume_mm3[0] == pytest.approx((inward * areas).sum(), rel=2e-3)  # four points of Gauss in a cell
         assert abs(truth.centres[0, 0]) <= 30.0
 
 

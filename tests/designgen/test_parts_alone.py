@@ -10,21 +10,14 @@ from designgen.scenes import make
 from processor.defects import step as defects_step
 from processor.deviation import step as deviation_step
 from processor.model import UsageError
-from processor.space_frame import step as spheres_step
 
 
-def test_one_ball_alone():
-    scene, truth = designgen.make("bolt-ball", settings={"scan.step_mrad": 1.0})
-    (centre,), (radius,) = truth.frame.centres, truth.frame.radii
+def test_balls_alone_and_in_a_row_with_members_between_them():
+    scene, truth = designgen.make("bolt-ball", settings={"scan.step_mrad": 8.0})
+    assert truth.frame.radii.tolist() == [60.0]
     positions = np.array([scan.T_project_scan[:3, 3] for scan in scene.scans])
     assert np.ptp(positions[:, :2], axis=0).max() > 1000.0, "stations below it stand apart"
-    (found,) = spheres_step.run(scene, spheres_step.Params()).balls.centres
-    assert radius == 60.0
-    assert np.linalg.norm(found - centre) < 1.0
-
-
-def test_a_row_of_balls_has_members_between_them():
-    settings = {"frame.nodes_x": 3, "scan.step_mrad": 2.0, "scan.stations": 1}
+    settings = {"frame.nodes_x": 3, "scan.step_mrad": 8.0, "scan.stations": 1}
     scene, truth = designgen.make("bolt-ball", settings=settings)
     assert len(truth.frame.centres) == 3
     np.testing.assert_array_equal(np.stack([scene.frame.member_a, scene.frame.member_b], axis=1), [[0, 1], [1, 2]])
@@ -34,7 +27,7 @@ def test_a_row_of_balls_has_members_between_them():
 
 @pytest.mark.parametrize(
     ("recipe", "expected"),
-    [("arch-foot", []), pytest.param("arch-rib", ["dent"], marks=pytest.mark.slow)],
+    [pytest.param("arch-foot", [], marks=pytest.mark.slow), pytest.param("arch-rib", ["dent"], marks=pytest.mark.slow)],
 )
 def test_a_part_of_an_arch_alone(recipe, expected):
     """A foot has no place on one side of a step near its base: nothing may be taken for a movement there."""
@@ -51,7 +44,7 @@ def test_a_part_of_an_arch_alone(recipe, expected):
     if expected:
         (row,) = np.flatnonzero(sure)
         assert found.component[row] == name
-        assert abs(found.depth_max[row] - 5.0) < max(0.5, found.depth_ci95[row])
+        assert abs(found.depth_max[row] - 5.0) < max(0.5, found.depth_ci95[row])  # mm, of a dent of 5
 
 
 def test_unknown_part_or_conflicting_keys_of_a_recipe_are_refused(tmp_path):

@@ -7,11 +7,9 @@ from designgen import recipe_files
 from designgen.export import folder as export_folder
 from designgen.scanning import picking
 from designgen.scenes.make import make
-from processor.evaluation import stitching as stitching_evaluation
 from processor.geometry import rigid
 from processor.model import Scan, UsageError
 from processor.scan_folder import folder
-from processor.stitching import step as stitching_step
 from processor.store import store
 from tests.support.clouds.stitch_clouds import pose
 
@@ -33,8 +31,8 @@ def test_picks_without_noise_are_the_same_place_in_both_scans():
     rows = {scan.name: k for k, scan in enumerate(scans)}
     seen = zip(picks.scan_a, picks.scan_b, picks.in_a, picks.in_b, places, strict=True)
     for a, b, in_a, in_b, place in seen:
-        np.testing.assert_allclose(rigid.apply(T[rows[a]], in_a[None])[0], place, atol=1e-6)
-        np.testing.assert_allclose(rigid.apply(T[rows[b]], in_b[None])[0], place, atol=1e-6)
+        np.testing.assert_allclose(rigid.apply(T[rows[a]], in_a[None])[0], place, atol=1e-6)  # float64 at 200 m
+        np.testing.assert_allclose(rigid.apply(T[rows[b]], in_b[None])[0], place, atol=1e-6)  # float64 at 200 m
     pairs = list(zip(picks.scan_a, picks.scan_b, strict=True))
     assert len(set(pairs)) == 6  # in a ring of four each is tied to all others
     for first in range(0, len(places), 4):
@@ -79,7 +77,7 @@ def test_corners_are_picked_where_the_first_scan_saw_them_and_the_second_may():
     params = picking.Params(points=3, sigma_mm=0.0, apart_mm=100.0, at="corners")
     picks, places = picking.pick(scans, T, params, 4, corners, lambda points: points[:, 0] > 0.0)
     off = np.linalg.norm(places[:, None] - corners[:40], axis=2).min(axis=1)
-    assert off.max() < 1e-2
+    assert off.max() < 1e-2  # the nearest point lies 30 mm off in each axis: the corner itself is picked
     assert (picks.in_b[:, 0] > 0.0).all()
     with pytest.raises(UsageError, match="no 3 corners in common"):
         picking.pick(scans, T, params, 4, corners, lambda points: points[:, 0] > 1e9)
@@ -96,7 +94,7 @@ def test_scanner_with_a_window_returns_no_points_outside_it():
     for scan, all_round in zip(scene.scans, whole.scans, strict=True):
         x, y, z = scan.points.T
         azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
-        assert np.abs(azimuth).max() <= 20.01
+        assert np.abs(azimuth).max() <= 20.01  # the encoders turn rays by some 0.001 degrees
         assert np.abs(elevation - 12.0).max() <= 20.01
         assert 100 < len(scan.points) < 0.5 * len(all_round.points)
 
@@ -110,7 +108,7 @@ def test_only_scans_of_one_station_each_have_picks(scan):
         make("t", recipe, 1)
 
 
-def test_picks_go_through_the_folder_and_tie_the_scans(tmp_path):
+def test_picks_go_through_the_folder(tmp_path):
     scene, truth = make(
         "t", recipe_files.overridden(recipe_files.load("truss-bridge-picks")[1], [*COARSE, "picks.points=6"]), 1
     )
@@ -119,12 +117,5 @@ def test_picks_go_through_the_folder_and_tie_the_scans(tmp_path):
     read = folder.read_input(tmp_path / "out")
     for name in ("scan_a", "scan_b", "points"):
         assert getattr(read.picks, name) == getattr(scene.picks, name)
-    np.testing.assert_allclose(read.picks.in_a, scene.picks.in_a, atol=1e-9)
-    np.testing.assert_allclose(read.picks.in_b, scene.picks.in_b, atol=1e-9)
-    found = stitching_step.run(scene, stitching_step.Params(method="three-point", weak_mm=100.0, weak_mrad=10.0))
-    T = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
-    base = found.scans.T_project_scan[0] @ rigid.invert(T[scene.scans[0].name])
-    for scan, posed in zip(scene.scans, found.scans.T_project_scan, strict=True):
-        off = posed[:3, 3] - (base @ T[scan.name])[:3, 3]
-        assert np.linalg.norm(off) < 60.0  # six points of 5 mm, some metres from the station
-    assert all(metric.passed for metric in stitching_evaluation.check(scene, found, truth))  # no limit for a hand
+    np.testing.assert_allclose(read.picks.in_a, scene.picks.in_a, atol=1e-9)  # written in full
+    np.testing.assert_allclose(read.picks.in_b, scene.picks.in_b, atol=1e-9)  # written in full

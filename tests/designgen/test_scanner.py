@@ -7,9 +7,9 @@ import open3d
 import pytest
 import scipy.stats
 import trimesh
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 
-from designgen.designs import arch_bridge, arch_part, boxes_and_tubes, space_frame
+from designgen.designs import boxes_and_tubes, space_frame
 from designgen.designs.parametric_face import Patch
 from designgen.scanning import clutter, ray_kernels, raycast, scanner, space_frame_surfaces, survey
 from designgen.scanning import returns as scanning_returns
@@ -17,6 +17,9 @@ from designgen.scanning.surfaces import Builder
 from processor.model import UsageError
 
 QUIET = scanner.Scanner(**{**scanner.preset("plain-2mm"), "noise_mm": 0.0})
+ORIGIN = np.eye(4)
+EXACT_MM = 1e-6  # of closed forms in float64, whose digits end at 1e-12 of 10 m
+STORED_MM = 1e-4  # of points in a scan, and of nets that are refined to 1e-5 mm
 
 
 def frame_of_balls():
@@ -46,6 +49,19 @@ def named(surfaces, returns, name):
     return returns.surface == surfaces.surface_names.index(name)
 
 
+def scan(shapes, T=ORIGIN, device=QUIET, seed=0, params=None, **settings):
+    """What a station sees of the shapes of a builder, with the places of its hits."""
+    surfaces = shapes.to_surfaces() if isinstance(shapes, Builder) else shapes
+    params = params or scanner.Params(**settings)
+    return scanning_returns.scan_station(surfaces, T, device, params, seed, "S1", keep_hits=True).returns
+
+
+def sheet(builder, part, name, y):
+    """A square plate of 4 m across the y axis."""
+    corners = np.array([[-2000.0, y, -2000.0], [2000.0, y, -2000.0], [2000.0, y, 2000.0], [-2000.0, y, 2000.0]])
+    builder.polygon(part, name, corners)
+
+
 def in_scene(T, points):
     return points @ T[:3, :3].T + T[:3, 3]
 
@@ -57,12 +73,11 @@ def seen():
     device = dataclasses.replace(QUIET, encoder_urad=20.0)
     T = standing(2500.0, 2800.0, 1600.0)
     surfaces = surfaces_of(frame)
-    params = scanner.Params(step_mrad=2.0)
     return (
         frame,
         surfaces,
         T,
-        scanning_returns.scan_station(surfaces, T, device, params, 3, "S1", keep_hits=True).returns,
+        scan(surfaces, T, device, 3, step_mrad=2.0),
     )
 
 
@@ -72,7 +87,7 @@ def test_hits_lie_on_spheres_tubes_and_sleeves(seen):
     ball = named(surfaces, returns, "ball")
     off = np.linalg.norm(hits[ball] - frame.centres[returns.part[ball]], axis=1) - frame.radii[returns.part[ball]]
     assert ball.sum() > 1_500
-    assert np.abs(off).max() < 1e-6
+    assert np.abs(off).max() < EXACT_MM
     # A bowed tube: the distance from its axis, moved by the bow of where it is along the tube, found member by member.
     tube = hits[named(surfaces, returns, "tube")]
     nearest = np.full(len(tube), np.inf)
@@ -86,13 +101,15 @@ def test_hits_lie_on_spheres_tubes_and_sleeves(seen):
         off = np.abs(np.linalg.norm(tube - axis, axis=1) - 30.0)
         nearest = np.minimum(nearest, np.where((z > -1e-6) & (z < length + 1e-6), off, np.inf))
     assert len(tube) > 50_000
-    assert nearest.max() < 1e-6
+    assert nearest.max() < EXACT_MM
     assert {"sleeve", "cone"} <= {surfaces.surface_names[k] for k in np.unique(returns.surface)}
 
 
 def test_points_lie_at_the_angles_of_the_encoders_with_their_errors(seen):
     _, _, _, returns = seen
-    np.testing.assert_allclose(np.linalg.norm(returns.points, axis=1), np.linalg.norm(returns.hits, axis=1), atol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(returns.points, axis=1), np.linalg.norm(returns.hits, axis=1), atol=STORED_MM
+    )
 
     def angles(x):
         return np.stack([np.arctan2(x[:, 1], x[:, 0]), np.arctan2(x[:, 2], np.hypot(x[:, 0], x[:, 1]))], axis=1)
@@ -105,19 +122,6 @@ def test_points_lie_at_the_angles_of_the_encoders_with_their_errors(seen):
         own = off[(elevation > low) & (elevation < high)]
         assert len(own) > 20_000
         np.testing.assert_allclose(own.std(axis=0), 20e-6, rtol=4.0 / np.sqrt(2.0 * len(own)))
-
-
-def test_georeferenced_hits_stay_exact(seen):
-    frame, surfaces, T, returns = seen
-    origin = np.array([5.0e8, 4.3e9, 0.0])
-    ball = named(surfaces, returns, "ball")
-    far = T.copy()
-    far[:3, 3] += origin
-    hits = in_scene(far, returns.hits[ball])
-    centres = frame.centres[returns.part[ball]] + origin
-    # float64 itself resolves 1e-6 mm at 4300 km.
-    off = np.linalg.norm(hits - centres, axis=1) - frame.radii[returns.part[ball]]
-    assert np.abs(off).max() < 1e-4
 
 
 def test_hits_and_ranges_agree_with_open3d():
@@ -140,9 +144,7 @@ def test_hits_and_ranges_agree_with_open3d():
         meshes.append(trimesh.Trimesh(corners, [[0, 1, 2]]))
     surfaces = builder.to_surfaces()
     T = standing(0.0, 0.0, 0.0)
-    found = scanning_returns.scan_station(
-        surfaces, T, QUIET, scanner.Params(step_mrad=2.0), 0, "S1", keep_hits=True
-    ).returns
+    found = scan(surfaces, T, step_mrad=2.5)
     scene = open3d.t.geometry.RaycastingScene()
     owner = []
     for number, mesh in enumerate(meshes):
@@ -151,7 +153,7 @@ def test_hits_and_ranges_agree_with_open3d():
             open3d.core.Tensor(np.asarray(mesh.faces, np.uint32)),
         )
         owner.append(number // 3)
-    grid = raycast.Grid(2e-3, np.radians(-60.0), int(np.radians(150.0) / 2e-3), round(np.pi / 1e-3))
+    grid = raycast.Grid(2.5e-3, np.radians(-60.0), int(np.radians(150.0) / 2.5e-3), round(2.0 * np.pi / 2.5e-3))
     # All shapes are in front: rays backward meet nothing.
     assert min(mesh.bounds[0][1] for mesh in meshes) > 0.0
     row, column = (x.ravel() for x in np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing="ij"))
@@ -163,15 +165,16 @@ def test_hits_and_ranges_agree_with_open3d():
     met = np.isfinite(t)
     theirs = row[met] * grid.columns + column[met]
     ours = found.row.astype(np.int64) * grid.columns + found.column
-    assert len(theirs) > 20_000
+    assert len(theirs) > 13_000
     both, i, j = np.intersect1d(ours, theirs, assume_unique=True, return_indices=True)
     # Facets lie inside of the shapes: rays past a silhouette may see one of the two only.
     assert len(both) > 0.995 * max(len(ours), len(theirs))
     same = found.part[i] == np.array(owner)[number[met][j]]
     apart = np.abs(np.linalg.norm(found.points[i], axis=1) - t[met][j])
     assert same.mean() > 0.999
-    assert np.median(apart[same]) < 0.02
-    assert np.quantile(apart[same], 0.99) < 1.0
+    # A facet of an icosphere of 5 divisions lies 150 (1 - cos 1.1 deg) = 0.03 mm deep at most, more along grazing rays.
+    assert np.median(apart[same]) < 0.02  # two thirds of a facet's depth
+    assert np.quantile(apart[same], 0.99) < 1.0  # grazing rays: 0.03 mm over a cosine of 0.03
 
 
 def _mantle(radius, length, matrix):
@@ -182,34 +185,6 @@ def _mantle(radius, length, matrix):
     i, j = np.arange(360), np.roll(np.arange(360), -1)
     faces = np.vstack([np.stack([i, j, i + 360], axis=1), np.stack([j, j + 360, i + 360], axis=1)])
     return trimesh.Trimesh(np.vstack([low, high]), faces, process=False).apply_transform(matrix)
-
-
-def test_hits_on_an_arch_part_lie_on_its_parabola():
-    params = arch_bridge.Params()
-    part = arch_bridge.build(params)[2]
-    builder = Builder()
-    for patch in arch_part.ray_patches(part):
-        builder.patch(0, patch)
-    surfaces = builder.to_surfaces()
-    middle = part.key_points(0.5 * (part.s0 + part.s1)).mean(axis=0)
-    T = standing(*(middle + np.array([-500.0, 6000.0, 2500.0])))
-    returns = scanning_returns.scan_station(
-        surfaces, T, QUIET, scanner.Params(step_mrad=4.0), 0, "S1", keep_hits=True
-    ).returns
-    hits = in_scene(T, returns.hits)
-    L, f = params.span_mm, params.rise_mm
-    left = named(surfaces, returns, "outer-left")
-    assert left.sum() > 5_000
-    np.testing.assert_allclose(hits[left, 1], 0.5 * params.width_mm, atol=1e-6)
-    top = hits[named(surfaces, returns, "outer-top")]
-    assert len(top) > 1_000
-    for x, _, z in top[:: len(top) // 40]:
-        # The distance to the parabola itself, by a minimiser that knows nothing of arc lengths.
-        def squared(at, x=x, z=z):
-            return (at - x) ** 2 + (4.0 * f * at * (L - at) / L**2 - z) ** 2
-
-        found = minimize_scalar(squared, bounds=(x - 3000.0, x + 3000.0), method="bounded", options={"xatol": 1e-9})
-        assert np.sqrt(found.fun) == pytest.approx(params.height_mm, abs=1e-4)
 
 
 def law(device, R, signal, cosine):
@@ -239,37 +214,35 @@ def check_noise(device, params, R, error, cosine, classes=5):
     which = np.digitize(np.degrees(np.arccos(cosine)), [20.0, 40.0, 60.0, 75.0][: classes - 1])
     for k in range(classes):
         own = pull[which == k]
-        assert len(own) > 2_000
-        allowed = 4.0 / np.sqrt(len(own))  # of chance itself
+        assert len(own) > 1_000
+        allowed = 4.0 / np.sqrt(len(own))  # of chance itself, beside the law's tables
         assert abs(own.mean()) < 0.02 + allowed
         assert own.std() == pytest.approx(1.0, abs=0.03 + allowed)
-    assert abs(pull.mean()) < 0.02
-    assert pull.std() == pytest.approx(1.0, rel=0.03)
 
 
 def without_systematics(name):
     return dataclasses.replace(scanner.Scanner(**scanner.preset(name)), offset_mm=0.0, scale_ppm=0.0, tilt_urad=0.0)
 
 
-@pytest.mark.parametrize("name", ["phase", "pulse", "long-range"])
+@pytest.mark.parametrize("name", ["phase", "long-range"])  # pulse has terms of both
 def test_clean_ranges_have_the_specified_noise_at_every_incidence(name):
-    device, params = without_systematics(name), scanner.Params(scanner=name, step_mrad=1.6)
+    device, params = without_systematics(name), scanner.Params(scanner=name, step_mrad=2.0)
     frame = frame_of_balls()
     surfaces, T = surfaces_of(frame, things=9), standing(2500.0, 2800.0, 1600.0)
-    returns = scanning_returns.scan_station(surfaces, T, device, params, 1, "S1", keep_hits=True).returns
+    returns = scan(surfaces, T, device, seed=1, params=params)
     clean = returns.source == scanning_returns.SURFACE
     R = np.linalg.norm(returns.hits[clean], axis=1)
     error = np.linalg.norm(returns.points[clean], axis=1) - R  # not what the scanner says of it, but where points are
-    np.testing.assert_allclose(error, returns.range_error_mm[clean], atol=1e-3)
+    np.testing.assert_allclose(error, returns.range_error_mm[clean], atol=1e-3)  # kept as float32
     cosine = returns.incidence_cos[clean].astype(np.float64)
-    np.testing.assert_allclose(returns.intensity[clean], signal(params, R, cosine), rtol=1e-4)
+    np.testing.assert_allclose(returns.intensity[clean], signal(params, R, cosine), rtol=1e-4)  # kept as float32
     check_noise(device, params, R, error, cosine)
     # On balls the incidence follows from the hits alone.
     ball = named(surfaces, returns, "ball") & clean
     radial = in_scene(T, returns.hits[ball]) - frame.centres[returns.part[ball]]
     rays = (returns.hits[ball] / np.linalg.norm(returns.hits[ball], axis=1)[:, None]) @ T[:3, :3].T
     facing = -np.einsum("ni,ni->n", rays, radial) / frame.radii[returns.part[ball]]
-    np.testing.assert_allclose(returns.incidence_cos[ball], facing, atol=1e-6)
+    np.testing.assert_allclose(returns.incidence_cos[ball], facing, atol=EXACT_MM)
 
 
 TUBE = (np.array([3000.0, -2500.0, 1500.0]), np.array([3400.0, 2500.0, 2200.0]), 150.0)
@@ -289,19 +262,17 @@ def off_axis(start, end, points):
 
 
 def test_noise_on_a_net_follows_the_surface_and_not_its_facets():
-    device, params = without_systematics("phase"), scanner.Params(step_mrad=1.2)
+    device, params = without_systematics("phase"), scanner.Params(step_mrad=1.6)
     start, end, radius = TUBE
     T = standing(0.0, 0.0, 1600.0)
-    returns = scanning_returns.scan_station(
-        tube_of_patches(*TUBE).to_surfaces(), T, device, params, 1, "S1", keep_hits=True
-    ).returns
+    returns = scan(tube_of_patches(*TUBE), T, device, seed=1, params=params)
     clean = returns.source == scanning_returns.SURFACE
     hits = returns.hits[clean]
     R = np.linalg.norm(hits, axis=1)
     radial = off_axis(start, end, in_scene(T, hits))
-    np.testing.assert_allclose(np.linalg.norm(radial, axis=1), radius, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(radial, axis=1), radius, atol=STORED_MM)
     cosine = -np.einsum("ni,ni->n", (hits / R[:, None]) @ T[:3, :3].T, radial) / radius
-    np.testing.assert_allclose(returns.incidence_cos[clean], cosine, atol=1e-4)
+    np.testing.assert_allclose(returns.incidence_cos[clean], cosine, atol=STORED_MM)
     check_noise(device, params, R, np.linalg.norm(returns.points[clean], axis=1) - R, cosine)
 
 
@@ -316,19 +287,18 @@ def test_mixed_pixels_on_a_net_lie_where_they_do_on_the_exact_tube():
     for builder in (exact, net):
         corners = np.array([[2500.0, 300.0, 0.0], [2500.0, 300.0, 1790.0], [2500.0, -600.0, 1600.0]])
         builder.polygon(1, "sheet", corners)
-        params = scanner.Params(step_mrad=0.6, specular=0.0)
-        found.append(scanning_returns.scan_station(builder.to_surfaces(), np.eye(4), device, params, 0, "S1").returns)
+        found.append(scan(builder, device=device, step_mrad=0.8, specular=0.0))
     mixed = [scanning_returns.rows_of(one, one.source == scanning_returns.MIXED) for one in found]
     rays = [one.row.astype(np.int64) * 100_000 + one.column for one in mixed]
     both, i, j = np.intersect1d(*rays, assume_unique=True, return_indices=True)
     R, ours = np.linalg.norm(mixed[0].points[i], axis=1), np.linalg.norm(mixed[1].points[j], axis=1)
     apart, cells = ours - R, np.column_stack(np.divmod(both, 100_000))
     # Not at the tube's silhouette, where rays meet the exact tube and pass by its net.
-    grid = raycast.Grid(6e-4, np.radians(-60.0), int(np.radians(150.0) / 6e-4), round(2.0 * np.pi / 6e-4))
+    grid = raycast.Grid(8e-4, np.radians(-60.0), int(np.radians(150.0) / 8e-4), round(2.0 * np.pi / 8e-4))
     across = np.cross(start, end) / np.linalg.norm(np.cross(start, end))
     rays = grid.directions(*cells.T)
     on_both = (np.abs(rays @ across) < 0.7 * radius / 3500.0) & (np.abs(rays[:, 1]) < 0.3)
-    assert on_both.sum() > 300
+    assert on_both.sum() > 150
     assert R[on_both].max() > R[on_both].min() + 100.0
     assert np.abs(apart[on_both]).max() < 5e-4  # by energies, which differ by what the normals do; the net is 0.32 off
 
@@ -366,9 +336,9 @@ def test_rays_meet_cones_where_bisection_does():
             continue
         met += 1
         expected = brentq(off, t[crossing[0]], t[crossing[0] + 1], xtol=1e-9)
-        assert found == pytest.approx(expected, abs=1e-6) or found < expected - 0.01  # two roots within one step
+        assert found == pytest.approx(expected, abs=EXACT_MM) or found < expected - 0.01  # two roots within one step
         if found < expected - 0.01:
-            assert abs(off(np.array([found]))[0]) < 1e-6
+            assert abs(off(np.array([found]))[0]) < EXACT_MM
     assert met > 300
 
 
@@ -386,9 +356,8 @@ def test_large_and_slim_triangles_are_met_wherever_they_are():
         triangles.append(corners)
         builder.polygon(i, "face", corners)
     device = dataclasses.replace(QUIET, min_range_mm=0.0, max_range_mm=1e6, divergence_mrad=0.0)
-    params = scanner.Params(step_mrad=12.0, sub_rays=1)
-    returns = scanning_returns.scan_station(builder.to_surfaces(), np.eye(4), device, params, 0, "S1").returns
-    grid = raycast.Grid(0.012, np.radians(-60.0), int(np.radians(150.0) / 0.012), round(2.0 * np.pi / 0.012))
+    returns = scan(builder, device=device, step_mrad=16.0, sub_rays=1)
+    grid = raycast.Grid(0.016, np.radians(-60.0), int(np.radians(150.0) / 0.016), round(2.0 * np.pi / 0.016))
     row, column = (x.ravel() for x in np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing="ij"))
     rays, nearest = grid.directions(row, column), np.full(len(row), np.inf)
     for corners in triangles:
@@ -400,9 +369,9 @@ def test_large_and_slim_triangles_are_met_wherever_they_are():
         nearest[met] = np.minimum(nearest[met], 1.0 / shares[met].sum(axis=1))
     found = np.full(len(row), np.inf)
     found[returns.row * grid.columns + returns.column] = np.linalg.norm(returns.points, axis=1)
-    assert np.isfinite(nearest).sum() > 50_000
+    assert np.isfinite(nearest).sum() > 25_000
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(nearest))
-    np.testing.assert_allclose(found, nearest, rtol=1e-9)
+    np.testing.assert_allclose(found, nearest, rtol=1e-9)  # float64, planes through the scanner left out
 
 
 def test_only_flat_faces_are_intersected_by_their_nets():
@@ -443,27 +412,22 @@ def test_grazing_rays_stay_near_their_net():
     knots = np.linspace(0.0, 1.0, 12)
     builder.patch(0, Patch("wavy", at, knots, knots))
     T = standing(0.0, 0.0, 6.0)
-    returns = scanning_returns.scan_station(
-        builder.to_surfaces(), T, QUIET, scanner.Params(step_mrad=0.5), 0, "S1", keep_hits=True
-    ).returns
+    returns = scan(builder, T, step_mrad=0.8)
     assert asked[0] < 1.0 + 4.0 / 11.0 + 1e-3
     x, y, z = in_scene(T, returns.hits).T
     p, q = x / 3000.0 + 0.5, (y - 2000.0) / 3000.0
-    np.testing.assert_allclose(z, 3.0 * np.sin(9.0 * p) + 3.0 * np.cos(9.0 * q), atol=1e-5)
-    assert len(x) > 8_000
+    np.testing.assert_allclose(z, 3.0 * np.sin(9.0 * p) + 3.0 * np.cos(9.0 * q), atol=1e-5)  # as refined
+    assert len(x) > 3_000
 
 
 def test_object_nearer_than_the_minimum_range_shadows_what_lies_behind():
     builder = Builder()
-    plate = np.array([[-2000.0, 0.0, -2000.0], [2000.0, 0.0, -2000.0], [2000.0, 0.0, 2000.0], [-2000.0, 0.0, 2000.0]])
-    builder.polygon(0, "plate", plate + np.array([0.0, 3000.0, 0.0]))
+    sheet(builder, 0, "plate", 3000.0)
     builder.sphere(1, "head", np.array([0.0, 200.0, 0.0]), 50.0, [])
     device = dataclasses.replace(QUIET, divergence_mrad=1.0, min_range_mm=300.0)
-    points = scanning_returns.scan_station(
-        builder.to_surfaces(), np.eye(4), device, scanner.Params(step_mrad=1.0), 0, "S1"
-    ).returns.points
+    points = scan(builder, device=device, step_mrad=1.5).points
     away = np.degrees(np.arccos(points[:, 1] / np.linalg.norm(points, axis=1)))
-    assert away.min() > np.degrees(np.arcsin(50.0 / 200.0)) - 0.1
+    assert away.min() > np.degrees(np.arcsin(50.0 / 200.0)) - 0.1  # a step is 0.09
     assert away.min() < np.degrees(np.arcsin(50.0 / 200.0)) + 0.1
 
 
@@ -472,7 +436,7 @@ def test_sub_rays_share_the_energy_of_a_gaussian_beam():
         offsets, share = scanning_returns.beam(count)
         assert len(offsets) == count
         assert share.sum() == pytest.approx(1.0)
-        np.testing.assert_allclose(share @ offsets, 0.0, atol=1e-12)
+        np.testing.assert_allclose(share @ offsets, 0.0, atol=1e-12)  # float64
 
 
 def test_strongest_echo_by_hand():
@@ -484,15 +448,12 @@ def test_strongest_echo_by_hand():
 
 def test_hidden_and_out_of_range_objects_return_no_points():
     builder = Builder()
-    plate = np.array([[-2000.0, 0.0, -2000.0], [2000.0, 0.0, -2000.0], [2000.0, 0.0, 2000.0], [-2000.0, 0.0, 2000.0]])
-    builder.polygon(0, "near", plate + np.array([0.0, 3000.0, 0.0]))
+    sheet(builder, 0, "near", 3000.0)
     builder.sphere(1, "hidden", np.array([0.0, 5000.0, 0.0]), 500.0, [])
     builder.sphere(2, "too far", np.array([0.0, -90_000.0, 0.0]), 500.0, [])
     builder.sphere(3, "too near", np.array([0.0, -200.0, 0.0]), 50.0, [])
     device = dataclasses.replace(QUIET, max_range_mm=80_000.0)
-    returns = scanning_returns.scan_station(
-        builder.to_surfaces(), np.eye(4), device, scanner.Params(step_mrad=2.0), 0, "S1"
-    ).returns
+    returns = scan(builder, device=device, step_mrad=2.0)
     assert set(returns.part) == {0}
 
 
@@ -500,17 +461,15 @@ def test_weak_signals_are_lost_and_some_returns_stray():
     surfaces = surfaces_of(frame_of_balls())
     T = standing(2500.0, 2800.0, 1600.0)
     params = scanner.Params(step_mrad=2.5)
-    every = scanning_returns.scan_station(surfaces, T, QUIET, params, 1, "S1").returns
-    dim = scanning_returns.scan_station(surfaces, T, dataclasses.replace(QUIET, threshold=0.5), params, 1, "S1").returns
+    every = scan(surfaces, T, seed=1, params=params)
+    dim = scan(surfaces, T, dataclasses.replace(QUIET, threshold=0.5), seed=1, params=params)
     # Speckle of eight looks multiplies the signal: the share that stays is a gamma law's.
     stays = scipy.stats.gamma.sf(0.5 / every.intensity, 8.0, scale=1.0 / 8.0)
     assert len(dim.points) == pytest.approx(stays.sum(), abs=5.0 * np.sqrt((stays * (1.0 - stays)).sum()))
     assert np.median(dim.incidence_cos) > np.median(every.incidence_cos) + 0.05  # steel shines away from the scanner
-    stray = scanning_returns.scan_station(
-        surfaces, T, dataclasses.replace(QUIET, flying_share=0.02), params, 1, "S1"
-    ).returns
+    stray = scan(surfaces, T, dataclasses.replace(QUIET, flying_share=0.02), seed=1, params=params)
     outliers = stray.source == scanning_returns.OUTLIER
-    assert outliers.mean() == pytest.approx(0.02, abs=0.002)
+    assert outliers.mean() == pytest.approx(0.02, abs=0.002)  # of 200,000: sd 0.0003
     assert (stray.part[outliers] == -1).all()
     assert (stray.surface[outliers] == -1).all()
     R = np.linalg.norm(stray.points[outliers], axis=1)
@@ -522,20 +481,19 @@ def test_range_and_tilt_errors_of_a_station_equal_those_of_its_truth():
     surfaces = surfaces_of(frame_of_balls())
     T = standing(2500.0, 2800.0, 1600.0)
     device = dataclasses.replace(QUIET, offset_mm=2.0, scale_ppm=50.0, tilt_urad=100.0)
-    found = scanning_returns.scan_station(
-        surfaces, T, device, scanner.Params(step_mrad=2.0, sub_rays=1), 7, "S1", keep_hits=True
-    )
+    params = scanner.Params(step_mrad=2.0, sub_rays=1)
+    found = scanning_returns.scan_station(surfaces, T, device, params, 7, "S1", keep_hits=True)
     hits, points = found.returns.hits, found.returns.points
     R = np.linalg.norm(hits, axis=1)
     scale, offset = np.polyfit(R, np.linalg.norm(points, axis=1) - R, 1)
-    assert (offset, 1e6 * scale) == pytest.approx(found.systematic[:2], abs=0.02)
+    assert (offset, 1e6 * scale) == pytest.approx(found.systematic[:2], abs=0.02)  # points are rounded to 1e-4 mm
     # A small turn w moves p by w x p.
     turn = np.linalg.lstsq(
         np.concatenate([np.cross(np.eye(3)[k], hits / R[:, None]).reshape(-1, 1) for k in range(3)], axis=1),
         (points / np.linalg.norm(points, axis=1)[:, None] - hits / R[:, None]).ravel(),
         rcond=None,
     )[0]
-    np.testing.assert_allclose(turn, [*found.systematic[2:], 0.0], atol=1e-8)
+    np.testing.assert_allclose(turn, [*found.systematic[2:], 0.0], atol=1e-8)  # rad: the second order of 100 urad
     assert abs(found.systematic[0]) > 0.0
 
 
@@ -556,7 +514,7 @@ def test_a_station_does_not_depend_on_others_or_on_threads(monkeypatch):
     )
     moved = both.registered @ np.linalg.inv(np.array(list(poses.values())))
     shift = (both.registered - np.array(list(poses.values())))[:, :3, 3]
-    assert 0.0 < np.abs(shift).max() < 10.0
+    assert 0.0 < np.abs(shift).max() < 10.0  # five sd
     np.testing.assert_allclose(np.linalg.det(moved[:, :3, :3]), 1.0)
 
 
@@ -567,32 +525,16 @@ def test_merged_scans_lie_where_the_stations_saw_them():
     origin = np.array([5.0e8, 4.3e9, 1.0e5])
     (scan,), (labels,), stations, truth = survey.in_project(found, origin, merge=True)
     assert stations.ids == truth.ids == ("S1", "S2")
-    np.testing.assert_allclose(stations.positions - origin, [T[:3, 3] for T in poses.values()], atol=1e-6)
+    np.testing.assert_allclose(stations.positions - origin, [T[:3, 3] for T in poses.values()], atol=EXACT_MM)
     scans, _, _, _ = survey.in_project(found, origin, merge=False)
     at = 0
     for k, single in enumerate(scans):
         own = scan.point_station == k
         assert own.sum() == len(single.points)
-        np.testing.assert_allclose(scan.points[own], in_scene(poses[single.name], single.points), atol=1e-6)
-        np.testing.assert_allclose(single.T_project_scan[:3, 3] - origin, poses[single.name][:3, 3], atol=1e-6)
+        np.testing.assert_allclose(scan.points[own], in_scene(poses[single.name], single.points), atol=EXACT_MM)
+        np.testing.assert_allclose(single.T_project_scan[:3, 3] - origin, poses[single.name][:3, 3], atol=EXACT_MM)
         at += own.sum()
     assert at == len(scan.points) == len(labels.surface)
-
-
-def test_patches_of_steep_dents_are_met_exactly():
-    def at(p, q):
-        x, y = 2000.0 * (p - 0.5), 2000.0 * (q - 0.5)
-        return np.stack([x, 4000.0 + 40.0 * np.exp(-(x * x + y * y) / 150.0**2), y], axis=1)
-
-    builder = Builder()
-    knots = np.linspace(0.0, 1.0, 60)
-    builder.patch(0, Patch("dented", at, knots, knots))
-    returns = scanning_returns.scan_station(
-        builder.to_surfaces(), np.eye(4), QUIET, scanner.Params(step_mrad=1.0), 0, "S1", keep_hits=True
-    ).returns
-    x, y, z = returns.hits.T
-    np.testing.assert_allclose(y, 4000.0 + 40.0 * np.exp(-(x * x + z * z) / 150.0**2), atol=1e-4)
-    assert len(x) > 200_000
 
 
 @pytest.mark.parametrize(

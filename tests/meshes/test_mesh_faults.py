@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from processor.deviation import step as deviation_step
 from processor.meshes import faults
+from processor.scan_folder import folder
 
 BOX = trimesh.creation.box((400.0, 300.0, 200.0))
 VERTICES, SIDES = np.asarray(BOX.vertices), np.asarray(BOX.faces, np.int64)
@@ -132,3 +134,24 @@ def test_corners_of_a_closed_mesh_are_never_joined():
     body = trimesh.util.concatenate([trimesh.creation.box((1e4, 10.0, 10.0)), pin])
     mended = faults.mended(np.asarray(body.vertices), np.asarray(body.faces, np.int64))
     assert (len(mended.points), mended.open_edges) == (16, 0)
+
+
+def test_inverted_design_gives_the_same_deviations_with_a_message(tmp_path):
+    found = {}
+    for name, faces in (("sound", BOX.faces), ("inverted", BOX.faces[:, ::-1])):
+        place = tmp_path / name
+        place.mkdir()
+        trimesh.Trimesh(BOX.vertices, faces, process=False).export(place / "design.ply")
+        points = trimesh.sample.sample_surface(BOX, 5_000, seed=1)[0] * [1.0, 1.0, 1.02]
+        np.savetxt(place / "scan.xyz", points)
+        (place / "project.toml").write_text(
+            'kind = "structure"\nunits = "mm"\ndesign = "design.ply"\n[[scan]]\nfile = "scan.xyz"\n'
+        )
+        scene = folder.read_input(place)
+        found[name] = deviation_step.run(scene, deviation_step.Params(register="none"))
+    told = [reason for reason in found["inverted"].reasons if reason.code.startswith("design.")]
+    assert [(reason.code, reason.values) for reason in told] == [("design.turned", {"turned": 12})]
+    assert not [reason for reason in found["sound"].reasons if reason.code.startswith("design.")]
+    assert found["sound"].max > 1.5
+    assert found["inverted"].max == pytest.approx(found["sound"].max, abs=0.1)  # mm; 5000 points without noise
+    assert found["inverted"].mean == pytest.approx(found["sound"].mean, abs=0.02)  # mm

@@ -126,7 +126,7 @@ def test_files_of_another_library_are_read(kind, tmp_path):
     path = tmp_path / f"a.{kind[:3]}"
     torus.export(path, file_type=kind)
     vertices, triangles = mesh_files.read_whole(path)
-    np.testing.assert_allclose(vertices[triangles], torus.triangles, rtol=1e-6, atol=1e-4)
+    np.testing.assert_allclose(vertices[triangles], torus.triangles, rtol=1e-6, atol=1e-4)  # float32 of STL
 
 
 @pytest.mark.parametrize("first", range(6))

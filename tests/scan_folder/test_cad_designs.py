@@ -12,7 +12,7 @@ import pytest
 
 from designgen.cad.bodies import UNITS_MM
 from processor.model import InputError
-from processor.scan_folder import cad, folder
+from processor.scan_folder import cad, folder, guess
 from processor.scan_folder.units import MM_PER_UNIT
 
 REAL = Path(__file__).resolve().parents[3] / "shared/data/design/base_interface_AP203.STEP"
@@ -156,8 +156,16 @@ def test_a_real_step_file(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     shutil.copy(REAL, tmp_path / "接口 'a'.STEP")
     vertices, faces, _ = cad.read(tmp_path / "接口 'a'.STEP", "m")
-    assert np.sort(np.ptp(vertices, axis=0)) == pytest.approx([4.7625, 599.41, 638.7], abs=0.1)
+    assert np.sort(np.ptp(vertices, axis=0)) == pytest.approx([4.7625, 599.41, 638.7], abs=0.1)  # as meshes deviate
     corners = vertices[faces] - vertices.mean(axis=0)
     volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
-    assert volume == pytest.approx(1.25799e6, rel=1e-3)
+    assert volume == pytest.approx(1.25799e6, rel=1e-3)  # the same, on round edges
     assert subprocess.run(["ls", "-A", tmp_path], capture_output=True, text=True, check=True).stdout.count("\n") == 2
+
+
+def test_a_design_that_cannot_be_read_is_no_structure(tmp_path):
+    (tmp_path / "scans").mkdir()
+    np.savetxt(tmp_path / "scans/S1.xyz", np.random.default_rng(0).uniform(0, 1000, (200, 3)))
+    (tmp_path / "bridge.stl").write_text("solid bridge\nfacet normal 0 0 0\n")
+    with pytest.raises(InputError, match=r"bridge\.stl: is cut off"):
+        guess.guess(tmp_path)

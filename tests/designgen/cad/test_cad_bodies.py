@@ -3,7 +3,6 @@
 import re
 
 import cadquery as cq
-import ifcopenshell
 import numpy as np
 import pytest
 import trimesh
@@ -11,8 +10,6 @@ from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 
 from designgen.cad import files, process, shapes, tessellation
-from processor.model import InputError
-from processor.scan_folder import guess
 
 pytestmark = pytest.mark.usefixtures("cad_here")
 
@@ -36,8 +33,8 @@ def test_a_curved_plate_of_any_size_becomes_a_closed_mesh(span_mm):
     mesh = trimesh.Trimesh(body.vertices, body.faces, process=False)
     assert body.closed
     assert mesh.is_watertight
-    assert mesh.volume == pytest.approx(exact.Mass(), abs=body.deviation_mm * mesh.area)
-    assert mesh.volume == pytest.approx(exact.Mass(), rel=1e-5)
+    assert mesh.volume == pytest.approx(exact.Mass(), abs=body.deviation_mm * mesh.area)  # as stated
+    assert mesh.volume == pytest.approx(exact.Mass(), rel=1e-5)  # 0.1 mm on a plate of 40 mm, mean of both sides
     assert body.deviation_mm <= 0.1
 
 
@@ -61,45 +58,6 @@ def test_occurrences_of_a_sub_assembly_keep_the_names_of_their_assemblies(tmp_pa
     assert found == dict(zip(("A/left", "A/right", "B/left", "B/right"), places, strict=True))
 
 
-def beam_with_opening(path):
-    """A beam of 200 x 100 x 3000 mm with an opening through it of 100 x 100 x 200 mm."""
-    model = ifcopenshell.file(schema="IFC4")
-    make, new = model.create_entity, ifcopenshell.guid.new
-
-    def frame(*origin):
-        return make("IfcAxis2Placement3D", make("IfcCartesianPoint", [float(x) for x in origin]))
-
-    context = make("IfcGeometricRepresentationContext", None, "Model", 3, 1e-5, frame(0, 0, 0), None)
-    units = make("IfcUnitAssignment", [make("IfcSIUnit", None, "LENGTHUNIT", "MILLI", "METRE")])
-    make("IfcProject", new(), None, "p", None, None, None, None, [context], units)
-
-    def box(kind, name, origin, sizes):
-        middle = make("IfcAxis2Placement2D", make("IfcCartesianPoint", [0.0, 0.0]))
-        profile = make("IfcRectangleProfileDef", "AREA", None, middle, *map(float, sizes[:2]))
-        up = make("IfcDirection", [0.0, 0.0, 1.0])
-        solid = make("IfcExtrudedAreaSolid", profile, frame(*origin), up, float(sizes[2]))
-        shape = make("IfcShapeRepresentation", context, "Body", "SweptSolid", [solid])
-        return make(
-            kind,
-            GlobalId=new(),
-            Name=name,
-            ObjectPlacement=make("IfcLocalPlacement", None, frame(0, 0, 0)),
-            Representation=make("IfcProductDefinitionShape", None, None, [shape]),
-        )
-
-    beam = box("IfcBeam", "B1", (0, 0, 0), (200, 100, 3000))
-    opening = box("IfcOpeningElement", "O1", (0, 0, 1000), (100, 300, 200))
-    make("IfcRelVoidsElement", new(), RelatingBuildingElement=beam, RelatedOpeningElement=opening)
-    model.write(str(path))
-
-
-def test_a_beam_with_an_opening_in_ifc_is_closed(tmp_path):
-    beam_with_opening(tmp_path / "a.ifc")
-    (body,) = files.read(tmp_path / "a.ifc").bodies
-    assert body.closed
-    assert body.volume_mm3 == pytest.approx(200.0 * 100.0 * 3000.0 - 100.0 * 100.0 * 200.0)
-
-
 @pytest.mark.parametrize(
     ("name", "coding"),
     [
@@ -112,11 +70,3 @@ def test_a_beam_with_an_opening_in_ifc_is_closed(tmp_path):
 )
 def test_names_beyond_ascii_are_read_in_the_encoding_that_they_have(name, coding):
     assert process.escaped(f"#1=PRODUCT('{name}')".encode(coding)) == process.escape(f"#1=PRODUCT('{name}')").encode()
-
-
-def test_a_design_that_cannot_be_read_is_no_structure(tmp_path):
-    (tmp_path / "scans").mkdir()
-    np.savetxt(tmp_path / "scans/S1.xyz", np.random.default_rng(0).uniform(0, 1000, (200, 3)))
-    (tmp_path / "bridge.stl").write_text("solid bridge\nfacet normal 0 0 0\n")
-    with pytest.raises(InputError, match=r"bridge\.stl: is cut off"):
-        guess.guess(tmp_path)

@@ -144,7 +144,16 @@ def test_rays_meet_structures_where_their_solids_are(components):
     places = around(corners.min(axis=0), corners.max(axis=0), GIRDER_WAYS[:2])
     points, names = hits(of_patches(patches), places, 4.0)
     assert len(points) > 500
-    check(points, names, boxes_and_tubes.solid(components))
+    solid, bodies = boxes_and_tubes.solid(components), [body for one in components for body in one.bodies]
+    assert solid.isValid()
+    assert solid.Volume() == pytest.approx(sum(volume_of(body) for body in bodies), rel=1e-6)  # that of the kernel
+    check(points, names, solid)
+
+
+def volume_of(body):
+    if isinstance(body, boxes_and_tubes.Tube):
+        return np.pi * body.radius**2 * np.linalg.norm(body.end - body.start)
+    return float(np.prod(body.size))
 
 
 def test_bodies_as_built_go_out_as_step(tmp_path):

@@ -14,13 +14,13 @@ from processor import __main__ as processor_main
 MAIN = {"processor": processor_main.main, "designgen": designgen_main.main}
 
 
-def here(program, *arguments):
-    """Run a command line of ``program`` and return what subprocess.run would, for text."""
+def here(program, *arguments, stderr=None):
+    """Run a command line of ``program`` and return what subprocess.run would, for text; errors may go to a file."""
     out, err = io.StringIO(), io.StringIO()
     with (
         mock.patch.object(sys, "argv", [program, *map(str, arguments)]),
         contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
+        contextlib.redirect_stderr(stderr or err),
         pytest.raises(SystemExit) as end,
     ):
         MAIN[program]()

@@ -41,6 +41,10 @@ def arch_solid(name, built):
     return arch_part.solid(arch(name, built))
 
 
+def bridge_solid(params, number):
+    return arch_part.solid(arch_bridge.build(params)[number])
+
+
 def girder(kind, section, number, bolted=False):
     """A part of an assembly, with all errors that it can have."""
     recipe = {
