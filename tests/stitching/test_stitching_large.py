@@ -9,11 +9,11 @@ import pytest
 
 from processor import large_arrays
 from processor.model import Scene
-from processor.stitching import step as stitching_step
 from processor.stitching.planes import grid_bands, scan_planes
 from processor.store import store
 from tests.support import arrays_in_files
 from tests.support.clouds import stitch_clouds
+from tests.support.scenes.stitched_rooms import adjusted, errors, reordered
 
 
 @pytest.fixture
@@ -36,42 +36,34 @@ def assert_same(ours, theirs):
 
 @pytest.mark.parametrize("grid", [True, False])
 def test_planes_and_ends_by_blocks_are_those_of_the_whole(grid, request):
-    scan = stitch_clouds.four(1, grid=grid)[1][2]
-    mixed = np.random.default_rng(0).permutation(len(scan.points))  # the points of a file are in any order
-    columns = {name: getattr(scan, name)[mixed] for name in ("points", "grid_row", "grid_column") if grid}
-    scan = dataclasses.replace(scan, **(columns or {"points": scan.points[mixed]}))
+    scan = stitch_clouds.four(1, step_mrad=20.0, grid=grid)[1][2]
+    scan = reordered(scan, np.random.default_rng(0).permutation(len(scan.points)))  # those of a file are in any order
     whole = scan_planes.extract(scan)
-    assert (len(whole.ends.points) > 100) == grid
+    assert (len(whole.ends.points) > 50) == grid
     request.getfixturevalue("small")
     assert_same(scan_planes.extract(scan), whole)
 
 
 def test_points_that_are_not_finite_are_left_out_with_their_places_in_the_grid():
-    scan = stitch_clouds.four(1)[1][0]
+    scan = stitch_clouds.four(1, step_mrad=24.0)[1][0]
     points = scan.points.copy()
     points[::5] = np.nan
-    kept = np.arange(len(points)) % 5 > 0
-    there = dataclasses.replace(
-        scan, points=points[kept], grid_row=scan.grid_row[kept], grid_column=scan.grid_column[kept]
-    )
-    assert_same(scan_planes.extract(dataclasses.replace(scan, points=points)), scan_planes.extract(there))
+    there = scan_planes.extract(reordered(scan, np.arange(len(points)) % 5 > 0))
+    assert_same(scan_planes.extract(dataclasses.replace(scan, points=points)), there)
 
 
 def test_more_points_make_no_more_cells(monkeypatch):
     """The poses are those of the finer cells within their intervals."""
     T, scans = stitch_clouds.four(2)
-    scene = Scene("room", "structure", scans)
-    fine = stitching_step.run(scene, stitching_step.Params())
-    monkeypatch.setattr(scan_planes, "MOST_CELLS", sum(len(scan.points) for scan in scans) // 20)
-    assert scan_planes.points_a_cell(scans[0], sum(len(scan.points) for scan in scans)) == pytest.approx(20.0, rel=0.01)
+    count = sum(len(scan.points) for scan in scans)
+    monkeypatch.setattr(scan_planes, "MOST_CELLS", count // 20)
+    assert scan_planes.points_a_cell(scans[0], count) == pytest.approx(20.0, rel=0.01)  # count is no multiple of 20
     cells = [scan_planes.extract(scans[0], a_cell=a_cell).cell_mm for a_cell in (5.0, 20.0)]
-    assert cells[1] > 1.5 * cells[0]
-    coarse = stitching_step.run(scene, stitching_step.Params())
-    want = (np.linalg.inv(T[0]) @ T)[1:, :3, 3]
-    for result in (fine, coarse):
-        off = np.abs(result.scans.T_project_scan[1:, :3, 3] - want)
-        assert (off < 4.0 * result.scans.position_sd[1:]).all()
-        assert result.scans.status == ("ok",) * 4
+    assert cells[1] > 1.5 * cells[0]  # a cell of four times the points has twice the side
+    result = adjusted(T, scans)
+    off = np.abs(errors(result.scans.T_project_scan, T)[0][1:])
+    assert (off < 4.0 * result.scans.position_sd[1:]).all()
+    assert result.scans.status == ("ok",) * 4
 
 
 @pytest.mark.slow

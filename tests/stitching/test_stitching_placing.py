@@ -9,29 +9,42 @@ from processor.geometry import rigid
 from processor.model import Status
 from processor.stitching import to_result
 from processor.stitching.coarse import network, pairwise
+from processor.stitching.coarse.pairwise import ScoredPose
 from processor.stitching.planes import free_space
 
+HERE = np.eye(4)
 
-def test_a_group_of_equal_poses_has_the_score_of_its_best_member(monkeypatch):
+
+def along(x):
+    return rigid.transform(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def shift(pose, other=HERE):
+    return float(np.linalg.norm(pose[:3, 3] - other[:3, 3]))
+
+
+def scans(count):
+    return [SimpleNamespace(side_mm=700.0)] * count
+
+
+@pytest.fixture
+def scored(monkeypatch):
+    """Give poses by a function of (network, i, j, pose) for their scores; those within 500 mm are the same."""
+    monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: shift(T, S) < 500.0)
+    return lambda score: monkeypatch.setattr(network.Network, "score_beside", score)
+
+
+def test_a_group_of_equal_poses_has_the_score_of_its_best_member(scored):
     """Beside scan 0 the right pose of scan 2 is 250 mm off and contradicted by others; beside scan 1 it is exact."""
-    right, turned = (rigid.transform(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 50_000.0))
-    near = rigid.transform(np.eye(3), np.array([250.0, 0.0, 0.0]))
+    right, near, turned = along(0.0), along(250.0), along(50_000.0)
 
-    def distance(pose, other):
-        return float(np.linalg.norm(pose[:3, 3] - other[:3, 3]))
+    def score(self, i, j, pose):
+        return ScoredPose(pose, 600.0, 10.0 if shift(pose, turned) < 1.0 else 0.05 * shift(pose, right), 0.4)
 
-    def score_beside(self, i, j, pose):
-        against = 10.0 if distance(pose, turned) < 1.0 else 0.05 * distance(pose, right)
-        return pairwise.ScoredPose(pose, 600.0, against, 0.4)
-
-    monkeypatch.setattr(network.Network, "score_beside", score_beside)
-    monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: distance(T, S) < 500.0)
-    candidates = {
-        (0, 2): [pairwise.ScoredPose(near, 1.0, 0.0, 0.4), pairwise.ScoredPose(turned, 0.9, 0.0, 0.4)],
-        (1, 2): [pairwise.ScoredPose(right, 1.0, 0.0, 0.4), pairwise.ScoredPose(turned, 0.9, 0.0, 0.4)],
-    }
-    scans = [SimpleNamespace(side_mm=700.0)] * 3
-    placed = network.Network(scans=scans, candidates=candidates, T=np.tile(np.eye(4), (3, 1, 1)), placed=[0, 1])
+    scored(score)
+    candidates = {(i, 2): [ScoredPose(first, 1.0, 0.0, 0.4), ScoredPose(turned, 0.9, 0.0, 0.4)]
+                  for i, first in enumerate((near, right))}  # fmt: skip
+    placed = network.Network(scans=scans(3), candidates=candidates, T=np.tile(HERE, (3, 1, 1)), placed=[0, 1])
     assert network.joint_score(placed, 2, [0], near) < network.joint_score(placed, 2, [0], turned)
     ranked = network.rank_poses(placed, 2, [0, 1])
     np.testing.assert_array_equal(ranked[0][1], right)
@@ -41,57 +54,60 @@ def test_a_group_of_equal_poses_has_the_score_of_its_best_member(monkeypatch):
 
 def test_a_pose_by_a_single_overlap_is_refuted_by_free_space():
     """A bridge turned end for end: most patches match, and a few lie in free space of the other scan."""
-    T = np.eye(4)
-    right, turned, separate = (pairwise.ScoredPose(T, 50.0, a, o) for a, o in ((0.02, 0.3), (1.1, 0.5), (2.0, 0.01)))
-    np.testing.assert_array_equal(network.refuted({(0, 1): right}, 2, 0), [0.0, 0.0])
-    np.testing.assert_allclose(network.refuted({(0, 1): turned}, 2, 0), [0.0, 1.1 / 50.0])
-    # Two overlaps that agree are not both wrong; a pair with almost no overlap is no support.
-    both = {(0, 1): right, (0, 2): turned, (1, 2): turned}
-    np.testing.assert_array_equal(network.refuted(both, 3, 0), [0.0, 0.0, 0.0])
-    alone = {(0, 1): right, (0, 2): turned, (1, 2): separate}
-    np.testing.assert_allclose(network.refuted(alone, 3, 0), [0.0, 2.02 / 50.0, 3.1 / 50.0])
+    right, turned, separate = (ScoredPose(HERE, 50.0, a, o) for a, o in ((0.02, 0.3), (1.1, 0.5), (2.0, 0.01)))
+    for poses, count, refuted in (
+        ({(0, 1): right}, 2, [0.0, 0.0]),
+        ({(0, 1): turned}, 2, [0.0, 1.1 / 50.0]),
+        # Two overlaps that agree are not both wrong; a pair with almost no overlap is no support.
+        ({(0, 1): right, (0, 2): turned, (1, 2): turned}, 3, [0.0, 0.0, 0.0]),
+        ({(0, 1): right, (0, 2): turned, (1, 2): separate}, 3, [0.0, 2.02 / 50.0, 3.1 / 50.0]),
+    ):
+        np.testing.assert_allclose(network.refuted(poses, count, 0), refuted)
 
 
-def test_applied_motion_is_not_a_rival_of_the_resulting_pose(monkeypatch):
+def test_applied_motion_is_not_a_rival_of_the_resulting_pose(monkeypatch, scored):
     """Every motion seems better than the pose at hand: the rivals in the result are those of the last poses."""
     poses = []
 
     def moves(placed, coarse, reference):
         poses.append(placed.T.copy())
-        return [network.Move(scans=[1], M=rigid.transform(np.eye(3), np.array([100.0, 0.0, 0.0])), ratio=2.0)]
+        return [network.Move(scans=[1], M=along(100.0), ratio=2.0)]
 
-    scored = pairwise.ScoredPose(np.eye(4), 600.0, 0.0, 0.4)
-    monkeypatch.setattr(network.Network, "score_beside", lambda self, i, j, pose: scored)
-    monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: np.array_equal(T, S))
+    scored(lambda self, i, j, pose: ScoredPose(HERE, 600.0, 0.0, 0.4))
     monkeypatch.setattr(network, "_moves", moves)
-    scans = [SimpleNamespace(side_mm=700.0)] * 2
-    placed = network.place(scans, {(0, 1): [pairwise.ScoredPose(np.eye(4), 1.0, 0.0, 0.4)]}, 0)
+    placed = network.place(scans(2), {(0, 1): [ScoredPose(HERE, 1.0, 0.0, 0.4)]}, 0)
     np.testing.assert_array_equal(poses[-1], placed.T)
     np.testing.assert_allclose((placed.T_rival[1] @ rigid.invert(placed.T[1]))[:3, 3], [100.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize(("against", "ambiguous"), [(0.05, True), (3.0, False)])
-def test_scans_beyond_a_rival_pose_are_ambiguous_together(monkeypatch, against, ambiguous):
-    """Free space decides between two bays, if it contradicts one of them; else all that lies beyond is ambiguous."""
-    step, off = (rigid.transform(np.eye(3), np.array([x, 0.0, 0.0])) for x in (6000.0, 12000.0))
-    T = np.stack([rigid.transform(np.eye(3), np.array([6000.0 * i, 0.0, 0.0])) for i in range(4)])
-    poses = {}
+def test_a_scan_that_overlaps_with_none_where_it_was_placed_loses_to_any_rival(scored):
+    """Moved there with others, it has a score of 0, which is not ranked."""
+    scored(lambda self, i, j, pose: ScoredPose(pose, 60.0, 0.0, 0.3 if shift(pose, along(9000.0)) < 1.0 else 1e-9))
+    candidates = {(0, 1): [ScoredPose(along(9000.0), 60.0, 0.0, 0.3)]}
+    placed = network.Network(scans=scans(2), candidates=candidates, T=np.tile(HERE, (2, 1, 1)), placed=[0, 1])
+    rated = network._rated(placed, 0)
+    assert rated.rivalry[1] > 1.0
+    np.testing.assert_array_equal(rated.T_rival[1], along(9000.0))
 
-    def score_beside(self, i, j, pose):
+
+@pytest.mark.parametrize(("against", "ambiguous"), [(0.05, True), (3.0, False)])
+def test_scans_beyond_a_rival_pose_are_ambiguous_together(scored, against, ambiguous):
+    """Free space decides between two bays, if it contradicts one of them; else all that lies beyond is ambiguous."""
+    step, off = along(6000.0), along(12000.0)
+    T = np.stack([along(6000.0 * i) for i in range(4)])
+
+    def score(self, i, j, pose):
         apart = (rigid.invert(self.T[i]) @ pose)[0, 3] / 6000.0 * (1 if j > i else -1)
         if abs(i - j) == 1 and apart == 1.0:
-            return pairwise.ScoredPose(pose, 60.0, 0.0, 0.3)
+            return ScoredPose(pose, 60.0, 0.0, 0.3)
         if {i, j} == {1, 2} and apart == 2.0:
-            return pairwise.ScoredPose(pose, 60.0, against, 0.3)
-        return pairwise.ScoredPose(pose, 0.0, 0.0 if abs(apart) >= 2.0 and {i, j} != {2, 3} else 9.0, 1e-9)
+            return ScoredPose(pose, 60.0, against, 0.3)
+        return ScoredPose(pose, 0.0, 0.0 if abs(apart) >= 2.0 and {i, j} != {2, 3} else 9.0, 1e-9)
 
-    monkeypatch.setattr(network.Network, "score_beside", score_beside)
-    monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: bool(np.abs(T - S).max() < 500.0))
-    for i in range(3):
-        poses[i, i + 1] = [pairwise.ScoredPose(step, 60.0, 0.0, 0.3)]
-    poses[1, 2].append(pairwise.ScoredPose(off, 60.0, 0.05, 0.3))
-    scans = [SimpleNamespace(side_mm=700.0)] * 4
-    placed = network.place(scans, poses, 0)
+    scored(score)
+    poses = {(i, i + 1): [ScoredPose(step, 60.0, 0.0, 0.3)] for i in range(3)}
+    poses[1, 2].append(ScoredPose(off, 60.0, 0.05, 0.3))
+    placed = network.place(scans(4), poses, 0)
     np.testing.assert_allclose(placed.T, T)
     assert (placed.rivalry[2:] > network.AMBIGUOUS).tolist() == [ambiguous] * 2
     assert (placed.rivalry[:2] < network.AMBIGUOUS).all()
@@ -99,24 +115,18 @@ def test_scans_beyond_a_rival_pose_are_ambiguous_together(monkeypatch, against, 
 
 def test_scans_that_join_only_through_an_ambiguous_one_are_ambiguous():
     status = [Status.OK, Status.AMBIGUOUS, Status.OK, Status.OK]
-    assert to_result._not_joined([(0, 1), (1, 2), (0, 3)], status, 0) == [2]
-    assert to_result._not_joined([(0, 1), (1, 2), (0, 3), (2, 3)], status, 0) == []
-    assert to_result._not_joined(None, status, 0) == []
+    links = [(0, 1), (1, 2), (0, 3)]
+    for given, apart in ((links, [2]), ([*links, (2, 3)], []), (None, [])):
+        assert to_result._not_joined(given, status, 0) == apart
 
 
 def test_links_are_overlaps_that_free_space_does_not_contradict():
-    pose = np.eye(4)
-    scores = {
-        (0, 1): pairwise.ScoredPose(pose, 60.0, 0.1, 0.3),
-        (0, 2): pairwise.ScoredPose(pose, 60.0, 0.9, 0.3),
-        (1, 2): pairwise.ScoredPose(pose, 6.0, 0.0, 0.03),
-    }
-    assert network.links(scores) == [(0, 1)]
+    scores = {(0, 1): (60.0, 0.1, 0.3), (0, 2): (60.0, 0.9, 0.3), (1, 2): (6.0, 0.0, 0.03)}
+    assert network.links({pair: ScoredPose(HERE, *score) for pair, score in scores.items()}) == [(0, 1)]
 
 
 def test_scan_of_another_place_is_in_a_group_of_its_own():
-    pose = np.eye(4)
-    good, bad = ([pairwise.ScoredPose(pose, 60.0, against, 0.3)] for against in (0.0, 9.0))
+    good, bad = ([ScoredPose(HERE, 60.0, against, 0.3)] for against in (0.0, 9.0))
     group = network.groups({(0, 1): bad, (0, 2): good, (1, 2): bad, (2, 3): good, (1, 3): []}, 4)
     assert group[0] == group[2] == group[3] != group[1]
 

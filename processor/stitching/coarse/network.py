@@ -185,7 +185,8 @@ def _rated(network: Network, reference: int) -> CoarsePoses:
         if j == reference or not others:
             continue
         ranked = rank_poses(network, j, others, T[j])
-        best = next(score for score, pose in ranked if network.same(pose, T[j], j))
+        # A pose that overlaps with none of the others, or that free space contradicts wholly, is not ranked.
+        best = next((score for score, pose in ranked if network.same(pose, T[j], j)), 0.0)
         rivals = [(score, pose) for score, pose in ranked if not network.same(pose, T[j], j)]
         if rivals:
             rivalry[j] = rivals[0][0] / max(best, 1e-12)
