@@ -9,6 +9,8 @@ from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.grid_bands import GridBands
 from tests.support.clouds.stitch_clouds import pose, scan
 
+ROUNDING = 1e-12  # of unit vectors by sums over a thousand rays
+
 
 def test_rays_fitted_to_a_grid_are_the_simulated_ones():
     made = scan("S", pose([0.0, 0.0, 1500.0], 0.0), 1, step_mrad=20.0, sigma_mm=0.0)
@@ -16,12 +18,12 @@ def test_rays_fitted_to_a_grid_are_the_simulated_ones():
     row, column = made.grid_row.astype(np.int64), made.grid_column.astype(np.int64)
     rays = scan_grid_directions.fitted(made.points[keep], row[keep], column[keep])
     true = made.points / np.linalg.norm(made.points, axis=1)[:, None]
-    np.testing.assert_allclose(rays.of(row, column), true, atol=1e-9)
+    np.testing.assert_allclose(rays.of(row, column), true, atol=ROUNDING)
     empty = np.ones((row.max() + 1, column.max() + 1), bool)
     empty[row[keep], column[keep]] = False
     lost = scan_grid_directions.unanswered(rays, empty)
     assert len(lost) == (~keep).sum()
-    np.testing.assert_allclose(np.sort(lost, axis=0), np.sort(true[~keep], axis=0), atol=1e-9)
+    np.testing.assert_allclose(np.sort(lost, axis=0), np.sort(true[~keep], axis=0), atol=ROUNDING)
 
 
 def bands(points, row, column):
@@ -59,6 +61,7 @@ def test_ends_of_a_post_are_unbiased_for_all_phases_of_the_rays():
             side = (np.abs(ends.across[:, 1]) > 50.0) & (ends.across[:, 1] > 0.0)
             assert side.sum() >= 20  # of 26 rows, of which 4 were in a piece
             shares.append(np.mean((ends.points[side, 1] - 0.5 * width) / ends.across[side, 1]))
+        # Half a gap at most, and of 40 even phases the mean of a share within half a phase.
         assert np.abs(shares).max() < 0.51
         assert abs(np.mean(shares)) < 0.03
 
@@ -82,7 +85,7 @@ def test_ends_in_one_gap_weigh_as_one_and_spread_ends_by_their_number():
     slanting = edge_constraints.variance(matches(anywhere, np.arange(200)))
     np.testing.assert_allclose(slanting, 60.0**2 / 12.0)
     steep = edge_constraints.variance(matches(np.linspace(-0.5, 0.5, 200), np.zeros(200, np.int64)))
-    np.testing.assert_allclose(1.0 / (1.0 / steep).sum(), 60.0**2 / 12.0 / 200, rtol=0.3)
+    np.testing.assert_allclose(1.0 / (1.0 / steep).sum(), 60.0**2 / 12.0 / 200, rtol=1e-9)
 
 
 def test_variance_of_ends_in_step_with_the_grid():
@@ -100,7 +103,7 @@ def test_far_edges_of_an_inclined_face_are_unbiased():
     """A floor that ends 9 m ahead of a scanner 1.5 m above it: rays are even in angle, so that gaps widen outwards."""
     height, edge, step = 1500.0, 9000.0, 2e-3
     off, width = [], []
-    for phase in np.linspace(0.0, 1.0, 50, endpoint=False):
+    for phase in np.linspace(0.0, 1.0, 25, endpoint=False):
         column, row = np.meshgrid(np.arange(60), np.arange(300))
         turn, up = (column.ravel() - 30.3) * step, -0.4507 + (row.ravel() + phase) * step
         u = np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], axis=1)

@@ -74,8 +74,9 @@ def test_range_scales_are_separated_from_the_poses():
     start = T.copy()
     start[1:, :3, 3] += [1.0, -2.0, 0.5]
     solution = bundle_adjustment.solve(blocks, start, 0, tau=(0.0, 0.0, 0.0))
-    np.testing.assert_allclose(solution.of_scans[:, 1], scale, atol=3e-7)
-    np.testing.assert_allclose(solution.T[:, :3, 3], T[:, :3, 3], atol=0.02)
+    # The end of an iteration whose steps shrink by more than a hundred: 3e-9 and 2e-5 mm are left.
+    np.testing.assert_allclose(solution.of_scans[:, 1], scale, atol=1e-8)
+    np.testing.assert_allclose(solution.T[:, :3, 3], T[:, :3, 3], atol=1e-4)
 
 
 def test_scatter_of_points_does_not_bias_the_range_scales():
@@ -83,7 +84,7 @@ def test_scatter_of_points_does_not_bias_the_range_scales():
     T = stations()
     blocks = blocks_of(T, *wall_points(), np.zeros(4), each=1_000_000)
     solution = bundle_adjustment.solve(blocks, T, 0, tau=(0.0, 0.0, 0.0))
-    assert np.abs(solution.of_scans[:, 1]).max() < 1e-8
+    assert np.abs(solution.of_scans[:, 1]).max() < 1e-8  # the bias would be 1e-7: 2 mm squared by the points and 20 m
 
 
 def cloud_of(planes, position=True):
@@ -111,6 +112,7 @@ def test_the_noise_follows_incidence_and_range(across, along):
     planes = Planes(np.full(n, dof + 3.0), mean, normal, variance, np.tile(np.eye(3), (n, 1, 1)))
     found = noise_model.variances(cloud_of(planes))
     steep = c2 > 0.04  # the least variance at grazing incidence is a bound
+    # 900 pieces of 40 freedoms know a variance to 0.7 %, four of them apart to some 5 %; a seventh is rough.
     assert np.abs(np.log(found / true)[steep]).max() < 0.25
     assert np.abs(np.median(found / true) - 1.0) < 0.1
 
