@@ -50,7 +50,7 @@ def test_jacobian_equals_finite_differences(known):
         d = np.zeros(4)
         d[i] = 1e-5
         numeric = (residual(*p, *u, *(state + d))[0] - residual(*p, *u, *(state - d))[0]) / 2e-5
-        assert J[i] == pytest.approx(numeric, abs=1e-7)
+        assert J[i] == pytest.approx(numeric, abs=1e-8)  # second order: 1e-10
 
 
 def test_selection_depends_on_the_ray_and_not_on_the_noisy_point():
@@ -72,8 +72,7 @@ def test_selection_depends_on_the_ray_and_not_on_the_noisy_point():
 def test_weight_is_one_for_small_and_zero_for_large_residuals():
     assert [weight(t) for t in (0.0, -3.0, 4.5, 9.0)] == [1.0, 1.0, 0.0, 0.0]
     assert weight(3.75) == pytest.approx((1.0 - 0.25) ** 2)
-    t = np.random.default_rng(2).standard_normal(400_000)
-    w = np.array([weight(x) for x in t[:40_000]])
+    w = np.array([weight(x) for x in np.random.default_rng(2).standard_normal(10_000)])
     assert w.mean() > 0.998  # next to nothing of normal noise is lost
 
 
@@ -109,8 +108,8 @@ def test_covariance_with_station_shifts_is_that_of_the_joint_problem():
         J[i, :4] = residual(*points[i], *u[i], 0.0, 0.0, 0.0, 50.0)[2:]
         J[i, 4 + 3 * station[i] : 7 + 3 * station[i]] = J[i, :3]
     joint = J.T @ J + np.diag([0.0] * 4 + [0.25] * 6)
-    np.testing.assert_allclose(covariance, np.linalg.inv(joint)[:4, :4], rtol=1e-6)
-    np.testing.assert_allclose(state, [0, 0, 0, 50.0], atol=1e-6)
+    np.testing.assert_allclose(covariance, np.linalg.inv(joint)[:4, :4], rtol=1e-9)
+    np.testing.assert_allclose(state, [0, 0, 0, 50.0], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +122,7 @@ def test_covariance_with_station_shifts_is_that_of_the_joint_problem():
     ],
 )
 def test_errors_reach_the_bound_and_intervals_cover(radius, count, visible, sigma, several):
-    draws = 600
+    draws = 300
     errors, covariance, bounds, *_ = ball_fit.trial(
         np.random.default_rng(7), draws, radius, count, visible, sigma, several
     )
@@ -156,7 +155,7 @@ def test_the_noise_is_read_from_residuals():
 
 def test_radius_without_rays_is_corrected_by_half_the_noise_bias():
     rng = np.random.default_rng(12)
-    draws, count, radius, sigma = 400, 200, 45.0, 2.0
+    draws, count, radius, sigma = 150, 200, 45.0, 2.0
     normal = rng.standard_normal((draws * count, 3))
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     most = sigma**2 / radius  # by which noise in all directions lengthens distances from the centre
@@ -175,7 +174,9 @@ def test_radius_without_rays_is_corrected_by_half_the_noise_bias():
     chance = 4.0 * sigma / np.sqrt(draws * count)
     off, variance = radii(rng.normal(0.0, sigma, (draws * count, 3)))
     assert off.mean() == pytest.approx(0.5 * most, abs=chance)
-    assert np.median(variance) == pytest.approx(sigma**2 / count + most**2 / 12.0, rel=0.06)
+    assert np.median(variance) == pytest.approx(
+        sigma**2 / count + most**2 / 12.0, rel=0.06
+    )  # a median of 150 of a few per cent
     off, _ = radii(rng.normal(0.0, sigma, (draws * count, 1)) * normal)
     assert off.mean() == pytest.approx(-0.5 * most, abs=chance)
 
@@ -213,7 +214,7 @@ def seen_by_a_wide_beam(rng, radius, station, beam_mm, step_mm, sigma):
 def test_a_beam_cut_at_the_limb_does_not_raise_the_size():
     """A beam of 8 mm makes a ball look wider by up to 8 mm, where the next size of the catalogue is 5 mm larger."""
     rng = np.random.default_rng(21)
-    true = np.repeat([60.0, 65.0], 30)
+    true = np.repeat([60.0, 65.0], 10)
     stations = 2.0 * ball_fit.STATIONS[3]
     views = [[seen_by_a_wide_beam(rng, r, s, 8.0, 8.0, 2.5) for s in stations] for r in true]
     start = np.cumsum([0, *(sum(map(len, of_ball)) for of_ball in views)])
@@ -236,6 +237,7 @@ def test_the_scatter_of_radii_is_that_of_the_balls():
     measured = true + own * rng.standard_normal(800)
     weight_ = 1 / own**2 + 1 / 0.4**2
     posterior = (measured / own**2 + sizes / 0.4**2) / weight_
+    # 800 radii of 0.2 mm and 0.35 mm of their own: 0.02 mm; of two the scatter stays the prior's.
     assert radius_scatter(posterior, 1 / weight_, sizes, 0.4, 0.4) == pytest.approx(0.2, abs=0.04)
     assert radius_scatter(posterior[:2], 1 / weight_[:2], sizes[:2], 0.4, 0.4) == pytest.approx(0.4, abs=0.08)
 

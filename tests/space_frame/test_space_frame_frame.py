@@ -11,18 +11,19 @@ from processor import pipeline
 from processor.evaluation import space_frame
 from processor.geometry import rigid, thread_ranges
 from processor.model import FrameDesign, Scan, reason
-from processor.space_frame import step as space_frame_step
 from processor.space_frame import to_result
 from processor.space_frame.design.movement import verdict_of
 from processor.space_frame.points.scene_source import of_scene
 from processor.space_frame.spheres import baselines
+from processor.space_frame.step import Params, run
+from tests.support.made import made
 
 ROOF = ["frame.nodes_x=6", "frame.nodes_y=5", "scan.stations=[2,2]", "scan.clutter=6", "scan.step_mrad=2.2"]
 
 
 @pytest.fixture(scope="module")
 def roof():
-    return make("roof", recipe_files.overridden(recipe_files.load("frame-1040")[1], ROOF), 3)
+    return made(make, "roof", recipe_files.overridden(recipe_files.load("frame-1040")[1], ROOF), 3)
 
 
 def errors(result, truth, rows=slice(None)):
@@ -32,12 +33,10 @@ def errors(result, truth, rows=slice(None)):
 
 def test_every_ball_is_found_without_a_design(roof):
     scene, truth = roof
-    result = space_frame_step.run(dataclasses.replace(scene, frame=None), space_frame_step.Params())
+    result = run(dataclasses.replace(scene, frame=None), Params())
     assert result.status == "ok"
     assert len(result.balls.ids) == len(truth.frame.ids)
-    checks = {
-        metric.name: metric for metric in space_frame.check(dataclasses.replace(scene, frame=None), result, truth)
-    }
+    checks = {one.name: one for one in space_frame.check(dataclasses.replace(scene, frame=None), result, truth)}
     assert all(metric.passed for metric in checks.values())
     assert checks["nodes found within 3 mm"].value == 100.0
     assert checks["nodes that are none"].value == 0.0
@@ -47,7 +46,7 @@ def test_every_ball_is_found_without_a_design(roof):
 
 def test_rows_are_the_designs_nodes_in_its_order(roof):
     scene, truth = roof
-    result = space_frame_step.run(scene, space_frame_step.Params())
+    result = run(scene, Params())
     assert result.balls.ids.tolist() == scene.frame.ids.tolist()
     assert result.movement_reference.gauge == "design-coordinates"
     assert errors(result, truth).max() < 1.5
@@ -60,7 +59,7 @@ def test_a_design_of_another_frame_is_found(roof):
     scene, truth = roof
     R, t = rigid.rotation_from_vector(np.array([0.02, -0.01, 0.7])), np.array([5.0e8, 4.3e9, 1e3])
     moved = dataclasses.replace(scene.frame, centres=scene.frame.centres @ R.T + t)
-    result = space_frame_step.run(dataclasses.replace(scene, frame=moved), space_frame_step.Params())
+    result = run(dataclasses.replace(scene, frame=moved), Params())
     assert result.matching.status == "ok"
     assert result.movement_reference.gauge == "best-fit"
     assert errors(result, truth).max() < 1.5
@@ -76,7 +75,7 @@ def test_a_list_of_nodes_in_coordinates_of_the_site_gives_the_sag_and_the_best_f
     share = (truth.frame.centres - truth.frame.centres.min(axis=0)) / np.ptp(truth.frame.centres, axis=0)
     sag = np.column_stack([np.zeros((len(share), 2)), -4.0 - 42.0 * share[:, 0] ** 2 * share[:, 1]])
     listed = FrameDesign(scene.frame.ids, truth.frame.centres - sag, scene.frame.radii, coordinates=stated)
-    result = space_frame_step.run(dataclasses.replace(scene, frame=listed), space_frame_step.Params())
+    result = run(dataclasses.replace(scene, frame=listed), Params())
     row = {number: k for k, number in enumerate(result.balls.ids.tolist())}
     rows = [row[number] for number in listed.ids.tolist()]
     by_design, by_fit = result.balls.design_movement[rows], result.balls.best_fit_movement[rows]
@@ -95,21 +94,15 @@ def test_a_list_of_nodes_in_coordinates_of_the_site_gives_the_sag_and_the_best_f
 def test_unbuilt_node_is_not_found_and_undesigned_node_is_extra(roof):
     scene, truth = roof
     frame = scene.frame
-    centres, ids = frame.centres.copy(), frame.ids.copy()
+    centres = frame.centres.copy()
     centres[7] += [0.0, 0.0, -900.0]  # nothing is there
     own = (frame.member_a != frame.ids[7]) & (frame.member_b != frame.ids[7])
-    other = dataclasses.replace(
-        frame,
-        centres=centres,
-        ids=ids,
-        member_a=frame.member_a[own],
-        member_b=frame.member_b[own],
-        tube_diameters=frame.tube_diameters[own],
-    )
-    result = space_frame_step.run(dataclasses.replace(scene, frame=other), space_frame_step.Params())
+    names = "member_a", "member_b", "tube_diameters"
+    other = dataclasses.replace(frame, centres=centres, **{name: getattr(frame, name)[own] for name in names})
+    result = run(dataclasses.replace(scene, frame=other), Params())
     assert result.balls.flag[7] == "not-found"
     assert np.isnan(result.balls.centres[7]).all()
-    rest = np.arange(len(ids)) != 7
+    rest = np.arange(len(centres)) != 7
     assert errors(result, truth, rest).max() < 1.5
     assert result.status == "partial"
 
@@ -118,16 +111,14 @@ def test_a_ball_of_another_size_is_named(roof):
     scene, _ = roof
     radii = scene.frame.radii.copy()
     radii[3] += 10.0
-    result = space_frame_step.run(
-        dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, radii=radii)), space_frame_step.Params()
-    )
+    result = run(dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, radii=radii)), Params())
     assert [i for i, flag in enumerate(result.balls.flag) if flag == "wrong-size"] == [3]
 
 
-@pytest.mark.parametrize(("chunk", "threads_used"), [(1 << 20, 2), (70_001, 1), (12_345, 3)])
+@pytest.mark.parametrize(("chunk", "threads_used"), [(70_001, 1), (12_345, 3)])
 def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used, monkeypatch):
     scene, _ = roof
-    first = space_frame_step.run(scene, space_frame_step.Params())
+    first = run(scene, Params())
     pools, pool = set(), thread_ranges._pool
     monkeypatch.setattr(thread_ranges, "usable", lambda: threads_used)
     monkeypatch.setattr(thread_ranges, "_pool", lambda count: (pools.add(count), pool(count))[1])
@@ -138,7 +129,7 @@ def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used,
         order = rng.permutation(len(scan.points))
         columns = {name: getattr(scan, name) for name in ("points", "intensity", "grid_row", "grid_column")}
         scans.append(dataclasses.replace(scan, **{k: v[order] if len(v) else v for k, v in columns.items()}))
-    again = space_frame_step.run(dataclasses.replace(scene, scans=tuple(scans)), space_frame_step.Params())
+    again = run(dataclasses.replace(scene, scans=tuple(scans)), Params())
     assert pools == {threads_used} - {1}  # one thread needs no pool
     for name in ("balls", "tubes", "stations", "matching"):
         for field in dataclasses.fields(getattr(first, name)):
@@ -158,7 +149,7 @@ SQUARE = [
 
 @pytest.fixture(scope="module")
 def square():
-    return make("square", recipe_files.overridden(recipe_files.load("frame-1040")[1], SQUARE), 3)
+    return made(make, "square", recipe_files.overridden(recipe_files.load("frame-1040")[1], SQUARE), 3)
 
 
 def elsewhere(frame, without=(), extra=(), radius=50.0):
@@ -196,7 +187,7 @@ def test_sizes_of_balls_decide_the_turn_of_a_square_roof(square):
     assert len(truly_wrong(scene, truth)) == 3
     for without, extra in (((), ()), (scene.frame.ids[[7, 20]], beyond)):
         design, R = elsewhere(scene.frame, without, extra)
-        result = space_frame_step.run(dataclasses.replace(scene, frame=design), space_frame_step.Params())
+        result = run(dataclasses.replace(scene, frame=design), Params())
         assert result.matching.status == "ok"
         assert np.degrees(rigid.rotation_angle(result.matching.T_design_scan[:3, :3] @ R.T)) < 0.2
         assert wrong_sizes(result) == truly_wrong(scene, truth) - set(without)
@@ -211,7 +202,7 @@ def test_where_the_pose_stays_ambiguous_no_ball_is_called_wrong_on_its_account(s
     # of one size but for a corner: which of four that is, one ball does not decide
     radii = np.where(corner, 60.0, 50.0)
     design, _ = elsewhere(dataclasses.replace(scene.frame, radii=radii))
-    result = space_frame_step.run(dataclasses.replace(scene, frame=design), space_frame_step.Params())
+    result = run(dataclasses.replace(scene, frame=design), Params())
     assert result.matching.status == "ambiguous"
     disputed = np.isnan(result.balls.nominal_radii)
     assert disputed.sum() == len(result.matching.rivals) + 1 >= 2
@@ -244,7 +235,7 @@ def test_a_ball_that_rays_went_through_is_missing_and_one_that_was_not_seen_has_
         (None, "low-confidence", "spheres.few-rays"),
         (-900.0, "low-confidence", "spheres.hidden"),
     ):
-        result = space_frame_step.run(emptied(scene, truth, row, onward), space_frame_step.Params())
+        result = run(emptied(scene, truth, row, onward), Params())
         assert result.balls.flag[row] == flag, onward
         assert code in codes(result.balls.reasons[row])
         assert reason("spheres.axes-alone", axes=8) in result.balls.reasons[row]
@@ -264,26 +255,24 @@ def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
     jobs = pipeline.plan(("spheres",), ("ray", "ransac", "least-squares"), params, 0)
     runs = pipeline.execute(tmp_path / "s.h5", scene, jobs).runs
     ray = runs[0].result
-    error = {run.method: np.abs(run.result.balls.radii - truth.frame.radii)[ray.balls.points > 30] for run in runs}
-    alone = space_frame_step.run(scene, space_frame_step.Params(method="least-squares"))
-    for run in runs[1:]:
-        np.testing.assert_array_equal(run.result.balls.ids, ray.balls.ids)
-        assert baselines.SAME in run.result.reasons
+    many = ray.balls.points > 30
+    error = {one.method: np.abs(one.result.balls.radii - truth.frame.radii)[many] for one in runs}
+    alone = pipeline.execute(tmp_path / "s.h5", scene, jobs[2:]).runs[0].result
+    for other in (one.result for one in runs[1:]):
+        np.testing.assert_array_equal(other.balls.ids, ray.balls.ids)
+        assert baselines.SAME in other.reasons
         # tens of points of a ball and sleeves beside: hundreds are in the crop
-        assert (run.result.balls.points <= 1.3 * ray.balls.points + 10).all()
-        assert run.result.balls.points.sum() < 0.8 * alone.balls.points.sum()
-    assert np.median(error["least-squares"]) < 0.7 * np.median(
-        np.abs(alone.balls.radii - truth.frame.radii)[ray.balls.points > 30]
-    )
+        assert (other.balls.points <= 1.3 * ray.balls.points + 10).all()
+        assert other.balls.points.sum() < 0.8 * alone.balls.points.sum()
+    assert np.median(error["least-squares"]) < 0.7 * np.median(np.abs(alone.balls.radii - truth.frame.radii)[many])
     assert np.median(error["ray"]) < np.median(error["least-squares"])
-    again = pipeline.execute(tmp_path / "s.h5", scene, jobs[1:]).runs[0].result
-    assert baselines.SAME not in again.reasons
-    assert baselines.RAW not in again.reasons
+    assert baselines.SAME not in alone.reasons
+    assert baselines.RAW not in alone.reasons
 
 
 def test_wrong_size_is_flagged_without_a_catalogue(square):
     scene, truth = square
-    result = space_frame_step.run(scene, space_frame_step.Params(catalogue="none"))
+    result = run(scene, Params(catalogue="none"))
     reasons = [result.balls.reasons[i] for i, flag in enumerate(result.balls.flag) if flag == "wrong-size"]
     assert all("spheres.beyond-blank" in codes(one) for one in reasons)
     assert wrong_sizes(result) >= truly_wrong(scene, truth)
@@ -294,7 +283,7 @@ def test_wrong_size_is_flagged_without_a_catalogue(square):
 
 def test_wrong_size_missing_in_the_catalogue_is_flagged_by_its_interval(square):
     scene, truth = square
-    result = space_frame_step.run(scene, space_frame_step.Params(radii_mm=(45.0, 50.0)))
+    result = run(scene, Params(radii_mm=(45.0, 50.0)))
     largest = scene.frame.ids[np.argmax(truth.frame.radii)]
     assert wrong_sizes(result) == {largest}
     assert "spheres.beyond-blank" in codes(result.balls.reasons[list(result.balls.ids).index(largest)])

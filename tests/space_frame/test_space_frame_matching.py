@@ -13,7 +13,11 @@ from processor.space_frame.design.matching import NodePattern, match, match_memb
 from processor.space_frame.design.movement import movement
 from processor.space_frame.result import MovementGauge
 
+# Of a pose by 60 nodes or more that moved by up to 20 mm, 7 mm rms an axis: 1 mm at their middle, twice at their ends.
+POSE_MM = 4.0
+ROUNDING_MM = 1e-9  # at 40 m, through some tens of sums
 SIZES = (45.0, 50.0, 60.0, 70.0, 80.0)
+NONE = np.empty(0, np.int64)
 CHI2_95_OF_3 = 7.814727903251179
 
 
@@ -64,8 +68,12 @@ class Cloud:
         back = (self.positions + (self.origin - self.t)) @ self.R
         return np.abs(self.positions @ T[:3, :3].T + (T[:3, :3] @ self.origin + T[:3, 3]) - back).max()
 
+    def least_error(self, found):
+        """The error of the best of the pose and its rivals."""
+        return min(self.error(T) for T in (found.T_design_scan, *found.rivals))
 
-@pytest.mark.parametrize("seed", range(4))
+
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("pose", ["same", "any"])
 def test_every_node_is_named_with_a_fifth_missing_and_a_fifth_extra(pose, seed):
     d = design()
@@ -75,7 +83,7 @@ def test_every_node_is_named_with_a_fifth_missing_and_a_fifth_extra(pose, seed):
     assert found.relation == {"same": "same frame", "any": "registered"}[pose]
     np.testing.assert_array_equal(found.assignment, cloud.truth)
     np.testing.assert_array_equal(found.missing, np.setdiff1d(np.arange(len(d.ids)), cloud.truth))
-    assert cloud.error(found.T_design_scan) < (1e-6 if pose == "same" else 4.0)
+    assert cloud.error(found.T_design_scan) < (ROUNDING_MM if pose == "same" else POSE_MM)
     if pose == "same":
         assert not found.covariance.any()
 
@@ -87,7 +95,7 @@ def test_coordinates_of_a_map_grid():
     found = match(cloud.found(), d)
     assert found.status == "ok"
     np.testing.assert_array_equal(found.assignment, cloud.truth)
-    assert cloud.error(found.T_design_scan) < 4.0
+    assert cloud.error(found.T_design_scan) < POSE_MM
     full = cloud.positions + cloud.origin
     placed = full @ found.T_design_scan[:3, :3].T + found.T_design_scan[:3, 3]
     on = cloud.truth >= 0
@@ -95,22 +103,13 @@ def test_coordinates_of_a_map_grid():
 
 
 def test_flat_grid_of_one_size_is_ambiguous_with_the_true_pose_among_rivals():
-    d = design("flat", radii=(45.0,))
-    for seed in range(3):
-        cloud = Cloud(d, seed)
+    for nx, ny, rivals in ((7, 9, 1), (8, 8, 3)):  # turned by 180 degrees, and by 90
+        d = design("flat", nx=nx, ny=ny, radii=(45.0,))
+        cloud = Cloud(d, 1)
         found = match(cloud.found(radii=True), d)
         assert found.status == "ambiguous"
-        assert len(found.rivals) == 1  # turned by 180 degrees
-        assert min(cloud.error(T) for T in (found.T_design_scan, *found.rivals)) < 4.0
-
-
-def test_a_square_grid_has_four_answers():
-    d = design("flat", nx=8, ny=8, radii=(45.0,))
-    cloud = Cloud(d, 1)
-    found = match(cloud.found(), d)
-    assert found.status == "ambiguous"
-    assert len(found.rivals) == 3
-    assert min(cloud.error(T) for T in (found.T_design_scan, *found.rivals)) < 4.0
+        assert len(found.rivals) == rivals
+        assert cloud.least_error(found) < POSE_MM
 
 
 def test_attitude_of_a_flat_layer_is_restricted_by_gravity_alone():
@@ -120,7 +119,7 @@ def test_attitude_of_a_flat_layer_is_restricted_by_gravity_alone():
     assert found.status == "ambiguous"
     assert len(found.rivals) == 1  # of four poses two stand upright
     assert {"spheres.turned-over", "spheres.equal-poses"} & {one.code for one in found.reasons}
-    assert min(upright.error(T) for T in (found.T_design_scan, *found.rivals)) < 4.0
+    assert upright.least_error(found) < POSE_MM
     tilted = Cloud(d, 2, missing=0.1, extra=0.05)
     found = match(tilted.found(), d)
     assert len(found.rivals) == 3
@@ -134,7 +133,7 @@ def test_pose_is_unique_as_far_as_sizes_members_or_shape_determine_it(by):
         pairs = np.stack([d.member_a, d.member_b], axis=1) - 100
         members, answers = pairs, 1  # a half turn remains
     elif by == "radii":
-        d, more, answers = design("flat", radii=SIZES), {"radii": True}, 0
+        d, more, answers = design("flat", nx=7, ny=9, radii=SIZES), {"radii": True}, 0
     elif by == "shape":
         d, answers = design("free-form", radii=(60.0,)), 0
     else:
@@ -143,18 +142,17 @@ def test_pose_is_unique_as_far_as_sizes_members_or_shape_determine_it(by):
         keep[[0, 1, 8]] = False
         d = FrameDesign(whole.ids[keep], whole.centres[keep], whole.radii[keep])
         answers = 0
-    for seed in range(2):
-        cloud = Cloud(d, seed, missing=0.05, extra=0.03, pose=70.0)
-        found = match(cloud.found(members=members, **more), d)
-        assert len(found.rivals) == answers, found.reasons
-        assert min(cloud.error(T) for T in (found.T_design_scan, *found.rivals)) < 4.0
+    cloud = Cloud(d, 0, missing=0.05, extra=0.03, pose=70.0)
+    found = match(cloud.found(members=members, **more), d)
+    assert len(found.rivals) == answers, found.reasons
+    assert cloud.least_error(found) < POSE_MM
 
 
 def test_balls_are_measured_where_the_pattern_leaves_several_poses_and_nowhere_else():
     """A square roof of three sizes: two nodes were not designed, three not built, three balls are of another size."""
     whole = design("flat", nx=5, ny=5, radii=(45.0, 50.0, 60.0))
     asked = []
-    for seed in range(4):
+    for seed in range(2):
         cloud = Cloud(whole, seed, off=8.0, missing=0.0, extra=0.0)
         cloud.radii[[3, 17, 30]] += 10.0
         keep = ~np.isin(np.arange(len(whole.ids)), [7, 20])
@@ -175,21 +173,21 @@ def test_balls_are_measured_where_the_pattern_leaves_several_poses_and_nowhere_e
         assert found.status == "ok"
         assert cloud.error(found.T_design_scan) < 12.0
         assert (found.assignment < 0).sum() == 2
-    assert len(asked) == 4
+    assert len(asked) == 2
     clear = Cloud(design(), 1)
     assert match(clear.found(), design(), sized=sized).status == "ok"
-    assert len(asked) == 4
+    assert len(asked) == 2
 
 
 def test_half_a_flat_roof_is_ambiguous():
     """What was scanned is a part that fits in several places: none of them is a guess worth giving alone."""
-    d = design("flat", nx=10, ny=10, radii=(45.0,))
+    d = design("flat", nx=8, ny=8, radii=(45.0,))
     cloud = Cloud(d, 5, missing=0.0, extra=0.0, off=5.0)
     x = d.centres[cloud.truth][:, 0]
-    part = x < 17_000.0
+    part = x < 13_000.0
     found = match(NodePattern(cloud.positions[part]), d)
     assert found.status == "ambiguous"
-    assert min(cloud.error(T) for T in (found.T_design_scan, *found.rivals)) < 4.0
+    assert cloud.least_error(found) < POSE_MM
 
 
 def test_coordinates_shifted_by_one_bay_are_ambiguous():
@@ -217,20 +215,18 @@ def test_another_structure_fails():
 def test_a_mirror_image_is_not_a_pose():
     d = design("free-form", nx=8, ny=8)
     cloud = Cloud(d, 0, missing=0.0, extra=0.0, off=5.0)
-    found = match(NodePattern(cloud.positions * [1.0, 1.0, -1.0]), d)
-    assert found.status == "failed"
-    for T in (match(cloud.found(), d).T_design_scan,):
-        assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    assert match(NodePattern(cloud.positions * [1.0, 1.0, -1.0]), d).status == "failed"
+    assert match(cloud.found(), d).status == "ok"
 
 
 def test_the_order_of_the_nodes_does_not_matter():
-    d = design()
+    d = design(nx=6, ny=7)
     cloud = Cloud(d, 2)
     one = match(cloud.found(), d)
     order = np.random.default_rng(9).permutation(len(cloud.positions))
     other = match(NodePattern(cloud.positions[order]), d)
     np.testing.assert_array_equal(other.assignment, one.assignment[order])
-    np.testing.assert_allclose(other.T_design_scan, one.T_design_scan, atol=1e-6)
+    np.testing.assert_allclose(other.T_design_scan, one.T_design_scan, atol=ROUNDING_MM)
 
 
 def test_covariance_of_the_pose_agrees_with_its_errors():
@@ -238,7 +234,7 @@ def test_covariance_of_the_pose_agrees_with_its_errors():
     d = design(nx=6, ny=7)
     middle = d.centres.mean(axis=0)
     pulls = []
-    for seed in range(60):
+    for seed in range(30):
         cloud = Cloud(d, seed, missing=0.1, extra=0.0, pose=10.0, off=15.0)
         found = match(cloud.found(radii=True), d)
         assert found.status == "ok"
@@ -252,7 +248,7 @@ def test_covariance_of_the_pose_agrees_with_its_errors():
         C = at @ found.covariance @ at.T
         off = np.concatenate([turn, E[:3, :3] @ middle + E[:3, 3] - middle])
         pulls.append(off / np.sqrt(np.diag(C)))
-    assert 0.85 < np.sqrt(np.mean(np.square(pulls))) < 1.15  # 360 numbers: 4 %
+    assert 0.85 < np.sqrt(np.mean(np.square(pulls))) < 1.15  # 180 numbers: 5 %
 
 
 # --- movements ------------------------------------------------------------------------------------------------------
@@ -271,15 +267,15 @@ def test_movements_in_the_designs_own_frame():
     out = movement(matched, found, covariance, shifted)
     assert out.gauge == "design-coordinates"
     np.testing.assert_array_equal(out.design, cloud.truth[out.found])
-    np.testing.assert_allclose(out.vector, (cloud.moved + noise)[out.found], atol=1e-5)
-    np.testing.assert_allclose(out.ci95, np.tile(1.96 * sd, (len(out.found), 1)), rtol=1e-3)
+    np.testing.assert_allclose(out.vector, (cloud.moved + noise)[out.found], atol=1e-6)  # float64 at 4300 km is 5e-7 mm
+    np.testing.assert_allclose(out.ci95, np.tile(1.959964 * sd, (len(out.found), 1)), rtol=1e-6)
     # What is uncertain about the frame itself is in every interval, farther out more.
     datum = np.diag([1e-4**2] * 3 + [0.4**2] * 3)
     place = found.positions.mean(axis=0)
     wider = movement(matched, found, covariance, shifted, datum, place)
     arm = found.positions[wider.found] - place
     np.testing.assert_allclose(
-        wider.covariance[:, 0, 0], sd[0] ** 2 + 0.4**2 + 1e-8 * (arm[:, 1] ** 2 + arm[:, 2] ** 2), rtol=1e-6
+        wider.covariance[:, 0, 0], sd[0] ** 2 + 0.4**2 + 1e-8 * (arm[:, 1] ** 2 + arm[:, 2] ** 2), rtol=1e-12
     )
 
 
@@ -302,7 +298,7 @@ def test_a_roof_that_sagged_in_coordinates_of_its_site_moved_by_the_difference_o
     listed, moved, found = at_the_site(design(nx=6, ny=7), origin)
     matched = match(found, listed)
     covariance = np.tile(0.04 * np.eye(3), (len(moved), 1, 1))
-    np.testing.assert_allclose(movement(matched, found, covariance, listed).vector, moved, atol=1e-5)
+    np.testing.assert_allclose(movement(matched, found, covariance, listed).vector, moved, atol=1e-6)  # as above
     fit = movement(matched, found, covariance, listed, gauge=MovementGauge.BEST_FIT)
     turn, _ = Rotation.align_vectors(
         listed.centres - np.average(listed.centres, axis=0, weights=matched.weight),
@@ -311,7 +307,7 @@ def test_a_roof_that_sagged_in_coordinates_of_its_site_moved_by_the_difference_o
     )
     away = found.positions - np.average(found.positions, axis=0, weights=matched.weight)
     nominal = listed.centres - np.average(listed.centres, axis=0, weights=matched.weight)
-    np.testing.assert_allclose(fit.vector, turn.apply(away) - nominal, atol=1e-4)
+    np.testing.assert_allclose(fit.vector, turn.apply(away) - nominal, atol=1e-5)  # by sums of 4300 km
     assert fit.vector[:, 2].min() > moved[:, 2].min() + 5.0  # the fit takes up what the whole settled by
 
 
@@ -338,7 +334,7 @@ def test_what_the_project_states_of_the_frame_decides_and_a_contradiction_is_fla
     np.testing.assert_array_equal(matched.assignment, np.arange(len(moved)))
     if relation == "same frame":
         out = movement(matched, found, np.zeros((len(moved), 3, 3)), listed)
-        np.testing.assert_allclose(out.vector, moved, atol=1e-6)
+        np.testing.assert_allclose(out.vector, moved, atol=ROUNDING_MM)
         assert not matched.covariance.any()
     else:
         assert matched.covariance.any()
@@ -348,15 +344,13 @@ def test_intervals_of_movements_after_a_best_fit_cover():
     """Against the true movements after the same fit of the true nodes; few nodes: the fit's own error counts."""
     d = design(nx=3, ny=3, layers=2, radii=SIZES)
     pulls = []
-    for seed in range(80):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         cloud = Cloud(d, seed, missing=0.0, extra=0.0, off=4.0, pose=20.0)
         sd = rng.uniform(0.3, 1.5, len(cloud.positions))
         covariance = sd[:, None, None] ** 2 * np.eye(3)
         noisy = cloud.positions + sd[:, None] * rng.standard_normal(cloud.positions.shape)
-        found = NodePattern(
-            noisy, cloud.origin, cloud.radii, np.full(len(noisy), 0.5), np.empty(0, np.int64), np.empty(0, np.int64)
-        )
+        found = NodePattern(noisy, cloud.origin, cloud.radii, np.full(len(noisy), 0.5), NONE, NONE)
         matched = match(found, d)
         assert matched.relation == "registered"
         out = movement(matched, found, covariance, d)
@@ -370,7 +364,7 @@ def test_intervals_of_movements_after_a_best_fit_cover():
         w = matched.weight[out.found]
         placed = turn.apply(true - np.average(true, axis=0, weights=w)) + np.average(nominal, axis=0, weights=w)
         pulls.append((out.vector - (placed - nominal)) / np.sqrt(np.einsum("nii->ni", out.covariance)))
-    assert 0.95 < np.sqrt(np.mean(np.square(np.concatenate(pulls)))) < 1.05  # some 3000 numbers: 1.3 %
+    assert 0.95 < np.sqrt(np.mean(np.square(np.concatenate(pulls)))) < 1.05  # some 1500 numbers: 1.8 %
 
 
 def off_by(out):
@@ -385,10 +379,10 @@ def test_a_common_movement_is_gone_after_a_best_fit():
     matched = match(found, d)
     covariance = np.tile(np.eye(3), (len(found.positions), 1, 1))
     own = movement(matched, found, covariance, d)
-    np.testing.assert_allclose(own.vector, np.tile([12.0, 0.0, -8.0], (len(own.found), 1)), atol=1e-6)
+    np.testing.assert_allclose(own.vector, np.tile([12.0, 0.0, -8.0], (len(own.found), 1)), atol=ROUNDING_MM)
     assert (off_by(own) > CHI2_95_OF_3).all()
     fit = movement(matched, found, covariance, d, gauge=MovementGauge.BEST_FIT)
-    np.testing.assert_allclose(fit.vector, 0.0, atol=1e-6)
+    np.testing.assert_allclose(fit.vector, 0.0, atol=ROUNDING_MM)
     assert not (off_by(fit) > CHI2_95_OF_3).any()
 
 
@@ -399,7 +393,7 @@ def test_warm_steel_is_no_movement():
     found = NodePattern((d.centres - middle) * warm + middle)
     matched = match(found, d, expansion=warm)
     out = movement(matched, found, np.tile(np.eye(3), (len(d.ids), 1, 1)), d, expansion=warm)
-    assert np.abs(out.vector).max() < 1e-6
+    assert np.abs(out.vector).max() < ROUNDING_MM
     cold = movement(match(found, d), found, np.tile(np.eye(3), (len(d.ids), 1, 1)), d)
     assert np.abs(cold.vector).max() > 4.0  # 12 m times 12e-6 times 30 K
 
@@ -409,13 +403,12 @@ def test_displaced_node_does_not_shift_the_others():
     cloud = Cloud(d, 0, missing=0.0, extra=0.0, off=1.0, pose=50.0)
     positions = cloud.positions.copy()
     positions[7] += [0.0, 0.0, 110.0]
-    found = NodePattern(
-        positions, cloud.origin, cloud.radii, np.full(41, 0.5), np.empty(0, np.int64), np.empty(0, np.int64)
-    )
+    found = NodePattern(positions, cloud.origin, cloud.radii, np.full(41, 0.5), NONE, NONE)
     matched = match(found, d)
     assert matched.assignment[7] == cloud.truth[7]
     assert matched.weight[7] == 0.0
     out = movement(matched, found, np.tile(np.eye(3), (41, 1, 1)), d)
+    # Of nodes that moved by up to 1 mm, fitted by 40 others.
     assert abs(np.linalg.norm(out.vector[7]) - 110.0) < 2.0
     assert np.abs(np.delete(out.vector, 7, axis=0)).max() < 1.5
 
@@ -453,11 +446,11 @@ def test_robust_fit_is_scipys_without_outliers():
     T, weight = matching.robust_fit(source, target)
     middle, goal = np.average(source, axis=0, weights=weight), np.average(target, axis=0, weights=weight)
     best, _ = Rotation.align_vectors(target - goal, source - middle, weights=weight)
-    np.testing.assert_allclose(T[:3, :3], best.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(T[:3, :3], best.as_matrix(), atol=1e-12)  # rounding
     assert weight.min() > 0.3
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_nodes_that_the_design_lacks_in_the_middle_do_not_hide_the_true_pose(seed):
     d = design("flat", 5, 6, layers=2)
     rng = np.random.default_rng(seed)
@@ -465,9 +458,7 @@ def test_nodes_that_the_design_lacks_in_the_middle_do_not_hide_the_true_pose(see
     extra, missing = middle[[0, 1, 3]], middle[[5, 9]]
     keep = np.setdiff1d(np.arange(len(d.centres)), missing)
     lacks = np.setdiff1d(np.arange(len(d.centres)), extra)
-    known = FrameDesign(
-        d.ids[lacks], d.centres[lacks], d.radii[lacks], np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-    )
+    known = FrameDesign(d.ids[lacks], d.centres[lacks], d.radii[lacks], NONE, NONE, np.empty(0))
     R = Rotation.from_euler("z", 20.0 * seed, degrees=True).as_matrix()
     found = (d.centres[keep] + rng.normal(0.0, 3.0, (len(keep), 3))) @ R.T
     sized = NodePattern(found, np.zeros(3), d.radii[keep], np.full(len(keep), 0.3))
@@ -484,9 +475,7 @@ def test_a_pose_that_the_sizes_contradict_is_ambiguous():
     rng = np.random.default_rng(3)
     row = np.arange(1, len(d.centres))
     others = NodePattern(d.centres[row] + 7e4, np.zeros(3), d.radii[rng.permutation(row)], np.full(len(row), 0.3))
-    lacks = FrameDesign(
-        d.ids[:-1], d.centres[:-1], d.radii[:-1], np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-    )
+    lacks = FrameDesign(d.ids[:-1], d.centres[:-1], d.radii[:-1], NONE, NONE, np.empty(0))
     answer = match(NodePattern(others.positions), lacks, sized=lambda: others)
     assert answer.status is Status.AMBIGUOUS
     assert matching.sizes_contradict(others, lacks, answer.assignment)

@@ -1,6 +1,7 @@
 """Merged clouds of frames whose views nobody names: what the views have in common is part of the intervals."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ CENTRES = np.array([[x, y, 0.0] for x in (-4000.0, 0, 4000) for y in (-4000.0, 0
 RADII = np.array([53.0, 60, 67] * 3)
 
 
+@functools.cache
 def fitted(seed, shift_mm):
     """Fit balls in a merged cloud; each view has a shift, and the axes have the mean of all."""
     rng = np.random.default_rng(seed)
