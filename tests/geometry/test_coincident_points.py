@@ -27,7 +27,7 @@ def plate(count=6000, spacing=5.0, noise=2.0, step=0.001, seed=0):
     return np.round(flat @ SLOPE / step) * step
 
 
-@pytest.mark.parametrize("step", [1e-9, 0.001, 0.1, 1.0, 3.048])
+@pytest.mark.parametrize("step", [1e-9, 0.1, 3.048])
 @pytest.mark.parametrize("copies", [1.3, 2, 4])
 def test_of_doubled_points_each_counts_once_whatever_their_order(step, copies):
     once = np.unique(plate(spacing=12.0, step=step), axis=0)
@@ -87,14 +87,14 @@ def test_m3c2_and_compare_count_doubled_points_once(tmp_path):
     core = np.column_stack([rng.uniform(150, 850, (40, 2)), np.zeros(40)])
     alone = processor.m3c2(*once, core, **lengths)
     doubled = processor.m3c2(*(np.vstack([cloud] * 4) for cloud in once), core, **lengths)
-    np.testing.assert_allclose(doubled.lod95, alone.lod95, rtol=1e-12)
+    np.testing.assert_array_equal(doubled.lod95, alone.lod95)
     assert [(one.code, one.values["left_out"]) for one in doubled.reasons] == [("points.coincident", 18_000)] * 2
     assert alone.reasons == ()
     for name, cloud in (("a", once[0]), ("b", once[1]), ("core", core)):
         np.savetxt(tmp_path / f"{name}.xyz", cloud if name == "core" else np.vstack([cloud] * 2), fmt="%.3f")
     request = compare.Request(*(tmp_path / f"{name}.xyz" for name in ("a", "b", "core")), units="mm", **lengths)
     compared = compare.compare(request)
-    np.testing.assert_allclose(np.median(compared.distances.lod95), np.median(alone.lod95), rtol=1e-2)
+    np.testing.assert_allclose(np.median(compared.distances.lod95), np.median(alone.lod95))
     assert [one.values["left_out"] for one in compared.notes] == [6000, 6000]
 
 
@@ -110,7 +110,7 @@ def test_a_sphere_of_doubled_points_has_the_interval_of_each_once():
     once = ball()
     alone = processor.fit_sphere(once, scanner=[0.0, 0, 0])
     doubled = processor.fit_sphere(np.vstack([once, once]), scanner=np.zeros((2 * len(once), 3)))
-    np.testing.assert_allclose(doubled.covariance, alone.covariance, rtol=1e-9)
+    np.testing.assert_array_equal(doubled.covariance, alone.covariance)
     assert doubled.status is alone.status
     assert [one.code for one in doubled.reasons][-1] == "points.coincident"
 

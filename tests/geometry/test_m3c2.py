@@ -1,14 +1,13 @@
 """M3C2 against brute force from its definition and real planes; order and threads must not change it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from processor.geometry import m3c2, point_grid
 from tests.support.clouds.m3c2_clouds import brute, wavy
+from tests.support.files.scan_bytes import DATA, needs_data
 
-PLANES = Path(__file__).resolve().parents[3] / "shared/data/m3c2"
+ROUNDING_MM = 1e-12  # of a metre, through sums of some ten points: 1e-13
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -33,16 +32,18 @@ def both(reference, compared, core, normal_diameter=80.0, diameter=50.0, depth=4
 
 @pytest.mark.parametrize("case", [(80.0, 50.0, 40.0), (60.0, 120.0, 5.0), (200.0, 20.0, 300.0)])
 def test_normals_and_distances_equal_those_by_brute_force(case):
-    reference, compared = wavy(20_000, 1), wavy(15_000, 2, 5.0)
-    core = np.vstack([reference[:150], wavy(40, 3, 15.0), [[-400.0, 0.0, 0.0], [1e6, 0.0, 0.0], [500.0, 500.0, 70.0]]])
+    reference, compared = wavy(10_000, 1), wavy(8_000, 2, 5.0)
+    core = np.vstack([reference[:60], wavy(20, 3, 15.0), [[-400.0, 0.0, 0.0], [1e6, 0.0, 0.0], [500.0, 500.0, 70.0]]])
     normals, found = both(reference, compared, core, *case)
     known = np.isfinite(normals).all(axis=1)
-    assert 150 < known.sum() < len(core)
+    assert 60 < known.sum() < len(core)
     for place, normal in zip(core[known], normals[known], strict=True):
         expected = brute_normal(reference, place, case[0])
-        np.testing.assert_allclose(normal, expected * np.sign(expected[2]), atol=1e-9)
+        np.testing.assert_allclose(
+            normal, expected * np.sign(expected[2]), atol=1e-11
+        )  # by singular values of ten points and more
     expected = brute(reference, compared, core[known], normals[known], *case[1:], 0.3)
-    np.testing.assert_allclose(columns(found)[:, known], expected, atol=1e-9)
+    np.testing.assert_allclose(columns(found)[:, known], expected, atol=ROUNDING_MM)
     assert np.isnan(found.distance[~known]).all()
     assert (found.n1[~known] == 0).all()
 
@@ -50,15 +51,17 @@ def test_normals_and_distances_equal_those_by_brute_force(case):
 def test_distances_are_right_along_normals_of_any_direction():
     rng = np.random.default_rng(4)
     reference, compared = rng.uniform(0.0, 300.0, (2, 6000, 3))
-    core = rng.uniform(-20.0, 320.0, (200, 3))
-    normals = rng.normal(size=(200, 3))
+    core = rng.uniform(-20.0, 320.0, (100, 3))
+    normals = rng.normal(size=(100, 3))
     normals[:6] = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     found = m3c2.distances(
         m3c2.grid(reference, 40.0), m3c2.grid(compared, 11.0), core, normals, projection_diameter_mm=40.0,
         max_depth_mm=150.0,
     )  # fmt: skip
-    np.testing.assert_allclose(columns(found), brute(reference, compared, core, normals, 40.0, 150.0, 0.0), atol=1e-9)
+    np.testing.assert_allclose(
+        columns(found), brute(reference, compared, core, normals, 40.0, 150.0, 0.0), atol=ROUNDING_MM
+    )
 
 
 def test_fewer_than_four_points_have_no_level_of_detection():
@@ -85,7 +88,7 @@ def test_a_cloud_is_at_no_distance_from_itself():
 
 
 def test_order_of_points_and_threads_do_not_change_the_results():
-    reference, compared = wavy(30_000, 6), wavy(30_000, 7)
+    reference, compared = wavy(10_000, 6), wavy(10_000, 7)
     reference[100:200] = reference[:100]  # twice the same
     core = reference[::7]
     first = both(reference, compared, core, threads=1)
@@ -118,16 +121,9 @@ def test_points_on_a_line_have_no_normal():
     assert np.isnan(m3c2.normals(m3c2.grid(line, 20.0), line, 40.0).normals).all()
 
 
-def test_normals_are_turned_towards_the_given_directions():
-    normals = np.array([[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
-    np.testing.assert_array_equal(m3c2.oriented(normals, UP), np.abs(normals))
-    towards = np.array([[0.0, 0.0, -2.0], [0.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    np.testing.assert_array_equal(m3c2.oriented(normals, towards), normals * [[1], [1], [1], [-1]])
-
-
-@pytest.mark.skipif(not PLANES.is_dir(), reason="the two real planes are not here")
+@needs_data
 def test_real_planes_are_a_tenth_apart():
-    t1, t2 = (np.loadtxt(PLANES / f"plane_horizontal_t{i}.xyz") for i in (1, 2))
+    t1, t2 = (np.loadtxt(DATA / f"m3c2/plane_horizontal_t{i}.xyz") for i in (1, 2))
     _, found = both(t1, t2, t1, normal_diameter=6.0, diameter=4.0, depth=2.0, error=0.0)
-    assert np.mean(found.distance) == pytest.approx(-0.100, abs=1e-3)
+    assert np.mean(found.distance) == pytest.approx(-0.100, abs=1e-3)  # as its publishers state it
     assert found.significant.all()

@@ -11,7 +11,7 @@ from tests.support.clouds.m3c2_clouds import wavy
 ACROSS = 120.0  # normal diameter, mm
 
 
-def wall(seed, along=(1.0, 0.0), count=8000, size=1000.0, sigma=2.0, lean=0.0):
+def wall(seed, along=(1.0, 0.0), count=4000, size=1000.0, sigma=2.0, lean=0.0):
     """An upright wall through zero along a level direction, that leans by so much."""
     rng = np.random.default_rng(seed)
     u, z = rng.uniform(0.0, size, (2, count))
@@ -20,7 +20,7 @@ def wall(seed, along=(1.0, 0.0), count=8000, size=1000.0, sigma=2.0, lean=0.0):
     return np.column_stack([u * a - off * b, u * b + off * a, z])
 
 
-def tube(seed, count=12_000, radius=150.0):
+def tube(seed, count=6_000, radius=150.0):
     rng = np.random.default_rng(seed)
     angle, z = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(0.0, 800.0, count)
     r = radius + rng.normal(0.0, 1.0, count)
@@ -49,7 +49,7 @@ def test_a_normal_is_turned_along_its_direction_and_square_to_it_upwards(normal,
 
 
 def test_normals_of_level_surfaces_equal_those_oriented_upwards_bit_for_bit():
-    cloud = wavy(20_000, 1)
+    cloud = wavy(5_000, 1)
     found, got = turned(cloud)
     np.testing.assert_array_equal(got.normals, oriented(found.normals, UP))
     assert (got.up, got.upright) == (len(cloud), 0)
@@ -60,11 +60,10 @@ def test_normals_of_level_surfaces_equal_those_oriented_upwards_bit_for_bit():
     [((1, 0), (0, 1)), ((0, 1), (1, 0)), ((1, 1), (-1, 1)), ((1, -1), (1, 1)), ((1, 2), (2, -1))],
 )
 def test_normals_of_an_upright_wall_have_one_side_by_convention(along, outward):
-    for seed in range(3):
-        found, got = turned(wall(seed, along))
-        assert 0.3 < (oriented(found.normals, UP)[:, :2] @ outward > 0.0).mean() < 0.7  # as it was: by chance
-        assert (got.normals[:, :2] @ outward > 0.0).all()
-        assert (got.convention, got.surfaces) == (8000, 1)
+    found, got = turned(wall(1, along))
+    assert 0.3 < (oriented(found.normals, UP)[:, :2] @ outward > 0.0).mean() < 0.7  # as it was: by chance
+    assert (got.normals[:, :2] @ outward > 0.0).all()
+    assert (got.convention, got.surfaces) == (4000, 1)
 
 
 def test_normals_of_a_leaning_wall_point_upwards_on_the_whole():
@@ -80,16 +79,16 @@ def test_normals_of_a_leaning_wall_point_upwards_on_the_whole():
 def test_normals_of_a_wall_point_to_the_side_of_its_floor():
     rng = np.random.default_rng(5)
     for side in (1.0, -1.0):
-        x, y = rng.uniform(0.0, 1000.0, (2, 8000))
-        floor = np.column_stack([x, side * y, rng.normal(0.0, 1.0, 8000)])
+        x, y = rng.uniform(0.0, 1000.0, (2, 4000))
+        floor = np.column_stack([x, side * y, rng.normal(0.0, 1.0, 4000)])
         upright = wall(6, sigma=1.0)
         _, got = turned(np.vstack([floor, upright]))
-        high = slice(8000, None)
+        high = slice(4000, None)
         above = upright[:, 2] > 100.0
         assert (side * got.normals[high][above, 1] > 0.0).all()
-        assert got.neighbours > 5000
+        assert got.neighbours > 2500
         assert got.surfaces <= 2
-        assert (got.normals[:8000][np.abs(floor[:, 1]) > 100.0, 2] > 0.9).all()
+        assert (got.normals[:4000][np.abs(floor[:, 1]) > 100.0, 2] > 0.9).all()
 
 
 def test_a_tube_that_stands_alone_looks_outward():
@@ -107,7 +106,7 @@ def test_normals_of_an_upright_wall_point_to_the_scanner():
     half = np.where(cloud[:, :1] < 500.0, scanner, np.nan)  # the rest follows its neighbours
     _, got = turned(cloud, scanner=half)
     assert (got.normals[:, 1] < 0.0).all()
-    assert got.scanner > 3000 < got.neighbours
+    assert got.scanner > 1500 < got.neighbours
 
 
 def test_order_and_repeated_points_do_not_change_orientations():
