@@ -45,7 +45,8 @@ def turned(cloud, core=None, scanner=None, across=ACROSS):
     ],
 )
 def test_a_normal_is_turned_along_its_direction_and_square_to_it_upwards(normal, towards, expected):
-    np.testing.assert_array_equal(oriented(np.array([normal], float), np.array(towards, float)), [expected])
+    for directions in (towards, [towards]):  # one of all, or one of each
+        np.testing.assert_array_equal(oriented(np.array([normal], float), np.array(directions, float)), [expected])
 
 
 def test_normals_of_level_surfaces_equal_those_oriented_upwards_bit_for_bit():

@@ -43,9 +43,8 @@ def slope(a, b, c, size=1e5):
 # --- plumb lines ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_heights_are_those_of_an_independent_interpolation(seed):
-    rng = np.random.default_rng(seed)
+def test_heights_are_those_of_an_independent_interpolation():
+    rng = np.random.default_rng(0)
     plan = rng.uniform(0.0, 20_000.0, (400, 2))
     z = 300.0 * np.sin(plan[:, 0] / 4000.0) + 0.02 * plan[:, 1]
     mesh = Delaunay(plan)
@@ -53,7 +52,7 @@ def test_heights_are_those_of_an_independent_interpolation(seed):
     expected = LinearNDInterpolator(mesh, z)(places)
     height, _ = mesh_heights.plan(np.column_stack([plan, z]), mesh.simplices).heights(places)
     assert np.array_equal(np.isfinite(height), np.isfinite(expected))
-    assert np.nanmax(np.abs(height - expected)) < 1e-6
+    assert np.nanmax(np.abs(height - expected)) < 1e-6  # by slopes of triangles as thin as 1e-6
 
 
 def test_slopes_are_those_of_the_plane():
@@ -79,7 +78,7 @@ def test_lengths_to_a_level():
     result = whole()
     found = with_hangers(result, scene(level=5000.0))
     assert found.hangers.length[:2] == pytest.approx([1000.0 - 45.1, 988.0 - 60.2])
-    assert found.hangers.ci95[:2] == pytest.approx([1.96 * 0.1, 1.96 * 0.2], rel=1e-3)
+    assert found.hangers.ci95[:2] == pytest.approx([1.96 * 0.1, 1.96 * 0.2], rel=1e-3)  # 1.95996
     assert np.isnan(found.hangers.length[2])  # not found
     assert [str(one) for one in found.hangers.verdict] == ["pass", "indeterminate", "none", "indeterminate", "pass"]
     assert with_hangers(result, dataclasses.replace(scene(level=0.0), ceiling=None)) is result
@@ -98,7 +97,7 @@ def test_the_interval_over_a_slope_is_that_of_a_simulation():
     found = with_hangers(result, scene(**slope(-0.3, 0.5, -900.0)))
     x, y, z, r = rng.multivariate_normal([0.0, 1000.0, 2000.0, 45.0], covariance, 200_000).T
     simulated = z - r - (-0.3 * x + 0.5 * y - 900.0)
-    assert found.hangers.ci95[0] == pytest.approx(1.96 * simulated.std(), rel=0.01)
+    assert found.hangers.ci95[0] == pytest.approx(1.96 * simulated.std(), rel=0.01)  # 200,000 draws: 0.16 %
 
 
 @pytest.mark.parametrize(

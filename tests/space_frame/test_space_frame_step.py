@@ -13,6 +13,7 @@ from processor.space_frame.result import Balls
 from processor.space_frame.step import Params
 
 PITCH = 1500.0
+ROUNDING_MM = 1e-6  # coordinates of a map are of 4300 km, where float64 is 5e-7 mm
 PAPERS = ("ransac", "least-squares")
 
 
@@ -168,8 +169,8 @@ def test_ball_of_another_size_than_designed_is_flagged():
     result = space_frame_step.run(Scene("s", "space-frame", (Scan("s", points),), frame=design), paper())
     assert result.balls.flag == ("wrong-size", "ok")
     assert result.balls.reasons[0][0].code == "spheres.beyond-blank"
-    assert result.balls.reasons[0][0].values["error"] == pytest.approx(5.0, abs=0.05)
-    np.testing.assert_allclose(result.balls.radii, [50.0, 45.4], atol=0.2)
+    assert result.balls.reasons[0][0].values["error"] == pytest.approx(5.0, abs=0.05)  # 400 points of 0.5 mm: 0.025 mm
+    np.testing.assert_allclose(result.balls.radii, [50.0, 45.4], atol=0.2)  # eight of these
 
 
 def test_balls_do_not_depend_on_map_offsets_and_on_poses_of_scans():
@@ -179,8 +180,8 @@ def test_balls_do_not_depend_on_map_offsets_and_on_poses_of_scans():
     here = space_frame_step.run(scene, paper())
     far = replace(scene, scans=(Scan("s", points, utm),), frame=replace(scene.frame, centres=scene.frame.centres + utm))
     there = space_frame_step.run(far, paper())
-    np.testing.assert_allclose(there.balls.centres - utm, here.balls.centres, atol=1e-6)
-    np.testing.assert_allclose(there.balls.radii, here.balls.radii, atol=1e-6)
+    np.testing.assert_allclose(there.balls.centres - utm, here.balls.centres, atol=ROUNDING_MM)
+    np.testing.assert_allclose(there.balls.radii, here.balls.radii, atol=ROUNDING_MM)
 
     # the same points as two posed scans: a quarter turn about z and a shift, and as they are
     turn = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, -20.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
@@ -188,8 +189,8 @@ def test_balls_do_not_depend_on_map_offsets_and_on_poses_of_scans():
     in_scan = (points[:half] - turn[:3, 3]) @ turn[:3, :3]
     posed = (Scan("a", in_scan, T_project_scan=turn), Scan("b", points[half:], T_project_scan=np.eye(4)))
     merged = space_frame_step.run(replace(scene, scans=posed), paper())
-    np.testing.assert_allclose(merged.balls.centres, here.balls.centres, atol=1e-6)
-    np.testing.assert_allclose(merged.balls.radii, here.balls.radii, atol=1e-6)
+    np.testing.assert_allclose(merged.balls.centres, here.balls.centres, atol=ROUNDING_MM)
+    np.testing.assert_allclose(merged.balls.radii, here.balls.radii, atol=ROUNDING_MM)
 
 
 def test_same_seed_same_answer_whatever_the_order_of_points():
@@ -198,7 +199,7 @@ def test_same_seed_same_answer_whatever_the_order_of_points():
     shuffled = replace(scene, scans=(Scan("s", points[np.random.default_rng(1).permutation(len(points))]),))
     first, again, other = (space_frame_step.run(s, paper(seed=3)) for s in (scene, scene, shuffled))
     assert first.balls.centres.tobytes() == again.balls.centres.tobytes()
-    np.testing.assert_allclose(other.balls.centres, first.balls.centres, atol=1e-8)
+    np.testing.assert_allclose(other.balls.centres, first.balls.centres, atol=ROUNDING_MM)
 
 
 def target(rng, n=800, view=(0.0, 0.0, 1.0)):
@@ -227,7 +228,7 @@ def test_search_without_a_design_uses_the_scanner_positions():
         assert reason("spheres.robust-ranges") in result.reasons
         assert np.linalg.norm(result.balls.centres[0]) < 0.3
         assert result.balls.radii[0] == pytest.approx(70.0, abs=0.2)
-    np.testing.assert_allclose(results[0].balls.centres, results[1].balls.centres, atol=1e-6)
+    np.testing.assert_allclose(results[0].balls.centres, results[1].balls.centres, atol=ROUNDING_MM)
     unknown = space_frame_step.run(Scene("t", "structure", (Scan("s", points),)), Params())
     assert reason("spheres.robust-distances") in unknown.reasons
 
@@ -237,7 +238,7 @@ def test_bound_of_a_target_is_that_of_its_points():
     position = np.array([3000.0, 1000.0, 8000.0])
     view = position / np.linalg.norm(position)
     off, bounds, efficiency = [], [], []
-    for _ in range(20):
+    for _ in range(12):
         points = target(rng, 800, view)
         ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
         scan = Scan("s", points + ray * rng.normal(0.0, 0.5, (len(points), 1)), position=position)
@@ -246,10 +247,11 @@ def test_bound_of_a_target_is_that_of_its_points():
         bounds.append(result.balls.bound_sd[0])
         efficiency.append(result.balls.efficiency[0])
     by_bound = np.sqrt(np.mean((np.array(off) / bounds) ** 2, axis=0))
+    # Twelve draws: an rms to 20 %, five of them together.
     assert (by_bound > 0.7).all()
     assert (by_bound < 1.6).all()
     # Of the points alone, without the scanner's class and the limb: the biweight's.
-    assert np.median(efficiency) == pytest.approx(0.95, abs=0.15)
+    assert np.median(efficiency) == pytest.approx(0.95, abs=0.15)  # a sample's, from its own scatter
 
 
 @pytest.mark.parametrize(("scale", "factor"), [(1000.0, "1/1000"), (1e-3, "1000"), (1e6, "")])
@@ -263,19 +265,12 @@ def test_implausible_radius_lowers_confidence_and_names_the_unit(scale, factor):
     assert doubt.values.get("factor", "") == factor
 
 
-@pytest.mark.parametrize(
-    ("radius", "factor", "scaled"),
-    [
-        (19050.0, "1/1000", 19.05),
-        (19.05 * 304.8, "1/304.8", 19.05),
-        (72.5 / 25.4, "25.4", 72.5),
-        (0.145, "1000", 145.0),
-    ],
-)
-def test_a_unit_that_gives_a_usual_size_of_balls_is_preferred(radius, factor, scaled):
-    doubt = unit_mistakes.implausible(radius)
-    assert (doubt.code, doubt.values["factor"]) == ("spheres.unit-mistake", factor)
-    assert doubt.values["scaled"] == pytest.approx(scaled)
+def test_a_unit_that_gives_a_usual_size_of_balls_is_preferred():
+    table = (19050.0, "1/1000", 19.05), (19.05 * 304.8, "1/304.8", 19.05), (72.5 / 25.4, "25.4", 72.5)
+    for radius, factor, scaled in (*table, (0.145, "1000", 145.0)):
+        doubt = unit_mistakes.implausible(radius)
+        assert (doubt.code, doubt.values["factor"]) == ("spheres.unit-mistake", factor)
+        assert doubt.values["scaled"] == pytest.approx(scaled)
 
 
 def test_coordinates_rounded_so_that_no_ball_is_seen_are_the_reason():
@@ -317,34 +312,22 @@ def test_check_metrics_of_known_errors_equal_those_computed_by_hand():
     got = centres[[2, 0, 1]] + np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 30.0]])
     radii = np.array([46.0, 43.0, 45.0])
     found = Balls(
-        ids=[9, 7, 8],
-        centres=got,
-        radii=radii,
-        lowest=got - radii[:, None] * [0.0, 0.0, 1.0],
-        covariance=np.tile(np.eye(4), (3, 1, 1)),
-        points=[200] * 3,
-        visible_fraction=[0.4] * 3,
-        lowest_sd=[1.0] * 3,
-        rms=[2.0] * 3,
-        nominal_radii=[45.0] * 3,
-        evidence=("ball",) * 3,
-        flag=("ok",) * 3,
-        reasons=((),) * 3,
+        ids=[9, 7, 8], centres=got, radii=radii, lowest=got - radii[:, None] * [0.0, 0.0, 1.0],
+        covariance=np.tile(np.eye(4), (3, 1, 1)), points=[200] * 3, visible_fraction=[0.4] * 3, lowest_sd=[1.0] * 3,
+        rms=[2.0] * 3, nominal_radii=[45.0] * 3, evidence=("ball",) * 3, flag=("ok",) * 3, reasons=((),) * 3,
         verdict=("none",) * 3,
-    )
+    )  # fmt: skip
     result = space_frame_step.Result("ok", "ransac", balls=found)
     design = FrameDesign(ids=[7, 8, 9], centres=centres, radii=[45.0] * 3)
     for scene in (Scene("s", "space-frame", frame=design), Scene("s", "space-frame")):
         value = {name: metric.value for name, metric in metrics(scene, result, Truth(frame=truth)).items()}
-        assert value["radius error, median"] == 1.0
-        assert value["radius error, 95th percentile"] == pytest.approx(1.9)
-        assert value["radius error, max"] == 2.0
-        assert value["centre error, median"] == 5.0
-        assert value["lowest point error, max"] == 30.0
-        assert value["lowest point error, median"] == 4.0
-        assert value["balls not found"] == 0.0
-        assert value["balls called ok, centre over 10 mm off"] == 1.0
-        assert value["radii within their 95 % intervals"] == pytest.approx(200.0 / 3.0)
+        expected = {
+            "radius error, median": 1.0, "radius error, 95th percentile": 1.9, "radius error, max": 2.0,
+            "centre error, median": 5.0, "lowest point error, max": 30.0, "lowest point error, median": 4.0,
+            "balls not found": 0.0, "balls called ok, centre over 10 mm off": 1.0,
+            "radii within their 95 % intervals": 200.0 / 3.0,
+        }  # fmt: skip
+        assert {name: value[name] for name in expected} == pytest.approx(expected)
     nothing = space_frame_step.Result("failed", "ransac")
     none = metrics(Scene("s", "space-frame", frame=design), nothing, Truth(frame=truth))
     assert none["balls not found"].value == 3.0
@@ -352,22 +335,11 @@ def test_check_metrics_of_known_errors_equal_those_computed_by_hand():
     assert space_frame.check(Scene("s", "space-frame"), nothing, Truth()) == []
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"method": "magic"},
-        {"tau_mm": 0.0},
-        {"probability": 1.0},
-        {"max_iterations": 0},
-        {"crop_margin_mm": math.nan},
-        {"radius_mm": -1.0},
-        {"radius_mm": 50.0},
-        {"seed": -1},
-        {"max_balls": 0},
-        {"min_points": 0},
-    ],
-)
-def test_parameters_that_make_no_sense(wrong):
+def test_parameters_that_make_no_sense_are_refused():
     scene, _ = frame(k=1)
-    with pytest.raises(UsageError, match="spheres"):
-        space_frame_step.run(scene, Params(**wrong))
+    for name, value in (
+        ("method", "magic"), ("tau_mm", 0.0), ("probability", 1.0), ("max_iterations", 0), ("crop_margin_mm", math.nan),
+        ("radius_mm", -1.0), ("radius_mm", 50.0), ("seed", -1), ("max_balls", 0), ("min_points", 0),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match="spheres"):
+            space_frame_step.run(scene, Params(**{name: value}))

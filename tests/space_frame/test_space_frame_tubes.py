@@ -91,11 +91,12 @@ def test_residual_is_the_range_measured_less_the_range_to_the_cylinder():
         measured = true + rng.normal()
         J = np.empty(NP)
         got, cos = residual(p, h, *(start + measured * ray)[0], *ray[0], True, J)
-        assert got == pytest.approx(measured - true, abs=0.01)  # the axis's slope changes by 1e-6 over a mm
+        assert got == pytest.approx(measured - true, abs=1e-5)  # the axis's slope changes by 1e-6 over a mm
         assert 0.0 < cos < 1.0
         for k in range(NP):
             step = 0.01 * np.eye(NP)[k]
             slope = (ranges_to(p - step, h, start, ray) - ranges_to(p + step, h, start, ray))[0] / 0.02
+            # The slope of the axis, 1e-3, is left out of the derivatives.
             assert J[k] == pytest.approx(slope, abs=5e-3 * max(1.0, abs(slope)))
 
 
@@ -152,7 +153,7 @@ def test_seen_from_one_side_there_is_no_bias():
         errors.append(at_ends(fine)[0])
         radii.append(fine.radii[0])
     assert np.abs(np.mean(errors, axis=0)).max() < 4.0 * np.std(errors) / np.sqrt(60)
-    assert np.mean(radii) == pytest.approx(30.0, abs=0.06)
+    assert np.mean(radii) == pytest.approx(30.0, abs=0.06)  # 900 points of 2 mm and 60 fits: 0.02 mm
 
 
 def test_cones_sleeves_and_balls_do_not_bend_the_axis():
@@ -162,6 +163,7 @@ def test_cones_sleeves_and_balls_do_not_bend_the_axis():
         _, fine = fitted(cloud, station, off_mm=20.0)
         errors, said = at_ends(fine)
         assert np.abs(errors / said).max() < 4.5
+        # The cone begins at the tube's radius: it is as thick within the noise for some 10 mm at either end.
         assert fine.lengths[0] == pytest.approx(LENGTH, abs=40.0)
         assert np.abs((A + 0.5 * LENGTH * U - fine.points[0]) @ U) < 20.0
 
@@ -192,6 +194,7 @@ def test_a_bow_is_found_and_the_ends_stay(bow):
     assert np.abs(errors / said).max() < 4.5
     axes = np.stack([fine.side[0], np.cross(fine.directions[0], fine.side[0])])
     true = bow[0] * frame_clouds.across(U)[0] + bow[1] * frame_clouds.across(U)[1]
+    # 2100 points of 0.5 mm, of which a share sees the bow: 0.05 mm.
     assert fine.bow[0] == pytest.approx(axes @ true, abs=0.2)
     # A model without bows is off at the ends by a third of it and more, and does not know.
     _, straight = fitted(cloud, station, bow_share=1e-6)
@@ -233,7 +236,7 @@ def test_a_wide_beam_spoils_grazing_rays_and_they_are_left_out():
     rough, fine = fitted(spoilt, station)
     assert tube_fits.least_cosine(rough, 0.2) == pytest.approx(0.4)
     assert tube_fits.least_cosine(fitted(cloud, station)[0], 0.2) == pytest.approx(0.2)
-    assert fine.radii[0] == pytest.approx(30.0, abs=0.1)
+    assert fine.radii[0] == pytest.approx(30.0, abs=0.1)  # 0.02 mm by noise; the spoilt rays would add 1 mm
 
 
 def test_too_few_points_or_no_tube_give_no_answer():

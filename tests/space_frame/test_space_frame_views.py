@@ -59,19 +59,11 @@ def test_intervals_of_tubes_of_a_merged_cloud_cover_shifted_views():
     below, narrow = np.zeros((2, 24))
     below[12:], narrow[15:21] = 10.0, 10.0
     tubes = Members(
-        points=np.zeros((2, 3)),
-        directions=np.tile([1.0, 0.0, 0.0], (2, 1)),
-        side=np.tile([0.0, 1.0, 0.0], (2, 1)),
-        lengths=np.full(2, 1000.0),
-        radii=np.full(2, 30.0),
-        bow=np.zeros((2, 2)),
-        covariance=np.zeros((2, 5, 5)),
-        node_a=np.full(2, -1),
-        node_b=np.full(2, -1),
-        count=np.full(2, 100),
-        rms=np.ones(2),
+        points=np.zeros((2, 3)), directions=np.tile([1.0, 0.0, 0.0], (2, 1)), side=np.tile([0.0, 1.0, 0.0], (2, 1)),
+        lengths=np.full(2, 1000.0), radii=np.full(2, 30.0), bow=np.zeros((2, 2)), covariance=np.zeros((2, 5, 5)),
+        node_a=np.full(2, -1), node_b=np.full(2, -1), count=np.full(2, 100), rms=np.ones(2),
         around=np.stack([below, narrow]),
-    )
+    )  # fmt: skip
     whole = of_tubes(found.views, tubes)
     assert (np.linalg.eigvalsh(whole) > 0.0).all()
     assert whole[1, 2, 2] > whole[0, 2, 2]
@@ -82,7 +74,6 @@ def test_intervals_of_tubes_of_a_merged_cloud_cover_shifted_views():
 
 def test_intervals_between_balls_cover_and_are_narrow_if_views_agree():
     """Centres less their mean, which no common shift moves: neither too narrow nor, without errors, too wide."""
-    rms = {}
     for shift_mm in (0.0, 0.6):
         pulls = []
         for seed in range(5):
@@ -93,6 +84,5 @@ def test_intervals_between_balls_cover_and_are_narrow_if_views_agree():
             apart = shared - shared.mean(axis=0)
             variance = np.einsum("kii->ki", own + apart @ np.swapaxes(apart, 1, 2))
             pulls.append((off - off.mean(axis=0)) / np.sqrt(variance))
-        rms[shift_mm] = float(np.sqrt(np.mean(np.square(pulls))))
-    assert 0.5 < rms[0.0] < 1.15
-    assert 0.5 < rms[0.6] < 1.15
+        # Five scenes of 24 free numbers: 6 %. Views that agree have less than the least that is assumed of them.
+        assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 1.15, shift_mm

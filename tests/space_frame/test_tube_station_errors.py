@@ -60,7 +60,9 @@ def fitted_radius_change(places, rng):
 def test_radius_changes_by_an_offset_of_ranges_as_a_fit_to_moved_points_does(places):
     one = stations(places, np.zeros((7 * len(places),) * 2), shared_offset=OFFSET)
     sd = float(np.sqrt(station_error_propagation.of_radii(tube(), one)[0]))
-    assert sd == pytest.approx(abs(fitted_radius_change(places, np.random.default_rng(1))), rel=0.02)
+    assert sd == pytest.approx(
+        abs(fitted_radius_change(places, np.random.default_rng(1))), rel=0.02
+    )  # rays that are not quite parallel
 
 
 def test_a_tube_seen_from_one_side_keeps_its_radius():
@@ -76,4 +78,4 @@ def test_a_motion_common_to_all_stations_moves_the_axis_as_much():
     shift = np.diag([4.0, 1.0, 9.0])
     one = stations(places, J @ shift @ J.T)
     covariance = station_error_propagation.of_axes(tube(), one, np.array([500.0]))[0]
-    np.testing.assert_allclose(covariance, np.diag([1.0, 9.0]), atol=1e-9)
+    np.testing.assert_allclose(covariance, np.diag([1.0, 9.0]), atol=1e-9)  # rounding
