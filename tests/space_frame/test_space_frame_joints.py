@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from processor.space_frame import extract
 from processor.space_frame.members import member_extraction
-from processor.space_frame.spheres import ball_joint_classification
+from processor.space_frame.spheres.ball_joint_classification import UNLIKE, log_odds_of_ball, most_likely
 from tests.support.clouds import frame_clouds
 from tests.support.clouds.frame_clouds import STATIONS
 from tests.support.clouds.memory_source import InMemory
@@ -51,9 +51,7 @@ def test_joints_of_a_scaffold_are_no_nodes():
 
 
 def test_balls_without_sleeves_are_recognised_by_their_surface():
-    odds = ball_joint_classification.log_odds_of_ball(
-        np.array([40.0] * 8 + [-9.0] * 4 + [1.0]), np.array([-60.0] * 12 + [-20.0])
-    )
+    odds = log_odds_of_ball(np.array([40.0] * 8 + [-9.0] * 4 + [1.0]), np.array([-60.0] * 12 + [-20.0]))
     assert (odds[:8] > 3.0).all()
     assert (odds[8:12] < -3.0).all()
 
@@ -61,10 +59,7 @@ def test_balls_without_sleeves_are_recognised_by_their_surface():
 def test_round_looking_clamp_follows_the_neighbouring_clamps():
     sphere, neck = np.array([30.0] * 20 + [6.0, -5.0, -8.0, -6.0]), np.array([50.0] * 20 + [-40.0] * 4)
     pairs = np.array([(i, i + 1) for i in range(19)] + [(20, 21), (20, 22), (20, 23)])
-    assert (
-        ball_joint_classification.most_likely(ball_joint_classification.log_odds_of_ball(sphere, neck), pairs).tolist()
-        == [True] * 20 + [False] * 4
-    )
+    assert most_likely(log_odds_of_ball(sphere, neck), pairs).tolist() == [True] * 20 + [False] * 4
 
 
 @pytest.mark.parametrize("chain", [5, 9])
@@ -72,11 +67,11 @@ def test_joints_without_evidence_follow_their_neighbours(chain):
     pairs = np.stack([np.arange(chain - 1), np.arange(1, chain)], axis=1)
     odds = np.zeros(chain)
     odds[0] = 9.0
-    assert ball_joint_classification.most_likely(odds, pairs).all()
+    assert most_likely(odds, pairs).all()
     odds[0], odds[-1] = -9.0, -9.0
-    assert ball_joint_classification.most_likely(odds, pairs).tolist() == [False] * chain
+    assert most_likely(odds, pairs).tolist() == [False] * chain
     odds[0] = 9.0  # cut once, where it costs least
-    assert ball_joint_classification.most_likely(odds, pairs).sum() in range(1, chain)
+    assert most_likely(odds, pairs).sum() in range(1, chain)
 
 
 def test_the_assignment_is_the_best_of_all():
@@ -84,9 +79,7 @@ def test_the_assignment_is_the_best_of_all():
     for _ in range(20):
         odds, pairs = rng.normal(0.0, 2.0, 7), rng.integers(0, 7, (9, 2))
         pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
-        alike = np.log((1.0 - ball_joint_classification.UNLIKE) / ball_joint_classification.UNLIKE)
+        alike = np.log((1.0 - UNLIKE) / UNLIKE)
         every = (np.arange(1 << 7)[:, None] >> np.arange(7)) & 1
         cost = -every @ odds + alike * (every[:, pairs[:, 0]] != every[:, pairs[:, 1]]).sum(axis=1)
-        assert (
-            ball_joint_classification.most_likely(odds, pairs).tolist() == every[np.argmin(cost)].astype(bool).tolist()
-        )
+        assert most_likely(odds, pairs).tolist() == every[np.argmin(cost)].astype(bool).tolist()

@@ -17,7 +17,6 @@ from processor.space_frame.result import MovementGauge
 POSE_MM = 4.0
 ROUNDING_MM = 1e-9  # at 40 m, through some tens of sums
 SIZES = (45.0, 50.0, 60.0, 70.0, 80.0)
-NONE = np.empty(0, np.int64)
 CHI2_95_OF_3 = 7.814727903251179
 
 
@@ -293,6 +292,13 @@ def at_the_site(d, origin, shift=(0.0, 0.0, 0.0)):
     return listed, moved, NodePattern(d.centres + moved, np.array(origin))
 
 
+def after_fit(places, nominal, weight):
+    """What is left of places (n, 3) less nominal ones after their fit by scipy."""
+    middle, goal = (np.average(x, axis=0, weights=weight) for x in (places, nominal))
+    turn, _ = Rotation.align_vectors(nominal - goal, places - middle, weights=weight)
+    return turn.apply(places - middle) - (nominal - goal)
+
+
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (5.12e8, 3.39e9, 3.8e4)])
 def test_a_roof_that_sagged_in_coordinates_of_its_site_moved_by_the_difference_of_coordinates(origin):
     listed, moved, found = at_the_site(design(nx=6, ny=7), origin)
@@ -300,14 +306,8 @@ def test_a_roof_that_sagged_in_coordinates_of_its_site_moved_by_the_difference_o
     covariance = np.tile(0.04 * np.eye(3), (len(moved), 1, 1))
     np.testing.assert_allclose(movement(matched, found, covariance, listed).vector, moved, atol=1e-6)  # as above
     fit = movement(matched, found, covariance, listed, gauge=MovementGauge.BEST_FIT)
-    turn, _ = Rotation.align_vectors(
-        listed.centres - np.average(listed.centres, axis=0, weights=matched.weight),
-        found.positions - np.average(found.positions, axis=0, weights=matched.weight),
-        weights=matched.weight,
-    )
-    away = found.positions - np.average(found.positions, axis=0, weights=matched.weight)
-    nominal = listed.centres - np.average(listed.centres, axis=0, weights=matched.weight)
-    np.testing.assert_allclose(fit.vector, turn.apply(away) - nominal, atol=1e-5)  # by sums of 4300 km
+    expected = after_fit(found.positions, listed.centres, matched.weight)
+    np.testing.assert_allclose(fit.vector, expected, atol=1e-5)  # by sums of 4300 km
     assert fit.vector[:, 2].min() > moved[:, 2].min() + 5.0  # the fit takes up what the whole settled by
 
 
@@ -350,20 +350,13 @@ def test_intervals_of_movements_after_a_best_fit_cover():
         sd = rng.uniform(0.3, 1.5, len(cloud.positions))
         covariance = sd[:, None, None] ** 2 * np.eye(3)
         noisy = cloud.positions + sd[:, None] * rng.standard_normal(cloud.positions.shape)
-        found = NodePattern(noisy, cloud.origin, cloud.radii, np.full(len(noisy), 0.5), NONE, NONE)
+        found = NodePattern(noisy, cloud.origin, cloud.radii, np.full(len(noisy), 0.5))
         matched = match(found, d)
         assert matched.relation == "registered"
         out = movement(matched, found, covariance, d)
         assert out.gauge == "best-fit"
-        true, nominal = cloud.positions[out.found], d.centres[out.design]
-        turn, _ = Rotation.align_vectors(
-            nominal - np.average(nominal, axis=0, weights=matched.weight[out.found]),
-            true - np.average(true, axis=0, weights=matched.weight[out.found]),
-            weights=matched.weight[out.found],
-        )
-        w = matched.weight[out.found]
-        placed = turn.apply(true - np.average(true, axis=0, weights=w)) + np.average(nominal, axis=0, weights=w)
-        pulls.append((out.vector - (placed - nominal)) / np.sqrt(np.einsum("nii->ni", out.covariance)))
+        off = after_fit(cloud.positions[out.found], d.centres[out.design], matched.weight[out.found])
+        pulls.append((out.vector - off) / np.sqrt(np.einsum("nii->ni", out.covariance)))
     assert 0.95 < np.sqrt(np.mean(np.square(np.concatenate(pulls)))) < 1.05  # some 1500 numbers: 1.8 %
 
 
@@ -403,7 +396,7 @@ def test_displaced_node_does_not_shift_the_others():
     cloud = Cloud(d, 0, missing=0.0, extra=0.0, off=1.0, pose=50.0)
     positions = cloud.positions.copy()
     positions[7] += [0.0, 0.0, 110.0]
-    found = NodePattern(positions, cloud.origin, cloud.radii, np.full(41, 0.5), NONE, NONE)
+    found = NodePattern(positions, cloud.origin, cloud.radii, np.full(41, 0.5))
     matched = match(found, d)
     assert matched.assignment[7] == cloud.truth[7]
     assert matched.weight[7] == 0.0
@@ -458,7 +451,7 @@ def test_nodes_that_the_design_lacks_in_the_middle_do_not_hide_the_true_pose(see
     extra, missing = middle[[0, 1, 3]], middle[[5, 9]]
     keep = np.setdiff1d(np.arange(len(d.centres)), missing)
     lacks = np.setdiff1d(np.arange(len(d.centres)), extra)
-    known = FrameDesign(d.ids[lacks], d.centres[lacks], d.radii[lacks], NONE, NONE, np.empty(0))
+    known = FrameDesign(d.ids[lacks], d.centres[lacks], d.radii[lacks])
     R = Rotation.from_euler("z", 20.0 * seed, degrees=True).as_matrix()
     found = (d.centres[keep] + rng.normal(0.0, 3.0, (len(keep), 3))) @ R.T
     sized = NodePattern(found, np.zeros(3), d.radii[keep], np.full(len(keep), 0.3))
@@ -475,7 +468,7 @@ def test_a_pose_that_the_sizes_contradict_is_ambiguous():
     rng = np.random.default_rng(3)
     row = np.arange(1, len(d.centres))
     others = NodePattern(d.centres[row] + 7e4, np.zeros(3), d.radii[rng.permutation(row)], np.full(len(row), 0.3))
-    lacks = FrameDesign(d.ids[:-1], d.centres[:-1], d.radii[:-1], NONE, NONE, np.empty(0))
+    lacks = FrameDesign(d.ids[:-1], d.centres[:-1], d.radii[:-1])
     answer = match(NodePattern(others.positions), lacks, sized=lambda: others)
     assert answer.status is Status.AMBIGUOUS
     assert matching.sizes_contradict(others, lacks, answer.assignment)

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from processor.model import Scene
-from processor.stitching import step as stitching_step
 from tests.support.clouds.hall_clouds import hall
+from tests.support.scenes.stitched_rooms import stitched
 
-RIGHT_MM = 500.0
+RIGHT_MM = 500.0  # of bays of 6 m
 
 
 def wrong_but_ok(T, result):
@@ -22,19 +21,13 @@ def wrong_but_ok(T, result):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 7, 8, 9, 10])
+@pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6, 7, 8, 9, 10])
 def test_a_hall_of_nine_bays_is_right_or_ambiguous(seed):
-    """Folded about its middle it overlaps more: free space must not be contradicted by what lies between far rays."""
+    """Folded about its middle it overlaps more: free space must not be contradicted by what lies between far rays.
+
+    With seed 6 three scans fit the first bays as well as the last; moves are tried from either scan of a pair.
+    """
     T, scans = hall(seed, step_mrad=18.0)
-    result = stitching_step.run(Scene("hall", "structure", scans), stitching_step.Params())
+    status, result = "ambiguous" if seed == 6 else "ok", stitched(scans)
     assert wrong_but_ok(T, result) == 0
-    assert sum(state == "ok" for state in result.scans.status) >= 2
-
-
-@pytest.mark.slow
-def test_a_hall_that_fits_as_well_folded_about_its_middle_is_ambiguous():
-    """Three scans fit the first bays as well as the last; moves are tried from either scan of a pair."""
-    T, scans = hall(6, step_mrad=18.0)
-    result = stitching_step.run(Scene("hall", "structure", scans), stitching_step.Params())
-    assert wrong_but_ok(T, result) == 0
-    assert "ambiguous" in result.scans.status
+    assert result.scans.status.count(status) >= (1 if seed == 6 else 2)
