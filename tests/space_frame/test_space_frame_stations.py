@@ -257,6 +257,7 @@ def targets(seen, seed, count, sd=0.3, off=None, sightings=2):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_covariances_with_control_points_agree_with_errors_over_many_seeds():
     """Pulls of nodes after the correction, the error that the sightings of one target share among them."""
     pulls, shift, doubted = [], [], 0

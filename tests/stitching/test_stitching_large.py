@@ -54,7 +54,7 @@ def test_points_that_are_not_finite_are_left_out_with_their_places_in_the_grid()
 
 def test_more_points_make_no_more_cells(monkeypatch):
     """The poses are those of the finer cells within their intervals."""
-    T, scans = stitch_clouds.four(2)
+    T, scans = stitch_clouds.four(2, step_mrad=20.0)
     count = sum(len(scan.points) for scan in scans)
     monkeypatch.setattr(scan_planes, "MOST_CELLS", count // 20)
     assert scan_planes.points_a_cell(scans[0], count) == pytest.approx(20.0, rel=0.01)  # count is no multiple of 20
