@@ -16,7 +16,7 @@ demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
 
 # All tests but the slow ones; weekend runs these, too. The types are checked beside them: that takes one core.
-# FOLDER=spheres: those of tests/spheres alone.
+# FOLDER=stitching: those of tests/stitching alone.
 FOLDER ?=
 TESTS = tests/$(patsubst tests/%,%,$(FOLDER))
 PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
