@@ -10,7 +10,7 @@ DEPENDENCIES ?= newest
 # Modules stay compiled, also where the environment says otherwise: tests and demo start many processes.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-lowest lint docs bench mutants profile paper nightly weekend lock audit clean system
+.PHONY: demo test test-lowest lint docs bench compare mutants profile paper nightly weekend lock audit clean system
 
 demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
@@ -52,6 +52,14 @@ bench: $(VENV)/.test
 	$(BIN)/python -m tests.bench.readers --speed --output $(OUT)/bench-readers.json
 	$(BIN)/python -m tests.bench.start --output $(OUT)/bench-start.json
 	$(BIN)/python -m tests.bench.cost --output $(OUT)/bench-cost.json
+
+# Results of this code held against stored ones of the same scenes: see tests/bench/comparer. Without a reference one is
+# made, of the code as it is: make it before a change. COMPARE="--time 3" judges the time as well.
+REFERENCE ?= $(OUT)/reference
+COMPARE ?=
+compare: $(VENV)/.test
+	test -e $(REFERENCE)/reference.json || $(BIN)/python -m tests.bench.comparer references -o $(REFERENCE) --jobs $(JOBS)
+	$(BIN)/python -m tests.bench.comparer compare $(REFERENCE) --jobs $(JOBS) -o $(OUT)/comparison.json $(COMPARE)
 
 # Small errors put into the numeric code, one at a time: which of them does no test see? SEED draws others.
 NUMBER ?= 200

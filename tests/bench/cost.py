@@ -59,16 +59,19 @@ print(json.dumps([code, usage.ru_utime + usage.ru_stime, wall, usage.ru_maxrss /
 """
 
 
-def measured(command: list[str], folder: Path) -> dict[str, float]:
-    """Run a command; processor seconds, seconds by the clock and peak memory. Raises RuntimeError if it fails."""
+def measured(command: list[str], folder: Path, code: Path | None = None) -> dict[str, float]:
+    """Run a command, of the ``code`` of another checkout; processor seconds, by the clock, peak memory, exit code.
+
+    Raises RuntimeError if it fails.
+    """
     log = folder / "log.txt"
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     launch = [sys.executable, "-S", "-c", LAUNCHER, str(log), *command]
-    done = subprocess.run(launch, check=True, capture_output=True, text=True, env=environment)
-    code, cpu, wall, peak = json.loads(done.stdout)
-    if code not in DONE:
-        raise RuntimeError(f"{' '.join(command)}: exit code {code}\n{log.read_text()}")
-    return {"cpu": cpu, "wall": wall, "mb": peak}
+    done = subprocess.run(launch, check=True, capture_output=True, text=True, env=environment, cwd=code)
+    exit_code, cpu, wall, peak = json.loads(done.stdout)
+    if exit_code not in DONE:
+        raise RuntimeError(f"{' '.join(command)}: exit code {exit_code}\n{log.read_text()}")
+    return {"cpu": cpu, "wall": wall, "mb": peak, "code": exit_code}
 
 
 def make(recipe: str, settings: tuple[str, ...], place: Path) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""Results of today's code held against stored ones: ``python -m tests.bench.comparer``."""
