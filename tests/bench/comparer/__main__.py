@@ -52,8 +52,8 @@ def references(output: Path, only: list[str], jobs: int) -> int:
     if not only and path.exists():
         raise SystemExit(f"{output}: has references; take another folder, or replace some of them with --only")
     here = {"commit": runs.commit(), "software": pipeline.software(), "machine": cost.machine()}
-    if only and content["runs"] and content["commit"] != here["commit"]:
-        raise SystemExit(f"{path}: made by commit {content['commit']}; make all references again")
+    if content["runs"] and runs.differs_from(content["commit"]):
+        raise SystemExit(f"{path}: made by processor of commit {content['commit']}, which differs; make all again")
     every = [run for name, recipe in chosen.items() for run in runs_of(name, recipe)]
     output.mkdir(parents=True, exist_ok=True)
     twice = runs.compiled_anew()

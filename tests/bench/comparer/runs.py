@@ -120,6 +120,12 @@ def commit() -> str:
     ).stdout.strip()  # fmt: skip
 
 
+def differs_from(name: str) -> bool:
+    """Whether processor as it is here differs from that of a commit."""
+    compared = ["git", "diff", "--quiet", name.removesuffix("-dirty"), "--", "processor"]
+    return name.endswith("-dirty") or subprocess.run(compared, cwd=ROOT).returncode != 0
+
+
 def old_code(reference: Path, name: str) -> Path:
     """Return a folder with the code of the reference's commit, beside the reference, where it stays compiled."""
     folder = reference / "code"
