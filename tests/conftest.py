@@ -18,6 +18,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
 from processor.jobs import garbage_collection
+from tests.support import kernels
 from tests.support.files.scan_folders import BOX, arch_design, surface, write_ply, write_xyz
 from tests.support.pages import browser
 from tests.support.solids import cad_in_process
@@ -55,6 +56,12 @@ def _compile_once(self: Dispatcher, signature: object) -> object:
 
 
 Dispatcher.compile = _compile_once
+
+
+def pytest_configure(config):
+    """Have kernels compiled anew where one within them has changed; workers start after that."""
+    if not hasattr(config, "workerinput") and "KERNELS_KEPT" not in os.environ:
+        kernels.discard_stale()
 
 
 def pytest_collection_finish():

@@ -121,6 +121,7 @@ class Copy:
     def _run(self, tests: list[str]) -> tuple[str, str]:
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests]
         env = {**os.environ, "PYTHONPATH": str(self.place), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        env["KERNELS_KEPT"] = "1"  # those of the mutant are away, the others need not be compiled for it
         try:
             done = subprocess.run(
                 command, cwd=self.place, env=env, capture_output=True, text=True, timeout=LIMIT_S, check=False

@@ -37,6 +37,7 @@ from tests.bench import cost
 from tests.bench.comparer import differences, runs, scenes, table
 from tests.bench.comparer.differences import Comparison, Difference
 from tests.bench.comparer.runs import PAIR, ROOT, Run, in_turn, least, measured, runs_of
+from tests.support import kernels
 
 REFERENCE, CHANGES = "reference.json", "changes.toml"
 
@@ -56,7 +57,7 @@ def references(output: Path, only: list[str], jobs: int) -> int:
         raise SystemExit(f"{path}: made by processor of commit {content['commit']}, which differs; make all again")
     every = [run for name, recipe in chosen.items() for run in runs_of(name, recipe)]
     output.mkdir(parents=True, exist_ok=True)
-    twice = runs.compiled_anew()
+    twice = kernels.discard_stale()
 
     writing = threading.Lock()
 
@@ -94,7 +95,7 @@ def compare(given: argparse.Namespace) -> int:
         for seed, one in seeds.items()
         if not given.only or name in given.only
     }
-    runs.compiled_anew()
+    kernels.discard_stale()
     code = runs.old_code(given.reference, content["commit"].removesuffix("-dirty")) if given.time else ROOT
     with tempfile.TemporaryDirectory() as place:
         results = given.keep or Path(place) / "new"

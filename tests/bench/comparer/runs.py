@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 import subprocess
 import sys
@@ -89,27 +88,6 @@ def in_turn(runs: list[Run], jobs: int, work: Callable[[Run], Any]) -> dict[Run,
         for group in ([run for run in runs if run.seed != PAIR], [run for run in runs if run.seed == PAIR]):
             done |= dict(zip(group, pool.map(work, group), strict=True))
     return done
-
-
-def compiled_anew() -> bool:
-    """Remove compiled kernels where the source of one has changed since, and return whether it has.
-
-    Numba compiles a kernel again when its own file changes, not when that of a kernel within it does.
-    """
-    sources = [
-        path.read_bytes() for folder in ("processor", "designgen") for path in sorted((ROOT / folder).rglob("*.py"))
-    ]
-    state = hashlib.sha256(b"".join(text for text in sources if b"njit" in text or b"kernels" in text)).hexdigest()
-    stamp = ROOT / "processor/__pycache__/kernels.sha256"
-    if stamp.exists() and stamp.read_text("utf-8") == state:
-        return False
-    for pattern in ("*.nbi", "*.nbc"):
-        for folder in ("processor", "designgen"):
-            for path in (ROOT / folder).rglob(pattern):
-                path.unlink(missing_ok=True)
-    stamp.parent.mkdir(exist_ok=True)
-    stamp.write_text(state, "utf-8")
-    return True
 
 
 def commit() -> str:
