@@ -624,6 +624,7 @@ def cluster(tmp_path):
         yield one
 
 
+@pytest.mark.slow
 def test_lost_worker_changes_no_summary_and_lost_scheduler_is_reported(tmp_path, cluster):
     address, (scheduler, worker, _) = cluster
     for i in range(7):

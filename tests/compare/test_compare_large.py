@@ -76,7 +76,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", ["core points", "scanners"])  # every point: with a sample, below
+@pytest.mark.parametrize(
+    "case", [pytest.param("core points", marks=pytest.mark.slow), "scanners"]
+)  # every point: with a sample, below
 def test_files_have_the_same_bytes_by_tiles(case, inputs, tiny, request):
     if case != "scanners":
         request.getfixturevalue("blank_pictures")

@@ -331,6 +331,7 @@ def test_stops_cleanly(whole, tmp_path, sent, code, to_all):
         assert (folder / name).read_bytes() == (whole / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_dying_process_loses_its_job_alone(tmp_path):
     do = functools.partial(processes.in_process, dying_job.kill_own_process)
     found = {path.name: result for path, result in runner.Local(2).run(do, [tmp_path / "always", tmp_path / "once"])}

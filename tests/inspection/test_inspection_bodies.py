@@ -61,6 +61,7 @@ def runs():
     return found
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_deviations_as_built(runs):
     """50 intervals: with 95 % each, 44 or more cover in 98 of 100 cases."""
     errors = []

@@ -121,7 +121,7 @@ def without_motion(departure):
     return a @ turn - b
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_intervals_cover_drilled_places_pitches_and_diameters(known):
     held: dict[str, list[bool]] = {"along": [], "across": [], "pitch": [], "diameter": []}
     for seed in range(10):

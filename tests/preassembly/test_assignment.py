@@ -31,6 +31,7 @@ def scanned(part, seed=1, spacing_mm=50.0):
     return rigid.apply(arch_clouds.random_pose(rng), points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("came", "asked", "found"),
     [(0, 2, 0), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1, 2, 1), (2, 1, 2), (3, 0, 1)))],
@@ -40,7 +41,7 @@ def test_scan_of_another_size_is_assigned_to_the_parts_of_that_size(shapes, came
     assert assignment.rather(scanned(came), asked, shapes) == found
 
 
-@pytest.mark.parametrize("part", [0, 1, 2])  # the two others have their shapes
+@pytest.mark.parametrize("part", [0, 1, pytest.param(2, marks=pytest.mark.slow)])  # the two others have their shapes
 def test_scan_of_its_own_part_gets_no_other_assignment(shapes, part):
     assert assignment.rather(scanned(part), part, shapes) is None
 
@@ -52,6 +53,7 @@ def test_scan_of_half_a_part_gets_no_other_assignment(shapes):
     assert assignment.rather(points[along < 0.0], 1, shapes) is None
 
 
+@pytest.mark.slow
 def test_a_scan_of_something_else_is_of_no_part(shapes):
     ball = np.random.default_rng(0).normal(size=(4_000, 3))
     assert assignment.rather(3000.0 * ball / np.linalg.norm(ball, axis=1)[:, None], 1, shapes) == -1

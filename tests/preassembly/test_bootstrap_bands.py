@@ -102,6 +102,7 @@ def test_bands_cover_the_errors_over_several_bridges():
         assert (np.mean(own, axis=0) > 0.9).all()
 
 
+@pytest.mark.slow
 def test_where_the_chain_is_broken_there_is_no_band(bridge):
     design, parts = bridge
     ball = np.random.default_rng(0).normal(size=(5_000, 3))

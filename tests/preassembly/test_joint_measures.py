@@ -132,7 +132,7 @@ def test_half_widths_against_draws():
 SLOW_SHAPES = [pytest.param(shape, marks=pytest.mark.slow) for shape in ("wedge", "zero")]
 
 
-@pytest.mark.parametrize("shape", ["level", "two alike", *SLOW_SHAPES])
+@pytest.mark.parametrize("shape", [pytest.param("level", marks=pytest.mark.slow), "two alike", *SLOW_SHAPES])
 def test_intervals_of_extremes_cover(shape):
     """True extremes lie within the intervals in at least 95 % of measurements, however many points are alike."""
     true = np.zeros((8, 3))

@@ -317,6 +317,7 @@ def test_rival_pose_shifted_along_the_part_is_reported_as_a_shift():
     assert (rival.code, rival.values) == ("preassemble.rival-shift", {"shift": pytest.approx(240.0)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in range(1, 8))])
 @pytest.mark.parametrize("upper", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_half_a_part_is_found_however_it_lies_in_its_file(upper, seed):

@@ -47,6 +47,7 @@ def test_key_points_of_a_scan_without_noise_are_those_of_the_closed_form(sizes, 
     assert np.abs(error).max() < 0.02
 
 
+@pytest.mark.slow
 def test_intervals_cover_key_points_as_built():
     held, sizes_of = [], []
     for seed in range(8):

@@ -194,6 +194,7 @@ def test_a_run_writes_all_reports(room, tmp_path):
     assert "GLCS" in page
 
 
+@pytest.mark.slow
 @needs_data
 def test_two_real_scans_of_a_room_are_registered():
     """Point-to-plane ICP of Open3D, started at the result, stays there."""

@@ -135,7 +135,7 @@ def torus(rng, noise):
 
 
 @pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 5), marks=pytest.mark.slow)], ids=["one", "more"])
-@pytest.mark.parametrize("noise", [0.5, 2.0])
+@pytest.mark.parametrize("noise", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 @pytest.mark.parametrize("body", [flattened, cylinder, short_cylinder, corner, torus])
 def test_other_bodies_are_no_sphere_without_a_doubt(body, noise, seeds):
     for seed in seeds:

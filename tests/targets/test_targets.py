@@ -47,6 +47,7 @@ def test_centres_at_ten_metres(step, count, median_mm, most_mm):
     assert max(errors) < most_mm
 
 
+@pytest.mark.slow
 def test_standard_deviations_agree_with_the_errors_of_targets():
     """Of three coordinates of twenty boards at all turns: 60 errors; the bounds hold 99.9 % of such sets."""
     squares = []

@@ -229,7 +229,7 @@ def one_night(number, check=checks):
     ]
 
 
-@pytest.mark.parametrize("earlier", [1, 7])
+@pytest.mark.parametrize("earlier", [pytest.param(1, marks=pytest.mark.slow), 7])
 def test_an_estimator_20_percent_worse_is_reported_the_first_night(earlier, monkeypatch):
     as_it_was = functools.cache(checks)  # the fixed seeds' figures are the same every night
     given = [row for number in range(earlier) for row in one_night(number, as_it_was)]
@@ -249,7 +249,8 @@ def test_an_estimator_20_percent_worse_is_reported_the_first_night(earlier, monk
 
 
 @pytest.mark.parametrize(
-    ("seed", "nights"), [(1, 20), *(pytest.param(seed, 60, marks=pytest.mark.slow) for seed in (1, 2, 3))]
+    ("seed", "nights"),
+    [pytest.param(seed, nights, marks=pytest.mark.slow) for seed, nights in ((1, 60), (2, 60), (3, 60))],
 )
 def test_undisturbed_nights_raise_at_most_one_alarm(seed, nights):
     simulated = validation_nights.Simulated(seed)
@@ -258,7 +259,7 @@ def test_undisturbed_nights_raise_at_most_one_alarm(seed, nights):
     assert len({night for night, _ in simulated.alarms}) <= 1
 
 
-@pytest.mark.parametrize("method", ["ray", "ransac"])
+@pytest.mark.parametrize("method", ["ray", pytest.param("ransac", marks=pytest.mark.slow)])
 def test_a_worse_figure_of_stored_cells_is_reported_the_first_night(method):
     simulated = validation_nights.Simulated(3)
     for number in range(10):

@@ -89,7 +89,15 @@ def test_rays_and_samples_meet_frames_where_their_solids_are(built):
     check(cloud.points, cloud.part, solid)
 
 
-@pytest.mark.parametrize(("name", "built"), [("rib", False), ("rib", True), ("foot", True), ("segment", True)])
+@pytest.mark.parametrize(
+    ("name", "built"),
+    [
+        pytest.param("rib", False, marks=pytest.mark.slow),
+        ("rib", True),
+        ("foot", True),
+        pytest.param("segment", True, marks=pytest.mark.slow),
+    ],
+)
 def test_rays_meet_parts_of_arches_and_rings_where_their_solids_are(name, built):
     part, solid = built_solids.arch(name, built), made(built_solids.arch_solid, name, built)
     assert solid.isValid()
@@ -117,7 +125,9 @@ def test_the_faces_of_a_part_of_an_assembly_enclose_the_volume_of_its_solid(whic
     assert volume == pytest.approx(solid.Volume(), rel=1e-9)  # sums of float64; no face is missing
 
 
-@pytest.mark.parametrize("which", [*GIRDERS[:3], (*GIRDERS[3], True)])
+@pytest.mark.parametrize(
+    "which", [GIRDERS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in GIRDERS[1:3]), (*GIRDERS[3], True)]
+)
 def test_rays_meet_parts_of_assemblies_as_built_where_their_solids_are(which):
     part, solid = built_solids.girder(*which), made(built_solids.girder_solid, *which)
     assert solid.isValid()
@@ -189,7 +199,10 @@ AS_BUILT = {
 }
 
 
-@pytest.mark.parametrize("kind", AS_BUILT)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param("ring", marks=pytest.mark.slow), pytest.param("assembly", marks=pytest.mark.slow), "space-frame"],
+)
 def test_scans_lie_on_the_solids_as_built_that_are_exported(kind, tmp_path):
     recipe = {"kind": kind, "seed": 1, "scan": {"mode": "surface", "spacing_mm": 60.0, "sigma_mm": 0.0}}
     scene, truth = make.make(kind, recipe | AS_BUILT[kind], 4)
