@@ -160,18 +160,17 @@ def long_functions():
     return found
 
 
+def is_record(node):
+    """Whether a node is a class that holds values alone: a dataclass or a named tuple."""
+    return isinstance(node, ast.ClassDef) and (
+        any("dataclass" in ast.dump(one) for one in node.decorator_list)
+        or any("NamedTuple" in ast.dump(one) for one in node.bases)
+    )
+
+
 def positional_records(most=5):
     """Calls of dataclasses and named tuples of the project with more than ``most`` positional arguments."""
-    records = {
-        node.name
-        for path in SOURCES
-        for node in nodes(path)
-        if isinstance(node, ast.ClassDef)
-        and (
-            any("dataclass" in ast.dump(one) for one in node.decorator_list)
-            or any("NamedTuple" in ast.dump(one) for one in node.bases)
-        )
-    }
+    records = {node.name for path in SOURCES for node in nodes(path) if is_record(node)}
     found = []
     for path in SOURCES:
         for node in nodes(path):
