@@ -16,7 +16,14 @@ from processor.geometry import rigid
 from processor.limits import standards
 from processor.model import ArchDesign, Bools, Floats, Reason, Scan, Scene, Tolerance, Verdict, reason
 from processor.preassembly import to_result, topology
-from processor.preassembly.chain import adjustment, assembled_parts, linear_error, loop_closure, span_and_closure
+from processor.preassembly.chain import (
+    adjustment,
+    assembled_parts,
+    joint_measures,
+    linear_error,
+    loop_closure,
+    span_and_closure,
+)
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
@@ -28,7 +35,7 @@ from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.result import Result
 from processor.preassembly.to_result import Assembly, JudgedJoint
 from processor.preassembly.verdicts import chain as chain_verdicts
-from processor.preassembly.verdicts import joint_measures, joints, reasons, trim_and_build_up
+from processor.preassembly.verdicts import joints, reasons, trim_and_build_up
 from processor.preassembly.verdicts.joints import Conformity
 
 TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)

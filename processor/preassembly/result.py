@@ -35,8 +35,8 @@ from processor.model import (
     words,
     worst,
 )
+from processor.preassembly.chain.joint_measures import Measures
 from processor.preassembly.parts.systematic_errors import BudgetSource
-from processor.preassembly.verdicts.joint_measures import Measures
 from processor.preassembly.verdicts.joints import Conformity
 from processor.preassembly.verdicts.trim_and_build_up import Proposal
 

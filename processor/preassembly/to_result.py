@@ -14,6 +14,7 @@ from processor.preassembly import topology
 from processor.preassembly.assembly_errors import mean_max, splicing_error
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.chain.assembled_parts import Placement
+from processor.preassembly.chain.joint_measures import RAYLEIGH_95, Measures
 from processor.preassembly.chain.linear_error import EdgeErrors
 from processor.preassembly.chain.span_and_closure import Figures, mean_max_ci95
 from processor.preassembly.params import Params, SystematicParams
@@ -40,7 +41,6 @@ from processor.preassembly.result import (
     overall_status,
 )
 from processor.preassembly.verdicts.chain import unused_limits
-from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
 from processor.preassembly.verdicts.joints import Conformity, LimitOrigin
 from processor.preassembly.verdicts.reasons import of_assignment
 from processor.preassembly.verdicts.trim_and_build_up import Proposal

@@ -16,7 +16,6 @@ from processor.space_frame.ball_catalogue import Catalogue
 from processor.space_frame.design.matching import FrameRelation, Matching
 from processor.space_frame.design.movement import Movement, size_of, verdict_of
 from processor.space_frame.extract import Extracted, Options, extract
-from processor.space_frame.members import station_error_propagation
 from processor.space_frame.members.records import Members
 from processor.space_frame.params import Params
 from processor.space_frame.points.scene_source import PointReader, SceneSource, of_scene
@@ -37,6 +36,7 @@ from processor.space_frame.result import (
 )
 from processor.space_frame.spheres import baselines
 from processor.space_frame.spheres.unnamed_view_errors import of_tubes
+from processor.space_frame.stations import station_error_propagation
 from processor.space_frame.stations.records import Stations
 from processor.space_frame.stations.sightings import control_of
 

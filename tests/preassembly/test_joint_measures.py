@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from processor.limits import project_limits, standards
 from processor.limits.decision_rule import decide
 from processor.model import Tolerance, reason
+from processor.preassembly.chain import joint_measures
+from processor.preassembly.chain.joint_measures import measure
 from processor.preassembly.ends.joint_frame import joint_frame
-from processor.preassembly.verdicts import joint_measures
-from processor.preassembly.verdicts.joint_measures import measure
 from processor.preassembly.verdicts.joints import judge
 
 ROUNDING = 1e-9  # float64 at tens of metres, of mm and mrad

@@ -7,10 +7,10 @@ from processor.evaluation import preassembly as evaluation
 from processor.geometry import mesh_distance, rigid
 from processor.model import NORMAL_95, Statistic, Status
 from processor.preassembly import step
+from processor.preassembly.chain import joint_measures
 from processor.preassembly.ends import section, tube_end
 from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
-from processor.preassembly.verdicts import joint_measures
 from tests.support.results import measured_parts
 from tests.support.results.reasons import codes
 from tests.support.solids import round_tubes

@@ -12,8 +12,9 @@ from scipy.stats import norm
 from processor.language.messages import messages
 from processor.limits import project_limits, standards
 from processor.model import Checked, StepRun, Tolerance, UsageError, reason
+from processor.preassembly.chain import joint_measures
 from processor.preassembly.params import TrimParams
-from processor.preassembly.verdicts import joint_measures, joints, trim_and_build_up
+from processor.preassembly.verdicts import joints, trim_and_build_up
 from processor.preassembly.verdicts.trim_and_build_up import propose
 from processor.store import store
 

@@ -14,8 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import Status, StepRun, Verdict
 from processor.pipeline import Execution
+from processor.preassembly.chain import joint_measures
 from processor.preassembly.result import Deviations
-from processor.preassembly.verdicts import joint_measures
 from processor.report import all_figures, all_tables, page
 from processor.report import table as report_table
 from processor.report.preassembly import figures, joint_figures, residual_map

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from processor.space_frame.members import station_error_propagation
 from processor.space_frame.members.records import Members
+from processor.space_frame.stations import station_error_propagation
 from processor.space_frame.stations.records import Stations, StationStatus
 
 RADIUS, OFFSET = 80.0, 0.5

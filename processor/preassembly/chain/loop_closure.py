@@ -13,11 +13,10 @@ import numpy as np
 from processor.geometry import rigid
 from processor.model import NORMAL_95, ArchDesign, Floats
 from processor.preassembly import topology
-from processor.preassembly.chain import adjustment
+from processor.preassembly.chain import adjustment, joint_measures
 from processor.preassembly.chain.span_and_closure import JOINTS_ALONE
 from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.result import Loops
-from processor.preassembly.verdicts import joint_measures
 
 
 def measure(members: Sequence[Member], design: ArchDesign, frames: Floats) -> Loops | None:

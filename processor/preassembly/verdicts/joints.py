@@ -40,7 +40,7 @@ from processor.model import (
     words,
     worst,
 )
-from processor.preassembly.verdicts.joint_measures import ACROSS, Measures, motion_of
+from processor.preassembly.chain.joint_measures import ACROSS, Measures, motion_of
 
 MEASURES = ("misalignment", "groove_gap", "eccentricity")
 

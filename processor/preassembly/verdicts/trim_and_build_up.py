@@ -47,8 +47,8 @@ from processor.model import (
     reason,
     reasons,
 )
+from processor.preassembly.chain.joint_measures import ACROSS, Measures
 from processor.preassembly.params import TrimParams
-from processor.preassembly.verdicts.joint_measures import ACROSS, Measures
 from processor.preassembly.verdicts.joints import allowed, conforms, joint_limits, judge
 
 SHOWN_MM = 0.1  # resolution of amounts in the reasons

@@ -8,9 +8,9 @@ from typing import Any
 
 from processor.geometry import rigid
 from processor.language.messages import Message, label, text
+from processor.preassembly.chain.joint_measures import JointQuantity
 from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.result import Adjustment, Result
-from processor.preassembly.verdicts.joint_measures import JointQuantity
 from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
 from processor.report.columns import MM, columns, under
 from processor.report.limit_comparison_table import with_unverified

@@ -13,8 +13,8 @@ from matplotlib.patches import Ellipse, Polygon
 
 from processor.language.messages import Message, text
 from processor.model import KEY_POINTS, NORMAL_95, Bools, Floats, StepRun
+from processor.preassembly.chain.joint_measures import RAYLEIGH_95, Measures
 from processor.preassembly.result import Result
-from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
 from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, png, printable_name, rounded
 
 MOST_JOINTS = 24

@@ -18,6 +18,7 @@ from processor.model import (
     reason,
 )
 from processor.pipeline import Execution
+from processor.preassembly.chain import joint_measures
 from processor.preassembly.chain.span_and_closure import EndSurface, PartEnd
 from processor.preassembly.result import (
     Adjustment,
@@ -34,8 +35,8 @@ from processor.preassembly.result import (
     TradeOff,
 )
 from processor.preassembly.verdicts import chain as verdicts_chain
-from processor.preassembly.verdicts import joint_measures, trim_and_build_up
 from processor.preassembly.verdicts import joints as verdicts_joints
+from processor.preassembly.verdicts import trim_and_build_up
 
 NAN = float("nan")
 
