@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import sys
 from pathlib import Path
 
 import click
 
 from processor.cli.common import LANGUAGES, debug_option, split_names
 from processor.jobs.exit_codes import DONE, IN_PART
+from processor.model import UsageError
+
+CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 @click.command()
@@ -34,10 +39,16 @@ def papers(
 ) -> None:
     """Repeat the tables and figures of the source papers by their methods, beside ours.
 
-    The data sets are simulated by designgen, which must be installed. Exit codes: 0 done, 1 some data sets failed.
+    The data sets are simulated by designgen, which must be installed; what measures them is part of the source and not
+    of an installed package. Exit codes: 0 done, 1 some data sets failed.
     """
-    from processor.papers import command
-
+    if not (CHECKOUT / "tests/bench/papers").is_dir():
+        raise UsageError(
+            "processor papers: the comparison with the papers is part of the source; in a checkout of it: "
+            "pip install --editable '.[designgen]'"
+        )
+    sys.path.insert(0, str(CHECKOUT))
+    command = importlib.import_module("tests.bench.papers.command")
     found = command.run(output, only, seeds, jobs, lang, keep_steps)
     click.echo(json.dumps(found.content, ensure_ascii=False) if as_json else str(found.line))
     context.exit(IN_PART if found.failed else DONE)

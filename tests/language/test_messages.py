@@ -14,12 +14,13 @@ from processor.batch import record, summary_values
 from processor.epochs.change import Finding
 from processor.language.messages import CODES, Text, catalogue, messages, text
 from processor.model import VOCABULARIES, Status, reason
-from processor.papers import rows
 from processor.report.columns import COLUMNS
 from processor.validation import change_detection, coverage, curves
+from tests.bench.papers import rows
 from tests.support import structure
 
-SOURCES = Path(processor.__file__).parent
+PAPERS = structure.ROOT / "tests/bench/papers"  # the comparison with them has its texts in the catalogues as well
+SOURCES = (Path(processor.__file__).parent, PAPERS)
 OTHERS = [code for code in CODES if code != "en"]
 
 
@@ -27,7 +28,10 @@ OTHERS = [code for code in CODES if code != "en"]
 def all_calls():
     """Every call in the sources, with its file."""
     return [
-        (path.name, node) for path in structure.SOURCES for node in structure.nodes(path) if isinstance(node, ast.Call)
+        (path.name, node)
+        for path in (*structure.SOURCES, *PAPERS.glob("*.py"))
+        for node in structure.nodes(path)
+        if isinstance(node, ast.Call)
     ]
 
 
@@ -48,7 +52,7 @@ def headings():
 
 def in_templates():
     """The texts of the pages' templates."""
-    for path in sorted(SOURCES.rglob("*.html")):
+    for path in sorted(page for folder in SOURCES for page in folder.rglob("*.html")):
         yield from re.findall(r'\btext\("([^"]+)"', path.read_text("utf-8"))
 
 

@@ -13,10 +13,10 @@ from processor.jobs import process
 from processor.jobs.causes import Cause
 from processor.language.messages import NO_NUMBER, text
 from processor.model import UsageError, reason
-from processor.papers import bolt_balls, command, measuring, parameters, preassembly
-from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Outcome, Row, Rule, holds, is_smaller
 from processor.report.charts import line_chart as drawing
+from tests.bench.papers import bolt_balls, command, measuring, parameters, preassembly
+from tests.bench.papers.data_sets import DataSet, Found, Measured
+from tests.bench.papers.rows import Outcome, Row, Rule, holds, is_smaller
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 

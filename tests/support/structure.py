@@ -219,7 +219,7 @@ LAYERS = (
     ("epochs",),
     ("report", "clouds"),
     ("api",),
-    ("batch", "validation", "papers"),
+    ("batch", "validation"),
     ("cli",),
     ("__main__",),
 )

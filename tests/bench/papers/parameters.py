@@ -5,9 +5,9 @@ from __future__ import annotations
 from processor.deviation.params import Params as DeviationParams
 from processor.language.messages import Text, text
 from processor.model import Reason, reason
-from processor.papers.rows import Row, Rule
 from processor.preassembly.baselines.edge_features import EDGE_BOX
 from processor.preassembly.params import Params as PreassemblyParams
+from tests.bench.papers.rows import Row, Rule
 
 Stated = tuple[Text, Text, str, float, float, Reason]  # place, quantity, unit, published, ours
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from processor.language.messages import NO_NUMBER, Text, text
-from processor.papers.data_sets import Measured
-from processor.papers.rows import DECADE, TOLERANCE, Outcome, Row
 from processor.report import templates
 from processor.report.charts import line_chart as drawing
 from processor.report.charts.line_chart import Chart
+from tests.bench.papers.data_sets import Measured
+from tests.bench.papers.rows import DECADE, TOLERANCE, Outcome, Row
 
 RULE = text(
     "An error is reproduced where the median over the seeds is at most the published one, a quantity where it is near "
@@ -51,7 +52,7 @@ def html(
                 ],
             }
         )
-    template = templates.environment("papers", lang).get_template("page.html")
+    template = templates.environment(Path(__file__).parent, lang).get_template("page.html")
     page: str = template.render(lang=lang, line=line, rule=RULE, papers=papers)
     return page + "\n"
 

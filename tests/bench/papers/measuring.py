@@ -12,10 +12,10 @@ from processor.jobs import process
 from processor.jobs.causes import Cause
 from processor.jobs.child import Loss, Lost
 from processor.jobs.make_scene_command import scene_command
-from processor.papers import bolt_balls, defects, deviation, preassembly, stitching
-from processor.papers.data_sets import DataSet, Measured
 from processor.store.making import beside
 from processor.writers import step_clouds
+from tests.bench.papers import bolt_balls, defects, deviation, preassembly, stitching
+from tests.bench.papers.data_sets import DataSet, Measured
 
 PAPERS: dict[str, tuple[str, Any]] = {  # name and module
     "000": ("preassembly", preassembly),

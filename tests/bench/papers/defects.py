@@ -14,11 +14,11 @@ from processor.evaluation import defects as against_truth
 from processor.evaluation import evaluate
 from processor.language.messages import Text, text
 from processor.model import Reason, Scene, Statistic, StepRun, reason
-from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule, median
 from processor.pipeline import Execution
 from processor.report.charts.line_chart import Chart
 from processor.store import store
+from tests.bench.papers.data_sets import DataSet, Found, Measured
+from tests.bench.papers.rows import Row, Rule, median
 
 PAPER = "004"
 PLATES = "12 plates"

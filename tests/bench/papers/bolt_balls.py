@@ -17,13 +17,13 @@ from processor.geometry.nearest_neighbours import nearest_crops
 from processor.geometry.sphere import algebraic, ransac
 from processor.language.messages import Text, text
 from processor.model import Floats, FrameDesign, Ints, Reason, reason
-from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule, is_smaller, median
 from processor.report.charts.line_chart import Chart
 from processor.scene_cloud import MergedCloud, merged
 from processor.space_frame import step
 from processor.space_frame.params import Params
 from processor.store import store
+from tests.bench.papers.data_sets import DataSet, Found, Measured
+from tests.bench.papers.rows import Row, Rule, is_smaller, median
 
 PAPER = "001"
 BALLS = "100 balls"

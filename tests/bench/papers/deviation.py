@@ -21,12 +21,12 @@ from processor.geometry import mesh_distance, rigid
 from processor.geometry.thinning import thinned
 from processor.language.messages import Text, text
 from processor.model import Floats, Reason, reason
-from processor.papers import parameters
-from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule, holds, median
 from processor.registration import icp, principal
 from processor.report.charts.line_chart import Chart
 from processor.store import store
+from tests.bench.papers import parameters
+from tests.bench.papers.data_sets import DataSet, Found, Measured
+from tests.bench.papers.rows import Row, Rule, holds, median
 
 PAPER = "002"
 ROOF = "roof, 500 points/m2"

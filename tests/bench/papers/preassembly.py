@@ -21,15 +21,15 @@ from processor.evaluation import evaluate
 from processor.evaluation import preassembly as against_truth
 from processor.language.messages import Text, text
 from processor.model import Floats, Reason, Scene, Statistic, StepRun, reason
-from processor.papers import parameters
-from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule, is_smaller
 from processor.pipeline import Execution
 from processor.preassembly import step
 from processor.preassembly.baselines import methods as paper_methods
 from processor.preassembly.result import Result
 from processor.report.charts.line_chart import Chart
 from processor.store import store
+from tests.bench.papers import parameters
+from tests.bench.papers.data_sets import DataSet, Found, Measured
+from tests.bench.papers.rows import Row, Rule, is_smaller
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -53,7 +53,7 @@ NAN = float("nan")
 def published() -> dict[str, Any]:
     """Return the paper's numbers."""
     content: dict[str, Any] = tomllib.loads(
-        resources.files("processor.papers").joinpath("paper_000.toml").read_text("utf-8")
+        resources.files("tests.bench.papers").joinpath("paper_000.toml").read_text("utf-8")
     )
     return content
 

@@ -16,14 +16,14 @@ from processor.evaluation import evaluate
 from processor.evaluation import stitching as against_truth
 from processor.language.messages import Text, text
 from processor.model import Floats, Reason, Scene, Statistic, Status, StepRun, reason
-from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.rows import Row, Rule
 from processor.pipeline import Execution
 from processor.report.charts.line_chart import Chart
 from processor.stitching import step
 from processor.stitching.params import Params
 from processor.stitching.result import Result
 from processor.store import store
+from tests.bench.papers.data_sets import DataSet, Found, Measured
+from tests.bench.papers.rows import Row, Rule
 
 PAPER = "003"
 BRIDGE = "truss bridge"

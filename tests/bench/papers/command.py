@@ -18,14 +18,14 @@ from processor.jobs import runner
 from processor.jobs.child import Lost
 from processor.language.messages import Text
 from processor.model import UsageError
-from processor.papers import measuring, page
-from processor.papers.data_sets import DataSet, Found, Measured
-from processor.papers.measuring import PAPERS
-from processor.papers.rows import Row
 from processor.plain_text import printable
 from processor.report import write_results
 from processor.store.making import beside
 from processor.store.replaced_folder import replacing_folder, write_text
+from tests.bench.papers import measuring, page
+from tests.bench.papers.data_sets import DataSet, Found, Measured
+from tests.bench.papers.measuring import PAPERS
+from tests.bench.papers.rows import Row
 
 FORMAT, FORMAT_VERSION = "processor-papers", "1.0"
 MATRICES = ("T1", "T2")  # of paper 002
