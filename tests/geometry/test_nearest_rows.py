@@ -15,11 +15,12 @@ def by_all_distances(points, places, reach, count):
     return np.where(near, rows, -1), np.where(near, distance, np.inf)
 
 
+@pytest.mark.parametrize("height", [1.0, 100.0])  # within one block of cells, and across several
 @pytest.mark.parametrize("count", [1, 5])
 @pytest.mark.parametrize("reach", [3.0, 40.0, np.inf])
-def test_rows_are_those_of_all_distances(reach, count):
+def test_rows_are_those_of_all_distances(reach, count, height):
     rng = np.random.default_rng(7)
-    grid = point_grid.of_points(rng.uniform(0.0, 100.0, (2_000, 3)) * [1.0, 1.0, 0.01], 4.0)
+    grid = point_grid.of_points(rng.uniform(0.0, [100.0, 100.0, height], (2_000, 3)), 4.0)
     places = np.vstack([rng.uniform(-60.0, 160.0, (300, 3)), grid.cells.points[:100]])
     rows, distance = nearest_neighbours.nearest_rows(grid.cells, places, reach, count)
     expected, away = by_all_distances(grid.cells.points, places, reach, count)

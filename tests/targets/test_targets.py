@@ -83,6 +83,28 @@ def test_slopes_of_the_pattern_are_those_of_finite_differences():
     np.testing.assert_allclose(checkerboard._slopes(at, x), (ahead - behind) / 2e-5, atol=1e-8)
 
 
+@pytest.mark.parametrize("field", [(1, 1), (-1, -1), (1, -1), (-1, 1)])
+def test_a_field_has_points_in_half_of_its_cells_and_the_colour_of_the_one_across(field):
+    """Within 10 spacings of the centre's lines, and beyond one, a field has 9 by 9 cells."""
+    u, v = (10.0 * one.ravel() for one in np.meshgrid(*[np.arange(-9.5, 10.0)] * 2))
+    of_field = np.flatnonzero((field[0] * u > 10.0) & (field[1] * v > 10.0))
+    bright = np.where(u * v > 0.0, 0.1, 0.9)
+
+    def accepted(points, colour):
+        rows, colours = np.delete(np.arange(len(u)), of_field[points:]), bright.copy()
+        colours[of_field] = colour
+        return checkerboard._has_fields(u[rows], v[rows], colours[rows], 100.0, 10.0)
+
+    colour = bright[of_field[0]]
+    assert len(of_field) == 81
+    assert accepted(41, colour)
+    assert not accepted(40, colour)
+    # A field that is d nearer to the other colour leaves a step of 0.8 - d / 2; d = 0.3 (0.8 - d / 2) at 0.2087.
+    toward = 1.0 if colour == 0.1 else -1.0
+    assert accepted(81, colour + 0.208 * toward)
+    assert not accepted(81, colour + 0.209 * toward)
+
+
 def test_the_order_of_the_points_does_not_matter():
     rng = np.random.default_rng(3)
     points, intensity, _ = board(rng)
