@@ -97,6 +97,17 @@ def test_bodies_that_touch_have_each_its_own_truth():
         StructureTruth(at[:5], up[:5], moved[:5], bodies)
 
 
+def test_near_points_of_the_truth_count_more_by_their_squared_distance_and_50_mm():
+    """One point moved by 1 mm, four about it stay: of weights 1 / 50^2 and 1 / (3 50^2 + 50^2) it has a half."""
+    ring = 50.0 * np.sqrt(3.0) * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    at, up = np.vstack([np.zeros(3), ring]), np.tile([0.0, 0.0, 1.0], (5, 1))
+    core = surface_rows.core_points(at[:1], up[:1], np.zeros(1), 0.1)
+    result = DeviationResult(status="ok", method="default", T_design_scan=np.eye(4), core=core)
+    truth = StructureTruth(at, up, np.diag([1.0, 0.0, 0.0, 0.0, 0.0])[:, [1, 2, 0]])
+    # The bound of 1e-12 that keeps the equations solvable, beside weights of 1e-3.
+    assert deviation.true_deviation(result, truth, np.eye(4)) == pytest.approx(0.5, rel=1e-8)
+
+
 def test_turned_pose_shows_in_its_error_and_in_significant_unmoved_steel():
     found = slab(0.0, turn=1.0)
     assert found["pose, turn"].value == pytest.approx(1.0, rel=1e-6)  # sine of 1e-3
@@ -198,6 +209,7 @@ def test_the_other_side_of_a_dented_plate_is_no_false_alarm():
     assert of_bodies(DENT, MOVED, ("unknown", "b", 30.0, -4.0, -1.0)) == [0, 0, 0, 0, 1], "another body"
     assert of_bodies(DENT, MOVED, ("unknown", "a", 30.0, 4.0, -1.0)) == [0, 0, 0, 0, 1], "inward, too"
     assert of_bodies(DENT, MOVED, ("unknown", "a", 90.0, -4.0, -1.0)) == [0, 0, 0, 0, 1], "beside it"
+    assert of_bodies(DENT, MOVED, ("unknown", "b", 1030.0, -4.0, -1.0)) == [0, 0, 0, 0, 1], "what moved has no dent"
 
 
 # --- stitching --------------------------------------------------------------------------------------------------------
@@ -251,3 +263,11 @@ def test_errors_without_an_interval_are_not_counted():
     }
     assert (told[Statistic.COVERAGE], told[Statistic.NUMBER]) == (50.0, 2.0)
     assert error_statistics.covered("s", "x", np.array([nan]), np.array([1.0])) == []
+
+
+@pytest.mark.parametrize(("errors", "efficiency"), [([0.3, -0.4], np.sqrt(8.0)), ([0.0, 0.0], np.nan)])
+def test_the_efficiency_is_one_over_the_rms_of_errors_in_least_standard_deviations(errors, efficiency):
+    """Errors of 0.3 and 0.4 of least standard deviations 1: 1 / sqrt(0.125); without errors there is none."""
+    figures = error_statistics.signed("s", "x", np.array(errors), np.ones(2))
+    assert figures[-1].statistic == Statistic.EFFICIENCY
+    assert figures[-1].value == pytest.approx(efficiency, nan_ok=True)
