@@ -1,5 +1,7 @@
 """Ends of round tubes against closed forms: key points and their intervals, and what no scan shows, a tube's turn."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -19,11 +21,15 @@ from tests.support.solids.round_tubes import AsBuilt, Sizes
 STRAIGHT, ARCH = Sizes(parts=2), Sizes(parts=2, bend=20_000.0)
 
 
+def mesh_of(sizes, part, inside_out=False):
+    vertices, faces = round_tubes.mesh(sizes, part)
+    return mesh_distance.of_mesh(vertices, faces[:, ::-1] if inside_out else faces)
+
+
 def fitted(sizes, part, built, rng, sigma=1.0, spacing=12.0, turn_known=True, inside_out=False):
     """The end of a tube at joint J1, registered as designed; part 0 ends there, part 1 starts."""
     design = round_tubes.design(sizes)
-    vertices, faces = round_tubes.mesh(sizes, part)
-    surface = mesh_distance.of_mesh(vertices, faces[:, ::-1] if inside_out else faces)
+    surface = mesh_of(sizes, part, inside_out)
     points = round_tubes.scanned(sizes, part, built, rng, spacing, sigma)
     registered = measured_parts.registered(points, surface, surface)
     place = end_place(design.joint_points[0], 1.0 - 2.0 * part, surface)
@@ -94,6 +100,31 @@ def test_any_turn_is_within_the_bound_of_its_linear_change():
         r = np.linspace(0.0, 2.0 * np.pi, 721)
         largest = np.abs(np.sin(r) * t + (np.cos(r) - 1.0) * q).max()
         assert largest <= tube_end.TURN_BOUND * np.hypot(t, 2.0 * q) + 1e-12
+
+
+def test_the_covariance_of_a_wall_is_that_of_least_squares_and_of_errors_that_its_points_share():
+    """Noise of 0.02 mm of pairs that cancel, so that no cell is off; one station's error of 0.5 mm is of the radius."""
+    x, angle = (np.repeat(v, 2) for v in np.meshgrid(np.linspace(5.0, 495.0, 30), np.arange(-3.1, 3.1, 0.1)))
+    x, angle = x.ravel(), angle.ravel()
+    residual = 0.02 * (-1.0) ** np.arange(len(x))
+    part = SimpleNamespace(station=np.zeros(len(x), np.int64), between_stations=0.25)
+    found = tube_end._wall_covariance(part, x, angle, np.arange(len(x)), residual)
+    around = np.stack([f(k * angle) for k, f in ((0, np.cos), (1, np.cos), (1, np.sin), (2, np.cos), (2, np.sin))])
+    basis = np.vstack([around, x / 500.0 * around, (x / 500.0) ** 2 * around[1:3]])
+    expected = 0.02**2 * len(x) / (len(x) - 12) * np.linalg.inv(basis @ basis.T)
+    expected[0, 0] += 0.25
+    # What is known of coefficients beforehand, 80 mm, is beside 0.01 mm of the least known one as 1 to 1e-7.
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-9)
+
+
+def test_intervals_of_large_departures_include_what_the_linear_model_leaves_out():
+    """A radius 100 mm too large: half a percent of it as a limit, divided by sqrt(3), and a least sd of 0.004 mm."""
+    place = end_place(round_tubes.design(STRAIGHT).joint_points[0], 1.0, mesh_of(STRAIGHT, 0))
+    end = tube_end.FittedTube(
+        coefficients=100.0 * np.eye(17)[0], covariance=np.zeros((17, 17)), pose=np.zeros((6, 6)), place=place,
+        turn_known=True, plates=(), ring_noise=0.0,
+    )  # fmt: skip
+    np.testing.assert_allclose(tube_end.estimate(end).covariance, (0.004**2 + 0.5**2 / 3.0) * np.eye(24), rtol=1e-9)
 
 
 def test_a_section_is_round_by_its_key_points():

@@ -401,4 +401,6 @@ def test_scans_that_saw_enough_control_points_have_a_pose_by_these():
     wrong = seen.copy()
     wrong[7] += [0.0, 300.0, 0.0]
     assert sorted(control_points.poses_of_scans(dataclasses.replace(control, seen=wrong), [np.zeros(3)] * 3)) == [0]
+    wrong[2] += [0.0, 0.0, 300.0]  # of six sightings: some of the others still fit
+    assert control_points.poses_of_scans(dataclasses.replace(control, seen=wrong), [np.zeros(3)] * 3) == {}
     assert control_points.poses_of_scans(None, []) == {}

@@ -117,6 +117,14 @@ def test_the_noise_follows_incidence_and_range(across, along):
     assert np.abs(np.median(found / true) - 1.0) < 0.1
 
 
+def test_pieces_weigh_by_their_freedoms_and_by_what_pieces_differ_by():
+    """Variances 1 of 10 freedoms and 1.1 of any number: 1 / (2 / 10 + 0.3^2) and 1 / 0.3^2 are their weights."""
+    v, dof = np.array([1.0, 1.1, 1.0, 1.0]), np.array([10.0, 1e12, 1e12, 1e12])
+    mean, other = noise_model._fitted(np.repeat(np.eye(2), 2, axis=0), v, dof)
+    expected = (1.0 / 0.29 + 1.1 / 0.09) / (1.0 / 0.29 + 1.0 / 0.09)
+    assert mean / other == pytest.approx(expected, rel=1e-9)  # rounding, and 2 / 1e12 beside 0.09
+
+
 def test_noise_is_one_number_for_scans_with_unknown_rays():
     n = 30
     planes = Planes(np.full(n, 20.0), np.eye(3)[np.arange(n) % 3] * 1e4, np.tile([0.0, 0.0, 1.0], (n, 1)),
