@@ -153,6 +153,18 @@ def test_reduced_boxes_find_the_inner_edges_of_the_plates():
     assert edge_features.reduced_boxes(cut[:20], 1.0, 4.0, BoxParams(), rng) is None
 
 
+def test_an_edge_box_is_sized_by_the_middle_of_its_plate_where_side_walls_were_scanned_densely():
+    """Of 120 mm of side walls at any depth the median would be of their depths, some 60 mm, not the plate's 24 mm."""
+    rng, n = np.random.default_rng(0), 60_000
+    walls = np.column_stack(
+        [rng.uniform(-600.0, 0.0, n), rng.choice([-450.0, 450.0], n), rng.uniform(-550.0, 550.0, n)]
+    )
+    with diagnostics.recording() as notes:
+        edge_features.reduced_boxes(np.vstack([box_end(16.0), walls]), 1.0, 4.0, BoxParams(), rng)
+    boxes = {place: value for _, place, quantity, value in notes.rows if quantity == "L_edge_mm"}
+    assert boxes["top"] == boxes["bottom"] == 1.5 * 24.0
+
+
 def test_x_axis_of_the_joint_frame_points_along_the_bridge():
     points = arch_clouds.key_points(0.4 * arch_clouds.ARC)
     T = joint_frame(points)

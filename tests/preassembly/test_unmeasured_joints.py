@@ -1,6 +1,7 @@
 """Joints of which an end was not measured: pieces that nothing measured ties together, their status and reasons."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from processor.inspection.result import Characteristics, InspectedComponent, Qua
 from processor.inspection.result import Result as Inspection
 from processor.language.messages import CODES, messages
 from processor.model import Status, Verdict, reason
-from processor.preassembly import step, topology
+from processor.preassembly import assemble, step, topology
 from processor.preassembly.chain import adjustment, design_places, span_and_closure
 from processor.preassembly.ends import bottom_edges
 from processor.preassembly.parts.part_in_chain import Member
@@ -189,6 +190,24 @@ def test_a_joint_that_closes_by_moving_is_not_nothing_to_do():
     assert "preassemble.nothing-to-do" in [one.code for one in plain.reasons]
     assert "preassemble.nothing-to-do" not in [one.code for one in by_moving.reasons]
     assert moved[0] in by_moving.reasons
+
+
+def test_a_joint_closes_by_moving_where_the_gap_at_the_parts_places_is_beyond_its_limits():
+    """An inclined joint, 1.5 mm wide along its own axis: in its limits, which 1.5 mm in the bridge's axes are not."""
+    joint = int(np.abs(FRAMES[:, 2, 0]).argmax())
+    limits = dataclasses.replace(
+        bridge_results.LIMITS,
+        limits=(dataclasses.replace(bridge_results.LIMITS.limits[0], high=0.7), bridge_results.LIMITS.limits[1]),
+    )
+
+    def closing(gap):
+        of_members = members(lambda part, end, at: np.tile(gap, (8, 1)) * (at == joint) * (end == 0))
+        parts = [SimpleNamespace(member=one) for one in of_members]
+        return assemble._closes_by_moving(parts, adjusted(of_members), DESIGN, FRAMES, limits, joint)
+
+    assert closing([1.5, 0.0, 0.0]) == ()
+    (why,) = closing([0.0, 0.0, 1.5])
+    assert why.values["gap"] == pytest.approx(1.5 * np.abs(FRAMES[joint, :3, 2]).max())
 
 
 @pytest.mark.parametrize("lang", CODES)
