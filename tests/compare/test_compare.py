@@ -355,6 +355,13 @@ def test_stated_units_count_before_those_of_the_files(tmp_path):
     assert not [one for one in expected.notes if one.code == "compare.over-files"]
 
 
+def test_a_stated_unit_has_a_remark_only_where_the_file_states_another(tmp_path):
+    path = las_with_keys(tmp_path / "m.las", wavy(COUNT, 1) / 1000.0, {1024: 1, 3072: 25832}, 1e-6)
+    for given, stated in (("m", None), ("ft", "m")):
+        remark = compare._read(path).otherwise(compare.units.of_files(given, ("reference",))["reference"])
+        assert (remark and remark.values["unit"]) == stated
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

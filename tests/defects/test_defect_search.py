@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+from scipy.stats import norm
 
 from processor.defects import (
     alignment,
@@ -333,6 +334,22 @@ def test_covariance_of_station_shifts_includes_undetermined_directions():
         error = float(((x - moved) * between).sum())
         z.append(error / np.sqrt(between.ravel() @ covariance @ between.ravel()))
     assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
+
+
+def test_the_covariance_of_the_whole_is_that_of_components_that_scatter():
+    """Components lie off by a or -a in each of six ways: a mean of n with 6 unknowns has the variance a^2 / (n - 6)."""
+    a, n = 2.0, 10
+    J = np.tile(np.diag([1e4] * 3 + [1.0] * 3), (n, 1))  # turns show at 10 m
+    component = np.repeat(np.arange(n), 6)
+    deviation = np.where(component % 2 == 0, a, -a)
+    x, covariance, gain = alignment._whole(deviation, J, component)
+    scale = a / norm.ppf(0.75)  # by the median, of normal errors
+    cauchy = (1.0 + (np.array([norm.ppf(0.75), 1.0]) / alignment.CAUCHY) ** 2) ** -2  # of a block, of its component
+    of_fit = scale**2 / (n * np.prod(cauchy))
+    # The prior, 50 mm there as well, pulls by a thousandth: the square of a fit's sd of 1.2 mm to it.
+    np.testing.assert_allclose(np.diag(J[:6] @ covariance @ J[:6]), a**2 / (n - 6) + of_fit, rtol=0.02)
+    assert x == pytest.approx(np.zeros(6), abs=1e-12)
+    np.testing.assert_allclose(J[:6] @ gain[:, :6], np.eye(6) / n, atol=2e-3)
 
 
 def test_cells_cover_the_area_of_a_design():

@@ -6,7 +6,7 @@ import trimesh
 
 from designgen import recipe_files
 from designgen.asbuilt import defects
-from designgen.designs import boxes_and_tubes, defect_specimens, stadium_roof, truss_bridge
+from designgen.designs import boxes_and_tubes, defect_specimens, prismatic_parts, stadium_roof, truss_bridge
 from designgen.scenes.make import make
 
 EXACT_MM = 1e-6  # float64 at 100 m: 1e-11, and squares of it
@@ -52,6 +52,32 @@ def test_every_box_of_a_structure_has_its_volume(components):
             assert signed_volume(body.patches(), body.centre) == pytest.approx(float(np.prod(body.size)))
         volume = sum(float(np.prod(body.size)) for body in one.bodies)
         assert signed_volume(one.patches, one.bodies[0].centre) == pytest.approx(volume)
+
+
+def test_a_truss_bridge_is_symmetric_about_its_middle_plane_and_its_beams_join_the_chords_axes():
+    trusses = truss_bridge.build(truss_bridge.Params(width_mm=6000.0, height_mm=4500.0, depth_mm=5000.0))[:4]
+    left, right, floor, top = ([_ends(box) for box in one.bodies] for one in trusses)
+    # Ends are sums of numbers of 1e4 mm in float64.
+    np.testing.assert_allclose(np.multiply(left, [1.0, -1.0, 1.0]), right, atol=1e-9)
+    for beams, z in ((floor, 4500.0), (top, 9500.0)):
+        for start, end in beams:
+            np.testing.assert_allclose([start[1:], end[1:]], [[-3000.0, z], [3000.0, z]], atol=1e-9)
+    heights = np.array([end for bar in left for end in bar])
+    assert set(np.round(heights[:, 1], 9)) == {3000.0}
+    assert set(np.round(heights[:, 2], 9)) == {4500.0, 9500.0}
+
+
+def test_the_net_about_a_pad_fits_its_sides():
+    """Edges of a single triangle lie at the rim of the wall: about the pad every edge has two."""
+    edge = np.array([[-300.0, 0.0], [300.0, 0.0]])  # 2000 x 600 mm, whose net has a line at x = 1000
+    whole = prismatic_parts.Part("wall", tuple(prismatic_parts.marked(np.eye(4), 0.0, 2000.0, edge, 1040.0)), (), None)
+    vertices, faces = whole.mesh()
+    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    open_, count = np.unique(sides, axis=0, return_counts=True)
+    middle = vertices[open_[count == 1]].mean(axis=1)
+    at_rim = np.isclose(middle[:, 0], [[0.0], [2000.0]]).any(axis=0) | np.isclose(np.abs(middle[:, 1]), 300.0)
+    assert at_rim.all()
+    assert (count <= 2).all()
 
 
 def test_a_hole_takes_its_volume_from_the_plate():
