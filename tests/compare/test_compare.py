@@ -13,7 +13,7 @@ import pytest
 from processor.__main__ import main
 from processor.compare import compare
 from processor.compare.compare import Request
-from processor.geometry.m3c2 import Distances
+from processor.geometry.m3c2 import Distances, Scales
 from processor.model import InputError, Scan, Scene, UsageError
 from processor.report import cloud_comparison
 from processor.report.deviation import core_points_csv
@@ -353,6 +353,15 @@ def test_stated_units_count_before_those_of_the_files(tmp_path):
         (note,) = [one for one in found.notes if one.code == "compare.over-files"]
         assert [one.values["name"] for one in note.values["files"]] == ["0.las", "1.las"]
     assert not [one for one in expected.notes if one.code == "compare.over-files"]
+
+
+def test_points_of_a_cylinder_are_said_of_the_sparser_cloud(clouds):
+    """A point a square of 2 by 2 in a circle of a diameter of 20: 25 pi; of the denser cloud 100 pi."""
+    for spacings in ((2.0, 1.0), (1.0, 2.0)):
+        lines = []
+        used = Scales(30.0, 20.0, 9.0, *spacings)
+        compare._log_scales(Request(*clouds[:2]), used, "mm", lines.append)
+        assert lines[-1] == f"a cylinder holds about {25.0 * np.pi:.3g} points of the sparser cloud"
 
 
 def test_a_stated_unit_has_a_remark_only_where_the_file_states_another(tmp_path):

@@ -44,18 +44,21 @@ def test_moved_body_is_reported_once_by_name_without_false_defects():
 
 def test_a_body_is_moved_as_its_shape_states():
     """A turn about the frame's origin and a shift, against the closed form of a rotation."""
-    surface = surface_charts.of_mesh(*box_mesh(), 20.0, DesignBodies(("box",), np.zeros(12, np.int64)))
+    vertices, faces = box_mesh()
+    both, bodies = np.vstack([vertices, vertices + 900.0]), DesignBodies(("box", "other"), np.repeat([0, 1], 12))
+    surface = surface_charts.of_mesh(both, np.vstack([faces, faces + 8]), 20.0, bodies)
     frame = shape_models.Frame(np.array([100.0, 50.0, 25.0]), np.eye(3), np.array([100.0, 50.0, 25.0]), 50.0)
     angle, span = 0.02, 100.0
     shape = shape_models.Shape(shape_models.RIGID, (), np.array([1.0, -2.0, 3.0, 0.0, 0.0, angle * span]))
     judged = SignificantShape(shape=shape, peak=3.0, ci95=0.1, volume_ci95=9.0, z=9.0, chance=0.0, margin=9.0)
     fit = ComponentShape(0, frame, None, None)
     design = moved_bodies.design("box", surface, {0: (fit, judged)})
-    arm = surface.vertices - frame.origin
+    arm = vertices - frame.origin
     turned = np.stack([arm[:, 0] * np.cos(angle) - arm[:, 1] * np.sin(angle),
                        arm[:, 0] * np.sin(angle) + arm[:, 1] * np.cos(angle), arm[:, 2]], axis=1)  # fmt: skip
-    assert design.vertices == pytest.approx(turned + frame.origin + [1.0, -2.0, 3.0], abs=1e-9)  # float64
-    assert design.bodies.names == ("box",)
+    assert design.vertices[:8] == pytest.approx(turned + frame.origin + [1.0, -2.0, 3.0], abs=1e-9)  # float64
+    np.testing.assert_array_equal(design.vertices[8:], both[8:])
+    assert design.bodies.names == ("box", "other")
 
 
 def box_mesh():

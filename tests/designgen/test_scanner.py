@@ -342,6 +342,23 @@ def test_rays_meet_cones_where_bisection_does():
     assert met > 300
 
 
+@pytest.mark.parametrize("bow", [0.0, 40.0])
+def test_pieces_of_a_bar_cover_its_surface(bow):
+    """Rims of pieces lie on their spheres: a bar of 1 m and radii up to 100 mm has three pieces."""
+    bowed = (np.array([bow, 0.0, 0.0]), 0.0, 1000.0)
+    builder = Builder()
+    builder.cone(0, "bar", np.zeros(3), np.array([0.0, 0.0, 1.0]), (100.0, 100.0), 1000.0, bowed)
+    shapes = builder.to_surfaces()
+    z, turn = (grid.ravel() for grid in np.meshgrid(np.linspace(0.0, 1000.0, 301), np.linspace(-np.pi, np.pi, 37)))
+    sag = 4.0 * bow * z / 1000.0 * (1.0 - z / 1000.0)
+    points = np.stack([100.0 * np.cos(turn) + sag, 100.0 * np.sin(turn), z], axis=1)
+    off = np.linalg.norm(points[:, None] - shapes.piece_centre, axis=2) - shapes.piece_radius
+    assert shapes.piece_centre.shape == (3, 3)
+    assert off.min(axis=1).max() < EXACT_MM
+    if not bow:
+        assert off.min(axis=1).max() > -EXACT_MM  # and are no larger than that
+
+
 def test_large_and_slim_triangles_are_met_wherever_they_are():
     """Around the scanner, over its head, seen edge on: each ray against each plane's equation, without boxes."""
     rng = np.random.default_rng(6)

@@ -21,6 +21,8 @@ def test_adaptive_voxels_contain_their_number_of_points():
     assert count.sum() == len(points)
     widths = [np.ptp(points[group == g], axis=0).max() for g in range(len(count) - 1)]
     assert max(widths[:50]) <= 2.0 < np.max(widths)
+    shifted = deviation_cloud.adaptive_voxels(points + np.array([700.7, -0.3, 1.1]), 2.0, 5, 2.0)
+    np.testing.assert_array_equal(shifted, group)  # voxels begin at the lowest point, in any frame
     means = group_means(points, group)
     np.testing.assert_allclose(means[3], points[group == 3].mean(axis=0))
 

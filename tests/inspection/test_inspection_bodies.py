@@ -147,6 +147,16 @@ def flat_plate(wave, noise, seed):
     return {one.id: one for one in structure_bodies.measured(Body("plate", body.faces, tuple(pieces)))[0]}
 
 
+@pytest.mark.parametrize(("size", "apart"), [(1000.0, 0.5), (2000.0, 1.0), (8000.0, 1.0)])
+def test_quarters_of_a_face_share_less_the_farther_they_lie_apart(size, apart):
+    """Halves differ along, across and crosswise by half the shared variance each, from 2 m on; by a square before."""
+    x, y = (0.5 * size * np.array(axis) for axis in ([0.6, 0.6, -0.6, -0.6], [0.8, -0.8, 0.8, -0.8]))
+    pieces = Pieces(np.stack([x, y, 0.0 * x], axis=1), 0.0 * x, np.full(4, 0.04), 0.3)
+    expected = np.full((4, 4), 1.0 - 0.5 * apart**2)  # of the three products of signs two are -1, one is 1
+    np.fill_diagonal(expected, 1.0 + 1.5 * apart**2)
+    np.testing.assert_allclose(pieces.covariance(x, y, 0.01), 0.09 * expected + 0.05 * np.eye(4), rtol=1e-12)
+
+
 @pytest.mark.parametrize(("wave", "noise"), [(0.0, 0.2), (0.1, 0.2), (1.0, 0.2), (2.0, 0.02)])
 def test_flatness_is_not_the_spread_of_the_noise(wave, noise):
     """320 pieces of 0.2 mm noise spread over 1.2 mm by noise alone."""

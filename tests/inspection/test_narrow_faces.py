@@ -259,6 +259,29 @@ def test_edges_of_scanned_plates_are_measured():
 def test_one_of_two_levels_with_as_many_points_is_taken():
     used = narrow_faces._of_level(np.arange(6.0), np.array([0.0, 0.1, 0.2, 9.0, 9.1, 9.2]))
     assert used.tolist() in ([True] * 3 + [False] * 3, [False] * 3 + [True] * 3)
+    off = np.repeat([9.0, 0.0, 18.0], [3, 4, 3])  # the level of the most points, which is not that of the middle one
+    assert narrow_faces._of_level(np.arange(10.0), off).tolist() == (off == 0.0).tolist()
+
+
+def test_the_tilt_that_views_leave_in_an_edge_widens_its_slope_alone(monkeypatch):
+    """The slope is that over half of the length, 150 mm: 2 mrad are 0.3 mm there; half of an overhang is its own."""
+    structure = design(box(PLATE))
+    surroundings, faces = around(structure, np.zeros((1, 3)))
+    nothing = flat_faces.Observed(np.empty((0, 3)), np.empty(0, int), NOTHING, NOTHING, NOTHING, side=50.0)
+    (body,) = flat_faces.bodies(structure, nothing, 60.0)
+    y = np.linspace(-140.0, 140.0, 15)
+    seen = flat_faces.Pieces(np.stack([0.0 * y + 200.0, y, 0.0 * y], axis=1), 0.0 * y, 0.0 * y + 0.01, 0.0)
+
+    def covariance(overhang, tilt):
+        monkeypatch.setattr(narrow_faces, "pieces", lambda *_: (seen, overhang, tilt))
+        axes = structure_bodies.body_axes(body)
+        side = structure_bodies._narrow_side(faces[1, 0, 0], [], axes, np.zeros(3), surroundings, still)
+        return side.fit.covariance
+
+    plain = covariance(0.0, 0.0)
+    # Float64.
+    np.testing.assert_allclose(covariance(0.0, 2e-3) - plain, np.diag([0.0, 0.3**2]), atol=1e-12)
+    np.testing.assert_allclose(covariance(0.4, 0.0) - plain, np.diag([0.4**2, 0.2**2]), atol=1e-12)
 
 
 @pytest.mark.slow
