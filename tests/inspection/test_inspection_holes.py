@@ -284,6 +284,20 @@ def test_places_and_pitches_have_the_scale_of_the_scanner():
     assert found["hole-1-along"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)
 
 
+def test_a_hole_lies_between_two_stations_by_the_variances_of_their_shifts_and_offsets():
+    """Walls seen from either side are 0.3 mm farther apart than the diameter; one station looks across the axis, one
+    by 0.6 of its rays. Quiet points leave the errors of the stations alone, whose variances share the difference."""
+    turn, apart = np.linspace(-0.9, 0.9, 1000), 0.3
+    wall = RADIUS * np.column_stack([np.cos(turn), np.sin(turn)])
+    places, source = np.concatenate([wall + np.array([apart, 0.0]), -wall]), np.repeat([0, 1], 1000)
+    ray = np.where(source[:, None] == 0, [1.0, 0.0], [-0.6, 0.0])
+    radius = np.array([RADIUS])
+    solved, *_ = bore_fit._adjusted(places, ray, source, np.zeros(2000, int), radius, np.zeros((1, 3)), 2)
+    first, second = (OFFSET_SD * np.array([1.0, 0.6])) ** 2 + SHIFT_SD**2
+    # The noise of 0.02 mm that is assumed at least has a thousandth of the weight, by a thousand points.
+    np.testing.assert_allclose(solved, [[apart * second / (first + second), 0.0, 0.0]], atol=2e-3)
+
+
 def test_the_adjustment_of_many_holes_needs_no_matrix_of_all_points():
     rng = np.random.default_rng(2)
     count, points = 100, 1000
