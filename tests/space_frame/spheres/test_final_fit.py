@@ -4,12 +4,16 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from processor.geometry.sphere import sphere_cells
 from processor.space_frame.spheres.final_fit import NodesToFit, fit_final
 from processor.space_frame.spheres.records import (
+    CELLS,
     CENTRE_CHI2,
     DEGREES,
+    POINTS,
     RMS,
     SCALE,
+    STATIONS,
     CropsWithRays,
     Masks,
     Priors,
@@ -95,6 +99,8 @@ def test_a_final_fit_is_that_of_scipy_less_the_bias_by_curvature_and_by_unknown_
     chi2 = x[:3] @ PRIOR[:3, :3] @ x[:3]
     expected = [np.sqrt(scale2), degrees, np.sqrt(np.mean(e**2)), chi2]
     np.testing.assert_allclose(found.numbers[0, [SCALE, DEGREES, RMS, CENTRE_CHI2]], expected, rtol=CLOSE)
+    cells = len(np.unique(sphere_cells(ball.points - ball.second[:, None] * x[4:], x[:3])))
+    np.testing.assert_array_equal(found.numbers[0, [POINTS, CELLS, STATIONS]], [COUNT, cells, 2])
     bound = np.linalg.inv((J.T / variances @ J + PRIOR)[:4, :4])  # stations fixed
     np.testing.assert_allclose(found.bounds[0], bound, atol=CLOSE * bound.max())
 
