@@ -51,6 +51,18 @@ def test_covariance_agrees_with_errors_with_and_without_eccentric_axes(eccentric
         assert met.eccentricity_mm == pytest.approx(max(eccentricity, 0.02), abs=0.08)
 
 
+def test_nodes_of_two_axes_are_no_evidence_of_eccentricity():
+    nodes = np.random.default_rng(9).uniform(-1e4, 1e4, (40, 3))
+    per_node = np.repeat([3, 5, 2, 1], 10)
+    both = ends_at(np.random.default_rng(8), nodes, per_node, 0.1, 1.0)
+    rows = slice(0, 80)  # of the nodes of three and of five
+    without = axis_intersection.AxisEnds(
+        both.node[rows], both.offsets[rows], both.across[rows], both.covariance[rows], both.response[rows]
+    )
+    first, alone = (axis_intersection._first_eccentricity2(ends, k, 0.02) for ends, k in ((both, 40), (without, 20)))
+    assert first == pytest.approx(alone, rel=1e-9)  # rounding
+
+
 def test_outlying_axis_is_excluded_from_its_node():
     rng = np.random.default_rng(3)
     nodes = rng.uniform(-1e4, 1e4, (50, 3))

@@ -1,0 +1,32 @@
+"""Statistics of the fine registration to a surface by hand."""
+
+import numpy as np
+import pytest
+
+from processor.registration import surface_registration
+
+
+def test_form_is_the_ratio_of_squares_of_full_cells_without_clutter():
+    """Cells of 30 residuals m +- 0.2: their means have n m^2 = 0.3 and 1.2 mm^2, chance has 0.04 mm^2."""
+    alternating = 0.2 * (-1.0) ** np.arange(30)
+    residual = np.concatenate([0.1 + alternating, -0.2 + alternating, np.full(20, 5.0), np.full(40, 20.0)])
+    counted = residual < 20.0  # the last are clutter, in the cells of the first
+    cell = np.concatenate([np.repeat([0, 1, 2], [30, 30, 20]), np.repeat([0, 1], 20)])  # 20 points do not fill a cell
+    assert surface_registration._form(residual, counted, cell) == pytest.approx(0.5 * (0.3 + 1.2) / 0.04)
+    assert surface_registration._form(residual[60:80], counted[60:80], np.zeros(20, int)) == np.inf
+
+
+def test_gradients_are_summed_by_cell_before_they_are_squared():
+    gradient = np.array([[1.0, 2.0, 0.0, 0.0, 0.0, 0.0], [3.0, -1.0, 0.0, 0.0, 0.0, 0.0], *np.eye(6)[2:].repeat(2, 0)])
+    cell = np.array([0, 0, *range(1, 9)])
+    # Of 9 cells and 6 parameters: 9 / 3. The first has the sum (4, 1).
+    expected = 3.0 * np.diag([16.0, 1.0, 2.0, 2.0, 2.0, 2.0])
+    expected[0, 1] = expected[1, 0] = 12.0
+    np.testing.assert_allclose(surface_registration._scatter(gradient, cell), expected)
+
+
+def test_cells_are_lengths_of_a_side():
+    place = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [499.0, 9.0, 9.0], [499.0, 0.0, 0.0], [499.0, 0.0, 0.0]])
+    normal = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.9, 0.1], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+    cell = surface_registration.cells(place, np.array([1, 1, 1, 1, 2]), normal)
+    assert cell.tolist() == [0, 2, 2, 1, 3]
