@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.stats
+from scipy.fft import rfftn
 
 import designgen
 from processor.geometry import rigid
@@ -81,6 +82,19 @@ def test_slopes_of_the_pattern_are_those_of_finite_differences():
     ahead, behind = (np.stack([checkerboard._model(at, x + way * h) for h in steps], axis=1) for way in (1.0, -1.0))
     # Rounding of 1e-16 over 1e-5 and third differences.
     np.testing.assert_allclose(checkerboard._slopes(at, x), (ahead - behind) / 2e-5, atol=1e-8)
+
+
+def test_the_correlation_is_one_where_the_image_is_the_pattern():
+    upright = checkerboard._patterns(SIDE, 41)[0]
+    assert upright.window == 17**2  # of cells of 1 / 18: those within 0.47 * 18 = 8.46 of the centre
+    grid = np.arange(41) - 24
+    square = np.where(np.abs(grid) <= 8, np.sign(grid), 0.0)
+    image = 3.0 * np.outer(square, square)
+    fields = {"there": np.ones((41, 41)), "image": image, "square": image**2}
+    spectra = {name: rfftn(values, upright.extent) for name, values in fields.items()}
+    found = checkerboard._correlation(spectra, upright, 41)
+    assert np.unravel_index(found.argmax(), found.shape) == (24, 24)
+    assert found.max() == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("field", [(1, 1), (-1, -1), (1, -1), (-1, 1)])
@@ -164,6 +178,11 @@ def test_painted_target_on_a_wall_is_found_at_its_centre():
 
 
 # --- names ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_least_height_of_a_triangle_stands_on_its_longest_side():
+    assert naming._height(np.array([[7.0, 0.0, 0.0], [7.0, 300.0, 0.0], [7.0, 0.0, 400.0]])) == pytest.approx(240.0)
+    assert naming._height(np.ones((3, 3))) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(5))
