@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.stats import norm
 
 from processor.space_frame import extract
 from processor.space_frame.members import member_extraction
+from processor.space_frame.spheres import ball_joint_classification
 from processor.space_frame.spheres.ball_joint_classification import UNLIKE, log_odds_of_ball, most_likely
 from tests.support.clouds import frame_clouds
 from tests.support.clouds.frame_clouds import STATIONS
@@ -39,6 +41,11 @@ def found(frame, sleeves=True, seed=3, **kinds):
     meeting = member_extraction.meeting(start.measured, member_extraction.Params().largest_scatter_mm)
     positions = start.measured.nodes.positions
     return positions[meeting], positions[meeting & start.balls]
+
+
+def test_the_density_of_residuals_is_the_normal_one():
+    for e, sd in ((0.0, 1.0), (1.5, 0.4), (-3.0, 2.0)):
+        assert ball_joint_classification._normal(e, sd) == pytest.approx(norm.pdf(e, 0.0, sd), rel=1e-12)
 
 
 def test_joints_of_a_scaffold_are_no_nodes():

@@ -195,6 +195,8 @@ def test_only_differences_of_range_offsets_between_stations_are_corrected():
     # what all share may be the mean of four that scatter so, along the mean ray
     scatter = np.std(offset, ddof=1) / 2.0
     assert found.shared_offset_sd == pytest.approx(scatter, rel=0.3)  # offsets that are known to 0.1 to 0.2 mm
+    of_four = np.sqrt((found.range_offset**2).sum() / 3.0) / 2.0  # their mean is 0
+    assert found.shared_offset_sd == pytest.approx(of_four, rel=1e-9)  # rounding
     above = found.places.mean(axis=0) + np.array([0.0, 0.0, 1e6])
     along = found.shared_offset_at(above[None])[0]
     # Rays of 1 km from stations metres apart are parallel to 1e-2.
