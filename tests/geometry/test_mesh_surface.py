@@ -36,6 +36,16 @@ def test_a_plate_has_two_sides_and_edges():
     assert outside[1][0] == pytest.approx(7.0) or outside[2][0] == pytest.approx(7.0)
 
 
+def test_how_far_a_point_is_beyond_each_side_of_a_facet():
+    one = np.array([[0.0, 0.0, 0.0], [300.0, 0.0, 0.0], [0.0, 400.0, 0.0]])
+    surface = mesh_distance.of_mesh(np.vstack([one, one + 5000.0]), np.arange(6).reshape(2, 3))
+    points = np.array([[120.0, -7.0, 3.0], [-7.0, 160.0, -3.0], [150.0 + 5.6, 200.0 + 4.2, 3.0], [50.0, 50.0, 3.0]])
+    face, distance, beyond = surface.distances(points, 60.0)
+    assert face.tolist() == [0] * 4
+    np.testing.assert_allclose(distance, [3.0, -3.0, 3.0, 3.0])
+    np.testing.assert_allclose(beyond, [7.0, 7.0, 7.0, 0.0], atol=1e-12)  # rounding
+
+
 def test_facets_are_neighbours_over_smooth_sides_only():
     mesh = trimesh.creation.box((100.0, 100.0, 100.0))
     surface = mesh_distance.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))

@@ -49,6 +49,20 @@ def test_a_normal_is_turned_along_its_direction_and_square_to_it_upwards(normal,
         np.testing.assert_array_equal(oriented(np.array([normal], float), np.array(directions, float)), [expected])
 
 
+def test_links_between_neighbours_are_lighter_the_more_parallel_their_normals_and_the_more_in_one_plane():
+    """A step (0, 3, 4) is 4 along the normal z, and 5 along (0, 0.6, 0.8), which is turned by a cosine of 0.8."""
+    places = np.array([[1.0, 2.0, 3.0], [1.0, 5.0, 7.0], [1.0, 62.0, 83.0]])
+    normals = np.array([[0.0, 0.0, 1.0], [0.0, -0.6, -0.8], [0.0, 0.0, 1.0]])
+    index, far = np.array([[0, 1, 2]]), np.array([[0.0, 5.0, 100.0]])
+    cosine, weight = np.empty((1, 3)), np.empty((1, 3), np.uint16)
+    rows = np.array([0])
+    normal_orientation._links(places, normals, rows, index, far, 50.0, 0, 1, cosine, weight)
+    no_link = normal_orientation.NO_LINK  # to itself and to a place beyond the limit of 50
+    np.testing.assert_allclose(cosine, [[0.0, -0.8, 0.0]])
+    # 1 - 0.8 + (4 + 5) / 2 / 5, in steps.
+    assert weight.tolist() == [[no_link, pytest.approx(1.1 * normal_orientation.STEPS, abs=1.0), no_link]]
+
+
 def test_normals_of_level_surfaces_equal_those_oriented_upwards_bit_for_bit():
     cloud = wavy(5_000, 1)
     found, got = turned(cloud)
