@@ -32,6 +32,19 @@ def test_share_of_correlated_places_has_the_interval_of_one_per_place():
     assert np.isnan(distance_summary.share(np.zeros(0, bool), np.zeros((0, 3)), 1.0).share)
 
 
+def test_the_interval_of_a_share_is_wilsons_for_the_number_that_its_places_are_worth():
+    """Wilson (1927): the limits q solve (p - q)^2 = z^2 q (1 - q) / n."""
+    marks = np.repeat([True, True, True, False, False, False, False, False], 2)
+    places = np.repeat(np.arange(8.0), 2)[:, None] * [100.0, 0.0, 0.0]
+    # Pairs of one place are one: eight with the sample variance are worth seven of a known share.
+    p, z2 = 3.0 / 8.0, distance_summary.Z95**2
+    low, high = np.sort(np.roots([1.0 + z2 / 7.0, -(2.0 * p + z2 / 7.0), p * p]))
+    found = distance_summary.share(marks, places, 50.0)
+    assert (found.share, found.low, found.high) == pytest.approx((p, low, high), rel=1e-9)  # rounding
+    found = distance_summary.share(np.ones(16, bool), places, 50.0)
+    assert (found.share, found.low, found.high) == pytest.approx((1.0, 8.0 / (8.0 + z2), 1.0), rel=1e-9)
+
+
 def test_summary_counts_core_points_without_level_of_detection():
     nan = np.nan
     found = Distances(

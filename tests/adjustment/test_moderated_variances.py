@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.optimize import brentq
+from scipy.special import digamma, polygamma
 
 from processor.adjustment import moderated_variances
 
@@ -43,6 +45,18 @@ def test_groups_of_one_variance_have_it():
         found.variance, COMMON, rtol=0.2
     )  # the common one by 6,000 degrees: 2 %; the law itself is estimated
     assert found.dof.min() > 50.0
+
+
+def test_the_law_has_the_mean_and_the_variance_of_the_groups_logarithms():
+    """Of s^2 with d degrees of freedom, about s0^2 with d0: ln s^2 has trigamma(d / 2) + trigamma(d0 / 2)."""
+    dof, square = np.array([6.0, 8.0, 10.0, 12.0]), np.array([1.0, 16.0, 4.0, 90.0])
+    logs = np.log(square / dof) - digamma(dof / 2.0) + np.log(dof / 2.0)
+    surplus = np.sum((logs - logs.mean()) ** 2) / 3.0 - np.mean(polygamma(1, dof / 2.0))
+    law = 2.0 * brentq(lambda y: polygamma(1, y) - surplus, 0.1, 100.0)
+    common = np.exp(logs.mean() + digamma(law / 2.0) - np.log(law / 2.0))
+    found = moderated_variances.moderated(square, dof)
+    np.testing.assert_allclose(found.dof, law + dof, rtol=1e-6)  # where Newton's iteration stops
+    np.testing.assert_allclose(found.variance, (law * common + square) / (law + dof), rtol=1e-6)
 
 
 def test_groups_without_points_have_the_common_variance():
