@@ -499,7 +499,7 @@ def test_eliminating_the_tubes_is_solving_for_all_at_once():
     )
     H, g = normal_equations.reduced(*arguments)
     # One row a point: tube's seven unknowns less the station's motion of the axis at the middle and at its end.
-    A, right = [], []
+    A, right, moved = [], [], []
     for i in range(q):
         j, s = tube[i], station[i]
         G = np.zeros((8, 7))
@@ -509,6 +509,7 @@ def test_eliminating_the_tubes_is_solving_for_all_at_once():
             end = np.cross(w, half[j] * axis[j, 3:])
             G[:4, k] = at @ e1[j], at @ e2[j], end @ e1[j], end @ e2[j]
         G[7, 6] = 1.0
+        moved.append(G)
         for f, value in zip(F[i], y[i], strict=True):
             row = np.zeros(7 * tubes + 7 * stations)
             row[7 * j : 7 * j + 7] = f[:7]
@@ -520,8 +521,17 @@ def test_eliminating_the_tubes_is_solving_for_all_at_once():
     x = np.linalg.solve(full, A.T @ right)
     mine = np.linalg.solve(H + 1e-2 * np.eye(len(H)), g)
     np.testing.assert_allclose(mine, x[7 * tubes :], rtol=1e-8, atol=ROUNDING)
-    found, _ = normal_equations.tubes(*arguments, mine, 0.09)
+    found, scores = normal_equations.tubes(*arguments, mine, 0.09)
     np.testing.assert_allclose(found[:, :7].ravel(), x[: 7 * tubes], rtol=1e-8, atol=ROUNDING)
+    # Scores by their definition: residuals' gradient by the axis's place, and its covariance V after the fit.
+    for i in range(q):
+        j, rows = tube[i], tube == tube[i]
+        left = y[i] - F[i] @ (found[j] - moved[i] @ mine[7 * station[i] : 7 * station[i] + 7])
+        u = (F[i].T @ left)[:2]
+        C = np.linalg.inv(N[i, :2, :2] + np.eye(2) / 0.09)
+        of_tube = (weight[rows, None, None] * N[rows]).sum(axis=0) + np.diag(prior[j])
+        V = (N[i] - weight[i] * N[i] @ np.linalg.inv(of_tube) @ N[i])[:2, :2]
+        np.testing.assert_allclose(scores[i], [u @ C @ u, np.trace(C @ V), np.trace(C @ V @ V)], rtol=1e-8)
 
 
 def test_a_floor_is_an_unknown_of_its_own():
