@@ -5,6 +5,7 @@ import pytest
 
 from processor.adjustment import mixed_pixels
 from processor.defects import observations, surface_charts
+from processor.geometry import rigid
 
 SCANNER, STEP, WALL, POST = np.array([0.0, -5000.0, 0.0]), 1.6e-3, 0.0, -300.0
 HALF = 50.0  # of the post, mm
@@ -43,6 +44,19 @@ def test_points_beside_a_post_are_marked_and_no_others():
     step_mm = 5000.0 * STEP
     assert found[off < step_mm].all()
     assert not found[off > mixed_pixels.WINDOW_STEPS * step_mm + mixed_pixels.half_beam_width(5000.0) + step_mm].any()
+
+
+@pytest.mark.parametrize("face", [1, -1])  # of the post: of its own, or none, which the slope of a dent may explain
+def test_marks_do_not_depend_on_the_frame(face):
+    points, wall = scan()
+    every, height, on = np.where(wall, 0, face), -points[wall, 1], np.zeros(wall.sum(), np.int64)
+    normals = np.tile([0.0, -1.0, 0.0], (wall.sum(), 1))
+    before = mixed_pixels.mark(points[wall], SCANNER, normals, height, on, (points, every))
+    turn = rigid.rotation_from_vector(np.array([0.0, 0.0, 0.7]))
+    moved, scanner = points @ turn.T + [4e4, -3e4, 2e3], turn @ SCANNER + [4e4, -3e4, 2e3]
+    after = mixed_pixels.mark(moved[wall], scanner, normals @ turn.T, height, on, (moved, every))
+    assert before.any()
+    np.testing.assert_array_equal(after, before)
 
 
 def test_without_the_post_nothing_is_marked_whatever_the_noise_of_a_point_itself():
