@@ -9,7 +9,7 @@ import pytest
 from processor.geometry import mesh_distance, rigid
 from processor.model import reason
 from processor.preassembly.chain import adjustment, span_and_closure
-from processor.preassembly.ends import joint_end, plate_sides
+from processor.preassembly.ends import end_ring, joint_end, plate_sides
 from processor.preassembly.ends import outer_faces as ends_faces
 from processor.preassembly.ends.joint_frame import end_place
 from processor.preassembly.parts.part_in_chain import Member
@@ -201,6 +201,17 @@ def test_waves_of_the_plates_are_in_the_middles_of_the_edges():
     sd = sds(end)
     assert abs(off) < 0.25  # without the waves in the model it is -0.93
     assert (np.abs(np.append(off, end.departure[:2, 2])) < 3.0 * np.append(sd[4, 2], sd[:2, 2])).all()
+
+
+def test_densities_of_points_near_an_end_face_integrate_to_their_mass():
+    """Over the window, 6 mm about a plate of 20 mm and about where the ring was before it moved by 0.5 mm."""
+    off, e = (0.05 * (np.arange(int(20 * size)) + 0.5) - 6.0 for size in (12.0, 32.0))
+    off, e = (grid.ravel() for grid in np.meshgrid(off - 0.5, e))
+    rho = end_ring._Densities(3.0, 2.0, 1.0)
+    ring, wall, outlier, mass = end_ring._mixture(off, e, np.full(len(e), 20.0), 1.0, rho, 6.0, np.full(len(e), 0.5))
+    # Beyond the window are 1e-7 of a normal distribution; a sum of steps of 0.05 sd is exact but for that.
+    assert (ring + wall).sum() * 0.05**2 == pytest.approx(mass[0], rel=1e-6)
+    assert outlier.sum() * 0.05**2 == pytest.approx(0.005 * mass[0], rel=1e-9)
 
 
 def test_the_outermost_layer_of_a_tilted_plate():
