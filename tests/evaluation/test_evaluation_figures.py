@@ -57,6 +57,7 @@ def slab(error, turn=0.0, half=True, by_stations=()):
     result = DeviationResult(
         status="ok", method="default", T_design_scan=off @ PROJECT, core=core, covariance=1e-6 * np.eye(6),
         min_ci95=found.min() + np.array([-0.5, 0.5]), max_ci95=found.max() + np.array([-0.5, 0.5]),
+        mean_ci95=found.mean() + np.array([-0.045, 0.045]),
     )  # fmt: skip
     truth = Truth(structure=StructureTruth(at, up, moved[:, None] * up), pose=PoseTruth(PROJECT, by_stations))
     scene = Scene("slab", "structure", (Scan("s", at),))
@@ -135,7 +136,10 @@ def test_steel_as_designed_has_the_mean_and_the_pose_of_the_truth():
     found = slab(0.04, half=False)
     assert found["mean of steel as designed"].value == pytest.approx(0.04)
     assert found["mean of steel as designed"].passed
-    assert not slab(-0.06, half=False)["mean of steel as designed"].passed
+    assert found["means within their 95 % intervals"].value == 100.0  # 0.04 of 0.045
+    beyond = slab(-0.06, half=False)
+    assert not beyond["mean of steel as designed"].passed
+    assert beyond["means within their 95 % intervals"].value == 0.0
     assert found["poses within their 95 % intervals"].value == 100.0
     assert slab(0.04, half=False)["wrong poses called ok"].passed
     assert not slab(0.04, turn=3000.0, half=False)["wrong poses called ok"].passed
