@@ -1,12 +1,15 @@
 """Figures of results compared with a truth, by results made by hand: values within their intervals are counted."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from processor.defects.result import Result as DefectsResult
 from processor.deviation.result import Result as DeviationResult
-from processor.evaluation import defects, deviation, error_statistics, space_frame, stitching
+from processor.evaluation import defects, deviation, error_statistics, inspection, space_frame, stitching
 from processor.geometry import rigid
+from processor.inspection.result import AxisDepartures, InspectedComponent
 from processor.model import (
     BodyTruth,
     DefectTruth,
@@ -24,6 +27,7 @@ from processor.model import (
 )
 from processor.stitching.result import Pairs, Scans
 from processor.stitching.result import Result as StitchResult
+from tests.support.clouds import arch_clouds
 from tests.support.results import ball_results, surface_rows
 
 ROUNDING_MM = 1e-6  # float64 at 90 m is 1e-11: of inverse transforms
@@ -240,6 +244,23 @@ def test_poses_of_pairs_are_compared_with_the_truth_in_any_frame(shift, share):
     told = figures(stitching.check(Scene("s", "structure"), result, truth))
     assert told["poses of pairs within their 95 % intervals"].value == pytest.approx(share)
     assert told["scales within their 95 % intervals"].value == 0.0
+
+
+# --- inspection -------------------------------------------------------------------------------------------------------
+
+
+def test_the_true_width_and_sweep_of_a_part_are_of_both_edges():
+    """A left edge 2 mm and a right edge 0.5 mm to the left of the design's: 1.5 mm wider, and straight."""
+    design = arch_clouds.design()
+    part, chainage, zero = design.parts[1], np.linspace(500.0, 4500.0, 5), np.zeros(5)
+    edges = np.stack([part.bottom_edge_left, part.bottom_edge_right])
+    edges[:, :, 1] += [[2.0], [0.5]]
+    ends = np.array(inspection.design_ends(design, 1))
+    truth = SimpleNamespace(names=(part.name,), key_points_bridge=ends[None], edges_bridge=edges[None])
+    component = InspectedComponent(name=part.name, axis=AxisDepartures(chainage, zero, zero, zero, zero))
+    true = inspection._of_part(design, component, truth)
+    assert true["middle-width-bottom"] == pytest.approx(1.5, abs=ROUNDING_MM)
+    assert true["sweep"] == pytest.approx(0.0, abs=ROUNDING_MM)
 
 
 # --- balls ------------------------------------------------------------------------------------------------------------
