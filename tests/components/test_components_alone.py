@@ -13,6 +13,7 @@ import trimesh
 from processor import scene_cloud
 from processor.components import bridge_parts, frame_members
 from processor.defects import step as defects
+from processor.defects.bridges import parts
 from processor.deviation import step as deviation
 from processor.model import ArchDesign, DesignPart, FrameDesign, Scan, Scene, Stations, Status, StepRun, UsageError
 from processor.pipeline import result_classes
@@ -102,6 +103,15 @@ def test_dent_is_found_on_its_part_without_false_defects(compared):
     middle = np.array([0.5 * SIZE[0], 0.0, SIZE[2]])  # of the top of the right part, as designed
     assert np.linalg.norm(found.centre[0] - middle) < 0.5 * DENT_RADIUS  # the dent, not a neighbour
     assert result.parts.defects.tolist() == [0, 1]
+
+
+def test_defects_of_parts_are_numbered_one_after_another(compared):
+    _, result = compared
+    first, second = parts._numbered([result, result])
+    assert (first.defects.id.tolist(), second.defects.id.tolist()) == ([0], [1])
+    np.testing.assert_array_equal(first.surface.defect, result.surface.defect)
+    assert set(second.surface.defect - first.surface.defect) == {0, 1}
+    assert (second.surface.defect[first.surface.defect < 0] < 0).all()
 
 
 def test_a_part_that_was_not_registered_fails_alone(bridge):

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
+from scipy.stats import norm
 
 from processor.adjustment import scanner_class_errors
 from processor.defects import alignment, deviation_field, regions, scan_statistic, surface_charts
@@ -167,6 +168,20 @@ def test_few_degrees_of_freedom_need_larger_deviations():
         field = scan_statistic.widened(field, levels)
         found[dof] = bool(scan_statistic.search(field, surface, levels).sign.any())
     assert found == {30.0: False, 1e6: True}
+
+
+def test_a_region_ends_where_its_cells_deviate_less():
+    """Squares of four cells are significant from 5.2 sds: with two of 4 sds and two of 1.5, below 2.5, as well."""
+    surface = surface_of(BOX, 20.0)
+    field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
+    levels = scan_statistic.levels_of(field, surface, 1e-8, 0.0)
+    assert levels.threshold[1] == pytest.approx(-norm.ppf(0.5e-8 * 400.0 / (len(levels.sides) + 2)))
+    off = np.abs(surface.centres[:, :2] - [500.0, 300.0]).max(axis=1)
+    up = (field.seen > 0) & (surface.outward[:, 2] > 0.5)
+    sds = np.where(up & (off < 80.0), np.where(off < 60.0, 4.0, 1.5), 0.0)
+    deviation = sds * np.sqrt(field.variance)
+    found = scan_statistic.search(dataclasses.replace(field, deviation=deviation), surface, levels).sign
+    np.testing.assert_array_equal(found, sds > 2.5)
 
 
 def test_single_cell_in_line_with_a_ridge_is_not_part_of_its_region():

@@ -61,6 +61,17 @@ def test_a_body_is_moved_as_its_shape_states():
     assert design.bodies.names == ("box", "other")
 
 
+def test_cells_within_30_mm_of_a_steps_edge_mix_both_sides():
+    """An edge across the box at a quarter of its half length from the middle; a cell and a half of 20 mm."""
+    surface = surface_charts.of_mesh(*box_mesh(), 20.0)
+    frame = shape_models.Frame(np.array([100.0, 50.0, 25.0]), np.eye(3), np.array([100.0, 50.0, 25.0]), 50.0)
+    step, bend = (shape_models.Shape(kind, (0, 0.25), np.ones(1)) for kind in ("step", "bend"))
+    fit = ComponentShape(0, frame, None, None)
+    cells = component_shapes.jumps(surface, [fit], {0: [bend, step]})
+    np.testing.assert_array_equal(cells, np.flatnonzero(np.abs(surface.centres[:, 0] - 125.0) <= 30.0))
+    assert len(component_shapes.jumps(surface, [fit], {0: [bend]})) == 0
+
+
 def box_mesh():
     mesh = trimesh.creation.box(bounds=[[0, 0, 0], [200, 100, 50]])
     return np.array(mesh.vertices), np.array(mesh.faces, np.int64)
