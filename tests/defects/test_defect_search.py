@@ -180,7 +180,8 @@ def test_surface_in_the_shadow_of_clutter_is_not_missing():
 )
 def test_shapes_of_whole_components(kind, inward, depth):
     """On the second of four plates; the others determine the pose of the whole, to 0.05 mm."""
-    result = run(scene_of(4, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)))
+    clutter = (1200.0, -250.0, 300.0, 90.0) if kind == "bend" else None  # cells behind it have no deflection
+    result = run(scene_of(4, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0), clutter=clutter))
     assert found(result) == [(kind, "component-2")]
     assert abs(result.defects.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
     if kind == "misalignment":  # by 2 mm on average
