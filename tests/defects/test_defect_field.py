@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,16 @@ import trimesh
 from scipy.stats import norm
 
 from processor.adjustment import scanner_class_errors
-from processor.defects import alignment, deviation_field, regions, scan_statistic, surface_charts
+from processor.defects import (
+    alignment,
+    component_shapes,
+    deviation_field,
+    regions,
+    scan_statistic,
+    shape_models,
+    surface_charts,
+)
+from processor.defects.component_shapes import ComponentShape
 from processor.defects.observations import Pairs, Stations
 
 EDGE, SIGMA, POINTS = 8.0, 0.5, 12
@@ -168,6 +178,25 @@ def test_few_degrees_of_freedom_need_larger_deviations():
         field = scan_statistic.widened(field, levels)
         found[dof] = bool(scan_statistic.search(field, surface, levels).sign.any())
     assert found == {30.0: False, 1e6: True}
+
+
+@pytest.mark.parametrize(("fitted", "mean", "variance"), [(True, 0.0, 0.09 + 0.04), (False, 1.0 / 3.0, 0.01)])
+def test_a_bend_is_no_movement_where_the_pose_is_not_of_the_design(fitted, mean, variance):
+    """The square of the place along a plate: its mean is a shift. A pose that was not fitted shifts it, too."""
+    surface = surface_of((((0, 0, 0), (1000, 600, 12)),), 20.0)
+    field, none = field_of(surface, pairs_of(surface, 1)), np.zeros(len(surface.share))
+    field = dataclasses.replace(field, stations=none + 0.04, stations_free=none + 0.01)
+    frame = shape_models.Frame(np.array([500.0, 300.0, 6.0]), np.eye(3), np.array([500.0, 300.0, 6.0]), 300.0)
+    top = np.flatnonzero(surface.outward[:, 2] > 0.5)
+    blocks = shape_models.Blocks(surface.centres[top], surface.outward[top], none[top], np.ones(len(top)), 20.0)
+    bend = shape_models.Shape("bend", (0, 2), np.array([2.0]), np.array([[0.01]]))
+    fit, levels = ComponentShape(0, frame, blocks, None), SimpleNamespace(common_mm=0.1, systematic_mm=0.2)
+    of_pose = SimpleNamespace(fitted=fitted, sd=lambda points, _: np.full(len(points), 0.3))
+    value, own, sd, shared = component_shapes._errors(fit, bend, surface, field, of_pose, levels)
+    # Cells of a fiftieth of the length: a ten-thousandth. Signs are those of the front, above or below.
+    np.testing.assert_allclose(np.abs(value - own), 2.0 * mean, rtol=1e-3)
+    np.testing.assert_allclose(sd, 0.05 * np.abs(value), rtol=1e-9)
+    np.testing.assert_allclose(shared**2, 0.05 + variance, rtol=1e-9)
 
 
 def test_a_region_ends_where_its_cells_deviate_less():
