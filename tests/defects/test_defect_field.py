@@ -199,6 +199,17 @@ def test_a_bend_is_no_movement_where_the_pose_is_not_of_the_design(fitted, mean,
     np.testing.assert_allclose(shared**2, 0.05 + variance, rtol=1e-9)
 
 
+@pytest.mark.parametrize("side", [1, 3, 8])
+def test_means_of_windows_scatter_by_the_root_of_their_cells(side):
+    surface = surface_of(BOX, 20.0)
+    field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
+    even = dataclasses.replace(field, variance=np.full(len(field.variance), 0.04), deviation=0.5 + 0.0 * field.variance)
+    z, sd = scan_statistic._windows(even, surface.charts, scan_statistic._used(even, surface.charts), side)
+    assert sd.min() == pytest.approx(0.2 / side)  # of windows that were seen whole
+    assert z.max() == pytest.approx(0.5 * side / 0.2)
+    np.testing.assert_allclose(z * sd, 0.5)
+
+
 def test_a_region_ends_where_its_cells_deviate_less():
     """Squares of four cells are significant from 5.2 sds: with two of 4 sds and two of 1.5, below 2.5, as well."""
     surface = surface_of(BOX, 20.0)
