@@ -87,6 +87,18 @@ def test_area_hidden_by_a_touching_body_is_the_contact_area(turn):
     assert not hidden[~(up | foot)].any()
 
 
+@pytest.mark.parametrize(("gap", "hidden"), [(0.0, True), (0.3, True), (0.7, False)])
+def test_an_open_sheet_within_half_a_millimetre_of_a_body_is_hidden_there(gap, hidden):
+    whole = trimesh.creation.box(bounds=np.array(BOX[0], float))
+    corners = np.array([[-200.0, -200.0], [1200.0, -200.0], [1200.0, 800.0], [-200.0, 800.0]])
+    sheet = trimesh.Trimesh(np.column_stack([corners, np.full(4, -gap)]), [[0, 1, 2], [0, 2, 3]])
+    mesh = trimesh.util.concatenate([whole, sheet])
+    surface = surface_charts.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64), 20.0)
+    on_sheet = (surface.outward[:, 2] > 0.5) & (surface.centres[:, 2] < 1.0)
+    area = (surface.hidden & surface.covered)[on_sheet].sum() * (20.0 / surface_charts.PER_SIDE) ** 2
+    assert area == pytest.approx(1000.0 * 600.0 * hidden, rel=0.02)  # a sample at either border
+
+
 def test_points_alone_on_a_face_are_not_examined():
     surface = surface_of(BOX, 20.0)
     pairs = pairs_of(surface, 1)
