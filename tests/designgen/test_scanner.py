@@ -359,6 +359,26 @@ def test_pieces_of_a_bar_cover_its_surface(bow):
         assert off.min(axis=1).max() > -EXACT_MM  # and are no larger than that
 
 
+def test_normals_of_shapes_are_those_of_closed_forms():
+    """A ball; a cone from 80 to 50 mm over 400 mm, whose normal leans by 30 : 400; a ring; a triangle."""
+    rng, axis = np.random.default_rng(3), np.array([2.0, -1.0, 2.0]) / 3.0
+    centre, side = np.array([10.0, 20.0, 300.0]), np.cross(axis, [0.0, 0.0, 1.0]) / np.linalg.norm(axis[:2])
+    builder = Builder()
+    builder.sphere(0, "ball", centre, 60.0, [])
+    builder.cone(0, "cone", centre, axis, (80.0, 50.0), 400.0)
+    builder.disc(0, "ring", centre, axis, 90.0, 30.0)
+    builder.polygon(0, "plate", np.array([centre, centre + 100.0 * axis, centre + 70.0 * side]))
+    shapes, unit = builder.to_surfaces(), rng.normal(size=(50, 3))
+    unit /= np.linalg.norm(unit, axis=1)[:, None]
+    of_ball = ray_kernels.normals(shapes.kind, shapes.numbers, np.zeros(50, np.int32), centre + 60.0 * unit)
+    np.testing.assert_allclose(of_ball, unit, atol=1e-12)  # float64
+    points = centre + 100.0 * axis + 72.5 * side
+    found = ray_kernels.normals(shapes.kind, shapes.numbers, np.array([1, 2, 3], np.int32), np.array([points] * 3))
+    expected = [(400.0 * side + 30.0 * axis) / np.hypot(400.0, 30.0), axis, np.cross(axis, side)]
+    np.testing.assert_allclose(np.abs(np.einsum("ni,ni->n", found, expected)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
+
+
 def test_large_and_slim_triangles_are_met_wherever_they_are():
     """Around the scanner, over its head, seen edge on: each ray against each plane's equation, without boxes."""
     rng = np.random.default_rng(6)
