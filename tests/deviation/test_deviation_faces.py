@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.deviation import assignment
+from processor.deviation import assignment, surface_movement
 from processor.deviation import step as deviation_step
 from processor.geometry import mesh_distance
 from processor.model import Scan, Scene, StructureDesign
@@ -68,6 +68,11 @@ def test_the_nearest_face_is_taken_and_its_clearance_is_the_distance_of_the_next
     assert seen.facet[3] == -1
     assert not assignment.clear(seen, np.full(5, 2.0))[[0, 1, 3, 4]].any()
     assert assignment.clear(seen, np.full(5, 2.0))[2]
+    middles = np.vstack([surface.vertices[surface.faces].mean(axis=1), [0.0, 0.0, -50.0]])
+    cloud = surface_movement.Cloud(middles, None, np.zeros(13, bool), np.zeros(13, np.int64))
+    of_points = surface_movement._assigned_of(cloud, surface_movement._Fit(None, curved, grid, 20.0, 30.0))
+    assert of_points[2].face.tolist() == [*surface.part_of, -1]  # of every facet, the first as well
+    assert of_points[3] == (12, 13)
     # From below, the top is not visible: neither to a point that lies there, nor as what a point may be mistaken for.
     below = assignment.assigned(points, np.tile([0.0, 0.0, -5000.0], (5, 1)), curved, grid)
     assert surface.normals[below.facet[2], 2] == pytest.approx(-1.0)
