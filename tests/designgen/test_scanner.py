@@ -342,6 +342,17 @@ def test_rays_meet_cones_where_bisection_does():
     assert met > 300
 
 
+@pytest.mark.parametrize(("off", "met"), [(29.8, True), (-29.8, True), (30.2, False), (-30.2, False)])
+def test_a_ray_past_the_silhouette_of_a_bowed_tube_misses_it(off, met):
+    """A tube of 30 mm whose middle is bowed by 100 mm towards x; the ray passes the middle's axis ``off`` mm aside."""
+    builder = Builder()
+    start, bow = np.array([off - 100.0, 1000.0, -500.0]), (np.array([100.0, 0.0, 0.0]), 0.0, 1000.0)
+    builder.cone(0, "t", start, np.array([0.0, 0.0, 1.0]), (30.0, 30.0), 1000.0, bow)
+    shapes = builder.to_surfaces()
+    found = ray_kernels.hit(1, shapes.numbers[0], shapes.cuts, 0, 0, 0.0, 1.0, 0.0)
+    assert found == (pytest.approx(1000.0 - np.sqrt(30.0**2 - off**2), abs=EXACT_MM) if met else np.inf)
+
+
 @pytest.mark.parametrize("bow", [0.0, 40.0])
 def test_pieces_of_a_bar_cover_its_surface(bow):
     """Rims of pieces lie on their spheres: a bar of 1 m and radii up to 100 mm has three pieces."""

@@ -32,6 +32,8 @@ def test_boxes_look_outward_in_frames_of_either_hand():
     for axes in (R, R * [[-1.0], [1.0], [1.0]]):
         box = boxes_and_tubes.Box(np.array([100.0, -50.0, 7.0]), axes, np.array([3.0, 5.0, 7.0]))
         assert signed_volume(box.patches(), np.zeros(3)) == pytest.approx(105.0)
+        within = box.centre + np.array([[1.0, 0.5, -3.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) @ axes
+        np.testing.assert_allclose(box.depth(within), [0.5, -0.5, 1.5], atol=1e-12)  # below the nearest side; float64
         knots = tuple(np.array([0.0, 0.3, 1.0]) for _ in range(3))
         assert signed_volume(box.patches(knots), np.zeros(3)) == pytest.approx(105.0)
 
