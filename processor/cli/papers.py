@@ -13,8 +13,6 @@ from processor.cli.common import LANGUAGES, debug_option, split_names
 from processor.jobs.exit_codes import DONE, IN_PART
 from processor.model import UsageError
 
-CHECKOUT = Path(__file__).resolve().parents[2]
-
 
 @click.command()
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of papers.json and page")
@@ -42,12 +40,14 @@ def papers(
     The data sets are simulated by designgen, which must be installed; what measures them is part of the source and not
     of an installed package. Exit codes: 0 done, 1 some data sets failed.
     """
-    if not (CHECKOUT / "tests/bench/papers").is_dir():
+    from processor.jobs.process import PROJECT
+
+    if not (PROJECT / "tests/bench/papers").is_dir():
         raise UsageError(
             "processor papers: the comparison with the papers is part of the source; in a checkout of it: "
             "pip install --editable '.[designgen]'"
         )
-    sys.path.insert(0, str(CHECKOUT))
+    sys.path.insert(0, str(PROJECT))
     command = importlib.import_module("tests.bench.papers.command")
     found = command.run(output, only, seeds, jobs, lang, keep_steps)
     click.echo(json.dumps(found.content, ensure_ascii=False) if as_json else str(found.line))

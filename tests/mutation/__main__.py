@@ -22,6 +22,7 @@ from queue import SimpleQueue
 
 from tests.mutation.nearest import Record, distances, record
 from tests.mutation.sites import Site, sites
+from tests.support import kernels
 from tests.support.structure import MODULES, ROOT, module_name
 
 # Where numbers are made. What reads, writes and shows them is tested by examples of files and pages.
@@ -93,8 +94,8 @@ class Copy:
             return NO_TESTS, ""
         path = self.place / mutant.path
         source = path.read_text("utf-8")
-        kernels = self._compiled(mutant.path)
-        for each in kernels:  # compiled code has the old function in it, also where another file calls it
+        put_away = self._compiled(mutant.path)
+        for each in put_away:  # compiled code has the old function in it, also where another file calls it
             each.rename(each.with_name(each.name + ".kept"))
         times = path.stat()
         try:
@@ -105,7 +106,7 @@ class Copy:
             os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # or its kernels would be compiled again
             for each in self._compiled(mutant.path):
                 each.unlink()
-            for each in kernels:
+            for each in put_away:
                 each.with_name(each.name + ".kept").rename(each)
 
     def _compiled(self, path: str) -> list[Path]:
@@ -114,8 +115,7 @@ class Copy:
         for name in distances(module_name(ROOT / path)):
             source = MODULES.get(name)
             if source is not None:
-                cache_folder = (self.place / source.relative_to(ROOT)).parent / "__pycache__"
-                found += [*cache_folder.glob(f"{source.stem}.*.nbi"), *cache_folder.glob(f"{source.stem}.*.nbc")]
+                found += kernels.compiled(self.place / source.relative_to(ROOT))
         return found
 
     def _run(self, tests: list[str]) -> tuple[str, str]:

@@ -6,6 +6,7 @@ Compiled kernels run no lines that a record could see: for those, and for consta
 
 import json
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -56,13 +57,19 @@ def nearest_files(path: str) -> list[str]:
 
 
 def record(place: Path) -> None:
-    """Run the suite once and keep in a folder which lines each test runs and its processor time."""
-    place.mkdir(parents=True, exist_ok=True)
-    env = {**os.environ, "COVERAGE_FILE": str(place / "lines.sqlite"), "SUITE_TIMES": str(place / "times")}
+    """Run the suite once and keep in a new folder which lines each test runs and its processor time.
+
+    The folder has its name when the suite has ended: of one that was stopped nothing is taken for a record.
+    """
+    making = place.with_name(place.name + ".making").absolute()
+    shutil.rmtree(making, ignore_errors=True)
+    making.mkdir(parents=True)
+    env = {**os.environ, "COVERAGE_FILE": str(making / "lines.sqlite"), "SUITE_TIMES": str(making / "times")}
     env |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     plugins = ["-p", "tests.bench.suite", "--cov", "--cov-context=test", "--cov-report="]
     command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "-m", "not slow", *plugins]
     subprocess.run(command, cwd=ROOT, env=env, check=False)
+    making.rename(place)
 
 
 class Record:
@@ -99,21 +106,24 @@ class Record:
         def rank(name: str) -> tuple[bool, bool, float]:
             return name in others, not near & set(Path(name.partition("::")[0]).parts), self.seconds.get(name, 1.0)
 
-        chosen, total = [], 0.0
-        for name in sorted((running | others) & self.seconds.keys(), key=rank):
+        return self._in_time(sorted((running | others) & self.seconds.keys(), key=rank))
+
+    def of_imports(self, path: str) -> list[str]:
+        """Return the tests of the nearest files by imports, the quickest of each first."""
+        ordered = [
+            name
+            for file in nearest_files(path)
+            for name in sorted(self._of_file.get(file, ()), key=self.seconds.__getitem__)
+        ]
+        return self._in_time(ordered)
+
+    def _in_time(self, names: list[str]) -> list[str]:
+        """Return the first of the tests, as many as take TESTS_S together, and one in any case."""
+        chosen: list[str] = []
+        total = 0.0
+        for name in names:
             total += self.seconds[name]
             if total > TESTS_S and chosen:
                 break
             chosen.append(name)
-        return chosen
-
-    def of_imports(self, path: str) -> list[str]:
-        """Return the tests of the nearest files by imports, the quickest of each first."""
-        chosen, total = [], 0.0
-        for file in nearest_files(path):
-            for name in sorted(self._of_file.get(file, ()), key=self.seconds.__getitem__):
-                total += self.seconds[name]
-                if total > TESTS_S and chosen:
-                    return chosen
-                chosen.append(name)
         return chosen

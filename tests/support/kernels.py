@@ -35,11 +35,16 @@ def discard_stale():
             stale.add(name)
             waiting += users[name]
     for name in stale & MODULES.keys():
-        for path in (MODULES[name].parent / "__pycache__").glob(f"{MODULES[name].stem}.*.nb[ci]"):
+        for path in compiled(MODULES[name]):
             path.unlink(missing_ok=True)
     STATE.parent.mkdir(exist_ok=True)
     STATE.write_text(json.dumps(now), "utf-8")
     return True
+
+
+def compiled(source):
+    """Files of the compiled kernels of a source, and their index."""
+    return [*(source.parent / "__pycache__").glob(f"{source.stem}.*.nb[ci]")]
 
 
 def _has_kernels(path):

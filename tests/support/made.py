@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 def made(function: Callable[..., T], *arguments: Any) -> T:
-    """Return what a function of a module makes of arguments that ``repr`` tells apart; each caller gets its own copy.
+    """Return a copy of what a function of a module makes of arguments; they differ where their ``repr`` does.
 
     Keep it in a module whose imports are those of what is made: one that imports ``processor`` makes anew after every
     change of that package.
