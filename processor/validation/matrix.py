@@ -16,7 +16,7 @@ Example::
     full = true                # only with --full
 
     [[cell]]
-    generator = "arch_bridge"  # a script of designgen/foreign, or a .py file beside the matrix, in place of a recipe
+    generator = "arch_bridge"  # a script of tests/bench/foreign, or a .py file beside the matrix, in place of a recipe
     steps = ["preassemble"]
     set.waviness = 0.5
 
@@ -41,6 +41,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from processor.jobs.process import PROJECT
 from processor.model import InputError, UsageError
 from processor.validation.cells import Case, Cell, Origin, fresh_seed
 from processor.validation.coverage import Limits
@@ -52,6 +53,7 @@ else:
     import tomli as tomllib
 
 DEFAULT = Path(__file__).with_name("default_matrix.toml")
+FOREIGN = PROJECT / "tests" / "bench" / "foreign"  # part of the sources, not of an installed package
 TOP_KEYS = {"name", "about", "fixed_seeds", "fresh_seeds", "aim", "coverage", "cell"}
 CELL_KEYS = {"name", "recipe", "generator", "steps", "methods", "seeds", "fresh", "set", "params", "full"}
 AIMS = ("low", "high")
@@ -93,7 +95,7 @@ class Matrix:
 
 
 def read(path: Path, full: bool) -> Matrix:
-    """Read a matrix, with ``full`` also the cells marked so.
+    """Read a matrix, with ``full`` also the cells marked so; the default one without foreign scenes outside a checkout.
 
     Raises InputError for a file that cannot be read, UsageError for unknown keys and wrong values.
     """
@@ -111,6 +113,8 @@ def read(path: Path, full: bool) -> Matrix:
     cells = table.get("cell")
     if not isinstance(cells, list) or not cells or not all(isinstance(cell, dict) for cell in cells):
         raise UsageError(f"{path}: expected at least one [[cell]]")
+    if path == DEFAULT and not FOREIGN.is_dir():
+        cells = [cell for cell in cells if "generator" not in cell]
     entries: list[Entry] = []
     for i, cell in enumerate(cells):
         where = f"{path}: cell {i + 1}"
@@ -200,11 +204,12 @@ def _flat(table: dict[str, Any], above: str = "") -> dict[str, Any]:
 def _generator(name: str, path: Path, where: str) -> tuple[str, bool]:
     """Return the script of a foreign generator, and whether it is a file of the user."""
     from_file = name.endswith(".py")
-    file = path.parent / name if from_file else _installed(where) / "foreign" / f"{name}.py"
+    file = path.parent / name if from_file else FOREIGN / f"{name}.py"
     try:
         return file.read_text("utf-8"), from_file
     except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{where}: no generator {name!r}: {error}") from error
+        known = "" if from_file else " (those of a name are part of the sources; or give a .py file beside the matrix)"
+        raise UsageError(f"{where}: no generator {name!r}{known}: {error}") from error
 
 
 def _installed(where: str) -> Path:

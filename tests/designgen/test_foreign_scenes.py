@@ -14,7 +14,7 @@ from processor.preassembly.parts import assignment, attitude
 from processor.scan_folder import folder
 
 ROOT = Path(__file__).resolve().parents[2]
-FOREIGN = ROOT / "designgen" / "foreign"
+FOREIGN = ROOT / "tests" / "bench" / "foreign"
 SCRIPTS = sorted(path for path in FOREIGN.glob("*.py") if path.name != "__init__.py")
 SMALL = {
     "arch_bridge": ("spacing=60", "stations=3", "span=9000", "rise=2000"),

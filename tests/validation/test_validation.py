@@ -8,7 +8,6 @@ import runpy
 import sqlite3
 import time
 from contextlib import closing
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -22,7 +21,6 @@ from processor.validation.history import History
 from tests.support.processes import commands
 from tests.support.results import validation_nights
 
-ROOT = Path(__file__).resolve().parents[2]
 NIGHT = "2026-11-21"
 TWO_CELLS = """
 [[cell]]
@@ -115,10 +113,17 @@ def test_the_default_matrix_covers_every_step_that_is_there():
 
 def test_foreign_cells_name_settings_that_their_generators_have():
     foreign = [e.case for e in matrix.read(matrix.DEFAULT, True).entries if e.case.origin is cells.Origin.FOREIGN]
-    assert {case.recipe for case in foreign} == {path.stem for path in (ROOT / "designgen/foreign").glob("[a-z]*.py")}
+    assert {case.recipe for case in foreign} == {path.stem for path in matrix.FOREIGN.glob("[a-z]*.py")}
     for case in foreign:
-        known = runpy.run_path(str(ROOT / "designgen/foreign" / f"{case.recipe}.py"))["SETTINGS"]
+        known = runpy.run_path(str(matrix.FOREIGN / f"{case.recipe}.py"))["SETTINGS"]
         assert {setting.split("=")[0] for setting in case.settings} <= set(known), case.name
+
+
+def test_outside_a_checkout_the_default_matrix_has_the_scenes_of_designgen_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(matrix, "FOREIGN", tmp_path / "none")
+    assert {entry.case.origin for entry in matrix.read(matrix.DEFAULT, True).entries} == {cells.Origin.OWN}
+    with pytest.raises(UsageError, match="part of the sources"):
+        read(tmp_path, '[[cell]]\ngenerator = "steelwork"\nsteps = ["deviation"]')
 
 
 def test_figures_are_separated_by_method():
