@@ -61,7 +61,7 @@ def of_distances(
     without_normal = few_points = 0
     for rows in blocks(len(core)):
         known[rows] = np.isfinite(measured.lod95[rows])
-        beyond[rows] = measured.at(rows).significant
+        beyond[rows] = measured.take(rows).significant
         without_normal += int((~np.isfinite(normals[rows]).all(axis=1)).sum())
         few_points += int((np.minimum(measured.n1[rows], measured.n2[rows])[known[rows]] < few).sum())
     distance, lod95, places = (chosen(column, known) for column in (measured.distance, measured.lod95, core))

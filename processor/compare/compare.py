@@ -298,7 +298,7 @@ def _seen_from(
         return None
     wanted = allocate(core.count, dtype=np.bool_)
     for rows in blocks(core.count):
-        wanted[rows] = normal_orientation.undecided(fitted.at(rows), diameter)
+        wanted[rows] = normal_orientation.undecided(fitted.take(rows), diameter)
     if not wanted.any():
         return None
     ends, positions = np.cumsum([len(scan.points) for scan in reference.scans]), allocate(core.count, 3)

@@ -118,7 +118,7 @@ def _structure(scene: Scene, part: DesignPart, placed: list[_Placed], shrink: fl
         scene.name,
         "structure",
         tuple(scans),
-        stations=_joined(stations),
+        stations=Stations.concat(stations) if stations else None,
         temperature_C=scene.temperature_C,
         units=scene.units,
         units_reason=scene.units_reason,
@@ -142,15 +142,4 @@ def _stations(known: Stations, number: Ints, placed: _Placed, shrink: float, aga
         ids=tuple(f"{known.ids[k]}, {placed.scan.name}" if again else known.ids[k] for k in number),
         positions=rigid.apply(T_bridge_scan, shrink * rigid.apply(T_scan_project, known.positions[number])),
         T_project_station=T,
-    )
-
-
-def _joined(stations: list[Stations]) -> Stations | None:
-    """Return the stations of all scans of a part; None without any."""
-    if not stations:
-        return None
-    return Stations(
-        ids=tuple(id_ for one in stations for id_ in one.ids),
-        positions=np.concatenate([one.positions for one in stations]),
-        T_project_station=np.concatenate([one.T_project_station for one in stations]),
     )

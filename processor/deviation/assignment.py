@@ -21,7 +21,7 @@ from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import SHARP_COS, CurvedFacets, FacetGrid, square_to
 from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import put_aside
-from processor.model import Floats, Ints
+from processor.model import Columns, Floats, Ints
 
 LEAST_RANGE = 5_000  # points per task of a thread
 AT_ONCE = 100_000  # points whose heights are computed together
@@ -32,7 +32,7 @@ OPPOSED = -0.5  # cosine between the normals of a plate's two sides, at most
 
 
 @dataclass(frozen=True)
-class OnSurface:
+class OnSurface(Columns):
     """Points of a scan on the design: foot (n, 3), signed distance (n,) and facet (n,); mm, outward > 0.
 
     Off the design's faces the distance is NaN and the facet -1. ``clearance`` (n,) is the distance of the foot from the
@@ -45,12 +45,6 @@ class OnSurface:
     facet: Ints
     clearance: Floats
     flat: Floats
-
-    def of(self, rows: Ints) -> OnSurface:
-        """Return the points of some rows alone."""
-        return OnSurface(
-            self.feet[rows], self.distance[rows], self.facet[rows], self.clearance[rows], flat=self.flat[rows]
-        )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from processor.components.bridge_parts import PartScene
 from processor.deviation import result_fields
 from processor.deviation.result import CorePoints, ErrorSource, PartFits, Result
 from processor.geometry import m3c2
-from processor.limits import judging
+from processor.limits.judging import JudgedLimits
 from processor.model import Floats, Reason, Scene, Status, reason
 
 
@@ -54,7 +54,7 @@ def deviations(parts: Sequence[PartScene], method: str, one: Callable[[Scene], R
         max_depth=max(result.max_depth for result in known),
         origin=origin,
         core=core,
-        limits=judging.joined(limits) if limits else None,
+        limits=JudgedLimits.concat(limits) if limits else None,
         parts=table,
         **result_fields.statistics(core, total),
     )
@@ -80,36 +80,20 @@ def _doubts(parts: Sequence[PartScene], results: Sequence[Result]) -> list[Reaso
 
 
 def _joined(cores: Sequence[CorePoints], shifts: Sequence[Floats]) -> CorePoints:
-    columns = {
-        field.name: np.concatenate([getattr(core, field.name) for core in cores])
-        for field in fields(CorePoints)
-        if field.name != "points"
-    }
-    columns["body"] = np.full_like(columns["body"], -1)  # rows of one part's bodies, which the whole does not name
-    points = np.concatenate([core.points + shift for core, shift in zip(cores, shifts, strict=True)])
-    return CorePoints(points=points, **columns)
+    core = CorePoints.concat(
+        [replace(core, points=core.points + shift) for core, shift in zip(cores, shifts, strict=True)]
+    )
+    return replace(core, body=np.full_like(core.body, -1))  # rows of one part's bodies, which the whole does not name
 
 
 def _table(parts: Sequence[PartScene], results: Sequence[Result]) -> PartFits:
-    def column(name: str) -> Floats:
-        return np.array([getattr(result, name) for result in results], np.float64)
-
     none, unknown = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
-    return PartFits(
+    return PartFits.from_items(
+        results,
         name=tuple(part.name for part in parts),
-        status=tuple(result.status for result in results),
-        reasons=tuple(result.reasons for result in results),
-        registration=tuple(result.registration for result in results),
         T_design_scan=np.array([result.T_design_scan if result.T_design_scan.size else none for result in results]),
         covariance=np.array([result.covariance if result.covariance.size else unknown for result in results]),
-        registration_error=column("registration_error"),
         core_points=np.array([len(result.core) for result in results], np.int64),
-        core_points_measured=np.array([result.core_points_measured for result in results], np.int64),
-        mean=column("mean"),
-        sd=column("sd"),
-        min=column("min"),
-        max=column("max"),
-        lod95_median=column("lod95_median"),
     )
 
 

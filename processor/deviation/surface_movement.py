@@ -23,7 +23,7 @@ from processor.deviation.station_offsets import OnFaces, OnPieces, Pieces
 from processor.geometry import m3c2, mesh_bodies, mesh_distance
 from processor.geometry.mesh_distance import CurvedFacets, FacetGrid, Samples
 from processor.large_arrays import put_aside, release
-from processor.model import Bools, Floats, Ints, Labels
+from processor.model import Bools, Columns, Floats, Ints, Labels
 from processor.tiles import Shared
 
 LEAST_COS = 0.5  # between the normals at a core point and below a scanned point
@@ -34,7 +34,7 @@ RETURNS = 3.0  # standard deviations from the surface within which a point remov
 
 
 @dataclass(frozen=True)
-class Cloud:
+class Cloud(Columns):
     """Points (n, 3) of a scan, the positions (n, 3) they were seen from, if known, and which (n,) may be outliers.
 
     ``station`` (n,) is the number of the scan or station that a point is from.
@@ -44,11 +44,6 @@ class Cloud:
     scanner: Floats | None
     doubtful: npt.NDArray[np.bool_]
     station: Ints
-
-    def of(self, rows: Ints) -> Cloud:
-        """Return the points of some rows alone."""
-        scanner = None if self.scanner is None else self.scanner[rows]
-        return Cloud(self.points[rows], scanner, self.doubtful[rows], self.station[rows])
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,7 @@ class _Passes:
     def near(self) -> Iterator[tuple[Cloud, Aside]]:
         """Pass over the points near the surface, cloud by cloud."""
         for cloud, aside, doubtful in zip(self.clouds, self.asides, self.doubtful, strict=True):
-            yield replace(cloud.of(aside.rows), doubtful=doubtful), aside
+            yield replace(cloud.take(aside.rows), doubtful=doubtful), aside
             release()
 
 
@@ -190,7 +185,7 @@ def _assigned_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, Bools, _Faces, tuple[i
 def _first_of(near: _Near, fit: _Fit) -> PartSums:
     """Return sums over the points of a cloud near the surface, doubtful ones left out."""
     seen, sure = near.aside.seen(near.points, fit.curved), np.flatnonzero(~near.doubtful)
-    return fit.part(fit.sums(), seen.of(sure), seen.distance[sure])
+    return fit.part(fit.sums(), seen.take(sure), seen.distance[sure])
 
 
 def _mark_mixed(passes: _Passes, faces: Sequence[_Faces]) -> None:
@@ -258,7 +253,7 @@ def _second_of(near: _Near, fit: _Fit, around: _Around) -> tuple[Ints, PartSums,
     seen = near.aside.seen(near.points, fit.curved)
     at = around.known[around.tree.query(seen.feet, workers=-1)[1]] if len(seen.feet) else around.known[:0]
     rows = np.flatnonzero(assignment.clear(seen, around.scatter[at]) & ~near.doubtful)
-    clear = seen.of(rows)
+    clear = seen.take(rows)
     about, moved = (fit.part(sums, clear, clear.distance) for sums in (fit.about(), fit.sums()))
     return at.astype(np.int32), about, moved
 
@@ -287,7 +282,7 @@ def _last_of(near: tuple[Cloud, Ints], fit: _Fit, vector: Floats, scatter: Float
     left = np.abs(before.distance)
     clear = assignment.clear(before, about) & (left <= fit.depth) & (~cloud.doubtful | (left <= RETURNS * about))
     rows = np.flatnonzero(clear)
-    aside, before = Aside.of(rows, before), before.of(rows)
+    aside, before = Aside.of(rows, before), before.take(rows)
     part = fit.part(fit.sums(), before, _distance(fit.curved, before, vector[at[rows]]))
     return aside, part, set(np.unique(cloud.station[rows]).tolist())
 

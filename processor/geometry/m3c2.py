@@ -20,7 +20,7 @@ from processor.geometry.linalg_small import eigen
 from processor.geometry.point_grid import HALF_DIAGONAL, SIDE, PointGrid, block_at, cells_within
 from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import blocks
-from processor.model import Bools, Floats, InputError, Ints
+from processor.model import Bools, Columns, Floats, InputError, Ints
 
 CELLS_PER_DIAMETER = 2.0
 FEWEST_FOR_LOD = 4  # points of either cloud, below which there is no level of detection
@@ -29,20 +29,16 @@ LEAST_RANGE = 256  # core points per task of a thread
 
 
 @dataclass(frozen=True)
-class CloudNormals:
+class CloudNormals(Columns):
     """Unit normals (k, 3), NaN where there is none; the sd (k,) of the points about the plane, their number (k,)."""
 
     normals: Floats
     roughness: Floats
     count: Ints
 
-    def at(self, rows: slice) -> CloudNormals:
-        """Return the rows of a slice."""
-        return CloudNormals(self.normals[rows], self.roughness[rows], self.count[rows])
-
 
 @dataclass(frozen=True)
-class Distances:
+class Distances(Columns):
     """M3C2 at each core point: compared minus reference, along the normal.
 
     ``distance`` (k,) is NaN where either cloud has no point in the cylinder, ``lod95`` where either has fewer than
@@ -55,10 +51,6 @@ class Distances:
     n2: Ints
     std1: Floats
     std2: Floats
-
-    def at(self, rows: slice | Ints) -> Distances:
-        """Return some rows."""
-        return Distances(**{name: column[rows] for name, column in vars(self).items()})
 
     @property
     def significant(self) -> Bools:

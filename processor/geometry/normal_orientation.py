@@ -78,7 +78,7 @@ def turned(fitted: CloudNormals, core: Floats, normal_diameter: float, scanner: 
     up = seen = left = 0
     for rows in blocks(count):
         sight = None if scanner is None else scanner[rows] - core[rows]
-        normals[rows], open_[rows], level, known = _by_direction(fitted.at(rows), normal_diameter, sight)
+        normals[rows], open_[rows], level, known = _by_direction(fitted.take(rows), normal_diameter, sight)
         now = int(open_[rows].sum())
         up, seen, left = up + known - level, seen + level - now, left + now
     if not left:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from processor.inspection.flat_faces import FLOOR_MM, FlatFace, Observed, Pieces
 from processor.inspection.holes import REACH_MM
 from processor.model import (
     Bools,
+    Columns,
     Floats,
     Ints,
     Reason,
@@ -77,16 +79,13 @@ class Surroundings(NamedTuple):
     shared: float
 
 
-class OnFace(NamedTuple):
+@dataclass(frozen=True)
+class OnFace(Columns):
     """Points (n, 3) that may be of a face, how far outward (n,) they lie from its design, and the view (n,) of each."""
 
     points: Floats
     off: Floats
     view: Ints
-
-    def of(self, rows: Ints | Bools) -> OnFace:
-        """Return some of the points."""
-        return OnFace(self.points[rows], self.off[rows], self.view[rows])
 
 
 class Outline(NamedTuple):
@@ -220,7 +219,7 @@ def pieces(around: Surroundings, face: FlatFace, shift: Shift) -> tuple[Pieces, 
     used = _of_level(at, seen.off)
     if used.sum() < FEWEST or used.sum() < LEAST_SHARE * len(used):
         return reason("inspect.face-few-points", points=int(used.sum()))
-    combined, tilt = _combined(seen.of(used), at[used], around.shared)
+    combined, tilt = _combined(seen.take(used), at[used], around.shared)
     return combined, OVERHANG_SHARE * (RIM_MM - _margin(shape)), tilt
 
 
@@ -279,7 +278,7 @@ def _on_face(around: Surroundings, face: FlatFace, shape: Outline, places: Float
     feet = seen.points - np.outer(off, face.normal) - shift(seen.points)
     inside = shape.clearance(shape.flat(feet)) >= _margin(shape)
     inside[inside] = stands_before(around, face, feet[inside]) < 0
-    return OnFace(seen.points, off, seen.view).of(inside)
+    return OnFace(seen.points, off, seen.view).take(inside)
 
 
 def _of_level(at: Floats, off: Floats) -> Bools:

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from itertools import chain
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -150,17 +148,6 @@ def judged(comparisons: Iterable[Comparison], tolerance: Tolerance) -> JudgedLim
         source=tuple(row.limit.source for row in rows),
         verified=np.array([row.limit.verified for row in rows], np.bool_),
     )
-
-
-def joined(tables: Sequence[JudgedLimits]) -> JudgedLimits:
-    """Return the rows of several tables as one."""
-    columns: dict[str, Any] = {}
-    for field_ in fields(JudgedLimits):
-        values = [getattr(table, field_.name) for table in tables]
-        columns[field_.name] = (
-            np.concatenate(values) if isinstance(values[0], np.ndarray) else tuple(chain.from_iterable(values))
-        )
-    return JudgedLimits(**columns)
 
 
 def clause_of(limit: Limit, tolerance: Tolerance) -> str:

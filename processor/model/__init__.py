@@ -1,5 +1,6 @@
 """The records that travel between the parts of the project, by what they hold."""
 
+from processor.model.columns import Columns
 from processor.model.errors import LONGEST_NAME, InputError, PlainError, UsageError, did_you_mean
 from processor.model.fields import (
     AMOUNT,
@@ -104,7 +105,7 @@ __all__ = [
     "FARTHEST_MM", "KEY_POINTS", "KINDS", "LARGEST_MM", "LONGEST_NAME", "MEASURES", "METRIC_NAMES", "NAMES",
     "NORMAL_95", "NUMBER", "OPEN", "PLACE", "POSE", "RADIUS", "RATIO", "SAMPLED_POINTS", "SCALED_POSE", "SHARE",
     "SOURCES", "SUPPORTS", "VOCABULARIES", "WORST_FIRST", "ArchDesign", "ArchTruth", "AsBuilt", "Better",
-    "BodyTruth", "Bools", "Ceiling", "Checked", "Clips", "Codes", "Control", "DefectTruth", "DesignBodies",
+    "BodyTruth", "Bools", "Ceiling", "Checked", "Clips", "Codes", "Columns", "Control", "DefectTruth", "DesignBodies",
     "DesignFaults", "DesignPart", "Diagnostics", "Fault", "Floats", "FrameDesign", "FrameTruth", "InputError",
     "Ints", "Labels", "Limit", "Meaning", "Metric", "Picks", "PlainError", "PointLabels", "PoseTruth", "Reason",
     "RecordError", "Rows", "Scan", "Scene", "Shorts", "StationTruth", "Stations", "Statistic", "Status", "StepRun",

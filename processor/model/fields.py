@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from processor.model.columns import Columns
 from processor.model.errors import LONGEST_NAME
 
 Floats = npt.NDArray[np.float64]
@@ -259,7 +260,7 @@ class Checked:
         return ()
 
 
-class Rows(Checked):
+class Rows(Columns, Checked):
     """A table stored as columns of one length, a row per item; results.json has a list of its rows."""
 
     def __len__(self) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor import large_arrays
+from processor.model.columns import Columns
 from processor.model.fields import (
     BOUND,
     DEVIATION,
@@ -141,7 +142,7 @@ class Scan(Checked):
 
 
 @dataclass(frozen=True)
-class Stations(Checked):
+class Stations(Columns, Checked):
     """Scanner positions in the project's frame, and the poses of the scanners where they are known."""
 
     ids: tuple[str, ...] = names("k", means=NAMES)
@@ -449,7 +450,7 @@ class Picks(Checked):
 
 
 @dataclass(frozen=True)
-class Clips(Checked):
+class Clips(Columns, Checked):
     """Boxes that the scans were cut by as they were read: corners in the project's frame, mm, and the points in each.
 
     ``keep`` marks boxes whose points are the ones kept, the others are left out. ``scan`` is the one meant, "" all.

@@ -114,12 +114,4 @@ class Clipper:
                     f"{box.where}: no point lies in the box; it is in the project's frame and units (of a scan without "
                     "a pose: its own frame): correct it, or leave it out"
                 )
-        return Clips(
-            scan=tuple(box.scan for box in self.boxes),
-            low=np.array([box.low for box in self.boxes]),
-            high=np.array([box.high for box in self.boxes]),
-            keep=np.array([box.keep for box in self.boxes]),
-            inside=np.array(self.inside),
-            read=self.read,
-            kept=self.kept,
-        )
+        return Clips.from_items(self.boxes, inside=np.array(self.inside), read=self.read, kept=self.kept)

@@ -50,8 +50,9 @@ def with_hangers(result: Result, scene: Scene) -> Result:
         verdict=tuple(worst(row.verdict for row in rows) for rows in of_ball),
     )
     rows = [*(row for rows in of_ball for row in rows), *_of_tubes(result.tubes, surface, limits[0])]
-    judged = judging.judged(rows, standards.default_for(scene.tolerance))
-    return replace(result, hangers=hangers, limits=_joined(result.limits, judged))
+    both = (result.limits, judging.judged(rows, standards.default_for(scene.tolerance)))
+    tables = [table for table in both if table is not None]
+    return replace(result, hangers=hangers, limits=JudgedLimits.concat(tables) if tables else None)
 
 
 @dataclass(frozen=True)
@@ -142,13 +143,6 @@ def _name(tube: int, a: int | str, b: int | str) -> str:
     if len(balls) == 2:
         return f"tube {tube}, balls {a} and {b}"
     return f"tube {tube}, ball {balls[0]} and a free end" if balls else f"tube {tube}, no balls"
-
-
-def _joined(first: JudgedLimits | None, second: JudgedLimits | None) -> JudgedLimits | None:
-    """Return the rows of both."""
-    if first is None or second is None:
-        return second if first is None else first
-    return judging.joined([first, second])
 
 
 def clashes(hangers: Hangers) -> Sequence[int]:

@@ -226,11 +226,11 @@ def _assess(
 def _pairs(names: Sequence[str], network: Network) -> Pairs:
     pairs, origins = network.pairs, network.origins
     unknown = np.full(len(pairs), NAN)
-    return Pairs(
+    return Pairs.from_items(
+        pairs,
         a=tuple(names[pair.a] for pair in pairs),
         b=tuple(names[pair.b] for pair in pairs),
         overlap=network.overlap,
-        residual=np.array([pair.residual for pair in pairs]),
         used=np.array(network.used, bool),
         reasons=tuple(network.pair_reasons),
         shared=np.array([pair.pieces for pair in pairs], np.int64),
@@ -254,12 +254,7 @@ def _closures(names: Sequence[str], network: Network) -> Closures:
     used = [pair for pair, is_used in zip(network.pairs, network.used, strict=True) if is_used]
     weights = np.array([1.0 / max(float(np.trace(pair.covariance[3:6, 3:6])), 1e-12) for pair in used])
     loops = pairs_and_loops.loops(used, weights, len(names)) if used else []
-    return Closures(
-        loop=tuple(tuple(names[i] for i in loop.rows) for loop in loops),
-        mm=np.array([loop.mm for loop in loops]),
-        mrad=np.array([loop.mrad for loop in loops]),
-        ratio=np.array([loop.ratio for loop in loops]),
-    )
+    return Closures.from_items(loops, loop=tuple(tuple(names[i] for i in loop.rows) for loop in loops))
 
 
 def _socs(name: str) -> str:

@@ -50,20 +50,11 @@ def joined(records: Sequence[Any]) -> Any:
     for field in dataclasses.fields(kind):
         every = tuple(getattr(record, field.name) for record in records)
         if isinstance(every[0], Rows):
-            values[field.name] = _one_after_another(every)
+            values[field.name] = every[0].concat(every)
             values[ROWS.format(name=field.name)] = np.array([len(one) for one in every], np.int64)
         else:
             values[field.name] = every
     return table_of(kind)(**values)
-
-
-def _one_after_another(tables: Sequence[Any]) -> Any:
-    values = {}
-    for field in dataclasses.fields(tables[0]):
-        every = [getattr(table, field.name) for table in tables]
-        is_array = isinstance(every[0], np.ndarray)
-        values[field.name] = np.concatenate(every) if is_array else tuple(item for one in every for item in one)
-    return type(tables[0])(**values)
 
 
 def split(table: Any, kind: Any) -> tuple[Any, ...]:
@@ -79,11 +70,6 @@ def split(table: Any, kind: Any) -> tuple[Any, ...]:
                     f" found {len(value)}"
                 )
             ends = np.cumsum(counts).tolist()
-            value = [_part(value, start, end) for start, end in zip([0, *ends], ends, strict=False)]
+            value = [value.take(slice(start, end)) for start, end in zip([0, *ends], ends, strict=False)]
         columns[field.name] = value
     return tuple(kind(**dict(zip(columns, values, strict=True))) for values in zip(*columns.values(), strict=True))
-
-
-def _part(table: Any, start: int, end: int) -> Any:
-    fields = dataclasses.fields(table)
-    return type(table)(**{field.name: getattr(table, field.name)[start:end] for field in fields})

@@ -123,15 +123,11 @@ def _names(scene: Scene, found: list[_Found], remarks: list[Reason]) -> Ints:
 
 def _table(scene: Scene, found: list[_Found], names: Ints) -> Targets:
     ids = () if scene.control is None else scene.control.ids
-    return Targets(
+    return Targets.from_items(
+        found,
         name=tuple(ids[row] if row >= 0 else "" for row in names.tolist()),
-        kind=tuple(one.kind for one in found),
-        scan=np.array([one.scan for one in found], np.int64),
-        station=np.array([one.station for one in found], np.int64),
         places=np.array([one.place for one in found]).reshape(-1, 3),
         sd=np.array([one.with_view_sd for one in found]),
-        points=np.array([one.points for one in found], np.int64),
-        fit=np.array([one.fit for one in found]),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -13,8 +13,8 @@ from processor.components.bridge_parts import PartScene
 from processor.defects.design_pose import Measured
 from processor.defects.result import Defects, PartPoses, Picture, Result, SurfacePlaces, Windows
 from processor.defects.verdicts import depths_and_areas
-from processor.limits import judging
-from processor.model import Floats, Reason, Scene, Status, reason
+from processor.limits.judging import JudgedLimits
+from processor.model import Reason, Scene, Status, reason
 
 
 def defects(
@@ -53,10 +53,10 @@ def defects(
         points=sum(result.points for result in known),
         points_used=sum(result.points_used for result in known),
         least_depth=_least_depth(known),
-        defects=_joined(Defects, [result.defects for result in found if len(result.defects)]),
+        defects=Defects.concat([result.defects for result in found if len(result.defects)]),
         pictures=tuple(chain.from_iterable(_pictures(result) for result in found)),
-        surface=_joined(SurfacePlaces, [result.surface for result in found if len(result.surface)]),
-        limits=judging.joined(limits) if limits else None,
+        surface=SurfacePlaces.concat([result.surface for result in found if len(result.surface)]),
+        limits=JudgedLimits.concat(limits) if limits else None,
         parts=_table(parts, results),
     )
 
@@ -105,18 +105,6 @@ def _numbered(results: Sequence[Result]) -> Iterator[Result]:
         before += len(result.defects)
 
 
-def _joined(record: Any, tables: Sequence[Any]) -> Any:
-    """Return the rows of tables of one record as one table."""
-    if not tables:
-        return record()
-    columns = {}
-    for field in fields(record):
-        values = [getattr(table, field.name) for table in tables]
-        array = isinstance(values[0], np.ndarray)
-        columns[field.name] = np.concatenate(values) if array else tuple(chain.from_iterable(values))
-    return record(**columns)
-
-
 def _pictures(result: Result) -> Iterator[Picture]:
     """Yield a picture a defect; empty ones for those of which there is none."""
     for row in range(len(result.defects)):
@@ -130,20 +118,12 @@ def _least_depth(results: Sequence[Result]) -> Windows:
 
 
 def _table(parts: Sequence[PartScene], results: Sequence[Result]) -> PartPoses:
-    def column(name: str) -> Floats:
-        return np.array([getattr(result, name) for result in results], np.float64)
-
     none, unknown = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
     poses = [result.T_design_project if result.T_design_project.size else none for result in results]
-    return PartPoses(
+    return PartPoses.from_items(
+        results,
         name=tuple(part.name for part in parts),
-        status=tuple(result.status for result in results),
-        reasons=tuple(result.reasons for result in results),
         T_design_project=np.array(poses),
         covariance=np.array([result.covariance if result.covariance.size else unknown for result in results]),
-        noise=column("noise"),
-        lod95=column("lod95"),
-        examined_mm2=column("examined_mm2"),
-        expected_mm2=column("expected_mm2"),
         defects=np.array([len(result.defects) for result in results], np.int64),
     )

@@ -25,7 +25,7 @@ from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.nearest_neighbours import within_reach
 from processor.large_arrays import blocks
-from processor.model import Bools, Floats, Ints, Labels
+from processor.model import Bools, Columns, Floats, Ints, Labels
 from processor.preassembly.assembly_errors import INTERVAL_MM
 from processor.preassembly.ends import plate_sides
 from processor.preassembly.ends.outer_faces import ALONG, RegisteredPart
@@ -74,7 +74,8 @@ NONE = EdgeDepartures(  # of a part whose design has no bottom edges
 )
 
 
-class _FacePoints(NamedTuple):
+@dataclass(frozen=True)
+class _FacePoints(Columns):
     """Points (n,) of one face near an edge: interval, distances along and from the edge, residual, station."""
 
     interval: Labels
@@ -82,10 +83,6 @@ class _FacePoints(NamedTuple):
     w: Floats
     residual: Floats
     station: Labels
-
-    def of(self, rows: slice | Bools) -> _FacePoints:
-        """Return some of the points."""
-        return _FacePoints(self.interval[rows], self.x[rows], self.w[rows], self.residual[rows], self.station[rows])
 
     def basis(self) -> Floats:
         """Return the terms (n, 3) of a plane."""
@@ -257,7 +254,7 @@ def _near(part: RegisteredPart, rows: Ints, edge: _Edge) -> tuple[_Candidates, _
     numbers, stations = interval.astype(np.int32), station.astype(np.int32)
     of_web = _FacePoints(numbers, x, up, np.sign(facing[0]) * residual, stations)
     of_bottom = _FacePoints(numbers, x, inward, np.sign(facing[1]) * residual, stations)
-    return _Candidates(of_web.of(web), inner[web]), _Candidates(of_bottom.of(bottom), inner[bottom])
+    return _Candidates(of_web.take(web), inner[web]), _Candidates(of_bottom.take(bottom), inner[bottom])
 
 
 def _frame(line: Polyline, other: Polyline, chainage: Floats, sense: float) -> tuple[Floats, Floats, Floats]:
@@ -302,7 +299,7 @@ def _at_edge(face: _FacePoints, count: int, stations: int) -> _AtEdge:
         solution[fitted] = np.einsum("nij,nj->ni", inverse, right[fitted])
         rest = np.empty(len(face.x))
         for rows in blocks(len(rest)):
-            some = face.of(rows)
+            some = face.take(rows)
             rest[rows] = some.residual - np.einsum("ni,ni->n", some.basis(), solution[some.interval])
         known = np.isin(face.interval, fitted)
         sd = robust_sd(rest[known & used])
@@ -329,7 +326,7 @@ def _sums(face: _FacePoints, used: Bools, count: int, stations: int) -> tuple[In
     number, N, right = np.zeros(count, np.int64), np.zeros((count, 9)), np.zeros((count, 3))
     of_station = np.zeros((count * stations, 3))
     for rows in blocks(len(used)):
-        some = face.of(rows).of(used[rows])
+        some = face.take(rows).take(used[rows])
         B, group = some.basis(), some.interval.astype(np.int64) * stations + some.station
         number += np.bincount(some.interval, minlength=count)
         for k in range(3):

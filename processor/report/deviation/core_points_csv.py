@@ -30,7 +30,7 @@ def parts(origin: Floats, core: Floats, distances: Distances, normals: Floats) -
     """Pass over the text of :func:`csv_text`."""
     yield csv_of_rows(COLUMNS, ())
     for rows in large_arrays.blocks(len(core), ROWS_AT_ONCE):
-        one = distances.at(rows)
+        one = distances.take(rows)
         numbers = (
             *(core[rows] + origin).T, one.distance, one.lod95, one.significant.astype(np.int64), one.n1, one.n2,
             one.std1, one.std2, *normals[rows].T,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -139,10 +138,8 @@ def of_nodes(measured: Measured, kept: npt.NDArray[np.bool_]) -> Measured:
     row = np.where(kept, np.cumsum(kept) - 1, -1)
     a, b = row[members.node_a], row[members.node_b]
     rows = np.flatnonzero((a >= 0) | (b >= 0))
-    columns = {field.name: getattr(members, field.name)[rows] for field in dataclasses.fields(members)}
-    columns |= {"node_a": a[rows], "node_b": b[rows]}
-    left = Nodes(nodes.positions[kept], nodes.covariance[kept], nodes.axis_count[kept], nodes.scatter[kept])
-    return replace(measured, nodes=left, members=Members(**columns), lines=measured.lines[rows])
+    left = replace(members.take(rows), node_a=a[rows], node_b=b[rows])
+    return replace(measured, nodes=nodes.take(kept), members=left, lines=measured.lines[rows])
 
 
 def _lines(starts: Floats, pairs: Ints) -> tuple[Floats, Floats, Floats]:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.model import Checked, Floats, Ints, column
+from processor.model import Checked, Columns, Floats, Ints, column
 
 
 @dataclass(frozen=True)
-class Nodes(Checked):
+class Nodes(Columns, Checked):
     """Nodes where the axes of their members meet: mm, less the origin of the source.
 
     ``covariance`` is that of the meeting point; it includes the axes' scatter by eccentric joints. A node of fewer than
@@ -29,7 +29,7 @@ class Nodes(Checked):
 
 
 @dataclass(frozen=True)
-class Members(Checked):
+class Members(Columns, Checked):
     """Members as tubes: the straight line through the ends of each cylinder, and the bow beside it; mm.
 
     ``points`` are the middles of that line, ``directions`` run from node a to node b, ``side`` is a unit vector across

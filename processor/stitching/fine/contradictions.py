@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Floats, Ints
+from processor.model import Columns, Floats, Ints
 from processor.stitching.fine import bundle_adjustment, correspondences, normal_equations
 from processor.stitching.fine.bundle_adjustment import REJECTION_SIGMAS, Solution
 from processor.stitching.fine.correspondences import FLAT_SIGMAS, KINDS, Blocks, CellTable
@@ -40,17 +40,13 @@ class Contradiction:
 
 
 @dataclass(frozen=True)
-class _Misfits:
+class _Misfits(Columns):
     """Faces of all scans: distance from the plane of the other scans, its variance, and its derivative by the pose."""
 
     scan: Ints
     offset: Floats
     variance: Floats
     by_pose: Floats  # (n, 6): rotation about the scan's origin, shift
-
-    def of_scan(self, s: int) -> _Misfits:
-        rows = self.scan == s
-        return _Misfits(self.scan[rows], self.offset[rows], self.variance[rows], self.by_pose[rows])
 
 
 def of_scans(cells: CellTable, solution: Solution, gate_mm: float) -> list[Contradiction]:
@@ -60,7 +56,7 @@ def of_scans(cells: CellTable, solution: Solution, gate_mm: float) -> list[Contr
     if blocks is None or not blocks.pieces:
         return [Contradiction()] * count
     misfits = _misfits(blocks, solution)
-    return [_strongest(misfits.of_scan(s)) for s in range(count)]
+    return [_strongest(misfits.take(misfits.scan == s)) for s in range(count)]
 
 
 def _misfits(blocks: Blocks, solution: Solution) -> _Misfits:

@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from processor.adjustment import data_snooping
 from processor.adjustment.sighting_covariance import sighting_covariance
 from processor.geometry import rigid
-from processor.model import Bools, Control, Floats, InputError, Ints, Reason, reason
+from processor.model import Bools, Columns, Control, Floats, InputError, Ints, Reason, reason
 from processor.stitching import common_point_checks
 from processor.stitching.result import ControlPoints, ControlSightings
 
@@ -31,7 +31,7 @@ LOOSENED = 30  # rounds at most
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Sightings(Columns):
     """Sightings of control points by scans, a row per sighting; mm.
 
     ``seen`` (m, 3) is in the frame of scan ``scan`` (m,) less its cloud's origin, ``known`` (m, 3) in that of the
@@ -44,10 +44,6 @@ class Sightings:
     seen_sd: Floats
     known: Floats
     known_sd: Floats
-
-    def only(self, rows: Bools) -> Sightings:
-        """Return some rows (m,)."""
-        return Sightings(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
     @property
     def covariance(self) -> Floats:
@@ -122,7 +118,7 @@ def adjust(
         seen_sd=np.maximum(seen_sd, LEAST_SD_MM), known=control.positions[control.point] - centre,
         known_sd=control.sd[control.point],
     )  # fmt: skip
-    shortage = _shortage(every.only(of_posed))
+    shortage = _shortage(every.take(of_posed))
     if shortage:
         return Placed(
             T=T, covariance=covariance, M=np.eye(4), centre=centre, contradictions=(None,) * k,
@@ -134,7 +130,7 @@ def adjust(
     prior = 0.5 * (prior + prior.T)
     poses = np.where(posed[:, None, None], T, np.eye(4))
     fit, accepted, reasons, contradictions, factor = _without_blunders(
-        every.only(of_posed), poses, prior, control, names
+        every.take(of_posed), poses, prior, control, names
     )
     used = of_posed.copy()
     used[of_posed] = accepted
@@ -229,7 +225,7 @@ def _without_blunders(
     contradictions: list[Reason | None] = [None] * len(T)
     factor = 1.0
     while True:
-        rest = used.only(accepted)
+        rest = used.take(accepted)
         fit = fitted(rest, T, prior)
         suspicion = data_snooping.strongest(fit, rest.point, rest.scan)
         if suspicion is None:
@@ -237,7 +233,7 @@ def _without_blunders(
         out = np.zeros(len(accepted), bool)
         out[np.flatnonzero(accepted)[suspicion.rows]] = True
         suspects = [_suspect(kind, number, rest, control.ids, names) for kind, number in suspicion.rivals]
-        if len(suspects) > 1 or _shortage(used.only(accepted & ~out)):
+        if len(suspects) > 1 or _shortage(used.take(accepted & ~out)):
             fit, factor = _loosened(rest, T, prior)
             reasons.append(reason("stitch.control-undecided", suspects=tuple(suspects[:3]), factor=factor))
             break
@@ -247,7 +243,7 @@ def _without_blunders(
             reasons.append(reason("stitch.control-left-out", suspect=suspects[0], size_mm=suspicion.size_mm))
         accepted &= ~out
     if factor == 1.0 and data_snooping.beyond_chance(fit.chi2, fit.free):
-        fit, factor = _loosened(used.only(accepted), T, prior)
+        fit, factor = _loosened(used.take(accepted), T, prior)
         reasons.append(reason("stitch.control-scatters", factor=factor))
     return fit, accepted, reasons, tuple(contradictions), factor
 

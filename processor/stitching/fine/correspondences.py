@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.geometry.thinning import thinned
-from processor.model import Floats, Ints
+from processor.model import Columns, Floats, Ints
 from processor.stitching.coarse import candidate_rotations
 from processor.stitching.fine import noise_model
 from processor.stitching.planes import extraction, grouped_sums
@@ -31,7 +31,7 @@ PRIOR_DOF = 20.0  # with which a piece's points are taken to scatter as the nois
 
 
 @dataclass(frozen=True)
-class Blocks:
+class Blocks(Columns):
     """The points of each scan on each piece: one row for a scan and piece, sorted by piece.
 
     ``sums`` (b, 10) are moments weighted by 1 / variance, in the frame of the scan's cloud. ``kind`` is ON_PIECE for
@@ -51,13 +51,6 @@ class Blocks:
     def faces(self) -> int:
         """Number of faces of several pieces."""
         return int(self.face.max(initial=-1)) + 1
-
-    def take(self, rows: npt.NDArray[np.bool_]) -> Blocks:
-        """Keep some rows; the pieces keep their numbers."""
-        return replace(
-            self, piece=self.piece[rows], scan=self.scan[rows], sums=self.sums[rows], count=self.count[rows],
-            kind=self.kind[rows], rays=self.rays[rows], face=self.face[rows],
-        )  # fmt: skip
 
     def weighted(self, weight: Floats) -> Blocks:
         """Multiply the weights of the points by those of their rows (b,)."""
