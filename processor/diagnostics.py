@@ -90,11 +90,6 @@ def placed(T_frame: Floats, frame: str = "") -> Iterator[None]:
         yield
 
 
-def paused() -> AbstractContextManager[None]:
-    """Record nothing within the block: it repeats what was recorded before."""
-    return _set(_notes, None)
-
-
 def note(stage: str, **values: float) -> None:
     """Record numbers of a stage; their names are the quantities, with a unit at the end."""
     notes = _notes.get()

@@ -416,8 +416,7 @@ def test_a_bridge_through_the_pipeline(tmp_path, monkeypatch):
         attitude, "find", lambda _, part: attitude.Attitude(known[part.name], known[part.name], Status.OK)
     )
     store.write_scene(tmp_path / "b.h5", scene, truth, {})
-    without_bands = {"preassemble": {"repetitions": 0}}
-    found, report = run_in_process(tmp_path / "b.h5", tmp_path / "out", ("design-aided", "corner"), without_bands)
+    found, report = run_in_process(tmp_path / "b.h5", tmp_path / "out", ("design-aided", "corner"))
     answer = found["steps"]["preassemble"]
     assert (answer["status"], answer["method"]) == ("ok", "design-aided")
     assert [c["name"] for c in answer["components"]] == list(arch_clouds.NAMES)

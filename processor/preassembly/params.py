@@ -120,7 +120,6 @@ class Params:
     seed: int = 0
     end_limit_mm: float = 100.0  # a joint end found farther than this from its place in the design is not used
     gap_limit_mm: float = 100.0  # a part that leaves a wider gap is called weak
-    repetitions: int = 5  # of the scans as designed, for a band of the paper's methods; fewer than 3: none
     adjust: AdjustParams = field(default_factory=AdjustParams)
     systematic: SystematicParams = field(default_factory=SystematicParams)
     trim: TrimParams = field(default_factory=TrimParams)

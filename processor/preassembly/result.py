@@ -306,11 +306,6 @@ class Result(Checked):
         """95 % half-widths (6,) of mean and largest of :attr:`errors`; (0,) of a method that states none."""
         return np.concatenate([error.ci95 for error in self.errors])
 
-    @property
-    def bands_as_designed(self) -> bool:
-        """Whether the bands are the method's errors of parts exactly as designed, and not about the truth."""
-        return self.adjustment is None and bool(np.isfinite(self.errors_ci95).any())
-
 
 def overall_status(statuses: Sequence[Status]) -> Status:
     """Return the status of a step by those of its parts."""

@@ -17,7 +17,7 @@ from processor import diagnostics
 from processor.adjustment import thermal
 from processor.model import ArchDesign, InputError, Scan, Scene, UsageError, reason
 from processor.preassembly import assemble
-from processor.preassembly.baselines import bootstrap_bands, methods
+from processor.preassembly.baselines import methods
 from processor.preassembly.params import METHODS, Params
 from processor.preassembly.result import Result
 from processor.preassembly.verdicts import part_failures
@@ -65,11 +65,8 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
     if "parts" not in kept:
         with diagnostics.recording() as kept["notes"]:
             kept["parts"] = methods.extract([of_part[0] for of_part in scans], design, params, attitudes)
-        kept["scanned again"] = bootstrap_bands.repeat_scans(kept["parts"], design, params)
     diagnostics.replay(kept["notes"])
     result = methods.assemble(kept["parts"], design, params)
-    with diagnostics.paused():
-        result = bootstrap_bands.with_bands(result, kept["scanned again"], design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != thermal.REFERENCE_C:
         remark = reason("preassemble.temperature-not-corrected", temperature=scene.temperature_C)
         result = replace(result, reasons=(*result.reasons, remark))

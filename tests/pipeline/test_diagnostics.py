@@ -31,8 +31,6 @@ def test_notes_are_recorded_in_their_own_thread_while_recording():
     with diagnostics.recording() as notes:
         with diagnostics.at("joint"), diagnostics.at("top"):
             diagnostics.note("a", x=2.0, y=np.inf)
-            with diagnostics.paused():
-                diagnostics.note("a", x=3.0)
         thread = Thread(target=lambda: diagnostics.note("a", x=4.0))
         thread.start()
         thread.join()
@@ -59,7 +57,7 @@ def test_clouds_are_in_the_outermost_frame():
 
 # --- the paper's methods of preassembly ---
 
-PARAMS = {"preassemble": {"repetitions": 0, "match": {"pfh_iterations": 300}}}  # poses need not be good
+PARAMS = {"preassemble": {"match": {"pfh_iterations": 300}}}  # poses need not be good
 METHODS = "line,design-aided"
 
 

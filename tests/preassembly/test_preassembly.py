@@ -40,7 +40,7 @@ def together(bridge):
     find, kept = mock.Mock(side_effect=known_attitudes.find_by(truth)), {}
     with mock.patch.object(attitude, "find", find):
         adjusted = preassembly_step.run(scene, preassembly_step.Params(), kept)
-        preassembly_step.run(scene, preassembly_step.Params(method="corner", repetitions=0), kept)
+        preassembly_step.run(scene, preassembly_step.Params(method="corner"), kept)
     return kept["parts"], adjusted, find.call_args_list
 
 
@@ -374,7 +374,7 @@ def test_uncorrected_temperature_is_reported(bridge, monkeypatch):
     scene, _ = bridge
     monkeypatch.setattr(methods, "assemble", lambda *_: preassembly_step.Result("ok", "corner"))
     params = preassembly_step.Params(method="corner")
-    kept = {"parts": [], "notes": diagnostics.Notes(), "scanned again": []}
+    kept = {"parts": [], "notes": diagnostics.Notes()}
     result = preassembly_step.run(dataclasses.replace(scene, temperature_C=31.5), params, kept)
     assert result.reasons == (reason("preassemble.temperature-not-corrected", temperature=31.5),)
 

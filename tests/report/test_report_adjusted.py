@@ -33,7 +33,6 @@ from tests.support.results.bridge_results import (
     of_bridge,
     trade_off,
     verdicts,
-    with_band,
 )
 
 NAN = float("nan")
@@ -168,21 +167,6 @@ def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     assert "without a band, because they state no uncertainty: line" in str(answered[0])
     line = execution.runs[1]
     linear = line.result.linear
-    own = dataclasses.replace(
-        line.result,
-        splicing=dataclasses.replace(line.result.splicing, ci95=[9.0, 9.0]),
-        linear=dataclasses.replace(
-            linear,
-            assembled=with_band(linear.assembled, 9.0, [9.0, 9.0]),
-            best_fit=with_band(linear.best_fit, 9.0, [9.0, 9.0]),
-        ),
-    )
-    alone = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=own)))
-    caption, picture = linear_error(alone)
-    assert "the error of these methods for parts exactly as designed, scanned alike: line" in str(caption)
-    assert picture != answered[1]
-    (summary,) = (table for table in all_tables.tables_of_run(alone, ErrorReport()) if table.file == "summary")
-    assert "Of a bridge exactly as designed, scanned alike, line states up to 9.000" in str(summary.note)
     nothing = Deviations(deviation=np.full(120, NAN))
     result = dataclasses.replace(line.result, linear=dataclasses.replace(linear, assembled=nothing, best_fit=nothing))
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))

@@ -2,7 +2,7 @@
 
 They chain the parts by the edges of their joints: ``corner`` pairs the four scanned points at the corners of a joint,
 ``line`` aligns the points on its edges, ``design-aided`` aligns them together with the bottom edges, with the design's
-as their target. They state no uncertainty (:mod:`~processor.preassembly.baselines.bootstrap_bands` adds a band), and
+as their target. They state no uncertainty, and
 their key points lie on the inner edges of the plates. Source: paper 000.
 """
 

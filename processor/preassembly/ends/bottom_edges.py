@@ -224,11 +224,8 @@ def _faces(
 
 def _outer_side(found: Sequence[_Candidates], sense: float) -> _FacePoints:
     """Join the points of a face, those of the plate's inner side left out; residuals by ``sense`` are outward."""
-    columns = list(zip(*(one.face for one in found), strict=True))
-    interval, residual = np.concatenate(columns[0]), np.concatenate(columns[3])
-    used = _outer(interval, sense * residual, np.concatenate([one.inner for one in found]))
-    x, w, station = (np.concatenate(columns[k])[used] for k in (1, 2, 4))
-    return _FacePoints(interval[used], x, w, residual[used], station)
+    face = _FacePoints.concat([one.face for one in found])
+    return face.take(_outer(face.interval, sense * face.residual, np.concatenate([one.inner for one in found])))
 
 
 def _near(part: RegisteredPart, rows: Ints, edge: _Edge) -> tuple[_Candidates, _Candidates]:
@@ -267,7 +264,7 @@ def _frame(line: Polyline, other: Polyline, chainage: Floats, sense: float) -> t
     return along, left, np.cross(along, left)
 
 
-def _outer(interval: Ints, out: Floats, inner: Bools) -> Bools:
+def _outer(interval: Labels, out: Floats, inner: Bools) -> Bools:
     """Mark points (n,) that are not of a plate's inner side, interval by interval.
 
     A single layer where the design has the ``inner`` (n,) side may be either side, and is left out.

@@ -30,7 +30,6 @@ from processor.report.style import (
     rounded,
 )
 
-AS_DESIGNED_ALPHA = 0.4  # of the lines of a method's error for parts exactly as designed
 # Dark enough to be read; a failed joint is told by its word as well.
 CALLOUTS = {Verdict.FAIL: "#b34700", Verdict.PASS: "#005a94", Verdict.INDETERMINATE: "black", Verdict.NONE: "black"}
 GAP_SHARE = 0.04  # of the bridge's length: how long the largest gap is drawn
@@ -252,18 +251,14 @@ def _draw_deviations(axes: Axes, run: StepRun, deviations: Deviations, k: int) -
         if not np.isfinite(deviations.ci95).any():
             continue
         band = deviations.ci95[on]
-        if run.result.bands_as_designed:
-            axes.plot(chainage_m, band, color=colour, linewidth=width, alpha=AS_DESIGNED_ALPHA)
-        else:
-            low, high = (np.maximum(deviation + sign * band, LEAST_SHOWN_MM) for sign in (-1.0, 1.0))
-            axes.fill_between(chainage_m, low, high, color=colour, alpha=0.2, linewidth=0.0)
+        low, high = (np.maximum(deviation + sign * band, LEAST_SHOWN_MM) for sign in (-1.0, 1.0))
+        axes.fill_between(chainage_m, low, high, color=colour, alpha=0.2, linewidth=0.0)
 
 
 def _linear_caption(runs: Sequence[StepRun], drawn: Sequence[StepRun]) -> Message:
     """State what the curves and bands are, and which methods have none."""
     has_band = {run.method: bool(np.isfinite(run.result.linear.assembled.ci95).any()) for run in drawn}
-    as_designed = [run.method for run in drawn if run.result.bands_as_designed]
-    shaded = any(has_band[run.method] and not run.result.bands_as_designed for run in drawn)
+    shaded = any(has_band.values())
     bare = [method for method, known in has_band.items() if not known]
     missing = [run.method for run in runs if run.method not in has_band]
     caption = [
@@ -272,14 +267,6 @@ def _linear_caption(runs: Sequence[StepRun], drawn: Sequence[StepRun]) -> Messag
     ]
     if shaded:
         caption.append(text("the shaded band holds 95 % or more"))
-    if as_designed:
-        caption.append(
-            text(
-                "pale: upper bound (95 % or more) of the error of these methods for parts exactly as designed, scanned "
-                "alike: {methods}",
-                methods=as_designed,
-            )
-        )
     if shaded and bare:
         caption.append(text("without a band, because they state no uncertainty: {methods}", methods=bare))
     if missing:
