@@ -17,6 +17,7 @@ else:
     import tomli as tomllib
 
 DEFAULT = "plausible"
+ESTIMATED = "estimated"
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,16 @@ class Catalogue(Checked):
     sd_mm: float = 0.4
     name: str = ""
     verified: bool = False  # the sizes were compared with a published catalogue
+
+    @property
+    def assumed(self) -> bool:
+        """Whether nobody stated the sizes: those of the package stand for an unknown catalogue."""
+        return self.name == DEFAULT
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the sizes are estimates from the balls."""
+        return self.name == ESTIMATED
 
     def __post_init__(self) -> None:
         super().__post_init__()

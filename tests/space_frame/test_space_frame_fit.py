@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from processor.adjustment.scanner_class_errors import OFFSET_SD_MM
 from processor.geometry.linalg_small import inverse_of
 from processor.model import reason
 from processor.space_frame import ball_catalogue
@@ -126,6 +127,8 @@ def test_errors_reach_the_bound_and_intervals_cover(radius, count, visible, sigm
     errors, covariance, bounds, *_ = ball_fit.trial(
         np.random.default_rng(7), draws, radius, count, visible, sigma, several
     )
+    # Balls of free radii have the offset that scanners of the class may have, which these draws have not.
+    covariance = covariance - OFFSET_SD_MM**2 * np.outer([0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 1.0, 1.0])
     chance = 2.5 / np.sqrt(2.0 * draws)  # of an rms, beyond which one in a hundred falls
     assert max(ball_fit.ratios(errors, bounds)) < 1.05 + chance
     sd = np.sqrt(np.einsum("kii->ki", covariance))

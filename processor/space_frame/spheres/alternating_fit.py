@@ -12,6 +12,7 @@ import numpy as np
 
 from processor.limits import standards
 from processor.model import Floats, Tolerance
+from processor.space_frame import shared_sizes
 from processor.space_frame.ball_catalogue import Catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
@@ -139,10 +140,20 @@ def fit_crops(
         params=params,
     )
     fits, setting, residuals = _rounds(problem, len(scanners), station_covariance)
+    if catalogue.assumed:
+        by_points = noise_estimation.without_prior(
+            fits.states[:, 3], fits.covariance[:, 3, 3], fits.sizes, setting.radius_sd
+        )
+        shared = shared_sizes.estimated(*by_points, catalogue, problem.nominal)
+        if shared is not None:
+            del residuals
+            catalogue = shared
+            problem = replace(problem, catalogue=shared)
+            fits, setting, residuals = _rounds(problem, len(scanners), station_covariance)
     scanners_known = bool(np.any(problem.crops.ranges > 0.0))
     priors = Priors(problem.centre_weight, fits.sizes, np.full(len(fits.sizes), setting.size_weight(problem.free)))
     offset = (0.0, np.inf)
-    if len(catalogue.radii):
+    if len(catalogue.radii) and not catalogue.estimated:
         sure = fits.clear
         offset = noise_estimation.radius_offset(
             fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm

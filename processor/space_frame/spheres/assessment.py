@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from processor.adjustment.scanner_class_errors import SHIFT_SD_MM
+from processor.adjustment.scanner_class_errors import OFFSET_SD_MM, SHIFT_SD_MM
 from processor.geometry.sphere import BANDS, SECTORS
 from processor.limits import limit_bounds, standards
 from processor.model import NORMAL_95, Bools, Floats, Reason, Tolerance, reason
@@ -114,7 +114,8 @@ def _states(fits: Fits, nodes: Nodes, nominal: Floats, context: FitContext) -> t
     wider = np.where(degrees > 4.0, degrees / np.maximum(degrees - 2.0, 1.0), 2.0)
     covariance = fits.covariance * wider[:, None, None]
     if context.views is None:
-        common = np.array([0.0, 0.0, 1.0, 1.0]) * context.radius_offset[0]
+        offset, offset_sd = context.radius_offset  # without sizes of balls, the class of the scanners bounds it
+        common = np.array([0.0, 0.0, 1.0, 1.0]) * (offset if np.isfinite(offset_sd) else OFFSET_SD_MM)
         covariance = covariance + np.outer(common, common)
     else:  # they include the offset of radii
         covariance = covariance + context.views.covariance
@@ -243,7 +244,9 @@ def _messages(context: FitContext) -> tuple[Reason, ...]:
         )
     if abs(offset) > SURE * offset_sd:
         messages.append(reason("spheres.radius-offset", offset=offset))
-    if len(catalogue.radii) and not catalogue.verified:
+    if catalogue.estimated:
+        messages.append(reason("spheres.estimated-sizes", sizes=tuple(f"{radius:.1f}" for radius in catalogue.radii)))
+    elif len(catalogue.radii) and not catalogue.verified:
         messages.append(reason("spheres.unverified-catalogue", catalogue=catalogue.name))
     return tuple(messages)
 

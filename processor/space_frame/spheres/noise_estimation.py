@@ -131,10 +131,15 @@ def _off_sizes(
     radii: Floats, variances: Floats, sizes: Floats, used_sd: float, stated_sd: float
 ) -> tuple[Floats, Floats]:
     """Radii less sizes (j,) from the points alone, and their variances (j,), of spheres with enough information."""
-    prior = 1.0 / used_sd**2
-    weight = 1.0 / variances - prior
-    good = np.isfinite(weight) & (weight > 0.1 * prior)
-    variance = 1.0 / weight[good]
-    off = (radii[good] / variances[good] - sizes[good] * prior) * variance - sizes[good]
+    by_points, variance = without_prior(radii, variances, sizes, used_sd)
+    off = by_points - sizes
     near = np.abs(off) < 4.0 * np.sqrt(variance + stated_sd**2)
     return off[near], variance[near]
+
+
+def without_prior(radii: Floats, variances: Floats, sizes: Floats, used_sd: float) -> tuple[Floats, Floats]:
+    """Return radii (k,) by the points alone and their variances, mm^2; NaN where the prior, of ``used_sd``, decides."""
+    prior = 1.0 / used_sd**2
+    weight = 1.0 / variances - prior
+    variance = 1.0 / np.where(weight > 0.1 * prior, weight, np.nan)
+    return (radii / variances - sizes * prior) * variance, variance

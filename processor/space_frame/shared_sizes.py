@@ -1,0 +1,56 @@
+"""Sizes that the balls of a frame share, estimated from their radii where no catalogue is stated.
+
+Balls are made in few sizes, each for many nodes. Where the radii of many balls lie at places that neither the sizes of
+a plausible catalogue nor an error common to all ranges explain, these places are the sizes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import chdtrc
+
+from processor.adjustment.scanner_class_errors import VIEW_SD_MM
+from processor.model import Floats
+from processor.space_frame.ball_catalogue import ESTIMATED, Catalogue
+
+WELL_KNOWN = 0.5  # sd of a radius by its points, by the scatter of a size, up to which the ball shows its size
+GAP = 4.0  # scatters of a size between neighbouring radii, beyond which they are of two sizes: 1 in 15,000 of one size
+SHARED = 3  # balls of a size: two alike may both be wrong ones
+UNLIKELY = 1e-3  # probability of the radii by the catalogue, below which their sizes are estimated
+
+
+def estimated(radii: Floats, variances: Floats, catalogue: Catalogue, nominal: Floats) -> Catalogue | None:
+    """Return the sizes that balls share; None where the sizes of a catalogue explain their radii.
+
+    Parameters
+    ----------
+    radii, variances : (k,) of the balls by their points alone, mm and mm^2
+    catalogue : sizes that balls may have; those of the design, ``nominal`` (k,), NaN = none, belong to them
+    """
+    sd = catalogue.sd_mm
+    known = np.sort(radii[np.isfinite(radii) & (variances < (WELL_KNOWN * sd) ** 2)])
+    if not len(known):
+        return None
+    groups = np.split(known, np.flatnonzero(np.diff(known) > GAP * sd) + 1)
+    count = np.array([len(group) for group in groups])
+    size = np.array([group.mean() for group in groups])
+    sizes = np.union1d(catalogue.radii, nominal[np.isfinite(nominal)])
+    if explained(size[count >= SHARED], count[count >= SHARED], sizes, sd):
+        return None
+    return Catalogue(size, sd, ESTIMATED, False)
+
+
+def explained(size: Floats, count: Floats, sizes: Floats, sd: float) -> bool:
+    """Whether the means (g,) of groups of radii are those of given sizes, all off by one error of the ranges.
+
+    The balls of one batch may be off their size together, by as much as radii scatter.
+    """
+    if not len(size):
+        return True
+    weight = 1.0 / (sd**2 * (1.0 + 1.0 / count))
+    least = np.inf
+    for start in (size[:, None] - sizes).ravel():  # each places a group at a size
+        nearest = sizes[np.abs(size[:, None] - start - sizes).argmin(axis=1)]
+        error = weight @ (size - nearest) / (weight.sum() + VIEW_SD_MM**-2)
+        least = min(least, weight @ (size - error - nearest) ** 2 + (error / VIEW_SD_MM) ** 2)
+    return bool(chdtrc(len(size), least) > UNLIKELY)
