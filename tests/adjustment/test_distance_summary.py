@@ -24,13 +24,13 @@ def test_intervals_of_the_extremes_hold_the_true_extremes(bulge):
     true = np.zeros(2000)
     true[:40] = bulge * np.linspace(0.5, 1.0, 40)
     least = greatest = alone = 0
-    for seed in range(200):
+    for seed in range(100):
         found = summarised(true + np.random.default_rng(seed).normal(0.0, 1.0, len(true)), 1.0)
         least += found.min_ci95[0] <= true.min() <= found.min_ci95[1]
         greatest += found.max_ci95[0] <= true.max() <= found.max_ci95[1]
         alone += abs(found.max - true.max()) <= Z95
-    assert min(least, greatest) >= 184  # of 200 at 95 %: 190 with a standard deviation of 3
-    assert bulge > 0.0 or alone < 10
+    assert min(least, greatest) >= 91  # of 100 at 95 %: 95 less two standard deviations of 2.2
+    assert bulge > 0.0 or alone < 5
 
 
 def test_the_interval_of_a_distance_that_stands_clear_is_its_own():

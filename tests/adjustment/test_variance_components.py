@@ -15,7 +15,7 @@ def drawn(rng, stations, apart, cells=40, points=40):
     return shift[station] + 0.5 * rng.normal(size=len(station)), station, cell
 
 
-@pytest.mark.parametrize("apart", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("apart", [0.0, pytest.param(0.1, marks=pytest.mark.slow), 1.0])
 def test_the_variance_between_stations_is_estimated(apart):
     rng = np.random.default_rng(0)
     found = np.array([variance_components.between_stations(*drawn(rng, 9, apart)) for _ in range(300)])

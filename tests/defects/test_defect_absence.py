@@ -101,6 +101,7 @@ def assert_found(found, expected):
         assert min(away) < 40.0, (kind, place)
 
 
+@pytest.mark.slow
 def test_steel_as_designed_has_no_missing_parts():
     """The step itself finds that the cloud lies at the design."""
     assert run(cloud_of(BOXES, 1), {}) == []

@@ -22,7 +22,7 @@ def found(inward, *more, earlier=AT_DESIGN, spacing=7.0):
     return dict(zip(kinds, zip(defects.depth_max, defects.depth_ci95, strict=True), strict=True))
 
 
-@pytest.mark.parametrize(("off_mm", "earlier"), [(0.15, AT_DESIGN), (0.5, {})])
+@pytest.mark.parametrize(("off_mm", "earlier"), [(0.15, AT_DESIGN), pytest.param(0.5, {}, marks=pytest.mark.slow)])
 def test_a_dent_is_found_where_the_whole_plate_is_off(off_mm, earlier):
     """A registration within its error of 1 mm moves the plate by more than the noise of its mean.
 
@@ -34,7 +34,7 @@ def test_a_dent_is_found_where_the_whole_plate_is_off(off_mm, earlier):
     assert abs(depth - 4.0) < min(ci95, 0.2)
 
 
-@pytest.mark.parametrize("bow_mm", [-1.0, 1.0])
+@pytest.mark.parametrize("bow_mm", [pytest.param(-1.0, marks=pytest.mark.slow), 1.0])
 def test_a_dent_is_found_on_a_bowed_plate(bow_mm):
     """Both are found: an error of the pose moves a plate but does not bow it, so that the bow is known well."""
     half = 0.5 * SIDE

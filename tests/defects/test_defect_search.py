@@ -79,6 +79,7 @@ def from_behind(scene, inward, count, seed):
     return dataclasses.replace(scene, scans=(*scene.scans, scan))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [4.0, -4.0])
 def test_a_plate_dented_through_is_one_defect_though_both_sides_show_it(depth):
     pushed, pit = bump(depth, 90.0, (250.0, 300.0)), bump(3.0, 40.0, (1250.0, 350.0))
@@ -93,7 +94,7 @@ def test_a_plate_dented_through_is_one_defect_though_both_sides_show_it(depth):
 def test_a_dent_a_bulge_and_a_pit_are_measured():
     bumps = {"dent": (3.0, 90.0, (250.0, 300.0)), "bulge": (-2.0, 80.0, (1250.0, 350.0)),
              "pit": (4.0, 16.0, (2100.0, 200.0))}  # fmt: skip
-    scene = scene_of(3, lambda x, z: sum(bump(*one)(x, z) for one in bumps.values()), spacing=3.0)
+    scene = scene_of(3, lambda x, z: sum(bump(*one)(x, z) for one in bumps.values()), spacing=4.0)
     result = run(scene)
     assert sorted(found(result)) == [("bulge", "component-2"), ("dent", "component-1"), ("pit", "component-3")]
     assert not result.defects.doubtful.any()
@@ -172,9 +173,13 @@ def test_surface_in_the_shadow_of_clutter_is_not_missing():
     ("kind", "inward", "depth"),
     [
         ("bend", lambda x, z: 3.0 * np.cos(np.pi * (x - 1200.0) / SIDE), 3.0),
-        ("twist", lambda x, z: 0.006 * (x - 1200.0) / SIDE * (z - 300.0) * 2.0, 1.8),
-        ("waviness", lambda x, z: 1.0 * np.sin(2.0 * np.pi * (x - 1200.0) / 150.0), 1.0),
-        ("step", lambda x, z: np.where(x > 1300.0, 1.5, 0.0), 1.5),
+        pytest.param(
+            "twist", lambda x, z: 0.006 * (x - 1200.0) / SIDE * (z - 300.0) * 2.0, 1.8, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "waviness", lambda x, z: 1.0 * np.sin(2.0 * np.pi * (x - 1200.0) / 150.0), 1.0, marks=pytest.mark.slow
+        ),
+        pytest.param("step", lambda x, z: np.where(x > 1300.0, 1.5, 0.0), 1.5, marks=pytest.mark.slow),
         ("misalignment", lambda x, z: 2.0 + 0.003 * (z - 300.0), 2.9),
     ],
 )
@@ -197,15 +202,13 @@ def test_shapes_of_whole_components(kind, inward, depth):
         np.testing.assert_allclose(curve.displacement, -3.0 * np.cos(np.pi * at / SIDE), atol=0.06)  # 2 % of 3 mm
 
 
-def test_unsettled_alignment_gives_the_same_pose_as_a_settled_one(monkeypatch):
-    """The whole is 1.5 mm off; an alignment that never settles gives the same pose as one that does."""
+def test_an_alignment_that_never_settles_gives_the_right_pose(monkeypatch):
     scene = scene_of(4, lambda x, z: np.full(len(x), 1.5))
-    settled = run(scene)
     monkeypatch.setattr(detect, "AGAIN_MM", 0.0)
     again = run(scene)
     # Plates fix y: noise of 0.4 mm, 40,000 points, and a prior of 1 mm for the pose, which draws it by 1 %.
-    assert settled.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
-    np.testing.assert_allclose(again.T_design_project[1], settled.T_design_project[1], atol=0.01)
+    assert again.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
+    np.testing.assert_allclose(again.T_design_project[1, :3], [0.0, 1.0, 0.0], atol=1e-4)  # 0.1 mm over 3.3 m
     assert again.covariance.shape == (6, 6)
     assert 0.0 < np.sqrt(again.covariance[4, 4]) < 1.0
 
@@ -249,7 +252,7 @@ def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
 
 def test_the_papers_chain_finds_a_dent_and_is_seeded():
     scene = scene_of(2, bump(5.0, 120.0, (250.0, 300.0)), spacing=8.0)
-    params = defects_step.Params(method="paper", paper=baseline.Paper(trials=60, feature_points=80))
+    params = defects_step.Params(method="paper", paper=baseline.Paper(trials=30, feature_points=80))
     result = defects_step.run(scene, params)
     assert set(result.defects.defect_class) == {"unknown"}
     np.testing.assert_allclose(result.defects.centre[0], [250.0, 2.0, 300.0], atol=12.0)  # a tenth of its radius
@@ -280,7 +283,8 @@ def test_false_alarms_are_no_more_than_asked_for():
     seen = np.zeros(len(plate.share))
     seen[rows] = 1.0
     alarms = 0
-    for seed in range(10):
+    runs = 8
+    for seed in range(runs):
         noise = np.random.default_rng(seed).normal(0.0, 0.1, len(seen))
         ones = np.ones(len(seen), np.int64)
         field = deviation_field.Field(
@@ -289,7 +293,7 @@ def test_false_alarms_are_no_more_than_asked_for():
         levels = scan_statistic.levels_of(field, plate, 1e-8, 0.0)
         sign = scan_statistic.search(field, plate, levels).sign
         alarms += int((np.abs(plate.charts.image(sign.astype(float), chart)) > 0).any())
-    assert alarms <= 10  # of 10 runs, in each of which 1 is allowed: at 0.63 a run, ten of ten is one in a hundred
+    assert alarms < runs  # in each of which 1 is allowed: at 0.63 a run, eight of eight is one in forty
     assert np.all(levels.inflation < 1.1)
 
 

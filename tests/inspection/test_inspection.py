@@ -124,7 +124,7 @@ def test_intervals_cover_the_true_values_in_95_of_100_cases():
     true_ends = RIB.copy() + rng.normal(0.0, 1.0, DESIGN.shape)
     true = part_geometry.deviations(RIB, true_ends)
     held = dict.fromkeys(true, 0)
-    draws = 100
+    draws = 60
     for _ in range(draws):
         found = inspected(shape(true_ends + (root @ rng.standard_normal(48)).reshape(2, 8, 3), covariance))
         for id_ in true:
@@ -133,12 +133,12 @@ def test_intervals_cover_the_true_values_in_95_of_100_cases():
     share = np.array(list(held.values())) / draws
     spread = np.sqrt(0.95 * 0.05 / draws)
     assert np.abs(share - 0.95).max() < 4.0 * spread  # 27 characteristics
-    assert share.mean() == pytest.approx(0.95, abs=0.02)  # ten characteristics' worth, as errors are shared: 3 sds
+    assert share.mean() == pytest.approx(0.95, abs=0.027)  # ten characteristics' worth, as errors are shared: 3 sds
 
 
-@pytest.mark.parametrize("bow", [0.0, -3.0])
+@pytest.mark.parametrize("bow", [pytest.param(0.0, marks=pytest.mark.slow), -3.0])
 def test_sweep_is_measured_from_the_parts_own_ends(bow):
-    """Of 40 intervals 34 or more cover with a probability of 99 %, if each covers with 95 %."""
+    """Of 24 intervals 20 or more cover with a probability of 99 %, if each covers with 95 %."""
     rng = np.random.default_rng(7)
     n = len(CHAINAGE)
     tilted = 5.0 + 4e-3 * CHAINAGE  # a motion of the part is no sweep
@@ -147,13 +147,13 @@ def test_sweep_is_measured_from_the_parts_own_ends(bow):
     root = np.linalg.cholesky(covariance[0])
     true = np.abs(part_geometry.off_the_chord(CHAINAGE) @ curve).max()
     held, signs = 0, []
-    for _ in range(40):
+    for _ in range(24):
         noisy = np.tile(curve + tilted, 2) + root @ rng.standard_normal(2 * n)
         found = inspected(shape(sideways=noisy.reshape(2, n), edge_covariance=covariance))
         one = by_id(found.characteristics, "sweep")
         held += abs(abs(one.deviation) - true) <= one.ci95
         signs.append(np.sign(one.deviation))
-    assert held >= 34
+    assert held >= 20
     if bow:
         assert set(signs) == {np.sign(bow)}
 
@@ -227,8 +227,8 @@ def test_the_step_runs_with_the_one_that_measures():
 
 
 def test_parts_as_designed_are_inspected_from_their_scans(monkeypatch):
-    """Some hundred values: 95 % intervals that are right are missed by more than a tenth in one case of 100."""
-    scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=1.0, seed=2)
+    """Some fifty values: 95 % intervals that are right are missed by more than a sixth in one case of 1000."""
+    scene, truth = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=2, count=3)
     monkeypatch.setattr(attitude, "find", known_attitudes.find_by(truth))
     runs = {run.step: run.result for run, _ in processor.run(scene, steps=["inspect"]).execution.by_step()}
     assert list(runs) == ["preassemble", "inspect"]
@@ -236,10 +236,11 @@ def test_parts_as_designed_are_inspected_from_their_scans(monkeypatch):
     for component in runs["inspect"].components:
         found = component.characteristics
         known = np.isfinite(found.deviation)
-        assert known.sum() == (11 if component.name.startswith("foot") else 27)
+        assert known.sum() == (27 if component.name == "rib1" else 11)  # with two ends at joints and with one
         held += (np.abs(found.deviation[known]) <= found.ci95[known]).tolist()
         assert np.nanmax(found.ci95) < 0.6
-    assert np.mean(held) > 0.9
+    assert len(held) == 49
+    assert np.mean(held) > 5 / 6
     found = {one.quantity: one.value for one in evaluation.check(scene, runs["inspect"], truth) if one.unit == "%"}
     assert set(found) == {
         "lengths", "widths and heights", "diagonals", "twists", "sweeps and cambers", "squareness of end faces",

@@ -22,6 +22,7 @@ from tests.support.clouds import beam_clouds
 from tests.support.clouds.beam_clouds import SIZE, Built
 
 SEEDS, COUNT = 5, 40_000
+FEW = 15_000  # points where what is asserted is within an interval, or no figure
 
 
 def by_id(result, name=None):
@@ -50,22 +51,26 @@ def true_values(built):
     }
 
 
+def beam(seed, count=COUNT):
+    """A scene of a box as built, and how it is built."""
+    draws = np.random.default_rng(8).standard_normal((SEEDS, 6))
+    built = Built(*(draws[seed] * np.array([2.5, 1.5, 3.0, 2.0, 4e-3, 2e-3])))
+    return beam_clouds.beam(built, seed, count=count), built
+
+
 @pytest.fixture(scope="module")
-def runs():
-    rng = np.random.default_rng(8)
-    found = []
-    for seed in range(SEEDS):
-        built = Built(*(rng.standard_normal(6) * np.array([2.5, 1.5, 3.0, 2.0, 4e-3, 2e-3])))
-        scene = beam_clouds.beam(built, seed, count=COUNT)
-        found.append((scene, built, inspected(scene)))
-    return found
+def measured():
+    """A scene, how it is built, and its deviations."""
+    scene, built = beam(1, FEW)
+    return scene, built, deviation_step.run(scene, deviation_step.Params(register="none"))
 
 
 @pytest.mark.slow
-def test_intervals_cover_the_deviations_as_built(runs):
+def test_intervals_cover_the_deviations_as_built():
     """50 intervals: with 95 % each, 44 or more cover in 98 of 100 cases."""
     errors = []
-    for _, built, result in runs:
+    for scene, built in map(beam, range(SEEDS)):
+        result = inspected(scene)
         found = by_id(result)
         for id_, true in true_values(built).items():
             deviation, ci95 = found[id_]
@@ -86,7 +91,7 @@ def test_a_box_that_is_moved_and_turned_as_a_whole_has_no_defect_by_that():
 
 
 def test_an_end_that_was_not_seen_has_no_value():
-    scene = beam_clouds.beam(Built(), 4, count=COUNT)
+    scene = beam_clouds.beam(Built(), 4, count=FEW)
     hidden = [
         dataclasses.replace(scan, points=scan.points[scan.points[:, 0] < 0.5 * SIZE[0] - 20.0]) for scan in scene.scans
     ]
@@ -99,8 +104,9 @@ def test_an_end_that_was_not_seen_has_no_value():
     assert np.isfinite(by_id(result)["start-squareness-over-width"][0])
 
 
-def test_the_truth_is_measured_by_the_same_definitions(runs):
-    scene, built, result = runs[1]
+def test_the_truth_is_measured_by_the_same_definitions(measured):
+    scene, built, deviation = measured
+    result = inspection_step.run(scene, inspection_step.Params(), {"deviation": deviation})
     mesh = trimesh.creation.box(SIZE)
     points, facet = trimesh.sample.sample_surface(mesh, 20_000, seed=2)
     points = np.asarray(points)
@@ -157,7 +163,9 @@ def test_quarters_of_a_face_share_less_the_farther_they_lie_apart(size, apart):
     np.testing.assert_allclose(pieces.covariance(x, y, 0.01), 0.09 * expected + 0.05 * np.eye(4), rtol=1e-12)
 
 
-@pytest.mark.parametrize(("wave", "noise"), [(0.0, 0.2), (0.1, 0.2), (1.0, 0.2), (2.0, 0.02)])
+@pytest.mark.parametrize(
+    ("wave", "noise"), [(0.0, 0.2), pytest.param(0.1, 0.2, marks=pytest.mark.slow), (1.0, 0.2), (2.0, 0.02)]
+)
 def test_flatness_is_not_the_spread_of_the_noise(wave, noise):
     """320 pieces of 0.2 mm noise spread over 1.2 mm by noise alone."""
     true, held, values = 2.0 * wave * np.cos(np.pi / 10.0), 0, []  # of the middles of pieces
@@ -186,13 +194,13 @@ def test_scene_without_design_or_deviation_is_not_inspected_with_a_reason():
     assert inspection_step.run(scene, inspection_step.Params()).reasons[0].code == "inspect.no-deviation"
 
 
-def test_verdicts_are_given_by_the_limits_and_indeterminate_where_another_attitude_fits_as_well(runs):
-    scene, _, result = runs[0]
-    assert set(result.components[0].characteristics.verdict) == {Verdict.NONE}
+def test_verdicts_are_given_by_the_limits_and_indeterminate_where_another_attitude_fits_as_well(measured):
+    scene, _, deviation = measured
+    plain = inspection_step.run(scene, inspection_step.Params(), {"deviation": deviation})
+    assert set(plain.components[0].characteristics.verdict) == {Verdict.NONE}
     named = dataclasses.replace(scene, tolerance=standards.load("GB 50205-2020"))
-    measured = deviation_step.run(named, deviation_step.Params(register="none"))
-    ambiguous = dataclasses.replace(measured, status=Status.AMBIGUOUS)
-    for status, given in ((False, measured), (True, ambiguous)):
+    ambiguous = dataclasses.replace(deviation, status=Status.AMBIGUOUS)
+    for status, given in ((False, deviation), (True, ambiguous)):
         result = inspection_step.run(named, inspection_step.Params(), {"deviation": given})
         found = result.components[0].characteristics
         assert found.upper[found.id.index("length")] == pytest.approx(3000.0 / 2500.0)
@@ -204,7 +212,7 @@ def test_verdicts_are_given_by_the_limits_and_indeterminate_where_another_attitu
 def test_sizes_of_a_warm_body_are_those_at_the_reference_temperature():
     """A box as designed, 40 K warmer than its design: 12e-6 a kelvin longer (EN 1993-1-1)."""
     longer = 12e-6 * 40.0 * SIZE
-    scene = beam_clouds.beam(Built(longer=longer[0], wider=longer[1]), 6, sigma=0.2, registration=0.0, count=COUNT)
+    scene = beam_clouds.beam(Built(longer=longer[0], wider=longer[1]), 6, sigma=0.2, registration=0.0, count=FEW)
     warm = by_id(inspected(dataclasses.replace(scene, temperature_C=60.0)))
     plain = by_id(inspected(scene))
     for name, size in (("length", longer[0]), ("width", longer[1])):
@@ -212,21 +220,19 @@ def test_sizes_of_a_warm_body_are_those_at_the_reference_temperature():
         assert abs(warm[name][0]) <= warm[name][1]
 
 
-def test_the_step_is_partial_if_a_body_was_not_seen_and_failed_if_none_was(runs):
-    scene, *_ = runs[0]
+def test_the_step_is_partial_if_a_body_was_not_seen_and_failed_if_none_was():
+    scene, _ = beam(0, FEW)
     mesh = scene.structure
     two = StructureDesign(
         "two",
         np.concatenate([mesh.vertices, mesh.vertices + np.array([0.0, 0.0, 9000.0])]),
         np.concatenate([mesh.faces, mesh.faces + len(mesh.vertices)]),
     )
-    for seen, status in ((True, Status.PARTIAL), (False, Status.FAILED)):
-        both = dataclasses.replace(scene, structure=two)
-        measured = deviation_step.run(both, deviation_step.Params(register="none"))
-        if not seen:
-            core = dataclasses.replace(measured.core, distance=np.full(len(measured.core), np.nan))
-            measured = dataclasses.replace(measured, core=core)
-        result = inspection_step.run(both, inspection_step.Params(), {"deviation": measured})
+    both = dataclasses.replace(scene, structure=two)
+    measured = deviation_step.run(both, deviation_step.Params(register="none"))
+    core = dataclasses.replace(measured.core, distance=np.full(len(measured.core), np.nan))
+    for given, status in ((measured, Status.PARTIAL), (dataclasses.replace(measured, core=core), Status.FAILED)):
+        result = inspection_step.run(both, inspection_step.Params(), {"deviation": given})
         assert result.status is status
 
 
@@ -236,7 +242,7 @@ def test_twist_interval_of_a_half_hidden_flange_covers():
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-2975.0, 3000.0, 50.0), np.arange(-125.0, 150.0, 50.0)))
     shared, noise = 0.35, 0.05
     held = 0
-    for seed in range(40):
+    for seed in range(24):
         rng = np.random.default_rng(seed)
         pieces = []
         for face in body.faces:
@@ -251,4 +257,4 @@ def test_twist_interval_of_a_half_hidden_flange_covers():
         measured = structure_bodies.measured(Body("flange", body.faces, tuple(pieces)))[0]
         (twist,) = (one for one in measured if one.quantity is Quantity.TWIST)
         held += twist.low <= 0.0 <= twist.high
-    assert held >= 34  # of 40 with 95 %: in 99 of 100 cases
+    assert held >= 20  # of 24 with 95 %: in 99 of 100 cases

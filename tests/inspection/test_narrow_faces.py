@@ -190,10 +190,10 @@ def body_of(structure):
 
 
 def test_lengths_and_squareness_of_plates_with_known_ends_are_covered():
-    """Both ends seen, each from a station with a shift of .3 mm; of 40 with 95 %, 34 or more cover in 99 of 100."""
+    """Both ends seen, each from a station with a shift of .3 mm; of 24 with 95 %, 20 or more cover in 99 of 100."""
     structure, shift = design(box(PLATE)), 0.3
     body, held = body_of(structure), {"length": 0, "end-squareness-over-width": 0}
-    for seed in range(40):
+    for seed in range(24):
         rng = np.random.default_rng(seed)
         longer, skew = rng.normal(0.0, 2.0), rng.normal(0.0, 3e-3)
         count = int(rng.integers(15, 150))
@@ -215,7 +215,7 @@ def test_lengths_and_squareness_of_plates_with_known_ends_are_covered():
         found = {one.id: one for one in structure_bodies.measured(body, around=surroundings)[0]}
         for id_, true in (("length", longer), ("end-squareness-over-width", skew * PLATE[1])):
             held[id_] += found[id_].low <= true <= found[id_].high
-    assert min(held.values()) >= 34, held
+    assert min(held.values()) >= 20, held
 
 
 # --- scans of plates as built -----------------------------------------------------------------------------------------
@@ -250,7 +250,7 @@ def errors_of(seed, step_mrad):
 
 
 def test_edges_of_scanned_plates_are_measured():
-    errors, count = errors_of(1, 1.8)
+    errors, count = errors_of(1, 2.2)
     assert len(errors) >= 0.8 * count
     assert np.sqrt(np.mean(errors[:, 0] ** 2)) < 1.0
     assert (np.abs(errors[:, 0]) <= errors[:, 1]).sum() >= len(errors) - 3  # 95 % of 16: in 98 of 100 cases

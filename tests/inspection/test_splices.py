@@ -107,7 +107,7 @@ def test_a_part_that_was_moved_and_turned_passes():
 
 def test_intervals_cover_the_share_of_the_true_places():
     held = []
-    for seed in range(30):
+    for seed in range(16):
         rng = np.random.default_rng(seed)
         groups = girder(rng, 0.7)
         true = float(np.mean(best_fit(groups) <= 1.0))
@@ -118,7 +118,7 @@ def test_intervals_cover_the_share_of_the_true_places():
             measured.append(drilled(group.part, group.origin, group.group.axes, GRID, departure, sd=0.15))
         one = shares(*measured)["splice-pass-through"]
         held.append(one.low - 1e-9 <= true - 1.0 <= one.high + 1e-9)
-    assert sum(held) >= 26  # of 30 at 95 %: fewer in two of 100 cases
+    assert sum(held) >= 13  # of 16 at 95 %: fewer in one of 100 cases
 
 
 def test_holes_that_are_not_seen_may_pass_or_not():

@@ -87,7 +87,7 @@ def closed_form(errors):
 @pytest.mark.parametrize("of", ["box", pytest.param("stiffened-box", marks=pytest.mark.slow), "i"])
 def test_corners_are_where_the_faces_and_the_end_meet(of):
     held, rms = [], []
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng([seed, 7])
         errors = prismatic_parts.EndErrors(rng.normal(0.0, [2.0, 1e-3, 1e-3]), rng.normal(0.0, 1.0, (4, 3)))
         end = measured(of, errors, seed)
@@ -96,7 +96,7 @@ def test_corners_are_where_the_faces_and_the_end_meet(of):
         held.append(np.abs(off) < 1.96 * sd)
         rms.append(np.sqrt(np.mean(off**2)))
         assert (np.abs(off) < 4.5 * np.hypot(sd, 0.05)).all()  # an end by itself learns from no other
-    assert np.mean(held) > 0.75  # of some 24 independent coordinates 95 % have a standard deviation of 4.4 %
+    assert np.mean(held) > 0.75  # of some 16 independent coordinates 95 % have a standard deviation of 5.4 %
     assert np.mean(rms) < 0.35  # of ends that are off by 2 mm; points 8 mm apart on plates of 14 mm
 
 

@@ -98,7 +98,7 @@ def test_the_outer_faces_are_those_that_the_corners_lie_on():
     assert np.isin(np.abs(outer.vertices[outer.faces][:, :, 1]), [B]).all()
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_corners_centimetres_off_are_found_within_their_intervals(seed):
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-20.0, 20.0, (4, 3))

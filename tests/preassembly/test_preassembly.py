@@ -27,35 +27,36 @@ KEY_POINT_MM = 0.12  # by faces of thousands of points with noise of 1 mm, extra
 
 @pytest.fixture(scope="module")
 def bridge():
-    return arch_clouds.bridge(spacing_mm=SPACING_MM, sigma_mm=1.0, seed=1)
+    return arch_clouds.bridge(spacing_mm=SPACING_MM, sigma_mm=1.0, seed=1, count=3)
 
 
 @pytest.fixture(scope="module")
-def together(bridge):
-    """Features of parts, the result of the adjustment before them, and the calls of the search for attitudes.
+def together():
+    """Three parts, the result of the adjustment by few points, the truth, and the calls of the search for attitudes.
 
     The attitudes are the true ones: the search is tested by single parts.
     """
-    scene, truth = bridge
+    scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=1.0, seed=1, count=3)
     find, kept = mock.Mock(side_effect=known_attitudes.find_by(truth)), {}
     with mock.patch.object(attitude, "find", find):
         adjusted = preassembly_step.run(scene, preassembly_step.Params(), kept)
         preassembly_step.run(scene, preassembly_step.Params(method="corner"), kept)
-    return kept["parts"], adjusted, find.call_args_list
+    return scene, truth, adjusted, find.call_args_list
 
 
 @pytest.fixture(scope="module")
-def runs(bridge, together):
-    """Results of all methods; features are common to the paper's three."""
-    design, (parts, adjusted, _) = bridge[0].arch, together
-    found = {one: methods.assemble(parts, design, preassembly_step.Params(method=one)) for one in PAPER_METHODS}
-    return found | {"adjustment": adjusted}
+def runs(bridge):
+    """Results of the paper's methods; features are common to the three."""
+    scene, truth = bridge
+    with mock.patch.object(attitude, "find", known_attitudes.find_by(truth)):
+        parts = methods.extract(scene.scans, scene.arch, preassembly_step.Params(method="corner"))
+    return {one: methods.assemble(parts, scene.arch, preassembly_step.Params(method=one)) for one in PAPER_METHODS}
 
 
-def test_the_attitude_of_a_scan_is_searched_for_once_for_all_methods(bridge, together, monkeypatch):
-    scene, _ = bridge
-    by_part = {call.args[1].name: call.args[0] for call in together[2]}
-    assert len(together[2]) == len(by_part) == len(scene.scans)
+def test_the_attitude_of_a_scan_is_searched_for_once_for_all_methods(together, monkeypatch):
+    scene, _, _, calls = together
+    by_part = {call.args[1].name: call.args[0] for call in calls}
+    assert len(calls) == len(by_part) == len(scene.scans)
     find = mock.Mock(side_effect=InputError)  # alone, a method searches with the same points in the same order
     monkeypatch.setattr(attitude, "find", find)
     for scan, part in zip(scene.scans, scene.arch.parts, strict=True):
@@ -64,9 +65,10 @@ def test_the_attitude_of_a_scan_is_searched_for_once_for_all_methods(bridge, tog
         np.testing.assert_array_equal(find.call_args.args[0], by_part[part.name])
 
 
-def test_a_symmetric_rib_without_its_mark_is_ambiguous():
+def test_a_symmetric_rib_without_its_mark_is_ambiguous(monkeypatch):
     rng = np.random.default_rng(0)
     points, T = arch_clouds.scan_points(2, 30.0, 1.0, rng), arch_clouds.random_pose(rng)
+    monkeypatch.setattr(attitude, "FINE_POINTS", 5_000)
     found = attitude.find(rigid.apply(T, points), bare_of_its_mark(arch_clouds.design().parts[2]))
     assert found.status == "ambiguous"
     assert [one.code for one in found.reasons] == ["preassemble.rival-rotation"]
@@ -211,21 +213,13 @@ def test_splicing_error_by_hand():
     assert largest == 3.0
 
 
-@pytest.mark.parametrize("method", preassembly_step.METHODS)
-def test_every_method_assembles_the_bridge(bridge, runs, method):
-    scene, truth = bridge
-    result = runs[method]
+def assembled(scene, truth, result):
+    """Check what results of all methods have in common; return the error of the key points."""
     assert result.status == "ok"
-    assert result.components.name == arch_clouds.NAMES
+    assert result.components.name == arch_clouds.NAMES[:3]
     assert result.splicing.mean < SPACING_MM
     checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
     assert checks["wrong poses called ok"].passed
-    if method in PAPER_METHODS:
-        # The key points lie on the inner edges: corners off by the root of the sum of two thicknesses squared, middles
-        # by one thickness: 0.87 of it; the nearest point is off by some mm of a spacing.
-        assert checks["key points in the scan, rms"].value == pytest.approx(np.hypot(24.0, 24.0) * 0.87, rel=0.2)
-    else:
-        assert checks["key points in the scan, rms"].value < KEY_POINT_MM
     for left, right, gap, T_left, T_right in zip(
         result.components.key_points_scan[:-1, 1],
         result.components.key_points_scan[1:, 0],
@@ -236,20 +230,28 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
     ):
         # float64 at tens of metres
         np.testing.assert_allclose(rigid.apply(T_right, right) - rigid.apply(T_left, left), gap, atol=1e-9)
+    return checks["key points in the scan, rms"].value
 
 
-def test_intervals_of_the_adjustment_cover(bridge, runs):
-    _, truth = bridge
-    result = runs["adjustment"]
-    components, joints, trade_off = result.components, result.joints, result.trade_off
-    off = components.key_points_scan - truth.arch.key_points_scan
-    known = np.isfinite(components.key_points_sd)
-    assert known.sum() == 8 * 8 * 3
-    pull = (off / components.key_points_sd)[known]
-    # An end has 19 independent coordinates of 24: 8 ends determine the ratio to a tenth.
-    assert 0.7 < np.sqrt((pull**2).mean()) < 1.3
-    for size in (off[known], components.key_points_sd[known]):
-        assert np.sqrt((size**2).mean()) < KEY_POINT_MM
+def test_every_method_of_the_paper_assembles_the_bridge(bridge, runs):
+    for result in runs.values():
+        # The key points lie on the inner edges: corners off by the root of the sum of two thicknesses squared, middles
+        # by one thickness: 0.87 of it; the nearest point is off by some mm of a spacing.
+        assert assembled(*bridge, result) == pytest.approx(np.hypot(24.0, 24.0) * 0.87, rel=0.2)
+    # As found by the source paper: chained by joints alone, the bridge turns with Foot 1's attitude.
+    mean = {method: run.linear.assembled.error.mean for method, run in runs.items()}
+    assert mean["design-aided"] < 0.5 * mean["line"]
+    assert mean["design-aided"] < 0.5 * mean["corner"]
+
+
+def test_the_adjustment_assembles_the_bridge(together):
+    scene, truth, result, _ = together
+    joints, trade_off = result.joints, result.trade_off
+    assert assembled(scene, truth, result) < KEY_POINT_MM
+    off = result.components.key_points_scan - truth.arch.key_points_scan
+    known = np.isfinite(result.components.key_points_sd)
+    assert known.sum() == 4 * 8 * 3
+    assert np.sqrt(((off / result.components.key_points_sd)[known] ** 2).mean()) < 1.3  # see below
     np.testing.assert_array_less(np.abs(joints.gaps), 2.0 * joints.gap_ci95)  # perfect parts: no gap but noise
     assert result.splicing.mean < KEY_POINT_MM
     assert set(joints.verdict) == {result.overall} == {Verdict.PASS}
@@ -262,6 +264,20 @@ def test_intervals_of_the_adjustment_cover(bridge, runs):
 
 
 @pytest.mark.slow
+def test_intervals_of_the_adjustment_are_no_larger_than_they_must():
+    scene, truth = arch_clouds.bridge(spacing_mm=SPACING_MM, sigma_mm=1.0, seed=1)
+    with mock.patch.object(attitude, "find", known_attitudes.find_by(truth)):
+        components = preassembly_step.run(scene, preassembly_step.Params()).components
+    off = components.key_points_scan - truth.arch.key_points_scan
+    known = np.isfinite(components.key_points_sd)
+    pull = (off / components.key_points_sd)[known]
+    # An end has 19 independent coordinates of 24: 8 ends determine the ratio to a tenth.
+    assert 0.7 < np.sqrt((pull**2).mean()) < 1.3
+    for size in (off[known], components.key_points_sd[known]):
+        assert np.sqrt((size**2).mean()) < KEY_POINT_MM
+
+
+@pytest.mark.slow
 def test_a_warm_bridge_is_assembled_at_the_reference_temperature(bridge):
     scene, truth = bridge
     grown = 1.0 + 12e-6 * 30.0
@@ -271,13 +287,6 @@ def test_a_warm_bridge_is_assembled_at_the_reference_temperature(bridge):
     assert np.sqrt(np.nanmean(off**2)) < KEY_POINT_MM
     assert np.abs(result.joints.gaps).max() < 1.0  # a rib of 6 m grows by 2 mm
     assert reason("preassemble.temperature-corrected") in result.reasons
-
-
-def test_design_aided_method_has_half_the_linear_error_of_others(runs):
-    # As found by the source paper: chained by joints alone, the bridge turns with Foot 1's attitude.
-    mean = {method: run.linear.assembled.error.mean for method, run in runs.items()}
-    assert mean["design-aided"] < 0.5 * mean["line"]
-    assert mean["design-aided"] < 0.5 * mean["corner"]
 
 
 def ring(length=1400.0, height=1800.0, spacing=25.0):
@@ -316,7 +325,7 @@ def test_point_to_line_icp_recovers_the_pose_along_the_lines():
 
 def test_edge_box_is_sized_by_the_plate_thickness():
     rng = np.random.default_rng(0)
-    for plate in (16.0, 24.0, 40.0):
+    for plate in (16.0, 40.0):
         cut = edge_features.cut_joint_end(box_end(plate=plate), np.eye(4), 1.0, np.array([900.0, 1100.0]), BoxParams())
         across = cut[:, 2].max() - cut[:, 2]
         middle = across[np.abs(cut[:, 1]) < 300.0]
@@ -331,11 +340,11 @@ def test_edge_box_is_sized_by_the_plate_thickness():
 def test_a_part_that_leaves_a_wide_gap_is_called_weak(bridge, runs):
     scene, _ = bridge
     widest = np.abs(runs["corner"].joints.gaps).max(axis=(1, 2))
-    limit = float(np.sort(widest)[1:3].mean())  # two of the four joints gape wider
+    limit = float(widest.mean())  # one of the two joints gapes wider
     found = preassembly_step.run(scene, preassembly_step.Params(method="corner", gap_limit_mm=limit))
     assert [one == "weak" for one in found.components.status] == [False, *(widest > limit)]
     assert found.status == "partial"
-    assert [one.code for row in found.components.reasons for one in row].count("preassemble.wide-gap") == 2
+    assert [one.code for row in found.components.reasons for one in row].count("preassemble.wide-gap") == 1
 
 
 @pytest.mark.slow
@@ -361,17 +370,17 @@ def test_missing_joint_end_breaks_the_chain_with_a_reason(bridge):
     middle = arch_clouds.position([start], [0.0], [550.0])
     near = np.linalg.norm(rigid.apply(T, rib.points) - middle, axis=1) < 1300.0  # its mark stays
     cut = dataclasses.replace(rib, points=rib.points[~near])
-    scans = (*scene.scans[:2], cut, *scene.scans[3:])
+    scans = (*scene.scans[:2], cut)
     result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params(method="line"))
     assert result.status == "partial"
-    assert result.components.status == ("ok", "ok", "failed", "failed", "failed")
+    assert result.components.status == ("ok", "ok", "failed")
     (at_joint,) = (one for one in result.components.reasons[2] if one.code == "preassemble.at")
     assert [one.code for one in at_joint.values["reasons"]] == ["preassemble.no-joint-edges"]
     assert np.isnan(result.joints.gaps[1:]).all()
 
 
-def test_uncorrected_temperature_is_reported(bridge, monkeypatch):
-    scene, _ = bridge
+def test_uncorrected_temperature_is_reported(together, monkeypatch):
+    scene, *_ = together
     monkeypatch.setattr(methods, "assemble", lambda *_: preassembly_step.Result("ok", "corner"))
     params = preassembly_step.Params(method="corner")
     kept = {"parts": [], "notes": diagnostics.Notes()}
@@ -379,12 +388,12 @@ def test_uncorrected_temperature_is_reported(bridge, monkeypatch):
     assert result.reasons == (reason("preassemble.temperature-not-corrected", temperature=31.5),)
 
 
-def test_missing_design_scan_or_method_is_refused(bridge):
-    scene, _ = bridge
+def test_missing_design_scan_or_method_is_refused(together):
+    scene, *_ = together
     with pytest.raises(InputError, match="arch-bridge design"):
         preassembly_step.run(Scene("x", "arch-bridge", scene.scans), preassembly_step.Params())
-    with pytest.raises(InputError, match="expected a scan of component 'rib3', found none"):
-        preassembly_step.run(dataclasses.replace(scene, scans=scene.scans[:3]), preassembly_step.Params())
+    with pytest.raises(InputError, match="expected a scan of component 'rib2', found none"):
+        preassembly_step.run(dataclasses.replace(scene, scans=scene.scans[:2]), preassembly_step.Params())
     twice = (*scene.scans, dataclasses.replace(scene.scans[1], name="again"))
     with pytest.raises(InputError, match=r"takes one scan per part, rib1 has several"):
         preassembly_step.run(dataclasses.replace(scene, scans=twice), preassembly_step.Params(method="line"))

@@ -1,17 +1,15 @@
 """Splice plates bolted to the end of a scanned part are not taken for the part."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from designgen.scenes import make as scenes
 from processor.geometry import rigid
 from processor.model import Scan, Status
-from processor.preassembly import step
 from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import EndPlace, joint_frame
-from processor.preassembly.parts import attitude, beyond_ends
+from processor.preassembly.params import SystematicParams
+from processor.preassembly.parts import attitude, beyond_ends, measure
 from tests.support.made import made
 from tests.support.results.reasons import codes
 from tests.support.scenes import known_attitudes
@@ -90,15 +88,14 @@ def test_a_girder_scanned_with_its_splice_plates_has_no_key_points(monkeypatch):
     }  # fmt: skip
     scene, truth = made(scenes.make, "bolted", recipe, 1)
     monkeypatch.setattr(attitude, "find", known_attitudes.find_by(truth))
-    rng, frame = np.random.default_rng(1), joint_frame(scene.arch.joint_points[0])
-    first, second = scene.scans
+    rng, frame, first = np.random.default_rng(1), joint_frame(scene.arch.joint_points[0]), scene.scans[0]
     T = rigid.invert(frame) @ truth.arch.T_bridge_scan[0]
     local = rigid.apply(T, first.points + first.origin)
     local = np.vstack([local[~covered(local)], plates(rng, spacing=8.0)])
     plated = Scan(first.name, rigid.apply(rigid.invert(T), local), component=first.component, sigma_mm=first.sigma_mm)
-    result = step.run(replace(scene, scans=(plated, second)), step.Params())
-    assert result.components.status[0] == Status.FAILED
-    assert "preassemble.splice-plates" in codes(result.components.reasons[0])
-    assert np.isnan(result.components.key_points_scan[0]).all()
-    assert np.isfinite(result.components.key_points_scan[1, 0, :4]).all()  # those of the girder without plates
-    assert np.isnan(result.joints.gaps).all()
+    systematic = SystematicParams()
+    fitted = measure.fit([plated], 0, attitude.Shapes(scene.arch), 1.0, systematic)
+    (result,) = measure.estimate([fitted], systematic)
+    assert result.status == Status.FAILED
+    assert "preassemble.splice-plates" in codes(result.reasons)
+    assert np.isnan(result.member.ends[1].departure).all()

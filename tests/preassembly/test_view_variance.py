@@ -6,6 +6,8 @@ import pytest
 from processor.adjustment import scanner_class_errors
 from processor.preassembly.ends import view_variance
 
+FEW = 600  # points a side where views differ by 0.3 mm: noise of 1 mm makes 0.1 mm of a thickness, which is allowed for
+
 
 def plate(rng, apart, thick=24.0, waves=0.0, off=None, count=1_500):
     """Points on both sides of a plate of 500 by 900 mm; each side is ``off``, or by a draw of ``apart`` mm."""
@@ -33,7 +35,7 @@ def test_waves_of_a_plate_do_not_change_its_thickness():
 def pair(rng, apart, thick=24.0):
     """Two opposite plates of an end, seen from the same two sides: shifts of views point outward on one alone."""
     off = apart * rng.standard_normal(2)
-    return [plate(rng, apart, thick, off=one) for one in (off, -off[::-1])]
+    return [plate(rng, apart, thick, off=one, count=FEW) for one in (off, -off[::-1])]
 
 
 # Of 12 pairs of opposite plates less 3 means of equal thickness 9 are left. By Student's t they are widened by
@@ -60,7 +62,10 @@ def box(rng, apart, rolled, one_outer):
     for _ in range(2):
         outer = outer if one_outer else apart * rng.standard_normal(4)
         inner = apart * rng.standard_normal(4)
-        ends += [plate(rng, apart, t, off=off) for t, *off in zip(thick, outer, inner, strict=True)]
+        ends += [
+            plate(rng, apart, t, off=off, count=FEW if apart else 1_500)
+            for t, *off in zip(thick, outer, inner, strict=True)
+        ]
     return ends, [(k, 4 + k) for k in range(4)]
 
 
@@ -77,7 +82,7 @@ def of_boxes(rng, apart, rolled, one_outer):
 def test_plates_that_were_rolled_differently_are_no_difference_between_views():
     """Of 0.3 mm by plate the variance is less than a tenth where each plate is as thick at one end as at the other."""
     rng = np.random.default_rng(6)
-    found = [of_boxes(rng, 0.0, 0.3, one_outer=False) for _ in range(20)]
+    found = [of_boxes(rng, 0.0, 0.3, one_outer=False) for _ in range(10)]
     assert not any(one.evident for one in found)
     assert np.mean([one.level for one in found]) < 0.1 * 0.5 * 0.3**2
 

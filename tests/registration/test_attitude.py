@@ -47,12 +47,12 @@ def test_brackets_distinguish_the_attitudes_of_a_box_though_one_is_displaced_and
     at = [-2400.0, -1200.0, 300.0, 1800.0]
     design = structure(*(bracket(x, y) for x in at for y in (1.0, -1.0)))
     built = structure(*(bracket(x, y) for x in at[1:] for y in (1.0, -1.0)), bracket(at[0], 1.0, up=14.0))
-    off, ambiguous = placed(design, sampled(built, 15_000, seed)[0], seed)
+    off, ambiguous = placed(design, sampled(built, 8_000, seed)[0], seed)
     assert rigid.rotation_angle(off[:3, :3]) < ANGLE
     assert not ambiguous
 
 
-@pytest.mark.parametrize("thickness", [6.0, 40.0])
+@pytest.mark.parametrize("thickness", [6.0, pytest.param(40.0, marks=pytest.mark.slow)])
 def test_scanned_side_of_a_plate_is_registered_to_the_same_side(thickness):
     box = trimesh.creation.box(
         (240.0, 170.0, 160.0), rigid.transform(np.eye(3), [-170.0, -115.0, 80.0 + thickness / 2])
@@ -80,16 +80,16 @@ def angle():
 def test_two_plates_of_which_one_side_each_was_scanned_lie_on_their_own_sides(seed):
     """An angle of plates of 20 mm, seen from within: one plate after the other has to change sides."""
     design = angle()
-    points, normals = sampled(design, 6_000, seed, 0.3)
+    points, normals = sampled(design, 4_000, seed, 0.3)
     points = points[(normals @ np.diag([1.0, -1.0, 1.0]) > 0.5).any(axis=1)]
     off, _ = placed(design, points, seed)
-    # The wrong side is 20 mm off; the plate's edges, of some 100 points of 0.3 mm, hold it along itself.
+    # The wrong side is 20 mm off; the plate's edges, of some 60 points of 0.3 mm, hold it along itself.
     assert np.linalg.norm(rigid.apply(off, points) - points, axis=1).max() < 1.0
 
 
 def test_a_scan_the_wrong_way_round_in_the_design_s_frame_is_turned():
     design = structure(*(bracket(x, y) for x in (-2400.0, -1200.0, 300.0) for y in (1.0, -1.0)))
-    points, half_turn = sampled(design, 15_000, 2)[0], np.diag([-1.0, -1.0, 1.0])
+    points, half_turn = sampled(design, 8_000, 2)[0], np.diag([-1.0, -1.0, 1.0])
     turned = points @ half_turn
     right, wrong = (surface_registration.place(p, surface_of(design), np.eye(4), "auto") for p in (points, turned))
     assert right.registration is surface_registration.Registration.AS_GIVEN
@@ -99,7 +99,7 @@ def test_a_scan_the_wrong_way_round_in_the_design_s_frame_is_turned():
 
 def test_attitude_without_distinguishing_features_is_ambiguous():
     # A bracket was left out: nothing shows where it belongs.
-    assert placed(structure(bracket(1500.0, 1.0)), sampled(structure(), 6_000, 0)[0], 0)[1]
+    assert placed(structure(bracket(1500.0, 1.0)), sampled(structure(), 3_000, 0)[0], 0)[1]
 
 
 def test_attitude_is_ambiguous_if_contradiction_equals_evidence():

@@ -19,7 +19,7 @@ def coarse(mesh, T, seed):
 
 def test_any_attitude_is_found_and_never_a_mirror_image():
     rng = np.random.default_rng(9)
-    for seed in range(3):
+    for seed in range(2):
         T = rigid.transform(rigid.rotation_from_vector(rng.normal(size=3) * 2.0), rng.normal(size=3) * 1e4)
         found = coarse(bracket(), T, seed)
         assert np.linalg.det(found.T_target_source[:3, :3]) == pytest.approx(1.0)

@@ -101,17 +101,17 @@ def key_points(s):
 
 
 @cache
-def design():
-    """The bridge's design; not to be changed."""
+def design(count=5):
+    """The design of the bridge's first parts; not to be changed."""
     parts = []
-    for i, name in enumerate(NAMES):
+    for i, name in enumerate(NAMES[:count]):
         s = np.linspace(CUTS[i] * ARC, CUTS[i + 1] * ARC, 101)
         b = 0.5 * WIDTH * widening(s, i)
         vertices, triangles = mesh(i)
         parts.append(DesignPart(name, vertices, triangles, position(s, b, 0.0 * s), position(s, -b, 0.0 * s)))
-    return ArchDesign(
-        tuple(parts), ("J1", "J2", "J3", "J4"), NAMES[:4], NAMES[1:], np.array([key_points(c * ARC) for c in CUTS[1:5]])
-    )
+    joints = np.array([key_points(c * ARC) for c in CUTS[1:count]])
+    names = tuple(f"J{j}" for j in range(1, count))
+    return ArchDesign(tuple(parts), names, NAMES[: count - 1], NAMES[1:count], joints)
 
 
 def random_pose(rng):
@@ -134,22 +134,22 @@ def scan_points(part, spacing_mm, sigma_mm, rng):
     return points + sigma_mm * rng.normal(size=points.shape)
 
 
-def bridge(spacing_mm=10.0, sigma_mm=1.0, seed=0):
-    """A scene of the five parts in arbitrary poses, and its truth."""
+def bridge(spacing_mm=10.0, sigma_mm=1.0, seed=0, count=5):
+    """A scene of the first parts in arbitrary poses, and its truth."""
     rng = np.random.default_rng(seed)
     scans, poses, key_scan, key_bridge, edges = [], [], [], [], []
-    for i, name in enumerate(NAMES):
+    for i, name in enumerate(NAMES[:count]):
         T_scan_bridge = random_pose(rng)
         R, t = T_scan_bridge[:3, :3], T_scan_bridge[:3, 3]
         scans.append(Scan(name, scan_points(i, spacing_mm, sigma_mm, rng) @ R.T + t, component=name))
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R.T, -R.T @ t
-        ends = [key_points(CUTS[j] * ARC) if 0 < j < 5 else np.full((8, 3), np.nan) for j in (i, i + 1)]
+        ends = [key_points(CUTS[j] * ARC) if 0 < j < count else np.full((8, 3), np.nan) for j in (i, i + 1)]
         poses.append(T)
         key_bridge.append(ends)
-        part = design().parts[i]
+        part = design(count).parts[i]
         edges.append([part.bottom_edge_left, part.bottom_edge_right])
         key_scan.append([end @ R.T + t for end in ends])
-    scene = Scene("bridge", "arch-bridge", tuple(scans), arch=design())
-    arch = ArchTruth(NAMES, np.array(poses), np.array(key_scan), np.array(key_bridge), np.array(edges))
+    scene = Scene("bridge", "arch-bridge", tuple(scans), arch=design(count))
+    arch = ArchTruth(NAMES[:count], np.array(poses), np.array(key_scan), np.array(key_bridge), np.array(edges))
     return scene, Truth(arch=arch, spacing_mm=spacing_mm, sigma_mm=sigma_mm)

@@ -14,7 +14,14 @@ def attitude_of(points, part, T):
     return attitude.Attitude(hypotheses[int(np.argmin(turns))], T, Status.OK)
 
 
-def find_by(truth):
-    """What stands for :func:`processor.preassembly.parts.attitude.find` for scans of a bridge with this truth."""
-    poses = dict(zip(truth.arch.names, truth.arch.T_bridge_scan, strict=True))
-    return lambda points, part, _=None: attitude_of(points, part, poses[part.name])
+def find_by(truth, searched=""):
+    """What stands for :func:`processor.preassembly.parts.attitude.find` for scans of a bridge with this truth.
+
+    That of the part ``searched`` is searched for.
+    """
+    poses, search = dict(zip(truth.arch.names, truth.arch.T_bridge_scan, strict=True)), attitude.find
+
+    def find(points, part, surface=None):
+        return search(points, part, surface) if part.name == searched else attitude_of(points, part, poses[part.name])
+
+    return find
