@@ -142,8 +142,9 @@ def box_end(spacing=4.0, sigma=0.0, width=900.0, height=1100.0, plate=24.0):
 
 def test_reduced_boxes_find_the_inner_edges_of_the_plates():
     # As published: the point nearest to P lies on the end's inner edge, a plate's thickness inside the outer edge.
-    edges = edge_features.reduced_boxes(box_end(), 1.0, 4.0, BoxParams(edge_box_mm=36.0), np.random.default_rng(0))
-    inner_b, inner_h = 450.0 - 24.0, 550.0 - 24.0
+    cut = box_end(width=450.0, height=550.0)
+    edges = edge_features.reduced_boxes(cut, 1.0, 4.0, BoxParams(edge_box_mm=36.0), np.random.default_rng(0))
+    inner_b, inner_h = 225.0 - 24.0, 275.0 - 24.0
     expected = np.array(
         [[0, inner_b, -inner_h], [0, -inner_b, -inner_h], [0, -inner_b, inner_h], [0, inner_b, inner_h]]
     )
@@ -326,9 +327,10 @@ def test_point_to_line_icp_recovers_the_pose_along_the_lines():
 def test_edge_box_is_sized_by_the_plate_thickness():
     rng = np.random.default_rng(0)
     for plate in (16.0, 40.0):
-        cut = edge_features.cut_joint_end(box_end(plate=plate), np.eye(4), 1.0, np.array([900.0, 1100.0]), BoxParams())
+        end, size = box_end(width=450.0, height=550.0, plate=plate), np.array([450.0, 550.0])
+        cut = edge_features.cut_joint_end(end, np.eye(4), 1.0, size, BoxParams())
         across = cut[:, 2].max() - cut[:, 2]
-        middle = across[np.abs(cut[:, 1]) < 300.0]
+        middle = across[np.abs(cut[:, 1]) < 150.0]
         # Half of the spacing of points at the plate's inner side, 1.5 times, less than a spacing of 4 mm
         assert edge_features.edge_box(middle, BoxParams()) == pytest.approx(1.5 * plate, abs=1.5)
         one_side = np.abs(rng.normal(size=500))

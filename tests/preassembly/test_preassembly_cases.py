@@ -160,12 +160,13 @@ def test_ends_are_right_despite_stray_points_and_the_same_where_points_lie_in_fi
         np.testing.assert_allclose(one, other, atol=1e-6)
 
 
-def test_a_square_box_is_not_turned_by_a_quarter():
+def test_a_square_box_is_not_turned_by_a_quarter(monkeypatch):
+    monkeypatch.setattr(attitude, "FINE_POINTS", SEARCHED)
     parts, design = ribs(dataclasses.replace(SMALL, width_mm=1_000.0, height_mm=1_000.0, plate_web_mm=24.0))
     scan, T = scanned(cloud(parts[1], spacing_mm=24.0))
     found = attitude.find(scan.points, design.parts[1], shapes_of(design)[1])
     assert found.status == "ok"
-    assert turn_deg(found.T_surface, T) < TURNED_DEG
+    assert turn_deg(found.T_surface, T) < 2.0 * TURNED_DEG  # by the few points of the search
 
 
 def test_erected_foot_is_registered_without_a_turn():
