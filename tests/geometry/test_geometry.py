@@ -137,24 +137,6 @@ def test_equal_points_of_a_cell_keep_their_order():
     assert (np.diff(grid.order)[same] > 0).all()
 
 
-def test_outliers_are_those_of_open3d():
-    o3d = pytest.importorskip("open3d")
-    rng = np.random.default_rng(5)
-    points = np.vstack(
-        [np.column_stack([rng.uniform(0, 500, (4000, 2)), np.zeros(4000)]), rng.uniform(0, 500, (40, 3))]
-    )
-    grid = nearest_neighbours.of_spacing(points)
-    ours = np.zeros(len(points), bool)
-    ours[grid.order] = nearest_neighbours.statistical_inliers(grid, 20, 2.0)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    # Open3D counts the point itself as its first neighbour, so its mean is 20/21 of ours; the rule is scale-free.
-    theirs = np.zeros(len(points), bool)
-    theirs[np.asarray(cloud.remove_statistical_outlier(21, 2.0)[1])] = True
-    assert (ours != theirs).mean() < 0.001
-    assert ours[:4000].mean() > 0.98
-    assert ours[4000:].mean() < 0.2
-
-
 def test_voxel_means_by_hand():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [10.0, 0, 0], [11.0, 2.0, 0], [30.0, 0, 0]])
     means = thinning.voxel_means(points, 5.0, least=2)
@@ -167,15 +149,6 @@ def test_voxel_means_do_not_depend_on_how_many_voxels_are_empty():
     far = thinning.voxel_means(np.vstack([points, np.full((1, 3), 1e5)]), 10.0)  # 10^12 voxels
     np.testing.assert_array_equal(far[:-1], near)
     np.testing.assert_array_equal(far[-1], [1e5, 1e5, 1e5])
-
-
-def test_the_order_by_cells_does_not_depend_on_that_of_the_file():
-    rng = np.random.default_rng(0)
-    points = rng.uniform(0.0, 300.0, (2_000, 3)).round(0)  # some coordinates are equal
-    shuffled = points[rng.permutation(len(points))]
-    found, other = thinning.by_cell(points, 40.0), thinning.by_cell(shuffled, 40.0)
-    np.testing.assert_array_equal(found.points, points[found.row])
-    np.testing.assert_array_equal(found.points, other.points)
 
 
 @pytest.mark.parametrize("grid_mm", [1e-6, 7.0])

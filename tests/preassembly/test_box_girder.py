@@ -53,7 +53,10 @@ def off(mesh, points):
 # --- the box ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bridge", [{}, {"curve": "circle"}, {"curve": "catenary", "span_mm": 60_000.0}])
+@pytest.mark.parametrize(
+    "bridge",
+    [pytest.param({}, marks=pytest.mark.slow), {"curve": "circle"}, {"curve": "catenary", "span_mm": 60_000.0}],
+)
 def test_surrogate_of_a_rib_is_its_outer_faces(bridge):
     part = parts(**bridge)[1]
     mesh = trimesh.Trimesh(*surrogate_of(parts(**bridge), 1), process=False)
