@@ -145,8 +145,8 @@ def made(settings=(), seed=1):
     return make_scene("bridge", recipe_files.overridden(recipe_files.load("arch-s1")[1], list(settings)), seed)
 
 
-def test_a_folder_without_meshes_comes_back(tmp_path):
-    scene, truth = made(["scan.spacing_mm=60"])
+def test_a_folder_without_meshes_comes_back_with_thicknesses_of_the_design(tmp_path):
+    scene, truth = made(["scan.spacing_mm=200"])
     out = exported(tmp_path, scene, truth, "--without-meshes")
     assert not (out / "design").exists()
     written = json.loads((out / "design.json").read_text())
@@ -162,12 +162,6 @@ def test_a_folder_without_meshes_comes_back(tmp_path):
         assert (theirs.source, ours.source) == (box_girder_mesh.SOURCE, "mesh")
     store.write_scene(tmp_path / "again.h5", back, None, {})
     assert [part.source for part in store.read_scene(tmp_path / "again.h5").arch.parts] == ["curves"] * 5
-
-
-def test_a_thickness_in_the_design_is_used(tmp_path):
-    scene, truth = made(["scan.spacing_mm=60"])
-    out = exported(tmp_path, scene, truth, "--without-meshes")
-    written = json.loads((out / "design.json").read_text())
     written["components"]["rib1"]["plate_mm"] = 36.0
     (out / "design.json").write_text(json.dumps(written))
     rib = folder.read_input(out).arch.parts[1]
@@ -185,7 +179,7 @@ def test_only_an_arch_bridge_goes_without_meshes(tmp_path):
     from designgen.export import folder as export_folder
 
     scene, truth = make_scene(
-        "f", recipe_files.overridden(recipe_files.load("frame-small")[1], ["scan.spacing_mm=60"]), 1
+        "f", recipe_files.overridden(recipe_files.load("frame-small")[1], ["scan.spacing_mm=300"]), 1
     )
     store.write_scene(tmp_path / "f.h5", scene, truth, {})
     with pytest.raises(UsageError, match="only an arch bridge"):
