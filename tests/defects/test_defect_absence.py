@@ -118,7 +118,8 @@ def test_a_rib_that_is_gone_and_a_corner_are_missing_and_a_long_bite_is_edge_los
     assert_found(found, [("missing-part", rib), ("missing-part", corner), ("edge-loss", [1207.0, 273.0, 470.0])])
 
 
-@pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 12])
 def test_bites_no_deeper_than_the_cells_at_the_border_are_edge_loss(seed):
     """Away from the border no cell is empty; along it there is steel at either end."""
     cuts = [((1195.0, 310.0 - 24.0, 400.0), (1220.0, 320.0, 500.0)), ((395.0, -320.0, 400.0), (420.0, -276.0, 500.0))]
