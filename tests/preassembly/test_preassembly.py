@@ -14,7 +14,6 @@ from processor.model import InputError, Scene, UsageError, Verdict, reason
 from processor.preassembly import assembly_errors
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import edge_features, joint_alignment, methods
-from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import PAPER_METHODS, BoxParams, MatchParams, SliceParams
 from processor.preassembly.parts import attitude
 from processor.registration import icp
@@ -166,16 +165,6 @@ def test_an_edge_box_is_sized_by_the_middle_of_its_plate_where_side_walls_were_s
         edge_features.reduced_boxes(np.vstack([box_end(16.0), walls]), 1.0, 4.0, BoxParams(), rng)
     boxes = {place: value for _, place, quantity, value in notes.rows if quantity == "L_edge_mm"}
     assert boxes["top"] == boxes["bottom"] == 1.5 * 24.0
-
-
-def test_x_axis_of_the_joint_frame_points_along_the_bridge():
-    points = arch_clouds.key_points(0.4 * arch_clouds.ARC)
-    T = joint_frame(points)
-    ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))
-    here = arch_clouds.position(np.array([0.4 * arch_clouds.ARC]), np.zeros(1), np.zeros(1))
-    np.testing.assert_allclose(T[:3, 0], (ahead - here)[0], atol=1e-4)  # a chord of 1 mm at a radius of 18 m: 3e-5
-    np.testing.assert_allclose(T[:3, 1], [0, 1, 0], atol=1e-12)  # float64
-    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
 
 
 def test_slices_follow_the_bottom_edges():
