@@ -25,6 +25,7 @@ from processor.model import Status, Verdict
 from processor.scan_folder import folder
 from processor.scan_folder.folder import read_input
 from tests.support.processes import batches
+from tests.support.scenes.coarse_scans import coarsely
 from tests.support.solids import cad_in_process
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
@@ -332,8 +333,10 @@ def arguments(tmp_path):
     }
 
 
-def test_the_lines_of_the_python_page_run(arguments):
+def test_the_lines_of_the_python_page_run(arguments, monkeypatch):
     """Each returns what the page's table names. The ball is registered to no body: its pose fails."""
+    coarsely(monkeypatch, "make", spacing_mm=100.0)
+    coarsely(monkeypatch, "scan", step_mrad=20.0)
     exec("\n".join(blocks(ROOT / "docs/python.md", "python")), arguments)
     names = re.findall(
         r"^\| `(?:processor|designgen)\.(\w+)`", (ROOT / "docs/python.md").read_text("utf-8"), re.MULTILINE

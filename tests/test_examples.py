@@ -9,6 +9,7 @@ import pytest
 
 import designgen
 import processor
+from tests.support.scenes.coarse_scans import coarsely
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = {path.stem: path for path in sorted((ROOT / "examples").glob("*.py"))}
@@ -44,13 +45,9 @@ def test_every_example_is_run():
 
 @pytest.fixture
 def coarse_scans(monkeypatch):
-    """A quarter of the points in what examples make."""
-    make = designgen.make
-
-    def coarsely(recipe, settings, **others):
-        return make(recipe, settings={**settings, "scan.step_mrad": 4.0}, **others)
-
-    monkeypatch.setattr(designgen, "make", coarsely)
+    """Few points in what examples make."""
+    for function in ("make", "scan"):
+        coarsely(monkeypatch, function, step_mrad=8.0)
 
 
 @pytest.mark.usefixtures("coarse_scans")
