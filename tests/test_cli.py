@@ -409,7 +409,7 @@ def test_names_from_outside_are_shown_as_text(frame, tmp_path):
 
 
 def test_a_bridge_through_the_pipeline(tmp_path, monkeypatch):
-    scene, truth = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=2)
+    scene, truth = arch_clouds.bridge(spacing_mm=40.0, sigma_mm=1.0, seed=2)
     # The search for attitudes takes most of the time: tests/pipeline/test_diagnostics.py runs it on such a bridge.
     known = dict(zip(truth.arch.names, truth.arch.T_bridge_scan, strict=True))
     monkeypatch.setattr(

@@ -10,8 +10,9 @@ from click.testing import CliRunner
 
 from designgen import card, recipe_files
 from designgen.cli import commands
+from tests.support.processes.staying import processes_stay  # noqa: F401
 
-DENTS = ("--set", 'structure.components=["none", "dent"]', "--set", "scan.step_mrad=20", "--set", "scan.stations=2")
+DENTS = ("--set", 'structure.components=["none", "dent"]', "--set", "scan.step_mrad=30", "--set", "scan.stations=2")
 
 
 def make(folder, recipe, *more):

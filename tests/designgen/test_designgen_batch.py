@@ -15,7 +15,6 @@ import sys
 import termios
 import time
 from pathlib import Path
-from unittest import mock
 
 import h5py
 import numpy as np
@@ -28,6 +27,7 @@ from processor.jobs.child import Loss, Lost
 from processor.model import UsageError
 from processor.store import store
 from tests.support.processes import commands, dask_cluster, dying_job
+from tests.support.processes.staying import processes_stay  # noqa: F401
 
 COMMAND = (sys.executable, "-m", "designgen", "make", "frame-small")
 SMALL = ("scan.spacing_mm=60", "frame.nodes_x=2", "frame.nodes_y=2")
@@ -46,15 +46,6 @@ def run(*arguments, code=0, command=MAKE, stderr=None):
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     return done
-
-
-@pytest.fixture(scope="module", autouse=True)
-def processes_stay():
-    """Processes that make scenes stay for the runs of other tests: each takes a second to load what it needs."""
-    close = processes.POOL.close
-    with mock.patch.object(processes.POOL, "close"):
-        yield
-    close()
 
 
 def digests(folder):

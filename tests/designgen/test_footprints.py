@@ -58,7 +58,7 @@ def before_a_wall():
 OUTERMOST = 0.7 * np.cos(np.radians(30.0))  # of the middle to an edge upright: the six stand at 30, 90 degrees, ...
 
 
-@pytest.mark.parametrize("step_mrad", [0.75, *(pytest.param(step, marks=pytest.mark.slow) for step in (0.5, 0.2))])
+@pytest.mark.parametrize("step_mrad", [1.0, *(pytest.param(step, marks=pytest.mark.slow) for step in (0.5, 0.2))])
 def test_mixed_pixels_reach_as_far_from_an_edge_as_the_beam(step_mrad):
     surfaces, device = before_a_wall()
     returns = scan(surfaces, device, step_mrad)
@@ -138,7 +138,7 @@ WIDE = dataclasses.replace(QUIET, divergence_mrad=27.0, beam_exit_mm=5.0, thresh
     ("surfaces", "divergence_mrad", "step_mrad", "sub_rays", "mixed"),
     [
         (thin_objects, 0.8, 4.0, 7, 300),
-        (large_faces, 27.0, 9.0, 19, 4_000),  # three times the step
+        (large_faces, 39.0, 13.0, 19, 3_000),  # three times the step
         pytest.param(large_faces, 600.0, 10.0, 19, 50_000, marks=pytest.mark.slow),  # further than edges are followed
     ],
     ids=["thin", "wide", "wider"],
@@ -159,8 +159,8 @@ def test_a_scan_does_not_depend_on_its_strips(monkeypatch):
     found = []
     for strip in (64, 7):
         monkeypatch.setattr(scanning_returns, "STRIP", strip)
-        found.append(scan(surfaces, WIDE, 9.0))
-    assert (found[0].source == scanning_returns.MIXED).sum() > 4_000
+        found.append(scan(surfaces, WIDE, 13.0))
+    assert (found[0].source == scanning_returns.MIXED).sum() > 2_000
     for other in found[1:]:
         for column in ("row", "column", "points", "source", "part", "range_error_mm"):
             np.testing.assert_array_equal(getattr(other, column), getattr(found[0], column))
@@ -293,7 +293,7 @@ def test_nearest_range_to_many_triangles_is_that_to_the_nearest_of_them():
         rng.uniform(-2000.0, 2000.0, 3)
         + rng.normal(0.0, size, 3) * rng.uniform(-1.0, 1.0, (3, 1))
         + rng.normal(0.0, 5.0, (3, 3))
-        for size in rng.choice([10.0, 300.0, 3000.0], 150)
+        for size in rng.choice([10.0, 300.0, 3000.0], 80)
     ]
     every = Builder()
     for corners in triangles:
@@ -302,6 +302,7 @@ def test_nearest_range_to_many_triangles_is_that_to_the_nearest_of_them():
     for one, corners in zip(alone, triangles, strict=True):
         one.polygon(0, "plate", corners)
     single = [one.to_surfaces() for one in alone]
+    together = every.to_surfaces()
     for place in rng.uniform(-3000.0, 3000.0, (40, 3)):
         nearest = min(edge_footprints.nearest_mm(one, place) for one in single)
-        assert edge_footprints.nearest_mm(every.to_surfaces(), place) == nearest
+        assert edge_footprints.nearest_mm(together, place) == nearest

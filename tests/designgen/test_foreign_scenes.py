@@ -2,9 +2,10 @@
 
 import ast
 import runpy
-import subprocess
 import sys
+import warnings
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -17,16 +18,11 @@ ROOT = Path(__file__).resolve().parents[2]
 FOREIGN = ROOT / "tests" / "bench" / "foreign"
 SCRIPTS = sorted(path for path in FOREIGN.glob("*.py") if path.name != "__init__.py")
 SMALL = {
-    "arch_bridge": ("spacing=60", "stations=3", "span=9000", "rise=2000"),
+    "arch_bridge": ("spacing=90", "stations=3", "span=9000", "rise=2000"),
     "space_frame": ("rows=2", "columns=2", "stations=2", "step_mrad=8"),
     "steelwork": ("case=plate", "step_mrad=8", "spacing=20"),
 }
-COARSER = {
-    "arch_bridge": (
-        "spacing=400",
-        "stations=2",
-    )
-}  # where bytes alone are compared
+COARSER = {"arch_bridge": ("spacing=400", "stations=2"), "space_frame": ("step_mrad=16",)}  # bytes alone are compared
 QUIET = {
     "arch_bridge": ("noise=0", "noise_ppm=0", "range_offset=0", "shift=0", "rotation_urad=0", "drift=0",
                     "incidence_bias=0", "outliers=0", "beam=0", "clutter=0"),
@@ -38,9 +34,12 @@ QUIET = {
 
 
 def make(name, out, *settings, seed=3):
+    """Run a generator as a script, in this process."""
     words = [word for setting in settings for word in ("--set", setting)]
-    command = [sys.executable, str(FOREIGN / f"{name}.py"), str(out), "--seed", str(seed), *words]
-    subprocess.run(command, check=True, capture_output=True)
+    script = str(FOREIGN / f"{name}.py")
+    arguments = [script, str(out), "--seed", str(seed), *words]
+    with mock.patch.object(sys, "argv", arguments), warnings.catch_warnings(action="ignore"):  # as Python runs it
+        runpy.run_path(script, run_name="__main__")
     return out
 
 
@@ -64,7 +63,7 @@ def test_a_generator_shares_no_code(path):
     assert modules <= {*sys.stdlib_module_names, "numpy"}
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", [pytest.param("arch_bridge", marks=pytest.mark.slow), "space_frame", "steelwork"])
 def test_the_same_seed_makes_the_same_bytes(name, tmp_path):
     one, again, other = (
         contents(make(name, tmp_path / str(i), *SMALL[name], *COARSER.get(name, ()), seed=seed))
@@ -140,7 +139,7 @@ def test_motion_by_station_errors_has_the_covariance_of_the_truth():
     stations = np.array([[-3000.0, 500, 900], [7000, 900, 2500], [2000, -4000, 1000]])
     of, settings = rng.integers(0, 3, 600), module["SETTINGS"]
     J = np.hstack([np.cross(points, normals), normals])
-    solve, draws = np.linalg.pinv(J), np.empty((3000, 6))
+    solve, draws = np.linalg.pinv(J), np.empty((1500, 6))
     for draw in draws:
         moved = points.copy()
         for k, station in enumerate(stations):
@@ -150,7 +149,9 @@ def test_motion_by_station_errors_has_the_covariance_of_the_truth():
         draw[:] = solve @ np.einsum("ni,ni->n", moved - points, normals)
     stated = module["by_stations"](points, normals, of, stations, settings)
     root = np.linalg.inv(np.linalg.cholesky(stated))
-    np.testing.assert_allclose(root @ np.cov(draws.T) @ root.T, np.eye(6), atol=0.12)  # 3000 draws: 0.026 each
+    np.testing.assert_allclose(
+        root @ np.cov(draws.T) @ root.T, np.eye(6), atol=0.12
+    )  # 1500 draws: 0.037 each on the diagonal, 0.026 beside it
 
 
 def test_a_piece_that_reaches_two_borders_is_a_missing_part(tmp_path):

@@ -24,7 +24,7 @@ from tests.support.processes import commands
 
 pytestmark = pytest.mark.usefixtures("cad_here")
 QUIET = scanner.Scanner(**{**scanner.preset("phase"), "flying_share": 0.0, "threshold": 0.0})
-FINE = {"scan.scanner": "plain-2mm", "scanner.noise_mm": 0.0, "scan.step_mrad": 4.5}
+FINE = {"scan.scanner": "plain-2mm", "scanner.noise_mm": 0.0, "scan.step_mrad": 6.0}
 FEW = {"scan.step_mrad": 4.0}
 TOLERANCE_MM = 0.01  # of points on a CAD model, stated in docs/simulation.md
 NAMES = ("box", "cylinder", "cone", "ball", "torus", "spline")
@@ -147,11 +147,15 @@ def test_labels_name_bodies_and_bodies_as_designed_have_no_defect(seen):
     assert not seen.truth.structure.displacement.any()
 
 
-@pytest.mark.parametrize("kind", SOLIDS)
+# Those that points_lie_on_the_face has, too, by night.
+BY_NIGHT = ("plane", "cylinder", "cone", "sphere", "torus")
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k in BY_NIGHT else k for k in SOLIDS])
 def test_hits_lie_on_the_surface_of_the_solid(kind):
     hits = hits_on(loading.load(SOLIDS[kind]), stations=2)
     assert len(hits) > 100
-    picked = hits[np.random.default_rng(0).permutation(len(hits))[:60]]  # a face that lies wrong has many of them
+    picked = hits[np.random.default_rng(0).permutation(len(hits))[:40]]  # a face that lies wrong has many of them
     distances = departures(picked, cq.Compound.makeCompound(SOLIDS[kind].val().Shells()))
     assert max(distances) < 1e-5, "a hit is refined to 1e-5 mm; 0.01 mm is promised"
 
@@ -291,7 +295,6 @@ def test_a_moved_body_and_its_truth(built):
     truth, defects = built.truth.structure, built.truth.defects
     on_it = truth.points[:, 0] > 610.0
     assert on_it.sum() > 1000
-    # Float64.
     np.testing.assert_allclose(
         truth.displacement[on_it],
         np.tile([10.0, 0.0, 0.0], (on_it.sum(), 1)),
@@ -332,7 +335,6 @@ def test_a_dent_has_its_shape(built):
     middle = np.hypot(*(truth.points - [200.0, 150.0, 200.0]).T[:2]) < 5.0
     middle &= truth.points[:, 2] > 199.0
     assert middle.any()
-    # 5 mm off: 0.11.
     np.testing.assert_allclose(
         truth.displacement[middle],
         np.tile([0.0, 0.0, -8.0], (middle.sum(), 1)),
@@ -361,7 +363,6 @@ def test_bodies_as_built_are_where_the_truth_has_them(source):
     assert (share < 0.5).sum() > 15
     assert np.abs(off).max() < (1e-5 if source == "solid" else TOLERANCE_MM)  # as refined, as promised
     nearest = np.argmin(np.linalg.norm(built.movement.points - [100.0, 20.0, 10.0], axis=1))
-    # Of the nearest sample, up to 15 mm off.
     assert built.movement.displacement[nearest, 2] == pytest.approx(
         2.0,
         abs=0.3,  # of the nearest sample, up to 15 mm off

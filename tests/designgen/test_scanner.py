@@ -77,7 +77,7 @@ def seen():
         frame,
         surfaces,
         T,
-        scan(surfaces, T, device, 3, step_mrad=2.0),
+        scan(surfaces, T, device, 3, step_mrad=3.0),
     )
 
 
@@ -86,7 +86,7 @@ def test_hits_lie_on_spheres_tubes_and_sleeves(seen):
     hits = in_scene(T, returns.hits)
     ball = named(surfaces, returns, "ball")
     off = np.linalg.norm(hits[ball] - frame.centres[returns.part[ball]], axis=1) - frame.radii[returns.part[ball]]
-    assert ball.sum() > 1_500
+    assert ball.sum() > 700
     assert np.abs(off).max() < EXACT_MM
     # A bowed tube: the distance from its axis, moved by the bow of where it is along the tube, found member by member.
     tube = hits[named(surfaces, returns, "tube")]
@@ -100,7 +100,7 @@ def test_hits_lie_on_spheres_tubes_and_sleeves(seen):
         axis = a + np.outer(z + starts[0], unit) + np.outer(4.0 * z * (length - z) / length**2, frame.bow(m))
         off = np.abs(np.linalg.norm(tube - axis, axis=1) - 30.0)
         nearest = np.minimum(nearest, np.where((z > -1e-6) & (z < length + 1e-6), off, np.inf))
-    assert len(tube) > 50_000
+    assert len(tube) > 25_000
     assert nearest.max() < EXACT_MM
     assert {"sleeve", "cone"} <= {surfaces.surface_names[k] for k in np.unique(returns.surface)}
 
@@ -120,7 +120,7 @@ def test_points_lie_at_the_angles_of_the_encoders_with_their_errors(seen):
     elevation = np.degrees(angles(returns.hits)[:, 1])
     for low, high in ((45.0, 60.0), (60.0, 70.0), (70.0, 80.0)):
         own = off[(elevation > low) & (elevation < high)]
-        assert len(own) > 20_000
+        assert len(own) > 9_000
         np.testing.assert_allclose(own.std(axis=0), 20e-6, rtol=4.0 / np.sqrt(2.0 * len(own)))
 
 
@@ -224,9 +224,9 @@ def without_systematics(name):
     return dataclasses.replace(scanner.Scanner(**scanner.preset(name)), offset_mm=0.0, scale_ppm=0.0, tilt_urad=0.0)
 
 
-@pytest.mark.parametrize("name", ["phase", "long-range"])  # pulse has terms of both
+@pytest.mark.parametrize("name", [pytest.param("phase", marks=pytest.mark.slow), "long-range"])  # pulse: terms of both
 def test_clean_ranges_have_the_specified_noise_at_every_incidence(name):
-    device, params = without_systematics(name), scanner.Params(scanner=name, step_mrad=2.0)
+    device, params = without_systematics(name), scanner.Params(scanner=name, step_mrad=2.6)
     frame = frame_of_balls()
     surfaces, T = surfaces_of(frame, things=9), standing(2500.0, 2800.0, 1600.0)
     returns = scan(surfaces, T, device, seed=1, params=params)
@@ -287,16 +287,14 @@ def test_mixed_pixels_on_a_net_lie_where_they_do_on_the_exact_tube():
     for builder in (exact, net):
         corners = np.array([[2500.0, 300.0, 0.0], [2500.0, 300.0, 1790.0], [2500.0, -600.0, 1600.0]])
         builder.polygon(1, "sheet", corners)
-        found.append(scan(builder, device=device, step_mrad=0.8, specular=0.0))
+        found.append(scan(builder, device=device, step_mrad=0.8, specular=0.0, field_of_view_deg=80.0))
     mixed = [scanning_returns.rows_of(one, one.source == scanning_returns.MIXED) for one in found]
-    rays = [one.row.astype(np.int64) * 100_000 + one.column for one in mixed]
-    both, i, j = np.intersect1d(*rays, assume_unique=True, return_indices=True)
+    cells = [one.row.astype(np.int64) * 100_000 + one.column for one in mixed]
+    _, i, j = np.intersect1d(*cells, assume_unique=True, return_indices=True)
     R, ours = np.linalg.norm(mixed[0].points[i], axis=1), np.linalg.norm(mixed[1].points[j], axis=1)
-    apart, cells = ours - R, np.column_stack(np.divmod(both, 100_000))
+    apart, rays = ours - R, mixed[0].points[i] / R[:, None]
     # Not at the tube's silhouette, where rays meet the exact tube and pass by its net.
-    grid = raycast.Grid(8e-4, np.radians(-60.0), int(np.radians(150.0) / 8e-4), round(2.0 * np.pi / 8e-4))
     across = np.cross(start, end) / np.linalg.norm(np.cross(start, end))
-    rays = grid.directions(*cells.T)
     on_both = (np.abs(rays @ across) < 0.7 * radius / 3500.0) & (np.abs(rays[:, 1]) < 0.3)
     assert on_both.sum() > 150
     assert R[on_both].max() > R[on_both].min() + 100.0
@@ -501,14 +499,14 @@ def test_hidden_and_out_of_range_objects_return_no_points():
     builder.sphere(2, "too far", np.array([0.0, -90_000.0, 0.0]), 500.0, [])
     builder.sphere(3, "too near", np.array([0.0, -200.0, 0.0]), 50.0, [])
     device = dataclasses.replace(QUIET, max_range_mm=80_000.0)
-    returns = scan(builder, device=device, step_mrad=2.0)
+    returns = scan(builder, device=device, step_mrad=4.0)
     assert set(returns.part) == {0}
 
 
 def test_weak_signals_are_lost_and_some_returns_stray():
     surfaces = surfaces_of(frame_of_balls())
     T = standing(2500.0, 2800.0, 1600.0)
-    params = scanner.Params(step_mrad=2.5)
+    params = scanner.Params(step_mrad=4.0)
     every = scan(surfaces, T, seed=1, params=params)
     dim = scan(surfaces, T, dataclasses.replace(QUIET, threshold=0.5), seed=1, params=params)
     # Speckle of eight looks multiplies the signal: the share that stays is a gamma law's.
@@ -517,7 +515,7 @@ def test_weak_signals_are_lost_and_some_returns_stray():
     assert np.median(dim.incidence_cos) > np.median(every.incidence_cos) + 0.05  # steel shines away from the scanner
     stray = scan(surfaces, T, dataclasses.replace(QUIET, flying_share=0.02), seed=1, params=params)
     outliers = stray.source == scanning_returns.OUTLIER
-    assert outliers.mean() == pytest.approx(0.02, abs=0.002)  # of 200,000: sd 0.0003
+    assert outliers.mean() == pytest.approx(0.02, abs=0.003)  # of 50,000: sd 0.0006
     assert (stray.part[outliers] == -1).all()
     assert (stray.surface[outliers] == -1).all()
     R = np.linalg.norm(stray.points[outliers], axis=1)
@@ -529,7 +527,7 @@ def test_range_and_tilt_errors_of_a_station_equal_those_of_its_truth():
     surfaces = surfaces_of(frame_of_balls())
     T = standing(2500.0, 2800.0, 1600.0)
     device = dataclasses.replace(QUIET, offset_mm=2.0, scale_ppm=50.0, tilt_urad=100.0)
-    params = scanner.Params(step_mrad=2.0, sub_rays=1)
+    params = scanner.Params(step_mrad=4.0, sub_rays=1)
     found = scanning_returns.scan_station(surfaces, T, device, params, 7, "S1", keep_hits=True)
     hits, points = found.returns.hits, found.returns.points
     R = np.linalg.norm(hits, axis=1)
@@ -548,7 +546,7 @@ def test_range_and_tilt_errors_of_a_station_equal_those_of_its_truth():
 def test_a_station_does_not_depend_on_others_or_on_threads(monkeypatch):
     surfaces = surfaces_of(frame_of_balls())
     poses = {"S1": standing(2500.0, 2800.0, 1600.0), "S2": standing(100.0, 400.0, 1500.0)}
-    device, params = scanner.Scanner(), scanner.Params(step_mrad=5.0, registration_mm=2.0, registration_mrad=0.1)
+    device, params = scanner.Scanner(), scanner.Params(step_mrad=8.0, registration_mm=2.0, registration_mrad=0.1)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     one = survey.survey(surfaces, (), {"S2": poses["S2"]}, device, params, 5)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
@@ -569,7 +567,7 @@ def test_a_station_does_not_depend_on_others_or_on_threads(monkeypatch):
 def test_merged_scans_lie_where_the_stations_saw_them():
     surfaces = surfaces_of(frame_of_balls())
     poses = {"S1": standing(2500.0, 2800.0, 1600.0), "S2": standing(100.0, 400.0, 1500.0)}
-    found = survey.survey(surfaces, (), poses, QUIET, scanner.Params(step_mrad=3.0, sub_rays=1), 5)
+    found = survey.survey(surfaces, (), poses, QUIET, scanner.Params(step_mrad=6.0, sub_rays=1), 5)
     origin = np.array([5.0e8, 4.3e9, 1.0e5])
     (scan,), (labels,), stations, truth = survey.in_project(found, origin, merge=True)
     assert stations.ids == truth.ids == ("S1", "S2")
