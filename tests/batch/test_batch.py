@@ -407,7 +407,7 @@ def test_a_signal_stops_it_cleanly(tmp_path, stop):
 
 def test_child_process_that_ignores_signals_ends_at_its_time_limit(tmp_path):
     folder(tmp_path / "root/a", "deaf")
-    run(tmp_path / "root", "-o", tmp_path / "out", "--timeout-s", 1, code=1)
+    run(tmp_path / "root", "-o", tmp_path / "out", "--timeout-s", 0.5, code=1)
     assert said(tmp_path / "out")["a"]["reason"].startswith("took longer")
 
 

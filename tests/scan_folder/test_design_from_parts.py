@@ -333,7 +333,13 @@ def init(place, *options):
     return done.output
 
 
-def test_the_picture_marks_what_is_not_sure(tmp_path, monkeypatch):
+@pytest.fixture
+def no_picture(monkeypatch):
+    """Leave the picture of a design out: for tests of all else, as drawing takes most of the time."""
+    monkeypatch.setattr(design_picture, "draw", lambda *_: b"")
+
+
+def test_the_picture_marks_what_is_not_sure_and_a_design_that_is_there_is_not_changed(tmp_path, monkeypatch):
     meshes, _ = bridge_parts.bridge(5, 0)
     meshes[1] = bevelled(*meshes[1])
     meshes[3] = chamfered(*meshes[3], steps=8)
@@ -352,14 +358,19 @@ def test_the_picture_marks_what_is_not_sure(tmp_path, monkeypatch):
     assert f"? {names[3]}" in drawn
     assert not {f"? {name}" for name in sure} & set(drawn)
     assert set(names) | {"J1", "J2", "J3", "J4"} == {name.removeprefix("? ") for name in drawn}
+    with (tmp_path / "design.json").open("a", encoding="utf-8") as file:
+        file.write("\n")
+    before = (tmp_path / "design.json").read_bytes()
+    init(tmp_path, "--force")
+    assert (tmp_path / "design.json").read_bytes() == before
 
 
 UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4, "ft": 304.8}
-# By day every format and most units: no format states its unit, so that units do not depend on the format.
-BY_DAY = {("obj", "mm"), ("stl", "m"), ("ply", "inch")}
+# By day two units: no format states its unit, so that units do not depend on the format.
+BY_DAY = {("stl", "m"), ("ply", "inch")}
 
 
-@pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.usefixtures("no_picture")
 @pytest.mark.parametrize(
     ("suffix", "unit", "size_mm"),
     [
@@ -389,7 +400,7 @@ def test_the_unit_comes_from_scans_that_state_theirs(tmp_path, suffix, unit, siz
     assert again.units_reason[-1].code == "units.design-guessed"
 
 
-@pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.usefixtures("no_picture")
 def test_guessed_unit_of_a_design_is_marked_unsure(tmp_path):
     meshes, _ = bridge_parts.bridge()
     write_parts(tmp_path, meshes, "ply", size_mm=1000.0)
@@ -431,7 +442,7 @@ def test_bodies_of_cad_files_without_a_unit_have_the_guessed_one(tmp_path, monke
     assert np.abs(guessed.design.joint_points - joints).max() < CORNER_MM
 
 
-@pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.usefixtures("no_picture")
 def test_design_in_inches_is_made_only_with_stated_units(tmp_path):
     meshes, joints = bridge_parts.bridge()
     write_parts(tmp_path, meshes, "ply", size_mm=25.4)
@@ -443,7 +454,7 @@ def test_design_in_inches_is_made_only_with_stated_units(tmp_path):
     assert np.abs(scan_folder.read_input(tmp_path).arch.joint_points - joints).max() < CORNER_MM
 
 
-@pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.usefixtures("no_picture")
 def test_two_files_of_one_name_and_a_root_gap(tmp_path):
     meshes, _ = bridge_parts.bridge(5, 0, 6.0)
     write_parts(tmp_path, meshes, "obj")
@@ -456,18 +467,6 @@ def test_two_files_of_one_name_and_a_root_gap(tmp_path):
     (tmp_path / "project.toml").unlink()
     (tmp_path / "design.json").unlink()
     assert scan_folder.read_input(tmp_path).tolerance.root_gap_mm == pytest.approx(6.0, abs=0.01)  # as it is printed
-
-
-@pytest.mark.usefixtures("blank_pictures")
-def test_a_design_that_is_there_is_not_changed(tmp_path):
-    meshes, _ = bridge_parts.bridge()
-    write_parts(tmp_path, meshes, "obj")
-    write_scans(tmp_path, meshes)
-    init(tmp_path)
-    (tmp_path / "design.json").write_text((tmp_path / "design.json").read_text("utf-8") + "\n", "utf-8")
-    before = (tmp_path / "design.json").read_bytes()
-    init(tmp_path, "--force")
-    assert (tmp_path / "design.json").read_bytes() == before
 
 
 @pytest.mark.usefixtures("cad_here")

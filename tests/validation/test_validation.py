@@ -13,12 +13,13 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from processor.jobs import process
 from processor.language.messages import text
 from processor.model import InputError, UsageError
 from processor.validation import cell_runner, cells, certificate, coverage, history, matrix, night, software_identity
 from processor.validation.cells import Outcome
 from processor.validation.history import History
-from tests.support.processes import commands
+from tests.support.processes import batches
 from tests.support.results import validation_nights
 
 NIGHT = "2026-11-21"
@@ -314,15 +315,15 @@ def test_a_night_killed_at_any_moment_loses_and_doubles_nothing(tmp_path):
     FORKS.set_forkserver_preload([__name__])
     for attempt in range(12):
         here, there = FORKS.Pipe(duplex=False)
-        process = FORKS.Process(target=slow_night, args=(out, there))
-        process.start()
+        begun = FORKS.Process(target=slow_night, args=(out, there))
+        begun.start()
         assert here.poll(60.0)
         if attempt < 3:
             time.sleep((0.15, 0.33, 0.2)[attempt])
-            process.kill()
-        process.join()
+            begun.kill()
+        begun.join()
         counts.append(stored(out, "SELECT COUNT(*) FROM cells")[0][0])
-        if process.exitcode == 0:
+        if begun.exitcode == 0:
             break
     assert counts == sorted(counts)
     assert counts[0] < 60  # it was killed in the middle
@@ -514,18 +515,16 @@ member_reach_mm = 100.0
 """
 
 
-def test_a_real_cell_through_the_command_line(tmp_path):
+def test_a_real_cell_through_the_command_line(tmp_path, monkeypatch):
     (tmp_path / "tiny.toml").write_text(RECIPE, "utf-8")
     (tmp_path / "m.toml").write_text(TINY, "utf-8")
-    words = ["validate", str(tmp_path / "m.toml"), "-o", str(tmp_path / "out"), "--night", NIGHT, "--json"]
-    words += ["--lang", "zh"]
-    done = commands.here("processor", *words, "--jobs", "2")
-    assert done.returncode == 1, done.stderr
+    monkeypatch.setattr(process, "run", batches.run_here)
+    words = [tmp_path / "m.toml", "-o", tmp_path / "out", "--night", NIGHT, "--json", "--lang", "zh", "--jobs", "2"]
+    done = batches.called("validate", words, 1)
     assert 'impossible scan.mode="magic" seed 1: failed: designgen make: exit code 2' in done.stderr
     told = json.loads(done.stdout)
     real = next(cell for cell in told["cells"] if not cell["failed"])
     assert real["figures"] > 20
-    assert real["peak_mb"] > 50.0  # NumPy and SciPy alone
     assert '<html lang="zh">' in (tmp_path / "out" / "nights.html").read_text("utf-8")
     rows = dict(stored(tmp_path / "out", "SELECT method || ' ' || name, value FROM rows"))
     assert rows["ransac balls not found"] == 0.0
@@ -545,6 +544,7 @@ def test_a_generator_beside_the_matrix(tmp_path):
     assert (cell.case.origin, cell.case.recipe) == (cells.Origin.FOREIGN, "mine")
     found = cell_runner.do(cell, scratch=str(tmp_path))
     assert not found.failed
+    assert found.peak_mb > 50.0  # NumPy and SciPy alone
     assert [figure.name for figure in cells.check_values(found.results)][:1] == ["scans not placed"]
     (tmp_path / "mine.py").write_text("import sys; sys.exit('no idea')", "utf-8")
     (cell,) = matrix.read(tmp_path / "m.toml", False).cells(1)

@@ -15,6 +15,7 @@ import pytest
 from processor import __main__
 from processor.batch import batch, job
 from processor.jobs import causes, process
+from tests.support.processes import commands
 
 ROOT = Path(__file__).resolve().parents[3]
 ENV = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
@@ -23,18 +24,19 @@ REAL, FAILING = process.GUARDED, (sys.executable, str(ROOT / "tests/support/proc
 
 def run(*arguments, code=0, program=FAILING, stderr=None):
     """Run the command line in this process, the jobs by ``program``; None: one after another in this process, too."""
-    here = mock.patch.object(job.process, "run", _run_here) if program is None else contextlib.nullcontext()
+    here = mock.patch.object(job.process, "run", run_here) if program is None else contextlib.nullcontext()
     settings = functools.partial(batch.Settings, program=program or REAL)
     with here, mock.patch.object(batch, "Settings", settings):
-        return _called("batch", arguments, code, stderr)
+        return called("batch", arguments, code, stderr)
 
 
 def run_one(*arguments, code=0):
     """Run ``processor run`` in this process."""
-    return _called("run", arguments, code)
+    return called("run", arguments, code)
 
 
-def _called(name, arguments, code, stderr=None):
+def called(name, arguments, code, stderr=None):
+    """Run a command of processor in this process, whose threads may run others by :func:`run_here`."""
     out, err = _TextOfThread(), _TextOfThread()
     with (
         mock.patch.object(sys, "argv", ["processor", name, *map(str, arguments)]),
@@ -63,10 +65,15 @@ class _TextOfThread(io.StringIO):
 _ONE_AT_A_TIME = threading.Lock()  # the command line is of the whole process
 
 
-def _run_here(command, *, log, **_):
-    """What :func:`processor.jobs.process.run` makes of a guarded command, without a process."""
+_run_there = process.run
+
+
+def run_here(command, *, log=None, **limits):
+    """What :func:`processor.jobs.process.run` makes of a guarded command, without a process; for :func:`called`."""
+    if command[: len(REAL)] != REAL:  # that of another program
+        return _run_there(command, log=log, **limits)
     memory_mb, module, *arguments = command[len(REAL) :]
-    assert (command[: len(REAL)], memory_mb.isdigit(), module) == (REAL, True, "processor")
+    assert memory_mb.isdigit()
     sys.stdout.of_thread.text, err = io.StringIO(), io.StringIO()
     sys.stderr.of_thread.text = err
     with (
@@ -74,9 +81,10 @@ def _run_here(command, *, log, **_):
         mock.patch.object(sys, "argv", [module, *arguments]),
         pytest.raises(SystemExit) as end,
     ):
-        __main__.main()
-    with log.open("a", encoding="utf-8") as file:
-        file.write(err.getvalue())
+        commands.MAIN[module]()
+    if log is not None:
+        with log.open("a", encoding="utf-8") as file:
+            file.write(err.getvalue())
     last = ["", *filter(str.strip, err.getvalue().splitlines())][-1]
     code = end.value.code or 0
     return process.Ended(causes.Cause.EXIT, code, last_line=last, seconds=0.0, peak_mb=0.0, max_rss_mb=0.0)
