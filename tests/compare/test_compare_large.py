@@ -20,7 +20,7 @@ from tests.support.clouds.m3c2_clouds import wavy
 UTM = np.array([512_345.25, 5_412_678.5, 231.0])  # metres
 
 
-def site(seed, off, count=1200):
+def site(seed, off, count=900):
     """Waves with a hole, an upright wall, and a few points far away; metres at UTM coordinates."""
     rng = np.random.default_rng(seed)
     ground = wavy(count, seed, off) / 1000.0
@@ -80,7 +80,7 @@ CASES = {
     "case", [pytest.param("core points", marks=pytest.mark.slow), "scanners"]
 )  # every point: with a sample, below
 def test_files_have_the_same_bytes_by_tiles(case, inputs, tiny, request):
-    if case != "scanners":
+    if case != "core points":
         request.getfixturevalue("blank_pictures")
     whole = compared(inputs, "whole", *CASES[case])
     tiny()
@@ -114,7 +114,7 @@ def test_normals_follow_the_sample_as_they_follow_the_whole(inputs, monkeypatch)
     found = compare(request)
     same = (found.normals == whole.normals).all(axis=1) | np.isnan(found.normals).any(axis=1)
     upright = np.abs(whole.normals[:, 1]) > 0.95
-    assert upright.sum() > 450
+    assert upright.sum() > 330
     assert same[upright].all()
     assert (found.turned.up, found.turned.upright) == (whole.turned.up, whole.turned.upright)
 

@@ -60,13 +60,13 @@ def test_scanned_points_of_a_girder_lie_on_its_drilled_solid(mode):
             in_bore |= (np.abs(along) < 0.5 * depth - 0.1) & (off < bore.radius + 0.5)
         assert in_bore.sum() > 12
         for rows in (np.flatnonzero(in_bore), np.flatnonzero(~in_bore)):
-            few = points[rng.choice(rows, min(len(rows), 12), replace=False)]
+            few = points[rng.choice(rows, min(len(rows), 8), replace=False)]
             assert max(cq.Vertex.makeVertex(*p).distance(solid) for p in few) < TOLERANCE_MM
 
 
 QUIET = {
     "scanner": "plain-2mm",
-    "step_mrad": 3.0,
+    "step_mrad": 4.0,
     "stations": [4],
     "distance_mm": 1500.0,
     "sub_rays": 1,
@@ -103,13 +103,13 @@ def made(seed, scan, mode="surface", hole_mm=1.0, bolts=True):
 
 
 def test_holes_are_drilled_off_their_places_along_their_plates():
-    _, _, shifts = made(seed=5, scan={"spacing_mm": 200.0})
+    _, _, shifts = made(seed=5, scan={"spacing_mm": 500.0})
     for part in girder_assemblies.build(SIZES, BOLTS).parts:
         for bore, shift in zip(part.girder.bores, shifts[part.name], strict=True):
             assert shift @ np.array([0.0, *(bore.end - bore.start)]) == pytest.approx(0.0, abs=1e-12)  # float64
-    drawn = np.concatenate([np.concatenate(list(made(s, {"spacing_mm": 500.0})[2].values())) for s in range(6)])
+    drawn = np.concatenate([np.concatenate(list(made(s, {"spacing_mm": 500.0})[2].values())) for s in range(4)])
     across = np.linalg.norm(drawn, axis=1) ** 2
-    assert across.mean() == pytest.approx(2.0, rel=0.35)  # two coordinates of 1 mm each, 144 draws
+    assert across.mean() == pytest.approx(2.0, rel=0.35)  # two coordinates of 1 mm each, 96 draws: sd 10 %
 
 
 @pytest.mark.parametrize("changes", [{"hole_mm": 200.0}, {"pitch_mm": 20.0}, {"web_bolts": 30}])

@@ -15,7 +15,7 @@ from tests.support.files.e57_fields import e57_field
 
 COLUMNS = ("part", "surface", "mixed", "defect")
 PLATES = [
-    "make", "plates-defects", "--seed", "3", "--set", "scan.step_mrad=3",
+    "make", "plates-defects", "--seed", "3", "--set", "scan.step_mrad=4",
     "--set", "scanner.encoder_urad=0", "--set", 'structure.components=["none", "dent", "pit"]',
 ]  # fmt: skip
 

@@ -159,7 +159,7 @@ def inside_by(body, points):
 @pytest.mark.parametrize("name", ["stadium-roof", pytest.param("truss-bridge", marks=pytest.mark.slow)])
 def test_no_point_of_a_sample_lies_inside_a_body(name):
     table = {key: value for key, value in recipe_files.load(name)[1].items() if key not in ("scan", "asbuilt")}
-    settings = ["scan.mode=surface", "scan.spacing_mm=60", "scan.sigma_mm=0"]
+    settings = ["scan.mode=surface", "scan.spacing_mm=120", "scan.sigma_mm=0"]
     settings += ["structure.trusses=4"] if name == "stadium-roof" else []
     made, truth = make("x", recipe_files.overridden(table, settings))
     points, part = made.scans[0].points, truth.labels[0].part
@@ -171,7 +171,7 @@ def test_no_point_of_a_sample_lies_inside_a_body(name):
         deepest = np.maximum(deepest, inside_by(body, points))
     assert deepest.max() < EXACT_MM
     np.testing.assert_allclose(deepest, 0.0, atol=EXACT_MM)  # each is on a body's surface
-    # Far from joints nothing is left out: points a square of 60 mm along the middle of the first bodies.
+    # Far from joints nothing is left out: points a square of 120 mm along the middle of the first bodies.
     for number, one in enumerate(components[:2]):
         body = one.bodies[0]
         start, end = (body.start, body.end) if name == "stadium-roof" else _ends(body)
@@ -181,7 +181,7 @@ def test_no_point_of_a_sample_lies_inside_a_body(name):
         length = (high - low) * np.linalg.norm(end - start)
         girth = 2.0 * np.pi * body.radius if name == "stadium-roof" else 2.0 * (body.size[1] + body.size[2])
         count = ((t > low) & (t < high)).sum()
-        assert count == pytest.approx(girth * length / 3600.0, abs=5.0 * np.sqrt(girth * length / 3600.0))
+        assert count == pytest.approx(girth * length / 14_400.0, abs=5.0 * np.sqrt(girth * length / 14_400.0))
 
 
 def _ends(box):

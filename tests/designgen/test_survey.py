@@ -24,7 +24,7 @@ def test_sequences_by_hand():
     np.testing.assert_allclose([np.linalg.norm(low_discrepancy.on_sphere(i)) for i in range(20)], 1.0)
 
 
-@pytest.mark.parametrize("count", [1, 3, 8])
+@pytest.mark.parametrize("count", [1, 8])
 def test_a_station_more_leaves_the_others_where_they_are(count):
     low, high = np.array([0.0, 0.0, 6000.0]), np.array([30_000.0, 20_000.0, 8000.0])
 
@@ -90,7 +90,7 @@ def test_all_sides_are_seen_as_well_as_from_evenly_spread_places(count, half):
 
 
 def test_a_station_more_leaves_the_scans_of_the_others():
-    settings = ["frame.nodes_x=3", "frame.nodes_y=3", "scan.mode=rays", "scan.step_mrad=8", "scan.clutter=3"]
+    settings = ["frame.nodes_x=3", "frame.nodes_y=3", "scan.mode=rays", "scan.step_mrad=16", "scan.clutter=3"]
     table = {key: value for key, value in recipe_files.load("frame-small")[1].items() if key != "scan"}
     table["asbuilt"] = {"node_movement_mm": 3.0}
 
@@ -151,7 +151,7 @@ def poles_of(monkeypatch, name, settings):
 
 
 def test_poles_stand_between_stations_and_a_structure(monkeypatch):
-    settings = ["scan.step_mrad=4", "scan.stations=2", "scan.clutter=5", 'structure.components=["none", "dent"]']
+    settings = ["scan.step_mrad=6", "scan.stations=2", "scan.clutter=5", 'structure.components=["none", "dent"]']
     made, truth, poles = poles_of(monkeypatch, "plates-defects", settings)
     assert len(poles) == 5
     places = truth.stations.T_project_station[:, :3, 3]
@@ -171,7 +171,7 @@ def test_poles_stand_between_stations_and_a_structure(monkeypatch):
 
 
 def test_more_poles_than_stations_go_round_them(monkeypatch):
-    settings = ["scan.step_mrad=20", "scan.stations=2", "scan.clutter=5"]
+    settings = ["scan.step_mrad=45", "scan.stations=2", "scan.clutter=5"]
     _, _, poles = poles_of(monkeypatch, "arch-s1-rays", settings)
     assert len(poles) == 5 * 5
     assert all(length == 2000.0 for _, _, _, length in poles)

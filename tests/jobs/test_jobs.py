@@ -14,6 +14,7 @@ from processor.jobs.causes import Cause
 from processor.jobs.child import Loss, Lost
 from processor.model import InputError, UsageError
 from processor.store import atomic_file
+from tests.support.processes.living import alive, ends_soon
 
 SLEEP = "import time; time.sleep(60)"
 PARENT = """
@@ -25,21 +26,6 @@ child = process.start(process.isolated(
 ), stdout=None, own_group=sys.argv[1] == "own")
 child.wait()
 """
-
-
-def alive(pid):
-    try:
-        with open(f"/proc/{pid}/stat", encoding="ascii") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def ends_soon(pid):
-    deadline = time.monotonic() + 10.0
-    while alive(pid) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return not alive(pid)
 
 
 @pytest.mark.parametrize("group", ["own", "parent's"])

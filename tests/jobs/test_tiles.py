@@ -21,7 +21,8 @@ from processor.tiles import Shared
 from tests.support.clouds import frame_clouds
 from tests.support.clouds.m3c2_clouds import wavy
 from tests.support.processes import tile_functions
-from tests.support.processes.dask_cluster import cluster_in, dask_cluster  # noqa: F401
+from tests.support.processes.dask_cluster import dask_cluster  # noqa: F401
+from tests.support.processes.living import alive
 from tests.support.scenes.bracket_scenes import scene_of
 
 TILES = [np.full(3, float(k)) for k in range(7)]
@@ -81,22 +82,6 @@ def test_a_worker_with_other_software_is_named(dask_cluster, monkeypatch):  # no
         tile_cluster.on_cluster(dask_cluster.address, no_log),
     ):
         list(tiles.mapped(np.sum, TILES))
-
-
-def test_dying_worker_has_its_tile_computed_again(tmp_path):
-    """Its tile is computed again; Dask gives up after some attempts, and the message says what to do."""
-    with cluster_in(tmp_path) as cluster:
-        cluster.add_worker("a")
-        cluster.add_worker("b")
-        attempts = tmp_path / "attempts"
-        attempts.mkdir()
-        with tile_cluster.on_cluster(cluster.address, no_log):
-            found = list(tiles.mapped(tile_functions.ends_its_worker, TILES, Shared(str(attempts))))
-        np.testing.assert_array_equal(found, np.sqrt(TILES))
-        again = {k for k, n in Counter(one.name.split("-")[0] for one in attempts.iterdir()).items() if n > 1}
-        assert "2" in again
-        assert len(again) <= 2 * tile_cluster.AHEAD, "of those submitted, what it had begun or not handed over"
-        assert sum(one.poll() is not None for one in cluster.workers.values()) == 1
 
 
 # --- results ----------------------------------------------------------------------------------------------------------
@@ -177,3 +162,14 @@ def test_commands_take_a_cluster(command, tmp_path, monkeypatch):
     arguments = [str(tmp_path / one) if one.endswith(".xyz") else one for one in command]
     with pytest.raises(UsageError, match="expected the address of a Dask scheduler that answers"):
         commands([*arguments, "-o", str(tmp_path / "out"), "--cluster", "tcp://127.0.0.1:1"], standalone_mode=False)
+
+
+def test_dying_worker_has_its_tile_computed_again(dask_cluster, tmp_path):  # noqa: F811
+    """The last test of the cluster, as one of its workers ends; its tile and what it had begun are computed again."""
+    with tile_cluster.on_cluster(dask_cluster.address, no_log):
+        found = list(tiles.mapped(tile_functions.ends_its_worker, TILES, Shared(str(tmp_path))))
+    np.testing.assert_array_equal(found, np.sqrt(TILES))
+    again = {k for k, n in Counter(one.name.split("-")[0] for one in tmp_path.iterdir()).items() if n > 1}
+    assert "2" in again
+    assert len(again) <= 2 * tile_cluster.AHEAD, "of those submitted, what it had begun or not handed over"
+    assert sum(not alive(one.pid) for one in dask_cluster.workers) == 1

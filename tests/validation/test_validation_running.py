@@ -12,6 +12,7 @@ from processor.model import UsageError
 from processor.validation import cell_runner
 from processor.validation.cells import Case, Cell, Outcome
 from processor.writers import toml
+from tests.support.processes.living import children, ends_soon
 from tests.support.results import validation_nights
 
 CELL = Cell(Case("frame", "frame-small", "", False, (), ("spheres",), ()), 1, True)
@@ -31,25 +32,7 @@ def test_a_cell_ends_with_the_process_that_started_it(tmp_path):
     assert below
     process.kill()
     assert process.wait(10.0) == -9
-    while any(alive(one) for one in below) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not any(alive(one) for one in below)
-
-
-def children(pid):
-    found = []
-    for task in os.listdir(f"/proc/{pid}/task"):
-        with open(f"/proc/{pid}/task/{task}/children", encoding="ascii") as file:
-            found += [int(one) for one in file.read().split()]
-    return found
-
-
-def alive(pid):
-    try:
-        with open(f"/proc/{pid}/stat", encoding="ascii") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    assert all(ends_soon(one) for one in below)
 
 
 def test_a_cell_that_takes_too_long_fails(tmp_path):
