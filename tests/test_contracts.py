@@ -55,7 +55,7 @@ def test_every_reader_declares_its_suffixes():
 # By day one of each kind, mode and way to be built; those that differ from such a one in numbers alone by night.
 BY_NIGHT = (
     "arch-d1", "arch-d2", "arch-d3", "arch-d2-as-built", "arch-d3-as-built", "arch-west", "arch-west-sampled",
-    "frame-1040", "frame-1040-phase", "truss-bridge", "stadium-roof",
+    "arch-east", "arch-rib", "frame-1040", "frame-1040-phase", "girders-defects", "truss-bridge", "stadium-roof",
 )  # fmt: skip
 
 

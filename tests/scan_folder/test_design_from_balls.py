@@ -43,7 +43,12 @@ def compare(design, truth):
 
 
 @pytest.mark.parametrize(
-    ("hollow", "fused", "seed"), [(False, False, 0), (True, False, 1), (False, True, 2), (True, True, 3)]
+    ("hollow", "fused", "seed"),
+    [
+        (False, False, 0),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((True, False, 1), (False, True, 2))),
+        (True, True, 3),
+    ],
 )
 def test_all_nodes_and_members_are_found(hollow, fused, seed):
     bodies, truth = frame_solids.solids(seed, hollow=hollow)

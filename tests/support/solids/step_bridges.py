@@ -118,6 +118,8 @@ def lofted_parts(seed):
 
 def our_frame():
     """Return a file of a frame of two nodes by two, and its design."""
-    params = space_frame.Params(nodes_x=2, nodes_y=2, spacing_mm=1200.0, depth_mm=900.0, radii_mm=(45.0, 60.0))
+    params = space_frame.Params(
+        nodes_x=2, nodes_y=2, layers=1, spacing_mm=1200.0, depth_mm=900.0, radii_mm=(45.0, 60.0)
+    )
     design = space_frame.build(params)
     return _bytes({"frame": space_frame.solid(design)}), design
