@@ -175,7 +175,7 @@ def test_file_name_that_is_not_utf8_is_refused(tmp_path):
 
 def test_closed_pipe_ends_the_command_without_a_message(sphere_run):
     folder, _ = sphere_run
-    command = f"{sys.executable} -m processor check {folder / 'out'} --json | true"
+    command = f"{sys.executable} -m processor verify {folder / 'out'} --json | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.stderr == ""
 

@@ -24,7 +24,7 @@ from tests.support.processes import commands
 
 pytestmark = pytest.mark.usefixtures("cad_here")
 QUIET = scanner.Scanner(**{**scanner.preset("phase"), "flying_share": 0.0, "threshold": 0.0})
-FINE = {"scan.scanner": "plain-2mm", "scanner.noise_mm": 0.0, "scan.step_mrad": 6.0}
+FINE = {"scan.scanner": "plain-2mm", "scanner.noise_mm": 0.0, "scan.step_mrad": 4.5}
 FEW = {"scan.step_mrad": 4.0}
 TOLERANCE_MM = 0.01  # of points on a CAD model, stated in docs/simulation.md
 NAMES = ("box", "cylinder", "cone", "ball", "torus", "spline")
@@ -72,7 +72,7 @@ def shapes():
         "torus": cq.Workplane().center(1400, 0).circle(40).revolve(90, (-150, 0, 0), (-150, 1, 0)).val(),
         "spline": spline.lineTo(1600, 900).lineTo(1200, 900).close().extrude(150).val(),
     }
-    return {name: shape.scale(0.5) for name, shape in whole.items()}
+    return {name: shape.scale(0.3) for name, shape in whole.items()}
 
 
 def assembly(of):
@@ -109,7 +109,7 @@ def surfaces_of(model):
     return builder.to_surfaces()
 
 
-def hits_on(model, step_mrad=6.0, stations=4):
+def hits_on(model, step_mrad=6.0, stations=2):
     """Places that the middles of whole footprints hit, in the model's frame."""
     found, surfaces, params = [], surfaces_of(model.bodies), scanner.Params(step_mrad=step_mrad)
     for name, T in station_placement.place_stations(model, stations, None, QUIET, 0).items():
@@ -153,7 +153,7 @@ BY_NIGHT = ("plane", "cylinder", "cone", "sphere", "torus")
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k in BY_NIGHT else k for k in SOLIDS])
 def test_hits_lie_on_the_surface_of_the_solid(kind):
-    hits = hits_on(loading.load(SOLIDS[kind]), stations=2)
+    hits = hits_on(loading.load(SOLIDS[kind]))
     assert len(hits) > 100
     picked = hits[np.random.default_rng(0).permutation(len(hits))[:40]]  # a face that lies wrong has many of them
     distances = departures(picked, cq.Compound.makeCompound(SOLIDS[kind].val().Shells()))

@@ -81,7 +81,6 @@ def reported(error, cause, fail=full_disk):
         (0, "reported(InputError('damaged'), cause=True, fail=lambda: bytes(2**62))", Cause.EXIT, 3),
         (0, "raise OSError(errno.ENOENT, 'MemoryError: No space left on device')", Cause.EXIT, 1),
         (0, "print('error: MemoryError', file=sys.stderr); sys.exit(3)", Cause.EXIT, 3),
-        (0, "sys.exit(0)", Cause.EXIT, 0),
     ],
 )
 def test_a_guarded_process_tells_its_cause_by_its_exit_code(tmp_path, memory_mb, code, cause, exit_code):
