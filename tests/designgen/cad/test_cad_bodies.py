@@ -24,7 +24,7 @@ def curved_rib(span_mm, scale=1.0):
     return face.extrude(1000.0).val()
 
 
-@pytest.mark.parametrize("span_mm", [600.0, 6000.0])
+@pytest.mark.parametrize("span_mm", [600.0, pytest.param(6000.0, marks=pytest.mark.slow)])
 def test_a_curved_plate_of_any_size_becomes_a_closed_mesh(span_mm):
     rib = curved_rib(span_mm)
     body = shapes.body_of("a.step", "rib", rib.wrapped, 1.0, solid=True)

@@ -15,6 +15,8 @@ import sys
 def main():
     for each in ("scheduler", "worker"):
         importlib.import_module(f"distributed.cli.dask_{each}")
+    for each in ("compare.compare", "deviation.step", "space_frame.step"):  # once for all workers
+        importlib.import_module(f"processor.{each}")
     from dask.__main__ import main as dask
 
     answers = os.fdopen(os.dup(1), "w")
