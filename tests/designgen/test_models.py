@@ -344,7 +344,7 @@ def test_a_dent_has_its_shape(built):
     assert defects.volume_mm3[1] == pytest.approx(np.pi * 60.0**2 * 8.0 / 3.0)  # 2 pi int r (1 - r2/R2)^2 dr
 
 
-@pytest.mark.parametrize("source", ["solid", "mesh"])
+@pytest.mark.parametrize("source", ["solid", pytest.param("mesh", marks=pytest.mark.slow)])
 def test_bodies_as_built_are_where_the_truth_has_them(source):
     plate = loading.load(cq.Workplane().box(1000, 400, 20))
     if source == "mesh":

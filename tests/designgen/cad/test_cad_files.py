@@ -399,6 +399,7 @@ def test_large_sphere_is_meshed_by_few_triangles_and_its_deviation_is_stated(tmp
 # --- out -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cad_here")
 def test_georeferenced_designs_lie_where_their_scene_has_them(tmp_path):
     origin, recipe = [5.0e8, 4.3e9, 1.0e5], recipe_files.load("frame-small")[1]

@@ -144,7 +144,7 @@ def test_rays_meet_parts_of_assemblies_as_built_where_their_solids_are(which):
     [
         defect_specimens.build(defect_specimens.Params(form="girder", components=("none", "step"))),
         pytest.param(truss_bridge.build(truss_bridge.Params())[:12], marks=pytest.mark.slow),
-        stadium_roof.build(stadium_roof.Params())[:3],
+        pytest.param(stadium_roof.build(stadium_roof.Params())[:3], marks=pytest.mark.slow),
     ],
     ids=["girders", "truss", "roof"],
 )
