@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numba.core.caching import FunctionCache
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
@@ -24,6 +25,7 @@ from tests.support.pages import browser
 from tests.support.solids import cad_in_process
 
 _compile = Dispatcher.compile
+_DRAW = {drawn: drawn.draw for drawn in (FigureCanvasAgg, Figure)}
 _held: set[Path] = set()  # locks of this process: a kernel that calls itself asks for its own
 _LOCKS = Path(tempfile.gettempdir(), f"kernel-locks-{os.getuid()}")
 
@@ -71,10 +73,26 @@ def pytest_collection_finish():
     garbage_collection.collect_rarely()
 
 
+def _blank(canvas):
+    """Draw nothing, on a strip as wide as the picture: pages are laid out by its width, and encoding it takes time."""
+    canvas.figure.set_size_inches(canvas.figure.get_figwidth(), 0.2)
+    canvas.get_renderer()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def blank_pictures():
+    """Leave every picture and page of a document blank: few tests look at them, and drawing takes long."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FigureCanvasAgg, "draw", _blank)
+        patch.setattr(Figure, "draw", lambda *_: None)
+        yield
+
+
 @pytest.fixture
-def blank_pictures(monkeypatch):
-    """Leave every picture blank: for tests of all else on a page, as drawing takes most of the time."""
-    monkeypatch.setattr(FigureCanvasAgg, "draw", FigureCanvasAgg.get_renderer)
+def drawn_pictures(monkeypatch):
+    """Draw pictures and pages of documents, for a test of what they show."""
+    for drawn, draw in _DRAW.items():
+        monkeypatch.setattr(drawn, "draw", draw)
 
 
 @pytest.fixture

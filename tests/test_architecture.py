@@ -111,9 +111,10 @@ def test_help_is_printed_without_heavy_imports(module):
 def test_run_starts_without_rarely_used_imports():
     """A batch starts a process for every input: half a second each of loading all distributions and PDF fonts."""
     code = (
-        "import sys; from processor import pipeline; from processor.api import runs\n"
+        "import sys; from processor import pipeline; from processor.api import runs; import processor.cli.main\n"
+        "from processor.report import write_results\n"
         "pipeline.step_modules()\n"
-        "heavy = {'scipy.stats', 'fontTools.subset', 'matplotlib.pyplot', 'cadquery'} & set(sys.modules)\n"
+        "heavy = {'scipy.stats', 'fontTools.subset', 'matplotlib.pyplot', 'cadquery', 'ezdxf'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

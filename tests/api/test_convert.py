@@ -27,8 +27,6 @@ from tests.support.files.scan_bytes import las_bytes, put
 from tests.support.processes import commands as in_process
 from tests.support.scenes.exported_scenes import exported, merged, on_grid, stations_apart
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
-
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"
 FORMATS = sorted((FIXTURES / "formats").iterdir())
 PLACE = FIXTURES / "scan-folder"

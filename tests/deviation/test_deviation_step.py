@@ -272,7 +272,6 @@ def test_a_scan_of_something_else_fails():
     assert codes(result)[0] == "deviation.not-at-design"
 
 
-@pytest.mark.usefixtures("blank_pictures")
 def test_after_a_stitch_that_failed_later_steps_do_not_run(tmp_path, monkeypatch):
     scene, _ = scene_of(12, count=5000)
     jobs = pipeline.plan(("stitch", "deviation", "defects"), (), {}, 0)
@@ -462,7 +461,6 @@ def test_a_fitted_pose_is_that_of_a_scan_with_axes_of_its_own():
     assert np.abs(rigid.apply(found, scan.points) - points).max() < 0.4
 
 
-@pytest.mark.usefixtures("blank_pictures")
 def test_deviation_in_results_json_has_the_keys_of_the_interface(tmp_path):
     scene, truth = scene_of(9, count=8_000)
     jobs = pipeline.plan(("deviation",), (), {}, 0)

@@ -24,8 +24,6 @@ from tests.support.results.ball_results import of_frame, whole, with_truth
 from tests.support.results.bridge_results import of_bridge
 from tests.support.results.metrics import metric
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
-
 CODES = [code for code in messages_.CODES if code != "en"]
 
 

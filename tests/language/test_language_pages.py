@@ -31,8 +31,6 @@ from tests.support.pages.pages import (
 from tests.support.results import step_results, validation_nights
 from tests.support.results.metrics import metric
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
-
 # --- steps ----------------------------------------------------------------------------------------------------------
 
 

@@ -527,7 +527,6 @@ def test_joints_are_counted_in_words(verdicts, said):
     assert not latin([messages("zh").text(found)])
 
 
-@pytest.mark.usefixtures("blank_pictures")
 def test_a_frame_with_supports_through_the_command_line(tmp_path):
     """Supports of a frame are judged by the rows of JGJ 7; one that was designed 30 mm higher fails."""
     place = tmp_path / "frame"

@@ -18,8 +18,6 @@ from tests.bench.papers import bolt_balls, command, measuring, parameters, preas
 from tests.bench.papers.data_sets import DataSet, Found, Measured
 from tests.bench.papers.rows import Outcome, Row, Rule, holds, is_smaller
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
-
 TINY = {
     "000": ("arch-s1", ("scan.spacing_mm=25.0", "scan.sigma_mm=0.001", "scan.net=true")),
     "001": ("balls-100", ("frame.nodes_x=3", "frame.nodes_y=3", "scan.spacing_mm=5.0")),

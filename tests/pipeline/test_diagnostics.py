@@ -84,7 +84,6 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.usefixtures("blank_pictures")
 def test_results_hold_the_numbers_of_every_stage_of_each_method(folder):
     stored = store.read_results(folder / "results.h5", pipeline.result_classes())
     assert [run.method for run in stored] == METHODS.split(",")

@@ -57,7 +57,6 @@ def number(text):
 # --- tables --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("blank_pictures")
 def test_table_what_to_do_has_the_numbers_of_results_json():
     execution, step = bridge_and_step()
     on_page = Page(rendered(execution)).tables["Joints: what to do, method adjustment"][2:]
@@ -154,25 +153,30 @@ def test_accuracy_budget_is_written_and_shown_on_the_terminal():
 
 
 def linear_error(execution):
-    """Caption and picture of the linear error alone, of all methods."""
-    with default_settings():
-        return figures._linear_error(execution.scene, execution.runs)
+    """Caption of the linear error of all methods, and the numbers of curves and bands of its upper panel."""
+    made = []
+    with default_settings(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "png", made.append)
+        caption, _ = figures._linear_error(execution.scene, execution.runs)
+    upper = made[0].axes[0]
+    return str(caption), len([line for line in upper.lines if len(line.get_xdata()) > 2]), len(upper.collections)
 
 
 def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     execution = of_bridge()
     (row,) = of_file(execution, "components-compared")
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
-    answered = linear_error(execution)
-    assert "without a band, because they state no uncertainty: line" in str(answered[0])
+    caption, *shown = linear_error(execution)
+    assert "without a band, because they state no uncertainty: line" in caption
+    assert shown == [4, 2]  # both edges by two methods, bands of one
     line = execution.runs[1]
     linear = line.result.linear
     nothing = Deviations(deviation=np.full(120, NAN))
     result = dataclasses.replace(line.result, linear=dataclasses.replace(linear, assembled=nothing, best_fit=nothing))
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
-    caption, picture = linear_error(silent)
-    assert "without a result, so not drawn: line" in str(caption)
-    assert picture != answered[1]
+    caption, *shown = linear_error(silent)
+    assert "without a result, so not drawn: line" in caption
+    assert shown == [2, 2]
     blank = page.html(silent, ErrorReport(), {"preassemble": Drawn({})})
     data = json.loads(Page(blank).scripts[0][1])["steps"]["preassemble"]
     assert [one["method"] for one in data["linear"]] == ["adjustment"]
@@ -193,7 +197,6 @@ def test_span_closure_budget_and_trade_off_as_tables():
     assert low < value < high
 
 
-@pytest.mark.usefixtures("blank_pictures")
 def test_methods_without_intervals_have_no_tables_of_the_adjustment():
     runs = (StepRun("preassemble", "line", "{}", assembled("line")),)
     execution = Execution(arch_scene(), runs, PROVENANCE)
@@ -209,7 +212,6 @@ def test_a_pass_is_marked_as_good_only_by_limits_that_are_verified(verified, ton
     assert page._tone(StepRun("preassemble", "adjustment", "{}", result)) == tone
 
 
-@pytest.mark.usefixtures("blank_pictures")
 def test_page_has_verdict_then_actions_then_pictures():
     text = rendered(of_bridge())
     actions = ("verdicts are provisional", "-1.250 ± 0.500", "J1 P1: ±", "A scan of rib1")
@@ -244,7 +246,6 @@ def unknown(result, joints, parts):
     )
 
 
-@pytest.mark.usefixtures("blank_pictures")
 @pytest.mark.parametrize(("joints", "parts", "pictures"), [((1,), (2,), 2), ((0, 1), (0, 1, 2), 0)])
 def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
     execution = of_bridge()
@@ -265,7 +266,7 @@ def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
 # --- pictures ------------------------------------------------------------------------------------------------------
 
 
-def test_pictures_show_something_and_change_with_their_data_alone():
+def test_pictures_show_something_and_change_with_their_data_alone(drawn_pictures, monkeypatch):
     """Pictures of other residuals or weights are other pictures; the rest stay as they are."""
     execution = of_bridge()
     before = drawn(execution)["preassemble"].figures
@@ -279,6 +280,8 @@ def test_pictures_show_something_and_change_with_their_data_alone():
     given = run.result.adjustment
     residuals = dataclasses.replace(given.residuals, distance=-3.0 * np.abs(given.residuals.distance))
     other = dataclasses.replace(run.result, adjustment=dataclasses.replace(given, residuals=residuals, weight=1.0))
+    for name in ("_bridge", "_linear_error", "by_axis"):  # of all methods, and not looked at again
+        monkeypatch.setattr(figures, name, lambda *_: None)
     after = all_figures.draw_figures(
         dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
     )["preassemble"].figures
@@ -322,7 +325,7 @@ def test_noise_has_no_colour_on_maps_of_residuals():
     assert levels[-1] > 1.9 * band.high  # colours begin pale
 
 
-def test_numbers_of_large_gaps_fit_their_frames_and_missing_gaps_are_stated(monkeypatch):
+def test_numbers_of_large_gaps_fit_their_frames_and_missing_gaps_are_stated(monkeypatch, drawn_pictures):
     figures_made = []
 
     def kept(figure):

@@ -306,26 +306,29 @@ def test_entities_are_written_as_the_library_writes_them():
     assert entities[0] == entities[1]
 
 
-def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
-    """The order of sets differs there; and until something is drawn, the program has loaded no drawing library."""
-    code = (
-        "import sys, processor.cli.main, processor.report.write_results; assert 'ezdxf' not in sys.modules\n"
-        "import hashlib; from processor.report.space_frame import dxf;"
-        "from tests.support.results.ball_results import whole;"
-        "print(hashlib.sha256(dxf.drawing(whole())).hexdigest())"
-    )
+def test_a_drawing_is_the_same_bytes_again_and_holds_no_names():
     data = dxf.drawing(whole())
+    assert data == dxf.drawing(whole())
     assert not ezdxf.options.write_fixed_meta_data_for_testing
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True,
-        env={**os.environ, "PYTHONHASHSEED": "7"},
-    )  # fmt: skip
-    assert done.stdout.strip() == hashlib.sha256(data).hexdigest()
     assert b"S2" not in data
     assert b"determined" not in data
 
 
-@pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.slow
+def test_a_drawing_is_the_same_bytes_in_another_process():
+    """The order of sets differs there."""
+    code = (
+        "import hashlib; from processor.report.space_frame import dxf;"
+        "from tests.support.results.ball_results import whole;"
+        "print(hashlib.sha256(dxf.drawing(whole())).hexdigest())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONHASHSEED": "7"},
+    )  # fmt: skip
+    assert done.stdout.strip() == hashlib.sha256(dxf.drawing(whole())).hexdigest()
+
+
 def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
     execution, report = of_frame()
     write_results.write_results(tmp_path / "out", execution, report)
@@ -366,9 +369,9 @@ def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
     assert "Standard deviations" in str(found["ball-errors.png"][0])  # there is no truth to compare with
 
 
-def test_few_balls_have_a_picture_worst_first_and_pages_share_the_pixels_of_their_frames(monkeypatch):
+def test_few_balls_have_a_picture_worst_first_and_all_a_page(monkeypatch):
     assert flagged_ball_figures.MOST_BALLS == 12
-    monkeypatch.setattr(flagged_ball_figures, "MOST_BALLS", 2)  # of seven, as more take seconds
+    monkeypatch.setattr(flagged_ball_figures, "MOST_BALLS", 2)
     made = repeated(whole(), 3)
     drawn = flagged_ball_figures.draw(scene(made), made)
     captions = [str(caption) for caption, _ in drawn.figures.values()]
@@ -377,15 +380,20 @@ def test_few_balls_have_a_picture_worst_first_and_pages_share_the_pixels_of_thei
     assert "the first 2 of 7" in captions[0]
     every = [made.balls.flag[i] for i in flagged_ball_figures.flagged_rows(scene(made), made)]
     assert every == ["wrong-size"] * 3 + ["not-found"] + ["low-confidence"] * 3
+    assert pages_of(drawn.documents[flagged_ball_figures.DOCUMENT]) == len(every)
+
+
+def test_balls_are_drawn_as_the_same_bytes_and_pages_share_the_pixels_of_their_frames(drawn_pictures, monkeypatch):
+    """Two balls of one size and one of another, the second of which has not been found: the design's place is drawn."""
+    monkeypatch.setattr(flagged_ball_figures, "MOST_BALLS", 2)
+    made = whole(changed={"radii": np.array([45.1, 50.2, NAN, 45.0, 50.0])})
+    drawn = flagged_ball_figures.draw(scene(made), made)
     document = drawn.documents[flagged_ball_figures.DOCUMENT]
-    assert pages_of(document) == len(every)
+    monkeypatch.setattr(flagged_ball_figures, "MOST_BALLS", 0)
+    assert flagged_ball_figures.draw(scene(made), made).documents == drawn.documents
     wide = round(ball_picture.PAGE_DPI * ball_picture.SIZE_IN[0])
-    assert len(re.findall(rb"/Width %d\b" % wide, document)) == 2  # of balls of two sizes
-
-
-def test_pictures_of_balls_show_the_middle_of_the_design(compared):
-    made = whole()
-    png = compared[2]["spheres"].figures["flagged-ball-12.png"][1]
+    assert (pages_of(document), len(re.findall(rb"/Width %d\b" % wide, document))) == (3, 2)
+    png = drawn.figures["flagged-ball-12.png"][1]
     assert made.balls.flag[2] == "not-found"
     pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
     left, bottom, wide, high = (DPI * inches for inches in ball_picture.VIEWS_IN[0])
@@ -409,7 +417,6 @@ def test_a_ball_to_look_at_has_a_page_with_its_numbers(compared):
     assert said["off the design's place, y"] == "2.00"  # found less designed
     first = compared[2]["spheres"].documents[flagged_ball_figures.DOCUMENT]
     assert pages_of(first) == 3
-    assert first == flagged_ball_figures.draw(scene(made), made).documents[flagged_ball_figures.DOCUMENT]
     fine = whole(changed={"flag": ("ok",) * 5})
     assert flagged_ball_figures.draw(scene(fine), fine) == Drawn({})
 
@@ -435,8 +442,15 @@ def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
         )  # at 3e9 mm
 
 
-def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
-    """The same bytes, though of the file only the tiles about each ball are read."""
+def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path, monkeypatch):
+    """The same points about each, though of the file only the tiles about it are read."""
+    shown, show = [], ball_picture.BallPicture.show
+
+    def kept(picture, *args):
+        shown.append(args[4])
+        show(picture, *args)
+
+    monkeypatch.setattr(ball_picture.BallPicture, "show", kept)
     rng = np.random.default_rng(4)
     made = whole()
     T = pose(TURN, (100.0, 0.0, 0.0))
@@ -455,6 +469,10 @@ def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
     assert len(in_memory.figures) > 1
     assert flagged_ball_figures.draw(alone, made) == Drawn({})
     assert flagged_ball_figures.draw(alone, made, tmp_path / "s.h5") == in_memory
+    half = len(shown) // 2
+    assert max(map(len, shown)) > 100
+    for one, other in zip(shown[:half], shown[half:], strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_control_points_have_a_table_and_their_place_in_results_json():

@@ -13,8 +13,6 @@ from tests.support.pages.report_pages import BAD, rendered
 from tests.support.results.ball_results import of_frame
 from tests.support.results.bridge_results import of_bridge
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
-
 
 def written(folder, text, name="r.html"):
     path = folder / name

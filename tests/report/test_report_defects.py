@@ -48,11 +48,13 @@ def test_failed_search_has_no_view():
     assert drawn(Result(status="failed", method="default")) is None
 
 
-@pytest.mark.usefixtures("blank_pictures")
-def test_many_defects_and_places_keep_the_page_small():
+def test_many_defects_and_places_keep_the_page_small(monkeypatch):
+    """6 MB for 60,000 points and 400 outlines are at most 3 MB of outlines and 50 bytes a point."""
+    assert (surface_view.MOST_POINTS, surface_view.MOST_REGIONS) == (60_000, 400)
+    monkeypatch.setattr(surface_view, "MOST_POINTS", 3_000)
     result = step_results.defects(surface_view.MOST_REGIONS + 1, places=2 * surface_view.MOST_POINTS)
     text = page.html(step_results.execution(("defects", "default", "{}", result)), ErrorReport(), {})
-    assert len(text.encode()) < 6_000_000
+    assert len(text.encode()) < 3_000_000 + 50 * surface_view.MOST_POINTS
     found = json.loads(Page(text).scripts[0][1])["steps"]["defects"]
     assert len(found["parts"][0]["residual"]) <= surface_view.MOST_POINTS
     assert len(found["marks"]) == surface_view.MOST_REGIONS

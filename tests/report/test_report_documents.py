@@ -15,8 +15,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import messages
 from processor.model import TitleBlock
 from processor.report import all_tables, pdf_report, style, workbook
-from processor.report.style import default_settings
-from tests.support.pages.report_pages import drawn
+from processor.report.style import Drawn, default_settings
 from tests.support.results.bridge_results import of_bridge
 
 FORMULAS = ("=1+1", "+1", "-1", "@SUM(A1)")
@@ -29,17 +28,19 @@ def signed(names=("foot1", "rib1", "foot2")):
 
 
 def written(execution):
+    """The document of an execution, with two figures of a pixel."""
+    one = io.BytesIO()
+    Image.new("RGB", (1, 1)).save(one, "PNG")
+    figures = {"preassemble": Drawn({f"{name}.png": (f"Caption of {name}", one.getvalue()) for name in "ab"})}
     with default_settings():
-        return pdf_report.document(execution, drawn(execution))
+        return pdf_report.document(execution, figures)
 
 
-@pytest.mark.usefixtures("blank_pictures")
-def test_the_document_has_a_page_a_figure_and_the_same_bytes_again():
+def test_the_document_has_a_page_a_figure_and_the_same_bytes_again(drawn_pictures):
     execution = signed()
     first = written(execution)
     assert first == written(execution)
-    pages = len(re.findall(rb"/Type /Page\b(?!s)", first))
-    assert pages >= 2 + len(drawn(execution)["preassemble"].figures)
+    assert len(re.findall(rb"/Type /Page\b(?!s)", first)) == 2 + 2  # two of text, and one a figure
     assert not re.search(rb"/(CreationDate|ModDate)", first)
     content = b"".join(zlib.decompress(part) for part in re.findall(rb"stream\r?\n(x.*?)\r?\nendstream", first, re.S))
     assert b"CreationDate" not in content
@@ -96,7 +97,7 @@ def texts_of(page):
     return [one.get_text() for one in page.texts]
 
 
-def test_document_is_chinese_if_a_font_is_installed(a_chinese_font):
+def test_document_is_chinese_if_a_font_is_installed(a_chinese_font, drawn_pictures):
     execution = signed()
     seen = texts_of(front(execution, "zh"))
     assert any("桥 Meyer" in one for one in seen)
@@ -107,7 +108,7 @@ def test_document_is_chinese_if_a_font_is_installed(a_chinese_font):
     assert b"LastResort" in data
 
 
-def test_document_without_a_font_is_english_with_question_marks(monkeypatch):
+def test_document_without_a_font_is_english_with_question_marks(monkeypatch, drawn_pictures):
     for module in (style, pdf_report):
         monkeypatch.setattr(module, "chinese_font", lambda: "")
     style._has.cache_clear()

@@ -23,8 +23,6 @@ from tests.support.pages.browser import opened
 from tests.support.pages.report_pages import BAD, Page, rendered
 from tests.support.results.bridge_results import PROVENANCE, of_bridge
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
-
 FULL = """
 [report]
 weather = "dry, 4 C"
@@ -82,6 +80,18 @@ def test_title_block_does_not_change_the_hash_of_a_scene(tmp_path):
     assert store.read_scene(tmp_path / "s.h5").title_block.values == with_block.title_block.values
 
 
+@pytest.fixture(scope="module")
+def bad_logos():
+    """Files that are no logo, by their names."""
+    return {
+        "half.png": picture(size=(400, 400))[:-300],
+        "logo.gif": picture("GIF"),
+        "logo.svg": b"<svg xmlns='http://www.w3.org/2000/svg'><script>alert(1)</script></svg>",
+        "large.png": picture(size=(3000, 2000)),
+        "long.png": picture() + bytes(1_000_000),
+    }
+
+
 @pytest.mark.parametrize(
     ("toml", "said"),
     [
@@ -101,12 +111,9 @@ def test_title_block_does_not_change_the_hash_of_a_scene(tmp_path):
         ("[report]\nlogo = 'long.png'", "expected a logo of at most 1000000 bytes"),
     ],
 )
-def test_bad_input_is_one_clear_error(tmp_path, toml, said):
-    (tmp_path / "half.png").write_bytes(picture(size=(400, 400))[:-300])
-    (tmp_path / "logo.gif").write_bytes(picture("GIF"))
-    (tmp_path / "logo.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'><script>alert(1)</script></svg>")
-    (tmp_path / "large.png").write_bytes(picture(size=(3000, 2000)))
-    (tmp_path / "long.png").write_bytes(picture() + bytes(1_000_000))
+def test_bad_input_is_one_clear_error(tmp_path, bad_logos, toml, said):
+    for name, content in bad_logos.items():
+        (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=re.escape(said)) as raised:
         read_input(folder_of(tmp_path, toml))
     assert str(tmp_path) in str(raised.value)

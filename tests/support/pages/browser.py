@@ -11,25 +11,26 @@ ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--disable-background-networking",
 
 
 class _Shared:
-    """One browser for the pages of a file of tests; each has a context of its own."""
+    """One browser for a file of tests, and one tab, as each takes a process of its own."""
 
     def __init__(self):
-        self.playwright = self.browser = None
+        self.playwright = self.browser = self.page = None
 
     def get(self):
-        if self.browser is None:
+        if self.page is None:
             from playwright.sync_api import sync_playwright
 
             self.playwright = sync_playwright().start()
             self.browser = self.playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
-        return self.browser
+            self.page = self.browser.new_page()
+        return self.page
 
     def close(self):
         if self.browser is not None:
             self.browser.close()
         if self.playwright is not None:
             self.playwright.stop()
-        self.playwright = self.browser = None
+        self.playwright = self.browser = self.page = None
 
 
 SHARED = _Shared()  # closed by a fixture of tests/conftest.py when the tests of a file are over
@@ -44,15 +45,23 @@ def opened(path, width=1200, height=900):
     if CHROMIUM is None:
         (pytest.fail if os.environ.get("CI") else pytest.skip)("no Chromium: install Debian's package chromium")
     said, asked = [], []
-    page = SHARED.get().new_page(viewport={"width": width, "height": height})
+    page, listeners = (
+        SHARED.get(),
+        {
+            "console": lambda message: said.append(message.text),
+            "pageerror": lambda error: said.append(str(error)),
+            "request": lambda request: asked.append(request.url),
+        },
+    )
+    page.set_viewport_size({"width": width, "height": height})
+    for event, listener in listeners.items():
+        page.on(event, listener)
     try:
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
         page.goto(path.as_uri())
         yield page
     finally:
-        page.close()
+        for event, listener in listeners.items():
+            page.remove_listener(event, listener)
     assert not said, said
     assert [url for url in asked if not url.startswith("data:")] == [path.as_uri()]
 
