@@ -88,7 +88,7 @@ def metrics(scene, result, truth):
 
 
 def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_bad_frame():
-    scene, truth = scene_of(1, origin=FAR, count=60_000)
+    scene, truth = scene_of(1, origin=FAR, count=20_000)
     result = run(scene)
     assert (result.status, result.registration) == ("ok", "as given")
     np.testing.assert_array_equal(result.T_design_scan, np.eye(4))
@@ -106,24 +106,26 @@ def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_b
     fitted = run(scene, register="fine")
     assert fitted.registration == "fine"
     assert abs(np.nanmean(fitted.core.distance[result.core.normals[:, 1] > 0.9])) < 0.7  # the best fit has it
-    # It is bent all along.
-    assert codes(fitted) == ["deviation.no-stable-half", "deviation.stable-fit", "deviation.views-by-class"]
+    # It is bent all along, and of so few points no block agrees with any motion.
+    assert codes(fitted) == ["deviation.no-stable-half", "deviation.best-fit", "deviation.views-by-class"]
     assert fitted.status == "weak"
-    best = run(scene, register="fine", fit="all")
-    assert codes(best)[1:] == ["deviation.best-fit", "deviation.stable-fit-would-move", "deviation.views-by-class"]
-    assert np.linalg.norm(best.best_fit_shift) < 0.05
+    assert np.isfinite(fitted.registration_error)
     assert metrics(scene, fitted, truth)["core points farther from the truth than their LOD95"].value < 5.0
 
 
-def test_a_structure_that_is_bent_all_over_is_laid_on_all_its_points():
-    """So much that no block agrees with any motion: the stable fit has no clusters at all."""
-    scene, _ = scene_of(
-        2, lambda p: 80.0 * np.column_stack([0.0 * p[:, :2], (p[:, :2] ** 2).sum(axis=1) / 4e6]), count=20_000
-    )
-    result = run(scene, register="fine")
+@pytest.mark.parametrize("fit", [pytest.param("stable", marks=pytest.mark.slow), "all"])
+def test_of_two_fits_the_other_is_stated(fit):
+    """A structure that is bent all along, of enough points that some blocks agree."""
+    scene, truth = scene_of(1, count=60_000)
+    result = run(scene, register="fine", fit=fit)
     assert result.status == "weak"
-    assert codes(result)[:2] == ["deviation.no-stable-half", "deviation.best-fit"]
-    assert np.isfinite(result.registration_error)
+    if fit == "stable":
+        assert codes(result) == ["deviation.no-stable-half", "deviation.stable-fit", "deviation.views-by-class"]
+        assert metrics(scene, result, truth)["core points farther from the truth than their LOD95"].value < 5.0
+    else:
+        stated = ["deviation.best-fit", "deviation.stable-fit-would-move", "deviation.views-by-class"]
+        assert codes(result)[1:] == stated
+        assert np.linalg.norm(result.best_fit_shift) < 0.05
 
 
 def test_a_thin_plate_seen_from_one_side_is_not_surely_registered(monkeypatch):
@@ -132,11 +134,11 @@ def test_a_thin_plate_seen_from_one_side_is_not_surely_registered(monkeypatch):
     result = run(scene, register="fine")
     assert result.status == "weak"
     assert codes(result)[0] == "deviation.registration-uncertain"
-    thick = plate_clouds.plate(8.0, 1, plate_clouds.STATIONS[:1], positions=False)
+    thick = plate_clouds.plate(8.0, 1, plate_clouds.STATIONS[:1], positions=False, count=20_000)
     assert run(thick, register="fine").status == "ok"
 
 
-@pytest.mark.parametrize(("sigma", "proven"), [(3.0, True), (12.0, False)])
+@pytest.mark.parametrize(("sigma", "proven"), [pytest.param(3.0, True, marks=pytest.mark.slow), (12.0, False)])
 def test_a_pose_about_which_points_scatter_is_not_proven(sigma, proven, monkeypatch):
     """From any attitude, a pose is one of the design's only if points lie at its surface: within 10 mm (one sd)."""
     monkeypatch.setattr("tests.deviation.test_deviation_step.SIGMA", sigma)
@@ -151,9 +153,11 @@ def test_a_pose_about_which_points_scatter_is_not_proven(sigma, proven, monkeypa
 
 def test_a_scan_in_another_frame_is_registered_whatever_its_order():
     T = pose([0.4, -1.1, 2.0], [9e3, -4e3, 700.0])
-    scene, _ = scene_of(2, still, T, count=5_000)
+    scene, _ = scene_of(2, still, T, count=3_000)
     result = run(scene)
     assert (result.status, result.registration) == ("ok", "coarse")
+    placed = design_pose.pose(scene, {"deviation": result}, DefectParams())
+    assert (placed.doubt, placed.status) == (None, "ok")
     off = result.T_design_scan @ rigid.invert(T)
     sd = np.sqrt(np.diag(result.covariance))
     moved = np.concatenate([rigid.vector_from_rotation(off[:3, :3]), off[:3, 3]])
@@ -172,13 +176,13 @@ def test_an_undamaged_structure_is_a_twentieth_beyond_where_the_frame_is_sure(se
     scene, _ = scene_of(seed, still, count=40_000)
     result = run(scene, register="none", registration_error_mm=0.0)
     assert 0.035 < result.significant_share < 0.065
-    cautious = run(scene)
+    cautious = run(scene, register="none")
     assert cautious.registration_error > 0.0
     assert cautious.significant_share < result.significant_share
 
 
 def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not():
-    scene, _ = scene_of(10, still, count=8_000)
+    scene, _ = scene_of(10, still, count=4_000)
     T = pose([0.0, 0.0, 1.0], [500.0, 0.0, 0.0])
     points = scene.scans[0].points
     scans = (
@@ -206,7 +210,7 @@ def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not
 )
 def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
     """Of three scans as they stand, of a third of the points each, one or two are in frames of their own."""
-    scene, _ = scene_of(11, still, count=6_000)
+    scene, _ = scene_of(11, still, count=4_500)
     points = scene.scans[0].points
     frame = pose([0.0, 0.0, 0.5], [30_000.0, 0.0, 0.0])
     common = frame if elsewhere else np.eye(4)  # the other scans are at the design, or together in another frame
@@ -223,7 +227,7 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
         return
     assert result.status == "weak"
     assert result.reasons[0].values["scans"] == ", ".join(f"scan-{k}" for k in range(wrong))
-    assert result.reasons[0].values["points"] == pytest.approx(2_000 * wrong, rel=0.01)  # less the outliers
+    assert result.reasons[0].values["points"] == pytest.approx(1_500 * wrong, rel=0.01)  # less the outliers
     assert result.registration == ("coarse" if elsewhere else "as given")
     assert result.significant_share < 0.07
     assert np.isfinite(result.core.lod95).mean() > 0.9
@@ -231,7 +235,7 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
 
 @pytest.mark.parametrize("elsewhere", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_scan_with_more_points_of_the_ground_than_of_the_structure_is_placed_right(elsewhere):
-    scene, _ = scene_of(12, still, count=6_000)
+    scene, _ = scene_of(12, still, count=4_000)
     points, rng = scene.scans[0].points, np.random.default_rng(12)
     low, high = points.min(axis=0) - 1_000.0, points.max(axis=0) + 1_000.0
     ground = rng.uniform(low, high, (3 * len(points), 3))
@@ -262,10 +266,10 @@ def test_a_station_of_a_merged_scan_is_named_too():
 
 
 def test_a_scan_of_something_else_fails():
-    scene, _ = scene_of(13, still, count=8_000)
+    scene, _ = scene_of(13, still, count=4_000)
     T = pose([0.3, 0.2, 1.0], [90_000.0, 0.0, 0.0])
     rng = np.random.default_rng(1)
-    ground = rng.uniform([-9e3, -6e3, 0.0], [9e3, 6e3, 3e3], (8_000, 3))
+    ground = rng.uniform([-9e3, -6e3, 0.0], [9e3, 6e3, 3e3], (4_000, 3))
     other = dataclasses.replace(scene, scans=(Scan("yard", rigid.apply(T, ground)),))
     result = run(other)
     assert result.status == "failed"
@@ -348,19 +352,19 @@ def arch(seed=11, count=10_000):
 
 
 def test_the_papers_attitude_is_called_ambiguous_where_another_fits_as_well():
-    scene, _ = arch()
+    scene, _ = arch(count=5_000)
     result = run(scene, method="paper", register="coarse")
     assert result.status == "ambiguous"
     assert 1.0 <= result.ambiguity < 1.3
     assert {"deviation.ambiguous", "deviation.paper-ambiguous"} & set(codes(result))
-    bracket_scene, _ = scene_of(12, still, count=10_000)
+    bracket_scene, _ = scene_of(12, still, count=8_000)
     sure = run(bracket_scene, method="paper", register="coarse")
     assert sure.status == "ok"
     assert sure.ambiguity > 2.0
     assert rigid.rotation_angle(sure.T_design_scan[:3, :3]) < 0.01
 
 
-@pytest.mark.parametrize(("width", "knob"), [(1980, (500, -900)), (1700, (0, 900))])
+@pytest.mark.parametrize(("width", "knob"), [(1980, (500, -900)), pytest.param(1700, (0, 900), marks=pytest.mark.slow)])
 def test_cases_are_compared_after_they_were_refined_and_alike_axes_are_swapped(width, knob):
     """Seen more in two corners, a plate nearly as wide as long has other axes than its design."""
     pin = trimesh.creation.box((80, 80, 300), pose([0.0] * 3, [*knob, 160.0]))
@@ -463,7 +467,7 @@ def test_a_fitted_pose_is_that_of_a_scan_with_axes_of_its_own():
 
 def test_deviation_in_results_json_has_the_keys_of_the_interface(tmp_path):
     scene, truth = scene_of(9, count=8_000)
-    jobs = pipeline.plan(("deviation",), (), {}, 0)
+    jobs = pipeline.plan(("deviation",), (), {"deviation": {"register": "none"}}, 0)
     found = pipeline.execute(tmp_path / "scene.h5", scene, jobs)
     report = ErrorReport(tuple(deviation_evaluation.check(scene, found.runs[0].result, truth)))
     assert isinstance(found, Execution)
