@@ -72,8 +72,7 @@ class Cloud:
         return min(self.error(T) for T in (found.T_design_scan, *found.rivals))
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("pose", ["same", "any"])
+@pytest.mark.parametrize(("pose", "seed"), [("same", 0), ("any", 1)])
 def test_every_node_is_named_with_a_fifth_missing_and_a_fifth_extra(pose, seed):
     d = design()
     cloud = Cloud(d, seed, pose=pose)
@@ -102,7 +101,7 @@ def test_coordinates_of_a_map_grid():
 
 
 def test_flat_grid_of_one_size_is_ambiguous_with_the_true_pose_among_rivals():
-    for nx, ny, rivals in ((7, 9, 1), (8, 8, 3)):  # turned by 180 degrees, and by 90
+    for nx, ny, rivals in ((5, 7, 1), (6, 6, 3)):  # turned by 180 degrees, and by 90
         d = design("flat", nx=nx, ny=ny, radii=(45.0,))
         cloud = Cloud(d, 1)
         found = match(cloud.found(radii=True), d)
@@ -112,7 +111,7 @@ def test_flat_grid_of_one_size_is_ambiguous_with_the_true_pose_among_rivals():
 
 
 def test_attitude_of_a_flat_layer_is_restricted_by_gravity_alone():
-    d = design("flat", nx=7, ny=12, layers=1, radii=(60.0,))
+    d = design("flat", nx=5, ny=8, layers=1, radii=(60.0,))
     upright = Cloud(d, 2, missing=0.1, extra=0.05, pose=37.0)
     found = match(upright.found(), d)
     assert found.status == "ambiguous"
@@ -132,13 +131,13 @@ def test_pose_is_unique_as_far_as_sizes_members_or_shape_determine_it(by):
         pairs = np.stack([d.member_a, d.member_b], axis=1) - 100
         members, answers = pairs, 1  # a half turn remains
     elif by == "radii":
-        d, more, answers = design("flat", nx=7, ny=9, radii=SIZES), {"radii": True}, 0
+        d, more, answers = design("flat", nx=5, ny=7, radii=SIZES), {"radii": True}, 0
     elif by == "shape":
         d, answers = design("free-form", radii=(60.0,)), 0
     else:
-        whole = design("flat", nx=8, ny=8, layers=1, radii=(60.0,))
-        keep = np.ones(64, bool)
-        keep[[0, 1, 8]] = False
+        whole = design("flat", nx=6, ny=6, layers=1, radii=(60.0,))
+        keep = np.ones(36, bool)
+        keep[[0, 1, 6]] = False
         d = FrameDesign(whole.ids[keep], whole.centres[keep], whole.radii[keep])
         answers = 0
     cloud = Cloud(d, 0, missing=0.05, extra=0.03, pose=70.0)
@@ -212,7 +211,7 @@ def test_another_structure_fails():
 
 
 def test_a_mirror_image_is_not_a_pose():
-    d = design("free-form", nx=8, ny=8)
+    d = design("free-form", nx=6, ny=6)
     cloud = Cloud(d, 0, missing=0.0, extra=0.0, off=5.0)
     assert match(NodePattern(cloud.positions * [1.0, 1.0, -1.0]), d).status == "failed"
     assert match(cloud.found(), d).status == "ok"
@@ -233,7 +232,7 @@ def test_covariance_of_the_pose_agrees_with_its_errors():
     d = design(nx=6, ny=7)
     middle = d.centres.mean(axis=0)
     pulls = []
-    for seed in range(30):
+    for seed in range(20):
         cloud = Cloud(d, seed, missing=0.1, extra=0.0, pose=10.0, off=15.0)
         found = match(cloud.found(radii=True), d)
         assert found.status == "ok"
@@ -247,7 +246,7 @@ def test_covariance_of_the_pose_agrees_with_its_errors():
         C = at @ found.covariance @ at.T
         off = np.concatenate([turn, E[:3, :3] @ middle + E[:3, 3] - middle])
         pulls.append(off / np.sqrt(np.diag(C)))
-    assert 0.85 < np.sqrt(np.mean(np.square(pulls))) < 1.15  # 180 numbers: 5 %
+    assert 0.85 < np.sqrt(np.mean(np.square(pulls))) < 1.15  # 120 numbers: 6.5 %
 
 
 # --- movements ------------------------------------------------------------------------------------------------------
@@ -344,7 +343,7 @@ def test_intervals_of_movements_after_a_best_fit_cover():
     """Against the true movements after the same fit of the true nodes; few nodes: the fit's own error counts."""
     d = design(nx=3, ny=3, layers=2, radii=SIZES)
     pulls = []
-    for seed in range(40):
+    for seed in range(25):
         rng = np.random.default_rng(seed)
         cloud = Cloud(d, seed, missing=0.0, extra=0.0, off=4.0, pose=20.0)
         sd = rng.uniform(0.3, 1.5, len(cloud.positions))
@@ -357,7 +356,7 @@ def test_intervals_of_movements_after_a_best_fit_cover():
         assert out.gauge == "best-fit"
         off = after_fit(cloud.positions[out.found], d.centres[out.design], matched.weight[out.found])
         pulls.append((out.vector - off) / np.sqrt(np.einsum("nii->ni", out.covariance)))
-    assert 0.95 < np.sqrt(np.mean(np.square(np.concatenate(pulls)))) < 1.05  # some 1500 numbers: 1.8 %
+    assert 0.95 < np.sqrt(np.mean(np.square(np.concatenate(pulls)))) < 1.05  # some 950 numbers: 2.3 %
 
 
 def off_by(out):

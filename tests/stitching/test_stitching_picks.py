@@ -228,7 +228,7 @@ def test_a_blunder_in_one_pair_does_not_widen_the_intervals_of_others():
     assert np.abs(errors(result.scans.T_project_scan, T)[0]).max() < 30.0
 
 
-@pytest.mark.parametrize("points", [3, 6])
+@pytest.mark.parametrize("points", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_a_scale_of_one_is_rarely_reported(points):
     """Picks of 5 mm without a scale: 2 % of 200 pairs at most are reported, also with two freedoms a pair."""
     rows = [row for seed in range(40) for row in picked(network(seed, 5.0, points=points)[1]).pairs.reasons]

@@ -41,9 +41,9 @@ def by_walls(scan, T):
 @pytest.mark.parametrize("kind", ["offsets of scans", "errors of walls"])
 def test_range_errors_are_separated_from_the_poses(kind):
     """Opposite walls show them: without an unknown of its own an offset goes into the poses, by its size."""
-    T, scans = four(3, step_mrad=STEP_MRAD)
+    T, scans = (some[:3] for some in four(3, step_mrad=STEP_MRAD))
     if kind == "offsets of scans":
-        scans = [longer(scan, mm) for scan, mm in zip(scans, (1.5, -1.0, 0.0, -1.5), strict=True)]
+        scans = [longer(scan, mm) for scan, mm in zip(scans, (1.5, -1.0, -1.5), strict=True)]
     else:
         scans = [by_walls(*both) for both in zip(scans, T, strict=True)]
     result = adjusted(T, scans)
@@ -52,7 +52,7 @@ def test_range_errors_are_separated_from_the_poses(kind):
         off = T_a_b @ np.linalg.inv(T[int(b[1:]) - 1]) @ T[int(a[1:]) - 1]
         pulls.append(np.append(Rotation.from_matrix(off[:3, :3]).as_rotvec(), off[:3, 3]) / np.sqrt(np.diag(C)))
     assert result.pairs.used.all()
-    # Of 36 numbers in six pairs of four scans, 18 are free: their rms scatters by 17 %.
+    # Of 18 numbers in three pairs of three scans, 12 are free: their rms scatters by 20 %.
     assert np.abs(pulls).max() < 4.0
     assert np.sqrt(np.mean(np.square(pulls))) < 1.5
     if kind == "offsets of scans":
@@ -93,18 +93,20 @@ def test_rays_along_a_cell_are_those_of_finite_differences():
     assert np.abs(rays - points / np.linalg.norm(points, axis=1)[:, None]).max() > 5e-4
 
 
-def moved(seed, pick, step_mrad=STEP_MRAD):
-    """Poses and scans of a room, where ``pick`` of the third scan's points (n, 3) in the room lies 3 mm off in x."""
-    T, scans = four(seed, step_mrad=step_mrad)
+def moved(seed, pick, mm):
+    """Poses and scans of a room, where ``pick`` of the third scan's points (n, 3) in the room lies ``mm`` off in x."""
+    T, scans = (some[:3] for some in four(seed, step_mrad=STEP_MRAD))
     points = in_room(scans[2], T[2])
-    points = points + np.where(pick(points), 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
+    points = points + np.where(pick(points), mm, 0.0)[:, None] * [1.0, 0.0, 0.0]
     changed = dataclasses.replace(scans[2], points=rigid.apply(rigid.invert(T[2]), points))
-    return T, (*scans[:2], changed, scans[3])
+    return T, (*scans[:2], changed)
 
 
 def test_a_board_that_moved_during_one_scan_does_not_bias_its_pose():
     """A board on the nearest wall, 3 mm off during one scan: its pieces have the most points of all."""
-    T, scans = moved(4, lambda at: (at[:, 0] > 6900.0) & (np.abs(at[:, 1:] - [-2000.0, 1500.0]) < 750.0).all(axis=1))
+    T, scans = moved(
+        4, lambda at: (at[:, 0] > 6900.0) & (np.abs(at[:, 1:] - [-2000.0, 1500.0]) < 750.0).all(axis=1), 3.0
+    )
     result = adjusted(T, scans)
     off = np.abs(errors(result.scans.T_project_scan, T)[0][1:])
     assert (off < 4.0 * result.scans.position_sd[1:]).all()
@@ -113,8 +115,8 @@ def test_a_board_that_moved_during_one_scan_does_not_bias_its_pose():
 
 def test_a_wall_that_moved_during_one_scan_is_contradicted_by_the_rejected_faces():
     """The points of the near wall outweigh all others in its direction, so that the pose follows it."""
-    T, scans = moved(6, lambda at: at[:, 0] > 6900.0, 20.0)  # a wall of enough points to outweigh the others
+    T, scans = moved(6, lambda at: at[:, 0] > 6900.0, 8.0)
     result = adjusted(T, scans)
     assert np.abs(errors(result.scans.T_project_scan, T)[0][2]).max() > 1.0  # else the test would be void
-    assert result.scans.status == ("ok", "ok", "weak", "ok")
+    assert result.scans.status == ("ok", "ok", "weak")
     assert [one.code for one in result.scans.reasons[2]] == ["stitch.faces-contradict"]
