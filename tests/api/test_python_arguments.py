@@ -140,7 +140,7 @@ def test_faces_that_are_no_mesh(scan, change, message):
 
 
 def test_a_pose_states_why_it_is_not_ok(scan):
-    points, vertices, faces = scan
+    points, vertices, faces = scan[0][::2], *scan[1:]
     good = processor.register(points, vertices, faces)
     assert (good.status, good.reasons) == (Status.OK, ())
     large = processor.register(10.0 * points, vertices, faces)
@@ -164,9 +164,9 @@ def test_ground_around_a_part_does_not_change_the_status_of_its_pose(scan):
 
 def test_a_pose_at_which_a_third_of_the_points_has_no_surface_is_weak(scan):
     """What stands in the part is no ground or wall, which are left out."""
-    points, vertices, faces = scan
+    points, vertices, faces = scan[0][::2], *scan[1:]
     rng = np.random.default_rng(1)
-    beside = rng.uniform([0.0, 0.0, 200.0], [1500.0, 1500.0, 900.0], (1500, 3)) + vertices.min(axis=0)
+    beside = rng.uniform([0.0, 0.0, 200.0], [1500.0, 1500.0, 900.0], (750, 3)) + vertices.min(axis=0)
     pose = processor.register(np.vstack([points, rigid.apply(T_SCAN_MESH, beside)]), vertices, faces)
     assert pose.status is Status.WEAK
     assert [one.code for one in pose.reasons] == ["register.points-elsewhere"]

@@ -26,10 +26,11 @@ OTHERS = [code for code in CODES if code != "en"]
 
 @functools.cache
 def all_calls():
-    """Every call in the sources, with its file."""
+    """Every call in the sources that have texts, with its file."""
     return [
         (path.name, node)
         for path in (*structure.SOURCES, *PAPERS.glob("*.py"))
+        if re.search(r"\b(reason|text|figures_of)\(|\bheading=", path.read_text("utf-8"))
         for node in structure.nodes(path)
         if isinstance(node, ast.Call)
     ]
