@@ -111,6 +111,7 @@ def test_help_is_printed_without_heavy_imports(module):
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=ROOT)
 
 
+@pytest.mark.slow
 def test_run_starts_without_rarely_used_imports():
     """A batch starts a process for every input: half a second each of loading all distributions and PDF fonts."""
     code = (

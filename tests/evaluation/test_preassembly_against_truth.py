@@ -1,5 +1,7 @@
 """Gaps compared with those of the truth, with members made by hand: exact ends and edges, no points."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -80,11 +82,16 @@ def stated(members, adjusted, edges, off):
     )
 
 
-def checked(unseen, without, off=0.0, built=as_built):
-    """Checks of the answer from exact members; ``without`` are parts that were not placed."""
+@functools.cache
+def adjusted_members(unseen, without, built):
     ends, edges = built()
     members = members_of(ends, edges, unseen, without)
-    adjusted = adjustment.adjust(members, DESIGN.joint_points, FRAMES, WEIGHT)
+    return ends, edges, members, adjustment.adjust(members, DESIGN.joint_points, FRAMES, WEIGHT)
+
+
+def checked(unseen, without, off=0.0, built=as_built):
+    """Checks of the answer from exact members; ``without`` are parts that were not placed."""
+    ends, edges, members, adjusted = adjusted_members(unseen, without, built)
     pose = np.array(adjusted.motions)  # the scans lie in the bridge's frame
     pose[list(without)] = np.nan
     lengths = np.cumsum([[0.0, 0.0], *([Polyline.through(e).length for e in (part.bottom_edge_left,

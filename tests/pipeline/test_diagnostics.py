@@ -65,7 +65,7 @@ METHODS = "line,design-aided"
 def bridge():
     """A bridge whose parts' attitudes are known: the search for them does not use the module under test."""
     assert "diagnostics" not in Path(attitude.__file__).read_text("utf-8")
-    scene, truth = arch_clouds.bridge(spacing_mm=40.0, sigma_mm=0.5, seed=3)
+    scene, truth = arch_clouds.bridge(spacing_mm=50.0, sigma_mm=0.5, seed=3)
     with mock.patch.object(attitude, "find", known_attitudes.find_by(truth)):
         yield scene
 

@@ -42,7 +42,7 @@ def test_a_file_named_as_a_script_is_shown_as_text(tmp_path):
         assert shown.locator("script, img").count() == 0
 
 
-@pytest.mark.parametrize(("lang", "width"), BOTH)
+@pytest.mark.parametrize(("lang", "width"), [pytest.param(*BOTH[0], marks=pytest.mark.slow), BOTH[1]])
 def test_the_pages_of_nights(tmp_path, lang, width):
     pages.two_nights(tmp_path, lang)
     for name in ("nights.html", "certificate.html"):

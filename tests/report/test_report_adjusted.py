@@ -16,7 +16,7 @@ from processor.model import Status, StepRun, Verdict
 from processor.pipeline import Execution
 from processor.preassembly.chain import joint_measures
 from processor.preassembly.result import Deviations
-from processor.report import all_figures, all_tables, page
+from processor.report import all_figures, all_tables, page, style
 from processor.report import table as report_table
 from processor.report.preassembly import figures, joint_figures, residual_map
 from processor.report.style import Drawn, default_settings, rounded
@@ -268,6 +268,7 @@ def test_unknown_joints_are_reported_and_not_drawn(joints, parts, pictures):
 
 def test_pictures_show_something_and_change_with_their_data_alone(drawn_pictures, monkeypatch):
     """Pictures of other residuals or weights are other pictures; the rest stay as they are."""
+    monkeypatch.setattr(style, "DPI", 40)  # most of the time goes by pixels
     execution = of_bridge()
     before = drawn(execution)["preassemble"].figures
     assert set(before) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}

@@ -60,6 +60,7 @@ def test_rows_are_the_designs_nodes_in_its_order(roof, designed):
     assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3
 
 
+@pytest.mark.slow  # every day: the square roof, below
 def test_a_design_of_another_frame_is_found(roof):
     scene, truth = roof
     R, t = rigid.rotation_from_vector(np.array([0.02, -0.01, 0.7])), np.array([5.0e8, 4.3e9, 1e3])
