@@ -137,6 +137,7 @@ def test_all_points_are_used_without_a_limit_of_points(small, monkeypatch):
     assert thinned.core.n1.sum() / one.core.n1.sum() == pytest.approx(1.0, rel=0.05)  # as above
 
 
+@pytest.mark.slow  # every day: of points in memory, in test_deviation_step.py
 def test_scans_that_lie_elsewhere_are_left_out_of_all_points(small):
     scene = bracket_scenes.scene_of(scans=2)
     away = dataclasses.replace(scene.scans[1], T_project_scan=rigid.transform(np.eye(3), np.array([9e4, 0.0, 0.0])))

@@ -38,7 +38,7 @@ def by_walls(scan, T):
     )
 
 
-@pytest.mark.parametrize("kind", ["offsets of scans", "errors of walls"])
+@pytest.mark.parametrize("kind", ["offsets of scans", pytest.param("errors of walls", marks=pytest.mark.slow)])
 def test_range_errors_are_separated_from_the_poses(kind):
     """Opposite walls show them: without an unknown of its own an offset goes into the poses, by its size."""
     T, scans = (some[:3] for some in four(3, step_mrad=STEP_MRAD))
