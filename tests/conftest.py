@@ -76,7 +76,7 @@ def pytest_collection_finish():
 def _blank(canvas):
     """Draw nothing, on a strip as wide as the picture: pages are laid out by its width, and encoding it takes time."""
     canvas.figure.set_size_inches(canvas.figure.get_figwidth(), 0.2)
-    canvas.get_renderer()
+    canvas.figure.draw(canvas.get_renderer())
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -99,7 +99,7 @@ def test_tables_show_sizes_and_exponents():
     assert with_peers[-1] == "Not installed in that run: py4dgeo."
 
 
-def test_page_is_written_between_its_marks(tmp_path, monkeypatch):
+def test_page_is_written_between_its_marks(tmp_path, monkeypatch, drawn_pictures):
     page, bench = tmp_path / "cost.md", tmp_path / "bench.json"
     page.write_text(f"before\n{make_cost.START}\nold\n{make_cost.END}\nafter\n")
     bench.write_text(json.dumps(CONTENT))

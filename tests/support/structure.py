@@ -249,28 +249,11 @@ def wrong_arrows():
 
 
 CUTS = (
-    "split",
-    "rsplit",
-    "partition",
-    "rpartition",
-    "startswith",
-    "endswith",
-    "removeprefix",
-    "removesuffix",
-    "replace",
-)
+    "split", "rsplit", "partition", "rpartition", "startswith", "endswith", "removeprefix", "removesuffix", "replace",
+)  # fmt: skip
 FOR_PEOPLE = {
-    "message",
-    "reason",
-    "reasons",
-    "units_reason",
-    "doubt",
-    "doubts",
-    "problem",
-    "problems",
-    "fault",
-    "faults",
-}
+    "message", "reason", "reasons", "units_reason", "doubt", "doubts", "problem", "problems", "fault", "faults",
+}  # fmt: skip
 
 
 def messages_read_again(sources=SOURCES):

@@ -84,9 +84,3 @@ def circles_of_folders():
 
 def _folder(name):
     return name if MODULES[name].name == "__init__.py" else name.rpartition(".")[0]
-
-
-def comment_share():
-    """Share of the lines that are comments alone, %."""
-    lines = [line.strip() for path in SOURCES for line in path.read_text("utf-8").splitlines()]
-    return 100.0 * sum(line.startswith("#") for line in lines) / len(lines)
