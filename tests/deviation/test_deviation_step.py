@@ -142,7 +142,7 @@ def test_a_thin_plate_seen_from_one_side_is_not_surely_registered(monkeypatch):
 def test_a_pose_about_which_points_scatter_is_not_proven(sigma, proven, monkeypatch):
     """From any attitude, a pose is one of the design's only if points lie at its surface: within 10 mm (one sd)."""
     monkeypatch.setattr("tests.deviation.test_deviation_step.SIGMA", sigma)
-    scene, _ = scene_of(3, still, count=3_000)
+    scene, _ = scene_of(3, still, count=1_500)
     result = run(scene, register="coarse")
     assert 0.6 * sigma < result.sigma < 1.4 * sigma
     assert (codes(result)[0] == "deviation.no-fit") is not proven
