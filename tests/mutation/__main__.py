@@ -10,13 +10,13 @@ import argparse
 import hashlib
 import json
 import os
-import random
 import shutil
 import subprocess
 import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -53,24 +53,27 @@ class Mutant:
 
 
 def drawn(number: int, seed: int, folders: tuple[str, ...] = CORE_FOLDERS) -> list[Mutant]:
-    """Return mutants: every kind as often as another, then every place of it as often as another."""
-    by_kind: dict[str, list[Mutant]] = {}
+    """Return mutants, every kind as often as another as far as there are as many.
+
+    Each place has its lot by what it says, not by what stands about it: a change of the sources leaves most of those
+    drawn before, so that the same seed can be run before and after it.
+    """
+    by_kind: dict[str, list[tuple[str, Mutant]]] = {}
     for folder in folders:
         for path in sorted((ROOT / folder).rglob("*.py")):
             source = path.read_text("utf-8")
             digest = hashlib.sha256(source.encode()).hexdigest()[:12]
+            times: Counter[str] = Counter()
             for site in sites(source):
                 mutant = Mutant(path=path.relative_to(ROOT).as_posix(), digest=digest, site=site)
-                by_kind.setdefault(site.kind, []).append(mutant)
-    generator = random.Random(seed)
-    mutants: list[Mutant] = []
-    while len(mutants) < number and by_kind:
-        kind = generator.choice(sorted(by_kind))
-        places = by_kind[kind]
-        mutants.append(places.pop(generator.randrange(len(places))))
-        if not places:
-            del by_kind[kind]
-    return mutants
+                text = f"{seed} {mutant.path} {site.kind} {site.old} {site.new}"
+                times[text] += 1
+                lot = hashlib.sha256(f"{text} {times[text]}".encode()).hexdigest()
+                by_kind.setdefault(site.kind, []).append((lot, mutant))
+    for mutants in by_kind.values():
+        mutants.sort(key=lambda one: one[0])
+    rounds = zip_longest(*(by_kind[kind] for kind in sorted(by_kind)))
+    return [one[1] for of_round in rounds for one in of_round if one is not None][:number]
 
 
 class Copy:
