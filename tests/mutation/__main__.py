@@ -82,9 +82,9 @@ class Copy:
     def __init__(self, place: Path, known: Record) -> None:
         self.place = place
         self.known = known
-        if not place.exists():
-            skipped = shutil.ignore_patterns(".git", ".venv*", "out", ".mypy_cache", ".ruff_cache", ".pytest_cache")
-            shutil.copytree(ROOT, place, ignore=skipped)
+        shutil.rmtree(place, ignore_errors=True)  # of an earlier run: its sources may be others
+        skipped = shutil.ignore_patterns(".git", ".venv*", "out", ".mypy_cache", ".ruff_cache", ".pytest_cache")
+        shutil.copytree(ROOT, place, ignore=skipped)
 
     def verdict(self, mutant: Mutant, killer: str) -> tuple[str, str]:
         """Return the verdict on a mutant and the test that killed it; ``killer`` did so before, or is empty."""
