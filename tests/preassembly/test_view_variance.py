@@ -1,5 +1,7 @@
 """Variance between viewpoints: from the two sides of plates, by draws of known size."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,6 +96,18 @@ def test_views_that_differ_are_not_taken_for_rolling(one_outer):
     found = [of_boxes(rng, 0.3, 0.0, one_outer) for _ in range(30)]
     assert np.mean([one.level for one in found]) > 0.3**2
     assert np.mean([one.evident for one in found]) > 0.9  # of 30
+
+
+def test_plates_of_two_designed_thicknesses_are_compared_with_their_like_alone():
+    """Webs of 20 and flanges of 22 mm: their difference is none between views, though rolling spreads as far."""
+    rng = np.random.default_rng(6)
+    thick = np.tile([20.0, 20.0, 22.0, 22.0], 8)
+    plates = [one for t in thick[::2] for one in pair(rng, 0.3, t)]
+    apart = view_variance.variances([replace(one, designed=t) for one, t in zip(plates, thick, strict=True)])
+    together = view_variance.variances(plates)
+    # Of 14 pairs a variance has the relative standard deviation sqrt(2 / 14); it is widened, by the class as well.
+    assert 0.3**2 * (1.0 - 2.0 * np.sqrt(2.0 / 14.0)) < apart.level < 2.0 * 0.3**2
+    assert together.level > 0.5  # half of the variance of 1 mm about the mean of both
 
 
 def test_opposite_plates_of_one_end_show_no_difference_between_views():

@@ -147,7 +147,9 @@ def fit(part: RegisteredPart, local: Floats, place: EndPlace, thickness: Floats)
     centred = [sheets.out - np.median(sheets.out) for sheets in faces if len(sheets.out)]
     margin = 3.0 * robust_sd_about_median(np.concatenate(centred or [np.empty(0)])) + 2.0
     fits = []
-    for of_design, (rows, out, cell, behind, behind_out, single_layer) in zip(place.section.faces, faces, strict=True):
+    for of_design, of_plate, (rows, out, cell, behind, behind_out, single_layer) in zip(
+        place.section.faces, thickness, faces, strict=True
+    ):
         across, half = of_design.across, of_design.half
         clear = np.abs(of_design.from_middle(local[rows])) < half - (
             min(margin, 0.5 * half) if of_design.narrow else margin
@@ -170,7 +172,7 @@ def fit(part: RegisteredPart, local: Floats, place: EndPlace, thickness: Floats)
             height = np.concatenate([out[clear][inliers], behind_out[inner]])
             terms = basis(local[both, 0], of_design.w(local[both]))[:, : view_variance.TERMS]
             marked = np.arange(len(both)) >= int(inliers.sum())
-            plate = view_variance.thickness(terms, local[both][:, [0, across]], height, marked)
+            plate = view_variance.thickness(terms, local[both][:, [0, across]], height, marked, float(of_plate))
         fits.append(FaceFit(mean, hypotheses, used, plate, single_layer))
     return fits
 

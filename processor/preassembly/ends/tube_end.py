@@ -245,7 +245,7 @@ def _quadrants(local: Floats, inward: Floats, on_outer: Bools, thickness: float)
         x, w = local[rows, 0], off[rows] / (0.25 * np.pi)
         at = np.stack([x, np.hypot(local[rows, 1], local[rows, 2]).mean() * off[rows]], axis=1)
         trend = np.stack([np.ones_like(x), x / ZONE_MM, w], axis=1)
-        found.append(view_variance.thickness(trend, at, -depth[rows], inner[rows]))
+        found.append(view_variance.thickness(trend, at, -depth[rows], inner[rows], thickness))
     return tuple(found)
 
 

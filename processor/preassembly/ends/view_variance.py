@@ -28,7 +28,8 @@ from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd, student_factor
 
 TERMS = 3  # of a plate's thickness: its mean, its changes along and across
-ALIKE_MM = 2.0  # plates that differ by less are of one nominal thickness: rolling and viewpoints differ by less
+ALIKE_MM = 2.0  # plates that differ by less may be of one nominal thickness: rolling and viewpoints differ by less
+DESIGNED_MM = 0.5  # plates are rolled in steps of 1 mm or more: those of one nominal thickness differ by less in a mesh
 PATCH_MM, FEWEST_OF_PATCH = 50.0, 4  # size of a patch, and points on either side of it
 FLOOR_MM = 0.004
 RISK = 1e-3  # that noise alone is taken for a difference between viewpoints
@@ -40,12 +41,14 @@ OF_PAIR = 2  # opposite plates of an end are seen from the same two sides: their
 class Thickness:
     """Thickness (3,) of a plate at an end, mm: mean, changes along and across; variances (3,) by noise.
 
-    ``sides`` are the variances of single points on its outer and on its inner side.
+    ``sides`` are the variances of single points on its outer and on its inner side. ``designed`` is the thickness that
+    it has in the design, mm; 0 = unknown.
     """
 
     value: Floats
     noise: Floats
     sides: tuple[float, float]
+    designed: float = 0.0
 
 
 class Variances(NamedTuple):
@@ -70,11 +73,12 @@ class Variances(NamedTuple):
 NONE = Variances()
 
 
-def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickness | None:
+def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools, designed: float = 0.0) -> Thickness | None:
     """Measure a plate by points (n,) at ``height`` above the design's outer side; None without an inner side.
 
     The two sides are compared patch by patch: ``at`` (n, 2) is the place of the points along and across the plate, mm,
-    ``trend`` (n, 3) are the terms there, and ``inner`` (n,) marks the points behind the outer side.
+    ``trend`` (n, 3) are the terms there, and ``inner`` (n,) marks the points behind the outer side. ``designed`` is its
+    thickness in the design; 0 = unknown.
     """
     patch = patch_numbers(at, PATCH_MM)
     count = int(patch.max(initial=-1)) + 1
@@ -100,7 +104,7 @@ def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickn
         return None
     solve = np.linalg.pinv(terms * root) * root.T
     of_terms = np.diag(solve @ np.diag(variance[enough]) @ solve.T)
-    return Thickness(solve @ difference[enough], of_terms, (sides[0], sides[1]))
+    return Thickness(solve @ difference[enough], of_terms, (sides[0], sides[1]), designed)
 
 
 def variances(
@@ -115,7 +119,7 @@ def variances(
     if not plates:
         return NONE
     value, noise = np.array([one.value for one in plates]), np.array([one.noise for one in plates])
-    group = _alike(value[:, 0])
+    group = _alike(plates)
     count = np.bincount(group)
     level = value[:, 0] - (np.bincount(group, value[:, 0]) / count)[group]
     # The mean of a group takes its share of the noise out of the differences.
@@ -147,10 +151,11 @@ def tails(ends: Sequence[Sequence[Thickness]]) -> Floats:
 
     Other ends show the variance of a plate's thickness. Opposite plates of an end count as one observation.
     """
-    value = np.array([plate.value[0] for end in ends for plate in end])
-    noise = np.array([max(plate.noise[0], FLOOR_MM**2) for end in ends for plate in end])
+    plates = [plate for end in ends for plate in end]
+    value = np.array([plate.value[0] for plate in plates])
+    noise = np.array([max(plate.noise[0], FLOOR_MM**2) for plate in plates])
     of_end = np.repeat(np.arange(len(ends)), [len(end) for end in ends])
-    group = _alike(value)
+    group = _alike(plates)
     found = np.full(len(ends), np.nan)
     for number in np.unique(of_end):
         own, others = of_end == number, of_end != number
@@ -171,11 +176,14 @@ def tails(ends: Sequence[Sequence[Thickness]]) -> Floats:
     return found
 
 
-def _alike(level: Floats) -> Ints:
-    """Return the number (n,) of each plate's group, of one nominal thickness, by their thickness ``level`` (n,)."""
-    order = np.argsort(level, kind="stable")
+def _alike(plates: Sequence[Thickness]) -> Ints:
+    """Return the number (n,) of each plate's group: of one thickness in the design, and about as thick."""
+    level, designed = np.array([(plate.value[0], plate.designed) for plate in plates]).reshape(-1, 2).T
+    order = np.lexsort((level, designed))
+    apart = np.diff(designed[order], prepend=designed[order[:1]]) > DESIGNED_MM
+    apart |= np.abs(np.diff(level[order], prepend=level[order[:1]])) > ALIKE_MM
     group = np.zeros(len(level), np.int64)
-    group[order] = np.cumsum(np.diff(level[order], prepend=level[order[:1]]) > ALIKE_MM)
+    group[order] = np.cumsum(apart)
     return group
 
 
