@@ -20,7 +20,7 @@ from itertools import zip_longest
 from pathlib import Path
 from queue import SimpleQueue
 
-from tests.mutation.nearest import Record, distances, record
+from tests.mutation.nearest import Record, record
 from tests.mutation.sites import Site, sites
 from tests.support import kernels
 from tests.support.structure import MODULES, ROOT, module_name
@@ -97,7 +97,7 @@ class Copy:
             return NO_TESTS, ""
         path = self.place / mutant.path
         source = path.read_text("utf-8")
-        put_away = self._compiled(mutant.path)
+        put_away = self._compiled(mutant)
         for each in put_away:  # compiled code has the old function in it, also where another file calls it
             each.rename(each.with_name(each.name + ".kept"))
         times = path.stat()
@@ -107,19 +107,17 @@ class Copy:
         finally:
             path.write_text(source, "utf-8")
             os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # or its kernels would be compiled again
-            for each in self._compiled(mutant.path):
+            for each in self._compiled(mutant):
                 each.unlink()
             for each in put_away:
                 each.with_name(each.name + ".kept").rename(each)
 
-    def _compiled(self, path: str) -> list[Path]:
-        """Return the files of kernels of a module and of all that use it."""
-        found: list[Path] = []
-        for name in distances(module_name(ROOT / path)):
-            source = MODULES.get(name)
-            if source is not None:
-                found += kernels.compiled(self.place / source.relative_to(ROOT))
-        return found
+    def _compiled(self, mutant: Mutant) -> list[Path]:
+        """Return the files of kernels that a mutant makes stale: of its file, and if it is compiled, of its users."""
+        changed = {module_name(ROOT / mutant.path)}
+        names = kernels.with_users(changed) if mutant.site.compiled else changed
+        sources = [MODULES[name].relative_to(ROOT) for name in sorted(names & MODULES.keys())]
+        return [path for source in sources for path in kernels.compiled(self.place / source)]
 
     def _run(self, tests: list[str]) -> tuple[str, str]:
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests]

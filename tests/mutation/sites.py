@@ -21,7 +21,10 @@ KEPT = (ast.JoinedStr, ast.Raise, ast.Assert)  # texts of errors are not numbers
 
 @dataclass(frozen=True)
 class Site:
-    """One change: characters ``start`` to ``end`` of the source become ``new``."""
+    """One change: characters ``start`` to ``end`` of the source become ``new``.
+
+    ``compiled``: it may stand in compiled code, as all does that is not within a plain function.
+    """
 
     kind: str
     line: int
@@ -29,6 +32,7 @@ class Site:
     end: int
     old: str
     new: str
+    compiled: bool
 
     def applied(self, source: str) -> str:
         return source[: self.start] + self.new + source[self.end :]
@@ -45,12 +49,20 @@ def sites(source: str) -> list[Site]:
         return lines[line - 1] + len(text.encode()[:column].decode())
 
     found = []
-    for node in _numeric_nodes(ast.parse(source)):
+    tree = ast.parse(source)
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    for node in _numeric_nodes(tree):
+        around = [one for one in functions if one.lineno <= node.lineno <= (one.end_lineno or 0)]
+        compiled = not around or any(_is_kernel(one) for one in around)
         start, end = offset(node.lineno, node.col_offset), offset(node.end_lineno, node.end_col_offset)
         for kind, new in _changes(node):
             old, new = source[start:end], f"({new.strip()})" if " " in new else new
-            found.append(Site(kind=kind, line=node.lineno, start=start, end=end, old=old, new=new))
+            found.append(Site(kind=kind, line=node.lineno, start=start, end=end, old=old, new=new, compiled=compiled))
     return sorted(found, key=lambda site: (site.start, site.end, site.kind, site.new))
+
+
+def _is_kernel(function: ast.FunctionDef) -> bool:
+    return any(word in ast.unparse(one) for one in function.decorator_list for word in ("njit", "inner", "vectorize"))
 
 
 def _numeric_nodes(tree: ast.AST) -> Iterator[ast.expr]:

@@ -24,22 +24,28 @@ def discard_stale():
     changed = {name for name in {**before, **now} if before.get(name) != now.get(name)}
     if not changed:
         return False
+    for name in with_users(changed) & MODULES.keys():
+        for path in compiled(MODULES[name]):
+            path.unlink(missing_ok=True)
+    STATE.parent.mkdir(exist_ok=True)
+    STATE.write_text(json.dumps(now), "utf-8")
+    return True
+
+
+def with_users(changed):
+    """Return names of modules, and of those whose kernels may have kernels or constants of them within."""
     users = defaultdict(set)
-    for name in now:
-        for imported in imports(MODULES[name]):
-            users[imported].add(name)
+    for name, path in MODULES.items():
+        if _has_kernels(path):
+            for imported in imports(path):
+                users[imported].add(name)
     waiting, stale = sorted(changed), set()
     while waiting:
         name = waiting.pop()
         if name not in stale:
             stale.add(name)
             waiting += users[name]
-    for name in stale & MODULES.keys():
-        for path in compiled(MODULES[name]):
-            path.unlink(missing_ok=True)
-    STATE.parent.mkdir(exist_ok=True)
-    STATE.write_text(json.dumps(now), "utf-8")
-    return True
+    return stale
 
 
 def compiled(source):

@@ -43,7 +43,9 @@ def constants_without_reason():
 
 
 def _numeric(value):
-    return any(isinstance(one, ast.Constant) and type(one.value) in (int, float) for one in ast.walk(value))
+    """Whether a value has numbers that were chosen: 0 and 1 are of axes, signs, rows and codes."""
+    numbers = (one.value for one in ast.walk(value) if isinstance(one, ast.Constant))
+    return any(type(one) in (int, float) and one not in (0, 1) for one in numbers)
 
 
 def called_once():
