@@ -20,6 +20,9 @@ SCALE_SD = 5e-6
 SHIFT_SD_MM = 0.2
 # Zero offset of the ranges of a calibrated scanner, which all of its views have in common.
 OFFSET_SD_MM = 0.2
+# What all surfaces have in common along their normals: bias by incidence, by the signal of their paint, and its layer.
+# Black targets were measured 0.2 to 0.7 mm nearer than white ones, in 7 of 8 views of a pulsed scanner.
+SURFACE_SD_MM = 0.3
 
 
 def scale_variance(length: float) -> float:

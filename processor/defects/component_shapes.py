@@ -179,7 +179,7 @@ def _errors(
         # The error of a pose that was not fitted to the design may be large: it moves, it does not deform.
         own = value - _rigid_part(fit, shape).values(fit.frame, points, outward)
         registration = np.full_like(value, field.stations_sd(rows, free=True))
-    shared = np.sqrt(levels.common_mm**2 + levels.systematic_mm**2 + registration**2)
+    shared = np.sqrt(levels.common[-1] ** 2 + levels.systematic_mm**2 + registration**2)
     return value, own, shape.sd(fit.frame, points, outward), shared
 
 

@@ -253,6 +253,8 @@ def _shapes_of(registered: Registered, aligned: Alignment, params: Params) -> tu
     surface = registered.surface
     inner = deviation_field.inner_cells(surface, params.edge_mm)
     field = deviation_field.of_pairs(registered.pairs, surface, registered.observed.stations, aligned, inner)
+    if aligned.fitted:
+        field = field.minus(np.full(len(inner), deviation_field.common_bias(field, surface)))
     return field, component_shapes.fit_all(field, surface)
 
 

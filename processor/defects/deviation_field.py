@@ -10,14 +10,19 @@ from scipy import ndimage
 
 from processor import tiles
 from processor.adjustment import moderated_variances, view_error_from_opposite_sides
+from processor.adjustment.scanner_class_errors import SURFACE_SD_MM
 from processor.defects.alignment import PAIRS_AT_ONCE, Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
-from processor.model import Bools, Floats, Ints
+from processor.model import NORMAL_95, Bools, Floats, Ints
+from processor.robust_statistics import robust_sd_about_median
 
 POOLED_CELLS = 9  # side of the square over which noise is pooled
 ABOUT_CELLS, SEEN_SHARE = 3, 0.5  # side of the square about a cell, and the least share of it that was seen
 LOCAL_FREE = 20.0  # degrees of freedom by which the noise about a cell is taken to be that of its face
+BODY_CELLS, FEWEST_BODIES = 24, 5  # cells of a component that show its level, and components that show a common one
+SURE = 3.0  # standard deviations of the median of their levels, beyond which they have it in common
+ONE_WAY = 0.5  # share of a surface that faces one way, beyond which an offset of all of it may be a movement
 PIECE_CELLS = 6.0  # side of a piece of a face, whose mean is compared with that of the other side
 
 
@@ -103,6 +108,25 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
         views=views,
         dof=dof,
     )
+
+
+def common_bias(field: Field, surface: DesignSurface) -> float:
+    """Return what all components lie outward of the design by, mm, as by a bias that all surfaces have.
+
+    0 where they do not agree on it, where it is more than the scanners of the class explain, or where most of what was
+    seen faces one way: there it is a movement.
+    """
+    seen = np.flatnonzero(field.seen * field.count)
+    weight = surface.share[seen]
+    if np.linalg.norm(weight @ surface.outward[seen]) > ONE_WAY * weight.sum():
+        return 0.0
+    component = component_of_cells(surface)[seen]
+    bodies = [number for number in np.unique(component) if (component == number).sum() >= BODY_CELLS]
+    level = np.array([np.median(field.deviation[seen[component == number]]) for number in bodies])
+    if len(level) < FEWEST_BODIES:
+        return 0.0
+    bias, sd = float(np.median(level)), robust_sd_about_median(level) / float(np.sqrt(len(level)))
+    return bias if SURE * sd < abs(bias) < NORMAL_95 * SURFACE_SD_MM else 0.0
 
 
 def _noise(pairs: Pairs, surface: DesignSurface, count: Floats) -> tuple[Floats, Floats]:

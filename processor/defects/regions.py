@@ -133,7 +133,7 @@ def is_significant(region: Region, field: Field, levels: Levels) -> bool:
     weight = field.seen[region.cells] / field.variance[region.cells]
     total = max(float(weight.sum()), 1e-30)
     size = max(0, int(np.searchsorted(levels.sides, np.sqrt(len(region.cells)), side="right")) - 1)
-    sd = float(scan_statistic.mean_sd(total, levels.inflation[size], field, levels))
+    sd = float(scan_statistic.mean_sd(total, levels.inflation[size], levels.common[size], field, levels))
     return abs(float(weight @ field.deviation[region.cells])) / total > float(levels.threshold[size]) * sd
 
 

@@ -38,19 +38,20 @@ EIGHT_NEIGHBOURS = np.ones((3, 3))
 class Levels:
     """Levels of significance by size of window (k,).
 
-    ``sides`` in cells; ``inflation`` of the noise over that of single points; ``threshold`` in standard deviations;
-    ``per_mm2``, the number of windows on one mm2, times the number of sizes. ``common_mm`` is the standard deviation of
-    means of the largest windows, independent of the number of points.
+    ``sides`` in cells; ``inflation`` of the noise over that of single points; ``common`` (k,), the standard deviation
+    of means that the same scatter would be independent of the number of points, mm; ``threshold`` in standard
+    deviations; ``per_mm2``, the number of windows on one mm2, times the number of sizes.
     """
 
     sides: tuple[int, ...]
     inflation: Floats
+    common: Floats
     threshold: Floats
     per_mm2: Floats
-    common_mm: float
     line_threshold: float
     line_per_mm2: float
     line_inflation: float
+    line_common: float
     systematic_mm: float
 
 
@@ -71,29 +72,26 @@ def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float, syste
     charts = surface.charts
     used = _used(field, charts)
     sides = tuple(side for side in SIDES if any(side <= charts.shape[k].min() for k in used)) or (1,)
-    scatter: list[float] = []
-    common = 0.0
+    scatter: list[tuple[float, float]] = []
     for side in sides:
         z, sd = _windows(field, charts, used, side)
-        if len(z) < FEWEST_WINDOWS:
-            scatter.append(scatter[-1] if scatter else 1.0)
-            continue
-        surplus = _surplus(z, sd, field.views)
-        scatter.append(float(np.sqrt(1.0 + surplus)))
-        common = float(np.sqrt(surplus) * np.median(sd))
+        scatter.append(_scatter(z, sd, field.views) if len(z) >= FEWEST_WINDOWS else (scatter or [(1.0, 0.0)])[-1])
+    inflation, common = np.array(scatter, float).T
+    line_inflation, line_common = _line_scatter(field, charts, used)
     cell = charts.cell_mm
     kinds = len(sides) + len(LINE_CELLS)
     windows = kinds / np.array([max(1, side // 4) * cell for side in sides]) ** 2
     lines = kinds * LINE_TURNS / cell**2
     return Levels(
         sides=sides,
-        inflation=np.asarray(np.maximum.accumulate(scatter), float),
+        inflation=np.maximum.accumulate(inflation),
+        common=common,
         threshold=-ndtri(0.5 * np.minimum(alarms_per_mm2 / windows, 0.5)),
         per_mm2=windows,
-        common_mm=common,
         line_threshold=-float(ndtri(0.5 * min(alarms_per_mm2 / lines, 0.5))),
         line_per_mm2=lines,
-        line_inflation=_line_inflation(field, charts, used),
+        line_inflation=line_inflation,
+        line_common=line_common,
         systematic_mm=systematic_mm,
     )
 
@@ -124,12 +122,15 @@ def widened(field: Field, levels: Levels) -> Field:
     return dataclasses.replace(field, variance=field.variance * (student / threshold) ** 2)
 
 
-def mean_sd(weight: Any, inflation: float, field: Field, levels: Levels) -> Any:
+def mean_sd(weight: Any, inflation: float, common: float, field: Field, levels: Levels) -> Any:
     """Return the standard deviation of means of cells, mm: noise, differences of unnamed views, systematic errors.
 
-    ``weight`` are sums of the inverse variances of cells, of which the noise is ``inflation`` times as large.
+    ``weight`` are sums of the inverse variances of cells. What means scatter more than by these is noise that is
+    ``inflation`` times as large, as by correlated points, or ``common`` mm, as by bias of a paint or an incidence,
+    which more points do not reduce: the larger of both counts.
     """
-    return np.hypot(inflation / np.sqrt(weight), np.hypot(levels.systematic_mm, field.views))
+    noise = np.maximum(inflation / np.sqrt(weight), np.hypot(1.0 / np.sqrt(weight), common))
+    return np.hypot(noise, np.hypot(levels.systematic_mm, field.views))
 
 
 def _used(field: Field, charts: Charts) -> list[int]:
@@ -147,9 +148,14 @@ def _windows(field: Field, charts: Charts, used: list[int], side: int) -> tuple[
     return np.concatenate(z), np.concatenate(sd)
 
 
-def _surplus(z: Floats, sd: Floats, views_mm: float) -> float:
-    """Return the variance of means by their formal standard deviations (n,), less 1 and that of unnamed views."""
-    return max(robust_sd_about_median(z) ** 2 - 1.0 - (views_mm / float(np.median(sd))) ** 2, 0.0)
+def _scatter(z: Floats, sd: Floats, views_mm: float) -> tuple[float, float]:
+    """Return by how much means scatter more than by their formal standard deviations (n,) and by unnamed views.
+
+    As a factor on these, and as a standard deviation of its own, mm.
+    """
+    typical = float(np.median(sd))
+    surplus = max(robust_sd_about_median(z) ** 2 - 1.0 - (views_mm / typical) ** 2, 0.0)
+    return float(np.sqrt(1.0 + surplus)), float(np.sqrt(surplus)) * typical
 
 
 def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> Finding:
@@ -157,14 +163,14 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> F
     shape = tuple(charts.shape[chart])
     finding = Finding(np.zeros(shape, np.int8), np.zeros(shape), np.full(shape, np.inf))
     sign = finding.sign
-    for side, inflation, threshold, per_mm2 in zip(
-        levels.sides, levels.inflation, levels.threshold, levels.per_mm2, strict=True
+    for side, inflation, common, threshold, per_mm2 in zip(
+        levels.sides, levels.inflation, levels.common, levels.threshold, levels.per_mm2, strict=True
     ):
         if side > min(shape):
             break
         top, weight = _window_sums(field, charts, chart, side, sign != 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            z = np.where(weight > 0.0, top / weight / mean_sd(weight, inflation, field, levels), 0.0)
+            z = np.where(weight > 0.0, top / weight / mean_sd(weight, inflation, common, field, levels), 0.0)
         if side == LINES_AFTER:
             _search_lines(field, charts, chart, levels, finding)
         if not (np.abs(z) > threshold).any():
@@ -201,7 +207,7 @@ def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, find
             offsets = _line(length, np.pi * turn / LINE_TURNS)
             sum_top, sum_weight, number = _along(padded, margin, offsets)
             with np.errstate(invalid="ignore", divide="ignore"):
-                sd = mean_sd(sum_weight, levels.line_inflation, field, levels)
+                sd = mean_sd(sum_weight, levels.line_inflation, levels.line_common, field, levels)
                 z = np.where(number >= COVERED * length, sum_top / sum_weight / sd, 0.0)
             for direction in (-1, 1):
                 towards = direction * score
@@ -229,8 +235,8 @@ def _long_runs(score: Floats, cells: Ints) -> Ints:
     return long
 
 
-def _line_inflation(field: Field, charts: Charts, used: list[int]) -> float:
-    """Return by how much the means of lines along the grid scatter more than by independent noise."""
+def _line_scatter(field: Field, charts: Charts, used: list[int]) -> tuple[float, float]:
+    """Return by how much the means of lines along the grid scatter more than by independent noise; see _scatter."""
     scores, sds = [np.empty(0)], [np.empty(0)]
     for chart in used:
         top, weight = _images(field, charts, chart, None)
@@ -244,7 +250,7 @@ def _line_inflation(field: Field, charts: Charts, used: list[int]) -> float:
             sds.append(1.0 / np.sqrt(sum_weight[enough]))
             scores.append(sum_top[enough] * sds[-1])
     z = np.concatenate(scores)
-    return float(np.sqrt(1.0 + _surplus(z, np.concatenate(sds), field.views))) if len(z) >= FEWEST_WINDOWS else 1.0
+    return _scatter(z, np.concatenate(sds), field.views) if len(z) >= FEWEST_WINDOWS else (1.0, 0.0)
 
 
 def _line(length: int, angle: float) -> list[tuple[int, int]]:

@@ -202,7 +202,7 @@ def test_a_bend_is_no_movement_where_the_pose_is_not_of_the_design(fitted, mean,
     top = np.flatnonzero(surface.outward[:, 2] > 0.5)
     blocks = shape_models.Blocks(surface.centres[top], surface.outward[top], none[top], np.ones(len(top)), 20.0)
     bend = shape_models.Shape("bend", (0, 2), np.array([2.0]), np.array([[0.01]]))
-    fit, levels = ComponentShape(0, frame, blocks, None), SimpleNamespace(common_mm=0.1, systematic_mm=0.2)
+    fit, levels = ComponentShape(0, frame, blocks, None), SimpleNamespace(common=np.array([0.1]), systematic_mm=0.2)
     of_pose = SimpleNamespace(fitted=fitted, sd=lambda points, _: np.full(len(points), 0.3))
     value, own, sd, shared = component_shapes._errors(fit, bend, surface, field, of_pose, levels)
     # Cells of a fiftieth of the length: a ten-thousandth. Signs are those of the front, above or below.
@@ -269,3 +269,42 @@ def test_a_region_is_significant_by_its_own_cells():
     mean_sd = float(np.sqrt(field.variance[cells[:9]].mean() / 9.0)) * levels.inflation.max()
     differing = dataclasses.replace(deviating, views=mean_sd)  # the deviation is 5.1 / sqrt(2) standard deviations
     assert not regions.is_significant(region, differing, levels)
+
+
+BOXES = tuple(((2_000 * i, 0, 0), (2_000 * i + 1_000, 600, 400)) for i in range(6))
+
+
+@pytest.mark.parametrize(
+    ("off", "of_one", "common"),
+    [
+        (0.2, 0.2, 0.2),
+        (0.2, 5.0, 0.2),  # one of six bodies moved
+        (0.8, 0.8, 0.0),  # more than a scanner is off
+        (0.0, 5.0, 0.0),
+    ],
+)
+def test_what_all_bodies_are_off_by_is_a_bias(off, of_one, common):
+    surface = surface_of(BOXES, 25.0)
+    body = deviation_field.component_of_cells(surface)
+    noise = np.random.default_rng(8).normal(0.0, SIGMA / np.sqrt(POINTS), len(body))
+    field = field_of(surface, pairs_of(surface, 8, np.where(body == 0, of_one, off) + noise))
+    # Medians of thousands of cells: SIGMA / sqrt(12 * 1000) = 0.005 each, of which the median of six is taken.
+    assert deviation_field.common_bias(field, surface) == pytest.approx(common, abs=0.01)
+
+
+def test_faces_that_all_face_one_way_show_no_bias():
+    surface = surface_of(BOXES, 25.0)
+    up = (surface.outward[:, 2] > 0.9).astype(float)
+    field = field_of(surface, pairs_of(surface, 9, np.full(len(up), 0.2)))
+    assert deviation_field.common_bias(dataclasses.replace(field, seen=field.seen * up), surface) == 0.0
+
+
+def test_bias_that_more_points_do_not_reduce_is_no_deviation_of_well_seen_windows():
+    """Half of the windows have a hundred times the points, and all scatter by 0.3 mm."""
+    rng = np.random.default_rng(10)
+    sd = np.tile([0.01, 0.1], 2_000)
+    inflation, common = scan_statistic._scatter(rng.normal(0.0, np.hypot(sd, 0.3)) / sd, sd, 0.0)
+    levels = SimpleNamespace(systematic_mm=0.0)
+    well, badly = scan_statistic.mean_sd(1.0 / sd[:2] ** 2, inflation, common, SimpleNamespace(views=0.0), levels)
+    assert well > 0.2  # the factor alone makes 0.05
+    assert badly > 0.3
