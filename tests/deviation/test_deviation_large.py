@@ -120,7 +120,7 @@ def test_a_point_beside_a_post_is_a_mixed_pixel_whatever_the_block_of_the_post(s
     np.testing.assert_allclose(blocks.distance, whole.distance, atol=1e-9)  # sums in another order
     on_wall = (whole.normals[:, 1] < -0.9) & (np.abs(whole.points[:, 1] + found[1].origin[1]) < 1.0)
     assert on_wall.sum() > 100
-    assert np.nanmax(np.abs(whole.distance[on_wall])) < 1.0
+    assert np.nanmax(np.abs(whole.distance[on_wall])) < 1e-9  # points lie on it: rounding
 
 
 def test_all_points_are_used_without_a_limit_of_points(small, monkeypatch):
@@ -143,7 +143,7 @@ def test_scans_that_lie_elsewhere_are_left_out_of_all_points(small):
     away = dataclasses.replace(scene.scans[1], T_project_scan=rigid.transform(np.eye(3), np.array([9e4, 0.0, 0.0])))
     result = deviation_step.run(dataclasses.replace(scene, scans=(scene.scans[0], away)), Params())
     assert "deviation.scans-elsewhere" in [reason.code for reason in result.reasons]
-    assert 0.9 < result.points_kept / (bracket_scenes.COUNT / 2) < 1.0
+    assert 0.9 < result.points_kept / (bracket_scenes.COUNT / 2) < 1.0  # less the 200 outliers of 12,000, and some more
     alone = deviation_step.run(dataclasses.replace(scene, scans=scene.scans[:1]), Params(register="none"))
     assert result.mean == pytest.approx(alone.mean, abs=0.05)  # other core points of the same scan: 0.015 came
 
