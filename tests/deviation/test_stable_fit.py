@@ -58,11 +58,13 @@ def test_half_of_a_structure_that_moved_does_not_take_the_other_half_along(seed)
     u[:, 2] -= 20.0 * 0.5 * (1.0 - np.cos(np.pi * share))
     found = stable_fit.fits(core, moved(core, u, seed), 2.0 * SPACING, SPACING, 0)
     shift_off, turn_off = off(found.stable, core, turn, shift)
-    assert shift_off < 0.15
-    assert turn_off < 0.05
-    assert off(found.best, core, turn, shift)[0] > 2.0
-    assert 0.5 < found.stable.share < 0.75
-    assert found.limit_mm < 1.0
+    # 5,000 core points of 0.32 mm, a third of them along each axis, are 0.0076 mm an axis, and 0.002 mrad with arms
+    # of 3.5 m; those that moved by less than the limit count too. Largest of 12 draws 0.032 mm and 0.007 mrad.
+    assert shift_off < 0.05
+    assert turn_off < 0.015
+    assert off(found.best, core, turn, shift)[0] > 2.0  # dragged along: 3.4 to 3.6 mm in 12 draws
+    assert 0.5 < found.stable.share < 0.75  # 7 of 12 points did not move, some by less than the limit
+    assert found.limit_mm < 0.65  # 1.96 sds of a core point are 0.62
 
 
 def test_covariances_agree_with_errors_of_a_stable_structure():
@@ -72,13 +74,13 @@ def test_covariances_agree_with_errors_of_a_stable_structure():
     z = []
     for seed in range(20):
         found = stable_fit.fits(core, moved(core, u, seed), 2.0 * SPACING, SPACING, 0)
-        assert found.stable.share > 0.95
+        assert found.stable.share > 0.95  # nothing moved: 1.0 in 60 draws
         T = rigid.transform(rigid.rotation_from_vector(np.array(turn)), np.array(shift))
         between = found.stable.motion @ rigid.invert(T)
         error = np.concatenate([rigid.vector_from_rotation(between[:3, :3]), between[:3, 3]])
         z.append(error / np.sqrt(np.diag(found.stable.covariance)))
-    # Core points here have points of their own: the step's share them, so that the variance is that of pi times fewer.
-    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.25
+    # The rms of 120 numbers scatters by 6.5 %: 2.6 of these.
+    assert 0.83 < np.sqrt(np.mean(np.square(z))) < 1.17
 
 
 def test_where_all_moved_otherwise_no_half_agrees():
@@ -88,7 +90,7 @@ def test_where_all_moved_otherwise_no_half_agrees():
     u[:, 2] = -25.0 * np.sin(3.0 * x + 1.0) * np.cos(2.0 * y) - 9.0 * np.sin(11.0 * x)
     u[:, 1] = 12.0 * np.sin(9.0 * x)
     found = stable_fit.fits(core, moved(core, u, 0), 2.0 * SPACING, SPACING, 0)
-    assert found.stable.share < 0.5
+    assert found.stable.share < 0.5  # of the name; 0.13 to 0.14 in three draws
 
 
 def test_a_plane_determines_no_motion_along_itself_but_an_error_along_its_normal():
@@ -108,7 +110,7 @@ def test_where_no_block_agrees_there_is_no_stable_motion_but_a_best_one(bend_mm)
     u = np.zeros_like(core.points)
     u[:, 2] = bend_mm * ((core.points[:, :2] / 12_000.0) ** 2).sum(axis=1)
     found = stable_fit.fits(core, moved(core, u, 0), 2.0 * SPACING, SPACING, 0)
-    assert found.stable.share < 0.05
+    assert found.stable.share < 0.05  # no more than lies where the bend is level: 0.011 to 0.017 in six draws
     assert np.isnan(found.stable.motion).all()
     assert np.isnan(found.stable.error_mm)
     assert not found.determined
