@@ -94,22 +94,23 @@ def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_b
     np.testing.assert_array_equal(result.T_design_scan, np.eye(4))
     found = metrics(scene, result, truth)["core points farther from the truth than their LOD95"]
     assert found.limit == 5.0
-    assert found.value < 5.0
+    assert found.value < 5.0  # the limit of that metric
     up = result.core.normals[:, 2] > 0.99
     known = up & np.isfinite(result.core.lod95)
     expected = field(result.core.points[known])[:, 2]
-    assert np.median(np.abs(result.core.distance[known] - expected)) < 0.5
+    assert np.median(np.abs(result.core.distance[known] - expected)) < 0.25  # 1 mm of some 30 points: 0.12
     low, high = result.significant_share_ci95
     assert low < result.significant_share < high
     assert "deviation.best-fit-would-move" in codes(result)
     assert 3.0 < result.best_fit_shift @ [0.0, -1.0, 0.0] < 5.0  # as the scan lies 4 mm to +y
     fitted = run(scene, register="fine")
     assert fitted.registration == "fine"
-    assert abs(np.nanmean(fitted.core.distance[result.core.normals[:, 1] > 0.9])) < 0.7  # the best fit has it
+    assert abs(np.nanmean(fitted.core.distance[result.core.normals[:, 1] > 0.9])) < 0.2  # a best fit has it: 0.03 came
     # It is bent all along, and of so few points no block agrees with any motion.
     assert codes(fitted) == ["deviation.no-stable-half", "deviation.best-fit", "deviation.views-by-class"]
     assert fitted.status == "weak"
     assert np.isfinite(fitted.registration_error)
+    # The limit of that metric.
     assert metrics(scene, fitted, truth)["core points farther from the truth than their LOD95"].value < 5.0
 
 
@@ -121,11 +122,12 @@ def test_of_two_fits_the_other_is_stated(fit):
     assert result.status == "weak"
     if fit == "stable":
         assert codes(result) == ["deviation.no-stable-half", "deviation.stable-fit", "deviation.views-by-class"]
+        # The limit of that metric.
         assert metrics(scene, result, truth)["core points farther from the truth than their LOD95"].value < 5.0
     else:
         stated = ["deviation.best-fit", "deviation.stable-fit-would-move", "deviation.views-by-class"]
         assert codes(result)[1:] == stated
-        assert np.linalg.norm(result.best_fit_shift) < 0.05
+        assert np.linalg.norm(result.best_fit_shift) < 1e-9  # nothing is left for the same fit: rounding
 
 
 def test_a_thin_plate_seen_from_one_side_is_not_surely_registered(monkeypatch):
@@ -144,7 +146,7 @@ def test_a_pose_about_which_points_scatter_is_not_proven(sigma, proven, monkeypa
     monkeypatch.setattr("tests.deviation.test_deviation_step.SIGMA", sigma)
     scene, _ = scene_of(3, still, count=1_500)
     result = run(scene, register="coarse")
-    assert 0.6 * sigma < result.sigma < 1.4 * sigma
+    assert 0.8 * sigma < result.sigma < 1.2 * sigma  # of 12 mm three draws gave 12.1 to 13.0
     assert (codes(result)[0] == "deviation.no-fit") is not proven
     assert result.status == ("ok" if proven else "weak")
     placed = design_pose.pose(scene, {"deviation": result}, DefectParams())
@@ -161,9 +163,9 @@ def test_a_scan_in_another_frame_is_registered_whatever_its_order():
     off = result.T_design_scan @ rigid.invert(T)
     sd = np.sqrt(np.diag(result.covariance))
     moved = np.concatenate([rigid.vector_from_rotation(off[:3, :3]), off[:3, 3]])
-    assert (np.abs(moved) < 4.0 * sd + 1e-9).all()
-    assert result.ambiguity > 2.0
-    assert result.significant_share < 0.06
+    assert (np.abs(moved) < 4.0 * sd + 1e-9).all()  # four sds, and rounding
+    assert result.ambiguity > 3.0  # 1.3 and less is ambiguous; 9.7 to 10.7 in three draws
+    assert result.significant_share < 0.06  # a twentieth at most: LOD95 holds the pose's error too
     points = np.random.default_rng(3).permutation(scene.scans[0].points)
     mixed = Scene("bracket", "structure", (Scan("scan", points),), structure=scene.structure, units="mm")
     again = run(mixed)
@@ -175,7 +177,7 @@ def test_a_scan_in_another_frame_is_registered_whatever_its_order():
 def test_an_undamaged_structure_is_a_twentieth_beyond_where_the_frame_is_sure(seed):
     scene, _ = scene_of(seed, still, count=40_000)
     result = run(scene, register="none", registration_error_mm=0.0)
-    assert 0.035 < result.significant_share < 0.065
+    assert 0.035 < result.significant_share < 0.065  # a twentieth, to three sds of its own interval of 0.010
     cautious = run(scene, register="none")
     assert cautious.registration_error > 0.0
     assert cautious.significant_share < result.significant_share
@@ -200,7 +202,7 @@ def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not
     assert result.status == "weak"
     assert codes(result)[0] == "deviation.scans-unplaced"
     assert result.reasons[0].values["scans"] == "c"
-    assert abs(np.nanmean(result.core.distance)) < 0.05
+    assert abs(np.nanmean(result.core.distance)) < 0.05  # three sds of 4,000 points of 1 mm
     assert "deviation.unposed-scans" in codes(run(several, register="none"))
 
 
@@ -229,6 +231,7 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
     assert result.reasons[0].values["scans"] == ", ".join(f"scan-{k}" for k in range(wrong))
     assert result.reasons[0].values["points"] == pytest.approx(1_500 * wrong, rel=0.01)  # less the outliers
     assert result.registration == ("coarse" if elsewhere else "as given")
+    # A twentieth at most, as LOD95 holds a registration error; three draws gave 0.013 to 0.044, and 0.95 to 0.96 known.
     assert result.significant_share < 0.07
     assert np.isfinite(result.core.lod95).mean() > 0.9
 
@@ -245,6 +248,7 @@ def test_a_scan_with_more_points_of_the_ground_than_of_the_structure_is_placed_r
     result = deviation_step.run(dataclasses.replace(scene, scans=(scan,)), deviation_step.Params())
     assert result.status == "ok"
     assert result.registration == ("coarse" if elsewhere else "as given")
+    # As above: three draws gave 0.010 to 0.023, and 0.949 known.
     assert result.significant_share < 0.07
     assert np.isfinite(result.core.lod95).mean() > 0.9
 
@@ -262,7 +266,7 @@ def test_a_station_of_a_merged_scan_is_named_too():
     )
     assert result.status == "weak"
     assert result.reasons[0].values["scans"] == "S2"
-    assert result.points_kept < 10_500
+    assert result.points_kept < 10_500  # two thirds of 15,000, and points of the third that lie in reach by chance
 
 
 def test_a_scan_of_something_else_fails():
@@ -326,6 +330,7 @@ def test_method_paper_reports_points_without_level_at_its_scales(tmp_path):
     surface, face = trimesh.sample.sample_surface(mesh, 20_000, seed=0)
     nearest = face[cKDTree(surface).query(result.core.points + result.origin)[1]]
     outward = np.einsum("ni,ni->n", result.core.normals, mesh.face_normals[nearest])
+    # But at edges, where the nearest sample may lie on the next face: 0.990 and 0.992 came.
     assert np.nanmean(outward > 0.0) > 0.99
     known = np.isfinite(result.core.lod95)
     expected = 1.96 * (
@@ -355,11 +360,12 @@ def test_the_papers_attitude_is_called_ambiguous_where_another_fits_as_well():
     scene, _ = arch(count=5_000)
     result = run(scene, method="paper", register="coarse")
     assert result.status == "ambiguous"
-    assert 1.0 <= result.ambiguity < 1.3
+    assert 1.0 <= result.ambiguity < 1.3  # below 1.3 is ambiguous
     assert {"deviation.ambiguous", "deviation.paper-ambiguous"} & set(codes(result))
     bracket_scene, _ = scene_of(12, still, count=8_000)
     sure = run(bracket_scene, method="paper", register="coarse")
     assert sure.status == "ok"
+    # 1.3 and less is ambiguous: two draws gave 2.6 and 2.9, and turns of 0.003 and 0.004.
     assert sure.ambiguity > 2.0
     assert rigid.rotation_angle(sure.T_design_scan[:3, :3]) < 0.01
 
@@ -373,6 +379,7 @@ def test_cases_are_compared_after_they_were_refined_and_alike_axes_are_swapped(w
     T = pose([0.3, -0.2, 1.5], [500.0, -80.0, 7.0])
     kept = np.random.default_rng(1).random(len(seen)) < np.where(seen[:, 0] * seen[:, 1] > 0.0, 1.0, 0.8)
     found = baseline.coarse(rigid.apply(rigid.invert(T), seen[kept]), target)
+    # The next case is 1.57 off; two draws gave 0.06 and 0.11, as a quarter of the plate is seen more.
     assert rigid.rotation_angle(found.T_target_source[:3, :3] @ T[:3, :3].T) < 0.15
     assert found.ambiguity > 1.3
 
