@@ -186,7 +186,7 @@ def test_negative_coordinates_to_stake_out_are_numbers():
         found, hangers=dataclasses.replace(found.hangers, top=found.hangers.top - [1234.5, 0.0, 0.0])
     )
     rows = list(csv.DictReader(io.StringIO(hanger_report.stake_out(west).decode("utf-8"))))
-    assert float(rows[0]["x_m"]) == pytest.approx(0.003 - 1.2345, abs=6e-5)
+    assert float(rows[0]["x_m"]) == pytest.approx(0.003 - 1.2345, abs=6e-5)  # written to 0.1 mm
 
 
 def test_table_and_plan():
@@ -211,7 +211,7 @@ def test_a_run_with_a_ceiling(tmp_path):
     results = runs.run(frame, tmp_path / "out")
     hangers = results.steps["spheres"].hangers
     lowest = results.steps["spheres"].balls.lowest[:, 2]
-    assert np.nanmax(np.abs(hangers.length - lowest)) < 1e-9
+    assert np.nanmax(np.abs(hangers.length - lowest)) < 1e-9  # the level is 0: rounding
     assert {"hangers.csv", "stakeout.csv", "nodes.dxf", "lowest.csv"} <= {
         one.name for one in (tmp_path / "out").iterdir()
     }

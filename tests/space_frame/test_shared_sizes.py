@@ -18,7 +18,7 @@ def radii(sizes, counts, seed=0, error=0.0, scatter=0.25, sd=0.05):
 
 def test_many_balls_of_one_unlisted_size_are_a_size():
     found = shared_sizes.estimated(*radii([84.0], [40]), PLAUSIBLE, NO_DESIGN)
-    assert found.radii == pytest.approx([84.0], abs=4.0 * 0.26 / np.sqrt(40))
+    assert found.radii == pytest.approx([84.0], abs=4.0 * 0.26 / np.sqrt(40))  # four sds: 40 balls
     assert found.estimated
     assert not PLAUSIBLE.estimated
 
@@ -26,7 +26,7 @@ def test_many_balls_of_one_unlisted_size_are_a_size():
 def test_sizes_of_a_catalogue_of_another_maker_are_found():
     sizes, counts = [57.7, 64.7, 78.0, 84.3, 98.9], [19, 25, 20, 7, 4]
     found = shared_sizes.estimated(*radii(sizes, counts), PLAUSIBLE, NO_DESIGN)
-    np.testing.assert_allclose(found.radii, sizes, atol=4.0 * 0.26 / np.sqrt(4))
+    np.testing.assert_allclose(found.radii, sizes, atol=4.0 * 0.26 / np.sqrt(4))  # four sds: a size of four balls
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -31,7 +31,7 @@ def test_intersections_of_exact_axes_are_the_nodes():
     nodes = rng.uniform(-5e4, 5e4, (20, 3))
     starts = nodes + rng.uniform(-20.0, 20.0, nodes.shape)
     met = axis_intersection.intersect_axes(ends_at(rng, nodes, 4, sd=1e-9, starts=starts), starts, 0.05)
-    assert np.abs(met.positions - nodes).max() < 1e-6
+    assert np.abs(met.positions - nodes).max() < 1e-7  # axes 1e-9 mm off, some of a node nearly parallel
     assert met.used.all()
     assert (met.axis_count == 4).all()
 
@@ -71,8 +71,8 @@ def test_outlying_axis_is_excluded_from_its_node():
     met = axis_intersection.intersect_axes(ends, nodes, 0.05)
     assert not met.used[::6].any()
     assert met.used.sum() >= 5 * 50 - 2  # 4.5 sigma: hardly another one
-    assert (np.linalg.norm(met.positions - nodes, axis=1) < 1.0).all()
-    assert met.eccentricity_mm < 0.1
+    assert (np.linalg.norm(met.positions - nodes, axis=1) < 0.5).all()  # five axes of 0.1 mm; their mean would be 3 off
+    assert met.eccentricity_mm < 0.1  # it stays what it is at least, 0.05
 
 
 def test_two_axes_fix_a_point_and_one_or_parallel_ones_do_not():

@@ -82,7 +82,7 @@ def test_inverse_is_that_of_another_library():
     A = rng.normal(size=(7, 4))
     out = np.empty((4, 4))
     assert inverse_of(A.T @ A, out)
-    np.testing.assert_allclose(out, np.linalg.inv(A.T @ A), rtol=1e-9)
+    np.testing.assert_allclose(out, np.linalg.inv(A.T @ A), rtol=1e-9)  # rounding
     assert not inverse_of(np.diag([1.0, 2.0, 0.0, 1.0]), out)
 
 
@@ -109,6 +109,7 @@ def test_covariance_with_station_shifts_is_that_of_the_joint_problem():
         J[i, :4] = residual(*points[i], *u[i], 0.0, 0.0, 0.0, 50.0)[2:]
         J[i, 4 + 3 * station[i] : 7 + 3 * station[i]] = J[i, :3]
     joint = J.T @ J + np.diag([0.0] * 4 + [0.25] * 6)
+    # Rounding, and the tolerance of the solution.
     np.testing.assert_allclose(covariance, np.linalg.inv(joint)[:4, :4], rtol=1e-9)
     np.testing.assert_allclose(state, [0, 0, 0, 50.0], atol=1e-9)
 
@@ -130,14 +131,18 @@ def test_errors_reach_the_bound_and_intervals_cover(radius, count, visible, sigm
     # Balls of free radii have the offset that scanners of the class may have, which these draws have not.
     covariance = covariance - OFFSET_SD_MM**2 * np.outer([0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 1.0, 1.0])
     chance = 2.5 / np.sqrt(2.0 * draws)  # of an rms, beyond which one in a hundred falls
+    # The biweight's efficiency of 0.95 makes 1.03; four draws gave 0.97 to 1.11.
     assert max(ball_fit.ratios(errors, bounds)) < 1.05 + chance
     sd = np.sqrt(np.einsum("kii->ki", covariance))
     pulls = np.sqrt(np.mean((errors / sd) ** 2, axis=0))
+    # The noise is estimated from as few as 30 points: 5 % too wide, 10 % too narrow, and an rms's chance.
     assert (pulls > 0.95 - chance).all()
     assert (pulls < 1.10 + chance).all()
     lowest = errors @ ball_fit.DOWN / np.sqrt(np.einsum("i,kij,j->k", ball_fit.DOWN, covariance, ball_fit.DOWN))
+    # A share of 300 draws scatters by 1.3 %, of 150 by 1.8 %.
     assert 0.92 < np.mean(np.abs(lowest) < 1.96) < 0.98
     if visible == 0.25:
+        # 2.5 sds of the mean, and a bias of 2.5 % of the noise.
         assert abs(errors[:, 3].mean()) < 0.05 + 2.5 * errors[:, 3].std() / np.sqrt(draws)
 
 
@@ -150,6 +155,7 @@ def test_the_noise_is_read_from_residuals():
     noise, believed = noise_model(e, c, R, np.ones(40_000), np.array([4.0, 0.0, 0.0]))
     model = noise[0] + noise[1] * R**2 / c + noise[2] * (1 - c**2) / c**2
     assert believed == 40_000
+    # A twentieth of strays raises a median of sizes by 6.2 %; 5.7 and 6.6 % came in two draws.
     assert np.median(np.abs(np.sqrt(model / variance) - 1.0)) < 0.08
     few, worth = noise_model(e[:20], c[:20], R[:20], np.ones(20), np.array([4.0, 0.0, 0.0]))
     assert few.tolist() == [4.0, 0.0, 0.0]
