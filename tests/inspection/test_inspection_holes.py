@@ -179,9 +179,9 @@ def test_the_share_that_a_pin_passes_is_unsure_where_the_play_is_used_up():
         departure[1] = [0.0, off]
         found.append(measured(*bore_cloud(np.random.default_rng(1), departure))["holes-1-6-pass-through"])
     shares, widths = np.array([(one.deviation, one.high - one.low) for one in found]).T
-    assert (np.diff(shares) <= 1e-6).all()
+    assert (np.diff(shares) <= 1e-6).all()  # rounding
     np.testing.assert_allclose(shares[[0, -1]], [0.0, -1.0 / 6.0], atol=1e-3)  # chances beyond three sds
-    assert widths[[0, -1]].max() < 1e-6 < 0.1 < widths.max()
+    assert widths[[0, -1]].max() < 1e-6 < 0.1 < widths.max()  # no chances but beside the play: rounding
 
 
 def test_mixed_pixels_in_the_bore_do_not_move_it():
@@ -310,5 +310,5 @@ def test_the_adjustment_of_many_holes_needs_no_matrix_of_all_points():
     )
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert np.abs(solved).max() < 0.2
+    assert np.abs(solved).max() < 0.07  # five sds of a thousand points of 0.3 mm, each along one direction
     assert most < 8 * len(places) * 3 * (count + 3)  # bytes of a number for each point and unknown
