@@ -47,6 +47,7 @@ def source(frame):
 def matched(nodes, true):
     """Rows of the nodes nearest to each true one; every node has to be one's nearest."""
     distance = np.linalg.norm(nodes.positions[:, None] - true[None], axis=2)
+    # As the evaluation counts nodes as found: within 3 mm; 0.3 to 0.8 mm came in ten draws.
     assert distance.min(axis=1).max() < 3.0, "a node that is none"
     assert distance.min(axis=0).max() < 3.0, "a node is missing"
     return distance.argmin(axis=0)
@@ -68,11 +69,11 @@ def test_all_nodes_and_members_are_found_without_a_design(frame, source):
     assert nodes.count == len(frame.nodes)
     joined = {tuple(sorted(pair)) for pair in zip(tubes.node_a.tolist(), tubes.node_b.tolist(), strict=True)}
     assert joined == {tuple(sorted((rows[i], rows[j]))) for i, j in frame.members}
-    assert np.median(np.linalg.norm(nodes.positions[rows] - frame.nodes, axis=1)) < 0.8
-    assert np.abs(tubes.radii - 30.0).max() < 1.0
+    assert np.median(np.linalg.norm(nodes.positions[rows] - frame.nodes, axis=1)) < 0.5  # 0.17 and 0.23 came
+    assert np.abs(tubes.radii - 30.0).max() < 0.6  # of some 40 that are known to 0.1 mm: 0.35 came
     # The cylinder alone is the tube: 135 mm of ball, sleeve and cone at either end.
     lengths = np.linalg.norm(nodes.positions[tubes.node_b] - nodes.positions[tubes.node_a], axis=1)
-    assert np.abs(lengths - tubes.lengths - 270.0).max() < 80.0
+    assert np.abs(lengths - tubes.lengths - 270.0).max() < 80.0  # 33 and 40 mm came
 
 
 def test_errors_of_nodes_agree_with_their_covariance():
@@ -94,7 +95,7 @@ def test_a_design_20_mm_off_gives_the_same_nodes(frame, source):
     nodes, tubes = measure(source, starts, frame.members)
     assert len(tubes.radii) == len(frame.members)
     sd = np.sqrt(nodes.covariance.trace(axis1=1, axis2=2))
-    assert (np.linalg.norm(nodes.positions - frame.nodes, axis=1) < 4.0 * sd).all()
+    assert (np.linalg.norm(nodes.positions - frame.nodes, axis=1) < 4.0 * sd).all()  # four sds
 
 
 @pytest.mark.parametrize("how", ["order", "chunks", "threads"])
@@ -116,7 +117,7 @@ def test_same_bytes_whatever_the_order_the_chunks_and_the_threads(source, how):
 def test_nodes_are_found_without_scanner_positions(frame, source):
     nodes, _ = find(InMemory(source.points))
     rows = matched(nodes, frame.nodes)
-    assert np.median(np.linalg.norm(nodes.positions[rows] - frame.nodes, axis=1)) < 1.0
+    assert np.median(np.linalg.norm(nodes.positions[rows] - frame.nodes, axis=1)) < 0.6  # 0.28 and 0.31 came
 
 
 def test_lamps_pipes_and_strays_are_no_nodes(frame, source):
