@@ -45,6 +45,7 @@ def found(frame, sleeves=True, seed=3, **kinds):
 
 def test_the_density_of_residuals_is_the_normal_one():
     for e, sd in ((0.0, 1.0), (1.5, 0.4), (-3.0, 2.0)):
+        # Rounding.
         assert ball_joint_classification._normal(e, sd) == pytest.approx(norm.pdf(e, 0.0, sd), rel=1e-12)
 
 
@@ -54,11 +55,12 @@ def test_joints_of_a_scaffold_are_no_nodes():
     assert len(every) >= len(frame.nodes) + 8  # most joints of the tower are places where members meet
     distance = cKDTree(frame.nodes).query(kept)[0]
     assert len(kept) == len(frame.nodes)
-    assert distance.max() < 10.0
+    assert distance.max() < 3.0  # as the evaluation counts nodes as found; 0.45 came
 
 
 def test_balls_without_sleeves_are_recognised_by_their_surface():
     odds = log_odds_of_ball(np.array([40.0] * 8 + [-9.0] * 4 + [1.0]), np.array([-60.0] * 12 + [-20.0]))
+    # Log odds: 20 to 1.
     assert (odds[:8] > 3.0).all()
     assert (odds[8:12] < -3.0).all()
 

@@ -169,7 +169,7 @@ def test_balls_are_measured_where_the_pattern_leaves_several_poses_and_nowhere_e
         assert match(cloud.found(), d).status == "ambiguous"
         found = match(cloud.found(), d, sized=sized)
         assert found.status == "ok"
-        assert cloud.error(found.T_design_scan) < 12.0
+        assert cloud.error(found.T_design_scan) < 8.0  # by less than a node moved
         assert (found.assignment < 0).sum() == 2
     assert len(asked) == 2
     clear = Cloud(design(), 1)
@@ -195,6 +195,7 @@ def test_coordinates_shifted_by_one_bay_are_ambiguous():
     found = match(NodePattern(cloud.positions + np.array([3000.0, 0.0, 0.0])), d)
     assert found.status == "ambiguous"
     shift = np.array([T[:3, 3] for T in (found.T_design_scan, *found.rivals)])
+    # Nodes moved by some mm, and a bay is 3 m.
     assert np.abs(shift).min(axis=0)[0] < 10.0
     assert (np.abs(shift[:, 0] + 3000.0) < 10.0).any()
 
@@ -266,12 +267,13 @@ def test_movements_in_the_designs_own_frame():
     assert out.gauge == "design-coordinates"
     np.testing.assert_array_equal(out.design, cloud.truth[out.found])
     np.testing.assert_allclose(out.vector, (cloud.moved + noise)[out.found], atol=1e-6)  # float64 at 4300 km is 5e-7 mm
-    np.testing.assert_allclose(out.ci95, np.tile(1.959964 * sd, (len(out.found), 1)), rtol=1e-6)
+    np.testing.assert_allclose(out.ci95, np.tile(1.959964 * sd, (len(out.found), 1)), rtol=1e-7)  # of seven digits
     # What is uncertain about the frame itself is in every interval, farther out more.
     datum = np.diag([1e-4**2] * 3 + [0.4**2] * 3)
     place = found.positions.mean(axis=0)
     wider = movement(matched, found, covariance, shifted, datum, place)
     arm = found.positions[wider.found] - place
+    # Rounding.
     np.testing.assert_allclose(
         wider.covariance[:, 0, 0], sd[0] ** 2 + 0.4**2 + 1e-8 * (arm[:, 1] ** 2 + arm[:, 2] ** 2), rtol=1e-12
     )
@@ -439,7 +441,7 @@ def test_robust_fit_is_scipys_without_outliers():
     middle, goal = np.average(source, axis=0, weights=weight), np.average(target, axis=0, weights=weight)
     best, _ = Rotation.align_vectors(target - goal, source - middle, weights=weight)
     np.testing.assert_allclose(T[:3, :3], best.as_matrix(), atol=1e-12)  # rounding
-    assert weight.min() > 0.3
+    assert weight.min() > 0.5  # nothing lies apart: 0.78 and 0.85 came
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -456,7 +458,7 @@ def test_nodes_that_the_design_lacks_in_the_middle_do_not_hide_the_true_pose(see
     sized = NodePattern(found, np.zeros(3), d.radii[keep], np.full(len(keep), 0.3))
     answer = match(NodePattern(found), known, sized=lambda: sized)
     if answer.status is Status.OK:
-        assert np.abs(answer.T_design_scan[:3, :3] @ R - np.eye(3)).max() < 0.01
+        assert np.abs(answer.T_design_scan[:3, :3] @ R - np.eye(3)).max() < 0.002  # 3 mm over 6 m are 5e-4
         assert int((answer.assignment >= 0).sum()) == len(d.centres) - 5
     else:
         assert answer.status is Status.AMBIGUOUS

@@ -60,12 +60,12 @@ def test_ransac_has_smaller_radius_errors_than_least_squares():
     scene, truth = frame()
     by_method = {method: metrics(scene, run(scene, Params(method=method)), truth) for method in PAPERS}
     median = {method: by_name["radius error, median"].value for method, by_name in by_method.items()}
-    assert median["ransac"] < 0.7
-    assert 3.0 < median["least-squares"] < 8.0
+    assert median["ransac"] < 0.5  # 200 points of 2 mm, seen from one side: 0.30 and 0.34 came
+    assert 3.0 < median["least-squares"] < 8.0  # sleeves of 40 points each are in the crop: 4.6 and 4.8 came
     assert by_method["ransac"]["radius error, median"].limit == 3.0
     assert math.isnan(by_method["least-squares"]["radius error, median"].limit)
     assert by_method["ransac"]["balls not found"].value == 0.0
-    assert by_method["ransac"]["lowest point error, median"].value < 0.5
+    assert by_method["ransac"]["lowest point error, median"].value < 0.5  # 0.23 and 0.25 came
 
 
 def test_rows_are_the_designs_nodes_in_its_order():
@@ -123,7 +123,7 @@ def test_intervals_of_balls_without_members_cover_a_range_offset():
     moved = replace(scene, scans=(Scan("all", points + 0.6 * rays),))
     balls = run(moved, Params()).balls
     off = np.column_stack([balls.centres - true, balls.radii - 45.0])
-    assert np.abs(off[:, 2]).max() > 0.4
+    assert np.abs(off[:, 2]).max() > 0.4  # else void
     assert (np.abs(off) < 1.96 * np.sqrt(np.einsum("kii->ki", balls.covariance))).all()
     assert (np.abs(balls.lowest[:, 2] - (true[:, 2] - 45.0)) < 1.96 * balls.lowest_sd).all()
 
@@ -214,8 +214,9 @@ def test_search_without_a_design_uses_the_scanner_positions():
     results = [run(scene, Params()) for scene in scenes]
     for result in results:
         assert reason("spheres.robust-ranges") in result.reasons
-        assert np.linalg.norm(result.balls.centres[0]) < 0.3
-        assert result.balls.radii[0] == pytest.approx(70.0, abs=0.2)
+        # 0.5 mm of 800 points are 0.018, and centre and radius depend on each other: 0.03 came.
+        assert np.linalg.norm(result.balls.centres[0]) < 0.1
+        assert result.balls.radii[0] == pytest.approx(70.0, abs=0.1)
     np.testing.assert_allclose(results[0].balls.centres, results[1].balls.centres, atol=ROUNDING_MM)
     unknown = run(Scene("t", "structure", (Scan("s", points),)), Params())
     assert reason("spheres.robust-distances") in unknown.reasons

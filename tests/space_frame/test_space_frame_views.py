@@ -40,8 +40,9 @@ def test_intervals_of_lowest_points_cover_with_and_without_view_differences(shif
         wide.append(np.median(found.lowest_sd))
         message = next(one for one in found.messages if one.code == "spheres.unnamed-views")
         sd = dict(message.values)["common"]
-        assert sd < (0.25 if shift_mm == 0.0 else 3.0 * shift_mm)
-    assert np.mean(np.abs(pulls) < 1.96) > 0.85
+        assert sd < (0.15 if shift_mm == 0.0 else 3.0 * shift_mm)  # without shifts 0.03 to 0.09 came; three sds
+    assert np.mean(np.abs(pulls) < 1.96) > 0.85  # of 27 at 95 % fewer than 23 in one of 100 cases
+    # 0.2 mm is assumed of views at least: 0.28 came without shifts, 0.45 and 0.53 with.
     assert np.median(wide) < (0.35 if shift_mm == 0.0 else 1.0)
 
 
@@ -50,7 +51,7 @@ def test_errors_of_views_common_to_all_spheres_are_part_of_the_whole():
     shared = found.views.shared @ np.swapaxes(found.views.shared, 1, 2)
     left = found.covariance - shared
     assert (np.linalg.eigvalsh(left).min(axis=1) > 0.0).all()
-    assert (shared[:, 2, 2] > 0.2**2 - 1e-9).all()
+    assert (shared[:, 2, 2] > 0.2**2 - 1e-9).all()  # 0.2 mm is assumed at least
 
 
 def test_intervals_of_tubes_of_a_merged_cloud_cover_shifted_views():
@@ -68,7 +69,7 @@ def test_intervals_of_tubes_of_a_merged_cloud_cover_shifted_views():
     assert (np.linalg.eigvalsh(whole) > 0.0).all()
     assert whole[1, 2, 2] > whole[0, 2, 2]
     least = of_tubes(dataclasses.replace(found.views, sd=0.0), tubes)
-    assert (np.einsum("mii->mi", least)[:, :2] > 0.2**2 - 1e-9).all()
+    assert (np.einsum("mii->mi", least)[:, :2] > 0.2**2 - 1e-9).all()  # as above
     assert (np.einsum("mii->mi", whole - least) > 0.0).all()
 
 

@@ -26,7 +26,7 @@ def test_voxels_are_those_of_numpy(cloud):
     assert found.number == (count >= 2).sum()
     at = [rows[tuple(c)] for c in found.cells.tolist()]
     assert (found.counts == count[at]).all()
-    assert np.abs(found.means - means[at]).max() < 1e-8
+    assert np.abs(found.means - means[at]).max() < 1e-8  # rounding, in sums
     for b in range(len(found.blocks)):
         assert (found.cells[found.starts[b] : found.starts[b + 1]] // voxels.SIDE == found.blocks[b]).all()
         for k, other in enumerate(found.beside[b]):
@@ -66,6 +66,7 @@ def test_principal_axes_of_any_matrix():
             )  # a closed form: roots of rounding
             assert np.linalg.norm(axis) == pytest.approx(1.0)
             if scale[1] < 0.5 < scale[0]:
+                # As above.
                 assert np.linalg.norm(M @ axis - first * np.array(axis)) < 1e-6
 
 
@@ -82,7 +83,7 @@ def test_a_line_is_one_segment(cloud):
 def test_hash_thinning_depends_on_coordinates_alone(cloud):
     whole = {tuple(p) for p in np.rint(cloud * 100.0).astype(int).tolist()}
     kept = hash_sampling.thinned(InMemory(cloud), 10_000)
-    assert len(kept) == pytest.approx(10_000, abs=4.0 * np.sqrt(7_500))
+    assert len(kept) == pytest.approx(10_000, abs=4.0 * np.sqrt(7_500))  # four sds
     assert {tuple(p) for p in kept.tolist()} <= whole
     again = hash_sampling.thinned(InMemory(cloud[::-1], chunk_size=999), 10_000, threads=2)
     assert sorted(map(tuple, again.tolist())) == sorted(map(tuple, kept.tolist()))

@@ -68,7 +68,7 @@ def test_radius_changes_by_an_offset_of_ranges_as_a_fit_to_moved_points_does(pla
 def test_a_tube_seen_from_one_side_keeps_its_radius():
     """The points lie on a circle of the same radius, shifted along the rays, but for the limb."""
     one = stations([(0, 5000, 0)], np.zeros((7, 7)), shared_offset_sd=OFFSET)
-    assert np.sqrt(station_error_propagation.of_radii(tube(), one)[0]) < 0.01 * OFFSET
+    assert np.sqrt(station_error_propagation.of_radii(tube(), one)[0]) < 1e-9  # rounding
 
 
 def test_a_motion_common_to_all_stations_moves_the_axis_as_much():
