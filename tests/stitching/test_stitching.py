@@ -57,7 +57,7 @@ def test_covariance_is_that_of_a_left_perturbation_in_the_project_frame(room):
         np.testing.assert_allclose(T[:3, 3], position, atol=1e-9)  # float64 at 10 m: 1e-12
         x, y, z = position
         J = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
-        np.testing.assert_allclose(np.sqrt(np.diag(J @ C @ J.T)), sd, rtol=1e-9)
+        np.testing.assert_allclose(np.sqrt(np.diag(J @ C @ J.T)), sd, rtol=1e-9)  # rounding
     assert not scans.covariance[0].any()
 
 

@@ -156,7 +156,7 @@ def test_intervals_cover_and_no_sighting_is_rejected_without_a_blunder():
         squares.append(found.control.ratio * found.control.redundancy)
         normal.append(found.control.sightings.off / found.control.sightings.sd)
         doubted += not found.control.sightings.used.all() or found.control.loosened > 1.0
-    assert 0.935 < np.mean(inside) < 0.965
+    assert 0.935 < np.mean(inside) < 0.965  # two sds, as above
     assert np.all(np.mean(inside, axis=0) > 0.90)  # 95 % of 120 within 2.0 %, the least of 24
     assert np.mean(squares) == pytest.approx(12 * 3 - 6, rel=0.05)  # sqrt(2 / 30 / 120) is 2.4 %
     assert chi2.cdf(squares, 30).std() == pytest.approx(12**-0.5, rel=0.1)  # evenly spread, to 4.1 %
@@ -186,8 +186,9 @@ def test_a_point_with_a_blunder_is_named_and_left_out(off):
         np.testing.assert_array_equal(seen.used, [name != "P2" for name in seen.point])
         # Its sightings' mean, which the poses follow by a share: five seeds of each size differ by up to 22 %.
         assert found.reasons[1].values["size_mm"] == pytest.approx(off, rel=0.35)
-        assert np.abs(in_site(found)[:, :3, 3] - true[:, :3, 3]).max() < 6.0
+        assert np.abs(in_site(found)[:, :3, 3] - true[:, :3, 3]).max() < 4.0  # 1.2 to 2.3 came, of twelve each
         left_out = seen.used == 0
+        # What is left out is beyond chance.
         assert (np.linalg.norm(seen.off[left_out] / seen.sd[left_out], axis=1) > 3.0).all()
 
 
@@ -227,9 +228,9 @@ def test_intervals_cover_a_blunder_that_cannot_be_located():
     found = adjusted(T, C, points)
     assert found.reasons[1].code == "stitch.control-undecided"
     assert found.control.sightings.used.all()
-    assert found.control.loosened > 5.0
+    assert found.control.loosened > 5.0  # by 40 mm among three points of 1 mm: 11 came
     sd = np.sqrt(np.diag(found.covariance)).reshape(-1, 6)[:, 3:]
-    assert (np.abs(in_site(found)[:, :3, 3] - true[:, :3, 3]) < 3.0 * sd).all()
+    assert (np.abs(in_site(found)[:, :3, 3] - true[:, :3, 3]) < 3.0 * sd).all()  # three sds
 
 
 def test_sightings_without_sd_get_the_assumed_sd_of_single_points():
@@ -310,7 +311,7 @@ def test_picked_scans_are_laid_to_control_points():
     assert np.abs(off).max() < 4.0  # 2 mm of picks, and their turns at the scanner
     middle = [scan.points.mean(axis=0) for scan in scene.scans]
     at = [rigid.apply(a, p) - rigid.apply(b, p) for a, b, p in zip(scans.T_project_scan, want, middle, strict=True)]
-    assert (np.abs(at) < 4.0 * scans.position_sd).all()
+    assert (np.abs(at) < 4.0 * scans.position_sd).all()  # four sds
     assert (scans.position_sd > 0.0).all()  # the reference is not held
     assert result.control.redundancy == 3 * 30 - 6
     used = result.reasons[0]
@@ -374,6 +375,7 @@ def test_control_points_of_a_folder_reach_tables_json_and_terminal(tmp_path):
     assert len(found["control"]["sightings"]) == 18
     table = rows_of(out / "control.csv")
     assert [row["used"] for row in table if row["point"] == "T3"] == ["no"] * 3
+    # Of sightings of 2 mm, 2.5 sds; others within five.
     assert all(abs(float(row["dz_mm"]) - 70.0) < 5.0 for row in table if row["point"] == "T3")
     assert all(abs(float(row["dz_mm"])) < 5.0 * float(row["sd_z_mm"]) for row in table if row["used"] == "yes")
     poses = rows_of(out / "stitch.csv")

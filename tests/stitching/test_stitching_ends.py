@@ -85,7 +85,7 @@ def test_ends_in_one_gap_weigh_as_one_and_spread_ends_by_their_number():
     slanting = edge_constraints.variance(matches(anywhere, np.arange(200)))
     np.testing.assert_allclose(slanting, 60.0**2 / 12.0)
     steep = edge_constraints.variance(matches(np.linspace(-0.5, 0.5, 200), np.zeros(200, np.int64)))
-    np.testing.assert_allclose(1.0 / (1.0 / steep).sum(), 60.0**2 / 12.0 / 200, rtol=1e-9)
+    np.testing.assert_allclose(1.0 / (1.0 / steep).sum(), 60.0**2 / 12.0 / 200, rtol=1e-9)  # rounding
 
 
 def test_variance_of_ends_in_step_with_the_grid():

@@ -64,7 +64,7 @@ def test_more_points_make_no_more_cells(monkeypatch):
     assert cells[1] > 1.5 * cells[0]  # a cell of four times the points has twice the side
     result = adjusted(T, scans)
     off = np.abs(errors(result.scans.T_project_scan, T)[0][1:])
-    assert (off < 4.0 * result.scans.position_sd[1:]).all()
+    assert (off < 4.0 * result.scans.position_sd[1:]).all()  # four sds
     assert result.scans.status == ("ok",) * 3
 
 

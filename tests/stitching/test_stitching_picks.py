@@ -61,7 +61,7 @@ def test_seven_parameters_absorb_a_scale_that_six_show():
     np.testing.assert_allclose(free.T_a_b[:3, :3], 1.0005 * R, atol=1e-12)  # rounding
     np.testing.assert_allclose(free.T_a_b[:3, 3], [100.0, 200.0, 300.0], atol=ROUNDING_MM)
     assert (free.scale, fixed.scale) == pytest.approx((1.0005, 1.0005), abs=1e-12)  # rounding
-    assert np.abs(fixed.residuals).max() > 1.0
+    assert np.abs(fixed.residuals).max() > 1.0  # a scale of 5e-4 over metres
 
 
 @pytest.mark.parametrize("scale", [0.995, 1.005])
@@ -77,7 +77,7 @@ def test_written_matrix_of_seven_parameters_includes_the_scale(scale, noise):
         worst.append(np.sqrt(((in_b @ found[:3, :3].T + found[:3, 3] - true) ** 2).sum(axis=1).mean()))
         assert result.scans.scale[1] == pytest.approx(np.linalg.det(found[:3, :3]) ** (1 / 3), abs=1e-12)  # rounding
         pulls.append((result.scans.scale[1] - scale) / max(result.scans.scale_sd[1], 1e-12))
-    assert max(worst) < 3.0 * noise + ROUNDING_MM
+    assert max(worst) < 3.0 * noise + ROUNDING_MM  # three times the noise of a pick
     assert noise == 0.0 or np.mean(np.abs(pulls) < 1.96) >= 0.8  # of ten, two by a chance of 9 %
 
 
@@ -242,7 +242,7 @@ def test_a_single_pair_needs_a_larger_scale_to_be_reported():
     """
     assert three_point.cause_of_scale(1.0005, 1e-4, 1000.0, 2) is None
     assert three_point.cause_of_scale(1.0005, 1e-4, 1000.0, 60).code == "stitch.scale"
-    assert three_point.cause_of_scale(1.003, 1e-4, 5000.0, 2).values["ci95_ppm"] == pytest.approx(430.0, abs=0.5)
+    assert three_point.cause_of_scale(1.003, 1e-4, 5000.0, 2).values["ci95_ppm"] == pytest.approx(430.3, abs=0.05)
 
 
 def test_a_true_scale_is_reported_and_its_interval_covers():
