@@ -114,7 +114,7 @@ def test_a_height_between_two_joints_is_linear():
         ends.append(np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))]))
     vertices, faces = box_girder_mesh.mesh(edge, edge * [1, -1, 1], *ends)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    assert off(mesh, np.array([[1000.0, 0.0, 900.0], [3000.0, 100.0, 1100.0], [2000.0, 400.0, 990.0]])).max() < 1e-6
+    assert off(mesh, np.array([[1000.0, 0.0, 900.0], [3000.0, 100.0, 1100.0], [2000.0, 400.0, 990.0]])).max() < 1e-9
 
 
 def test_edges_and_joints_that_do_not_belong_together():
@@ -212,7 +212,7 @@ def test_ends_are_measured_as_with_meshes(without_meshes):
         known = error[i][np.isfinite(error[i])]
         assert np.sqrt(np.mean(known**2)) < 0.25  # points 25 mm apart with 1 mm of noise, as with meshes
         spread = result.components.key_points_sd[i][np.isfinite(error[i])]
-        assert np.mean(np.abs(known) < 3.5 * spread) > 0.97
+        assert np.mean(np.abs(known) < 3.5 * spread) > 0.97  # nearly all within 3.5 sds; errors of an end hang together
 
 
 def measured(scan, index, design):

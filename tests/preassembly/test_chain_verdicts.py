@@ -79,6 +79,7 @@ def test_edges_are_judged_along_their_length_by_limits_of_the_span():
         _, bottom, top = maximum_interval.of_independent(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
         low.append(bottom)
         high.append(top)
+    # Or more: by the sum over all that can be the extreme.
     assert np.mean((np.array(low) <= 0.0) & (np.array(high) >= 0.0)) >= 0.95
 
 
@@ -95,7 +96,7 @@ def test_quantities_of_the_edges_by_hand():
                 "elevation": (2.5, 0.125)}  # fmt: skip
     for name, (value, sd) in expected.items():
         np.testing.assert_allclose(found[name][0], value)
-        np.testing.assert_allclose(found[name][1], sd, rtol=1e-4)
+        np.testing.assert_allclose(found[name][1], sd, rtol=3e-5)  # 1.96 for 1.959964
     assert [len(found[name][0]) for name in ("inner_arc", "lateral_axis")] == [4, 2]
 
 

@@ -49,10 +49,10 @@ def test_the_sides_of_an_i_are_the_edges_of_its_flanges():
         (PlateFace.LEFT, B, middle, half, False),
     ]
     assert [one[0] for one in found] == [one[0] for one in expected]
-    np.testing.assert_allclose([one[1:] for one in found], [one[1:] for one in expected], atol=1e-6)
+    np.testing.assert_allclose([one[1:] for one in found], [one[1:] for one in expected], atol=1e-9)  # float64
     assert [(corner.upright, corner.level) for corner in place.section.corners] == [(4, 0), (1, 0), (2, 3), (5, 3)]
     assert section.on_steel([place.section] * 2).tolist() == [True] * 5 + [False, True, False]
-    np.testing.assert_allclose(joint_end._design_thickness(surface, place), [FLANGE, 0, 0, FLANGE, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(joint_end._design_thickness(surface, place), [FLANGE, 0, 0, FLANGE, 0, 0], atol=1e-9)
 
 
 def test_a_hole_in_a_web_at_a_joint_makes_no_i_of_a_box():
@@ -106,7 +106,7 @@ def test_outer_faces_of_a_strongly_curved_part_contain_its_corners(radius_mm):
     part, joint = curved_box(radius_mm)
     outer = outer_faces.outer_faces(part, [joint])
     for corner in joint[:4]:
-        assert np.linalg.norm(outer.vertices[outer.faces].reshape(-1, 3) - corner, axis=1).min() < 1e-6
+        assert np.linalg.norm(outer.vertices[outer.faces].reshape(-1, 3) - corner, axis=1).min() < 1e-9  # float64
     height = np.linalg.norm(outer.vertices[outer.faces].reshape(-1, 3)[:, [0, 2]], axis=1)
     assert not ((height > radius_mm + 1.0) & (height < radius_mm + 799.0)).any()  # nothing of the inner sides
 

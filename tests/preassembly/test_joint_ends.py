@@ -106,7 +106,7 @@ def test_corners_centimetres_off_are_found_within_their_intervals(seed):
     assert end.doubts == ()
     truth = np.vstack([corners, *(0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)))])
     assert sds(end).max() < 0.4  # twice the 0.2 mm
-    assert (np.abs(end.departure - truth) < 4.0 * np.hypot(sds(end), ROUGH_MM)).all()
+    assert (np.abs(end.departure - truth) < 4.0 * np.hypot(sds(end), ROUGH_MM)).all()  # four sds
 
 
 @pytest.mark.parametrize("through", ["webs", "flanges", "mitred"])
@@ -155,7 +155,7 @@ def test_a_face_seen_as_one_strip_is_within_its_interval_where_it_was_not_seen(s
     shift = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 9.0], [0.0, 0.0, -7.0]])
     end = fitted(built(points[seen], shift), rng)
     sd = sds(end)[[2, 3], 2]
-    assert (np.abs(end.departure[[2, 3], 2] - shift[2:, 2]) < 2.5 * sd).all()
+    assert (np.abs(end.departure[[2, 3], 2] - shift[2:, 2]) < 2.5 * sd).all()  # 2.5 sds
     assert (sd > 1.0).all()  # 40 of 1200 mm were seen
 
 
@@ -200,7 +200,7 @@ def test_waves_of_the_plates_are_in_the_middles_of_the_edges():
     off = end.departure[4, 2] - np.sin(1.2)
     sd = sds(end)
     assert abs(off) < 0.25  # without the waves in the model it is -0.93
-    assert (np.abs(np.append(off, end.departure[:2, 2])) < 3.0 * np.append(sd[4, 2], sd[:2, 2])).all()
+    assert (np.abs(np.append(off, end.departure[:2, 2])) < 3.0 * np.append(sd[4, 2], sd[:2, 2])).all()  # three sds
 
 
 def test_densities_of_points_near_an_end_face_integrate_to_their_mass():
@@ -329,7 +329,7 @@ def test_a_face_seen_as_a_strip_and_one_outlier_keeps_its_corners():
     strip = (points[:, 2] == 0.0) & (points[:, 0] > -60.0)
     points = np.vstack([points[~bottom | strip], [[-480.0, 0.6 * B, -40.0]]])
     end = fitted(points, rng)
-    assert (np.abs(end.departure) < 4.0 * np.hypot(sds(end), ROUGH_MM)).all()
+    assert (np.abs(end.departure) < 4.0 * np.hypot(sds(end), ROUGH_MM)).all()  # four sds
 
 
 @pytest.mark.parametrize("thickness", [16.0, 24.0])

@@ -126,6 +126,7 @@ def test_intervals_of_large_departures_include_what_the_linear_model_leaves_out(
         coefficients=100.0 * np.eye(17)[0], covariance=np.zeros((17, 17)), pose=np.zeros((6, 6)), place=place,
         turn_known=True, plates=(), ring_noise=0.0,
     )  # fmt: skip
+    # Rounding.
     np.testing.assert_allclose(tube_end.estimate(end).covariance, (0.004**2 + 0.5**2 / 3.0) * np.eye(24), rtol=1e-9)
 
 

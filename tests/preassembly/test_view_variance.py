@@ -94,7 +94,7 @@ def test_views_that_differ_are_not_taken_for_rolling(one_outer):
     """Also where the outer sides at both ends were seen from one place, nineteen in twenty limits hold the truth."""
     rng = np.random.default_rng(7)
     found = [of_boxes(rng, 0.3, 0.0, one_outer) for _ in range(30)]
-    assert np.mean([one.level for one in found]) > 0.3**2
+    assert np.mean([one.level for one in found]) > 0.3**2  # a limit is above the variance of that sd
     assert np.mean([one.evident for one in found]) > 0.9  # of 30
 
 
