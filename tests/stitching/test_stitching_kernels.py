@@ -96,7 +96,7 @@ def test_points_next_to_the_edge_of_a_bar_are_left_out_without_a_grid():
     assert not clear[(a > 0.0181) & ~side].any()  # a step of 0.002 beside the edge, but for noise
     inner = (a < 0.015) & (np.abs(e) < 0.045)
     # Two steps and more from it.
-    assert clear[inner].mean() > 0.9
+    assert clear[inner].mean() > 0.9  # 0.966 and 0.988 came
 
 
 @pytest.mark.parametrize("count", [5, 4000])

@@ -223,6 +223,7 @@ def test_a_blunder_in_one_pair_does_not_widen_the_intervals_of_others():
     in_a[0] += 4000.0
     result = picked(dataclasses.replace(scene, picks=dataclasses.replace(scene.picks, in_a=in_a)))
     assert BLUNDERS.intersection(codes(of_pairs(result)))
+    # Scans hang on a pair less.
     assert np.nanmax(result.scans.position_sd) < 3.0 * np.nanmax(picked(scene).scans.position_sd)
     # Six picks of 2 mm over some metres, at 30 m.
     assert np.abs(errors(result.scans.T_project_scan, T)[0]).max() < 30.0
