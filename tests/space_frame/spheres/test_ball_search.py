@@ -83,7 +83,7 @@ def test_a_ball_of_a_hundredth_of_a_street_is_found(place, radius):
     # Noise of 8 mm a point and 3 mm a line, by some ten lines
     assert np.linalg.norm(one.fit.sphere.centre - centre) < 10.0
     assert one.fit.sphere.radius == pytest.approx(300.0, abs=10.0)
-    assert one.fit.inliers[on].mean() > 0.9
+    assert one.fit.inliers[on].mean() > 0.9  # within 4.7 sds but strays
 
 
 @pytest.mark.parametrize("radius", [None, 300.0])
@@ -93,7 +93,7 @@ def test_a_ball_in_four_lines_of_a_scanner_is_found(radius):
     points, on = street_clouds.street(np.random.default_rng(0), centre, 300.0, sigma=4.0, rays=rays)
     assert len(np.unique(np.round(np.degrees(np.arcsin(points[on, 2] / np.linalg.norm(points[on], axis=1))), 1))) <= 5
     (one,) = find_balls(points, np.random.default_rng(0), most=10, radius_mm=radius)
-    assert np.linalg.norm(one.fit.sphere.centre - centre) < 10.0
+    assert np.linalg.norm(one.fit.sphere.centre - centre) < 10.0  # as above
 
 
 def test_a_street_without_a_ball_has_none():

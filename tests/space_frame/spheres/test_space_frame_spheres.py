@@ -154,7 +154,7 @@ def test_a_target_on_a_mount_needs_no_member_and_no_catalogue():
     assert found.evidence == ("ball",)
     assert found.flag == ("ok",)
     error = np.append(found.centres[0] - centre[0], found.radii[0] - 70.0)
-    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance[0])) + 1e-9).all()
+    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance[0])) + 1e-9).all()  # four sds
     assert np.abs(error).max() < 1.0  # noise of 0.8 mm
 
 
@@ -212,7 +212,7 @@ def test_crops_of_many_points_keep_an_even_share_whatever_the_order():
     assert 0.8 * 2000 < kept[0] <= 2000 < within[0]  # a step is a factor of 2^(1/4), and what it lets by is chance's
     some = got.points[: kept[0]]
     assert np.abs(some.mean(axis=0)).max() < 4.0 * 45.0 / np.sqrt(kept[0])  # sd a coordinate in a sphere: r / root 5
-    assert np.bincount(got.station[: kept[0]]).min() > 0.28 * kept[0]
+    assert np.bincount(got.station[: kept[0]]).min() > 0.29 * kept[0]  # a third less four sds of a share of 2000
 
 
 def test_methods_of_the_paper_use_the_points_of_method_ray(roof, found):
