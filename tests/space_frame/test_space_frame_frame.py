@@ -47,6 +47,7 @@ def test_every_ball_is_found_without_a_design(roof):
     assert checks["nodes found within 3 mm"].value == 100.0
     assert checks["nodes that are none"].value == 0.0
     assert "spheres.joined-only" in codes(result.reasons)
+    # Balls share the errors of stations, and what scanners of the class may have is in the intervals alone: 0.73 came.
     assert 0.7 < checks["centres, rms of error by standard deviation"].value < 1.3
 
 
@@ -54,10 +55,10 @@ def test_rows_are_the_designs_nodes_in_its_order(roof, designed):
     (scene, truth), result = roof, designed
     assert result.balls.ids.tolist() == scene.frame.ids.tolist()
     assert result.movement_reference.gauge == "design-coordinates"
-    assert errors(result, truth).max() < 1.5
+    assert errors(result, truth).max() < 0.6  # 0.29 came, as with a ball that was not built
     true = truth.frame.centres - scene.frame.centres
     pull = (result.balls.movement - true) / (result.balls.movement_ci95 / 1.96)
-    assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3
+    assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3  # as above: 0.78 came
 
 
 @pytest.mark.slow  # every day: the square roof, below
@@ -85,9 +86,9 @@ def test_a_list_of_nodes_in_coordinates_of_the_site_gives_the_sag_and_the_best_f
     row = {number: k for k, number in enumerate(result.balls.ids.tolist())}
     rows = [row[number] for number in listed.ids.tolist()]
     by_design, by_fit = result.balls.design_movement[rows], result.balls.best_fit_movement[rows]
-    assert np.abs(by_design - sag).max() < 0.5
+    assert np.abs(by_design - sag).max() < 0.5  # as above: 0.26 came
     assert result.gauges.largest_difference == pytest.approx(np.linalg.norm(by_design - by_fit, axis=1).max())
-    assert result.gauges.largest_difference > 4.0
+    assert result.gauges.largest_difference > 4.0  # else void
     answer = {None: by_design, "own": by_fit}[stated]
     np.testing.assert_array_equal(result.balls.movement[rows], answer)
     gauge, basis = {None: ("design-coordinates", "stations"), "own": ("best-fit", "stated")}[stated]
@@ -109,7 +110,7 @@ def test_unbuilt_node_is_not_found_and_undesigned_node_is_extra(roof):
     assert result.balls.flag[7] == "not-found"
     assert np.isnan(result.balls.centres[7]).all()
     rest = np.arange(len(centres)) != 7
-    assert errors(result, truth, rest).max() < 1.5
+    assert errors(result, truth, rest).max() < 0.6  # as above
     assert result.status == "partial"
 
 
@@ -194,7 +195,8 @@ def test_sizes_of_balls_decide_the_turn_of_a_square_roof(square):
     design, R = elsewhere(scene.frame, without, beyond)
     result = run(dataclasses.replace(scene, frame=design), Params())
     assert result.matching.status == "ok"
-    assert np.degrees(rigid.rotation_angle(result.matching.T_design_scan[:3, :3] @ R.T)) < 0.2
+    # The next pose is a quarter turn off; 0.009 came.
+    assert np.degrees(rigid.rotation_angle(result.matching.T_design_scan[:3, :3] @ R.T)) < 0.05
     assert wrong_sizes(result) == truly_wrong(scene, truth) - set(without)
     assert (np.array(result.balls.flag) == "not-found").sum() == len(beyond)
 

@@ -155,7 +155,7 @@ def test_a_target_on_a_mount_needs_no_member_and_no_catalogue():
     assert found.flag == ("ok",)
     error = np.append(found.centres[0] - centre[0], found.radii[0] - 70.0)
     assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance[0])) + 1e-9).all()  # four sds
-    assert np.abs(error).max() < 1.0  # noise of 0.8 mm
+    assert np.abs(error).max() < 0.2  # 0.8 mm of 956 points is 0.026; 0.04 and 0.05 came
 
 
 def test_stations_that_moved_are_noticed_and_enter_the_covariance():
@@ -169,7 +169,7 @@ def test_stations_that_moved_are_noticed_and_enter_the_covariance():
     assert "spheres.stations-disagree" in [one.code for one in found.messages]
     pull = (found.lowest[:, 2] - centres[:, 2] + radii) / found.lowest_sd
     still = fit_spheres(source, nodes, tubes, ball_catalogue.load(), station_covariance=np.zeros((4, 3, 3)))
-    assert (still.lowest_sd < 0.6 * found.lowest_sd).mean() > 0.7
+    assert (still.lowest_sd < 0.6 * found.lowest_sd).mean() > 0.7  # by shifts of 2 mm: all of them came
     assert np.sqrt(np.mean(pull**2)) < 1.6  # as above
 
 
