@@ -168,7 +168,7 @@ def test_a_folder_without_meshes_comes_back_with_thicknesses_of_the_design(tmp_p
     start = scene.arch.joint_points[0]
     near = rib.vertices[np.linalg.norm(rib.vertices - start[0], axis=1) < 60.0]
     # The ring's inner corner: less than a plate from the outer one, along both sides.
-    assert np.abs(np.linalg.norm(near - start[0], axis=1) - np.sqrt(2.0) * 0.7 * 36.0).min() < 0.01
+    assert np.abs(np.linalg.norm(near - start[0], axis=1) - np.sqrt(2.0) * 0.7 * 36.0).min() < 1e-9
     written["components"]["rib1"]["plate_mm"] = -1.0
     (out / "design.json").write_text(json.dumps(written))
     with pytest.raises(InputError, match="rib1: expected a number above 0 as 'plate_mm'"):

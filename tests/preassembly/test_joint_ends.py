@@ -186,8 +186,8 @@ def test_a_face_of_which_one_side_alone_was_seen_may_be_either(further_in):
     assert end.doubts == (reason("preassemble.inner-side", faces=("top",)),)
     sd = sds(end)
     off = np.abs(end.departure + np.array([0.0, 0.0, further_in * T]))[[2, 3, 6], 2]  # P3, P4 and P7 are on the top
-    assert (off < 1.96 * sd[[2, 3, 6], 2] + 0.2).all()
-    assert sd[[0, 1, 4], 2].max() < 0.5
+    assert (off < 1.96 * sd[[2, 3, 6], 2] + 0.2).all()  # and the 0.2 mm that ends are known to
+    assert sd[[0, 1, 4], 2].max() < 0.2  # as above, seen on both sides: 0.02 came
 
 
 def test_waves_of_the_plates_are_in_the_middles_of_the_edges():
@@ -243,7 +243,7 @@ def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
     adjusted = adjustment.adjust([member], np.empty((0, 8, 3)), np.empty((0, 4, 4)), 0.1)
     assert np.abs(adjusted.motions[0][:3, 3]).max() < 1.0 + 60_000.0 * 2e-5  # its turn is about the middle
     moved = adjusted.motions[0] @ np.array([0.0, 0.0, 60_000.0, 1.0])
-    assert abs(moved[0]) < 1.0
+    assert abs(moved[0]) < 0.01  # noise alone would make decimetres; 0.0002 came
 
 
 def test_registration_error_is_common_to_both_ends_of_a_part():
@@ -269,7 +269,7 @@ def test_registration_error_is_common_to_both_ends_of_a_part():
     for end in (parts[0].ends[1], parts[1].ends[0]):
         left = np.sqrt(np.diag(end.without_pose(pose)))
         # The error of the registration cancels in the gap: (0.1 / 0.003)^2 of it, by inverses in float64
-        np.testing.assert_allclose(left, noise, rtol=1e-3)
+        np.testing.assert_allclose(left, noise, rtol=1e-9)
     gaps, moved, at_rest, largest = [], [], [], []
     for _ in range(400):
         wrong = np.sqrt(np.diag(pose)) * rng.standard_normal((2, 6))
@@ -294,17 +294,17 @@ def test_registration_error_is_common_to_both_ends_of_a_part():
         # Error of the last part's outer end: by its movement and by its registration.
         at = np.array([[6000.0, 0.0, 0.0]])
         moved.append((rigid.apply(found.motions[1], at) - at)[0] - rigid.motion(at)[0] @ wrong[1])
-    # A standard deviation of 400 draws is known to 3.5 %, the largest of dozens to a tenth.
+    # A standard deviation of 400 draws is known to 3.5 %: four of these, for the largest of dozens.
     pulls = np.array(gaps) / np.sqrt(np.diag(stated.gap_covariance[0]))
-    np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.2)  # of the gap at the poses found
+    np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.15)  # of the gap at the poses found
     drawn_sd = np.std(np.array(at_rest).reshape(400, 48, 2), axis=0)
-    np.testing.assert_allclose(drawn_sd, np.sqrt(np.vstack(stated.at_rest_variance)), rtol=0.2)
+    np.testing.assert_allclose(drawn_sd, np.sqrt(np.vstack(stated.at_rest_variance)), rtol=0.15)
     halves = span_and_closure.mean_max_ci95(stated.gaps.reshape(-1, 1), np.diag(stated.gap_covariance[0])[:, None])
     assert (np.quantile(largest, 0.95, axis=0) <= halves).all()  # the true gaps are zero
     J, own = rigid.motion(at - parts[1].centre)[0], rigid.motion(at)[0]
     both = J @ stated.motion_with_pose[6:, 6:] @ own.T
     covariance = J @ stated.motion_covariance[6:, 6:] @ J.T + both + both.T + own @ pose @ own.T
-    np.testing.assert_allclose(np.std(moved, axis=0), np.sqrt(np.diag(covariance)), rtol=0.2)
+    np.testing.assert_allclose(np.std(moved, axis=0), np.sqrt(np.diag(covariance)), rtol=0.15)
 
 
 @pytest.mark.parametrize("seed", range(3))
