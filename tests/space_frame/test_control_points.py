@@ -69,17 +69,19 @@ def test_the_shift_all_stations_share_is_found_by_control_points_and_covered_wit
     off, sd = offsets(held, truth)
     # six targets of 0.3 mm, each seen twice to 0.4: 0.17 mm an axis, and their turn's share at the roof
     assert np.abs(np.mean(off, axis=0)).max() < 0.6
+    # All balls share the three numbers of the datum: the rms of three exceeds 1.6 once in 20 cases; 0.70 to 1.02 came.
     assert np.sqrt(np.mean((off / sd) ** 2)) < 1.6
-    assert np.mean(np.abs(off) < 1.96 * sd) > 0.85
+    assert np.mean(np.abs(off) < 1.96 * sd) > 0.85  # 95 % less what they share: 0.93 to 1.0 came, also below
     assert held.datum == (reason("spheres.datum-control", points=6),)
     assert np.all(held.control.used)
-    assert np.linalg.norm(held.control.off, axis=1).max() < 2.0
+    assert np.linalg.norm(held.control.off, axis=1).max() < 2.0  # four times 0.5 mm, by 0.3 and 0.4
     off, sd = offsets(free, truth)
-    np.testing.assert_allclose(np.mean(off, axis=0), COMMON_MM, atol=0.4)
+    np.testing.assert_allclose(np.mean(off, axis=0), COMMON_MM, atol=0.15)  # the mean of 50 balls: 0.02 to 0.035 came
     assert np.mean(np.abs(off) < 1.96 * sd) > 0.85
     assert [item.code for item in free.datum] == ["spheres.datum-stations"]
     # and the movements, in the design's own frame, are sure to what the datum is
     true = truth.frame.centres - scene.frame.centres
     for result in (held, free):
         assert np.mean(np.abs(result.balls.movement - true) < result.balls.movement_ci95) > 0.85
+    # Of 0.2 mm instead of 1.5 mm, and the balls' own.
     assert np.median(held.balls.movement_ci95) < 0.5 * np.median(free.balls.movement_ci95)
