@@ -114,6 +114,7 @@ def test_a_height_between_two_joints_is_linear():
         ends.append(np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))]))
     vertices, faces = box_girder_mesh.mesh(edge, edge * [1, -1, 1], *ends)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
+    # Rounding.
     assert off(mesh, np.array([[1000.0, 0.0, 900.0], [3000.0, 100.0, 1100.0], [2000.0, 400.0, 990.0]])).max() < 1e-9
 
 

@@ -304,6 +304,7 @@ def test_registration_error_is_common_to_both_ends_of_a_part():
     J, own = rigid.motion(at - parts[1].centre)[0], rigid.motion(at)[0]
     both = J @ stated.motion_with_pose[6:, 6:] @ own.T
     covariance = J @ stated.motion_covariance[6:, 6:] @ J.T + both + both.T + own @ pose @ own.T
+    # As above.
     np.testing.assert_allclose(np.std(moved, axis=0), np.sqrt(np.diag(covariance)), rtol=0.15)
 
 

@@ -243,6 +243,7 @@ def test_a_single_pair_needs_a_larger_scale_to_be_reported():
     """
     assert three_point.cause_of_scale(1.0005, 1e-4, 1000.0, 2) is None
     assert three_point.cause_of_scale(1.0005, 1e-4, 1000.0, 60).code == "stitch.scale"
+    # 4.303 of 1e-4.
     assert three_point.cause_of_scale(1.003, 1e-4, 5000.0, 2).values["ci95_ppm"] == pytest.approx(430.3, abs=0.05)
 
 

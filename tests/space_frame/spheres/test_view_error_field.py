@@ -62,7 +62,7 @@ def test_the_variance_is_the_posterior_mean_over_sizes_and_lengths(scale):
     weights = (p * variance).reshape(len(field.LENGTHS_MM), -1).sum(axis=1) / expected
     np.testing.assert_allclose(found.weights, weights, rtol=1e-6)
     at_3_m = found.correlation(np.array(3000.0))
-    assert at_3_m == pytest.approx(weights @ np.exp(-3000.0 / field.LENGTHS_MM), rel=1e-6)
+    assert at_3_m == pytest.approx(weights @ np.exp(-3000.0 / field.LENGTHS_MM), rel=1e-6)  # as above
 
 
 def test_without_balls_the_variance_is_that_of_the_class():
