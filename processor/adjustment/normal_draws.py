@@ -8,18 +8,7 @@ import numpy as np
 
 from processor.model import Floats
 
-DRAWS = 4_000
 SEED = 20
-
-
-def antithetic(mean: Floats, covariance: Floats, count: int = DRAWS, seed: int = SEED) -> Floats:
-    """Draw (count, n) from a normal distribution, each draw with its mirror image about the mean (antithetic draws).
-
-    By the mirror images linear functions of the draws are exact: a value on its limit keeps it in exactly half of them.
-    """
-    errors = errors_of(covariance, count // 2, seed)
-    drawn: Floats = mean + np.concatenate([errors, -errors])
-    return drawn
 
 
 def errors_of(covariance: Floats, count: int, seed: int = SEED) -> Floats:

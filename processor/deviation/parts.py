@@ -36,7 +36,6 @@ def deviations(parts: Sequence[PartScene], method: str, one: Callable[[Scene], R
     total = distance_summary.of_distances(
         core.distances, core.points, core.normals, known[0].projection_diameter, m3c2.PAPER_POINTS_A_CYLINDER
     )
-    limits = [result.limits for result in known if result.limits is not None]
     error = np.array([result.registration_error for result in known])
     return Result(
         status=status,
@@ -54,7 +53,7 @@ def deviations(parts: Sequence[PartScene], method: str, one: Callable[[Scene], R
         max_depth=max(result.max_depth for result in known),
         origin=origin,
         core=core,
-        limits=JudgedLimits.concat(limits) if limits else None,
+        limits=JudgedLimits.joined(result.limits for result in known),
         parts=table,
         **result_fields.statistics(core, total),
     )

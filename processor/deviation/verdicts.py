@@ -18,8 +18,19 @@ from scipy.special import ndtri
 from processor.deviation.result import ErrorSource, Result
 from processor.geometry import mesh_distance
 from processor.limits import judging, limit_bounds, measurands, standards
-from processor.limits.judging import Comparison, JudgedLimits, Measured
-from processor.model import NORMAL_95, WORST_FIRST, Bools, Floats, Ints, Limit, Scene, Status, StructureDesign
+from processor.limits.judging import Judged, JudgedLimits, Measured
+from processor.model import (
+    NORMAL_95,
+    WORST_FIRST,
+    Bools,
+    Floats,
+    Ints,
+    Limit,
+    Scene,
+    Status,
+    StructureDesign,
+    Tolerance,
+)
 
 WHOLE = "surface"
 
@@ -31,18 +42,21 @@ def judge(scene: Scene, result: Result) -> JudgedLimits | None:
         return None
     unsure = result.status in (Status.FAILED, Status.AMBIGUOUS)
     unsure |= result.registration_error_from is ErrorSource.UNKNOWN
-    rows: list[Comparison] = []
+    rows: list[Judged] = []
     for name, of_it in _components(result).items():
         shares = judging.limits_for(tolerance, measurands.DEVIATION_SHARE, name)
         core = result.core
         values, half = core.distance[of_it], core.lod95[of_it]
         known = np.isfinite(values) & np.isfinite(half)
+        values, half = values[known], half[known]
         for limit in judging.limits_for(tolerance, measurands.DEVIATION, name):
-            if shares:
-                rows.append(judging.compare(shares[0], _share(name, values[known], half[known], limit, unsure)))
+            if not len(values):
+                rows.append(judging.judge(shares[0] if shares else limit, Measured(name), tolerance))
+            elif shares:
+                rows.append(judging.judge(shares[0], _share(name, values, half, limit, unsure), tolerance))
             else:
-                rows.append(_extreme(name, values[known], half[known], limit, unsure))
-    return judging.judged(rows, tolerance)
+                rows.append(_extreme(name, values, half, limit, tolerance, unsure))
+    return judging.table(rows)
 
 
 def with_bodies(result: Result, design: StructureDesign, vertices: Floats, origin: Floats) -> Result:
@@ -69,19 +83,15 @@ def _components(result: Result) -> Mapping[str, Bools]:
 def _share(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool) -> Measured:
     """Share of core points within a limit: at least, as measured, and at most."""
     low, high = limit_bounds.bounds(limit, {})
-    if not len(values):
-        return Measured(name, np.nan, np.nan, np.nan, doubtful=True)
     within = float(np.mean((values >= low) & (values <= high)))
     surely = float(np.mean((values - half >= low) & (values + half <= high)))
     beyond = float(np.mean((values + half < low) | (values - half > high)))
     return Measured(name, within, surely, 1.0 - beyond, doubtful=unsure)
 
 
-def _extreme(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool) -> Comparison:
-    """Compare the least and the greatest deviation; return the one of the worse verdict, then nearer to its bound."""
+def _extreme(name: str, values: Floats, half: Floats, limit: Limit, tolerance: Tolerance, unsure: bool) -> Judged:
+    """Judge the least and the greatest deviation; return the one of the worse verdict, then nearer to its bound."""
     low, high = limit_bounds.bounds(limit, {})
-    if not len(values):
-        return judging.compare(limit, Measured(name, np.nan, np.nan, np.nan, doubtful=True))
     widened = half * float(ndtri(1.0 - 0.025 / len(values))) / NORMAL_95
     sides = []
     for sign, bound in ((-1.0, -low), (1.0, high)):
@@ -89,6 +99,6 @@ def _extreme(name: str, values: Floats, half: Floats, limit: Limit, unsure: bool
         most = float((signed + half).max())
         ends = (sign * float((signed - widened).max()), sign * most)
         measured = Measured(name, sign * float(signed.max()), min(ends), max(ends), doubtful=unsure)
-        compared = judging.compare(limit, measured)
-        sides.append((WORST_FIRST.index(compared.verdict), bound - most, compared))
+        judged = judging.judge(limit, measured, tolerance)
+        sides.append((WORST_FIRST.index(judged.verdict), bound - most, judged))
     return min(sides, key=lambda side: side[:2])[2]

@@ -139,7 +139,7 @@ def _of_bodies(design: StructureDesign, truth: StructureTruth) -> dict[str, dict
     seen = flat_faces.Observed(places=points, facet=facet, deviation=moved, noise=none, shared=none, side=PIECE_MM)
     return {
         body.name: {
-            one.id: one.deviation for one in structure_bodies.measured(body)[0] if one.quantity is not Quantity.FLATNESS
+            one.of: one.value for one in structure_bodies.measured(body)[0] if one.what is not Quantity.FLATNESS
         }
         for body in flat_faces.bodies(design, seen, LEAST_FACE_MM)
     }

@@ -8,16 +8,16 @@ pose. The scale of the scanner, which no part shows, is added by its class.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from processor.adjustment import scanner_class_errors
 from processor.geometry.lines_and_polylines import Polyline
 from processor.inspection import characteristic, part_geometry
-from processor.inspection.characteristic import Characteristic
 from processor.inspection.part_geometry import Value
 from processor.inspection.result import AxisDepartures, InspectedComponent, Quantity, Result
+from processor.limits.judging import Measured
 from processor.model import (
     ENDS,
     NORMAL_95,
@@ -34,22 +34,18 @@ NAN = float("nan")
 LEAST_REACH = 0.7  # of the edges' length, over which both have to be seen
 
 
-class HoleCharacteristics(NamedTuple):
-    """What was measured of bolt holes, of parts and of joints by their names."""
-
-    parts: Mapping[str, Sequence[Characteristic]]
-    joints: Mapping[str, Sequence[Characteristic]]
-
-
 def inspect(
     design: ArchDesign,
     assembled: Any,
     tolerance: Tolerance | None,
     method: str,
-    of_holes: HoleCharacteristics | None = None,
+    holes_of_parts: Mapping[str, Sequence[Measured]] | None = None,
+    holes_of_joints: Mapping[str, Sequence[Measured]] | None = None,
 ) -> Result:
-    """Inspect the parts of a bridge, and its bolted joints, by the result of step ``preassemble``."""
-    of_holes = of_holes or HoleCharacteristics({}, {})
+    """Inspect the parts of a bridge, and its bolted joints, by the result of step ``preassemble``.
+
+    What was measured of bolt holes is given by the names of parts and joints.
+    """
     if assembled is None or assembled.adjustment is None or not assembled.adjustment.shapes:
         return Result(status=Status.OK, method=method, reasons=(reason("inspect.no-measured-ends"),))
     shapes = {shape.name: shape for shape in assembled.adjustment.shapes}
@@ -61,18 +57,18 @@ def inspect(
             shapes[part.name],
             states[part.name],
             tolerance,
-            of_holes.parts.get(part.name, ()),
+            (holes_of_parts or {}).get(part.name, ()),
         )
         for i, part in enumerate(design.parts)
     )
-    components += tuple(_joints(design, of_holes.joints, states, tolerance))
+    components += tuple(_joints(design, holes_of_joints or {}, states, tolerance))
     remarks = () if tolerance is not None else (reason("inspect.no-limits"),)
     return Result.of_components(components, method, remarks)
 
 
 def _joints(
     design: ArchDesign,
-    found: Mapping[str, Sequence[Characteristic]],
+    found: Mapping[str, Sequence[Measured]],
     states: Mapping[str, Status],
     tolerance: Tolerance | None,
 ) -> Iterator[InspectedComponent]:
@@ -107,7 +103,7 @@ def _part(
     shape: Any,
     status: Status,
     tolerance: Tolerance | None,
-    others: Sequence[Characteristic],
+    others: Sequence[Measured],
 ) -> InspectedComponent:
     if status is Status.FAILED:
         return InspectedComponent(name=part.name, status=status, reasons=(reason("inspect.not-registered"),))
@@ -141,14 +137,14 @@ def _length(part: DesignPart, design: Floats) -> float:
     return float(np.linalg.norm(design[1, :4].mean(axis=0) - design[0, :4].mean(axis=0)))
 
 
-def _sections(design: Floats, shape: Any) -> Iterator[Characteristic]:
+def _sections(design: Floats, shape: Any) -> Iterator[Measured]:
     """Yield the characteristics of the end sections at joints."""
     for end in range(2):
         if np.isfinite(design[end]).all():
             yield from _of_ends(list(part_geometry.of_end(end)), design, shape, [end])
 
 
-def _lengths(part: DesignPart, design: Floats, shape: Any) -> Iterator[Characteristic]:
+def _lengths(part: DesignPart, design: Floats, shape: Any) -> Iterator[Measured]:
     """Yield what both ends determine; of a part with one joint the length at the middle of the bottom alone."""
     joined = np.isfinite(design).all(axis=(1, 2))
     if joined.all():
@@ -168,7 +164,7 @@ def _lengths(part: DesignPart, design: Floats, shape: Any) -> Iterator[Character
     yield characteristic.absent("twist", Quantity.TWIST, 0.0, reason("inspect.one-section-alone"))
 
 
-def _of_ends(values: Sequence[Value], design: Floats, shape: Any, needed: Sequence[int]) -> Iterator[Characteristic]:
+def _of_ends(values: Sequence[Value], design: Floats, shape: Any, needed: Sequence[int]) -> Iterator[Measured]:
     """Yield functions of the ends with their intervals; without an end that is ``needed``, why they are not known."""
     unknown = [end for end in needed if not np.isfinite(shape.ends[end]).all()]
     of_needed = np.concatenate([np.arange(24 * end, 24 * end + 24) for end in needed])
@@ -204,7 +200,7 @@ def _foot_length(part: DesignPart, design: Floats, shape: Any, joint: int) -> tu
     return nominal, float(departure @ along) + shape.outer, variance + scanner_class_errors.scale_variance(nominal)
 
 
-def _axis(part: DesignPart, shape: Any) -> tuple[AxisDepartures, list[Characteristic]]:
+def _axis(part: DesignPart, shape: Any) -> tuple[AxisDepartures, list[Measured]]:
     """Departures of the axis from the design's, and the greatest sideways and up.
 
     The axis is the middle between the bottom edges. A motion of the part is taken off. Departures sideways and up are
@@ -234,7 +230,7 @@ def _axis(part: DesignPart, shape: Any) -> tuple[AxisDepartures, list[Characteri
     ), [*found, _middle_width(part, shape, left[known], right[known])]
 
 
-def _middle_width(part: DesignPart, shape: Any, left: Ints, right: Ints) -> Characteristic:
+def _middle_width(part: DesignPart, shape: Any, left: Ints, right: Ints) -> Measured:
     """Width at the bottom half way along the part."""
     at = int(np.argmin(np.abs(shape.chainage[left] - shape.chainage[left].mean())))
     a, b = left[at], right[at]

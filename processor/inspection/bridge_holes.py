@@ -11,9 +11,9 @@ import numpy as np
 from processor.components import bridge_parts
 from processor.inspection import design_cloud, flat_faces, holes
 from processor.inspection.bore_fit import Fitted
-from processor.inspection.characteristic import Characteristic
 from processor.inspection.design_cloud import DesignCloud
 from processor.inspection.design_holes import Hole
+from processor.limits.judging import Measured
 from processor.model import ArchDesign, Floats, Scene
 
 
@@ -49,9 +49,9 @@ def of_parts(scene: Scene, assembled: Any) -> list[DrilledGroup]:
     return groups
 
 
-def characteristics(drilled: Sequence[DrilledGroup]) -> dict[str, list[Characteristic]]:
+def characteristics(drilled: Sequence[DrilledGroup]) -> dict[str, list[Measured]]:
     """Return the characteristics of the holes of each part that has any."""
-    found: dict[str, list[Characteristic]] = defaultdict(list)
+    found: dict[str, list[Measured]] = defaultdict(list)
     for one in drilled:
         found[one.part] += holes.characteristics(one.group, one.fitted, one.first)
     return dict(found)

@@ -15,10 +15,10 @@ from processor.adjustment import scanner_class_errors, thermal
 from processor.geometry import rigid
 from processor.inspection import bore_fit, characteristic
 from processor.inspection.bore_fit import BorePoints, Fitted
-from processor.inspection.characteristic import Characteristic
 from processor.inspection.design_cloud import DesignCloud
 from processor.inspection.design_holes import Hole
 from processor.inspection.result import Quantity
+from processor.limits.judging import Measured
 from processor.model import Bools, Floats, Ints, reason
 
 REACH_MM, PITCH_SHARE = 25.0, 0.4  # of a hole from its designed place, and at most this share of the way to the next
@@ -128,12 +128,12 @@ def _level(height: Floats, beyond: Floats, hole: Hole) -> float:
     return float(np.mean(found)) if found else 0.0
 
 
-def characteristics(group: Group, fitted: Fitted, first: int) -> Iterator[Characteristic]:
+def characteristics(group: Group, fitted: Fitted, first: int) -> Iterator[Measured]:
     """Yield the characteristics of a group whose holes are numbered from ``first``."""
     yield from _characteristics(_designed(group), np.array([hole.radius for hole in group.holes]), fitted, first)
 
 
-def _characteristics(places: Floats, radius: Floats, fitted: Fitted, first: int) -> Iterator[Characteristic]:
+def _characteristics(places: Floats, radius: Floats, fitted: Fitted, first: int) -> Iterator[Measured]:
     known = np.flatnonzero(np.isfinite(fitted.departure).all(axis=1))
     why = reason("inspect.hole-not-seen")
     if len(places) >= FEWEST_PLACED:
@@ -179,7 +179,7 @@ def _within(places: Floats, fitted: Fitted, known: Ints) -> tuple[Floats, Floats
     )
 
 
-def _places(places: Floats, within: tuple[Floats, Floats] | None, known: Ints, first: int) -> Iterator[Characteristic]:
+def _places(places: Floats, within: tuple[Floats, Floats] | None, known: Ints, first: int) -> Iterator[Measured]:
     """Yield the places of holes within their group, along and across; None: too few holes of it were seen."""
     middle = places.mean(axis=0)
     at = {int(k): i for i, k in enumerate(known)}
@@ -195,14 +195,12 @@ def _places(places: Floats, within: tuple[Floats, Floats] | None, known: Ints, f
                 yield characteristic.absent(id_, Quantity.HOLE_POSITION, nominal, why)
 
 
-def _passing(
-    fitted: Fitted, within: tuple[Floats, Floats] | None, known: Ints, numbers: tuple[int, int]
-) -> Characteristic:
+def _passing(fitted: Fitted, within: tuple[Floats, Floats] | None, known: Ints, numbers: tuple[int, int]) -> Measured:
     """Return the share of a group's holes that a gauge pin passes together with a splice plate drilled as designed."""
     id_ = f"holes-{numbers[0]}-{numbers[1]}-pass-through"
     if within is None:
         why = (reason("inspect.few-holes-seen"),)
-        return Characteristic(id_, Quantity.PASS_THROUGH, 1.0, unit="1", why=why)
+        return Measured(id_, what=Quantity.PASS_THROUGH, nominal=1.0, unit="1", reasons=why)
     return share_of(id_, passes(within[0], fitted.departure[known, 2], within[1]), numbers[1] - numbers[0] + 1)
 
 
@@ -223,7 +221,7 @@ def passes(off: Floats, wider: Floats, covariance: Floats) -> Bools:
     return passed
 
 
-def share_of(id_: str, passed: Bools, holes: int) -> Characteristic:
+def share_of(id_: str, passed: Bools, holes: int) -> Measured:
     """Return the share of ``holes`` holes that a pin passes, by draws (d, n) of those seen.
 
     It is the mean of the probabilities of the holes seen, its interval that of draws of all errors together. It is of
@@ -231,15 +229,15 @@ def share_of(id_: str, passed: Bools, holes: int) -> Characteristic:
     """
     unseen = holes - passed.shape[1]
     low, high = np.quantile(passed.sum(axis=1), [0.025, 0.975])
-    return Characteristic(
+    return Measured(
         id_,
-        Quantity.PASS_THROUGH,
-        1.0,
-        deviation=float(passed.mean()) - 1.0,
+        float(passed.mean()) - 1.0,
         low=float(low) / holes - 1.0,
         high=float(high + unseen) / holes - 1.0,
+        what=Quantity.PASS_THROUGH,
         unit="1",
-        why=(reason("inspect.holes-unseen", unseen=unseen, holes=holes),) if unseen else (),
+        nominal=1.0,
+        reasons=(reason("inspect.holes-unseen", unseen=unseen, holes=holes),) if unseen else (),
     )
 
 

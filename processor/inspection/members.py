@@ -16,8 +16,8 @@ import numpy as np
 from processor.adjustment import scanner_class_errors, thermal
 from processor.components.frame_members import SEEN
 from processor.inspection import characteristic
-from processor.inspection.characteristic import Characteristic
 from processor.inspection.result import InspectedComponent, Quantity, Result
+from processor.limits.judging import Measured
 from processor.model import NORMAL_95, FrameDesign, Scene, Status, reason
 
 CERTAIN = "ok"  # flag of a sphere that nothing contradicts
@@ -62,7 +62,7 @@ def _member(
     row = tube.get(frozenset(nodes))
     own = list(_of_tube(float(design.tube_diameters[member]), found, row))
     sizes = {"length": length.nominal, "diameter": float(design.tube_diameters[member])}
-    seen, name = row is not None or np.isfinite(length.deviation), name_of(design, member)
+    seen, name = row is not None or np.isfinite(length.value), name_of(design, member)
     return InspectedComponent(
         name=name,
         status=Status.OK if seen else Status.FAILED,
@@ -73,7 +73,7 @@ def _member(
 
 def _length(
     scene: Scene, design: FrameDesign, nodes: tuple[int, int], rows: tuple[int, int], found: Any, ball: dict[int, int]
-) -> Characteristic:
+) -> Measured:
     """Distance of the centres of a member's nodes, at the reference temperature if the steel's is known.
 
     ``rows`` are those of the nodes in the design, ``ball`` those of the balls with a centre, by their nodes.
@@ -94,10 +94,10 @@ def _length(
     )
     flagged = [k for k in at if str(balls.flag[k]) != CERTAIN]
     why = tuple(reason("inspect.node-flagged", node=balls.names[k], flag=balls.flag[k]) for k in flagged)
-    return replace(length, doubtful=bool(flagged), why=why)
+    return replace(length, doubtful=bool(flagged), reasons=why)
 
 
-def _of_tube(diameter: float, found: Any, row: int | None) -> Iterator[Characteristic]:
+def _of_tube(diameter: float, found: Any, row: int | None) -> Iterator[Measured]:
     """Yield diameter and bow of the tube that is row ``row`` of what was found."""
     if row is None:
         why = reason("inspect.tube-not-seen")
@@ -110,4 +110,4 @@ def _of_tube(diameter: float, found: Any, row: int | None) -> Iterator[Character
         "diameter", Quantity.DIAMETER, diameter, 2.0 * float(tubes.radii[row]) - diameter, sd**2
     )
     bow, half = float(tubes.bow[row]), float(tubes.bow_ci95[row]) if len(tubes.bow_ci95) else float("nan")
-    yield Characteristic("bow", Quantity.BOW, 0.0, deviation=bow, low=max(bow - half, 0.0), high=bow + half, size=True)
+    yield Measured("bow", bow, max(bow - half, 0.0), bow + half, what=Quantity.BOW, unsigned=True)

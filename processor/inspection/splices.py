@@ -15,8 +15,8 @@ from scipy.linalg import block_diag
 from processor.geometry import rigid
 from processor.inspection import holes
 from processor.inspection.bridge_holes import DrilledGroup
-from processor.inspection.characteristic import Characteristic
 from processor.inspection.result import Quantity
+from processor.limits.judging import Measured
 from processor.model import ArchDesign, Floats, Ints, reason
 
 DETERMINED = 1e-9  # least singular value of a motion that the holes determine, by the largest
@@ -49,7 +49,7 @@ class HolesSeen(NamedTuple):
     covariance: Floats
 
 
-def of_joints(design: ArchDesign, drilled: Sequence[DrilledGroup]) -> dict[str, list[Characteristic]]:
+def of_joints(design: ArchDesign, drilled: Sequence[DrilledGroup]) -> dict[str, list[Measured]]:
     """Return the characteristics of the splices of each joint that has any, by the joint's name."""
     found = {}
     for joint, name in enumerate(design.joint_names):
@@ -94,7 +94,7 @@ def _in_one_plane(left: DrilledGroup, right: DrilledGroup) -> bool:
     return bool(abs(hole.axis @ other.axis) > holes.PARALLEL and abs(off) < SAME_PLANE * min(hole.depth, other.depth))
 
 
-def _characteristics(plates: list[Splice]) -> Iterator[Characteristic]:
+def _characteristics(plates: list[Splice]) -> Iterator[Measured]:
     """Yield the share of the holes that a gauge pin passes, of each plate and of the whole joint."""
     number = np.array([len(group.group.holes) for plate in plates for group in plate]).reshape(-1, 2).sum(axis=1)
     seen = _seen(plates)
@@ -102,7 +102,7 @@ def _characteristics(plates: list[Splice]) -> Iterator[Characteristic]:
     if seen is None:
         for id_ in [*ids, "splice-pass-through"]:
             why = (reason("inspect.few-holes-of-splice"),)
-            yield Characteristic(id_, Quantity.PASS_THROUGH, 1.0, unit="1", why=why)
+            yield Measured(id_, what=Quantity.PASS_THROUGH, nominal=1.0, unit="1", reasons=why)
         return
     off, covariance = misfit(seen)
     passed = holes.passes(off, seen.wider, covariance)

@@ -64,7 +64,5 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
             scene, found, (earlier or {}).get("stitch"), params.least_face_mm, params.method
         )
     drilled = [] if found is None else bridge_holes.of_parts(scene, found)
-    of_holes = arch_parts.HoleCharacteristics(
-        bridge_holes.characteristics(drilled), splices.of_joints(scene.arch, drilled)
-    )
-    return arch_parts.inspect(scene.arch, found, scene.tolerance, params.method, of_holes)
+    of_parts, of_joints = bridge_holes.characteristics(drilled), splices.of_joints(scene.arch, drilled)
+    return arch_parts.inspect(scene.arch, found, scene.tolerance, params.method, of_parts, of_joints)

@@ -17,12 +17,12 @@ from processor import scene_cloud
 from processor.adjustment import maximum_interval, scanner_class_errors, thermal
 from processor.geometry import rigid
 from processor.inspection import characteristic, design_cloud, edge_counts, flat_faces, holes, narrow_faces
-from processor.inspection.characteristic import Characteristic
 from processor.inspection.design_cloud import DesignCloud
 from processor.inspection.flat_faces import Body, Fit, FlatFace, Pieces
 from processor.inspection.narrow_faces import Surroundings
 from processor.inspection.part_geometry import off_the_chord
 from processor.inspection.result import InspectedComponent, Quantity, Result
+from processor.limits.judging import Measured
 from processor.model import Floats, Reason, Scene, Status, reason
 from processor.registration import surface_registration
 
@@ -110,14 +110,14 @@ def _component(body: Body, scene: Scene, around: Surroundings, doubtful: bool) -
         found = [*found, *_holes(body, around.cloud, scene.temperature_C)]
     if not found:
         return None
-    if all(np.isnan(one.deviation) for one in found):
+    if all(np.isnan(one.value) for one in found):
         return InspectedComponent(name=body.name, status=Status.FAILED, reasons=(reason("inspect.body-not-seen"),))
     return InspectedComponent(
         name=body.name, characteristics=characteristic.table(found, scene.tolerance, body.name, sizes, doubtful)
     )
 
 
-def _holes(body: Body, cloud: DesignCloud, temperature_C: float) -> Iterator[Characteristic]:
+def _holes(body: Body, cloud: DesignCloud, temperature_C: float) -> Iterator[Measured]:
     """Yield the characteristics of a body's holes, numbered over the whole body."""
     first = 1
     for group in holes.groups(list(body.holes), [axis.direction for axis in body_axes(body)]):
@@ -127,7 +127,7 @@ def _holes(body: Body, cloud: DesignCloud, temperature_C: float) -> Iterator[Cha
 
 def measured(
     body: Body, temperature_C: float = float("nan"), around: Surroundings | None = None
-) -> tuple[list[Characteristic], dict[str, float]]:
+) -> tuple[list[Measured], dict[str, float]]:
     """Return the characteristics of a body and its sizes as designed; none of a body without flat sides.
 
     Sizes are those at the reference temperature, if that of the steel is known. Faces without pieces, such as narrow
@@ -318,7 +318,7 @@ def _term(side: Side, k: int) -> tuple[float, float]:
     return float(side.fit.mean[k]), float(side.fit.covariance[k, k])
 
 
-def _sizes(axes: list[Axis], names: list[Quantity], sides: Sides, temperature_C: float) -> Iterator[Characteristic]:
+def _sizes(axes: list[Axis], names: list[Quantity], sides: Sides, temperature_C: float) -> Iterator[Measured]:
     """Yield the distances of opposite faces at the body's middle."""
     expansion = thermal.expansion(temperature_C)
     for axis, name in zip(axes, names, strict=True):
@@ -346,7 +346,7 @@ def _turn(axes: list[Axis], k: int, sides: Sides) -> tuple[float, float]:
     return float(value), float(variance) / len(found)
 
 
-def _squareness(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterator[Characteristic]:
+def _squareness(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterator[Measured]:
     """Yield the tilt of each end face against the long faces, times the size that it is tilted over."""
     for end, (row, sense) in enumerate(zip(axes[0].faces, (-1.0, 1.0), strict=True)):
         side = sides[row]
@@ -366,7 +366,7 @@ def _squareness(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterat
             )
 
 
-def _twist(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterator[Characteristic]:
+def _twist(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterator[Measured]:
     """Yield the rotation of the end against the start about the body's axis, times its height.
 
     A rotation by w per unit of length moves a face at the side outward by w x times the place across it.
@@ -393,7 +393,7 @@ def _twist(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterator[Ch
     yield characteristic.normal("twist", Quantity.TWIST, 0.0, height * mean, height**2 * of_mean)
 
 
-def _bows(axes: list[Axis], sides: Sides) -> Iterator[Characteristic]:
+def _bows(axes: list[Axis], sides: Sides) -> Iterator[Measured]:
     """Yield the greatest departures of the axis from straight along both other axes."""
     upright = 1 if abs(axes[1].direction @ UP) > abs(axes[2].direction @ UP) else 2
     for k in (1, 2):
@@ -430,7 +430,7 @@ def _axis_curve(sides: list[tuple[Side, float]]) -> tuple[Floats, Floats] | None
     return off @ np.mean(values, axis=0), off @ np.sum(covariances, axis=0) @ off.T / len(values) ** 2
 
 
-def _flatness(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterator[Characteristic]:
+def _flatness(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterator[Measured]:
     """Yield the flatness of faces: the greatest less the least departure from their plane, noise taken out.
 
     The plane is fitted to all of a face. The extremes of noisy values are too far apart: departures are shrunk by their
@@ -448,7 +448,7 @@ def _flatness(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterator
             yield _peak_to_valley(id_, side)
 
 
-def _peak_to_valley(id_: str, side: Side) -> Characteristic:
+def _peak_to_valley(id_: str, side: Side) -> Measured:
     plane = np.stack([np.ones_like(side.along), side.along, side.across], axis=1)
     root = 1.0 / np.sqrt(side.pieces.noise)
     solve = np.linalg.pinv(plane * root[:, None]) * root
@@ -463,12 +463,11 @@ def _peak_to_valley(id_: str, side: Side) -> Characteristic:
     by_noise = float(np.ptp(repeated, axis=1).mean() - np.ptp(shrunk))
     _, high_low, high_high = maximum_interval.of_independent(rest, sd)
     _, low_low, low_high = maximum_interval.of_independent(-rest, sd)
-    return Characteristic(
+    return Measured(
         id_,
-        Quantity.FLATNESS,
-        0.0,
-        deviation=max(float(np.ptp(shrunk)) - by_noise, 0.0),
-        low=max(high_low + low_low, 0.0),
-        high=high_high + low_high,
-        size=True,
+        max(float(np.ptp(shrunk)) - by_noise, 0.0),
+        max(high_low + low_low, 0.0),
+        high_high + low_high,
+        what=Quantity.FLATNESS,
+        unsigned=True,
     )

@@ -1,20 +1,21 @@
-"""Measured values against limits: rows of comparisons with a verdict each.
+"""Verdicts: quantities as measured, judged by limits.
 
-A step states what it measured as :class:`Measured`, a value with its 95 % interval, and gets one row per comparison. A
-value passes where its interval lies within the limit and fails where it lies beyond. Otherwise it is indeterminate, as
-it is where the step flags the value as doubtful or a bound depends on a size that is not known (ISO 14253-1).
+A step states what it measured as :class:`Measured`, a value with its 95 % interval; :func:`judge` alone decides and
+returns a row. A value passes where its interval lies within the limit and fails where it lies beyond. Otherwise it is
+indeterminate, as it is where the step flags the value as doubtful or a bound depends on a size that is not known (ISO
+14253-1).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from processor.limits import limit_bounds
-from processor.limits.decision_rule import decide
 from processor.model import (
     AMOUNT,
     NUMBER,
@@ -22,6 +23,7 @@ from processor.model import (
     Bools,
     Floats,
     Limit,
+    Reason,
     Rows,
     Tolerance,
     Verdict,
@@ -31,7 +33,7 @@ from processor.model import (
     worst,
 )
 
-NOT_VERIFIED = "not verified"
+NAN = float("nan")
 
 
 @dataclass(frozen=True)
@@ -61,57 +63,132 @@ class JudgedLimits(Rows):
         """The worst verdict; none without a comparison."""
         return worst(self.verdict)
 
+    @classmethod
+    def joined(cls, tables: Iterable[JudgedLimits | None]) -> JudgedLimits | None:
+        """Return the rows of several tables as one; None without any."""
+        known = [one for one in tables if one is not None]
+        return cls.concat(known) if known else None
+
+    @property
+    def rows(self) -> list[Judged]:
+        """The rows, one by one."""
+        return [Judged(**row) for row in self.items()]
+
 
 @dataclass(frozen=True)
 class Measured:
-    """A quantity as measured: of what, its value and the ends of its 95 % interval, in the limit's unit.
+    """A quantity as measured: of what, its value and the ends of its 95 % interval; NaN: not known.
 
-    ``sizes_mm`` are for limits that depend on a size, by the names of ``Limit.of``. NaN: not known. ``doubtful``: it
-    may be wrong altogether, beyond what the interval covers. ``unsigned``: the interval is that of a size whose sign is
-    not sure, so the tighter bound counts.
+    ``what`` it is where a step measures several. The value is a deviation from ``nominal``, if given. ``ci95`` is the
+    half-width to state, NaN for half of the interval. ``sizes_mm`` are for limits that depend on a size, by the names
+    of ``Limit.of``. ``doubtful``: it may be wrong altogether, beyond what the interval covers. ``unsigned``: the
+    interval is that of a size whose sign is not sure, so the tighter bound counts. ``reasons`` state why it was not
+    measured, or what the value lacks.
     """
 
     of: str
-    value: float
-    low: float
-    high: float
+    value: float = NAN
+    low: float = NAN
+    high: float = NAN
+    what: str = ""
+    unit: str = "mm"
+    nominal: float = 0.0
+    ci95: float = NAN
     sizes_mm: Mapping[str, float] = field(default_factory=dict)
     doubtful: bool = False
     unsigned: bool = False
+    reasons: tuple[Reason, ...] = ()
 
     @classmethod
-    def within(
-        cls,
-        of: str,
-        value: float,
-        ci95: float,
-        sizes_mm: Mapping[str, float] | None = None,
-        doubtful: bool = False,
-    ) -> Measured:
-        """Return a quantity with the half-width ``ci95`` of its interval."""
-        return cls(of, value, value - ci95, value + ci95, sizes_mm=sizes_mm or {}, doubtful=doubtful)
+    def within(cls, of: str, value: float, half_width: float, **further: Any) -> Measured:
+        """Return a quantity with the half-width of its interval."""
+        return cls(of, value, value - half_width, value + half_width, **further)
+
+    @property
+    def wider_side(self) -> float:
+        """The wider side of the interval about the value, about its size where the sign is not sure."""
+        middle = abs(self.value) if self.unsigned else self.value
+        return max(self.high - middle, middle - self.low)
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A quantity compared with a limit: the bounds and the verdict."""
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """A quantity judged by a limit: a row of the tables of a result, whose columns have the names of these fields.
 
-    limit: Limit
-    measured: Measured
-    low: float
-    high: float
-    verdict: Verdict
+    ``of``, ``what`` and ``clause`` are messages where a report words them. ``probability``: that the limit is kept.
+    """
+
+    of: Any
+    what: Any = ""
+    value: float
+    ci95: float
+    low: float = NAN
+    high: float = NAN
+    verdict: Verdict = Verdict.NONE
+    probability: float = NAN
+    nominal: float = 0.0
+    unit: str = "mm"
+    key: str = ""
+    clause: Any = ""
+    edition: str = ""
+    source: str = ""
+    verified: bool = False
+
+    @property
+    def actual(self) -> float:
+        """The value itself where it is a deviation; NaN where the nominal is not known."""
+        return self.nominal + self.value
 
 
-def compare(limit: Limit, measured: Measured) -> Comparison:
-    """Compare a quantity with a limit; indeterminate where either is not known."""
+def judge(
+    limit: Limit | None,
+    measured: Measured,
+    tolerance: Tolerance,
+    greatest: Measured | None = None,
+    *,
+    probability: float = NAN,
+) -> Judged:
+    """Judge a quantity by a limit of a ``tolerance``; indeterminate where bound or interval is unknown, or doubtful.
+
+    Of many values ``measured`` is the least and ``greatest`` is given as well: each is compared with the bound on its
+    side. The verdict is the worse of both, and the value stated is the one nearer to its bound. Without a limit there
+    is no verdict.
+    """
+    if limit is None:
+        return Judged(of=measured.of, value=measured.value, ci95=measured.ci95, nominal=measured.nominal)
     low, high = limit_bounds.bounds(limit, measured.sizes_mm)
-    unknown = any(map(math.isnan, (low, high, measured.low, measured.high)))
-    least, most = (-math.inf, min(-low, high)) if measured.unsigned else (low, high)
-    verdict = (
-        Verdict.INDETERMINATE if unknown or measured.doubtful else decide((measured.low, measured.high), least, most)
+    sides = [(measured, low, high)]
+    if greatest is not None:
+        sides = [(measured, low, math.inf), (greatest, -math.inf, high)]
+    verdicts = []
+    for one, least, most in sides:
+        if one.unsigned:
+            least, most = -math.inf, min(-least, most)
+        unknown = one.doubtful or any(map(math.isnan, (low, high, one.low, one.high)))
+        if not unknown and least <= one.low and one.high <= most:
+            verdicts.append(Verdict.PASS)
+        else:
+            beyond = not unknown and (one.high < least or one.low > most)
+            verdicts.append(Verdict.FAIL if beyond else Verdict.INDETERMINATE)
+    stated, *_ = min(sides, key=lambda side: min(side[0].value - side[1], side[2] - side[0].value))
+    ci95 = 0.5 * (stated.high - stated.low) if math.isnan(stated.ci95) else stated.ci95
+    return Judged(
+        of=stated.of,
+        what=limit.what,
+        value=stated.value,
+        ci95=ci95 if math.isfinite(ci95) else NAN,
+        low=low,
+        high=high,
+        verdict=worst(verdicts),
+        probability=probability,
+        nominal=stated.nominal,
+        unit=limit.unit,
+        key=limit.key,
+        clause=f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source,
+        edition="" if of_project(limit) else tolerance.edition,
+        source=limit.source,
+        verified=limit.verified,
     )
-    return Comparison(limit=limit, measured=measured, low=low, high=high, verdict=verdict)
 
 
 def limits_for(tolerance: Tolerance, measure: str, component: str = "") -> list[Limit]:
@@ -128,28 +205,12 @@ def limits_for(tolerance: Tolerance, measure: str, component: str = "") -> list[
     return list(found.values())
 
 
-def judged(comparisons: Iterable[Comparison], tolerance: Tolerance) -> JudgedLimits | None:
-    """Return the comparisons as the record of a result; None without any, as nothing is limited then."""
-    rows: Sequence[Comparison] = tuple(comparisons)
-    if not rows:
-        return None
-    half = [0.5 * (row.measured.high - row.measured.low) for row in rows]
-    return JudgedLimits(
-        key=tuple(row.limit.key for row in rows),
-        what=tuple(row.limit.what for row in rows),
-        of=tuple(row.measured.of for row in rows),
-        value=np.array([row.measured.value for row in rows]),
-        ci95=np.array([number if math.isfinite(number) else math.nan for number in half]),
-        low=np.array([row.low for row in rows]),
-        high=np.array([row.high for row in rows]),
-        unit=tuple(row.limit.unit for row in rows),
-        verdict=tuple(row.verdict for row in rows),
-        clause=tuple(clause_of(row.limit, tolerance) for row in rows),
-        source=tuple(row.limit.source for row in rows),
-        verified=np.array([row.limit.verified for row in rows], np.bool_),
-    )
+def of_project(limit: Limit) -> bool:
+    """Whether the project gave the limit itself: of a standard's rows only those with a clause are verified."""
+    return limit.verified and not limit.clause
 
 
-def clause_of(limit: Limit, tolerance: Tolerance) -> str:
-    """Name where a limit is from: standard and clause, or the source of a limit without one."""
-    return f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source
+def table(rows: Iterable[Judged]) -> JudgedLimits | None:
+    """Return what a step judged as the record of its result; None without any, as nothing is limited then."""
+    rows = tuple(rows)
+    return JudgedLimits.from_items(rows) if rows else None

@@ -12,7 +12,6 @@ from importlib import resources
 from typing import Any
 
 from processor import record_checks
-from processor.limits import measurands
 from processor.model import InputError, Limit, Tolerance, did_you_mean
 
 if sys.version_info >= (3, 11):
@@ -22,7 +21,6 @@ else:
 
 DEFAULT = "GB 50205-2020"
 NAN = float("nan")
-NODE_PLACE = measurands.NODE_PLACE
 NOT_OF_LIMITS = ("class", "needs")  # keys of rows that are no fields of a limit
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from typing import Any, TypeVar
 
@@ -45,6 +45,12 @@ class Columns:
         items = tuple(items)
         names = (field.name for field in dataclasses.fields(cls) if field.name not in columns)  # type: ignore[arg-type]
         return cls(**columns, **{name: tuple(getattr(item, name) for item in items) for name in names})
+
+    def items(self) -> Iterator[dict[str, Any]]:
+        """Yield the rows, each as what the columns hold by their names; absent columns are left out."""
+        columns = {name: one.tolist() if isinstance(one, np.ndarray) else one for name, one in _columns(self)}
+        for values in zip(*columns.values(), strict=True):
+            yield dict(zip(columns, values, strict=True))
 
 
 def _columns(table: Any, absent: bool = False) -> list[tuple[str, Any]]:

@@ -128,7 +128,8 @@ def _judge_joints(
         if (adjusted.in_pieces or not judges_places) and conformity.verdict is Verdict.PASS:
             moved = _closes_by_moving(parts, adjusted, design, frames, limits, j)
         doubts += moved if adjusted.in_pieces else ()
-        conformity = joints.left_open(conformity, doubts)
+        if doubts:
+            conformity = joints.judge(measures, limits, doubts)
         proposal = trim_and_build_up.propose(measures, limits, trim, doubts=doubts, weak_parts=weak, moved=moved)
         if in_pieces and measures.known:
             remark = reason("preassemble.joint-of-piece", joints=in_pieces[0].values["joints"])

@@ -7,12 +7,10 @@ from collections.abc import Sequence
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, text
-from processor.limits.judging import JudgedLimits
 from processor.model import METRIC_NAMES, Metric, Statistic, StepRun
 from processor.pipeline import Execution
 from processor.report import characteristics
 from processor.report.columns import columns
-from processor.report.limit_comparison_table import limit_table
 from processor.report.reports_of_steps import characteristics_of, step_report
 from processor.report.table import Table
 
@@ -21,8 +19,8 @@ LIMITS = "-limits"  # ends the file of what a step compared with limits
 
 def tables_of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     """Tables of a step's result, with those of other methods on the same scene."""
-    limits: JudgedLimits | None = getattr(run.result, "limits", None)
-    return [*limit_table(limits, f"{run.step}{LIMITS}"), *step_report(run.step).tables((run, *others), report)]
+    limits = characteristics.limit_table(getattr(run.result, "limits", None), f"{run.step}{LIMITS}")
+    return [*limits, *step_report(run.step).tables((run, *others), report)]
 
 
 def checks_table(report: ErrorReport) -> Table:

@@ -1,13 +1,13 @@
-"""The table of characteristics: quantities compared with limits, with nominal, actual value and verdict."""
+"""The tables of quantities judged by limits, alike for all steps: as compared, and as characteristics with nominals."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
-from processor.language.messages import Message, label, text
-from processor.limits.judging import JudgedLimits
+from processor.language.messages import Message, Text, label, text
+from processor.limits.judging import Judged, JudgedLimits
 from processor.model import WORST_FIRST, Verdict
 from processor.report.columns import columns
 from processor.report.table import NAN, Table
@@ -16,81 +16,65 @@ FILE = "characteristics"
 COLUMNS = columns(
     "id", "verdict", "quantity", "nominal", "actual", "deviation", "ci95", "lower", "upper", "unit", "limit_from",
 )  # fmt: skip
-ORDER = {verdict: place for place, verdict in enumerate(WORST_FIRST)}
+OF_LIMITS = columns("limit", "of", "verdict", "value", "ci95", "least", "greatest", "unit", "clause")
 MOST_NAMED = 4
 NOTE = text(
     "Worst first. Deviation is actual less nominal, ci95 the half-width of its 95 % interval, lower and upper the "
     "deviations allowed; a dash is no bound, or not known."
 )
+NOTE_OF_LIMITS = text(
+    "± is the 95 % half-width, a dash is no bound or no number. Pass: the whole interval keeps the limit; fail: the "
+    "whole interval exceeds it; indeterminate: the limit lies within it, or the value is in doubt."
+)
+UNVERIFIED = "{note} Not verified: the limits from {sources} were not compared with the published text; do so first."
 
 
-@dataclass(frozen=True, kw_only=True)
-class Characteristic:
-    """A quantity compared with limits: ``deviation`` = actual - nominal, allowed from ``lower`` to ``upper``; NaN none.
-
-    ``limit_from`` says where the limit is from, and whether it was checked against the standard's text.
-    """
-
-    id: str | Message
-    quantity: str | Message
-    deviation: float
-    ci95: float
-    verdict: Verdict
-    nominal: float = NAN
-    lower: float = NAN
-    upper: float = NAN
-    unit: str = "mm"
-    limit_from: str | Message = ""
-
-    @property
-    def actual(self) -> float:
-        """The value itself; NaN where the nominal is not known."""
-        return self.nominal + self.deviation
+def worst_first(rows: Iterable[Judged]) -> list[Judged]:
+    """Return what was judged with the worst first, else in its order."""
+    order = {verdict: place for place, verdict in enumerate(WORST_FIRST)}
+    return sorted(rows, key=lambda one: order.get(one.verdict, len(order)))
 
 
-def worst_first(found: Iterable[Characteristic]) -> list[Characteristic]:
-    """Return characteristics with the worst first, else in their order."""
-    return sorted(found, key=lambda one: ORDER.get(one.verdict, len(ORDER)))
+def limit_table(limits: JudgedLimits | None, file: str) -> list[Table]:
+    """Return the table of comparisons of a step, the worst first; none where nothing is limited."""
+    if limits is None:
+        return []
+    rows = tuple(
+        (label(one.what), one.of, one.verdict, one.value, one.ci95, one.low, one.high, one.unit, label(one.clause))
+        for one in worst_first(limits.rows)
+    )
+    note = with_unverified(NOTE_OF_LIMITS, (one.clause for one in limits.rows if not one.verified))
+    return [Table(text("Compared with limits"), OF_LIMITS, rows, file, note, on_page=False)]
 
 
-def of_limits(limits: JudgedLimits | None) -> Iterator[Characteristic]:
-    """Yield what a step compared with limits; such values are deviations."""
-    for k in range(0 if limits is None else len(limits)):
-        assert limits is not None
-        yield Characteristic(
-            id=label(limits.of[k]),
-            quantity=label(limits.what[k]),
-            nominal=0.0,
-            deviation=float(limits.value[k]),
-            ci95=float(limits.ci95[k]),
-            lower=float(limits.low[k]),
-            upper=float(limits.high[k]),
-            unit=limits.unit[k],
-            verdict=limits.verdict[k],
-            limit_from=label(limits.clause[k]),
-        )
+def with_unverified(note: Text, clauses: Iterable[str]) -> Text:
+    """Add to a note that the limits from these clauses were not compared with the text of their standard."""
+    sources = sorted(set(clauses))
+    return text(UNVERIFIED, note=note, sources=", ".join(sources)) if sources else note
 
 
-def table(found: Sequence[Characteristic], remark: str | Message = "") -> Table:
+def of_limits(limits: JudgedLimits | None) -> Iterator[Judged]:
+    """Yield what a step compared with limits, worded; such values are deviations."""
+    for one in [] if limits is None else limits.rows:
+        yield replace(one, of=label(one.of), what=label(one.what), clause=label(one.clause))
+
+
+def table(judged: Sequence[Judged], remark: str | Message = "") -> Table:
     """Tabulate characteristics, with a remark on them."""
     rows = tuple(
         (
-            one.id, one.verdict, one.quantity, one.nominal, one.actual, one.deviation, one.ci95, _bound(one.lower),
-            _bound(one.upper), one.unit, one.limit_from,
+            one.of, one.verdict, one.what, one.nominal, one.actual, one.value, one.ci95,
+            *(bound if math.isfinite(bound) else NAN for bound in (one.low, one.high)), one.unit, one.clause,
         )
-        for one in found
+        for one in judged
     )  # fmt: skip
     note = text("{note} {remark}", note=NOTE, remark=remark) if remark else NOTE
     return Table(text("Characteristics"), COLUMNS, rows, FILE, note, on_terminal=False)
 
 
-def _bound(value: float) -> float:
-    return value if math.isfinite(value) else NAN
-
-
-def summary(found: Iterable[Characteristic]) -> Message:
+def summary(judged: Iterable[Judged]) -> Message:
     """Say how many characteristics have which verdict, and name the first of the worst."""
-    ordered = worst_first(found)
+    ordered = worst_first(judged)
     if not ordered:
         return text("Nothing was compared with limits.")
     worst = ordered[0].verdict
@@ -109,7 +93,7 @@ def summary(found: Iterable[Characteristic]) -> Message:
     )
 
 
-def _named(one: Characteristic) -> Message:
-    if not math.isfinite(one.deviation):
-        return one.id if isinstance(one.id, Message) else label(one.id)
-    return text("{id} {deviation:+.2f} {unit}", id=one.id, deviation=one.deviation, unit=one.unit)
+def _named(one: Judged) -> Message:
+    if not math.isfinite(one.value):
+        return one.of if isinstance(one.of, Message) else label(one.of)
+    return text("{id} {deviation:+.2f} {unit}", id=one.of, deviation=one.value, unit=one.unit)

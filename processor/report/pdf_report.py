@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from processor.language.messages import Messages, label, messages, text
+from processor.limits.judging import Judged
 from processor.model import Verdict, worst
 from processor.pipeline import Execution
 from processor.report import characteristics, headline, title_block
-from processor.report.characteristics import Characteristic
 from processor.report.reports_of_steps import characteristics_of
 from processor.report.style import Drawn, chinese_font, drawable, families, pdf
 from processor.report.table import shown
@@ -188,11 +188,11 @@ def _characteristics(execution: Execution, say: Messages) -> Iterator[Figure]:
             yield page
 
 
-def _row(page: Figure, y: float, one: Characteristic, say: Messages) -> None:
+def _row(page: Figure, y: float, one: Judged, say: Messages) -> None:
     verdict = say.text(one.verdict)
     verdict = verdict.upper() if one.verdict is Verdict.FAIL else verdict
-    numbers = (one.nominal, one.actual, one.deviation, one.ci95, one.lower, one.upper)
-    cells = (say.text(one.id)[:34], verdict, *(shown(number) for number in numbers), one.unit)
+    numbers = (one.nominal, one.actual, one.value, one.ci95, one.low, one.high)
+    cells = (say.text(one.of)[:34], verdict, *(shown(number) for number in numbers), one.unit)
     for (name, x, side), cell in zip(COLUMNS, cells, strict=True):
         colour = COLOURS.get(one.verdict, "black") if name == "verdict" else "black"
         weight = "bold" if name == "verdict" else "normal"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib
 
+from processor.limits.judging import Judged
 from processor.model import Scene, StepRun
 from processor.pipeline import package_of
-from processor.report.characteristics import Characteristic, of_limits, worst_first
+from processor.report.characteristics import of_limits, worst_first
 from processor.report.step_report import StepReport
 
 
@@ -16,7 +17,7 @@ def step_report(step: str) -> StepReport:
     return report
 
 
-def characteristics_of(scene: Scene, run: StepRun) -> list[Characteristic]:
+def characteristics_of(scene: Scene, run: StepRun) -> list[Judged]:
     """Return the characteristics of a step, worst first, else in their order."""
     own = step_report(run.step).characteristics(scene, run)
     return worst_first([*own, *of_limits(getattr(run.result, "limits", None))])

@@ -14,7 +14,7 @@ from processor.pipeline import Execution
 from processor.plain_text import printable
 from processor.report import all_tables, headline
 from processor.report import table as report_table
-from processor.report.limit_comparison_table import worst_first
+from processor.report.characteristics import worst_first
 from processor.report.reports_of_steps import step_report
 
 MOST_LINES, LONGEST = 15, 200
@@ -87,13 +87,12 @@ def _beyond_limits(run: StepRun) -> Iterator[Message]:
     limits: JudgedLimits | None = getattr(run.result, "limits", None)
     if limits is None:
         return
-    rows = [k for k in worst_first(limits) if limits.verdict[k] != Verdict.PASS]
-    for k in rows[:LIMITS]:
-        allowed = _allowed(float(limits.low[k]), float(limits.high[k]))
+    rows = [one for one in worst_first(limits.rows) if one.verdict != Verdict.PASS]
+    for one in rows[:LIMITS]:
         yield text(
             "{verdict}: {of}, {what}: {value} ± {ci95} {unit}, {allowed}",
-            verdict=limits.verdict[k], of=limits.of[k], what=label(limits.what[k]), value=float(limits.value[k]),
-            ci95=float(limits.ci95[k]), unit=limits.unit[k], allowed=allowed,
+            verdict=one.verdict, of=one.of, what=label(one.what), value=one.value, ci95=one.ci95, unit=one.unit,
+            allowed=_allowed(one.low, one.high),
         )  # fmt: skip
     if len(rows) > LIMITS:
         yield text("... and {count} more of {step}", count=len(rows) - LIMITS, step=step_report(run.step).title)

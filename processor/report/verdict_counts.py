@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from processor.language.messages import Message, label, text
+from processor.language.messages import Message, Text, label, text
 from processor.model import Verdict
 
 MOST_NAMED = 3
@@ -19,7 +19,17 @@ LIMITS = {
     Verdict.INDETERMINATE: "{part} of {count} {count:?limit|limits} {part:?is|are} indeterminate: {named}",
 }
 SINGLE = {JOINTS[Verdict.PASS]: "the joint passes", LIMITS[Verdict.PASS]: "the limit is kept"}
+EACH = {
+    Verdict.PASS: text("{count} pass"),
+    Verdict.FAIL: text("{count} fail"),
+    Verdict.INDETERMINATE: text("{count} indeterminate"),
+}
 FURTHER = {Verdict.INDETERMINATE: "{part} indeterminate", Verdict.PASS: "{part} {part:?passes|pass}"}
+
+
+def each(verdicts: Sequence[Verdict]) -> list[Text]:
+    """Return how many of ``verdicts`` there are of each kind."""
+    return [Text(said.template, {"count": count}) for one, said in EACH.items() if (count := verdicts.count(one))]
 
 
 def summary(phrases: Mapping[Verdict, str], names: Sequence[str], verdicts: Sequence[Verdict]) -> Message:

@@ -9,13 +9,13 @@ also against their greatest length. The use is that of paper 001, section 4.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from processor.limits import judging, measurands, standards
-from processor.limits.judging import Comparison, JudgedLimits, Measured
+from processor.limits.judging import JudgedLimits, Measured
 from processor.model import NORMAL_95, Ceiling, Floats, Limit, Scene, Verdict, worst
 from processor.space_frame import mesh_heights
 from processor.space_frame.mesh_heights import Plan
@@ -33,9 +33,9 @@ def with_hangers(result: Result, scene: Scene) -> Result:
     surface = _Surface.of(ceiling)
     balls = result.balls
     length, sd, bottom = _lengths(balls, surface)
-    limits = _limits(ceiling)
+    limits, tolerance = _limits(ceiling), standards.default_for(scene.tolerance)
     of_ball = [
-        [judging.compare(limit, _measured(balls, i, float(length[i]), float(sd[i]))) for limit in limits]
+        [judging.judge(limit, _measured(balls, i, float(length[i]), float(sd[i])), tolerance) for limit in limits]
         if math.isfinite(length[i])
         else []  # it was not found, or no ceiling is below it
         for i in range(len(balls))
@@ -49,10 +49,9 @@ def with_hangers(result: Result, scene: Scene) -> Result:
         ci95=NORMAL_95 * sd,
         verdict=tuple(worst(row.verdict for row in rows) for rows in of_ball),
     )
-    rows = [*(row for rows in of_ball for row in rows), *_of_tubes(result.tubes, surface, limits[0])]
-    both = (result.limits, judging.judged(rows, standards.default_for(scene.tolerance)))
-    tables = [table for table in both if table is not None]
-    return replace(result, hangers=hangers, limits=JudgedLimits.concat(tables) if tables else None)
+    of_tubes = (judging.judge(limits[0], one, tolerance) for one in _of_tubes(result.tubes, surface))
+    rows = [*(row for rows in of_ball for row in rows), *of_tubes]
+    return replace(result, hangers=hangers, limits=JudgedLimits.joined((result.limits, judging.table(rows))))
 
 
 @dataclass(frozen=True)
@@ -111,10 +110,10 @@ def _lengths(balls: Balls, surface: _Surface) -> tuple[Floats, Floats, Floats]:
     return balls.lowest[:, 2] - height, np.sqrt(np.maximum(variance, 0.0)), bottom
 
 
-def _of_tubes(tubes: Tubes, surface: _Surface, clearance: Limit) -> list[Comparison]:
-    """Compare the lowest line of each tube with the clearance, where it is nearest to the ceiling."""
+def _of_tubes(tubes: Tubes, surface: _Surface) -> Iterator[Measured]:
+    """Yield the height of the lowest line of each tube where it is nearest to the ceiling."""
     share = np.linspace(0.0, 1.0, PLACES_OF_A_TUBE)[:, None]
-    rows, ends = [], tubes.ends
+    ends = tubes.ends
     for k in range(len(tubes)):
         axis = tubes.start[k] + share * (tubes.end[k] - tubes.start[k])
         along = tubes.end[k] - tubes.start[k]
@@ -132,9 +131,7 @@ def _of_tubes(tubes: Tubes, surface: _Surface, clearance: Limit) -> list[Compari
         of_axis = (1.0 - at) * tubes.start_ci95[k] + at * tubes.end_ci95[k]
         of_height = of_axis[2] + np.abs(slopes[nearest]) @ of_axis[:2]
         half = float(np.hypot(of_height, tubes.radius_ci95[k])) + float(np.nan_to_num(tubes.bow[k]))
-        name = _name(k, *ends[k])
-        rows.append(judging.compare(clearance, Measured.within(name, float(above[nearest]), half)))
-    return rows
+        yield Measured.within(_name(k, *ends[k]), float(above[nearest]), half)
 
 
 def _name(tube: int, a: int | str, b: int | str) -> str:

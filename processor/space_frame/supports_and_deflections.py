@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from processor.limits import judging, measurands
-from processor.limits.judging import Comparison, JudgedLimits, Measured
+from processor.limits.judging import JudgedLimits, Measured
 from processor.model import NORMAL_95, SUPPORTS, Bools, Floats, FrameDesign, Ints, Tolerance
 from processor.space_frame.result import Balls, Evidence
 
@@ -31,13 +31,13 @@ def judge(balls: Balls, design: FrameDesign, tolerance: Tolerance, matched: bool
     ``balls`` have movements, and ids of the design's nodes. ``matched`` is False where it is not certain which node is
     which: then all is indeterminate.
     """
-    rows: list[Comparison] = []
     nodes = _Nodes(balls, design, matched)
-    for limit in tolerance.limits:
-        measured = QUANTITIES.get(limit.measure)
-        if measured is not None:
-            rows += (judging.compare(limit, one) for one in measured(nodes))
-    return judging.judged(rows, tolerance)
+    return judging.table(
+        judging.judge(limit, measured, tolerance)
+        for limit in tolerance.limits
+        if limit.measure in QUANTITIES
+        for measured in QUANTITIES[limit.measure](nodes)
+    )
 
 
 class _Nodes:
@@ -77,7 +77,7 @@ def _centres(nodes: _Nodes) -> Iterator[Measured]:
         size = float(np.linalg.norm(offset))
         along = offset / size if size > 0.0 else np.array([1.0, 0.0])
         half = NORMAL_95 * float(np.sqrt(max(along @ covariance @ along, 0.0)))
-        yield Measured.within(nodes.name(row), size, half, {"length": length}, doubtful=not nodes.matched)
+        yield Measured.within(nodes.name(row), size, half, sizes_mm={"length": length}, doubtful=not nodes.matched)
 
 
 def _heights(nodes: _Nodes) -> Iterator[Measured]:
@@ -88,7 +88,7 @@ def _heights(nodes: _Nodes) -> Iterator[Measured]:
     z, sd = nodes.movement[rows, 2], nodes.sd[rows, 2]
     if not np.isfinite(z).all():
         missing = ", ".join(nodes.name(row) for row in rows[~np.isfinite(z)].tolist()[:3])
-        yield Measured(f"supports (not seen: {missing})", np.nan, np.nan, np.nan, doubtful=True)
+        yield Measured(f"supports (not seen: {missing})")
         return
     top, bottom = int(np.argmax(z)), int(np.argmin(z))
     between = f"{nodes.name(int(rows[top]))} - {nodes.name(int(rows[bottom]))}"
@@ -107,7 +107,7 @@ def _adjacent(nodes: _Nodes, kind: int) -> Iterator[Measured]:
         half = NORMAL_95 * float(np.hypot(nodes.sd[a, 2], nodes.sd[b, 2]))
         spacing = float(np.linalg.norm(plan[i] - plan[j]))
         name = f"{nodes.name(a)} - {nodes.name(b)}"
-        yield Measured.within(name, difference, half, {"spacing": spacing}, doubtful=not nodes.matched)
+        yield Measured.within(name, difference, half, sizes_mm={"spacing": spacing}, doubtful=not nodes.matched)
 
 
 def adjacent(plan: Floats) -> list[tuple[int, int]]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from processor.adjustment import thermal
-from processor.limits import standards
+from processor.limits import measurands, standards
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
 from processor.space_frame import ball_catalogue, supports_and_deflections
 from processor.space_frame.ball_catalogue import Catalogue
@@ -81,7 +81,7 @@ def _catalogue(params: Params) -> Catalogue:
 def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
     balls = _balls(extracted, source.origin, scene)
     matched, movements, stations = extracted.matching, extracted.movement, extracted.stations
-    limit = standards.find(standards.default_for(scene.tolerance), standards.NODE_PLACE)
+    limit = standards.find(standards.default_for(scene.tolerance), measurands.NODE_PLACE)
     reference = pose = judged = gauges = None
     if movements is not None and matched is not None:
         reference = MovementReference(

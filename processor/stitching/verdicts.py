@@ -15,14 +15,11 @@ from processor.stitching.result import Result
 def judge(scene: Scene, result: Result) -> JudgedLimits | None:
     """Compare a network with the limits of a scene; None where none is given."""
     tolerance = standards.default_for(scene.tolerance)
-    return judging.judged(
-        (
-            judging.compare(limit, measured)
-            for limit in tolerance.limits
-            if limit.measure in QUANTITIES
-            for measured in QUANTITIES[limit.measure](result)
-        ),
-        tolerance,
+    return judging.table(
+        judging.judge(limit, measured, tolerance)
+        for limit in tolerance.limits
+        if limit.measure in QUANTITIES
+        for measured in QUANTITIES[limit.measure](result)
     )
 
 

@@ -156,7 +156,7 @@ def test_holes_of_girders_are_measured_where_they_were_drilled():
         places = np.array([bores[k].middle for k in web])[:, [0, 2]]
         true = without_motion(places, shifts[part.name][web][:, [0, 2]])
         centred = places - places.mean(axis=0)
-        by_id = {one.id: one for one in found[part.name]}
+        by_id = {one.of: one for one in found[part.name]}
         assert sum(id_.endswith("diameter") for id_ in by_id) == HOLES
         assert sum(id_.endswith("along") for id_ in by_id) == len(web)  # two holes of a flange have a pitch alone
         for k in range(1, HOLES + 1):
@@ -169,14 +169,14 @@ def test_holes_of_girders_are_measured_where_they_were_drilled():
             row = int(np.argmin(np.linalg.norm(centred - [one.nominal, sign * other.nominal], axis=1)))
             np.testing.assert_allclose(centred[row], [one.nominal, sign * other.nominal], atol=0.01)  # the same
             held.append(one.low <= true[row, 0] <= one.high)
-            assert abs(one.deviation - true[row, 0]) < 2.3 * one.ci95  # 4.5 standard deviations
-            assert one.ci95 < 0.25  # some 35 points of 0.3 mm a bore
+            assert abs(one.value - true[row, 0]) < 2.3 * one.wider_side  # 4.5 standard deviations
+            assert one.wider_side < 0.25  # some 35 points of 0.3 mm a bore
         pitches = [one for id_, one in by_id.items() if id_.startswith("pitch")]
         assert len(pitches) == 2 + 10  # of each flange one; of two by four in the web ten
     assert np.mean(held) > 0.7  # of 16
-    joint = {one.id: one for one in splices.of_joints(scene.arch, drilled)[scene.arch.joint_names[0]]}
+    joint = {one.of: one for one in splices.of_joints(scene.arch, drilled)[scene.arch.joint_names[0]]}
     assert list(joint) == [*(f"plate-{k}-pass-through" for k in (1, 2, 3)), "splice-pass-through"]
-    assert all(one.low <= one.deviation <= one.high and not one.why for one in joint.values())
+    assert all(one.low <= one.value <= one.high and not one.reasons for one in joint.values())
 
 
 def test_a_bridge_without_holes_has_none():

@@ -109,7 +109,7 @@ def group():
 
 def measured(points, source, scanners):
     cloud = design_cloud.of_points(points, source, scanners)
-    return {one.id: one for one in holes.characteristics(group(), holes.fitted(cloud, group()), 1)}
+    return {one.of: one for one in holes.characteristics(group(), holes.fitted(cloud, group()), 1)}
 
 
 def without_motion(departure):
@@ -137,7 +137,7 @@ def test_intervals_cover_drilled_places_pitches_and_diameters(known):
             one = found[f"hole-{k + 1}-diameter"]
             held["diameter"].append(one.low <= 2.0 * radius <= one.high)
         for one in (one for id_, one in found.items() if id_.startswith("pitch")):
-            a, b = (int(n) - 1 for n in one.id.split("-")[1:])
+            a, b = (int(n) - 1 for n in one.of.split("-")[1:])
             apart = np.linalg.norm((GRID + departure)[b] - (GRID + departure)[a])
             held["pitch"].append(one.low <= apart - one.nominal <= one.high)
     for name, of_name in held.items():
@@ -157,7 +157,7 @@ def test_a_plate_that_is_moved_and_turned_keeps_its_holes():
     after = measured(moved, source, turn.apply(scanners))
     for id_, one in before.items():
         # Motions are linearised: a degree turns departures of 1 mm by 0.02 mm.
-        assert after[id_].deviation == pytest.approx(one.deviation, abs=0.05), id_
+        assert after[id_].value == pytest.approx(one.value, abs=0.05), id_
 
 
 @pytest.mark.parametrize(("off", "share"), [(0.0, 1.0), (0.8, 1.0), (3.0, 5.0 / 6.0)])
@@ -167,7 +167,7 @@ def test_a_gauge_pin_passes_holes_that_are_less_than_its_play_off(off, share):
     departure = np.zeros(GRID.shape)
     departure[1] = [0.0, off]
     one = measured(*bore_cloud(np.random.default_rng(1), departure, sigma=0.1))["holes-1-6-pass-through"]
-    assert 1.0 + one.deviation == pytest.approx(share, abs=0.02)  # an eighth of a hole of six: none is unsure
+    assert 1.0 + one.value == pytest.approx(share, abs=0.02)  # an eighth of a hole of six: none is unsure
     assert one.low <= share - 1.0 <= one.high
     assert one.unit == "1"
 
@@ -178,7 +178,7 @@ def test_the_share_that_a_pin_passes_is_unsure_where_the_play_is_used_up():
         departure = np.zeros(GRID.shape)
         departure[1] = [0.0, off]
         found.append(measured(*bore_cloud(np.random.default_rng(1), departure))["holes-1-6-pass-through"])
-    shares, widths = np.array([(one.deviation, one.high - one.low) for one in found]).T
+    shares, widths = np.array([(one.value, one.high - one.low) for one in found]).T
     assert (np.diff(shares) <= 1e-6).all()  # rounding
     np.testing.assert_allclose(shares[[0, -1]], [0.0, -1.0 / 6.0], atol=1e-3)  # chances beyond three sds
     assert widths[[0, -1]].max() < 1e-6 < 0.1 < widths.max()  # no chances but beside the play: rounding
@@ -191,7 +191,7 @@ def test_mixed_pixels_in_the_bore_do_not_move_it():
         departure = rng.normal(0.0, 0.7, GRID.shape)
         found = measured(*bore_cloud(rng, departure, mixed=0.15))
         true = without_motion(departure)
-        errors += [found[f"hole-{k + 1}-along"].deviation - true[k, 0] for k in range(len(GRID))]
+        errors += [found[f"hole-{k + 1}-along"].value - true[k, 0] for k in range(len(GRID))]
     assert np.sqrt(np.mean(np.square(errors))) < 0.1  # as hole centres are asked for
 
 
@@ -200,10 +200,10 @@ def test_a_hole_that_was_not_seen_has_no_value():
     points, source, scanners = bore_cloud(rng, np.zeros(GRID.shape))
     hidden = np.linalg.norm(points[:, :2] - GRID[0], axis=1) < 30.0
     found = measured(points[~hidden], source[~hidden], scanners)
-    assert np.isnan(found["hole-1-along"].deviation)
-    assert np.isnan(found["hole-1-diameter"].deviation)
-    assert [one.code for one in found["hole-1-along"].why] == ["inspect.hole-not-seen"]
-    assert np.isfinite(found["hole-2-along"].deviation)
+    assert np.isnan(found["hole-1-along"].value)
+    assert np.isnan(found["hole-1-diameter"].value)
+    assert [one.code for one in found["hole-1-along"].reasons] == ["inspect.hole-not-seen"]
+    assert np.isfinite(found["hole-2-along"].value)
 
 
 def test_few_points_on_one_side_of_a_bore_are_no_hole():
@@ -234,26 +234,26 @@ def drilled(seen, sd=0.05, places=GRID, temperature_C=float("nan"), departure=0.
     covariance[np.ix_(rows, rows)] = sd**2 * np.eye(len(rows))
     radius = np.full(count, RADIUS)
     fitted = holes._referred(bore_fit.Fitted(off, covariance, np.zeros(count, np.int64)), places, radius, temperature_C)
-    return {one.id: one for one in holes._characteristics(places, radius, fitted, 1)}
+    return {one.of: one for one in holes._characteristics(places, radius, fitted, 1)}
 
 
 def test_holes_not_seen_may_pass_or_not():
     """Of six holes three were seen, all of them as designed: between three and six pass."""
     some = drilled([0, 1, 2])["holes-1-6-pass-through"]
     assert (1.0 + some.low, 1.0 + some.high) == pytest.approx((0.5, 1.0))
-    assert some.low <= some.deviation <= some.high
-    assert [one.code for one in some.why] == ["inspect.holes-unseen"]
+    assert some.low <= some.value <= some.high
+    assert [one.code for one in some.reasons] == ["inspect.holes-unseen"]
     whole = drilled(list(range(6)))["holes-1-6-pass-through"]
-    assert (whole.low, whole.high, whole.why) == (0.0, 0.0, ())
+    assert (whole.low, whole.high, whole.reasons) == (0.0, 0.0, ())
 
 
 def test_places_of_a_group_of_which_two_holes_were_seen_are_absent_with_a_reason():
     found = drilled([1, 4])
-    assert np.isnan([found["hole-2-along"].deviation, found["holes-1-6-pass-through"].deviation]).all()
-    assert [one.code for one in found["hole-2-along"].why] == ["inspect.few-holes-seen"]
-    assert [one.code for one in found["hole-1-along"].why] == ["inspect.hole-not-seen"]
-    assert [one.code for one in found["holes-1-6-pass-through"].why] == ["inspect.few-holes-seen"]
-    assert np.isfinite(found["hole-2-diameter"].deviation)
+    assert np.isnan([found["hole-2-along"].value, found["holes-1-6-pass-through"].value]).all()
+    assert [one.code for one in found["hole-2-along"].reasons] == ["inspect.few-holes-seen"]
+    assert [one.code for one in found["hole-1-along"].reasons] == ["inspect.hole-not-seen"]
+    assert [one.code for one in found["holes-1-6-pass-through"].reasons] == ["inspect.few-holes-seen"]
+    assert np.isfinite(found["hole-2-diameter"].value)
     assert "hole-1-along" not in drilled([0, 1], places=GRID[:2])  # of two holes none has a place in the group
 
 
@@ -273,15 +273,15 @@ def test_lengths_of_warm_steel_are_those_at_the_reference_temperature():
     larger = 12e-6 * 30.0 * np.column_stack([GRID - GRID.mean(axis=0), np.full(len(GRID), RADIUS)])
     every = list(range(len(GRID)))
     for one in drilled(every, departure=larger, temperature_C=50.0).values():
-        assert one.deviation == pytest.approx(0.0, abs=1e-4)  # of second order: 3.6e-4 of 0.05 mm
-    assert drilled(every, departure=larger)["pitch-1-2"].deviation == pytest.approx(12e-6 * 30.0 * PITCH[0])
+        assert one.value == pytest.approx(0.0, abs=1e-4)  # of second order: 3.6e-4 of 0.05 mm
+    assert drilled(every, departure=larger)["pitch-1-2"].value == pytest.approx(12e-6 * 30.0 * PITCH[0])
 
 
 def test_places_and_pitches_have_the_scale_of_the_scanner():
     places = 50.0 * GRID
     found = drilled(list(range(6)), sd=0.0, places=places)
-    assert found["pitch-1-2"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)  # 1.96 for 1.95996
-    assert found["hole-1-along"].ci95 == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)
+    assert found["pitch-1-2"].wider_side == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)  # 1.96 for 1.95996
+    assert found["hole-1-along"].wider_side == pytest.approx(1.96 * 5e-6 * 50.0 * PITCH[0], rel=1e-3)
 
 
 def test_a_hole_lies_between_two_stations_by_the_variances_of_their_shifts_and_offsets():

@@ -25,7 +25,6 @@ from processor.deviation import verdicts as of_surface
 from processor.deviation.result import ErrorSource
 from processor.deviation.result import Result as DeviationResult
 from processor.inspection import characteristic
-from processor.inspection.characteristic import Characteristic
 from processor.inspection.result import Quantity
 from processor.jobs import exit_codes
 from processor.language.messages import messages
@@ -47,7 +46,7 @@ from processor.model import (
     reason,
 )
 from processor.preassembly.verdicts import chain
-from processor.report import headline, limit_comparison_table, verdict_counts
+from processor.report import characteristics, headline, verdict_counts
 from processor.scan_folder import folder, tolerance
 from processor.space_frame import supports_and_deflections
 from processor.space_frame.result import Balls, Evidence, Flag
@@ -85,15 +84,52 @@ def given(of_components=None, **limits):
 def test_verdict_follows_from_the_interval_of_the_value(value, ci95, verdict):
     tolerance = given(node_place_mm=5.0)
     (limit,) = tolerance.limits
-    assert judging.compare(limit, Measured.within("n", value, ci95)).verdict is verdict
-    assert judging.compare(limit, Measured.within("n", value, ci95, doubtful=True)).verdict is OPEN
+    assert judging.judge(limit, Measured.within("n", value, ci95), tolerance).verdict is verdict
+    assert judging.judge(limit, Measured.within("n", value, ci95, doubtful=True), tolerance).verdict is OPEN
+
+
+@pytest.mark.parametrize(
+    ("interval", "verdict"),
+    [
+        ((1.0, 2.0), "pass"),  # 1.5 +- 0.5 reaches the limit just so
+        ((1.0, 2.01), "indeterminate"),
+        ((1.9, 2.1), "indeterminate"),
+        ((2.0, 3.0), "indeterminate"),
+        ((2.01, 3.0), "fail"),
+        ((-1.01, 0.0), "indeterminate"),
+        ((-3.0, -1.01), "fail"),
+        ((np.nan, np.nan), "indeterminate"),
+    ],
+)
+def test_verdict_of_an_interval_against_bounds(interval, verdict):
+    limit = Limit("k", "x", low=-1.0, high=2.0)
+    assert judging.judge(limit, Measured("n", 0.5 * sum(interval), *interval), Tolerance()).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("least", "greatest", "verdict", "value"),
+    [
+        (-3.0, 1.0, "pass", -3.0),  # 2 from the lower bound, 4 from the upper one
+        (-4.8, 1.0, "indeterminate", -4.8),
+        (-4.8, 6.0, "fail", 6.0),
+        (-9.0, -8.0, "fail", -9.0),
+        (-9.0, math.nan, "fail", -9.0),
+        (-1.0, math.nan, "indeterminate", -1.0),
+    ],
+)
+def test_least_and_greatest_are_judged_by_the_bound_on_their_side(least, greatest, verdict, value):
+    limit = Limit("k", "x", low=-5.0, high=5.0)
+    sides = [Measured.within("n", one, 0.5) for one in (least, greatest)]
+    row = judging.judge(limit, sides[0], Tolerance(), sides[1])
+    assert (row.verdict, row.value, row.ci95) == (verdict, value, pytest.approx(0.5))
 
 
 def test_limit_by_an_unknown_size_gives_an_indeterminate_verdict():
-    limit = standards.find(standards.load("JGJ 7-2010"), "support_centre_mm")
-    assert judging.compare(limit, Measured.within("n", 1.0, 0.1)).verdict is OPEN
-    assert judging.compare(limit, Measured.within("n", 1.0, 0.1, {"length": 30_000.0})).verdict is PASS
-    assert judging.compare(limit, Measured.within("n", 11.0, 0.1, {"length": 30_000.0})).verdict is FAIL
+    jgj, sizes_mm = standards.load("JGJ 7-2010"), {"length": 30_000.0}
+    limit = standards.find(jgj, "support_centre_mm")
+    assert judging.judge(limit, Measured.within("n", 1.0, 0.1), jgj).verdict is OPEN
+    assert judging.judge(limit, Measured.within("n", 1.0, 0.1, sizes_mm=sizes_mm), jgj).verdict is PASS
+    assert judging.judge(limit, Measured.within("n", 11.0, 0.1, sizes_mm=sizes_mm), jgj).verdict is FAIL
 
 
 @pytest.mark.parametrize("unsigned", [False, True])
@@ -107,9 +143,9 @@ def test_nothing_is_decided_where_one_of_the_bounds_or_ends_is_unknown(unknown, 
         limit = dataclasses.replace(limit, **{unknown.removesuffix("_ratio"): math.nan, unknown: 1e-3})
     else:
         ends[unknown] = math.nan
-    row = judging.compare(limit, Measured("n", 0.5 * sum(interval), **ends, unsigned=unsigned))
+    row = judging.judge(limit, Measured("n", 0.5 * sum(interval), **ends, unsigned=unsigned), Tolerance())
     assert row.verdict is OPEN
-    assert judging.judged([row], Tolerance()).overall is OPEN
+    assert judging.table([row]).overall is OPEN
 
 
 @pytest.mark.parametrize("size_mm", [math.nan, 1000.0])
@@ -128,7 +164,7 @@ def test_a_bound_by_number_and_size_is_unknown_with_the_size(size_mm):
 @pytest.mark.parametrize("ends", [(math.nan, -9.0), (8.0, math.nan), (8.0, math.inf), (math.nan, math.nan)])
 def test_a_characteristic_with_an_open_interval_is_indeterminate(ends):
     limit = Limit("part_bow_mm", "bow", low=-5.0, high=5.0, measure="part bow")
-    one = Characteristic("bow", Quantity.BOW, 0.0, deviation=7.0, low=ends[0], high=ends[1])
+    one = Measured("bow", 7.0, *ends, what=Quantity.BOW)
     table = characteristic.table([one], Tolerance(limits=(limit,)), "m1", {}, doubtful=False)
     assert table.verdict == (OPEN,)
 
@@ -404,17 +440,17 @@ def test_the_page_and_the_table_have_the_worst_first_and_name_what_is_not_verifi
     moved = np.zeros((5, 3))
     moved[1, :2] = 0.0, 11.0
     limits = supports_and_deflections.judge(*frame(moved), standards.load("GB 50205-2020"), True)
-    (table,) = limit_comparison_table.limit_table(limits, "x-limits")
+    (table,) = characteristics.limit_table(limits, "x-limits")
     assert [str(row[2]) for row in table.rows] == sorted([str(row[2]) for row in table.rows], key=WORST.index)
     assert "Not verified" not in str(table.note)
     unsure = dataclasses.replace(limits, verified=np.zeros(len(limits), bool))
-    (table,) = limit_comparison_table.limit_table(unsure, "x-limits")
+    (table,) = characteristics.limit_table(unsure, "x-limits")
     assert "Not verified: the limits from GB 50205-2020 11.3.6 were not" in str(table.note)
     failing = limits.of[limits.verdict.index(Verdict.FAIL)]
     assert (
         str(headline.of_limits(limits)) == f"1 of {len(limits)} limits is not kept: {failing}; {len(limits) - 1} pass"
     )
-    assert limit_comparison_table.limit_table(None, "x") == []
+    assert characteristics.limit_table(None, "x") == []
 
 
 # --- networks

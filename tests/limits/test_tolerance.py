@@ -134,10 +134,10 @@ def test_project_without_a_standard_has_its_own_limits_alone(tmp_path):
 
 def test_project_may_set_a_limit_that_no_standard_has(tmp_path):
     for name in standards.standards():
-        assert standards.find(standards.load(name), standards.NODE_PLACE) is None
+        assert standards.find(standards.load(name), measurands.NODE_PLACE) is None
     for text in ("", 'standard = "JGJ 7-2010"\n'):
         scene = folder.read_input(write_project(tmp_path, f"[tolerance]\n{text}node_place_mm = 15\n"))
-        own = standards.find(scene.tolerance, standards.NODE_PLACE)
+        own = standards.find(scene.tolerance, measurands.NODE_PLACE)
         assert (own.high, own.verified, own.source) == (15.0, True, "project.toml")
 
 

@@ -137,29 +137,6 @@ def test_span_is_nan_if_a_joint_is_not_measured():
     assert np.isnan(span_and_closure.span([], adjusted, design)).all()
 
 
-def test_limits_of_an_undecided_joint_are_indeterminate():
-    limits = joints.ComparedLimits(
-        key=("a",),
-        what=("b",),
-        value=np.ones(1),
-        ci95=np.ones(1),
-        low=np.zeros(1),
-        high=np.zeros(1),
-        verdict=("fail",),
-        probability=np.zeros(1),
-        clause=("c",),
-        edition=("",),
-        source=("s",),
-        verified=np.zeros(1, bool),
-    )
-    verdict = joints.Conformity(verdict="fail", probability=0.0, limits=limits)
-    doubt = reason("preassemble.ambiguous-part", part="rib1")
-    opened = joints.left_open(verdict, (doubt,))
-    assert (opened.verdict, opened.limits.verdict, opened.reasons) == ("indeterminate", ("indeterminate",), (doubt,))
-    assert np.isnan([opened.probability, opened.limits.probability[0]]).all()
-    assert joints.left_open(verdict, ()) is verdict
-
-
 def test_mean_and_largest_of_correlated_values_have_the_interval_of_one():
     """1.96 sd for one value, and for the mean of a hundred values that may be fully correlated."""
     of = span_and_closure.mean_max_ci95

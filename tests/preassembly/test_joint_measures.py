@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from processor.limits import project_limits, standards
-from processor.limits.decision_rule import decide
 from processor.model import Tolerance, reason
 from processor.preassembly.chain import joint_measures
 from processor.preassembly.chain.joint_measures import measure
@@ -153,7 +152,8 @@ def test_intervals_of_extremes_cover(shape):
     drawn = np.random.default_rng(9).multivariate_normal(true.ravel(), covariance, 250).reshape(-1, 8, 3)
     measured = [at_rest(gaps, covariance) for gaps in drawn]
     for name, value in truth.items():
-        within = np.mean([low <= value <= high for low, high in (one.interval(name) for one in measured)])
+        intervals = [joint.measured(name) for joint in measured]
+        within = np.mean([one.low <= value <= one.high for one in intervals])
         assert within >= 0.93, name  # 0.95 less 1.4 sd of 250
     at = np.array([one.misalignment_at for one in measured])
     half = measured[0].misalignment_at_ci95
@@ -168,25 +168,8 @@ def test_single_extreme_has_the_interval_of_one_value():
     gaps[3, 0] = 5.0
     assert at_rest(gaps, covariance).of("groove_gap_greatest") == pytest.approx((5.0, 1.959964 * 0.2))
     # Seven alike: of independent errors 95 % are all within k sd where (2 Phi(k) - 1)^7 = 0.95, so k = 2.68.
-    low, high = at_rest(gaps, covariance).interval("groove_gap_least")
-    assert (low, high) == pytest.approx((-0.536, 0.536), abs=0.01)  # the figures of k
-
-
-@pytest.mark.parametrize(
-    ("interval", "verdict"),
-    [
-        ((1.0, 2.0), "pass"),  # 1.5 +- 0.5 reaches the limit just so
-        ((1.0, 2.01), "indeterminate"),
-        ((1.9, 2.1), "indeterminate"),
-        ((2.0, 3.0), "indeterminate"),
-        ((2.01, 3.0), "fail"),
-        ((-1.01, 0.0), "indeterminate"),
-        ((-3.0, -1.01), "fail"),
-        ((np.nan, np.nan), "indeterminate"),
-    ],
-)
-def test_verdict_of_an_interval_against_bounds(interval, verdict):
-    assert decide(interval, -1.0, 2.0) == verdict
+    least = at_rest(gaps, covariance).measured("groove_gap_least")
+    assert (least.low, least.high) == pytest.approx((-0.536, 0.536), abs=0.01)  # the figures of k
 
 
 def lone(value, sd, point=5, axis=1):
@@ -215,6 +198,19 @@ def test_misalignment_against_its_limit(value, verdict, probability):
     assert found.limits.probability[0] == found.probability
     assert found.limits.value[0] == abs(value)
     assert found.limits.ci95[0] == pytest.approx(1.959964 * 0.5)
+
+
+@pytest.mark.parametrize("limits", [{"misalignment_mm": 2.0}, {}])
+def test_limits_of_an_undecided_joint_are_indeterminate(limits):
+    doubts = (reason("preassemble.ambiguous-part", part="rib1"),)
+    found = judge(lone(-3.0, 0.5), only(**limits), doubts)
+    assert (found.verdict, found.limits.verdict, found.reasons) == (
+        "indeterminate",
+        ("indeterminate",) * len(limits),
+        doubts,
+    )
+    assert np.isnan([found.probability, *found.limits.probability]).all()
+    assert found.limits.value.tolist() == [3.0] * len(limits)
 
 
 def test_two_limits_and_the_root_gap():

@@ -38,8 +38,6 @@ def defects(
     if status is Status.OK and any(result.status is not Status.OK for result in known):
         status = Status.WEAK
     found = list(_numbered(known))
-    judged = [depths_and_areas.judge(scene, result) for result in found]
-    limits = [rows for rows in judged if rows is not None]
     return Result(
         status=status,
         method=method,
@@ -56,7 +54,7 @@ def defects(
         defects=Defects.concat([result.defects for result in found if len(result.defects)]),
         pictures=tuple(chain.from_iterable(_pictures(result) for result in found)),
         surface=SurfacePlaces.concat([result.surface for result in found if len(result.surface)]),
-        limits=JudgedLimits.concat(limits) if limits else None,
+        limits=JudgedLimits.joined(depths_and_areas.judge(scene, result) for result in found),
         parts=_table(parts, results),
     )
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from processor.defects.result import DefectClass, Result
 from processor.limits import judging, measurands, standards
-from processor.limits.judging import Comparison, JudgedLimits, Measured
+from processor.limits.judging import Judged, JudgedLimits, Measured
 from processor.model import Limit, Scene, Status, Tolerance, Verdict
 
 SURE = 0.95  # confidence of a class, from which limits of another class do not matter
@@ -29,20 +29,19 @@ def judge(scene: Scene, result: Result) -> JudgedLimits | None:
     kinds = (measurands.DEFECT_DEPTH, measurands.DEFECT_AREA)
     if not any(limit.measure in kinds for limit in tolerance.limits):
         return None
-    rows: list[Comparison] = []
+    rows: list[Judged] = []
     for measure in kinds:
         of_measure = [limit for limit in tolerance.limits if limit.measure == measure]
         if of_measure and result.status is Status.FAILED:
-            nan = Measured(SURFACE, math.nan, math.nan, math.nan, doubtful=True)
-            rows.append(judging.compare(of_measure[0], nan))
+            rows.append(judging.judge(of_measure[0], Measured(SURFACE), tolerance))
             continue
         for row in range(len(result.defects)):
             rows += _of_defect(result, row, tolerance, measure)
     rows += _not_found(result, tolerance) if result.status is not Status.FAILED else ()
-    return judging.judged(rows, tolerance)
+    return judging.table(rows)
 
 
-def _of_defect(result: Result, row: int, tolerance: Tolerance, measure: str) -> Iterator[Comparison]:
+def _of_defect(result: Result, row: int, tolerance: Tolerance, measure: str) -> Iterator[Judged]:
     """Compare one defect by one measure with the limits of its class and component; at most one comparison."""
     defects = result.defects
     limits = judging.limits_for(tolerance, measure, defects.component[row])
@@ -52,10 +51,10 @@ def _of_defect(result: Result, row: int, tolerance: Tolerance, measure: str) -> 
     other = limit if sure else _limit(limits, defects.otherwise[row])
     if limit is None:
         return
-    compared = judging.compare(limit, measured)
-    if other is None or judging.compare(other, measured).verdict is not compared.verdict:
-        compared = replace(compared, verdict=Verdict.INDETERMINATE)
-    yield compared
+    judged = judging.judge(limit, measured, tolerance)
+    if other is None or judging.judge(other, measured, tolerance).verdict is not judged.verdict:
+        judged = replace(judged, verdict=Verdict.INDETERMINATE)
+    yield judged
 
 
 def _limit(limits: Sequence[Limit], kind: DefectClass) -> Limit | None:
@@ -86,7 +85,7 @@ def _area(result: Result, row: int) -> Measured:
     return Measured(_name(result, row), area, least, area + half, doubtful=bool(defects.doubtful[row]))
 
 
-def _not_found(result: Result, tolerance: Tolerance) -> Iterator[Comparison]:
+def _not_found(result: Result, tolerance: Tolerance) -> Iterator[Judged]:
     """Compare the least depth that is found with the strictest limit of depth: shallower defects may be there."""
     depths = [limit for limit in tolerance.limits if limit.measure == measurands.DEFECT_DEPTH]
     if not depths:
@@ -94,4 +93,4 @@ def _not_found(result: Result, tolerance: Tolerance) -> Iterator[Comparison]:
     strictest = min(depths, key=lambda limit: limit.high)
     rows = len(result.least_depth)
     found_from = float(result.least_depth.depth[rows // 2]) if rows else math.nan
-    yield judging.compare(strictest, Measured(SURFACE, 0.0, 0.0, found_from))
+    yield judging.judge(strictest, Measured(SURFACE, 0.0, 0.0, found_from), tolerance)

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from itertools import product
 
 import numpy as np
 
 from processor.adjustment import maximum_interval
 from processor.geometry import rigid
+from processor.limits.judging import Measured
 from processor.model import (
     AMOUNT,
     COORDINATE,
@@ -97,23 +98,14 @@ class Measures(Checked):
 
     def of(self, name: str) -> tuple[float, float]:
         """Value and 95 % half-width of a quantity. Raises ValueError for an unknown name."""
+        one = self.measured(name)
+        return one.value, one.ci95
+
+    def measured(self, name: str) -> Measured:
+        """Return a quantity with its 95 % interval. Raises ValueError for an unknown name."""
         row = self.quantities.name.index(JointQuantity(name))
-        return float(self.quantities.value[row]), float(self.quantities.ci95[row])
-
-    def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval of a quantity. Raises ValueError for an unknown name."""
-        row = self.quantities.name.index(JointQuantity(name))
-        return float(self.quantities.low[row]), float(self.quantities.high[row])
-
-
-class _Row(NamedTuple):
-    """One measure with its 95 % interval."""
-
-    name: JointQuantity
-    value: float
-    unit: str
-    low: float
-    high: float
+        (found,) = self.quantities.take(slice(row, row + 1)).items()
+        return Measured(found.pop("name"), **found)
 
 
 def in_joint_axes(gaps: Floats, covariance: Floats, T_bridge_joint: Floats) -> tuple[Floats, Floats]:
@@ -128,19 +120,11 @@ def measure(gaps: Floats, covariance: Floats, T_bridge_joint: Floats, points: Fl
     local, spread = in_joint_axes(gaps, covariance, T_bridge_joint)
     at = rigid.apply(rigid.invert(T_bridge_joint), points)
     rows = [*_groove_rows(local, spread), _misalignment_row(local, spread), *_motion_rows(local, spread, at)]
-    low, high = np.array([row.low for row in rows]), np.array([row.high for row in rows])
-    value = np.array([row.value for row in rows])
     misalignment, half_width = _misalignment_at(local, spread)
-    quantities = MeasuredQuantities(
-        name=tuple(row.name for row in rows),
-        value=value,
-        ci95=np.maximum(high - value, value - low),
-        low=low,
-        high=high,
-        unit=tuple(row.unit for row in rows),
-    )
     return Measures(
-        quantities=quantities,
+        quantities=MeasuredQuantities.from_items(
+            rows, name=tuple(row.of for row in rows), ci95=tuple(row.wider_side for row in rows)
+        ),
         points=at,
         gaps=local,
         gaps_ci95=NORMAL_95 * np.sqrt(np.maximum(np.diag(spread), 0.0)).reshape(8, 3),
@@ -161,30 +145,26 @@ def motion_of(points: Floats) -> Floats:
     return solve
 
 
-def _row(name: JointQuantity, value: float, unit: str, half_width: float) -> _Row:
-    return _Row(name, value, unit, value - half_width, value + half_width)
-
-
-def _groove_rows(gaps: Floats, covariance: Floats) -> list[_Row]:
+def _groove_rows(gaps: Floats, covariance: Floats) -> list[Measured]:
     x, spread = gaps[:, 0], covariance[np.ix_(_ALONG, _ALONG)]
     mean_sd = float(np.sqrt(max(spread.mean(), 0.0)))
     negative, below, above = maximum_interval.of_correlated(-x, spread)
     greatest, low, high = maximum_interval.of_correlated(x, spread)
     return [
-        _row(JointQuantity.GROOVE_GAP_MEAN, float(x.mean()), "mm", NORMAL_95 * mean_sd),
-        _Row(JointQuantity.GROOVE_GAP_LEAST, -negative, "mm", -above, -below),
-        _Row(JointQuantity.GROOVE_GAP_GREATEST, greatest, "mm", low, high),
+        Measured.within(JointQuantity.GROOVE_GAP_MEAN, float(x.mean()), NORMAL_95 * mean_sd),
+        Measured(JointQuantity.GROOVE_GAP_LEAST, -negative, -above, -below),
+        Measured(JointQuantity.GROOVE_GAP_GREATEST, greatest, low, high),
     ]
 
 
-def _misalignment_row(gaps: Floats, covariance: Floats) -> _Row:
+def _misalignment_row(gaps: Floats, covariance: Floats) -> Measured:
     across, spread = gaps.ravel()[_ROWS], covariance[np.ix_(_ROWS, _ROWS)]
     sign = np.where(across < 0.0, -1.0, 1.0)
     greatest, low, high = maximum_interval.of_correlated(sign * across, spread * np.outer(sign, sign), folded=True)
-    return _Row(JointQuantity.MISALIGNMENT, greatest, "mm", low, high)
+    return Measured(JointQuantity.MISALIGNMENT, greatest, low, high)
 
 
-def _motion_rows(gaps: Floats, covariance: Floats, points: Floats) -> list[_Row]:
+def _motion_rows(gaps: Floats, covariance: Floats, points: Floats) -> list[Measured]:
     solve = motion_of(points)
     motion, spread = solve @ gaps.ravel(), solve @ covariance @ solve.T
     half_width = NORMAL_95 * np.sqrt(np.maximum(np.diag(spread), 0.0))
@@ -192,11 +172,11 @@ def _motion_rows(gaps: Floats, covariance: Floats, points: Floats) -> list[_Row]
     offset = float(np.hypot(motion[4], motion[5]))
     reach = RAYLEIGH_95 * _largest_sd(spread[4:, 4:])
     low = max(offset - reach, 0.0) if np.isfinite(offset) else offset
-    rows = [_Row(JointQuantity.ECCENTRICITY, offset, "mm", low, offset + reach)]
-    for k, axis in enumerate("xyz"):
-        rows.append(_row(JointQuantity(f"rotation_{axis}"), 1e3 * float(motion[k]), "mrad", 1e3 * float(half_width[k])))
-    for k, axis in enumerate("xyz"):
-        rows.append(_row(JointQuantity(f"offset_{axis}"), float(motion[3 + k]), "mm", float(half_width[3 + k])))
+    rows = [Measured(JointQuantity.ECCENTRICITY, offset, low, offset + reach)]
+    for k, (kind, axis) in enumerate(product(("rotation", "offset"), "xyz")):
+        unit, scale = ("mrad", 1e3) if kind == "rotation" else ("mm", 1.0)
+        value, half = scale * float(motion[k]), scale * float(half_width[k])
+        rows.append(Measured.within(JointQuantity(f"{kind}_{axis}"), value, half, unit=unit))
     return rows
 
 

@@ -6,7 +6,6 @@ extremes over all chainages, see :func:`processor.adjustment.maximum_interval.of
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -14,19 +13,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from processor.adjustment import maximum_interval
-from processor.limits import limit_bounds
-from processor.limits.decision_rule import decide
+from processor.limits import judging, limit_bounds
+from processor.limits.judging import Judged, Measured
 from processor.model import MEASURES as OF_STEPS
-from processor.model import NORMAL_95, Floats, Limit, Reason, Tolerance, Verdict, reason, worst
+from processor.model import NORMAL_95, Floats, Limit, Reason, Tolerance, reason
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.part_in_chain import Member
-from processor.preassembly.verdicts.joints import (
-    Comparison,
-    Conformity,
-    LimitOrigin,
-    compose,
-    of_project,
-)
+from processor.preassembly.verdicts.joints import Conformity, LimitOrigin
 
 OF_SPAN, OF_EDGES = ("span", "unit_length"), ("inner_arc", "lateral_axis", "elevation")
 MEASURES = (*OF_SPAN, *OF_EDGES)
@@ -72,7 +65,7 @@ def applicable(tolerance: Tolerance, *, span: bool, edges: bool) -> Tolerance:
 
 
 def judge(measured: Quantities, tolerance: Tolerance, span_mm: float, doubts: tuple[Reason, ...] = ()) -> Conformity:
-    """Compare the chain with the limits of ``tolerance``; ``span_mm`` is the design's, for limits that depend on it.
+    """Judge the chain by the limits of ``tolerance``; ``span_mm`` is the design's, for limits that depend on it.
 
     ``doubts`` are reasons why no verdict is possible (an ambiguous part, a joint without a result): then all is
     indeterminate.
@@ -81,34 +74,33 @@ def judge(measured: Quantities, tolerance: Tolerance, span_mm: float, doubts: tu
     if not limits:
         standard = tolerance.standard or LimitOrigin.PROJECT
         return Conformity(reasons=(reason("preassemble.no-chain-limit", standard=standard),))
-    comparisons = [_compare(measured[limit.measure], limit, span_mm, bool(doubts)) for limit in limits]
-    return compose(limits, comparisons, tolerance, float("nan"), doubts)
+    rows = [_judged(measured[limit.measure], limit, tolerance, span_mm, bool(doubts)) for limit in limits]
+    return Conformity.of_rows(rows, probability=float("nan"), doubts=doubts)
 
 
 def unused_limits(tolerance: Tolerance) -> list[Limit]:
     """Return the limits given by a project that apply to nothing of a bridge."""
     compared = (*OF_STEPS["preassemble"], *OF_STEPS["inspect"])
-    return [limit for limit in tolerance.limits if of_project(limit) and limit.measure not in compared]
+    return [limit for limit in tolerance.limits if judging.of_project(limit) and limit.measure not in compared]
 
 
-def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, doubtful: bool) -> Comparison:
-    """Compare the value nearer to its limit; the probability is of single values only."""
-    nan = float("nan")
-    low, high = limit_bounds.bounds(limit, {"length": span_mm})
+def _judged(
+    measured: tuple[Floats, Floats], limit: Limit, tolerance: Tolerance, span_mm: float, doubtful: bool
+) -> Judged:
+    """Judge the least and the greatest value; the probability is of single values only."""
+    sizes_mm = {"length": span_mm}
+    low, high = limit_bounds.bounds(limit, sizes_mm)
     values, sd = measured
-    known = np.isfinite(values) & np.isfinite(sd)
+    known = np.isfinite(values) & np.isfinite(sd) & ~np.isnan([low, high]).any()
     values, sd = values[known], sd[known]
-    if not len(values) or math.isnan(low) or math.isnan(high):
-        return Comparison(value=nan, ci95=nan, low=low, high=high, verdict=Verdict.INDETERMINATE, probability=nan)
-    sides = []
-    for sign, bound in ((-1.0, -low), (1.0, high)):
-        value, bottom, top = maximum_interval.of_independent(sign * values, sd)
-        sides.append((bound - value, sign * value, top - value, decide((bottom, top), -math.inf, bound)))
-    verdict = worst([side[3] for side in sides])
-    _, value, half_width, _ = min(sides, key=lambda side: side[0])
-    probability = nan
+    sides, probability = [Measured("chain", sizes_mm=sizes_mm)] * 2, float("nan")
+    if len(values):
+        for side, sign in enumerate((-1.0, 1.0)):
+            value, bottom, top = maximum_interval.of_independent(sign * values, sd)
+            ends = sorted((sign * bottom, sign * top))
+            sides[side] = replace(sides[side], value=sign * value, low=ends[0], high=ends[1], ci95=top - value)
     if len(values) == 1 and not doubtful:
         spread = max(float(sd[0]), maximum_interval.EXACT_MM)
-        probability = float(ndtr((high - value) / spread) - ndtr((low - value) / spread))
-    verdict = Verdict.INDETERMINATE if doubtful else verdict
-    return Comparison(value=value, ci95=half_width, low=low, high=high, verdict=verdict, probability=probability)
+        probability = float(ndtr((high - sides[1].value) / spread) - ndtr((low - sides[1].value) / spread))
+    least, greatest = (replace(side, doubtful=doubtful) for side in sides)
+    return judging.judge(limit, least, tolerance, greatest, probability=probability)

@@ -5,6 +5,7 @@ A part that is too short leaves no gap where the chain can follow it: its joints
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -19,13 +20,18 @@ OF_NO_WORK = ("preassemble.nothing-to-do", "preassemble.all-limits")
 def named_at_joints(result: Result, components: Sequence[Any]) -> Result:
     """Return a result whose proposals name the ``components`` beside the joint that fail, as step inspect found."""
     adjustment = result.adjustment
-    failing = {component.name: why for component in components if (why := _failures(component))}
+    failing: dict[str, list[Reason]] = defaultdict(list)
+    for component in components:
+        for row in component.characteristics.items():
+            if row["verdict"] is Verdict.FAIL:
+                values = {name: row[name] for name in ("id", "deviation", "ci95", "unit")}
+                failing[component.name].append(reason("preassemble.part-failure", **values))
     if adjustment is None or not failing:
         return result
     joints, proposals = result.joints, []
     for left, right, proposal in zip(joints.left, joints.right, adjustment.joints.proposal, strict=True):
         beside = tuple(
-            reason("preassemble.part-fails", part=name, failures=failing[name])
+            reason("preassemble.part-fails", part=name, failures=tuple(failing[name]))
             for name in (left, right)
             if name in failing
         )
@@ -35,19 +41,3 @@ def named_at_joints(result: Result, components: Sequence[Any]) -> Result:
         proposals.append(replace(proposal, reasons=stated))
     judged = replace(adjustment.joints, proposal=tuple(proposals))
     return replace(result, adjustment=replace(adjustment, joints=judged))
-
-
-def _failures(component: Any) -> tuple[Reason, ...]:
-    """State the characteristics of an inspected component that fail their limits."""
-    found = component.characteristics
-    return tuple(
-        reason(
-            "preassemble.part-failure",
-            id=found.id[k],
-            deviation=float(found.deviation[k]),
-            ci95=float(found.ci95[k]),
-            unit=found.unit[k],
-        )
-        for k, verdict in enumerate(found.verdict)
-        if verdict is Verdict.FAIL
-    )

@@ -19,7 +19,7 @@ may be that of another plate side.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -49,7 +49,7 @@ from processor.model import (
 )
 from processor.preassembly.chain.joint_measures import ACROSS, Measures
 from processor.preassembly.params import TrimParams
-from processor.preassembly.verdicts.joints import allowed, conforms, joint_limits, judge
+from processor.preassembly.verdicts.joints import conforms, draws, joint_limits, judge, share
 
 SHOWN_MM = 0.1  # resolution of amounts in the reasons
 ALIKE = 0.01  # difference of probabilities that does not count
@@ -185,19 +185,18 @@ def propose(
     if not measures.known:
         return _no_proposal(reason("preassemble.gaps-unknown"))
     limits = {limit.measure: limit for limit in reversed(joint_limits(tolerance))}
-    drawn = normal_draws.antithetic(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3)
-
-    def conforming(limit: Limit, gaps: Floats) -> Bools | None:
-        bounds = allowed(limit, tolerance)
-        return conforms(gaps, measures.points, bounds) if bounds.known else None
-
-    across = [conforming(limit, drawn) for limit in joint_limits(tolerance) if limit.measure != "groove_gap"]
+    drawn = draws(measures)
+    across = [
+        conforms(drawn, measures.points, limit, tolerance)
+        for limit in joint_limits(tolerance)
+        if limit.measure != "groove_gap"
+    ]
     groove, best = limits.get("groove_gap"), NO_WORK
     before: list[Bools | None] = []
     after: list[Bools | None] = []
     wanted = tolerance.root_gap_mm + params.aim_mm
     if groove is not None:
-        best, before, after = _best_work(measures, replace(tolerance, limits=(groove,)), params, drawn, conforming)
+        best, before, after = _best_work(measures, replace(tolerance, limits=(groove,)), params, drawn)
     proposal = Proposal(
         action=best.action,
         cut=best.cut,
@@ -206,10 +205,10 @@ def propose(
         gap_before=measures.gaps[:, 0],
         gap_after=measures.gaps[:, 0] + best.cut - best.build_up,
         wanted_gap=wanted,
-        probability=_share([*across, *after]),
-        probability_as_is=_share([*across, *before]),
-        groove_probability=_share(after),
-        misalignment_probability=_share(across),
+        probability=share([*across, *after]),
+        probability_as_is=share([*across, *before]),
+        groove_probability=share(after),
+        misalignment_probability=share(across),
         misaligned_by=_misaligned_by(measures, limits.get("misalignment")).max(axis=1),
     )
     return replace(
@@ -228,7 +227,6 @@ def _best_work(
     groove: Tolerance,
     params: TrimParams,
     drawn: Floats,
-    conforming: Callable[[Limit, Floats], Bools | None],
 ) -> tuple[_Work, list[Bools | None], list[Bools | None]]:
     """Choose the work by the groove gap's limit alone, and mark the draws that keep it before and after the work."""
     limit = groove.limits[0]
@@ -237,8 +235,8 @@ def _best_work(
     if judge(measures, groove).verdict is not Verdict.PASS:
         room = limit_bounds.bounds(limit, {})[1] - params.aim_mm
         works += _works(measures, groove.root_gap_mm + params.aim_mm, max(params.least_mm, SHOWN_MM), room)
-    marks = [conforming(limit, work.on(drawn, error)) for work in works]
-    chosen = _choice(works, [_share([mark]) for mark in marks])
+    marks = [conforms(work.on(drawn, error), measures.points, limit, groove) for work in works]
+    chosen = _choice(works, [share([mark]) for mark in marks])
     return works[chosen], marks[:1], [marks[chosen]]
 
 
@@ -247,12 +245,6 @@ def _no_proposal(why: Reason) -> Proposal:
     return Proposal(
         cut=nan, build_up=nan, plane=nan[:3], gap_before=nan, gap_after=nan, misaligned_by=nan, reasons=(why,)
     )
-
-
-def _share(marks: Sequence[Bools | None]) -> float:
-    """Share of draws that keep all limits; NaN without a limit or with an unknown one."""
-    known = [mark for mark in marks if mark is not None]
-    return float(np.all(known, axis=0).mean()) if known and len(known) == len(marks) else float("nan")
 
 
 def _cut_errors(points: Floats, sd_mm: float, count: int) -> Floats:

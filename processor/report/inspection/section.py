@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-import collections
 from collections.abc import Iterator
 
 from processor.inspection.result import Result
-from processor.language.messages import Message, Text, label, text
+from processor.language.messages import Message, label, text
+from processor.limits.judging import Judged
 from processor.model import Scene, Status, StepRun, Verdict
 from processor.report import verdict_counts
-from processor.report.characteristics import Characteristic
 from processor.report.inspection import tables
 from processor.report.step_report import StepReport
 from processor.report.style import Drawn
-
-VERDICTS = {
-    Verdict.PASS: text("{count} pass"),
-    Verdict.FAIL: text("{count} fail"),
-    Verdict.INDETERMINATE: text("{count} indeterminate"),
-}
 
 
 def _summary(result: Result) -> tuple[Message, Message]:
     if not result.components:
         return result.status, text("{reasons}", reasons=result.reasons)
     rows = [component.characteristics for component in result.components]
-    counts = collections.Counter(verdict for found in rows for verdict in found.verdict)
+    every = [verdict for found in rows for verdict in found.verdict]
     head = text(
         "{status}, {measured} of {number} characteristics of {components} components measured",
         status=result.status,
@@ -33,7 +26,7 @@ def _summary(result: Result) -> tuple[Message, Message]:
         number=sum(len(found) for found in rows),
         components=len(result.components),
     )
-    if counts[Verdict.FAIL]:
+    if Verdict.FAIL in every:
         compared = [
             (f"{component.name} {of}", verdict)
             for component, found in zip(result.components, rows, strict=True)
@@ -43,9 +36,9 @@ def _summary(result: Result) -> tuple[Message, Message]:
         named, judged = zip(*compared, strict=True)
         limits = verdict_counts.summary(verdict_counts.LIMITS, named, judged)
         head = text("{head}; {verdicts}", head=head, verdicts=limits)
-    verdicts = [Text(said.template, {"count": counts[name]}) for name, said in VERDICTS.items() if counts[name]]
+    verdicts = verdict_counts.each(every)
     body: list[Message] = [text("Limits: {verdicts}.", verdicts=verdicts)] if verdicts else []
-    if any(verdict is not Verdict.NONE and not known for found in rows for verdict, known in _compared(found)):
+    if any(row["verdict"] is not Verdict.NONE and not row["verified"] for found in rows for row in found.items()):
         body.insert(0, text("Limits not checked against the standard: verdicts are provisional."))
     body += [text("{name}: {reasons}.", name=c.name, reasons=c.reasons) for c in result.components if c.reasons]
     if result.status is Status.OK or not result.reasons:
@@ -53,42 +46,33 @@ def _summary(result: Result) -> tuple[Message, Message]:
     return head, text("{sentences:.}", sentences=body) if body else text("")
 
 
-def _compared(found: tables.Characteristics) -> list[tuple[Verdict, bool]]:
-    return list(zip(found.verdict, found.verified.tolist(), strict=True))
-
-
 def _beyond(result: Result) -> Iterator[Message]:
     """Yield the characteristics that fail their limits."""
     for component in result.components:
-        found = component.characteristics
-        for k, verdict in enumerate(found.verdict):
-            if verdict is Verdict.FAIL:
+        for row in component.characteristics.items():
+            if row["verdict"] is Verdict.FAIL:
                 yield text(
                     "correct {component}: {quantity} is off by {deviation} ± {ci95} mm",
-                    component=component.name, quantity=label(found.quantity[k]), deviation=float(found.deviation[k]),
-                    ci95=float(found.ci95[k]),
+                    component=component.name, quantity=label(row["quantity"]), deviation=row["deviation"],
+                    ci95=row["ci95"],
                 )  # fmt: skip
 
 
-def _characteristics(_: Scene, run: StepRun) -> list[Characteristic]:
+def _characteristics(_: Scene, run: StepRun) -> list[Judged]:
     """Return what of the components is compared with limits."""
     return [
-        Characteristic(
-            id=f"{component.name} {found.id[i]}",
-            quantity=found.quantity[i],
-            nominal=float(found.nominal[i]),
-            deviation=float(found.deviation[i]),
-            ci95=float(found.ci95[i]),
-            lower=float(found.lower[i]),
-            upper=float(found.upper[i]),
-            unit=found.unit[i],
-            verdict=found.verdict[i],
-            limit_from=label(found.clause[i]),
+        Judged(
+            of=f"{component.name} {row['id']}",
+            what=row["quantity"],
+            value=row["deviation"],
+            low=row["lower"],
+            high=row["upper"],
+            clause=label(row["clause"]),
+            **{name: row[name] for name in ("nominal", "ci95", "unit", "verdict")},
         )
         for component in run.result.components
-        for found in (component.characteristics,)
-        for i in range(len(found))
-        if found.verdict[i] is not Verdict.NONE
+        for row in component.characteristics.items()
+        if row["verdict"] is not Verdict.NONE
     ]
 
 

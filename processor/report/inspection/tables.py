@@ -38,13 +38,8 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
 
 
 def _rows(component: InspectedComponent) -> Iterator[tuple[Any, ...]]:
-    found = component.characteristics
-    for i in range(len(found)):
-        yield (
-            component.name, found.id[i], found.quantity[i], float(found.nominal[i]), float(found.actual[i]),
-            float(found.deviation[i]), float(found.ci95[i]), float(found.lower[i]), float(found.upper[i]),
-            found.unit[i], found.verdict[i], found.clause[i], found.reasons[i],
-        )  # fmt: skip
+    for row in component.characteristics.items():
+        yield (component.name, *(one for name, one in row.items() if name not in ("limit", "verified")))
 
 
 def _axes(result: Result) -> Table:

@@ -12,8 +12,8 @@ from processor.preassembly.chain.joint_measures import JointQuantity
 from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.result import Adjustment, Result
 from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
+from processor.report.characteristics import with_unverified
 from processor.report.columns import MM, columns, under
-from processor.report.limit_comparison_table import with_unverified
 from processor.report.table import NAN, Table
 
 TO_DO, LIMITS, CHAIN = "what-to-do", "limits", "limits-chain"
@@ -188,10 +188,9 @@ def _unverified(judged: Sequence[Conformity]) -> Iterator[str]:
 
 
 def _limit_rows(limits: ComparedLimits) -> Iterator[tuple[Any, ...]]:
-    for k, quantity in enumerate(limits.what):
-        numbers = (limits.value, limits.ci95, limits.low, limits.high, limits.probability)
-        values = (float(column[k]) for column in numbers)
-        yield (label(quantity), limits.verdict[k], *values, label(limits.clause[k]))
+    for row in limits.items():
+        numbers = (row[name] for name in ("value", "ci95", "low", "high", "probability"))
+        yield (label(row["what"]), row["verdict"], *numbers, label(row["clause"]))
 
 
 def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:

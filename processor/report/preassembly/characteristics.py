@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from processor.language.messages import Message, label, text
-from processor.limits.judging import NOT_VERIFIED
+from processor.limits.judging import Judged
 from processor.model import ArchDesign, Scene, StepRun
 from processor.preassembly.chain.span_and_closure import design_span
 from processor.preassembly.result import Result
 from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
-from processor.report.characteristics import Characteristic
 from processor.report.table import NAN
 
 LIMITS = {
@@ -31,7 +30,7 @@ NOTE = text(
 )
 
 
-def of_run(scene: Scene, run: StepRun) -> list[Characteristic]:
+def of_run(scene: Scene, run: StepRun) -> list[Judged]:
     """Return a characteristic for each limit of each joint and of the chain; none of a method without intervals."""
     result: Result = run.result
     adjustment = result.adjustment
@@ -41,26 +40,19 @@ def of_run(scene: Scene, run: StepRun) -> list[Characteristic]:
         *zip(adjustment.joints.name, adjustment.joints.conformity, strict=True),
         *((CHAIN, conformity) for conformity in adjustment.chain),
     ]
-    return [one for name, conformity in judged for one in _held(name, conformity.limits, scene)]
+    return [one for name, conformity in judged for one in _worded(name, conformity.limits, scene)]
 
 
-def _held(name: str | Message, limits: ComparedLimits, scene: Scene) -> Iterator[Characteristic]:
-    for k, key in enumerate(limits.key):
-        standing = label("verified" if limits.verified[k] else NOT_VERIFIED)
-        clause = text("{clause}, {standing}", clause=label(limits.clause[k]), standing=standing)
-        if not limits.bounds_known[k]:
+def _worded(name: str | Message, limits: ComparedLimits, scene: Scene) -> Iterator[Judged]:
+    for row, bounds_known in zip(limits.items(), limits.bounds_known, strict=True):
+        standing = label("verified" if row["verified"] else "not verified")
+        clause = text("{clause}, {standing}", clause=label(row["clause"]), standing=standing)
+        if not bounds_known:
             clause = text("{clause}; depends on a size that is not known", clause=clause)
-        yield Characteristic(
-            id=text("{place} {what}", place=name, what=LIMITS.get(key, label(key))),
-            quantity=label(limits.what[k]),
-            nominal=_nominal(key, scene),
-            deviation=float(limits.value[k]),
-            ci95=float(limits.ci95[k]),
-            lower=float(limits.low[k]),
-            upper=float(limits.high[k]),
-            verdict=limits.verdict[k],
-            limit_from=clause,
-        )
+        key = row["key"]
+        of = text("{place} {what}", place=name, what=LIMITS.get(key, label(key)))
+        worded = {"of": of, "what": label(row["what"]), "nominal": _nominal(key, scene), "clause": clause}
+        yield Judged(**row | worded)
 
 
 def _nominal(key: str, scene: Scene) -> float:

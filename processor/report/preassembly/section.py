@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 from collections.abc import Iterator
 
 import numpy as np
@@ -16,12 +15,6 @@ from processor.report.preassembly import characteristics, figures, interactive_v
 from processor.report.step_report import StepReport
 from processor.report.style import Drawn
 
-VERDICTS = {
-    Verdict.PASS: text("{count} pass"),
-    Verdict.FAIL: text("{count} fail"),
-    Verdict.INDETERMINATE: text("{count} indeterminate"),
-}
-
 # Reasons by which a joint that passes is not all there is to do.
 NOT_DONE = ("preassemble.part-fails", "preassemble.joint-of-piece", "preassemble.closes-by-moving")
 
@@ -29,10 +22,6 @@ NOT_DONE = ("preassemble.part-fails", "preassemble.joint-of-piece", "preassemble
 def _summary(result: Result) -> tuple[Message, Message]:
     in_pieces = [one for one in result.reasons if one.code == "preassemble.in-pieces"]
     placed = 0 if in_pieces else sum(status != Status.FAILED for status in result.components.status)
-    counts = collections.Counter(result.joints.verdict)
-    verdicts = [
-        Text(verdict_text.template, {"count": counts[name]}) for name, verdict_text in VERDICTS.items() if counts[name]
-    ]
     head = text(
         "{status}, {placed} of {parts} parts placed",
         status=result.status,
@@ -47,7 +36,7 @@ def _summary(result: Result) -> tuple[Message, Message]:
         text("Linear error {errors}.", errors=_mean_max(linear)),
     ]
     if result.adjustment is None:
-        body.append(text("Joints: {verdicts}.", verdicts=verdicts or text("none")))
+        body.append(text("Joints: {verdicts}.", verdicts=verdict_counts.each(result.joints.verdict) or text("none")))
     if result.adjustment is not None:
         told = verdict_counts.summary(verdict_counts.JOINTS, result.joints.name, result.joints.verdict)
         head = text("{verdicts}; assembly {head}", verdicts=told, head=head)

@@ -15,7 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Checked, Floats, FrameDesign, Ints, Verdict, column, described
+from processor.limits import judging
+from processor.limits.judging import Measured
+from processor.model import (
+    NORMAL_95,
+    Checked,
+    Floats,
+    FrameDesign,
+    Ints,
+    Limit,
+    Tolerance,
+    Verdict,
+    column,
+    described,
+)
 from processor.space_frame.design.matching import FrameRelation, Matching, NodePattern, expanded
 from processor.space_frame.result import MovementGauge
 
@@ -115,16 +128,12 @@ def size_of(vector: Floats, covariance: Floats) -> tuple[Floats, Floats]:
 
 
 def verdict_of(size: float, ci95: float, limit: float, certain: bool) -> Verdict:
-    """Compare the size of a movement and its half-width with a limit, mm; NaN = none.
+    """Judge the size of a movement with its half-width by a limit, mm; NaN = none.
 
-    Pass where size and interval are within the limit, fail where the size exceeds it by more than the interval, else
-    indeterminate. ``certain`` is False where other poses of the design fit the nodes as well, and for a sphere that was
+    ``certain`` is False where other poses of the design fit the nodes as well, and for a sphere that was
     not seen: the point where its axes meet is not the sphere's centre. Such a movement is indeterminate.
     """
     if np.isnan(size) or np.isnan(limit):
         return Verdict.NONE
-    if not certain or np.isnan(ci95):
-        return Verdict.INDETERMINATE
-    if size + ci95 <= limit:
-        return Verdict.PASS
-    return Verdict.FAIL if size - ci95 > limit else Verdict.INDETERMINATE
+    measured = Measured.within("node", size, ci95, doubtful=not certain)
+    return judging.judge(Limit("node_place", "place of a node", high=limit), measured, Tolerance()).verdict
