@@ -37,6 +37,11 @@ class Group(NamedTuple):
     holes: tuple[Hole, ...]
     axes: Floats
 
+    @property
+    def places(self) -> Floats:
+        """The designed places (h, 2) along the axes."""
+        return np.array([self.axes @ hole.middle for hole in self.holes])
+
 
 def groups(holes: list[Hole], axes: list[Floats]) -> Iterator[Group]:
     """Yield the holes of a body by the plate that they go through; ``axes`` are directions of the body, if known."""
@@ -80,17 +85,12 @@ def fitted(cloud: DesignCloud, group: Group, temperature_C: float = float("nan")
 
     Lengths are those at the reference temperature, if that of the steel is known.
     """
-    places = _designed(group)
+    places = group.places
     between = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(len(places), np.inf))
     reach = np.minimum(REACH_MM, PITCH_SHARE * between.min(axis=1))
     bores = [_bore(cloud, group, hole) for hole in group.holes]
     radius = np.array([hole.radius for hole in group.holes])
     return _referred(bore_fit.fit(bores, radius, reach, len(cloud.scanners)), places, radius, temperature_C)
-
-
-def _designed(group: Group) -> Floats:
-    """Return the designed places (h, 2) along the axes of a group."""
-    return np.array([group.axes @ hole.middle for hole in group.holes])
 
 
 def _referred(fitted: Fitted, places: Floats, radius: Floats, temperature_C: float) -> Fitted:
@@ -130,10 +130,7 @@ def _level(height: Floats, beyond: Floats, hole: Hole) -> float:
 
 def characteristics(group: Group, fitted: Fitted, first: int) -> Iterator[Measured]:
     """Yield the characteristics of a group whose holes are numbered from ``first``."""
-    yield from _characteristics(_designed(group), np.array([hole.radius for hole in group.holes]), fitted, first)
-
-
-def _characteristics(places: Floats, radius: Floats, fitted: Fitted, first: int) -> Iterator[Measured]:
+    places = group.places
     known = np.flatnonzero(np.isfinite(fitted.departure).all(axis=1))
     why = reason("inspect.hole-not-seen")
     if len(places) >= FEWEST_PLACED:
@@ -147,7 +144,7 @@ def _characteristics(places: Floats, radius: Floats, fitted: Fitted, first: int)
             yield characteristic.normal(id_, Quantity.HOLE_PITCH, nominal, deviation, variance)
         else:
             yield characteristic.absent(id_, Quantity.HOLE_PITCH, nominal, why)
-    for k, r in enumerate(radius.tolist()):
+    for k, r in enumerate(hole.radius for hole in group.holes):
         id_ = f"hole-{first + k}-diameter"
         if k in known:
             variance = 4.0 * float(fitted.covariance[3 * k + 2, 3 * k + 2])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 
@@ -12,6 +12,13 @@ from processor.limits.limit_bounds import at_least
 from processor.model import Floats, Limit, Tolerance
 
 NAN = float("nan")
+OF_HOLES_AND_MEMBERS = {
+    "hole-position": "place of a hole within its group, along and across, less the design's",
+    "hole-pitch": "distance of two neighbouring holes less the design's",
+    "hole-diameter": "diameter of a hole less the design's",
+    "diameter": "diameter of a tube less the design's",
+    "bow": "bow of a tube",
+}
 
 
 def choice(base: Tolerance) -> dict[str, Limit]:
@@ -86,8 +93,33 @@ def of_projects() -> tuple[Limit, ...]:
             low=0.0,
             measure=measurands.DEVIATION_SHARE,
         ),
-        *_of_holes_and_members(),
-        *_of_defects(),
+        *(
+            Limit(
+                f"part_{quantity.replace('-', '_')}_mm", what, low=-math.inf, high=math.inf, measure=f"part {quantity}"
+            )
+            for quantity, what in OF_HOLES_AND_MEMBERS.items()
+        ),
+        Limit(
+            "part_pass_through_ratio",
+            "share of a group's holes that a gauge pin passes, 1 mm thinner than the hole, less 1",
+            unit="1",
+            low=-1.0,
+            high=0.0,
+            measure="part pass-through",
+        ),
+        *(
+            Limit(
+                f"{name.replace('-', '_')}_{size}",
+                f"{extent} of a {'defect of any class' if name == measurands.ANY_CLASS else name}",
+                unit=unit,
+                measure=measure,
+            )
+            for name in (measurands.ANY_CLASS, *measurands.DEFECT_CLASSES)
+            for size, extent, unit, measure in (
+                ("depth_mm", "depth", "mm", measurands.DEFECT_DEPTH),
+                ("area_mm2", "area", "mm2", measurands.DEFECT_AREA),
+            )
+        ),
         Limit("closure_mm", "misclosure of a loop of scans", measure=measurands.CLOSURE),
         Limit(
             "control_point_mm",
@@ -96,30 +128,3 @@ def of_projects() -> tuple[Limit, ...]:
         ),
         Limit("scan_position_mm", "95 % uncertainty of a scan's place", measure=measurands.SCAN_POSITION),
     )
-
-
-def _of_holes_and_members() -> Iterator[Limit]:
-    for quantity, what in (
-        ("hole-position", "place of a hole within its group, along and across, less the design's"),
-        ("hole-pitch", "distance of two neighbouring holes less the design's"),
-        ("hole-diameter", "diameter of a hole less the design's"),
-        ("diameter", "diameter of a tube less the design's"),
-        ("bow", "bow of a tube"),
-    ):
-        key = f"part_{quantity.replace('-', '_')}_mm"
-        yield Limit(key, what, low=-math.inf, high=math.inf, measure=f"part {quantity}")
-    yield Limit(
-        "part_pass_through_ratio",
-        "share of a group's holes that a gauge pin passes, 1 mm thinner than the hole, less 1",
-        unit="1",
-        low=-1.0,
-        high=0.0,
-        measure="part pass-through",
-    )
-
-
-def _of_defects() -> Iterator[Limit]:
-    for name in (measurands.ANY_CLASS, *measurands.DEFECT_CLASSES):
-        key, what = name.replace("-", "_"), "defect of any class" if name == measurands.ANY_CLASS else name
-        yield Limit(f"{key}_depth_mm", f"depth of a {what}", measure=measurands.DEFECT_DEPTH)
-        yield Limit(f"{key}_area_mm2", f"area of a {what}", unit="mm2", measure=measurands.DEFECT_AREA)

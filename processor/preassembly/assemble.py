@@ -32,8 +32,8 @@ from processor.preassembly.parts import measure
 from processor.preassembly.parts.attitude import Attitude, Shapes
 from processor.preassembly.parts.each_part import each_part
 from processor.preassembly.parts.measure import MeasuredPart
-from processor.preassembly.result import Result
-from processor.preassembly.to_result import Assembly, JudgedJoint
+from processor.preassembly.result import JudgedJoints, Result
+from processor.preassembly.to_result import Assembly
 from processor.preassembly.verdicts import chain as chain_verdicts
 from processor.preassembly.verdicts import joints, reasons, trim_and_build_up
 from processor.preassembly.verdicts.joints import Conformity
@@ -112,7 +112,7 @@ def _judge_joints(
     limits: Tolerance,
     trim: TrimParams,
     in_pieces: tuple[Reason, ...],
-) -> list[JudgedJoint]:
+) -> JudgedJoints:
     """Measure every joint by its gaps (8, 3), compare it with the limits, and propose work on it.
 
     ``in_pieces`` is the reason of an assembly in pieces: there a joint that closes only by moving its parts is open.
@@ -134,8 +134,9 @@ def _judge_joints(
         if in_pieces and measures.known:
             remark = reason("preassemble.joint-of-piece", joints=in_pieces[0].values["joints"])
             proposal = replace(proposal, reasons=(*proposal.reasons, remark))
-        judged.append(JudgedJoint(measures, conformity, proposal))
-    return judged
+        judged.append((measures, conformity, proposal))
+    measured, conformities, proposals = zip(*judged, strict=True) if judged else ((), (), ())
+    return JudgedJoints(name=design.joint_names, measures=measured, conformity=conformities, proposal=proposals)
 
 
 def _closes_by_moving(
@@ -172,6 +173,10 @@ def _judge_chain(
     members = [part.member for part in parts]
     quantities = chain_verdicts.quantities(members, adjusted, figures.span_departure, figures.span_ci95)
     edges = any(len(part.bottom_edge_left) for part in design.parts)
-    limits = chain_verdicts.applicable(limits, span=span_and_closure.has_span(design), edges=edges)
+    absent = (
+        *(() if span_and_closure.has_span(design) else chain_verdicts.OF_SPAN),
+        *(() if edges else chain_verdicts.OF_EDGES),
+    )
+    limits = replace(limits, limits=tuple(limit for limit in limits.limits if limit.measure not in absent))
     doubts = reasons.of_chain(parts, design.joint_names, adjusted.gaps)
     return chain_verdicts.judge(quantities, limits, span_and_closure.design_span(design), doubts)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from processor.preassembly import topology
 from processor.preassembly.assembly_errors import mean_max, splicing_error
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.chain.assembled_parts import Placement
-from processor.preassembly.chain.joint_measures import RAYLEIGH_95, Measures
+from processor.preassembly.chain.joint_measures import RAYLEIGH_95
 from processor.preassembly.chain.linear_error import EdgeErrors
 from processor.preassembly.chain.span_and_closure import Figures, mean_max_ci95
 from processor.preassembly.params import Params, SystematicParams
@@ -43,15 +42,6 @@ from processor.preassembly.result import (
 from processor.preassembly.verdicts.chain import unused_limits
 from processor.preassembly.verdicts.joints import Conformity, LimitOrigin
 from processor.preassembly.verdicts.reasons import of_assignment
-from processor.preassembly.verdicts.trim_and_build_up import Proposal
-
-
-class JudgedJoint(NamedTuple):
-    """One joint: its measures, its conformity with the limits, and the proposal."""
-
-    measures: Measures
-    conformity: Conformity
-    proposal: Proposal
 
 
 @dataclass(frozen=True)
@@ -70,7 +60,7 @@ class Assembly:
     edges: EdgeErrors
     figures: Figures
     loops: Loops | None
-    joints: Sequence[JudgedJoint]
+    joints: JudgedJoints
     chain: Conformity
 
 
@@ -154,7 +144,7 @@ def _joints(assembly: Assembly) -> tuple[Joints, MeanMax]:
         right=design.joint_right,
         gaps=gaps,
         gap_ci95=NORMAL_95 * sd,
-        verdict=tuple(joint.conformity.verdict for joint in assembly.joints),
+        verdict=tuple(one.verdict for one in assembly.joints.conformity),
     )
     ci95 = np.array(mean_max_ci95(gaps.reshape(-1, 1), np.square(sd).reshape(-1, 1)))
     return joints, MeanMax(mean=mean, max=largest, ci95=ci95)
@@ -196,12 +186,7 @@ def _adjustment(assembly: Assembly) -> Adjustment:
     unused = unused_limits(assembly.limits)
     return Adjustment(
         weight=assembly.params.adjust.weight,
-        joints=JudgedJoints(
-            name=assembly.design.joint_names,
-            measures=tuple(joint.measures for joint in assembly.joints),
-            conformity=tuple(joint.conformity for joint in assembly.joints),
-            proposal=tuple(joint.proposal for joint in assembly.joints),
-        ),
+        joints=assembly.joints,
         chain=(assembly.chain,),
         unused_limits=tuple(limit.key for limit in unused),
         unused_limits_what=tuple(limit.what for limit in unused),
@@ -290,7 +275,7 @@ def _reasons(assembly: Assembly) -> Iterator[Reason]:
         yield reason("preassemble.temperature-corrected")
     else:
         yield reason("preassemble.reference-temperature")
-    compared = [*(joint.conformity for joint in assembly.joints), assembly.chain]
+    compared = [*assembly.joints.conformity, assembly.chain]
     standard = limits.standard or LimitOrigin.PROJECT
     if all(conformity.limits.verified.all() for conformity in compared):
         yield reason("preassemble.limits", standard=standard)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from processor.language.messages import Message, Text, label, text
 from processor.limits.judging import Judged, JudgedLimits
@@ -43,20 +43,23 @@ def limit_table(limits: JudgedLimits | None, file: str) -> list[Table]:
         (label(one.what), one.of, one.verdict, one.value, one.ci95, one.low, one.high, one.unit, label(one.clause))
         for one in worst_first(limits.rows)
     )
-    note = with_unverified(NOTE_OF_LIMITS, (one.clause for one in limits.rows if not one.verified))
+    note = with_unverified(NOTE_OF_LIMITS, [limits])
     return [Table(text("Compared with limits"), OF_LIMITS, rows, file, note, on_page=False)]
 
 
-def with_unverified(note: Text, clauses: Iterable[str]) -> Text:
-    """Add to a note that the limits from these clauses were not compared with the text of their standard."""
-    sources = sorted(set(clauses))
+def unverified(tables: Iterable[Any]) -> list[str]:
+    """Name the clauses of limits that were used and not compared with the published text of their standard.
+
+    ``tables`` are records with columns ``clause`` and ``verified``.
+    """
+    rows = (row for table in tables for row in zip(table.clause, table.verified, strict=True))
+    return sorted({clause for clause, verified in rows if clause and not verified})
+
+
+def with_unverified(note: Text, tables: Iterable[Any]) -> Text:
+    """Add to a note which limits were not compared with the published text, as of :func:`unverified`."""
+    sources = unverified(tables)
     return text(UNVERIFIED, note=note, sources=", ".join(sources)) if sources else note
-
-
-def of_limits(limits: JudgedLimits | None) -> Iterator[Judged]:
-    """Yield what a step compared with limits, worded; such values are deviations."""
-    for one in [] if limits is None else limits.rows:
-        yield replace(one, of=label(one.of), what=label(one.what), clause=label(one.clause))
 
 
 def table(judged: Sequence[Judged], remark: str | Message = "") -> Table:

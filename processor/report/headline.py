@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from processor.language.messages import Message, Text, messages, text
+from processor.language.messages import Text, messages, text
 from processor.limits.judging import JudgedLimits
 from processor.model import Clips, StepRun
 from processor.pipeline import Execution
-from processor.report import verdict_counts
+from processor.report import characteristics, verdict_counts
 from processor.report.reports_of_steps import step_report
 
 
@@ -34,19 +32,12 @@ def of_step(run: StepRun) -> Text:
     limits: JudgedLimits | None = getattr(run.result, "limits", None)
     if limits is None:
         return text("{step}: {head}", step=report_of.title, head=head)
-    return text("{step}: {head}; {verdicts}", step=report_of.title, head=head, verdicts=of_limits(limits))
-
-
-def of_limits(limits: JudgedLimits) -> Message:
-    """Return how many comparisons with limits have which verdict."""
-    return verdict_counts.summary(verdict_counts.LIMITS, limits.of, limits.verdict)
+    verdicts = verdict_counts.summary(verdict_counts.LIMITS, limits.of, limits.verdict)
+    return text("{step}: {head}; {verdicts}", step=report_of.title, head=head, verdicts=verdicts)
 
 
 def unverified(execution: Execution) -> list[str]:
     """Name the clauses of limits that were used and not compared with the published text of their standard."""
-    clauses: set[str] = set()
-    for run, _ in execution.by_step():
-        for limits in (getattr(run.result, "limits", None), *step_report(run.step).limits(run.result)):
-            if limits is not None:
-                clauses |= {limits.clause[k] for k in np.flatnonzero(~limits.verified).tolist() if limits.clause[k]}
-    return sorted(clauses)
+    runs = [run for run, _ in execution.by_step()]
+    every = [(getattr(run.result, "limits", None), *step_report(run.step).limits(run.result)) for run in runs]
+    return characteristics.unverified(table for tables in every for table in tables if table is not None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Mapping
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ BANNER = {
     Verdict.INDETERMINATE: text("INDETERMINATE"),
     Verdict.NONE: text("No verdict"),
 }
+UNVERIFIED = "{sources}: not compared with the published text; do so before verdicts are relied on."
 TONES = {Verdict.PASS: "good", Verdict.FAIL: "bad", Verdict.INDETERMINATE: "open", Verdict.NONE: ""}
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
@@ -113,14 +114,10 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]
         verified = getattr(run.result, "verified", True)
         verdicts += [_further(verified, *further) for further in report_of.further_verdicts(run.result)]
     if sources := headline.unverified(execution):
-        verdicts.append({"tone": "", "head": text("Limits that are not verified"), "text": _unverified(sources)})
+        verdicts.append(
+            {"tone": "", "head": text("Limits that are not verified"), "text": text(UNVERIFIED, sources=sources)}
+        )
     return [*verdicts, _truth(report)]
-
-
-def _unverified(sources: Sequence[str]) -> Text:
-    return text(
-        "{sources}: not compared with the published text; do so before verdicts are relied on.", sources=sources
-    )
 
 
 def _further(verified: bool, head: Any, body: Any, verdict: Verdict = Verdict.NONE) -> dict[str, Any]:

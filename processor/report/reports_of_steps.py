@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 
-from processor.limits.judging import Judged
+from processor.language.messages import label
+from processor.limits.judging import Judged, JudgedLimits
 from processor.model import Scene, StepRun
 from processor.pipeline import package_of
-from processor.report.characteristics import of_limits, worst_first
+from processor.report.characteristics import worst_first
 from processor.report.step_report import StepReport
 
 
@@ -19,5 +21,9 @@ def step_report(step: str) -> StepReport:
 
 def characteristics_of(scene: Scene, run: StepRun) -> list[Judged]:
     """Return the characteristics of a step, worst first, else in their order."""
-    own = step_report(run.step).characteristics(scene, run)
-    return worst_first([*own, *of_limits(getattr(run.result, "limits", None))])
+    limits: JudgedLimits | None = getattr(run.result, "limits", None)
+    worded = (
+        replace(one, of=label(one.of), what=label(one.what), clause=label(one.clause))
+        for one in ([] if limits is None else limits.rows)
+    )
+    return worst_first([*step_report(run.step).characteristics(scene, run), *worded])

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from processor.limits import judging, measurands, standards
-from processor.limits.judging import JudgedLimits, Measured
+from processor.limits.judging import Judged, JudgedLimits, Measured
 from processor.model import NORMAL_95, Ceiling, Floats, Limit, Scene, Verdict, worst
 from processor.space_frame import mesh_heights
 from processor.space_frame.mesh_heights import Plan
@@ -34,12 +34,12 @@ def with_hangers(result: Result, scene: Scene) -> Result:
     balls = result.balls
     length, sd, bottom = _lengths(balls, surface)
     limits, tolerance = _limits(ceiling), standards.default_for(scene.tolerance)
-    of_ball = [
-        [judging.judge(limit, _measured(balls, i, float(length[i]), float(sd[i])), tolerance) for limit in limits]
-        if math.isfinite(length[i])
-        else []  # it was not found, or no ceiling is below it
-        for i in range(len(balls))
-    ]
+    of_ball: list[list[Judged]] = []
+    for name, flag, evidence, above, error in zip(balls.names, balls.flag, balls.evidence, length, sd, strict=True):
+        doubtful = flag is not Flag.OK or evidence is Evidence.AXES
+        one = Measured.within(f"ball {name}", float(above), NORMAL_95 * float(error), doubtful=doubtful)
+        # Without a length it was not found, or no ceiling is below it.
+        of_ball.append([judging.judge(limit, one, tolerance) for limit in limits if math.isfinite(above)])
     hangers = Hangers(
         ids=balls.ids,
         labels=balls.labels,
@@ -87,11 +87,6 @@ def _limits(ceiling: Ceiling) -> list[Limit]:
         source=SOURCE, verified=True,
     )  # fmt: skip
     return [clearance, longest]
-
-
-def _measured(balls: Balls, row: int, length: float, sd: float) -> Measured:
-    doubtful = balls.flag[row] is not Flag.OK or balls.evidence[row] is Evidence.AXES
-    return Measured.within(f"ball {balls.names[row]}", length, NORMAL_95 * sd, doubtful=doubtful)
 
 
 def _lengths(balls: Balls, surface: _Surface) -> tuple[Floats, Floats, Floats]:

@@ -13,6 +13,7 @@ from scipy.stats import binom
 
 from processor.inspection import bore_fit, design_cloud, design_holes, flat_faces, holes
 from processor.inspection.bore_fit import BorePoints
+from processor.inspection.design_holes import Hole
 from processor.model import StructureDesign
 
 RADIUS, DEPTH = 12.0, 16.0
@@ -233,8 +234,10 @@ def drilled(seen, sd=0.05, places=GRID, temperature_C=float("nan"), departure=0.
     rows = (3 * np.array(seen, np.int64)[:, None] + np.arange(3)).ravel()
     covariance[np.ix_(rows, rows)] = sd**2 * np.eye(len(rows))
     radius = np.full(count, RADIUS)
+    x, y, up = np.eye(3)
+    designed = holes.Group(tuple(Hole(a * x + b * y, up, RADIUS, DEPTH) for a, b in places), np.array([x, y]))
     fitted = holes._referred(bore_fit.Fitted(off, covariance, np.zeros(count, np.int64)), places, radius, temperature_C)
-    return {one.of: one for one in holes._characteristics(places, radius, fitted, 1)}
+    return {one.of: one for one in holes.characteristics(designed, fitted, 1)}
 
 
 def test_holes_not_seen_may_pass_or_not():

@@ -11,6 +11,7 @@ from processor.model import ArchDesign, DesignPart, Tolerance, reason
 from processor.preassembly import to_result
 from processor.preassembly.chain import span_and_closure
 from processor.preassembly.parts.part_in_chain import Member
+from processor.preassembly.result import JudgedJoints
 from processor.preassembly.verdicts import chain, joints
 from tests.support.results import measured_parts
 
@@ -111,7 +112,7 @@ def test_unused_limits_are_reported():
         temperature_corrected=False,
         parts=(),
         in_pieces=(),
-        joints=[],
+        joints=JudgedJoints(),
         chain=joints.Conformity(),
     )
     assert reason("preassemble.unused-limits", limits=("bow_mm",)) in to_result._reasons(assembly)

@@ -58,12 +58,6 @@ def quantities(members: Sequence[Member], adjusted: Adjusted, span: float, span_
     }
 
 
-def applicable(tolerance: Tolerance, *, span: bool, edges: bool) -> Tolerance:
-    """Return the limits without those of what an assembly does not have: a span, bottom edges."""
-    absent = (*(() if span else OF_SPAN), *(() if edges else OF_EDGES))
-    return replace(tolerance, limits=tuple(limit for limit in tolerance.limits if limit.measure not in absent))
-
-
 def judge(measured: Quantities, tolerance: Tolerance, span_mm: float, doubts: tuple[Reason, ...] = ()) -> Conformity:
     """Judge the chain by the limits of ``tolerance``; ``span_mm`` is the design's, for limits that depend on it.
 

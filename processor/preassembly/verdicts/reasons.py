@@ -9,7 +9,6 @@ import numpy as np
 
 from processor.model import NORMAL_95, ArchDesign, Floats, Reason, Status, reason
 from processor.preassembly.chain.adjustment import Adjusted
-from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.topology import Side
 
@@ -20,13 +19,10 @@ def of_assignment(parts: Sequence[MeasuredPart]) -> tuple[Reason, ...]:
     wrong = tuple(why for scan in scans for why in scan.wrong)
     if not wrong:
         return ()
-    matching = tuple(f"{scan.scan} = {_which(scan, len(parts))}" for scan in scans)
+    # A question mark where nothing is known of a scan.
+    which = (" / ".join(scan.parts) if 0 < len(scan.parts) < len(parts) else "?" for scan in scans)
+    matching = tuple(f"{scan.scan} = {names}" for scan, names in zip(scans, which, strict=True))
     return (reason("preassemble.wrong-assignment", scans=wrong, matching=matching),)
-
-
-def _which(scan: ScanParts, count: int) -> str:
-    """Write the parts that a scan may be of; a question mark where nothing is known of it."""
-    return " / ".join(scan.parts) if 0 < len(scan.parts) < count else "?"
 
 
 def of_pieces(adjusted: Adjusted, design: ArchDesign, place_sd_mm: float) -> tuple[Reason, ...]:

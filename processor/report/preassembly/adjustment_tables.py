@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 from processor.geometry import rigid
@@ -11,7 +11,7 @@ from processor.language.messages import Message, label, text
 from processor.preassembly.chain.joint_measures import JointQuantity
 from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.result import Adjustment, Result
-from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
+from processor.preassembly.verdicts.joints import ComparedLimits
 from processor.report.characteristics import with_unverified
 from processor.report.columns import MM, columns, under
 from processor.report.table import NAN, Table
@@ -175,16 +175,9 @@ def _limits(adjustment: Adjustment, method: str) -> Table:
         for joint, conformity in zip(adjustment.joints.name, adjustment.joints.conformity, strict=True)
         for row in _limit_rows(conformity.limits)
     )
-    note = with_unverified(LIMITS_NOTE, _unverified(adjustment.joints.conformity))
+    note = with_unverified(LIMITS_NOTE, [one.limits for one in adjustment.joints.conformity])
     title = text("Limits, method {method}", method=method)
     return Table(title, header, rows, file=LIMITS, note=note, units=MM, on_page=False)
-
-
-def _unverified(judged: Sequence[Conformity]) -> Iterator[str]:
-    """Yield the clauses of limits that were not compared with the standard's text."""
-    for conformity in judged:
-        limits = conformity.limits
-        yield from (clause for clause, verified in zip(limits.clause, limits.verified, strict=True) if not verified)
 
 
 def _limit_rows(limits: ComparedLimits) -> Iterator[tuple[Any, ...]]:
@@ -208,7 +201,7 @@ def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     )
     if rows:
         title = text("Limits of the whole chain, method {method}", method=method)
-        note = with_unverified(CHAIN_NOTE, _unverified(adjustment.chain))
+        note = with_unverified(CHAIN_NOTE, [one.limits for one in adjustment.chain])
         yield Table(title, header, rows, file=CHAIN, note=note, units=MM, on_page=False)
     if adjustment.unused_limits:
         yield Table(

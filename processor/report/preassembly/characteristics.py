@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from processor.language.messages import Message, label, text
 from processor.limits.judging import Judged
 from processor.model import ArchDesign, Scene, StepRun
 from processor.preassembly.chain.span_and_closure import design_span
 from processor.preassembly.result import Result
-from processor.preassembly.verdicts.joints import ComparedLimits, Conformity
+from processor.preassembly.verdicts.joints import Conformity
 from processor.report.table import NAN
 
 LIMITS = {
@@ -40,19 +38,18 @@ def of_run(scene: Scene, run: StepRun) -> list[Judged]:
         *zip(adjustment.joints.name, adjustment.joints.conformity, strict=True),
         *((CHAIN, conformity) for conformity in adjustment.chain),
     ]
-    return [one for name, conformity in judged for one in _worded(name, conformity.limits, scene)]
-
-
-def _worded(name: str | Message, limits: ComparedLimits, scene: Scene) -> Iterator[Judged]:
-    for row, bounds_known in zip(limits.items(), limits.bounds_known, strict=True):
-        standing = label("verified" if row["verified"] else "not verified")
-        clause = text("{clause}, {standing}", clause=label(row["clause"]), standing=standing)
-        if not bounds_known:
-            clause = text("{clause}; depends on a size that is not known", clause=clause)
-        key = row["key"]
-        of = text("{place} {what}", place=name, what=LIMITS.get(key, label(key)))
-        worded = {"of": of, "what": label(row["what"]), "nominal": _nominal(key, scene), "clause": clause}
-        yield Judged(**row | worded)
+    found = []
+    for name, limits in ((name, conformity.limits) for name, conformity in judged):
+        for row, bounds_known in zip(limits.items(), limits.bounds_known, strict=True):
+            standing = label("verified" if row["verified"] else "not verified")
+            clause = text("{clause}, {standing}", clause=label(row["clause"]), standing=standing)
+            if not bounds_known:
+                clause = text("{clause}; depends on a size that is not known", clause=clause)
+            key = row["key"]
+            of = text("{place} {what}", place=name, what=LIMITS.get(key, label(key)))
+            worded = {"of": of, "what": label(row["what"]), "nominal": _nominal(key, scene), "clause": clause}
+            found.append(Judged(**row | worded))
+    return found
 
 
 def _nominal(key: str, scene: Scene) -> float:
