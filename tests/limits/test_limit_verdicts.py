@@ -122,6 +122,9 @@ def test_least_and_greatest_are_judged_by_the_bound_on_their_side(least, greates
     sides = [Measured.within("n", one, 0.5) for one in (least, greatest)]
     row = judging.judge(limit, sides[0], Tolerance(), sides[1])
     assert (row.verdict, row.value, row.ci95) == (verdict, value, pytest.approx(0.5))
+    # An interval that is open to the other side decides nothing there.
+    inward = Measured("n", least, least - 0.5, 99.0), Measured("n", greatest, -99.0, greatest + 0.5)
+    assert (judging.judge(limit, inward[0], Tolerance(), inward[1]).verdict is PASS) == (row.verdict is PASS)
 
 
 def test_limit_by_an_unknown_size_gives_an_indeterminate_verdict():
