@@ -287,7 +287,10 @@ def make_many(
     from processor.store.atomic_file import replace_text
     from processor.store.making import remove_leftovers
 
-    _make_folder(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UsageError(f"{folder}: many scenes need a folder, and there is a file of this name") from None
     busy = f"{folder}: another designgen is making scenes here; wait for it or stop it"
     try:
         with (
@@ -300,7 +303,13 @@ def make_many(
             for name in OF_SET:
                 (folder / name).unlink(missing_ok=True)
             remove_leftovers(folder)
-            _report_strangers(folder, jobs)
+            # Scenes of other runs stay, and one line says so
+            ours = {job.file for job in jobs}
+            strangers = sorted(p.name for p in folder.iterdir() if SCENE_FILE.fullmatch(p.name) and p.name not in ours)
+            if strangers:
+                print_error_line(
+                    f"{folder}: {len(strangers)} scene(s) of other runs are left as they are, e.g. {strangers[0]}"
+                )
             jobs = [replace(job, indexed=indexed.get(job.file)) for job in jobs]
             try:
                 with closing(executor.run(partial(process.in_process, run_job), jobs, check_stop)) as results:
@@ -362,20 +371,6 @@ def _summary(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome])
         "points": sum(content.points for _, content in done),
         "failed": [{"file": job.file, "reason": outcomes[job.file].reason} for job in failed],
     }
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise UsageError(f"{folder}: many scenes need a folder, and there is a file of this name") from None
-
-
-def _report_strangers(folder: Path, jobs: Sequence[Job]) -> None:
-    ours = {job.file for job in jobs}
-    strangers = sorted(p.name for p in folder.iterdir() if SCENE_FILE.fullmatch(p.name) and p.name not in ours)
-    if strangers:
-        print_error_line(f"{folder}: {len(strangers)} scene(s) of other runs are left as they are, e.g. {strangers[0]}")
 
 
 def _present(folder: Path, outcomes: dict[str, Outcome]) -> dict[str, Outcome]:

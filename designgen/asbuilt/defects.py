@@ -185,7 +185,10 @@ def _whole(kind: str, params: Params, form: defect_specimens.Params) -> Defect:
         depth = high if half_waves or rest > 0.5 * np.pi else high * np.sin(rest)
         # The integral of |sin| from the middle to both ends (2 for each half wave, and the rest) and of cos^2 over H.
         volume = high * 2.0 * (2.0 * half_waves + 1.0 - np.cos(rest)) / wave_number * 0.5 * H
-        displacement = _out(lambda x: high * np.sin(wave_number * x[:, 0]) * _fading(x[:, 1], H))
+        # 1 at the middle of the height, falling to 0 at its ends; 0 on a girder's flanges beyond
+        displacement = _out(
+            lambda x: high * np.sin(wave_number * x[:, 0]) * (np.cos(np.pi * np.clip(x[:, 1] / H, -0.5, 0.5)) ** 2)
+        )
         step = 0.08 * params.wave_length_mm
     elif kind == "step":
         depth = params.sized("step_mm")
@@ -206,12 +209,6 @@ def _whole(kind: str, params: Params, form: defect_specimens.Params) -> Defect:
         volume_mm3=float(volume),
         fine=(0.5 * L, step),
     )
-
-
-def _fading(b: Floats, H: float) -> Floats:
-    """Return 1 at the middle of the height, falling to 0 at its ends; 0 on a girder's flanges beyond."""
-    result: Floats = np.cos(np.pi * np.clip(b / H, -0.5, 0.5)) ** 2
-    return result
 
 
 def _missing(kind: str, params: Params, form: defect_specimens.Params, shares: tuple[float, float]) -> Defect:

@@ -142,12 +142,13 @@ def import_file(
     check_new(folder)
     content = _content(path, named or path)
     cad = read(named or path, units, default_units, content=content)
+    unit_from = "stated in the file" if cad.unit_stated else "given by --default-units"
     report: dict[str, Any] = {
         "file": path.name,
         "sha256": sha256(content).hexdigest(),
         "unit": cad.unit,
         "unit_mm": cad.unit_mm,
-        "unit_from": _unit_from(cad, units),
+        "unit_from": "given by --units" if units else unit_from,
         "unit_stated": cad.unit_stated or None,
         "bodies": [],
         "problems": list(cad.problems),
@@ -187,12 +188,6 @@ def _notes(cad: CadFile, stem: str) -> list[str]:
         *faults.of_shells(open_, inverted, "written as it is"),
         *faults.of_bodies(bodies),
     ]
-
-
-def _unit_from(cad: CadFile, units: str) -> str:
-    if units:
-        return "given by --units"
-    return "stated in the file" if cad.unit_stated else "given by --default-units"
 
 
 def summary(report: Mapping[str, Any]) -> list[str]:

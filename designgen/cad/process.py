@@ -168,7 +168,10 @@ def parse(
         from designgen.cad import step
 
         cad = step.parse(path, text, units, default_units, exact=exact)
-    lost = missing_lines(text)
+    # Numbers of entities that the file refers to but does not contain
+    plain = re.sub(rb"'[^']*'|/\*.*?\*/", b"", text, flags=re.S)
+    defined = {int(number) for number in re.findall(rb"#(\d{1,18})\s*=", plain)}
+    lost = sorted({int(number) for number in re.findall(rb"#(\d{1,18})(?!\d)", plain)} - defined)
     if not lost:
         return cad
     problem = f"{len(lost)} line(s) that others refer to are missing, first #{lost[0]}: bodies may be missing or wrong"
@@ -189,10 +192,3 @@ def escape(text: str) -> str:
     r"""Escape characters beyond ASCII as in ISO 10303-21: ``\X2\6881\X0\``, beyond 16 bits ``\X4\00020000\X0\``."""
     text = re.sub("[\x80-\uffff]+", lambda m: rf"\X2\{m[0].encode('utf-16-be', 'replace').hex().upper()}\X0" "\\", text)
     return re.sub("[\U00010000-\U0010ffff]+", lambda m: rf"\X4\{m[0].encode('utf-32-be').hex().upper()}\X0" "\\", text)
-
-
-def missing_lines(text: bytes) -> list[int]:
-    """Return the numbers of entities that a file refers to but does not contain, in order."""
-    plain = re.sub(rb"'[^']*'|/\*.*?\*/", b"", text, flags=re.S)
-    defined = {int(number) for number in re.findall(rb"#(\d{1,18})\s*=", plain)}
-    return sorted({int(number) for number in re.findall(rb"#(\d{1,18})(?!\d)", plain)} - defined)

@@ -148,7 +148,16 @@ class _Names:
         pairs = []
         for entity in entities:
             if isinstance(entity, StepShape_ShapeDefinitionRepresentation):
-                products[entity.UsedRepresentation()] = _product(entity)
+                # "" where a damaged file lacks a link of the chain to the product
+                links = (
+                    "Definition",
+                    "PropertyDefinition",
+                    "Definition",
+                    "ProductDefinition",
+                    "Formation",
+                    "OfProduct",
+                )
+                products[entity.UsedRepresentation()] = _text_by(entity, links)
             elif isinstance(entity, StepRepr_ShapeRepresentationRelationship) and not isinstance(
                 entity, StepRepr_ShapeRepresentationRelationshipWithTransformation
             ):
@@ -216,12 +225,6 @@ class _Names:
             self._bare_shapes.Add(bare)
             self._items.append(self._transfers.EntityFromShapeResult(bare, 1))
         return self._items[self._bare_shapes.FindIndex(bare) - 1]
-
-
-def _product(representation: Any) -> str:
-    """Return the name of a representation's product, "" where a damaged file lacks a link of the chain to it."""
-    links = ("Definition", "PropertyDefinition", "Definition", "ProductDefinition", "Formation", "OfProduct")
-    return _text_by(representation, links)
 
 
 def _text_by(entity: Any, links: Sequence[str]) -> str:

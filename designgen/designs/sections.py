@@ -51,27 +51,21 @@ def make(params: Params) -> Section:
         key_points = corners.copy()
         key_points[[5, 7]] = np.nan
         plates = np.array([[-b, b, -h, t - h], [-b, b, h - t, h], [-0.5 * w, 0.5 * w, t - h, h - t]])
-        return Section((_i_outline(b, h, t, w),), plates, key_points, 2.0 * b, 2.0 * h)
+        right = [[b, -h], [b, t - h], [0.5 * w, t - h], [0.5 * w, h - t], [b, h - t], [b, h]]
+        outline = np.array([*right, *([-y, z] for y, z in reversed(right))])
+        return Section((outline,), plates, key_points, 2.0 * b, 2.0 * h)
     outer = np.array([[-b, -h], [b, -h], [b, h], [-b, h]])
-    at, half = _stiffeners(params, b - w), 0.5 * params.stiffener_mm
+    # Places y (n,) of the stiffeners
+    at, half = np.empty(0), 0.5 * params.stiffener_mm
+    if params.section == "stiffened-box":
+        share = 2.0 * (np.arange(params.stiffeners) + 1.0) / (params.stiffeners + 1.0) - 1.0
+        at = np.asarray((b - w) * share)
     depth = params.stiffener_height_mm
     inner = _hole(b - w, h - t, at, half, depth)
     box = [[-b, b, -h, t - h], [-b, b, h - t, h], [-b, w - b, t - h, h - t], [b - w, b, t - h, h - t]]
     for y in at:
         box += [[y - half, y + half, t - h, t - h + depth], [y - half, y + half, h - t - depth, h - t]]
     return Section((outer, inner), np.array(box), corners, 2.0 * b, 2.0 * h)
-
-
-def _stiffeners(params: Params, half_width: float) -> Floats:
-    """Places y (n,) of the stiffeners of a stiffened box; none of others."""
-    if params.section != "stiffened-box":
-        return np.empty(0)
-    return np.asarray(half_width * (2.0 * (np.arange(params.stiffeners) + 1.0) / (params.stiffeners + 1.0) - 1.0))
-
-
-def _i_outline(b: float, h: float, t: float, w: float) -> Floats:
-    right = [[b, -h], [b, t - h], [0.5 * w, t - h], [0.5 * w, h - t], [b, h - t], [b, h]]
-    return np.array([*right, *([-y, z] for y, z in reversed(right))])
 
 
 def _hole(b: float, h: float, at: Floats, half: float, depth: float) -> Floats:

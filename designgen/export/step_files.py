@@ -104,7 +104,10 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
         components = structure_registry.design(recipe)
         shapes = {component.name: boxes_and_tubes.solid([component]) for component in components}
     elif kind == "assembly":
-        path, shapes = folder / "assembly.step", _parts_of_assembly(recipe)
+        # The solids of the girders and nodes of an assembly
+        bolts = filled(bolt_holes.Params, recipe, "bolts") if "bolts" in recipe else None
+        built = girder_assemblies.build(filled(girder_assemblies.Params, recipe, "assembly"), bolts).parts
+        path, shapes = folder / "assembly.step", {part.name: prismatic_solids.solid(part.made_of) for part in built}
     else:
         raise UsageError("--step: the scene does not name the recipe it was made from, so its solids are not known")
     write_step(path, shapes, _origin(recipe))
@@ -122,13 +125,6 @@ def _parts_of_arch(recipe: Mapping[str, Any]) -> tuple[arch_part.ArchPart, ...]:
     if recipe["kind"] == "ring":
         return closed_ring.build(filled(closed_ring.Params, recipe, "ring"))
     return arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
-
-
-def _parts_of_assembly(recipe: Mapping[str, Any]) -> dict[str, cq.Shape]:
-    """Return the solids of the girders and nodes of an assembly."""
-    bolts = filled(bolt_holes.Params, recipe, "bolts") if "bolts" in recipe else None
-    parts = girder_assemblies.build(filled(girder_assemblies.Params, recipe, "assembly"), bolts).parts
-    return {part.name: prismatic_solids.solid(part.made_of) for part in parts}
 
 
 def write_step(path: Path, shapes: Mapping[str, cq.Shape], origin_mm: Sequence[float] = (0.0, 0.0, 0.0)) -> None:

@@ -118,17 +118,13 @@ def _candidates(low: Floats, high: Floats, distance: float, room: float, points:
                 across, up = np.cos(elevation), np.sin(elevation)
                 unit = np.array([across * np.cos(azimuth), across * np.sin(azimuth), up])
                 # On a box with round edges, ``reach`` outside of the model's box.
-                places.append(middle + unit * (reach + _to_box(unit, half)))
+                # The least is the way from the middle to the surface of the box, mm.
+                places.append(middle + unit * (reach + float(np.min(half / np.maximum(np.abs(unit), 1e-12)))))
     step = float(np.ptp([low, high], axis=0).max()) / INSIDE
     counts = np.maximum(1, np.round((high - low) / step)).astype(int)
     inside = [low + (np.array(index) + 0.5) / counts * (high - low) for index in np.ndindex(*counts.tolist())]
     free = cKDTree(points).query(np.array(inside))[0] > room
     return np.array([*places, *np.array(inside)[free]])
-
-
-def _to_box(unit: Floats, half: Floats) -> float:
-    """Return the distance from the middle to the surface of a box along a direction, mm."""
-    return float(np.min(half / np.maximum(np.abs(unit), 1e-12)))
 
 
 def _seen(

@@ -134,7 +134,8 @@ def scan_station(
         margin=margin,
         least=least,
     )
-    with ThreadPoolExecutor(_threads()) as pool:  # the kernels release the interpreter's lock
+    threads = int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
+    with ThreadPoolExecutor(threads) as pool:  # the kernels release the interpreter's lock
         # One strip at least: it gives the columns of an empty scan their types.
         strips = [number for number in caster.view.occupied() if caster.in_view(number)] or [0]
         returns = join(list(pool.map(caster.strip, strips)))
@@ -147,10 +148,6 @@ def scan_station(
     turned = np.array([[1.0, 0.0, tilt[1]], [0.0, 1.0, -tilt[0]], [-tilt[1], tilt[0], 1.0]])
     returns = dataclasses.replace(returns, points=(returns.points * factor[:, None]) @ turned.T)
     return StationScan(returns, (float(offset), float(scale), float(tilt[0]), float(tilt[1])))
-
-
-def _threads() -> int:
-    return int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
 
 
 def beam(count: int) -> tuple[Floats, Floats]:

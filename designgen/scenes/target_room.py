@@ -73,7 +73,12 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     ids, kinds, places = [], [], []
     for i in range(room.checkerboards):
         place, frame = _on_face(faces, room.checkerboard_mm, taken, rng)
-        _checkerboard(builder, f"checkerboard {i + 1}", place, frame, room.checkerboard_mm)
+        # Two by two fields with a white border
+        half = 0.5 * room.checkerboard_mm
+        colours = np.full((4, 4), WHITE)
+        colours[1, 1] = colours[2, 2] = BLACK
+        edges = np.array([-half - BORDER_MM, -half, 0.0, half, half + BORDER_MM])
+        _fields(builder, f"checkerboard {i + 1}", place, frame, edges, colours)
         ids.append(f"K{i + 1}")
         kinds.append(TargetKind.CHECKERBOARD)
         places.append(place)
@@ -155,15 +160,6 @@ def _on_face(
     return place, (first, np.cross(face.inward, first))
 
 
-def _board(
-    builder: Builder, name: str, place: Floats, frame: tuple[Floats, Floats], box: Floats, albedo: float
-) -> None:
-    """Add a rectangle with corners ``box`` (2, 2) along the two directions of a frame about a place."""
-    (a, b), (c, d) = box
-    plan = np.array([[a, b], [c, b], [c, d], [a, d]])
-    builder.polygon(-1, name, place + plan @ np.array(frame), albedo)
-
-
 def _fields(
     builder: Builder, name: str, place: Floats, frame: tuple[Floats, Floats], edges: Floats, colours: Floats
 ) -> None:
@@ -171,16 +167,10 @@ def _fields(
     for i in range(len(edges) - 1):
         for j in range(len(edges) - 1):
             box = np.array([[edges[i], edges[j]], [edges[i + 1], edges[j + 1]]])
-            _board(builder, f"{name} {i}{j}", place, frame, box, float(colours[i, j]))
-
-
-def _checkerboard(builder: Builder, name: str, place: Floats, frame: tuple[Floats, Floats], size: float) -> None:
-    """Add a target of two by two fields with a white border."""
-    half = 0.5 * size
-    colours = np.full((4, 4), WHITE)
-    colours[1, 1] = colours[2, 2] = BLACK
-    edges = np.array([-half - BORDER_MM, -half, 0.0, half, half + BORDER_MM])
-    _fields(builder, name, place, frame, edges, colours)
+            # A rectangle along the two directions of the frame about the place
+            (a, b), (c, d) = box
+            plan = np.array([[a, b], [c, b], [c, d], [a, d]])
+            builder.polygon(-1, f"{name} {i}{j}", place + plan @ np.array(frame), float(colours[i, j]))
 
 
 def _decoy(builder: Builder, kind: str, name: str, place: Floats, frame: tuple[Floats, Floats], size: float) -> None:
