@@ -156,12 +156,6 @@ def _tone(run: StepRun) -> str:
     return "" if provisional else "good"
 
 
-def _message(run: StepRun, lang: str) -> str:
-    """Write the reasons of a step; of one that failed first why."""
-    why: list[Any] = list(step_report(run.step).why(run.result)) if run.result.status == Status.FAILED else []
-    return messages(lang).sentences([*why, *(reason for reason in run.result.reasons if reason not in why)])
-
-
 def _sections(
     execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live: Container[str], lang: str
 ) -> list[dict[str, Any]]:
@@ -189,9 +183,11 @@ def _section(
     lead = [characteristics.table(held, report_of.characteristics_note)] if held else []
     lead += [table for table in tables if table.file in LEAD]
     further = [table for table in tables if table.file not in LEAD and table.folded]
+    # Of a step that failed first why
+    why: list[Any] = list(step_report(run.step).why(run.result)) if run.result.status == Status.FAILED else []
     return {
         "title": report_of.title,
-        "message": _message(run, lang),
+        "message": messages(lang).sentences([*why, *(reason for reason in run.result.reasons if reason not in why)]),
         "lead": [written_table(table, lang) for table in lead],
         "tables": [written_table(table, lang) for table in tables if table.file not in LEAD and not table.folded],
         "further": [written_table(table, lang) for table in further],

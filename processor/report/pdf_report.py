@@ -22,7 +22,7 @@ from processor.model import Verdict, worst
 from processor.pipeline import Execution
 from processor.report import characteristics, headline, title_block
 from processor.report.reports_of_steps import characteristics_of
-from processor.report.style import Drawn, chinese_font, drawable, families, pdf
+from processor.report.style import LATIN, Drawn, chinese_font, drawable, pdf
 from processor.report.table import shown
 
 NAME = "report.pdf"
@@ -53,7 +53,7 @@ class Line:
 
 def document(execution: Execution, figures: Mapping[str, Drawn], lang: str = "en") -> bytes:
     """Write the document; the same run gives the same bytes on systems with the same fonts."""
-    with rc_context({"font.family": families()}):
+    with rc_context({"font.family": [LATIN, *filter(None, [chinese_font()])]}):
         return _document(execution, figures, messages(lang if lang == "en" or chinese_font() else "en"))
 
 
@@ -61,7 +61,9 @@ def _document(execution: Execution, figures: Mapping[str, Drawn], say: Messages)
     pages = [*_front(execution, say), *_characteristics(execution, say)]
     drawn = [(say.text(caption), png) for of_step in figures.values() for caption, png in of_step.figures.values()]
     count = len(pages) + len(drawn)
-    head = drawable(" · ".join(filter(None, [*_heads(execution), execution.scene.name])))
+    given = title_block.entries(execution.scene)
+    heads = [given.get(key, "") for key in ("company", "project", "drawing")]
+    head = drawable(" · ".join(filter(None, [*heads, execution.scene.name])))
     foot = drawable(", ".join(value for _, value in title_block.facts(execution.provenance)))
 
     def finished() -> Iterator[Figure]:
@@ -73,11 +75,6 @@ def _document(execution: Execution, figures: Mapping[str, Drawn], say: Messages)
             yield page
 
     return pdf(finished())
-
-
-def _heads(execution: Execution) -> list[str]:
-    given = title_block.entries(execution.scene)
-    return [given.get(key, "") for key in ("company", "project", "drawing")]
 
 
 def _front(execution: Execution, say: Messages) -> Iterator[Figure]:

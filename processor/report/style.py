@@ -116,11 +116,6 @@ def chinese_font() -> str:
     return next((name for name in CHINESE if name in there), "")
 
 
-def families() -> list[str]:
-    """Return the families of text: that of Matplotlib, then one with Chinese characters if there is one."""
-    return [LATIN, *filter(None, [chinese_font()])]
-
-
 @cache
 def _has(character: str) -> bool:
     code = ord(character)

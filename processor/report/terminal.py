@@ -27,7 +27,7 @@ def lines(execution: Execution, report: ErrorReport, page: str) -> list[str]:
     middle = list(_middle(execution, report))
     if len(middle) > MOST_LINES - 2:
         middle = [*middle[: MOST_LINES - 3], MORE]
-    written = [_short(messages("en").text(line)) for line in middle]
+    written = [textwrap.shorten(printable(messages("en").text(line)), LONGEST, placeholder=" ...") for line in middle]
     return [printable(headline.of_run(execution)), *written, f"report: {page}"]
 
 
@@ -49,10 +49,6 @@ def failures(execution: Execution) -> Iterator[str]:
             reasons = _reasons(run)
             why = messages("en").text(reasons) if reasons else "no reason is known"
             yield f"{run.step} ({run.method}) failed: {why}"
-
-
-def _short(line: str) -> str:
-    return textwrap.shorten(printable(line), LONGEST, placeholder=" ...")
 
 
 def _middle(execution: Execution, report: ErrorReport) -> Iterator[Message]:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from processor.epochs.change import Change, Component, Finding
+from processor.epochs.change import Component, Finding
 from processor.epochs.compare import History
 from processor.language.messages import Message, text
 from processor.report import style
@@ -51,13 +51,11 @@ def _panel(axes: Axes, history: History, row: int, one: Component) -> None:
     axes.plot(days[rows[:1]], [0.0], "o", color=colour, markersize=4)
     half = [change.ci95 for change in same]
     axes.errorbar(days[rows[1:]], values[1:], half, fmt="o", color=colour, markersize=4, capsize=3)
-    axes.set_title(f"{style.printable_name(one.name, row)}, {_quantity(one.leading)}", fontsize=9)
+    axes.set_title(
+        f"{style.printable_name(one.name, row)}, {style.drawable(str(one.leading.series.quantity))[:40]}", fontsize=9
+    )
     axes.set_ylabel(one.leading.series.unit, fontsize=8)
     axes.tick_params(labelsize=7)
     axes.xaxis.set_major_locator(dates.AutoDateLocator(minticks=2, maxticks=4))
     axes.xaxis.set_major_formatter(dates.DateFormatter("%Y-%m-%d"))
     axes.margins(x=0.12, y=0.15)
-
-
-def _quantity(change: Change) -> str:
-    return style.drawable(str(change.series.quantity))[:40]

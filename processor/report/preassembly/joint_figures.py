@@ -19,6 +19,8 @@ from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS
 
 MOST_JOINTS = 24
 ARROW_SHARE = 0.3  # of the section: how long the longest arrow is drawn
+# A thin line with a small head, which covers neither the start nor the end
+ARROW = {"arrowstyle": "-|>", "color": COLOURS[0], "lw": 1.4, "mutation_scale": 7, "shrinkA": 0, "shrinkB": 0}
 # Where the numbers of P1..P8 stand: outward of the section, left of the bridge is left on the page.
 OUTWARD = ((-1, -1), (1, -1), (1, 1), (-1, 1), (0, -1), (1, 0), (0, 1), (-1, 0))
 ALIGNED = {-1: ("right", "top"), 0: ("center", "center"), 1: ("left", "bottom")}
@@ -120,10 +122,13 @@ def _section(axes: Axes, measures: Measures, times: float) -> None:
         tip = at[k] + times * gaps[k, 1:]
         block = measures.covariance[3 * k + 1 : 3 * k + 3, 3 * k + 1 : 3 * k + 3]
         axes.add_patch(_ellipse(tip, block * times**2))
-        if _is_noise(gaps[k, 1:], block):
+        # Whether a gap across (2,) is within the 95 % region of its covariance (2, 2) about none
+        gap = gaps[k, 1:]
+        if bool(gap @ np.linalg.pinv(block) @ gap <= RAYLEIGH_95**2):
             axes.plot(*at[k], "o", color=WITHIN, markersize=8, zorder=2)
         else:
-            _arrow(axes, at[k], tip)
+            start, end = ((float(point[0]), float(point[1])) for point in (at[k], tip))
+            axes.annotate("", end, start, arrowprops=ARROW)
         is_open = gaps[k, 0] >= 0.0
         axes.plot(*at[k], "o" if is_open else "s", color="black", markersize=5, fillstyle="none" if is_open else "full")
         side, up = OUTWARD[k]
@@ -146,16 +151,6 @@ def _section(axes: Axes, measures: Measures, times: float) -> None:
     axes.set(xlabel="to the left, mm", ylabel="up, mm")
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.25)
-
-
-def _is_noise(gap: Floats, covariance: Floats) -> bool:
-    """Whether a gap across (2,) is within the 95 % region of its covariance (2, 2) about none."""
-    return bool(gap @ np.linalg.pinv(covariance) @ gap <= RAYLEIGH_95**2)
-
-
-def _arrow(axes: Axes, start: Floats, tip: Floats) -> None:
-    props = {"arrowstyle": "-|>", "color": COLOURS[0], "lw": 1.4, "mutation_scale": 7, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", (float(tip[0]), float(tip[1])), (float(start[0]), float(start[1])), arrowprops=props)
 
 
 def _ellipse(at: Floats, covariance: Floats) -> Ellipse:

@@ -121,16 +121,13 @@ def maps(scene: Scene, result: Result) -> list[PartMap]:
     found = []
     for i, name in enumerate(result.components.name):
         rows = (residuals.component == i) & np.isfinite(residuals.distance)
-        if not rows.any() or name not in parts or _edge_points(parts[name]) < 2:
+        part = parts.get(name)
+        if not rows.any() or part is None or min(len(part.bottom_edge_left), len(part.bottom_edge_right)) < 2:
             continue
         points = residuals.points[rows]
-        flat = unroll(parts[name], points)
+        flat = unroll(part, points)
         found.append(PartMap(name, flat, *cells(flat, residuals.distance[rows]), points))
     return found
-
-
-def _edge_points(part: DesignPart) -> int:
-    return min(len(part.bottom_edge_left), len(part.bottom_edge_right))
 
 
 def scatter_band(drawn: Sequence[PartMap]) -> Band:

@@ -11,7 +11,6 @@ from processor.model import Verdict
 from processor.report.columns import MM, columns
 from processor.report.style import COLOURS, DIVERGING_STOPS, CaptionedPngs, png
 from processor.report.table import Table, csv_of_rows
-from processor.space_frame.hanger_lengths import clashes
 from processor.space_frame.result import Flag, Result
 
 PLAN, STAKE_OUT = "hangers.png", "stakeout.csv"
@@ -70,7 +69,7 @@ def draw(result: Result) -> CaptionedPngs:
     x, y = hangers.top[known, :2].T / 1000.0
     points = axes.scatter(x, y, c=hangers.length[known], s=30.0, cmap=LENGTHS)
     figure.colorbar(points, ax=axes, label="length, mm", shrink=0.8)
-    failed = list(clashes(hangers))
+    failed = [row for row, verdict in enumerate(hangers.verdict) if verdict is Verdict.FAIL]
     open_ = [row for row, verdict in enumerate(hangers.verdict) if verdict is Verdict.INDETERMINATE]
     for rows, colour, style, label in ((failed, COLOURS[1], "-", "fail"), (open_, "black", ":", "indeterminate")):
         if rows:

@@ -163,16 +163,13 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
         error = np.abs(run.result.balls.radii - report.true_radii[run.method])
         finite = error[np.isfinite(error)]
         figures = np.quantile(finite, [0.5, 0.95, 1.0]).tolist() if len(finite) else [NAN] * 3
-        rows.append((run.method, len(finite), len(error), *figures, _points_used(run)))
+        # Errors of methods are comparable only on the same points.
+        points = text("those of ray") if SAME in run.result.reasons else text("all of its crop")
+        if run.method == "ray":
+            points = text("selected by the method")
+        rows.append((run.method, len(finite), len(error), *figures, points))
     header = columns("method", "fitted", "balls", "median_mm", "quantile_95_mm", "largest_mm", "points_used")
     return Table(text("|radius error| by method"), header, tuple(rows), "summary", units=MM)
-
-
-def _points_used(run: StepRun) -> Message:
-    """Return which points a method fitted: errors of methods are comparable only on the same points."""
-    if run.method == "ray":
-        return text("selected by the method")
-    return text("those of ray") if SAME in run.result.reasons else text("all of its crop")
 
 
 def _sd(balls: Balls) -> Floats:

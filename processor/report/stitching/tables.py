@@ -36,13 +36,19 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     tables: list[Table] = []
     for number, run in enumerate(runs):
         result, suffix = run.result, f"-{run.method}" if number else ""
+        # Tabulate the reasons that are of no single scan, for the terminal; the page has all reasons as a paragraph
+        rows = tuple((single,) for single in result.reasons if single.code != OF_SCAN)
         tables += [
             _scans(result, run.method, suffix),
             _pairs(result, run.method, suffix),
             _loops(result, run.method, suffix),
             _matrices(result, run.method),
             *_control(result, run.method, suffix),
-            *_remarks(result, run.method),
+            *(
+                [Table(text("Remarks, method {method}", method=run.method), columns("remark"), rows, on_page=False)]
+                if rows
+                else []
+            ),
         ]
     return tables
 
@@ -158,14 +164,6 @@ def _control(result: Result, method: str, suffix: str) -> list[Table]:
     )
     title = text("Control points, method {method}", method=method)
     return [Table(title, header, rows, f"control{suffix}", note, units=MM)]
-
-
-def _remarks(result: Result, method: str) -> list[Table]:
-    """Tabulate the reasons that are of no single scan, for the terminal; the page has all reasons as a paragraph."""
-    rows = tuple((single,) for single in result.reasons if single.code != OF_SCAN)
-    return (
-        [Table(text("Remarks, method {method}", method=method), columns("remark"), rows, on_page=False)] if rows else []
-    )
 
 
 def _yes_no(value: np.bool_) -> Message:
