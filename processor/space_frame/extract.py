@@ -290,13 +290,21 @@ def _fit_spheres(
     expected, disputed = np.full(nodes.count, np.nan), np.zeros(nodes.count, bool)
     if design is not None:
         expected, disputed = _expected(start, design, source.origin, options.expansion)
-        nodes = _with_nominal_places(nodes, start.positions)
+        # Nodes that no axes fix are at their nominal places, with a large covariance
+        lost = ~np.isfinite(nodes.positions).all(axis=1)
+        places, covariance = nodes.positions.copy(), nodes.covariance.copy()
+        places[lost], covariance[lost] = start.positions[lost], NOMINAL_SD_MM**2 * np.eye(3)
+        nodes = Nodes(places, covariance, np.where(lost, 0, nodes.axis_count), nodes.scatter)
     between = None if stations is None else stations.between
     spheres = alternating_fit.fit_spheres(
         source, nodes, measured.members, catalogue, expected, between, limits=options.limits
     )
     smallest = float(catalogue.radii.min()) if len(catalogue.radii) else np.nan
-    spheres = assessment.with_ambiguous_design(spheres, disputed)
+    # Poses of the design give different nominal radii to these spheres: none is wrong then
+    reasons = list(spheres.reasons)
+    for i in np.flatnonzero(disputed).tolist():
+        reasons[i] = (*reasons[i], reason("spheres.ambiguous-node"))
+    spheres = replace(spheres, reasons=tuple(reasons))
     return nodes, hidden_or_missing.with_cause_of_absence(spheres, source, smallest)
 
 
@@ -318,14 +326,6 @@ def _expected(start: Start, design: FrameDesign, origin: Floats, expansion: floa
         other = np.where(distance < matching.FAR * matching.TOLERANCE_MM, design.radii[nearest], np.nan)
         disputed |= (rows >= 0) & (other != expected)
     return np.where(disputed, np.nan, expected), disputed
-
-
-def _with_nominal_places(nodes: Nodes, positions: Floats) -> Nodes:
-    """Put nodes that no axes fix at their nominal places, with a large covariance."""
-    lost = ~np.isfinite(nodes.positions).all(axis=1)
-    places, covariance = nodes.positions.copy(), nodes.covariance.copy()
-    places[lost], covariance[lost] = positions[lost], NOMINAL_SD_MM**2 * np.eye(3)
-    return Nodes(places, covariance, np.where(lost, 0, nodes.axis_count), nodes.scatter)
 
 
 # --- design ----------------------------------------------------------------------------------------------------------

@@ -9,14 +9,14 @@ also against their greatest length. The use is that of paper 001, section 4.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from processor.limits import judging, measurands, standards
 from processor.limits.judging import Judged, JudgedLimits, Measured
-from processor.model import NORMAL_95, Ceiling, Floats, Limit, Scene, Verdict, worst
+from processor.model import NORMAL_95, Ceiling, Floats, Limit, Scene, worst
 from processor.space_frame import mesh_heights
 from processor.space_frame.mesh_heights import Plan
 from processor.space_frame.result import Balls, Evidence, Flag, Hangers, Result, Tubes
@@ -135,8 +135,3 @@ def _name(tube: int, a: int | str, b: int | str) -> str:
     if len(balls) == 2:
         return f"tube {tube}, balls {a} and {b}"
     return f"tube {tube}, ball {balls[0]} and a free end" if balls else f"tube {tube}, no balls"
-
-
-def clashes(hangers: Hangers) -> Sequence[int]:
-    """Return the rows of the hangers that fail."""
-    return [row for row, verdict in enumerate(hangers.verdict) if verdict is Verdict.FAIL]

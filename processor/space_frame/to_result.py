@@ -12,7 +12,6 @@ from processor.adjustment import thermal
 from processor.limits import measurands, standards
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
 from processor.space_frame import ball_catalogue, supports_and_deflections
-from processor.space_frame.ball_catalogue import Catalogue
 from processor.space_frame.design.matching import FrameRelation, Matching
 from processor.space_frame.design.movement import Movement, size_of, verdict_of
 from processor.space_frame.extract import Extracted, Options, extract
@@ -69,13 +68,9 @@ def _extracted(source: SceneSource, scene: Scene, params: Params) -> Extracted |
         datum_mm=params.datum_mm,
         limits=standards.default_for(scene.tolerance),
     )
-    return extract(source, scene.frame, _catalogue(params), options, control_of(scene, source))
-
-
-def _catalogue(params: Params) -> Catalogue:
-    if params.radii_mm:
-        return ball_catalogue.of_radii(params.radii_mm)
-    return ball_catalogue.of_radii(()) if params.catalogue == "none" else ball_catalogue.load(params.catalogue)
+    listed = not params.radii_mm and params.catalogue != "none"
+    catalogue = ball_catalogue.load(params.catalogue) if listed else ball_catalogue.of_radii(params.radii_mm)
+    return extract(source, scene.frame, catalogue, options, control_of(scene, source))
 
 
 def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
@@ -110,7 +105,11 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
         movement_reference=reference,
         matching=pose,
         tubes=_tubes(extracted, balls.ids, source.origin),
-        stations=StationCorrections() if stations is None else _corrections(stations, source),
+        stations=StationCorrections()
+        if stations is None
+        else StationCorrections(
+            names=source.names, T=_in_place(stations.T_project_station, source.origin), reasons=stations.reasons
+        ),
         datum=() if stations is None else stations.datum,
         control=ControlDeviations() if stations is None else _control(stations),
         limits=judged,
@@ -259,6 +258,11 @@ def _tubes(extracted: Extracted, ids: Ints, origin: Floats) -> Tubes:
         at_start = at_start + station_error_propagation.of_axes(members, stations, -0.5 * members.lengths)
         at_end = at_end + station_error_propagation.of_axes(members, stations, 0.5 * members.lengths)
         of_radius = of_radius + station_error_propagation.of_radii(members, stations)
+    # The standard deviation (m,) of each bow is along its own direction; of a tube without bow the larger one
+    size = np.hypot(*members.bow.T)
+    along = members.bow / np.maximum(size, 1e-9)[:, None]
+    variance = np.einsum("mi,mij,mj->m", along, members.bow_covariance, along)
+    sd: Floats = np.sqrt(np.where(size > 1e-9, variance, np.einsum("mii->mi", members.bow_covariance).max(axis=1)))
     return Tubes(
         a=np.where(members.node_a >= 0, ids[members.node_a], -1),
         b=np.where(members.node_b >= 0, ids[members.node_b], -1),
@@ -269,17 +273,8 @@ def _tubes(extracted: Extracted, ids: Ints, origin: Floats) -> Tubes:
         radius_ci95=NORMAL_95 * np.sqrt(members.covariance[:, 4, 4] + of_radius),
         start_ci95=_across(members, -0.5 * members.lengths, at_start),
         end_ci95=_across(members, 0.5 * members.lengths, at_end),
-        bow_ci95=NORMAL_95 * _bow_sd(members),
+        bow_ci95=NORMAL_95 * sd,
     )
-
-
-def _bow_sd(members: Members) -> Floats:
-    """Return the standard deviation (m,) of each bow along its own direction; of a tube without bow the larger one."""
-    size = np.hypot(*members.bow.T)
-    along = members.bow / np.maximum(size, 1e-9)[:, None]
-    variance = np.einsum("mi,mij,mj->m", along, members.bow_covariance, along)
-    sd: Floats = np.sqrt(np.where(size > 1e-9, variance, np.einsum("mii->mi", members.bow_covariance).max(axis=1)))
-    return sd
 
 
 def _across(members: Members, t: Floats, common: Floats) -> Floats:
@@ -294,12 +289,6 @@ def _across(members: Members, t: Floats, common: Floats) -> Floats:
     C = J @ members.covariance[:, :4, :4] @ np.swapaxes(J, 1, 2) + common
     half: Floats = NORMAL_95 * np.sqrt(np.maximum(np.einsum("mia,mab,mib->mi", basis, C, basis), 0.0))
     return half
-
-
-def _corrections(stations: Stations, source: SceneSource) -> StationCorrections:
-    return StationCorrections(
-        names=source.names, T=_in_place(stations.T_project_station, source.origin), reasons=stations.reasons
-    )
 
 
 def _control(stations: Stations) -> ControlDeviations:

@@ -22,7 +22,10 @@ def between(known: Floats, seen: Floats) -> str:
     if not sound.any():
         return ""
     ratio = float(np.median(known[sound] / seen[sound]))
-    factor = unit_ratio.nearest_factor(ratio, unit_ratio.with_inverses(FACTORS), NEAR)
+    # Each factor f followed by 1 / f
+    factor = unit_ratio.nearest_factor(
+        ratio, tuple(value for factor in FACTORS for value in (factor, 1.0 / factor)), NEAR
+    )
     if factor is None:
         return ""
     return f"{factor:g}" if factor > 1.0 else f"1/{1.0 / factor:g}"

@@ -99,7 +99,11 @@ def _agreeing(ends: AxisEnds, e2: float, k: int, floor_mm: float, rounds: int) -
         size = np.einsum("ij,ijk,ik->i", miss, _inverse2(_total_covariance(ends, e2)), miss)
         count = np.bincount(ends.node[used], minlength=k)
         # The worst axis of a node goes first; the others may agree without it.
-        test = np.nan_to_num(np.where(used, size / np.maximum(_redundancy(ends, cov, e2), 0.1), 0.0))
+        # Share (i,) of an axis's variance that remains in its miss, its node being fitted to it
+        node = ends.across @ cov[ends.node] @ ends.across.transpose(0, 2, 1)
+        share = 1.0 - 0.5 * np.einsum("ijk,ikj->i", _inverse2(_total_covariance(ends, e2)), node)
+        redundancy: Floats = np.nan_to_num(share, nan=1.0)
+        test = np.nan_to_num(np.where(used, size / np.maximum(redundancy, 0.1), 0.0))
         worst = np.zeros(k)
         np.maximum.at(worst, ends.node, test)
         out = used & (test > CUT_SIGMAS**2) & (test == worst[ends.node]) & (count[ends.node] > 2)
@@ -170,14 +174,6 @@ def _miss(ends: AxisEnds, x: Floats) -> Floats:
     """Offsets (i, 2) from nodes moved by x (k, 3) to the axes, across them."""
     miss: Floats = np.einsum("ijk,ik->ij", ends.across, ends.offsets - x[ends.node])
     return miss
-
-
-def _redundancy(ends: AxisEnds, cov: Floats, e2: float) -> Floats:
-    """Share (i,) of an axis's variance that remains in its miss, its node being fitted to it."""
-    node = ends.across @ cov[ends.node] @ ends.across.transpose(0, 2, 1)
-    share = 1.0 - 0.5 * np.einsum("ijk,ikj->i", _inverse2(_total_covariance(ends, e2)), node)
-    redundancy: Floats = np.nan_to_num(share, nan=1.0)
-    return redundancy
 
 
 def _intersect(

@@ -199,7 +199,11 @@ def _assessment(
     """Flag and reasons of a fitted sphere, by its doubts, its priors (``disagrees``) and its nominal radius."""
     catalogue = context.catalogue
     away, off = float(np.linalg.norm(state[:3])), float(state[3] - size)
-    if not doubts and _unlisted(disagrees, off, context.radius_sd, catalogue):
+    # Whether a sphere without other doubts may be of a size that the catalogue does not list. Without a catalogue
+    # every sphere may. With one, points and priors must disagree, and the radius must be ``off`` mm from the size by
+    # far more than radii scatter.
+    far = abs(off) > UNLISTED * context.radius_sd
+    if not doubts and (disagrees and far if len(catalogue.radii) else not disagrees):
         wrong = beyond(state[3], nominal, NORMAL_95 * radius_sd, context.limits)
         if wrong is not None:
             return Flag.WRONG_SIZE, (wrong,)
@@ -212,17 +216,6 @@ def _assessment(
     if np.isfinite(nominal) and len(catalogue.radii) and size != nominal:
         return Flag.WRONG_SIZE, (reason("spheres.other-size", size=size, nominal=nominal),)
     return Flag.OK, ()
-
-
-def _unlisted(disagrees: bool, off: float, radius_sd: float, catalogue: Catalogue) -> bool:
-    """Whether a sphere without other doubts may be of a size that the catalogue does not list.
-
-    Without a catalogue every sphere may. With one, points and priors must disagree, and the radius must be ``off`` mm
-    from the size by far more than radii scatter.
-    """
-    if not len(catalogue.radii):
-        return not disagrees
-    return disagrees and abs(off) > UNLISTED * radius_sd
 
 
 def _messages(context: FitContext) -> tuple[Reason, ...]:
@@ -294,14 +287,6 @@ def with_shared_offset(spheres: Spheres, covariance: Floats) -> Spheres:
         flags[i] = Flag.LOW_CONFIDENCE
         reasons[i] = (reason("spheres.common-offset", sd=sd[i]), *reasons[i])
     return replace(spheres, flag=tuple(flags), reasons=tuple(reasons))
-
-
-def with_ambiguous_design(spheres: Spheres, rows: Bools) -> Spheres:
-    """Add a reason to spheres (k,) for which poses of the design give different nominal radii: none is wrong then."""
-    reasons = list(spheres.reasons)
-    for i in np.flatnonzero(rows).tolist():
-        reasons[i] = (*reasons[i], reason("spheres.ambiguous-node"))
-    return replace(spheres, reasons=tuple(reasons))
 
 
 def with_ambiguous_matching(spheres: Spheres, rows: Bools, listed: bool) -> Spheres:

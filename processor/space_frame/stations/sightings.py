@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.model import Floats, InputError, Ints, Scene
+from processor.model import InputError, Scene
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.points.scene_source import SceneSource
 from processor.space_frame.stations.control_points import ControlPoints
@@ -33,7 +33,12 @@ def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
     point, target = control.point[rows], control.positions[control.point[rows]] - source.origin
     off = float(np.median(np.linalg.norm(target - measured, axis=1)))
     if off > FARTHEST_MM:
-        factor = unit_mistakes.between(*_spans(point, scanner[rows], target, measured))
+        # Distances between control points that one scanner saw do not depend on poses.
+        a, b = np.triu_indices(len(point), 1)
+        both = (scanner[rows[a]] == scanner[rows[b]]) & (point[a] != point[b])
+        a, b = a[both], b[both]
+        known, found = (np.linalg.norm(at[a] - at[b], axis=1) for at in (target, measured))
+        factor = unit_mistakes.between(known, found)
         if factor:
             raise InputError(
                 f"{scene.name}: control points lie {factor} times as far apart as the scans have them: one of the two "
@@ -53,11 +58,3 @@ def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
         target_sd=control.sd[point],
         scanners=source.names,
     )
-
-
-def _spans(point: Ints, scanner: Ints, target: Floats, measured: Floats) -> tuple[Floats, Floats]:
-    """Distances (n,) between control points that one scanner saw, as known and as measured; independent of poses."""
-    a, b = np.triu_indices(len(point), 1)
-    both = (scanner[a] == scanner[b]) & (point[a] != point[b])
-    a, b = a[both], b[both]
-    return np.linalg.norm(target[a] - target[b], axis=1), np.linalg.norm(measured[a] - measured[b], axis=1)
