@@ -67,18 +67,32 @@ def stitch(
     these is the only candidate, so that repetitive structures are not ambiguous. Scans that overlap with no other one
     have a pose of NaN.
     """
-    clouds = _extract(scans, params.cell_mm)
-    patches = _sample_patches(clouds)
+    count = sum(len(scan.points) for scan in scans)
+    clouds = thread_ranges.each(
+        lambda scan: scan_planes.extract(scan, params.cell_mm, scan_planes.points_a_cell(scan, count)), scans
+    )
+    side = pairwise.cube_side(clouds)
+    patches = thread_ranges.each(lambda cloud: pairwise.prepare(cloud, side), clouds)
     known = control_points.poses_of_scans(control, [cloud.origin for cloud in clouds])
     candidates = _find_candidates(patches, params, picked, known)
     coarse = network.place(patches, candidates, reference)
     cells = correspondences.gather(clouds)
     solution, blocks = _adjust(clouds, cells, coarse.T, reference)
-    pairs = _measure_pairs(blocks, solution)
+    # All pairs that share enough pieces, each by itself
+    with_pose = np.flatnonzero(np.isfinite(solution.T).all(axis=(1, 2)))
+    registered = [
+        pairs_and_loops.register_pair(blocks, solution, a, b) for a, b in itertools.combinations(with_pose.tolist(), 2)
+    ]
+    pairs = [pair for pair in registered if pair is not None]
     solution, blocks = _without_gross_pairs(blocks, solution, pairs, reference)
     factor = jackknife.factors(blocks, solution, reference)
     solution, pairs = jackknife.with_raised_covariance(solution, pairs, factor)
-    scores = _score_pairs(patches, solution.T)
+    # All pairs of scans that have a pose
+    placed = [s for s in range(len(solution.T)) if np.isfinite(solution.T[s]).all()]
+    scores = {
+        (a, b): pairwise.score_pose(patches[a], patches[b], rigid.invert(solution.T[a]) @ solution.T[b])
+        for a, b in itertools.combinations(placed, 2)
+    }
     return RegisteredScans(
         clouds=clouds,
         coarse=coarse,
@@ -97,18 +111,6 @@ def stitch(
         links=sorted({*network.links(scores), *itertools.combinations(sorted(known), 2)}),
         groups=network.groups(candidates, len(scans)),
     )
-
-
-def _extract(scans: Sequence[Scan], cell_mm: float) -> list[Cloud]:
-    count = sum(len(scan.points) for scan in scans)
-    return thread_ranges.each(
-        lambda scan: scan_planes.extract(scan, cell_mm, scan_planes.points_a_cell(scan, count)), scans
-    )
-
-
-def _sample_patches(clouds: list[Cloud]) -> list[ScanPatches]:
-    side = pairwise.cube_side(clouds)
-    return thread_ranges.each(lambda cloud: pairwise.prepare(cloud, side), clouds)
 
 
 def _find_candidates(
@@ -164,24 +166,12 @@ def _adjust(clouds: list[Cloud], cells: CellTable, T: Floats, reference: int) ->
         blocks = edge_constraints.with_ends(clouds, pieces, T, gate * cells.size_mm).shared()
         solution = bundle_adjustment.solve(blocks, T, reference, slack_mm=gate * cells.size_mm)
         before, T, ranges = T, solution.T, solution.of_scans
-        if gate == 0.0 and _largest_shift(T, before) < STILL_MM:
+        # Between the origins of the scans
+        shift = np.linalg.norm(T[:, :3, 3] - before[:, :3, 3], axis=1)
+        shift_mm = float(np.nanmax(shift)) if np.isfinite(shift).any() else 0.0
+        if gate == 0.0 and shift_mm < STILL_MM:
             break
     return solution, blocks
-
-
-def _largest_shift(T: Floats, S: Floats) -> float:
-    """Return the largest distance, mm, between the origins of two sets of poses (k, 4, 4)."""
-    shift = np.linalg.norm(T[:, :3, 3] - S[:, :3, 3], axis=1)
-    return float(np.nanmax(shift)) if np.isfinite(shift).any() else 0.0
-
-
-def _measure_pairs(blocks: Blocks, solution: Solution) -> list[Pair]:
-    """Register all pairs that share enough pieces, each by itself."""
-    placed = np.flatnonzero(np.isfinite(solution.T).all(axis=(1, 2)))
-    pairs = [
-        pairs_and_loops.register_pair(blocks, solution, a, b) for a, b in itertools.combinations(placed.tolist(), 2)
-    ]
-    return [pair for pair in pairs if pair is not None]
 
 
 def _without_gross_pairs(
@@ -198,15 +188,6 @@ def _without_gross_pairs(
     keep = np.array([piece not in out for piece in blocks.piece.tolist()], bool)
     blocks = blocks.take(keep).shared()
     return bundle_adjustment.solve(blocks, solution.T, reference), blocks
-
-
-def _score_pairs(patches: list[ScanPatches], T: Floats) -> dict[tuple[int, int], ScoredPose]:
-    """Score the relative poses of all pairs of scans that have a pose in T (k, 4, 4)."""
-    placed = [s for s in range(len(T)) if np.isfinite(T[s]).all()]
-    return {
-        (a, b): pairwise.score_pose(patches[a], patches[b], rigid.invert(T[a]) @ T[b])
-        for a, b in itertools.combinations(placed, 2)
-    }
 
 
 def _is_elsewhere(candidates: list[ScoredPose], adjusted: ScoredPose, b: ScanPatches) -> bool:

@@ -184,12 +184,12 @@ def _strangers(names: Sequence[str], network: Network, scans: Scans, reference: 
     if sizes.max() > 1 and sizes[network.groups[reference]] < sizes.max():
         out = np.flatnonzero(network.groups == network.groups[reference]).tolist()
     else:
-        out = [s for s in range(len(names)) if _is_stranger(scans.status[s], scans.reasons[s])]
+        out = [
+            s
+            for s in range(len(names))
+            if (scans.status[s] == Status.FAILED or any(one.code in STRANGE for one in scans.reasons[s]))
+        ]
     return (reason("stitch.not-of-network", scans=tuple(names[s] for s in out)),) if out else ()
-
-
-def _is_stranger(status: Status, reasons: Sequence[Reason]) -> bool:
-    return status == Status.FAILED or any(one.code in STRANGE for one in reasons)
 
 
 def _assess(

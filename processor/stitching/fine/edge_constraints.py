@@ -215,7 +215,13 @@ def resolve_loose_motions(clouds: list[Cloud], blocks: Blocks, faces: Solution, 
         sensitive = np.abs(rate) > LEAST_RATE
         if sensitive.sum() < NEIGHBOURS:
             continue
-        step = _best_shift(ends.off[sensitive], rate[sensitive], 0.5 * ends.width[sensitive] + SLACK_MM, reach_mm)
+        # The shift with the most ends between their rays; the middle of the shifts that are almost as good
+        off, room = ends.off[sensitive], 0.5 * ends.width[sensitive] + SLACK_MM
+        speed = rate[sensitive]
+        shifts = np.arange(-reach_mm, reach_mm + SHIFT_STEP_MM, SHIFT_STEP_MM)
+        support = np.array([((np.abs(off + speed * shift) < room) / room).sum() for shift in shifts])
+        good = np.flatnonzero(support > 0.98 * support.max())
+        step = float(shifts[good].mean()) if np.ptp(good) < len(shifts) // 10 else float(shifts[np.argmax(support)])
         T = rigid.moved_about_own_origins(T, step * motion)
     return T
 
@@ -234,14 +240,6 @@ def _loose_motions(faces: Solution) -> list[Floats]:
         if largest >= 1e-6:
             motions.append((vector[:, m] / scale).reshape(k, 6) / largest)
     return motions
-
-
-def _best_shift(off: Floats, rate: Floats, room: Floats, reach_mm: float) -> float:
-    """Return the shift with the most ends between their rays; the middle of the shifts that are almost as good."""
-    shifts = np.arange(-reach_mm, reach_mm + SHIFT_STEP_MM, SHIFT_STEP_MM)
-    support = np.array([((np.abs(off + rate * shift) < room) / room).sum() for shift in shifts])
-    good = np.flatnonzero(support > 0.98 * support.max())
-    return float(shifts[good].mean()) if np.ptp(good) < len(shifts) // 10 else float(shifts[np.argmax(support)])
 
 
 def _velocity(motion: Floats, T: Floats, scan: Ints, at: Floats) -> Floats:

@@ -74,7 +74,9 @@ def linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: Fl
     W = _shifted(W, planes.mean[blocks.piece])
     t2 = tau[blocks.kind] ** 2 * unit_variance(blocks)
     by_columns, by_plane = _design_matrices(blocks, T, planes)
-    reduced = _without_common_offset(W, t2) * weight[:, None, None]
+    # An offset common to a block's points, of variance t2 (b,), is eliminated from the moments (b, 7, 7)
+    e, mass = W[:, :, 3], W[:, 3, 3]
+    reduced = (W - (t2 / (1.0 + t2 * mass))[:, None, None] * e[:, :, None] * e[:, None, :]) * weight[:, None, None]
     N, g, spurious, inverse = _normal_matrix(
         blocks, planes, reduced, by_columns, by_plane, columns, 6 * k + len(ranges)
     )
@@ -87,13 +89,6 @@ def _columns(blocks: Blocks, k: int) -> Ints:
     of_face = 8 * k + np.where(blocks.face < 0, blocks.faces, blocks.face)
     poses = 6 * blocks.scan[:, None] + np.arange(6)
     return np.column_stack([poses, 6 * k + blocks.scan, 7 * k + blocks.scan, of_face])
-
-
-def _without_common_offset(W: Floats, t2: Floats) -> Floats:
-    """Return moments (b, 7, 7) with an offset common to a block's points, of variance t2 (b,), eliminated."""
-    e, mass = W[:, :, 3], W[:, 3, 3]
-    reduced: Floats = W - (t2 / (1.0 + t2 * mass))[:, None, None] * e[:, :, None] * e[:, None, :]
-    return reduced
 
 
 def _normal_matrix(

@@ -79,7 +79,9 @@ def extract(scan: Scan, cell_mm: float = 0.0, a_cell: float = POINTS_A_CELL) -> 
     merged, piece_of_merged = _merged(cells, sums, piece, level)
     planes = extraction.planes_of(grouped_sums.summed(merged, piece_of_merged, len(level)))
     if known:
-        planes = _facing_scanner(planes)
+        # Normals point to the scanner
+        sign = np.where(np.einsum("ni,ni->n", planes.normal, planes.mean) > 0.0, -1.0, 1.0)
+        planes = replace(planes, normal=planes.normal * sign[:, None])
     ends, rays = Ends(), None
     if bands is not None and (rays := scan_grid_directions.fitted(points, row, column)) is not None:
         ends = ends_of(bands, piece, planes, sigma, rays)
@@ -151,11 +153,6 @@ def _merged(cells: Ints, sums: Floats, piece: Ints, level: Ints) -> tuple[Floats
     piece_of_merged = np.zeros(count, np.int64)
     piece_of_merged[inverse] = piece[on]
     return grouped_sums.summed(sums[on], inverse, count), piece_of_merged
-
-
-def _facing_scanner(planes: Planes) -> Planes:
-    sign = np.where(np.einsum("ni,ni->n", planes.normal, planes.mean) > 0.0, -1.0, 1.0)
-    return replace(planes, normal=planes.normal * sign[:, None])
 
 
 def _seen_from_origin(scan: Scan) -> bool:
