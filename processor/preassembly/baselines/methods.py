@@ -21,7 +21,7 @@ from processor.geometry import rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.nearest_neighbours import surface_spacing
 from processor.geometry.thinning import by_cell
-from processor.model import ArchDesign, DesignPart, Floats, Reason, Scan, Status, Verdict, reason
+from processor.model import ArchDesign, Floats, Reason, Scan, Status, Verdict, reason
 from processor.preassembly import assembly_errors
 from processor.preassembly.baselines import edge_features, joint_alignment
 from processor.preassembly.baselines.edge_features import JointEdges
@@ -83,15 +83,13 @@ def extract(
     known = known or {}
 
     def of_part(k: int) -> PartFeatures:
-        pose = known[k] if k in known else _attitude(scans[k], design.parts[k])
+        # By points in the order that the adjustment has them in
+        pose = (
+            known[k] if k in known else attitude.find(by_cell(scans[k].points, measure.CELL_MM).points, design.parts[k])
+        )
         return features_of(scans[k], k, pose, design, params)
 
     return each_part(of_part, [[scan] for scan in scans])
-
-
-def _attitude(scan: Scan, part: DesignPart) -> Attitude:
-    """Find the attitude of a scan by its points in the order that the adjustment has them in."""
-    return attitude.find(by_cell(scan.points, measure.CELL_MM).points, part)
 
 
 def assemble(parts: list[PartFeatures], design: ArchDesign, params: Params) -> Result:

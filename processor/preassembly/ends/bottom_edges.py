@@ -177,7 +177,13 @@ def _measure_edge(side: str, part: RegisteredPart, line: Polyline, other: Polyli
     by_station = np.stack([at.by_station for at in at_edge])
     views = by_station, np.zeros_like(by_station)
     if stations == 1:
-        views = _of_halves(chainage < 0.5 * line.length, sense)
+        # Derivatives (2, k, 4) of raw departures by the levels and tilts of views that are not named
+        first = chainage < 0.5 * line.length
+        half = np.stack([first, ~first], axis=1).astype(np.float64)
+        none = np.zeros_like(half)
+        web = np.hstack([half, none] if sense > 0.0 else [none, half])
+        bottom = np.hstack([half, none])
+        views = np.stack([web, bottom]), np.stack([web, sense * bottom])
     by_view, by_tilt = (np.stack([e.gain for e in smoothed]) @ of_views for of_views in views)
     by_pose = [estimate.not_followed(motion) for estimate, motion in zip(smoothed, motions, strict=True)]
     return EdgeDepartures(
@@ -192,18 +198,6 @@ def _measure_edge(side: str, part: RegisteredPart, line: Polyline, other: Polyli
         by_tilt=by_tilt,
         tails=np.array([[estimate.tail for estimate in smoothed]]),
     )
-
-
-def _of_halves(first: Bools, sense: float) -> tuple[Floats, Floats]:
-    """Return derivatives (2, k, 4) of raw departures by the levels and tilts of views that are not named.
-
-    ``first`` (k,) marks the departures of the part's first half.
-    """
-    half = np.stack([first, ~first], axis=1).astype(np.float64)
-    none = np.zeros_like(half)
-    web = np.hstack([half, none] if sense > 0.0 else [none, half])
-    bottom = np.hstack([half, none])
-    return np.stack([web, bottom]), np.stack([web, sense * bottom])
 
 
 def _faces(

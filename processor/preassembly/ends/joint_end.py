@@ -398,7 +398,11 @@ def _averaged(ends: Sequence[FittedEnd], fitted: Sequence[kriging.Kriged]) -> li
         ]
         blocks = [_block(*of_end) for of_end in zip(ends, fitted, at, every, strict=True)]
         logs = np.array([model_averaging.log_likelihoods(*block) for block in blocks])
-        weights = model_averaging.weights_by_others(logs, prior, _traits(sizes))
+        # Numbers (2, h) of the hypotheses' common sizes: of level and tilt, and of bends
+        traits = np.stack(
+            [np.unique(of, axis=0, return_inverse=True)[1].ravel() for of in (sizes[:, :2], sizes[:, -1:])]
+        )
+        weights = model_averaging.weights_by_others(logs, prior, traits)
         for whole, rows, block, log, weight in zip(averaged, at, blocks, logs, weights, strict=True):
             part = _average_block(block, log, sizes, prior, weight)
             whole.mean[rows], whole.covariance[rows, rows] = part.mean, part.covariance
@@ -416,11 +420,6 @@ def _shares(face: EndFace) -> Floats:
     if face.narrow:
         shares[ACROSS] = face.half / WIDE_MM
     return shares
-
-
-def _traits(sizes: Floats) -> Ints:
-    """Numbers (2, h) of the hypotheses' common sizes: of level and tilt, and of bends."""
-    return np.stack([np.unique(of, axis=0, return_inverse=True)[1].ravel() for of in (sizes[:, :2], sizes[:, -1:])])
 
 
 def _block(end: FittedEnd, fitted: kriging.Kriged, rows: slice, sizes: Floats) -> _Block:

@@ -120,19 +120,13 @@ def outer_faces(surface: MeshSurface, joints: Sequence[Floats]) -> MeshSurface:
             if not candidates.any():
                 return surface
             candidates &= np.abs(local[:, 0]) < NEAR_MM + np.abs(local[candidates, 0]).min()
-            chosen |= surface.part_of == _nearest_face(surface, place, face, np.flatnonzero(candidates))
+            # By its places nearest to the joint: over some distance a curved plate departs by more than it is thick
+            facets = np.flatnonzero(candidates)
+            corners = rigid.apply(rigid.invert(place.T_bridge_joint), surface.vertices[surface.faces[facets]])
+            along, off = np.abs(corners[:, :, 0]), np.abs(face.sense * corners[:, :, face.axis] - face.offset)
+            score = (off + ALONG_SHARE * along).min(axis=1)
+            chosen |= surface.part_of == int(surface.part_of[facets[np.argmin(score)]])
     return surface.only(chosen) if chosen.any() else surface
-
-
-def _nearest_face(surface: MeshSurface, place: EndPlace, face: EndFace, facets: Ints) -> int:
-    """Return the smooth face, of those with some ``facets``, that is nearest to a face of the section at the joint.
-
-    By its places nearest to the joint: over some distance a curved plate departs by more than it is thick.
-    """
-    corners = rigid.apply(rigid.invert(place.T_bridge_joint), surface.vertices[surface.faces[facets]])
-    along, off = np.abs(corners[:, :, 0]), np.abs(face.sense * corners[:, :, face.axis] - face.offset)
-    score = (off + ALONG_SHARE * along).min(axis=1)
-    return int(surface.part_of[facets[np.argmin(score)]])
 
 
 def fit(part: RegisteredPart, local: Floats, place: EndPlace, thickness: Floats) -> list[FaceFit] | Reason:
@@ -167,7 +161,11 @@ def fit(part: RegisteredPart, local: Floats, place: EndPlace, thickness: Floats)
         plate = None
         if of_design.plate:
             level = basis(local[behind, 0], of_design.w(local[behind])) @ mean[:FACE]
-            inner = _inner_side(local[behind], level - behind_out, place, across)
+            depth, at = level - behind_out, local[behind]
+            inner = (depth > plate_sides.THINNEST_MM) & (depth < plate_sides.REACH_MM)
+            inner &= np.abs(at[:, across]) < place.half[across] - np.minimum(REACH_MM, 0.5 * place.half[across])
+            inner &= -place.outward * at[:, 0] > plate_sides.LAYER_MM
+            inner[inner] = plate_sides.outer_layer(-depth[inner])
             both = np.concatenate([rows[inliers], behind[inner]])
             height = np.concatenate([out[clear][inliers], behind_out[inner]])
             terms = basis(local[both, 0], of_design.w(local[both]))[:, : view_variance.TERMS]
@@ -280,15 +278,6 @@ def _without_inner_side(sheets: _Sheets, local: Floats, face: EndFace, thickness
         behind_out=np.concatenate([sheets.behind_out, sheets.out[inner]]),
         single_layer=False,
     )
-
-
-def _inner_side(local: Floats, depth: Floats, place: EndPlace, across: int) -> Bools:
-    """Mark points (n, 3) at ``depth`` (n,) behind an outer face that are of the inner side of its plate."""
-    inner = (depth > plate_sides.THINNEST_MM) & (depth < plate_sides.REACH_MM)
-    inner &= np.abs(local[:, across]) < place.half[across] - np.minimum(REACH_MM, 0.5 * place.half[across])
-    inner &= -place.outward * local[:, 0] > plate_sides.LAYER_MM
-    inner[inner] = plate_sides.outer_layer(-depth[inner])
-    return inner
 
 
 def least_squares(basis: Floats, value: Floats, least: int = LEAST_POINTS) -> tuple[Floats, Floats, Bools]:

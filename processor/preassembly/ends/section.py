@@ -131,11 +131,6 @@ def of_surface(half: Floats, T_bridge_joint: Floats, surface: MeshSurface) -> Se
     return _made(half, tuple(closed.tolist()), thickness)
 
 
-def is_hollow(section: Section) -> bool:
-    """Return whether no side is open: nothing but an open end shows the inner sides of its plates."""
-    return all(face >= 0 for face in section.middles)
-
-
 def on_steel(sections: Sequence[Section]) -> Bools:
     """Mark the key points (8,) of a joint of parts with these sections that lie on steel: not those of open sides."""
     open_sides = [[face < 0 for face in one.middles] for one in sections]

@@ -60,7 +60,12 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     Of parts with equal edges, which their marks alone distinguish, it is any: see :mod:`.identity`.
     """
     alike = of_size(points, shapes)
-    others = _other_shapes(index, alike or range(len(shapes)), shapes)
+    # One part of each other shape
+    different = [index]
+    for number in alike or range(len(shapes)):
+        if not any(number == one or same_shape.motions(shapes, one, number) for one in different):
+            different.append(number)
+    others = different[1:]
     if index in alike and not others:
         return None
     few = thinned(points, POINTS)
@@ -85,15 +90,6 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     # The first rough pose may have missed the part itself: a scan is called wrong only after all that are promising.
     own = shapes[index], rough(index, None)
     return best if _shows_other(few, own, (shapes[best], T_best)) else None
-
-
-def _other_shapes(index: int, numbers: Sequence[int] | range, shapes: Shapes) -> list[int]:
-    """Return those of the numbers of parts that differ in shape from part ``index``, one of each shape."""
-    found = [index]
-    for k in numbers:
-        if not any(k == one or same_shape.motions(shapes, one, k) for one in found):
-            found.append(k)
-    return found[1:]
 
 
 def _near_share(points: Floats, T: Floats, surface: Surface) -> float:

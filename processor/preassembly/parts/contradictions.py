@@ -48,7 +48,10 @@ def find(parts: Sequence[Examined]) -> list[tuple[Reason, ...]]:
     for part, beyond in zip(parts, of_edges, strict=True):
         reasons = []
         for joint, end in part.ends:
-            why = (*_of_faces(end, of_faces[number]), *_of_plates(bool(of_plates[number])))
+            why = (
+                *_of_faces(end, of_faces[number]),
+                *((reason("preassemble.plates-contradict-views"),) if of_plates[number] else ()),
+            )
             reasons += [reason("preassemble.at", place=joint, reasons=why)] if why else []
             number += 1
         found.append((*reasons, *_of_edges(beyond)))
@@ -70,10 +73,6 @@ def _of_faces(end: FittedEnd, beyond: Bools) -> tuple[Reason, ...]:
     failed = {face.name for face, one in zip(end.place.section.faces, beyond, strict=True) if one}
     names = tuple(name for name in PlateFace if name in failed)
     return (reason("preassemble.face-contradicts-noise", faces=names),) if names else ()
-
-
-def _of_plates(beyond: bool) -> tuple[Reason, ...]:
-    return (reason("preassemble.plates-contradict-views"),) if beyond else ()
 
 
 def _of_edges(beyond: Bools) -> tuple[Reason, ...]:

@@ -85,7 +85,10 @@ def identify(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> 
         # A part that is symmetric but for its mark lies on the other in two ways. Where the marks agree in one of them
         # the two parts are the same; a mark that agrees in the other way is the part's own, turned round.
         if on_design is None:
-            on_design = _on_design(rigid.apply(T, thinned(points, AROUND)), surface)
+            placed = rigid.apply(T, thinned(points, AROUND))
+            face, distance, beyond = surface.mesh.distances(placed, REACH_MM)
+            used = on_face(face, beyond)
+            on_design = _Surroundings(placed[used], surface.mesh.normals[face[used]], distance[used])
         outcomes = {_compare(points, T, surface, shapes[k], motion, on_design) for motion in motions}
         if _Outcome.SAME in outcomes:
             same.append(other.name)
@@ -120,13 +123,6 @@ def _compare(
     if more < LEAST_EVIDENCE or more < 2 * fewer:
         return _Outcome.UNSEEN
     return _Outcome.PART if part_count > other_count else _Outcome.OTHER
-
-
-def _on_design(points: Floats, surface: attitude.Surface) -> _Surroundings:
-    """Points, of those (n, 3) placed on a part's design, that lie on its faces."""
-    face, distance, beyond = surface.mesh.distances(points, REACH_MM)
-    used = on_face(face, beyond)
-    return _Surroundings(points[used], surface.mesh.normals[face[used]], distance[used])
 
 
 def _around(on_design: _Surroundings, marks: Floats) -> _Surroundings:

@@ -17,7 +17,7 @@ from processor.geometry.thinning import by_cell, thinned
 from processor.large_arrays import allocate, blocks, chosen
 from processor.model import ArchDesign, DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly import topology
-from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, section, tube_end, view_variance
+from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, tube_end, view_variance
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import FittedEnd, JointEnd
 from processor.preassembly.ends.joint_frame import end_place
@@ -261,7 +261,8 @@ def _between_viewpoints(parts: Sequence[FittedPart]) -> view_variance.Variances:
             of_ends.append({k: len(plates) + i for i, k in enumerate(known)})
             plates += known.values()
             rings += [end.ring_noise] if end.plates else []
-        if len(part.ends) == len(fitted) == 2 and section.is_hollow(fitted[1].place.section):
+        # Nothing but an open end shows the inner sides of the plates of a section without open sides
+        if len(part.ends) == len(fitted) == 2 and all(face >= 0 for face in fitted[1].place.section.middles):
             first, last = of_ends
             same += [(first[k], last[k]) for k in last if k in first]
     return view_variance.variances(plates, rings, same)
