@@ -19,7 +19,7 @@ from processor.adjustment import scanner_class_errors
 from processor.defects.observations import Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
-from processor.model import Bools, Floats, Ints
+from processor.model import Floats, Ints
 from processor.robust_statistics import robust_sd
 
 BLOCK_MM = 80.0
@@ -130,10 +130,15 @@ def align(
     # Of what moved by much, stations do not see the same place in one cell: they are compared on the rest.
     enough = len(np.unique(component[used])) >= FEWEST_COMPONENTS
     compared = used if enough else np.ones_like(used)
-    movements, station_covariance = station_movements(_of_rows(blocks, compared), J[compared], len(stations.names))
+    movements, station_covariance = station_movements(
+        StationBlocks(*(column[compared] for column in vars(blocks).values())), J[compared], len(stations.names)
+    )
     start = replace(start, movements=movements, station_covariance=station_covariance)
     if not enough:
-        free = _free_gain(J[:, :6], blocks.variance)
+        # The gain (6, n) of a whole that all deviations would be fitted by
+        of_whole = J[:, :6]
+        weighted = of_whole.T / blocks.variance
+        free: Floats = np.linalg.solve(weighted @ of_whole + np.diag(1.0 / WHOLE_PRIOR**2), weighted)
         return replace(start, free_response=_response(free, J, blocks.station, len(stations.names)))
     residual = blocks.mean - np.einsum("nk,nk->n", J, movements[blocks.station])
     whole, covariance, gain = _whole(residual[used], J[used, :6], component[used])
@@ -150,13 +155,6 @@ def _response(gain: Floats, J: Floats, station: Ints, stations: int) -> Floats:
         rows = np.flatnonzero(station == k)
         response[:, 7 * k : 7 * k + 7] = -gain[:, rows] @ J[rows]
     return response
-
-
-def _free_gain(J: Floats, variance: Floats) -> Floats:
-    """Return the gain (6, n) of a whole that deviations (n,) with derivative J (n, 6) are fitted by."""
-    weighted = J.T / variance
-    gain: Floats = np.linalg.solve(weighted @ J + np.diag(1.0 / WHOLE_PRIOR**2), weighted)
-    return gain
 
 
 def station_variance(
@@ -241,11 +239,6 @@ def rays_to(points: Floats, positions: Floats) -> Floats:
 def _derivative(arm: Floats, outward: Floats, rays: Floats) -> Floats:
     """Return the derivative (n, 7) of deviations by rotation about the centre, translation and range offset."""
     return np.hstack([np.cross(arm, outward), outward, np.einsum("ni,ni->n", rays, outward)[:, None]])
-
-
-def _of_rows(blocks: StationBlocks, rows: Bools) -> StationBlocks:
-    """Return some of the observations."""
-    return StationBlocks(*(column[rows] for column in vars(blocks).values()))
 
 
 def _blocks(pairs: Pairs, surface: DesignSurface) -> StationBlocks:
@@ -349,14 +342,6 @@ def _normal_equations(
     return A, right
 
 
-def _component_weights(residual: Floats, component: Ints) -> Floats:
-    """Return the weight (n,) of each residual's component, by the root mean square of a component's residuals."""
-    rms = np.sqrt(np.bincount(component, residual**2) / np.bincount(component))
-    scale = max(float(np.median(rms)), FLOOR_MM)
-    weight: Floats = 1.0 / (1.0 + (rms / (CAUCHY * scale)) ** 2) ** 2
-    return weight[component]
-
-
 def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Floats, Floats]:
     """Return the movement (6,) of the whole, with redescending weights, its covariance, and its gain (6, n).
 
@@ -373,7 +358,11 @@ def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Float
     of_component = of_component.reshape(-1)
     for _ in range(4 * ROUNDS):
         residual = deviation - J @ x
-        weight = _component_weights(residual, of_component) / (1.0 + (residual / (CAUCHY * scale)) ** 2) ** 2
+        # By the root mean square of the residuals of each component
+        rms = np.sqrt(np.bincount(of_component, residual**2) / np.bincount(of_component))
+        typical = max(float(np.median(rms)), FLOOR_MM)
+        of_its_component: Floats = 1.0 / (1.0 + (rms / (CAUCHY * typical)) ** 2) ** 2
+        weight = of_its_component[of_component] / (1.0 + (residual / (CAUCHY * scale)) ** 2) ** 2
         A = J.T @ (weight[:, None] * J) / scale**2 + prior
         step = np.linalg.solve(A, J.T @ (weight * deviation) / scale**2) - x
         x = x + step

@@ -76,7 +76,12 @@ def fit_all(field: Field, surface: DesignSurface) -> list[ComponentShape]:
             fitted = shape_models.fit(blocks, frame)
             if fitted.shapes and side > 1:
                 fine = _blocks_of(field, surface, cells, max(1, side // FINER))
-                fitted = shape_models.refitted(fitted, _masked(fine, fitted, blocks), frame)
+                # Finer blocks have the weights by which the fit left out blocks.
+                if (fitted.weight < blocks.weight).any():
+                    nearest = cKDTree(blocks.points).query(fine.points)[1]
+                    weight = fine.weight * (fitted.weight / blocks.weight)[nearest]
+                    fine = dataclasses.replace(fine, weight=weight)
+                fitted = shape_models.refitted(fitted, fine, frame)
             shapes.append(ComponentShape(number, frame, blocks, fitted))
     return shapes
 
@@ -146,11 +151,18 @@ def significant(
             top = int(np.argmax(np.abs(value)))
             z = deviate_of_one(float((np.abs(own) / sd).max()), len(shape.factors))
             if z > threshold:
+                # The noise of places averages out in the volume, what they have in common does not.
+                cells = swept_cells(surface, field, fit, shape)
+                points, outward = surface.centres[cells], surface.outward[cells]
+                # 0 where the shape does not reach
+                swept = np.sign(shape.values(fit.frame, points, outward)) * surface.cell_areas[cells]
+                of_noise = inflation * shape.total_sd(fit.frame, points, outward, swept)
+                in_common = np.abs(swept).sum() * np.sqrt(np.mean(shared**2))
                 judged = SignificantShape(
                     shape=shape,
                     peak=float(value[top]),
                     ci95=NORMAL_95 * float(sd[top]),
-                    volume_ci95=NORMAL_95 * _volume_sd(fit, shape, surface, field, inflation, shared),
+                    volume_ci95=NORMAL_95 * float(np.hypot(of_noise, in_common)),
                     z=z,
                     chance=2.0 * float(ndtr(-z)) * len(shape_models.BASES) / area,
                     margin=fit.fitted.margin / inflation**2,
@@ -177,36 +189,12 @@ def _errors(
     registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
     if shape.kind != shape_models.RIGID and not alignment.fitted:
         # The error of a pose that was not fitted to the design may be large: it moves, it does not deform.
-        own = value - _rigid_part(fit, shape).values(fit.frame, points, outward)
+        there = shape.values(fit.frame, fit.blocks.points, fit.blocks.outward)
+        rigid_part = shape_models.rigid_motion(dataclasses.replace(fit.blocks, mean=there), fit.frame)
+        own = value - rigid_part.values(fit.frame, points, outward)
         registration = np.full_like(value, field.stations_sd(rows, free=True))
     shared = np.sqrt(levels.common[-1] ** 2 + levels.systematic_mm**2 + registration**2)
     return value, own, shape.sd(fit.frame, points, outward), shared
-
-
-def _volume_sd(
-    fit: ComponentShape,
-    shape: shape_models.Shape,
-    surface: DesignSurface,
-    field: Field,
-    inflation: float,
-    shared: Floats,
-) -> float:
-    """Return the standard deviation of the volume that a shape displaces, mm3.
-
-    ``shared`` (n,) is what places have in common, one sd, mm; ``inflation`` is how much larger than by the noise of
-    blocks the noise of the component is.
-    """
-    cells = swept_cells(surface, field, fit, shape)
-    points, outward = surface.centres[cells], surface.outward[cells]
-    swept = np.sign(shape.values(fit.frame, points, outward)) * surface.cell_areas[cells]  # 0 where it does not reach
-    noise = inflation * shape.total_sd(fit.frame, points, outward, swept)
-    return float(np.hypot(noise, np.abs(swept).sum() * np.sqrt(np.mean(shared**2))))
-
-
-def _rigid_part(fit: ComponentShape, shape: shape_models.Shape) -> shape_models.Shape:
-    """Return the rigid motion of the component that is nearest to a shape where blocks were seen."""
-    value = shape.values(fit.frame, fit.blocks.points, fit.blocks.outward)
-    return shape_models.rigid_motion(dataclasses.replace(fit.blocks, mean=value), fit.frame)
 
 
 def unproven_motions(
@@ -328,14 +316,6 @@ def _blocks_of(field: Field, surface: DesignSurface, cells: Ints, side: int) -> 
     )
     outward /= np.linalg.norm(outward, axis=1)[:, None]
     return shape_models.Blocks(points, outward, mean, 1.0 / (1.0 / total + FLOOR_MM**2), side * charts.cell_mm)
-
-
-def _masked(fine: shape_models.Blocks, fitted: shape_models.Fitted, blocks: shape_models.Blocks) -> shape_models.Blocks:
-    """Return finer blocks with the weights by which the fit left out blocks."""
-    if not (fitted.weight < blocks.weight).any():
-        return fine
-    nearest = cKDTree(blocks.points).query(fine.points)[1]
-    return dataclasses.replace(fine, weight=fine.weight * (fitted.weight / blocks.weight)[nearest])
 
 
 def with_corners(surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats]:

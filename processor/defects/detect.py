@@ -36,7 +36,7 @@ from processor.defects.result import Result
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import mesh_distance, rigid
 from processor.large_arrays import every
-from processor.model import DesignBodies, Floats, InputError, Ints, Reason, Scene, Status, StructureDesign, reason
+from processor.model import DesignBodies, Floats, InputError, Reason, Scene, Status, StructureDesign, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
 CELL_BOUNDS_MM = (5.0, 60.0)
@@ -141,7 +141,9 @@ def _registered(
 
     ``excluded`` are components that stations and whole are not fitted by.
     """
-    base = surface_charts.of_mesh(vertices, design.faces, _coarse_cell(vertices, design.faces), design.bodies)
+    # A first size of cells that keeps their number within MOST_CELLS
+    cell_mm = max(FIRST_CELL_MM, float(np.sqrt(mesh_distance.area(vertices, design.faces) / (0.25 * MOST_CELLS))))
+    base = surface_charts.of_mesh(vertices, design.faces, cell_mm, design.bodies)
     for left in reversed(range(ROUNDS)):
         observed = observations.observe(scene, T, base, params.reach_mm)
         if not len(observed.chart):
@@ -154,7 +156,12 @@ def _registered(
             aligned = alignment.none(surface, len(observed.stations.names), error_mm)
             break
         aligned = alignment.align(pairs, surface, observed.stations, error_mm, excluded)
-        if not left or _largest_movement(aligned, surface) < AGAIN_MM:
+        # The largest movement of the whole along the normals of cells
+        rows = slice(None, None, max(1, len(surface.centres) // SD_SAMPLES))
+        points, outward = surface.centres[rows], surface.outward[rows]
+        J = np.hstack([np.cross(points - aligned.centre, outward), outward])
+        movement_mm = float(np.abs(J @ aligned.whole).max())
+        if not left or movement_mm < AGAIN_MM:
             break
         T = alignment.corrected_pose(T, aligned)
     return Registered(T_design_project=T, observed=observed, surface=surface, pairs=pairs, alignment=aligned)
@@ -258,20 +265,7 @@ def _shapes_of(registered: Registered, aligned: Alignment, params: Params) -> tu
     return field, component_shapes.fit_all(field, surface)
 
 
-def _coarse_cell(vertices: Floats, faces: Ints) -> float:
-    """Return a first size of cells that keeps their number within MOST_CELLS."""
-    return max(FIRST_CELL_MM, float(np.sqrt(mesh_distance.area(vertices, faces) / (0.25 * MOST_CELLS))))
-
-
 def _median_sd(aligned: Alignment, surface: DesignSurface) -> float:
     """Return the median over the surface of the standard deviation that the fit of the whole leaves, mm."""
     rows = slice(None, None, max(1, len(surface.centres) // SD_SAMPLES))
     return float(np.median(aligned.sd(surface.centres[rows], surface.outward[rows])))
-
-
-def _largest_movement(aligned: Alignment, surface: DesignSurface) -> float:
-    """Return the largest movement of the whole along the normals of cells, mm."""
-    rows = slice(None, None, max(1, len(surface.centres) // SD_SAMPLES))
-    points, outward = surface.centres[rows], surface.outward[rows]
-    J = np.hstack([np.cross(points - aligned.centre, outward), outward])
-    return float(np.abs(J @ aligned.whole).max())

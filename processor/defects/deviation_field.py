@@ -87,7 +87,10 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     variance, seen = noise**2 / divisor, inner * ((count + stray - mixed >= FEWEST_POINTS) & (count > 0))
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
-        seen[rows] *= _amid(charts.image(seen, chart), charts.image(inner, chart), charts, chart).ravel()
+        # What lies alone on a face are beams past its edges: half of the cells about a cell are to be seen.
+        images = charts.image(seen, chart), charts.image(inner, chart)
+        about, possible = (_pooled(image, charts, chart, ABOUT_CELLS) for image in images)
+        seen[rows] *= (about > SEEN_SHARE * possible - 1e-9).ravel()
     views = 0.0
     if stations.unnamed:
         used, side = np.flatnonzero(seen * count), PIECE_CELLS * charts.cell_mm
@@ -181,13 +184,6 @@ def _pooled(image: Floats, charts: Charts, chart: int, side: int = POOLED_CELLS)
     mode = ("constant", "wrap" if charts.kind[chart] == CYLINDER else "constant")
     mean: Floats = ndimage.uniform_filter(image, side, mode=mode)
     return np.maximum(mean, 0.0)
-
-
-def _amid(seen: Floats, inner: Floats, charts: Charts, chart: int) -> Bools:
-    """Mark cells with half of the cells about them ``seen``: what lies alone on a face are beams past its edges."""
-    about, possible = (_pooled(image, charts, chart, ABOUT_CELLS) for image in (seen, inner))
-    amid: Bools = about > SEEN_SHARE * possible - 1e-9
-    return amid
 
 
 def inner_cells(surface: DesignSurface, edge_mm: float) -> Floats:

@@ -231,7 +231,8 @@ def fit(blocks: Blocks, frame: Frame, most: int = 2, least_gain: float = 30.0) -
         kind, at = best
         square = squares[kind]
         if kind == "bump":
-            near = _near_bump(seen, at)
+            apart2 = (seen.p[:, 0] - at[0]) ** 2 + (seen.p[:, 1] - at[1]) ** 2
+            near: np.typing.NDArray[np.bool_] = apart2 < (MASK_RADII * at[2] + seen.blocks.side_mm) ** 2
             if near.mean() > MOST_MASKED:
                 break
             seen = seen.weighted(np.where(near, WEAK * seen.blocks.weight, seen.blocks.weight))
@@ -280,13 +281,6 @@ def _best_candidate(
         if best is None or score < best[0]:
             best = (score, (kind, at))
     return best and best[1], squares
-
-
-def _near_bump(seen: Observations, at: At) -> np.typing.NDArray[np.bool_]:
-    """Mark the blocks (n,) that a bump extends to."""
-    square = (seen.p[:, 0] - at[0]) ** 2 + (seen.p[:, 1] - at[1]) ** 2
-    near: np.typing.NDArray[np.bool_] = square < (MASK_RADII * at[2] + seen.blocks.side_mm) ** 2
-    return near
 
 
 def refitted(fitted: Fitted, fine: Blocks, frame: Frame) -> Fitted:

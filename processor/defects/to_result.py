@@ -153,15 +153,11 @@ def _shape_defects(search: Search) -> Iterator[Defect]:
         front = cells_of_shape(surface, search.field, fit)
         for shape in _of_held_plate(search, front, shapes, fit.frame) if len(front) else ():
             rows = cells_of_shape(surface, search.field, fit, shape.shape)
-            yield _shape_defect(search, fit, rows, _on_cells(shape, fit, surface, rows))
-
-
-def _on_cells(judged: SignificantShape, fit: ComponentShape, surface: DesignSurface, rows: Ints) -> SignificantShape:
-    """Return a movement with its largest value on the cells of a face and at its corners."""
-    if judged.shape.kind != RIGID:
-        return judged
-    value = judged.shape.values(fit.frame, *with_corners(surface, rows))
-    return dataclasses.replace(judged, peak=float(value[int(np.argmax(np.abs(value)))]))
+            judged = shape
+            if shape.shape.kind == RIGID:  # a movement has its largest value on the cells of a face or at its corners
+                value = shape.shape.values(fit.frame, *with_corners(surface, rows))
+                judged = dataclasses.replace(shape, peak=float(value[int(np.argmax(np.abs(value)))]))
+            yield _shape_defect(search, fit, rows, judged)
 
 
 def _of_held_plate(search: Search, rows: Ints, shapes: list[SignificantShape], frame: Frame) -> list[SignificantShape]:
@@ -363,7 +359,12 @@ def _place_values(
         if not abs(measured.depth) > measured.lod95:
             return None  # significant only together with the defect beside it
         if crack:
-            measured, reasons = _crack_depth(search, region, measured, thickness)
+            # The plate's thickness if rays went through, else what was measured as a bound
+            reasons = (reason("defects.depth-bound"),)
+            points = (search.field.count + search.field.stray)[region.cells].sum()
+            expected = search.expected[region.cells].sum()
+            if expected > 0.0 and points < THROUGH_SHARE * expected and np.isfinite(thickness):
+                measured, reasons = dataclasses.replace(measured, depth=thickness), (reason("defects.through"),)
         else:
             chosen, measured, reasons = _by_profile(search, region, measured, chosen, assumed, inflation, claimed)
     return _row_of(measured, chosen, surface.names[component], region, reasons)
@@ -416,14 +417,3 @@ def _by_profile(
     by_profile = classification.of_profile(fitted, thickness, chosen)
     is_crack = by_profile.defect_class is DefectClass.CRACK
     return by_profile, measured, (reason("defects.depth-bound"),) if is_crack else ()
-
-
-def _crack_depth(
-    search: Search, region: Region, measured: Measures, thickness: float
-) -> tuple[Measures, tuple[Reason, ...]]:
-    """Return the depth of a crack: the plate's thickness if rays went through, else what was measured as a bound."""
-    points = (search.field.count + search.field.stray)[region.cells].sum()
-    expected = search.expected[region.cells].sum()
-    if expected > 0.0 and points < THROUGH_SHARE * expected and np.isfinite(thickness):
-        return dataclasses.replace(measured, depth=thickness), (reason("defects.through"),)
-    return measured, (reason("defects.depth-bound"),)

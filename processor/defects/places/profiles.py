@@ -76,7 +76,10 @@ def fit(cells: PlaceCells, sign: int) -> Fit | None:
     best: dict[Profile, tuple[float, Fit]] = {}
     inside = True  # a bump has its middle on the face
     for profile, axis, start, model in _models(cells, top):
-        lower, upper = _bounds(start, cells, top)
+        least, most = LEAST_SIZE * start[[2, 4]], MOST_SIZE * start[[2, 4]]
+        room = np.array([start[2] + cells.cell_mm, start[4] + cells.cell_mm])
+        lower = np.array([0.2 * top, start[1] - room[0], least[0], start[3] - room[1], least[1], EXPONENTS[0]])
+        upper = np.array([5.0 * top, start[1] + room[0], most[0], start[3] + room[1], most[1], EXPONENTS[1]])
         solved = least_squares(
             lambda x, model=model: (value - model(uv, x)) / sd, np.clip(start, lower, upper), bounds=(lower, upper)
         )
@@ -136,15 +139,6 @@ def _shown(uv: Floats, x: Floats, axis: int, cell_mm: float) -> bool:
     off = (uv[:, axis] - x[1]) / cell_mm
     fewest = x[4] / cell_mm  # of the line's cells, half
     return all(int((beside & (way * off > 0.5) & (way * off < 2.5)).sum()) >= 2.0 * fewest for way in (-1.0, 1.0))
-
-
-def _bounds(start: Floats, cells: PlaceCells, top: float) -> tuple[Floats, Floats]:
-    """Return the least and the largest parameters (6,)."""
-    least, most = LEAST_SIZE * start[[2, 4]], MOST_SIZE * start[[2, 4]]
-    room = np.array([start[2] + cells.cell_mm, start[4] + cells.cell_mm])
-    lower = np.array([0.2 * top, start[1] - room[0], least[0], start[3] - room[1], least[1], EXPONENTS[0]])
-    upper = np.array([5.0 * top, start[1] + room[0], most[0], start[3] + room[1], most[1], EXPONENTS[1]])
-    return lower, upper
 
 
 def _bump(s: Floats, exponent: float) -> Floats:

@@ -57,7 +57,9 @@ def waves(lobes: Sequence[Lobe]) -> list[list[int]]:
     for row in rows:
         if len(row) >= FEWEST and not taken.intersection(row):
             taken.update(row)
-            found.append(row if _direction(lobes, row) > 0.0 else row[::-1])
+            # Rows are in the order in which the larger component of the way along them increases
+            along = lobes[row[-1]].middle - lobes[row[0]].middle
+            found.append(row if float(along[np.argmax(np.abs(along))]) > 0.0 else row[::-1])
     return found
 
 
@@ -89,9 +91,3 @@ def _row(lobes: Sequence[Lobe], neighbours: Mapping[int, Sequence[int]], first: 
         if not ahead:
             return row
         row.append(min(ahead)[1])
-
-
-def _direction(lobes: Sequence[Lobe], row: Sequence[int]) -> float:
-    """Return the larger component of the way along a row: rows are in the order of its increase."""
-    along = lobes[row[-1]].middle - lobes[row[0]].middle
-    return float(along[np.argmax(np.abs(along))])
