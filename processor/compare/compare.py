@@ -379,10 +379,12 @@ def _log_scales(request: Request, used: Scales, unit: str, log: Callable[[str], 
         return "given" if given else f"derived from {derived_from}"
 
     spacing = max(used.reference_spacing_mm, used.compared_spacing_mm)
-    log(
-        f"{_unit_said(request, unit)}; "
-        f"spacing {used.reference_spacing_mm:.4g} (reference), {used.compared_spacing_mm:.4g} (compared)"
+    of_lengths = (
+        f"files read as {request.units} (--units), lengths are in {unit}"
+        if request.units
+        else f"lengths are in the unit of the files{f' ({unit})' if unit else ', which they do not give'}"
     )
+    log(f"{of_lengths}; spacing {used.reference_spacing_mm:.4g} (reference), {used.compared_spacing_mm:.4g} (compared)")
     if request.normals is not None:
         unused = "; --normal-diameter is not used" if request.normal_diameter else ""
         log(f"normals of file {request.normals.name}{unused}")
@@ -392,12 +394,6 @@ def _log_scales(request: Request, used: Scales, unit: str, log: Callable[[str], 
     log(f"max depth to either side {used.max_depth_mm:.6g}, {source(request.max_depth, 'the distance of the clouds')}")
     points = np.pi / 4.0 * (used.projection_diameter_mm / spacing) ** 2
     log(f"a cylinder holds about {points:.3g} points of the sparser cloud")
-
-
-def _unit_said(request: Request, unit: str) -> str:
-    if request.units:
-        return f"files read as {request.units} (--units), lengths are in {unit}"
-    return f"lengths are in the unit of the files{f' ({unit})' if unit else ', which they do not give'}"
 
 
 def _log_warnings(comparison: Comparison, log: Callable[[str], None]) -> None:

@@ -52,7 +52,9 @@ def no_distance(reference: Floats, compared: Floats, core: Floats, without_norma
     if reason := _different_units(reference, compared):
         return reason
     for name, points in (("core points", core), ("compared cloud", compared)):
-        gap = box_distance(reference, points)
+        (low, high), (other_low, other_high) = large_arrays.corners(reference), large_arrays.corners(points)
+        between = np.maximum(low - other_high, other_low - high)
+        gap = float(np.linalg.norm(np.maximum(between, 0.0)))
         if gap > used.max_depth_mm:
             return (
                 f"the {name} and the reference cloud lie {gap:.6g} apart (their boxes), farther than the max depth of "
@@ -67,10 +69,3 @@ def no_distance(reference: Floats, compared: Floats, core: Floats, without_norma
         f"no cylinder of diameter {used.projection_diameter_mm:.6g} and {used.max_depth_mm:.6g} to either side holds "
         "points of both clouds; a larger --max-depth or --projection-diameter may help"
     )
-
-
-def box_distance(a: Floats, b: Floats) -> float:
-    """Return the distance between the bounding boxes of two clouds (n, 3) and (m, 3), 0 where they overlap."""
-    (low, high), (other_low, other_high) = large_arrays.corners(a), large_arrays.corners(b)
-    gap = np.maximum(low - other_high, other_low - high)
-    return float(np.linalg.norm(np.maximum(gap, 0.0)))

@@ -114,7 +114,9 @@ def _registered(scan: ScanCloud, core: Floats, origin: Floats, params: Params) -
         fine = icp.point_to_point(source, target, T)
         T = fine.T_target_source
         diagnostics.note("iterative closest point", rounds=fine.iterations, rms_mm=fine.rms)
-        error = clone_error(rigid.apply(T, source))
+        # What the same registration leaves between the points (n, 3) and a clone of them, rms in mm
+        points = rigid.apply(T, source)
+        error = icp.point_to_point(points, points, coarse(points, points).T_target_source).rms
         diagnostics.note("clone", rms_mm=error)
     if np.isfinite(params.registration_error_mm):
         error = params.registration_error_mm
@@ -140,8 +142,3 @@ def coarse(source: Floats, target: Floats) -> CoarsePose:
 
     size = float(np.linalg.norm(np.ptp(target, axis=0)))
     return principal.coarse(principal.of_points(source), principal.of_points(target), size, refined)
-
-
-def clone_error(points: Floats) -> float:
-    """Rms in mm that the same registration leaves between points (n, 3) and a clone of them."""
-    return icp.point_to_point(points, points, coarse(points, points).T_target_source).rms

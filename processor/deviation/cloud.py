@@ -182,7 +182,9 @@ def adaptive_voxels(points: Floats, size_mm: float, least: int, growth: float) -
     lower = points.min(axis=0)
     widest = float((points.max(axis=0) - lower).max())
     while len(left):
-        number, count = _voxels(points[left] - lower, size_mm)
+        cell = np.floor((points[left] - lower) / size_mm).astype(np.int64)
+        voxels = distinct(cell)
+        number, count = voxels.number, voxels.count
         full = (count >= least) | (size_mm > widest)
         new = np.cumsum(full) - 1 + groups
         done = full[number]
@@ -191,10 +193,3 @@ def adaptive_voxels(points: Floats, size_mm: float, least: int, growth: float) -
         left = left[~done]
         size_mm *= growth
     return group
-
-
-def _voxels(points: Floats, size: float) -> tuple[Ints, Ints]:
-    """Return the number (n,) of each point's voxel, and points (v,) in each."""
-    cell = np.floor(points / size).astype(np.int64)
-    voxels = distinct(cell)
-    return voxels.number, voxels.count

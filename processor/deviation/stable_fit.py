@@ -131,7 +131,10 @@ def fits(
     worst, scale = _largest(levels, stable), levels[0].sd
     weight = biweight((worst) / TUKEY)
     z = np.abs(blocks.value - blocks.design @ stable) / scale
-    slope = np.where(z < worst, weight, _tukey_slope(z))
+    # The derivative of the influence z w(z)
+    u = (z / TUKEY) ** 2
+    of_influence = np.where(u < 1.0, (1.0 - u) * (1.0 - 5.0 * u), 0.0)
+    slope = np.where(z < worst, weight, of_influence)
     return Fits(
         best=_fit(blocks, best, 1.0 / variance, 1.0 / variance, 1.0, places),
         # What the larger blocks changed shows what is left of movements too small for any block.
@@ -268,13 +271,6 @@ def _scaled(blocks: _Blocks, motion: Floats, sd: Floats, limit: Floats) -> Float
     z = (blocks.value - blocks.design @ motion) / sd
     near = _worst(blocks, motion[None], limit)[0] <= 1.0
     return sd * (max(1.0, float(np.sqrt(np.median(z[near] ** 2) / CHI2_MEDIAN))) if near.any() else 1.0)
-
-
-def _tukey_slope(z: Floats) -> Floats:
-    """Return the derivative of the influence z w(z)."""
-    u = (z / TUKEY) ** 2
-    slope: Floats = np.where(u < 1.0, (1.0 - u) * (1.0 - 5.0 * u), 0.0)
-    return slope
 
 
 def _fit(

@@ -78,7 +78,9 @@ class Component:
 
 def of_component(step: str, name: str, found: Sequence[Series]) -> Component:
     """Compare the values of one component over the epochs."""
-    looked_at = sum(max(len(_rows(series)) - 1, 0) for series in found if _has_intervals(series))
+    looked_at = sum(
+        max(len(_rows(series)) - 1, 0) for series in found if np.isfinite(series.ci95[_rows(series)]).sum() > 1
+    )
     changes = [change for series in found for change in _changes(series, looked_at)]
     sure = [change for change in changes if change.surely and not change.doubtful]
     doubtful = [change for change in changes if change.surely and change.doubtful]
@@ -109,10 +111,6 @@ def _rows(series: Series) -> list[int]:
     with_interval = value & np.isfinite(series.ci95)
     rows: list[int] = np.flatnonzero(with_interval if with_interval.sum() > 1 else value).tolist()
     return rows
-
-
-def _has_intervals(series: Series) -> bool:
-    return bool(np.isfinite(series.ci95[_rows(series)]).sum() > 1)
 
 
 def _changes(series: Series, looked_at: int) -> Iterable[Change]:

@@ -57,8 +57,12 @@ def compare(epochs: Sequence[Epoch]) -> History:
             f"{epochs[0].folder} and {epochs[-1].folder}: no step has results of one component in two runs; "
             "expected runs of one structure"
         )
+    # Say of components that changed by the places of balls alone which balls these are: it is one movement. Where
+    # something else changed too, that is the component's leading change.
+    moved = {one.name for one in components if one.kind is Kind.BALL and one.finding in BEYOND}
+    followed = tuple(_following(one, moved) if one.finding in BEYOND else one for one in components)
     return History(
-        name=str(epochs[-1].facts.get("name", "")), epochs=tuple(epochs), components=_followed(components),
+        name=str(epochs[-1].facts.get("name", "")), epochs=tuple(epochs), components=followed,
         remarks=tuple(remarks),
     )  # fmt: skip
 
@@ -78,15 +82,6 @@ def _components(step: str, found: Sequence[Series]) -> Iterator[Component]:
         by_name.setdefault(one.component, []).append(one)
     for name, of_it in by_name.items():
         yield change.of_component(step, name, of_it)
-
-
-def _followed(components: Sequence[Component]) -> tuple[Component, ...]:
-    """Say of components that changed by the places of balls alone which balls these are: it is one movement.
-
-    Where something else changed too, that is the component's leading change.
-    """
-    moved = {one.name for one in components if one.kind is Kind.BALL and one.finding in BEYOND}
-    return tuple(_following(one, moved) if one.finding in BEYOND else one for one in components)
 
 
 def _following(component: Component, moved: set[str]) -> Component:

@@ -62,7 +62,13 @@ class _Core:
 
 def series(results: Sequence[Result | None]) -> Iterator[Series]:
     """Yield the mean deviation of each component, the movement of each body, and the core point that changed most."""
-    doubtful = np.array([one is not None and _is_unsure(one) for one in results], np.bool_)
+    doubtful = np.array(
+        [
+            one is not None and (one.status is Status.AMBIGUOUS or one.registration_error_from is ErrorSource.UNKNOWN)
+            for one in results
+        ],
+        np.bool_,
+    )
     with_bodies = all(one is None or len(one.bodies) for one in results)
     for name in _names(results):
         cores = _cores(results, name)
@@ -95,10 +101,6 @@ def _names(results: Sequence[Result | None]) -> list[str]:
 
 def _cores(results: Sequence[Result | None], name: str) -> list[_Core]:
     return [_Core.of(result, None if result is None else _of_body(result, name)) for result in results]
-
-
-def _is_unsure(result: Result) -> bool:
-    return result.status is Status.AMBIGUOUS or result.registration_error_from is ErrorSource.UNKNOWN
 
 
 def _of_body(result: Result, name: str) -> Ints:
@@ -172,7 +174,16 @@ def _movement(name: str, cores: Sequence[_Core], common: Sequence[Ints], doubtfu
     if first is None:
         return
     core, rows = cores[first], common[first]
-    solve, determined = _rigid_motion(core.places[rows], core.normals[rows])
+    # The matrix (3, c) from distances along normals to the shift of the middle, and its axes determined (3,). A place
+    # p with normal n moves along it by n t + (p x n) w. Directions that the normals do not determine are taken out by
+    # their singular values; lengths are in units of the body's size, so that turns compare with shifts.
+    places = core.places[rows]
+    normals = core.normals[rows]
+    arm = places - places.mean(axis=0)
+    size = max(float(np.linalg.norm(arm, axis=1).max()), 1e-9)
+    A = np.hstack([normals, np.cross(arm, normals) / size])
+    inverse = np.linalg.pinv(A, rcond=LEAST_DETERMINED)
+    solve, determined = inverse[:3], np.diag(inverse @ A)[:3] > DETERMINED_SHARE
     values, half = np.full((2, len(cores), 3), np.nan)
     for e, (one, own) in enumerate(zip(cores, common, strict=True)):
         if len(own):
@@ -183,19 +194,6 @@ def _movement(name: str, cores: Sequence[_Core], common: Sequence[Ints], doubtfu
             component=name, kind=Kind.SURFACE, quantity=text("movement {axis}", axis="xyz"[axis]),
             value=values[:, axis], ci95=half[:, axis], doubtful=doubtful,
         )  # fmt: skip
-
-
-def _rigid_motion(places: Floats, normals: Floats) -> tuple[Floats, Bools]:
-    """Return the matrix (3, c) from distances along normals to the shift of the middle, and its axes determined (3,).
-
-    A place p with normal n moves along it by n t + (p x n) w. Directions that the normals do not determine are taken
-    out by their singular values; lengths are in units of the body's size, so that turns compare with shifts.
-    """
-    arm = places - places.mean(axis=0)
-    size = max(float(np.linalg.norm(arm, axis=1).max()), 1e-9)
-    A = np.hstack([normals, np.cross(arm, normals) / size])
-    inverse = np.linalg.pinv(A, rcond=LEAST_DETERMINED)
-    return inverse[:3], np.diag(inverse @ A)[:3] > DETERMINED_SHARE
 
 
 def _strongest(name: str, cores: Sequence[_Core], doubtful: Bools) -> Iterator[Series]:

@@ -43,7 +43,8 @@ def read(root: Path) -> list[Epoch]:
     """
     if not root.is_dir():
         raise InputError(f"{root}: expected a folder with folders of results, found no folder")
-    folders = sorted(path.parent for path in root.rglob(RESULTS_H5) if not _is_hidden(path.relative_to(root)))
+    below = [path.relative_to(root) for path in root.rglob(RESULTS_H5)]
+    folders = sorted(root / path.parent for path in below if not any(part.startswith(".") for part in path.parts))
     if len(folders) < 2:
         raise InputError(
             f"{root}: expected two folders of results or more, of one structure, found {len(folders)}; "
@@ -52,10 +53,6 @@ def read(root: Path) -> list[Epoch]:
     epochs = sorted((_read(root, folder) for folder in folders), key=lambda one: (one.day, one.folder))
     _check_different(root, epochs)
     return epochs
-
-
-def _is_hidden(path: Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)
 
 
 def _read(root: Path, folder: Path) -> Epoch:

@@ -27,7 +27,12 @@ def series(results: Sequence[Result | None]) -> Iterator[Series]:
     for name in dict.fromkeys(name for table in tables for name in table):
         parts = [table.get(name) for table in tables]
         known = [part for part in parts if part is not None]
-        kind = Kind.MEMBER if any(_is_member(part) for part in known) else Kind.PART
+        # A member of a frame has the name of its balls
+        kind = (
+            Kind.MEMBER
+            if any(quantity in OF_MEMBERS for part in known for quantity in part.characteristics.quantity)
+            else Kind.PART
+        )
         for key in dict.fromkeys(key for part in known for key in part.characteristics.id):
             yield _characteristic(name, kind, key, parts)
         yield from _along_axis(name, kind, parts)
@@ -36,11 +41,6 @@ def series(results: Sequence[Result | None]) -> Iterator[Series]:
 def remarks(_: Sequence[Result | None]) -> Iterator[Reason]:
     """Say nothing: sizes of a part have nothing in common but the scanner."""
     yield from ()
-
-
-def _is_member(part: InspectedComponent) -> bool:
-    """Whether a component is a member of a frame, whose name is that of its balls."""
-    return any(quantity in OF_MEMBERS for quantity in part.characteristics.quantity)
 
 
 def _characteristic(name: str, kind: Kind, key: str, parts: Sequence[InspectedComponent | None]) -> Series:

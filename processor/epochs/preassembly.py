@@ -35,7 +35,14 @@ def series(results: Sequence[Result | None]) -> Iterator[Series]:
     value = np.array([np.nan if one is None else one.span_departure for one in spans])
     if np.isfinite(value).any():
         ci95 = np.array([np.nan if one is None else one.span_ci95 for one in spans])
-        doubtful = np.array([result is not None and _any_doubtful(result) for result in results], np.bool_)
+        # Where any part of the bridge is weak or has a rival pose: the span is over all of them
+        doubtful = np.array(
+            [
+                result is not None and any(status is not Status.OK for status in result.components.status)
+                for result in results
+            ],
+            np.bool_,
+        )
         yield Series(
             component=SPAN, kind=Kind.SPAN, quantity=text("departure from the design"), value=value, ci95=ci95,
             doubtful=doubtful,
@@ -57,11 +64,6 @@ def _of_row(result: Result | None, row: int | None, column: str) -> Floats:
         return np.full((8, 3), np.nan)
     values: Floats = getattr(result.joints, column)[row]
     return values
-
-
-def _any_doubtful(result: Result) -> bool:
-    """Whether any part of the bridge is weak or has a rival pose: the span is over all of them."""
-    return any(status is not Status.OK for status in result.components.status)
 
 
 def _doubtful(result: Result | None, row: int | None) -> bool:

@@ -129,6 +129,12 @@ def _seen(plates: list[Splice]) -> HolesSeen | None:
     if not blocks:
         return None
     at, found = np.concatenate(places), np.concatenate(departure)
+    # One covariance of all holes, places first, from those (3k, 3k) of groups: place and radius hole by hole. Errors
+    # of stations that groups of one part share would cancel in the misfit; taken as independent they count.
+    whole = block_diag(*blocks)
+    hole = 3 * np.arange(len(whole) // 3)
+    order = np.concatenate([(hole[:, None] + [0, 1]).ravel(), hole + 2])
+    covariance: Floats = whole[np.ix_(order, order)]
     return HolesSeen(
         places=at - at.mean(axis=0),
         plate=np.concatenate(plate),
@@ -136,20 +142,8 @@ def _seen(plates: list[Splice]) -> HolesSeen | None:
         axes=np.concatenate(axes),
         departure=found[:, :2],
         wider=found[:, 2],
-        covariance=_places_before_radii(blocks),
+        covariance=covariance,
     )
-
-
-def _places_before_radii(blocks: list[Floats]) -> Floats:
-    """Return one covariance of all holes, places first, from those (3k, 3k) of groups: place and radius hole by hole.
-
-    Errors of stations that groups of one part share would cancel in the misfit; taken as independent they count.
-    """
-    whole = block_diag(*blocks)
-    hole = 3 * np.arange(len(whole) // 3)
-    order = np.concatenate([(hole[:, None] + [0, 1]).ravel(), hole + 2])
-    covariance: Floats = whole[np.ix_(order, order)]
-    return covariance
 
 
 def misfit(seen: HolesSeen) -> tuple[Floats, Floats]:

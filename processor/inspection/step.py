@@ -27,17 +27,13 @@ def applies(scene: Scene) -> bool:
     return bool(needed(scene))
 
 
-def _with_design(scene: Scene) -> bool:
-    return scene.structure is not None and len(scene.structure.faces) > 0
-
-
 def needed(scene: Scene) -> tuple[str, ...]:
     """Name the steps whose measurements the inspection of a scene rests on: they run with it."""
     if scene.arch is not None:
         return ("preassemble",)
     if scene.frame is not None and len(scene.frame.member_a):
         return ("spheres",)
-    return ("deviation",) if _with_design(scene) else ()
+    return ("deviation",) if (scene.structure is not None and len(scene.structure.faces) > 0) else ()
 
 
 def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) -> Result:

@@ -171,14 +171,13 @@ def body_axes(body: Body) -> list[Axis]:
     for axis in sorted(axes, key=lambda one: -one.size):
         if all(abs(axis.direction @ other.direction) < SQUARE for other in square):
             square.append(axis)
-    return [_forwards(axis) for axis in square]
-
-
-def _forwards(axis: Axis) -> Axis:
-    """Let an axis look the way of its largest component, so that its sense does not depend on the order of faces."""
-    if rigid.looks_forwards(axis.direction):
-        return axis
-    return Axis(-axis.direction, (axis.faces[1], axis.faces[0]), axis.size)
+    # An axis looks the way of its largest component, so that its sense does not depend on the order of faces.
+    return [
+        axis
+        if rigid.looks_forwards(axis.direction)
+        else Axis(-axis.direction, (axis.faces[1], axis.faces[0]), axis.size)
+        for axis in square
+    ]
 
 
 def axis_names(axes: list[Axis]) -> list[Quantity]:
