@@ -197,12 +197,16 @@ def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurf
     normals = cross / size[:, None]
     count = np.maximum(1, np.ceil(0.5 * size / spacing_mm**2)).astype(np.int64)
     neighbours = _neighbours(faces, normals)
+    # Facets joined by smooth edges have the same number (f,) of a smooth face
+    facet, side = np.nonzero(neighbours >= 0)
+    links = coo_array((np.ones(len(facet), np.int8), (facet, neighbours[facet, side])), (len(neighbours),) * 2)
+    number: Ints = connected_components(links, directed=False)[1].astype(np.int64)
     return MeshSurface(
         vertices=vertices,
         faces=faces,
         normals=normals,
         neighbours=neighbours,
-        part_of=_smooth_faces(neighbours),
+        part_of=number,
         count=count,
     )
 
@@ -217,14 +221,6 @@ def on_face(face: Ints, beyond: Floats) -> Bools:
     """Mark the points (n,) that have a facet and their foot on its face, by :meth:`MeshSurface.distances`."""
     marked: Bools = (face >= 0) & (beyond < EDGE_MM)
     return marked
-
-
-def _smooth_faces(neighbours: Ints) -> Ints:
-    """Return the number (f,) of the smooth face of each facet: facets joined by smooth edges have the same one."""
-    facet, side = np.nonzero(neighbours >= 0)
-    links = coo_array((np.ones(len(facet), np.int8), (facet, neighbours[facet, side])), (len(neighbours),) * 2)
-    number: Ints = connected_components(links, directed=False)[1].astype(np.int64)
-    return number
 
 
 def _neighbours(faces: Ints, normals: Floats) -> Ints:

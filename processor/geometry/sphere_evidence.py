@@ -116,20 +116,16 @@ def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: NoiseLimits
     nearest = cKDTree(radial).query(radial, k=2)[1][:, 1]
     if np.sqrt(np.mean((residual[rows] - residual[rows][nearest]) ** 2) / 2.0) < limits.white * sd:
         return False
-    explained, of_all = _explained_squares(points, residual, ball), float(np.sum(residual**2))
+    # The part of the sum of squares of residuals (n,) that the shape of an ellipsoid explains
+    x, y, z = _radial(points, ball).T
+    A = np.column_stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, y * z, z * x])
+    left = residual - A @ np.linalg.lstsq(A, residual, rcond=None)[0]
+    explained, of_all = float(np.sum(residual**2) - np.sum(left**2)), float(np.sum(residual**2))
     if explained > EXPLAINED * of_all:
         return False
     noise = max(of_all - explained, 0.0) / max(len(residual) - QUADRIC_TERMS, 1)
     by_chance = explained <= LEAST_F * QUADRIC_TERMS * noise
     return by_chance or explained - QUADRIC_TERMS * noise <= len(residual) * (limits.shape * ball.radius) ** 2
-
-
-def _explained_squares(points: Floats, residual: Floats, ball: Sphere) -> float:
-    """Return the part of the sum of squares of residuals (n,) that the shape of an ellipsoid explains."""
-    x, y, z = _radial(points, ball).T
-    A = np.column_stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, y * z, z * x])
-    left = residual - A @ np.linalg.lstsq(A, residual, rcond=None)[0]
-    return float(np.sum(residual**2) - np.sum(left**2))
 
 
 def _radial(points: Floats, ball: Sphere) -> Floats:

@@ -127,13 +127,6 @@ def voxel_means(points: Floats, size_mm: float, least: int = 1) -> Floats:
     return means
 
 
-def cell_keys(cell: Ints) -> Ints:
-    """Return the number (n,) of cells (n, 3), all indices 0 or more, in the order of x, y, z."""
-    extent = cell.max(axis=0) + 1
-    key: Ints = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    return key
-
-
 class _Grid(NamedTuple):
     """Corner (3,) of the first cell, cells along each axis (3,), and their number."""
 

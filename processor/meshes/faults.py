@@ -232,7 +232,10 @@ def _outward(points: Floats, corners: Ints, edges: _Edges) -> tuple[Bools, Ints]
     hosts = np.arange(len(closed))
     local = points - points.mean(axis=0) if len(points) else points
     right = _turned(corners, turned)
-    volume = np.asarray(np.bincount(part, _volumes(local[right]), len(closed)), np.float64)
+    # Six times the volume (f,) between each facet and the origin
+    at = local[right]
+    six_volumes = np.einsum("ni,ni->n", at[:, 0], np.cross(at[:, 1], at[:, 2]))
+    volume = np.asarray(np.bincount(part, six_volumes, len(closed)), np.float64)
     if (volume < 0.0).any():
         hosts = _hosts(local, right, part, volume)
         inside_out = (volume < 0.0) & closed & (hosts == np.arange(len(hosts)))
@@ -283,12 +286,6 @@ def _parts(corners: Ints, edges: _Edges, sheet: Ints, turned: Bools) -> Ints:
     return _renumbered(part)
 
 
-def _volumes(corners: Floats) -> Floats:
-    """Return six times the volume (f,) between each facet (f, 3, 3) and the origin."""
-    volumes: Floats = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    return volumes
-
-
 def _hosts(points: Floats, corners: Ints, part: Ints, volume: Floats) -> Ints:
     """Return for each part (p,) itself, or for one of negative volume the smallest positive one around it."""
     low, high = np.full((len(volume), 3), np.inf), np.full((len(volume), 3), -np.inf)
@@ -300,16 +297,12 @@ def _hosts(points: Floats, corners: Ints, part: Ints, volume: Floats) -> Ints:
     for i in np.flatnonzero(volume < 0.0).tolist():
         around = (volume > 0.0) & (low < low[i]).all(axis=1) & (high > high[i]).all(axis=1)
         for k in np.flatnonzero(around)[np.argsort(volume[around], kind="stable")].tolist():
-            if _is_inside(points[corners[first[i]]].mean(axis=0), points[corners[part == k]]):
+            # The winding number of a closed mesh about a point inside of it is about 1
+            a, b, c = np.moveaxis(points[corners[part == k]] - points[corners[first[i]]].mean(axis=0), 1, 0)
+            la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+            above = np.einsum("ni,ni->n", a, np.cross(b, c))
+            below = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+            if bool(np.arctan2(above, below).sum() > np.pi):
                 result[i] = k
                 break
     return result
-
-
-def _is_inside(point: Floats, corners: Floats) -> bool:
-    """Return whether a point (3,) is inside of a closed mesh (f, 3, 3): its winding number is about 1."""
-    a, b, c = np.moveaxis(corners - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
-    above = np.einsum("ni,ni->n", a, np.cross(b, c))
-    below = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
-    return bool(np.arctan2(above, below).sum() > np.pi)

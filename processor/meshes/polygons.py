@@ -54,19 +54,18 @@ def triangulated(vertices: Floats, corners: Ints, counts: Ints) -> Ints:
         cut = _clipped(vertices[ring] - vertices[ring[0]], normal[row])
         end = begin + int(counts[row]) - 2
         if cut is None:
-            if not _is_sliver(vertices[ring]):
+            points = vertices[ring]
+            from_first = points[1:] - points[0]
+            size = float(np.linalg.norm(np.ptp(points, axis=0)))
+            in_one_line = (
+                float(np.linalg.norm(np.cross(from_first[:-1], from_first[1:]), axis=1).sum()) <= SLIVER * size * size
+            )
+            if not in_one_line:
                 raise CrossingError(row)
             continue  # the fan stays: whichever way it is cut, its area is that of the digits
         parts += [triangles[done:begin], ring[cut].astype(np.int64)]
         done = end
     return np.concatenate([*parts, triangles[done:]])
-
-
-def _is_sliver(points: Floats) -> bool:
-    """Whether the corners (n, 3) of a polygon lie in one line."""
-    from_first = points[1:] - points[0]
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    return float(np.linalg.norm(np.cross(from_first[:-1], from_first[1:]), axis=1).sum()) <= SLIVER * size * size
 
 
 def _clipped(points: Floats, normal: Floats) -> Ints | None:

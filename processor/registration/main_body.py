@@ -51,7 +51,12 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
         if (principal.sizes(even[left]) <= largest).all():
             break
     piece = np.zeros(len(even), bool)
-    piece[np.flatnonzero(left)[_largest_piece(even[left], step)]] = True
+    # The largest of the connected pieces
+    rest = even[left]
+    pairs = cKDTree(rest).query_pairs(LINK * step, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(rest),) * 2)
+    number = connected_components(links, directed=False)[1]
+    piece[np.flatnonzero(left)[number == np.argmax(np.bincount(number))]] = True
     best = piece if _misfit(even[piece], sizes) <= _misfit(even[left], sizes) else left
     if best.all():
         return None
@@ -100,12 +105,3 @@ def _plane(points: Floats, step: float, least: float) -> Bools | None:
     cells = np.floor((points[off < THIN * step] - axes.centre) @ axes.axes[:, :2] / step).astype(np.int64)
     near: Bools = off < step
     return near if len(distinct(cells).rows) * step**2 > least else None
-
-
-def _largest_piece(points: Floats, step: float) -> Bools:
-    """Return which points (n, 3) are in the largest of their connected pieces."""
-    pairs = cKDTree(points).query_pairs(LINK * step, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(points),) * 2)
-    piece = connected_components(links, directed=False)[1]
-    largest: Bools = piece == np.argmax(np.bincount(piece))
-    return largest

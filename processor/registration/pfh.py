@@ -131,7 +131,14 @@ def coarse_alignment(
     diagnostics.note(
         "histograms", pairs=len(rows), score_median=float(np.median(scores)), trials=iterations, agreeing=best_count
     )
-    return best if best is None else _refitted(best, points, paired, source, tolerance_mm, prior)
+    if best is None:
+        return None
+    # A pose fitted to all pairs that agree with it is taken where that keeps within the limits.
+    agree = np.linalg.norm(rigid.apply(best, points) - paired, axis=1) <= tolerance_mm
+    if agree.sum() < SAMPLE:
+        return best
+    fitted = rigid.fit(points[agree], paired[agree])
+    return fitted if prior is None or prior.allows(fitted, source) else best
 
 
 def _poses_of_samples(
@@ -146,17 +153,6 @@ def _poses_of_samples(
         T = rigid.fit(a[alike], b[alike])
         moved = points @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
         yield from zip(T, (np.linalg.norm(moved - paired, axis=2) <= tolerance_mm).sum(axis=1).tolist(), strict=True)
-
-
-def _refitted(
-    T: Floats, points: Floats, paired: Floats, source: Floats, tolerance_mm: float, prior: Prior | None
-) -> Floats:
-    """Fit a pose to all pairs (k, 3) that agree with it, where that keeps within the limits."""
-    agree = np.linalg.norm(rigid.apply(T, points) - paired, axis=1) <= tolerance_mm
-    if agree.sum() < SAMPLE:
-        return T
-    fitted = rigid.fit(points[agree], paired[agree])
-    return fitted if prior is None or prior.allows(fitted, source) else T
 
 
 def _nearest_histograms(

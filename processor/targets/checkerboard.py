@@ -22,7 +22,6 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.special import erf
 
-from processor.geometry.thinning import cell_keys
 from processor.model import Bools, Floats, Ints
 from processor.progress import tracked
 
@@ -138,7 +137,9 @@ def _seeds(points: Floats, intensity: Floats, side: float) -> Iterator[Floats]:
 def _cells(points: Floats, intensity: Floats, side: float, shift: float) -> tuple[Floats, Floats]:
     """Return middles (k, 3) and contrasts (k,) of the cells of a grid that have contrast."""
     cell = np.floor(points / (CELL_SHARE * side) + shift).astype(np.int64)
-    _, inverse = np.unique(cell_keys(cell - cell.min(axis=0)), return_inverse=True)
+    cell -= cell.min(axis=0)
+    extent = cell.max(axis=0) + 1
+    _, inverse = np.unique((cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2], return_inverse=True)
     count = np.bincount(inverse)
     mean = np.bincount(inverse, intensity) / count
     variance = np.bincount(inverse, intensity**2) / count - mean**2
@@ -275,7 +276,15 @@ def _fitted(plane: _Plane, intensity: Floats, start: Floats, side: float) -> Che
     if _goes_on(u, v, intensity, abs(float(fit.x[4])), side) or float(np.sqrt((plane.off[rows] ** 2).mean())) > FLAT_MM:
         return None
     sampling = [_sampling_sd(d, other, spacing, float(fit.x[5])) for d, other in ((u, v), (v, u))]
-    across = _plane_sd(plane.off[rows], u[rows] * v[rows] > 0.0)
+    # Many scanners measure other ranges to dark fields than to bright ones. The plane lies midway, and which colour
+    # is right is not known: half of the difference, as far as it exceeds the noise, counts as a standard deviation.
+    first = u[rows] * v[rows] > 0.0
+    off = plane.off[rows]
+    mean_variance = float((off**2).mean()) / len(off)
+    fields = (off[first], off[~first])
+    noise = sum(float(one.var()) / len(one) for one in fields)
+    difference = float(fields[0].mean() - fields[1].mean())
+    across = float(np.sqrt(mean_variance + max(difference**2 - noise, 0.0) / 4.0))
     return _placed(plane, plane.off[rows], fit, np.array([*sampling, across]), explained)
 
 
@@ -373,19 +382,6 @@ def _sampling_sd(d: Floats, other: Floats, spacing: float, width: float) -> floa
     common = float((np.maximum(aligned - BY_CHANCE / count, 0.0) * of_rows**2).max())
     rows = max(np.sqrt(count), 1.0)
     return float(np.sqrt(common + misplaced(np.array([spacing]))[0] ** 2 / rows))
-
-
-def _plane_sd(off: Floats, first: Bools) -> float:
-    """Return the sd of the plane's place across it, by distances (m,) of points on the first or the other fields.
-
-    Many scanners measure other ranges to dark fields than to bright ones. The plane lies midway, and which colour is
-    right is not known: half of the difference, as far as it exceeds the noise, counts as a standard deviation.
-    """
-    mean_variance = float((off**2).mean()) / len(off)
-    fields = (off[first], off[~first])
-    noise = sum(float(one.var()) / len(one) for one in fields)
-    difference = float(fields[0].mean() - fields[1].mean())
-    return float(np.sqrt(mean_variance + max(difference**2 - noise, 0.0) / 4.0))
 
 
 def _placed(plane: _Plane, off: Floats, fit: Any, sd: Floats, explained: float) -> Checkerboard | None:
