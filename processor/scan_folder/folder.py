@@ -20,8 +20,6 @@ from processor.model import (
     Floats,
     FrameDesign,
     InputError,
-    Ints,
-    Labels,
     Reason,
     Scan,
     Scene,
@@ -179,7 +177,12 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     ceiling = read_ceiling(folder, project.table, unit, project.design_units or unit)
     scene = dataclasses.replace(scene, ceiling=ceiling) if ceiling is not None else scene
     if (folder / PICKS).exists():
-        scene = _with_picks(folder, scene)
+        # Picks are in the unit of their scans; scans in different units need one by --units.
+        unit_of_picks = scene.units if scene.units in MM_PER_UNIT else ""
+        if not unit_of_picks:
+            raise InputError(f"{folder / PICKS}: expected scans in one unit, found {scene.units}; give one by --units")
+        existing_file_in(folder, PICKS, str(folder))
+        scene = dataclasses.replace(scene, picks=read_picks(folder / PICKS, scene.scans, unit_of_picks))
     files = {"stations": STATIONS, "picks": PICKS, "control": CONTROL if (folder / CONTROL).exists() else PROJECT}
     files |= dict.fromkeys(
         ("arch", "frame", "structure"), str(project.design.relative_to(folder) if project.design else PROJECT)
@@ -201,15 +204,6 @@ def _in_stated_frame(design: Design | None, table: Table) -> Design | None:
     if not isinstance(design, FrameDesign):
         raise InputError(f"{table.where}: 'design_frame' is for the nodes of a space frame; take it out")
     return dataclasses.replace(design, coordinates=stated)
-
-
-def _with_picks(folder: Path, scene: Scene) -> Scene:
-    # Picks are in the unit of their scans; scans in different units need one by --units.
-    unit = scene.units if scene.units in MM_PER_UNIT else ""
-    if not unit:
-        raise InputError(f"{folder / PICKS}: expected scans in one unit, found {scene.units}; give one by --units")
-    existing_file_in(folder, PICKS, str(folder))
-    return dataclasses.replace(scene, picks=read_picks(folder / PICKS, scene.scans, unit))
 
 
 def _component_names(design: Design | None) -> Sequence[str]:
@@ -380,6 +374,9 @@ def _scene(
     where = stations or _stations(scans)
     search = read_search(project.table)
     of_project = project.units or option or "m"
+    of_guess: tuple[Reason, ...] = ()
+    if project.guessed is not None:
+        of_guess = (reason("units.design-guessed-unsure" if project.guessed.doubts else "units.design-guessed"),)
     return Scene(
         project.name,
         kind,
@@ -389,7 +386,7 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason=(*_different(reasons.values()), *_said(project), *summed(remarks)),
+        units_reason=(*_different(reasons.values()), *of_guess, *summed(remarks)),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
         control=control_points(project.control, scans, scan_units, where, of_project, search is not None),
@@ -406,12 +403,6 @@ def _different(reasons: Iterable[Reason]) -> list[Reason]:
     for one in reasons:
         different += [] if one in different else [one]
     return different
-
-
-def _said(project: _Project) -> tuple[Reason, ...]:
-    if project.guessed is None:
-        return ()
-    return (reason("units.design-guessed-unsure") if project.guessed.doubts else reason("units.design-guessed"),)
 
 
 def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
@@ -488,12 +479,16 @@ def _scan(raw: RawScan, entry: _Entry, unit: FileUnit, parts: set[str], stations
     scanner = position if position.size else np.zeros(3)
     origin = raw.origin * scale
     row, column = scanner_grid.of_scanner(raw.points, raw.grid_row, raw.grid_column, scanner - raw.origin)
+    # As rows of the scene's stations: of those counted from 1, 0 is unknown
+    rows = large_arrays.allocate(len(station), dtype=np.int32)
+    for part in large_arrays.blocks(len(station)):
+        rows[part] = station[part] - 1
     return Scan(
         raw.name,
         scaled_in_place(raw, scale),
         origin,
         intensity=raw.intensity,
-        point_station=_from_0(station),
+        point_station=rows,
         grid_row=row,
         grid_column=column,
         component=entry.component or (raw.name if raw.name in parts else ""),
@@ -511,14 +506,6 @@ def _named_position(name: str, stations: Stations, pose: Floats) -> Floats:
         return np.empty(0)
     position = stations.positions[stations.ids.index(name)]
     return rigid.apply(rigid.invert(pose), position) if pose.size else position
-
-
-def _from_0(station: Ints) -> Labels:
-    """Return stations (n,) counted from 1, 0 = unknown, as rows of the scene's stations."""
-    rows = large_arrays.allocate(len(station), dtype=np.int32)
-    for part in large_arrays.blocks(len(station)):
-        rows[part] = station[part] - 1
-    return rows
 
 
 def _stations(scans: list[Scan]) -> Stations | None:

@@ -104,7 +104,10 @@ def guess(folder: Path, design_units: str = "") -> Guess:
     if shapes:
         _guess_components(project, shapes)
     elif not design:
-        _guess_kind(project)
+        project.kind, project.kind_reasons = "structure", (reason("init.needs-no-design"),)
+        for scan in project.scans:
+            scan.station = component_names.station(scan.stem)
+        project.doubts.append(reason("init.kind-without-design"))
     if (folder / STATIONS).is_file():
         project.stations = STATIONS
     return project
@@ -147,14 +150,23 @@ def _shown_design(
             continue
         (without if guessed.design is None else found).append(guessed)
     if len(found) == 1:
-        _take_design(project, found[0])
-        return found[0].design
+        made = project.made = found[0]
+        project.design = DESIGNS[0]
+        project.kind = "arch-bridge" if isinstance(made.design, ArchDesign) else "space-frame"
+        project.kind_reasons = project.design_reasons = made.reasons
+        project.doubts += [reason("init.kind-taken", kind=project.kind, reason=doubt) for doubt in made.kind_doubts]
+        project.doubts += made.doubts
+        return made.design
     paths = [path for group in groups for path in group]
     if len(paths) == 1 and not found:
         project.design, project.design_reasons = str(paths[0].relative_to(folder)), (reason("init.only-candidate"),)
         # The unit of one surface of the whole is that of 'design_units', which has a doubt of its own.
         project.doubts += [doubt for one in without for doubt in one.other_doubts]
-        return _read_surface(folder, paths[0], project)  # an error ends here: of what kind it is, nothing else shows
+        # An error of reading ends the guess: of what kind the project is, nothing else shows.
+        existing_file_in(folder, project.design, str(folder))
+        surface = read_surface(paths[0], "mm")[:2]
+        project.kind, project.kind_reasons = "structure", (reason("init.one-surface", file=project.design),)
+        return surface
     if not paths:
         project.doubts.append(reason("init.no-design"))
         return None
@@ -162,14 +174,6 @@ def _shown_design(
     project.doubts.append(reason("init.several-surfaces", files=tuple(candidates[:5])))
     project.doubts += [reason("init.of-design", reason=doubt) for one in without for doubt in one.doubts]
     return None
-
-
-def _take_design(project: Guess, guessed: GuessedDesign) -> None:
-    project.made, project.design = guessed, DESIGNS[0]
-    project.kind = "arch-bridge" if isinstance(guessed.design, ArchDesign) else "space-frame"
-    project.kind_reasons = project.design_reasons = guessed.reasons
-    project.doubts += [reason("init.kind-taken", kind=project.kind, reason=doubt) for doubt in guessed.kind_doubts]
-    project.doubts += guessed.doubts
 
 
 def _has_kind(path: Path) -> bool:
@@ -190,14 +194,6 @@ def _read_design(folder: Path, path: Path, project: Guess) -> ArchDesign | Frame
     project.kind = "arch-bridge" if isinstance(design, ArchDesign) else "space-frame"
     project.kind_reasons = (reason("init.kind-of-design", file=project.design),)
     return design
-
-
-def _read_surface(folder: Path, path: Path, project: Guess) -> Surface:
-    """Read the surface of a whole structure. Raises InputError."""
-    existing_file_in(folder, str(path.relative_to(folder)), str(folder))
-    surface = read_surface(path, "mm")[:2]
-    project.kind, project.kind_reasons = "structure", (reason("init.one-surface", file=project.design),)
-    return surface
 
 
 def _sizes(design: ArchDesign | FrameDesign | Surface | None) -> list[float]:
@@ -310,13 +306,6 @@ def _guess_units(project: Guess, nominal: Sequence[float], shapes: Mapping[str, 
         why = reason("init.units-by-extent", extent=extent)
     project.units_reasons = (why,)
     project.doubts.append(reason("init.units-taken", units=project.units, reason=why))
-
-
-def _guess_kind(project: Guess) -> None:
-    project.kind, project.kind_reasons = "structure", (reason("init.needs-no-design"),)
-    for scan in project.scans:
-        scan.station = component_names.station(scan.stem)
-    project.doubts.append(reason("init.kind-without-design"))
 
 
 def _guess_components(project: Guess, shapes: Mapping[str, Floats]) -> None:
@@ -464,6 +453,7 @@ def as_json(project: Guess) -> dict[str, Any]:
         }
         for scan in project.scans
     ]
+    made = (project.design, *(name for name, _, _ in project.made.meshes)) if project.made else ()
     return {
         "file": f"{project.folder}/{PROJECT}",
         "name": project.name,
@@ -476,7 +466,7 @@ def as_json(project: Guess) -> dict[str, Any]:
         "units_reason": english(project.units_reasons),
         "unsure": [english(doubt) for doubt in project.doubts],
         "scans": scans,
-        "made": [f"{project.folder}/{name}" for name in (project.design, *_meshes(project))] if project.made else [],
+        "made": [f"{project.folder}/{name}" for name in made],
     }
 
 
@@ -494,10 +484,6 @@ def summary(project: Guess) -> Text:
     if isinstance(design, FrameDesign):
         return text("{nodes} node(s), {members} member(s)", nodes=len(design.ids), members=len(design.member_a))
     return text("no design")
-
-
-def _meshes(project: Guess) -> list[str]:
-    return [name for name, _, _ in project.made.meshes] if project.made else []
 
 
 def write_design(folder: Path, project: Guess, lang: str = "en") -> None:

@@ -173,17 +173,15 @@ def check_ratio(
     centre = np.quantile(sample, [STRAY, 1.0 - STRAY], axis=0).mean(axis=0)
     ratio = float(np.quantile(np.linalg.norm(sample - centre, axis=1), 0.99)) / size
     factor = unit_ratio.nearest_factor(ratio, ratios, RATIO_TOLERANCE)
-    if factor is None or not (_certain(factor) or _scaled_alike(sample, nominal, factor)):
+    if factor is None or not (
+        (not 1.0 / CERTAIN_RATIO < factor < CERTAIN_RATIO) or _scaled_alike(sample, nominal, factor)
+    ):
         return
     likely = [name for name, mm in MM_PER_UNIT.items() if abs(MM_PER_UNIT[unit] / mm / factor - 1.0) < 0.01]
     raise InputError(
         f"{what} is {ratio:.4g} times as large as the design, close to {factor:.4g}: its unit was read as {unit} "
         f"({source}), which seems wrong{f' (is it {likely[0]}?)' if likely else ''}; {advice}"
     )
-
-
-def _certain(factor: float) -> bool:
-    return not 1.0 / CERTAIN_RATIO < factor < CERTAIN_RATIO
 
 
 def _scaled_alike(points: Floats, nominal: Floats, factor: float) -> bool:

@@ -97,7 +97,9 @@ def find(bodies: Sequence[Body]) -> GuessedArch:
         parts.append(part)
         doubts += of_part
         unsure += [Unsure(body.name, body.centre)] if of_part or body.step_mm else []
-    doubts += _numbering(found) if found.row else []
+    numbered = tuple(part.name for part in found.parts)
+    if found.row and numbered_backwards(numbered):
+        doubts.append(reason("init.numbered-backwards", parts=numbered))
     rounded = tuple(part.name for part in found.parts if part.step_mm)
     if rounded:
         doubts.append(reason("init.rounded-parts", parts=rounded))
@@ -283,9 +285,3 @@ def _reach(body: Body, edge: Floats) -> float:
     """Return how far an edge reaches, as a share of how far the body reaches from the edge's first point."""
     farthest = np.linalg.norm(body.vertices - edge[0], axis=1).max()
     return float(np.linalg.norm(edge[-1] - edge[0]) / farthest)
-
-
-def _numbering(chain: Assembly) -> list[Reason]:
-    """Return a doubt where the names are numbered against X."""
-    names = tuple(part.name for part in chain.parts)
-    return [reason("init.numbered-backwards", parts=names)] if numbered_backwards(names) else []

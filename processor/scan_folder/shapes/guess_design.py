@@ -95,7 +95,11 @@ def guess(
         return GuessedDesign(other_doubts=tuple(doubts), unit_doubts=units.doubts, files=names)
     surfaces = _in_unit(folder, surfaces, before, units.unit)
     parts = _bodies(folder, surfaces, units.unit)
-    scanned = _scanned_apart(parts.bodies, stems)
+    # Two scans or more have the names of one body each, and none that of several
+    of_bodies = [body.name for body in parts.bodies]
+    of_scan = [component_names.components(stem, of_bodies) for stem in stems]
+    single = [found[0] for found in of_scan if len(found) == 1]
+    scanned = len(set(single)) > 1 and len(single) == len(stems)
     guessed = _bridge(parts, names, tuple(doubts), _json_unit(surfaces, units), scanned)
     return replace(guessed, unit_doubts=units.doubts)
 
@@ -132,7 +136,7 @@ def _bridge(
 ) -> GuessedDesign:
     """Return the design of parts that meet end to end; ``scanned``: each scan has the name of one of them."""
     found = arch_bridge.find(parts.bodies)
-    named = _named_as_parts(parts.bodies)
+    named = any(word in component_names.plain(body.name).split() for body in parts.bodies for word in PARTS)
     likely = named or scanned or len(names) > 1
     if found.design is None or not (found.arched or likely):
         of_bridge = [reason("init.as-arch-bridge", reason=doubt) for doubt in found.doubts if likely]
@@ -166,18 +170,6 @@ def _some(names: Sequence[str]) -> tuple[str, ...] | Reason:
 
 def _names(folder: Path, paths: Sequence[Path]) -> tuple[str, ...]:
     return tuple(str(path.relative_to(folder)) for path in paths)
-
-
-def _named_as_parts(bodies: Sequence[Body]) -> bool:
-    return any(word in component_names.plain(body.name).split() for body in bodies for word in PARTS)
-
-
-def _scanned_apart(bodies: Sequence[Body], stems: Sequence[str]) -> bool:
-    """Whether two scans or more have the names of one body each, and none that of several."""
-    names = [body.name for body in bodies]
-    of_scan = [component_names.components(stem, names) for stem in stems]
-    single = [found[0] for found in of_scan if len(found) == 1]
-    return len(set(single)) > 1 and len(single) == len(stems)
 
 
 def _bodies(folder: Path, surfaces: Sequence[surface_files.Surface], units: str) -> _Parts:
