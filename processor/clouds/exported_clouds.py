@@ -66,19 +66,15 @@ def scan_cloud(run: Run, placed: Placed) -> Cloud:
     """Return the cloud of a scan in its own frame, with its pose, and rows and columns of the scanner's grid."""
     in_place = replace(placed, T=np.eye(4))
     cloud = _cloud(run, in_place, placed.scan.name, in_place.origin(), grid=True)
+    largest = {}
+    for name, field in (("grid_row", ROW), ("grid_column", COLUMN)) if ROW in cloud.fields else ():
+        column = run.points.column(placed.number, name)
+        largest[field] = max(int(column[i : i + BLOCK].max()) for i in range(0, len(column), BLOCK))
     return replace(
         cloud,
         T_project_scan=placed.T if placed.known else np.empty(0),
-        largest=_largest_cells(run, placed.number) if ROW in cloud.fields else {},
+        largest=largest,
     )
-
-
-def _largest_cells(run: Run, number: int) -> dict[str, int]:
-    largest = {}
-    for name, field in (("grid_row", ROW), ("grid_column", COLUMN)):
-        column = run.points.column(number, name)
-        largest[field] = max(int(column[i : i + BLOCK].max()) for i in range(0, len(column), BLOCK))
-    return largest
 
 
 def part_cloud(run: Run, placed: Placed) -> Cloud:

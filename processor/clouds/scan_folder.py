@@ -12,7 +12,7 @@ import numpy as np
 from processor.clouds import exported_clouds
 from processor.clouds.earlier_run import Run
 from processor.clouds.poses import Placed
-from processor.model import Control, Floats, Picks, Scan, Stations, Tolerance
+from processor.model import Control, Floats, Picks, Tolerance
 from processor.plain_text import spreadsheet_text
 from processor.scan_folder import picks as picks_table
 from processor.scan_folder.control_points import COLUMNS
@@ -40,37 +40,40 @@ def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str],
     lines += _tolerance(scene.tolerance)
     if what == "merged":
         stations = exported_clouds.stations_of(run, scans)
-        lines += ["", "[[scan]]", f"file = {as_toml(files[0])}", *_common_noise(scans)]
+        # The noise of a merged cloud is stated where it is the same in all scans
+        sigmas = {one.scan.sigma_mm for one in scans}
+        lines += [
+            "",
+            "[[scan]]",
+            f"file = {as_toml(files[0])}",
+            *([f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []),
+        ]
     else:
         stations = exported_clouds.stations_moved(run, scans)
         for one, file in zip(scans, files, strict=True):
-            written = _as_written(one, what)
+            # The pose and the position that belong to the points as written
+            position = one.scale * one.scan.position
+            if what in EACH_SCAN:
+                pose, component = one.T if one.known else NO_POSE, one.scan.component
+            else:
+                position = one.T[:3, :3] @ position + one.T[:3, 3] if position.size else position
+                pose, component = NO_POSE, one.component
+            written = dataclasses.replace(one.scan, T_project_scan=pose, position=position, component=component)
             lines += ["", "[[scan]]", f"file = {as_toml(file)}"]
             in_file = format_ == "e57" and written.T_project_scan.size > 0
             lines += project.scan_lines(
                 dataclasses.replace(written, T_project_scan=NO_POSE) if in_file else written, scale, with_pose=False
             )
     (folder / PROJECT).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    _write_stations(folder / STATIONS, stations, scale)
+    if stations is not None:
+        places = zip(stations.ids, stations.positions, strict=True)
+        project.write_json(
+            folder / STATIONS, {name: {"position": (position * scale).tolist()} for name, position in places}
+        )
     if what in EACH_SCAN:
         names = {one.number: Path(file).stem for one, file in zip(scans, files, strict=True)}
         _write_picks(folder / PICKS, run, scans, names, scale)
         _write_control(folder / CONTROL, scene.control, run, names, scale)
-
-
-def _as_written(one: Placed, what: str) -> Scan:
-    """Return a scan without points, with the pose and the position that belong to its points as written."""
-    position = one.scale * one.scan.position
-    if what in EACH_SCAN:
-        return dataclasses.replace(one.scan, T_project_scan=one.T if one.known else NO_POSE, position=position)
-    at = one.T[:3, :3] @ position + one.T[:3, 3] if position.size else position
-    return dataclasses.replace(one.scan, T_project_scan=NO_POSE, position=at, component=one.component)
-
-
-def _common_noise(scans: Sequence[Placed]) -> list[str]:
-    """Return the line about the noise of a merged cloud, where it is the same in all scans."""
-    sigmas = {one.scan.sigma_mm for one in scans}
-    return [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []
 
 
 def _tolerance(tolerance: Tolerance | None) -> list[str]:
@@ -87,12 +90,6 @@ def _tolerance(tolerance: Tolerance | None) -> list[str]:
             both = [limit.low, limit.high] if np.isfinite(limit.low) else limit.high
             lines.append(f"{limit.key} = {both!r}")
     return lines
-
-
-def _write_stations(path: Path, stations: Stations | None, scale: float) -> None:
-    if stations is not None:
-        places = zip(stations.ids, stations.positions, strict=True)
-        project.write_json(path, {name: {"position": (position * scale).tolist()} for name, position in places})
 
 
 def _write_picks(path: Path, run: Run, scans: Sequence[Placed], names: dict[int, str], scale: float) -> None:

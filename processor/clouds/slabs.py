@@ -49,12 +49,6 @@ def points_of(rows: Records) -> Floats:
     return np.stack([rows[axis] for axis in "xyz"], axis=1)
 
 
-def block_of(rows: Records) -> Block:
-    """Return records as a block of a cloud."""
-    names = [name for name in rows.dtype.names or () if name not in "xyz"]
-    return Block(points_of(rows), {name: np.ascontiguousarray(rows[name]) for name in names})
-
-
 def cut(cloud: Cloud, aside: Path, most: int = MOST) -> Slabs:
     """Cut a cloud into slabs of ``most`` points or less, as far as possible, in files below the folder ``aside``."""
     low, high, count = np.full(3, np.inf), np.full(3, -np.inf), 0
@@ -102,5 +96,7 @@ def _records(cloud: Cloud) -> Iterator[Records]:
 
 def in_blocks(rows: Records) -> Iterator[Block]:
     """Yield records as blocks of a cloud."""
+    names = [name for name in rows.dtype.names or () if name not in "xyz"]
     for start in range(0, len(rows), BLOCK):
-        yield block_of(rows[start : start + BLOCK])
+        part = rows[start : start + BLOCK]
+        yield Block(points_of(part), {name: np.ascontiguousarray(part[name]) for name in names})

@@ -127,6 +127,8 @@ def _stored_name(header: Any) -> str:
 
 def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> RawScan | None:
     """Return a scan of a file, None where it has no points, or none that is valid."""
+    from pye57 import libe57
+
     name = scan_names[index]
     header = file.get_header(index)
     declared = int(header.point_count)
@@ -150,6 +152,7 @@ def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> 
     pose = _pose(path, name, header) if header.has_pose() else np.empty(0)
     # Writers give single and merged clouds an identity pose too, so it is no evidence of a scanner's position.
     posed = pose.size > 0 and (len(scan_names) > 1 or bool((pose != np.eye(4)).any()))
+    node = libe57.StructureNode(header.points.prototype())[axes[0]]
     scan = build_scan(
         path,
         name,
@@ -159,7 +162,7 @@ def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> 
         position=np.zeros(3) if posed else (),
         T_project_scan=pose,
         grid=(cells[0], cells[1]) if cells else None,
-        single=_is_single(header, axes[0]),
+        single=isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE,
     )
     return dataclasses.replace(scan, colour=colour if len(colour) else scan.colour, scanned=_day(file, header))
 
@@ -261,13 +264,6 @@ def _colour_limits(header: Any) -> tuple[float, float]:
         limits = {"Minimum": float(red.minimum()), "Maximum": float(red.maximum())}
     low, high = limits.get("Minimum", 0.0), limits.get("Maximum", 255.0)
     return (low, high) if np.isfinite([low, high]).all() and low < high else (0.0, 255.0)
-
-
-def _is_single(header: Any, field: str) -> bool:
-    from pye57 import libe57
-
-    node = libe57.StructureNode(header.points.prototype())[field]
-    return isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE
 
 
 def cartesian_from_spherical(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats:

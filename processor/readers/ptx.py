@@ -80,7 +80,10 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
         )
     check_declared_points(path, "PTX", cells, SHORTEST_ROW, size)
     matrix = np.array(numbers[6:])
-    for_columns = _is_for_columns(matrix)
+    # Whether a matrix (4, 4) as written has its translation in the last column, and not in the last row
+    for_columns = bool(
+        np.abs(matrix[3] - [0, 0, 0, 1]).max() < RIGID_TOLERANCE and np.abs(matrix[:3, 3]).max() > RIGID_TOLERANCE
+    )
     T_project_scan = _rigid(path, number, matrix if for_columns else matrix.T)
     with errors_name_the_file(path, "PTX"):
         width = rows.width()
@@ -112,13 +115,6 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
     )
     remarks = (reason("read.matrix-for-columns", count=1, scans=(name,)),) if for_columns else ()
     return dataclasses.replace(scan, colour=colour[:count] if len(colour) else scan.colour, remarks=remarks)
-
-
-def _is_for_columns(matrix: Floats) -> bool:
-    """Whether a matrix (4, 4) as written has its translation in the last column, and not in the last row."""
-    return bool(
-        np.abs(matrix[3] - [0, 0, 0, 1]).max() < RIGID_TOLERANCE and np.abs(matrix[:3, 3]).max() > RIGID_TOLERANCE
-    )
 
 
 def _scanner(stated: Floats, T_project_scan: Floats, points: Floats) -> Floats:

@@ -30,16 +30,14 @@ def replacing_folder(out: Path) -> Iterator[Path]:
             yield new
             _replace(new, out, folder / OLD)
     except OSError as error:
-        raise _unwritable(out, error) from error
+        raise InputError(
+            f"cannot be written ({error.strerror or error}); nothing was changed there", path=out
+        ) from error
     except InputError as error:
         if error.path is None or not error.path.is_relative_to(new):
             raise
         # The file was in the folder that is removed: the message names the place that it was for.
         raise InputError(error.problem, path=out / error.path.relative_to(new)) from error
-
-
-def _unwritable(out: Path, error: OSError) -> InputError:
-    return InputError(f"cannot be written ({error.strerror or error}); nothing was changed there", path=out)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -212,7 +212,7 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
         wanted = " or ".join(FORMATS[kind] for kind in kinds)
         raise InputError(
             f"expected a {wanted} file (HDF5), found one that is damaged, cut off or of another kind "
-            f"({_first_line(error)}); make or copy it again",
+            f"({(str(error).splitlines() or [type(error).__name__])[0]}); make or copy it again",
             path=path,
         ) from error
 
@@ -239,10 +239,6 @@ def _listed(problems: Sequence[str], most: int = 20) -> str:
     return "; ".join([*problems[:most], *more])
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
 def _header_problems(file: Any, kinds: Sequence[str], known: Mapping[str, str | None]) -> list[str]:
     header = {name: _attribute(file, name) for name in ("format", "format_version", "units")}
     wanted = [FORMATS[kind] for kind in kinds]
@@ -257,11 +253,11 @@ def _header_problems(file: Any, kinds: Sequence[str], known: Mapping[str, str | 
         faults.append(f"expected format_version {' or '.join(readable)}, found {version}{advice}")
     if header["units"] != "mm":
         faults.append(f"expected units mm, found {header['units'] or 'none'}")
-    return faults or _checksum_problems(file, str(header["format_version"]), known)
-
-
-def _checksum_problems(file: Any, version: str, known: Mapping[str, str | None]) -> list[str]:
-    return [] if version in WITHOUT_CHECKSUMS and not checksums.has_any(file) else checksums.root_problems(file, known)
+    return faults or (
+        []
+        if str(header["format_version"]) in WITHOUT_CHECKSUMS and not checksums.has_any(file)
+        else checksums.root_problems(file, known)
+    )
 
 
 def _attribute(file: Any, name: str) -> str:

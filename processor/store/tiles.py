@@ -83,7 +83,8 @@ def arrange(points: Floats, others: Mapping[str, Array] = types.MappingProxyType
             grid, cell=cell, start=empty, count=empty, columns=(none, none, none), order=empty, others=dict(others)
         )
     scale = _scale(points)
-    levels = _levels(len(points))
+    # Enough levels of the finest grid for points on a line, and two more for gaps
+    levels = int(np.clip(np.ceil(np.log2(len(points) / POINTS_PER_TILE)) + 2, 0, MOST_LEVELS))
     grid = _finest(points, scale, levels)
     finest = np.zeros(2 ** (3 * levels), np.int32)
     for rows in large_arrays.blocks(len(points)):
@@ -206,11 +207,6 @@ def _finest(points: Floats, scale: _Scale, levels: int) -> Grid:
     if scale.steps_per_mm == 1.0:
         edge = (extent or 1.0) / 2.0**levels * (1.0 + 1e-9)
     return Grid(scale.steps_per_mm, scale.offset, lower, edge)
-
-
-def _levels(n: int) -> int:
-    """Return the levels of the finest grid for ``n`` points: enough for points on a line, and two more for gaps."""
-    return int(np.clip(np.ceil(np.log2(n / POINTS_PER_TILE)) + 2, 0, MOST_LEVELS))
 
 
 def _level(counts: Array, n: int, levels: int) -> tuple[int, Array]:

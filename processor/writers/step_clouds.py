@@ -41,7 +41,10 @@ def write(folder: Path, runs: Sequence[OfRun]) -> None:
     numbers = [["step", "method", "stage", "place", "quantity", "value"]]
     used: set[str] = set()
     for run in runs:
-        for (stage, frame), clouds in _grouped(run.clouds).items():
+        found: dict[tuple[str, str], list[KeptCloud]] = {}
+        for cloud in run.clouds:
+            found.setdefault((cloud.stage, cloud.frame), []).append(cloud)
+        for (stage, frame), clouds in found.items():
             file = _name(f"{run.step}-{run.method}-{stage}-{frame}", used)
             comments = (f"{stage}, {run.step} ({run.method})", f"frame: {frame}; mm; place: see {CLOUDS}")
             ply.write(folder / file, _cloud(clouds, comments))
@@ -56,13 +59,6 @@ def write(folder: Path, runs: Sequence[OfRun]) -> None:
         text = io.StringIO(newline="")
         csv.writer(text, lineterminator="\n").writerows(rows_of)
         write_text(folder / name, text.getvalue())
-
-
-def _grouped(clouds: Sequence[KeptCloud]) -> dict[tuple[str, str], list[KeptCloud]]:
-    found: dict[tuple[str, str], list[KeptCloud]] = {}
-    for cloud in clouds:
-        found.setdefault((cloud.stage, cloud.frame), []).append(cloud)
-    return found
 
 
 def _name(text: str, used: set[str]) -> str:
