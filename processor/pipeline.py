@@ -147,11 +147,6 @@ def is_large(path: Path) -> bool:
         return not any(coincident_points.used_once(sample) is not None for sample in points.samples(SAMPLED_TILES))
 
 
-def streams(jobs: Sequence[Job]) -> bool:
-    """Whether all jobs take points piece by piece."""
-    return all(job.params.method in getattr(job.module, "STREAMS", ()) for job in jobs)
-
-
 def read_params(path: Path | None) -> dict[str, Any]:
     """Read a parameter file: a table per step. UsageError where it is not TOML."""
     if path is None:
@@ -211,7 +206,9 @@ def prepare(
     piecewise = is_large(path)
     scene = read(path, units, piecewise)
     jobs = jobs_for(scene, wanted, methods, params, seed)
-    if piecewise and not (streams(jobs) and scene.target_search is None):
+    if piecewise and not (
+        all(job.params.method in getattr(job.module, "STREAMS", ()) for job in jobs) and scene.target_search is None
+    ):
         return read(path, units), jobs, False
     return scene, jobs, piecewise
 
@@ -259,16 +256,17 @@ def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any
             raise UsageError(f"{name}.method: expected one of {', '.join(module.METHODS)}, got {first!r}")
         used_seed = seed if seed is not None else filled.seed
         jobs += [
-            Job(name, module, dataclasses.replace(filled, method=method, seed=used_seed), _own_function(method))
+            Job(
+                name,
+                module,
+                dataclasses.replace(filled, method=method, seed=used_seed),
+                user_methods.load(method) if user_methods.is_named(method) else None,
+            )
             for method in dict.fromkeys(offered[name] or [first])
         ]
     # Answers before comparisons, in the order of the steps.
     firsts = [next(job for job in jobs if job.step == name) for name in chosen]
     return (*firsts, *(job for job in jobs if job not in firsts))
-
-
-def _own_function(method: str) -> Callable[..., Any] | None:
-    return user_methods.load(method) if user_methods.is_named(method) else None
 
 
 def _in_order(chosen: Sequence[str], modules: Mapping[str, ModuleType]) -> list[str]:
@@ -335,7 +333,12 @@ def execute(
             needs: dict[str, Any] = {}
             if job.module.NEEDS:
                 needs["earlier"] = {name: answers[name] for name in job.module.NEEDS if name in answers}
-            if stopping := _stopping(job, answers):
+            # The step that places the scans, if the job needs it and it failed or is ambiguous
+            modules = step_modules()
+            placing = [name for name in job.module.NEEDS if name in answers and getattr(modules[name], "PLACES", False)]
+            if stopping := next(
+                (name for name in placing if answers[name].status in (Status.FAILED, Status.AMBIGUOUS)), ""
+            ):
                 runs.append(_stopped(job, stopping, log))
                 answers.setdefault(job.step, runs[-1].result)
                 continue
@@ -401,13 +404,6 @@ def _completed(runs: Sequence[StepRun], answers: Mapping[str, Any]) -> list[Step
             run = dataclasses.replace(run, result=by_others(run.result, answers))
         completed.append(run)
     return completed
-
-
-def _stopping(job: Job, answers: Mapping[str, Any]) -> str:
-    """Name the step that places the scans, if a job needs it and it failed or is ambiguous; else nothing."""
-    modules = step_modules()
-    placing = [name for name in job.module.NEEDS if name in answers and getattr(modules[name], "PLACES", False)]
-    return next((name for name in placing if answers[name].status in (Status.FAILED, Status.AMBIGUOUS)), "")
 
 
 def _stopped(job: Job, step: str, log: Callable[[str], None]) -> StepRun:

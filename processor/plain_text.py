@@ -27,7 +27,12 @@ def decoded(data: bytes) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         pass
-    if not _is_latin(data):
+    # Chinese characters of everyday use (GB 2312) are two bytes beyond ASCII each, and no small Latin letter stands
+    # beside them: a run of an odd number of bytes is of a European word, and so is one of letters alone between small
+    # letters. Both are valid GB18030.
+    runs = re.findall(rb"([a-z]?)([\x80-\xff]+)(?=([a-z]?))", data)
+    latin = sum(len(run) % 2 == 1 or bool(before and after and min(run) >= 0xC0) for before, run, after in runs)
+    if 2 * latin <= len(runs):
         try:
             return data.decode("gb18030")
         except UnicodeDecodeError:
@@ -36,15 +41,3 @@ def decoded(data: bytes) -> str:
         return data.decode("cp1252")
     except UnicodeDecodeError:
         return data.decode("utf-8", "replace")
-
-
-def _is_latin(data: bytes) -> bool:
-    """Whether most runs of bytes beyond ASCII are letters of European words.
-
-    Chinese characters of everyday use (GB 2312) are two such bytes each, and no small Latin letter stands beside them:
-    a run of an odd number of bytes is of a European word, and so is one of letters alone between small letters. Both
-    are valid GB18030.
-    """
-    runs = re.findall(rb"([a-z]?)([\x80-\xff]+)(?=([a-z]?))", data)
-    latin = sum(len(run) % 2 == 1 or bool(before and after and min(run) >= 0xC0) for before, run, after in runs)
-    return 2 * latin > len(runs)

@@ -15,8 +15,3 @@ def nearest_factor(ratio: float, factors: Iterable[float], tolerance: float) -> 
         return None
     nearest = min(factors, key=lambda factor: abs(math.log(ratio / factor)))
     return nearest if abs(ratio / nearest - 1.0) <= tolerance else None
-
-
-def with_inverses(factors: Iterable[float]) -> tuple[float, ...]:
-    """Return each factor f followed by 1 / f."""
-    return tuple(value for factor in factors for value in (factor, 1.0 / factor))

@@ -34,18 +34,14 @@ def length_of(value: Any, name: str, *, zero: bool = False, unit: str = " in mm"
     """
     number = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(number, Real) and not isinstance(number, bool):
-        length = _as_float(number)
+        try:
+            length = float(number)
+        except OverflowError:  # a whole number beyond the largest float
+            length = math.inf
         if math.isfinite(length) and (length > 0.0 or (zero and length == 0.0)):
             return length
     wanted = "0 or a positive length" if zero else "a positive length"
     raise UsageError(f"{name}: expected {wanted}{unit}, got {_shown(value)}")
-
-
-def _as_float(number: Real) -> float:
-    try:
-        return float(number)
-    except OverflowError:  # a whole number beyond the largest float
-        return math.inf
 
 
 def _shown(value: Any) -> str:

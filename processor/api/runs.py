@@ -178,21 +178,18 @@ def compute(
     with tile_cluster.on_cluster(cluster, log), large_arrays.in_files(folder), one_blas_thread():
         with stage(f"reading {path.name}"):
             scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
-        _log_reading(path, scene, log, () if wanted else jobs)
+        # How the input was read; ``chosen`` are the jobs if the program chose them
+        chosen = () if wanted else jobs
+        log(f"{path.name}: read as {scene.units} ({messages('en').text(scene.units_reason)})")
+        if scene.clips is not None:
+            log(f"{path.name}: {headline.clipped(scene.clips)}")
+        if len(scene.scans) == 2 and [job.step for job in chosen] == ["stitch"]:
+            log("two scans without a design are stitched; to measure between them: processor compare A B -o OUT")
         keep = None if so_far is None else partial(_keep, Path(so_far), jobs)
         execution = pipeline.execute(path, scene, jobs, log, piecewise, keep)
     results = Results(execution, evaluate.evaluate(path, execution))
     fingerprint.check_unchanged(path.resolve(), before, place)
     return results
-
-
-def _log_reading(path: Path, scene: Scene, log: Callable[[str], None], chosen: Sequence[pipeline.Job]) -> None:
-    """Say how an input was read; ``chosen`` are the jobs if the program chose them."""
-    log(f"{path.name}: read as {scene.units} ({messages('en').text(scene.units_reason)})")
-    if scene.clips is not None:
-        log(f"{path.name}: {headline.clipped(scene.clips)}")
-    if len(scene.scans) == 2 and [job.step for job in chosen] == ["stitch"]:
-        log("two scans without a design are stitched; to measure between them: processor compare A B -o OUT")
 
 
 def _keep(folder: Path, jobs: Sequence[pipeline.Job], execution: Execution) -> None:

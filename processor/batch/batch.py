@@ -165,6 +165,8 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
     for each in inputs.inputs:
         key = keys[each.name]
         units = ("--units", settings.units) if settings.units and not each.is_scene else ()
+        # Of the machine's share each job at once has its part
+        total_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
         jobs.append(
             Job(
                 name=each.name,
@@ -181,7 +183,7 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
                 identity_parameters={**settings.identity_parameters, "units": settings.units if units else None},
                 software=batch_job.software(),
                 timeout_s=settings.timeout_s,
-                memory_mb=settings.memory_mb or _memory_mb(settings.at_once),
+                memory_mb=settings.memory_mb or max(LEAST_MEMORY_MB, int(MEMORY_SHARE * total_mb / settings.at_once)),
                 threads=threads,
                 retry=settings.retry,
                 program=settings.program,
@@ -193,12 +195,6 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
 def _log(out: Path, each: Input, key: str) -> Path:
     path = out / LOGS / f"{each.path.name if each.name == '.' else each.name}.log"
     return path if len(os.fsencode(path.name)) <= LONGEST_NAME else path.with_name(f"{key}.log")
-
-
-def _memory_mb(at_once: int) -> int:
-    """Return the memory for a job: its part of the machine's share."""
-    total_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
-    return max(LEAST_MEMORY_MB, int(MEMORY_SHARE * total_mb / at_once))
 
 
 @contextmanager

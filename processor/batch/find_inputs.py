@@ -62,7 +62,12 @@ def _search(folder: Path, name: str, out: Path, left_out: dict[str, Reason]) -> 
         left_out[name or "."] = reason("batch.holds-results")
         return []
     if names.intersection(MARKS):
-        _leave_out_inner(folder, name, left_out)
+        # Projects within a scan folder are parts of it
+        for place, folders, files in os.walk(folder):
+            folders[:] = sorted(each for each in folders if not each.startswith("."))
+            if PROJECT in files and Path(place) != folder:
+                within = Path(name, Path(place).relative_to(folder))
+                left_out[str(within)] = reason("batch.in-scan-folder", folder=name or ".")
         return [Input(name or ".", folder)]
     below: list[Input] = []
     scans: list[Input] = []
@@ -116,12 +121,3 @@ def _holds_scans(folder: Path) -> bool:
         return any(readers.is_closed(path) or _is_scan(path) for path in folder.iterdir())
     except OSError:
         return False
-
-
-def _leave_out_inner(folder: Path, name: str, left_out: dict[str, Reason]) -> None:
-    """List projects within a scan folder, which are parts of it, as left out."""
-    for place, folders, files in os.walk(folder):
-        folders[:] = sorted(each for each in folders if not each.startswith("."))
-        if PROJECT in files and Path(place) != folder:
-            inner = Path(name, Path(place).relative_to(folder))
-            left_out[str(inner)] = reason("batch.in-scan-folder", folder=name or ".")

@@ -39,11 +39,21 @@ COLUMNS: Mapping[str, Column] = {
 def summary_values(results: Mapping[str, Any]) -> SummaryValues:
     """Return the values of a results.json by the names of COLUMNS; absent are those of steps not run and of nulls."""
     steps: Mapping[str, Mapping[str, Any]] = results["steps"]
-    values: SummaryValues = {"steps": ", ".join(_with_status(*each) for each in step_status(results).items())}
+    ended = step_status(results).items()
+    values: SummaryValues = {
+        "steps": ", ".join(name if status == Status.OK else f"{name} ({status})" for name, status in ended)
+    }
     if "preassemble" in steps:
-        _add_preassembly(steps["preassemble"], values)
+        step = steps["preassemble"]
+        verdicts = Counter(str(joint.get("verdict")) for joint in step.get("joints", []) if joint.get("verdict"))
+        values.update({f"joints_{name}": verdicts[name] for name in WORST_FIRST} if verdicts else {})
+        for error in ("splicing", "linear"):
+            for statistic in ("mean", "max"):
+                values[f"{error}_{statistic}_mm"] = step.get(f"{error}_error", {}).get(statistic)
     if "spheres" in steps:
-        _add_spheres(steps["spheres"], values)
+        flags = [ball.get("flag") for ball in steps["spheres"].get("balls", [])]
+        present = len(flags) - flags.count("not-found")
+        values |= {"balls_found": present, "balls_flagged": len(flags) - flags.count("ok")}
     if "stitch" in steps:
         states = [scan.get("status") for scan in steps["stitch"].get("scans", [])]
         values |= {"scans_stitched": states.count("ok"), "scans_not_stitched": len(states) - states.count("ok")}
@@ -63,21 +73,3 @@ def summary_values(results: Mapping[str, Any]) -> SummaryValues:
 def step_status(results: Mapping[str, Any]) -> dict[str, str]:
     """Return the status of each step of a results.json."""
     return {name: step.get("status", Status.OK.value) for name, step in results["steps"].items()}
-
-
-def _with_status(name: str, status: str) -> str:
-    return name if status == Status.OK else f"{name} ({status})"
-
-
-def _add_preassembly(step: Mapping[str, Any], values: SummaryValues) -> None:
-    verdicts = Counter(str(joint.get("verdict")) for joint in step.get("joints", []) if joint.get("verdict"))
-    values.update({f"joints_{name}": verdicts[name] for name in WORST_FIRST} if verdicts else {})
-    for error in ("splicing", "linear"):
-        for statistic in ("mean", "max"):
-            values[f"{error}_{statistic}_mm"] = step.get(f"{error}_error", {}).get(statistic)
-
-
-def _add_spheres(step: Mapping[str, Any], values: SummaryValues) -> None:
-    flags = [ball.get("flag") for ball in step.get("balls", [])]
-    present = len(flags) - flags.count("not-found")
-    values |= {"balls_found": present, "balls_flagged": len(flags) - flags.count("ok")}

@@ -34,7 +34,9 @@ def cause_of(error: BaseException | None) -> Cause | None:
     """
     of_input = False
     while error is not None:
-        of_input = of_input or _is_of_input(error)
+        # Where the module of InputError is not loaded there is none, and none is loaded here
+        model = sys.modules.get("processor.model")
+        of_input = of_input or (model is not None and isinstance(error, model.InputError))
         lacks = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
         if lacks and not of_input:
             return Cause.MEMORY
@@ -44,20 +46,9 @@ def cause_of(error: BaseException | None) -> Cause | None:
     return None
 
 
-def _is_of_input(error: BaseException) -> bool:
-    """Whether an exception is an InputError; where its module is not loaded there is none, and none is loaded here."""
-    model = sys.modules.get("processor.model")
-    return model is not None and isinstance(error, model.InputError)
-
-
 def one_line(error: BaseException) -> str:
     """Return type and message of an exception on one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
-
-
-def of_exit_code(code: int) -> Cause:
-    """Return the cause of an exit code."""
-    return next((cause for cause, known in EXIT_CODES.items() if known == code), Cause.EXIT)
 
 
 @contextmanager

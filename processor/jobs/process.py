@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from processor.jobs.causes import Cause, of_exit_code
+from processor.jobs.causes import EXIT_CODES, Cause
 from processor.jobs.child import Loss, Lost
 from processor.library_settings import ROOT
 
@@ -77,15 +77,12 @@ def isolated(code: str, *arguments: str) -> list[str]:
     The current folder, and that of the script that this process runs, are no part of the path.
     """
     options = ["-I", *(["-B"] if sys.dont_write_bytecode else []), *(["-X", "utf8"] if sys.flags.utf8_mode else [])]
-    set_path = f"import sys; sys.path[:] = dict.fromkeys([*{_search_path()!r}, *sys.path]); "
-    return [sys.executable, *options, "-c", set_path + code, *arguments]
-
-
-def _search_path() -> list[str]:
     script = getattr(sys.modules.get("__main__"), "__file__", None)
     left_out = {_identity("."), _identity(os.path.dirname(os.path.abspath(script)) if script else ".")}
     left_out.discard(_identity(PROJECT))  # a checkout that is not installed
-    return [folder for folder in sys.path if os.path.isabs(folder) and _identity(folder) not in left_out]
+    folders = [folder for folder in sys.path if os.path.isabs(folder) and _identity(folder) not in left_out]
+    set_path = f"import sys; sys.path[:] = dict.fromkeys([*{folders!r}, *sys.path]); "
+    return [sys.executable, *options, "-c", set_path + code, *arguments]
 
 
 def _identity(folder: str | Path) -> tuple[int, int] | str:
@@ -180,7 +177,12 @@ def run(
             raise stderr.error
     code: int = process.returncode
     if cause is Cause.EXIT:
-        cause, code = (Cause.SIGNAL, -code) if code < 0 else (of_exit_code(code), code)
+        # The cause of an exit code
+        cause, code = (
+            (Cause.SIGNAL, -code)
+            if code < 0
+            else (next((cause for cause, known in EXIT_CODES.items() if known == code), Cause.EXIT), code)
+        )
     return Ended(
         cause=cause,
         code=code,

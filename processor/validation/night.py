@@ -111,7 +111,10 @@ def run(
                 ready += 1
                 progress(ready, len(cells), cell, outcome)
         report = _report(matrix, out, night, cells, present, history, lang)
-    _forget_old(out)
+    # Only the last nights keep their cells
+    nights = sorted(folder for folder in (out / CELLS).glob("*") if folder.is_dir())
+    for folder in nights[:-KEPT_NIGHTS]:
+        shutil.rmtree(folder, ignore_errors=True)
     return report
 
 
@@ -177,12 +180,6 @@ def _earlier(out: Path, night: str, cell: Cell, code: str) -> Outcome | None:
         return Outcome("", results, float(content["seconds"]), float(content["peak_mb"]))
     except (OSError, ValueError, LookupError, TypeError):
         return None
-
-
-def _forget_old(out: Path) -> None:
-    nights = sorted(folder for folder in (out / CELLS).glob("*") if folder.is_dir())
-    for folder in nights[:-KEPT_NIGHTS]:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _write(path: Path, data: bytes) -> None:
