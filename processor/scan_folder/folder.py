@@ -376,7 +376,8 @@ def _scene(
     of_project = project.units or option or "m"
     of_guess: tuple[Reason, ...] = ()
     if project.guessed is not None:
-        of_guess = (reason("units.design-guessed-unsure" if project.guessed.doubts else "units.design-guessed"),)
+        unsure = bool(project.guessed.doubts)
+        of_guess = (reason("units.design-guessed-unsure") if unsure else reason("units.design-guessed"),)
     return Scene(
         project.name,
         kind,

@@ -83,7 +83,7 @@ class Copy:
         self.place = place
         self.known = known
         shutil.rmtree(place, ignore_errors=True)  # of an earlier run: its sources may be others
-        skipped = shutil.ignore_patterns(".git", ".venv*", "out", ".mypy_cache", ".ruff_cache", ".pytest_cache")
+        skipped = shutil.ignore_patterns(".git", ".venv*", "out", ".mypy_cache", ".ruff_cache")  # made scenes go along
         shutil.copytree(ROOT, place, ignore=skipped)
 
     def verdict(self, mutant: Mutant, killer: str) -> tuple[str, str]:
