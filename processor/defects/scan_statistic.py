@@ -122,7 +122,7 @@ def widened(field: Field, levels: Levels) -> Field:
     return dataclasses.replace(field, variance=field.variance * (student / threshold) ** 2)
 
 
-def mean_sd(weight: Any, inflation: float, common: float, field: Field, levels: Levels) -> Any:
+def mean_sd(weight: Any, inflation: Any, common: Any, field: Field, levels: Levels) -> Any:
     """Return the standard deviation of means of cells, mm: noise, differences of unnamed views, systematic errors.
 
     ``weight`` are sums of the inverse variances of cells. What means scatter more than by these is noise that is

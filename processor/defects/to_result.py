@@ -27,7 +27,7 @@ from processor.defects.places.profiles import Profile
 from processor.defects.places.waves import Lobe
 from processor.defects.regions import Region
 from processor.defects.result import DOUBTFUL, Curve, DefectClass, Defects, Result, Windows
-from processor.defects.scan_statistic import Levels
+from processor.defects.scan_statistic import Levels, mean_sd
 from processor.defects.shape_models import RIGID, Frame
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Status, reason
@@ -99,19 +99,18 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
         lod95=NORMAL_95 * finite_median(np.hypot(formal, registration)),
         examined_mm2=examined,
         expected_mm2=float(surface.share[search.expected > 0.0].sum()) * cell**2,
-        least_depth=_least_depth(search.levels, cell, noise, finite_median(field.count[seen]), field.views),
+        least_depth=_least_depth(search.levels, cell, noise, finite_median(field.count[seen]), field),
         defects=table([defect.values for defect in defects], origin, doubt),
         pictures=defect_grids.of_defects(drawn, surface),
         surface=defect_grids.of_surface([defect.cells for defect in defects], field, surface, origin),
     )
 
 
-def _least_depth(levels: Levels, cell: float, noise: float, points: float, views: float) -> Windows:
+def _least_depth(levels: Levels, cell: float, noise: float, points: float, field: Field) -> Windows:
     """Return the least mean depth that is found, by size of window, for cells of median noise and points."""
     sides = np.array(levels.sides)
-    sd = levels.inflation * noise / np.sqrt(points) / sides
-    depth = levels.threshold * np.sqrt(sd**2 + levels.systematic_mm**2 + views**2)
-    return Windows(side=sides * cell, depth=depth, noise_inflation=levels.inflation)
+    sd = mean_sd(points * (sides / noise) ** 2, levels.inflation, levels.common, field, levels)
+    return Windows(side=sides * cell, depth=levels.threshold * sd, noise_inflation=levels.inflation)
 
 
 def table(rows: Sequence[dict[str, Any]], origin: Floats, doubt: Reason | None = None) -> Defects:

@@ -18,6 +18,7 @@ from processor.defects import (
     scan_statistic,
     shape_models,
     surface_charts,
+    to_result,
 )
 from processor.defects.component_shapes import ComponentShape
 from processor.defects.observations import Pairs, Stations
@@ -308,3 +309,14 @@ def test_bias_that_more_points_do_not_reduce_is_no_deviation_of_well_seen_window
     well, badly = scan_statistic.mean_sd(1.0 / sd[:2] ** 2, inflation, common, SimpleNamespace(views=0.0), levels)
     assert well > 0.2  # the factor alone makes 0.05
     assert badly > 0.3
+
+
+def test_the_least_depth_is_the_threshold_of_a_window_of_usual_cells():
+    """By hand: 25 points of 0.5 mm a cell are 0.1 mm, of 2 by 2 cells 0.05 mm."""
+    levels = SimpleNamespace(
+        sides=(1, 2), inflation=np.array([1.0, 2.0]), common=np.array([0.0, 0.4]), threshold=np.array([5.0, 4.0]),
+        systematic_mm=0.03,
+    )  # fmt: skip
+    found = to_result._least_depth(levels, 20.0, 0.5, 25.0, SimpleNamespace(views=0.04))
+    assert found.side.tolist() == [20.0, 40.0]
+    assert found.depth == pytest.approx([5.0 * np.hypot(0.1, 0.05), 4.0 * np.sqrt(0.05**2 + 0.4**2 + 0.05**2)])
