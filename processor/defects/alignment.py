@@ -19,7 +19,7 @@ from processor.adjustment import scanner_class_errors
 from processor.defects.observations import Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
-from processor.model import Floats, Ints
+from processor.model import Columns, Floats, Ints
 from processor.robust_statistics import robust_sd
 
 BLOCK_MM = 80.0
@@ -80,7 +80,7 @@ class Alignment:
 
 
 @dataclass(frozen=True)
-class StationBlocks:
+class StationBlocks(Columns):
     """Observations of stations summed up by blocks of cells; ``variance`` is of the mean.
 
     ``cell`` is the cell nearest to the middle of the points of all stations: a place on the face, as the mean of places
@@ -130,9 +130,7 @@ def align(
     # Of what moved by much, stations do not see the same place in one cell: they are compared on the rest.
     enough = len(np.unique(component[used])) >= FEWEST_COMPONENTS
     compared = used if enough else np.ones_like(used)
-    movements, station_covariance = station_movements(
-        StationBlocks(*(column[compared] for column in vars(blocks).values())), J[compared], len(stations.names)
-    )
+    movements, station_covariance = station_movements(blocks.take(compared), J[compared], len(stations.names))
     start = replace(start, movements=movements, station_covariance=station_covariance)
     if not enough:
         # The gain (6, n) of a whole that all deviations would be fitted by
