@@ -119,13 +119,15 @@ def _of_names(bodies: DesignBodies | None) -> Iterator[Reason]:
 
 
 def _of_views(search: to_result.Search) -> Iterator[Reason]:
-    """Yield what is taken of the errors of views that are not named."""
+    """Yield what is taken of the errors of views that are not named, and of those that all views share."""
     if search.points.observed.stations.unnamed and search.alignment.fitted:
         yield reason(
             "defects.views-by-class", shift=scanner_class_errors.SHIFT_SD_MM, offset=scanner_class_errors.OFFSET_SD_MM
         )
     if search.field.views > 0.0:
         yield reason("defects.views-differ", sd=search.field.views)
+    if search.field.bias:
+        yield reason("defects.common-bias", bias=search.field.bias)
 
 
 def _registered(
@@ -226,13 +228,7 @@ def _sample(scene: Scene, T_design_project: Floats) -> Floats:
     """Return points (n, 3) of all scans in the design's frame, at most about SD_SAMPLES of them."""
     step = max(1, sum(len(scan.points) for scan in scene.scans) // SD_SAMPLES)
     return np.concatenate(
-        [
-            rigid.apply(
-                T_design_project @ scan.pose,
-                every(scan.points, step) + scan.origin,
-            )
-            for scan in scene.scans
-        ]
+        [rigid.apply(T_design_project @ scan.pose, every(scan.points, step) + scan.origin) for scan in scene.scans]
     )
 
 
@@ -261,7 +257,8 @@ def _shapes_of(registered: Registered, aligned: Alignment, params: Params) -> tu
     inner = deviation_field.inner_cells(surface, params.edge_mm)
     field = deviation_field.of_pairs(registered.pairs, surface, registered.observed.stations, aligned, inner)
     if aligned.fitted:
-        field = field.minus(np.full(len(inner), deviation_field.common_bias(field, surface)))
+        bias = deviation_field.common_bias(field, surface)
+        field = dataclasses.replace(field, deviation=field.deviation - bias, bias=bias)
     return field, component_shapes.fit_all(field, surface)
 
 

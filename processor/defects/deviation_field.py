@@ -35,7 +35,8 @@ class Field:
     well. ``stations`` is the variance by errors of the stations' movements, which neighbouring cells have in common; 0
     in cells without points. ``stations_free`` is that of deviations from the best fit of the whole. ``views`` is the
     standard deviation of what the points of one view have in common, where views are not named, mm. ``dof`` (cells,)
-    is of the variance; without it the variance is known.
+    is of the variance; without it the variance is known. ``bias`` is what all components lay outward by in common, mm;
+    it has been taken off the deviations.
     """
 
     deviation: Floats
@@ -49,6 +50,7 @@ class Field:
     stations_free: Floats
     views: float = 0.0
     dof: Floats = dataclasses.field(default_factory=lambda: np.empty(0))
+    bias: float = 0.0
 
     def stations_sd(self, cells: Ints, free: bool = False) -> float:
         """Return the standard deviation that cells have in common by errors of stations' movements or of views, mm.

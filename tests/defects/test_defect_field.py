@@ -20,8 +20,11 @@ from processor.defects import (
     surface_charts,
     to_result,
 )
+from processor.defects import step as defects_step
 from processor.defects.component_shapes import ComponentShape
 from processor.defects.observations import Pairs, Stations
+from processor.model import Scan, Scene, StructureDesign
+from tests.support.scenes.at_design import AT_DESIGN
 
 EDGE, SIGMA, POINTS = 8.0, 0.5, 12
 SCANNER = np.array([[1000.0, -9000.0, 4000.0]])
@@ -291,6 +294,19 @@ def test_what_all_bodies_are_off_by_is_a_bias(off, of_one, common):
     field = field_of(surface, pairs_of(surface, 8, np.where(body == 0, of_one, off) + noise))
     # Medians of thousands of cells: SIGMA / sqrt(12 * 1000) = 0.005 each, of which the median of six is taken.
     assert deviation_field.common_bias(field, surface) == pytest.approx(common, abs=0.01)
+
+
+@pytest.mark.parametrize("off", [0.3, 0.0])
+def test_a_bias_of_all_bodies_is_stated_with_its_size_and_is_no_defect(off):
+    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=np.array(bounds, float)) for bounds in BOXES])
+    points, face = trimesh.sample.sample_surface(mesh, 60_000, seed=4)
+    away = off + np.random.default_rng(5).normal(0.0, SIGMA, len(points))
+    scan = Scan("merged", points + away[:, None] * mesh.face_normals[face], T_project_scan=np.eye(4))
+    design = StructureDesign("boxes", np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    result = defects_step.run(Scene("boxes", "structure", (scan,), structure=design), defects_step.Params(), AT_DESIGN)
+    stated = [reason.values["bias"] for reason in result.reasons if reason.code == "defects.common-bias"]
+    assert stated == pytest.approx([off] if off else [], abs=0.02)  # 60,000 points: SIGMA / sqrt(10,000) of a body
+    assert not len(result.defects.centre)
 
 
 def test_faces_that_all_face_one_way_show_no_bias():
