@@ -1,14 +1,18 @@
 """Defects of scanned models: bodies that touch, overlap a little or lie a little apart, as designed and as built."""
 
+from types import SimpleNamespace
+
 import cadquery as cq
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 from scipy.stats import poisson
 
-from processor.defects import component_shapes, detect, shape_models, step, surface_charts
+from processor.defects import alignment, component_shapes, detect, shape_models, step, surface_charts
 from processor.defects.component_shapes import ComponentShape, SignificantShape
 from processor.defects.movement import moved_bodies
+from processor.geometry import rigid
 from processor.model import DesignBodies
 from processor.scan_folder import cad
 from tests.support.made import made
@@ -60,6 +64,30 @@ def test_a_body_is_moved_as_its_shape_states():
     assert design.vertices[:8] == pytest.approx(turned + frame.origin + [1.0, -2.0, 3.0], abs=1e-9)  # float64
     np.testing.assert_array_equal(design.vertices[8:], both[8:])
     assert design.bodies.names == ("box", "other")
+
+
+def test_a_movement_sweeps_the_volume_of_faces_that_were_seen():
+    """Down by 3 mm: the bottom comes out and the top goes in, by as much; only one of them was seen."""
+    vertices, faces = box_mesh()
+    surface = surface_charts.of_mesh(vertices, faces, 20.0)
+    frame = shape_models.Frame(np.array([100.0, 50.0, 25.0]), np.eye(3), np.array([100.0, 50.0, 25.0]), 50.0)
+    shape = shape_models.Shape(shape_models.RIGID, (), np.array([0.0, 0.0, -3.0, 0.0, 0.0, 0.0]))
+    for up in (1.0, -1.0):
+        seen = SimpleNamespace(seen=(up * surface.outward[:, 2] > 0.5).astype(float))
+        cells = component_shapes.swept_cells(surface, seen, ComponentShape(0, frame, None, None), shape)
+        np.testing.assert_allclose(surface.outward[cells], np.tile([0.0, 0.0, up], (len(cells), 1)), atol=1e-12)
+        assert surface.share[cells].sum() * 20.0**2 == pytest.approx(200.0 * 100.0, rel=0.3)  # whole cells of 20 mm
+
+
+def test_the_corrected_pose_takes_back_the_movement_of_the_whole():
+    """A structure that was moved by a turn about a centre and a shift, written out with SciPy's rotation."""
+    pose = rigid.transform(Rotation.from_rotvec([0.2, -0.1, 1.0]).as_matrix(), np.array([10.0, 20.0, 30.0]))
+    moved = SimpleNamespace(whole=np.array([0.1, -0.2, 0.3, 4.0, -5.0, 6.0]), centre=np.array([700.0, -300.0, 90.0]))
+    points = np.random.default_rng(6).uniform(-900.0, 900.0, (5, 3))
+    where = rigid.apply(pose, points)
+    turned = Rotation.from_rotvec(moved.whole[:3]).apply(where - moved.centre) + moved.centre + moved.whole[3:]
+    back = alignment.corrected_pose(rigid.transform(np.eye(3), np.zeros(3)), moved)
+    np.testing.assert_allclose(rigid.apply(back, turned), where, atol=1e-9)
 
 
 def test_cells_within_30_mm_of_a_steps_edge_mix_both_sides():

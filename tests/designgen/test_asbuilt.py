@@ -140,6 +140,15 @@ def test_dents_waves_and_missing_pieces_are_at_the_places_of_the_truth():
         for f, g in zip(arch_part.faces(waves, 500.0), arch_part.faces(RIB, 500.0), strict=True)
     }
     assert np.linalg.norm(off["outer-left"], axis=1).max() == pytest.approx(1.5, abs=0.02)  # 20,000 places drawn
+    left, designed = (
+        next(f for f in arch_part.faces(part, 500.0) if f.name == "outer-left").at(
+            np.array([0.5, 0.0, 1.0, 0.5, 0.5]), np.array([0.5, 0.5, 0.5, 0.0, 1.0])
+        )
+        for part in (waves, RIB)
+    )
+    s = 0.5 * (RIB.s0 + RIB.s1)
+    height = 1.5 * np.sin(2.0 * np.pi * s / 1500.0)  # midway between edges and ends the wave has all of its height
+    np.testing.assert_allclose((left - designed)[:, 1], [height, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(off["ring-end"], 0.0, atol=ROUNDING_MM)
     np.testing.assert_allclose(waves.key_points(RIB.s1), RIB.key_points(RIB.s1), atol=ROUNDING_MM)
 

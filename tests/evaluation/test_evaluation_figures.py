@@ -9,7 +9,7 @@ from processor.defects.result import Result as DefectsResult
 from processor.deviation.result import Result as DeviationResult
 from processor.evaluation import defects, deviation, error_statistics, inspection, space_frame, stitching
 from processor.geometry import rigid
-from processor.inspection.result import AxisDepartures, InspectedComponent
+from processor.inspection.result import AxisDepartures, InspectedComponent, Quantity
 from processor.model import (
     BodyTruth,
     DefectTruth,
@@ -261,6 +261,32 @@ def test_the_true_width_and_sweep_of_a_part_are_of_both_edges():
     true = inspection._of_part(design, component, truth)
     assert true["middle-width-bottom"] == pytest.approx(1.5, abs=ROUNDING_MM)
     assert true["sweep"] == pytest.approx(0.0, abs=ROUNDING_MM)
+
+
+def test_errors_of_characteristics_have_the_rms_of_their_kind():
+    """Errors of 0.3 and -0.4 mm of two lengths: sqrt((0.09 + 0.16) / 2); a bow has no sign."""
+    design = arch_clouds.design()
+    part = design.parts[1]
+    edges = np.stack([part.bottom_edge_left, part.bottom_edge_right])
+    ends = np.array(inspection.design_ends(design, 1))
+    arch = SimpleNamespace(names=(part.name,), key_points_bridge=ends[None], edges_bridge=edges[None])
+    at = np.linspace(500.0, 4500.0, 5)
+    straight = InspectedComponent(name=part.name, axis=AxisDepartures(at, *np.zeros((4, 5))))
+    ids = sorted(inspection._of_part(design, straight, arch))[:2]
+    measured = SimpleNamespace(
+        id=[*ids, "unknown"],
+        quantity=[Quantity.LENGTH, Quantity.LENGTH, Quantity.LENGTH],
+        deviation=np.array([0.3, -0.4, 9.0]),
+        ci95=np.array([0.35, 0.35, 1.0]),
+    )
+    component = SimpleNamespace(name=part.name, axis=straight.axis, characteristics=measured)
+    scene = SimpleNamespace(arch=design)
+    truth = SimpleNamespace(arch=arch, frame=None, structure=None)
+    found = {
+        one.statistic: one.value for one in inspection.check(scene, SimpleNamespace(components=[component]), truth)
+    }
+    assert found[Statistic.RMS] == pytest.approx(np.sqrt(0.125), abs=ROUNDING_MM)
+    assert found[Statistic.COVERAGE] == 50.0
 
 
 # --- balls ------------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from processor import large_arrays
 from processor.geometry import nearest_neighbours, point_grid, rigid, thinning
@@ -32,6 +33,13 @@ def test_invert_and_angle():
     tiny = rigid.rotation_from_vector(np.array([1e-9, 0.0, 0.0]))
     assert rigid.rotation_angle(tiny) == pytest.approx(1e-9, rel=1e-6)  # an arc cosine of it would be 0
     assert rigid.rotation_angle(np.diag([-1.0, -1.0, 1.0])) == pytest.approx(np.pi)
+
+
+@pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (1e-9, -2e-9, 3e-9), (0.3, -0.4, 0.5), (-1.7, 0.2, 2.0)])
+def test_a_rotation_has_the_vector_that_it_was_made_of(vector):
+    R = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(rigid.vector_from_rotation(R), vector, rtol=1e-7, atol=1e-16)  # float64 of a sine
+    np.testing.assert_allclose(rigid.rotation_from_vector(np.array(vector)), R, atol=1e-15)
 
 
 @pytest.mark.parametrize("size", [6, 7])

@@ -11,6 +11,7 @@ from processor.deviation import step as deviation_step
 from processor.inspection import design_cloud, edge_counts, flat_faces, narrow_faces, structure_bodies
 from processor.inspection import step as inspection_step
 from processor.model import DesignBodies, Reason, Scan, Scene, StructureDesign
+from processor.robust_statistics import MAD_TO_SD
 from tests.support.made import made
 from tests.support.scenes.portal_scenes import SIZES, plate_scene
 
@@ -45,6 +46,19 @@ def around(structure, points, shared=0.0):
     body = next(iter(flat_faces.bodies(structure, seen._replace(facet=np.zeros(1, np.int64)), 60.0)))
     of_direction = {tuple(np.rint(face.normal).astype(int).tolist()): face for face in body.faces}
     return narrow_faces.surroundings(structure, cloud, seen), of_direction
+
+
+def test_offsets_of_views_are_shrunk_by_what_views_share():
+    """Two views 0.5 mm off to either side of a face, 20 points each: a ridge of (sd / shared)^2, solved by hand."""
+    count, off, shared = 20, 0.5, 0.2
+    at = np.repeat(np.linspace(-100.0, 100.0, count), 2)
+    view = np.tile([0, 1], count)
+    seen = narrow_faces.OnFace(np.zeros((2 * count, 3)), np.where(view == 0, off, -off), view)
+    left, by_view, _ = narrow_faces._levelled(seen, at, shared)
+    ridge = (MAD_TO_SD * off / shared) ** 2
+    of_view = np.where(view == 0, 1.0, -1.0) * off * count / (count + ridge)
+    np.testing.assert_allclose(by_view, of_view, rtol=1e-9)  # float64
+    np.testing.assert_allclose(left, seen.off - of_view, atol=1e-9)
 
 
 def still(places):

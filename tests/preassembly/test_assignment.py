@@ -4,13 +4,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from processor.geometry import rigid
 from processor.language.messages import messages
-from processor.model import Scene, reason
+from processor.model import DesignPart, Scene, reason
 from processor.preassembly import assemble
 from processor.preassembly import step as preassembly_step
-from processor.preassembly.parts import assignment
+from processor.preassembly.parts import assignment, attitude
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.attitude import Shapes
 from processor.preassembly.result import Result
@@ -133,3 +134,12 @@ def test_a_bridge_of_wrong_scans_is_not_assembled(order):
         # No joint to a wrong scan is measured: what is right is placed by the design alone.
         assert result.components.status[k] == ("weak" if right else "failed")
     assert [one.code for one in result.adjustment.advice] == ["preassemble.assign-scans"]
+
+
+@pytest.mark.parametrize(("edge_mm", "count"), [(3_000.0, 60_000), (30.0, attitude.FEWEST_SAMPLES)])
+def test_a_part_has_one_sample_on_each_square_of_the_spacing(edge_mm, count):
+    """A cube of 3 m has 54 m2: 60,000 squares of 30 mm. A small one has the fewest that a registration needs."""
+    box = trimesh.creation.box(3 * [edge_mm])
+    none = np.empty((0, 3))
+    part = DesignPart("cube", np.array(box.vertices), np.array(box.faces, np.int64), none, none)
+    assert len(attitude.samples_of(part).points) == count
