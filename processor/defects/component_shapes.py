@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtrc, ndtr, ndtri
 
+from processor.adjustment import scanner_class_errors
 from processor.defects import shape_models
 from processor.defects.alignment import Alignment, chart_of_cells
 from processor.defects.deviation_field import Field, component_of_cells
@@ -193,7 +194,14 @@ def _errors(
         rigid_part = shape_models.rigid_motion(dataclasses.replace(fit.blocks, mean=there), fit.frame)
         own = value - rigid_part.values(fit.frame, points, outward)
         registration = np.full_like(value, field.stations_sd(rows, free=True))
-    shared = np.sqrt(levels.common[-1] ** 2 + levels.systematic_mm**2 + registration**2)
+    # A surface that lies off as a whole, or from some place on, may be of another paint. Seen from all sides, a body
+    # does not move by it.
+    bias = np.full_like(value, scanner_class_errors.SURFACE_SD_MM if shape.kind == "step" else 0.0)
+    if shape.kind == shape_models.RIGID:
+        biased = dataclasses.replace(fit.blocks, mean=np.full(len(fit.blocks.mean), scanner_class_errors.SURFACE_SD_MM))
+        bias = shape_models.rigid_motion(biased, fit.frame).values(fit.frame, points, outward)
+    of_scanner = np.sqrt(levels.common[-1] ** 2 + levels.systematic_mm**2 + field.drift**2)
+    shared = np.sqrt(of_scanner**2 + bias**2 + registration**2)
     return value, own, shape.sd(fit.frame, points, outward), shared
 
 

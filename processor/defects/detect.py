@@ -126,6 +126,8 @@ def _of_views(search: to_result.Search) -> Iterator[Reason]:
         )
     if search.field.views > 0.0:
         yield reason("defects.views-differ", sd=search.field.views)
+    if search.field.drift > 0.0:
+        yield reason("defects.sides-differ", sd=search.field.drift)
     if search.field.bias:
         yield reason("defects.common-bias", bias=search.field.bias)
 
@@ -187,7 +189,11 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     searched = scan_statistic.widened(residuals, levels)
     finding = scan_statistic.search(searched, surface, levels)
     expected = expected_points.expected(scene, registered.T_design_project, pairs, surface, observed.stations)
-    missing = regions.missing(field, expected, surface, alarms_per_mm2)
+    missing = regions.missing(field, expected.points, surface, alarms_per_mm2)
+    if missing:
+        places, T = [region.cells for region in missing], registered.T_design_project
+        expected = expected_points.without_shade(expected, places, scene, T, surface, observed.stations)
+        missing = regions.missing(field, expected.points, surface, alarms_per_mm2)
     missing += _inferred(scene, registered, field, missing, alarms_per_mm2)
     deviating = regions.of_finding(finding, surface)
     near_mm = max(UNITE_CELLS * surface.charts.cell_mm, UNITE_MM)
@@ -201,7 +207,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
         shapes=shapes,
         significant=significant,
         places=[group for group in united if regions.is_significant(group[0], searched, levels)],
-        expected=expected,
+        expected=expected.points,
         shape_values=shape_values,
         points=measures.points_by_cell(observed, surface, aligned),
     )

@@ -35,7 +35,9 @@ class Field:
     well. ``stations`` is the variance by errors of the stations' movements, which neighbouring cells have in common; 0
     in cells without points. ``stations_free`` is that of deviations from the best fit of the whole. ``views`` is the
     standard deviation of what the points of one view have in common, where views are not named, mm. ``dof`` (cells,)
-    is of the variance; without it the variance is known. ``bias`` is what all components lay outward by in common, mm;
+    is of the variance; without it the variance is known. ``drift`` is what the points of a view have in common after
+    the alignment, as by a slow drift of its ranges, where views are named, mm: it bends and turns whole faces, while
+    the search compares places on them. ``bias`` is what all components lay outward by in common, mm;
     it has been taken off the deviations.
     """
 
@@ -50,6 +52,7 @@ class Field:
     stations_free: Floats
     views: float = 0.0
     dof: Floats = dataclasses.field(default_factory=lambda: np.empty(0))
+    drift: float = 0.0
     bias: float = 0.0
 
     def stations_sd(self, cells: Ints, free: bool = False) -> float:
@@ -93,12 +96,10 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
         images = charts.image(seen, chart), charts.image(inner, chart)
         about, possible = (_pooled(image, charts, chart, ABOUT_CELLS) for image in images)
         seen[rows] *= (about > SEEN_SHARE * possible - 1e-9).ravel()
-    views = 0.0
-    if stations.unnamed:
-        used, side = np.flatnonzero(seen * count), PIECE_CELLS * charts.cell_mm
-        views = view_error_from_opposite_sides.view_sd(
-            surface.centres[used], surface.outward[used], mean[used], variance[used], side
-        )
+    used, side = np.flatnonzero(seen * count), PIECE_CELLS * charts.cell_mm
+    of_views = view_error_from_opposite_sides.view_sd(
+        surface.centres[used], surface.outward[used], mean[used], variance[used], side
+    )
     of_stations = station_variance(pairs, surface, stations, alignment)
     return Field(
         deviation=mean,
@@ -110,7 +111,8 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
         seen=seen,
         stations=of_stations,
         stations_free=of_stations if alignment.fitted else station_variance(pairs, surface, stations, alignment, True),
-        views=views,
+        views=of_views if stations.unnamed else 0.0,
+        drift=0.0 if stations.unnamed else of_views,
         dof=dof,
     )
 

@@ -9,9 +9,9 @@ any point lies on, as of a part that is gone, those points are expected that wer
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from processor.defects.alignment import chart_of_cells
@@ -19,25 +19,46 @@ from processor.defects.observations import CHUNK, Pairs, Stations, cells_at
 from processor.defects.surface_charts import GRID_SHARE, DesignSurface
 from processor.geometry import mesh_distance, rigid
 from processor.large_arrays import blocks
-from processor.model import Floats, Ints, Scene
+from processor.model import Bools, Floats, Ints, Scene
 
 LEAST_COS = 0.34  # of incidence
 NEARER_MM = 100.0  # than the surface: an obstacle
-BEYOND_MM = 20.0  # least distance of a point behind a face that it was measured through
+THROUGH_MM = 5.0  # behind a face, from which on a point was measured through it: thinner plates are not looked for
+SHADE_MM = 20.0  # before a face, from which on a point is not of the face: it may be bent, or seen at 70 degrees
 BEFORE_MM = 1.0  # distance of a face of the design that hides a cell
 SEEN_SHARE = 0.5  # of the points expected, up to which a cell may be hidden
 LEAST_POINTS = 1e-6  # expected; less is the rounding of sums
 LEAST_BIN_RAD = 0.003
 BIN_STEPS = 5.0  # angular steps of a scanner in a bin of directions
 FACE_SHARE = 0.2  # of a face's cells seen by a station, from which on the rest is expected
+SHARED_RAYS = 50.0  # of cells together, to know the share of them that is shaded: within 14 %
 FEWEST_CELLS = 10  # with points, to estimate the density of points from
 GAP_RAD = 0.5  # of azimuth without returns, that is still within the field of view
 
 
+@dataclass(frozen=True)
+class Expected:
+    """Points that each station should have on the cells that it sees, and those measured through cells (cells,).
+
+    ``of_stations`` are the stations' numbers, cells (n,) and numbers of points (n,).
+    """
+
+    of_stations: tuple[tuple[int, Ints, Floats], ...]
+    through: Floats
+
+    @property
+    def points(self) -> Floats:
+        """Return the number of points (cells,) that all stations together should have on each cell."""
+        points = np.zeros(len(self.through))
+        for _, cell, number in self.of_stations:
+            points[cell] += number
+        return np.maximum(np.where(points > LEAST_POINTS, points, 0.0), self.through)
+
+
 def expected(
     scene: Scene, T_design_project: Floats, pairs: Pairs, surface: DesignSurface, stations: Stations
-) -> Floats:
-    """Return the number of points (cells,) that all stations together should have on each cell."""
+) -> Expected:
+    """Return the points expected of each station, of the design as scanned: see the head of this file."""
     cells = len(surface.share)
     parts = []
     for k, rows in enumerate(_rows(pairs, len(stations.names))):
@@ -53,10 +74,35 @@ def expected(
         rows = np.flatnonzero(empty[cell])
         starts = surface.centres[cell[rows]] + BEFORE_MM * surface.outward[cell[rows]]
         ends = np.repeat(stations.positions[k : k + 1], len(rows), axis=0)
-        rows = rows[np.unique(mesh_distance.crossings(surface.sight_grid, starts, ends, True)[0])]
-        points[cell[rows]] -= number[rows]
-    points = np.where(points > LEAST_POINTS, points, 0.0)
-    return np.maximum(points, _through(scene, T_design_project, counted, surface, stations))
+        number[rows[mesh_distance.crossings(surface.sight_grid, starts, ends, True)[0]]] = 0.0
+    return Expected(tuple(parts), _through(scene, T_design_project, counted, surface, stations))
+
+
+def without_shade(
+    of: Expected, places: list[Ints], scene: Scene, T_design_project: Floats, surface: DesignSurface, stations: Stations
+) -> Expected:
+    """Return the points expected less, on ``places`` of cells (n,), the rays that ended on something before them.
+
+    Shade of what stands close to a face and is not of the design, as of a stack beside a column, is found so to the
+    ray, where directions in bins would leave a strip of it.
+    """
+    charts, touched = surface.charts, np.unique(chart_of_cells(surface)[np.concatenate(places)])
+    facets = np.flatnonzero(np.isin(surface.chart_of, touched))
+    parts = []
+    for k, cell, number in of.of_stations:
+        rays, shaded = np.zeros(len(of.through)), np.zeros(len(of.through))
+        rays[cell] = number
+        for crossed in _crossed(scene, T_design_project, k, surface, stations, facets, places):
+            shaded += np.bincount(crossed, minlength=len(shaded))
+        for chart in touched:
+            rows = charts.cells(chart)
+            of_chart = charts.image(rays, chart)
+            # Single cells have too few rays for a share of them.
+            side = int(np.ceil(np.sqrt(SHARED_RAYS / max(float(of_chart.sum() / max((of_chart > 0.0).sum(), 1)), 1.0))))
+            near = [ndimage.uniform_filter(x, side, mode="constant") for x in (charts.image(shaded, chart), of_chart)]
+            rays[rows] *= np.clip(1.0 - near[0] / np.maximum(near[1], LEAST_POINTS), 0.0, 1.0).ravel()
+        parts.append((k, cell, rays[cell]))
+    return Expected(tuple(parts), of.through)
 
 
 def _through(
@@ -68,23 +114,57 @@ def _through(
     share = np.bincount(chart, (counted > 0) & (surface.share > 0.5), charts)
     unseen = share < FACE_SHARE * np.maximum(np.bincount(chart, surface.share > 0.5, charts), 1)
     facets = np.flatnonzero(unseen[surface.chart_of])
-    if not len(facets):
-        return through
-    faces, normals = surface.faces[facets], surface.normals[facets]
+    for k, position in enumerate(stations.positions):
+        if len(facets) and np.isfinite(position).all():
+            for crossed in _crossed(scene, T_design_project, k, surface, stations, facets):
+                through += np.bincount(crossed, minlength=len(through))
+    return through
+
+
+def _crossed(
+    scene: Scene,
+    T_design_project: Floats,
+    station: int,
+    surface: DesignSurface,
+    stations: Stations,
+    facets: Ints,
+    behind: list[Ints] | None = None,
+) -> Iterator[Ints]:
+    """Yield the cells of some facets that rays of a station cross before their points; or beyond them.
+
+    Beyond, rays to ``behind``, places of cells (n,), are looked at alone.
+    """
+    position, faces, normals = stations.positions[station], surface.faces[facets], surface.normals[facets]
     size = float(np.linalg.norm(np.ptp(surface.vertices[faces].reshape(-1, 3), axis=0)))
     grid = mesh_distance.facet_grid(surface.vertices, faces, normals, GRID_SHARE * size)
-    for k, position in enumerate(stations.positions):
-        for points in _points_of(scene, T_design_project, k) if np.isfinite(position).all() else ():
-            ray = position - points
-            length = np.linalg.norm(ray, axis=1)[:, None]
-            starts, ends = points + BEYOND_MM * ray / length, np.repeat(position[None], len(points), axis=0)
-            row, crossed, part = mesh_distance.crossings(grid, starts, ends, False)
-            steep = np.einsum("ni,ni->n", ray[row], normals[crossed]) > LEAST_COS * length[row, 0]
-            row, crossed, part = row[steep], crossed[steep], part[steep]
-            places = starts[row] + part[:, None] * (ends[row] - starts[row])
-            cell = cells_at(surface, surface.chart_of[facets[crossed]], places)
-            through += np.bincount(cell, minlength=len(through))
-    return through
+    for points in _points_of(scene, T_design_project, station):
+        if behind is not None:
+            to = [surface.centres[cells] - position for cells in behind]
+            points = points[_towards(points - position, to, surface.charts.cell_mm)]
+        ray = position - points
+        length = np.linalg.norm(ray, axis=1)[:, None]
+        if behind is None:
+            starts, ends = points + THROUGH_MM * ray / length, np.repeat(position[None], len(points), axis=0)
+        else:
+            starts, ends = points - SHADE_MM * ray / length, points - surface.size_mm * ray / length
+        row, crossed, part = mesh_distance.crossings(grid, starts, ends, False)
+        steep = np.einsum("ni,ni->n", ray[row], normals[crossed]) > LEAST_COS * length[row, 0]
+        row, crossed, part = row[steep], crossed[steep], part[steep]
+        places = starts[row] + part[:, None] * (ends[row] - starts[row])
+        yield cells_at(surface, surface.chart_of[facets[crossed]], places)
+
+
+def _towards(rays: Floats, places: list[Floats], cell_mm: float) -> Bools:
+    """Mark the rays (n, 3) that are within the cone about cells (m, 3) of a place, as seen from the rays' origin."""
+    rays = rays / np.linalg.norm(rays, axis=1)[:, None]
+    marked = np.zeros(len(rays), np.bool_)
+    for place in places:
+        away = np.linalg.norm(place, axis=1)
+        to = place / away[:, None]
+        axis = to.mean(axis=0) / np.linalg.norm(to.mean(axis=0))
+        half_angle = float(np.arccos(np.clip((to @ axis).min(), -1.0, 1.0))) + cell_mm / float(away.min())
+        marked |= rays @ axis >= np.cos(min(half_angle, np.pi))
+    return marked
 
 
 def _of_station(
@@ -124,7 +204,7 @@ def _rows(pairs: Pairs, stations: int) -> list[Ints]:
 
 def _nearest_ranges(
     scene: Scene, T_design_project: Floats, station: int, stations: Stations, bin_rad: float, arm: Floats
-) -> tuple[Floats, npt.NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Return the shortest range about directions arm (n, 3), and whether they are within the station's field of view.
 
     Bins of azimuth without any return are outside it, except for gaps as wide as structures have. What is lower or

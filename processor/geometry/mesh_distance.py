@@ -454,8 +454,8 @@ def _faces(normal, scanner, p):  # type: ignore[no-untyped-def]
 def crossings(grid: FacetGrid, starts: Floats, ends: Floats, once: bool) -> tuple[Ints, Ints, Floats]:
     """Return where lines from ``starts`` (n, 3) to ``ends`` (n, 3) cross facets: row, facet, and share of the line.
 
-    Lines that start outside of the grid cross none. With ``once``, one crossing of a line is enough. The voxels on a
-    line are visited in order (Amanatides and Woo 1987).
+    With ``once``, one crossing of a line is enough. The voxels on a line are visited in order (Amanatides and Woo
+    1987).
     """
     # Empty lists whose type Numba infers from the element that is not there.
     rows, facets = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
@@ -464,16 +464,23 @@ def crossings(grid: FacetGrid, starts: Floats, ends: Floats, once: bool) -> tupl
     index, step, leaving, per_voxel = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(3)
     for row in range(len(starts)):
         start, ray = starts[row], ends[row] - starts[row]
-        inside, entering, searched = True, 0.0, True
+        entering, left, searched = 0.0, 1.0, True  # shares of the line at which it comes into the grid and leaves it
         for k in range(3):
-            place = (start[k] - grid.low[k]) / grid.size
-            index[k] = int(np.floor(place))
-            inside = inside and 0 <= index[k] < grid.shape[k]
+            low, high = grid.low[k] - start[k], grid.low[k] + grid.shape[k] * grid.size - start[k]
+            if abs(ray[k]) > 1e-12:
+                entering = max(entering, min(low / ray[k], high / ray[k]))
+                left = min(left, max(low / ray[k], high / ray[k]))
+            elif low > 0.0 or high < 0.0:
+                left = -1.0
+        inside = entering < left
+        for k in range(3):
+            place = (start[k] + entering * ray[k] - grid.low[k]) / grid.size
+            index[k] = min(max(int(np.floor(place)), 0), grid.shape[k] - 1)
             step[k] = 1 if ray[k] > 0.0 else -1
             moves = abs(ray[k]) > 1e-12
             per_voxel[k] = grid.size / abs(ray[k]) if moves else np.inf
             to_side = index[k] + 1 - place if ray[k] > 0.0 else place - index[k]
-            leaving[k] = to_side * per_voxel[k] if moves else np.inf
+            leaving[k] = entering + to_side * per_voxel[k] if moves else np.inf
         while inside and searched and entering <= 1.0:
             voxel = (index[0] * grid.shape[1] + index[1]) * grid.shape[2] + index[2]
             k = int(np.argmin(leaving))

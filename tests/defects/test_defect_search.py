@@ -487,33 +487,51 @@ def design_of_solids(*solids):
     return StructureDesign("solids", vertices, np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)]))
 
 
-def girder_with_brackets(gone):
-    """A web with brackets standing off it, seen from two stations above and below; the last bracket may be gone."""
-    solids = [box((0.0, 0.0, 0.0), (3000.0, 14.0, 1400.0))]
-    solids += [box((x, -140.0, 700.0), (x + 400.0, 0.0, 714.0)) for x in (300.0, 1300.0, 2300.0)]
-    built = trimesh.util.concatenate(
-        [trimesh.Trimesh(corners, own, process=False) for corners, own in (solids[:-1] if gone else solids)]
-    )
-    surface = surface_charts.of_mesh(np.asarray(built.vertices), np.asarray(built.faces).astype(np.int64), 100.0)
+def scene_seen(design, built, stations):
+    """Scans of the solids ``built`` from stations at the design of the solids ``design``."""
+    mesh = trimesh.util.concatenate([trimesh.Trimesh(corners, own, process=False) for corners, own in built])
+    surface = surface_charts.of_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces).astype(np.int64), 100.0)
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 50.0)
     scans = []
-    for seed, station in enumerate(([1500.0, -3500.0, 2500.0], [1500.0, -3500.0, -1200.0])):
+    for seed, station in enumerate(stations):
         position = np.array(station)
-        points, facet = trimesh.sample.sample_surface(built, 50_000, seed=seed)
-        points, normal = np.asarray(points), np.asarray(built.face_normals)[facet]
-        front = np.einsum("ni,ni->n", position - points, normal) > 0.0
+        points, facet = trimesh.sample.sample_surface(mesh, 150_000, seed=seed)
+        points, normal = np.asarray(points), np.asarray(mesh.face_normals)[facet]
+        away = np.linalg.norm(position - points, axis=1)
+        angle = np.einsum("ni,ni->n", position - points, normal) / away**3  # solid angle of an area: as of rays
+        front = angle > np.random.default_rng([seed, 1]).uniform(0.0, np.quantile(angle, 0.99), len(angle))
         points, normal = points[front], normal[front]
         hidden = mesh_distance.crossings(grid, points + normal, np.repeat(position[None], len(points), axis=0), True)[0]
         points = np.delete(points, hidden, axis=0)
         ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
         points = points + np.random.default_rng(seed).normal(0.0, 0.3, len(points))[:, None] * ray
         scans.append(Scan(f"S{seed}", points, position=position, T_project_scan=np.eye(4)))
-    return Scene("girder", "structure", tuple(scans), structure=design_of_solids(*solids))
+    return Scene("solids", "structure", tuple(scans), structure=design_of_solids(*design))
 
 
-def test_a_part_that_is_gone_is_missing_where_scanners_see_through_it():
+WEB = box((0.0, 0.0, 0.0), (3000.0, 14.0, 1400.0))
+BRACKETS = [box((x, -140.0, 700.0), (x + 400.0, 0.0, 714.0)) for x in (300.0, 1300.0, 2300.0)]
+COVERS = [box((x, -10.0, 300.0), (x + 400.0, 0.0, 600.0)) for x in (300.0, 1300.0)]
+
+
+@pytest.mark.parametrize(
+    ("parts", "centre"), [(BRACKETS, [2500.0, -70.0, 707.0]), (COVERS, [1500.0, -5.0, 450.0])], ids=["bracket", "cover"]
+)
+def test_a_part_that_is_gone_is_missing_where_scanners_see_through_it(parts, centre):
+    """Behind a bracket they see the floor or the web far away, behind a cover of 10 mm the web that it lies on."""
+    stations = [1500.0, -3500.0, 2500.0], [1500.0, -3500.0, -1200.0]
     settings = {"align": False, "registration_error_mm": 0.01}
-    assert found(run(girder_with_brackets(gone=False), **settings)) == []
-    result = run(girder_with_brackets(gone=True), **settings)
+    assert found(run(scene_seen([WEB, *parts], [WEB, *parts], stations), **settings)) == []
+    result = run(scene_seen([WEB, *parts], [WEB, *parts[:-1]], stations), **settings)
     assert result.defects.defect_class == ("missing-part",)
-    np.testing.assert_allclose(result.defects.centre[0], [2500.0, -70.0, 707.0], atol=60.0)  # two to three cells
+    np.testing.assert_allclose(result.defects.centre[0], centre, atol=60.0)  # two to three cells
+
+
+def test_the_shadow_of_a_stack_close_to_a_wall_is_not_missing():
+    """Its top hides a strip of the wall 100 mm behind it from a station above: rays that end on the stack show it."""
+    wall, stack = box((0.0, 0.0, 0.0), (2000.0, 14.0, 2000.0)), box((200.0, -700.0, 0.0), (1800.0, -100.0, 1600.0))
+    high = [[1000.0, -2500.0, 5000.0]]
+    settings = {"align": False, "registration_error_mm": 0.01}
+    assert found(run(scene_seen([wall], [wall, stack], high), **settings)) == []
+    hole = [box((0.0, 0.0, z), (2000.0, 14.0, z + height)) for z, height in ((0.0, 1200.0), (1600.0, 400.0))]
+    assert found(run(scene_seen([wall], hole, high), **settings)) == [("missing-part", "component-1")]

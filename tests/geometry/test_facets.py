@@ -49,6 +49,13 @@ def test_lines_of_sight_end_at_facets():
         np.testing.assert_array_equal(np.sort(row[across[k]]), np.flatnonzero(crossed[k]))
     sides = crossed.any(axis=0)
     assert set(mesh_distance.crossings(grid, starts, ends, True)[0]) >= set(np.flatnonzero(sides).tolist())
+    # The other way, from far outside of the voxels
+    row, _, share = mesh_distance.crossings(grid, ends, starts, False)
+    for k in range(2):
+        across = np.isclose(share, 1.0 - list(shares.values())[k])
+        np.testing.assert_array_equal(np.sort(row[across]), np.flatnonzero(crossed[k]))
+    beside = ends + np.array([0.0, 0.0, 4000.0])
+    assert not len(mesh_distance.crossings(grid, ends, beside, False)[0])
 
 
 def test_samples_of_a_mesh_are_even():
