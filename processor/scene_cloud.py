@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from processor import large_arrays
-from processor.geometry import coincident_points, mesh_distance, rigid
+from processor.geometry import coincident_points, mesh_distance
 from processor.model import (
     DesignFaults,
     Floats,
@@ -22,6 +22,7 @@ from processor.model import (
     per_point_fields,
     reason,
 )
+from processor.views import views
 
 ORIGIN_STEP_MM = 1000.0
 UNPLACED = (Status.FAILED, Status.AMBIGUOUS)  # of a scan: its pose may be wrong
@@ -43,22 +44,10 @@ class MergedCloud:
 
 def merged(scene: Scene, with_scanner: bool) -> MergedCloud:
     """Merge the scans of a scene; a scan without a pose is taken to be in the project's frame already."""
-    origin = rigid.apply(scene.scans[0].pose, scene.scans[0].origin) if scene.scans else np.zeros(3)
-    points, scanners = [np.empty((0, 3))], [np.empty((0, 3))]
-    known = with_scanner
-    for scan in scene.scans:
-        T = rigid.between_origins(scan.pose, scan.origin, origin)
-        points.append(rigid.apply(T, scan.points) if scan.T_project_scan.size else scan.points + T[:3, 3])
-        if not known:
-            continue
-        if scan.position.size:
-            at = T[:3, :3] @ (scan.position - scan.origin) + T[:3, 3]
-            scanners.append(np.broadcast_to(at, (len(scan.points), 3)))
-        elif scene.stations is not None and len(scan.point_station) and scan.point_station.min() >= 0:
-            scanners.append(scene.stations.positions[scan.point_station] - origin)
-        else:
-            known = False
-    return MergedCloud(np.concatenate(points), origin, np.concatenate(scanners) if known else None)
+    seen = views(scene)
+    points, view = seen.placed()
+    scanners = seen.scanners(view) if with_scanner else None
+    return MergedCloud(points, seen.origin, None if scanners is None else scanners[view])
 
 
 def with_points_once(scene: Scene) -> tuple[Scene, tuple[Reason, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,21 +15,13 @@ from processor.clouds.poses import Placed
 from processor.defects import surface_charts
 from processor.geometry import rigid
 from processor.model import Floats, Ints, Stations
+from processor.views import Views, views
 from processor.writers.cloud import BLOCK, COLOURS, COLUMN, GRID, INTENSITY, ROW, STATION, Block, Cloud
 
 FULL = 65535  # intensities up to here that are whole numbers are written as they are
 SINGLE = np.dtype(np.float32)
 SAME_MM = 1e-3
 FOUND_MM = 200.0  # core points lie on the design's surface: its samples are nearer
-
-
-@dataclass(frozen=True)
-class Numbering:
-    """Names of the scanner's stations from 1, and the number of each: of scans by row, of stations by row."""
-
-    ids: tuple[str, ...]
-    of_scan: tuple[int, ...]
-    of_station: Ints
 
 
 def fields_of(run: Run, numbers: Sequence[int], *, grid: bool) -> dict[str, np.dtype[Any]]:
@@ -48,8 +40,8 @@ def fields_of(run: Run, numbers: Sequence[int], *, grid: bool) -> dict[str, np.d
     return fields
 
 
-def _columns(found: Mapping[str, Any], fields: Mapping[str, np.dtype[Any]], of_station: Ints) -> dict[str, Any]:
-    """Return the columns of a block by their names in files; zeros where a scan has none."""
+def _columns(found: Mapping[str, Any], fields: Mapping[str, np.dtype[Any]], station: Ints) -> dict[str, Any]:
+    """Return the columns of a block by their names in files, zeros where a scan has none, with its stations (n,)."""
     count = len(found["points"])
     columns: dict[str, Any] = {name: np.zeros(count, dtype) for name, dtype in fields.items()}
     for name, field in (("intensity", INTENSITY), ("grid_row", ROW), ("grid_column", COLUMN)):
@@ -57,8 +49,8 @@ def _columns(found: Mapping[str, Any], fields: Mapping[str, np.dtype[Any]], of_s
             columns[field] = found[name].astype(fields[field])
     if "colour" in found:
         columns |= dict(zip(COLOURS, found["colour"].T, strict=True))
-    if STATION in columns and "point_station" in found:
-        columns[STATION] = of_station[found["point_station"]].astype(fields[STATION])
+    if STATION in columns:
+        columns[STATION] = station.astype(fields[STATION])
     return columns
 
 
@@ -85,37 +77,32 @@ def part_cloud(run: Run, placed: Placed) -> Cloud:
 def _cloud(run: Run, placed: Placed, name: str, origin: Floats, *, grid: bool) -> Cloud:
     """Return the cloud of a scan in the frame that its pose leads to, with the numbers of the scene's stations."""
     fields = fields_of(run, [placed.number], grid=grid)
-    stations = np.append(np.arange(1, _stations(run) + 1), 0)  # the last is that of -1
 
     def read() -> Iterator[Block]:
         for found in blocks(run.points, placed.number):
-            yield Block(placed.moved(found["points"], origin), _columns(found, fields, stations))
+            station = found["point_station"] + 1 if STATION in fields else np.empty(0, np.int64)
+            yield Block(placed.moved(found["points"], origin), _columns(found, fields, station))
 
     return Cloud(name, fields, read, origin, len(run.points.column(placed.number, "points")))
 
 
 def merged_cloud(run: Run, scans: Sequence[Placed]) -> Cloud:
     """Return all scans as one cloud in the project's frame, with the number of the station of each point."""
-    numbers = numbering(run, scans)
+    seen, number = _views(run, scans)
     fields = fields_of(run, [placed.number for placed in scans], grid=False)
-    if len(numbers.ids) > 1:
+    if number.max() > 1:
         fields[STATION] = TYPES["point_station"]
     origin = np.floor(scans[0].origin() / scene_cloud.ORIGIN_STEP_MM) * scene_cloud.ORIGIN_STEP_MM
 
     def read() -> Iterator[Block]:
-        for placed, number in zip(scans, numbers.of_scan, strict=True):
+        for row, placed in enumerate(scans):
             for found in blocks(run.points, placed.number):
-                columns = _columns(found, fields, numbers.of_station)
-                if STATION in columns and "point_station" not in found:
-                    columns[STATION][:] = number
-                yield Block(placed.moved(found["points"], origin), columns)
+                points = found["points"]
+                view = seen.of_points(row, found.get("point_station", ()), len(points))
+                yield Block(placed.moved(points, origin), _columns(found, fields, number[view]))
 
     count = sum(len(run.points.column(placed.number, "points")) for placed in scans)
     return Cloud("merged", fields, read, origin, count)
-
-
-def _stations(run: Run) -> int:
-    return 0 if run.scene.stations is None else len(run.scene.stations.ids)
 
 
 def has_stations(run: Run, placed: Placed) -> bool:
@@ -123,40 +110,32 @@ def has_stations(run: Run, placed: Placed) -> bool:
     return len(run.points.column(placed.number, "point_station")) > 0
 
 
-def numbering(run: Run, scans: Sequence[Placed]) -> Numbering:
-    """Return the numbers of the stations of scans: those of merged clouds, then each other scan."""
-    stations = run.scene.stations
-    ids: list[str] = []
-    of_station = np.zeros(_stations(run) + 1, np.int64)  # the last is that of -1: unknown
-    if stations is not None and any(has_stations(run, placed) for placed in scans):
-        ids = list(stations.ids)
-        of_station[:-1] = np.arange(1, len(ids) + 1)
-    of_scan = []
-    for placed in scans:
-        if has_stations(run, placed):
-            of_scan.append(0)
-            continue
-        name = placed.scan.station or placed.scan.name
-        ids.append(name if name not in ids else placed.scan.name)
-        of_scan.append(len(ids))
-    return Numbering(tuple(ids), tuple(of_scan), of_station)
+def _views(run: Run, scans: Sequence[Placed]) -> tuple[Views, Ints]:
+    """Return the views of scans as they are placed, and the number (v,) of each as a station in files, from 1.
+
+    That of the points of a merged cloud that name no station is 0: unknown.
+    """
+    moved = []
+    for one in scans:
+        origin, position = one.scale * one.scan.origin, one.scale * one.scan.position
+        moved.append(replace(one.scan, T_project_scan=one.T, origin=origin, position=position))
+    seen = views(replace(run.scene, scans=tuple(moved)), origin=np.zeros(3))
+    known = np.ones(len(seen.names), bool)
+    known[seen.stations :] = [one.scan.position.size > 0 or not has_stations(run, one) for one in scans]
+    return seen, np.where(known, np.cumsum(known), 0)
 
 
 def stations_of(run: Run, scans: Sequence[Placed]) -> Stations | None:
     """Return the positions of the stations as numbered, in the project's frame; None where one is not known."""
-    numbers = numbering(run, scans)
-    positions: dict[int, Floats] = {}
-    for placed, number in zip(scans, numbers.of_scan, strict=True):
-        if number and placed.scan.position.size:
-            positions[number] = rigid.apply(placed.T, placed.scale * placed.scan.position)
-    if numbers.of_station.any():
+    seen, number = _views(run, scans)
+    positions = seen.positions.copy()
+    if seen.stations:
         moved = stations_moved(run, scans)
-        if moved is None:
-            return None
-        positions |= dict(enumerate(moved.positions, 1))
-    if len(positions) != len(numbers.ids):
+        positions[: seen.stations] = np.nan if moved is None else moved.positions
+    rows = np.flatnonzero(number)
+    if not np.isfinite(positions[rows]).all():
         return None
-    return Stations(numbers.ids, np.array([positions[i + 1] for i in range(len(numbers.ids))]))
+    return Stations(tuple(seen.names[row] for row in rows), positions[rows])
 
 
 def stations_moved(run: Run, scans: Sequence[Placed]) -> Stations | None:

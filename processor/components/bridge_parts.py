@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from processor.adjustment import thermal
-from processor.adjustment.point_groups import distinct_groups
 from processor.geometry import rigid
 from processor.large_arrays import allocate, blocks
 from processor.model import (
@@ -21,7 +20,6 @@ from processor.model import (
     DesignPart,
     Floats,
     InputError,
-    Ints,
     Reason,
     Scan,
     Scene,
@@ -92,15 +90,14 @@ def _structure(scene: Scene, part: DesignPart, placed: list[_Placed], shrink: fl
     """
     scans, stations, before = [], [], 0
     for one in placed:
-        number = distinct_groups(one.scan.point_station)
-        number = number[number >= 0]
-        if scene.stations is not None and len(number):
-            stations.append(_stations(scene.stations, number, one, shrink, again=before > 0))
+        named = scene.stations if len(one.scan.point_station) else None
+        if named is not None:
+            stations.append(_stations(named, one, shrink, again=before > 0))
         points, station = allocate(*one.scan.points.shape), allocate(len(one.scan.point_station), dtype=np.int32)
         for rows in blocks(len(points)):
             points[rows] = one.scan.points[rows] * shrink
             of_rows = one.scan.point_station[rows]
-            station[rows] = np.where(of_rows >= 0, before + np.searchsorted(number, of_rows), -1)
+            station[rows] = np.where(of_rows >= 0, before + of_rows, -1)
         scans.append(
             replace(
                 one.scan,
@@ -112,7 +109,7 @@ def _structure(scene: Scene, part: DesignPart, placed: list[_Placed], shrink: fl
                 component="",
             )
         )
-        before += len(number)
+        before += 0 if named is None else len(named.ids)
     bodies = DesignBodies(names=(part.name,), of_facet=np.zeros(len(part.faces), np.int64))
     return Scene(
         scene.name,
@@ -127,19 +124,19 @@ def _structure(scene: Scene, part: DesignPart, placed: list[_Placed], shrink: fl
     )
 
 
-def _stations(known: Stations, number: Ints, placed: _Placed, shrink: float, again: bool) -> Stations:
-    """Return the stations ``number`` (k,) where a scan has them, in the bridge's frame.
+def _stations(known: Stations, placed: _Placed, shrink: float, again: bool) -> Stations:
+    """Return the stations where a scan has them, in the bridge's frame.
 
     ``again`` marks stations of a further scan: their ids have its name, so that they differ from those of the first.
     """
     T_scan_project, T_bridge_scan = rigid.invert(placed.scan.pose), placed.T_bridge_scan
-    T = known.T_project_station[number] if len(known.T_project_station) else known.T_project_station
+    T = known.T_project_station
     if len(T):
         T = T_scan_project @ T
         T[:, :3, 3] *= shrink
         T = T_bridge_scan @ T
     return Stations(
-        ids=tuple(f"{known.ids[k]}, {placed.scan.name}" if again else known.ids[k] for k in number),
-        positions=rigid.apply(T_bridge_scan, shrink * rigid.apply(T_scan_project, known.positions[number])),
+        ids=tuple(f"{id_}, {placed.scan.name}" if again else id_ for id_ in known.ids),
+        positions=rigid.apply(T_bridge_scan, shrink * rigid.apply(T_scan_project, known.positions)),
         T_project_station=T,
     )

@@ -24,6 +24,7 @@ from processor.model import (
     StructureDesign,
     UsageError,
 )
+from processor.views import views
 
 AROUND, RINGS = 48, 24  # facets around tubes and balls, and from pole to pole; curvature between corners is allowed for
 CLEAR_MM, CLEAR_SHARE = 5.0, 1.25  # of a ball about a member's axis, in radii of the tube: its sleeve hides it
@@ -63,11 +64,13 @@ def _corrected(scene: Scene, found: Any) -> Scene:
         return scene
     stations = scene.stations
     of_row = {} if stations is None else {row: T_of[id_] for row, id_ in enumerate(stations.ids) if id_ in T_of}
+    seen = views(scene)
+    names = [seen.names[seen.of_scan(i)] for i in range(len(scene.scans))]
     scans = tuple(
-        replace(scan, T_project_scan=T_of[scan.name] @ scan.pose)
-        if scan.name in T_of
+        replace(scan, T_project_scan=T_of[name] @ scan.pose)
+        if name in T_of
         else replace(scan, points=_points_corrected(scan, of_row))
-        for scan in scene.scans
+        for name, scan in zip(names, scene.scans, strict=True)
     )
     if stations is not None and all(id_ in T_of for id_ in stations.ids):
         moved = np.stack([T_of[id_] for id_ in stations.ids])

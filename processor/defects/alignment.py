@@ -16,11 +16,12 @@ import numpy as np
 from numba import njit
 
 from processor.adjustment import scanner_class_errors
-from processor.defects.observations import Pairs, Stations
+from processor.defects.observations import Pairs
 from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
 from processor.model import Columns, Floats, Ints
 from processor.robust_statistics import robust_sd
+from processor.views import Views
 
 BLOCK_MM = 80.0
 BLOCK_RAD = 0.25  # of a block around a tube: within it, a movement of the tube is nearly one deviation
@@ -112,7 +113,7 @@ def none(surface: DesignSurface, stations: int, error_mm: float) -> Alignment:
 
 
 def align(
-    pairs: Pairs, surface: DesignSurface, stations: Stations, error_mm: float, excluded: frozenset[int] = frozenset()
+    pairs: Pairs, surface: DesignSurface, stations: Views, error_mm: float, excluded: frozenset[int] = frozenset()
 ) -> Alignment:
     """Fit stations to each other, and the whole to the design if there are enough components.
 
@@ -156,7 +157,7 @@ def _response(gain: Floats, J: Floats, station: Ints, stations: int) -> Floats:
 
 
 def station_variance(
-    pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, free: bool = False
+    pairs: Pairs, surface: DesignSurface, stations: Views, alignment: Alignment, free: bool = False
 ) -> Floats:
     """Return the variance (cells,) of the cells' deviations by errors of the stations' movements, mm2.
 

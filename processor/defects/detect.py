@@ -188,11 +188,11 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     residuals = field.minus(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
     searched = scan_statistic.widened(residuals, levels)
     finding = scan_statistic.search(searched, surface, levels)
-    expected = expected_points.expected(scene, registered.T_design_project, pairs, surface, observed.stations)
+    expected = expected_points.expected(pairs, surface, observed.stations)
     missing = regions.missing(field, expected.points, surface, alarms_per_mm2)
     if missing:
-        places, T = [region.cells for region in missing], registered.T_design_project
-        expected = expected_points.without_shade(expected, places, scene, T, surface, observed.stations)
+        places = [region.cells for region in missing]
+        expected = expected_points.without_shade(expected, places, surface, observed.stations)
         missing = regions.missing(field, expected.points, surface, alarms_per_mm2)
     missing += _inferred(scene, registered, field, missing, alarms_per_mm2)
     deviating = regions.of_finding(finding, surface)

@@ -12,10 +12,11 @@ from processor import tiles
 from processor.adjustment import moderated_variances, view_error_from_opposite_sides
 from processor.adjustment.scanner_class_errors import SURFACE_SD_MM
 from processor.defects.alignment import PAIRS_AT_ONCE, Alignment, chart_of_cells, rays_to, station_variance
-from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
+from processor.defects.observations import FEWEST_POINTS, Pairs
 from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
 from processor.model import NORMAL_95, Bools, Floats, Ints
 from processor.robust_statistics import robust_sd_about_median
+from processor.views import Views
 
 POOLED_CELLS = 9  # side of the square over which noise is pooled
 ABOUT_CELLS, SEEN_SHARE = 3, 0.5  # side of the square about a cell, and the least share of it that was seen
@@ -74,7 +75,7 @@ class Field:
         return dataclasses.replace(self, seen=seen)
 
 
-def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, inner: Floats) -> Field:
+def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Views, alignment: Alignment, inner: Floats) -> Field:
     """Combine the observations of all stations by cell, corrected by the alignment. ``inner`` (cells,): see Field."""
     cells = len(surface.share)
     correction = np.empty(len(pairs.cell))

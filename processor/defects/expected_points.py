@@ -15,11 +15,11 @@ import numpy as np
 from scipy import ndimage
 
 from processor.defects.alignment import chart_of_cells
-from processor.defects.observations import CHUNK, Pairs, Stations, cells_at
+from processor.defects.observations import CHUNK, Pairs, cells_at
 from processor.defects.surface_charts import GRID_SHARE, DesignSurface
-from processor.geometry import mesh_distance, rigid
-from processor.large_arrays import blocks
-from processor.model import Bools, Floats, Ints, Scene
+from processor.geometry import mesh_distance
+from processor.model import Bools, Floats, Ints
+from processor.views import Views
 
 LEAST_COS = 0.34  # of incidence
 NEARER_MM = 100.0  # than the surface: an obstacle
@@ -55,9 +55,7 @@ class Expected:
         return np.maximum(np.where(points > LEAST_POINTS, points, 0.0), self.through)
 
 
-def expected(
-    scene: Scene, T_design_project: Floats, pairs: Pairs, surface: DesignSurface, stations: Stations
-) -> Expected:
+def expected(pairs: Pairs, surface: DesignSurface, stations: Views) -> Expected:
     """Return the points expected of each station, of the design as scanned: see the head of this file."""
     cells = len(surface.share)
     parts = []
@@ -65,7 +63,7 @@ def expected(
         if np.isfinite(stations.positions[k]).all() and len(rows):
             count = np.zeros(cells)
             count[pairs.cell[rows]] = (pairs.count + pairs.stray)[rows]
-            parts.append((k, *_of_station(scene, T_design_project, k, stations, count, surface)))
+            parts.append((k, *_of_station(k, stations, count, surface)))
     points, counted = np.zeros(cells), np.bincount(pairs.cell, pairs.count + pairs.stray, cells)
     for _, cell, number in parts:
         points[cell] += number
@@ -75,12 +73,10 @@ def expected(
         starts = surface.centres[cell[rows]] + BEFORE_MM * surface.outward[cell[rows]]
         ends = np.repeat(stations.positions[k : k + 1], len(rows), axis=0)
         number[rows[mesh_distance.crossings(surface.sight_grid, starts, ends, True)[0]]] = 0.0
-    return Expected(tuple(parts), _through(scene, T_design_project, counted, surface, stations))
+    return Expected(tuple(parts), _through(counted, surface, stations))
 
 
-def without_shade(
-    of: Expected, places: list[Ints], scene: Scene, T_design_project: Floats, surface: DesignSurface, stations: Stations
-) -> Expected:
+def without_shade(of: Expected, places: list[Ints], surface: DesignSurface, stations: Views) -> Expected:
     """Return the points expected less, on ``places`` of cells (n,), the rays that ended on something before them.
 
     Shade of what stands close to a face and is not of the design, as of a stack beside a column, is found so to the
@@ -92,7 +88,7 @@ def without_shade(
     for k, cell, number in of.of_stations:
         rays, shaded = np.zeros(len(of.through)), np.zeros(len(of.through))
         rays[cell] = number
-        for crossed in _crossed(scene, T_design_project, k, surface, stations, facets, places):
+        for crossed in _crossed(k, surface, stations, facets, places):
             shaded += np.bincount(crossed, minlength=len(shaded))
         for chart in touched:
             rows = charts.cells(chart)
@@ -105,9 +101,7 @@ def without_shade(
     return Expected(tuple(parts), of.through)
 
 
-def _through(
-    scene: Scene, T_design_project: Floats, counted: Ints, surface: DesignSurface, stations: Stations
-) -> Floats:
+def _through(counted: Ints, surface: DesignSurface, stations: Views) -> Floats:
     """Return the number (cells,) of points measured through cells of faces that hardly any point lies on."""
     through = np.zeros(len(surface.share))
     chart, charts = chart_of_cells(surface), len(surface.charts.kind)
@@ -116,19 +110,13 @@ def _through(
     facets = np.flatnonzero(unseen[surface.chart_of])
     for k, position in enumerate(stations.positions):
         if len(facets) and np.isfinite(position).all():
-            for crossed in _crossed(scene, T_design_project, k, surface, stations, facets):
+            for crossed in _crossed(k, surface, stations, facets):
                 through += np.bincount(crossed, minlength=len(through))
     return through
 
 
 def _crossed(
-    scene: Scene,
-    T_design_project: Floats,
-    station: int,
-    surface: DesignSurface,
-    stations: Stations,
-    facets: Ints,
-    behind: list[Ints] | None = None,
+    station: int, surface: DesignSurface, stations: Views, facets: Ints, behind: list[Ints] | None = None
 ) -> Iterator[Ints]:
     """Yield the cells of some facets that rays of a station cross before their points; or beyond them.
 
@@ -137,7 +125,7 @@ def _crossed(
     position, faces, normals = stations.positions[station], surface.faces[facets], surface.normals[facets]
     size = float(np.linalg.norm(np.ptp(surface.vertices[faces].reshape(-1, 3), axis=0)))
     grid = mesh_distance.facet_grid(surface.vertices, faces, normals, GRID_SHARE * size)
-    for points in _points_of(scene, T_design_project, station):
+    for points, _ in stations.blocks(CHUNK, view=station):
         if behind is not None:
             to = [surface.centres[cells] - position for cells in behind]
             points = points[_towards(points - position, to, surface.charts.cell_mm)]
@@ -167,9 +155,7 @@ def _towards(rays: Floats, places: list[Floats], cell_mm: float) -> Bools:
     return marked
 
 
-def _of_station(
-    scene: Scene, T_design_project: Floats, station: int, stations: Stations, count: Floats, surface: DesignSurface
-) -> tuple[Ints, Floats]:
+def _of_station(station: int, stations: Views, count: Floats, surface: DesignSurface) -> tuple[Ints, Floats]:
     """Return cells (n,) that no scanned obstacle hides from a station, and the numbers (n,) of points expected there.
 
     ``count`` (cells,) is the number of points that the station has on each cell.
@@ -189,7 +175,7 @@ def _of_station(
         return np.empty(0, np.int64), np.empty(0)
     density = float(np.median(count[cell][occupied] / angle[occupied]))
     bin_rad = max(LEAST_BIN_RAD, BIN_STEPS / np.sqrt(density))
-    nearest, inside = _nearest_ranges(scene, T_design_project, station, stations, bin_rad, arm)
+    nearest, inside = _nearest_ranges(station, stations, bin_rad, arm)
     slack = NEARER_MM + 3.0 * bin_rad * distance * np.sqrt(1.0 - cosine**2) / cosine
     clear = inside & ~(nearest < distance - slack)
     return cell[clear], density * angle[clear]
@@ -202,9 +188,7 @@ def _rows(pairs: Pairs, stations: int) -> list[Ints]:
     return [order[at[k] : at[k + 1]] for k in range(stations)]
 
 
-def _nearest_ranges(
-    scene: Scene, T_design_project: Floats, station: int, stations: Stations, bin_rad: float, arm: Floats
-) -> tuple[Floats, Bools]:
+def _nearest_ranges(station: int, stations: Views, bin_rad: float, arm: Floats) -> tuple[Floats, Bools]:
     """Return the shortest range about directions arm (n, 3), and whether they are within the station's field of view.
 
     Bins of azimuth without any return are outside it, except for gaps as wide as structures have. What is lower or
@@ -221,7 +205,7 @@ def _nearest_ranges(
         j = np.minimum((elevation + 0.5 * np.pi) / bin_rad, high - 1).astype(np.int64)
         return i, j, elevation
 
-    for points in _points_of(scene, T_design_project, station):
+    for points, _ in stations.blocks(CHUNK, view=station):
         local = points - stations.positions[station]
         i, j, elevation = bins(local)
         np.minimum.at(nearest, i * high + j, np.linalg.norm(local, axis=1))
@@ -238,22 +222,3 @@ def _nearest_ranges(
 def _directions(arm: Floats) -> tuple[Floats, Floats]:
     """Return azimuth and elevation (n,), rad."""
     return np.arctan2(arm[:, 1], arm[:, 0]), np.arctan2(arm[:, 2], np.hypot(arm[:, 0], arm[:, 1]))
-
-
-def _points_of(scene: Scene, T_design_project: Floats, station: int) -> Iterator[Floats]:
-    """Yield the points of a station in chunks, in the design's frame."""
-    first = 0
-    for scan in scene.scans:
-        T = T_design_project @ scan.pose
-        T = rigid.transform(T[:3, :3], T[:3, :3] @ scan.origin + T[:3, 3])
-        count = 1
-        if not scan.position.size and scene.stations is not None and len(scan.point_station):
-            count = len(scene.stations.ids) + 1
-        if first <= station < first + count:
-            for rows in blocks(len(scan.points), CHUNK):
-                points = scan.points[rows]
-                if count > 1:
-                    points = points[scan.point_station[rows] == station - first]
-                if len(points):
-                    yield rigid.apply(T, points)
-        first += count

@@ -17,11 +17,12 @@ from processor import large_arrays
 from processor.adjustment import mixed_pixels
 from processor.adjustment.mixed_pixels import Block
 from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
-from processor.geometry import mesh_distance, rigid
+from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import FacetGrid
 from processor.large_arrays import Array, allocate, blocks, in_parts
-from processor.model import Bools, Floats, InputError, Ints, Labels, Scan, Scene
+from processor.model import Bools, Floats, InputError, Ints, Labels, Scene
 from processor.robust_statistics import MAD_TO_SD
+from processor.views import Views, views
 
 CHUNK = 500_000
 PART_POINTS = 500_000  # that are sorted by their cells in memory
@@ -31,19 +32,6 @@ GATE_SDS = 4.0  # robust standard deviations from the median of a cell, beyond w
 LEAST_GATE_MM = 1.0
 FEWEST_POINTS = 4  # of a cell, for its median to identify stray points
 FEWEST_OF_FACE = 40  # points of a station on a face, for their own robust standard deviation
-
-
-@dataclass(frozen=True)
-class Stations:
-    """Names and positions (k, 3) of the scanners of a scene, in the design's frame; NaN = unknown."""
-
-    names: tuple[str, ...]
-    positions: Floats
-
-    @property
-    def unnamed(self) -> bool:
-        """Whether the scan may be merged from several views of which nothing is known."""
-        return len(self.names) == 1 and not np.isfinite(self.positions).all()
 
 
 @dataclass(frozen=True)
@@ -59,7 +47,7 @@ class Observed:
     station: Labels
     deviation: Floats
     mixed: Bools
-    stations: Stations
+    stations: Views
     points: int  # of the scene
 
 
@@ -85,34 +73,20 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
 
     Raises InputError for a scene without points.
     """
-    if not any(len(scan.points) for scan in scene.scans):
+    seen = views(scene, T_design_project, np.zeros(3))
+    if not seen.count:
         raise InputError(f"{scene.name}: expected scans of the structure, found no points")
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, reach_mm)
-    names: list[str] = []
-    positions: list[Floats] = []
-    found = _Found.of(sum(len(scan.points) for scan in scene.scans))
-    for scan in scene.scans:
-        T = T_design_project @ scan.pose
-        T = rigid.transform(T[:3, :3], T[:3, :3] @ scan.origin + T[:3, 3])
-        first, merged = len(names), False
-        if scan.position.size:
-            names.append(scan.name)
-            positions.append(rigid.apply(T, scan.position - scan.origin))
-        elif scene.stations is not None and len(scan.point_station):
-            merged = True
-            names += [*scene.stations.ids, f"{scan.name}, unknown"]
-            positions += [*rigid.apply(T_design_project, scene.stations.positions), np.full(3, np.nan)]
-        else:
-            names.append(scan.name)
-            positions.append(np.full(3, np.nan))
-        found = _of_scan(_Placed(scan, T, first, merged, np.array(positions)), surface, grid, found)
+    found = _Found.of(seen.count)
+    for scan in range(len(scene.scans)):
+        found = _of_scan(seen, scan, surface, grid, found)
     return Observed(
         chart=found.chart[: found.filled],
         uv=found.uv[: found.filled],
         station=found.station[: found.filled],
         deviation=found.deviation[: found.filled],
         mixed=found.mixed[: found.filled],
-        stations=Stations(tuple(names), np.array(positions)),
+        stations=seen,
         points=len(found.chart),
     )
 
@@ -140,36 +114,14 @@ class _Found(NamedTuple):
         )
 
 
-class _Placed(NamedTuple):
-    """A scan that T (4, 4) maps to the design. ``first`` is the row of its first station in ``positions`` (k, 3).
-
-    The points of a ``merged`` scan name their stations, the last of which is for those unknown.
-    """
-
-    scan: Scan
-    T: Floats
-    first: int
-    merged: bool
-    positions: Floats
-
-    def blocks(self) -> Iterator[tuple[slice, Floats, Ints]]:
-        """Pass over rows, points (n, 3) in the design's frame and stations (n,)."""
-        for rows in blocks(len(self.scan.points), CHUNK):
-            points = rigid.apply(self.T, self.scan.points[rows])
-            station = np.full(len(points), self.first, np.int64)
-            if self.merged:
-                named = self.scan.point_station[rows]
-                station = np.where(named < 0, len(self.positions) - 1 - self.first, named) + self.first
-            yield rows, points, station
-
-
-def _of_scan(placed: _Placed, surface: DesignSurface, grid: FacetGrid, found: _Found) -> _Found:
+def _of_scan(seen: Views, scan: int, surface: DesignSurface, grid: FacetGrid, found: _Found) -> _Found:
     """Add what is known of the points of a scan that are on faces."""
-    known, scanners = np.isfinite(placed.positions.sum(axis=1)), np.nan_to_num(placed.positions)
-    nearest = allocate(len(placed.scan.points), dtype=np.int32)
-    used = allocate(len(placed.scan.points), dtype=np.bool_)
-    count = found.filled
-    for rows, points, station in placed.blocks():
+    known, scanners = np.isfinite(seen.positions.sum(axis=1)), np.nan_to_num(seen.positions)
+    total = len(seen.scans[scan].points)
+    nearest, used = allocate(total, dtype=np.int32), allocate(total, dtype=np.bool_)
+    count, any_known = found.filled, False
+    for rows, (points, station) in zip(blocks(total, CHUNK), seen.blocks(CHUNK, scan), strict=True):
+        any_known = any_known or bool(known[station].any())
         facet, deviation = mesh_distance.nearest_visible(grid, points, scanners, np.where(known[station], station, -1))
         near = np.flatnonzero(facet >= 0)
         of_near = station[near]
@@ -187,9 +139,9 @@ def _of_scan(placed: _Placed, surface: DesignSurface, grid: FacetGrid, found: _F
         nearest[rows], used[rows] = facet, False
         used[rows.start + on] = True
         count = part.stop
-    if known[placed.first :].any():
-        of_points = _Sights(placed, surface, nearest, used, found.deviation[found.filled : count])
-        beside = mixed_pixels.mark_passes(of_points, placed.positions, surface.normals)
+    if any_known:
+        of_points = _Sights(seen, scan, surface, nearest, used=used, deviation=found.deviation[found.filled : count])
+        beside = mixed_pixels.mark_passes(of_points, seen.positions, surface.normals)
         for rows in blocks(len(beside)):
             found.mixed[found.filled : count][rows] |= beside[rows]
     return found._replace(filled=count)
@@ -199,7 +151,8 @@ def _of_scan(placed: _Placed, surface: DesignSurface, grid: FacetGrid, found: _F
 class _Sights:
     """Passes over all points of a scan: ``nearest`` (n,) facets, those ``used`` (n,), and the deviations of these."""
 
-    placed: _Placed
+    seen: Views
+    scan: int
     surface: DesignSurface
     nearest: Labels
     used: Bools
@@ -208,7 +161,8 @@ class _Sights:
     def __iter__(self) -> Iterator[Block]:
         """Pass over all points."""
         done = 0
-        for rows, points, station in self.placed.blocks():
+        parts = blocks(len(self.nearest), CHUNK)
+        for rows, (points, station) in zip(parts, self.seen.blocks(CHUNK, self.scan), strict=True):
             facet, on = self.nearest[rows], np.flatnonzero(self.used[rows])
             height = np.zeros(len(points))
             height[on] = self.deviation[done : done + len(on)]

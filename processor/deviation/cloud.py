@@ -11,8 +11,9 @@ from processor import scene_cloud
 from processor.deviation import large_cloud
 from processor.deviation.large_cloud import LargeCloud
 from processor.distinct_rows import distinct
-from processor.geometry import nearest_neighbours, rigid
+from processor.geometry import nearest_neighbours
 from processor.model import Floats, InputError, Ints, Scene
+from processor.views import views
 
 MOST_POINTS = 3_000_000  # of a scan that are held at once; of more an even sample is held
 SAMPLE_POINTS = 1_000_000
@@ -20,24 +21,24 @@ SAMPLE_POINTS = 1_000_000
 
 @dataclass(frozen=True)
 class ScanCloud:
-    """Points (n, 3) of a scan less ``origin`` (3,), without outliers, in a grid's order, and scanners (n, 3).
+    """Points (n, 3) of a scan less ``origin`` (3,), without outliers, in a grid's order.
 
-    The points ``removed`` (m, 3) as outliers have the scanners ``removed_scanner`` (m, 3). ``source`` (n + m,) is the
-    row in ``sources`` of the scan that a point is from, or of the station if the scene is one scan. Scans that
-    stitching did not place are not in it: ``unplaced`` names them. Of a scan too large for memory the points are a
-    sample, and ``large`` has all of them.
+    ``view`` (n + m,) is the view of each of these points, and then of those ``removed`` (m, 3) as outliers: a row of
+    the names ``views``, and of ``scanners`` (v, 3), which is None where any is unknown. With ``unnamed_views`` the scan
+    may be merged from several views of which nothing is known. Scans that stitching did not place are not in it:
+    ``unplaced`` names them. Of a scan too large for memory the points are a sample, and ``large`` has all of them.
     """
 
     points: Floats
     origin: Floats
-    scanner: Floats | None
     removed: Floats
-    removed_scanner: Floats | None
     spacing_mm: float
     read: int
     kept: int
-    source: Ints
-    sources: tuple[str, ...]
+    view: Ints
+    views: tuple[str, ...]
+    scanners: Floats | None
+    unnamed_views: bool
     unposed: int = 0  # scans without a pose
     unplaced: tuple[str, ...] = ()
     large: LargeCloud | None = None
@@ -52,23 +53,20 @@ class ScanCloud:
             return self.spacing_mm
         return self.large.spacing_mm * max(1.0, float(np.sqrt(self.kept / MOST_POINTS)))
 
-    @property
-    def unnamed_views(self) -> bool:
-        """Whether the scan may be merged from several views of which nothing is known."""
-        return self.scanner is None and len(self.sources) == 1
+    def scanner(self, rows: slice) -> Floats | None:
+        """Return the positions (k, 3) that some of the points were seen from; None where they are unknown."""
+        return None if self.scanners is None else self.scanners[self.view[: len(self.points)][rows]]
 
-    def of(self, sources: Ints) -> ScanCloud:
-        """Return the points of some sources alone."""
-        used = np.isin(self.source, sources)
+    def of(self, numbers: Ints) -> ScanCloud:
+        """Return the points of some views alone."""
+        used = np.isin(self.view, numbers)
         rows, out = np.flatnonzero(used[: len(self.points)]), np.flatnonzero(used[len(self.points) :])
-        large = None if self.large is None else self.large.of(sources)
+        large = None if self.large is None else self.large.of(numbers)
         return replace(
             self,
             points=self.points[rows],
-            scanner=None if self.scanner is None else self.scanner[rows],
             removed=self.removed[out],
-            removed_scanner=None if self.removed_scanner is None else self.removed_scanner[out],
-            source=self.source[used],
+            view=self.view[used],
             kept=len(rows) if large is None else large.kept,
             large=large,
         )
@@ -97,35 +95,35 @@ def _sample(scene: Scene, neighbours: int, ratio: float, most: int) -> ScanCloud
 
     If there are more than ``most`` points, and that is not 0, the sample of as many replaces the large cloud.
     """
-    origin = rigid.apply(scene.scans[0].pose, scene.scans[0].origin)
-    names = _source_names(scene)
-    large = large_cloud.of_scene(scene, origin, len(names) > len(scene.scans), neighbours, ratio)
+    seen = views(scene)
+    large = large_cloud.of_views(seen, neighbours, ratio)
     if not large.spacing_mm > 0.0:
         raise InputError(f"{scene.name}: most points of the scan lie at the same place; export it again")
     kept = large.kept
     replaced = 0 < most < kept
     step = -(-kept // (most if replaced else SAMPLE_POINTS))
-    points, scanner, source = large.thinned(True, step)
-    removed, removed_scanner, removed_source = large.thinned(False, step)
+    points, view = large.thinned(True, step)
+    removed, removed_view = large.thinned(False, step)
     return ScanCloud(
         points=points,
-        origin=origin,
-        scanner=scanner,
+        origin=seen.origin,
         removed=removed,
-        removed_scanner=removed_scanner,
         spacing_mm=large.spacing_mm * np.sqrt(kept / len(points)),
         read=len(large.points),
         kept=kept,
-        source=np.concatenate([source, removed_source]),
-        sources=names,
+        view=np.concatenate([view, removed_view]),
+        views=seen.names,
+        scanners=large.scanners,
+        unnamed_views=seen.unnamed,
         large=None if replaced else large,
     )
 
 
 def _held(scene: Scene, neighbours: int, ratio: float, most: int) -> ScanCloud:
     """Merge the scans of a scene in memory; of ``most`` points or fewer, if that is not 0, every k-th is left."""
-    cloud = scene_cloud.merged(scene, with_scanner=True)
-    grid = nearest_neighbours.of_spacing(cloud.points)
+    seen = views(scene)
+    placed = seen.placed()
+    grid = nearest_neighbours.of_spacing(placed.points)
     spacing = nearest_neighbours.spacing(grid)
     if not spacing > 0.0:
         raise InputError(f"{scene.name}: most points of the scan lie at the same place; export it again")
@@ -135,41 +133,18 @@ def _held(scene: Scene, neighbours: int, ratio: float, most: int) -> ScanCloud:
     step = max(1, -(-int(inlier.sum()) // most)) if most else 1
     rows, out = np.flatnonzero(inlier)[::step], np.flatnonzero(~inlier)[::step]
     kept = int(inlier.sum())
-
-    source, names = _sources(scene), _source_names(scene)
-
-    def scanner(at: Ints) -> Floats | None:
-        return None if cloud.scanner is None else cloud.scanner[grid.order[at]]
-
     return ScanCloud(
         points=grid.cells.points[rows],
-        origin=cloud.origin,
-        scanner=scanner(rows),
+        origin=seen.origin,
         removed=grid.cells.points[out],
-        removed_scanner=scanner(out),
         spacing_mm=spacing * np.sqrt(kept / len(rows)),
         read=grid.count,
         kept=kept,
-        source=source[grid.order[np.concatenate([rows, out])]],
-        sources=names,
+        view=placed.view[grid.order[np.concatenate([rows, out])]].astype(np.int64),
+        views=seen.names,
+        scanners=seen.scanners(placed.view),
+        unnamed_views=seen.unnamed,
     )
-
-
-def _source_names(scene: Scene) -> tuple[str, ...]:
-    """Return the names of the scans, or of the stations of a single one, with "-" for unknown."""
-    scans = scene.scans
-    if len(scans) == 1 and len(scans[0].point_station) and scene.stations is not None:
-        return (*scene.stations.ids, "-")
-    return tuple(scan.name for scan in scans)
-
-
-def _sources(scene: Scene) -> Ints:
-    """Return the scan (n,) of each point in the order of the scans, or its station in a single one."""
-    scans = scene.scans
-    if len(scans) == 1 and len(scans[0].point_station) and scene.stations is not None:
-        station = scans[0].point_station.astype(np.int64)
-        return np.where(station < 0, len(scene.stations.ids), station)
-    return np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans])
 
 
 def adaptive_voxels(points: Floats, size_mm: float, least: int, growth: float) -> Ints:

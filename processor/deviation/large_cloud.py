@@ -16,8 +16,9 @@ import numpy as np
 from processor import tiles
 from processor.deviation.surface_movement import Cloud
 from processor.geometry import nearest_neighbours, rigid
-from processor.large_arrays import allocate, blocks, extremes, release, taken
-from processor.model import Bools, Floats, Ints, Labels, Scan, Scene
+from processor.large_arrays import allocate, blocks, release, taken
+from processor.model import Bools, Floats, Ints, Labels
+from processor.views import Views
 
 SLAB_POINTS = 500_000
 PASS_POINTS = 250_000  # in memory at once where no neighbours are searched for
@@ -27,32 +28,24 @@ SPACING_SAMPLE = 20_000
 SAMPLE = 60_000  # points of a slab by which its spacing is estimated
 
 
-class _Part(NamedTuple):
-    """Points (n, 3), the sources (n,) and the scanners (n,) they are from, as rows."""
-
-    points: Floats
-    source: Labels
-    scanner: Labels
-
-
 @dataclass(frozen=True)
 class LargeCloud:
-    """Points (n, 3) in files, mm, slab by slab; their sources, the rows (n,) of ``scanners`` (s, 3), and inliers (n,).
+    """Points (n, 3) in files, mm, slab by slab, the view (n,) of each, and which (n,) are inliers.
 
-    ``scanners`` is None where any is unknown. ``used`` are the sources that are left, of all at first.
+    ``scanners`` (v, 3) are the positions of the views, None where any is unknown. ``used`` are the views that are left,
+    of all at first.
     """
 
     points: Floats
-    source: Labels
-    scanner: Labels
+    view: Labels
     inlier: Bools
     scanners: Floats | None
     spacing_mm: float
     used: Ints
 
-    def of(self, sources: Ints) -> LargeCloud:
-        """Return the points of some sources alone."""
-        return replace(self, used=sources)
+    def of(self, numbers: Ints) -> LargeCloud:
+        """Return the points of some views alone."""
+        return replace(self, used=numbers)
 
     @property
     def kept(self) -> int:
@@ -60,18 +53,17 @@ class LargeCloud:
         return sum(int((self.inlier[rows] & self._is_used(rows)).sum()) for rows in blocks(len(self.points)))
 
     def _is_used(self, rows: slice) -> Bools:
-        return np.isin(self.source[rows], self.used)
+        return np.isin(self.view[rows], self.used)
 
-    def thinned(self, inliers: bool, step: int) -> tuple[Floats, Floats | None, Ints]:
-        """Return every k-th of the inliers, or of the others: points, scanners and sources."""
+    def thinned(self, inliers: bool, step: int) -> tuple[Floats, Ints]:
+        """Return every k-th of the inliers, or of the others: points (k, 3) and their views (k,)."""
         chosen, count = [np.empty(0, np.int64)], 0
         for block in blocks(len(self.points), SLAB_POINTS):
             rows = np.flatnonzero(self.inlier[block] == inliers)
             chosen.append(block.start + rows[-count % step :: step])
             count += len(rows)
         rows = np.concatenate(chosen)
-        scanner = None if self.scanners is None else self.scanners[taken(self.scanner, rows)]
-        return taken(self.points, rows), scanner, taken(self.source, rows).astype(np.int64)
+        return taken(self.points, rows), taken(self.view, rows).astype(np.int64)
 
     def placed(self, T: Floats) -> Placed:
         """Return the points placed by T (4, 4), for passes over them."""
@@ -88,84 +80,29 @@ class Placed:
     def __iter__(self) -> Iterator[Cloud]:
         """Pass over all points that are used."""
         large = self.cloud
-        scanners = None if large.scanners is None else rigid.apply(self.T, large.scanners)
         for block in blocks(len(large.points), PASS_POINTS):
-            rows = np.flatnonzero(np.isin(large.source[block], large.used))
+            rows = np.flatnonzero(np.isin(large.view[block], large.used))
             if len(rows):
-                yield Cloud(
-                    rigid.apply(self.T, large.points[block][rows]),
-                    None if scanners is None else scanners[large.scanner[block][rows]],
-                    ~large.inlier[block][rows],
-                    large.source[block][rows].astype(np.int64),
-                )
+                placed = rigid.apply(self.T, large.points[block][rows])
+                yield Cloud(placed, ~large.inlier[block][rows], large.view[block][rows].astype(np.int64))
 
 
-def of_scene(scene: Scene, origin: Floats, by_station: bool, neighbours: int, ratio: float) -> LargeCloud:
-    """Sort the scans of a scene, less ``origin`` (3,), into slabs, and mark outliers as paper 002 does.
-
-    Sources are the stations of a single scan (``by_station``, those unknown last), else the scans.
-    """
-    scanners, first = _scanners(scene, origin)
-    parts = _Parts(scene.scans, origin, by_station, len(scene.stations.ids) if scene.stations else 0, first)
-    slabs = _Slabs.of(parts)
+def of_views(seen: Views, neighbours: int, ratio: float) -> LargeCloud:
+    """Sort the points of views into slabs, and mark outliers as paper 002 does."""
+    slabs = _Slabs.of(seen)
     n = int(slabs.ends[-1])
-    points, source, scanner = allocate(n, 3), allocate(n, dtype=np.int32), allocate(n, dtype=np.int32)
+    points, view = allocate(n, 3), allocate(n, dtype=np.int32)
     place = slabs.ends - np.diff(slabs.ends, prepend=0)
-    for part in parts:
-        slab = slabs.of_points(part.points)
+    for block in seen.blocks():
+        slab = slabs.of_points(block.points)
         order = np.argsort(slab, kind="stable")
         count = np.bincount(slab, minlength=len(place))
         rows = np.repeat(place - (np.cumsum(count) - count), count) + np.arange(len(slab))
-        points[rows], source[rows], scanner[rows] = (column[order] for column in part)
+        points[rows], view[rows] = block.points[order], block.view[order]
         place += count
-        release()
-    inlier, spacing = _inliers(slabs, _Part(points, source, scanner), neighbours, ratio)
-    used = np.arange(parts.stations + 1 if by_station else len(scene.scans))
-    return LargeCloud(points, source, scanner, inlier, scanners=scanners, spacing_mm=spacing, used=used)
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """Passes over the points of scans in the project's frame less ``origin``, in blocks.
-
-    ``first`` is the row of the first station among the scanners, of which those of scans with a position come before.
-    """
-
-    scans: tuple[Scan, ...]
-    origin: Floats
-    by_station: bool
-    stations: int
-    first: int
-
-    def __iter__(self) -> Iterator[_Part]:
-        """Pass over all points."""
-        own = 0
-        for number, scan in enumerate(self.scans):
-            T = rigid.between_origins(scan.pose, scan.origin, self.origin)
-            for rows in blocks(len(scan.points)):
-                points = scan.points[rows]
-                points = rigid.apply(T, points) if scan.T_project_scan.size else points + T[:3, 3]
-                station = scan.point_station[rows]
-                source = np.full(len(points), number, np.int32)
-                if self.by_station:
-                    source = np.where(station < 0, self.stations, station).astype(np.int32)
-                seen_from = np.full(len(points), own, np.int32) if scan.position.size else self.first + station
-                yield _Part(points, source, seen_from if len(seen_from) else np.zeros(len(points), np.int32))
-            own += bool(scan.position.size)
-
-
-def _scanners(scene: Scene, origin: Floats) -> tuple[Floats | None, int]:
-    """Return positions (s, 3) of scanners, those of scans first, and the number of these; None where one is unknown."""
-    own, known = [np.empty((0, 3))], True
-    for scan in scene.scans:
-        if scan.position.size:
-            T = rigid.between_origins(scan.pose, scan.origin, origin)
-            own.append((T[:3, :3] @ (scan.position - scan.origin) + T[:3, 3])[None])
-        else:
-            named = scene.stations is not None and len(scan.point_station) > 0
-            known = known and named and extremes(scan.point_station)[0] >= 0
-    stations = np.empty((0, 3)) if scene.stations is None else scene.stations.positions - origin
-    return np.concatenate([*own, stations]) if known else None, len(own) - 1
+    inlier, spacing = _inliers(slabs, points, view, neighbours, ratio)
+    used = np.arange(len(seen.names))
+    return LargeCloud(points, view, inlier, scanners=seen.scanners(view), spacing_mm=spacing, used=used)
 
 
 @dataclass(frozen=True)
@@ -179,16 +116,16 @@ class _Slabs:
     ends: Ints
 
     @classmethod
-    def of(cls, parts: _Parts) -> _Slabs:
+    def of(cls, seen: Views) -> _Slabs:
         """Return the slabs of points."""
-        corners = [(part.points.min(axis=0), part.points.max(axis=0)) for part in parts]
+        corners = [(block.points.min(axis=0), block.points.max(axis=0)) for block in seen.blocks()]
         low, high = np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)
         axis = int(np.argmax(high - low))
         width = max(float(high[axis] - low[axis]) / BINS, 1e-9)
         one = cls(axis, float(low[axis]), width, np.arange(BINS), ends=np.empty(0, np.int64))
         filled = np.zeros(BINS, np.int64)
-        for part in parts:
-            filled += np.bincount(one.of_points(part.points), minlength=BINS)
+        for block in seen.blocks():
+            filled += np.bincount(one.of_points(block.points), minlength=BINS)
         slab_of_bin, slab, total = np.empty(BINS, np.int64), 0, 0
         for number, count in enumerate(filled.tolist()):
             if total and total + count > SLAB_POINTS:
@@ -239,13 +176,13 @@ def _near(slab: _Slab) -> _Near:
     return _Near(grid.order[own], distance, farthest, k)
 
 
-def _inliers(slabs: _Slabs, part: _Part, neighbours: int, ratio: float) -> tuple[Bools, float]:
+def _inliers(slabs: _Slabs, points: Floats, view: Labels, neighbours: int, ratio: float) -> tuple[Bools, float]:
     """Mark (n,) the points that outlier removal keeps, put each slab in the order of a grid, and return the spacing."""
-    n = len(part.points)
+    n = len(points)
     distance, order = allocate(n), allocate(n, dtype=np.int32)
     farthest, total, k = list[Floats](), 0.0, 1
-    filled = [slab for slab in range(len(slabs.ends)) if len(part.points[slabs.rows(slab)])]
-    found = tiles.mapped(_near, _slabs(slabs, part.points, filled, neighbours if ratio > 0.0 else 0))
+    filled = [slab for slab in range(len(slabs.ends)) if len(points[slabs.rows(slab)])]
+    found = tiles.mapped(_near, _slabs(slabs, points, filled, neighbours if ratio > 0.0 else 0))
     for slab, near in zip(filled, found, strict=True):
         rows = slabs.rows(slab)
         order[rows], distance[rows], k = near.order, near.distance, near.k
@@ -254,8 +191,7 @@ def _inliers(slabs: _Slabs, part: _Part, neighbours: int, ratio: float) -> tuple
         release()
     for slab in filled:  # not before all slabs were searched: those about a slab are parts of it
         rows = slabs.rows(slab)
-        for column in part:
-            column[rows] = column[rows][order[rows]]
+        points[rows], view[rows] = points[rows][order[rows]], view[rows][order[rows]]
         release()
     inlier = allocate(n, dtype=np.bool_)
     mean = total / n
@@ -267,25 +203,19 @@ def _inliers(slabs: _Slabs, part: _Part, neighbours: int, ratio: float) -> tuple
 
 
 def _slabs(slabs: _Slabs, points: Floats, numbers: Sequence[int], neighbours: int) -> Iterator[_Slab]:
-    """Pass over slabs with the points about them."""
-    step = max(1, len(points) // SPACING_SAMPLE)
+    """Pass over slabs, each with the points about it after its own."""
+    every = max(1, len(points) // SPACING_SAMPLE)
     for slab in numbers:
-        rows = slabs.rows(slab)
-        yield _Slab(_with_halo(slabs, points, slab), rows.stop - rows.start, step, neighbours)
-
-
-def _with_halo(slabs: _Slabs, points: Floats, slab: int) -> Floats:
-    """Return the points of a slab, and after them those about it."""
-    own = points[slabs.rows(slab)]
-    step = max(1, len(own) // SAMPLE)
-    few = nearest_neighbours.spacing(nearest_neighbours.of_spacing(own[::step]))
-    reach = HALO * few / np.sqrt(step) if few > 0.0 else 0.0
-    low, high = slabs.bounds(slab)
-    beside = [own]
-    for other in range(len(slabs.ends)):
-        start, stop = slabs.bounds(other)
-        if other != slab and start <= high + reach and stop >= low - reach:
-            part = points[slabs.rows(other)]
-            along = part[:, slabs.axis]
-            beside.append(part[(along >= low - reach) & (along <= high + reach)])
-    return np.concatenate(beside)
+        own = points[slabs.rows(slab)]
+        step = max(1, len(own) // SAMPLE)
+        few = nearest_neighbours.spacing(nearest_neighbours.of_spacing(own[::step]))
+        reach = HALO * few / np.sqrt(step) if few > 0.0 else 0.0
+        low, high = slabs.bounds(slab)
+        beside = [own]
+        for other in range(len(slabs.ends)):
+            start, stop = slabs.bounds(other)
+            if other != slab and start <= high + reach and stop >= low - reach:
+                part = points[slabs.rows(other)]
+                along = part[:, slabs.axis]
+                beside.append(part[(along >= low - reach) & (along <= high + reach)])
+        yield _Slab(np.concatenate(beside), len(own), every, neighbours)

@@ -45,14 +45,15 @@ def _shares(scan: ScanCloud, T: Floats, points: Floats, normals: Floats) -> Floa
     It is the station's share of the points at a core point times the cosine of incidence, on average; where scanners
     are not known, all ranges are taken to be along the normals of one station's faces, which is the most.
     """
-    if scan.scanner is None:
+    rows = slice(0, len(scan.points), max(1, len(scan.points) // SAMPLE))
+    scanner, view = scan.scanner(rows), scan.view[rows]
+    if scanner is None:
         return np.ones(1)
-    rows = np.arange(0, len(scan.points), max(1, len(scan.points) // SAMPLE))
-    at, seen_from, station = rigid.apply(T, scan.points[rows]), rigid.apply(T, scan.scanner[rows]), scan.source[rows]
+    at, seen_from = rigid.apply(T, scan.points[rows]), rigid.apply(T, scanner)
     nearest = cKDTree(points).query(at, workers=-1)[1]
     arm = seen_from - at
     cosine = np.abs(np.einsum("ni,ni->n", arm, normals[nearest])) / np.maximum(np.linalg.norm(arm, axis=1), 1e-9)
     count = np.bincount(nearest, minlength=len(points))
     weight = cosine / count[nearest]
-    shares: Floats = np.bincount(station, weight, len(scan.sources)) / (count > 0).sum()
+    shares: Floats = np.bincount(view, weight, len(scan.views)) / (count > 0).sum()
     return shares

@@ -113,7 +113,8 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
     core = mesh_distance.sampled(surface.vertices, surface.faces, core_spacing)
     depth = params.max_depth_mm or _depth(few.points, surface)
     clouds = [few] if most or scan.large is None else scan.large.placed(T)
-    moved, share, shared = surface_movement.movement(clouds, core, curved, diameter, depth)
+    scanners = None if scan.scanners is None else rigid.apply(T, scan.scanners)
+    moved, share, shared = surface_movement.movement(clouds, scanners, core, curved, diameter, depth)
     views = 0.0
     if scan.unnamed_views:
         # Each scanned point counts at ``overlap`` core points.
@@ -129,15 +130,8 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
 def _cloud(scan: ScanCloud, T: Floats, step: int, with_removed: bool) -> Cloud:
     """Return every k-th point of a scan placed by T (4, 4), and what was removed as outliers, or not."""
     points = np.concatenate([scan.points, scan.removed]) if with_removed else scan.points[::step]
-    scanner = scan.scanner
-    if scanner is not None and scan.removed_scanner is not None:
-        scanner = np.concatenate([scanner, scan.removed_scanner]) if with_removed else scanner[::step]
-    return Cloud(
-        rigid.apply(T, points),
-        None if scanner is None else rigid.apply(T, scanner),
-        np.arange(len(points)) >= len(scan.points),
-        scan.source if with_removed else scan.source[: len(scan.points) : step],
-    )
+    view = scan.view if with_removed else scan.view[: len(scan.points) : step]
+    return Cloud(rigid.apply(T, points), np.arange(len(points)) >= len(scan.points), view)
 
 
 def _fits(measured: Measured, params: Params) -> Fits:

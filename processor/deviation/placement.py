@@ -41,17 +41,17 @@ class Placement:
 
 
 def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> Placement:
-    """Place a scan at its design from ``given`` (4, 4), by the sources of it that lie there; the others are left out.
+    """Place a scan at its design from ``given`` (4, 4), by the views of it that lie there; the others are left out.
 
     If none lies there, the scan is placed as a whole, and nothing is left out.
     """
-    everything = np.flatnonzero(np.bincount(scan.source, minlength=len(scan.sources)) > 0)
+    everything = np.flatnonzero(np.bincount(scan.view, minlength=len(scan.views)) > 0)
     used = everything
     if how == "auto" and len(everything) > 1:
-        lying = [source for source in everything.tolist() if _near(scan, source, surface, given)[0] >= NEAR_SHARE]
+        lying = [view for view in everything.tolist() if _near(scan, view, surface, given)[0] >= NEAR_SHARE]
         used = np.array(lying or everything)
     placed = _placed(scan, used, surface, given, how)
-    count = np.bincount(scan.source, minlength=len(scan.sources))
+    count = np.bincount(scan.view, minlength=len(scan.views))
     at_design = _at_design(scan, everything, surface, placed.T)
     if len(everything) > 1 and how != "none" and not np.isin(used, at_design).all():
         # A scan in another frame moves the pose of the others: it is found again without it, or by one scan.
@@ -64,29 +64,29 @@ def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> Pla
     lies = bool(len(at_design)) or surface_registration.fits_design(placed, scan.points, surface)
     if not len(at_design) or len(at_design) == len(everything):
         return Placement(scan, placed, (), lies)
-    left_out = tuple(Elsewhere(scan.sources[k], int(count[k])) for k in everything if k not in at_design)
+    left_out = tuple(Elsewhere(scan.views[k], int(count[k])) for k in everything if k not in at_design)
     return Placement(scan.of(at_design), placed, left_out, lies)
 
 
-def _placed(scan: ScanCloud, sources: Ints, surface: MeshSurface, given: Floats, how: str) -> Placed:
-    few = scan.of(sources)
-    return surface_registration.place(few.points, surface, given, how, few.scanner)
+def _placed(scan: ScanCloud, numbers: Ints, surface: MeshSurface, given: Floats, how: str) -> Placed:
+    few = scan.of(numbers)
+    return surface_registration.place(few.points, surface, given, how, few.scanner(slice(None)))
 
 
-def _at_design(scan: ScanCloud, sources: Ints, surface: MeshSurface, T: Floats) -> Ints:
-    """Return the sources that lie at the design if the scan is placed by T (4, 4)."""
+def _at_design(scan: ScanCloud, numbers: Ints, surface: MeshSurface, T: Floats) -> Ints:
+    """Return the views that lie at the design if the scan is placed by T (4, 4)."""
     lying = []
-    for source in sources.tolist():
-        near, about, count = _near(scan, source, surface, T)
+    for view in numbers.tolist():
+        near, about, count = _near(scan, view, surface, T)
         enough = about >= FEWEST_SHARE and about * count >= FEWEST_POINTS
         if enough and near >= AT_DESIGN * about:
-            lying.append(source)
+            lying.append(view)
     return np.array(lying, np.int64)
 
 
-def _near(scan: ScanCloud, source: int, surface: MeshSurface, T: Floats) -> tuple[float, float, int]:
-    """Return the shares of a source's points within NEAR_MM and twice NEAR_MM of the design, and the sample's size."""
-    points = thinned(scan.points[scan.source[: len(scan.points)] == source], SAMPLE)
+def _near(scan: ScanCloud, view: int, surface: MeshSurface, T: Floats) -> tuple[float, float, int]:
+    """Return the shares of a view's points within NEAR_MM and twice NEAR_MM of the design, and the sample's size."""
+    points = thinned(scan.points[scan.view[: len(scan.points)] == view], SAMPLE)
     if not len(points):
         return 0.0, 0.0, 0
     face, distance, beyond = surface.distances(rigid.apply(T, points), 2.0 * NEAR_MM)

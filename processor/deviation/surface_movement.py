@@ -29,32 +29,32 @@ from processor.tiles import Shared
 LEAST_COS = 0.5  # between the normals at a core point and below a scanned point
 NOISE_SHARE = 0.75  # quantile of the core points' standard deviations that is the noise: noise across edges is larger
 ABOUT = 2.0  # diameters about a core point within which all faces are taken to move alike, to find each point's face
-SAME_MM = 0.1  # between positions of one scanner
 RETURNS = 3.0  # standard deviations from the surface within which a point removed as an outlier is none
 
 
 @dataclass(frozen=True)
 class Cloud(Columns):
-    """Points (n, 3) of a scan, the positions (n, 3) they were seen from, if known, and which (n,) may be outliers.
-
-    ``station`` (n,) is the number of the scan or station that a point is from.
-    """
+    """Points (n, 3) of a scan, which (n,) of them may be outliers, and the view (n,) that each is of."""
 
     points: Floats
-    scanner: Floats | None
     doubtful: npt.NDArray[np.bool_]
-    station: Ints
+    view: Ints
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Core points of a design, and what movements at them are fitted with."""
+    """Core points of a design, and what movements at them are fitted with; ``scanners`` (v, 3) of views, if known."""
 
     core: Samples
     curved: CurvedFacets
     grid: FacetGrid
     diameter: float
     depth: float
+    scanners: Floats | None
+
+    def scanner(self, cloud: Cloud) -> Floats | None:
+        """Return the position (n, 3) that each point of a cloud was seen from, if known."""
+        return None if self.scanners is None else self.scanners[cloud.view]
 
     def sums(self, times: float = 1.0, least_cos: float = LEAST_COS) -> Translations:
         """Begin the sums of a fit to the points within half of some diameters of the core points."""
@@ -105,9 +105,16 @@ class _Around(NamedTuple):
 
 
 def movement(
-    clouds: Iterable[Cloud], core: Samples, curved: CurvedFacets, diameter_mm: float, depth_mm: float
+    clouds: Iterable[Cloud],
+    scanners: Floats | None,
+    core: Samples,
+    curved: CurvedFacets,
+    diameter_mm: float,
+    depth_mm: float,
 ) -> tuple[Movement, float, Floats]:
     """Fit movements at core points to a scan in the design's frame, whose points come in the same ``clouds`` each time.
+
+    ``scanners`` (v, 3) are the positions of the views there, None where any is unknown.
 
     Three fits: the first gives the scatter of the points, the second movements from points whose face is decided for
     that scatter. The last compares each point with the face below its place before the movement, so that a tube that
@@ -123,7 +130,7 @@ def movement(
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, depth_mm)
     within = mesh_bodies.enclosed(core.points, core.normals, grid, mesh_bodies.closed_bodies(surface.faces))
     core = replace(core, normals=np.where(within[:, None], np.nan, core.normals))
-    passes = _Passes(clouds, Shared(_Fit(core, curved, grid, diameter=diameter_mm, depth=depth_mm)))
+    passes = _Passes(clouds, Shared(_Fit(core, curved, grid, diameter_mm, depth=depth_mm, scanners=scanners)))
     first, on_surface = _first(passes)
     known = np.flatnonzero(np.isfinite(first.along))
     if not len(known):
@@ -175,7 +182,7 @@ def _assigned_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, Bools, _Faces, tuple[i
 
     These are the numbers of points near the surface and of all, outliers left out.
     """
-    seen = assignment.assigned(cloud.points, cloud.scanner, fit.curved, fit.grid)
+    seen = assignment.assigned(cloud.points, fit.scanner(cloud), fit.curved, fit.grid)
     close = np.abs(seen.distance) <= fit.depth
     counts = int((close & ~cloud.doubtful).sum()), int((~cloud.doubtful).sum())
     face = np.where(seen.facet >= 0, fit.curved.surface.part_of[seen.facet], -1).astype(np.int32)
@@ -190,46 +197,30 @@ def _first_of(near: _Near, fit: _Fit) -> PartSums:
 
 def _mark_mixed(passes: _Passes, faces: Sequence[_Faces]) -> None:
     """Add to what is doubtful the mixed pixels among points near the surface, as all points of their scanner show."""
-    scanners, numbers = list[Floats](), list[Labels]()
-    for cloud in passes.clouds:
-        if cloud.scanner is None:
-            return
-        numbers.append(put_aside(_numbered(cloud.scanner, scanners)))
-    blocks = _Blocks(passes, faces, numbers)
-    mixed, done = mixed_pixels.mark_passes(blocks, np.array(scanners), passes.fit.value.curved.surface.normals), 0
+    fit, done = passes.fit.value, 0
+    if fit.scanners is None:
+        return
+    mixed = mixed_pixels.mark_passes(_Blocks(passes, faces), fit.scanners, fit.curved.surface.normals)
     for row, doubtful in enumerate(passes.doubtful):
         passes.doubtful[row] = put_aside(doubtful | mixed[done : done + len(doubtful)])
         done += len(doubtful)
         release()
 
 
-def _numbered(scanner: Floats, scanners: list[Floats]) -> Labels:
-    """Return the row (n,) of each scanner (n, 3) in ``scanners``, to which those are added that are not there yet."""
-    number, left, row = np.zeros(len(scanner), np.int32), np.arange(len(scanner)), 0
-    while len(left):
-        if row == len(scanners):
-            scanners.append(scanner[left[0]].copy())
-        of_one = np.abs(scanner[left] - scanners[row]).max(axis=1) <= SAME_MM
-        number[left[of_one]] = row
-        left, row = left[~of_one], row + 1
-    return number
-
-
 @dataclass(frozen=True)
 class _Blocks:
-    """Passes over all points of the clouds with their ``faces`` and the ``numbers`` of their scanners."""
+    """Passes over all points of the clouds with their ``faces``."""
 
     passes: _Passes
     faces: Sequence[_Faces]
-    numbers: Sequence[Labels]
 
     def __iter__(self) -> Iterator[mixed_pixels.Block]:
         """Pass over all points."""
-        columns = self.passes.clouds, self.passes.asides, self.faces, self.numbers
-        for cloud, aside, (face, above), number in zip(*columns, strict=True):
+        columns = self.passes.clouds, self.passes.asides, self.faces
+        for cloud, aside, (face, above) in zip(*columns, strict=True):
             facet, height = np.full(len(face), -1, np.int32), np.zeros(len(face))
             facet[aside.rows], height[aside.rows] = aside.facet, above
-            yield mixed_pixels.Block(cloud.points, number, face, facet, height)
+            yield mixed_pixels.Block(cloud.points, cloud.view, face, facet, height)
             release()
 
 
@@ -278,13 +269,13 @@ def _last_of(near: tuple[Cloud, Ints], fit: _Fit, vector: Floats, scatter: Float
     """Return what :func:`_last` needs of the points of a cloud."""
     cloud, at = near
     about = scatter[at]
-    before = assignment.assigned(cloud.points - vector[at], cloud.scanner, fit.curved, fit.grid)
+    before = assignment.assigned(cloud.points - vector[at], fit.scanner(cloud), fit.curved, fit.grid)
     left = np.abs(before.distance)
     clear = assignment.clear(before, about) & (left <= fit.depth) & (~cloud.doubtful | (left <= RETURNS * about))
     rows = np.flatnonzero(clear)
     aside, before = Aside.of(rows, before), before.take(rows)
     part = fit.part(fit.sums(), before, _distance(fit.curved, before, vector[at[rows]]))
-    return aside, part, set(np.unique(cloud.station[rows]).tolist())
+    return aside, part, set(np.unique(cloud.view[rows]).tolist())
 
 
 def _distance(curved: CurvedFacets, before: OnSurface, shift: Floats) -> Floats:
@@ -306,7 +297,7 @@ def _used(passes: _Passes, nearest: Sequence[Ints], used: Sequence[Aside]) -> It
     """Pass over the points of the last fit."""
     for cloud, near, at, aside in zip(passes.clouds, passes.asides, nearest, used, strict=True):
         rows = near.rows[aside.rows]
-        yield _Used(cloud.points[rows], cloud.station[rows], at[aside.rows], aside)
+        yield _Used(cloud.points[rows], cloud.view[rows], at[aside.rows], aside)
         release()
 
 

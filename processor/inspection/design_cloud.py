@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from processor import large_arrays
-from processor.adjustment.point_groups import distinct_groups, joined_numbers
 from processor.distinct_rows import distinct
-from processor.geometry import point_grid, rigid
+from processor.geometry import point_grid
 from processor.geometry.nearest_neighbours import within_reach
 from processor.geometry.point_grid import Cells
 from processor.large_arrays import allocate, blocks
-from processor.model import Bools, Floats, Ints, Labels, Scan, Scene
+from processor.model import Bools, Floats, Ints, Labels, Scene
+from processor.views import views
 
 CELL_MM = 25.0  # of the grid
 BOX_MM = 150.0  # about places that are searched together
@@ -36,8 +36,8 @@ class SeenPoints(NamedTuple):
 class DesignCloud:
     """All points of a scene in the design's frame less an origin, mm, sorted into cells, and from where each was seen.
 
-    A view is a scan, or a station of it; points of no station are one. ``view`` (n,) is of the points in the order of
-    the cells. ``scanners`` (v, 3) are the positions of the views, all NaN if one of them is unknown.
+    ``view`` (n,) is of the points in the order of the cells. ``scanners`` (v, 3) are the positions of the views, all
+    NaN if that of one with points is unknown.
     """
 
     cells: Cells
@@ -82,33 +82,7 @@ def of_points(points: Floats, view: Ints | Labels, scanners: Floats) -> DesignCl
 
 def of_scene(scene: Scene, T: Floats, origin: Floats) -> DesignCloud:
     """Return all points of a scene in the design's frame less ``origin`` (3,), mm, by a pose (4, 4) of the project."""
-    poses = [rigid.between_origins(T @ scan.pose, scan.origin, origin) for scan in scene.scans]
-    points = rigid.placed([(pose, scan.points) for pose, scan in zip(poses, scene.scans, strict=True)])
-    stations = [_stations(scan) for scan in scene.scans]
-    view = joined_numbers(stations)
-    of_scans = zip(scene.scans, map(distinct_groups, stations), strict=True)
-    scanners = [_scanners(scene, scan, known, T, origin) for scan, known in of_scans]
-    found = np.concatenate([np.empty((0, 3)), *scanners])
-    return of_points(points, view, found if np.isfinite(found).all() else np.full(found.shape, np.nan))
-
-
-def _is_of_stations(scan: Scan) -> bool:
-    return len(scan.point_station) > 0 and not scan.position.size
-
-
-def _stations(scan: Scan) -> Labels:
-    """Return the station (n,) of each point, -1 of none; 0 of all where the scan is one view."""
-    if _is_of_stations(scan):
-        return scan.point_station
-    return np.broadcast_to(np.int32(0), len(scan.points))
-
-
-def _scanners(scene: Scene, scan: Scan, stations: Ints, T: Floats, origin: Floats) -> Floats:
-    """Return the positions (s, 3) of the views of a scan in the design's frame less ``origin``, NaN if unknown."""
-    if scan.position.size:
-        at = rigid.apply(rigid.between_origins(T @ scan.pose, scan.origin, origin), scan.position - scan.origin)
-        return np.broadcast_to(at, (len(stations), 3))
-    if scene.stations is None or not _is_of_stations(scan) or stations[0] < 0:
-        return np.full((len(stations), 3), np.nan)
-    positions = scene.stations.positions[stations]
-    return rigid.apply(rigid.between_origins(T, positions[0], origin), positions - positions[0])
+    seen = views(scene, T, origin)
+    points, view = seen.placed()
+    scanners = seen.scanners(view)
+    return of_points(points, view, np.full(seen.positions.shape, np.nan) if scanners is None else scanners)

@@ -19,9 +19,9 @@ from processor.model import FrameDesign, InputError, Reason, Scene, Tolerance, r
 from processor.scene_cloud import merged
 from processor.space_frame import hanger_lengths, to_result
 from processor.space_frame.params import METHODS, Params
-from processor.space_frame.points.scene_source import PointReader
 from processor.space_frame.result import Balls, Result
 from processor.space_frame.spheres import baselines, search_without_design
+from processor.views import PointReader
 
 __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "STREAMS", "Params", "Result", "run"]
 

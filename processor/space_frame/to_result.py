@@ -17,7 +17,7 @@ from processor.space_frame.design.movement import Movement, size_of, verdict_of
 from processor.space_frame.extract import Extracted, Options, extract
 from processor.space_frame.members.records import Members
 from processor.space_frame.params import Params
-from processor.space_frame.points.scene_source import PointReader, SceneSource, of_scene
+from processor.space_frame.points.source import SceneSource
 from processor.space_frame.result import (
     NAN,
     Balls,
@@ -38,20 +38,21 @@ from processor.space_frame.spheres.unnamed_view_errors import of_tubes
 from processor.space_frame.stations import station_error_propagation
 from processor.space_frame.stations.records import Stations
 from processor.space_frame.stations.sightings import control_of
+from processor.views import PointReader, views
 
 UNUSED_CONTROL = reason("spheres.unused-control")
 
 
 def of_frame(scene: Scene, params: Params, points: PointReader | None = None) -> Result | None:
     """Find every sphere of a frame's scene; None where the cloud has no members that meet."""
-    source = of_scene(scene, points)
+    source = SceneSource(views(scene, reader=points))
     extracted = _extracted(source, scene, params)
     return None if extracted is None else _result(extracted, source, scene)
 
 
 def beside_ray(scene: Scene, params: Params) -> Result | None:
     """Fit the spheres that method ``ray`` finds by one of the paper's methods; None as above."""
-    extracted = _extracted(of_scene(scene), scene, params)
+    extracted = _extracted(SceneSource(views(scene)), scene, params)
     if extracted is None:
         return None
     ids, limits = _ids(extracted.design_row, scene.frame), standards.default_for(scene.tolerance)

@@ -9,10 +9,11 @@ import numpy as np
 
 from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
-from processor.model import Control, Floats, Ints, Reason, Scan, Scene, TargetKind, Targets, reason
+from processor.model import Control, Floats, Ints, Reason, Scene, TargetKind, Targets, reason
 from processor.space_frame.result import Balls
 from processor.targets import checkerboard, naming, spheres
 from processor.targets.checkerboard import Checkerboard
+from processor.views import Views, views
 
 LEAST_SD_MM = 0.05  # of a target's place: what a fit does not see, as the sheet's flatness
 # Of the ranges of a view: it moves all of its targets along their rays, and no fit of one target shows it.
@@ -41,12 +42,13 @@ def with_targets(scene: Scene) -> Scene:
     search = scene.target_search
     if search is None or scene.targets is not None:
         return scene
+    seen = views(scene)
     found: list[_Found] = []
     remarks: list[Reason] = []
     for row, scan in enumerate(scene.scans):
         if not np.isnan(search.checkerboard_mm) and not np.isfinite(scan.intensity).any():
             remarks.append(reason("targets.no-intensities", scan=scan.name))
-        for station, points, bright, scanner in _views(scene, scan):
+        for station, points, bright, scanner in _of_views(seen, row):
             if not np.isnan(search.checkerboard_mm):
                 boards, left_out = checkerboard.search(points, bright, search.checkerboard_mm)
                 found += [_of_board(one, row, station, scan.origin) for one in boards]
@@ -61,7 +63,12 @@ def with_targets(scene: Scene) -> Scene:
     names = _names(scene, found, remarks)
     return replace(
         scene,
-        targets=_table(scene, found, names),
+        targets=Targets.from_items(
+            found,
+            name=tuple("" if row < 0 or scene.control is None else scene.control.ids[row] for row in names.tolist()),
+            places=np.array([one.place for one in found]).reshape(-1, 3),
+            sd=np.array([one.with_view_sd for one in found]),
+        ),
         target_remarks=tuple(remarks),
         control=_with_sightings(scene.control, found, names),
     )
@@ -82,17 +89,15 @@ def _of_sphere(balls: Balls, row: int, scan: int, station: int, origin: Floats) 
     )  # fmt: skip
 
 
-def _views(scene: Scene, scan: Scan) -> Iterator[tuple[int, Floats, Floats, Floats | None]]:
+def _of_views(seen: Views, row: int) -> Iterator[tuple[int, Floats, Floats, Floats | None]]:
     """Yield station, points, intensities and the scanner's place, the latter less the scan's origin, of each view."""
+    scan, back = seen.scans[row], rigid.invert(seen.poses[row])
     bright = scan.intensity if len(scan.intensity) else np.full(len(scan.points), np.nan)
-    if scan.position.size or not len(scan.point_station) or scene.stations is None:
-        yield -1, scan.points, bright, scan.position - scan.origin if scan.position.size else None
-        return
-    back = rigid.invert(scan.pose)
-    for station in np.unique(scan.point_station).tolist():
-        rows = scan.point_station == station
-        at = None if station < 0 else rigid.apply(back, scene.stations.positions[station]) - scan.origin
-        yield station, scan.points[rows], bright[rows], at
+    of_points = seen.of_points(row, scan.point_station, len(scan.points))
+    for view in np.unique(of_points).tolist():
+        rows, position = of_points == view, seen.positions[view]
+        at = rigid.apply(back, position) if np.isfinite(position).all() else None
+        yield view if view < seen.stations else -1, scan.points[rows], bright[rows], at
 
 
 def _names(scene: Scene, found: list[_Found], remarks: list[Reason]) -> Ints:
@@ -119,16 +124,6 @@ def _names(scene: Scene, found: list[_Found], remarks: list[Reason]) -> Ints:
             remarks.append(reason("targets.contradict", scan=scan.name, targets=contradict, mm=naming.NEAR_MM))
         rows[of_view] = named
     return rows
-
-
-def _table(scene: Scene, found: list[_Found], names: Ints) -> Targets:
-    ids = () if scene.control is None else scene.control.ids
-    return Targets.from_items(
-        found,
-        name=tuple(ids[row] if row >= 0 else "" for row in names.tolist()),
-        places=np.array([one.place for one in found]).reshape(-1, 3),
-        sd=np.array([one.with_view_sd for one in found]),
-    )
 
 
 def _with_sightings(control: Control | None, found: list[_Found], names: Ints) -> Control | None:

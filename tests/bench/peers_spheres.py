@@ -27,7 +27,8 @@ import processor
 from processor.api.arrays import LEAST_POINTS
 from processor.model import NORMAL_95, Status
 from processor.space_frame import step as space_frame_step
-from processor.space_frame.points.scene_source import of_scene
+from processor.space_frame.points.source import SceneSource
+from processor.views import views
 from tests.bench.bolt_balls import scene_of
 
 NEAR_MM = 10.0
@@ -66,7 +67,7 @@ def ours(scene, truth):
 
 def crops_of(scene, truth):
     """Points of the crop about every true ball, of those that have as many as both fits need."""
-    source = of_scene(scene)
+    source = SceneSource(views(scene))
     points = np.vstack([chunk.points for chunk in source.chunks()]) + source.origin
     rows = cKDTree(points).query_ball_point(truth.centres, truth.radii + CROP_MM)
     return [points[own] for own in rows if len(own) >= LEAST_POINTS]
@@ -101,7 +102,7 @@ def ransac(crops, truth):
 
 def cloudcompare(scene, truth):
     """CloudCompare's RANSAC_SD for spheres and cylinders on the whole cloud, in metres less an origin."""
-    source = of_scene(scene)
+    source = SceneSource(views(scene))
     points = 1e-3 * np.vstack([chunk.points for chunk in source.chunks()])
     vertices = np.array([tuple(p) for p in points], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
     with tempfile.TemporaryDirectory() as folder:

@@ -76,8 +76,8 @@ def test_the_nearest_face_is_taken_and_its_clearance_is_the_distance_of_the_next
     assert not assignment.clear(seen, np.full(5, 2.0))[[0, 1, 3, 4]].any()
     assert assignment.clear(seen, np.full(5, 2.0))[2]
     middles = np.vstack([surface.vertices[surface.faces].mean(axis=1), [0.0, 0.0, -50.0]])
-    cloud = surface_movement.Cloud(middles, None, np.zeros(13, bool), np.zeros(13, np.int64))
-    of_points = surface_movement._assigned_of(cloud, surface_movement._Fit(None, curved, grid, 20.0, 30.0))
+    cloud = surface_movement.Cloud(middles, np.zeros(13, bool), np.zeros(13, np.int64))
+    of_points = surface_movement._assigned_of(cloud, surface_movement._Fit(None, curved, grid, 20.0, 30.0, None))
     assert of_points[2].face.tolist() == [*surface.part_of, -1]  # of every facet, the first as well
     assert of_points[3] == (12, 13)
     # From below, the top is not visible: neither to a point that lies there, nor as what a point may be mistaken for.

@@ -47,7 +47,7 @@ SCENES = {"posed": {"scans": 2}, "stations": {"stations": True}}
 
 
 @pytest.mark.parametrize("options", SCENES.values(), ids=SCENES)
-def test_outliers_scanners_and_sources_are_those_of_the_whole(options, small, monkeypatch):
+def test_outliers_scanners_and_views_are_those_of_the_whole(options, small, monkeypatch):
     scene = scene_of(**options)
     large = cloud.of_scene(scene, 20, 1.0).large
     monkeypatch.setattr(cloud, "MOST_POINTS", 10 * COUNT)
@@ -55,11 +55,12 @@ def test_outliers_scanners_and_sources_are_those_of_the_whole(options, small, mo
     assert held.large is None
     assert (large.kept, held.read) == (held.kept, COUNT)
     count = len(held.points)
-    for inliers, points, scanner, source in (
-        (True, held.points, held.scanner, held.source[:count]),
-        (False, held.removed, held.removed_scanner, held.source[count:]),
+    np.testing.assert_array_equal(large.scanners, held.scanners)
+    for inliers, points, view in (
+        (True, held.points, held.view[:count]),
+        (False, held.removed, held.view[count:]),
     ):
-        ours, theirs = in_order(*large.thinned(inliers, 1)), in_order(points, scanner, source)
+        ours, theirs = in_order(*large.thinned(inliers, 1)), in_order(points, view)
         np.testing.assert_allclose(ours, theirs, atol=1e-6)  # coordinates of float64 in another frame
     assert large.spacing_mm == pytest.approx(held.spacing_mm, rel=0.03)  # of another sample
 

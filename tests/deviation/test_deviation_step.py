@@ -436,8 +436,8 @@ def test_interval_of_the_mean_includes_common_and_separate_range_errors():
     cosine = np.einsum("kni,ni->kn", arm, normals) / np.linalg.norm(arm, axis=2)
     station = np.argmax(cosine, axis=0)
     scan = ScanCloud(
-        points=points, origin=np.zeros(3), scanner=positions[station], removed=np.empty((0, 3)), removed_scanner=None,
-        spacing_mm=30.0, read=6000, kept=6000, source=station, sources=tuple("ABCDEF"),
+        points=points, origin=np.zeros(3), removed=np.empty((0, 3)), spacing_mm=30.0, read=6000, kept=6000,
+        view=station, views=tuple("ABCDEF"), scanners=positions, unnamed_views=False,
     )  # fmt: skip
     core = Samples(points, normals, rows)
     moved = Movement(np.zeros(6000), np.full(6000, 20), np.full(6000, 0.2), np.zeros((6000, 3)), np.ones(6000))
@@ -462,8 +462,8 @@ def test_a_fitted_pose_is_that_of_a_scan_with_axes_of_its_own():
     points += np.random.default_rng(1).normal(0.0, 0.5, points.shape)
     true = pose([0.0, 0.0, 0.5 * np.pi], [500.0, -200.0, 100.0])
     scan = ScanCloud(
-        points=rigid.apply(rigid.invert(true), points), origin=np.zeros(3), scanner=None, removed=np.empty((0, 3)),
-        removed_scanner=None, spacing_mm=14.0, read=40_000, kept=40_000, source=np.zeros(40_000, int), sources=("A",),
+        points=rigid.apply(rigid.invert(true), points), origin=np.zeros(3), removed=np.empty((0, 3)), spacing_mm=14.0,
+        read=40_000, kept=40_000, view=np.zeros(40_000, int), views=("A",), scanners=None, unnamed_views=True,
     )  # fmt: skip
     curved = mesh_distance.of_surface(mesh_distance.of_design(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
     begun = SimpleNamespace(T=pose([1e-3, 0.0, 0.0], [4.0, 0.0, 0.0]) @ true)

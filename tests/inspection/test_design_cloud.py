@@ -19,20 +19,6 @@ def along_x(count, first):
     return np.column_stack([first + 100.0 * np.arange(count), np.zeros(count), np.zeros(count)])
 
 
-def test_each_station_of_each_scan_is_a_view_and_points_of_no_station_are_one():
-    scans = (
-        Scan("a", along_x(4, 0.0), point_station=[0, 1, 0, -1]),
-        Scan("b", along_x(4, 400.0), point_station=[1, 1, 0, 0]),
-        Scan("c", along_x(4, 800.0), position=np.zeros(3), point_station=[0, 0, 1, 1]),
-    )
-    cloud = design_cloud.of_scene(Scene("x", "structure", scans), *NOWHERE)
-    view = np.concatenate([cloud.near(place[None], 1.0).view for place in along_x(12, 0.0)])
-    apart = [view[[0, 2]], view[[1]], view[[3]], view[4:6], view[6:8], view[8:]]
-    assert all(len(set(one.tolist())) == 1 for one in apart)
-    assert len({int(one[0]) for one in apart}) == len(apart)
-    assert sorted(set(view.tolist())) == list(range(len(cloud.scanners)))
-
-
 @pytest.mark.parametrize("large", [False, True])
 def test_points_near_places_are_those_of_a_search_tree_with_their_rays(large, monkeypatch, tmp_path):
     rng = np.random.default_rng(4)

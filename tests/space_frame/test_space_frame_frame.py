@@ -1,6 +1,7 @@
 """A whole ray-cast roof by method ray: blind, with its design, with one of another frame or of other nodes."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from processor.geometry import rigid, thread_ranges
 from processor.model import FrameDesign, Scan, reason
 from processor.space_frame import to_result
 from processor.space_frame.design.movement import verdict_of
-from processor.space_frame.points.scene_source import of_scene
+from processor.space_frame.points.source import SceneSource
 from processor.space_frame.spheres import baselines
 from processor.space_frame.step import Params, run
 from tests.support.made import made
@@ -128,7 +129,7 @@ def test_order_chunks_and_threads_give_the_same_bytes(roof, designed, chunk, thr
     pools, pool = set(), thread_ranges._pool
     monkeypatch.setattr(thread_ranges, "usable", lambda: threads_used)
     monkeypatch.setattr(thread_ranges, "_pool", lambda count: (pools.add(count), pool(count))[1])
-    monkeypatch.setattr(to_result, "of_scene", lambda *given: dataclasses.replace(of_scene(*given), chunk_size=chunk))
+    monkeypatch.setattr(to_result, "SceneSource", partial(SceneSource, chunk_size=chunk))
     rng = np.random.default_rng(1)
     scans = []
     for scan in scene.scans:

@@ -5,8 +5,9 @@ import pytest
 
 from processor import store
 from processor.model import InputError, Scan, Scene, Stations
-from processor.space_frame.points.scene_source import of_scene
+from processor.space_frame.points.source import SceneSource
 from processor.store import points_of
+from processor.views import views
 
 
 @pytest.fixture
@@ -30,9 +31,9 @@ def path(tmp_path):
 def test_the_same_points_as_in_memory(path):
     whole, alone = store.read_scene(path), store.read_scene(path, points=False)
     assert [len(scan.points) for scan in alone.scans] == [0, 0, 0]
-    in_memory = list(of_scene(whole).chunks())
+    in_memory = list(SceneSource(views(whole)).chunks())
     with points_of(path) as points:
-        source = of_scene(alone, points)
+        source = SceneSource(views(alone, reader=points))
         assert source.count == 100_000
         for _ in range(2):
             pieces = list(source.chunks())
@@ -45,7 +46,7 @@ def test_the_same_points_as_in_memory(path):
 
 def test_points_are_moved_into_the_project(path):
     whole = store.read_scene(path)
-    source = of_scene(whole)
+    source = SceneSource(views(whole))
     first = next(iter(source.chunks())).points
     scan = whole.scans[0]
     true = (scan.points[:100] @ scan.T_project_scan[:3, :3].T) + (

@@ -205,6 +205,7 @@ LAYERS = (
         "column_names",
     ),
     ("geometry",),
+    ("views",),
     ("scene_cloud", "registration"),
     ("adjustment",),
     ("components", "limits", "store"),
@@ -225,8 +226,8 @@ LAYERS = (
 )
 FOR_STEPS = (
     "version", "plain_text", "large_arrays", "inner_kernels", "model", "progress", "diagnostics", "robust_statistics",
-    "distinct_rows", "unit_ratio", "tiles", "geometry", "registration", "scene_cloud", "adjustment", "components",
-    "limits",
+    "distinct_rows", "unit_ratio", "tiles", "geometry", "registration", "views", "scene_cloud", "adjustment",
+    "components", "limits",
 )  # fmt: skip
 
 

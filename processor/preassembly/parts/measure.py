@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import variance_components
-from processor.adjustment.point_groups import joined_numbers
 from processor.geometry import box_girder_mesh, rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
@@ -315,7 +314,10 @@ def _reasons(
 def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Sequence[Floats]) -> RegisteredPart:
     """Join the points of the scans used, on the design; ``joints`` are the key points (8, 3) of the part's joints."""
     points = rigid.placed([(scan.registration.T_design_scan, scan.points) for scan in used])
-    station = joined_numbers([scan.station for scan in used])
+    station, done, first = allocate(len(points), dtype=np.int64), 0, 1  # -1: of no station
+    for scan in used:
+        np.add(scan.station, first, out=station[done : done + len(scan.station)])
+        done, first = done + len(scan.station), first + int(scan.station.max(initial=-1)) + 2
     return RegisteredPart(
         points=points,
         station=station,

@@ -13,9 +13,9 @@ from processor.model import Floats, Scene
 from processor.report.space_frame.ball_picture import SLICE_MM, BallPicture
 from processor.report.space_frame.nominal_positions import designed_places
 from processor.report.style import CaptionedPngs, Drawn, pdf_document
-from processor.space_frame.points.scene_source import SceneSource, of_scene
 from processor.space_frame.result import Flag, Result
 from processor.store.streaming import StoredPoints, points_of
+from processor.views import Views, views
 
 PREFIX = "flagged-ball-"
 MOST_BALLS = 12  # on the page
@@ -87,8 +87,8 @@ def crops_about(scene: Scene, centres: Floats, reach: Floats, stored: StoredPoin
     Of points in a file only the tiles about the centres are read.
     """
     if stored is None:
-        return _within(of_scene(scene), centres, reach)
-    return _within(of_scene(scene, stored.near(_boxes(scene, centres, reach))), centres, reach)
+        return _within(views(scene), centres, reach)
+    return _within(views(scene, reader=stored.near(_boxes(scene, centres, reach))), centres, reach)
 
 
 def _boxes(scene: Scene, centres: Floats, reach: Floats) -> list[tuple[Floats, Floats]]:
@@ -104,12 +104,12 @@ def _boxes(scene: Scene, centres: Floats, reach: Floats) -> list[tuple[Floats, F
     return boxes
 
 
-def _within(source: SceneSource, centres: Floats, reach: Floats) -> list[Floats]:
-    middles = centres - source.origin
+def _within(seen: Views, centres: Floats, reach: Floats) -> list[Floats]:
+    middles = centres - seen.origin
     by_cell = _NearInX(middles[:, 0], reach)
     pieces: list[list[Floats]] = [[] for _ in reach]
     step, kept = [1] * len(pieces), [0] * len(pieces)
-    for chunk in source.chunks():
+    for chunk in seen.blocks():
         # By one axis first, for all centres at once: most of a roof is far away.
         some = np.compress(by_cell.holds(chunk.points[:, 0]), chunk.points, axis=0)
         for k, (middle, far) in enumerate(zip(middles, reach, strict=True)):

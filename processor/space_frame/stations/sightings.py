@@ -6,7 +6,7 @@ import numpy as np
 
 from processor.model import InputError, Scene
 from processor.space_frame.design import unit_mistakes
-from processor.space_frame.points.scene_source import SceneSource
+from processor.space_frame.points.source import SceneSource
 from processor.space_frame.stations.control_points import ControlPoints
 
 FARTHEST_MM = 1000.0  # control points farther from their sightings are in another frame
@@ -20,10 +20,9 @@ def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
     if scene.control is None or not len(scene.control.scan):
         return None
     control = scene.control
-    scanner = np.array(
-        [source.scanner_of[s] if k < 0 else k for s, k in zip(control.scan, control.station, strict=True)]
-    )
-    rows = np.flatnonzero((scanner >= 0) & (scanner < len(source.scanners)))
+    view = [int(source.views.of_points(s, [k], 1)[0]) for s, k in zip(control.scan, control.station, strict=True)]
+    scanner = source.station_of_view[view]
+    rows = np.flatnonzero(scanner >= 0)
     if not len(rows):
         return None
     measured = np.empty((len(rows), 3))
