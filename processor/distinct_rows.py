@@ -1,4 +1,7 @@
-"""Distinct rows: cells that points lie in, pairs of numbers, points; in a fraction of the time of np.unique."""
+"""Distinct rows: cells that points lie in, pairs of numbers, points; in a fraction of the time of np.unique.
+
+And the connected components of what is linked.
+"""
 
 from __future__ import annotations
 
@@ -60,3 +63,12 @@ def distinct_points(points: Floats) -> tuple[Floats, Ints]:
     number = np.empty(len(points), np.int64)
     number[order] = np.cumsum(begins) - 1
     return ordered[begins], number
+
+
+def components(count: int, a: Ints, b: Ints) -> Ints:
+    """Return the component (count,) of each node of a graph with links a, b (k,), numbered by their first nodes."""
+    from scipy.sparse import coo_array, csgraph
+
+    links = coo_array((np.ones(len(a), np.int8), (a, b)), (count, count))
+    label: Ints = csgraph.connected_components(links, directed=False)[1].astype(np.int64)
+    return label

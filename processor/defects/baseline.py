@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor import diagnostics, scene_cloud
@@ -25,6 +23,7 @@ from processor.defects.params import Paper, Params
 from processor.defects.result import DefectClass, Result, SurfacePlaces
 from processor.defects.surface_charts import of_mesh
 from processor.defects.to_result import table
+from processor.distinct_rows import components, distinct
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.nearest_neighbours import surface_spacing
 from processor.geometry.thinning import voxel_means
@@ -44,8 +43,6 @@ ICP_VOXELS = (20.0, 5.0)
 ICP_ITERATIONS = 40
 LENGTH_VOXELS = 10.0  # largest difference of the sides of two triangles of a sample
 NOISE = -1
-FEATURE_BINS = 5
-FEATURE_LOW, FEATURE_RANGE = np.array([-1.0, -1.0, -np.pi]), np.array([2.0, 2.0, 2.0 * np.pi])
 
 
 @dataclass(frozen=True)
@@ -210,14 +207,10 @@ def density_clusters(points: Floats, radius: float, least: int) -> Ints:
     degree = 1 + np.bincount(pairs.ravel(), minlength=len(points))
     core = degree >= least
     links = pairs[core[pairs].all(axis=1)]
-    graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), (len(points),) * 2)
-    group = connected_components(graph, directed=False)[1]
     if not core.any():
         return label
-    _, first, inverse = np.unique(group[core], return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    label[core] = rank[inverse.reshape(-1)]
+    # Components are numbered by their first nodes, so those of core points by their first core points.
+    label[core] = distinct(components(len(points), *links.T)[core, None]).number
     rest = np.flatnonzero(~core)
     near, index = cKDTree(points[core]).query(points[rest], distance_upper_bound=radius)
     reached = np.isfinite(near)
@@ -240,27 +233,6 @@ def _thinned(points: Floats, paper: Paper) -> tuple[float, Floats]:
         size *= max(1.1, float(np.sqrt(len(means) / paper.points)))
 
 
-def _histograms(points: Floats, normals: Floats, keys: Ints, radius: float) -> Floats:
-    """Return PFH (k, 125) at points (n, 3) with rows ``keys`` (k,), from their neighbours within ``radius``."""
-    tree = cKDTree(points)
-    histograms = np.zeros((len(keys), FEATURE_BINS**3))
-    for row, key in enumerate(keys.tolist()):
-        near = np.array(sorted(tree.query_ball_point(points[key], radius)))
-        if len(near) >= 3:
-            histograms[row] = _histogram(points[near], normals[near])
-    return histograms
-
-
-def _histogram(points: Floats, normals: Floats) -> Floats:
-    first, second = np.triu_indices(len(points), 1)
-    features = pfh.pair_features(points, normals, first, second)
-    features = features[np.isfinite(features).all(axis=1)]
-    index = np.floor((features - FEATURE_LOW) / FEATURE_RANGE * FEATURE_BINS).astype(np.int64)
-    index = np.clip(index, 0, FEATURE_BINS - 1) @ FEATURE_BINS ** np.arange(3)
-    histogram: Floats = np.bincount(index, minlength=FEATURE_BINS**3) / max(len(features), 1)
-    return histogram
-
-
 def _normals(points: Floats) -> Floats:
     """Return unit normals (n, 3) by the nearest 12 points, away from the centroid; features ignore the sign."""
     near = cKDTree(points).query(points, k=min(12, len(points)))[1]
@@ -279,8 +251,8 @@ def _first_pose(
     radius = FEATURE_VOXELS * size
     source = np.sort(rng.choice(len(points), min(paper.feature_points, len(points)), replace=False))
     target = np.sort(rng.choice(len(design), min(paper.feature_points, len(design)), replace=False))
-    of_source = _histograms(points, _normals(points), source, radius)
-    of_target = _histograms(design, design_normals, target, radius)
+    of_source = pfh.histograms(points, _normals(points), radius, rows=source)
+    of_target = pfh.histograms(design, design_normals, radius, rows=target)
     similar = cKDTree(of_target).query(of_source, k=min(CANDIDATES, len(target)))[1].reshape(len(source), -1)
     tree, limit = cKDTree(design), paper.huber_mm or HUBER_VOXELS * size
     keys = points[source]

@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from processor.distinct_rows import components as linked
 from processor.distinct_rows import distinct
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import FacetGrid
@@ -44,8 +43,7 @@ def welded(vertices: Floats, faces: Ints, body: Ints | None) -> tuple[Floats, In
 def pieces(faces: Ints) -> Ints:
     """Return the connected piece (f,) of each facet; vertices at one place are one, see :func:`welded`."""
     count = int(faces.max(initial=-1)) + 1
-    links = coo_array((np.ones(2 * len(faces), np.int8), (faces[:, :2].ravel(), faces[:, 1:].ravel())), (count, count))
-    piece: Ints = connected_components(links, directed=False)[1][faces[:, 0]].astype(np.int64)
+    piece: Ints = linked(count, faces[:, :2].ravel(), faces[:, 1:].ravel())[faces[:, 0]]
     return piece
 
 
@@ -65,8 +63,7 @@ def components(vertices: Floats, faces: Ints) -> Ints:
     body_of_vertex = np.full(len(vertices), -1, np.int64)
     body_of_vertex[faces.ravel()] = np.repeat(body, 3)
     count = int(body.max(initial=-1)) + 1
-    contacts = coo_array((np.ones(len(vertex), np.int8), (body_of_vertex[vertex], body[facet])), (count, count))
-    group = connected_components(contacts, directed=False)[1].astype(np.int64)
+    group = linked(count, body_of_vertex[vertex], body[facet])
     many = np.bincount(group) > MOST_BODIES
     group = np.where(many[group[body]], count + body, group[body])
     _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
@@ -146,8 +143,7 @@ def closed_bodies(faces: Ints) -> Ints:
     first, second = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     facet = np.repeat(np.arange(len(faces)), 3)
     count = int(faces.max()) + 1
-    links = coo_array((np.ones(len(first), np.int8), (first, second)), (count, count))
-    body = connected_components(links, directed=False)[1][faces[:, 0]]
+    body = linked(count, first, second)[faces[:, 0]]
     edge = np.minimum(first, second) * count + np.maximum(first, second)
     number = np.unique(edge, return_inverse=True)[1].reshape(-1)
     unpaired = np.bincount(number, np.where(first < second, 1.0, -1.0)) != 0.0

@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from processor.distinct_rows import components
 from processor.geometry import nearest_neighbours, point_grid
 from processor.geometry.linalg_small import assign_rows
 from processor.geometry.point_grid import Cells
@@ -199,8 +198,7 @@ def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurf
     neighbours = _neighbours(faces, normals)
     # Facets joined by smooth edges have the same number (f,) of a smooth face
     facet, side = np.nonzero(neighbours >= 0)
-    links = coo_array((np.ones(len(facet), np.int8), (facet, neighbours[facet, side])), (len(neighbours),) * 2)
-    number: Ints = connected_components(links, directed=False)[1].astype(np.int64)
+    number = components(len(neighbours), facet, neighbours[facet, side])
     return MeshSurface(
         vertices=vertices,
         faces=faces,

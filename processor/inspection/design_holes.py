@@ -11,10 +11,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from processor.distinct_rows import distinct
+from processor.distinct_rows import components, distinct
 from processor.geometry import circle, rigid
 from processor.geometry.nearest_neighbours import same_places
 from processor.model import Floats, Ints
@@ -94,8 +92,7 @@ def _circles(vertices: Floats, faces: Ints, normals: Floats, plane: Ints) -> Ite
     ends = np.concatenate([[group[border], a[border]], [group[border], b[border]]], axis=1).T
     node = distinct(ends).number
     start, end = node[: len(border)], node[len(border) :]
-    links = coo_array((np.ones(len(border)), (start, end)), (int(node.max()) + 1,) * 2)
-    loop = connected_components(links, directed=False)[1][start]
+    loop = components(int(node.max()) + 1, start, end)[start]
     degree = np.bincount(node)
     order = np.argsort(loop, kind="stable")
     for rows in np.split(order, np.cumsum(np.bincount(loop))[:-1]):

@@ -9,11 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from processor.distinct_rows import distinct_points
+from processor.distinct_rows import components, distinct_points
 from processor.model import Bools, Floats, Ints
 
 # Of the mesh's size: corners at open edges that are nearer to each other are one. Coordinates have seven digits in
@@ -113,7 +111,7 @@ def _joined(vertices: Floats, faces: Ints) -> tuple[Floats, Ints, _Edges]:
     near = near[~np.isin(near.min(axis=1) * len(points) + near.max(axis=1), along)]
     if not len(near):
         return points, corners, edges
-    number = _components(len(points), near[:, 0], near[:, 1])
+    number = components(len(points), near[:, 0], near[:, 1])
     points, corners = points[np.unique(number, return_index=True)[1]], number[corners]
     return points, corners, _Edges.of(corners[_proper(corners)])
 
@@ -151,12 +149,6 @@ class _Edges:
         order = np.argsort(self.number, kind="stable")
         order = order[self.uses[self.number[order]] == 2]
         return order[::2], order[1::2]
-
-
-def _components(count: int, a: Ints, b: Ints) -> Ints:
-    """Return the component (count,) of each node of a graph with links a, b (k,), numbered by their first nodes."""
-    links = coo_array((np.ones(len(a), np.int8), (a, b)), (count, count))
-    return _renumbered(connected_components(links, directed=False)[1])
 
 
 def _renumbered(labels: Ints) -> Ints:
@@ -206,7 +198,7 @@ def _is_contact(edges: _Edges, sides: Ints, repeated: Bools) -> Bools:
     order = np.argsort(edge, kind="stable")
     order = order[repeated[facet[order]]]
     follows = np.flatnonzero(edge[order][1:] == edge[order][:-1])
-    region = _components(len(sides), facet[order][follows], facet[order][follows + 1])
+    region = components(len(sides), facet[order][follows], facet[order][follows + 1])
     rim = others[edge] > 0
     wrong = np.repeat(repeated, 3) & ((others[edge] % 2 == 1) | (others[edge] + doubled[edge] == 1))
     bounded = np.bincount(region[facet], np.repeat(repeated, 3) & rim) > 0
@@ -250,15 +242,14 @@ def _alike(count: int, edges: _Edges) -> tuple[Ints, Bools]:
     surface with one side nothing is turned.
     """
     a, b = edges.pairs()
-    sheet = _components(count, a // 3, b // 3)
+    sheet = components(count, a // 3, b // 3)
     against = edges.forward[a] == edges.forward[b]  # both pass their edge the same way: opposite normals
     if not against.any():
         return sheet, np.zeros(count, np.bool_)
     other = against * count
     rows = np.concatenate([a // 3, a // 3 + count])
     columns = np.concatenate([b // 3 + other, (b // 3 + count + other) % (2 * count)])
-    links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), (2 * count, 2 * count))
-    side = connected_components(links, directed=False)[1]
+    side = components(2 * count, rows, columns)
     one_sided = side[:count] == side[count:]
     first = np.unique(sheet, return_index=True)[1]
     turned = (side[:count] != side[first][sheet]) & ~one_sided
@@ -282,7 +273,7 @@ def _parts(corners: Ints, edges: _Edges, sheet: Ints, turned: Bools) -> Ints:
     # The first corner of each facet links it to its other ones; closed sheets have corners of their own.
     count = int(corners.max(initial=-1)) + 1
     nodes = np.where(closed[sheet][:, None], sheet[:, None], len(closed) + corners)
-    part = _components(len(closed) + count, nodes[:, [0, 0]].ravel(), nodes[:, 1:].ravel())[nodes[:, 0]]
+    part = components(len(closed) + count, nodes[:, [0, 0]].ravel(), nodes[:, 1:].ravel())[nodes[:, 0]]
     return _renumbered(part)
 
 

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from processor.distinct_rows import components
 from processor.model import Bools, Ints
 
 
@@ -75,12 +74,7 @@ def pieces(joined: Ints, measured: Bools, parts: int) -> Ints:
 
     Pieces are numbered from 0 in the order of their first parts.
     """
-    left, right = joined[measured].T
-    number: Ints = connected_components(coo_array((np.ones(len(left)), (left, right)), (parts, parts)), directed=False)[
-        1
-    ]
-    first = np.unique(number, return_index=True)[1]
-    return np.argsort(np.argsort(first))[number]
+    return components(parts, *joined[measured].T)
 
 
 def loops(joined: Ints, parts: int) -> list[Loop]:

@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from processor.distinct_rows import distinct
+from processor.distinct_rows import components, distinct
 from processor.geometry.thinning import thinned, voxel_means
 from processor.large_arrays import blocks, corners
 from processor.model import Bools, Floats
@@ -54,8 +52,7 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
     # The largest of the connected pieces
     rest = even[left]
     pairs = cKDTree(rest).query_pairs(LINK * step, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(rest),) * 2)
-    number = connected_components(links, directed=False)[1]
+    number = components(len(rest), *pairs.T)
     piece[np.flatnonzero(left)[number == np.argmax(np.bincount(number))]] = True
     best = piece if _misfit(even[piece], sizes) <= _misfit(even[left], sizes) else left
     if best.all():

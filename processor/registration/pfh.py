@@ -61,17 +61,19 @@ def pair_features(points: Floats, point_normals: Floats, i: Ints, j: Ints) -> Fl
     )
 
 
-def histograms(points: Floats, point_normals: Floats, radius_mm: float, bins: int = 5) -> Floats:
-    """PFH (n, bins^3) of points (n, 3): for each, the shares of all pairs in its neighbourhood (itself included).
+def histograms(
+    points: Floats, point_normals: Floats, radius_mm: float, bins: int = 5, rows: Ints | None = None
+) -> Floats:
+    """PFH (k, bins^3) at ``rows`` (k,) of points (n, 3), or at all: the shares of all pairs near each, itself included.
 
     Each angle's range is cut into ``bins`` equal parts; alpha varies fastest. Pairs without a frame (coincident, or a
     line along the normal) are left out; a point without pairs has a histogram of zeros.
     """
-    tree = cKDTree(points)
-    result = np.zeros((len(points), bins**3))
+    tree, places = cKDTree(points), points if rows is None else points[rows]
+    result = np.zeros((len(places), bins**3))
     low, span = np.array([-1.0, -1.0, -np.pi]), np.array([2.0, 2.0, 2.0 * np.pi])
-    for query, rows in enumerate(tree.query_ball_point(points, radius_mm)):
-        neighbours = np.array(sorted(rows))
+    for query, near in enumerate(tree.query_ball_point(places, radius_mm)):
+        neighbours = np.array(sorted(near))
         first, second = np.triu_indices(len(neighbours), 1)
         features = pair_features(points, point_normals, neighbours[first], neighbours[second])
         features = features[np.isfinite(features).all(axis=1)]

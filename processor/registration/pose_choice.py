@@ -16,11 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from processor.distinct_rows import distinct
+from processor.distinct_rows import components, distinct
 from processor.geometry import mesh_distance, nearest_neighbours, rigid, thinning
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
 from processor.geometry.thread_ranges import over_ranges
@@ -130,7 +128,6 @@ def _weight(voxel: Ints, explained: Bools) -> float:
     if not len(voxel):
         return 0.0
     pairs = cKDTree(voxel).query_pairs(1.0, p=np.inf, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(voxel),) * 2)
-    piece = connected_components(links, directed=False)[1]
+    piece = components(len(voxel), *pairs.T)
     size, agreeing = np.bincount(piece), np.bincount(piece, explained)
     return float(np.log(agreeing[agreeing > 0.5 * size] / ERROR_RATE).sum())

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.distinct_rows import distinct, distinct_points
+from processor.distinct_rows import components, distinct, distinct_points
 
 
 @pytest.mark.parametrize("span", [3, 40, 10**6, 2**40])
@@ -30,3 +30,14 @@ def test_distinct_points_are_those_of_numpy(count):
     expected = np.unique(points, axis=0, return_inverse=True)
     for own, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(own, theirs.reshape(own.shape))
+
+
+@pytest.mark.parametrize("links", [0, 30, 200])
+def test_components_are_those_of_a_walk_numbered_by_their_first_nodes(links):
+    rng = np.random.default_rng(links)
+    a, b = rng.integers(0, 60, (2, links))
+    number = np.arange(60)  # each link gives both of its ends the lower number, until nothing changes
+    for _ in range(60):
+        for i, j in zip(a, b, strict=True):
+            number[i] = number[j] = min(number[i], number[j])
+    assert components(60, a, b).tolist() == np.unique(number, return_inverse=True)[1].tolist()

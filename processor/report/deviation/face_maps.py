@@ -14,10 +14,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, Colormap
 from matplotlib.figure import Figure
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processor.distinct_rows import components
 from processor.geometry.m3c2 import Distances
 from processor.language.messages import Message, text
 from processor.model import Bools, Floats, Ints
@@ -108,10 +107,9 @@ def faces(core: Floats, normals: Floats) -> list[tuple[str, Ints]]:
             if not len(rows):
                 continue
             pairs = cKDTree(core[rows]).query_pairs(REACH * spacing(core[rows]), output_type="ndarray")
-            links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(rows), len(rows)))
-            count, member = connected_components(links, directed=False)
+            member = components(len(rows), *pairs.T)
             order = np.argsort(member, kind="stable")
-            ends = np.cumsum(np.bincount(member, minlength=count))[:-1]
+            ends = np.cumsum(np.bincount(member))[:-1]
             found += [(f"{sign}{AXES[along]}", rows[part]) for part in np.split(order, ends)]
     return sorted(found, key=lambda face: -len(face[1]))
 

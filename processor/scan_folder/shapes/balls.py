@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
 from scipy.spatial import cKDTree
 
+from processor.distinct_rows import components
 from processor.model import Floats, Ints
 from processor.scan_folder.shapes.body import Body, Mask
 
@@ -103,9 +103,7 @@ def _alike(edges: Ints, centres: Floats, radii: Floats) -> Ints:
     a, b = np.concatenate(links).T
     limit = SAME * np.minimum(radii[a], radii[b])
     alike = (np.linalg.norm(centres[a] - centres[b], axis=1) < limit) & (np.abs(radii[a] - radii[b]) < limit)
-    graph = sparse.coo_matrix((np.ones(int(alike.sum()), np.int8), (a[alike], b[alike])), (len(edges), len(edges)))
-    label: Ints = sparse.csgraph.connected_components(graph, directed=False)[1]
-    return label
+    return components(len(edges), a[alike], b[alike])
 
 
 def _of_rounded(body: Body, used: Ints) -> list[list[float]]:

@@ -8,9 +8,8 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
-from processor.distinct_rows import distinct
+from processor.distinct_rows import components, distinct
 from processor.geometry.nearest_neighbours import same_places
 from processor.model import Floats, Ints
 
@@ -108,10 +107,7 @@ class Body:
     def faces_between(self) -> Ints:
         """Number (f,) of the face that each facet belongs to: faces end at sharp edges."""
         sides = self.edges[1][~self.turning]
-        count = len(self.faces)
-        graph = sparse.coo_matrix((np.ones(len(sides), np.int8), (sides[:, 0], sides[:, 1])), (count, count))
-        label: Ints = sparse.csgraph.connected_components(graph, directed=False)[1]
-        return label
+        return components(len(self.faces), *sides.T)
 
 
 def welded(name: str, vertices: Floats, faces: Ints) -> Body | None:

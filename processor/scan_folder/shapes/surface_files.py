@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from processor.distinct_rows import components
 from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
 from processor.meshes.mesh_files import read_whole
 from processor.model import DesignBodies, Floats, InputError, Ints, Reason, reason
@@ -111,11 +112,7 @@ def bodies(surface: Surface) -> list[tuple[str, Floats, Ints]]:
 
 def _pieces(surface: Surface) -> Ints:
     """Return the number (f,) of the connected piece of each facet, as the file shares vertices."""
-    from scipy import sparse
-
-    faces, count = surface.faces, len(surface.vertices)
-    rows = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
-    graph = sparse.coo_matrix((np.ones(len(rows[0]), np.int8), rows), (count, count))
-    label = sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
+    faces = surface.faces
+    label = components(len(surface.vertices), faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1))[faces[:, 0]]
     numbers: Ints = np.unique(label, return_inverse=True)[1].reshape(-1).astype(np.int64)
     return numbers

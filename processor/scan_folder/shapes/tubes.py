@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
 
+from processor.distinct_rows import components
 from processor.geometry import circle
 from processor.model import Floats, Ints
 from processor.scan_folder.shapes.body import Body
@@ -36,7 +36,7 @@ def find(body: Body) -> Tubes:
     cosine = np.zeros(len(ends))
     cosine[two] = np.abs(np.einsum("ei,ei->e", body.normals[sides[two, 0]], body.normals[sides[two, 1]]))
     flat = two[cosine[two] > FLAT_COS]
-    pieces = _joined(len(body.faces), sides[flat])
+    pieces = components(len(body.faces), *sides[flat].T)
     turning = two[(cosine[two] <= FLAT_COS) & (cosine[two] > TURN_COS)]
     ways = body.vertices[ends[turning, 1]] - body.vertices[ends[turning, 0]]
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -81,12 +81,6 @@ def _of_rounded(body: Body, used: Ints) -> list[tuple[Floats, float]]:
     return found
 
 
-def _joined(count: int, pairs: Ints) -> Ints:
-    graph = sparse.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
-    label: Ints = sparse.csgraph.connected_components(graph, directed=False)[1]
-    return label
-
-
 def _parallel(pieces: Ints, ways: Floats) -> Ints:
     """Return a number (n,) for each edge between plane pieces (n, 2): parallel edges of a piece have the same."""
     rows = np.repeat(np.arange(len(pieces)), 2)
@@ -102,7 +96,7 @@ def _parallel(pieces: Ints, ways: Floats) -> Ints:
         across = np.linalg.norm(np.cross(ways[a], ways[b]), axis=1)
         links.append(np.stack([a, b], axis=1)[across < PARALLEL])
         step += 1
-    return _joined(len(pieces), np.concatenate(links))
+    return components(len(pieces), *np.concatenate(links).T)
 
 
 def _fitted(edges: Floats, ways: Floats) -> tuple[Floats, float] | None:

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processor.distinct_rows import components
 from processor.model import Floats, Ints
 
 BEYOND_MM = 900.0  # from a line's end to its node: sphere, sleeve, cone, and the part of the tube that was not seen
@@ -96,11 +95,9 @@ def _crossings(lines: Lines) -> Floats:
     if not len(crossings):
         return crossings
     joined = cKDTree(crossings).query_pairs(2.0 * MISS_MM, output_type="ndarray")
-    size = len(crossings)
-    links = coo_matrix((np.ones(len(joined)), (joined[:, 0], joined[:, 1])), shape=(size, size))
-    count, label = connected_components(links, directed=False)
+    label = components(len(crossings), *joined.T)
     order = np.argsort(label, kind="stable")
-    bounds = np.searchsorted(label[order], np.arange(count + 1))
+    bounds = np.searchsorted(label[order], np.arange(label.max() + 2))
     return np.array([np.median(crossings[order[a:b]], axis=0) for a, b in pairwise(bounds.tolist())])
 
 

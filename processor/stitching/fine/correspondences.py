@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processor.distinct_rows import components
 from processor.geometry.thinning import thinned
 from processor.model import Columns, Floats, Ints
 from processor.stitching.coarse import candidate_rotations
@@ -196,8 +195,7 @@ def _faces(planes: Planes, cells: CellTable) -> Ints:
         & (np.abs(np.einsum("pi,pi->p", n[a], way)) < cells.limit_mm)
         & (np.abs(np.einsum("pi,pi->p", n[b], way)) < cells.limit_mm)
     )
-    links = csr_matrix((np.ones(one.sum()), (a[one], b[one])), shape=(p, p))
-    joined = connected_components(links, directed=False)[1]
+    joined = components(p, a[one], b[one])
     several = np.bincount(joined)[joined] > 1
     face[several] = np.unique(joined[several], return_inverse=True)[1]
     return face
