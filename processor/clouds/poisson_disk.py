@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from processor.clouds import slabs
-from processor.inner_kernels import inner
+from processor.geometry.point_grid import empty_table, slot_of
 from processor.model import Bools, Floats
 from processor.writers.cloud import Block, Cloud
 
@@ -46,21 +46,9 @@ def keep(before: Floats, points: Floats, spacing_mm: float) -> Bools:
     kept = np.zeros(len(every), np.bool_)
     if len(points):
         cell = np.floor((every - every.min(axis=0)) / spacing_mm).astype(np.int64)
-        slots = 1 << max(4, int(2 * len(every)).bit_length())
-        _keep(every, cell, len(before), spacing_mm**2, np.full(slots, -1, np.int64), np.full(slots, -1, np.int64), kept)
+        _keep(every, cell, len(before), spacing_mm**2, *empty_table(len(every)), kept)
     marked: Bools = kept[len(before) :]
     return marked
-
-
-@inner
-def _slot(keys, key):  # type: ignore[no-untyped-def]
-    """Find the slot of a cell in a hash table, or the free one where it would be."""
-    mask = np.uint64(len(keys) - 1)
-    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    at = (h ^ (h >> np.uint64(32))) & mask
-    while keys[at] != -1 and keys[at] != key:
-        at = (at + np.uint64(1)) & mask
-    return at
 
 
 @njit(cache=True, nogil=True)
@@ -73,8 +61,8 @@ def _keep(points, cell, fixed, square, keys, heads, kept):  # type: ignore[no-un
         if p >= fixed:
             for n in range(27):
                 i, j, k = cell[p, 0] + n // 9 - 1, cell[p, 1] + n // 3 % 3 - 1, cell[p, 2] + n % 3 - 1
-                at = _slot(keys, ((i & mask) << (2 * FIELD)) | ((j & mask) << FIELD) | (k & mask))
-                q = heads[at] if keys[at] != -1 else -1
+                at = slot_of(keys, ((i & mask) << (2 * FIELD)) | ((j & mask) << FIELD) | (k & mask))
+                q = heads[at]
                 while q != -1 and free:
                     x, y, z = points[p, 0] - points[q, 0], points[p, 1] - points[q, 1], points[p, 2] - points[q, 2]
                     free = x * x + y * y + z * z >= square
@@ -83,7 +71,7 @@ def _keep(points, cell, fixed, square, keys, heads, kept):  # type: ignore[no-un
                     break
         if free:
             key = ((cell[p, 0] & mask) << (2 * FIELD)) | ((cell[p, 1] & mask) << FIELD) | (cell[p, 2] & mask)
-            at = _slot(keys, key)
+            at = slot_of(keys, key)
             keys[at] = key
             following[p] = heads[at]
             heads[at] = p

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from processor import large_arrays
+from processor.geometry.selection import sort_rows
 from processor.geometry.thread_ranges import over_ranges
 from processor.inner_kernels import inner
 from processor.large_arrays import allocate, blocks
@@ -22,7 +23,8 @@ from processor.model import Floats, Ints
 
 SIDE = 4  # cells along a block's edge
 FIELD = 19  # bits of a block's number for each axis
-EMPTY = -1
+EMPTY = -1  # row of a block without points
+FREE = np.iinfo(np.int64).min  # key of a free slot of a hash table: no key is as low
 HALF_DIAGONAL = 0.5 * SIDE * 3.0**0.5 * (1.0 + 1e-9)  # of a block, in cells
 RUNS = 64  # runs of rows that there is room for at first
 LOOKED_UP = 64  # blocks of a box, up to which each is looked for in the table
@@ -36,7 +38,7 @@ class Cells(NamedTuple):
     """
 
     points: Floats
-    slots: Ints  # (slots,) keys of blocks by their hash, EMPTY = free
+    slots: Ints  # (slots,) keys of blocks by their hash, FREE = none
     blocks: Ints  # (slots,) row of ``starts``
     keys: Ints  # (b,) of the blocks, ascending
     starts: Ints  # (b, 65)
@@ -84,9 +86,9 @@ def of_points(points: Floats, cell: float) -> PointGrid:
     """
     if len(points) == 0:
         none = np.zeros((0, SIDE**3 + 1), np.int64)
-        empty = np.full(2, EMPTY, np.int64)
+        slots, rows = empty_table(0)
         cells = Cells(
-            points=np.zeros((0, 3)), slots=empty, blocks=empty.copy(), keys=np.empty(0, np.int64), starts=none,
+            points=np.zeros((0, 3)), slots=slots, blocks=rows, keys=np.empty(0, np.int64), starts=none,
             lower=np.zeros(3), size=1.0, extent=np.ones(3, np.int64),
         )  # fmt: skip
         return PointGrid(cells, np.empty(0, np.int64))
@@ -95,7 +97,7 @@ def of_points(points: Floats, cell: float) -> PointGrid:
     size = max(float(cell), extent / (SIDE * (1 << FIELD) - 2 * SIDE), 1e-300)
     while (whole := _sorted(points, lower, size, (ROOM_SHARE * len(points)) // SIDE**3 + 1)) is None:
         size *= 2.0
-    slots, rows = _table(whole.keys, large=len(points) > large_arrays.AT_ONCE)
+    slots, rows = hash_table(whole.keys, large=len(points) > large_arrays.AT_ONCE)
     reach = ((upper - lower) / size).astype(np.int64) // SIDE + 1
     cells = Cells(
         points=whole.points, slots=slots, blocks=rows, keys=whole.keys, starts=whole.starts, lower=lower, size=size,
@@ -144,7 +146,7 @@ def _part(points: Floats, order: Ints, lower: Floats, size: float, most: int) ->
     points, order = (large_arrays.read_only(np.ascontiguousarray(one)) for one in (points, order))
     block, cell = np.empty(len(points), np.int32), np.empty(len(points), np.uint8)
     most = min(most, len(points))
-    found = _into_blocks(points, lower, size, most, _empty_table(most), block, cell)
+    found = _into_blocks(points, lower, size, most, empty_table(most), block, cell)
     if found is None:
         return None
     keys, count = found
@@ -187,7 +189,7 @@ def within(grid: PointGrid, low: Floats, high: Floats) -> PointGrid:
     cells, kept = grid.cells, _blocks_within(grid.cells, low, high)
     starts = cells.starts[kept]
     rows, begin = _rows_of(starts)
-    slots, numbers = _table(cells.keys[kept])
+    slots, numbers = hash_table(cells.keys[kept])
     table = cells._replace(
         points=cells.points[rows], slots=slots, blocks=numbers, keys=cells.keys[kept],
         starts=starts + (begin - starts[:, 0])[:, None],
@@ -232,18 +234,18 @@ def _blocks_within(cells: Cells, low: Floats, high: Floats) -> Ints:
     return found
 
 
-def _table(block_keys: Ints, large: bool = False) -> tuple[Ints, Ints]:
-    """Return the hash table of blocks with ``block_keys`` (b,): keys (slots,) and rows (slots,)."""
-    keys, rows = _empty_table(len(block_keys), large)
+def hash_table(block_keys: Ints, large: bool = False) -> tuple[Ints, Ints]:
+    """Return a hash table of keys (b,) that differ: keys (slots,), FREE = none, and the row (slots,) of each."""
+    keys, rows = empty_table(len(block_keys), large)
     _fill(keys, rows, np.ascontiguousarray(block_keys))
     return keys, rows
 
 
-def _empty_table(count: int, large: bool = False) -> tuple[Ints, Ints]:
-    """Return an empty hash table for ``count`` blocks: a power of two of slots, twice as many as blocks or more."""
+def empty_table(count: int, large: bool = False) -> tuple[Ints, Ints]:
+    """Return an empty hash table for ``count`` keys: a power of two of slots, twice as many as keys or more."""
     slots = 1 << max(4, (2 * count).bit_length())
     keys, rows = (allocate(slots, dtype=np.int64) if large else np.empty(slots, np.int64) for _ in range(2))
-    keys[:], rows[:] = EMPTY, EMPTY
+    keys[:], rows[:] = FREE, EMPTY
     return keys, rows
 
 
@@ -256,12 +258,15 @@ def _keys(cell: Ints) -> Ints:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _slot(keys, key):  # type: ignore[no-untyped-def]
-    """Find where a block's key is in the hash table, or the free slot where it would be."""
+def slot_of(keys, key):  # type: ignore[no-untyped-def]
+    """Find where a key is in a hash table of a power of two of slots, or the free slot where it would be.
+
+    Multiplicative hashing by the golden ratio: consecutive keys would fill the table in runs otherwise.
+    """
     mask = np.uint64(len(keys) - 1)
     h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     at = (h ^ (h >> np.uint64(32))) & mask
-    while keys[at] != EMPTY and keys[at] != key:
+    while keys[at] != FREE and keys[at] != key:
         at = (at + np.uint64(1)) & mask
     return at
 
@@ -269,7 +274,7 @@ def _slot(keys, key):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, inline="always")
 def block_at(cells, i, j, k):  # type: ignore[no-untyped-def]
     """Find the row of a block by its indices along the axes; EMPTY where it holds no point."""
-    return cells.blocks[_slot(cells.slots, ((i << FIELD) | j) << FIELD | k)]
+    return cells.blocks[slot_of(cells.slots, ((i << FIELD) | j) << FIELD | k)]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -392,7 +397,7 @@ def _at_or_after(keys, first, key):  # type: ignore[no-untyped-def]
 def _fill(keys, blocks, block_keys):  # type: ignore[no-untyped-def]
     """Enter the rows of blocks with ``block_keys`` (b,) into the hash table."""
     for row in range(len(block_keys)):
-        at = _slot(keys, block_keys[row])
+        at = slot_of(keys, block_keys[row])
         keys[at], blocks[at] = block_keys[row], row
 
 
@@ -411,8 +416,8 @@ def _into_blocks(points, lower, size, most, table, block, cell):  # type: ignore
         k = int((points[row, 2] - zl) / size)
         key = ((i // SIDE << FIELD) | j // SIDE) << FIELD | k // SIDE
         if key != last:  # neighbours in a scan are often in the same block
-            slot = _slot(slots, key)
-            if slots[slot] == EMPTY:
+            slot = slot_of(slots, key)
+            if slots[slot] == FREE:
                 if found == most:
                     return None
                 slots[slot], rows[slot], keys[found] = key, found, key
@@ -445,30 +450,12 @@ def _into_cells(points, order, rows, cell, first, part, start, stop):  # type: i
         part.starts[block] = place
         for at in range(first[block], first[block + 1]):
             row = rows[at]
-            to = place[cell[row]]
+            part.order[place[cell[row]]] = row
             place[cell[row]] += 1
+        for c in range(SIDE**3):
+            sort_rows(points, part.order, part.starts[block, c], part.starts[block, c + 1])
+        for to in range(first[block], first[block + 1]):
+            row = part.order[to]
             part.order[to] = order[row]
             for axis in range(3):
                 part.points[to, axis] = points[row, axis]
-    _sort_cells(part.points, part.order, part.starts, start, stop)
-
-
-@njit(cache=True, nogil=True)
-def _sort_cells(points, order, starts, first, last):  # type: ignore[no-untyped-def]
-    """Sort the rows of each cell of blocks first to last - 1 by x, y, z (Shell's sort: cells are small)."""
-    for block in range(first, last):
-        for cell in range(starts.shape[1] - 1):
-            a, b = starts[block, cell], starts[block, cell + 1]
-            gap = (b - a) // 2
-            while gap > 0:
-                for i in range(a + gap, b):
-                    x, y, z, row = points[i, 0], points[i, 1], points[i, 2], order[i]
-                    j = i
-                    while j >= a + gap:
-                        u, v, w = points[j - gap, 0], points[j - gap, 1], points[j - gap, 2]
-                        if u < x or (u == x and (v < y or (v == y and w <= z))):
-                            break
-                        points[j, 0], points[j, 1], points[j, 2], order[j] = u, v, w, order[j - gap]
-                        j -= gap
-                    points[j, 0], points[j, 1], points[j, 2], order[j] = x, y, z, row
-                gap //= 2

@@ -1,4 +1,4 @@
-"""Compiled selection: the least of many values are put before the others without a sort."""
+"""Compiled selection and sorting: the least of many values before the others; rows of few points by coordinates."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
@@ -44,3 +44,26 @@ def median(values, count):  # type: ignore[no-untyped-def]
     for k in range(1, middle):
         below = max(below, values[k])
     return (below + values[middle]) / 2.0
+
+
+@inner
+def _is_after(points, one, other):  # type: ignore[no-untyped-def]
+    """Whether one row comes after another by x, y, z and its number."""
+    for i in range(3):
+        if points[one, i] != points[other, i]:
+            return points[one, i] > points[other, i]
+    return one > other
+
+
+@inner
+def sort_rows(points, rows, first, last):  # type: ignore[no-untyped-def]
+    """Sort ``rows`` of points (n, 3) from ``first`` to ``last`` - 1 by x, y, z and row (Shell's sort: for few)."""
+    gap = (last - first) // 2
+    while gap > 0:
+        for i in range(first + gap, last):
+            row, j = rows[i], i
+            while j >= first + gap and _is_after(points, rows[j - gap], row):
+                rows[j] = rows[j - gap]
+                j -= gap
+            rows[j] = row
+        gap //= 2

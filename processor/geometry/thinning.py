@@ -12,6 +12,7 @@ import numpy.typing as npt
 from numba import njit
 
 from processor import large_arrays
+from processor.geometry.selection import sort_rows
 from processor.model import Floats, Ints
 
 T = TypeVar("T", bound=np.generic)
@@ -172,35 +173,15 @@ def _into_cells(points, low, size, extent, starts, order):  # type: ignore[no-un
 
 @njit(cache=True, nogil=True)
 def _sort_cells(points, starts, order):  # type: ignore[no-untyped-def]
-    """Sort the rows of each cell of at most FEW points by x, y, z and row; return how many points the others hold.
-
-    Shell's sort: most cells are small.
-    """
+    """Sort the rows of each cell of at most FEW points by x, y, z and row; return how many points the others hold."""
     large = 0
     for cell in range(len(starts) - 1):
         first, last = starts[cell], starts[cell + 1]
         if last - first > FEW:
             large += last - first
             continue
-        gap = (last - first) // 2
-        while gap > 0:
-            for i in range(first + gap, last):
-                row, j = order[i], i
-                while j >= first + gap and _is_after(points, order[j - gap], row):
-                    order[j] = order[j - gap]
-                    j -= gap
-                order[j] = row
-            gap //= 2
+        sort_rows(points, order, first, last)
     return large
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _is_after(points, one, other):  # type: ignore[no-untyped-def]
-    """Whether one row comes after another by x, y, z and its number."""
-    for i in range(3):
-        if points[one, i] != points[other, i]:
-            return points[one, i] > points[other, i]
-    return one > other
 
 
 @njit(cache=True, nogil=True)

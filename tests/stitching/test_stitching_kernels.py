@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from processor import large_arrays
 from processor.stitching.coarse import face_index
 from processor.stitching.fine import correspondences
-from processor.stitching.planes import angular_neighbours, border_exclusion, extraction, grouped_sums
+from processor.stitching.planes import border_exclusion, extraction, grouped_sums
 from processor.stitching.planes.sampled_patches import Patches
 from tests.support import arrays_in_files
 
@@ -100,31 +100,30 @@ def test_points_next_to_the_edge_of_a_bar_are_left_out_without_a_grid():
 
 
 @pytest.mark.parametrize("count", [5, 4000])
-def test_neighbours_in_angle_by_bands_are_those_of_all_points(monkeypatch, tmp_path, count):
-    """A dense floor, sparse points above and a few lone ones at the poles: bands of few points and of wide gaps."""
+def test_points_clear_in_angle_are_those_by_all_directions(monkeypatch, tmp_path, count):
+    """A dense floor, sparse points above and a few lone ones at the poles: blocks of few points, in files."""
     rng = np.random.default_rng(5)
     points = rng.normal(0.0, 1.0, (count, 3)) * [1.0, 1.0, 0.05] * rng.uniform(0.5, 90.0, (count, 1))
     points[::9, 2] = rng.uniform(-60.0, 60.0, len(points[::9]))
     points[:2] = [[0.0, 0.0, 50.0], [0.0, 0.0, -2.0]]
-    piece = rng.integers(-1, 3, 7)
-    cell = rng.integers(0, 7, count)
-    monkeypatch.setattr(angular_neighbours, "BAND_POINTS", 300)
-    monkeypatch.setattr(angular_neighbours, "CHUNK", 90)
-    monkeypatch.setattr(angular_neighbours, "HALO_STEPS", 1.0)
+    piece, cell = rng.integers(-1, 3, 7), rng.integers(0, 7, count)
+    flat = rng.normal(0.0, 9.0, (3, 50, 3)) * [[[1.0, 1.0, 0.1]], [[1.0, 0.1, 1.0]], [[1.0, 1.0, 1.0]]]
+    planes, limit = (
+        extraction.planes_of(extraction.sums_of(flat.reshape(-1, 3)).reshape(3, 50, -1).sum(axis=1)),
+        np.array([4.0, 20.0, 9.0]),
+    )
+    monkeypatch.setattr(border_exclusion, "CHUNK", 90)
     arrays_in_files.limit(monkeypatch, 170)
     with large_arrays.in_files(tmp_path):
-        passed = list(angular_neighbours.neighbourhoods(points, cell, piece, 9))
-    assert len(passed) > count // 300
-    number = np.concatenate([one.number for one in passed])
-    np.testing.assert_array_equal(np.sort(number), np.flatnonzero(piece[cell] >= 0))
-    near = np.concatenate([one.near for one in passed])
-    np.testing.assert_array_equal(np.concatenate([one.piece for one in passed]), piece[cell[number]])
+        clear = border_exclusion._clear_in_angle(points, cell, piece, planes, limit)
     rays = points / np.linalg.norm(points, axis=1)[:, None]
-    cosine = rays[number] @ rays.T
-    expected = np.sort(cosine, axis=1)[:, ::-1][:, : min(9, count)]
-    found = near / np.linalg.norm(near, axis=2)[:, :, None]
-    got = np.einsum("nkm,nm->nk", found, rays[number])[:, : expected.shape[1]]
-    np.testing.assert_allclose(got, expected, atol=ROUNDING)
+    for i, f in enumerate(piece[cell]):
+        near = points[np.argsort(-(rays @ rays[i]), kind="stable")[: border_exclusion.NEIGHBOURS + 1]]
+        off = np.abs((near - planes.mean[f]) @ planes.normal[f])
+        behind = border_exclusion.BEYOND * np.linalg.norm(points[i])
+        own = abs((points[i] - planes.mean[f]) @ planes.normal[f]) < limit[f]
+        assert clear[i] == (f >= 0 and own and ((off < limit[f]) | (off > behind)).all())
+    assert clear.any()
 
 
 def test_pieces_that_scatter_by_more_than_the_noise_weigh_less():

@@ -16,10 +16,10 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.geometry.linalg_small import assign
+from processor.geometry.point_grid import FREE, hash_table, slot_of
 from processor.geometry.thread_ranges import over_ranges, usable
 from processor.model import Floats, Ints, Labels
 from processor.space_frame.points.hash_sampling import REACH, STEPS_PER_MM, WHOLE, hashed
-from processor.space_frame.points.voxels import EMPTY, slot_of
 
 CELL_MM = 200.0
 FIELD = 21  # bits for each coordinate of a point less its line's middle
@@ -113,15 +113,6 @@ def cells_near(points, directions, low, high, reach, keys, lines):  # type: igno
     return n
 
 
-@njit(cache=True, nogil=True)
-def tabulate(sorted_keys, starts, table, spans):  # type: ignore[no-untyped-def]
-    """Enter cells with their spans of entries in an open hash table."""
-    for i in range(len(sorted_keys)):
-        at = slot_of(table, sorted_keys[i])
-        table[at] = sorted_keys[i]
-        spans[at, 0], spans[at, 1] = starts[i], starts[i + 1]
-
-
 def corridors(points: Floats, directions: Floats, low: Floats, high: Floats, reach_mm: float) -> Corridors:
     """Prepare lines through points (m, 3) along unit directions (m, 3), from ``low`` to ``high`` (m,) along each."""
     count = cells_near(points, directions, low, high, reach_mm, np.empty(0, np.int64), np.empty(0, np.int32))
@@ -129,11 +120,9 @@ def corridors(points: Floats, directions: Floats, low: Floats, high: Floats, rea
     cells_near(points, directions, low, high, reach_mm, keys, lines)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
-    first = np.flatnonzero(np.diff(keys, prepend=EMPTY))
-    unique = keys[first]
-    slots = 1 << max(4, int(2 * len(unique)).bit_length())
-    table, spans = np.full(slots, EMPTY, np.int64), np.zeros((slots, 2), np.int64)
-    tabulate(unique, np.append(first, count), table, spans)
+    first = np.flatnonzero(np.diff(keys, prepend=-1))
+    table, row = hash_table(keys[first])
+    starts = np.append(first, count)
     return Corridors(
         points=points,
         directions=directions,
@@ -141,7 +130,7 @@ def corridors(points: Floats, directions: Floats, low: Floats, high: Floats, rea
         high=high,
         reach_mm=reach_mm,
         keys=table,
-        spans=spans,
+        spans=np.stack([starts[row], starts[row + 1]], axis=1) * (row >= 0)[:, None],
         lines=lines[order],
     )
 
@@ -167,7 +156,7 @@ def near(coordinates, scale, station, corridors, thresholds, middles, entries): 
         )
         if key != last_key:
             at, last_key = slot_of(table, key), key
-        if table[at] == EMPTY:
+        if table[at] == FREE:
             continue
         h = hashed(x, y, z)
         for e in range(spans[at, 0], spans[at, 1]):

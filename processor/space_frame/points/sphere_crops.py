@@ -15,15 +15,14 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.geometry.point_grid import hash_table, slot_of
 from processor.geometry.thread_ranges import over_ranges
-from processor.inner_kernels import inner_ieee
 from processor.model import Floats, Ints, Labels, UsageError
 from processor.space_frame.points.hash_sampling import WHOLE, hashed
 from processor.space_frame.points.source import Source
 
 GREATEST_REACH_MM = 1000.0  # 21 bits per axis
 BLOCK = 1 << 14
-EMPTY = -1
 MOST_POINTS = 2_000_000  # of all crops together, and of each
 LEAST_ROOM = 512  # of a crop, however many there are
 STEPS_PER_MM = 1000.0  # gathered coordinates are whole micrometres: sorting them is exact
@@ -55,7 +54,7 @@ class NodeIndex(NamedTuple):
     upper: Floats
     reach: float
     keys: Ints
-    rows: Labels
+    rows: Ints
     starts: Ints
     owners: Labels
 
@@ -119,9 +118,7 @@ def _indexed(nodes: Floats, reach: float) -> NodeIndex:
     key, owner = np.concatenate(parts), np.concatenate(owners)
     order = np.lexsort((owner, key))
     unique, begin = np.unique(key[order], return_index=True)
-    bits = max(4, int(4 * len(unique) - 1).bit_length())
-    keys, rows = np.full(1 << bits, EMPTY, np.int64), np.full(1 << bits, EMPTY, np.int32)
-    _fill(unique, keys, rows)
+    keys, rows = hash_table(unique)
     return NodeIndex(
         nodes=nodes,
         lower=lower,
@@ -132,23 +129,6 @@ def _indexed(nodes: Floats, reach: float) -> NodeIndex:
         starts=np.append(begin, len(key)).astype(np.int64),
         owners=owner[order].astype(np.int32),
     )
-
-
-@inner_ieee
-def _slot(key, mask):  # type: ignore[no-untyped-def]
-    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    return np.int64((h >> np.uint64(29)) & np.uint64(mask))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fill(keys, table, row):  # type: ignore[no-untyped-def]
-    mask = len(table) - 1
-    for i in range(len(keys)):
-        at = _slot(keys[i], mask)
-        while table[at] != EMPTY:
-            at = (at + 1) & mask
-        table[at] = keys[i]
-        row[at] = i
 
 
 def _near(points: Floats, station: Labels, index: NodeIndex, thresholds: npt.NDArray[np.uint64], threads: int) -> Pairs:
@@ -170,8 +150,7 @@ def _near(points: Floats, station: Labels, index: NodeIndex, thresholds: npt.NDA
 def _look(points, index, thresholds, candidates, begin, end):  # type: ignore[no-untyped-def]
     """Fill, by blocks, the points that are near a node and their cells, and the numbers of them and of the pairs."""
     n = len(points)
-    nodes, lower, upper, reach, keys, _, starts, owners = index
-    mask = len(keys) - 1
+    nodes, lower, upper, reach, keys, rows, starts, owners = index
     inverse = 1.0 / (2.0 * reach)
     reach2 = reach * reach
     for block in range(begin, end):
@@ -186,12 +165,9 @@ def _look(points, index, thresholds, candidates, begin, end):  # type: ignore[no
             iy = np.int64((y - lower[1]) * inverse)
             iz = np.int64((z - lower[2]) * inverse)
             key = (ix << 42) | (iy << 21) | iz
-            at = _slot(key, mask)
-            while keys[at] != EMPTY and keys[at] != key:
-                at = (at + 1) & mask
-            if keys[at] == EMPTY:
+            here = rows[slot_of(keys, key)]
+            if here < 0:
                 continue
-            here = index.rows[at]
             near = 0
             for j in range(starts[here], starts[here + 1]):
                 node = owners[j]

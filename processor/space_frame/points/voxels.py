@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from processor.geometry.point_grid import EMPTY, FREE, slot_of
 from processor.model import Floats, Ints
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM, Steps
 
@@ -18,7 +19,6 @@ BITS = 3  # a block is 8 voxels wide
 SIDE = 1 << BITS
 FIELD = 21  # bits of a key for each axis
 OFFSET = 1 << (FIELD - 1)
-EMPTY = -1
 
 
 class Voxels(NamedTuple):
@@ -42,17 +42,6 @@ class Voxels(NamedTuple):
         return len(self.cells)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def slot_of(keys, key):  # type: ignore[no-untyped-def]
-    """Return the slot of a key in an open table whose length is a power of two, or the empty slot for it."""
-    mask = np.uint64(len(keys) - 1)
-    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    at = (h ^ (h >> np.uint64(32))) & mask
-    while keys[at] != EMPTY and keys[at] != key:
-        at = (at + np.uint64(1)) & mask
-    return at
-
-
 @njit(cache=True, nogil=True)
 def accumulate(steps, size, keys, sums):  # type: ignore[no-untyped-def]
     """Add points to the table of voxels; returns the rows done, and stops when the table is half full."""
@@ -74,7 +63,7 @@ def accumulate(steps, size, keys, sums):  # type: ignore[no-untyped-def]
             | (c & (SIDE - 1))
         )
         at = slot_of(keys, key)
-        if keys[at] == EMPTY:
+        if keys[at] == FREE:
             keys[at] = key
             used += 1
         sums[at, 0] += 1
@@ -89,7 +78,7 @@ def gathered(steps: Steps, size_mm: float, least: int) -> Voxels:
     size = round(size_mm * STEPS_PER_MM)
     slots = 1 << max(14, int(len(steps) // 4).bit_length())
     while True:
-        keys, sums = np.full(slots, EMPTY, np.int64), np.zeros((slots, 4), np.int64)
+        keys, sums = np.full(slots, FREE, np.int64), np.zeros((slots, 4), np.int64)
         done = accumulate(steps, size, keys, sums)
         if done == len(steps):
             break

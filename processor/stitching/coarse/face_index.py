@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.geometry.point_grid import hash_table, slot_of
 from processor.inner_kernels import inner
 from processor.model import Floats, Ints
-from processor.stitching.planes.grouped_sums import EMPTY, place
+from processor.stitching.planes.grouped_sums import numbered
 from processor.stitching.planes.sampled_patches import Patches
 
 FIELD = 21  # bits of a cell's index along each axis
@@ -28,7 +29,6 @@ class FaceIndex(NamedTuple):
     points: Floats
     normals: Floats
     size: float  # edge of a cell, mm
-    shift: int  # of a mixed key, to its slot
     table: Ints  # (slots,) keys
     row: npt.NDArray[np.int32]  # (slots,) of ``starts``
     starts: Ints
@@ -38,67 +38,23 @@ class FaceIndex(NamedTuple):
 def build(patches: Patches, size_mm: float) -> FaceIndex:
     """Index patches by cells of edge ``size_mm``, which is also the largest distance that look-ups cover."""
     points = np.ascontiguousarray(patches.points)
-    bits = max(1, int(2 * 27 * len(points)).bit_length())
-    table, row = np.full(1 << bits, EMPTY, np.int64), np.zeros(1 << bits, np.int64)
-    counts = np.zeros(27 * len(points), np.int64)
-    cells = int(list_patches(points, size_mm, table, 64 - bits, row, counts, np.empty(0, np.int32), 0))
-    starts = np.concatenate([[0], np.cumsum(counts[:cells])])
-    items = np.empty(int(starts[-1]), np.int32)
-    list_patches(points, size_mm, table, 64 - bits, row, starts[:-1].copy(), items, cells)
-    # Neighbourhoods overlap: there are far fewer cells than entries, and a smaller table fits the processor's cache.
-    bits = max(1, int(2 * cells).bit_length())
-    keys, rows = np.full(1 << bits, EMPTY, np.int64), np.zeros(1 << bits, np.int32)
-    copy_table(table, row, keys, rows, 64 - bits)
+    cell = np.floor(points / size_mm).astype(np.int64)[:, None] + np.array(list(np.ndindex(3, 3, 3))) - 1
+    keys = (((cell[..., 0] & MASK) << FIELD | cell[..., 1] & MASK) << FIELD | cell[..., 2] & MASK).ravel()
+    first, number = numbered(keys)
+    table, row = hash_table(keys[first])
     return FaceIndex(
-        points=points, normals=np.ascontiguousarray(patches.normals), size=size_mm, shift=64 - bits,
-        table=keys, row=rows, starts=starts, items=items,
+        points=points, normals=np.ascontiguousarray(patches.normals), size=size_mm, table=table,
+        row=row.astype(np.int32), starts=np.concatenate([[0], np.cumsum(np.bincount(number))]),
+        items=(np.argsort(number, kind="stable") // 27).astype(np.int32),
     )  # fmt: skip
-
-
-@inner
-def _key(x, y, z):  # type: ignore[no-untyped-def]
-    return ((x & MASK) << (2 * FIELD)) | ((y & MASK) << FIELD) | (z & MASK)
-
-
-@njit(cache=True, nogil=True)
-def list_patches(points, size, table, shift, row, starts, items, number):  # type: ignore[no-untyped-def]
-    """Enter points (n, 3) in their own cell and the 26 around it: counts only if ``items`` is empty, else the rows."""
-    cells = number
-    for i in range(len(points)):
-        a = np.int64(np.floor(points[i, 0] / size))
-        b = np.int64(np.floor(points[i, 1] / size))
-        c = np.int64(np.floor(points[i, 2] / size))
-        for u in range(-1, 2):
-            for v in range(-1, 2):
-                for w in range(-1, 2):
-                    key = _key(a + u, b + v, c + w)
-                    slot = place(table, key, shift)
-                    if table[slot] == EMPTY:
-                        table[slot] = key
-                        row[slot] = cells
-                        cells += 1
-                    if len(items):
-                        items[starts[row[slot]]] = i
-                    starts[row[slot]] += 1
-    return cells
-
-
-@njit(cache=True, nogil=True)
-def copy_table(table, row, keys, rows, shift):  # type: ignore[no-untyped-def]
-    """Copy the entries of a hash table into one of another size."""
-    for i in range(len(table)):
-        if table[i] != EMPTY:
-            slot = place(keys, table[i], shift)
-            keys[slot], rows[slot] = table[i], row[i]
 
 
 @inner
 def cell_of(index, x, y, z):  # type: ignore[no-untyped-def]
     """Return the row of ``starts`` of the cell around a point, -1 = no patch near."""
     size = index.size
-    key = _key(np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size)))
-    slot = place(index.table, key, index.shift)
-    return index.row[slot] if index.table[slot] != EMPTY else -1
+    i, j, k = np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
+    return index.row[slot_of(index.table, ((i & MASK) << FIELD | j & MASK) << FIELD | k & MASK)]
 
 
 @njit(cache=True, nogil=True)

@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 
 from processor import large_arrays
+from processor.geometry import nearest_neighbours
 from processor.model import Bools, Floats, Ints
-from processor.stitching.planes.angular_neighbours import neighbourhoods
 from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.grid_bands import GridBands
 
@@ -22,6 +22,8 @@ ON_SIGMAS = 3.0  # a point this close to a plane lies on it
 LEAST_SHARE = 0.5  # of a piece's points that must remain
 BEYOND = 0.05  # of the range: a point this far behind the plane is not on a side face of the same bar
 NEIGHBOURS = 8  # in angle, where there is no grid
+ALL_AROUND = 3.0  # more than the distance of opposite directions, 2
+CHUNK = 1 << 15  # points whose neighbours are in memory at once: 7 MB
 
 
 def inside(points: Floats, cell: Ints, bands: GridBands | None, piece_of_cell: Ints, planes: Planes) -> Bools:
@@ -56,15 +58,24 @@ def inside(points: Floats, cell: Ints, bands: GridBands | None, piece_of_cell: I
 
 def _clear_in_angle(points: Floats, cell: Ints, piece_of_cell: Ints, planes: Planes, limit: Floats) -> Bools:
     """Mark points (n,) on the plane of their piece whose neighbours in angle lie on it too, or far behind it."""
-    clear = large_arrays.allocate(len(points), dtype=np.bool_)
+    rays, clear = large_arrays.allocate(len(points), 3), large_arrays.allocate(len(points), dtype=np.bool_)
     for rows in large_arrays.blocks(len(points)):
-        clear[rows] = False
-    for number, f, there, near in neighbourhoods(points, cell, piece_of_cell, NEIGHBOURS + 1):
+        rays[rows] = points[rows] / np.maximum(np.linalg.norm(points[rows], axis=1), 1e-9)[:, None]
+    grid = nearest_neighbours.of_spacing(rays)
+    ordered = large_arrays.taken(points, grid.order)
+    for rows in large_arrays.blocks(len(points), CHUNK):
+        number = grid.order[rows]
+        f = piece_of_cell[cell[number]]
+        clear[number] = False
+        on = np.flatnonzero(f >= 0)
+        number, f, own = number[on], f[on], rows.start + on
+        near = nearest_neighbours.nearest_rows(grid.cells, grid.cells.points[own], ALL_AROUND, NEIGHBOURS + 1)[0]
+        there, near = ordered[own], ordered[np.where(near < 0, own[:, None], near)]
         off = np.einsum("nki,ni->nk", near - planes.mean[f][:, None], planes.normal[f])
-        own = np.abs(np.einsum("ni,ni->n", there - planes.mean[f], planes.normal[f])) < limit[f]
+        on_plane = np.abs(np.einsum("ni,ni->n", there - planes.mean[f], planes.normal[f])) < limit[f]
         behind = BEYOND * np.linalg.norm(there, axis=1)
         good = (np.abs(off) < limit[f][:, None]) | (np.abs(off) > behind[:, None])
-        clear[number] = own & good.all(axis=1)
+        clear[number] = on_plane & good.all(axis=1)
     return clear
 
 

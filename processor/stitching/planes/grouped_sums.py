@@ -9,10 +9,8 @@ import numpy as np
 from numba import njit
 
 from processor import large_arrays
+from processor.geometry.point_grid import FREE, empty_table, slot_of
 from processor.model import Bools, Floats, Ints
-
-MIX = np.uint64(0x9E3779B97F4A7C15)  # multiplicative hashing: consecutive keys would fill a table in runs
-EMPTY = np.iinfo(np.int64).min
 
 
 def numbered(keys: Ints) -> tuple[Ints, Ints]:
@@ -21,10 +19,8 @@ def numbered(keys: Ints) -> tuple[Ints, Ints]:
     Returns the first row of each value (k,) and the number of each row (n,), as np.unique does.
     """
     number, distinct = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
-    bits = max(1, int(2 * len(keys)).bit_length())
-    table = np.full(1 << bits, EMPTY, np.int64)
     keys = np.ascontiguousarray(keys, np.int64)
-    count = gather(keys, table, 64 - bits, number, distinct)
+    count = gather(keys, *empty_table(len(keys)), number, distinct)
     order = np.argsort(distinct[:count])
     rank = np.empty(count, np.int64)
     rank[order] = np.arange(count)
@@ -36,8 +32,7 @@ def numbered(keys: Ints) -> tuple[Ints, Ints]:
 def distinct_count(keys: Ints) -> int:
     """Count the distinct values of keys (n,)."""
     number, distinct = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
-    bits = max(1, int(2 * len(keys)).bit_length())
-    return int(gather(np.ascontiguousarray(keys), np.full(1 << bits, EMPTY, np.int64), 64 - bits, number, distinct))
+    return int(gather(np.ascontiguousarray(keys), *empty_table(len(keys)), number, distinct))
 
 
 def summed(values: Floats, group: Ints, count: int) -> Floats:
@@ -83,23 +78,12 @@ def number_of_rows(keys: Callable[[slice], Ints], count: int) -> tuple[Ints, Int
 
 
 @njit(cache=True, nogil=True)
-def place(table, key, shift):  # type: ignore[no-untyped-def]
-    """Return the slot of a key in a table, or the free slot where it is to be inserted."""
-    last = len(table) - 1
-    slot = np.int64((np.uint64(key) * MIX) >> np.uint64(shift))
-    while table[slot] != EMPTY and table[slot] != key:
-        slot = (slot + 1) & last
-    return slot
-
-
-@njit(cache=True, nogil=True)
-def gather(keys, table, shift, number, distinct):  # type: ignore[no-untyped-def]
+def gather(keys, table, number_of_slot, number, distinct):  # type: ignore[no-untyped-def]
     """Write numbers of keys (n,), by first appearance, and the ``distinct`` keys; returns how many these are."""
-    number_of_slot = np.empty(len(table), np.int64)
     count = 0
     for i in range(len(keys)):
-        slot = place(table, keys[i], shift)
-        if table[slot] == EMPTY:
+        slot = slot_of(table, keys[i])
+        if table[slot] == FREE:
             table[slot] = keys[i]
             number_of_slot[slot] = count
             distinct[count] = keys[i]
