@@ -16,7 +16,7 @@ from numba import njit
 
 from processor.geometry.linalg_small import assign, assign_rows, eigen
 from processor.geometry.m3c2 import FEWEST_FOR_LOD, LEAST_RANGE
-from processor.geometry.point_grid import RUNS, PointGrid, runs_near
+from processor.geometry.point_grid import HALF_DIAGONAL, SIDE, PointGrid, block_at, cells_within
 from processor.geometry.thread_ranges import over_ranges
 from processor.model import Floats, Ints
 from processor.robust_statistics import student_factor
@@ -152,8 +152,10 @@ def _add(cells, feet, wanted, first, last, sums):  # type: ignore[no-untyped-def
     """Add the feet about places order[first] to order[last - 1] to their sums."""
     places, directions, order = wanted.places, wanted.directions, wanted.order
     distance, normals, radius, least_cos = feet.distance, feet.normals, feet.radius, feet.least_cos
-    points, runs = cells.points, np.empty((RUNS, 2), np.int64)
+    size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
+    points, starts = cells.points, cells.starts
     rim, extent = radius * radius, radius * (1.0 + 1e-9)
+    reach2 = (radius + HALF_DIAGONAL * size) ** 2
     A, g = np.empty((3, 3)), np.empty(3)
     for at in range(first, last):
         row = order[at]
@@ -161,29 +163,43 @@ def _add(cells, feet, wanted, first, last, sums):  # type: ignore[no-untyped-def
         a, b, c = directions[row, 0], directions[row, 1], directions[row, 2]
         if not np.isfinite(a + b + c + x + y + z) or len(points) == 0:
             continue
-        runs, found = runs_near(cells, x, y, z, 0.0, 0.0, 0.0, 0.0, extent, runs)
+        i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, extent, extent, extent)
         n, square = 0, 0.0
         A[:, :], g[:] = 0.0, 0.0
-        for run in range(found):
-            for p in range(runs[run, 0], runs[run, 1]):
-                u, v, t = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-                if u * u + v * v + t * t > rim:
-                    continue
-                e, m, o = normals[p, 0], normals[p, 1], normals[p, 2]
-                if e * a + m * b + o * c < least_cos:
-                    continue
-                s = distance[p]
-                n += 1
-                square += s * s
-                A[0, 0] += e * e
-                A[0, 1] += e * m
-                A[0, 2] += e * o
-                A[1, 1] += m * m
-                A[1, 2] += m * o
-                A[2, 2] += o * o
-                g[0] += e * s
-                g[1] += m * s
-                g[2] += o * s
+        for bi in range(i0 // SIDE, i1 // SIDE + 1):
+            for bj in range(j0 // SIDE, j1 // SIDE + 1):
+                for bk in range(k0 // SIDE, k1 // SIDE + 1):
+                    u = xl + SIDE * (bi + 0.5) * size - x
+                    v = yl + SIDE * (bj + 0.5) * size - y
+                    t = zl + SIDE * (bk + 0.5) * size - z
+                    if u * u + v * v + t * t > reach2:
+                        continue
+                    block = block_at(cells, bi, bj, bk)
+                    if block < 0:
+                        continue
+                    low, high = max(k0 - SIDE * bk, 0), min(k1 - SIDE * bk, SIDE - 1)
+                    for i in range(max(i0, SIDE * bi), min(i1, SIDE * bi + SIDE - 1) + 1):
+                        for j in range(max(j0, SIDE * bj), min(j1, SIDE * bj + SIDE - 1) + 1):
+                            cell = ((i - SIDE * bi) * SIDE + (j - SIDE * bj)) * SIDE
+                            for p in range(starts[block, cell + low], starts[block, cell + high + 1]):
+                                u, v, t = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                                if u * u + v * v + t * t > rim:
+                                    continue
+                                e, m, o = normals[p, 0], normals[p, 1], normals[p, 2]
+                                if e * a + m * b + o * c < least_cos:
+                                    continue
+                                s = distance[p]
+                                n += 1
+                                square += s * s
+                                A[0, 0] += e * e
+                                A[0, 1] += e * m
+                                A[0, 2] += e * o
+                                A[1, 1] += m * m
+                                A[1, 2] += m * o
+                                A[2, 2] += o * o
+                                g[0] += e * s
+                                g[1] += m * s
+                                g[2] += o * s
         sums.number[row] += n
         sums.square[row] += square
         for i in range(3):

@@ -17,7 +17,7 @@ from numba import njit
 from processor import large_arrays
 from processor.geometry import nearest_neighbours, point_grid
 from processor.geometry.linalg_small import eigen
-from processor.geometry.point_grid import RUNS, PointGrid, runs_near
+from processor.geometry.point_grid import HALF_DIAGONAL, SIDE, PointGrid, block_at, cells_within
 from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import blocks
 from processor.model import Bools, Columns, Floats, InputError, Ints
@@ -238,8 +238,11 @@ def along_normals(cells, places, normals, order, first, last, cylinder, count, m
     The ``cylinder`` is its radius and how far it reaches to either side of its place, both inclusive.
     """
     radius, depth = cylinder
-    points, runs = cells.points, np.empty((RUNS, 2), np.int64)
-    rim, slack = radius * radius, 1e-9 * (radius + depth)
+    size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
+    points, starts = cells.points, cells.starts
+    rim, reach = radius * radius, radius + HALF_DIAGONAL * size
+    reach2, end = reach * reach, depth + HALF_DIAGONAL * size
+    slack = 1e-9 * (radius + depth)
     for at in range(first, last):
         row = order[at]
         x, y, z = places[row, 0], places[row, 1], places[row, 2]
@@ -247,23 +250,41 @@ def along_normals(cells, places, normals, order, first, last, cylinder, count, m
         count[row], mean[row], sd[row] = 0, np.nan, np.nan
         if not np.isfinite(a + b + c + x + y + z) or len(points) == 0:
             continue
-        runs, found = runs_near(cells, x, y, z, a, b, c, depth, radius + slack, runs)
+        ex = depth * abs(a) + radius * np.sqrt(max(0.0, 1.0 - a * a)) + slack
+        ey = depth * abs(b) + radius * np.sqrt(max(0.0, 1.0 - b * b)) + slack
+        ez = depth * abs(c) + radius * np.sqrt(max(0.0, 1.0 - c * c)) + slack
+        i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, ex, ey, ez)
         n, shift, total, square = 0, 0.0, 0.0, 0.0
-        for run in range(found):
-            for p in range(runs[run, 0], runs[run, 1]):
-                u, v, w = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-                t = u * a + v * b + w * c
-                if abs(t) > depth:
-                    continue
-                u, v, w = u - t * a, v - t * b, w - t * c
-                if u * u + v * v + w * w > rim:
-                    continue
-                if n == 0:
-                    shift = t  # squares of small differences lose no digits
-                t -= shift
-                n += 1
-                total += t
-                square += t * t
+        for bi in range(i0 // SIDE, i1 // SIDE + 1):
+            for bj in range(j0 // SIDE, j1 // SIDE + 1):
+                for bk in range(k0 // SIDE, k1 // SIDE + 1):
+                    u = xl + SIDE * (bi + 0.5) * size - x
+                    v = yl + SIDE * (bj + 0.5) * size - y
+                    w = zl + SIDE * (bk + 0.5) * size - z
+                    t = u * a + v * b + w * c
+                    if abs(t) > end or u * u + v * v + w * w - t * t > reach2:
+                        continue
+                    block = block_at(cells, bi, bj, bk)
+                    if block < 0:
+                        continue
+                    low, high = max(k0 - SIDE * bk, 0), min(k1 - SIDE * bk, SIDE - 1)
+                    for i in range(max(i0, SIDE * bi), min(i1, SIDE * bi + SIDE - 1) + 1):
+                        for j in range(max(j0, SIDE * bj), min(j1, SIDE * bj + SIDE - 1) + 1):
+                            cell = ((i - SIDE * bi) * SIDE + (j - SIDE * bj)) * SIDE
+                            for p in range(starts[block, cell + low], starts[block, cell + high + 1]):
+                                u, v, w = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                                t = u * a + v * b + w * c
+                                if abs(t) > depth:
+                                    continue
+                                u, v, w = u - t * a, v - t * b, w - t * c
+                                if u * u + v * v + w * w > rim:
+                                    continue
+                                if n == 0:
+                                    shift = t  # squares of small differences lose no digits
+                                t -= shift
+                                n += 1
+                                total += t
+                                square += t * t
         count[row] = n
         if n > 0:
             mean[row] = shift + total / n
@@ -276,7 +297,7 @@ def normals_at(cells, places, order, first, last, radius, normals, roughness, co
 
     NaN for fewer than FEWEST_OF_PLANE points, and for points on a line. Of so few points the sd is NaN: none is off.
     """
-    points, runs = cells.points, np.empty((RUNS, 2), np.int64)
+    points, starts = cells.points, cells.starts
     rim, extent = radius * radius, radius * (1.0 + 1e-9)
     A, V = np.empty((3, 3)), np.empty((3, 3))
     for at in range(first, last):
@@ -285,18 +306,27 @@ def normals_at(cells, places, order, first, last, radius, normals, roughness, co
         normals[row, :], roughness[row], count[row] = np.nan, np.nan, 0
         if not np.isfinite(x + y + z) or len(points) == 0:
             continue
-        runs, found = runs_near(cells, x, y, z, 0.0, 0.0, 0.0, 0.0, extent, runs)
+        i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, extent, extent, extent)
         n = 0
         su = sv = sw = suu = suv = suw = svv = svw = sww = 0.0
-        for run in range(found):
-            for p in range(runs[run, 0], runs[run, 1]):
-                u, v, w = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-                if u * u + v * v + w * w > rim:
-                    continue
-                n += 1
-                su, sv, sw = su + u, sv + v, sw + w
-                suu, suv, suw = suu + u * u, suv + u * v, suw + u * w
-                svv, svw, sww = svv + v * v, svw + v * w, sww + w * w
+        for bi in range(i0 // SIDE, i1 // SIDE + 1):
+            for bj in range(j0 // SIDE, j1 // SIDE + 1):
+                for bk in range(k0 // SIDE, k1 // SIDE + 1):
+                    block = block_at(cells, bi, bj, bk)
+                    if block < 0:
+                        continue
+                    low, high = max(k0 - SIDE * bk, 0), min(k1 - SIDE * bk, SIDE - 1)
+                    for i in range(max(i0, SIDE * bi), min(i1, SIDE * bi + SIDE - 1) + 1):
+                        for j in range(max(j0, SIDE * bj), min(j1, SIDE * bj + SIDE - 1) + 1):
+                            cell = ((i - SIDE * bi) * SIDE + (j - SIDE * bj)) * SIDE
+                            for p in range(starts[block, cell + low], starts[block, cell + high + 1]):
+                                u, v, w = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                                if u * u + v * v + w * w > rim:
+                                    continue
+                                n += 1
+                                su, sv, sw = su + u, sv + v, sw + w
+                                suu, suv, suw = suu + u * u, suv + u * v, suw + u * w
+                                svv, svw, sww = svv + v * v, svw + v * w, sww + w * w
         count[row] = n
         if n < FEWEST_OF_PLANE:
             continue

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from processor import large_arrays
 from processor.distinct_rows import components, distinct_points
 from processor.geometry import point_grid
-from processor.geometry.point_grid import RUNS, SIDE, Cells, PointGrid, cells_within, runs_near
+from processor.geometry.point_grid import RUNS, SIDE, Cells, PointGrid, block_at, cells_within, runs_near
 from processor.geometry.selection import least_first
 from processor.geometry.thread_ranges import over_ranges
 from processor.inner_kernels import inner
@@ -345,8 +345,8 @@ def _nearest_rows(cells, places, reach, found, square, first, last):  # type: ig
 
     The radius of a search grows until it holds k points. That of one point begins at the one found for the last place.
     """
-    size, tops = cells.size, SIDE * cells.extent - 1
-    points, runs = cells.points, np.empty((RUNS, 2), np.int64)
+    size, xl, yl, tops = cells.size, cells.lower[0], cells.lower[1], SIDE * cells.extent - 1
+    points, starts = cells.points, cells.starts
     k, previous = found.shape[1], -1
     for row in range(first, last):
         x, y, z = places[row, 0], places[row, 1], places[row, 2]
@@ -360,18 +360,28 @@ def _nearest_rows(cells, places, reach, found, square, first, last):  # type: ig
         radius = min(FIRST_CELLS * size, np.sqrt(limit))
         while True:
             i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, radius, radius, radius)
-            runs, near = runs_near(cells, x, y, z, 0.0, 0.0, 0.0, 0.0, radius, runs)
-            for run in range(near):
-                for p in range(runs[run, 0], runs[run, 1]):
-                    d = _square(points, p, x, y, z)
-                    if d > limit or (d == limit and p >= rows[k - 1]):
+            for i in range(i0, i1 + 1):
+                gx = max(abs(xl + (i + 0.5) * size - x) - 0.5 * size, 0.0)
+                for j in range(j0, j1 + 1):
+                    gy = max(abs(yl + (j + 0.5) * size - y) - 0.5 * size, 0.0)
+                    if gx * gx + gy * gy > limit * (1.0 + 1e-9):
                         continue
-                    m = k - 1
-                    while m > 0 and (squares[m - 1] > d or (squares[m - 1] == d and rows[m - 1] > p)):
-                        squares[m], rows[m] = squares[m - 1], rows[m - 1]
-                        m -= 1
-                    squares[m], rows[m] = d, p
-                    limit = min(limit, squares[k - 1])
+                    cell = (i % SIDE * SIDE + j % SIDE) * SIDE
+                    for bk in range(k0 // SIDE, k1 // SIDE + 1):
+                        block = block_at(cells, i // SIDE, j // SIDE, bk)
+                        if block < 0:
+                            continue
+                        low, high = max(k0 - SIDE * bk, 0), min(k1 - SIDE * bk, SIDE - 1)
+                        for p in range(starts[block, cell + low], starts[block, cell + high + 1]):
+                            d = _square(points, p, x, y, z)
+                            if d > limit or (d == limit and p >= rows[k - 1]):
+                                continue
+                            m = k - 1
+                            while m > 0 and (squares[m - 1] > d or (squares[m - 1] == d and rows[m - 1] > p)):
+                                squares[m], rows[m] = squares[m - 1], rows[m - 1]
+                                m -= 1
+                            squares[m], rows[m] = d, p
+                            limit = min(limit, squares[k - 1])
             whole = i0 == j0 == k0 == 0 and i1 == tops[0] and j1 == tops[1] and k1 == tops[2]
             if whole or limit <= radius * radius:
                 break
@@ -392,15 +402,24 @@ def _square(points, row, x, y, z):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _mark_within(cells, points, reach, of_points, of_places, first, last):  # type: ignore[no-untyped-def]
     """Mark points first to last - 1 with a place of the grid within reach, and the places, in the grid's order."""
-    places, runs = cells.points, np.empty((RUNS, 2), np.int64)
+    places, starts = cells.points, cells.starts
     for row in range(first, last):
         x, y, z = points[row, 0], points[row, 1], points[row, 2]
-        runs, found = runs_near(cells, x, y, z, 0.0, 0.0, 0.0, 0.0, reach, runs)
-        for run in range(found):
-            for p in range(runs[run, 0], runs[run, 1]):
-                u, v, w = places[p, 0] - x, places[p, 1] - y, places[p, 2] - z
-                if u * u + v * v + w * w < reach * reach:
-                    of_points[row] = of_places[p] = True
+        i0, i1, j0, j1, k0, k1 = cells_within(cells, x, y, z, reach, reach, reach)
+        for bi in range(i0 // SIDE, i1 // SIDE + 1):
+            for bj in range(j0 // SIDE, j1 // SIDE + 1):
+                for bk in range(k0 // SIDE, k1 // SIDE + 1):
+                    block = block_at(cells, bi, bj, bk)
+                    if block < 0:
+                        continue
+                    low, high = max(k0 - SIDE * bk, 0), min(k1 - SIDE * bk, SIDE - 1)
+                    for i in range(max(i0, SIDE * bi), min(i1, SIDE * bi + SIDE - 1) + 1):
+                        for j in range(max(j0, SIDE * bj), min(j1, SIDE * bj + SIDE - 1) + 1):
+                            cell = ((i - SIDE * bi) * SIDE + (j - SIDE * bj)) * SIDE
+                            for p in range(starts[block, cell + low], starts[block, cell + high + 1]):
+                                u, v, w = places[p, 0] - x, places[p, 1] - y, places[p, 2] - z
+                                if u * u + v * v + w * w < reach * reach:
+                                    of_points[row] = of_places[p] = True
 
 
 def same_places(points: Floats, within_mm: float) -> Ints:
