@@ -59,7 +59,7 @@ def make_scene(
 
     from designgen.scenes import make
     from processor.store import store
-    from processor.store.output_checks import check_file
+    from processor.store.whole_output import check_file
 
     check_file(path, ".h5", "a scene")
     # The last bits of BLAS results depend on the number of threads.
@@ -284,8 +284,8 @@ def make_many(
     Raises UsageError if the folder is a file or another run is at work in it, or if the cluster does not answer;
     InputError if the cluster is lost on the way or the folder cannot be written.
     """
-    from processor.store.atomic_file import replace_text
     from processor.store.making import remove_leftovers
+    from processor.store.whole_output import replace_text
 
     try:
         folder.mkdir(parents=True, exist_ok=True)

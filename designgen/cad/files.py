@@ -20,7 +20,7 @@ from designgen.cad.process import received
 from processor.jobs.causes import Cause
 from processor.jobs.process import isolated, run
 from processor.model import InputError, PlainError, UsageError
-from processor.store.new_folder import check_new, new_folder
+from processor.store.whole_output import check_new, whole_folder
 from processor.writers.ply import write_mesh
 
 STEP_SUFFIXES, ZIPPED, IFC_SUFFIXES = (".step", ".stp"), ".ifczip", (".ifc", ".ifczip")
@@ -154,7 +154,7 @@ def import_file(
         "problems": list(cad.problems),
         "notes": _notes(cad, path.stem),
     }
-    with new_folder(folder) as making:
+    with whole_folder(folder) as making:
         taken = set[str]()
         for body in cad.bodies:
             file = f"{_file_stem(body.name, taken)}.ply"

@@ -22,7 +22,7 @@ from processor.model import (
 )
 from processor.plain_text import spreadsheet_text
 from processor.store import store
-from processor.store.new_folder import check_new, new_folder
+from processor.store.whole_output import check_new, whole_folder
 from processor.writers import project
 from processor.writers.cloud import METRES
 from processor.writers.toml import as_toml
@@ -68,7 +68,7 @@ def export(
     if not with_meshes and whole.arch is None:
         raise UsageError(f"{source}: only an arch bridge has a design without meshes")
     scene = dataclasses.replace(whole, scans=scans)
-    with new_folder(folder) as making:
+    with whole_folder(folder) as making:
 
         def write(labels: Sequence[PointLabels]) -> tuple[PointLabels, ...]:
             written = _write(scene, making, format_, labels, spherical=spherical, with_meshes=with_meshes)

@@ -28,7 +28,7 @@ from designgen.randomness import generator
 from designgen.recipe_params import filled
 from designgen.scenes import assembly
 from processor.model import UsageError
-from processor.store.atomic_file import replacing
+from processor.store.whole_output import replacing
 
 if TYPE_CHECKING:
     import cadquery as cq

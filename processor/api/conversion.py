@@ -13,7 +13,7 @@ from processor.language.messages import messages
 from processor.model import Scan, Truth, UsageError, per_point_fields
 from processor.progress import stage
 from processor.scan_folder import files, fingerprint
-from processor.store import output_checks, store
+from processor.store import store, whole_output
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def convert(input_: str | Path, output: str | Path, units: str | None = None) ->
         raise UsageError(f"{path}: is a scene file already; name a scan folder or a scan file")
     if out.name == files.TRUTH and out.resolve().parent == path.resolve():
         raise UsageError(f"{out}: is where the truth of the input lies; name another file with -o")
-    output_checks.check_file(out, ".h5", "a scene file")
+    whole_output.check_file(out, ".h5", "a scene file")
     before = fingerprint.signature(path.resolve(), out.resolve())
     with large_arrays.in_files(out.absolute().parent):
         with stage(f"reading {path.name}"):

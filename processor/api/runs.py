@@ -24,7 +24,7 @@ from processor.progress import stage
 from processor.report import headline, write_results
 from processor.results.file_names import RESULTS_H5
 from processor.scan_folder import files, fingerprint
-from processor.store import output_checks, store
+from processor.store import store, whole_output
 
 Names = str | Sequence[str] | None
 
@@ -174,7 +174,7 @@ def compute(
         pipeline.plan(wanted, methods, parameters, seed)  # wrong names are reported before a long reading
     place = out.resolve() if out else None
     before = fingerprint.signature(path.resolve(), place)
-    folder = Path(tempfile.gettempdir()) if out is None else output_checks.existing_parent(out)
+    folder = Path(tempfile.gettempdir()) if out is None else whole_output.existing_parent(out)
     with tile_cluster.on_cluster(cluster, log), large_arrays.in_files(folder), one_blas_thread():
         with stage(f"reading {path.name}"):
             scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)

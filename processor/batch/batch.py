@@ -28,8 +28,7 @@ from processor.language.messages import messages
 from processor.model import InputError, UsageError, reason
 from processor.results.file_names import JOB_RECORD
 from processor.scan_folder.files import missing
-from processor.store.atomic_file import replace_text
-from processor.store.output_checks import check_folder
+from processor.store.whole_output import check_folder, replace_text
 
 LOGS = "logs"
 LONGEST_NAME = 240  # bytes of a file's name, with room for prefix and suffix

@@ -28,7 +28,7 @@ from processor.model import InputError, Reason, reason
 from processor.plain_text import printable
 from processor.results.file_names import FORMAT, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
 from processor.scan_folder import fingerprint
-from processor.store.atomic_file import sync
+from processor.store.whole_output import sync
 from processor.version import __version__
 
 PACKAGES = (

@@ -15,7 +15,7 @@ from typing import Any
 
 from processor.language.messages import messages
 from processor.model import Reason, Word
-from processor.store.atomic_file import replace_text
+from processor.store.whole_output import replace_text
 
 FORMAT, FORMAT_VERSION = "processor-batch-job", "1.0"
 

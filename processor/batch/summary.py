@@ -24,7 +24,7 @@ from processor.report import templates
 from processor.report.columns import columns
 from processor.report.table import csv_of_rows, heading
 from processor.results.file_names import REPORT_PAGE
-from processor.store.atomic_file import replace_text
+from processor.store.whole_output import replace_text
 
 CSV, JSON, PAGE, TIMINGS = "summary.csv", "summary.json", "index.html", "timings.csv"
 FILES = (CSV, JSON, PAGE, TIMINGS)

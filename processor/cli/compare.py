@@ -63,7 +63,7 @@ def compare(reference: Path, compared: Path, output: Path | None, lang: str, as_
     from processor.plain_text import printable
     from processor.report import cloud_comparison
     from processor.scan_folder.files import missing
-    from processor.store import output_checks
+    from processor.store import whole_output
 
     for path in (reference, compared):
         if not path.exists():
@@ -72,7 +72,7 @@ def compare(reference: Path, compared: Path, output: Path | None, lang: str, as_
     cloud_comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
     address = options.pop("cluster")
     given = {name: value for name, value in options.items() if value is not None}
-    with large_arrays.in_files(output_checks.existing_parent(output)):
+    with large_arrays.in_files(whole_output.existing_parent(output)):
         with tile_cluster.on_cluster(address, print_error_line):
             result = comparing.compare(comparing.Request(reference, compared, **given), print_error_line)
         record = cloud_comparison.write(output, result, lang)

@@ -34,7 +34,7 @@ def init(folder: Path, force: bool, design_units: str | None, lang: str, as_json
     """
     from processor.language.messages import messages, text
     from processor.scan_folder import files, guess
-    from processor.store.atomic_file import replacing
+    from processor.store.whole_output import replacing
 
     path = folder / files.PROJECT
     if path.exists() and not force:

@@ -19,7 +19,7 @@ from processor.clouds.poses import Placed, Poses
 from processor.model import Reason, UsageError, reason
 from processor.pipeline import Execution
 from processor.progress import tracked
-from processor.store.new_folder import check_new, new_folder, unwritable
+from processor.store.whole_output import check_new, unwritable, whole_folder
 from processor.writers import e57, las, ply, project, text
 from processor.writers.cloud import Cloud
 
@@ -80,7 +80,7 @@ def export(
         raise UsageError(f"spacing_mm: expected a length of 0 mm or more, found {spacing_mm}")
     check_new(folder)
     with (
-        new_folder(folder) as making,
+        whole_folder(folder) as making,
         tempfile.TemporaryDirectory(prefix=".aside-", dir=making) as aside,
         _opened(source, Path(aside), input_, units) as run,
     ):

@@ -23,7 +23,7 @@ from processor.report.deviation import figures as deviation_figures
 from processor.report.style import default_settings
 from processor.results.fields_to_json import reason_json
 from processor.store.json_values import json_ready
-from processor.store.replaced_folder import replacing_folder, write_bytes, write_parts, write_text
+from processor.store.whole_output import whole_folder
 
 TABLE, FIGURES, RECORD, PAGE = "compare.csv", ("map.png", "histogram.png"), "compare.json", "report.html"
 LABEL = "compared minus reference along the normal"
@@ -109,14 +109,15 @@ def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
     """Write the folder in place of an earlier one, its page in ``lang``; returns the object of compare.json."""
     record = as_json(result)
     drawn = _drawn(result)
-    with replacing_folder(out) as making:
+    with whole_folder(out, replaces=True) as making:
         table = core_points_csv.parts(result.origin, result.core, result.distances, result.normals)
-        write_parts(making / TABLE, table)
+        with (making / TABLE).open("w", encoding="utf-8") as file:
+            file.writelines(table)
         record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
-        write_text(making / RECORD, record_text + "\n")
+        (making / RECORD).write_text(record_text + "\n", "utf-8")
         for name, (_, data) in zip(FIGURES, drawn, strict=True):
-            write_bytes(making / name, data)
-        write_text(making / PAGE, _page(result, record, drawn, lang))
+            (making / name).write_bytes(data)
+        (making / PAGE).write_text(_page(result, record, drawn, lang), "utf-8")
     return record
 
 

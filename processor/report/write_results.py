@@ -15,8 +15,7 @@ from processor.report.style import default_settings
 from processor.results.file_names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON, STEPS
 from processor.results.to_json import results_json, text_of
 from processor.store import store
-from processor.store.output_checks import check_folder
-from processor.store.replaced_folder import is_log, replacing_folder, write_bytes, write_text
+from processor.store.whole_output import check_folder, is_log, whole_folder
 from processor.writers import step_clouds
 
 # The record of a batch's job is replaced with its results: without it, the batch does the job again.
@@ -51,32 +50,32 @@ def write_results(
     Only the page is in the language ``lang``. ``further`` names forms of the report, of FURTHER, that are written too.
     Raises InputError where they cannot be written, and leaves ``out`` as it was.
     """
-    with replacing_folder(out) as making:
+    with whole_folder(out, replaces=True) as making:
         store.write_results(making / RESULTS_H5, execution.runs, execution.provenance)
         content = results_json(execution, report, headline.of_run(execution))
-        write_text(making / RESULTS_JSON, text_of(content))
+        (making / RESULTS_JSON).write_text(text_of(content), "utf-8")
         for table in all_tables.tables_of_run(execution, report):
             if table.file:
-                write_text(making / f"{table.file}.csv", report_table.csv_text(table))
+                (making / f"{table.file}.csv").write_text(report_table.csv_text(table), "utf-8")
         for run, _ in execution.by_step():
             for name, data in step_report(run.step).files(execution, run).items():
-                write_bytes(making / name, data)
+                (making / name).write_bytes(data)
         drawn = all_figures.draw_figures(execution, report)
         if any(of_step.figures for of_step in drawn.values()):
             (making / FIGURES).mkdir()
         for of_step in drawn.values():
             for name, (_, png) in of_step.figures.items():
-                write_bytes(making / FIGURES / name, png)
+                (making / FIGURES / name).write_bytes(png)
             for name, data in of_step.documents.items():
-                write_bytes(making / name, data)
-        write_text(making / REPORT_PAGE, page.html(execution, report, drawn, lang))
+                (making / name).write_bytes(data)
+        (making / REPORT_PAGE).write_text(page.html(execution, report, drawn, lang), "utf-8")
         if execution.clouds:
             step_clouds.write(making / STEPS, _of_stages(execution))
         if "pdf" in further:
             with default_settings():
-                write_bytes(making / pdf_report.NAME, pdf_report.document(execution, drawn, lang))
+                (making / pdf_report.NAME).write_bytes(pdf_report.document(execution, drawn, lang))
         if "xlsx" in further:
-            write_bytes(making / workbook.NAME, workbook.workbook(execution, report))
+            (making / workbook.NAME).write_bytes(workbook.workbook(execution, report))
 
 
 def _of_stages(execution: Execution) -> list[step_clouds.OfRun]:

@@ -27,7 +27,7 @@ from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, node_
 from processor.scan_folder.shapes import guess_design, surface_files
 from processor.scan_folder.shapes.guess_design import GuessedDesign
 from processor.scan_folder.units import MM_PER_UNIT, known_unit, radius
-from processor.store.atomic_file import replacing
+from processor.store.whole_output import replacing
 from processor.writers.ply import write_mesh
 from processor.writers.project import write_json
 from processor.writers.toml import as_toml

@@ -42,8 +42,8 @@ from processor.model import (
     Truth,
     per_point_fields,
 )
-from processor.store.atomic_file import replacing
 from processor.store.codec import DecodeError
+from processor.store.whole_output import replacing
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
 FORMAT_VERSION = "1.5"  # of scenes and truths

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from processor.model import InputError, UsageError
 from processor.plain_text import printable
-from processor.store.output_checks import check_folder
+from processor.store.whole_output import check_folder
 from processor.validation import cell_runner
 from processor.validation import matrix as matrices
 from processor.validation import night as nights

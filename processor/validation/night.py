@@ -22,7 +22,7 @@ from processor import pipeline
 from processor.jobs.runner import locked
 from processor.model import UsageError
 from processor.results.file_names import RESULTS_JSON
-from processor.store.atomic_file import replacing
+from processor.store.whole_output import replacing
 from processor.validation import certificate, change_detection, coverage, curves, junit, software_identity, summary
 from processor.validation.cell_runner import Runner
 from processor.validation.cells import Cell, Outcome

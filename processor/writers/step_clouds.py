@@ -16,7 +16,6 @@ import numpy as np
 
 from processor.diagnostics import KeptCloud
 from processor.model import Diagnostics
-from processor.store.replaced_folder import write_text
 from processor.writers import ply
 from processor.writers.cloud import Block, Cloud
 
@@ -58,7 +57,7 @@ def write(folder: Path, runs: Sequence[OfRun]) -> None:
     for name, rows_of in ((CLOUDS, listed), (NUMBERS, numbers)):
         text = io.StringIO(newline="")
         csv.writer(text, lineterminator="\n").writerows(rows_of)
-        write_text(folder / name, text.getvalue())
+        (folder / name).write_text(text.getvalue(), "utf-8")
 
 
 def _name(text: str, used: set[str]) -> str:

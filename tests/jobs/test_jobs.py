@@ -13,7 +13,7 @@ from processor.jobs import causes, process, program, runner
 from processor.jobs.causes import Cause
 from processor.jobs.child import Loss, Lost
 from processor.model import InputError, UsageError
-from processor.store import atomic_file
+from processor.store import whole_output
 from tests.support.processes.living import alive, ends_soon
 
 SLEEP = "import time; time.sleep(60)"
@@ -93,7 +93,7 @@ def test_a_guarded_process_tells_its_cause_by_its_exit_code(tmp_path, memory_mb,
 @pytest.mark.parametrize("kind", [OSError, RuntimeError])
 def test_a_full_disk_that_hdf5_tells_in_its_text_is_an_error_of_the_output(tmp_path, kind):
     message = r"cannot be written \(No space left on device\)"
-    with pytest.raises(InputError, match=message) as caught, atomic_file.replacing(tmp_path / "a.h5"):
+    with pytest.raises(InputError, match=message) as caught, whole_output.replacing(tmp_path / "a.h5"):
         raise kind("Can't write data (write failed, errno = 28, error message = 'No space left on device')")
     assert causes.cause_of(caught.value) is Cause.OUTPUT
 

@@ -8,10 +8,8 @@ import sys
 import pytest
 
 from processor.model import InputError, UsageError
-from processor.store import making, output_checks
-from processor.store.atomic_file import replace_text
-from processor.store.new_folder import new_folder
-from processor.store.replaced_folder import replacing_folder
+from processor.store import making, whole_output
+from processor.store.whole_output import replace_text, whole_folder
 
 PROGRAM = """
 import sys, time
@@ -22,12 +20,12 @@ import click
 for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, 0), (signal.SIGHUP, 0)):
     signal.signal(number, handler)
 from processor.jobs import program
-from processor.store.new_folder import new_folder
-from processor.store.replaced_folder import replacing_folder
+from processor.store.whole_output import whole_folder
+from processor.store.whole_output import whole_folder
 @click.command()
 @click.argument("out", type=Path)
 def command(out):
-    with new_folder(out) as made:
+    with whole_folder(out) as made:
         (made / "half").write_text("half")
         print("begun", flush=True)
         time.sleep(60)
@@ -63,7 +61,7 @@ def test_what_a_killed_command_left_is_removed_and_what_another_uses_is_not(tmp_
     other.kill()
     other.communicate()
     making._cleared.discard(tmp_path)  # as another process has not
-    with new_folder(tmp_path / "new"):
+    with whole_folder(tmp_path / "new"):
         pass
     assert sorted(os.listdir(tmp_path)) == [".out-holidays", "new"]
 
@@ -85,7 +83,7 @@ def test_a_log_stays_in_a_folder_that_is_replaced_and_is_still_written_to(tmp_pa
     with (out / "run.log").open("a") as log:
         log.write("before\n")
         log.flush()
-        with replacing_folder(out) as made:
+        with whole_folder(out, replaces=True) as made:
             (made / "report.html").write_text("new")
         log.write("after\n")
     assert sorted(os.listdir(out)) == ["report.html", "run.log"]
@@ -102,9 +100,9 @@ def test_a_file_is_replaced_only_by_its_suffix_and_where_it_is_a_plain_one(tmp_p
         ("folder.h5", "is a folder"),
     ):
         with pytest.raises(UsageError, match=said):
-            output_checks.check_file(tmp_path / name, ".h5", "a scene")
+            whole_output.check_file(tmp_path / name, ".h5", "a scene")
     with pytest.raises(InputError, match="device or pipe"):
         replace_text(tmp_path / "pipe.h5", "text")
     assert (tmp_path / "pipe.h5").is_fifo()
-    output_checks.check_file(tmp_path / "new.H5", ".h5", "a scene")
+    whole_output.check_file(tmp_path / "new.H5", ".h5", "a scene")
     replace_text(tmp_path / "new.H5", "text")

@@ -32,7 +32,7 @@ from processor.model import (
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Balls
 from processor.store import checksums, codec
-from processor.store.replaced_folder import replacing_folder
+from processor.store.whole_output import whole_folder
 from tests.support.files.old_files import sealed_again
 from tests.support.results.records import assert_equal
 from tests.support.scenes.store_scenes import a_scene, surface_points
@@ -379,7 +379,7 @@ def test_an_error_has_its_path_beside_its_problem_in_another_process_as_well():
 
 
 def test_an_error_of_a_file_in_a_folder_that_is_removed_names_its_place(tmp_path):
-    with pytest.raises(InputError) as caught, replacing_folder(tmp_path / "out") as making:
+    with pytest.raises(InputError) as caught, whole_folder(tmp_path / "out", replaces=True) as making:
         raise InputError("cannot be written", path=making / "a" / "b.csv")
     assert str(caught.value) == f"{tmp_path / 'out' / 'a' / 'b.csv'}: cannot be written"
 

@@ -17,7 +17,7 @@ from processor.report.style import default_settings
 from processor.report.table import csv_text
 from processor.results.fields_to_json import reason_json
 from processor.store.json_values import json_ready
-from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
+from processor.store.whole_output import whole_folder
 
 RECORD, PAGE, FIGURE = "history.json", "report.html", "history.png"
 OWN_NAMES = (RECORD, PAGE, FIGURE)
@@ -96,13 +96,13 @@ def write(out: Path, history: History, lang: str = "en") -> dict[str, Any]:
     record = as_json(history)
     with default_settings():
         drawn = figures.changes(history)
-    with replacing_folder(out) as making:
+    with whole_folder(out, replaces=True) as making:
         for table in tables.tables(history):
-            write_text(making / f"{table.file}.csv", csv_text(table))
-        write_text(making / RECORD, json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+            (making / f"{table.file}.csv").write_text(csv_text(table), "utf-8")
+        (making / RECORD).write_text(json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False) + "\n", "utf-8")
         if drawn is not None:
-            write_bytes(making / FIGURE, drawn[1])
-        write_text(making / PAGE, _page(history, drawn, lang))
+            (making / FIGURE).write_bytes(drawn[1])
+        (making / PAGE).write_text(_page(history, drawn, lang), "utf-8")
     return record
 
 

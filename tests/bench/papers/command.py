@@ -21,7 +21,7 @@ from processor.model import UsageError
 from processor.plain_text import printable
 from processor.report import write_results
 from processor.store.making import beside
-from processor.store.replaced_folder import replacing_folder, write_text
+from processor.store.whole_output import whole_folder
 from tests.bench.papers import measuring, page
 from tests.bench.papers.data_sets import DataSet, Found, Measured
 from tests.bench.papers.measuring import PAPERS
@@ -83,9 +83,9 @@ def _written(
         "rows": [row.as_object() for row in rows],
         "data_sets": [_of_data_set(one) for one in measured],
     }
-    with replacing_folder(out) as making:
-        write_text(making / JSON, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
-        write_text(making / PAGE, page.html(by_paper, line, lang))
+    with whole_folder(out, replaces=True) as making:
+        (making / JSON).write_text(json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n", "utf-8")
+        (making / PAGE).write_text(page.html(by_paper, line, lang), "utf-8")
         if steps.exists():
             shutil.move(steps, making / STEPS)
     return Comparison(line, rows, content, sum(bool(one.failed) for one in measured))
