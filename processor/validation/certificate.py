@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -25,7 +24,7 @@ from processor.report import templates
 from processor.robust_statistics import finite_median
 from processor.validation.cells import Case, Origin
 from processor.validation.coverage import Coverage
-from processor.validation.history import Row
+from processor.validation.history import Figures, Row, by_quantity
 from processor.validation.matrix import Matrix
 from processor.validation.software_identity import Software
 
@@ -70,9 +69,6 @@ NOT_SHOWN = (
         "within them, u_b contains it, from three scenes on."
     ),
 )
-
-
-_Rows = dict[tuple[str, str], Row]  # of one scene, by quantity and statistic
 
 
 @dataclass(frozen=True)
@@ -133,20 +129,12 @@ def make(
     """Make the certificate from the figures of ``nights``, all made by the present software."""
     cases = list({entry.case.key: entry.case for entry in matrix.entries}.values())
     of_case = {case.key: case for case in cases}
-    # A fixed seed is one scene, however many nights it was run in.
-    scenes: dict[tuple[str, str, str], dict[int, _Rows]] = defaultdict(lambda: defaultdict(dict))
-    for row in rows:
-        if row.night in nights and row.case in of_case:
-            scenes[row.case, row.name[0], row.name[1]][row.seed][row.quantity, row.statistic] = row
     lines: list[Line] = []
-    for (case, step, method), by_seed in scenes.items():
-        quantities = {
-            quantity: None
-            for figures in by_seed.values()
-            for quantity, statistic in figures
-            if statistic == Statistic.BIAS
-        }
-        lines += [_line(of_case[case], step, method, quantity, list(by_seed.values())) for quantity in quantities]
+    for (_, step, method, quantity), scenes in by_quantity(rows, nights).items():
+        for key, case in of_case.items():
+            own = [figures for (of, _), figures in scenes.items() if of == key]
+            if any(Statistic.BIAS in figures for figures in own):
+                lines.append(_line(case, step, method, quantity, own))
     order = {case.key: i for i, case in enumerate(cases)}
     by_title = {(case.recipe, case.settings): order[case.key] for case in reversed(cases)}
     origins = list(Origin)
@@ -172,9 +160,9 @@ def make(
     )
 
 
-def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[_Rows]) -> Line:
+def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[Figures]) -> Line:
     def of(statistic: Statistic) -> list[float]:
-        return [scene[quantity, statistic].value if (quantity, statistic) in scene else math.nan for scene in scenes]
+        return [scene[statistic].value if statistic in scene else math.nan for scene in scenes]
 
     numbers, biases, deviations = of(Statistic.NUMBER), of(Statistic.BIAS), of(Statistic.SD)
     used = [
@@ -191,8 +179,7 @@ def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[_R
         count = len(used)
         # The scatter of the scenes, weighted as in the bias.
         u_b = math.sqrt(sum((n * (b - bias)) ** 2 for n, b, _ in used) * count / (count - 1.0)) / total
-    of_bias = (quantity, Statistic.BIAS)
-    unit = next(scene[of_bias].unit for scene in scenes if of_bias in scene)
+    unit = next(scene[Statistic.BIAS].unit for scene in scenes if Statistic.BIAS in scene)
     known_u_b = u_b if math.isfinite(u_b) else (u_p / math.sqrt(total) if total > 1 else math.nan)
     scanner, noise, density = conditions(case)
     return Line(

@@ -6,13 +6,12 @@ intervals, and the least share of a single scene. Scenes of designgen and those 
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from processor.model import Statistic, Word
 from processor.validation.cells import Origin
-from processor.validation.history import Row
+from processor.validation.history import Quantity, Row, by_quantity
 
 AT_LEAST = ("mean and largest errors",)  # quantities whose intervals are stated to hold 95 % or more
 
@@ -58,27 +57,22 @@ def pooled(
     rows: Sequence[Row], nights: Collection[str], methods: Collection[tuple[str, str]], limits: Limits
 ) -> tuple[Coverage, ...]:
     """Pool the rows of ``nights``; a fixed seed counts once. ``methods``: steps with the method that is judged."""
-    shares: dict[tuple[str, str, str, str], dict[tuple[str, int], float]] = defaultdict(dict)
-    numbers: dict[tuple[str, str, str, str], dict[tuple[str, int], float]] = defaultdict(dict)
-    of = {Statistic.COVERAGE: shares, Statistic.NUMBER: numbers}
-    for row in rows:
-        if row.night in nights and row.name[:2] in methods and row.statistic in of:
-            key = (row.origin, row.name[0], row.name[1], row.quantity)
-            of[Statistic(row.statistic)][key][row.case, row.seed] = row.value
     found = []
-    for key in sorted(shares):
-        scenes = [(share, numbers[key].get(scene, 0.0)) for scene, share in shares[key].items() if share == share]
-        number = sum(n for _, n in scenes)
-        if number:
+    for key, of_scenes in sorted(by_quantity(rows, nights).items()):
+        shares = [
+            (scene[Statistic.COVERAGE].value, scene[Statistic.NUMBER].value if Statistic.NUMBER in scene else 0.0)
+            for scene in of_scenes.values()
+            if Statistic.COVERAGE in scene
+        ]
+        scenes = [(share, number) for share, number in shares if share == share]
+        number = sum(number for _, number in scenes)
+        if number and key[1:3] in methods:
             found.append(_judged(key, scenes, int(number), limits))
     return tuple(found)
 
 
-def _judged(
-    key: tuple[str, str, str, str], scenes: Sequence[tuple[float, float]], number: int, limits: Limits
-) -> Coverage:
+def _judged(key: Quantity, scenes: Sequence[tuple[float, float]], number: int, limits: Limits) -> Coverage:
     share = sum(s * n for s, n in scenes) / number
-    worst = min(s for s, n in scenes if n)
     least = min((s for s, n in scenes if n >= limits.least), default=100.0)
     holds = Holds.YES
     if number < limits.least:
@@ -87,16 +81,13 @@ def _judged(
         holds = Holds.NARROW
     elif share > limits.high and key[3] not in AT_LEAST:
         holds = Holds.WIDE
-    origin, step, method, quantity = key
     return Coverage(
-        origin=Origin(origin),
-        step=step,
-        method=method,
-        quantity=quantity,
+        Origin(key[0]),
+        *key[1:],
         scenes=sum(bool(n) for _, n in scenes),
         number=number,
         share=share,
-        worst=worst,
+        worst=min(s for s, n in scenes if n),
         holds=holds,
     )
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ from processor.model import Statistic, Word
 from processor.report import templates
 from processor.report.charts import line_chart
 from processor.report.charts.line_chart import Chart
-from processor.validation.history import Row
+from processor.validation.history import Figures, Row, by_quantity
 
 FORMAT, FORMAT_VERSION = "processor-validation-curves", "1.0"
 NOMINAL = 95.0
@@ -54,8 +54,8 @@ KEYS = {
     Axis.DENSITY: ("spacing_mm", "spacing", "step_mrad"),
     Axis.DISTANCE: ("distance_mm", "distance"),
 }
-AXIS_OF = {key: axis for axis, keys in KEYS.items() for key in keys}
 SIZES = {Axis.DEPTH: FOUND_BY_DEPTH, Axis.DIAMETER: FOUND_BY_AREA}
+AXIS_OF = {key: axis for axis, keys in KEYS.items() for key in keys} | {str(axis): axis for axis in SIZES}
 
 
 @dataclass(frozen=True)
@@ -82,128 +82,71 @@ class Curve:
     items: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, order=True)
-class _Of:
-    """What the values at the places of one curve have in common."""
-
-    origin: str
-    recipe: str
-    key: str
-    others: tuple[str, ...]
-    step: str
-    method: str
-    quantity: str
-
-
-def _of(row: Row, recipe: str, key: str, others: tuple[str, ...], quantity: str) -> _Of:
-    return _Of(
-        origin=row.origin,
-        recipe=recipe,
-        key=key,
-        others=others,
-        step=row.name[0],
-        method=row.name[1],
-        quantity=quantity,
-    )
+# What the values of one curve have in common: origin, recipe, key, others, step, method and quantity
+_Common = tuple[str, str, str, tuple[str, ...], str, str, str]
+_Places = dict[float, list[Figures]]  # scenes by the place on the axis
 
 
 def of_history(
     rows: Sequence[Row], nights: Collection[str], cases: Mapping[str, tuple[str, tuple[str, ...]]]
 ) -> list[Curve]:
     """Return the curves of the rows of ``nights``; ``cases`` are recipe and settings of each case."""
-    last: dict[tuple[str, int, tuple[str, str, str]], Row] = {}
-    for row in rows:
-        if row.night in nights and row.statistic:
-            last[row.case, row.seed, row.name] = row
-    latest = list(last.values())
-    return [*_against_settings(latest, cases), *_detection(latest, cases)]
-
-
-def _against_settings(rows: Iterable[Row], cases: Mapping[str, tuple[str, tuple[str, ...]]]) -> list[Curve]:
-    found: dict[_Of, dict[str, dict[float, list[Row]]]] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
-    for row in rows:
-        recipe, settings = cases.get(row.case, ("", ()))
-        for setting in settings:
-            key, place = _numeric(setting)
-            if key.rpartition(".")[2] in AXIS_OF and math.isfinite(place):
-                others = tuple(sorted(other for other in settings if other != setting))
-                of = _of(row, recipe, key, others, row.quantity)
-                found[of][row.statistic][place].append(row)
+    against: dict[_Common, _Places] = defaultdict(lambda: defaultdict(list))
+    sizes: dict[_Common, _Places] = defaultdict(lambda: defaultdict(list))
+    for (origin, step, method, quantity), scenes in by_quantity(rows, nights).items():
+        for (case, _), figures in scenes.items():
+            recipe, settings = cases.get(case, ("", ()))
+            for setting in settings:
+                key, place = _numeric(setting)
+                if key.rpartition(".")[2] in AXIS_OF and math.isfinite(place):
+                    others = tuple(sorted(other for other in settings if other != setting))
+                    against[origin, recipe, key, others, step, method, quantity][place].append(figures)
+            for axis, of_axis in SIZES.items():
+                if quantity in of_axis:
+                    place = math.sqrt(math.prod(of_axis[quantity]))
+                    sizes[origin, recipe, str(axis), (), step, method, str(axis)][place].append(figures)
     made = []
-    for of, by_statistic in sorted(found.items(), key=lambda item: item[0]):
-        statistic = next((str(one) for one in ERRORS if str(one) in by_statistic), "")
-        if statistic and next(iter(by_statistic[statistic].values()))[0].unit in LENGTHS_AND_ANGLES:
-            made += _curve(CurveKind.ERROR, of, statistic, by_statistic[statistic])
-        if Statistic.COVERAGE in by_statistic:
-            numbers = by_statistic.get(Statistic.NUMBER, {})
-            made += _curve(CurveKind.COVERAGE, of, Statistic.COVERAGE, by_statistic[Statistic.COVERAGE], numbers)
+    for common, by_place in sorted(against.items()):
+        known = {statistic for figures in by_place.values() for one in figures for statistic in one}
+        statistic = next((one for one in ERRORS if one in known), None)
+        drawn = _curve(CurveKind.ERROR, common, statistic, by_place) if statistic is not None else []
+        made += [curve for curve in drawn if curve.unit in LENGTHS_AND_ANGLES]
+        made += _curve(CurveKind.COVERAGE, common, Statistic.COVERAGE, by_place)
+    for common, by_place in sorted(sizes.items(), key=lambda item: (item[0][2], item[0])):
+        made += _curve(CurveKind.DETECTION, common, Statistic.SHARE, by_place, least=1)
     return made
 
 
-def _curve(
-    shown: CurveKind,
-    of: _Of,
-    statistic: str,
-    rows: Mapping[float, list[Row]],
-    numbers: Mapping[float, list[Row]] | None = None,
-) -> list[Curve]:
-    """Return a curve with two places or more, else none."""
-    points = []
-    for place in sorted(rows):
-        value, scenes, items = _pooled(rows[place], None if numbers is None else numbers.get(place, []))
+def _curve(shown: CurveKind, common: _Common, statistic: Statistic, by_place: _Places, least: int = 2) -> list[Curve]:
+    """Return a curve with ``least`` places or more, else none."""
+    points, units = [], [one[statistic].unit for figures in by_place.values() for one in figures if statistic in one]
+    for place in sorted(by_place):
+        value, scenes, items = _pooled(by_place[place], statistic, counted=shown is not CurveKind.ERROR)
         if math.isfinite(value):
             points.append((place, value, scenes, items))
-    if len(points) < 2:
+    if len(points) < least:
         return []
+    origin, recipe, key, others, step, method, quantity = common
     places, values, counts, items_of = zip(*points, strict=True)
-    unit = next(iter(rows.values()))[0].unit
     return [
         Curve(
-            shown=shown, axis=AXIS_OF[of.key.rpartition(".")[2]], statistic=str(statistic), unit=unit, places=places,
-            values=values, scenes=counts, items=items_of if numbers is not None else (), **asdict(of),
+            shown=shown, origin=origin, recipe=recipe, key=key, others=others, step=step, method=method,
+            axis=AXIS_OF[key.rpartition(".")[2]], quantity=quantity, statistic=str(statistic), unit=units[0],
+            places=places, values=values, scenes=counts, items=() if shown is CurveKind.ERROR else items_of,
         )
     ]  # fmt: skip
 
 
-def _pooled(rows: Sequence[Row], numbers: Sequence[Row] | None) -> tuple[float, int, int]:
+def _pooled(scenes: Sequence[Figures], statistic: Statistic, counted: bool) -> tuple[float, int, int]:
     """Return the median over scenes, or the share of all items together, with the numbers of scenes and of items."""
-    known = [row for row in rows if math.isfinite(row.value)]
-    if numbers is None:
-        return (float(np.median([row.value for row in known])) if known else math.nan), len(known), 0
-    number_of = {(row.case, row.seed): row.value for row in numbers}
-    pairs = [(row.value, number_of.get((row.case, row.seed), 0.0)) for row in known]
-    items = sum(number for _, number in pairs)
-    share = sum(value * number for value, number in pairs) / items if items else math.nan
-    return share, sum(number > 0.0 for _, number in pairs), int(items)
-
-
-def _detection(rows: Sequence[Row], cases: Mapping[str, tuple[str, tuple[str, ...]]]) -> list[Curve]:
-    """Return the share of defects that were found by their size, of each recipe and method."""
-    made = []
-    for axis, sizes in SIZES.items():
-        shares: dict[_Of, dict[float, list[Row]]] = defaultdict(lambda: defaultdict(list))
-        numbers: dict[_Of, dict[float, list[Row]]] = defaultdict(lambda: defaultdict(list))
-        for row in rows:
-            if row.quantity in sizes:
-                low, high = sizes[row.quantity]
-                recipe = cases.get(row.case, ("", ()))[0]
-                of = _of(row, recipe, str(axis), (), str(axis))
-                if row.statistic == Statistic.SHARE:
-                    shares[of][math.sqrt(low * high)].append(row)
-                elif row.statistic == Statistic.NUMBER:
-                    numbers[of][math.sqrt(low * high)].append(row)
-        for of, at in sorted(shares.items(), key=lambda item: item[0]):
-            points = [(place, *_pooled(at[place], numbers[of][place])) for place in sorted(at)]
-            points = [point for point in points if math.isfinite(point[1])]
-            if points:
-                places, values, scenes, items = zip(*points, strict=True)
-                made.append(
-                    Curve(
-                        shown=CurveKind.DETECTION, axis=axis, statistic=str(Statistic.SHARE), unit="%",
-                        places=places, values=values, scenes=scenes, items=items, **asdict(of),
-                    )
-                )  # fmt: skip
-    return made
+    known = [one for one in scenes if statistic in one and math.isfinite(one[statistic].value)]
+    values = [one[statistic].value for one in known]
+    if not counted:
+        return (float(np.median(values)) if values else math.nan), len(values), 0
+    numbers = [one[Statistic.NUMBER].value if Statistic.NUMBER in one else 0.0 for one in known]
+    items = sum(numbers)
+    share = sum(value * number for value, number in zip(values, numbers, strict=True)) / items if items else math.nan
+    return share, sum(number > 0.0 for number in numbers), int(items)
 
 
 def _numeric(setting: str) -> tuple[str, float]:

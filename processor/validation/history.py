@@ -12,7 +12,8 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +89,20 @@ class Row:
     statistic: str = ""
     better: str = ""
     origin: str = Origin.OWN
+
+
+Scene = tuple[str, int]  # case and seed
+Figures = dict[str, Row]  # of one quantity in one scene, by statistic
+Quantity = tuple[str, str, str, str]  # origin, step, method, and name
+
+
+def by_quantity(rows: Iterable[Row], nights: Collection[str]) -> dict[Quantity, dict[Scene, Figures]]:
+    """Group the figures of ``nights``; of a scene that several nights have, as fixed seeds are, the last one counts."""
+    found: dict[Quantity, dict[Scene, Figures]] = defaultdict(lambda: defaultdict(dict))
+    for row in rows:
+        if row.night in nights and row.statistic:
+            found[row.origin, row.name[0], row.name[1], row.quantity][row.case, row.seed][row.statistic] = row
+    return found
 
 
 @dataclass(frozen=True)
