@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -24,26 +24,6 @@ from processor.jobs.exit_codes import DONE, IN_PART, LIMIT_MISSED, VERDICT, is_r
 if TYPE_CHECKING:
     from processor.batch.batch import Settings
     from processor.batch.record import Record
-
-
-@dataclass(frozen=True)
-class BatchOptions:
-    """The options of the command, as click has them."""
-
-    output: Path
-    jobs: int | None
-    cluster: str | None
-    timeout_s: float
-    memory_mb: int | None
-    retry: bool
-    steps: tuple[str, ...]
-    methods: tuple[str, ...]
-    params: Path | None
-    units: str | None
-    seed: int | None
-    lang: str
-    fail_on: str | None
-    as_json: bool
 
 
 @click.command()
@@ -82,7 +62,7 @@ def batch(context: click.Context, /, root: Path, **options: Any) -> None:
     from processor.batch import batch as batch_run
     from processor.jobs.runner import StoppedError
 
-    chosen = BatchOptions(**options)
+    chosen = SimpleNamespace(**options)
     try:
         summary = batch_run.run(
             _settings(root, chosen), print_error_line, lambda record: _report_input(record, chosen.as_json)
@@ -102,7 +82,7 @@ def batch(context: click.Context, /, root: Path, **options: Any) -> None:
     context.exit(VERDICT if refused else IN_PART if "in-part" in counts else DONE)
 
 
-def _settings(root: Path, options: BatchOptions) -> Settings:
+def _settings(root: Path, options: SimpleNamespace) -> Settings:
     """Check the options and turn them into the settings of a batch."""
     from processor import pipeline
     from processor.batch import batch as batch_run

@@ -3,30 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
 
 from processor.cli.common import LANGUAGES, check_jobs, debug_option
 from processor.jobs.exit_codes import DONE, IN_PART, LIMIT_MISSED
-
-
-@dataclass(frozen=True)
-class ValidateOptions:
-    """The options of the command, as click has them."""
-
-    output: Path
-    jobs: int | None
-    cluster: str | None
-    full: bool
-    history: Path | None
-    night: str | None
-    again: bool
-    accept: bool
-    lang: str
-    as_json: bool
 
 
 @click.command()
@@ -51,7 +35,7 @@ def validate(context: click.Context, /, matrix: Path | None, **options: Any) -> 
     """
     from processor.validation import command
 
-    chosen = ValidateOptions(**options)
+    chosen = SimpleNamespace(**options)
     check_jobs(chosen.jobs, chosen.cluster)
     if chosen.accept:
         click.echo(command.accept(chosen.output, chosen.history, chosen.night))

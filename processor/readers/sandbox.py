@@ -23,6 +23,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -215,19 +216,18 @@ def _receive_some(channel: socket.socket, most: int) -> bytes:
     return data
 
 
-@dataclass
-class _Sender:
-    """Sends how much of a file is read, now and then."""
+def _sender(channel: socket.socket) -> Callable[[float], None]:
+    """Return what sends the share of a file that is read, from 0 to 1, now and then."""
+    last = 0.0
 
-    channel: socket.socket
-    last: float = 0.0
-
-    def __call__(self, share: float) -> None:
-        """Send a share, from 0 to 1."""
+    def send(share: float) -> None:
+        nonlocal last
         now = time.monotonic()
-        if now > self.last + SHOWN_S:
-            self.last = now
-            _send(self.channel, {"share": share})
+        if now > last + SHOWN_S:
+            last = now
+            _send(channel, {"share": share})
+
+    return send
 
 
 # --- the other process ---------------------------------------------------------------------------------------------
@@ -313,7 +313,7 @@ def serve() -> None:
             return
         shared = _Shared(_path(request["folder"]) if request["folder"] else None)
         large_arrays.allocate_with(shared.new)
-        pieces.show_with(_Sender(channel))
+        pieces.show_with(_sender(channel))
         address_space.limit(SLACK_BYTES)
         signal.setitimer(signal.ITIMER_PROF, request["limit_s"])
         signal.setitimer(signal.ITIMER_REAL, PATIENCE * request["limit_s"])

@@ -18,7 +18,6 @@ import stat
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,28 +38,12 @@ SOURCE = "design"  # stem of the copy that is imported, by which bodies without 
 UNNAMED = rf"{SOURCE}-\d+"
 
 
-@dataclass(frozen=True)
-class CadDesign:
-    """Vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file; the unit that it states, "" for none."""
+def read(path: Path, unit: str) -> tuple[Floats, Ints, DesignBodies, str]:
+    """Return vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file, the bodies, and its unit.
 
-    vertices: Floats
-    faces: Ints
-    bodies: DesignBodies
-    unit_stated: str
-
-
-def read(path: Path, unit: str) -> tuple[Floats, Ints, DesignBodies]:
-    """Return vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file, and the bodies.
-
-    ``unit`` is that of a file that states none. Raises InputError without designgen, and for a file that cannot be
-    converted completely.
+    ``unit`` is that of a file that states none, for which the one returned is "". Raises InputError without designgen,
+    and for a file that cannot be converted completely.
     """
-    design = read_design(path, unit)
-    return design.vertices, design.faces, design.bodies
-
-
-def read_design(path: Path, unit: str) -> CadDesign:
-    """Return a CAD file's bodies and whether it states a unit; see :func:`read`."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -76,7 +59,7 @@ def read_design(path: Path, unit: str) -> CadDesign:
     counts = np.cumsum([0, *(len(vertices) for vertices, _ in bodies)])
     faces = [faces + first for (_, faces), first in zip(bodies, counts.tolist(), strict=False)]
     named = _named([name for name, _ in record], [len(triangles) for _, triangles in bodies])
-    return CadDesign(np.concatenate([vertices for vertices, _ in bodies]), np.concatenate(faces), named, stated)
+    return np.concatenate([vertices for vertices, _ in bodies]), np.concatenate(faces), named, stated
 
 
 def _is_whole(meshes: Path) -> bool:

@@ -327,7 +327,7 @@ def read_surface(path: Path, unit: str) -> Surface:
     ``unit`` is that of a mesh, and of a CAD file that has none.
     """
     if path.suffix.lower() in cad.SUFFIXES:
-        vertices, faces, bodies = cad.read(path, unit)
+        vertices, faces, bodies, _ = cad.read(path, unit)
     else:
         vertices, faces = read_whole(path)
         vertices, bodies = vertices * MM_PER_UNIT[unit], None

@@ -147,7 +147,7 @@ def test_names_of_a_step_file_reach_the_results(tmp_path):
         whole.add(box(300.0 * k, 0, 0, 200, 100, 50), name=name)
     path = tmp_path / "row.step"
     whole.export(str(path))
-    _, faces, bodies = cad.read(path, "mm")
+    _, faces, bodies, _ = cad.read(path, "mm")
     assert bodies.names == ("web", "rib", "flange")
     assert bodies.of_facet.tolist() == np.repeat([0, 1, 2], len(faces) // 3).tolist()
     assert (bodies.shared, bodies.unnamed) == (0, 0)

@@ -60,7 +60,7 @@ def fake(tmp_path, monkeypatch):
 def test_all_bodies_are_read_and_converted_only_once(fake, tmp_path):
     path, calls = fake()
     for _ in range(2):
-        vertices, faces, _ = cad.read(path, "m")
+        vertices, faces, *_ = cad.read(path, "m")
     assert calls() == ["--default-units m"], "the second time it is known"
     assert vertices.shape == (8, 3)
     assert np.ptp(vertices, axis=0).tolist() == [3000.0, 1000.0, 1000.0]
@@ -155,7 +155,7 @@ def test_a_real_step_file(tmp_path, monkeypatch):
         pytest.skip(f"no {REAL}")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     shutil.copy(REAL, tmp_path / "接口 'a'.STEP")
-    vertices, faces, _ = cad.read(tmp_path / "接口 'a'.STEP", "m")
+    vertices, faces, *_ = cad.read(tmp_path / "接口 'a'.STEP", "m")
     assert np.sort(np.ptp(vertices, axis=0)) == pytest.approx([4.7625, 599.41, 638.7], abs=0.1)  # as meshes deviate
     corners = vertices[faces] - vertices.mean(axis=0)
     volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0

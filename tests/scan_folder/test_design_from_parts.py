@@ -428,9 +428,9 @@ def test_bodies_of_cad_files_without_a_unit_have_the_guessed_one(tmp_path, monke
         body = stacked("all", bodies)
         of_facet = np.repeat(np.arange(len(bodies)), [len(one.faces) for one in bodies])
         names = DesignBodies(names=tuple(parts), of_facet=of_facet)
-        return cad.CadDesign(body.vertices, body.faces, names, unit_stated=False)
+        return body.vertices, body.faces, names, ""
 
-    monkeypatch.setattr(cad, "read_design", read_design)
+    monkeypatch.setattr(cad, "read", read_design)
     (tmp_path / "design").mkdir()
     paths = [tmp_path / f"design/{name}.step" for name in (["bridge"] if one_file else parts_of)]
     for path in paths:

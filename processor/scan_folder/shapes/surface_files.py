@@ -87,10 +87,9 @@ def read(folder: Path, path: Path, unit: str) -> Surface:
     """
     existing_file_in(folder, str(path.relative_to(folder)), str(folder))
     if path.suffix.lower() in CAD_SUFFIXES:
-        design = cad.read_design(path, unit)
-        if design.unit_stated:
-            return Surface(path, design.vertices, design.faces, design.bodies, "mm")
-        return Surface(path, design.vertices / MM_PER_UNIT[unit], design.faces, design.bodies, "")
+        vertices, faces, bodies_of, stated = cad.read(path, unit)
+        in_unit = vertices if stated else vertices / MM_PER_UNIT[unit]
+        return Surface(path, in_unit, faces, bodies_of, "mm" if stated else "")
     vertices, faces = read_whole(path)
     if len(faces) < 4:
         raise InputError(f"expected a mesh of a body, found {len(faces)} faces", path=path)
