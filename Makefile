@@ -38,9 +38,10 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format .
 	$(BIN)/mypy
 
-# docs/parameters.md from the code; the rest of docs/ is written by hand.
+# docs/parameters.md and docs/schemas from the code; the rest of docs/ is written by hand.
 docs: $(VENV)/.test
 	$(BIN)/python -m docs.scripts.make_parameters
+	$(BIN)/python -m docs.scripts.make_schemas
 
 bench: $(VENV)/.test
 	$(BIN)/python -m pip install --quiet --editable ".[designgen,test,bench]"

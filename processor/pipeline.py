@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import Any
 
 from processor import diagnostics, user_methods
-from processor.model import InputError, Reason, Scan, Scene, Status, StepRun, UsageError, did_you_mean, reason
+from processor.model import InputError, Reason, Scan, Scene, Status, StepRun, UsageError, did_you_mean, inputs, reason
 from processor.progress import stage
 from processor.store import epoch
 from processor.store.json_values import json_ready
@@ -247,7 +247,10 @@ def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any
             like = did_you_mean(method, [one for name in chosen for one in modules[name].METHODS])
             raise UsageError(f"no method {method!r} for these steps{like} ({known})")
     # Tables of steps that do not run are checked too: one file serves many inputs, and a slip in it should not wait.
-    tables = {name: fill(modules[name].Params, params.get(name, {}), name) for name in (*chosen, *params)}
+    tables = {
+        name: inputs.read(modules[name].Params, params.get(name, {}), inputs.Place(name, UsageError, separator="."))
+        for name in (*chosen, *params)
+    }
     jobs = []
     for name in chosen:
         module, filled = modules[name], tables[name]
@@ -273,32 +276,6 @@ def _in_order(chosen: Sequence[str], modules: Mapping[str, ModuleType]) -> list[
     """Sort names so that a step comes after those it needs, else as they are."""
     needs = {name: [other for other in modules[name].NEEDS if other in chosen] for name in chosen}
     return list(TopologicalSorter(needs).static_order())
-
-
-def fill(cls: type, table: Any, where: str) -> Any:
-    """Make a Params record of a TOML table, tables within it for records within; UsageError names what does not fit."""
-    if not isinstance(table, Mapping):
-        raise UsageError(f"{where}: expected a table, got {table!r}")
-    default = cls()
-    known = {field.name: getattr(default, field.name) for field in dataclasses.fields(cls)}
-    values: dict[str, Any] = {}
-    for key, value in table.items():
-        if key not in known:
-            like = did_you_mean(key, known)
-            raise UsageError(f"{where}.{key}: unknown parameter{like}; there are {', '.join(known)}")
-        if dataclasses.is_dataclass(known[key]):
-            values[key] = fill(type(known[key]), value, f"{where}.{key}")
-            continue
-        if isinstance(known[key], tuple) and isinstance(value, list):
-            if not all(type(item) in (int, float) for item in value):
-                raise UsageError(f"{where}.{key}: expected a list of numbers, got {value!r}")
-            value = tuple(float(item) for item in value)
-        if isinstance(known[key], float) and type(value) is int and abs(value) < 2**53:
-            value = float(value)
-        if type(value) is not type(known[key]):
-            raise UsageError(f"{where}.{key}: expected a {type(known[key]).__name__}, got {value!r}")
-        values[key] = value
-    return dataclasses.replace(default, **values)
 
 
 def execute(

@@ -23,7 +23,8 @@ from processor.batch import batch
 from processor.evaluation import evaluate, truth_json
 from processor.limits import standards
 from processor.model import Status, Verdict
-from processor.scan_folder import folder
+from processor.model.inputs import keys_of
+from processor.scan_folder import project_file
 from processor.scan_folder.folder import read_input
 from tests.support.processes import batches
 from tests.support.scenes.coarse_scans import coarsely
@@ -377,7 +378,7 @@ def test_the_table_of_standards_is_that_of_the_files():
 
 def test_the_page_of_the_scan_folder_names_every_key():
     text = (ROOT / "docs/scan-folder.md").read_text("utf-8")
-    for key in (*folder.KEYS, *folder.SCAN_KEYS):
+    for key in (*keys_of(project_file.Project), *keys_of(project_file.ScanEntry)):
         assert re.search(rf"`(\[+)?{key}(\]+)?`", text), key
     examples = re.findall(r"```json\n(.*?)```", text, flags=re.DOTALL)
     assert [sorted(json.loads(example))[0] for example in examples] == ["components", "kind", "S1", "format"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import itertools
 import json
 import re
 import textwrap
@@ -138,8 +139,11 @@ def known(table: str, name: str) -> str:
 
 
 def comments_of(record: type) -> dict[str, str]:
-    """Return the comment on the line of each field, by the field's name."""
-    source = textwrap.dedent(inspect.getsource(record))
+    """Return the comment on the line of each field, or above it where there is none, by the field's name."""
+    try:
+        source = textwrap.dedent(inspect.getsource(record))
+    except OSError:  # made by a function
+        return {}
     lines = source.splitlines()
     (body,) = ast.parse(source).body
     assert isinstance(body, ast.ClassDef)
@@ -147,8 +151,11 @@ def comments_of(record: type) -> dict[str, str]:
     for node in body.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.end_lineno is not None:
             _, mark, comment = lines[node.end_lineno - 1][node.end_col_offset :].partition("#")
+            before = list(itertools.takewhile(lambda line: line.strip().startswith("#"), lines[node.lineno - 2 :: -1]))
             if mark:
                 found[node.target.id] = comment.strip()
+            elif before:
+                found[node.target.id] = " ".join(line.strip(" #") for line in reversed(before))
     return found
 
 

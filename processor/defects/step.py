@@ -46,7 +46,6 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
     """
     if params.method not in METHODS:
         raise UsageError(f"defects: unknown method {params.method!r}; it has {', '.join(METHODS)}")
-    params.check()
     method = baseline.defects if params.method == "paper" else detect.defects
     if scene.arch is not None:
         found, before = bridge_parts.of_bridge(scene, (earlier or {}).get("preassemble"), NAME), earlier or {}

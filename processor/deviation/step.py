@@ -45,7 +45,6 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
     """
     if params.method not in METHODS:
         raise UsageError(f"deviation: unknown method {params.method!r}; it has {', '.join(METHODS)}")
-    params.check()
     if scene.arch is not None:
         register = "fine" if params.register == "auto" else params.register
         of_parts = replace(params, register=register)

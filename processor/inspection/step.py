@@ -43,7 +43,6 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
     """
     if params.method not in METHODS:
         raise UsageError(f"inspect: unknown method {params.method!r}; it has {', '.join(METHODS)}")
-    params.check()
     measuring = next(iter(needed(scene)), "")
     if not measuring:
         raise InputError(

@@ -41,11 +41,11 @@ def _go_on() -> None:
     return
 
 
-@dataclass(frozen=True)
 class Local:
     """Runs jobs on this machine, ``at_once`` at a time."""
 
-    at_once: int
+    def __init__(self, at_once: int) -> None:
+        self.at_once = at_once
 
     def run(self, do: Callable[..., R], jobs: Sequence[J], check_stop: Callable[[], None] = _go_on) -> Results[J, R]:
         """Yield every job with its result, as it comes. ``do`` takes a job and a function that is true when stopped.

@@ -2,43 +2,34 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
-from processor.model import UsageError
+from processor.model.inputs import Parameters, entry, number
 
 PAPER_METHODS = ("design-aided", "line", "corner")
 METHODS = ("adjustment", *PAPER_METHODS)  # the first is the default
+AMOUNT, LIMIT = number(least=0), number(least=0, infinite=True)
 
 
 @dataclass(frozen=True)
-class AdjustParams:
+class AdjustParams(Parameters, table="preassemble.adjust"):
     """Parameters of the adjustment."""
 
-    weight: float = 0.1  # lambda: of a squared departure of the edges from the design, against a squared gap
-    # Half of 1/3000 of 60 m, the limit of an erected arch rib in height (processor/limits/jtg-arch-rib.toml).
-    place_sd_mm: float = 10.0  # of the place in the design, each axis, of what no measured joint ties to the rest
-
-    def __post_init__(self) -> None:
-        if not self.weight > 0.0:
-            raise UsageError(f"preassemble.adjust.weight: expected a number above 0, got {self.weight!r}")
-        if not 0.0 < self.place_sd_mm < math.inf:
-            raise UsageError(f"preassemble.adjust.place_sd_mm: expected a number above 0, got {self.place_sd_mm!r}")
+    # lambda: of a squared departure of the edges from the design, against a squared gap
+    weight: float = entry(number(above=0, infinite=True), default=0.1)
+    # of the place in the design, each axis, of what no measured joint ties to the rest; default: half of 1/3000 of
+    # 60 m, the limit of an erected arch rib in height (processor/limits/jtg-arch-rib.toml)
+    place_sd_mm: float = entry(number(above=0), default=10.0)
 
 
 @dataclass(frozen=True)
-class SystematicParams:
+class SystematicParams(Parameters, table="preassemble.systematic"):
     """Standard deviations of the errors common to all points of a scan; 0 = not stated."""
 
-    registration_mm: float = 0.0  # of the stations of one scan against each other, each axis
-    offset_mm: float = 0.0  # zero offset of the scanner
-    scale_ppm: float = 0.0
-    temperature_C: float = 0.0  # of the steel's stated temperature
-
-    def __post_init__(self) -> None:
-        for key, value in self.__dict__.items():
-            if not 0.0 <= value < math.inf:
-                raise UsageError(f"preassemble.systematic.{key}: expected 0 or more, got {value!r}")
+    registration_mm: float = entry(AMOUNT, default=0.0)  # of the stations of one scan against each other, each axis
+    offset_mm: float = entry(AMOUNT, default=0.0)  # zero offset of the scanner
+    scale_ppm: float = entry(AMOUNT, default=0.0)
+    temperature_C: float = entry(AMOUNT, default=0.0)  # of the steel's stated temperature
 
     @property
     def known(self) -> bool:
@@ -47,17 +38,12 @@ class SystematicParams:
 
 
 @dataclass(frozen=True)
-class TrimParams:
+class TrimParams(Parameters, table="preassemble.trim"):
     """Parameters of the proposals (mm)."""
 
-    cut_sd_mm: float = 1.0  # of a cut or build-up, at the corners of the section
-    aim_mm: float = 0.0  # wanted gap after it, less the design's root gap
-    least_mm: float = 0.5  # less, at its deepest, is not worth a cut or build-up
-
-    def __post_init__(self) -> None:
-        amounts = self.cut_sd_mm, self.least_mm
-        if not (all(0.0 <= amount < math.inf for amount in amounts) and math.isfinite(self.aim_mm)):
-            raise UsageError(f"preassemble.trim: expected numbers, cut_sd_mm and least_mm of 0 or more, got {self}")
+    cut_sd_mm: float = entry(AMOUNT, default=1.0)  # of a cut or build-up, at the corners of the section
+    aim_mm: float = entry(number(), default=0.0)  # wanted gap after it, less the design's root gap
+    least_mm: float = entry(AMOUNT, default=0.5)  # less, at its deepest, is not worth a cut or build-up
 
 
 @dataclass(frozen=True)
@@ -113,13 +99,14 @@ class MatchParams:
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(Parameters, table="preassemble"):
     """Parameters of the adjustment, and of the paper's methods: reduced boxes, slices, and the registration."""
 
     method: str = METHODS[0]
     seed: int = 0
-    end_limit_mm: float = 100.0  # a joint end found farther than this from its place in the design is not used
-    gap_limit_mm: float = 100.0  # a part that leaves a wider gap is called weak
+    # a joint end found farther than this from its place in the design is not used
+    end_limit_mm: float = entry(LIMIT, default=100.0)
+    gap_limit_mm: float = entry(LIMIT, default=100.0)  # a part that leaves a wider gap is called weak
     adjust: AdjustParams = field(default_factory=AdjustParams)
     systematic: SystematicParams = field(default_factory=SystematicParams)
     trim: TrimParams = field(default_factory=TrimParams)

@@ -24,7 +24,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,10 +49,9 @@ SHOWN_S = 0.5  # between two messages of how much is read
 START = "from processor.readers import sandbox; sandbox.serve()"
 
 
-@dataclass
 class _Helper:
-    process: subprocess.Popen[bytes]
-    channel: socket.socket
+    def __init__(self, process: subprocess.Popen[bytes], channel: socket.socket) -> None:
+        self.process, self.channel = process, channel
 
     def end(self) -> int:
         """End the process and return its exit code, negative for a signal."""

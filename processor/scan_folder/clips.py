@@ -10,51 +10,17 @@ from typing import Any
 import numpy as np
 
 from processor import large_arrays
-from processor.model import Bools, Clips, Floats, InputError, Scan, per_point_fields
-from processor.scan_folder.checked_table import Table
+from processor.model import Bools, Clips, InputError, Scan, per_point_fields
+from processor.scan_folder.project_file import ClipBox
 
-KEYS = ("box", "keep", "scan")
 FEWEST_POINTS = 4
-MOST_BOXES = 100  # each is compared with every point
-
-
-@dataclass(frozen=True)
-class Box:
-    """A box of the project's frame, mm: points in it are the ones kept, or the ones left out; of one scan or of all."""
-
-    where: str  # in project.toml
-    low: Floats
-    high: Floats
-    keep: bool
-    scan: str = ""
-
-
-def read_boxes(project: Table, mm: float) -> tuple[Box, ...]:
-    """Read [[clip]] of a project whose unit is ``mm`` millimetres. Raises InputError for a box that holds nothing."""
-    boxes = []
-    tables = project.tables("clip")
-    if len(tables) > MOST_BOXES:
-        raise InputError(f"{project.where}: expected at most {MOST_BOXES} of [[clip]], found {len(tables)}")
-    for table in tables:
-        table.only(KEYS)
-        low, high = table.array("box", 2, 3) * mm
-        if not (low < high).all():
-            raise InputError(
-                f"{table.where}: expected 'box' = [[x0, y0, z0], [x1, y1, z1]] with x0 < x1, y0 < y1 and z0 < z1, "
-                f"found {table.values['box']}; put the lower corner first"
-            )
-        keep = table.values.get("keep", True)
-        if not isinstance(keep, bool):
-            raise InputError(f"{table.where}: expected true or false as 'keep', found {keep!r}")
-        boxes.append(Box(table.where, low, high, keep, table.text("scan", "")))
-    return tuple(boxes)
 
 
 @dataclass
 class Clipper:
-    """Cuts scans one after the other, and counts; ``file`` has the boxes."""
+    """Cuts scans one after the other by boxes in mm, and counts; ``file`` has the boxes."""
 
-    boxes: Sequence[Box]
+    boxes: Sequence[ClipBox]
     file: str = ""
     inside: list[int] = field(default_factory=list)  # points of all scans so far, by box
     names: list[str] = field(default_factory=list)

@@ -3,70 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from processor.model import Control, Floats, InputError, Scan, Stations
-from processor.scan_folder.checked_table import Table, existing_file_in
+from processor.model import Control, InputError, Scan, Stations
+from processor.scan_folder.file_values import existing_file_in
 from processor.scan_folder.files import CONTROL
+from processor.scan_folder.project_file import ControlPoint
 from processor.scan_folder.text_files import csv_rows
 from processor.scan_folder.units import MM_PER_UNIT, FileUnit
 
-KEYS = ("name", "position", "sd_mm", "scan", "seen", "seen_sd_mm")
 COLUMNS = ("name", "scan", "x", "y", "z", "sd_mm")
 LARGEST_FILE = 16 * 2**20
 
 
-@dataclass(frozen=True)
-class Measured:
-    """A measurement of a target: its position (3,), in the unit of the file, and its standard deviation."""
+def read_control(
+    folder: Path, given: tuple[ControlPoint, ...] | Path | None
+) -> tuple[tuple[ControlPoint, ...], Path | None]:
+    """Return the control points of project.toml, or those of a CSV file with its path.
 
-    where: str  # place in the file
-    name: str
-    scan: str  # scan or station that saw the target; "" = known position in the project's frame
-    position: Floats
-    sd_mm: float
-
-
-def read_control(folder: Path, project: Table) -> tuple[tuple[Measured, ...], Path | None]:
-    """Read the control points of project.toml, and return the path of their CSV file if there is one.
-
-    ``control`` is a list of tables, or the name of a CSV file; without it control.csv is read if it exists. Raises
-    InputError for malformed entries.
+    Without either control.csv is read if it exists. Raises InputError for malformed entries.
     """
-    given = project.values.get("control")
-    if isinstance(given, list):
-        return tuple(measured for table in project.tables("control") for measured in _from_table(table)), None
+    if isinstance(given, tuple):
+        return given, None
     if given is None and not (folder / CONTROL).exists():
         return (), None
-    path = existing_file_in(folder, project.text("control", CONTROL), project.where)
+    path = given or existing_file_in(folder, CONTROL, str(folder))
     return tuple(_from_csv(path)), path
 
 
-def _from_table(table: Table) -> list[Measured]:
-    table.only(KEYS)
-    name = table.text("name")
-    measured = []
-    if "position" in table.values:
-        sd = table.number("sd_mm", positive=True)
-        measured.append(Measured(table.where, name, "", table.array("position", 3), sd))
-    if "scan" in table.values or "seen" in table.values:
-        sd = _not_negative(table.where, table.number("seen_sd_mm", 0.0))
-        measured.append(Measured(table.where, name, table.text("scan"), table.array("seen", 3), sd))
-    if not measured:
-        raise InputError(f"{table.where}: expected 'position' with 'sd_mm', or 'scan' with 'seen', found neither")
-    return measured
-
-
-def _not_negative(where: str, sd_mm: float) -> float:
-    if not 0.0 <= sd_mm < np.inf:
-        raise InputError(f"{where}: expected a standard deviation of 0 mm or more, found {sd_mm}")
-    return sd_mm
-
-
-def _from_csv(path: Path) -> list[Measured]:
+def _from_csv(path: Path) -> list[ControlPoint]:
     if not path.is_file():
         raise InputError("expected a file of control points, found a folder", path=path)
     if path.stat().st_size > LARGEST_FILE:
@@ -92,12 +59,19 @@ def _from_csv(path: Path) -> list[Measured]:
             raise InputError(f"{where}: expected a name and finite coordinates, found {row}")
         if not cells["scan"] and not 0.0 < sd_mm < np.inf:
             raise InputError(f"{where}: expected sd_mm above 0 for known coordinates, found {sd_mm:g}")
-        measured.append(Measured(where, cells["name"], cells["scan"], position, _not_negative(where, sd_mm)))
+        if not 0.0 <= sd_mm < np.inf:
+            raise InputError(f"{where}: expected a standard deviation of 0 mm or more, found {sd_mm}")
+        name, scan = cells["name"], cells["scan"]
+        measured.append(
+            ControlPoint(name, scan=scan, seen=position, seen_sd_mm=sd_mm, where=where)
+            if scan
+            else ControlPoint(name, position=position, sd_mm=sd_mm, where=where)
+        )
     return measured
 
 
 def control_points(
-    measured: Sequence[Measured],
+    measured: Sequence[ControlPoint],
     scans: Sequence[Scan],
     units: Sequence[FileUnit],
     stations: Stations | None,
@@ -112,12 +86,12 @@ def control_points(
     """
     if not measured:
         return None
-    known = [target for target in measured if not target.scan]
+    known = [target for target in measured if target.position is not None]
     row = {target.name: i for i, target in enumerate(known)}
     for i, target in enumerate(known):
         if row[target.name] != i:
             raise InputError(f"{target.where}: control point {target.name!r} has coordinates already; give them once")
-    seen = [target for target in measured if target.scan]
+    seen = [target for target in measured if target.seen is not None]
     if not seen and not searched:
         raise InputError(
             f"{known[0].where}: no control point was measured in a scan; give 'scan' and 'seen' for one, or [targets] "
@@ -141,14 +115,12 @@ def control_points(
         point=point,
         scan=scan,
         station=station,
-        seen=np.array([target.position * units[s].factors for target, s in zip(seen, scan, strict=True)]).reshape(
-            -1, 3
-        ),
-        seen_sd=np.array([target.sd_mm for target in seen]),
+        seen=np.array([target.seen * units[s].factors for target, s in zip(seen, scan, strict=True)]).reshape(-1, 3),
+        seen_sd=np.array([target.seen_sd_mm for target in seen]),
     )
 
 
-def _scan_and_station(target: Measured, scans: Sequence[Scan], stations: Stations | None) -> tuple[int, int]:
+def _scan_and_station(target: ControlPoint, scans: Sequence[Scan], stations: Stations | None) -> tuple[int, int]:
     """Return the row of the scan that saw a target, and of the station in a merged scan (-1 = the scan's own)."""
     named = [i for i, scan in enumerate(scans) if target.scan == scan.name]
     named = named or [i for i, scan in enumerate(scans) if target.scan == scan.station]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -28,10 +28,26 @@ from processor.model import (
     FrameDesign,
     InputError,
     Ints,
-    did_you_mean,
+)
+from processor.model.inputs import (
+    LARGEST_INTEGER,
+    LOG,
+    NOTHING,
+    Kind,
+    Place,
+    array,
+    entry,
+    hidden,
+    listed,
+    named_tables,
+    number,
+    read,
+    table,
+    tables,
+    text,
 )
 from processor.scan_folder import cad, node_list
-from processor.scan_folder.checked_table import LOG, Table, existing_file_in, ignore_unknown
+from processor.scan_folder.file_values import FILE, UNIT
 from processor.scan_folder.text_files import read_text
 from processor.scan_folder.units import MM_PER_UNIT
 from processor.scene_cloud import design_faults
@@ -44,7 +60,7 @@ def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | Frame
     """
     suffix = path.suffix.lower()
     if suffix in node_list.SUFFIXES:
-        return node_list.read_node_list(path, table_unit).design
+        return node_list.read_node_list(path, table_unit)[0]
     if is_surface(path):
         raise InputError(
             f"a {suffix[1:].upper()} file alone is a design of kind structure; an arch bridge or a space frame "
@@ -53,52 +69,174 @@ def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | Frame
         )
     if suffix != ".json":
         raise InputError(f"expected a design as .json or .csv, found {suffix or 'no suffix'}", path=path)
-    design = read_json(path)
-    kind = design.text("kind")
-    if kind == "arch-bridge":
-        return _arch(folder, design)
-    if kind == "space-frame":
-        return _frame(design)
-    raise InputError(f"expected kind arch-bridge or space-frame, found {kind!r}", path=path)
+    content, place = read_json(path), Place(str(path), folder=folder)
+    kind = content.get("kind", NOTHING) if isinstance(content, dict) else NOTHING
+    if isinstance(content, dict):
+        text("arch-bridge", "space-frame").value(kind, "kind", place)
+    return _frame(read(FrameFile, content, place)) if kind == "space-frame" else _arch(read(ArchFile, content, place))
 
 
-def read_json(path: Path) -> Table:
-    """Read a JSON file that holds an object. Raises InputError for any other."""
-    return Table.of(str(path), read_json_value(path))
-
-
-def read_json_value(path: Path) -> Any:
-    """Read a JSON file that holds any value. Raises InputError for a file that is not JSON."""
-    text = read_text(path)
+def read_json(path: Path) -> Any:
+    """Read a JSON file. Raises InputError for a file that is not JSON, or gives a key twice."""
+    content = read_text(path)
 
     def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        table = dict(pairs)
-        if len(table) < len(pairs):
+        values = dict(pairs)
+        if len(values) < len(pairs):
             twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
             raise InputError(f"expected each key once, found {twice!r} a second time", path=path)
-        return table
+        return values
 
     try:
-        return json.loads(text, object_pairs_hook=distinct)
+        return json.loads(content, object_pairs_hook=distinct)
     except InputError:
         raise
     except (ValueError, RecursionError) as error:
         raise InputError(f"not readable JSON: {error}", path=path) from None
 
 
-def _arch(folder: Path, design: Table) -> ArchDesign:
-    design.only(("units", "kind", "name", "unsure", "order", "components", "joints"))
-    scale = MM_PER_UNIT[design.unit("units")]
-    components = design.table("components")
-    joints = _joints(design, scale)
-    order = _order(design, list(components.values), joints)
-    unknown = sorted({name for joint in joints for name in (joint.left, joint.right)} - set(components.values))
+# --- design.json as declared ----------------------------------------------------------------------------------------
+
+
+WHOLE = number(whole=True)
+ID = Kind(
+    "a whole number or a text",
+    lambda value, at: value if isinstance(value, str) and value else str(WHOLE.convert(value, at)),
+    {"type": ["integer", "string"], "minLength": 1}
+    | {"exclusiveMinimum": -LARGEST_INTEGER, "exclusiveMaximum": LARGEST_INTEGER},
+)
+# Two points at least show a direction
+EDGE = Kind(array(-1, 3).expected, array(-1, 3).convert, {**array(-1, 3).schema, "minItems": 2})
+KeyPoints = make_dataclass("KeyPoints", [(key, Floats, entry(array(3))) for key in KEY_POINTS], frozen=True)
+UNSURE = entry(listed(text(empty=True), "a list of texts"), default=())
+
+
+@dataclass(frozen=True)
+class JointEntry:
+    """A joint of two components."""
+
+    IGNORES: ClassVar[bool] = True
+
+    name: str = entry(text())
+    left: str = entry(text())  # component before the joint
+    right: str = entry(text())  # component after the joint
+    # P1..P4: outer corners bottom-left, bottom-right, top-right, top-left, as seen from the left component towards
+    # the right one (left = +Y); P5..P8: middles of the outer bottom, right, top, left edges
+    points: Any = entry(table(KeyPoints))
+    where: str = hidden("")
+
+
+@dataclass(frozen=True)
+class ComponentEntry:
+    """A component of an arch bridge: its mesh, or its edges (n, 3)."""
+
+    SCHEMA: ClassVar[Mapping[str, Any]] = {
+        "anyOf": [
+            {"required": ["bottom_edge_left", "bottom_edge_right"]},
+            {
+                "required": ["mesh"],
+                "not": {"anyOf": [{"required": ["bottom_edge_left"]}, {"required": ["bottom_edge_right"]}]},
+            },
+        ]
+    }
+
+    # PLY, STL, OBJ, STEP or IFC file in the bridge's frame; without it the outer box between joints and bottom
+    # edges is used
+    mesh: Path | None = entry(FILE, default=None)
+    # points from the start to the end of the component, no point twice in a row
+    bottom_edge_left: Floats | None = entry(EDGE, default=None)
+    # points from the start to the end of the component, no point twice in a row
+    bottom_edge_right: Floats | None = entry(EDGE, default=None)
+    # thickness of the plates of a component without a mesh
+    plate_mm: float = entry(number(above=0), default=box_girder_mesh.PLATE_MM)
+    where: str = hidden("")
+
+    def contradiction(self) -> str:
+        """Return an edge that is missing, or has no direction somewhere."""
+        edges = {"bottom_edge_left": self.bottom_edge_left, "bottom_edge_right": self.bottom_edge_right}
+        if self.mesh is not None and not any(edge is not None for edge in edges.values()):
+            return ""
+        for key, edge in edges.items():
+            if edge is None:
+                return f"expected {EDGE.expected} as {key!r}, found nothing"
+            if len(edge) < 2 or (np.abs(np.diff(edge, axis=0)).max(axis=1) == 0).any():
+                return f"expected two points or more in {key}, none repeated in a row"
+        return ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArchFile:
+    """design.json of an arch bridge."""
+
+    units: str = entry(UNIT)  # of all coordinates here and of the components' meshes
+    kind: str = entry(text("arch-bridge"))
+    name: str = entry(text(empty=True), default="")
+    unsure: tuple[str, ...] = UNSURE  # what `processor init` is not sure of, for people; not used
+    # names of the components from one end of the bridge to the other; some of them, or none, where the joints form
+    # another graph
+    order: tuple[str, ...] | None = entry(
+        listed(text(), "the names of the components from one end to the other", minItems=1, uniqueItems=True),
+        default=None,
+    )
+    components: dict[str, ComponentEntry] = entry(named_tables(ComponentEntry, minProperties=1))  # by name
+    # one for each two neighbours in order, and others: the joints form any graph that joins all components
+    joints: tuple[JointEntry, ...] = entry(tables(JointEntry), default=())
+    where: str = hidden("")
+
+
+@dataclass(frozen=True)
+class NodeEntry:
+    """A node of a space frame; centre (3,)."""
+
+    IGNORES: ClassVar[bool] = True
+
+    id: str = entry(ID)  # unique
+    centre: Floats = entry(array(3))  # x, y, z
+    radius: float = entry(number(above=0))  # of the ball
+    # of a node that is a support: of a frame supported along its edges, or at single points
+    support: str = entry(text(*SUPPORTS), default="")
+    deflection: float = entry(number(above=0), default=float("nan"))  # computed deflection, downward
+
+
+@dataclass(frozen=True)
+class MemberEntry:
+    """A tube of a space frame."""
+
+    IGNORES: ClassVar[bool] = True
+
+    a: str = entry(ID)  # id of a node
+    b: str = entry(ID)  # id of another node
+    tube_diameter: float = entry(number(above=0))
+    where: str = hidden("")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameFile:
+    """design.json of a space frame."""
+
+    units: str = entry(UNIT)
+    kind: str = entry(text("space-frame"))
+    name: str = entry(text(empty=True), default="")
+    unsure: tuple[str, ...] = UNSURE  # what `processor init` is not sure of, for people; not used
+    nodes: tuple[NodeEntry, ...] = entry(tables(NodeEntry, minItems=1))
+    members: tuple[MemberEntry, ...] = entry(tables(MemberEntry), default=())
+    where: str = hidden("")
+
+
+def _arch(design: ArchFile) -> ArchDesign:
+    scale = MM_PER_UNIT[design.units]
+    pairs = [(joint.left, joint.right) for joint in design.joints]
+    for joint, pair in zip(design.joints, pairs, strict=True):
+        if pairs.count(pair) > 1:
+            raise InputError(f"{joint.where}: expected one joint of {joint.left} and {joint.right}, found a second")
+    joints = [replace(joint, points=np.stack(astuple(joint.points)) * scale) for joint in design.joints]
+    order = _order(design, joints)
+    unknown = sorted({name for pair in pairs for name in pair} - set(design.components))
     if unknown:
         raise InputError(
-            f"{design.where}: joint of {unknown[0]!r}, which is not in 'components' ({', '.join(components.values)})"
+            f"{design.where}: joint of {unknown[0]!r}, which is not in 'components' ({', '.join(design.components)})"
         )
-    at = {name: _row_ends(name, joints) for name in order}
-    parts = tuple(_part(folder, name, components.table(name), design.unit("units"), at[name]) for name in order)
+    parts = tuple(_part(name, design.components[name], design.units, _row_ends(name, joints)) for name in order)
     arch = ArchDesign(
         parts,
         joint_names=tuple(joint.name for joint in joints),
@@ -111,40 +249,15 @@ def _arch(folder: Path, design: Table) -> ArchDesign:
     return arch
 
 
-class _Joint(NamedTuple):
-    """A joint of two components, and its key points (8, 3), mm."""
-
-    name: str
-    left: str
-    right: str
-    points: Floats
-
-
-def _joints(design: Table, scale: float) -> list[_Joint]:
-    joints: list[_Joint] = []
-    tables = design.tables("joints")
-    ignore_unknown(f"{design.where}: joints", tables, ("name", "left", "right", "points"))
-    for joint in tables:
-        points = joint.table("points")
-        points.only(KEY_POINTS)
-        corners = np.stack([points.array(key, 3) for key in KEY_POINTS]) * scale
-        made = _Joint(joint.text("name"), joint.text("left"), joint.text("right"), corners)
-        if any((made.left, made.right) == (other.left, other.right) for other in joints):
-            raise InputError(f"{joint.where}: expected one joint of {made.left} and {made.right}, found a second")
-        joints.append(made)
-    return joints
-
-
-def _order(design: Table, components: list[str], joints: list[_Joint]) -> list[str]:
+def _order(design: ArchFile, joints: list[JointEntry]) -> list[str]:
     """Return the components in assembly order, and put ``joints`` in the order of a row if they form one.
 
     ``order`` in the file gives all of them, some, or none: the others follow in the order of 'components', unless all
     joints form one row.
     """
-    given = design.values.get("order")
-    if given is None:
-        given = _row_of(components, joints)
-    if not isinstance(given, list) or not all(isinstance(name, str) for name in given) or (not given and joints == []):
+    components = list(design.components)
+    given = _row_of(components, joints) if design.order is None else list(design.order)
+    if not given and not joints:
         raise InputError(f"{design.where}: expected 'order', the names of the components from one end to the other")
     if len(set(given)) != len(given) or not set(given) <= set(components):
         raise InputError(
@@ -168,7 +281,7 @@ def _order(design: Table, components: list[str], joints: list[_Joint]) -> list[s
     return [*given, *(name for name in components if name not in given)]
 
 
-def _row_of(components: list[str], joints: list[_Joint]) -> list[str]:
+def _row_of(components: list[str], joints: list[JointEntry]) -> list[str]:
     """Return the components from one end to the other if their joints form one row; else none."""
     after = {joint.left: joint.right for joint in joints}
     first = [name for name in components if name not in after.values()]
@@ -180,14 +293,14 @@ def _row_of(components: list[str], joints: list[_Joint]) -> list[str]:
     return row if set(row) == set(components) else []
 
 
-def _row_ends(name: str, joints: list[_Joint]) -> list[Floats | None]:
+def _row_ends(name: str, joints: list[JointEntry]) -> list[Floats | None]:
     """Key points (8, 3) at the start and at the end of a component; None where it has none or several."""
     starts = [joint.points for joint in joints if joint.right == name]
     ends = [joint.points for joint in joints if joint.left == name]
     return [points[0] if len(points) == 1 else None for points in (starts, ends)]
 
 
-def _check_graph(design: Table, arch: ArchDesign) -> None:
+def _check_graph(design: ArchFile, arch: ArchDesign) -> None:
     """Raise InputError for joints that do not join all components, share a name, or have left and right swapped."""
     for name, left, right in zip(arch.joint_names, arch.joint_left, arch.joint_right, strict=True):
         if left == right:
@@ -218,93 +331,52 @@ def _check_graph(design: Table, arch: ArchDesign) -> None:
                 )
 
 
-def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floats | None]) -> DesignPart:
+def _part(name: str, part: ComponentEntry, unit: str, joints: Sequence[Floats | None]) -> DesignPart:
     """Read a component; without a mesh one is made from its edges and the key points (8, 3), mm, of its joints."""
-    scale = MM_PER_UNIT[unit]
-    part.only(("mesh", "bottom_edge_left", "bottom_edge_right", "plate_mm"))
-    if "mesh" in part.values and not any(f"bottom_edge_{side}" in part.values for side in ("left", "right")):
-        return DesignPart(name, *_mesh(folder, part, unit))
-    edges = [part.array(f"bottom_edge_{side}", -1, 3) * scale for side in ("left", "right")]
-    for side, edge in zip(("left", "right"), edges, strict=True):
-        if len(edge) < 2 or (np.abs(np.diff(edge, axis=0)).max(axis=1) == 0).any():
-            raise InputError(f"{part.where}: expected two points or more in bottom_edge_{side}, none repeated in a row")
-    plate_mm = part.number("plate_mm", box_girder_mesh.PLATE_MM, positive=True)
-    if "mesh" in part.values:
-        return DesignPart(name, *_mesh(folder, part, unit), edges[0], edges[1])
+    edges = [edge * MM_PER_UNIT[unit] for edge in (part.bottom_edge_left, part.bottom_edge_right) if edge is not None]
+    if part.mesh is not None:
+        vertices, faces = _mesh(part.mesh, unit)
+        return DesignPart(name, vertices, faces, *(edges or ()))
     try:
-        vertices, faces = box_girder_mesh.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
+        vertices, faces = box_girder_mesh.mesh(edges[0], edges[1], joints[0], joints[1], part.plate_mm)
     except InputError as error:
         raise InputError(f"{part.where}: without a mesh: {error}") from None
     return DesignPart(name, vertices, faces, edges[0], edges[1], source=box_girder_mesh.SOURCE)
 
 
-def _mesh(folder: Path, part: Table, unit: str) -> tuple[Floats, Ints]:
+def _mesh(path: Path, unit: str) -> tuple[Floats, Ints]:
     """Read a component's mesh; facets given several times are logged. Ends may be left open, and normals any."""
-    path = existing_file_in(folder, part.text("mesh"), part.where)
     surface = read_surface(path, unit)
     for found in design_faults(surface.faults and replace(surface.faults, turned=0, open_edges=0)):
         LOG.warning("%s: %s", path, messages("en").text(found))
     return surface.vertices, surface.faces
 
 
-def _frame(design: Table) -> FrameDesign:
-    design.only(("units", "kind", "name", "unsure", "nodes", "members"))
-    scale = MM_PER_UNIT[design.unit("units")]
-    ids, centres, radii = [], [], []
-    supports, deflections = [], []
-    nodes, members = design.tables("nodes"), design.tables("members")
-    ignore_unknown(f"{design.where}: nodes", nodes, ("id", "centre", "radius", "support", "deflection"))
-    ignore_unknown(f"{design.where}: members", members, ("a", "b", "tube_diameter"))
-    for node in nodes:
-        ids.append(_name(node, "id"))
-        supports.append(_support(node))
-        deflections.append(node.number("deflection", float("nan"), positive=True) * scale)
-        centres.append(node.array("centre", 3) * scale)
-        radii.append(node.number("radius", positive=True) * scale)
+def _frame(design: FrameFile) -> FrameDesign:
+    scale = MM_PER_UNIT[design.units]
+    ids = [node.id for node in design.nodes]
     node_list.check_names(design.where, ids)
     numbers, labels = node_list.numbered_names(ids)
     number_of = dict(zip(ids, numbers.tolist(), strict=True))
-    a, b, diameters = [], [], []
-    for member in members:
-        ends = (_name(member, "a"), _name(member, "b"))
-        if not number_of.keys() >= set(ends) or ends[0] == ends[1]:
+    for member in design.members:
+        if not number_of.keys() >= {member.a, member.b} or member.a == member.b:
             raise InputError(
-                f"{member.where}: expected ids of two different nodes, found a member from {ends[0]} to {ends[1]}"
+                f"{member.where}: expected ids of two different nodes, found a member from {member.a} to {member.b}"
             )
-        a.append(number_of[ends[0]])
-        b.append(number_of[ends[1]])
-        diameters.append(member.number("tube_diameter", positive=True) * scale)
+    # Kinds of support as FrameDesign has them: 0 of none
+    supports = [SUPPORTS.index(node.support) + 1 if node.support else 0 for node in design.nodes]
+    deflections = np.array([node.deflection for node in design.nodes]) * scale
     return FrameDesign(
         numbers,
-        np.array(centres),
-        np.array(radii),
+        np.array([node.centre for node in design.nodes]) * scale,
+        np.array([node.radius for node in design.nodes]) * scale,
         labels=labels,
-        member_a=np.array(a, np.int64),
-        member_b=np.array(b, np.int64),
-        tube_diameters=np.array(diameters),
+        member_a=np.array([number_of[member.a] for member in design.members], np.int64),
+        member_b=np.array([number_of[member.b] for member in design.members], np.int64),
+        tube_diameters=np.array([member.tube_diameter for member in design.members]) * scale,
         supports=np.array(supports, np.uint8) if any(supports) else np.empty(0, np.uint8),
-        deflections=np.array(deflections) if np.isfinite(deflections).any() else np.empty(0),
+        deflections=deflections if np.isfinite(deflections).any() else np.empty(0),
     )
-
-
-def _name(table: Table, key: str) -> str:
-    """Return an id, a whole number or a text, as a text."""
-    return (
-        table.text(key)
-        if isinstance(table.values.get(key), str)
-        else str(table.integer(key, "a whole number or a text"))
-    )
-
-
-def _support(node: Table) -> int:
-    """Return the kind of support that a node is, as :class:`FrameDesign` has it: 0 of none."""
-    kind = node.text("support", "")
-    if kind and kind not in SUPPORTS:
-        raise InputError(
-            f"{node.where}: expected one of {', '.join(SUPPORTS)} as 'support', found {kind!r}"
-            f"{did_you_mean(kind, SUPPORTS)}"
-        )
-    return SUPPORTS.index(kind) + 1 if kind else 0
 
 
 def is_surface(path: Path) -> bool:

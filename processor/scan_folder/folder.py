@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +14,8 @@ from processor.geometry import rigid
 from processor.language.messages import messages
 from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
 from processor.model import (
-    DESIGN_FRAMES,
-    KINDS,
     ArchDesign,
+    Ceiling,
     Floats,
     FrameDesign,
     InputError,
@@ -25,21 +24,20 @@ from processor.model import (
     Scene,
     Stations,
     StructureDesign,
-    TitleBlock,
-    Tolerance,
+    TargetSearch,
     UsageError,
-    did_you_mean,
     reason,
 )
+from processor.model.inputs import Place, read, shown
 from processor.progress import tracked
 from processor.readers import RawScan
 from processor.readers.encoding import file_name_as_text
 from processor.readers.raw_scan import scaled_in_place, scan_name, summed
 from processor.scan_folder import guess, node_list, scanner_grid, units
-from processor.scan_folder.checked_table import Table, existing_file_in
-from processor.scan_folder.clips import FEWEST_POINTS, Clipper, read_boxes
-from processor.scan_folder.control_points import Measured, control_points, read_control
-from processor.scan_folder.design import is_surface, read_design, read_json_value, read_surface
+from processor.scan_folder.clips import FEWEST_POINTS, Clipper
+from processor.scan_folder.control_points import control_points, read_control
+from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
+from processor.scan_folder.file_values import existing_file_in
 from processor.scan_folder.files import (
     CONTROL,
     DESIGNS,
@@ -55,60 +53,20 @@ from processor.scan_folder.files import (
 )
 from processor.scan_folder.guess import Guess
 from processor.scan_folder.picks import read_picks
-from processor.scan_folder.project_tables.ceiling import read_ceiling
-from processor.scan_folder.project_tables.targets import read_search
+from processor.scan_folder.project_file import CeilingEntry, ListedStation, Project, ScanEntry, Station
 from processor.scan_folder.shapes import surface_files
 from processor.scan_folder.text_files import read_toml
-from processor.scan_folder.title_block import read_title_block
 from processor.scan_folder.tolerance import check_components, read_tolerance
 from processor.scan_folder.units import MM_PER_UNIT, FileUnit, file_unit, known_unit
 
-KEYS = (
-    "name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control", "report",
-    "clip", "ceiling", "targets", "design_frame",
-)  # fmt: skip
-SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position", "units")
 FLOAT_STEP_MM = 1.0
 UNIT_ADVICE = (
     "state its unit by --units, or by 'units' of its [[scan]] in project.toml (m, or m/us-ft where the heights have "
     "another), or export it in metres"
 )
-NAN = float("nan")
 
 Design = ArchDesign | FrameDesign | StructureDesign
 Keep = Callable[[Scan], Scan]
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A table [[scan]] of project.toml, or a scan file without one."""
-
-    path: Path
-    component: str = ""
-    station: str = ""
-    pose: Floats | None = None
-    position: Floats | None = None
-    sigma_mm: float = NAN
-    units: FileUnit | None = None  # that count before those of the file
-    units_by: Reason = reason("units.by-option")  # who gives them
-
-
-@dataclass(frozen=True)
-class _Project:
-    """The content of project.toml, or its defaults."""
-
-    name: str
-    entries: tuple[_Entry, ...]
-    kind: str = ""
-    units: str = ""
-    design: Path | None = None
-    design_units: str = ""
-    temperature_C: float = NAN
-    tolerance: Tolerance | None = None
-    control: tuple[Measured, ...] = ()
-    guessed: Guess | None = None  # instead of a project.toml
-    title_block: TitleBlock | None = None
-    table: Table = Table("", {})  # of which [[clip]] is read once the unit is known
 
 
 def truth_file(path: Path) -> Path | None:
@@ -146,8 +104,9 @@ def read_input(path: Path, units: str | None = None, keep: Keep = as_read) -> Sc
         return _read_folder(path, option.horizontal if option else "", keep)
     if path.suffix.lower() == ".h5":
         return store.read_scene(path)
-    entry = _Entry(path, units=option)
-    return record_checks.check(_scene(_Project(scan_name(path), (entry,)), None, "", keep=keep), str(path))
+    one = ScanEntry(path, units=option, units_by=reason("units.by-option"))
+    scene = _scene(Project(scan_name(path), scan=(one,)), None, "", keep=keep)
+    return record_checks.check(scene, str(path))
 
 
 def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
@@ -169,13 +128,13 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
         else:
             design = read_design(folder, project.design, unit)
         record_checks.check(design, str(project.design))  # before scans are compared with it
-    design = _in_stated_frame(design, project.table)
+    design = _in_stated_frame(design, project)
     check_components(str(folder / PROJECT), project.tolerance, _component_names(design))
     unit = project.units or option or "m"
     scene = _scene(project, design, option, _read_stations(folder, unit), keep)
     scene = dataclasses.replace(scene, units_reason=(*scene.units_reason, *remarks))
-    ceiling = read_ceiling(folder, project.table, unit, project.design_units or unit)
-    scene = dataclasses.replace(scene, ceiling=ceiling) if ceiling is not None else scene
+    if project.ceiling is not None:
+        scene = dataclasses.replace(scene, ceiling=_ceiling(project.ceiling, unit, project.design_units or unit))
     if (folder / PICKS).exists():
         # Picks are in the unit of their scans; scans in different units need one by --units.
         unit_of_picks = scene.units if scene.units in MM_PER_UNIT else ""
@@ -191,19 +150,22 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     return record_checks.check(scene, str(folder), {field: str(folder / file) for field, file in files.items()})
 
 
-def _in_stated_frame(design: Design | None, table: Table) -> Design | None:
+def _in_stated_frame(design: Design | None, project: Project) -> Design | None:
     """Add what project.toml states of the frame that a design's coordinates are in."""
-    stated = table.text("design_frame", "")
-    if not stated:
+    if not project.design_frame:
         return design
-    if stated not in DESIGN_FRAMES:
-        raise InputError(
-            f"{table.where}: expected one of {', '.join(DESIGN_FRAMES)} as 'design_frame', found {stated!r}"
-            f"{did_you_mean(stated, DESIGN_FRAMES)}"
-        )
     if not isinstance(design, FrameDesign):
-        raise InputError(f"{table.where}: 'design_frame' is for the nodes of a space frame; take it out")
-    return dataclasses.replace(design, coordinates=stated)
+        raise InputError(f"{project.where}: 'design_frame' is for the nodes of a space frame; take it out")
+    return dataclasses.replace(design, coordinates=project.design_frame)
+
+
+def _ceiling(given: CeilingEntry, unit: str, surface_unit: str) -> Ceiling:
+    """Return a ceiling in mm: ``unit`` is that of its level, ``surface_unit`` that of a mesh that states none."""
+    clearance, longest = given.clearance_mm, given.hanger_longest_mm
+    if given.surface is None:
+        return Ceiling(level=given.level * MM_PER_UNIT[unit], clearance_mm=clearance, longest_mm=longest)
+    vertices, faces = read_surface(given.surface, surface_unit)[:2]
+    return Ceiling(vertices=vertices, faces=faces, clearance_mm=clearance, longest_mm=longest)
 
 
 def _component_names(design: Design | None) -> Sequence[str]:
@@ -213,79 +175,63 @@ def _component_names(design: Design | None) -> Sequence[str]:
     return design.bodies.names if isinstance(design, StructureDesign) and design.bodies is not None else ()
 
 
-def _stations_by_name(path: Path) -> dict[str, Table]:
-    """Return the tables of stations.json, a table by names or a list with the names as ``id``."""
-    value = read_json_value(path)
-    if not isinstance(value, list):
-        table = Table.of(str(path), value)
-        named = {name: table.table(name) for name in table.values}
-        for station in named.values():
-            station.only(("position",))
-        return named
-    stations: dict[str, Table] = {}
-    for number, item in enumerate(value, 1):
-        station = Table.of(f"{path}: {number}", item)
-        station.only(("id", "position"))
-        name = station.text("id")
-        if name in stations:
-            raise InputError(f"{station.where}: id {name!r} is given more than once; give each station its own")
-        stations[name] = station
-    return stations
-
-
 def _read_stations(folder: Path, unit: str) -> Stations | None:
-    """Read stations.json, if it exists: positions of scanners by name, in the project's frame."""
+    """Read stations.json, if it exists: positions of scanners in the project's frame, by name or listed with ids."""
     path = folder / STATIONS
     if not path.exists():
         return None
     existing_file_in(folder, STATIONS, str(folder))
-    stations = _stations_by_name(path)
-    positions = np.array([station.array("position", 3) for station in stations.values()]).reshape(-1, 3)
-    return Stations(tuple(stations), positions * MM_PER_UNIT[unit])
+    value, place = read_json(path), Place(str(path))
+    stations: dict[str, Floats] = {}
+    if isinstance(value, list):
+        for number, item in enumerate(value, 1):
+            within = place.within(str(number))
+            listed: Any = read(ListedStation, item, within)
+            if listed.id in stations:
+                raise within.refused(f"id {listed.id!r} is given more than once; give each station its own")
+            stations[listed.id] = listed.position
+    elif isinstance(value, dict):
+        stations = {name: read(Station, item, place.within(name)).position for name, item in value.items()}
+    else:
+        raise place.refused(f"expected a table of names and values, found {shown(value)}")
+    return Stations(tuple(stations), np.array(list(stations.values())).reshape(-1, 3) * MM_PER_UNIT[unit])
 
 
-def _read_project(folder: Path) -> _Project:
+def _read_project(folder: Path) -> Project:
+    """Read project.toml, if it exists, with the files that it names or else those that are found."""
     path = folder / PROJECT
-    table = Table(str(path), {})
+    place = Place(str(path), folder=folder)
+    guessed, content = None, {}
     if path.exists():
         existing_file_in(folder, PROJECT, str(folder))
-        table = Table.of(str(path), read_toml(path))
-    guessed = None if path.exists() else _guess(folder)
-    table.only(KEYS)
-    kind = table.text("kind", "")
-    if kind and kind not in KINDS:
-        like = did_you_mean(kind, KINDS)
-        raise InputError(f"unknown kind {kind!r}{like}; expected one of {', '.join(KINDS)}", path=path)
-    found = next((name for name in DESIGNS if (folder / name).exists()), "")
-    named = table.text("design", "") or found
-    if not named and guessed is None and not path.exists():
-        named = only_cad_file(folder)
-    entries = [_entry(folder, scan) for scan in table.tables("scan")]
-    control, control_file = read_control(folder, table)
-    if not named and guessed is None and kind in ("", "space-frame"):
-        named = node_list_in(folder, (*(entry.path for entry in entries), control_file))
-    design = existing_file_in(folder, named, str(path)) if named else None
+        content = read_toml(path)
+    else:
+        guessed = _guess(folder)
+    project = read(Project, content, place)
+    control, control_file = read_control(folder, project.control)
+    name = project.name or file_name_as_text(folder.resolve().name)
+    project = dataclasses.replace(project, name=name, measured=control, guessed=guessed)
     if guessed:
-        gap = guessed.made.root_gap_mm if guessed.made else 0.0
-        table = Table(str(path), {"tolerance": {"root_gap_mm": gap}} if gap > 0.0 else {})
         components = {folder / scan.file: scan.component for scan in guessed.scans}
-        entries = [_Entry(scan, component=components[scan]) for scan in _open_scans(folder, list(components))]
-    return _Project(
-        name=table.text("name", file_name_as_text(folder.resolve().name)),
-        kind=kind,
-        units=guessed.units if guessed else table.unit("units", ""),
-        design=design,
-        design_units=table.unit("design_units", ""),
-        temperature_C=table.number("temperature_C", NAN),
-        entries=tuple(
-            entries or [_Entry(scan) for scan in _open_scans(folder, scan_files(folder, (design, control_file)))]
-        ),
-        tolerance=read_tolerance(table),
-        control=control,
-        guessed=guessed,
-        title_block=read_title_block(folder, table),
-        table=table,
+        gap = guessed.made.root_gap_mm if guessed.made else 0.0
+        return dataclasses.replace(
+            project,
+            units=guessed.units,
+            scan=tuple(ScanEntry(scan, components[scan]) for scan in _open_scans(folder, list(components))),
+            tolerance=read_tolerance({"root_gap_mm": gap}, place) if gap > 0.0 else None,
+        )
+    design = project.design
+    if design is None:
+        found = next((name for name in DESIGNS if (folder / name).exists()), "")
+        if not found and not path.exists():
+            found = only_cad_file(folder)
+        if not found and project.kind in ("", "space-frame"):
+            found = node_list_in(folder, (*(scan.file for scan in project.scan), control_file))
+        design = existing_file_in(folder, found, str(path)) if found else None
+    scans = project.scan or tuple(
+        ScanEntry(file) for file in _open_scans(folder, scan_files(folder, (design, control_file)))
     )
+    return dataclasses.replace(project, design=design, scan=scans)
 
 
 def _guess(folder: Path) -> Guess | None:
@@ -294,25 +240,6 @@ def _guess(folder: Path) -> Guess | None:
         return None
     guessed = guess.guess(folder)
     return guessed if guessed.made and not guessed.made.kind_doubts else None
-
-
-def _entry(folder: Path, scan: Table) -> _Entry:
-    scan.only(SCAN_KEYS)
-    pose = scan.array("pose", 4, 4) if "pose" in scan.values else None
-    if pose is not None and not record_checks.are_poses(pose[None])[0]:
-        raise InputError(
-            f"{scan.where}: 'pose' is not a rotation and a translation above a row of 0, 0, 0, 1; correct the matrix"
-        )
-    return _Entry(
-        existing_file_in(folder, scan.text("file"), scan.where),
-        component=scan.text("component", ""),
-        station=scan.text("station", ""),
-        pose=pose,
-        position=scan.array("position", 3) if "position" in scan.values else None,
-        sigma_mm=scan.number("sigma_mm", NAN, positive=True),
-        units=scan.file_unit("units"),
-        units_by=reason("units.by-scan", file=PROJECT),
-    )
 
 
 def _open_scans(folder: Path, files: Sequence[Path]) -> list[Path]:
@@ -341,7 +268,7 @@ def _open_scans(folder: Path, files: Sequence[Path]) -> list[Path]:
 
 
 def _scene(
-    project: _Project, design: Design | None, option: str, stations: Stations | None = None, keep: Keep = as_read
+    project: Project, design: Design | None, option: str, stations: Stations | None = None, keep: Keep = as_read
 ) -> Scene:
     arch = design if isinstance(design, ArchDesign) else None
     frame = design if isinstance(design, FrameDesign) else None
@@ -354,11 +281,12 @@ def _scene(
     remarks: list[Reason] = []
     days: set[str] = set()
     reasons: dict[str, Reason] = {}  # why a unit was taken, by units
-    clipper = Clipper(read_boxes(project.table, MM_PER_UNIT[project.units or option or "m"]), project.table.where)
-    for entry in tracked(project.entries):
+    mm = MM_PER_UNIT[project.units or option or "m"]
+    clipper = Clipper([dataclasses.replace(one, box=one.box * mm) for one in project.clip], project.where)
+    for entry in tracked(project.scan):
         if entry.component and parts and entry.component not in parts:
             raise InputError(
-                f"the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}", path=entry.path
+                f"the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}", path=entry.file
             )
         for raw in _read_raws(entry, scans):
             unit, why = _unit(raw, entry, project, option)
@@ -367,12 +295,15 @@ def _scene(
             remarks += raw.remarks
             scan = clipper.clip(_scan(raw, entry, unit, parts, stations))
             if any(scan.name == other.name for other in scans):
-                raise InputError(f"a second scan named {scan.name!r}; rename one of the files", path=entry.path)
-            _check_unit(entry.path, scan, unit, messages("en").text(why), design)
+                raise InputError(f"a second scan named {scan.name!r}; rename one of the files", path=entry.file)
+            _check_unit(entry.file, scan, unit, messages("en").text(why), design)
             scans.append(keep(scan))
             scan_units.append(unit)
     where = stations or _stations(scans)
-    search = read_search(project.table)
+    why_units = list(reasons.values())
+    different = (one for i, one in enumerate(why_units) if one not in why_units[:i])  # reasons have no hash
+    targets = project.targets
+    search = None if targets is None else TargetSearch(targets.checkerboard_mm, targets.sphere_radius_mm)
     of_project = project.units or option or "m"
     of_guess: tuple[Reason, ...] = ()
     if project.guessed is not None:
@@ -387,42 +318,34 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason=(*_different(reasons.values()), *of_guess, *summed(remarks)),
+        units_reason=(*different, *of_guess, *summed(remarks)),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
-        control=control_points(project.control, scans, scan_units, where, of_project, search is not None),
+        control=control_points(project.measured, scans, scan_units, where, of_project, search is not None),
         target_search=search,
-        title_block=project.title_block,
+        title_block=project.report,
         clips=clipper.record(),
         scanned=tuple(sorted(days)),
     )
 
 
-def _different(reasons: Iterable[Reason]) -> list[Reason]:
-    """Return each reason once, in their order; reasons have no hash."""
-    different: list[Reason] = []
-    for one in reasons:
-        different += [] if one in different else [one]
-    return different
-
-
-def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
+def _read_raws(entry: ScanEntry, scans: Sequence[Scan]) -> Iterator[RawScan]:
     """Yield the scans of a file, each released before the next; a name in ``scans`` is replaced by the file's name."""
-    raws = readers.read(entry.path)
+    raws = readers.read(entry.file)
     several = len(raws) > 1
     if several and (entry.pose is not None or entry.position is not None):
-        raise InputError(f"holds {len(raws)} scans, so one 'pose' or 'position' does not fit them", path=entry.path)
+        raise InputError(f"holds {len(raws)} scans, so one 'pose' or 'position' does not fit them", path=entry.file)
     for number in range(1, len(raws) + 1):
         raw = raws.pop(0)
         if several and any(raw.name == other.name for other in scans):  # scanners name the first of each file S1
-            raw = dataclasses.replace(raw, name=f"{scan_name(entry.path)}-{number}")
+            raw = dataclasses.replace(raw, name=f"{scan_name(entry.file)}-{number}")
         yield raw
 
 
-def _unit(raw: RawScan, entry: _Entry, project: _Project, option: str) -> tuple[FileUnit, Reason]:
+def _unit(raw: RawScan, entry: ScanEntry, project: Project, option: str) -> tuple[FileUnit, Reason]:
     """Return the unit of a scan and who gives it: the user for it, its file, the user for all, or the convention."""
     stated = FileUnit(known_unit(raw.unit), known_unit(raw.unit)) if raw.unit else None
-    fault, file_format = raw.unit_fault, entry.path.suffix.lower()[1:]
+    fault, file_format = raw.unit_fault, entry.file.suffix.lower()[1:]
     if option or entry.units:
         unit, by = entry.units or FileUnit(option, option), entry.units_by
         if option:
@@ -434,7 +357,7 @@ def _unit(raw: RawScan, entry: _Entry, project: _Project, option: str) -> tuple[
         return stated, reason("units.by-format", format=file_format)
     # The unit of a project does not say which of two units of a file is wrong.
     if fault is not None and (not project.units or fault.code == "units.file-in-two"):
-        raise InputError(f"{messages('en').text(fault)}; {UNIT_ADVICE}", path=entry.path)
+        raise InputError(f"{messages('en').text(fault)}; {UNIT_ADVICE}", path=entry.file)
     if project.units:
         by = reason("units.by-size") if project.guessed else reason("units.by-project", file=PROJECT)
         by = by if fault is None else reason("units.over-file", by=by, format=file_format, file=fault)
@@ -444,10 +367,10 @@ def _unit(raw: RawScan, entry: _Entry, project: _Project, option: str) -> tuple[
     return FileUnit("m", "m"), reason("units.as-scanners-write")
 
 
-def _scan(raw: RawScan, entry: _Entry, unit: FileUnit, parts: set[str], stations: Stations | None) -> Scan:
+def _scan(raw: RawScan, entry: ScanEntry, unit: FileUnit, parts: set[str], stations: Stations | None) -> Scan:
     if len(raw.points) < FEWEST_POINTS:
         raise InputError(
-            f"scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more", path=entry.path
+            f"scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more", path=entry.file
         )
     scale = unit.factors
     step_mm = raw.step * float(scale.max())
@@ -455,13 +378,13 @@ def _scan(raw: RawScan, entry: _Entry, unit: FileUnit, parts: set[str], stations
         raise InputError(
             f"the coordinates of scan {raw.name!r} are in 32 bits, which so far from their origin have "
             f"steps of {step_mm:.3g} mm; export it in double precision, or nearer to its origin",
-            path=entry.path,
+            path=entry.file,
         )
     pose = np.array(raw.T_project_scan if entry.pose is None else entry.pose)
     if pose.size:
         if unit.vertical != unit.horizontal:
             raise InputError(
-                f"expected one unit of a scan with a pose, found {unit}; export it in one", path=entry.path
+                f"expected one unit of a scan with a pose, found {unit}; export it in one", path=entry.file
             )
         pose[:3, 3] *= scale
     position = raw.position if entry.position is None else entry.position
@@ -475,7 +398,7 @@ def _scan(raw: RawScan, entry: _Entry, unit: FileUnit, parts: set[str], stations
         if not 0 <= least <= most <= len(stations.ids):
             raise InputError(
                 f"its points name stations {least} to {most}, but {STATIONS} has {len(stations.ids)}, counted from 1",
-                path=entry.path,
+                path=entry.file,
             )
     scanner = position if position.size else np.zeros(3)
     origin = raw.origin * scale

@@ -21,8 +21,8 @@ from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints, R
 from processor.readers import RawScan
 from processor.registration import main_body, principal
 from processor.scan_folder import component_names
-from processor.scan_folder.checked_table import existing_file_in
 from processor.scan_folder.design import read_design, read_json, read_surface
+from processor.scan_folder.file_values import existing_file_in
 from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, node_list_in, scan_files, scan_files_below
 from processor.scan_folder.shapes import guess_design, surface_files
 from processor.scan_folder.shapes.guess_design import GuessedDesign
@@ -178,8 +178,8 @@ def _shown_design(
 
 def _has_kind(path: Path) -> bool:
     try:
-        return isinstance(read_json(path).values.get("kind"), str)
-    except InputError:
+        return isinstance(read_json(path)["kind"], str)
+    except (InputError, LookupError, TypeError):
         return False
 
 

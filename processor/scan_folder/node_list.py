@@ -34,13 +34,6 @@ KNOWN = {kind: frozenset(words.split()) for kind, words in HEADINGS.items()}
 USUAL_MM = (10.0, 500.0)
 
 
-class NodeList(NamedTuple):
-    """The nodes of a table, and what was taken of it that it does not state."""
-
-    design: FrameDesign
-    remarks: tuple[Reason, ...]
-
-
 class _Header(NamedTuple):
     """Columns of name, x, y, z and size, the factor from size to radius, and the units stated, "" for none."""
 
@@ -67,10 +60,11 @@ def is_node_list(path: Path) -> bool:
         return True
 
 
-def read_node_list(path: Path, table_unit: str) -> NodeList:
-    """Read a table of nodes in mm; ``table_unit`` is the unit of coordinates without one in their headings.
+def read_node_list(path: Path, table_unit: str) -> tuple[FrameDesign, tuple[Reason, ...]]:
+    """Return the nodes of a table in mm, and what was taken of it that it does not state.
 
-    Raises InputError for missing columns, sizes in no usual unit, and rows that do not fit.
+    ``table_unit`` is the unit of coordinates without one in their headings. Raises InputError for missing columns,
+    sizes in no usual unit, and rows that do not fit.
     """
     first = next((line for line in read_text(path).splitlines() if line.strip()), "")
     names, separator = _cells(first)
@@ -103,15 +97,8 @@ def read_node_list(path: Path, table_unit: str) -> NodeList:
     if guessed and size_unit != unit:
         remarks.append(reason("units.node-sizes", column=names[header.size], units=size_unit, other=unit))
     numbered, labels = numbered_names(ids)
-    return NodeList(
-        FrameDesign(
-            numbered,
-            numbers[:, :3] * MM_PER_UNIT[unit],
-            header.to_radius * numbers[:, 3] * MM_PER_UNIT[size_unit],
-            labels=labels,
-        ),
-        tuple(remarks),
-    )
+    radii = header.to_radius * numbers[:, 3] * MM_PER_UNIT[size_unit]
+    return FrameDesign(numbered, numbers[:, :3] * MM_PER_UNIT[unit], radii, labels=labels), tuple(remarks)
 
 
 def numbered_names(names: Sequence[str]) -> tuple[Ints, tuple[str, ...]]:

@@ -11,56 +11,59 @@ from typing import Any
 import numpy as np
 
 from processor.model import InputError, TitleBlock
+from processor.model.inputs import Kind, Place
 from processor.plain_text import printable
-from processor.scan_folder.checked_table import Table, existing_file_in
+from processor.scan_folder.file_values import FILE
 
-KEYS = ("company", "project", "drawing", "order", "operator", "scanner", "serial", "scanned", "approved")
+KEYS = {  # with what they mean where their names do not say it
+    **dict.fromkeys(("company", "project", "drawing", "order"), ""),
+    "operator": "who inspected; stands on the line to sign",
+    "scanner": "",
+    "serial": "of the scanner",
+    "scanned": "date of the scan",
+    "approved": "who approves; stands on the line to sign",
+}
 LOGO = "logo"
 FORMATS = ("PNG", "JPEG")
 MOST_KEYS, LONGEST, LONGEST_KEY = 30, 200, 40
 MOST_BYTES, MOST_PIXELS = 1_000_000, 4_000_000  # the logo is part of the page
 
 
-def read_title_block(folder: Path, project: Table) -> TitleBlock | None:
-    """Return the table [report] of a project, its known keys first; None without one.
+def read_title_block(given: Any, place: Place) -> TitleBlock | None:
+    """Return the table [report] of a project, its known keys first; None for an empty one.
 
     Values are texts, numbers and dates; empty texts are left out. Raises InputError for anything else, and for a logo
-    that is no PNG or JPEG picture below ``folder``.
+    that is no PNG or JPEG picture below the folder.
     """
-    if not project.values.get("report"):
+    if not isinstance(given, dict):
+        raise TypeError
+    if not given:
         return None
-    table = project.table("report")
-    written = {key: _written(table, key) for key in table.values if key != LOGO}
+    written = {key: _written(key, value, place) for key, value in given.items() if key != LOGO}
     if len(written) > MOST_KEYS:
-        raise InputError(f"{table.where}: expected at most {MOST_KEYS} keys, found {len(written)}; leave some out")
+        raise place.refused(f"expected at most {MOST_KEYS} keys, found {len(written)}; leave some out")
     kept = [key for key in (*KEYS, *(key for key in written if key not in KEYS)) if written.get(key)]
-    logo = _logo(folder, table) if table.values.get(LOGO) else b""
+    logo = _logo(FILE.value(given[LOGO], LOGO, place)) if given.get(LOGO) else b""
     return TitleBlock(tuple(kept), tuple(written[key] for key in kept), np.frombuffer(logo, np.uint8))
 
 
-def _written(table: Table, key: str) -> str:
+def _written(key: str, value: Any, place: Place) -> str:
     if len(key) > LONGEST_KEY or not key.strip():
-        raise InputError(
-            f"{table.where}: expected keys of 1 to {LONGEST_KEY} characters, found {key[:60]!r}; shorten it"
-        )
-    value: Any = table.values[key]
+        raise place.refused(f"expected keys of 1 to {LONGEST_KEY} characters, found {key[:60]!r}; shorten it")
     if isinstance(value, datetime.datetime):
         return value.isoformat(" ", "minutes")
     if isinstance(value, datetime.date):
         return value.isoformat()
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         kind = {bool: "true or false", list: "a list", dict: "a table"}.get(type(value), type(value).__name__)
-        raise InputError(f"{table.where}: expected a text, number or date as {key!r}, found {kind}; write it as a text")
+        raise place.refused(f"expected a text, number or date as {key!r}, found {kind}; write it as a text")
     text = printable(" ".join(str(value).split()))
     if len(text) > LONGEST:
-        raise InputError(
-            f"{table.where}: expected at most {LONGEST} characters as {key!r}, found {len(text)}; shorten it"
-        )
+        raise place.refused(f"expected at most {LONGEST} characters as {key!r}, found {len(text)}; shorten it")
     return text
 
 
-def _logo(folder: Path, table: Table) -> bytes:
-    path = existing_file_in(folder, table.text(LOGO), f"{table.where}: {LOGO}")
+def _logo(path: Path) -> bytes:
     advice = f"expected a picture in {' or '.join(FORMATS)}"
     try:
         size = path.stat().st_size
@@ -88,3 +91,24 @@ def _problem(data: bytes) -> str:
     except (OSError, ValueError, SyntaxError, ArithmeticError, MemoryError, Image.DecompressionBombError):
         return "a file that is none, or is damaged"
     return ""
+
+
+ENTRY = {
+    "description": f"a text of at most {LONGEST} characters, a number, or a date of TOML",
+    "not": {"type": ["boolean", "array", "object", "null"]},
+    "maxLength": LONGEST,
+}
+TITLE_BLOCK = Kind(
+    "a table",
+    read_title_block,
+    {
+        "type": "object",
+        "maxProperties": MOST_KEYS + 1,
+        "propertyNames": {"minLength": 1, "maxLength": LONGEST_KEY},
+        "properties": {
+            **{key: {**ENTRY, "description": about} if about else ENTRY for key, about in KEYS.items()},
+            LOGO: {"description": "a PNG or JPEG file below the folder, at most 1 MB", "type": "string"},
+        },
+        "additionalProperties": ENTRY,
+    },
+)

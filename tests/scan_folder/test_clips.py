@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from processor.model import InputError, Scan
-from processor.scan_folder.clips import Box, Clipper
+from processor.scan_folder.clips import Clipper
 from processor.scan_folder.folder import read_input
+from processor.scan_folder.project_file import ClipBox
 from tests.support.processes import commands
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -75,7 +76,7 @@ def test_all_columns_of_the_points_stay_together():
     points = rng.uniform(-1.0, 1.0, (500, 3))
     row = np.arange(500)
     scan = Scan("s", points, intensity=row * 1.0, grid_row=row.astype(np.int32), colour=rng.integers(0, 255, (500, 3)))
-    made = Clipper([Box("p", np.full(3, -0.5), np.full(3, 0.5), True)]).clip(scan)
+    made = Clipper([ClipBox(np.array([[-0.5] * 3, [0.5] * 3]))]).clip(scan)
     kept = np.flatnonzero(within(points, -0.5, 0.5))
     np.testing.assert_array_equal(made.points, points[kept])
     np.testing.assert_array_equal(made.intensity, kept)
@@ -86,7 +87,7 @@ def test_all_columns_of_the_points_stay_together():
 
 def test_many_points_are_clipped_in_pieces_alike(monkeypatch):
     scan = Scan("s", cloud(3))
-    box = Box("p", np.zeros(3), np.full(3, 4.0), False)
+    box = ClipBox(np.array([[0.0] * 3, [4.0] * 3]), keep=False)
     whole = Clipper([box])
     wanted = whole.clip(scan)
     monkeypatch.setattr("processor.large_arrays.BLOCK_ROWS", 7)

@@ -104,8 +104,12 @@ def test_a_csv_is_no_scan_and_may_name_stations_of_a_merged_cloud(tmp_path):
     [
         (TABLES.replace('"b"', '"c"'), None, "unknown scan or station 'c'; expected one of a, b"),
         (TABLES.replace("sd_mm = 1.0", "sd_mm = 0.0"), None, "a number above 0"),
-        (TABLES.replace("sd_mm = 1.0", ""), None, "a number as 'sd_mm'"),
-        (TABLES.replace("seen_sd_mm = 0.5", "seen_sd_mm = -1"), None, "0 mm or more"),
+        (TABLES.replace("sd_mm = 1.0", ""), None, "a number above 0 as 'sd_mm', found nothing"),
+        (
+            TABLES.replace("seen_sd_mm = 0.5", "seen_sd_mm = -1"),
+            None,
+            "a number of 0 or more as 'seen_sd_mm', found -1",
+        ),
         (TABLES.replace("position = [0.0, 0.0, 100.0]", "where = 1"), None, "unknown key 'where'"),
         (TABLES.replace("[2000.0, 4000.0, 300.0]", "[2000.0, nan, 300.0]"), None, "numbers of shape 3"),
         ('[[control]]\nname = "T1"\n', None, "found neither"),

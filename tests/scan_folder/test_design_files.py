@@ -118,13 +118,16 @@ def change(path, value):
 
 
 DESIGNS = {
-    "unit missing": (change(["units"], None), "expected a text as 'units', found nothing"),
+    "unit missing": (change(["units"], None), "expected a unit of length as 'units', found nothing"),
     "unit": (change(["units"], "ell"), "unknown unit 'ell'"),
-    "kind": (change(["kind"], "tower"), "expected kind arch-bridge or space-frame, found 'tower'"),
+    "kind": (change(["kind"], "tower"), "expected one of arch-bridge, space-frame as 'kind', found 'tower'"),
     "key": (change(["colour"], 1), "unknown key 'colour'"),
     "order": (change(["order"], ["foot1", "rib9"]), "expected each component"),
     "order twice": (change(["order"], ["foot1", "foot1", "rib1"]), "expected each component"),
-    "order of numbers": (change(["order"], [1, 2]), "expected 'order'"),
+    "order of numbers": (
+        change(["order"], [1, 2]),
+        "expected the names of the components from one end to the other as 'order'",
+    ),
     "mesh missing": (
         change(["components", "rib1", "mesh"], None),
         r"components: rib1: without a mesh: expected the bottom edges to start at P1 and P2 .* 390 mm away",

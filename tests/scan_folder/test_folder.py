@@ -244,7 +244,7 @@ SCAN = '[[scan]]\nfile = "scans/foot1.xyz"\n'
 PROJECTS = {
     "key": ("colour = 1", "unknown key 'colour'; known are name, kind, units"),
     "scan key": (SCAN + "weight = 1", r"scan 1: unknown key 'weight'; known are file, component"),
-    "kind": ('kind = "tower"', "unknown kind 'tower'; expected one of arch-bridge, space-frame"),
+    "kind": ('kind = "tower"', "expected one of arch-bridge, space-frame, structure as 'kind', found 'tower'"),
     "other kind": ('kind = "space-frame"', "expected a design of kind space-frame by project.toml, found arch-bridge"),
     "unit": ('units = "furlong"', "unknown unit 'furlong'; expected one of mm"),
     "type": ("name = 3", "expected a text as 'name', found 3"),

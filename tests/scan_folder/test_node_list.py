@@ -47,18 +47,18 @@ def test_columns_of_a_list_are_known_by_the_names_of_the_trade(tmp_path, header,
     for k, ((x, y, z), r) in enumerate(zip(PLACES, RADII, strict=True), 1):
         metres = {"x": x / 1e3, "y": y / 1e3, "z": z / 1e3, "dm": 2e-3 * r, "rm": 1e-3 * r}
         rows.append(row.format(id=f"N{k:03}", xm=x, ym=y, zm=z, r=r, d=2 * r, **metres))
-    design = listed(tmp_path, "\n".join([header, *rows]) + "\n").design
+    design = listed(tmp_path, "\n".join([header, *rows]) + "\n")[0]
     assert design.labels == ("N001", "N002", "N003")
     np.testing.assert_allclose(design.centres, PLACES, atol=1e-6)  # of 3e9 mm: two steps
     np.testing.assert_allclose(design.radii, RADII)
 
 
 def test_a_size_in_another_unit_than_the_coordinates_is_said(tmp_path):
-    remarks = {one.code: one.values for one in listed(tmp_path, SURVEYED).remarks}
+    remarks = {one.code: one.values for one in listed(tmp_path, SURVEYED)[1]}
     assert remarks["units.node-sizes"] == {"column": "Diameter", "units": "mm", "other": "m"}
     assert remarks["units.node-list"]["columns"] == ("Easting", "Northing", "Height")
     plain = "id,x,y,z,radius\n1,0,0,0,0.075\n2,2,0,0,0.075\n"
-    assert listed(tmp_path, plain).remarks == ()
+    assert listed(tmp_path, plain)[1] == ()
 
 
 @pytest.mark.parametrize(

@@ -82,13 +82,13 @@ def guess(
     frame = space_frame.find(stacked("all", bodies))
     if frame is not None:
         return GuessedDesign(
-            design=frame.design if units.unit else None,
-            other_doubts=(*doubts, *frame.doubts),
+            design=frame[0] if units.unit else None,
+            other_doubts=(*doubts, *frame[1]),
             unit_doubts=units.doubts,
             units=_json_unit(surfaces, units),
             reasons=(reason("init.shown-by-balls", files=_some(names)),),
             files=names,
-            unsure=frame.unsure,
+            unsure=frame[2],
         )
     units = _unit(surfaces, scans, given_unit, as_whole=len(surfaces) == 1)
     if not units.unit:

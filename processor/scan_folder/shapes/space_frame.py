@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -24,17 +22,11 @@ SAMPLE = 40_000  # facets
 PLAUSIBLE_MM = (20.0, 600.0)  # radii of balls
 
 
-@dataclass(frozen=True)
-class GuessedFrame:
-    """A design and the doubts about it."""
+def find(body: Body) -> tuple[FrameDesign, tuple[Reason, ...], tuple[Unsure, ...]] | None:
+    """Return the design of a space frame whose surfaces are one mesh in mm; None without balls and tubes between.
 
-    design: FrameDesign
-    doubts: tuple[Reason, ...] = ()
-    unsure: tuple[Unsure, ...] = ()  # nodes, and members by their middles
-
-
-def find(body: Body) -> GuessedFrame | None:
-    """Return the design of a space frame whose surfaces are one mesh in mm; None without balls and tubes between."""
+    With it the doubts about it, and the nodes, and the members by their middles, that are not sure.
+    """
     nodes = balls.find(body)
     if len(nodes.radii) < FEWEST_BALLS:
         return None
@@ -55,13 +47,9 @@ def find(body: Body) -> GuessedFrame | None:
     if others:
         doubts.append(reason("init.tubes-left-out", tubes=others))
     ids = np.arange(len(nodes.radii))
-    return GuessedFrame(
-        FrameDesign(
-            ids, nodes.centres, nodes.radii, member_a=ids[a], member_b=ids[b], tube_diameters=2.0 * pipes.radii[which]
-        ),
-        tuple(doubts),
-        unsure,
-    )
+    diameters = 2.0 * pipes.radii[which]
+    design = FrameDesign(ids, nodes.centres, nodes.radii, member_a=ids[a], member_b=ids[b], tube_diameters=diameters)
+    return design, tuple(doubts), unsure
 
 
 def _members(nodes: Balls, pipes: Tubes) -> tuple[Ints, Ints, Ints, Floats]:

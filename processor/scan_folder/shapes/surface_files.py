@@ -14,7 +14,7 @@ from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
 from processor.meshes.mesh_files import read_whole
 from processor.model import DesignBodies, Floats, InputError, Ints, Reason, reason
 from processor.scan_folder import cad
-from processor.scan_folder.checked_table import existing_file_in
+from processor.scan_folder.file_values import existing_file_in
 from processor.scan_folder.files import CAD_SUFFIXES, SCANS, belongs
 from processor.scan_folder.units import MM_PER_UNIT
 

@@ -1,1 +1,0 @@
-"""Single tables of project.toml."""
