@@ -11,7 +11,7 @@ from processor.geometry import rigid
 from processor.model import NORMAL_95, Better, Floats, FrameTruth, Ints, Metric, Scene, Statistic, Truth
 from processor.space_frame.design.matching import robust_fit
 from processor.space_frame.result import Balls, Flag, MovementGauge, Result
-from processor.space_frame.spheres import single_fit_assessment
+from processor.space_frame.spheres import assessment
 
 NAN = float("nan")
 WRONG_MM = 10.0  # a centre farther off is that of another ball
@@ -42,9 +42,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     centre = np.linalg.norm(off, axis=1)
     lowest = balls.lowest[rows, 2] - true.lowest[matches, 2]
     near = set(matches[centre < FOUND_MM].tolist())
-    limit = (
-        single_fit_assessment.PAPER_RADIUS_ERROR_MM if result.method == "ransac" and scene.frame is not None else NAN
-    )
+    limit = assessment.PAPER_RADIUS_ERROR_MM if result.method == "ransac" and scene.frame is not None else NAN
     metrics = [
         Metric(
             "spheres",

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry.linalg_small import eigen
 from processor.geometry.sphere import Sphere, sphere_cells, visible_fraction
-from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit
+from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit
 from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd
 

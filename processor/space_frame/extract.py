@@ -24,7 +24,7 @@ from processor.space_frame.members.member_extraction import Measured
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.result import NAN, Flag, MovementGauge
-from processor.space_frame.spheres import alternating_fit, assessment, ball_joint_classification, hidden_or_missing
+from processor.space_frame.spheres import alternating_fit, assessment, ball_joint_classification
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
 from processor.space_frame.stations.control_points import ControlPoints
@@ -305,7 +305,7 @@ def _fit_spheres(
     for i in np.flatnonzero(disputed).tolist():
         reasons[i] = (*reasons[i], reason("spheres.ambiguous-node"))
     spheres = replace(spheres, reasons=tuple(reasons))
-    return nodes, hidden_or_missing.with_cause_of_absence(spheres, source, smallest)
+    return nodes, assessment.with_cause_of_absence(spheres, source, smallest)
 
 
 def _expected(start: Start, design: FrameDesign, origin: Floats, expansion: float) -> tuple[Floats, Bools]:

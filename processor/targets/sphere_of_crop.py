@@ -29,7 +29,7 @@ from processor.geometry.sphere_evidence import (
     NoiseLimits,
     rows_of_cells,
 )
-from processor.geometry.sphere_robust_fit import RobustFit, robust_fit
+from processor.geometry.sphere_fit import RobustFit, robust_fit
 from processor.model import Floats, Ints
 from processor.space_frame.spheres.sphere_detection import Ball
 

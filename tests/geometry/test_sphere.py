@@ -15,7 +15,7 @@ from processor.geometry.sphere import (
     trials_needed,
     visible_fraction,
 )
-from processor.geometry.sphere_robust_fit import robust_fit
+from processor.geometry.sphere_fit import robust_fit
 from tests.support.solids import robust_sphere
 from tests.support.solids.robust_sphere import cap
 

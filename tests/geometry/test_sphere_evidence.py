@@ -5,7 +5,7 @@ import pytest
 
 from processor.geometry.sphere import Sphere
 from processor.geometry.sphere_evidence import LARGEST_HALF_SD, redundant
-from processor.geometry.sphere_robust_fit import RobustFit
+from processor.geometry.sphere_fit import RobustFit
 
 RADIUS = 50.0
 

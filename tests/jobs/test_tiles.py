@@ -15,7 +15,7 @@ from processor.compare.compare import Request, compare
 from processor.deviation import cloud, large_cloud
 from processor.jobs import runner, tile_cluster
 from processor.model import InputError, Scan, Scene, Stations, UsageError
-from processor.space_frame.spheres import node_tiles
+from processor.space_frame.spheres import alternating_fit
 from processor.store import store
 from processor.tiles import Shared
 from tests.support.clouds import frame_clouds
@@ -84,7 +84,7 @@ def test_a_worker_with_other_software_is_named(dask_cluster, monkeypatch):  # no
         list(tiles.mapped(np.sum, TILES))
 
 
-# --- results ----------------------------------------------------------------------------------------------------------
+# --- results ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ def test_spheres_have_the_same_bytes_as_here(dask_cluster, used, tmp_path, monke
     scene = Scene("frame", "space-frame", (scan,), stations=stations, units="mm")
     found = []
     for nodes, cluster in ((200, None), (3, None), (3, dask_cluster.address)):
-        monkeypatch.setattr(node_tiles, "NODES", nodes)
+        monkeypatch.setattr(alternating_fit, "NODES", nodes)
         found.append(stored(scene, tmp_path / "a.h5", "spheres", cluster))
     assert used == {"_chosen", "fit_final"}
     assert found[0] == found[1] == found[2]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processor.space_frame import ball_catalogue, shared_sizes
-from processor.space_frame.spheres import noise_estimation
+from processor.space_frame.spheres import stochastic_model
 
 PLAUSIBLE = ball_catalogue.load()
 NO_DESIGN = np.full(1, np.nan)
@@ -54,5 +54,5 @@ def test_the_prior_is_removed_from_radii():
     """Of a radius 60.2 +- 0.3 mm and a size 60 +- 0.4 mm the fit is their weighted mean."""
     weight = 1.0 / np.array([0.3, 0.4]) ** 2
     fitted = np.array([weight @ np.array([60.2, 60.0]) / weight.sum()])
-    radius, variance = noise_estimation.without_prior(fitted, 1.0 / weight.sum(keepdims=True), np.array([60.0]), 0.4)
+    radius, variance = stochastic_model.without_prior(fitted, 1.0 / weight.sum(keepdims=True), np.array([60.0]), 0.4)
     assert (radius.item(), variance.item()) == pytest.approx((60.2, 0.09))

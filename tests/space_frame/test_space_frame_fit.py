@@ -5,24 +5,24 @@ import pytest
 
 from processor.adjustment.scanner_class_errors import OFFSET_SD_MM
 from processor.geometry.linalg_small import inverse_of
+from processor.geometry.sphere_fit import residual
 from processor.model import reason
 from processor.space_frame import ball_catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.sphere_crops import Crops
 from processor.space_frame.result import Evidence, Flag
 from processor.space_frame.spheres import alternating_fit, assessment
-from processor.space_frame.spheres.gauss_newton import (
+from processor.space_frame.spheres.ball_fit import (
     Observations,
     Prior,
     SphereMask,
     Unknowns,
-    residual,
     select,
     solve,
     weight,
 )
-from processor.space_frame.spheres.noise_estimation import limb_cosine, noise_model, radius_offset, radius_scatter
 from processor.space_frame.spheres.records import Spheres, StochasticModel
+from processor.space_frame.spheres.stochastic_model import limb_cosine, noise_model, radius_offset, radius_scatter
 from tests.bench import ball_fit
 
 

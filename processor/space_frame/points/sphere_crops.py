@@ -42,6 +42,24 @@ class Crops:
     station: Labels
 
 
+class CropsWithRays(NamedTuple):
+    """Points about k nodes with their rays: those of node i are rows ``start[i]`` to ``start[i + 1]``, by station."""
+
+    start: Ints  # (k + 1,)
+    points: Floats  # (n, 3) relative to their node, mm
+    rays: Floats  # (n, 3) unit vectors from the scanner; 0 where it is unknown
+    ranges: Floats  # (n,) mm
+    station: Labels  # (n,) rows of the scanners; -1 = unknown
+
+    def of_nodes(self, nodes: slice) -> CropsWithRays:
+        """Return the points of some nodes."""
+        start = self.start[nodes.start : nodes.stop + 1]
+        rows = slice(start[0], start[-1])
+        return CropsWithRays(
+            start - start[0], self.points[rows], self.rays[rows], self.ranges[rows], self.station[rows]
+        )
+
+
 class NodeIndex(NamedTuple):
     """Nodes (k, 3), and a hash table of the cells that spheres about them touch.
 
@@ -274,7 +292,7 @@ def _sort(start, by_node, steps, station, points, seen_from, begin, end):  # typ
             to[s] += 1
 
 
-# --- the choice of points, where a node has more than its room: those of the lowest hashes ----------------------------
+# --- the choice of points, where a node has more than its room: those of the lowest hashes ---------------------------
 
 
 class PairBuffer:
@@ -345,3 +363,35 @@ def _lowered(owner, rank, at, room, ranks):  # type: ignore[no-untyped-def]
             lowered[k] += 1
         counts[k] = total
     return lowered, counts
+
+
+# --- rays ------------------------------------------------------------------------------------------------------------
+
+
+def with_rays(crops: Crops, nodes: Floats, scanners: Floats, threads: int) -> CropsWithRays:
+    """Add unit rays and ranges, mm, of gathered points from the scanners (s, 3) that saw them.
+
+    The points are relative to their ``nodes`` (k, 3); nodes and scanners are in one frame, mm.
+    """
+    rays, ranges = np.zeros((len(crops.points), 3)), np.zeros(len(crops.points))
+    found = CropsWithRays(crops.start, crops.points, rays, ranges, crops.station)
+    over_ranges(partial(_aim, found, nodes, scanners), len(nodes), threads)
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _aim(crops, nodes, scanners, first, last):  # type: ignore[no-untyped-def]
+    """Fill unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,)."""
+    points = crops.points
+    for k in range(first, last):
+        for i in range(crops.start[k], crops.start[k + 1]):
+            s = crops.station[i]
+            if s < 0 or s >= len(scanners):
+                continue
+            x = points[i, 0] + (nodes[k, 0] - scanners[s, 0])
+            y = points[i, 1] + (nodes[k, 1] - scanners[s, 1])
+            z = points[i, 2] + (nodes[k, 2] - scanners[s, 2])
+            d = np.sqrt(x * x + y * y + z * z)
+            if d > 0.0:
+                crops.rays[i, 0], crops.rays[i, 1], crops.rays[i, 2] = x / d, y / d, z / d
+                crops.ranges[i] = d

@@ -10,20 +10,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from processor import tiles
 from processor.limits import standards
 from processor.model import Floats, Tolerance
 from processor.space_frame import shared_sizes
 from processor.space_frame.ball_catalogue import Catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
-from processor.space_frame.points.sphere_crops import Crops, gather
-from processor.space_frame.spheres import assessment, node_tiles, noise_estimation, sleeve_radii
-from processor.space_frame.spheres.crop_rays import with_rays
-from processor.space_frame.spheres.final_fit import NodesToFit
-from processor.space_frame.spheres.gauss_newton import CUT_SD, LEAST_COSINE
+from processor.space_frame.points.sphere_crops import Crops, CropsWithRays, gather, with_rays
+from processor.space_frame.spheres import assessment, ball_fit, size_selection, sleeve_radii, stochastic_model
+from processor.space_frame.spheres.ball_fit import CUT_SD, LEAST_COSINE, NodesToFit
 from processor.space_frame.spheres.records import (
     AMBIGUOUS,
-    CropsWithRays,
+    Finished,
     Fits,
     Masks,
     Priors,
@@ -33,8 +32,8 @@ from processor.space_frame.spheres.records import (
     Spheres,
     StochasticModel,
 )
+from processor.space_frame.spheres.size_selection import NodesToChoose
 from processor.space_frame.spheres.sleeve_radii import AXIS_MM, FLAT_MM, MemberEnds
-from processor.space_frame.spheres.station_shift_sd import shift_sd
 from processor.space_frame.spheres.unnamed_view_errors import view_errors
 
 NAN = float("nan")
@@ -43,6 +42,7 @@ LARGEST_FREE_MM = 150.0
 FREE_SIZES = np.arange(20.0, LARGEST_FREE_MM + 1.0, 5.0)  # where a fit of a free radius starts
 MOST_MODEL_POINTS = 60.0  # points that the noise model is worth for one sphere, at most
 ROUNDS = 3
+NODES = 200  # of a tile
 VAGUE_MM = 50.0  # a node with a larger sd than this has no prior
 
 
@@ -141,7 +141,7 @@ def fit_crops(
     )
     fits, setting, residuals = _rounds(problem, len(scanners), station_covariance)
     if catalogue.assumed:
-        by_points = noise_estimation.without_prior(
+        by_points = stochastic_model.without_prior(
             fits.states[:, 3], fits.covariance[:, 3, 3], fits.sizes, setting.radius_sd
         )
         shared = shared_sizes.estimated(*by_points, catalogue, problem.nominal)
@@ -155,7 +155,7 @@ def fit_crops(
     offset = (0.0, np.inf)
     if len(catalogue.radii) and not catalogue.estimated:
         sure = fits.clear
-        offset = noise_estimation.radius_offset(
+        offset = stochastic_model.radius_offset(
             fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
         )
     views = None
@@ -210,18 +210,18 @@ def _estimated(problem: _Problem, setting: _Setting, fits: Fits, residuals: Resi
     crops, catalogue, threads = problem.crops, problem.catalogue, problem.params.threads
     errors, cosines, weights = residuals
     radii = sleeve_radii.estimated(problem.ends, crops.start, crops.points, fits.states, threads)
-    noise, count = noise_estimation.noise_model(errors, cosines, crops.ranges, weights, setting.noise)
-    limb = noise_estimation.limb_cosine(errors, cosines, crops.ranges, weights, noise, setting.least_cosine)
+    noise, count = stochastic_model.noise_model(errors, cosines, crops.ranges, weights, setting.noise)
+    limb = stochastic_model.limb_cosine(errors, cosines, crops.ranges, weights, noise, setting.least_cosine)
     sure, radius_sd, size_weight = fits.clear, setting.radius_sd, setting.size_weight(problem.free)
     if not problem.free:
-        radius_sd = noise_estimation.radius_scatter(
+        radius_sd = stochastic_model.radius_scatter(
             fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
         )
     # once the fits allow for shifts, their residuals no longer show them
     station_sd = setting.station_sd
     if not station_sd:
         priors = Priors(problem.centre_weight, fits.sizes, np.full(len(fits.sizes), size_weight))
-        station_sd = shift_sd(crops, weights, fits.states, sure, noise, priors, threads)
+        station_sd = stochastic_model.shift_sd(crops, weights, fits.states, sure, noise, priors, threads)
     return _Setting(
         noise=noise,
         model_points=min(count, MOST_MODEL_POINTS),
@@ -258,15 +258,25 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
         centre_weight=problem.centre_weight,
     )
     undecided = np.ones(len(problem.nominal), bool) if before is None else ~before.final_size
-    reaches = (2.5 * sigma + 1.0, params.first_reach_mm)
-    choice = node_tiles.choose(problem.crops, masks, model, sizes, reaches, undecided, params.threads)
+    choice = _choose(
+        NodesToChoose(
+            crops=problem.crops,
+            masks=masks,
+            model=model,
+            sizes=sizes,
+            vote_half_width=2.5 * sigma + 1.0,
+            first_reach_mm=params.first_reach_mm,
+            wanted=undecided,
+            threads=params.threads,
+        )
+    )
     if before is not None:
         earlier = SizeChoice(before.states, before.sizes, before.energy, before.second, before.second_energy)
         for new, old in zip(choice, earlier, strict=True):
             new[~undecided] = old[~undecided]
     keep_nominal(choice, problem.nominal)
     priors = Priors(problem.centre_weight, choice.sizes, np.full(len(choice.sizes), size_weight))
-    final = node_tiles.fit_final(
+    final = _fit_final(
         NodesToFit(
             crops=problem.crops,
             masks=masks,
@@ -311,3 +321,32 @@ def centre_weights(covariance: Floats) -> Floats:
     known[known] &= np.linalg.eigvalsh(covariance[known]).max(axis=1) < VAGUE_MM**2
     weights[known] = np.linalg.inv(covariance[known])
     return weights
+
+
+# --- tiles of nodes, each with the points about them -----------------------------------------------------------------
+
+
+def _choose(nodes: NodesToChoose) -> SizeChoice:
+    """Choose the size of each node's sphere; see :func:`processor.space_frame.spheres.size_selection.choose`."""
+    parts = tiles.mapped(size_selection.choose, [nodes.of_nodes(rows) for rows in _ranges(len(nodes.wanted))])
+    return SizeChoice(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def _fit_final(nodes: NodesToFit) -> Finished:
+    """Fit every node whose state is finite; see :func:`processor.space_frame.spheres.ball_fit.fit_final`."""
+    start, ranges = nodes.crops.start, _ranges(len(nodes.states))
+    # The residuals of many points take more memory than all else: those of a tile are copied and forgotten.
+    residuals = Residuals(*(np.empty(len(nodes.crops.points)) for _ in Residuals._fields))
+    of_nodes = list[tuple[Floats, ...]]()
+    parts = tiles.mapped(ball_fit.fit_final, [nodes.of_nodes(rows) for rows in ranges])
+    for rows, part in zip(ranges, parts, strict=True):
+        for column, values in zip(residuals, part.residuals, strict=True):
+            column[start[rows.start] : start[rows.stop]] = values
+        of_nodes.append(part[:-1])
+    states, covariances, bounds, numbers = (np.concatenate(columns) for columns in zip(*of_nodes, strict=True))
+    return Finished(states, covariances, bounds, numbers, residuals)
+
+
+def _ranges(count: int) -> list[slice]:
+    """Return the rows of the nodes of each tile; one of none where there are none."""
+    return tiles.ranges(count, NODES) or [slice(0, 0)]

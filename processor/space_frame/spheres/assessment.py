@@ -1,19 +1,30 @@
-"""Evidence, flag and reasons of each fitted sphere."""
+"""Evidence, flag and reasons of each fitted sphere: those of a frame, those fitted one by one, those without points.
+
+Spheres without points are hidden or missing, by where the rays towards them end.
+"""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import zlib
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
+from numba import njit
 from scipy.special import chdtrc
 
 from processor.adjustment.scanner_class_errors import OFFSET_SD_MM, SHIFT_SD_MM
-from processor.geometry.sphere import BANDS, SECTORS
+from processor.geometry.sphere import BANDS, SECTORS, Sphere, visible_fraction
+from processor.geometry.thread_ranges import over_ranges
 from processor.limits import limit_bounds, standards
-from processor.model import NORMAL_95, Bools, Floats, Reason, Tolerance, reason
+from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Status, Tolerance, Verdict, reason
 from processor.space_frame.ball_catalogue import Catalogue
+from processor.space_frame.design import unit_mistakes
 from processor.space_frame.members.records import Nodes
-from processor.space_frame.result import Evidence, Flag
+from processor.space_frame.params import NAN, Params
+from processor.space_frame.points.source import Source
+from processor.space_frame.result import Balls, Evidence, Flag, Result
 from processor.space_frame.spheres.records import (
     AMBIGUOUS,
     CELLS,
@@ -30,7 +41,7 @@ from processor.space_frame.spheres.records import (
 
 LEAST_POINTS = 8
 LARGEST_LOWEST_SD_MM = 0.8  # an error of 3 mm is then nearly four standard deviations
-LARGEST_RADIUS_SD = 0.05
+LARGEST_RADIUS_SD = 0.05  # in radii
 LARGEST_SCALE = 1.6
 UNLIKELY = 1e-3  # probability below which points and priors disagree
 LEAST_GAIN = 0.02  # share of a prior's variance that points must remove to be tested against it
@@ -38,7 +49,14 @@ SURE = 3.0  # standard deviations beyond which an offset of all radii is reporte
 UNLISTED = 6.0  # scatters of radii off its size, from which on a sphere is of no size of the catalogue
 FEW = 30
 FEW_MARGIN = 10.0  # added to the margin that the runner-up must lose by, where points are few
-NAN = float("nan")
+LEAST_VISIBLE = 0.05  # share of the sphere
+LEAST_INLIERS = 0.3  # share of the crop
+LARGEST_RMS = 0.1  # of the residuals, in radii
+PAPER_RADIUS_ERROR_MM = 3.0  # paper 001, table 2: RANSAC keeps radii within 0-3 mm
+CENTRAL = 0.7  # of the radius: rays that pass the centre within this meet the sphere in spite of noise
+CLEAR = 1.5  # radii before or behind the centre: a ray that ends there does not end on the sphere
+LEAST_RAYS = 5
+UNKNOWN_RADIUS_MM = 40.0  # where neither design nor catalogue gives one
 DOWN = np.array([0.0, 0.0, 1.0, -1.0])  # height of the lowest point by (x, y, z, radius)
 
 
@@ -326,3 +344,168 @@ def beyond(radius: float, nominal: float, margin: float, limits: Tolerance) -> R
     if not (error < -below - margin or error > above + margin):
         return None
     return reason("spheres.beyond-blank", error=error, above=above, below=below, margin=margin)
+
+
+# --- spheres that were fitted one by one -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the result, less the cloud's origin; without a sphere it was not found; ``reasons`` state why."""
+
+    id: int
+    nominal: float
+    sphere: Sphere | None
+    points: int = 0
+    visible: float = 0.0
+    rms: float = NAN
+    flag: Flag = Flag.NOT_FOUND
+    reasons: tuple[Reason, ...] = ()
+    stations: int = 0  # number that saw it; 0 = unknown
+    bound: Floats = field(default_factory=lambda: np.full((4, 4), NAN))  # Cramér-Rao, of x, y, z, radius
+    formal: Floats = field(default_factory=lambda: np.full((4, 4), NAN))  # covariance by the points alone
+
+
+def generator(params: Params, purpose: str) -> np.random.Generator:
+    """Return the random generator of a purpose, by the seed."""
+    return np.random.default_rng([params.seed, zlib.crc32(purpose.encode())])
+
+
+def missing(id_: int, nominal: float, points: int, cause: Reason) -> Row:
+    """Return the row of a sphere that was not found."""
+    return Row(id=id_, nominal=nominal, sphere=None, points=points, reasons=(cause,))
+
+
+def assessed(
+    id_: int, nominal: float, sphere: Sphere, points: Floats, share: float, params: Params, limits: Tolerance
+) -> Row:
+    """Return a fitted sphere with its flag and every reason for it."""
+    visible = visible_fraction(points, sphere.centre)
+    rms = float(np.sqrt(np.mean(sphere.residuals(points) ** 2)))
+    sd = float(np.sqrt(sphere.covariance[3, 3]))
+    implausible = unit_mistakes.implausible(sphere.radius)
+    doubts = []
+    if len(points) < params.min_points:
+        doubts.append(reason("spheres.few-points", points=len(points), least=params.min_points))
+    if visible < LEAST_VISIBLE:
+        doubts.append(reason("spheres.little-visible", share=visible))
+    if share < LEAST_INLIERS:
+        doubts.append(reason("spheres.few-inliers", share=share))
+    if not sd <= LARGEST_RADIUS_SD * sphere.radius:
+        doubts.append(reason("spheres.uncertain-radius", sd=sd))
+    if implausible is not None:
+        doubts.append(implausible)
+    if rms > LARGEST_RMS * sphere.radius:
+        doubts.append(reason("spheres.large-residuals", rms=rms))
+    flag = Flag.LOW_CONFIDENCE if doubts else Flag.OK
+    error = sphere.radius - nominal
+    below, above = blank_tolerance(nominal, limits)
+    if not doubts and not np.isnan(nominal) and not -below <= error <= above:
+        # The interval is formal: a size is wrong only beyond the errors that the method is known to have.
+        margin = max(NORMAL_95 * sd, PAPER_RADIUS_ERROR_MM)
+        wrong = beyond(sphere.radius, nominal, margin, limits)
+        if params.method == "ransac" and wrong is not None:
+            flag, doubts = Flag.WRONG_SIZE, [wrong]
+        elif params.method == "least-squares":
+            flag, doubts = Flag.LOW_CONFIDENCE, [reason("spheres.size-or-sleeves", error=error)]
+    return Row(
+        id=id_,
+        nominal=nominal,
+        sphere=sphere,
+        points=len(points),
+        visible=visible,
+        rms=rms,
+        flag=flag,
+        reasons=tuple(doubts),
+    )
+
+
+def as_result(
+    rows: list[Row], origin: Floats, params: Params, reasons: tuple[Reason, ...], complete: bool = True
+) -> Result:
+    """Return the result of rows, with the cloud's origin put back."""
+    nowhere = Sphere(np.full(3, NAN), NAN, np.full((4, 4), NAN))
+    spheres = [nowhere if row.sphere is None else row.sphere for row in rows]
+    centres = np.array([sphere.centre + origin for sphere in spheres]).reshape(-1, 3)
+    radii = np.array([sphere.radius for sphere in spheres])
+    fitted = sum(row.sphere is not None for row in rows)
+    balls = Balls(
+        ids=np.array([row.id for row in rows], np.int64),
+        centres=centres,
+        radii=radii,
+        lowest=centres - radii[:, None] * np.array([0.0, 0.0, 1.0]),
+        covariance=np.array([sphere.covariance for sphere in spheres]),
+        lowest_sd=np.array([sphere.lowest_sd for sphere in spheres]),
+        points=np.array([row.points for row in rows], np.int64),
+        visible_fraction=np.array([row.visible for row in rows]),
+        rms=np.array([row.rms for row in rows]),
+        nominal_radii=np.array([row.nominal for row in rows]),
+        evidence=(Evidence.BALL,) * len(rows),
+        flag=tuple(row.flag for row in rows),
+        reasons=tuple(row.reasons for row in rows),
+        verdict=(Verdict.NONE,) * len(rows),
+    )
+    status = Status.FAILED if fitted == 0 else Status.OK if complete and fitted == len(rows) else Status.PARTIAL
+    return Result(status=status, method=params.method, reasons=reasons, balls=balls)
+
+
+# --- spheres without points: hidden or missing -----------------------------------------------------------------------
+
+
+def count_rays(source: Source, places: Floats, radii: Floats) -> Ints:
+    """Count the rays (k, 3) aimed at spheres that ended before, at and beyond them; one pass over the source.
+
+    ``places`` (k, 3) are relative to the source's origin. Points of unknown scanners are left out.
+    """
+    counts = np.zeros((len(places), 3), np.int64)
+    scanners = np.ascontiguousarray(source.scanners)
+    places, radii = np.ascontiguousarray(places), np.ascontiguousarray(radii)
+    for chunk in source.chunks():
+        points, station = np.ascontiguousarray(chunk.points, np.float64).view(), chunk.station.view()
+        points.flags.writeable = station.flags.writeable = False  # the kernel is compiled for one kind alone
+        over_ranges(partial(_count, points, station, scanners, places, radii, counts), len(places))
+    return counts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count(points, station, scanners, places, radii, counts, first, last):  # type: ignore[no-untyped-def]
+    """Add the rays at spheres ``first`` to ``last`` to their counts (k, 3)."""
+    for k in range(first, last):
+        reach = CENTRAL * radii[k]
+        for i in range(len(points)):
+            s = station[i]
+            if s < 0 or s >= len(scanners):
+                continue
+            vx, vy, vz = points[i, 0] - scanners[s, 0], points[i, 1] - scanners[s, 1], points[i, 2] - scanners[s, 2]
+            cx, cy, cz = places[k, 0] - scanners[s, 0], places[k, 1] - scanners[s, 1], places[k, 2] - scanners[s, 2]
+            dot = vx * cx + vy * cy + vz * cz
+            length2, away2 = vx * vx + vy * vy + vz * vz, cx * cx + cy * cy + cz * cz
+            if dot <= 0.0 or away2 - dot * dot / length2 > reach * reach:
+                continue
+            behind = np.sqrt(length2) - np.sqrt(away2)
+            counts[k, 0 if behind < -CLEAR * radii[k] else 2 if behind > CLEAR * radii[k] else 1] += 1
+
+
+def with_cause_of_absence(spheres: Spheres, source: Source, smallest_mm: float) -> Spheres:
+    """Separate hidden spheres from missing ones, where scanners are known.
+
+    A sphere is not found where rays passed through its place: its node is known from the axes, but the sphere is
+    missing. ``smallest_mm`` is the radius taken where the design gives none; NaN = unknown.
+    """
+    without_points = [evidence is Evidence.AXES and flag is not Flag.NOT_FOUND
+                      for evidence, flag in zip(spheres.evidence, spheres.flag, strict=True)]  # fmt: skip
+    rows = np.flatnonzero(np.array(without_points, bool))
+    if not len(rows) or not len(source.scanners):
+        return spheres
+    radii = np.where(np.isfinite(spheres.nominal[rows]), spheres.nominal[rows], smallest_mm)
+    counts = count_rays(source, spheres.centres[rows], np.where(np.isfinite(radii), radii, UNKNOWN_RADIUS_MM))
+    flags, reasons = list(spheres.flag), list(spheres.reasons)
+    for row, (before, at, passed) in zip(rows.tolist(), counts.tolist(), strict=True):
+        if passed >= max(LEAST_RAYS, at):
+            flags[row] = Flag.NOT_FOUND
+            reasons[row] += (reason("spheres.missing", rays=passed),)
+        elif before >= LEAST_RAYS and before > at:
+            reasons[row] += (reason("spheres.hidden"),)
+        elif before + at + passed < LEAST_RAYS:
+            reasons[row] += (reason("spheres.few-rays"),)
+    return replace(spheres, flag=tuple(flags), reasons=tuple(reasons))

@@ -18,6 +18,7 @@ from numba import njit
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
+from processor.geometry.sphere_fit import residual
 from processor.geometry.thread_ranges import over_ranges
 from processor.inner_kernels import inner_ieee
 from processor.model import Bools, Floats, Ints
@@ -25,8 +26,6 @@ from processor.space_frame.members.member_extraction import Measured
 from processor.space_frame.points import sphere_crops
 from processor.space_frame.points.source import Source
 from processor.space_frame.spheres import sleeve_radii
-from processor.space_frame.spheres.crop_rays import with_rays
-from processor.space_frame.spheres.gauss_newton import residual
 
 REACH_MM = 240.0  # about a node: sleeve and cone of an ordinary ball
 POINTS = 512  # of a node, at most
@@ -56,7 +55,7 @@ def nodes_with_ball(source: Source, measured: Measured, starts: Floats, threads:
     noise = float(np.median(members.rms)) if len(members.rms) else 1.0
     sd = float(np.sqrt(noise**2 + measured.station_sd_mm**2 + sleeve_radii.AXIS_MM**2))
     near = sphere_crops.gather(source, nodes.positions, REACH_MM, threads, POINTS * nodes.count)
-    crops = with_rays(near, nodes.positions, np.array(source.scanners, np.float64), threads)
+    crops = sphere_crops.with_rays(near, nodes.positions, np.array(source.scanners, np.float64), threads)
     sphere, neck = np.zeros(nodes.count), np.zeros(nodes.count)
     evidence_range = partial(_evidence, crops, sleeve_radii.member_ends(nodes, members), sd, sphere, neck)
     over_ranges(evidence_range, nodes.count, threads)

@@ -25,9 +25,9 @@ from processor.space_frame.points.sphere_crops import Crops, gather
 from processor.space_frame.result import Result
 from processor.space_frame.spheres import sleeve_radii
 from processor.space_frame.spheres.alternating_fit import RayFitParams
-from processor.space_frame.spheres.gauss_newton import VISIBLE, SphereMask, select
+from processor.space_frame.spheres.assessment import Row, as_result, assessed, generator, missing
+from processor.space_frame.spheres.ball_fit import VISIBLE, SphereMask, select
 from processor.space_frame.spheres.records import Spheres
-from processor.space_frame.spheres.single_fit_assessment import Row, as_result, assessed, generator, missing
 
 MARGIN_MM = 8.0  # on both sides of a sphere's surface: about what the ray fit uses with 2 mm of noise
 SLEEVES_MM = 26.0  # beyond a sphere: sleeves are measured there

@@ -8,21 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Checked, Floats, Ints, Labels, Reason, column, described, reasons, words
+from processor.model import Checked, Floats, Ints, Reason, column, described, reasons, words
 from processor.space_frame.result import Evidence, Flag
 
 AMBIGUOUS = 14.0  # in chi-square: below it the runner-up's size is more than a thousandth as likely
 POINTS, CELLS, STATIONS, RMS, SCALE, DEGREES, CENTRE_CHI2, FITTED = range(8)  # columns of ``Fits.numbers``
-
-
-class CropsWithRays(NamedTuple):
-    """Points about k nodes with their rays: those of node i are rows ``start[i]`` to ``start[i + 1]``, by station."""
-
-    start: Ints  # (k + 1,)
-    points: Floats  # (n, 3) relative to their node, mm
-    rays: Floats  # (n, 3) unit vectors from the scanner; 0 where it is unknown
-    ranges: Floats  # (n,) mm
-    station: Labels  # (n,) rows of the scanners; -1 = unknown
 
 
 class Masks(NamedTuple):
@@ -35,6 +25,18 @@ class Masks(NamedTuple):
     tube_off: Floats  # (m,) the same of the member's tube
     hole: float  # radius of the cap about the lowest point that the process hole takes, mm
     least_cosine: float  # of incidence
+
+    def of_nodes(self, nodes: slice) -> Masks:
+        """Return the masks of some nodes."""
+        start = self.start[nodes.start : nodes.stop + 1]
+        ends = slice(start[0], start[-1])
+        return self._replace(
+            start=start - start[0],
+            axis_points=self.axis_points[ends],
+            axes=self.axes[ends],
+            keep_off=self.keep_off[ends],
+            tube_off=self.tube_off[ends],
+        )
 
 
 class StochasticModel(NamedTuple):

@@ -9,14 +9,21 @@ import numpy as np
 from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.geometry import coincident_points
 from processor.geometry.sphere import Sphere, algebraic
-from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit, bound, robust_fit
+from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit, bound, robust_fit
 from processor.model import NORMAL_95, Floats, Reason, Status, Tolerance, reason
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Flag, Result
 from processor.space_frame.spheres import sphere_detection
-from processor.space_frame.spheres.assessment import DOWN, LARGEST_SCALE
-from processor.space_frame.spheres.single_fit_assessment import Row, as_result, assessed, generator, missing
+from processor.space_frame.spheres.assessment import (
+    DOWN,
+    LARGEST_SCALE,
+    Row,
+    as_result,
+    assessed,
+    generator,
+    missing,
+)
 
 COARSE_MM = 1.0  # rounding to it adds noise of 0.3 mm, as much as that of a good scanner
 LEAST_ONE_SIDED = 0.2  # length of the mean of normals; 0.5 of half a sphere, 0 of one seen from all around

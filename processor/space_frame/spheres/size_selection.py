@@ -8,59 +8,75 @@ its chi-square with that of its priors, less a reward for each point that it exp
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from processor.geometry.sphere_fit import residual
 from processor.geometry.thread_ranges import over_ranges
 from processor.inner_kernels import inner_ieee
 from processor.model import Bools
-from processor.space_frame.spheres.gauss_newton import (
-    CUT_SD,
+from processor.space_frame.points.sphere_crops import CropsWithRays
+from processor.space_frame.spheres.ball_fit import (
+    AROUND_MM,
+    COARSE_MM,
     MASKED,
     VISIBLE,
-    Observations,
     Prior,
-    SphereMask,
-    Unknowns,
-    residual,
+    fit_one,
+    mask_of,
+    segments,
     select,
-    solve,
     variance,
+    within,
 )
-from processor.space_frame.spheres.records import CropsWithRays, Masks, SizeChoice, Sizes, StochasticModel
+from processor.space_frame.spheres.records import Masks, SizeChoice, Sizes, StochasticModel
 
 REWARD = 9.0  # of a point on the sphere, in chi-square: at 3 sd a residual is as likely an outlier as not
 THROUGH = 9.0  # cost of a ray that ends beyond the sphere it meets: steel is opaque
 SQUARE_ON = 0.5  # least cosine for that cost: nearer the limb a beam may be split
-GATE_MM = 40.0
 NEIGHBOURS_MM = 12.0  # sizes within this are compared with each other
 TRIED = 8  # sizes fitted at most
 MANY = 30.0  # votes of the best radius from which on a neighbour with few votes is not fitted
 SHARE, NEAR_SHARE = 0.4, 0.15  # of the best vote, for a radius to be fitted; and for a neighbour of the best
-AROUND_MM = 25.0  # points farther from a sphere's surface are not used
-COARSE_MM, FINE_MM = 1e-3, 1e-4
 
 
-def choose(
-    crops: CropsWithRays,
-    masks: Masks,
-    model: StochasticModel,
-    sizes: Sizes,
-    vote_half_width: float,
-    first_reach_mm: float,
-    wanted: Bools,
-    threads: int = 0,
-) -> SizeChoice:
+class NodesToChoose(NamedTuple):
+    """Nodes (k,) whose sizes are to be chosen, those ``wanted`` (k,): their points and what is tried.
+
+    ``vote_half_width`` and ``first_reach_mm``, the reach of the first steps, are in mm.
+    """
+
+    crops: CropsWithRays
+    masks: Masks
+    model: StochasticModel
+    sizes: Sizes
+    vote_half_width: float
+    first_reach_mm: float
+    wanted: Bools
+    threads: int = 0
+
+    def of_nodes(self, nodes: slice) -> NodesToChoose:
+        """Return some of the nodes."""
+        sizes = self.sizes
+        return self._replace(
+            crops=self.crops.of_nodes(nodes),
+            masks=self.masks.of_nodes(nodes),
+            sizes=sizes._replace(nominal=sizes.nominal[nodes], centre_weight=sizes.centre_weight[nodes]),
+            wanted=self.wanted[nodes],
+        )
+
+
+def choose(nodes_to_choose: NodesToChoose) -> SizeChoice:
     """Choose the size of each node's sphere, and fit it.
 
-    ``vote_half_width`` and ``first_reach_mm``, the reach of the first steps, are in mm. States are NaN and energies
-    infinite where nothing fits, and where a node is not ``wanted`` (k,).
+    States are NaN and energies infinite where nothing fits, and where a node is not wanted.
 
     Sleeves hide more of a small sphere than of a large one. Sizes near the best are therefore compared by the points
     that are masked for none of them; otherwise the size with the most points would win.
     """
-    nodes = len(sizes.nominal)
+    nodes = len(nodes_to_choose.wanted)
     choice = SizeChoice(
         states=np.full((nodes, 4), np.nan),
         sizes=np.full(nodes, np.nan),
@@ -68,11 +84,7 @@ def choose(
         second=np.full(nodes, np.nan),
         second_energy=np.full(nodes, np.inf),
     )
-    over_ranges(
-        partial(_choose_range, crops, masks, model, sizes, vote_half_width, first_reach_mm, wanted, choice),
-        nodes,
-        threads,
-    )
+    over_ranges(partial(_choose_range, *nodes_to_choose[:-1], choice), nodes, nodes_to_choose.threads)
     return choice
 
 
@@ -186,34 +198,6 @@ def _leave_out_limb(points, rays, state, least_cosine, kept):  # type: ignore[no
 
 
 # --- one fit and its energy ------------------------------------------------------------------------------------------
-
-
-@inner_ieee
-def fit_one(observations, mask, model, prior, first_reach_mm, tolerance, state, shifts, surface, covariance):  # type: ignore[no-untyped-def]
-    """Fit from ``state``: select points, solve, and select again as the cut narrows; returns points used or -1."""
-    points, rays, ranges, _ = observations
-    noise = model.noise
-    unknowns = Unknowns(state, shifts, np.zeros((len(shifts), 3, 8)))
-    far = 0.0
-    for i in range(len(ranges)):
-        far += ranges[i] / len(ranges)
-    typical = np.sqrt(noise[0] + noise[1] * far * far)
-    first = max(1.0, first_reach_mm / (CUT_SD * typical))
-    used = -1
-    iterations = 3 if tolerance > FINE_MM else 4
-    for iteration in range(iterations):
-        last = iteration + 1 == iterations
-        stretch = first if iteration == 0 else np.sqrt(first) if iteration == 1 else 1.0
-        gate = GATE_MM if iteration == 0 else max(GATE_MM * 0.5, 30.0 * typical)
-        if select(points, rays, mask, state, gate, surface) == 0:
-            return -1
-        used = solve(
-            observations, surface, model, stretch, prior, unknowns, tolerance if last else max(tolerance, COARSE_MM),
-            12 if last else 6, covariance,
-        )  # fmt: skip
-        if used < 0:
-            return -1
-    return used
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -338,44 +322,6 @@ def by_votes(vote):  # type: ignore[no-untyped-def]
 
 
 # --- small parts -----------------------------------------------------------------------------------------------------
-
-
-@inner_ieee
-def mask_of(masks, k):  # type: ignore[no-untyped-def]
-    """Return the mask of node ``k``."""
-    ends = slice(masks.start[k], masks.start[k + 1])
-    return SphereMask(masks.axis_points[ends], masks.axes[ends], masks.keep_off[ends], masks.hole, masks.least_cosine)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def within(crops, k, near, far):  # type: ignore[no-untyped-def]
-    """Return the rows of the points of node ``k`` at distances ``near`` to ``far`` from it, and these observations."""
-    rows = np.empty(crops.start[k + 1] - crops.start[k], np.int64)
-    n = 0
-    for i in range(crops.start[k], crops.start[k + 1]):
-        d2 = crops.points[i, 0] ** 2 + crops.points[i, 1] ** 2 + crops.points[i, 2] ** 2
-        if near * near <= d2 <= far * far:
-            rows[n] = i
-            n += 1
-    points, rays, ranges, station = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int32)
-    for j in range(n):
-        i = rows[j]
-        for axis in range(3):
-            points[j, axis] = crops.points[i, axis]
-            rays[j, axis] = crops.rays[i, axis]
-        ranges[j] = crops.ranges[i]
-        station[j] = crops.station[i]
-    return rows[:n], Observations(points, rays, ranges, station)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def segments(station):  # type: ignore[no-untyped-def]
-    """Count the runs of one station among points sorted by station, at least 1."""
-    runs = 1
-    for i in range(1, len(station)):
-        if station[i] != station[i - 1]:
-            runs += 1
-    return runs
 
 
 @inner_ieee

@@ -37,7 +37,7 @@ from processor.geometry.sphere_evidence import (
     redundant,
     rows_of_cells,
 )
-from processor.geometry.sphere_robust_fit import LEAST_SCALE, RobustFit, robust_fit
+from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit, robust_fit
 from processor.geometry.thread_ranges import over_ranges
 from processor.inner_kernels import inner_ieee
 from processor.model import Floats, Ints

@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import minimize, minimize_scalar
 
 from processor.robust_statistics import MAD_TO_SD
-from processor.space_frame.spheres import gauss_newton
-from processor.space_frame.spheres import noise_estimation as noise
+from processor.space_frame.spheres import ball_fit
+from processor.space_frame.spheres import stochastic_model as noise
 
 PARTS = np.array([0.3, 4e-9, 0.1])
 
@@ -16,7 +16,7 @@ def test_variances_are_those_of_the_fit_also_at_the_limb():
     # 0.3 + 0.004 R^2 (m) / c + 0.1 (1 / c^2 - 1), by hand; below a cosine of 0.1 as there.
     by_hand = [0.3, 0.3 + 0.512 + 0.3, 0.3 + 3.24 + 9.9, 0.3 + 3.24 + 9.9]
     assert noise.variances_of(PARTS, cosines, ranges) == pytest.approx(by_hand, rel=1e-12)
-    in_fit = [gauss_newton.variance(PARTS, *one) for one in zip(ranges, np.maximum(cosines, 0.1), strict=True)]
+    in_fit = [ball_fit.variance(PARTS, *one) for one in zip(ranges, np.maximum(cosines, 0.1), strict=True)]
     assert in_fit == pytest.approx(by_hand, rel=1e-12)
 
 

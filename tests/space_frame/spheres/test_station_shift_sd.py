@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from processor.space_frame.spheres.records import CropsWithRays, Priors
-from processor.space_frame.spheres.station_shift_sd import GRID, _cost_range, shift_sd
+from processor.space_frame.points.sphere_crops import CropsWithRays
+from processor.space_frame.spheres.records import Priors
+from processor.space_frame.spheres.stochastic_model import GRID, _cost_range, shift_sd
 
 BALLS, SIZE, NOISE = 6, 60.0, 0.09  # number, mm and mm^2
 STATION = np.repeat(np.arange(3, dtype=np.int32), 10)  # of the points of a ball

@@ -6,7 +6,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from processor.adjustment.scanner_class_errors import VIEW_SD_MM
-from processor.space_frame.spheres import view_error_field as field
+from processor.space_frame.spheres import unnamed_view_errors as field
 
 ROUNDING = 1e-9  # of sums of float64 over some hundred cells
 

@@ -1,4 +1,4 @@
-"""Robust geometric fit of one sphere, by orthogonal distances or by ranges along the rays of a scanner."""
+"""The residual of a point to a sphere, along its ray or orthogonal, and the robust fit of one sphere by it."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
@@ -76,19 +76,18 @@ def robust_fit(
     residuals: errors common to all points (registration, a bias of the scanner) are not included.
     """
     origin = start.centre
-    seen_from = np.empty((0, 3)) if scanner is None else np.ascontiguousarray(scanner - origin)
     state = np.append(np.zeros(3), start.radius if radius_mm is None else radius_mm)
     free = 4 if radius_mm is None else 3
-    residual, J = np.empty(len(points)), np.empty((len(points), 4))
-    local = np.ascontiguousarray(points - origin)
-    outcome, scale = _iterate(local, seen_from, state, free, scale_mm, start.radius, residual, J)
+    errors, J = np.empty(len(points)), np.empty((len(points), 4))
+    local, rays = np.ascontiguousarray(points - origin), rays_of(points, scanner)
+    outcome, scale = _iterate(local, rays, state, free, scale_mm, start.radius, errors, J)
     if outcome == NO_FIT:
         return None
     covariance = np.zeros((4, 4))
-    covariance[:free, :free] = _sandwich(J[:, :free], residual / scale, scale)
-    inliers = np.asarray(np.abs(residual) < TUKEY * scale, bool)
+    covariance[:free, :free] = _sandwich(J[:, :free], errors / scale, scale)
+    inliers = np.asarray(np.abs(errors) < TUKEY * scale, bool)
     sphere = Sphere(origin + state[:3], float(state[3]), covariance)
-    return RobustFit(sphere, inliers, scale, outcome == CONVERGED, residual)
+    return RobustFit(sphere, inliers, scale, outcome == CONVERGED, errors)
 
 
 def bound(points: Floats, fit: RobustFit, radius_held: bool = False, scanner: Floats | None = None) -> Floats:
@@ -98,32 +97,64 @@ def bound(points: Floats, fit: RobustFit, radius_held: bool = False, scanner: Fl
     that were fitted. NaN where the points do not determine the sphere.
     """
     state = np.append(np.zeros(3), fit.sphere.radius)
-    local = points[fit.inliers] - fit.sphere.centre
-    seen_from = np.empty((0, 3)) if scanner is None else scanner[fit.inliers] - fit.sphere.centre
-    residual, J = np.empty(len(local)), np.empty((len(local), 4))
-    _linearise(local, seen_from, state, residual, J)
+    on = points[fit.inliers]
+    errors, J = np.empty(len(on)), np.empty((len(on), 4))
+    rays = rays_of(on, None if scanner is None else scanner[fit.inliers])
+    _linearise(on - fit.sphere.centre, rays, state, errors, J)
     free = 3 if radius_held else 4
-    J = J[np.isfinite(residual), :free]
+    J = J[np.isfinite(errors), :free]
     covariance = np.zeros((4, 4))
     N = J.T @ J
     covariance[:free, :free] = fit.scale**2 * np.linalg.inv(N) if np.linalg.cond(N) < WORST_CONDITION else np.nan
     return covariance
 
 
+def rays_of(points: Floats, scanner: Floats | None) -> Floats:
+    """Return unit rays (n, 3) to points (n, 3) from where each was seen (n, 3); 0 where that is unknown."""
+    if scanner is None:
+        return np.zeros((len(points), 3))
+    rays = points - scanner
+    rays /= np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
+    return np.ascontiguousarray(rays)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _iterate(points, seen_from, state, free, largest_scale, radius, residual, J):  # type: ignore[no-untyped-def]
-    """Move ``state`` (x, y, z, radius) to the fit; returns the outcome and the scale of the residuals (n,) filled."""
+def residual(px, py, pz, ux, uy, uz, cx, cy, cz, r):  # type: ignore[no-untyped-def]
+    """Residual of a point p to a sphere (c, r), the cosine of its incidence, and the residual's derivatives by c and r.
+
+    Along the unit ray u from the scanner, positive where the point lies behind the surface that the ray meets first.
+    All numbers are 0 where the ray misses the sphere. With u = 0 the ray is unknown: the distance from the centre less
+    the radius, positive outside the sphere, with cosine 1.
+    """
+    wx, wy, wz = cx - px, cy - py, cz - pz
+    if ux == 0.0 and uy == 0.0 and uz == 0.0:
+        d = np.sqrt(wx * wx + wy * wy + wz * wz)
+        if d < 1e-9:
+            return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return d - r, 1.0, wx / d, wy / d, wz / d, -1.0
+    a = ux * wx + uy * wy + uz * wz
+    vx, vy, vz = wx - a * ux, wy - a * uy, wz - a * uz
+    under = r * r - (vx * vx + vy * vy + vz * vz)
+    if under <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    root = np.sqrt(under)
+    return root - a, root / r, -ux - vx / root, -uy - vy / root, -uz - vz / root, r / root
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _iterate(points, rays, state, free, largest_scale, radius, errors, J):  # type: ignore[no-untyped-def]
+    """Move ``state`` (x, y, z, radius) to the fit; returns the outcome and the scale of the errors (n,) filled."""
     scale, tiny = largest_scale, LEAST_SCALE * radius
     considered, sizes, step = np.ones(len(points), np.bool_), np.empty(len(points)), np.empty(4)
     outcome = FITTED
     for iteration in range(ITERATIONS):
-        _linearise(points, seen_from, state, residual, J)
+        _linearise(points, rays, state, errors, J)
         if iteration < FREE_ITERATIONS:
-            scale = min(largest_scale, max(_scale(residual, sizes, scale), tiny))
+            scale = min(largest_scale, max(_scale(errors, sizes, scale), tiny))
         else:
             for i in range(len(points)):
-                considered[i] &= np.isfinite(residual[i])
-        if not _step(residual, J, considered, free, scale, step):
+                considered[i] &= np.isfinite(errors[i])
+        if not _step(errors, J, considered, free, scale, step):
             return NO_FIT, scale
         length = 0.0
         for a in range(free):
@@ -131,73 +162,53 @@ def _iterate(points, seen_from, state, free, largest_scale, radius, residual, J)
         length = np.sqrt(length)
         share = min(1.0, LONGEST_STEP * state[3] / max(length, 1e-300))
         for a in range(free):
-            state[a] += share * step[a]
+            state[a] -= share * step[a]
         if not 0.0 < state[3] < LARGEST_GROWTH * radius:
             return NO_FIT, scale
         if length < SHORTEST_STEP * state[3]:
             outcome = CONVERGED
             break
-    _linearise(points, seen_from, state, residual, J)
+    _linearise(points, rays, state, errors, J)
     return outcome, scale
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _linearise(points, seen_from, state, residual, J):  # type: ignore[no-untyped-def]
-    """Fill residuals (n,), measured minus model, and the model's derivatives (n, 4).
-
-    Without positions ``seen_from`` (n, 3) these are orthogonal distances. NaN where a ray misses the sphere or meets
-    it too steeply.
-    """
-    radius = state[3]
+def _linearise(points, rays, state, errors, J):  # type: ignore[no-untyped-def]
+    """Fill residuals (n,) and their derivatives (n, 4); NaN where a ray misses the sphere or meets it too steeply."""
     for i in range(len(points)):
-        if len(seen_from) == 0:
-            x, y, z = points[i, 0] - state[0], points[i, 1] - state[1], points[i, 2] - state[2]
-            length = np.sqrt(x * x + y * y + z * z)
-            residual[i] = length - radius
-            length = max(length, 1e-300)
-            J[i, 0], J[i, 1], J[i, 2], J[i, 3] = x / length, y / length, z / length, 1.0
-            continue
-        x, y, z = points[i, 0] - seen_from[i, 0], points[i, 1] - seen_from[i, 1], points[i, 2] - seen_from[i, 2]
-        length = np.sqrt(x * x + y * y + z * z)
-        least = max(length, 1e-300)
-        x, y, z = x / least, y / least, z / least
-        u, v, w = state[0] - seen_from[i, 0], state[1] - seen_from[i, 1], state[2] - seen_from[i, 2]
-        along = x * u + y * v + z * w
-        u, v, w = u - along * x, v - along * y, w - along * z
-        under = radius * radius - (u * u + v * v + w * w)
-        if not under > (STEEPEST * radius) ** 2:
-            residual[i] = np.nan
+        errors[i], cosine, J[i, 0], J[i, 1], J[i, 2], J[i, 3] = residual(
+            points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2],
+            state[0], state[1], state[2], state[3],
+        )  # fmt: skip
+        if not cosine > STEEPEST:
+            errors[i] = np.nan
             J[i, 0], J[i, 1], J[i, 2], J[i, 3] = 0.0, 0.0, 0.0, 0.0
-            continue
-        root = np.sqrt(under)
-        residual[i] = length - (along - root)
-        J[i, 0], J[i, 1], J[i, 2], J[i, 3] = x + u / root, y + v / root, z + w / root, -radius / root
 
 
 @inner
-def _scale(residual, sizes, scale):  # type: ignore[no-untyped-def]
-    """Return the standard deviation by the median size of the residuals (n,) within 4 scales."""
+def _scale(errors, sizes, scale):  # type: ignore[no-untyped-def]
+    """Return the standard deviation by the median size of the errors (n,) within 4 scales."""
     count = 0
-    for i in range(len(residual)):
-        if abs(residual[i]) <= WINDOW * scale:
-            sizes[count] = abs(residual[i])
+    for i in range(len(errors)):
+        if abs(errors[i]) <= WINDOW * scale:
+            sizes[count] = abs(errors[i])
             count += 1
     return MAD_TO_SD * median(sizes, count) if count else scale
 
 
 @inner_ieee
-def _step(residual, J, considered, free, scale, step):  # type: ignore[no-untyped-def]
+def _step(errors, J, considered, free, scale, step):  # type: ignore[no-untyped-def]
     """Fill the Gauss-Newton step with Tukey's weights; False where the points do not determine a sphere."""
     N, L, near = np.zeros((4, 4)), np.zeros((4, 4)), 0
     for a in range(4):
         step[a] = 0.0
-    for i in range(len(residual)):
-        if not (considered[i] and abs(residual[i]) < TUKEY * scale):
+    for i in range(len(errors)):
+        if not (considered[i] and abs(errors[i]) < TUKEY * scale):
             continue
         near += 1
-        weight = (1.0 - (residual[i] / (TUKEY * scale)) ** 2) ** 2
+        weight = (1.0 - (errors[i] / (TUKEY * scale)) ** 2) ** 2
         for a in range(free):
-            step[a] += weight * J[i, a] * residual[i]
+            step[a] += weight * J[i, a] * errors[i]
             for b in range(a + 1):
                 N[a, b] += weight * J[i, a] * J[i, b]
     if near < LEAST or not factorise(N, free, DEFINITE, L):

@@ -5,7 +5,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from processor.geometry.sphere import sphere_cells
-from processor.space_frame.spheres.final_fit import NodesToFit, fit_final
+from processor.space_frame.points.sphere_crops import CropsWithRays
+from processor.space_frame.spheres.ball_fit import NodesToFit, fit_final
 from processor.space_frame.spheres.records import (
     CELLS,
     CENTRE_CHI2,
@@ -14,7 +15,6 @@ from processor.space_frame.spheres.records import (
     RMS,
     SCALE,
     STATIONS,
-    CropsWithRays,
     Masks,
     Priors,
     StochasticModel,
