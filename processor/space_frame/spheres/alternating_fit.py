@@ -258,18 +258,11 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
         centre_weight=problem.centre_weight,
     )
     undecided = np.ones(len(problem.nominal), bool) if before is None else ~before.final_size
-    choice = _choose(
-        NodesToChoose(
-            crops=problem.crops,
-            masks=masks,
-            model=model,
-            sizes=sizes,
-            vote_half_width=2.5 * sigma + 1.0,
-            first_reach_mm=params.first_reach_mm,
-            wanted=undecided,
-            threads=params.threads,
-        )
-    )
+    to_choose = NodesToChoose(
+        crops=problem.crops, masks=masks, model=model, sizes=sizes, vote_half_width=2.5 * sigma + 1.0,
+        first_reach_mm=params.first_reach_mm, wanted=undecided, threads=params.threads,
+    )  # fmt: skip
+    choice = _choose(to_choose)
     if before is not None:
         earlier = SizeChoice(before.states, before.sizes, before.energy, before.second, before.second_energy)
         for new, old in zip(choice, earlier, strict=True):
