@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -27,20 +28,34 @@ ROUND = 0.02  # of the radius: nothing but a ball departs from a sphere by less
 ROUGHEST = 0.05  # noise over radius, above which a ball is not distinguishable from a cluster of points
 LEAST_VISIBLE = 0.08  # share of the sphere
 LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radii
+FLATTEST = 2.2  # rms of residuals of what is likely a sphere, in scales; 2.7 where a volume fills the window evenly
 STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
 ABOUT = 0.4  # of the radius: points up to there outside are about a ball
 RADIUS_BAND = 0.15  # proposals within this share of a fixed radius
 EVIDENCE_CELLS = 12.0  # of a cloud thinned to one point a cell, in a ball's radius
 
 
-class NoiseLimits(NamedTuple):
-    """What residuals must keep to be noise: limits of :func:`is_noise`.
+class Grade(Enum):
+    """What the tests of a sphere state of a fit."""
 
+    NONE = 0
+    LIKELY = 1
+    CERTAIN = 2
+
+
+class Limits(NamedTuple):
+    """Limits of the tests of a sphere.
+
+    ``facing`` is the least median cosine between the cloud's own normals and the ball's, ``likely_facing`` that of what
+    is likely a sphere, None where this is no answer. Density is that of a ``thinned`` cloud, or of all its points.
     ``white`` is the least sd by the differences of neighbours, over that of all residuals: 0.7 where a shape is as
     large as the noise. ``shape`` is the largest rms of an ellipsoid's part of the residuals, in radii. Residuals below
     ``small``, in radii, are accepted even if they are systematic.
     """
 
+    facing: float
+    likely_facing: float | None
+    thinned: bool
     white: float
     shape: float
     small: float
@@ -52,6 +67,28 @@ def rows_of_cells(points: Floats, cell: float) -> Ints:
     size = max(cell, float(np.ptp(points, axis=0).max()) / (1 << 20))  # 21 bits per axis
     i, j, k = np.floor((points - lower) / size).astype(np.int64).T
     return np.sort(np.unique(i << 42 | j << 21 | k, return_index=True)[1])
+
+
+def grade(points: Floats, fit: RobustFit, least_points: int, radius_held: bool, limits: Limits) -> Grade:
+    """Return what a fit to points (n, 3) is: NONE, LIKELY (determined, about the cloud's own normals, no volume).
+
+    CERTAIN passes every test: converged, enough of it visible, smooth, round, and far denser than its surroundings.
+    """
+    ball, on, residual = fit.sphere, points[fit.inliers], fit.residuals[fit.inliers]
+    if not determined(points, fit, least_points) or not redundant(on, fit, radius_held):
+        return Grade.NONE
+    smooth = fit.scale <= ROUGHEST * ball.radius and misfit(on, residual, ball, fit.scale) <= largest_misfit(fit)
+    if not smooth and limits.likely_facing is None:
+        return Grade.NONE
+    rows = rows_of_cells(points, ball.radius / EVIDENCE_CELLS)
+    cosine = facing(points[rows], fit.inliers[rows], ball)
+    cloud = points[rows] if limits.thinned else points
+    stands_out = smooth and cosine >= limits.facing and denser(cloud, ball, STANDS_OUT, fit.scale)
+    if stands_out and is_noise(on, residual, ball, limits):
+        return Grade.CERTAIN
+    if limits.likely_facing is None or not cosine >= limits.likely_facing:
+        return Grade.NONE
+    return Grade.LIKELY if np.sqrt(np.mean(residual**2)) <= FLATTEST * fit.scale else Grade.NONE
 
 
 def determined(points: Floats, fit: RobustFit, least_points: int) -> bool:
@@ -102,7 +139,7 @@ def redundant(points: Floats, fit: RobustFit, radius_held: bool) -> bool:
     return True
 
 
-def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: NoiseLimits) -> bool:
+def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: Limits) -> bool:
     """Whether residuals (n,) of points (n, 3) are noise and not the shape of another body, or are small.
 
     Those of neighbours differ (von Neumann 1941), and an ellipsoid explains little of them.

@@ -12,21 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from enum import Enum
 from itertools import chain
 
 import numpy as np
 from numba import njit
 
-from processor.geometry import sphere_evidence
 from processor.geometry.sphere import MINIMAL, Sphere, canonical_order, through_four, visible_fraction
 from processor.geometry.sphere_evidence import (
-    EVIDENCE_CELLS,
     LEAST_VISIBLE,
     RADIUS_BAND,
     ROUGHEST,
-    STANDS_OUT,
-    NoiseLimits,
+    Grade,
+    Limits,
+    grade,
+    inlier_share,
     rows_of_cells,
 )
 from processor.geometry.sphere_fit import RobustFit, robust_fit
@@ -39,20 +38,11 @@ CELLS, MOST_SCORED = 40, 300  # along the diagonal of a crop, of which one point
 SMALLEST, LARGEST = 0.15, 0.7  # radius of a sphere, in diagonals of the crop
 EACH_BAND, MOST_LOOKED = 2, 300  # spheres tried, of those with the best scores
 APART = 0.2  # of their centres, in radii
-LIKELY_FACING, LEAST_FACING = 0.9, 0.94  # median cosine between the crop's own normals and the sphere's
-NOISE_LIMITS = NoiseLimits(white=0.7, shape=0.005, small=0.002)  # no shape is as large as the noise
-FLATTEST = 2.2  # rms of residuals of what is likely a sphere, in scales; 2.7 where a volume fills the window evenly
+# No shape is as large as the noise: what a crop holds beside its sphere is little.
+LIMITS = Limits(facing=0.94, likely_facing=0.9, thinned=False, white=0.7, shape=0.005, small=0.002)
 MOST_FITTED = 20_000  # points that proposals are fitted to; the one taken is fitted to all
 WIDER, LEAST_WIDER = 2.0, 1.05  # times the scale of a fit: allowed to the next one, and reached by it
 CHI2_95 = {3: 7.815, 4: 9.488}  # 95 % of chi-square, by its degrees of freedom
-
-
-class Grade(Enum):
-    """What the tests of a sphere state of a fit."""
-
-    NONE = 0
-    LIKELY = 1
-    CERTAIN = 2
 
 
 @dataclass(frozen=True)
@@ -79,15 +69,15 @@ def find(points: Floats, least_points: int, radius_mm: float | None, scanner: Fl
     likely = None
     for start, scale in chain.from_iterable(_starts(few.points, rng, sets, radius_mm) for sets in SETS):
         fit = few.fit(start, scale)
-        grade = Grade.NONE if fit is None else few.grade(fit)
-        if fit is not None and few is not crop and grade is not Grade.NONE:
+        outcome = Grade.NONE if fit is None else few.grade(fit)
+        if fit is not None and few is not crop and outcome is not Grade.NONE:
             fit = crop.fit(fit.sphere, fit.scale)
-            grade = Grade.NONE if fit is None else crop.grade(fit)
-        if fit is None or grade is Grade.NONE:
+            outcome = Grade.NONE if fit is None else crop.grade(fit)
+        if fit is None or outcome is Grade.NONE:
             continue
-        if grade is Grade.CERTAIN:
-            fit, grade = _widest(crop, fit)
-            return _in_place(crop, fit, order, origin, certain=grade is Grade.CERTAIN)
+        if outcome is Grade.CERTAIN:
+            fit, outcome = _widest(crop, fit)
+            return _in_place(crop, fit, order, origin, certain=outcome is Grade.CERTAIN)
         likely = likely or fit
     return None if likely is None else _in_place(crop, likely, order, origin, certain=False)
 
@@ -116,27 +106,8 @@ class _Crop:
         return robust_fit(self.points, start, scale, self.radius_mm, self.scanner)
 
     def grade(self, fit: RobustFit) -> Grade:
-        """Return NONE, LIKELY (determined, about the crop's own normals, no volume), or CERTAIN: passes every test."""
-        ball, on = fit.sphere, self.points[fit.inliers]
-        if not sphere_evidence.determined(self.points, fit, self.least_points):
-            return Grade.NONE
-        if not sphere_evidence.redundant(on, fit, self.radius_mm is not None):
-            return Grade.NONE
-        rows = rows_of_cells(self.points, ball.radius / EVIDENCE_CELLS)
-        facing = sphere_evidence.facing(self.points[rows], fit.inliers[rows], ball)
-        if not facing >= LIKELY_FACING:
-            return Grade.NONE
-        residual = fit.residuals[fit.inliers]
-        certain = (
-            facing >= LEAST_FACING
-            and fit.scale <= ROUGHEST * ball.radius
-            and sphere_evidence.denser(self.points, ball, STANDS_OUT, fit.scale)
-            and sphere_evidence.misfit(on, residual, ball, fit.scale) <= sphere_evidence.largest_misfit(fit)
-            and sphere_evidence.is_noise(on, residual, ball, NOISE_LIMITS)
-        )
-        if certain:
-            return Grade.CERTAIN
-        return Grade.LIKELY if np.sqrt(np.mean(residual**2)) <= FLATTEST * fit.scale else Grade.NONE
+        """Return what the fit is by the tests of a sphere."""
+        return grade(self.points, fit, self.least_points, self.radius_mm is not None, LIMITS)
 
 
 def _widest(crop: _Crop, first: RobustFit) -> tuple[RobustFit, Grade]:
@@ -147,7 +118,7 @@ def _widest(crop: _Crop, first: RobustFit) -> tuple[RobustFit, Grade]:
     Hausman (1978), but with the covariance of the narrower fit, which is above that of the difference. The covariance
     of the fit returned holds what it moved by. The grade is only likely if more points agree, but are too rough.
     """
-    fit, grade, free = first, Grade.CERTAIN, 4 if crop.radius_mm is None else 3
+    fit, outcome, free = first, Grade.CERTAIN, 4 if crop.radius_mm is None else 3
     while True:
         wider = crop.fit(fit.sphere, WIDER * fit.scale)
         if wider is None or wider.scale < LEAST_WIDER * fit.scale:
@@ -156,14 +127,14 @@ def _widest(crop: _Crop, first: RobustFit) -> tuple[RobustFit, Grade]:
         if moved @ np.linalg.pinv(fit.sphere.covariance[:free, :free]) @ moved > CHI2_95[free]:
             break
         if crop.grade(wider) is not Grade.CERTAIN:
-            grade = Grade.LIKELY if wider.scale > ROUGHEST * fit.sphere.radius else grade
+            outcome = Grade.LIKELY if wider.scale > ROUGHEST * fit.sphere.radius else outcome
             break
         fit = wider
-    return replace(fit, sphere=fit.sphere.widened_by(first.sphere.moved_to(fit.sphere))), grade
+    return replace(fit, sphere=fit.sphere.widened_by(first.sphere.moved_to(fit.sphere))), outcome
 
 
 def _in_place(crop: _Crop, fit: RobustFit, order: Ints, origin: Floats, *, certain: bool) -> Found:
-    share = sphere_evidence.inlier_share(crop.points, fit)
+    share = inlier_share(crop.points, fit)
     return Found(Ball(fit.in_place(len(order), order, origin), share), certain)
 
 

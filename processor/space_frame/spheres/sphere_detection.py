@@ -24,17 +24,13 @@ from processor.geometry.sphere_evidence import (
     BAND,
     EVIDENCE_CELLS,
     RADIUS_BAND,
-    ROUGHEST,
     STANDS_OUT,
-    NoiseLimits,
+    Grade,
+    Limits,
     denser,
-    determined,
     facing,
+    grade,
     inlier_share,
-    is_noise,
-    largest_misfit,
-    misfit,
-    redundant,
     rows_of_cells,
 )
 from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit, robust_fit
@@ -43,7 +39,8 @@ from processor.inner_kernels import inner_ieee
 from processor.model import Floats, Ints
 from processor.robust_statistics import MAD_TO_SD
 
-NOISE_LIMITS = NoiseLimits(white=0.5, shape=0.01, small=0.005)  # residuals of scanners are correlated
+# Residuals of scanners are correlated.
+LIMITS = Limits(facing=0.985, likely_facing=None, thinned=True, white=0.5, shape=0.01, small=0.005)
 LEAST_POINTS = 40  # on a ball; with fewer, balls occur anywhere by chance
 STEP = 1.5  # between scales
 FINEST = 20  # neighbours of a point within the smallest scale
@@ -56,8 +53,7 @@ SMALLEST, LARGEST = 0.6, 1.6  # radius of a proposal, in patch radii
 FLAT = 0.04  # thickness of a patch, in its radii, below which it is a plane or an edge
 REFINED = 40  # best proposals of each scale, which are tried
 REFINEMENTS = 3
-FACING = 0.985  # median cosine between the cloud's own normals and the ball's
-ROUGHLY_FACING = 0.9  # the same of a proposal
+ROUGHLY_FACING = 0.9  # median cosine between the cloud's own normals and those of a proposal
 NEAR = 1.7  # radii of a proposal: points about its centre that a ball is fitted to
 AROUND = 1.4  # radii of a ball: its surroundings
 LIKELY_MM = 1500.0  # larger balls are searched for only where there is none below
@@ -350,7 +346,7 @@ def _accepted(cloud: Cloud, start: Sphere, least_points: int, radius_mm: float |
             return None
         scale = max(2.0 * MAD_TO_SD * float(np.median(off[close])), LEAST_SCALE * start.radius)
         fit = robust_fit(points[near], start, scale, radius_mm, None if scanner is None else scanner[near])
-        if fit is None or not _stands_out(points[near], fit, least, radius_mm is not None):
+        if fit is None or grade(points[near], fit, least, radius_mm is not None, LIMITS) is not Grade.CERTAIN:
             return None
         moved = float(np.linalg.norm(fit.sphere.centre - start.centre))
         if moved + AROUND * fit.sphere.radius > NEAR * start.radius:
@@ -359,24 +355,6 @@ def _accepted(cloud: Cloud, start: Sphere, least_points: int, radius_mm: float |
     if fit is None:
         return None
     return Ball(fit.in_place(len(points), near, np.zeros(3)), inlier_share(points[near], fit))
-
-
-def _stands_out(points: Floats, fit: RobustFit, least_points: int, radius_held: bool) -> bool:
-    """Whether a fit is a ball: converged, enough of it visible, smooth, round, and far denser than its surroundings."""
-    ball = fit.sphere
-    if not determined(points, fit, least_points) or fit.scale > ROUGHEST * ball.radius:
-        return False
-    if not redundant(points[fit.inliers], fit, radius_held):
-        return False
-    on, residual = points[fit.inliers], fit.residuals[fit.inliers]
-    if misfit(on, residual, ball, fit.scale) > largest_misfit(fit):
-        return False
-    rows = rows_of_cells(points, ball.radius / EVIDENCE_CELLS)
-    if facing(points[rows], fit.inliers[rows], ball) < FACING:
-        return False
-    if not denser(points[rows], ball, STANDS_OUT, fit.scale):
-        return False
-    return is_noise(on, residual, ball, NOISE_LIMITS)
 
 
 # --- noise of the cloud ----------------------------------------------------------------------------------------------
