@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import Floats
+from processor.model import Floats, Ints
 
 # What the points of one view have in common, relative to other views: data sheets give a range error of 1 mm for up to
 # 130 m, which is taken as the limit of 95 %.
@@ -28,6 +28,16 @@ SURFACE_SD_MM = 0.3
 def scale_variance(length: float) -> float:
     """Return the variance, mm^2, of a length, mm, by the scale of the scanner."""
     return (SCALE_SD * length) ** 2
+
+
+def view_errors(ranges: Floats, cosines: Floats, view: Ints) -> Floats:
+    """Errors (n, v + 1), mm, of ranges (n,) by independent standard variates, along the rays.
+
+    One variate a view (n,), numbered from 0, is its offset and its scale. The last is the bias by incidence that all
+    surfaces have in common, of ``cosines`` (n,): a footprint is longer by 1 / cosine, and its mean range off with it.
+    """
+    of_view = np.sqrt(VIEW_SD_MM**2 + (SCALE_SD * ranges) ** 2)[:, None] * (view[:, None] == np.arange(view.max() + 1))
+    return np.column_stack([of_view, SURFACE_SD_MM * (1.0 / cosines - 1.0)])
 
 
 def pose_covariance(points: Floats) -> Floats:

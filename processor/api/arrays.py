@@ -105,8 +105,8 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     of every size do. Gauss-Newton with Tukey's biweight then fits it. The residual is the orthogonal distance, or with
     ``scanner`` the difference of ranges along the ray, which has no bias where a sphere is partly seen. The covariance
     is that of an M-estimator (Huber and Ronchetti 2009, "Robust Statistics", 2nd ed., Wiley, eq. 6.6), with what
-    beams at the limb add, of which the sphere takes only a part: without ``scanner`` the difference between both
-    residuals, for a sphere that is seen from one side; else the difference from a fit without the rays near the limb.
+    beams at the limb add, by a second fit (by the other residual, or without the rays near the limb), with what
+    neighbouring points share, and by the class of scanners 0.5 mm of range a view and 0.3 mm of bias by incidence.
 
     Parameters
     ----------

@@ -32,9 +32,18 @@ class Sphere:
         """Return the difference (4,) in mm of centre and radius of another sphere."""
         return np.append(other.centre - self.centre, other.radius - self.radius)
 
-    def widened_by(self, moved: Floats) -> Sphere:
-        """Return the sphere whose covariance holds a difference (4,) of centre and radius as one standard deviation."""
-        return replace(self, covariance=self.covariance + np.outer(moved, moved))
+    def widened_by(self, moved: Floats, by_chance: Floats | None = None) -> Sphere:
+        """Return the sphere whose covariance holds a difference (4,) of centre and radius as one standard deviation.
+
+        With a covariance ``by_chance`` (4, 4) only what is left of the difference beyond that of chance: the square of
+        the difference less its mean.
+        """
+        share = 1.0
+        if by_chance is not None:
+            free = np.flatnonzero(np.diag(by_chance) > 0.0)
+            chi2 = float(moved[free] @ np.linalg.pinv(by_chance[free[:, None], free], hermitian=True) @ moved[free])
+            share = max(0.0, 1.0 - len(free) / chi2) if chi2 > 0.0 else 0.0
+        return replace(self, covariance=self.covariance + share * np.outer(moved, moved))
 
     def residuals(self, points: Floats) -> Floats:
         """Signed distances (n,) in mm of points (n, 3) from the surface, outside positive."""

@@ -11,7 +11,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry.linalg_small import eigen
-from processor.geometry.sphere import Sphere, sphere_cells, visible_fraction
+from processor.geometry.sphere import Sphere, canonical_order, sphere_cells, visible_fraction
 from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit
 from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd
@@ -147,8 +147,10 @@ def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: Limits) -> 
     sd = float(np.sqrt(np.mean(residual**2)))
     if sd <= limits.small * ball.radius:
         return True
-    # By direction: in space the nearest of several at about one distance is that of the most similar residual.
-    rows = np.unique(points, axis=0, return_index=True)[1]  # of equal points the nearest is no neighbour
+    # By direction: in space the nearest of several at about one distance is that of the most similar residual. Of equal
+    # points the nearest is no neighbour.
+    order = canonical_order(points)
+    rows = order[np.append(True, (points[order[1:]] != points[order[:-1]]).any(axis=1))]  # of equal points the first
     radial = _radial(points[rows], ball)
     nearest = cKDTree(radial).query(radial, k=2)[1][:, 1]
     if np.sqrt(np.mean((residual[rows] - residual[rows][nearest]) ** 2) / 2.0) < limits.white * sd:

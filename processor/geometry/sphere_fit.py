@@ -28,11 +28,12 @@ WORST_CONDITION = 1e12
 NO_FIT, FITTED, CONVERGED = range(3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RobustFit:
     """The sphere, the points (n,) of weight > 0, the scale (sd) of their residuals and whether the fit converged.
 
-    ``residuals`` (n,), mm, are those of the fit: distances or ranges, NaN where a ray misses the sphere.
+    ``residuals`` (n,), mm, are those of the fit: distances or ranges, NaN where a ray misses the sphere, and
+    ``derivatives`` (n, 4) theirs by centre and radius.
     """
 
     sphere: Sphere
@@ -40,13 +41,14 @@ class RobustFit:
     scale: float
     converged: bool
     residuals: Floats
+    derivatives: Floats
 
     def in_place(self, count: int, rows: Ints, origin: Floats) -> RobustFit:
         """Return the fit as one to ``count`` points of which it had these rows (n,), less the origin."""
-        inliers, residuals = np.zeros(count, bool), np.full(count, np.nan)
-        inliers[rows], residuals[rows] = self.inliers, self.residuals
+        inliers, residuals, derivatives = np.zeros(count, bool), np.full(count, np.nan), np.zeros((count, 4))
+        inliers[rows], residuals[rows], derivatives[rows] = self.inliers, self.residuals, self.derivatives
         sphere = replace(self.sphere, centre=self.sphere.centre + origin)
-        return replace(self, sphere=sphere, inliers=inliers, residuals=residuals)
+        return replace(self, sphere=sphere, inliers=inliers, residuals=residuals, derivatives=derivatives)
 
 
 def robust_fit(
@@ -79,7 +81,10 @@ def robust_fit(
     state = np.append(np.zeros(3), start.radius if radius_mm is None else radius_mm)
     free = 4 if radius_mm is None else 3
     errors, J = np.empty(len(points)), np.empty((len(points), 4))
-    local, rays = np.ascontiguousarray(points - origin), rays_of(points, scanner)
+    local, rays = np.ascontiguousarray(points - origin), np.zeros((len(points), 3))
+    if scanner is not None:
+        rays = np.ascontiguousarray(points - scanner)
+        rays /= np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
     outcome, scale = _iterate(local, rays, state, free, scale_mm, start.radius, errors, J)
     if outcome == NO_FIT:
         return None
@@ -87,35 +92,25 @@ def robust_fit(
     covariance[:free, :free] = _sandwich(J[:, :free], errors / scale, scale)
     inliers = np.asarray(np.abs(errors) < TUKEY * scale, bool)
     sphere = Sphere(origin + state[:3], float(state[3]), covariance)
-    return RobustFit(sphere, inliers, scale, outcome == CONVERGED, errors)
+    return RobustFit(
+        sphere=sphere,
+        inliers=inliers,
+        scale=scale,
+        converged=outcome == CONVERGED,
+        residuals=errors,
+        derivatives=J,
+    )
 
 
-def bound(points: Floats, fit: RobustFit, radius_held: bool = False, scanner: Floats | None = None) -> Floats:
-    """Cramér-Rao bound (4, 4) of the covariance of an unbiased estimate from the points of a fit.
+def bound(fit: RobustFit, free: int) -> Floats:
+    """Cramér-Rao bound (4, 4) of the covariance of an unbiased estimate of ``free`` unknowns from the points of a fit.
 
-    Every inlier has full weight and normal noise of the fit's scale; ``points`` (n, 3) and ``scanner`` (n, 3) are those
-    that were fitted. NaN where the points do not determine the sphere.
+    Every inlier has full weight and normal noise of the fit's scale. NaN where the points do not determine the sphere.
     """
-    state = np.append(np.zeros(3), fit.sphere.radius)
-    on = points[fit.inliers]
-    errors, J = np.empty(len(on)), np.empty((len(on), 4))
-    rays = rays_of(on, None if scanner is None else scanner[fit.inliers])
-    _linearise(on - fit.sphere.centre, rays, state, errors, J)
-    free = 3 if radius_held else 4
-    J = J[np.isfinite(errors), :free]
-    covariance = np.zeros((4, 4))
-    N = J.T @ J
+    J = fit.derivatives[fit.inliers, :free]
+    N, covariance = J.T @ J, np.zeros((4, 4))
     covariance[:free, :free] = fit.scale**2 * np.linalg.inv(N) if np.linalg.cond(N) < WORST_CONDITION else np.nan
     return covariance
-
-
-def rays_of(points: Floats, scanner: Floats | None) -> Floats:
-    """Return unit rays (n, 3) to points (n, 3) from where each was seen (n, 3); 0 where that is unknown."""
-    if scanner is None:
-        return np.zeros((len(points), 3))
-    rays = points - scanner
-    rays /= np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
-    return np.ascontiguousarray(rays)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

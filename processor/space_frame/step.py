@@ -103,12 +103,13 @@ def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
     if not len(result.balls):
         return replace(result, method=params.method, reasons=(*before, *result.reasons))
     reasons = (*before, *result.reasons, reason("spheres.by-class", sd=scanner_class_errors.VIEW_SD_MM))
-    balls = _with_class(result.balls, radius_known=scene.frame is None and not np.isnan(params.radius_mm))
+    # Those of a search have it already.
+    balls = result.balls if scene.frame is None else _with_class(result.balls)
     return replace(result, method=params.method, reasons=reasons, balls=balls)
 
 
-def _with_class(balls: Balls, radius_known: bool) -> Balls:
+def _with_class(balls: Balls) -> Balls:
     """Add what the views of a ball have in common, by the scanner's class: a ball alone does not show it."""
-    variance = scanner_class_errors.VIEW_SD_MM**2 * np.array([1.0, 1.0, 1.0, 0.0 if radius_known else 1.0])
+    variance = np.full(4, scanner_class_errors.VIEW_SD_MM**2)
     lowest_sd = np.sqrt(balls.lowest_sd**2 + variance[2:].sum())  # of the centre's height and the radius
     return replace(balls, covariance=balls.covariance + np.diag(variance), lowest_sd=lowest_sd)

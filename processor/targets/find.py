@@ -10,18 +10,24 @@ import numpy as np
 from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
 from processor.model import Control, Floats, Ints, Reason, Scene, TargetKind, Targets, reason
-from processor.space_frame.result import Balls
-from processor.targets import checkerboard, naming, spheres
+from processor.scene_cloud import MergedCloud
+from processor.space_frame.params import Params
+from processor.space_frame.result import Balls, Flag
+from processor.space_frame.spheres import search_without_design
+from processor.targets import checkerboard, naming
 from processor.targets.checkerboard import Checkerboard
 from processor.views import Views, views
 
 LEAST_SD_MM = 0.05  # of a target's place: what a fit does not see, as the sheet's flatness
-# Of the ranges of a view: it moves all of its targets along their rays, and no fit of one target shows it.
+MOST_SPHERES = 30  # of a view
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Found:
-    """A target in a scan, in the scan's frame; ``station`` as in Control."""
+    """A target in a scan, in the scan's frame; ``station`` as in Control.
+
+    ``sd`` has the error that all ranges of a view share: no fit of one target shows it.
+    """
 
     kind: TargetKind
     scan: int
@@ -30,11 +36,6 @@ class _Found:
     sd: float
     points: int
     fit: float
-
-    @property
-    def with_view_sd(self) -> float:
-        """Standard deviation of the place, with the error that all ranges of its view share."""
-        return float(np.hypot(max(self.sd, LEAST_SD_MM), scanner_class_errors.VIEW_SD_MM))
 
 
 def with_targets(scene: Scene) -> Scene:
@@ -56,9 +57,10 @@ def with_targets(scene: Scene) -> Scene:
                     looked_at = checkerboard.MOST_SEEDS
                     remarks.append(reason("targets.most-places", scan=scan.name, places=looked_at, left=left_out))
             if not np.isnan(search.sphere_radius_mm):
-                balls, stopped = spheres.find(points, scanner, search.sphere_radius_mm)
-                found += [_of_sphere(balls, k, row, station, scan.origin) for k in spheres.sure(balls)]
-                if stopped:
+                balls = _spheres(points, scanner, search.sphere_radius_mm)
+                sure = [k for k, flag in enumerate(balls.flag) if flag is Flag.OK]
+                found += [_of_sphere(balls, k, row, station, scan.origin) for k in sure]
+                if len(balls) >= MOST_SPHERES:
                     remarks.append(reason("targets.most-spheres", scan=scan.name, spheres=len(balls)))
     names = _names(scene, found, remarks)
     return replace(
@@ -67,25 +69,36 @@ def with_targets(scene: Scene) -> Scene:
             found,
             name=tuple("" if row < 0 or scene.control is None else scene.control.ids[row] for row in names.tolist()),
             places=np.array([one.place for one in found]).reshape(-1, 3),
-            sd=np.array([one.with_view_sd for one in found]),
+            sd=np.array([one.sd for one in found]),
         ),
         target_remarks=tuple(remarks),
         control=_with_sightings(scene.control, found, names),
     )
 
 
+def _spheres(points: Floats, scanner: Floats | None, radius_mm: float) -> Balls:
+    """Return the spheres among points (n, 3), flagged ones too, by the search of step ``spheres``.
+
+    ``scanner`` (3,) is where the points were seen from, None if not known.
+    """
+    seen_from = None if scanner is None else np.broadcast_to(scanner, points.shape)
+    params = Params(radius_mm=radius_mm, max_balls=MOST_SPHERES)
+    return search_without_design.search(MergedCloud(points, np.zeros(3), seen_from), params).balls
+
+
 def _of_board(one: Checkerboard, scan: int, station: int, origin: Floats) -> _Found:
+    sd = float(np.hypot(max(one.sd, LEAST_SD_MM), scanner_class_errors.VIEW_SD_MM))
     return _Found(
-        kind=TargetKind.CHECKERBOARD, scan=scan, station=station, place=one.centre + origin, sd=one.sd,
+        kind=TargetKind.CHECKERBOARD, scan=scan, station=station, place=one.centre + origin, sd=sd,
         points=one.points, fit=one.fit,
     )  # fmt: skip
 
 
 def _of_sphere(balls: Balls, row: int, scan: int, station: int, origin: Floats) -> _Found:
+    sd = float(np.sqrt(np.linalg.eigvalsh(balls.covariance[row, :3, :3])[-1]))
     return _Found(
         kind=TargetKind.SPHERE, scan=scan, station=station, place=balls.centres[row] + origin,
-        sd=float(np.sqrt(np.linalg.eigvalsh(balls.covariance[row, :3, :3])[-1])), points=int(balls.points[row]),
-        fit=float("nan"),
+        sd=max(sd, LEAST_SD_MM), points=int(balls.points[row]), fit=float("nan"),
     )  # fmt: skip
 
 
@@ -142,5 +155,5 @@ def _with_sightings(control: Control | None, found: list[_Found], names: Ints) -
         scan=np.concatenate([control.scan, np.array([one.scan for _, one in new], np.int64)]),
         station=np.concatenate([control.station, np.array([one.station for _, one in new], np.int64)]),
         seen=np.concatenate([control.seen, np.array([one.place for _, one in new]).reshape(-1, 3)]),
-        seen_sd=np.concatenate([control.seen_sd, np.array([one.with_view_sd for _, one in new])]),
+        seen_sd=np.concatenate([control.seen_sd, np.array([one.sd for _, one in new])]),
     )

@@ -130,7 +130,8 @@ def _widest(crop: _Crop, first: RobustFit) -> tuple[RobustFit, Grade]:
             outcome = Grade.LIKELY if wider.scale > ROUGHEST * fit.sphere.radius else outcome
             break
         fit = wider
-    return replace(fit, sphere=fit.sphere.widened_by(first.sphere.moved_to(fit.sphere))), outcome
+    moved = first.sphere.moved_to(fit.sphere)
+    return replace(fit, sphere=fit.sphere.widened_by(moved, first.sphere.covariance)), outcome
 
 
 def _in_place(crop: _Crop, fit: RobustFit, order: Ints, origin: Floats, *, certain: bool) -> Found:
@@ -180,7 +181,10 @@ def _score(points, centres, radii, band, scores):  # type: ignore[no-untyped-def
     """Fill the sums of 1 - u^2 over points (n, 3), u their distances from each sphere's surface in half-widths."""
     for s in range(len(radii)):
         width = band * radii[s]
+        nearest, farthest = (radii[s] - width) ** 2, (radii[s] + width) ** 2
         for i in range(len(points)):
             x, y, z = points[i, 0] - centres[s, 0], points[i, 1] - centres[s, 1], points[i, 2] - centres[s, 2]
-            u = (np.sqrt(x * x + y * y + z * z) - radii[s]) / width
-            scores[s] += max(1.0 - u * u, 0.0)
+            square = x * x + y * y + z * z
+            if nearest < square < farthest:  # of few points alone the root is taken
+                u = (np.sqrt(square) - radii[s]) / width
+                scores[s] += max(1.0 - u * u, 0.0)

@@ -60,7 +60,10 @@ def test_a_sphere_of_a_target():
     fit = processor.fit_sphere(np.vstack([points, clutter]))
     sd = np.sqrt(np.diag(fit.covariance))
     assert fit.status is Status.OK
-    assert sd.max() < 0.1
+    # By the class of scanners ranges are 0.5 mm off, which moves the centre along x, and 0.3 mm by incidence, as a
+    # larger radius farther away is. The rest is the noise of 1400 points.
+    assert sd[[0, 3]] == pytest.approx([np.hypot(0.5, 0.3), 0.3], rel=0.1)
+    assert sd[1:3].max() < 0.1
     # Four standard deviations, and what is left of clutter within the noise of the sphere: 0.1 mm, a fifth of it.
     assert (np.abs(fit.centre - CENTRE) < 4.0 * sd[:3] + 0.1).all()
     assert abs(fit.radius - RADIUS) < 4.0 * sd[3] + 0.1
@@ -99,8 +102,9 @@ def test_interval_of_a_sphere_seen_from_all_around_stays_as_it_is():
     normals = rng.normal(size=(4000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     fit = processor.fit_sphere(CENTRE + (RADIUS + rng.normal(0.0, 1.0, (4000, 1))) * normals)
-    # The mean of 4000 distances, a little less efficient by Tukey's weights.
-    assert 1.0 <= np.sqrt(fit.covariance[3, 3]) / (1.0 / np.sqrt(4000.0)) < 1.1
+    # The mean of 4000 distances, a little less efficient by Tukey's weights; the 0.5 mm of the class of scanners; and
+    # what correlation may add, which 90 cells alone bound: up to half of the sd where there is none.
+    assert 1.0 <= np.sqrt(fit.covariance[3, 3] - 0.5**2) / (1.0 / np.sqrt(4000.0)) < 1.5
 
 
 def test_a_sphere_without_noise():

@@ -13,7 +13,14 @@ RADIUS = 50.0
 def redundant_on(directions, scale, radius_held):
     points = np.array([1.0, 2.0, 3.0]) + RADIUS * directions
     ball = Sphere(np.array([1.0, 2.0, 3.0]), RADIUS, np.eye(4))
-    fit = RobustFit(ball, np.ones(len(points), bool), scale, True, np.zeros(len(points)))
+    fit = RobustFit(
+        sphere=ball,
+        inliers=np.ones(len(points), bool),
+        scale=scale,
+        converged=True,
+        residuals=np.zeros(len(points)),
+        derivatives=np.zeros((len(points), 4)),
+    )
     return redundant(points, fit, radius_held)
 
 

@@ -14,7 +14,7 @@ from processor.model import Control, InputError, Scan, Scene, Stations, TargetSe
 from processor.report.stitching import targets as report
 from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
-from processor.targets import checkerboard, find, naming, spheres
+from processor.targets import checkerboard, find, naming
 from processor.targets.summary import summary
 from tests.support.clouds.target_clouds import board
 
@@ -340,7 +340,7 @@ def test_places_and_spheres_beyond_the_search_limit_are_reported(monkeypatch):
     found = find.with_targets(scene)
     (remark,) = found.target_remarks
     assert (remark.code, remark.values["places"]) == ("targets.most-places", 2)
-    monkeypatch.setattr(spheres, "MOST", 1)
+    monkeypatch.setattr(find, "MOST_SPHERES", 1)
     rng = np.random.default_rng(3)
     unit = rng.standard_normal((2, 900, 3))
     unit /= np.linalg.norm(unit, axis=2)[..., None]

@@ -6,11 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from processor.adjustment import residual_correlation, scanner_class_errors
 from processor.adjustment.scanner_class_errors import VIEW_SD_MM
+from processor.distinct_rows import distinct_points
 from processor.geometry import coincident_points
-from processor.geometry.sphere import Sphere, algebraic
+from processor.geometry.sphere import Sphere, algebraic, sphere_cells
 from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit, bound, robust_fit
 from processor.model import NORMAL_95, Floats, Reason, Status, Tolerance, reason
+from processor.robust_statistics import TUKEY
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Flag, Result
@@ -28,7 +31,9 @@ from processor.space_frame.spheres.assessment import (
 COARSE_MM = 1.0  # rounding to it adds noise of 0.3 mm, as much as that of a good scanner
 LEAST_ONE_SIDED = 0.2  # length of the mean of normals; 0.5 of half a sphere, 0 of one seen from all around
 FAR_RADII = 1e4
+GRAZING_COS = 1e-3  # least cosine to the side that a sphere was seen from: its inverse must be finite
 STEEP_COS = 0.5  # of the incidence of a ray
+MOST_CELLS = 60  # of a sphere, else half as many: enough for correlations, and the time goes with the cube
 FIRST_SCALE = 2.0  # of the second fit, in scales of the first: ranges scatter more than distances
 CHANCE = 3.29  # standard deviations: 0.1 % of right radii are farther from a measured one
 
@@ -110,10 +115,15 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     row = replace(row, reasons=(*row.reasons, *doubts, *remarks))
     if params.method == "least-squares":
         return row
-    seen_from = None if cloud.scanner is None else cloud.scanner[candidate.fit.inliers]
-    stations = 0 if seen_from is None else len(np.unique(seen_from, axis=0))
-    least = bound(cloud.points, candidate.fit, _held(params) is not None, cloud.scanner)
-    return replace(row, stations=stations, bound=least, formal=candidate.fit.sphere.covariance)
+    free = 4 if _held(params) is None else 3
+    shared, stations = _by_neighbours_and_views(cloud, candidate.fit, free)
+    return replace(
+        row,
+        sphere=replace(sphere, covariance=sphere.covariance + shared),
+        stations=stations,
+        bound=bound(candidate.fit, free),
+        formal=candidate.fit.sphere.covariance,
+    )
 
 
 def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Sphere | None:
@@ -146,7 +156,44 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Sphere | 
     again = robust_fit(off[near], start, FIRST_SCALE * fit.scale, ball.radius if radius_held else None, seen_from)
     if again is None or not again.converged:
         return None
-    return ball.widened_by(start.moved_to(again.sphere))
+    # From the side of the points the noise is the same; fewer rays move the sphere by chance as well.
+    by_chance = None if cloud.scanner is None else again.sphere.covariance
+    return ball.widened_by(start.moved_to(again.sphere), by_chance)
+
+
+def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int) -> tuple[Floats, int]:
+    """Return what a fit's covariance (4, 4) lacks: errors that neighbouring points share, and those of their views.
+
+    The second is the number of views, 0 where it is not known.
+    Where the scanner is not known a sphere that is seen from one side was seen by one view from there. Of one that was
+    seen from all around nothing is known of the views: what they have in common is as likely along each axis.
+    """
+    on, added = fit.inliers, np.zeros((4, 4))
+    J, away = fit.derivatives[on, :free], cloud.points[on] - fit.sphere.centre
+    normals = away / np.linalg.norm(away, axis=1)[:, None]
+    weights = (1.0 - (fit.residuals[on] / (TUKEY * fit.scale)) ** 2) ** 2
+    cells = sphere_cells(away, np.zeros(3))
+    if len(np.unique(cells)) > MOST_CELLS:
+        cells //= 2
+    added[:free, :free] = residual_correlation.added_covariance(J, fit.residuals[on], weights, normals, cells)
+    if cloud.scanner is None:
+        side = normals.mean(axis=0)
+        if np.linalg.norm(side) < LEAST_ONE_SIDED:
+            added[:free, :free] += scanner_class_errors.VIEW_SD_MM**2 * np.eye(free)
+            return added, 0
+        cosines = np.maximum(normals @ side / np.linalg.norm(side), GRAZING_COS)
+        errors = scanner_class_errors.view_errors(np.zeros(len(J)), cosines, np.zeros(len(J), np.int64))
+        errors, stations = errors * cosines[:, None], 0  # along the normals
+    else:
+        seen_from = cloud.scanner[on]
+        one = (seen_from == seen_from[0]).all()  # without the sort that several need
+        view = np.zeros(len(J), np.int64) if one else distinct_points(seen_from)[1]
+        stations = int(view.max()) + 1
+        ranges = np.linalg.norm(cloud.points[on] - seen_from, axis=1)
+        errors = scanner_class_errors.view_errors(ranges, 1.0 / fit.derivatives[on, 3], view)
+    moved = np.linalg.solve(J.T @ J, J.T @ errors)
+    added[:free, :free] += moved @ moved.T
+    return added, stations
 
 
 def _by_free_radius(cloud: MergedCloud, fit: RobustFit) -> tuple[Floats, tuple[Reason, ...], bool]:
