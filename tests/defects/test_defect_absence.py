@@ -1,10 +1,13 @@
 """Missing material in clouds merged from unknown stations; points and shadows in closed form."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import trimesh
 from scipy.stats import poisson
 
-from processor.defects import regions
+from processor.defects import regions, surface_charts
 from processor.defects import step as defects_step
 from processor.model import Scan, Scene, StructureDesign
 from tests.support.clouds.plate_rows import box
@@ -167,3 +170,20 @@ def test_the_bound_of_a_poisson_number_is_above_its_tail():
         assert tail <= bound < 10.0 * tail
     assert regions.chernoff(3.0, 4.0, more=False) == regions.chernoff(3.0, 2.0, more=True) == 0.0
     assert regions.chernoff(5.0, 0.0, more=False) == 5.0
+
+
+@pytest.mark.parametrize(("of_chance", "found"), [(0.99, 0), (1.01, 1)])
+def test_an_empty_cell_is_missing_where_it_is_rarer_than_the_alarms_that_are_allowed(of_chance, found):
+    """Of 12 points expected on a cell of 20 mm 6 are counted on: none of them come by chance with exp(-6)."""
+    plate = trimesh.creation.box([200.0, 100.0, 20.0])
+    surface = surface_charts.of_mesh(np.array(plate.vertices), np.array(plate.faces, np.int64), 20.0)
+    count, cell = (
+        np.full(len(surface.share), 12),
+        int(np.argmin(np.abs(surface.centres - [10.0, 10.0, 10.0]).sum(axis=1))),
+    )
+    count[cell] = 0
+    field = SimpleNamespace(count=count, stray=0, inner=np.ones(len(count)))
+    chance = np.exp(-6.0) / 20.0**2  # of one mm2
+    missing = regions.missing(field, np.full(len(count), 12.0), surface, of_chance * chance)
+    expected = [(0, [cell], pytest.approx(np.sqrt(12.0)), pytest.approx(chance))]  # z^2 / 2 = 6
+    assert [(one.sign, list(one.cells), one.z, one.chance) for one in missing] == expected[:found]

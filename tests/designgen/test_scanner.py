@@ -105,6 +105,27 @@ def test_hits_lie_on_spheres_tubes_and_sleeves(seen):
     assert {"sleeve", "cone"} <= {surfaces.surface_names[k] for k in np.unique(returns.surface)}
 
 
+def test_the_process_hole_is_a_bore_of_20_mm_that_ends_35_mm_below_the_surface_of_the_ball():
+    """Seen from straight below: its wall begins where the ball ends, and there is no ball within it."""
+    frame = frame_of_balls()
+    node = int(np.argmax(frame.radii))
+    centre, R = frame.centres[node], frame.radii[node]
+    T = standing(*(centre - [0.0, 0.0, R + 60.0]))
+    surfaces = surfaces_of(frame)
+    returns = scan(surfaces, T, dataclasses.replace(QUIET, min_range_mm=0.0), step_mrad=16.0)
+    of_node = returns.part == node
+    wall, floor, ball = (
+        (in_scene(T, returns.hits) - centre)[of_node & named(surfaces, returns, name)]
+        for name in ("process hole", "process hole floor", "ball")
+    )
+    assert min(len(wall), len(floor), len(ball)) > 50
+    off = [np.hypot(*points[:, :2].T) for points in (wall, floor, ball)]
+    np.testing.assert_allclose(off[0], 10.0, atol=EXACT_MM)
+    np.testing.assert_allclose(floor[:, 2], 35.0 - R, atol=EXACT_MM)
+    assert wall[:, 2].min() > -np.sqrt(R**2 - 10.0**2) - EXACT_MM
+    assert off[1].max() < 10.0 < off[2][ball[:, 2] < 0.0].min()
+
+
 def test_points_lie_at_the_angles_of_the_encoders_with_their_errors(seen):
     _, _, _, returns = seen
     np.testing.assert_allclose(
@@ -427,7 +448,7 @@ def test_only_flat_faces_are_intersected_by_their_nets():
         return np.stack([2000.0 * p, 500.0 + 300.0 * p, 1000.0 * q + 100.0 * p * q], axis=1)
 
     def dented(p, q):
-        return flat(p, q) + np.outer(30.0 * np.exp(-((p - 0.3) ** 2 + (q - 0.4) ** 2) / 0.06**2), [0.0, 1.0, 0.0])
+        return flat(p, q) + np.outer(30.0 * np.exp(-((p - 0.3) ** 2 + (q - 0.4) ** 2) / 0.01**2), [0.0, 1.0, 0.0])
 
     def wavy(p, q):
         return flat(p, q) + np.outer(1e-4 * np.sin(np.pi * 8.0 * p), [0.0, 1.0, 0.0])

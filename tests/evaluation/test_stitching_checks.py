@@ -48,6 +48,22 @@ def test_poses_by_control_points_are_checked_in_the_control_frame():
     assert controlled["pose components within their 95 % intervals"] == pytest.approx(100.0 * 5 / 6)
 
 
+def test_a_datum_fit_weights_rotations_by_the_displacement_that_they_cause():
+    """All scans turned by 0.1 mrad on the spot: 6 places of a station hold against 4 that turn, a fit by 2 / 5 of it.
+
+    A shift outward by 0.15 mm is left; across it are 0.4 * 0.1 mrad * 5 m = 0.2 mm, which makes 0.25 mm.
+    """
+    places = np.array([[5e3, 0.0, 0.0], [0.0, 5e3, 0.0], [-5e3, 0.0, 0.0], [0.0, -5e3, 0.0], np.zeros(3)])
+    true, T = (
+        np.array([stitch_clouds.pose(place, np.degrees(turn)) for place in (1.0 + out / 5e3) * places])
+        for turn, out in ((0.0, 0.0), (1e-4, 0.15))
+    )
+    checks = checks_of(T, true, ("ok",) * 5)
+    assert checks["rotations after datum fit, max"] == pytest.approx(0.06, abs=1e-5)  # squares of angles are left out
+    assert checks["station positions after datum fit, max"] == pytest.approx(0.25, abs=1e-5)
+    assert checks["station positions after datum fit, rms"] == pytest.approx(0.25 * np.sqrt(4.0 / 5.0), abs=1e-5)
+
+
 def test_true_pose_of_a_tilted_scan_maps_its_points_to_their_places():
     """Points p of a scan with a tilt w are p + w x p: a pose turned back by w brings them to their places."""
     T = np.stack([stitch_clouds.pose([3000.0, -2000.0, 1500.0], 40.0)] * 2)

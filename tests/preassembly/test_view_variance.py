@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm, t
 
 from processor.adjustment import scanner_class_errors
 from processor.preassembly.ends import view_variance
@@ -130,6 +131,20 @@ def test_noise_alone_is_no_difference_between_viewpoints():
     found = [view_variance.variances([plate(rng, 0.0) for _ in range(16)]) for _ in range(10)]
     assert not any(one.evident for one in found)
     assert np.sqrt(np.mean([one.level for one in found])) < 0.03  # less than the noise of a thickness: 0.04
+
+
+def test_three_plates_alike_have_the_variance_of_one_difference():
+    """By hand: levels of 20.0, 20.3 and 20.9 mm are 0.42 mm^2 about their mean, of which noise makes 2 * 0.05 mm^2."""
+    values = [(20.0, 0.3, -0.2), (20.3, -0.5, 0.6), (20.9, 0.4, 0.1)]
+    found = view_variance.variances(
+        [view_variance.Thickness(np.array(value), np.array([0.05, 0.02, 0.03]), (1.5, 0.5)) for value in values]
+    )
+    factor = (t.ppf(0.975, [1.0, 1.5]) / norm.ppf(0.975)) ** 2  # one difference counts as one, half as many of pairs
+    assert (found.known, found.evident) == (True, False)
+    assert found.level == pytest.approx(1.5 * factor[0] * (0.42 - 0.10) / 2.0)
+    assert found.ring == pytest.approx(found.level)
+    assert found.along == pytest.approx(factor[1] * (0.50 - 0.06) / 6.0)
+    assert found.across == pytest.approx(factor[1] * (0.41 - 0.09) / 6.0)
 
 
 def test_a_plate_of_which_one_side_was_seen_has_no_thickness():
