@@ -172,18 +172,21 @@ def test_the_bound_of_a_poisson_number_is_above_its_tail():
     assert regions.chernoff(5.0, 0.0, more=False) == 5.0
 
 
-@pytest.mark.parametrize(("of_chance", "found"), [(0.99, 0), (1.01, 1)])
-def test_an_empty_cell_is_missing_where_it_is_rarer_than_the_alarms_that_are_allowed(of_chance, found):
-    """Of 12 points expected on a cell of 20 mm 6 are counted on: none of them come by chance with exp(-6)."""
+@pytest.mark.parametrize(("expected", "wide"), [(12.0, 1), (0.7, 3)])
+def test_empty_cells_are_missing_where_they_are_rarer_than_the_alarms_that_are_allowed(expected, wide):
+    """Of the points expected on a cell half are counted on: none of them come by chance with exp(-expected / 2).
+
+    Where less than 6 points are expected on a cell, it is judged with those about it: of 0.7 with 3 by 3.
+    """
     plate = trimesh.creation.box([200.0, 100.0, 20.0])
     surface = surface_charts.of_mesh(np.array(plate.vertices), np.array(plate.faces, np.int64), 20.0)
-    count, cell = (
-        np.full(len(surface.share), 12),
-        int(np.argmin(np.abs(surface.centres - [10.0, 10.0, 10.0]).sum(axis=1))),
-    )
-    count[cell] = 0
+    off = np.abs(surface.centres - [10.0, 0.0, 10.0])
+    cell = int(np.argmin(off.sum(axis=1)))
+    count = np.where((off.max(axis=1) < 10.0 * wide) & (surface.outward[:, 2] > 0.5), 0.0, expected)
+    assert (count == 0.0).sum() == wide**2
     field = SimpleNamespace(count=count, stray=0, inner=np.ones(len(count)))
-    chance = np.exp(-6.0) / 20.0**2  # of one mm2
-    missing = regions.missing(field, np.full(len(count), 12.0), surface, of_chance * chance)
-    expected = [(0, [cell], pytest.approx(np.sqrt(12.0)), pytest.approx(chance))]  # z^2 / 2 = 6
-    assert [(one.sign, list(one.cells), one.z, one.chance) for one in missing] == expected[:found]
+    chance = np.exp(-0.5 * expected) / 20.0**2  # of one mm2
+    for alarms, found in ((0.99 * chance, 0), (1.01 * chance, 1)):
+        missing = regions.missing(field, np.full(len(count), expected), surface, alarms)
+        one = [(0, [cell], pytest.approx(np.sqrt(expected)), pytest.approx(chance))]  # z^2 / 2 = expected / 2
+        assert [(region.sign, list(region.cells), region.z, region.chance) for region in missing] == one[:found]

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import poisson
 
 from processor.adjustment import scanner_class_errors
-from processor.defects import alignment, component_shapes, detect, shape_models, step, surface_charts
+from processor.defects import alignment, component_shapes, detect, measures, shape_models, step, surface_charts
 from processor.defects.component_shapes import ComponentShape, SignificantShape
 from processor.defects.movement import moved_bodies
+from processor.defects.regions import Region
 from processor.geometry import rigid
 from processor.model import DesignBodies
 from processor.scan_folder import cad
@@ -112,6 +113,32 @@ def test_the_corrected_pose_takes_back_the_movement_of_the_whole():
     turned = Rotation.from_rotvec(moved.whole[:3]).apply(where - moved.centre) + moved.centre + moved.whole[3:]
     back = alignment.corrected_pose(rigid.transform(np.eye(3), np.zeros(3)), moved)
     np.testing.assert_allclose(rigid.apply(back, turned), where, atol=1e-9)
+
+
+@pytest.mark.parametrize("inward", [1.0, -1.0])
+@pytest.mark.parametrize(("by_cells", "taken"), [(2.0, True), (1.2, False)])
+def test_a_small_bump_is_as_deep_as_its_points_where_cells_show_at_least_a_quarter_of_it(inward, by_cells, taken):
+    """6 exp(-(r / 15)^3): by the points it has its depth and the curvature 2 * 6 / 15^2 of the form, in 1 / m."""
+    surface = surface_charts.of_mesh(*box_mesh(), 20.0)
+    chart = int(np.argmax(surface.charts.axes[:, 2, 2]))
+    region = Region(chart, np.arange(surface.charts.cells(chart).start, surface.charts.cells(chart).stop), 1, 9.0, 0.0)
+    middle = surface.charts.low[chart] + 10.0 * surface.charts.shape[chart]
+    uv = middle + np.random.default_rng(0).uniform(-40.0, 40.0, (3_000, 2))
+    deviation = -inward * 6.0 * np.exp(-((np.linalg.norm(uv - middle, axis=1) / 15.0) ** 3))
+    points = SimpleNamespace(
+        about=lambda *_: (uv, deviation), surface=surface, alignment=alignment.none(surface, 1, error_mm=1.0)
+    )
+    field = SimpleNamespace(noise=np.full(len(surface.share), 0.1), stations_sd=lambda cells: 0.75)
+    rest = dict.fromkeys((one.name for one in dataclasses.fields(measures.Measures)), 0.0)
+    known = {"centre": np.array([100.0, 50.0, 50.0]), "axes": np.eye(3), "depth": inward * by_cells, "diameter": 40.0}
+    cells = measures.Measures(**rest | known)
+    found = measures.refined(cells, region, points, field, np.zeros(0), 0.0)
+    if not taken:  # a fit to the rest of the points that deviate less than the cells allow is not believed
+        assert found is cells
+        return
+    assert found.depth == pytest.approx(inward * 6.0, rel=1e-5)  # as least squares converges
+    assert found.curvature == pytest.approx(2.0 * 6.0 / 15.0**2 * 1000.0, rel=1e-4)
+    assert found.depth_ci95 == pytest.approx(1.96 * 1.25, rel=1e-4)  # 1 mm of the pose and 0.75 of views
 
 
 def test_cells_within_30_mm_of_a_steps_edge_mix_both_sides():

@@ -91,6 +91,18 @@ def test_solids_keep_to_the_closed_form(recipe):
         assert design.volume == pytest.approx(solid.Volume(), rel=1e-6)  # its steps follow the curve to 0.004 mm
 
 
+def test_the_ring_at_an_open_end_is_as_wide_as_its_plates_are_thick():
+    """Its four rectangles lie beside each other between the outlines, and each is as large as it states."""
+    part = arch_bridge.build(arch_bridge.Params())[2]
+    b, h, t = part.b(part.s0), part.h(part.s0), part.plates
+    ring = [face for face in arch_part.faces(part, 500.0) if face.name == "ring-start"]
+    corners = np.array([face.at(np.array([0.0, 1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0, 1.0])) for face in ring])
+    half = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]), axis=1)
+    np.testing.assert_allclose([face.element(np.zeros(1), np.zeros(1))[0] for face in ring], half, rtol=1e-9)
+    assert half.sum() == pytest.approx(2.0 * b * h - (2.0 * b - 2.0 * t.web) * (h - t.bottom - t.top), rel=1e-9)
+    np.testing.assert_allclose(np.ptp(corners.reshape(-1, 3)[:, 1]), 2.0 * b, rtol=1e-9)  # y runs across
+
+
 def test_clean_points_lie_on_the_surface_evenly():
     part = arch_bridge.build(arch_bridge.Params())[0]
     cloud = sampler.scan_part(part, 0, sampler.Params(spacing_mm=30.0, sigma_mm=0.0), generator(0, "x"))

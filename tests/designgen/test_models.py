@@ -161,7 +161,7 @@ def test_hits_lie_on_the_surface_of_the_solid(kind):
 
 
 def test_a_tree_of_triangles_gives_the_same_returns(monkeypatch):
-    """Of two bodies in one place, too: of hits at the same range the first shape has them."""
+    """Of three bodies in one place, too: of hits at the same range the first shape has them."""
     ball = trimesh.creation.icosphere(3, 800.0)
     body = of_mesh(
         "ball", np.asarray(ball.vertices) * [1, 0.6, 1.3] + [0, 3000, 200], np.array(ball.faces, np.int64), 1
@@ -170,7 +170,7 @@ def test_a_tree_of_triangles_gives_the_same_returns(monkeypatch):
     for many in (10, 10**9):
         monkeypatch.setattr(surfaces, "MANY", many)
         builder = Builder()
-        for part in (0, 2):
+        for part in (0, 2, 3):
             for patch, smooth in body.patches():
                 builder.patch(part, patch, smooth)
         builder.sphere(1, "pole", np.array([300.0, 1500.0, 0.0]), 100.0, [])

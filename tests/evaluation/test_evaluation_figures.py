@@ -295,12 +295,12 @@ def test_errors_of_characteristics_have_the_rms_of_their_kind():
 def test_sizes_that_are_called_wrong_are_counted():
     balls = ball_results.balls(method="ray", radii=(45.5, 60.0, 55.0), flag=("ok", "wrong-size", "wrong-size"))
     of = balls.balls
-    true = FrameTruth(of.ids, np.zeros((3, 3)), of.nominal_radii + np.array([0.2, 0.1, -5.0]), np.zeros((3, 3)))
+    true = FrameTruth(of.ids, np.zeros((3, 3)), of.nominal_radii + np.array([-5.0, 0.1, 0.2]), np.zeros((3, 3)))
     rows = np.arange(3)
     found = {one.quantity: one for one in space_frame._sizes(of, true, rows, rows, True)}
-    assert found["right sizes called wrong"].value == 1.0
+    assert found["right sizes called wrong"].value == 2.0
     assert found["right sizes called wrong"].limit == 0.0
-    assert found["wrong sizes called right"].value == 0.0
+    assert found["wrong sizes called right"].value == 1.0
 
 
 # --- shares -----------------------------------------------------------------------------------------------------------

@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
+from processor.adjustment import kriging, model_averaging
 from processor.geometry import mesh_distance, rigid
 from processor.model import reason
 from processor.preassembly.chain import adjustment, span_and_closure
@@ -157,6 +160,29 @@ def test_a_face_seen_as_one_strip_is_within_its_interval_where_it_was_not_seen(s
     sd = sds(end)[[2, 3], 2]
     assert (np.abs(end.departure[[2, 3], 2] - shift[2:, 2]) < 2.5 * sd).all()  # 2.5 sds
     assert (sd > 1.0).all()  # 40 of 1200 mm were seen
+
+
+def test_an_end_with_fewer_than_300_points_is_not_measured():
+    """60 for each of the faces and for the ring."""
+    rng = np.random.default_rng(1)
+    points = rng.permutation(cloud(rng, 12.0))
+    end = fitted(points[points[:, 0] > -700.0][:299], rng, 0.0)
+    assert end.doubts == (reason("preassemble.few-points-at-joint"),)
+    assert np.isnan(end.departure).all()
+
+
+def test_an_end_is_as_likely_as_its_noise_its_pose_and_the_sizes_of_its_departures_allow():
+    """Log likelihoods of hypotheses of the sizes, up to one constant, by SciPy's normal distribution."""
+    rng = np.random.default_rng(2)
+    A, motion, value = rng.normal(size=(4, 4)), rng.normal(size=(4, 6)), rng.normal(size=4)
+    sizes = np.array([[0.0, 0.0, 0.0, 0.0], [2.0, 0.5, 3.0, 1.0]])
+    block = joint_end._block(
+        SimpleNamespace(motion=motion, pose=0.3 * np.eye(6)), kriging.Kriged(value, A @ A.T), slice(None), sizes
+    )
+    logs = model_averaging.log_likelihoods(*block)
+    noise = A @ A.T + 0.3 * motion @ motion.T
+    exact = [multivariate_normal(cov=noise + np.diag(size**2)).logpdf(value) for size in sizes]
+    assert logs[1] - logs[0] == pytest.approx(exact[1] - exact[0], rel=1e-3)  # 0.004 mm are added to the noise
 
 
 def without_the_outside(side):

@@ -26,6 +26,23 @@ def ends_at(rng, nodes, per_node, sd=0.1, eccentricity=0.0, starts=None, respons
     return axis_intersection.axis_ends(node, starts, points, directions, side, covariance, response)
 
 
+def test_an_axis_is_known_at_its_node_by_its_place_and_its_slope():
+    """J = (1, t) from place and slope to 1500 mm along the axis: J N J^T of noise, J R of each station's shift."""
+    rng = np.random.default_rng(6)
+    scale = np.array([1.0, 1.0, 1e-3, 1e-3])
+    A, R = scale[:, None] * rng.normal(size=(4, 4)), scale[:, None] * rng.normal(size=(3, 4, 2))
+    covariance = np.zeros((1, 5, 5))
+    covariance[0, :4, :4] = A @ A.T + np.einsum("sjk,slk->jl", R, R)
+    J = np.hstack([np.eye(2), 1500.0 * np.eye(2)])
+    ends = axis_intersection.axis_ends(
+        np.zeros(1, np.int64), np.array([[0.5, -0.2, 1500.0]]), np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]),
+        np.array([[1.0, 0.0, 0.0]]), covariance, R[None],
+    )  # fmt: skip
+    np.testing.assert_allclose(ends.covariance[0], J @ A @ A.T @ J.T, rtol=1e-9)  # float64
+    np.testing.assert_allclose(ends.response[0], J @ R, rtol=1e-9)
+    np.testing.assert_allclose(ends.offsets[0], [-0.5, 0.2, 0.0], atol=1e-12)
+
+
 def test_intersections_of_exact_axes_are_the_nodes():
     rng = np.random.default_rng(1)
     nodes = rng.uniform(-5e4, 5e4, (20, 3))

@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from processor.space_frame.members import tube_fits
 from processor.space_frame.members.cylinder_fit import Errors
-from processor.space_frame.members.cylinder_model import NP, residual
+from processor.space_frame.members.cylinder_model import NP, extent_of, residual
 from processor.space_frame.points import line_crops
 from tests.support.clouds import frame_clouds
 
@@ -98,6 +98,27 @@ def test_residual_is_the_range_measured_less_the_range_to_the_cylinder():
             slope = (ranges_to(p - step, h, start, ray) - ranges_to(p + step, h, start, ray))[0] / 0.02
             # The slope of the axis, 1e-3, is left out of the derivatives.
             assert J[k] == pytest.approx(slope, abs=5e-3 * max(1.0, abs(slope)))
+
+
+def test_a_tube_extends_over_points_on_it_and_not_over_points_off_it():
+    """A leaning tube by bins of 100 mm: points on it add 2, grazing rays far off it take 4, others nothing."""
+    h, radius, p = 1000.0, 30.0, np.array([1.0, -2.0, 30.0, -40.0, 30.0, 0.0, 0.0])
+    shift = np.array([0.5, -0.8])  # of the only station
+    z = np.repeat(np.linspace(-950.0, 950.0, 20), 2)
+    way = np.tile([1.0, -1.0], 20)
+    axis = p[:2] + shift + z[:, None] / h * p[2:4]
+    on = np.abs(z) < 600.0
+    # Along the axis a ray meets no side: 10 mm off the tube it shows nothing, 13 mm off that there is none.
+    off = np.where(on, 0.0, np.where(z > 0.0, 10.0, 13.0))
+    side = np.where(on[:, None], [1.0, 0.0], [0.0, 1.0]) * way[:, None]
+    ray = np.where(on[:, None], np.stack([-way, 0.0 * way, 0.0 * way], axis=1), [0.030, -0.040, 1.0])
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    P = np.column_stack([axis + (radius + off)[:, None] * side, z])
+    bins = np.empty(20)
+    seen = (P, ray, np.ones(40, bool), np.array([0, 40]))
+    low, high = extent_of(p, h, seen, shift[None], 1.0, bins, 100.0)
+    np.testing.assert_allclose(bins, [-8.0] * 4 + [4.0] * 12 + [0.0] * 4, atol=1e-9)  # float64
+    assert (low, high) == (-600.0, 600.0)
 
 
 def bound(cloud, station, sigma):

@@ -1,10 +1,12 @@
 """Ends of faces between the rays of a scan grid: position, variance, and points near borders."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from processor.geometry import scan_grid_directions
 from processor.stitching.fine import edge_constraints
-from processor.stitching.planes import border_exclusion, face_ends
+from processor.stitching.planes import border_exclusion, extraction, face_ends
 from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.grid_bands import GridBands
 from tests.support.clouds.stitch_clouds import pose, scan
@@ -64,6 +66,31 @@ def test_ends_of_a_post_are_unbiased_for_all_phases_of_the_rays():
         # Half a gap at most, and of 40 even phases the mean of a share within half a phase.
         assert np.abs(shares).max() < 0.51
         assert abs(np.mean(shares)) < 0.03
+
+
+def test_an_end_is_bounded_by_a_piece_behind_that_stands_across_its_face():
+    """A face along x at y = 20 ends at x = 1 m; the piece there faces a second scan, away from the first."""
+    T = np.stack([pose([-5000.0, 400.0, 0.0], 40.0, 5.0), pose([3000.0, -700.0, 90.0], 130.0, 8.0)])
+    y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-100.0, 100.0, 9), np.linspace(-100.0, 100.0, 9)))
+    piece = (np.stack([np.full(81, 1000.0), y, z], axis=1) - T[1, :3, 3]) @ T[1, :3, :3]
+    blocks = SimpleNamespace(
+        piece=np.zeros(1, np.int64), scan=np.ones(1, np.int64), pieces=1,
+        sums=extraction.sums_of(piece).sum(axis=0, keepdims=True),
+    )  # fmt: skip
+    # The step from ray to ray is 30 mm: an end is within 0.75 of it and the gate of 2 mm.
+    (X, Y, Z), x = np.eye(3), 1006.0 * np.eye(3)[0]
+    at = np.array([x, x + 19.0 * X, x, x, x + 160.0 * Y, x - 26.0 * X]) + 20.0 * Y + 10.0 * Z
+    faces, steps = np.array([Y, Y, X, Y, Y, Z]), 30.0 * np.array([X, X, X, Z, X, X])
+    ends = face_ends.Ends(
+        (at - T[0, :3, 3]) @ T[0, :3, :3], steps @ T[0, :3, :3], faces @ T[0, :3, :3], np.arange(6), 10 * np.arange(6)
+    )
+    clouds = [SimpleNamespace(ends=ends, cell_mm=5.0), SimpleNamespace(ends=face_ends.Ends(), cell_mm=5.0)]
+    found = edge_constraints.match(clouds, blocks, T, 2.0)
+    assert found.gap.tolist() == [0, 5]
+    assert found.edge.tolist() == [0, 50]
+    np.testing.assert_allclose(found.off, [6.0, -20.0], atol=1e-9)  # float64 of some m
+    np.testing.assert_allclose(found.width, 30.0, atol=1e-9)
+    np.testing.assert_allclose(found.normal, [X, X], atol=1e-9)
 
 
 def matches(share, gap):

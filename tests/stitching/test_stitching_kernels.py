@@ -126,6 +126,22 @@ def test_points_clear_in_angle_are_those_by_all_directions(monkeypatch, tmp_path
     assert clear.any()
 
 
+@pytest.mark.parametrize(
+    ("piece", "kept", "numbers", "faces"),
+    [([2, 2, 5, 7, 7, 7], [0, 1, 3, 4, 5], [0, 0, 1, 1, 1], [-1, -1, 0, 0, 0]), ([1, 4], [], [], []), ([], [], [], [])],
+)
+def test_pieces_of_one_scan_alone_are_left_out_and_the_others_numbered_anew(piece, kept, numbers, faces):
+    rows = np.arange(len(piece))
+    face = np.where(np.array(piece, np.int64) > 2, 6, -1)
+    blocks = correspondences.Blocks(
+        np.array(piece, np.int64), rows, np.zeros((len(rows), 10)), np.ones(len(rows)), rows * 0, 9,
+        np.zeros((len(rows), 3, 7)), face,
+    )  # fmt: skip
+    shared = blocks.shared()
+    assert (shared.scan.tolist(), shared.piece.tolist(), shared.face.tolist()) == (kept, numbers, faces)
+    assert (shared.pieces, shared.faces) == (len(set(numbers)), len(set(faces) - {-1}))
+
+
 def test_pieces_that_scatter_by_more_than_the_noise_weigh_less():
     rng = np.random.default_rng(1)
     flat = np.column_stack([rng.uniform(-500.0, 500.0, (400, 2)), rng.normal(0.0, 1.0, 400)])

@@ -10,6 +10,7 @@ from processor.model import Status
 from processor.stitching import to_result
 from processor.stitching.coarse import network, pairwise
 from processor.stitching.coarse.pairwise import ScoredPose
+from processor.stitching.fine.pairs_and_loops import Pair
 from processor.stitching.planes import free_space
 
 HERE = np.eye(4)
@@ -118,6 +119,17 @@ def test_scans_that_join_only_through_an_ambiguous_one_are_ambiguous():
     links = [(0, 1), (1, 2), (0, 3)]
     for given, apart in ((links, [2]), ([*links, (2, 3)], []), (None, [])):
         assert to_result._not_joined(given, status, 0) == apart
+
+
+def test_closures_run_over_the_pairs_that_are_known_best():
+    """Of four scans in a ring and across it, the two worst pairs close loops over the others."""
+    sd = {(0, 1): 1.0, (1, 2): 9.0, (2, 3): 2.0, (0, 3): 3.0, (0, 2): 5.0}
+    pairs = [
+        Pair(a, b, 9, along(6000.0 * (b - a)), np.diag([1e-12] * 3 + [each**2] * 3), 1.0, 1.0)
+        for (a, b), each in sd.items()
+    ]
+    found = to_result._closures("ABCD", SimpleNamespace(pairs=pairs, used=[True] * 5))
+    assert [sorted(set(loop)) for loop in found.loop] == [["A", "C", "D"], ["A", "B", "C", "D"]]
 
 
 def test_links_are_overlaps_that_free_space_does_not_contradict():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from scipy.fft import rfftn
+from scipy.special import erfc
 
 import designgen
 from processor.geometry import rigid
@@ -73,6 +74,22 @@ def test_a_difference_of_ranges_to_dark_and_bright_fields_is_in_the_interval(lon
     for plane in (0.0, longer_mm):
         assert abs(float(ray @ (one.centre - centre)) - plane) < 1.96 * sd
     assert before < 0.3 < 0.45 * abs(longer_mm) < sd < 0.6 * abs(longer_mm)
+
+
+def test_a_step_between_samples_is_misplaced_as_the_sum_of_its_samples():
+    """The place of a step by all samples of one row, for steps anywhere between two of them: its scatter, in spacings.
+
+    Of 400 points that lie anywhere 20 rows average it; where all rows lie alike, none does.
+    """
+    spacing, width, count = 3.0, 1.5, 400
+    x, k = np.linspace(0.0, spacing, 1_000, endpoint=False), spacing * np.arange(-40, 40)
+    misplaced = np.std(0.5 * spacing * erfc((k - x[:, None]) / width).sum(axis=1) - x)
+    far = np.full(count, 50.0)
+    anywhere = spacing * (8.0 * (0.618034 * np.arange(count) % 1.0) - 4.0)
+    found = checkerboard._sampling_sd(anywhere, far, spacing, width)
+    assert found == pytest.approx(misplaced / np.sqrt(20.0), rel=1e-3)  # the second harmonic: 5e-5 / 0.085
+    aligned = checkerboard._sampling_sd(spacing * (np.arange(count) % 7 - 3.0), far, spacing, width)
+    assert misplaced < aligned < 1.5 * misplaced  # seven samples of a row fit a period a little longer, too
 
 
 def test_slopes_of_the_pattern_are_those_of_finite_differences():
