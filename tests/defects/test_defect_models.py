@@ -11,12 +11,22 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import poisson
 
 from processor.adjustment import scanner_class_errors
-from processor.defects import alignment, component_shapes, detect, measures, shape_models, step, surface_charts
+from processor.defects import (
+    alignment,
+    component_shapes,
+    defect_grids,
+    detect,
+    measures,
+    shape_models,
+    step,
+    surface_charts,
+    to_result,
+)
 from processor.defects.component_shapes import ComponentShape, SignificantShape
 from processor.defects.movement import moved_bodies
 from processor.defects.regions import Region
 from processor.geometry import rigid
-from processor.model import DesignBodies
+from processor.model import NORMAL_95, DesignBodies
 from processor.scan_folder import cad
 from tests.support.made import made
 from tests.support.scenes.at_design import AT_DESIGN
@@ -115,14 +125,72 @@ def test_the_corrected_pose_takes_back_the_movement_of_the_whole():
     np.testing.assert_allclose(rigid.apply(back, turned), where, atol=1e-9)
 
 
+def top_of_the_box():
+    """The surface of the box in cells of 20 mm, and the cells of its top: 10 by 5."""
+    surface = surface_charts.of_mesh(*box_mesh(), 20.0)
+    chart = int(np.argmax(surface.charts.axes[:, 2, 2]))
+    return surface, Region(chart, np.flatnonzero(surface.outward[:, 2] > 0.5), -1, 9.0, 0.0)
+
+
+def test_a_face_that_lies_deeper_as_a_whole_has_the_volume_of_its_area():
+    """2 mm over 200 x 100 mm. Noise of 0.2 mm of 50 cells of 20 x 20 mm, and what all have in common, 0.01 mm."""
+    surface, top = top_of_the_box()
+    count = len(surface.share)
+    field = SimpleNamespace(
+        deviation=np.full(count, -2.0),
+        variance=np.full(count, 0.04),
+        seen=np.ones(count),
+        stations_sd=lambda cells: 0.008,
+    )
+    found = measures.measure(top, field, surface, alignment.none(surface, 1, error_mm=0.006), 1.5, 50.0)
+    assert (found.area, found.mean, found.volume) == pytest.approx((20_000.0, 2.0, 40_000.0))
+    noise, common = 1.5 * 0.2 * np.sqrt(50.0) * 20.0**2, 0.01 * 20_000.0
+    assert found.volume_ci95 == pytest.approx(NORMAL_95 * np.hypot(noise, common), rel=1e-9)
+    assert found.depth == pytest.approx(2.0)
+    np.testing.assert_allclose(found.extent, [200.0, 100.0])
+    np.testing.assert_allclose(found.centre, [100.0, 50.0, 50.0], atol=1e-9)
+
+
+def test_a_step_covers_the_part_of_its_face_beyond_its_edge():
+    """An edge across the box at a quarter of its half length from the middle leaves 75 of 200 mm."""
+    surface, top = top_of_the_box()
+    frame = shape_models.Frame(np.array([100.0, 50.0, 50.0]), np.eye(3), np.array([100.0, 50.0, 25.0]), 50.0)
+    judged = SignificantShape(
+        shape=shape_models.Shape("step", (0, 0.25), np.array([-3.0, 0.0])),  # outward and across
+        peak=-3.0, ci95=0.2, volume_ci95=700.0, z=9.0, chance=0.0, margin=9.0,
+    )  # fmt: skip
+    search = SimpleNamespace(surface=surface, field=SimpleNamespace(seen=np.ones(len(surface.share))))
+    values = to_result._shape_defect(search, ComponentShape(0, frame, None, None), top.cells, judged).values
+    assert values["extent"] == pytest.approx([75.0, 100.0])
+    assert values["area_mm2"] == pytest.approx(75.0 * 100.0, rel=0.1)  # whole cells of 20 mm
+    assert (values["depth_max"], values["depth_mean"]) == pytest.approx((3.0, 3.0))
+    assert values["volume_mm3"] == pytest.approx(3.0 * values["area_mm2"])
+    assert values["centre"][0] == pytest.approx(125.0 + 0.5 * 75.0, abs=10.0)
+
+
+@pytest.mark.parametrize(("most", "cell"), [(120, 20.0), (3, 60.0)])
+def test_a_picture_has_the_cells_of_the_search_or_larger_ones_where_these_are_too_many(most, cell, monkeypatch):
+    """Deviations that rise along the face: a cell of a picture has the mean of its three by three."""
+    monkeypatch.setattr(defect_grids, "MOST_SIDE", most)
+    surface, top = top_of_the_box()
+    along = surface.centres @ surface.charts.axes[top.chart, 0]
+    field = SimpleNamespace(deviation=along, variance=np.ones(len(along)), count=np.ones(len(along)))
+    centre = np.array([100.0, 50.0, 50.0])
+    (picture,) = defect_grids.of_defects([(centre, top.cells[:3], field, 0)], surface)
+    assert picture.cell == cell
+    whole = picture.deviation[: int(along[top.cells].max() - along[top.cells].min() + 20.0) // int(cell)]
+    at = centre @ surface.charts.axes[top.chart, 0] + picture.low[0] + cell * (np.arange(len(whole)) + 0.5)
+    np.testing.assert_allclose(whole[np.isfinite(whole)], np.broadcast_to(at[:, None], whole.shape)[np.isfinite(whole)])
+    assert np.isfinite(whole).sum() >= len(top.cells) / (cell / 20.0) ** 2 - 1
+    assert picture.part.sum() == (3 if cell == 20.0 else 1)
+
+
 @pytest.mark.parametrize("inward", [1.0, -1.0])
 @pytest.mark.parametrize(("by_cells", "taken"), [(2.0, True), (1.2, False)])
 def test_a_small_bump_is_as_deep_as_its_points_where_cells_show_at_least_a_quarter_of_it(inward, by_cells, taken):
     """6 exp(-(r / 15)^3): by the points it has its depth and the curvature 2 * 6 / 15^2 of the form, in 1 / m."""
-    surface = surface_charts.of_mesh(*box_mesh(), 20.0)
-    chart = int(np.argmax(surface.charts.axes[:, 2, 2]))
-    region = Region(chart, np.arange(surface.charts.cells(chart).start, surface.charts.cells(chart).stop), 1, 9.0, 0.0)
-    middle = surface.charts.low[chart] + 10.0 * surface.charts.shape[chart]
+    surface, region = top_of_the_box()
+    middle = surface.charts.low[region.chart] + 10.0 * surface.charts.shape[region.chart]
     uv = middle + np.random.default_rng(0).uniform(-40.0, 40.0, (3_000, 2))
     deviation = -inward * 6.0 * np.exp(-((np.linalg.norm(uv - middle, axis=1) / 15.0) ** 3))
     points = SimpleNamespace(

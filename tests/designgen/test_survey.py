@@ -4,9 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from designgen import low_discrepancy, recipe_files
 from designgen.designs import structure_registry
+from designgen.randomness import generator
 from designgen.scanning import scanner, survey
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import make, structure
@@ -44,6 +46,17 @@ def test_a_station_more_leaves_the_others_where_they_are(count):
     for few, more in zip(places(count), places(count + 1), strict=True):
         assert list(few) == list(more)[: len(few)]
         np.testing.assert_array_equal(list(few.values()), list(more.values())[: len(few)])
+
+
+def test_a_registered_pose_is_off_by_a_turn_about_its_station_in_mrad_and_a_shift_in_mm():
+    T = survey.levelled_pose(np.array([3e4, -2e4, 1500.0]), 0.7)
+    params = scanner.Params(step_mrad=50.0, registration_mrad=2.0, registration_mm=3.0)
+    builder = Builder()
+    builder.sphere(-1, "ball", T[:3, 3] + 4000.0, 500.0, [])
+    (found,) = survey.survey(builder.to_surfaces(), (), {"S1": T}, scanner.Scanner(), params, 5).registered
+    turn, shift = generator(5, "registration S1").standard_normal((2, 3))  # as drawn, in standard deviations
+    np.testing.assert_allclose(found[:3, :3], Rotation.from_rotvec(2e-3 * turn).as_matrix() @ T[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(found[:3, 3], T[:3, 3] + 3.0 * shift, atol=1e-9)  # float64 at 30 m
 
 
 def test_stations_stand_within_their_area():

@@ -25,6 +25,7 @@ from processor.model import (
     StructureTruth,
     Truth,
 )
+from processor.space_frame.result import Tubes
 from processor.stitching.result import Pairs, Scans
 from processor.stitching.result import Result as StitchResult
 from tests.support.clouds import arch_clouds
@@ -41,7 +42,7 @@ def figures(metrics):
 # --- deviation --------------------------------------------------------------------------------------------------------
 
 
-def slab(error, turn=0.0, half=True, by_stations=()):
+def slab(error, turn=0.0, half=True, by_stations=(), posed=(False,)):
     """A slab of which x > 0 moved up by 5 mm, measured ``error`` too high with an LOD95 of 0.5, in a frame of its own.
 
     The pose found is turned by ``turn`` mrad about the middle of the part that did not move.
@@ -64,7 +65,8 @@ def slab(error, turn=0.0, half=True, by_stations=()):
         mean_ci95=found.mean() + np.array([-0.045, 0.045]),
     )  # fmt: skip
     truth = Truth(structure=StructureTruth(at, up, moved[:, None] * up), pose=PoseTruth(PROJECT, by_stations))
-    scene = Scene("slab", "structure", (Scan("s", at),))
+    poses = [{"T_project_scan": np.eye(4)} if known else {} for known in posed]
+    scene = Scene("slab", "structure", tuple(Scan(f"s{k}", at, **pose) for k, pose in enumerate(poses)))
     return figures(deviation.check(scene, result, truth))
 
 
@@ -79,6 +81,11 @@ def test_deviations_are_evaluated_against_the_truth_in_the_frame_of_the_structur
     beyond = slab(0.7)
     assert beyond["deviations within their 95 % intervals"].value < 5.0  # none but at the step
     assert beyond["unmoved steel beyond LOD95"].value == 100.0
+
+
+def test_deviations_of_scans_that_came_without_poses_are_not_evaluated():
+    assert slab(0.1, posed=(True, False)) == slab(0.1, posed=(False, False)) == {}
+    assert slab(0.1, posed=(True, True)).keys() == slab(0.1, posed=(False,)).keys() != set()
 
 
 def test_bodies_that_touch_have_each_its_own_truth():
@@ -301,6 +308,26 @@ def test_sizes_that_are_called_wrong_are_counted():
     assert found["right sizes called wrong"].value == 2.0
     assert found["right sizes called wrong"].limit == 0.0
     assert found["wrong sizes called right"].value == 1.0
+
+
+def test_tubes_are_compared_with_the_lines_between_the_true_centres():
+    """A tube may end anywhere along them; across it is 0.2, 0.2, 0.1 mm off at the start, twice that at the end."""
+    along, off = np.array([[1.0, 2.0, 2.0]]) / 3.0, 0.1 * np.array([[2.0, -2.0, 1.0]])
+    quarter = np.full((1, 3), 0.25)
+    tubes = Tubes(
+        a=np.array([7]), b=np.array([8]), start=300.0 * along + off, end=2500.0 * along + 2.0 * off,
+        radii=np.array([30.4]), radius_ci95=np.array([0.3]), start_ci95=quarter, end_ci95=quarter,
+    )  # fmt: skip
+    true = FrameTruth(np.array([7, 8]), np.vstack([0.0 * along, 3000.0 * along]), np.full(2, 60.0), np.zeros((2, 3)))
+    design = SimpleNamespace(member_a=np.array([8]), member_b=np.array([7]), tube_diameters=np.array([60.0]))
+    found = space_frame._tubes(
+        SimpleNamespace(frame=design),
+        SimpleNamespace(tubes=tubes, balls=SimpleNamespace(ids=np.array([7, 8]))),
+        SimpleNamespace(frame=true, as_built=None),
+        np.arange(2),
+    )
+    shares = {one.quantity: one.value for one in found if one.statistic == Statistic.COVERAGE}
+    assert shares == {"radii of tubes": 0.0, "axes of tubes": pytest.approx(100.0 * 4 / 6)}
 
 
 # --- shares -----------------------------------------------------------------------------------------------------------

@@ -72,7 +72,9 @@ def measured(structure, points, direction=(1, 0, 0)):
 
 @pytest.mark.parametrize("off", [-4.0, 0.0, 1.5, 12.0])
 def test_the_level_of_an_edge_is_that_of_its_points(off):
-    pieces, *_ = measured(design(box(PLATE)), on_end(np.random.default_rng(1), off=off))
+    pieces, overhang, _ = measured(design(box(PLATE)), on_end(np.random.default_rng(1), off=off))
+    wide = 300.0 * 10.0 / (0.5 * (2.0 * 300.0 + 2.0 * 10.0))  # twice the area by the perimeter
+    assert overhang == pytest.approx(0.25 * (3.5 - 0.25 * wide))  # a quarter of what half a beam reaches over the rim
     # Four sds.
     assert np.average(pieces.value, weights=1.0 / pieces.noise) == pytest.approx(off, abs=4.0 * 0.3 / np.sqrt(100))
 

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from processor import diagnostics, pipeline
 from processor.api import runs
+from processor.defects import baseline
 from processor.geometry import rigid
 from processor.model import Status
 from processor.preassembly.parts import attitude
@@ -53,6 +54,17 @@ def test_clouds_are_in_the_outermost_frame():
     assert kept.frame == "bridge"
     # Two products of the same matrices: rounding of float64.
     np.testing.assert_allclose(kept.points, rigid.apply(outer, rigid.apply(inner, points)), atol=1e-12)
+
+
+def test_clouds_of_density_clusters_and_of_noise_are_all_points_between_them():
+    points, clustered = np.random.default_rng(2).normal(size=(9, 3)), np.arange(9) % 3 > 0
+    with diagnostics.with_clouds(), diagnostics.recording() as notes:
+        baseline._say_clusters(points, clustered, 2, 25.0, np.array([1e3, 0.0, 0.0]))
+    numbers = {"radius_mm": 25.0, "points": 9.0, "clusters": 2.0, "kept": 6.0}
+    assert notes.rows == [("density clusters", "", *each) for each in numbers.items()]
+    assert [cloud.stage for cloud in notes.clouds] == ["density clusters", "noise"]
+    for cloud, rows in zip(notes.clouds, (clustered, ~clustered), strict=True):
+        np.testing.assert_allclose(cloud.points, points[rows] + [1e3, 0.0, 0.0], atol=1e-12)
 
 
 # --- the paper's methods of preassembly ---

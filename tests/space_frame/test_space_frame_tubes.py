@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from processor.space_frame.members import tube_fits
 from processor.space_frame.members.cylinder_fit import Errors
-from processor.space_frame.members.cylinder_model import NP, extent_of, residual
+from processor.space_frame.members.cylinder_model import NP, circle_along, extent_of, residual
 from processor.space_frame.points import line_crops
 from tests.support.clouds import frame_clouds
 
@@ -98,6 +98,18 @@ def test_residual_is_the_range_measured_less_the_range_to_the_cylinder():
             slope = (ranges_to(p - step, h, start, ray) - ranges_to(p + step, h, start, ray))[0] / 0.02
             # The slope of the axis, 1e-3, is left out of the derivatives.
             assert J[k] == pytest.approx(slope, abs=5e-3 * max(1.0, abs(slope)))
+
+
+def test_a_circle_along_a_line_is_that_of_its_points_whatever_lies_beside_it():
+    """A leaning tube of exact points and strangers 75 mm from its axis on two of its sides."""
+    h, true = 1000.0, np.array([0.3, -0.5, 2.0, -1.5, 30.0, 0.0, 0.0])
+    z, turn = (grid.ravel() for grid in np.meshgrid(np.linspace(-h, h, 21), np.linspace(0.0, 2.0 * np.pi, 25)[1:]))
+    strange = np.arange(len(z)) % 16 == 0
+    turn[strange] = 0.5 * np.pi * (np.arange(strange.sum()) % 2)
+    side = np.where(strange, 75.0, 30.0)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    P, p = np.column_stack([true[:2] + z[:, None] / h * true[2:4] + side, z]), np.zeros(NP)
+    assert circle_along.py_func(P, -h, h, 100.0, p, h)
+    np.testing.assert_allclose(p, true, atol=0.03)  # 2.5^3 / 30^2: the square of the lean is taken for its mean
 
 
 def test_a_tube_extends_over_points_on_it_and_not_over_points_off_it():

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
-from processor.model import InputError, Scan, Scene, StepRun, UsageError
+from processor.model import InputError, Scan, Scene, StepRun, StructureDesign, UsageError
 from processor.pipeline import Execution
 from processor.report import write_results
 from processor.scan_folder import folder
@@ -35,6 +35,23 @@ def room():
 def pair():
     T, scans = four(step_mrad=STEP_MRAD)
     return T[:2], scans[:2]
+
+
+@pytest.mark.parametrize(
+    ("posed", "design", "applies"),
+    [
+        ((True, True), False, True), ((True, True), True, False), ((False, True), True, False),
+        ((True, False), True, True), ((False, False), True, True), ((False,), False, False),
+    ],
+)  # fmt: skip
+def test_scans_are_stitched_where_one_has_no_pose_or_there_is_no_design(posed, design, applies):
+    """The first scan needs none: the others are placed beside it."""
+    corners = np.eye(3)
+    scans = tuple(
+        Scan(f"S{k}", corners, **({"T_project_scan": np.eye(4)} if known else {})) for k, known in enumerate(posed)
+    )
+    plan = StructureDesign("plate", corners, np.array([[0, 1, 2]])) if design else None
+    assert stitching_step.applies(Scene("s", "structure", scans, structure=plan)) == applies
 
 
 def test_three_scans_of_a_room_are_registered(room):

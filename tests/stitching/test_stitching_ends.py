@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from processor.geometry import scan_grid_directions
 from processor.stitching.fine import edge_constraints
@@ -66,6 +67,24 @@ def test_ends_of_a_post_are_unbiased_for_all_phases_of_the_rays():
         # Half a gap at most, and of 40 even phases the mean of a share within half a phase.
         assert np.abs(shares).max() < 0.51
         assert abs(np.mean(shares)) < 0.03
+
+
+@pytest.mark.parametrize("height", [0, 8])
+def test_a_bar_that_one_ray_hits_has_an_end_on_either_side(height):
+    """Be it the first or the last ray of a scan: rays 5 mrad apart at 20 m pass 50 mm beside it."""
+    column, row = (grid.ravel() for grid in np.meshgrid(np.arange(200), np.arange(9)))
+    turn, up = (column - 100) * 5e-3, (row - height) * 5e-3
+    u = np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], axis=1)
+    on_bar = (row == height) & (column == 100)
+    p = u * np.where(on_bar, 20_000.0, 12_000.0)[:, None]  # other rows determine the columns of the grid
+    kept = on_bar | (np.abs(row - 4) < 2)
+    plane = Planes(
+        np.ones(1), np.array([[20_000.0, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.ones((1, 3)), np.eye(3)[None]
+    )
+    rays = scan_grid_directions.fitted(p[kept], row[kept], column[kept])
+    ends = face_ends.ends_of(bands(p[kept], row[kept], column[kept]), np.where(on_bar[kept], 0, -1), plane, 2.0, rays)
+    beside = np.abs(ends.across[:, 1]) > 50.0
+    np.testing.assert_allclose(np.sort(ends.points[beside, 1]), [-50.0, 50.0], rtol=1e-4)  # squares of 5 mrad
 
 
 def test_an_end_is_bounded_by_a_piece_behind_that_stands_across_its_face():

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from processor.geometry import rigid
 from processor.stitching.fine import bundle_adjustment, correspondences, normal_equations
+from processor.stitching.planes import extraction
 from tests.support.clouds.stitch_clouds import ROOM, four
 from tests.support.scenes.stitched_rooms import STEP_MRAD, adjusted, errors, longer
 
@@ -83,6 +84,27 @@ def test_the_variance_of_faces_is_that_of_an_analysis_of_variance():
         equations = normal_equations.Equations(N=N, spurious=N, g=g, z=none, offset=none, variance=none)
         found = bundle_adjustment._estimate_face_sd(equations, np.array([3, 6, 7, *faces]), 1, np.append([0.0, 0.0], x))
         np.testing.assert_allclose(found, expected, rtol=1e-8)  # the end of an iteration
+
+
+@pytest.mark.parametrize("kind", [correspondences.ON_PIECE, correspondences.FACE_END])
+def test_an_offset_of_each_block_takes_information_from_its_points(kind):
+    """Four and twelve points, of variance 1, on one plane: m = M / (1 + t2 M) each, and m m' / (m + m') of a shift.
+
+    The standard deviation of an offset is 0.5 mm, of ends 0.5 of a single one's: of three ends for each mm^-2.
+    """
+    corners = 1000.0 * np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]])
+    sums = np.stack([each * extraction.sums_of(corners).sum(axis=0) for each in (1.0, 3.0)])
+    rows = np.arange(2)
+    blocks = correspondences.Blocks(
+        np.zeros(2, np.int64), rows, sums, 3.0 * sums[:, 9], np.full(2, kind), 1, np.zeros((2, 3, 7)), rows * 0 - 1
+    )
+    T = np.stack([np.eye(4)] * 2)
+    found = normal_equations.linearize(blocks, T, np.zeros(4), np.full(2, 0.5), np.ones(2))
+    mass = np.array([4.0, 12.0])
+    m = mass / (1.0 + 0.5**2 * (1.0 if kind == correspondences.ON_PIECE else 3.0) * mass)
+    shifts = found.N[np.ix_([5, 11], [5, 11])]
+    np.testing.assert_allclose(shifts, m.prod() / m.sum() * np.array([[1.0, -1.0], [-1.0, 1.0]]), rtol=1e-9)
+    np.testing.assert_allclose(found.variance, 1.0 / mass)
 
 
 def test_rays_along_a_cell_are_those_of_finite_differences():
