@@ -51,7 +51,7 @@ def before_a_wall():
     wall = np.array([[-3000.0, 7000.0, -900.0], [3000.0, 7000.0, -900.0], [3000.0, 7000.0, 900.0]])
     builder.polygon(0, "half", half)
     builder.polygon(1, "wall", np.vstack([wall, [-3000.0, 7000.0, 900.0]]))
-    device = dataclasses.replace(QUIET, divergence_mrad=4.0, beam_exit_mm=8.0)  # 12 mm at the half plane: 3 mrad
+    device = dataclasses.replace(QUIET, divergence_mrad=1.0, beam_exit_mm=40.0)  # 22 mm at the half plane: 5.5 mrad
     return builder.to_surfaces(), device
 
 
@@ -67,7 +67,7 @@ def test_mixed_pixels_reach_as_far_from_an_edge_as_the_beam(step_mrad):
     turn = 2.0 * np.pi * returns.column / columns - 0.5 * np.pi  # of the edge at x = 0, to the left
     level = np.cos(lowest + step * returns.row)
     R = 4000.0 / (level * np.cos(turn))
-    angle = 0.5 * (4e-3 + 8.0 / R)
+    angle = 0.5 * (1e-3 + 40.0 / R)
     low = np.abs(lowest + step * returns.row) < 0.12
     # A sub-ray turned to the side by a moves the ray by atan(a / level) about the axis.
     reach = np.arctan(OUTERMOST * angle / level)
@@ -76,7 +76,7 @@ def test_mixed_pixels_reach_as_far_from_an_edge_as_the_beam(step_mrad):
     mixed = returns.source == scanning_returns.MIXED
     np.testing.assert_array_equal(mixed[sure], off[sure] < 0.0)
     rows = len(np.unique(returns.row[low]))
-    width = 2.0 * OUTERMOST * 0.5 * (4e-3 + 8.0 / 4000.0)
+    width = 2.0 * OUTERMOST * 0.5 * (1e-3 + 40.0 / 4000.0)
     assert (mixed & low & (np.abs(turn) < 0.02)).sum() / rows * 2.0 * np.pi / columns == pytest.approx(
         width,
         abs=2.0 * step,  # a ray at either side

@@ -6,6 +6,7 @@ import pytest
 from processor.adjustment.point_groups import group_means
 from processor.deviation import cloud as deviation_cloud
 from processor.deviation import local_translation as moving
+from processor.deviation import station_offsets
 from processor.geometry import m3c2
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -51,6 +52,15 @@ def test_movement_along_the_normal_is_that_of_the_body_for_any_point_normals():
     assert found.count[0] == near.sum()
     assert np.isnan(found.along[2])
     assert found.count[2] == 0
+
+
+@pytest.mark.parametrize(("apart", "variance"), [(3, 0.0), (4, 4 * 2.0 / 100.0)])
+def test_stations_differ_where_the_mean_over_pieces_is_twice_its_standard_deviation(apart, variance):
+    """Of 100 pieces k have two stations 2 mm apart: mean 2 k / 100; k / (1 - k / 100) > 2^2 from k = 4 on."""
+    cell, off = np.repeat(np.arange(100), 2), np.where(np.arange(100) < apart, 1.0, 0.0)
+    mean = np.stack([off, -off], axis=1).ravel()
+    found = station_offsets._between(cell, mean, np.zeros(200), np.ones(200, bool))
+    assert found == pytest.approx(variance)
 
 
 def test_interval_of_a_movement_covers_for_six_points():

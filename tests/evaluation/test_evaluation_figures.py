@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from processor.defects.result import Result as DefectsResult
 from processor.deviation.result import Result as DeviationResult
@@ -294,6 +295,18 @@ def test_errors_of_characteristics_have_the_rms_of_their_kind():
     }
     assert found[Statistic.RMS] == pytest.approx(np.sqrt(0.125), abs=ROUNDING_MM)
     assert found[Statistic.COVERAGE] == 50.0
+
+
+def test_true_lengths_of_a_body_far_from_the_origin_are_those_of_its_ends():
+    """A plate in coordinates of a map, one end moved by 2 mm along it and the other by -0.5 mm."""
+    plate = trimesh.creation.box([800.0, 600.0, 400.0]).apply_translation([5e6, 3e6, 400.0])
+    design = StructureDesign("plate", np.array(plate.vertices), np.array(plate.faces, np.int64))
+    points, facet = trimesh.sample.sample_surface_even(plate, 4_000, seed=1)
+    normals = np.array(plate.face_normals[facet])
+    moved = np.select([normals[:, 0] > 0.5, normals[:, 0] < -0.5], [2.0, -0.5])[:, None] * [1.0, 0.0, 0.0]
+    (found,) = inspection._of_bodies(design, StructureTruth(np.array(points), normals, moved)).values()
+    assert found.pop("length") == pytest.approx(2.5)
+    assert list(found.values()) == pytest.approx([0.0] * len(found), abs=1e-9)
 
 
 # --- balls ------------------------------------------------------------------------------------------------------------

@@ -48,6 +48,13 @@ def test_places_that_rounding_makes_one_are_no_duplicates(spacing, step, noise):
     assert used_once(line) is None
 
 
+def test_coordinates_near_multiples_of_a_step_have_that_step():
+    """Off by up to 0.001 of it, the same at each multiple, as of places of a table that was rounded."""
+    rng = np.random.default_rng(6)
+    points = np.round(25.4 * rng.integers(0, 40, (500, 3)) / 7.0, 2)
+    np.testing.assert_allclose(coincident_points.lattice_of(points).step, 25.4 / 7.0, rtol=1e-3)
+
+
 def test_of_a_dense_cloud_that_was_merged_twice_half_of_each_place_is_used():
     points = plate(spacing=0.5, step=1.0)
     used = used_once(np.vstack([points, points]))

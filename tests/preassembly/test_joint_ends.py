@@ -171,6 +171,23 @@ def test_an_end_with_fewer_than_300_points_is_not_measured():
     assert np.isnan(end.departure).all()
 
 
+def test_the_points_of_a_ring_lie_between_the_two_sides_of_its_plates():
+    """Two standard deviations of 1 mm within plates of 26 mm: none of the inner walls, which end at the ring."""
+    rng = np.random.default_rng(3)
+    surface, joint = design()
+    points = cloud(rng, 12.0)
+    points += rng.standard_normal(points.shape)
+    place = end_place(joint, 1.0)
+    part = measured_parts.registered(points, surface, outer_faces(), 1e-12)
+    local, thickness = rigid.apply(rigid.invert(place.T_bridge_joint), points), np.full(4, T)
+    faces = ends_faces.fit(part, local, place, thickness)
+    _, used = joint_end._fit_ring(local, part.station, faces, place, thickness, 1.0)
+    depth = np.minimum(B * (1.0 - np.abs(used.basis[:, 1])), 0.5 * H * (1.0 - np.abs(used.basis[:, 2])))
+    assert len(depth) > 300
+    assert 1.5 < depth.min() < 3.0  # faces are known to 0.2 mm
+    assert T - 3.0 < depth.max() < T - 1.5
+
+
 def test_an_end_is_as_likely_as_its_noise_its_pose_and_the_sizes_of_its_departures_allow():
     """Log likelihoods of hypotheses of the sizes, up to one constant, by SciPy's normal distribution."""
     rng = np.random.default_rng(2)

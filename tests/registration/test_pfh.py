@@ -99,5 +99,17 @@ def test_coarse_alignment_on_a_shape_with_corners():
     assert np.linalg.norm(rigid.apply(found, shape) - moved, axis=1).max() < 40.0  # twice the tolerance asked for
 
 
+def test_a_pose_near_a_first_one_is_that_of_all_pairs_that_agree_with_it():
+    """Thirty pairs that cannot be mistaken, half a mm apart: their least-squares pose, not that of the best three."""
+    rng = np.random.default_rng(4)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.3, -0.2, 0.1])), np.array([10.0, -20.0, 30.0]))
+    source = rng.uniform(-500.0, 500.0, (30, 3))
+    target = rigid.apply(T, source) + rng.normal(0.0, 0.5, source.shape)
+    prior = pfh.Prior(T, 1.0, 20.0)
+    described = (np.eye(30), np.eye(30))
+    found = pfh.coarse_alignment(source, target, *described, tolerance_mm=5.0, iterations=50, rng=rng, prior=prior)
+    np.testing.assert_allclose(found, rigid.fit(source, target), atol=1e-9)  # float64
+
+
 def test_a_point_alone_has_an_empty_histogram():
     assert pfh.histograms(np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]]), 1.0).sum() == 0.0

@@ -1,6 +1,7 @@
 """Nodes against a design: matching in any frame, ambiguous matchings, and movements of nodes."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -175,6 +176,16 @@ def test_balls_are_measured_where_the_pattern_leaves_several_poses_and_nowhere_e
     clear = Cloud(design(), 1)
     assert match(clear.found(), design(), sized=sized).status == "ok"
     assert len(asked) == 2
+
+
+@pytest.mark.parametrize(("lead", "measured"), [(7.0 + 4.0 - 0.1, True), (7.0 + 4.0 + 0.1, False)])
+def test_balls_are_measured_unless_nodes_lead_by_a_thousand_to_one_and_one_node_in_ten(lead, measured, monkeypatch):
+    """Log odds of 7 and of a tenth of ten nodes, of 4 each: beyond that nodes decide."""
+    monkeypatch.setattr(matching, "radius_odds", lambda *_: 0.5)
+    candidates = [matching._Candidate(np.eye(4), np.arange(10), np.ones(10), odds) for odds in (-40.0 + lead, -40.0)]
+    problem = SimpleNamespace(fewer=10, design=None)
+    found = matching._with_radii(candidates, problem, lambda: None)
+    assert [one.odds for one in found] == [one.odds + 0.5 * measured for one in candidates]
 
 
 def test_half_a_flat_roof_is_ambiguous():

@@ -133,6 +133,18 @@ def test_points_near_lines_are_those_near_by_hand(cloud):
         assert sorted(map(tuple, got.tolist())) == sorted(map(tuple, want.tolist()))
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_points_at_the_rim_of_a_corridor_along_an_axis_are_near(axis):
+    """Wherever the line runs through the cells of 200 mm, which only their rims may touch."""
+    turn, at = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 33)[1:], np.linspace(-800.0, 800.0, 9))
+    ring = np.stack([at.ravel(), *(119.9 * f(turn.ravel()) for f in (np.cos, np.sin))], axis=1)
+    for shift in np.linspace(0.0, 200.0, 21):
+        points, direction = np.roll([[0.0, shift, 1.7 * shift]], axis, axis=1), np.roll(np.eye(3)[:1], axis, axis=1)
+        near = line_crops.corridors(points, direction, np.array([-900.0]), np.array([900.0]), 120.0)
+        cloud = points + np.roll(ring, axis, axis=1)
+        assert line_crops.gather([(cloud, np.empty(0, np.int32))], 100.0, near, len(cloud)).counts[0] == len(cloud)
+
+
 def test_full_line_crop_keeps_the_largest_share_that_fits(cloud):
     rng = np.random.default_rng(5)
     points, directions, low, high = lines(rng, 25)

@@ -79,6 +79,30 @@ def test_range_scales_are_separated_from_the_poses():
     np.testing.assert_allclose(solution.T[:, :3, 3], T[:, :3, 3], atol=1e-4)
 
 
+def test_what_is_left_out_of_exact_scans_moves_nothing_and_widens_the_poses():
+    T = stations()
+    blocks = blocks_of(T, *wall_points(), np.zeros(4), each=200_000)
+    solution = bundle_adjustment.solve(blocks, T, 0, tau=(0.0, 0.0, 0.0))
+    variances = []
+    for out in (np.zeros(len(blocks.piece), bool), np.arange(len(blocks.piece)) % 3 == 0):
+        step, covariance = bundle_adjustment.solve_without(blocks, solution, 0, out, 1e-9)
+        assert covariance.shape == (24, 24)
+        np.testing.assert_allclose(step, 0.0, atol=1e-5)  # what iterations leave
+        np.testing.assert_array_equal(covariance[:6], 0.0)
+        variances.append(np.diag(covariance)[6:])
+    assert (variances[1] > variances[0]).all()
+    assert np.median(variances[1] / variances[0]) == pytest.approx(1.5, rel=0.3)  # by a third less of the points
+
+
+def test_information_that_is_spurious_in_part_makes_a_covariance_wider():
+    """Of shares s of the information the standard deviation is 1 / (1 - s) times as large, at most 100 times."""
+    N, share = np.diag([4.0, 9.0, 25.0]), np.array([0.0, 0.5, 0.999])
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    found = bundle_adjustment._sandwich(turn @ N @ turn.T, turn @ (N * share) @ turn.T)
+    exact = np.diag(1.0 / np.diag(N) / np.maximum(1.0 - share, 0.01) ** 2)
+    np.testing.assert_allclose(turn.T @ found @ turn, exact, rtol=1e-9, atol=1e-9)  # float64
+
+
 def test_scatter_of_points_does_not_bias_the_range_scales():
     """Residuals are smaller in smaller scans: the least sum of squares alone would make all of them too small."""
     T = stations()
