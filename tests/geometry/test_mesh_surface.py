@@ -108,6 +108,19 @@ def slivers(count, length=3000.0, width=3.0, seed=3):
     return np.stack([start, far, far + across], axis=1).reshape(-1, 3), np.arange(3 * count).reshape(-1, 3)
 
 
+@pytest.mark.parametrize("turn", [0, 1, 2])
+def test_a_long_triangle_is_halved_at_its_longest_edge(turn, monkeypatch):
+    """Away from the origin, whichever of its edges that is."""
+    monkeypatch.setattr(mesh_distance, "assign_rows", np.copyto)  # that of kernels cannot be called from Python
+    corners = np.roll([[900.0, 500.0, 0.0], [0.0, 500.0, 0.0], [800.0, 600.0, 0.0]], turn, axis=0)
+    stack = np.stack([corners, np.zeros((3, 3))])
+    mesh_distance._halved.py_func(stack, 0)
+    middle = [450.0, 500.0, 0.0]
+    halves = [{tuple(corner) for corner in half} for half in stack.tolist()]
+    assert halves[0] | halves[1] == {tuple(corner) for corner in corners.tolist()} | {tuple(middle)}
+    assert halves[0] & halves[1] == {tuple(middle), (800.0, 600.0, 0.0)}
+
+
 @pytest.mark.parametrize("count", [20, 4000], ids=["few", "so many that voxels are larger"])
 def test_every_voxel_near_a_sliver_facet_lists_it_once(count, monkeypatch):
     vertices, faces = slivers(count)
