@@ -1,5 +1,7 @@
 """Joints that have balls and those that have none: scaffolds in a frame, and the assignment of all joints together."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -47,6 +49,20 @@ def test_the_density_of_residuals_is_the_normal_one():
     for e, sd in ((0.0, 1.0), (1.5, 0.4), (-3.0, 2.0)):
         # Rounding.
         assert ball_joint_classification._normal(e, sd) == pytest.approx(norm.pdf(e, 0.0, sd), rel=1e-12)
+
+
+def test_no_ball_has_less_than_five_quarters_of_the_radius_of_its_thinnest_tube(monkeypatch):
+    """Of tubes of 50 and 40 mm: radii from 50 mm on are tried. Inner kernels cannot be called from Python."""
+    tried = []
+    monkeypatch.setattr(ball_joint_classification, "_beside_members", lambda points, *_: np.arange(len(points)))
+    monkeypatch.setattr(ball_joint_classification, "_sphere_ratio", lambda *of: tried.append(of[2]) or -1.0)
+    monkeypatch.setattr(ball_joint_classification, "_neck_ratio", lambda *_: 0.0)
+    monkeypatch.setattr(ball_joint_classification, "_mean_of", max)
+    crops = SimpleNamespace(start=[0, 3], points=np.zeros((3, 3)), rays=np.zeros((3, 3)))
+    axes = np.eye(3)[:2]
+    ends = SimpleNamespace(start=[0, 2], points=0.0 * axes, directions=axes, tube_radii=np.array([50.0, 40.0]))
+    ball_joint_classification._evidence.py_func(crops, ends, 1.0, np.zeros(1), np.zeros(1), 0, 1)
+    np.testing.assert_array_equal(tried, np.arange(50.0, 160.0, 2.5))
 
 
 def test_joints_of_a_scaffold_are_no_nodes():
