@@ -95,11 +95,8 @@ def test_parameters_are_checked_by_name_and_type():
     assert filled[0].params.boxes.edge_box_mm == 42.0
     assert filled[0].params.seed == 3
     for table, said in [
-        ({"preassemble": {"box": {}}}, "preassemble: unknown key 'box' .did you mean 'boxes'"),
-        (
-            {"preassemble": {"boxes": {"box_count": 1.5}}},
-            "preassemble.boxes: expected a whole number as 'box_count'",
-        ),
+        ({"preassemble": {"box": {}}}, "preassemble.box: unknown parameter .did you mean 'boxes'"),
+        ({"preassemble": {"boxes": {"box_count": 1.5}}}, "preassemble.boxes.box_count: expected a whole number"),
         ({"preassemble": {"boxes": 3}}, "boxes: expected a table"),
         ({"preassemble": {"method": "magic"}}, "method: expected one of"),
         ({"magic": {}}, "no step 'magic'"),

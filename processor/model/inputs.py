@@ -54,12 +54,20 @@ class Place:
         """Return the error of the table as a whole."""
         return self.error(f"{self.where}: {text}")
 
+    def refused_key(self, key: str, expected: str, found: str) -> PlainError:
+        """Return the error of the value of a key; of parameters by the name that is typed, as in ``stitch.scale``."""
+        if self.separator == ".":
+            return self.error(f"{self.where}.{key}: expected {expected}, found {found}")
+        return self.refused(f"expected {expected} as {key!r}, found {found}")
+
     def only(self, keys: Collection[str], known: Collection[str], listed: Collection[str] = ()) -> None:
         """Raise the error of the first key that is not known; ``listed`` are those that the message has."""
         for key in keys:
             if key not in known:
-                names = ", ".join(listed or known)
-                raise self.refused(f"unknown key {key!r}{did_you_mean(key, known)}; known are {names}")
+                like, names = did_you_mean(key, known), ", ".join(listed or known)
+                if self.separator == ".":
+                    raise self.error(f"{self.where}.{key}: unknown parameter{like}; known are {names}")
+                raise self.refused(f"unknown key {key!r}{like}; known are {names}")
 
 
 class Kind(NamedTuple):
@@ -84,7 +92,7 @@ class Kind(NamedTuple):
         except NO_FIT:
             like = did_you_mean(value, self.schema["enum"]) if isinstance(value, str) and "enum" in self.schema else ""
             found = "nothing" if value is NOTHING else shown(value)
-            raise place.refused(f"expected {self.expected} as {key!r}, found {found}{like}") from None
+            raise place.refused_key(key, self.expected, found + like) from None
 
 
 def shown(value: Any) -> str:

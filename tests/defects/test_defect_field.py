@@ -22,13 +22,22 @@ from processor.defects import (
 )
 from processor.defects import step as defects_step
 from processor.defects.component_shapes import ComponentShape
-from processor.defects.observations import Pairs, Stations
+from processor.defects.observations import Pairs
 from processor.model import Scan, Scene, StructureDesign
 from tests.support.scenes.at_design import AT_DESIGN
 
 EDGE, SIGMA, POINTS = 8.0, 0.5, 12
 SCANNER = np.array([[1000.0, -9000.0, 4000.0]])
-UNNAMED, NAMED = Stations(("merged",), np.full((1, 3), np.nan)), Stations(("S1",), SCANNER)
+
+
+def stations_at(names, positions):
+    """What alignment and field read of views: without positions, one cloud has views of which nothing is known."""
+    return SimpleNamespace(
+        names=names, positions=positions, unnamed=len(names) == 1 and not np.isfinite(positions).all()
+    )
+
+
+UNNAMED, NAMED = stations_at(("merged",), np.full((1, 3), np.nan)), stations_at(("S1",), SCANNER)
 
 
 @cache
@@ -152,7 +161,7 @@ def test_differences_of_unnamed_views_are_no_defect_but_a_dent_is():
 def test_the_pose_of_unnamed_views_has_the_covariance_of_the_class():
     surface = surface_of(tuple(((900.0 * k, 0, 0), (900.0 * k + 300.0, 400, 500)) for k in range(4)), 40.0)
     pairs = pairs_of(surface, 2)
-    stations = Stations(("merged",), np.full((1, 3), np.nan)), Stations(("a", "b"), np.full((2, 3), np.nan))
+    stations = stations_at(("merged",), np.full((1, 3), np.nan)), stations_at(("a", "b"), np.full((2, 3), np.nan))
     unnamed, named = (alignment.align(pairs, surface, of, 1.0) for of in stations)
     added = unnamed.covariance - named.covariance
     # 0.2 mm of a shift and 0.2 mm of ranges along each axis; 0.2 mm at half of the points' diagonal. The pose without
@@ -172,7 +181,7 @@ def test_a_cell_that_a_far_station_sees_alone_has_its_noise():
     square = sd**2 * rng.chisquare(count - 1.0)
     none, station = np.zeros(len(cells), np.int64), alone.astype(np.int64)
     pairs = Pairs(cells, station, count, none, rng.normal(0.0, sd / np.sqrt(count)), square, none)
-    stations = Stations(("near", "far"), np.vstack([SCANNER, 3.0 * SCANNER]))
+    stations = stations_at(("near", "far"), np.vstack([SCANNER, 3.0 * SCANNER]))
     still, inner = alignment.none(surface, 2, 0.0), deviation_field.inner_cells(surface, EDGE)
     field = deviation_field.of_pairs(pairs, surface, stations, still, inner)
     for of_station in (alone, ~alone):

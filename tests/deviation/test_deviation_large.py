@@ -150,7 +150,7 @@ def test_scans_that_lie_elsewhere_are_left_out_of_all_points(small):
 
 
 def test_a_whole_number_of_points_is_asked_for():
-    with pytest.raises(UsageError, match="most_points: expected 0 or more"):
+    with pytest.raises(UsageError, match="most_points: expected a whole number of 0 or more"):
         Params(most_points=-1).check()
 
 

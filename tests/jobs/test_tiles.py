@@ -135,7 +135,7 @@ def test_spheres_have_the_same_bytes_as_here(dask_cluster, used, tmp_path, monke
     for nodes, cluster in ((200, None), (3, None), (3, dask_cluster.address)):
         monkeypatch.setattr(alternating_fit, "NODES", nodes)
         found.append(stored(scene, tmp_path / "a.h5", "spheres", cluster))
-    assert used == {"_chosen", "fit_final"}
+    assert used == {"choose", "fit_final"}
     assert found[0] == found[1] == found[2]
 
 
