@@ -3,19 +3,14 @@
 import ast
 import runpy
 import sys
-import warnings
-from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
 
 from processor.evaluation import truth_json
-from processor.preassembly.parts import assignment, attitude
 from processor.scan_folder import folder
+from tests.support.scenes.foreign_scenes import FOREIGN, foreign_scene
 
-ROOT = Path(__file__).resolve().parents[2]
-FOREIGN = ROOT / "tests" / "bench" / "foreign"
 SCRIPTS = sorted(path for path in FOREIGN.glob("*.py") if path.name != "__init__.py")
 SMALL = {
     "arch_bridge": ("spacing=90", "stations=3", "span=9000", "rise=2000"),
@@ -31,16 +26,6 @@ QUIET = {
     "steelwork": ("noise=0", "noise_ppm=0", "range_offset=0", "shift=0", "rotation_urad=0", "bias=0", "outliers=0",
                   "beam=0"),
 }  # fmt: skip
-
-
-def make(name, out, *settings, seed=3):
-    """Run a generator as a script, in this process."""
-    words = [word for setting in settings for word in ("--set", setting)]
-    script = str(FOREIGN / f"{name}.py")
-    arguments = [script, str(out), "--seed", str(seed), *words]
-    with mock.patch.object(sys, "argv", arguments), warnings.catch_warnings(action="ignore"):  # as Python runs it
-        runpy.run_path(script, run_name="__main__")
-    return out
 
 
 def contents(path):
@@ -66,7 +51,7 @@ def test_a_generator_shares_no_code(path):
 @pytest.mark.parametrize("name", [pytest.param("arch_bridge", marks=pytest.mark.slow), "space_frame", "steelwork"])
 def test_the_same_seed_makes_the_same_bytes(name, tmp_path):
     one, again, other = (
-        contents(make(name, tmp_path / str(i), *SMALL[name], *COARSER.get(name, ()), seed=seed))
+        contents(foreign_scene(name, tmp_path / str(i), *SMALL[name], *COARSER.get(name, ()), seed=seed))
         for i, seed in enumerate((3, 3, 4))
     )
     assert one == again
@@ -76,7 +61,9 @@ def test_the_same_seed_makes_the_same_bytes(name, tmp_path):
 
 def test_points_of_a_bridge_lie_on_the_true_parts(tmp_path):
     """The scan, by its true pose, lies within the box of the true key points' sections, and on its outer faces."""
-    path = make("arch_bridge", tmp_path, *SMALL["arch_bridge"], *QUIET["arch_bridge"], "waviness=0", "fabrication=0")
+    path = foreign_scene(
+        "arch_bridge", tmp_path, *SMALL["arch_bridge"], *QUIET["arch_bridge"], "waviness=0", "fabrication=0"
+    )
     truth, scene = truth_json.read(path).arch, folder.read_input(path)
     assert truth.names == ("SP-W", "SEG-1", "SEG-2", "SEG-3", "SP-E") == tuple(scan.component for scan in scene.scans)
     for i, scan in enumerate(scene.scans):
@@ -98,7 +85,7 @@ def test_points_of_a_bridge_lie_on_the_true_parts(tmp_path):
 
 
 def test_rays_end_on_balls_and_members(tmp_path):
-    path = make("space_frame", tmp_path, *SMALL["space_frame"], *QUIET["space_frame"], "step_mrad=3")
+    path = foreign_scene("space_frame", tmp_path, *SMALL["space_frame"], *QUIET["space_frame"], "step_mrad=3")
     truth, (scan,) = truth_json.read(path).frame, folder.read_input(path).scans
     points = scan.points + scan.origin
     distance = np.linalg.norm(points[:, None] - truth.centres, axis=2) - truth.radii
@@ -109,7 +96,7 @@ def test_rays_end_on_balls_and_members(tmp_path):
 
 
 def test_a_plate_as_designed_is_scanned_as_designed(tmp_path):
-    path = make("steelwork", tmp_path, *SMALL["steelwork"], *QUIET["steelwork"])
+    path = foreign_scene("steelwork", tmp_path, *SMALL["steelwork"], *QUIET["steelwork"])
     truth, scene = truth_json.read(path), folder.read_input(path)
     T = truth.pose.T_design_project
     (scan,) = scene.scans
@@ -156,28 +143,9 @@ def test_motion_by_station_errors_has_the_covariance_of_the_truth():
 
 def test_a_piece_that_reaches_two_borders_is_a_missing_part(tmp_path):
     """As docs/steps/defects.md defines the classes: the corner of a rib, whose borders are at 430 and 700 mm."""
-    path = make("steelwork", tmp_path, "case=defects", "step_mrad=8", "spacing=40")
+    path = foreign_scene("steelwork", tmp_path, "case=defects", "step_mrad=8", "spacing=40")
     truth = truth_json.read(path).defects
     off = np.array([430.0, 700.0]) - np.abs(truth.centres[:, 1:])
     sides = np.sqrt(truth.area_mm2)
     corner = np.flatnonzero((np.abs(off - sides[:, None] / 2) < 1e-6).all(axis=1))  # digits of the JSON
     assert [truth.classes[k] for k in corner] == ["missing-part"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("component", "seed", "more", "rather"),
-    [
-        # To 30 mm SEG-1 lies on either springing and on SEG-3: as much of it as of a piece of them with clutter.
-        ("SEG-1", 1, (), {0: 1, 1: None, 2: 1, 3: 1, 4: 1}),
-        # Both sides of its end plate of 40 mm are stable places: the scan passed for that of the other foot.
-        ("SP-E", 5, (), {4: None}),
-        # Of few points, the turned pose of SEG-1 has the least misfit: its scan passed for that of SEG-3.
-        ("SEG-1", 3, ("raised=3700",), {1: None}),
-    ],
-)
-def test_scan_of_a_part_is_not_assigned_to_one_like_it(tmp_path, component, seed, more, rather):
-    scene = folder.read_input(make("arch_bridge", tmp_path, "stations=4", "spacing=16", *more, seed=seed))
-    scan = next(scan for scan in scene.scans if scan.component == component)
-    shapes = attitude.Shapes(scene.arch)
-    assert {k: assignment.rather(scan.points, k, shapes) for k in rather} == rather

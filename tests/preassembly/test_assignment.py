@@ -16,7 +16,9 @@ from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.attitude import Shapes
 from processor.preassembly.result import Result
 from processor.preassembly.verdicts import reasons
+from processor.scan_folder import folder
 from tests.support.clouds import arch_clouds
+from tests.support.scenes.foreign_scenes import foreign_scene
 
 NAMES = arch_clouds.NAMES
 
@@ -143,3 +145,22 @@ def test_a_part_has_one_sample_on_each_square_of_the_spacing(edge_mm, count):
     none = np.empty((0, 3))
     part = DesignPart("cube", np.array(box.vertices), np.array(box.faces, np.int64), none, none)
     assert len(attitude.samples_of(part).points) == count
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("component", "seed", "more", "rather"),
+    [
+        # To 30 mm SEG-1 lies on either springing and on SEG-3: as much of it as of a piece of them with clutter.
+        ("SEG-1", 1, (), {0: 1, 1: None, 2: 1, 3: 1, 4: 1}),
+        # Both sides of its end plate of 40 mm are stable places: the scan passed for that of the other foot.
+        ("SP-E", 5, (), {4: None}),
+        # Of few points, the turned pose of SEG-1 has the least misfit: its scan passed for that of SEG-3.
+        ("SEG-1", 3, ("raised=3700",), {1: None}),
+    ],
+)
+def test_scan_of_a_part_is_not_assigned_to_one_like_it(tmp_path, component, seed, more, rather):
+    scene = folder.read_input(foreign_scene("arch_bridge", tmp_path, "stations=4", "spacing=16", *more, seed=seed))
+    scan = next(scan for scan in scene.scans if scan.component == component)
+    shapes = attitude.Shapes(scene.arch)
+    assert {k: assignment.rather(scan.points, k, shapes) for k in rather} == rather
