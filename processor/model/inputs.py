@@ -80,13 +80,14 @@ class Kind(NamedTuple):
     expected: str
     convert: Callable[[Any, Place], Any]
     schema: Mapping[str, Any]
+    plain: bool = False  # the place is not looked at: of twenty thousand nodes each key would make one
 
     def value(self, value: Any, key: str, place: Place) -> Any:
         """Return the value of a key, converted. Raises the error of the place for one of another kind."""
         try:
             if value is NOTHING:
                 raise ValueError
-            return self.convert(value, place.within(key))
+            return self.convert(value, place if self.plain else place.within(key))
         except PlainError:
             raise
         except NO_FIT:
@@ -130,7 +131,7 @@ def number(
         return found
 
     schema = {"type": "integer" if whole else "number", **bounds}
-    return Kind(expected or f"{plain} {of_range}".strip(), convert, schema)
+    return Kind(expected or f"{plain} {of_range}".strip(), convert, schema, True)
 
 
 def text(*words: str, empty: bool = False, expected: str = "") -> Kind:
@@ -143,7 +144,7 @@ def text(*words: str, empty: bool = False, expected: str = "") -> Kind:
 
     plain: dict[str, Any] = {"type": "string"} if empty else {"type": "string", "minLength": 1}
     schema = {"enum": list(words)} if words else plain
-    return Kind(expected or (f"one of {', '.join(words)}" if words else "a text"), convert, schema)
+    return Kind(expected or (f"one of {', '.join(words)}" if words else "a text"), convert, schema, True)
 
 
 def _flag(value: Any, _: Place) -> bool:
@@ -152,7 +153,7 @@ def _flag(value: Any, _: Place) -> bool:
     return value
 
 
-FLAG = Kind("true or false", _flag, {"type": "boolean"})
+FLAG = Kind("true or false", _flag, {"type": "boolean"}, True)
 
 
 def array(*shape: int) -> Kind:
@@ -168,7 +169,7 @@ def array(*shape: int) -> Kind:
     schema: dict[str, Any] = {"type": "number"}
     for n in reversed(shape):
         schema = {"type": "array", "items": schema, **({} if n < 0 else {"minItems": n, "maxItems": n})}
-    return Kind("numbers of shape " + " x ".join("n" if n < 0 else str(n) for n in shape), convert, schema)
+    return Kind("numbers of shape " + " x ".join("n" if n < 0 else str(n) for n in shape), convert, schema, True)
 
 
 def listed(item: Kind, expected: str, **schema: Any) -> Kind:

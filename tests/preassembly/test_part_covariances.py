@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from processor.geometry import mesh_distance
+from processor.geometry.lines_and_polylines import Polyline
+from processor.preassembly.ends import bottom_edges
 from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import measure, systematic_errors
 from processor.registration import principal
@@ -49,3 +51,14 @@ def test_an_offset_of_the_scanner_moves_all_faces_of_edges_inward_and_stations_e
     alone = (0.5**2 + 0.3**2) * np.eye(2)
     common = np.array([[[4.0, -4.0], [-4.0, 4.0]], [[4.0, 4.0], [4.0, 4.0]]])
     np.testing.assert_allclose(found, alone + common, rtol=1e-12)  # float64
+
+
+@pytest.mark.parametrize("number", [0, 6])
+def test_a_cloud_of_one_station_has_views_that_are_not_named_whatever_its_number(number):
+    """Both edges of a box, four views: two halves of a web each, and two of the bottom, that may tilt as well."""
+    mesh = mesh_distance.of_mesh(CORNERS, FACES)
+    part = measured_parts.registered(CORNERS[:1], mesh, mesh)
+    part = dataclasses.replace(part, station=part.station + number)
+    low, high = (np.array([[x, y, CORNERS[0, 2]] for x in CORNERS[[0, 7], 0]]) for y in CORNERS[[0, 7], 1])
+    edges = bottom_edges.measure(part, Polyline.through(high), Polyline.through(low), 0.3)
+    assert edges.by_view.shape == edges.by_tilt.shape == (2, len(edges.side), 4)

@@ -176,7 +176,7 @@ def _measure_edge(side: str, part: RegisteredPart, line: Polyline, other: Polyli
     ]
     by_station = np.stack([at.by_station for at in at_edge])
     views = by_station, np.zeros_like(by_station)
-    if stations == 1:
+    if (part.station == part.station[:1]).all():  # of one station, or of views that are not named
         # Derivatives (2, k, 4) of raw departures by the levels and tilts of views that are not named
         first = chainage < 0.5 * line.length
         half = np.stack([first, ~first], axis=1).astype(np.float64)
