@@ -191,8 +191,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     expected = expected_points.expected(pairs, surface, observed.stations)
     missing = regions.missing(field, expected.points, surface, alarms_per_mm2)
     if missing:
-        places = [region.cells for region in missing]
-        expected = expected_points.without_shade(expected, places, surface, observed.stations)
+        expected = expected_points.without_shade(expected, [one.cells for one in missing], surface, observed.stations)
         missing = regions.missing(field, expected.points, surface, alarms_per_mm2)
     missing += _inferred(scene, registered, field, missing, alarms_per_mm2)
     deviating = regions.of_finding(finding, surface)
