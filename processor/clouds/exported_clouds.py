@@ -119,7 +119,8 @@ def _views(run: Run, scans: Sequence[Placed]) -> tuple[Views, Ints]:
     for one in scans:
         origin, position = one.scale * one.scan.origin, one.scale * one.scan.position
         moved.append(replace(one.scan, T_project_scan=one.T, origin=origin, position=position))
-    seen = views(replace(run.scene, scans=tuple(moved)), origin=np.zeros(3))
+    stations = run.scene.stations if any(has_stations(run, one) for one in scans) else None
+    seen = views(replace(run.scene, scans=tuple(moved), stations=stations), origin=np.zeros(3))
     known = np.ones(len(seen.names), bool)
     known[seen.stations :] = [one.scan.position.size > 0 or not has_stations(run, one) for one in scans]
     return seen, np.where(known, np.cumsum(known), 0)

@@ -98,8 +98,10 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Views, alignment: A
         about, possible = (_pooled(image, charts, chart, ABOUT_CELLS) for image in images)
         seen[rows] *= (about > SEEN_SHARE * possible - 1e-9).ravel()
     used, side = np.flatnonzero(seen * count), PIECE_CELLS * charts.cell_mm
+    # What all sides lie outward by, as by a layer of paint, is no difference of views that are named.
+    common = 0.0 if stations.unnamed or not len(used) else float(np.median(mean[used]))
     of_views = view_error_from_opposite_sides.view_sd(
-        surface.centres[used], surface.outward[used], mean[used], variance[used], side
+        surface.centres[used], surface.outward[used], mean[used] - common, variance[used], side
     )
     of_stations = station_variance(pairs, surface, stations, alignment)
     return Field(

@@ -95,7 +95,8 @@ def without_shade(of: Expected, places: list[Ints], surface: DesignSurface, stat
             of_chart = charts.image(rays, chart)
             # Single cells have too few rays for a share of them.
             side = int(np.ceil(np.sqrt(SHARED_RAYS / max(float(of_chart.sum() / max((of_chart > 0.0).sum(), 1)), 1.0))))
-            near = [ndimage.uniform_filter(x, side, mode="constant") for x in (charts.image(shaded, chart), of_chart)]
+            on_clear = np.where(of_chart > 0.0, charts.image(shaded, chart), 0.0)  # others are hidden already
+            near = [ndimage.uniform_filter(x, side, mode="constant") for x in (on_clear, of_chart)]
             rays[rows] *= np.clip(1.0 - near[0] / np.maximum(near[1], LEAST_POINTS), 0.0, 1.0).ravel()
         parts.append((k, cell, rays[cell]))
     return Expected(tuple(parts), of.through)

@@ -98,6 +98,8 @@ class Kind(NamedTuple):
 
 def shown(value: Any) -> str:
     """Return a value for a message, or what it is where it is long."""
+    if isinstance(value, int) and abs(value) >= 10**SHOWN:  # Python refuses to write out thousands of digits
+        return "a number of very many digits"
     if isinstance(value, (str, int, float)):
         return repr(value)[:SHOWN]
     return {list: "a list", dict: "a table", type(None): "null"}.get(type(value), type(value).__name__)
@@ -160,6 +162,8 @@ def array(*shape: int) -> Kind:
     """Return arrays of finite numbers; -1 in ``shape`` allows any length of an axis."""
 
     def convert(value: Any, _: Place) -> Floats:
+        if np.array(value).dtype.kind in "USb":
+            raise TypeError
         found = np.array(value, np.float64)
         fits = found.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, found.shape, strict=True))
         if not fits or not np.isfinite(found).all():

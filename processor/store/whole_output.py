@@ -119,7 +119,7 @@ def whole_folder(out: Path, replaces: bool = False) -> Iterator[Path]:
 def unwritable(folder: Path, error: OSError) -> InputError:
     """Return the error of a folder that cannot be written."""
     why = error.strerror or error
-    return InputError(f"cannot be written ({why}); nothing was kept: free the disk or name another folder", path=folder)
+    return InputError(f"cannot be written ({why}); nothing changed: free the disk or name another folder", path=folder)
 
 
 def _replace(made: Path, out: Path, old: Path) -> None:

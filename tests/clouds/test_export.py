@@ -211,6 +211,15 @@ def test_stations_of_a_merged_cloud(tmp_path):
     assert [remark.code for remark in done.remarks] == ["export.stations-lost"]
 
 
+def test_stations_that_no_point_names_make_no_column(tmp_path):
+    """One scan of unknown position beside a file of three stations: nothing tells views of it apart."""
+    scan = dataclasses.replace(swept("all", 1), grid_row=(), grid_column=(), position=np.empty(0))
+    stations = Stations(("A", "B", "C"), RNG.uniform(-1e4, 1e4, (3, 3)))
+    results = exported_runs.not_run(Scene("hall", "structure", (scan,), stations=stations))
+    processor.export(results, tmp_path, what="merged", format="ply")
+    assert "station" not in plyfile.PlyData.read(str(tmp_path / "merged.ply"))["vertex"].data.dtype.names
+
+
 def test_of_several_scans_of_a_part_those_that_were_used_are_assembled(tmp_path):
     names = ("foot1", "foot1, again", "foot1, moved")
     scans = [swept(name, i, component="foot1") for i, name in enumerate(names)]

@@ -318,6 +318,18 @@ def test_a_bias_of_all_bodies_is_stated_with_its_size_and_is_no_defect(off):
     assert not len(result.defects.centre)
 
 
+@pytest.mark.parametrize(("layer", "apart", "drift"), [(0.3, 0.0, 0.0), (0.0, 0.2, 0.21), (0.3, 0.2, 0.21)])
+def test_what_the_sides_of_plates_differ_by_is_without_a_layer_that_all_have(layer, apart, drift):
+    """Sums of two sides of 0.2 mm either way: their squares by twice the variance of a side have the median 0.4549."""
+    surface = surface_of(tuple(((2_000 * i, 0, 0), (2_000 * i + 1_000, 600, 20)) for i in range(6)), 25.0)
+    body, up = deviation_field.component_of_cells(surface), surface.outward[:, 2]
+    noise = np.random.default_rng(8).normal(0.0, SIGMA / np.sqrt(POINTS), len(body))
+    off = layer + apart * np.where(up > 0.5, np.where(body % 2 == 0, 1.0, -1.0), 0.0)
+    field = field_of(surface, pairs_of(surface, 8, off + noise))
+    assert field.drift == pytest.approx(drift, abs=0.02)
+    assert field.views == 0.0
+
+
 def test_faces_that_all_face_one_way_show_no_bias():
     surface = surface_of(BOXES, 25.0)
     up = (surface.outward[:, 2] > 0.9).astype(float)

@@ -18,15 +18,7 @@ from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Flag, Result
 from processor.space_frame.spheres import sphere_detection
-from processor.space_frame.spheres.assessment import (
-    DOWN,
-    LARGEST_SCALE,
-    Row,
-    as_result,
-    assessed,
-    generator,
-    missing,
-)
+from processor.space_frame.spheres.assessment import DOWN, LARGEST_SCALE, Row, as_result, assessed, generator, missing
 
 COARSE_MM = 1.0  # rounding to it adds noise of 0.3 mm, as much as that of a good scanner
 LEAST_ONE_SIDED = 0.2  # length of the mean of normals; 0.5 of half a sphere, 0 of one seen from all around
