@@ -31,7 +31,8 @@ LEAST_POINTS = 1e-6  # expected; less is the rounding of sums
 LEAST_BIN_RAD = 0.003
 BIN_STEPS = 5.0  # angular steps of a scanner in a bin of directions
 FACE_SHARE = 0.2  # of a face's cells seen by a station, from which on the rest is expected
-SHARED_RAYS = 50.0  # of cells together, to know the share of them that is shaded: within 14 %
+SHARED_RAYS = 50.0  # of cells together, to know the share of them that is shaded: within 20 %
+CHANCE_SDS = 3.0  # of the difference of two Poisson numbers, up to which it may be by chance
 FEWEST_CELLS = 10  # with points, to estimate the density of points from
 GAP_RAD = 0.5  # of azimuth without returns, that is still within the field of view
 
@@ -91,13 +92,13 @@ def without_shade(of: Expected, places: list[Ints], surface: DesignSurface, stat
         for crossed in _crossed(k, surface, stations, facets, places):
             shaded += np.bincount(crossed, minlength=len(shaded))
         for chart in touched:
-            rows = charts.cells(chart)
             of_chart = charts.image(rays, chart)
-            # Single cells have too few rays for a share of them.
+            # Single cells have too few rays for a share of them; what is left by chance is none.
             side = int(np.ceil(np.sqrt(SHARED_RAYS / max(float(of_chart.sum() / max((of_chart > 0.0).sum(), 1)), 1.0))))
             on_clear = np.where(of_chart > 0.0, charts.image(shaded, chart), 0.0)  # others are hidden already
-            near = [ndimage.uniform_filter(x, side, mode="constant") for x in (on_clear, of_chart)]
-            rays[rows] *= np.clip(1.0 - near[0] / np.maximum(near[1], LEAST_POINTS), 0.0, 1.0).ravel()
+            ends, due = (ndimage.uniform_filter(x, side, mode="constant") * side**2 for x in (on_clear, of_chart))
+            left = np.where((ends > 0.5) & (due - ends < CHANCE_SDS * np.sqrt(due + ends)), 0.0, due - ends)
+            rays[charts.cells(chart)] *= np.clip(left / np.maximum(due, LEAST_POINTS), 0.0, 1.0).ravel()
         parts.append((k, cell, rays[cell]))
     return Expected(tuple(parts), of.through)
 
@@ -185,8 +186,7 @@ def _of_station(station: int, stations: Views, count: Floats, surface: DesignSur
 def _rows(pairs: Pairs, stations: int) -> list[Ints]:
     """Return the rows of each station's pairs."""
     order = np.argsort(pairs.station, kind="stable")
-    at = np.searchsorted(pairs.station[order], np.arange(stations + 1))
-    return [order[at[k] : at[k + 1]] for k in range(stations)]
+    return np.split(order, np.searchsorted(pairs.station[order], np.arange(1, stations)))
 
 
 def _nearest_ranges(station: int, stations: Views, bin_rad: float, arm: Floats) -> tuple[Floats, Bools]:
