@@ -187,19 +187,22 @@ def _errors(
     rows = cells_of_shape(surface, field, fit, shape)
     points, outward = with_corners(surface, rows)
     value = own = shape.values(fit.frame, points, outward)
+
+    def moved(mean: Floats) -> Floats:
+        """Return what the rigid motion nearest to deviations of the blocks moves the points by."""
+        motion = shape_models.rigid_motion(dataclasses.replace(fit.blocks, mean=mean), fit.frame)
+        return motion.values(fit.frame, points, outward)
+
     registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
     if shape.kind != shape_models.RIGID and not alignment.fitted:
         # The error of a pose that was not fitted to the design may be large: it moves, it does not deform.
-        there = shape.values(fit.frame, fit.blocks.points, fit.blocks.outward)
-        rigid_part = shape_models.rigid_motion(dataclasses.replace(fit.blocks, mean=there), fit.frame)
-        own = value - rigid_part.values(fit.frame, points, outward)
+        own = value - moved(shape.values(fit.frame, fit.blocks.points, fit.blocks.outward))
         registration = np.full_like(value, field.stations_sd(rows, free=True))
     # A surface that lies off as a whole, or from some place on, may be of another paint. Seen from all sides, a body
     # does not move by it.
     bias = np.full_like(value, scanner_class_errors.SURFACE_SD_MM if shape.kind == "step" else 0.0)
     if shape.kind == shape_models.RIGID:
-        biased = dataclasses.replace(fit.blocks, mean=np.full(len(fit.blocks.mean), scanner_class_errors.SURFACE_SD_MM))
-        bias = shape_models.rigid_motion(biased, fit.frame).values(fit.frame, points, outward)
+        bias = moved(np.full(len(fit.blocks.mean), scanner_class_errors.SURFACE_SD_MM))
     of_scanner = np.sqrt(levels.common[-1] ** 2 + levels.systematic_mm**2 + field.drift**2)
     shared = np.sqrt(of_scanner**2 + bias**2 + registration**2)
     return value, own, shape.sd(fit.frame, points, outward), shared

@@ -8,7 +8,7 @@ any point lies on, as of a part that is gone, those points are expected that wer
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from processor.defects.alignment import chart_of_cells
 from processor.defects.observations import CHUNK, Pairs, cells_at
 from processor.defects.surface_charts import GRID_SHARE, DesignSurface
 from processor.geometry import mesh_distance
+from processor.geometry.mesh_distance import FacetGrid
 from processor.model import Bools, Floats, Ints
 from processor.views import Views
 
@@ -60,15 +61,14 @@ def expected(pairs: Pairs, surface: DesignSurface, stations: Views) -> Expected:
     """Return the points expected of each station, of the design as scanned: see the head of this file."""
     cells = len(surface.share)
     parts = []
-    for k, rows in enumerate(_rows(pairs, len(stations.names))):
+    order = np.argsort(pairs.station, kind="stable")
+    for k, rows in enumerate(np.split(order, np.searchsorted(pairs.station[order], np.arange(1, len(stations.names))))):
         if np.isfinite(stations.positions[k]).all() and len(rows):
             count = np.zeros(cells)
             count[pairs.cell[rows]] = (pairs.count + pairs.stray)[rows]
             parts.append((k, *_of_station(k, stations, count, surface)))
-    points, counted = np.zeros(cells), np.bincount(pairs.cell, pairs.count + pairs.stray, cells)
-    for _, cell, number in parts:
-        points[cell] += number
-    empty = counted < SEEN_SHARE * points
+    counted = np.bincount(pairs.cell, pairs.count + pairs.stray, cells)
+    empty = counted < SEEN_SHARE * Expected(tuple(parts), np.zeros(cells)).points
     for k, cell, number in parts:
         rows = np.flatnonzero(empty[cell])
         starts = surface.centres[cell[rows]] + BEFORE_MM * surface.outward[cell[rows]]
@@ -85,11 +85,11 @@ def without_shade(of: Expected, places: list[Ints], surface: DesignSurface, stat
     """
     charts, touched = surface.charts, np.unique(chart_of_cells(surface)[np.concatenate(places)])
     facets = np.flatnonzero(np.isin(surface.chart_of, touched))
-    parts = []
+    grid, parts = _grid_of(surface, facets), []
     for k, cell, number in of.of_stations:
         rays, shaded = np.zeros(len(of.through)), np.zeros(len(of.through))
         rays[cell] = number
-        for crossed in _crossed(k, surface, stations, facets, places):
+        for crossed in _crossed(k, surface, stations, facets, grid, places):
             shaded += np.bincount(crossed, minlength=len(shaded))
         for chart in touched:
             of_chart = charts.image(rays, chart)
@@ -110,35 +110,43 @@ def _through(counted: Ints, surface: DesignSurface, stations: Views) -> Floats:
     share = np.bincount(chart, (counted > 0) & (surface.share > 0.5), charts)
     unseen = share < FACE_SHARE * np.maximum(np.bincount(chart, surface.share > 0.5, charts), 1)
     facets = np.flatnonzero(unseen[surface.chart_of])
+    if not len(facets):
+        return through
+    grid = _grid_of(surface, facets)
     for k, position in enumerate(stations.positions):
-        if len(facets) and np.isfinite(position).all():
-            for crossed in _crossed(k, surface, stations, facets):
+        if np.isfinite(position).all():
+            for crossed in _crossed(k, surface, stations, facets, grid):
                 through += np.bincount(crossed, minlength=len(through))
     return through
 
 
+def _grid_of(surface: DesignSurface, facets: Ints) -> FacetGrid:
+    """Return a grid of some of the facets: all stations look at the same ones."""
+    faces = surface.faces[facets]
+    size = float(np.linalg.norm(np.ptp(surface.vertices[faces].reshape(-1, 3), axis=0)))
+    return mesh_distance.facet_grid(surface.vertices, faces, surface.normals[facets], GRID_SHARE * size)
+
+
 def _crossed(
-    station: int, surface: DesignSurface, stations: Views, facets: Ints, behind: list[Ints] | None = None
+    station: int, surface: DesignSurface, stations: Views, facets: Ints, grid: FacetGrid, behind: Sequence[Ints] = ()
 ) -> Iterator[Ints]:
-    """Yield the cells of some facets that rays of a station cross before their points; or beyond them.
+    """Yield the cells of some facets, those of a grid, that rays of a station cross before their points; or beyond.
 
     Beyond, rays to ``behind``, places of cells (n,), are looked at alone.
     """
-    position, faces, normals = stations.positions[station], surface.faces[facets], surface.normals[facets]
-    size = float(np.linalg.norm(np.ptp(surface.vertices[faces].reshape(-1, 3), axis=0)))
-    grid = mesh_distance.facet_grid(surface.vertices, faces, normals, GRID_SHARE * size)
+    position = stations.positions[station]
+    to = [surface.centres[cells] - position for cells in behind]
     for points, _ in stations.blocks(CHUNK, view=station):
-        if behind is not None:
-            to = [surface.centres[cells] - position for cells in behind]
+        if behind:
             points = points[_towards(points - position, to, surface.charts.cell_mm)]
         ray = position - points
         length = np.linalg.norm(ray, axis=1)[:, None]
-        if behind is None:
-            starts, ends = points + THROUGH_MM * ray / length, np.repeat(position[None], len(points), axis=0)
-        else:
+        if behind:
             starts, ends = points - SHADE_MM * ray / length, points - surface.size_mm * ray / length
+        else:
+            starts, ends = points + THROUGH_MM * ray / length, np.repeat(position[None], len(points), axis=0)
         row, crossed, part = mesh_distance.crossings(grid, starts, ends, False)
-        steep = np.einsum("ni,ni->n", ray[row], normals[crossed]) > LEAST_COS * length[row, 0]
+        steep = np.einsum("ni,ni->n", ray[row], grid.normals[crossed]) > LEAST_COS * length[row, 0]
         row, crossed, part = row[steep], crossed[steep], part[steep]
         places = starts[row] + part[:, None] * (ends[row] - starts[row])
         yield cells_at(surface, surface.chart_of[facets[crossed]], places)
@@ -183,12 +191,6 @@ def _of_station(station: int, stations: Views, count: Floats, surface: DesignSur
     return cell[clear], density * angle[clear]
 
 
-def _rows(pairs: Pairs, stations: int) -> list[Ints]:
-    """Return the rows of each station's pairs."""
-    order = np.argsort(pairs.station, kind="stable")
-    return np.split(order, np.searchsorted(pairs.station[order], np.arange(1, stations)))
-
-
 def _nearest_ranges(station: int, stations: Views, bin_rad: float, arm: Floats) -> tuple[Floats, Bools]:
     """Return the shortest range about directions arm (n, 3), and whether they are within the station's field of view.
 
@@ -201,7 +203,7 @@ def _nearest_ranges(station: int, stations: Views, bin_rad: float, arm: Floats) 
     columns = np.zeros(wide, bool)
 
     def bins(arm: Floats) -> tuple[Ints, Ints, Floats]:
-        azimuth, elevation = _directions(arm)
+        azimuth, elevation = np.arctan2(arm[:, 1], arm[:, 0]), np.arctan2(arm[:, 2], np.hypot(arm[:, 0], arm[:, 1]))
         i = np.minimum((azimuth + np.pi) / bin_rad, wide - 1).astype(np.int64)
         j = np.minimum((elevation + 0.5 * np.pi) / bin_rad, high - 1).astype(np.int64)
         return i, j, elevation
@@ -218,8 +220,3 @@ def _nearest_ranges(station: int, stations: Views, bin_rad: float, arm: Floats) 
     i, j, elevation = bins(arm)
     inside = columns[i] & (elevation > lowest) & (elevation < highest)
     return nearest[i, j], inside
-
-
-def _directions(arm: Floats) -> tuple[Floats, Floats]:
-    """Return azimuth and elevation (n,), rad."""
-    return np.arctan2(arm[:, 1], arm[:, 0]), np.arctan2(arm[:, 2], np.hypot(arm[:, 0], arm[:, 1]))
