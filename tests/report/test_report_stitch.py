@@ -88,6 +88,6 @@ def test_scans_in_space_react(made, tmp_path, lang, unit):
         first = picture(shown)
         ticks = shown.locator(".live fieldset label")
         assert [one.strip() for one in ticks.all_text_contents()] == list(NAMES[:3])
-        assert any(unit in one for one in read_over(shown, 30, [down / 15 for down in range(1, 15)]))
+        assert any(unit in one for one in read_over(shown, 12, [down / 8 for down in range(1, 8)]))
         ticks.nth(0).locator("input").uncheck()
         assert picture(shown) != first

@@ -63,12 +63,12 @@ class Ball:
         return np.array([self.jacobian(x + h) - self.jacobian(x - h) for h in steps]) / (2.0 * STEP_MM)
 
 
-def fitted(ball):
+def fitted(ball, model_points=MODEL_POINTS):
     nodes = NodesToFit(
         crops=CropsWithRays(np.array([0, COUNT]), ball.points, ball.rays, ball.ranges, ball.second.astype(np.int32)),
         masks=Masks(np.array([0, 0]), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), 0.0, 0.15),
         model=StochasticModel(NOISE, np.array([np.zeros((3, 3)), SHIFT_SD**2 * np.eye(3)])),
-        model_points=MODEL_POINTS,
+        model_points=model_points,
         priors=Priors(PRIOR[None, :3, :3].copy(), START[3:4], PRIOR[3, 3:4]),
         states=START[None, :4],
         first_reach_mm=12.0,
@@ -115,3 +115,17 @@ def test_a_final_fit_is_that_of_scipy_less_the_bias_by_curvature_and_by_unknown_
         C = C + np.outer(bias, bias) / 12.0
     np.testing.assert_allclose(found.states[0], x[:4], atol=CLOSE)
     np.testing.assert_allclose(found.covariances[0], C, atol=CLOSE * C.max())
+
+
+def test_the_bound_of_a_covariance_counts_points_of_half_a_weight_in_full():
+    """What all points of the model could tell; beside the covariance, it shows what the robust weights cost."""
+    ball = Ball(True)
+    ball.points[5] += 2.88 * (ball.points[5] - [0.5, -0.3, 0.4]) / 60.2
+    found = fitted(ball, 1e4)  # the noise is known: a scale of 16 points follows the one that is off
+    assert 0.2 < found.residuals.weights[5] < 0.8
+    x = np.append(found.states[0], np.zeros(3))
+    variances = found.numbers[0, SCALE] ** 2 * ball.variances(x)
+    J = ball.jacobian(x)
+    bounds = [np.linalg.inv((J.T * w / variances @ J + PRIOR)[:4, :4]) for w in (1.0, found.residuals.weights)]
+    # Of x, which the point tells most of. The shifts, in which the derivatives are taken, are not returned: a quarter.
+    assert abs(found.bounds[0, 0, 0] - bounds[0][0, 0]) < 0.25 * (bounds[1] - bounds[0])[0, 0]
