@@ -515,7 +515,11 @@ COVERS = [box((x, -10.0, 300.0), (x + 400.0, 0.0, 600.0)) for x in (300.0, 1300.
 
 
 @pytest.mark.parametrize(
-    ("parts", "centre"), [(BRACKETS, [2500.0, -70.0, 707.0]), (COVERS, [1500.0, -5.0, 450.0])], ids=["bracket", "cover"]
+    ("parts", "centre"),
+    [
+        pytest.param(BRACKETS, [2500.0, -70.0, 707.0], id="bracket", marks=pytest.mark.slow),
+        pytest.param(COVERS, [1500.0, -5.0, 450.0], id="cover"),
+    ],
 )
 def test_a_part_that_is_gone_is_missing_where_scanners_see_through_it(parts, centre):
     """Behind a bracket they see the floor or the web far away, behind a cover of 10 mm the web that it lies on."""

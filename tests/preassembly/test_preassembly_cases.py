@@ -281,7 +281,7 @@ def on_foot():
     return scene.arch, Scan("scan", (points - middle) @ R.T + middle)
 
 
-@pytest.mark.parametrize("mast", [0, 900])
+@pytest.mark.parametrize("mast", [pytest.param(0, marks=pytest.mark.slow), 900])
 def test_scan_that_covers_half_of_another_part_is_rejected_or_unsure(on_foot, mast, monkeypatch):
     """The upper half of this foot has the rib's section, and the rest looks like clutter. A mast hides the size."""
     design, scan = on_foot
