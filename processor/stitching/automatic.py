@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from processor.stitching.fine import (
     contradictions,
     control_points,
     correspondences,
+    direction_errors,
     edge_constraints,
-    jackknife,
     pairs_and_loops,
 )
 from processor.stitching.fine.bundle_adjustment import Solution
@@ -80,13 +80,15 @@ def stitch(
     solution, blocks = _adjust(clouds, cells, coarse.T, reference)
     # All pairs that share enough pieces, each by itself
     with_pose = np.flatnonzero(np.isfinite(solution.T).all(axis=(1, 2)))
+    variance = direction_errors.added_covariance(blocks, solution, reference)[1]
     registered = [
-        pairs_and_loops.register_pair(blocks, solution, a, b) for a, b in itertools.combinations(with_pose.tolist(), 2)
+        pairs_and_loops.register_pair(blocks, solution, a, b, variance)
+        for a, b in itertools.combinations(with_pose.tolist(), 2)
     ]
     pairs = [pair for pair in registered if pair is not None]
     solution, blocks = _without_gross_pairs(blocks, solution, pairs, reference)
-    factor = jackknife.factors(blocks, solution, reference)
-    solution, pairs = jackknife.with_raised_covariance(solution, pairs, factor)
+    added, _ = direction_errors.added_covariance(blocks, solution, reference)
+    solution = replace(solution, covariance=solution.covariance + added)
     # All pairs of scans that have a pose
     placed = [s for s in range(len(solution.T)) if np.isfinite(solution.T[s]).all()]
     scores = {
@@ -116,7 +118,10 @@ def stitch(
 def _find_candidates(
     patches: list[ScanPatches], params: Params, picked: Picked, known: Mapping[int, Floats]
 ) -> network.Pairs:
-    """Return the candidate poses of all pairs (a < b), the best first; of two scans of ``known`` poses that alone."""
+    """Return the candidate poses of all pairs (a < b), the best first; of two scans of ``known`` poses that alone.
+
+    Groups of scans that no sure pose joins are searched for one once more, as deeply as would take too long for all.
+    """
     most_tilt_rad = 2e-3 * params.levelled_mrad if params.levelled_mrad else np.inf
 
     def candidates(key: tuple[int, int]) -> list[ScoredPose]:
@@ -131,8 +136,15 @@ def _find_candidates(
             poses.sort(key=lambda pose: -pose.score)
         return poses
 
+    def deeper(key: tuple[int, int]) -> list[ScoredPose]:
+        poses = pairwise.candidate_poses(patches[key[0]], patches[key[1]], most_tilt_rad, [pairwise.DEEP])
+        return poses if poses and poses[0].score > pairwise.SURE else found[key]
+
     keys = list(itertools.combinations(range(len(patches)), 2))
-    return dict(zip(keys, thread_ranges.each(candidates, keys), strict=True))
+    found = dict(zip(keys, thread_ranges.each(candidates, keys), strict=True))
+    group = network.groups(found, len(patches))
+    apart = [key for key in keys if group[key[0]] != group[key[1]]]
+    return found | dict(zip(apart, thread_ranges.each(deeper, apart), strict=True))
 
 
 def _pose_by_picks(a: ScanPatches, b: ScanPatches, in_a: Floats, in_b: Floats) -> list[ScoredPose]:

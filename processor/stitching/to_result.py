@@ -159,7 +159,7 @@ def _scans(
 
 
 def _not_joined(links: Sequence[tuple[int, int]] | None, status: Sequence[Status], reference: int) -> list[int]:
-    """Return the scans that are ok by themselves, but whose links lead to the reference only by way of ambiguous ones.
+    """Return the scans ok or weak by themselves, but whose links lead to the reference only by way of ambiguous ones.
 
     A repetitive structure may be placed wrongly in two halves, each of which is right by itself.
     """
@@ -173,7 +173,8 @@ def _not_joined(links: Sequence[tuple[int, int]] | None, status: Sequence[Status
             reached.add(s)
             if status[s] not in (Status.AMBIGUOUS, Status.FAILED):
                 todo.append(s)
-    return [] if links is None else [s for s, state in enumerate(status) if state == Status.OK and s not in reached]
+    settled = (Status.OK, Status.WEAK)
+    return [] if links is None else [s for s, state in enumerate(status) if state in settled and s not in reached]
 
 
 def _strangers(names: Sequence[str], network: Network, scans: Scans, reference: int) -> tuple[Reason, ...]:

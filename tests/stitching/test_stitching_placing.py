@@ -7,10 +7,11 @@ import pytest
 
 from processor.geometry import rigid
 from processor.model import Status
-from processor.stitching import to_result
+from processor.stitching import automatic, to_result
 from processor.stitching.coarse import network, pairwise
 from processor.stitching.coarse.pairwise import ScoredPose
 from processor.stitching.fine.pairs_and_loops import Pair
+from processor.stitching.params import Params
 from processor.stitching.planes import free_space
 
 HERE = np.eye(4)
@@ -115,10 +116,11 @@ def test_scans_beyond_a_rival_pose_are_ambiguous_together(scored, against, ambig
 
 
 def test_scans_that_join_only_through_an_ambiguous_one_are_ambiguous():
-    status = [Status.OK, Status.AMBIGUOUS, Status.OK, Status.OK]
     links = [(0, 1), (1, 2), (0, 3)]
-    for given, apart in ((links, [2]), ([*links, (2, 3)], []), (None, [])):
-        assert to_result._not_joined(given, status, 0) == apart
+    for state in (Status.OK, Status.WEAK):
+        status = [Status.OK, Status.AMBIGUOUS, state, Status.OK]
+        for given, apart in ((links, [2]), ([*links, (2, 3)], []), (None, [])):
+            assert to_result._not_joined(given, status, 0) == apart
 
 
 def test_closures_run_over_the_pairs_that_are_known_best():
@@ -152,3 +154,22 @@ def test_far_patches_between_rays_are_no_contradiction():
     assert share[0] == 1.0
     assert share[1] < 0.1  # (240 / 768)^2 = 0.098: half of its width by a step at 40 m
     assert share[2] < 0.1  # 240 / 3100: of a step at 9 m, 173 mm, at an incidence of 500 / 9000
+
+
+def test_groups_that_no_sure_pose_joins_are_searched_deeper(monkeypatch):
+    """A chain of four scans: of the pair in its middle only the deep search finds the pose."""
+    patches = [SimpleNamespace(row=row, patches=SimpleNamespace(weight=np.ones(9))) for row in range(4)]
+    sure, contradicted = ScoredPose(along(1.0), 60.0, 0.0, 0.3), ScoredPose(along(2.0), 90.0, 9.0, 0.4)
+    deep = []
+
+    def candidates(a, b, most_tilt_rad, efforts=()):
+        if efforts == [pairwise.DEEP]:
+            deep.append((a.row, b.row))
+        found = (a.row, b.row) in ((0, 1), (2, 3)) or (efforts and (a.row, b.row) == (1, 2))
+        return [sure if found else contradicted]
+
+    monkeypatch.setattr(pairwise, "candidate_poses", candidates)
+    poses = automatic._find_candidates(patches, Params(), {}, {})
+    assert sorted(deep) == [(0, 2), (0, 3), (1, 2), (1, 3)]
+    assert [key for key, (pose,) in poses.items() if pose is sure] == [(0, 1), (1, 2), (2, 3)]
+    assert network.groups(poses, 4).tolist() == [0, 0, 0, 0]

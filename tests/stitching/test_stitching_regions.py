@@ -78,11 +78,11 @@ def test_the_variance_of_faces_is_that_of_an_analysis_of_variance():
     N, g = np.zeros((8 + f, 8 + f)), np.zeros(8 + f)
     faces = np.arange(8, 8 + f)
     N[3, 3], N[3, faces], N[faces, 3], N[faces, faces] = a * f, a, a, a
-    for shrunk, expected in ((1.0, np.sqrt(y.var(ddof=1) - 1.0 / a)), (0.2, 0.0)):
+    for shrunk, expected in ((1.0, y.var(ddof=1) - 1.0 / a), (0.2, 0.0)):
         g[faces], g[3] = a * (x - shrunk * y), a * (x - shrunk * y).sum()
-        none = np.empty(0)
-        equations = normal_equations.Equations(N=N, spurious=N, g=g, z=none, offset=none, variance=none)
-        found = bundle_adjustment._estimate_face_sd(equations, np.array([3, 6, 7, *faces]), 1, np.append([0.0, 0.0], x))
+        found = bundle_adjustment.variance_of_errors(
+            N + np.diag([0.0] * 6 + [4.0, 1.0] + [0.0] * f), g, x, np.array([3, 6, 7]), faces
+        )
         np.testing.assert_allclose(found, expected, rtol=1e-8)  # the end of an iteration
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,9 +31,12 @@ class Effort:
 SIDES = 48.0  # along the reach of the points
 LIKE_COS = float(np.cos(np.radians(15.0)))
 FEWEST = 6  # patches
+MOST = 4  # candidate poses of two scans
 FINE = 0.3  # side of the cubes of indexed patches
 QUICK = Effort(peaks=6, least_of_best=0.5, scored=60, refined=8)
 WIDE = Effort(peaks=15, least_of_best=0.3, scored=150, refined=20)
+# In halls of unequal bays right poses were the 414th by votes at worst, and by their rough scores the ninth.
+DEEP = Effort(peaks=100, least_of_best=0.05, scored=1000, refined=30)
 GATES = (0.7, 0.35, 0.2, 0.12)  # distance across of matches, from refinement to refinement
 FEW_ABOVE = 0.3  # wider gates use the voters only
 STEPS = 4  # Gauss-Newton steps for each gate
@@ -118,15 +122,21 @@ def prepare(cloud: Cloud, side_mm: float) -> ScanPatches:
     )
 
 
-def candidate_poses(a: ScanPatches, b: ScanPatches, most_tilt_rad: float, most: int = 4) -> list[ScoredPose]:
-    """Return at most ``most`` poses of b in a, the best first; none if the scans have nothing alike.
+def candidate_poses(
+    a: ScanPatches, b: ScanPatches, most_tilt_rad: float, efforts: Sequence[Effort] = (QUICK, WIDE)
+) -> list[ScoredPose]:
+    """Return at most MOST poses of b in a, the best first; none if the scans have nothing alike.
 
-    If free space contradicts all poses of a quick search, as on a repetitive structure, a wider search follows.
+    If free space contradicts all poses of a search, as on a repetitive structure, the next effort follows.
     """
+    poses: list[ScoredPose] = []
     if min(len(a.patches.weight), len(b.patches.weight)) < FEWEST:
-        return []
-    poses = _search(a, b, most_tilt_rad, QUICK)[:most]
-    return poses if poses and poses[0].score > SURE else _search(a, b, most_tilt_rad, WIDE)[:most]
+        return poses
+    for effort in efforts:
+        poses = _search(a, b, most_tilt_rad, effort)[:MOST]
+        if poses and poses[0].score > SURE:
+            break
+    return poses
 
 
 def _search(a: ScanPatches, b: ScanPatches, most_tilt_rad: float, effort: Effort) -> list[ScoredPose]:

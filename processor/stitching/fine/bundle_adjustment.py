@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import brentq
 
 from processor.adjustment.scanner_class_errors import SCALE_SD, VIEW_SD_MM
@@ -25,7 +24,7 @@ REJECTED_WEIGHT, LEAST_INLIER_WEIGHT = 1e-6, 1e-3
 REWEIGHTINGS = 8  # at fixed poses
 PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # weak priors on the poses: undetermined components stay as they are
 MEDIAN_OF_ABS_Z = 0.6745  # z standard normal
-LEAST_FACE_MM, MOST_FACE_MM = 1e-3, 10.0  # standard deviation of the range errors of faces: where none show, at most
+LEAST_FACE_MM, MOST_COMMON_MM = 1e-3, 10.0  # standard deviation of the range errors of faces: where none show, at most
 EQUAL_ITERATIONS, INITIAL_TAU_SIGMAS = 3, 0.3  # first iterations weight pieces almost equally: tau, by point noise
 LEAST_GENUINE_SHARE = 0.01  # of the information in a direction: least that is taken as not spurious
 LEAST_BLOCKS = 10  # to estimate tau from
@@ -75,7 +74,7 @@ def solve(
     k = len(T)
     common = np.zeros(KINDS + 1) if tau is None else np.array(tau)
     ranges = np.zeros(2 * k + blocks.faces)
-    unknowns = _unknowns(blocks, len(ranges), k, reference)
+    unknowns = unknowns_of(blocks, len(ranges), k, reference)
     poses = unknowns[unknowns < 6 * k]
     if not len(poses):
         covariance = _fixed_reference(np.full((6 * k, 6 * k), np.nan), reference)
@@ -91,7 +90,10 @@ def solve(
         equations = linearize(blocks, T, ranges, np.maximum(common, least), weight)
         if iteration and tau is None:
             common[:KINDS] = _estimate_tau(blocks, equations.offset, equations.variance, common)
-            common[KINDS] = _estimate_face_sd(equations, unknowns, k, ranges)
+            if blocks.faces:
+                N, rows = equations.N + prior_information(len(ranges), k, np.inf), 8 * k + np.arange(blocks.faces)
+                rest = unknowns[unknowns < 8 * k]
+                common[KINDS] = np.sqrt(variance_of_errors(N, equations.g, ranges[2 * k :], rest, rows))
         if iteration == EQUAL_ITERATIONS and initial.any():
             weight = _robust_weights(blocks, _with_slack(equations, slack_mm))
             continue
@@ -104,7 +106,7 @@ def solve(
             break
     equations = linearize(blocks, T, ranges, common, weight)
     at = np.ix_(unknowns, unknowns)
-    C = _sandwich((equations.N + _prior(len(ranges), k, common[KINDS]))[at], equations.spurious[at])
+    C = _sandwich((equations.N + prior_information(len(ranges), k, common[KINDS]))[at], equations.spurious[at])
     covariance = np.full((6 * k, 6 * k), np.nan)
     covariance[np.ix_(poses, poses)] = C[: len(poses), : len(poses)]
     return Solution(
@@ -123,28 +125,10 @@ def weights_at(blocks: Blocks, solution: Solution) -> Floats:
     return weight
 
 
-def solve_without(
-    blocks: Blocks, solution: Solution, reference: int, out: npt.NDArray[np.bool_], almost_none: float
-) -> tuple[Floats, Floats]:
-    """Return step (6k,) and covariance (6k, 6k) of the poses if blocks ``out`` (b,) had the weight ``almost_none``.
-
-    The step is one of Newton's from the solution; rows and columns of poses that are not adjusted are 0.
-    """
-    weight = np.where(out, almost_none, solution.weight)
-    ranges, k = solution.ranges, len(solution.T)
-    equations = linearize(blocks, solution.T, ranges, np.array(solution.tau), weight)
-    unknowns = _unknowns(blocks, len(ranges), k, reference)
-    poses = unknowns[unknowns < 6 * k]
-    N = (equations.N + _prior(len(ranges), k, solution.tau[KINDS]))[np.ix_(unknowns, unknowns)]
-    covariance = np.zeros((6 * k, 6 * k))
-    covariance[np.ix_(poses, poses)] = np.linalg.solve(N, np.eye(len(N), len(poses)))[: len(poses)]
-    return _newton_step(equations, unknowns, ranges, solution.tau[KINDS])[: 6 * k], covariance
-
-
 def _newton_step(equations: Equations, unknowns: Ints, ranges: Floats, face_mm: float) -> Floats:
     """Return the step of all unknowns; ``ranges`` (2k + f,) are drawn to 0 by their priors."""
     size = len(equations.g)
-    prior = _prior(len(ranges), (size - len(ranges)) // 6, face_mm)
+    prior = prior_information(len(ranges), (size - len(ranges)) // 6, face_mm)
     g = equations.g.copy()
     g[size - len(ranges) :] += np.diag(prior)[size - len(ranges) :] * ranges
     step = np.zeros(size)
@@ -152,7 +136,7 @@ def _newton_step(equations: Equations, unknowns: Ints, ranges: Floats, face_mm: 
     return step
 
 
-def _prior(ranges: int, k: int, face_mm: float) -> Floats:
+def prior_information(ranges: int, k: int, face_mm: float) -> Floats:
     """Return the information of the priors: weak ones of k poses; range errors of scans by their class, of faces."""
     of_poses = np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k)
     of_scans = np.repeat([VIEW_SD_MM**-2, SCALE_SD**-2], k)
@@ -160,26 +144,23 @@ def _prior(ranges: int, k: int, face_mm: float) -> Floats:
     return np.diag(np.concatenate([of_poses, of_scans, of_faces]))
 
 
-def _unknowns(blocks: Blocks, ranges: int, k: int, reference: int) -> Ints:
+def unknowns_of(blocks: Blocks, ranges: int, k: int, reference: int) -> Ints:
     """Return the rows of the unknowns: six for every scan with blocks but the reference, and all range errors."""
     scans = [s for s in range(k) if s != reference and (blocks.scan == s).any()]
     poses = (6 * np.array(scans, np.int64)[:, None] + np.arange(6)).ravel()
     return np.concatenate([poses, 6 * k + np.arange(ranges)])
 
 
-def _estimate_face_sd(equations: Equations, unknowns: Ints, k: int, ranges: Floats) -> float:
-    """Estimate the standard deviation of the range errors of faces by restricted maximum likelihood.
+def variance_of_errors(N: Floats, g: Floats, errors: Floats, rest: Ints, own: Ints) -> float:
+    """Estimate the common variance of some unknowns, the ``errors`` (e,), by restricted maximum likelihood, mm2.
 
-    With the other unknowns eliminated, the faces' information S and S times their estimate are turned to the axes of S,
-    where they are independent.
+    N (m, m) and g (m,) are normal equations at these, ``own`` (e,) their rows, and ``rest`` those of all others. With
+    these eliminated, the errors' information S and S times their estimate are turned to the axes of S, where they are
+    independent.
     """
-    if len(ranges) == 2 * k:
-        return 0.0
-    rest, faces = unknowns[unknowns < 8 * k], np.arange(8 * k, len(equations.g))
-    N = equations.N + _prior(len(ranges), k, np.inf)
-    half = np.linalg.solve(N[np.ix_(rest, rest)], np.column_stack([N[np.ix_(rest, faces)], equations.g[rest]]))
-    S = N[np.ix_(faces, faces)] - N[np.ix_(faces, rest)] @ half[:, :-1]
-    pull = S @ ranges[2 * k :] - equations.g[faces] + N[np.ix_(faces, rest)] @ half[:, -1]
+    half = np.linalg.solve(N[np.ix_(rest, rest)], np.column_stack([N[np.ix_(rest, own)], g[rest]]))
+    S = N[np.ix_(own, own)] - N[np.ix_(own, rest)] @ half[:, :-1]
+    pull = S @ errors - g[own] + N[np.ix_(own, rest)] @ half[:, -1]
     information, axes = np.linalg.eigh(0.5 * (S + S.T))
     information = np.maximum(information, 0.0)
     square = (axes.T @ pull) ** 2
@@ -190,9 +171,9 @@ def _estimate_face_sd(equations: Equations, unknowns: Ints, k: int, ranges: Floa
 
     if slope(0.0) <= 0.0:
         return 0.0
-    if slope(MOST_FACE_MM**2) >= 0.0:
-        return MOST_FACE_MM
-    return float(np.sqrt(brentq(slope, 0.0, MOST_FACE_MM**2)))
+    if slope(MOST_COMMON_MM**2) >= 0.0:
+        return MOST_COMMON_MM**2
+    return float(brentq(slope, 0.0, MOST_COMMON_MM**2))
 
 
 def _sandwich(N: Floats, spurious: Floats) -> Floats:

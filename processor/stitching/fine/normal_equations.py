@@ -19,7 +19,6 @@ from processor.stitching.fine.correspondences import FACE_END, Blocks
 from processor.stitching.planes import extraction, grouped_sums
 from processor.stitching.planes.extraction import Planes
 
-COLUMNS = 9  # unknowns of a block: the pose of its scan, the scan's range errors (offset, scale), and its face's
 LEAST_FREE_SHARE = 0.02  # of the variance of a block's misfit: least that its leverage on the plane leaves
 RELATIVE_RIDGE = 1e-12  # of a plane's normal matrix: planes that few points determine
 
@@ -28,9 +27,9 @@ RELATIVE_RIDGE = 1e-12  # of a plane's normal matrix: planes that few points det
 class Equations:
     """Normal equations N (m, m), g (m,), and the misfits (b,) of the blocks.
 
-    The m = 8k + f unknowns are the poses of k scans, their range offsets, their scales, and the range errors of f
-    faces. ``spurious`` (m, m) is the part of N that is due to the uncertainty of the planes' normals. ``z`` are misfits
-    in standard deviations, ``offset`` in mm, ``variance`` of the latter without tau.
+    The m = 8k + f + d unknowns are the poses of k scans, their range offsets, their scales, and the range errors of f
+    faces and of d directions. ``spurious`` (m, m) is the part of N that is due to the uncertainty of the planes'
+    normals. ``z`` are misfits in standard deviations, ``offset`` in mm, ``variance`` of the latter without tau.
     """
 
     N: Floats
@@ -44,8 +43,9 @@ class Equations:
 class _Coupling(NamedTuple):
     """Rows (b,) of poses and planes to be eliminated, sorted by piece, and their blocks of the normal matrix.
 
-    ``columns`` (b, COLUMNS) are the unknowns of a row; the last, in blocks on no face, is one that is cut off.
-    ``Hsp`` (b, COLUMNS, 3) couples them and the plane of the piece; ``inverse`` (p, 3, 3) is that of the planes'
+    ``columns`` (b, q) are the unknowns of a row: the pose of its scan, the scan's range errors (offset, scale), its
+    face's, and its direction's where that is asked for; of blocks on no face, the face's is cut off.
+    ``Hsp`` (b, q, 3) couples them and the plane of the piece; ``inverse`` (p, 3, 3) is that of the planes'
     block, ``gp`` (p, 3) their gradient. ``tilt`` (p, 3, 3) is the covariance of the ``normal`` (p, 3), ``along`` (b,)
     the information of a row on the shift of its scan along the normal.
     """
@@ -60,13 +60,20 @@ class _Coupling(NamedTuple):
     along: Floats
 
 
-def linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: Floats) -> Equations:
-    """Build the normal equations at poses T (k, 4, 4) and range errors (2k + f,), by weights (b,) of the blocks.
+def linearize(
+    blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: Floats, direction: Ints | None = None
+) -> Equations:
+    """Build the normal equations at poses T (k, 4, 4) and range errors (2k + f + d,), by weights (b,) of the blocks.
 
-    ``tau`` is the standard deviation of the common offset of a block, by its kind.
+    ``tau`` is the standard deviation of the common offset of a block, by its kind; ``direction`` (b,), 0 to d - 1, the
+    one of its scan that a block lies in.
     """
     k = len(T)
-    columns = _columns(blocks, k)
+    of_face = np.where(blocks.face < 0, len(ranges) - 2 * k, blocks.face)
+    columns = np.column_stack(
+        [6 * blocks.scan[:, None] + np.arange(6), 6 * k + blocks.scan, 7 * k + blocks.scan, 8 * k + of_face]
+        + ([] if direction is None else [8 * k + blocks.faces + direction])
+    )
     errors = np.append(ranges, 0.0)[columns[:, 6:] - 6 * k]
     W = in_world(blocks, T, errors[:, 0] + errors[:, 2], errors[:, 1])
     total = grouped_sums.summed(extraction.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
@@ -74,6 +81,7 @@ def linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: Fl
     W = _shifted(W, planes.mean[blocks.piece])
     t2 = tau[blocks.kind] ** 2 * unit_variance(blocks)
     by_columns, by_plane = _design_matrices(blocks, T, planes)
+    by_columns = np.concatenate([by_columns, by_columns[:, 6 : columns.shape[1] - 3]], axis=1)  # directions are offsets
     # An offset common to a block's points, of variance t2 (b,), is eliminated from the moments (b, 7, 7)
     e, mass = W[:, :, 3], W[:, 3, 3]
     reduced = (W - (t2 / (1.0 + t2 * mass))[:, None, None] * e[:, :, None] * e[:, None, :]) * weight[:, None, None]
@@ -84,19 +92,12 @@ def linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: Fl
     return Equations(N=N, spurious=spurious, g=g, z=z, offset=offset, variance=variance)
 
 
-def _columns(blocks: Blocks, k: int) -> Ints:
-    """Return the columns (b, COLUMNS) of each block's unknowns; blocks on no face have one beyond all others."""
-    of_face = 8 * k + np.where(blocks.face < 0, blocks.faces, blocks.face)
-    poses = 6 * blocks.scan[:, None] + np.arange(6)
-    return np.column_stack([poses, 6 * k + blocks.scan, 7 * k + blocks.scan, of_face])
-
-
 def _normal_matrix(
     blocks: Blocks, planes: Planes, W: Floats, Ls: Floats, Lp: Floats, columns: Ints, size: int
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return N, its spurious part and g of :class:`Equations`, and the inverse (p, 3, 3) of the planes' own block.
 
-    W (b, 7, 7) are the weighted moments about the planes' means; Ls (b, COLUMNS, 7) and Lp (b, 3, 7) the derivatives by
+    W (b, 7, 7) are the weighted moments about the planes' means; Ls (b, q, 7) and Lp (b, 3, 7) the derivatives by
     the columns and the plane; ``size`` is the number of unknowns. The normal of a plane is not known exactly: if it is
     off, a piece seems to determine shifts along itself as well. This spurious part of N follows from the uncertainty of
     the planes.
@@ -169,7 +170,7 @@ def _design_matrices(blocks: Blocks, T: Floats, planes: Planes) -> tuple[Floats,
     Lp[:, 0, :3], Lp[:, 1, :3], Lp[:, 2, 3] = axes[:, :, 1], axes[:, :, 2], -1.0
     # Rotations w about the scan's own origin o: q = p - o, and n . (w x q) = w . (q x n).
     arm = c - T[blocks.scan, :3, 3]
-    Ls = np.zeros((b, COLUMNS, 7))
+    Ls = np.zeros((b, 9, 7))
     Ls[:, 0, 1], Ls[:, 0, 2] = n[:, 2], -n[:, 1]
     Ls[:, 1, 0], Ls[:, 1, 2] = -n[:, 2], n[:, 0]
     Ls[:, 2, 0], Ls[:, 2, 1] = n[:, 1], -n[:, 0]
@@ -192,7 +193,8 @@ def eliminate(coupling, N, g, spurious):  # type: ignore[no-untyped-def]
     piece, columns, Hsp, inverse = coupling.piece, coupling.columns, coupling.Hsp, coupling.inverse
     normal, tilt = coupling.normal, coupling.tilt
     b = len(piece)
-    W, pull = np.empty((COLUMNS, 3)), np.empty(3)
+    unknowns = columns.shape[1]
+    W, pull = np.empty((unknowns, 3)), np.empty(3)
     start = 0
     while start < b:
         p = piece[start]
@@ -201,7 +203,7 @@ def eliminate(coupling, N, g, spurious):  # type: ignore[no-untyped-def]
             end += 1
         for x in range(start, end):
             s = columns[x, 3]
-            for i in range(COLUMNS):
+            for i in range(unknowns):
                 for j in range(3):
                     W[i, j] = 0.0
                     for m in range(3):
@@ -220,8 +222,8 @@ def eliminate(coupling, N, g, spurious):  # type: ignore[no-untyped-def]
                     shared += pull[m] * (
                         normal[p, 0] * Hsp[y, 3, m] + normal[p, 1] * Hsp[y, 4, m] + normal[p, 2] * Hsp[y, 5, m]
                     )
-                for i in range(COLUMNS):
-                    for j in range(COLUMNS):
+                for i in range(unknowns):
+                    for j in range(unknowns):
                         total = 0.0
                         for m in range(3):
                             total += W[i, m] * Hsp[y, j, m]

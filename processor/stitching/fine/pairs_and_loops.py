@@ -10,7 +10,7 @@ from scipy.special import chdtri
 from processor.geometry import rigid
 from processor.model import Floats
 from processor.stitching import poses_with_scale
-from processor.stitching.fine import bundle_adjustment
+from processor.stitching.fine import bundle_adjustment, direction_errors
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import ON_PIECE, Blocks
 
@@ -46,10 +46,11 @@ class Loop:
     ratio: float
 
 
-def register_pair(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
+def register_pair(blocks: Blocks, network: Solution, a: int, b: int, variance: float) -> Pair | None:
     """Register a pair by its shared pieces alone; None if these are too few.
 
-    Outliers keep their weights from the network, since two scans alone cannot decide which of them is wrong.
+    ``variance`` is that of errors by direction, mm2. Outliers keep their weights from the network, since two scans
+    alone cannot decide which of them is wrong.
     """
     of_pair = blocks.weighted(network.weight).take(np.isin(blocks.scan, (a, b))).shared()
     if of_pair.pieces < LEAST_PIECES:
@@ -57,7 +58,7 @@ def register_pair(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | N
     local = replace(of_pair, scan=(of_pair.scan == b).astype(np.int64))
     start = np.stack([np.eye(4), rigid.invert(network.T[a]) @ network.T[b]])
     solution = bundle_adjustment.solve(local, start, 0, iterations=3, robust=False, tau=network.tau)
-    covariance = solution.covariance[6:, 6:]
+    covariance = (solution.covariance + direction_errors.added_covariance(local, solution, 0, variance)[0])[6:, 6:]
     d = poses_with_scale.difference(solution.T[1], start[1])[:6]
     points = local.kind == ON_PIECE
     weight = local.sums[points, 9]
