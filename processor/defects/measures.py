@@ -31,6 +31,7 @@ DEEPEST_MM = 500.0  # of the design behind a place
 MARGIN_CELLS = 2  # about a region, of which points are used for a small bump
 FEWEST_POINTS = 12
 EXPONENTS = (2.0, 12.0)  # of a bump: from round to flat-bottomed
+RIM_SHARE = 0.02  # of its depth, at which a bump ends: at the rim of a dent as round as a cosine
 ROBUST_SDS = 2.0  # of a point, from which on its weight decreases
 
 
@@ -324,9 +325,10 @@ def thickness_at(
 def refined(
     measured: Measures, region: Region, points: CellPoints, field: Field, shape_values: Floats, inflation: float
 ) -> Measures:
-    """Return measures with the depth of a bump d exp(-(r / R)^q) fitted to the points; unchanged without a fit.
+    """Return measures with depth and diameter of a bump d exp(-(r / R)^q) fitted to points; unchanged without a fit.
 
-    For small dents and pits: cells average their depth. The exponent q covers round and flat bottoms.
+    For small dents and pits: cells average their depth, and those at the rim are not significant one by one. The
+    exponent q covers round and flat bottoms.
     """
     uv, deviation = points.about(region, shape_values)
     middle = unrolled(points.surface, region).mean(axis=0)
@@ -360,4 +362,5 @@ def refined(
     curvature = 2.0 * abs(depth) / (fit.x[2] * radius) ** 2 * 1000.0
     registration = registration_sd(points.alignment, field, measured.centre, measured.axes[2], region.cells)
     ci95 = NORMAL_95 * float(np.hypot(sd * inflation, registration))
-    return dataclasses.replace(measured, depth=depth, depth_ci95=ci95, curvature=curvature)
+    diameter = float(2.0 * fit.x[2] * radius * np.log(1.0 / RIM_SHARE) ** (1.0 / fit.x[4]))
+    return dataclasses.replace(measured, depth=depth, depth_ci95=ci95, curvature=curvature, diameter=diameter)

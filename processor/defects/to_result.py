@@ -355,6 +355,9 @@ def _place_values(
         crack = chosen.defect_class is DefectClass.CRACK
         if measured.diameter < SMALL_CELLS * cell and not crack:
             measured = measures.refined(measured, region, search.points, search.field, search.shape_values, inflation)
+            chosen = classification.of_deviation(
+                region.sign, measured.diameter, length, width, assumed, region.z, stayed
+            )
         if not abs(measured.depth) > measured.lod95:
             return None  # significant only together with the defect beside it
         if crack:

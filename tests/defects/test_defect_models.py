@@ -234,6 +234,7 @@ def test_a_small_bump_is_as_deep_as_its_points_where_cells_show_at_least_a_quart
         return
     assert found.depth == pytest.approx(inward * 6.0, rel=1e-5)  # as least squares converges
     assert found.curvature == pytest.approx(2.0 * 6.0 / 15.0**2 * 1000.0, rel=1e-4)
+    assert found.diameter == pytest.approx(30.0 * np.log(50.0) ** (1.0 / 3.0), rel=1e-4)  # where it is a fiftieth
     assert found.depth_ci95 == pytest.approx(1.96 * 1.25, rel=1e-4)  # 1 mm of the pose and 0.75 of views
 
 
