@@ -36,6 +36,18 @@ def biweight(scaled: Floats) -> Floats:
     return weight
 
 
+def huber(z: Floats, limit: float) -> Floats:
+    """Huber's weights of residuals ``z`` in standard deviations: 1 up to ``limit``, then as their inverse."""
+    weight: Floats = np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-9))
+    return weight
+
+
+def cauchy(scaled: Floats) -> Floats:
+    """Cauchy's weights of residuals, given in units of the size at which the weight is one half."""
+    weight: Floats = 1.0 / (1.0 + scaled**2)
+    return weight
+
+
 def student_factor(dof: Floats | float) -> Floats:
     """Factor of standard deviations known by ``dof`` degrees of freedom, such that 1.96 of them contain 95 %.
 

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from processor.adjustment.point_groups import group_sums
 from processor.distinct_rows import distinct
 from processor.model import Floats, Ints
 from processor.robust_statistics import student_factor
@@ -56,7 +57,7 @@ def group_covariance(basis: Floats, group: Ints, variance: float) -> Floats:
     the shared errors, mm^2.
     """
     inverse = np.linalg.inv(basis.T @ basis)
-    by_group = np.stack([np.bincount(group, column) for column in basis.T], axis=1) @ inverse
+    by_group = group_sums(basis, group) @ inverse
     covariance: Floats = variance * by_group.T @ by_group
     return covariance
 

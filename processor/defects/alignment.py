@@ -15,12 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from processor.adjustment import scanner_class_errors
+from processor.adjustment import robust_least_squares, scanner_class_errors
+from processor.adjustment.body_motions import distance_derivative, transform_about, variances
+from processor.adjustment.elimination import eliminate
 from processor.defects.observations import Pairs
 from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
 from processor.model import Columns, Floats, Ints
-from processor.robust_statistics import robust_sd
+from processor.robust_statistics import cauchy, robust_sd
 from processor.views import Views
 
 BLOCK_MM = 80.0
@@ -36,7 +38,7 @@ GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of parameters with one varia
 WHOLE_PRIOR = np.array([5e-3] * 3 + [50.0] * 3)
 FLOOR_MM = 0.15  # standard deviation of a block's mean: beams, encoders and the roughness of the steel
 FEWEST_COMPONENTS = 3  # to fit the whole by: of fewer, a component that moved cannot be identified
-ROUNDS = 12
+ROUNDS, STILL_MM = 12, 1e-4  # a step of the whole that moves all blocks by less is the last
 MOST_ROUNDS, SETTLED = 40, 0.05  # of the stations' variance components, and the relative change of the last round
 CAUCHY = 2.385
 PAIRS_AT_ONCE = 1 << 18  # of cell and station, whose derivatives are in memory together
@@ -64,14 +66,13 @@ class Alignment:
 
     def corrections(self, points: Floats, outward: Floats, rays: Floats, station: Ints) -> Floats:
         """Return the corrections (n,) to subtract from deviations at points (n, 3) along unit rays (n, 3), mm."""
-        J = _derivative(points - self.centre, outward, rays)
+        J = distance_derivative(points - self.centre, outward, rays)
         correction: Floats = np.einsum("nk,nk->n", J, self.movements[station]) + J[:, :6] @ self.whole
         return correction
 
     def sd(self, points: Floats, outward: Floats) -> Floats:
         """Return the standard deviation (n,) of a deviation at points (n, 3) by the fit of the whole, mm."""
-        J = _derivative(points - self.centre, outward, np.zeros_like(points))[:, :6]
-        sd: Floats = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, self.covariance, J), 0.0))
+        sd: Floats = np.sqrt(variances(distance_derivative(points - self.centre, outward), self.covariance))
         return sd
 
     def pose_covariance(self) -> Floats:
@@ -125,7 +126,7 @@ def align(
     if not len(blocks.block):
         return start
     points, outward = surface.centres[blocks.cell], surface.outward[blocks.cell]
-    J = _derivative(points - start.centre, outward, rays_to(points, stations.positions[blocks.station]))
+    J = distance_derivative(points - start.centre, outward, rays_to(points, stations.positions[blocks.station]))
     component = surface.charts.component[chart_of_cells(surface)[blocks.cell]]
     used = ~np.isin(component, sorted(excluded))
     # Of what moved by much, stations do not see the same place in one cell: they are compared on the rest.
@@ -169,7 +170,7 @@ def station_variance(
     for rows in _whole_cells(pairs.cell):
         cell, station = pairs.cell[rows], pairs.station[rows]
         points, outward = surface.centres[cell], surface.outward[cell]
-        J = _derivative(points - alignment.centre, outward, rays_to(points, stations.positions[station]))
+        J = distance_derivative(points - alignment.centre, outward, rays_to(points, stations.positions[station]))
         quadratic_forms(cell, station, pairs.count[rows] / total[cell], J, C, CR, RCR, variance)
     return variance
 
@@ -217,9 +218,8 @@ def quadratic_forms(
 
 def corrected_pose(T_design_project: Floats, alignment: Alignment) -> Floats:
     """Return the pose less the movement of the whole."""
-    R = rigid.rotation_from_vector(-alignment.whole[:3])
-    shift = alignment.centre - R @ alignment.centre - R @ alignment.whole[3:]
-    T: Floats = rigid.transform(R, shift) @ T_design_project
+    moved = transform_about(alignment.whole, alignment.centre)
+    T: Floats = rigid.invert(moved) @ T_design_project
     return T
 
 
@@ -233,11 +233,6 @@ def rays_to(points: Floats, positions: Floats) -> Floats:
     arm = points - positions
     rays: Floats = np.nan_to_num(arm / np.linalg.norm(arm, axis=1)[:, None])
     return rays
-
-
-def _derivative(arm: Floats, outward: Floats, rays: Floats) -> Floats:
-    """Return the derivative (n, 7) of deviations by rotation about the centre, translation and range offset."""
-    return np.hstack([np.cross(arm, outward), outward, np.einsum("ni,ni->n", rays, outward)[:, None]])
 
 
 def _blocks(pairs: Pairs, surface: DesignSurface) -> StationBlocks:
@@ -299,21 +294,20 @@ def station_movements(blocks: StationBlocks, J: Floats, stations: int) -> tuple[
     weight = 1.0 / blocks.variance
     for iteration in range(MOST_ROUNDS):
         residual = blocks.mean - np.einsum("nk,nk->n", J, x[blocks.station])
-        total = np.bincount(block, weight, count)
-        middle = np.bincount(block, weight * residual, count) / total
-        normalized = (residual - middle[block]) / np.sqrt(blocks.variance)
-        weight = 1.0 / blocks.variance / (1.0 + (normalized / CAUCHY) ** 2)
-        A, right = _normal_equations(blocks, J, block, weight, stations)
-        covariance = np.asarray(np.linalg.inv(A + np.diag(np.tile(1.0 / prior**2, stations))), np.float64)
-        x = (covariance @ right).reshape(stations, 7)
-        expected = x**2 + np.diag(covariance).reshape(stations, 7)
+        middle = np.bincount(block, weight * residual) / np.bincount(block, weight)
+        weight = cauchy((residual - middle[block]) / np.sqrt(blocks.variance) / CAUCHY) / blocks.variance
+        N, g = _normal_equations(blocks, J, block, weight, stations)
+        covariance = np.asarray(np.linalg.inv(N + np.diag(np.tile(1.0 / prior**2, stations))), np.float64)
+        x = (covariance @ g).reshape(stations, 7)
+        remaining = np.diag(covariance).reshape(stations, 7)
         before = prior.copy()
         for group in GROUPS:
-            known = 1.0 - np.diag(covariance).reshape(stations, 7)[:, group] / prior[group] ** 2
+            known = 1.0 - remaining[:, group] / prior[group] ** 2
             undetermined = iteration == 0 and known.sum() < 1.0
+            expected = (x**2 + remaining)[seen, group]
             free = CLASS_FREE[group][0]
-            square = free * CLASS[group][0] ** 2 + float(expected[seen][:, group].sum())
-            size = 0.0 if undetermined else float(np.sqrt(square / (free + expected[seen][:, group].size)))
+            square = free * CLASS[group][0] ** 2 + float(expected.sum())
+            size = 0.0 if undetermined else float(np.sqrt(square / (free + expected.size)))
             prior[group] = max(size, LEAST_PRIOR[group][0])
         if iteration >= ROUNDS - 1 and np.abs(prior / before - 1.0).max() < SETTLED:
             break
@@ -323,22 +317,16 @@ def station_movements(blocks: StationBlocks, J: Floats, stations: int) -> tuple[
 def _normal_equations(
     blocks: StationBlocks, J: Floats, block: Ints, weight: Floats, stations: int
 ) -> tuple[Floats, Floats]:
-    """Return the normal equations (7k, 7k), (7k,) reduced by the deviation of each block (Schur complement)."""
-    count = int(block.max()) + 1
-    total = np.bincount(block, weight, count)
-    A, right = np.zeros((7 * stations, 7 * stations)), np.zeros(7 * stations)
-    coupling = np.zeros((count, 7 * stations))
+    """Return the normal equations (7k, 7k), (7k,) of the stations, reduced by the deviation of each block."""
+    N, g = np.zeros((7 * stations, 7 * stations)), np.zeros(7 * stations)
+    columns = 7 * blocks.station[:, None] + np.arange(7)
     for k in range(stations):
-        rows = blocks.station == k
-        wJ = weight[rows, None] * J[rows]
-        here = slice(7 * k, 7 * k + 7)
-        A[here, here] += wJ.T @ J[rows]
-        right[here] += wJ.T @ blocks.mean[rows]
-        for column in range(7):  # the same sums as np.add.at, which takes ten times as long
-            coupling[:, 7 * k + column] = np.bincount(block[rows], wJ[:, column], count)
-    A -= coupling.T @ (coupling / total[:, None])
-    right -= coupling.T @ (np.bincount(block, weight * blocks.mean, count) / total)
-    return A, right
+        own, rows = slice(7 * k, 7 * k + 7), blocks.station == k
+        N[own, own], g[own] = robust_least_squares.normal_equations(J[rows], weight[rows], blocks.mean[rows])
+    inverse = 1.0 / np.bincount(block, weight)
+    right = np.bincount(block, weight * blocks.mean)
+    eliminate(block, columns, (weight[:, None] * J)[:, :, None], inverse[:, None, None], right[:, None], N, g)
+    return N, g
 
 
 def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Floats, Floats]:
@@ -349,31 +337,31 @@ def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Float
 
     The covariance follows from the scatter between components (sandwich estimator), plus that of the fit itself.
     """
-    x = np.zeros(6)
     prior = np.diag(1.0 / WHOLE_PRIOR**2)
-    scale = robust_sd(deviation, FLOOR_MM)
-    weight = np.ones(len(deviation))
-    _, of_component = np.unique(component, return_inverse=True)
-    of_component = of_component.reshape(-1)
-    for _ in range(4 * ROUNDS):
+    number = np.unique(component, return_inverse=True)[1].reshape(-1)
+
+    def weights(x: Floats) -> Floats:
         residual = deviation - J @ x
-        # By the root mean square of the residuals of each component
-        rms = np.sqrt(np.bincount(of_component, residual**2) / np.bincount(of_component))
-        typical = max(float(np.median(rms)), FLOOR_MM)
-        of_its_component: Floats = 1.0 / (1.0 + (rms / (CAUCHY * typical)) ** 2) ** 2
-        weight = of_its_component[of_component] / (1.0 + (residual / (CAUCHY * scale)) ** 2) ** 2
-        A = J.T @ (weight[:, None] * J) / scale**2 + prior
-        step = np.linalg.solve(A, J.T @ (weight * deviation) / scale**2) - x
-        x = x + step
-        residual = deviation - J @ x
-        scale = robust_sd(residual, FLOOR_MM)
-        if np.abs(J @ step).max() < 1e-4:
-            break
-    residual = deviation - J @ x
-    A = J.T @ (weight[:, None] * J) / scale**2 + prior
-    pull = weight[:, None] * J * residual[:, None] / scale**2
-    groups = np.stack([np.bincount(component, pull[:, i], component.max() + 1) for i in range(6)], axis=1)
-    inverse = np.linalg.inv(A)
-    count = len(np.unique(component))
-    covariance = inverse @ (groups.T @ groups) @ inverse * count / max(count - 6.0, 1.0) + inverse
-    return x, covariance, inverse @ (weight[:, None] * J / scale**2).T
+        rms = np.sqrt(np.bincount(number, residual**2) / np.bincount(number))
+        of_component = cauchy(rms / (CAUCHY * max(float(np.median(rms)), FLOOR_MM)))
+        relative: Floats = (of_component[number] * cauchy(residual / (CAUCHY * robust_sd(residual, FLOOR_MM)))) ** 2
+        return relative
+
+    def scaled(x: Floats, relative: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return weights (n,) by the scale of the residuals at x, and the normal equations."""
+        weight = relative / robust_sd(deviation - J @ x, FLOOR_MM) ** 2
+        N, g = robust_least_squares.normal_equations(J, weight, deviation)
+        return weight, N + prior, g
+
+    def solved(x: Floats, relative: Floats) -> Floats:
+        _, N, g = scaled(x, relative)
+        return np.asarray(np.linalg.solve(N, g))
+
+    def is_still(step: Floats) -> bool:
+        return bool(np.abs(J @ step).max() < STILL_MM)
+
+    x, relative = robust_least_squares.reweighted(np.zeros(6), weights, solved, 4 * ROUNDS, is_still)
+    weight, N, _ = scaled(x, relative)
+    inverse, gradient = np.asarray(np.linalg.inv(N)), J * (weight * (deviation - J @ x))[:, None]
+    covariance = robust_least_squares.sandwich(inverse, gradient, component) + inverse
+    return x, covariance, inverse @ (weight[:, None] * J).T

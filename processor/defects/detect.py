@@ -11,6 +11,7 @@ import numpy as np
 
 from processor import scene_cloud
 from processor.adjustment import scanner_class_errors
+from processor.adjustment.body_motions import distance_derivative
 from processor.defects import (
     alignment,
     component_shapes,
@@ -163,8 +164,7 @@ def _registered(
         # The largest movement of the whole along the normals of cells
         rows = slice(None, None, max(1, len(surface.centres) // SD_SAMPLES))
         points, outward = surface.centres[rows], surface.outward[rows]
-        J = np.hstack([np.cross(points - aligned.centre, outward), outward])
-        movement_mm = float(np.abs(J @ aligned.whole).max())
+        movement_mm = float(np.abs(distance_derivative(points - aligned.centre, outward) @ aligned.whole).max())
         if not left or movement_mm < AGAIN_MM:
             break
         T = alignment.corrected_pose(T, aligned)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.adjustment import scanner_class_errors
+from processor.adjustment.body_motions import distance_derivative
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.geometry import rigid
@@ -32,7 +33,7 @@ def mean_sd(scan: ScanCloud, T: Floats, core: Samples, moved: Movement, covarian
         return float("nan")
     points, normals = core.points[known], core.normals[known]
     noise = overlap * float((moved.sd[known] ** 2 / moved.count[known]).sum()) / len(known) ** 2
-    J = np.hstack([np.cross(points, normals), normals]).mean(axis=0)
+    J = distance_derivative(points, normals).mean(axis=0)
     shares = _shares(scan, T, points, normals)
     own = scanner_class_errors.VIEW_SD_MM**2 * float((shares**2).sum())
     common = scanner_class_errors.OFFSET_SD_MM**2 * float(shares.sum()) ** 2

@@ -15,6 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor.adjustment import robust_least_squares
+from processor.adjustment.body_motions import distance_derivative, transform_about, variances
+from processor.adjustment.point_groups import group_sums
 from processor.deviation.local_translation import Movement
 from processor.distinct_rows import distinct
 from processor.geometry import rigid
@@ -72,14 +75,14 @@ UNDETERMINED = RigidFit(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float(
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Observations (m,) of block translations: value = design (m, 6) x motion, with variance, area, block and centre.
+    """Observations (m,) of block translations: value = J (m, 6) x motion, with variance, area, block and centre.
 
     Motions are about ``middle`` (3,), rotations in units of 1 / ``arm``. ``first_point`` is a core point of each block,
     ``of_point`` (k,) the block of each core point.
     """
 
     value: Floats
-    design: Floats
+    J: Floats
     variance: Floats
     area: Floats
     block: Ints
@@ -129,8 +132,8 @@ def fits(
     stable, small = _reweighted(levels, stable), _reweighted(levels[:1], stable)
     share = float(blocks.area[_worst(blocks, stable[None], limit)[0] <= 1.0].sum() / blocks.area.sum())
     worst, scale = _largest(levels, stable), levels[0].sd
-    weight = biweight((worst) / TUKEY)
-    z = np.abs(blocks.value - blocks.design @ stable) / scale
+    weight = biweight(worst / TUKEY)
+    z = np.abs(blocks.value - blocks.J @ stable) / scale
     # The derivative of the influence z w(z)
     u = (z / TUKEY) ** 2
     of_influence = np.where(u < 1.0, (1.0 - u) * (1.0 - 5.0 * u), 0.0)
@@ -161,26 +164,20 @@ def _blocks(
     side = times * max(BLOCK_DIAMETERS * diameter, float(extent.max()) / BLOCKS_ALONG)
     found = distinct(_cells(points, side))
     first, block, count = found.first, found.number, found.count
-    centre = np.stack([np.bincount(block, points[:, i]) for i in range(3)], axis=1) / count[:, None]
-    J = np.hstack([np.cross(points - middle, normals) / arm, normals])
-    weight = 1.0 / np.maximum(error, 1e-6) ** 2
-
-    def summed(values: Floats) -> Floats:
-        flat = values.reshape(len(values), -1)
-        sums: Floats = np.stack([np.bincount(block, flat[:, i]) for i in range(flat.shape[1])], axis=1)
-        return sums.reshape(-1, *values.shape[1:])
-
-    weighted = weight[:, None] * normals
-    A, b = summed(weighted[:, :, None] * normals[:, None]), summed(weighted * along[:, None])
-    B = summed(weighted[:, :, None] * J[:, None])
-    w, V = np.linalg.eigh(A)
+    centre = group_sums(points, block) / count[:, None]
+    J = distance_derivative((points - middle) / arm, normals)
+    weighted = normals / np.maximum(error, 1e-6)[:, None] ** 2
+    b = group_sums(weighted * along[:, None], block)
+    # Of a translation (the last three columns) by the motion of the whole
+    B = group_sums((weighted[:, :, None] * J[:, None]).reshape(-1, 18), block).reshape(-1, 3, 6)
+    w, V = np.linalg.eigh(B[:, :, 3:])
     row, k = np.nonzero(w > LEAST_STRENGTH * w.sum(axis=1)[:, None])
     direction, strength = V[row, :, k], w[row, k]
     value = np.einsum("mi,mi->m", direction, b[row]) / strength
-    design = np.einsum("mi,mij->mj", direction, B[row]) / strength[:, None]
     area = count[row] * strength / np.bincount(row, strength, len(count))[row]
+    J = np.einsum("mi,mij->mj", direction, B[row]) / strength[:, None]
     return _Blocks(
-        value=value, design=design, variance=1.0 / strength, area=area, block=row, centre=centre, middle=middle,
+        value=value, J=J, variance=1.0 / strength, area=area, block=row, centre=centre, middle=middle,
         arm=arm, side=side, first_point=first, of_point=block,
     )  # fmt: skip
 
@@ -194,7 +191,7 @@ def _cells(points: Floats, side: float) -> Ints:
 
 def _short_range(blocks: _Blocks) -> float:
     """Variance of movements from one block to the next beyond that of their noise, mm^2: waviness of the surface."""
-    direction = blocks.design[:, 3:]
+    direction = blocks.J[:, 3:]
     sign = np.where(direction[np.arange(len(direction)), np.argmax(np.abs(direction), axis=1)] < 0.0, -1.0, 1.0)
     place = np.hstack([blocks.centre[blocks.block] / blocks.side, 4.0 * sign[:, None] * direction])
     other = cKDTree(place).query(place, k=2)[1][:, 1]
@@ -205,19 +202,17 @@ def _short_range(blocks: _Blocks) -> float:
 
 def _solved(blocks: _Blocks, weight: Floats) -> Floats:
     """Return the motion (6,) of weighted least squares."""
-    H = blocks.design
-    normal = H.T @ (weight[:, None] * H)
-    motion: Floats = np.linalg.lstsq(normal, H.T @ (weight * blocks.value), rcond=1.0 / MOST_CONDITION)[0]
-    return motion
+    N, g = robust_least_squares.normal_equations(blocks.J, weight, blocks.value)
+    return np.asarray(np.linalg.lstsq(N, g, rcond=1.0 / MOST_CONDITION)[0])
 
 
 def _consensus(blocks: _Blocks, best: Floats, limit: Floats, seed: int) -> Floats:
     """Return the motion (6,) that the largest area agrees with, of trials on few blocks, each refined."""
-    H, weight = blocks.design, 1.0 / blocks.variance
+    J, weight = blocks.J, 1.0 / blocks.variance
     count = int(blocks.block.max()) + 1
     sums = np.zeros((count, 6, 7))
     np.add.at(
-        sums, blocks.block, weight[:, None, None] * H[:, :, None] * np.hstack([H, blocks.value[:, None]])[:, None]
+        sums, blocks.block, weight[:, None, None] * J[:, :, None] * np.hstack([J, blocks.value[:, None]])[:, None]
     )
     size = np.bincount(blocks.block, blocks.area, count)
     rng = np.random.default_rng(seed)
@@ -234,7 +229,7 @@ def _consensus(blocks: _Blocks, best: Floats, limit: Floats, seed: int) -> Float
 
 def _worst(blocks: _Blocks, motions: Floats, scale: Floats) -> Floats:
     """Largest residual (t, m) of motions (t, 6), over ``scale`` (m,), in any direction of each observation's block."""
-    residual = np.abs(blocks.value - motions @ blocks.design.T) / scale
+    residual = np.abs(blocks.value - motions @ blocks.J.T) / scale
     largest = np.maximum.reduceat(residual, np.unique(blocks.block, return_index=True)[1], axis=1)
     worst: Floats = largest[:, np.unique(blocks.block, return_inverse=True)[1].reshape(-1)]
     return worst
@@ -249,11 +244,13 @@ def _scores(blocks: _Blocks, motions: Floats, limit: Floats) -> Floats:
 def _reweighted(levels: list[_Level], motion: Floats) -> Floats:
     """Refine a motion (6,): blocks lose weight if they, or the larger blocks they are in, do not agree with it."""
     blocks, sd = levels[0].blocks, levels[0].sd
-    for _ in range(ITERATIONS):
-        last, motion = motion, _solved(blocks, biweight((_largest(levels, motion)) / TUKEY) / sd**2)
-        if np.abs(motion - last).max() < CONVERGED_MM:
-            break
-    return motion
+    return robust_least_squares.reweighted(
+        motion,
+        lambda motion: biweight(_largest(levels, motion) / TUKEY) / sd**2,
+        lambda _, weight: _solved(blocks, weight),
+        ITERATIONS,
+        lambda step: bool(np.abs(step).max() < CONVERGED_MM),
+    )[0]
 
 
 def _largest(levels: list[_Level], motion: Floats) -> Floats:
@@ -268,7 +265,7 @@ def _largest(levels: list[_Level], motion: Floats) -> Floats:
 
 def _scaled(blocks: _Blocks, motion: Floats, sd: Floats, limit: Floats) -> Floats:
     """Return standard deviations (m,) raised to the scale of the residuals of the blocks that agree with a motion."""
-    z = (blocks.value - blocks.design @ motion) / sd
+    z = (blocks.value - blocks.J @ motion) / sd
     near = _worst(blocks, motion[None], limit)[0] <= 1.0
     return sd * (max(1.0, float(np.sqrt(np.median(z[near] ** 2) / CHI2_MEDIAN))) if near.any() else 1.0)
 
@@ -286,35 +283,29 @@ def _fit(
 
     The square of a ``bias`` (6,) is added to the covariance.
     """
-    H = blocks.design
-    normal = H.T @ (slope[:, None] * H)
-    bread = np.linalg.pinv(normal, rcond=1.0 / MOST_CONDITION, hermitian=True)
-    gradient = H * (weight * (blocks.value - H @ motion))[:, None]
+    J = blocks.J
+    N = J.T @ (slope[:, None] * J)
+    inverse = np.linalg.pinv(N, rcond=1.0 / MOST_CONDITION, hermitian=True)
+    gradient = J * (weight * (blocks.value - J @ motion))[:, None]
     used = weight > 0.0
     scaling = np.diag(np.repeat([1.0 / blocks.arm, 1.0], 3))
     square = np.outer(bias + np.zeros(6), bias + np.zeros(6))
     covariance, error, side = np.full((6, 6), np.nan), -1.0, 1.0
     while True:
         cell = distinct(_cells(blocks.centre[blocks.block[used]] / blocks.side, side)).number
-        number = int(cell.max()) + 1 if len(cell) else 0
-        if number < FEWEST_CLUSTERS:
+        if cell.max(initial=-1) + 1 < FEWEST_CLUSTERS:
             break
-        sums = np.stack([np.bincount(cell, gradient[used, k], number) for k in range(6)], axis=1)
-        sandwich = bread @ (sums.T @ sums * (number / (number - 6.0))) @ bread
-        at_middle = scaling @ (sandwich + square) @ scaling
+        at_middle = scaling @ (robust_least_squares.sandwich(inverse, gradient[used], cell) + square) @ scaling
         at_origin = rigid.about_origin(at_middle, blocks.middle)
         along = _error_along(at_origin, *places)
         if along > error:
             covariance, error = at_origin, along
         side *= 2.0
-    if error < 0.0 or not np.linalg.cond(normal) < MOST_CONDITION:
+    if error < 0.0 or not np.linalg.cond(N) < MOST_CONDITION:
         return RigidFit(UNDETERMINED.motion, UNDETERMINED.covariance, error if error >= 0.0 else float("nan"), share)
-    x = scaling @ motion
-    R = rigid.rotation_from_vector(x[:3])
-    return RigidFit(rigid.transform(R, blocks.middle + x[3:] - R @ blocks.middle), covariance, error, share)
+    return RigidFit(transform_about(scaling @ motion, blocks.middle), covariance, error, share)
 
 
 def _error_along(covariance: Floats, points: Floats, normals: Floats) -> float:
     """Mean over points (k, 3) of the standard deviation along normals (k, 3) that a motion's covariance causes, mm."""
-    J = np.hstack([np.cross(points, normals), normals])
-    return float(np.mean(np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", J, covariance, J), 0.0))))
+    return float(np.mean(np.sqrt(variances(distance_derivative(points, normals), covariance))))

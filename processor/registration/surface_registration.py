@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor.adjustment import robust_least_squares
+from processor.adjustment.body_motions import distance_derivative, transform_about, variances
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
 from processor.geometry.thinning import thinned, voxel_means
@@ -110,18 +112,17 @@ def _iterate(
             break
         r, n = residual[used], surface.normals[face[used]]
         middle = placed[used].mean(axis=0)
-        J = np.hstack([np.cross(placed[used] - middle, n), n])
+        J = distance_derivative(placed[used] - middle, n)
         axis = icp.facing(n, axes)
         spread = np.array([robust_sd(r[axis == k], FLOOR_MM) for k in range(3)])
         sigma = robust_sd(r, FLOOR_MM)
         weight = biweight(r / (CUT * spread[axis]))
         weight = weight * icp.balance(axis) if even else weight
-        normal = J.T @ (J * weight[:, None])
-        if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)) + 1e-300)) > 1e10:
+        N, g = robust_least_squares.normal_equations(J, weight, -r)
+        if np.linalg.cond(N / np.sqrt(np.outer(np.diag(N), np.diag(N)) + 1e-300)) > 1e10:
             break  # the points seen do not determine the pose: the covariance stays NaN
-        step = np.linalg.solve(normal, -J.T @ (weight * r))
-        R = rigid.rotation_from_vector(step[:3])
-        T = rigid.transform(R, middle - R @ middle + step[3:]) @ T
+        step = np.asarray(np.linalg.solve(N, g))
+        T = transform_about(step, middle) @ T
         share = float(used.mean())
         if iteration >= 3:
             gate = max(GATES_MM[1], 6.0 * sigma)
@@ -129,8 +130,8 @@ def _iterate(
         if iteration == iterations - 1 or (move < CONVERGED_MM and (iteration > 4 or not even)):
             cell = cells(placed[used] @ axes, axis, n @ axes)
             form = _form(r, weight > 0.0, cell)
-            inverse = np.linalg.inv(normal)
-            at_middle = inverse @ _scatter(J * (weight * r)[:, None], cell) @ inverse
+            inverse = np.asarray(np.linalg.inv(N))
+            at_middle = robust_least_squares.sandwich(inverse, J * (weight * r)[:, None], cell)
             weak = _weak(at_middle, axes, float(np.abs((placed[used] - middle) @ axes[:, 0]).max()))
             covariance = rigid.about_origin(at_middle, middle)
             break
@@ -158,14 +159,6 @@ def _form(residual: Floats, counted: Bools, cell: Ints) -> float:
     rest = (residual - mean[cell])[counted & full[cell]]
     chance = max(float(rest.var()) if len(rest) else 0.0, FLOOR_MM**2)
     return float(np.mean(number[full] * mean[full] ** 2)) / chance if full.any() else float("inf")
-
-
-def _scatter(gradient: Floats, cell: Ints) -> Floats:
-    """Sum (6, 6) of the outer products of gradients (n, 6), summed within each cell first."""
-    cells = int(cell.max()) + 1
-    sums = np.stack([np.bincount(cell, gradient[:, k], cells) for k in range(6)], axis=1)
-    scatter: Floats = sums.T @ sums * (cells / max(cells - 6, 1))
-    return scatter
 
 
 def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[Motion, ...]:
@@ -476,6 +469,5 @@ def _rms(points: Floats, design: Samples, tree: cKDTree, T: Floats, most: float)
 
 def error_along(covariance: Floats, places: Floats, normals: Floats) -> float:
     """Rms over places (k, 3) of the standard deviation along normals (k, 3) that a pose's covariance causes, mm."""
-    J = np.hstack([np.cross(places, normals), normals])
-    variance = np.einsum("ki,ij,kj->k", J, covariance, J)
-    return float(np.sqrt(max(np.mean(variance), 0.0))) if len(J) else NAN
+    variance = variances(distance_derivative(places, normals), covariance)
+    return float(np.sqrt(np.mean(variance))) if len(variance) else NAN

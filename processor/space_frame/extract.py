@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.adjustment import scanner_class_errors
+from processor.adjustment.control_points import Sightings
 from processor.geometry import rigid
 from processor.model import DESIGN_FRAMES, Bools, Floats, FrameDesign, Ints, Reason, Status, Tolerance, reason
 from processor.space_frame.ball_catalogue import Catalogue
@@ -27,7 +28,6 @@ from processor.space_frame.result import NAN, Flag, MovementGauge
 from processor.space_frame.spheres import alternating_fit, assessment, ball_joint_classification
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
-from processor.space_frame.stations.control_points import ControlPoints
 from processor.space_frame.stations.corrected_source import Corrected, corrected_gathered
 from processor.space_frame.stations.records import Stations, StationStatus
 from processor.space_frame.stations.tube_points import tube_points
@@ -130,7 +130,7 @@ def extract(
     design: FrameDesign | None,
     catalogue: Catalogue,
     options: Options,
-    control: ControlPoints | None = None,
+    control: Sightings | None = None,
 ) -> Extracted | None:
     """Find every node of a frame; None where the cloud has no members that meet."""
     params = options.members
@@ -253,7 +253,7 @@ def _located(
 # --- stations --------------------------------------------------------------------------------------------------------
 
 
-def _register(source: Source, start: Start, control: ControlPoints | None, options: Options) -> _Registered:
+def _register(source: Source, start: Start, control: Sightings | None, options: Options) -> _Registered:
     """Register the stations on the members, and measure the members again after their corrections."""
     measured = start.measured
     shifted = len(source.scanners) > 1 and measured.station_sd_mm > LEAST_STATION_SD_MM

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from processor.adjustment.patch_means import patch_means
+from processor.adjustment.point_groups import patch_means
 
 
 def test_patches_have_the_means_and_the_noise_of_their_points():

@@ -16,15 +16,6 @@ def test_form_is_the_ratio_of_squares_of_full_cells_without_clutter():
     assert surface_registration._form(residual[60:80], counted[60:80], np.zeros(20, int)) == np.inf
 
 
-def test_gradients_are_summed_by_cell_before_they_are_squared():
-    gradient = np.array([[1.0, 2.0, 0.0, 0.0, 0.0, 0.0], [3.0, -1.0, 0.0, 0.0, 0.0, 0.0], *np.eye(6)[2:].repeat(2, 0)])
-    cell = np.array([0, 0, *range(1, 9)])
-    # Of 9 cells and 6 parameters: 9 / 3. The first has the sum (4, 1).
-    expected = 3.0 * np.diag([16.0, 1.0, 2.0, 2.0, 2.0, 2.0])
-    expected[0, 1] = expected[1, 0] = 12.0
-    np.testing.assert_allclose(surface_registration._scatter(gradient, cell), expected)
-
-
 def test_cells_are_lengths_of_a_side():
     place = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [499.0, 9.0, 9.0], [499.0, 0.0, 0.0], [499.0, 0.0, 0.0]])
     normal = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.9, 0.1], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from processor.adjustment.control_points import Sightings
 from processor.geometry import linalg_small, thread_ranges
 from processor.model import reason
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM
@@ -13,7 +14,6 @@ from processor.space_frame.points.line_crops import corridors, gather
 from processor.space_frame.result import StationMotion
 from processor.space_frame.stations import normal_equations, residual_kernels
 from processor.space_frame.stations import posterior as stations_posterior
-from processor.space_frame.stations.control_points import ControlPoints
 from processor.space_frame.stations.corrected_source import Corrected, corrected_gathered
 from processor.space_frame.stations.records import TubePoints
 from processor.space_frame.stations.registration import register
@@ -227,13 +227,12 @@ def test_without_control_the_datum_is_the_mean_of_the_stations():
 def test_control_points_fix_the_datum():
     nodes, seen, rng = frame(4, 5, 5, per_pair=40)
     corner = nodes[[0, 4, 20, 24, 40]]
-    share = np.zeros((5, 4))
-    share[np.arange(5), np.argmin(np.linalg.norm(corner[:, None] - seen.scanners, axis=2), axis=1)] = 1.0
-    measured = as_measured(seen, corner, share.argmax(axis=1))
+    station = np.argmin(np.linalg.norm(corner[:, None] - seen.scanners, axis=2), axis=1)
+    measured = as_measured(seen, corner, station)
     # The whole project lies 40 mm and 1 mrad off the control's frame.
     turn, shift = tube_clouds.turn(np.array([2e-4, -1e-4, 1e-3])), np.array([40.0, -25.0, 10.0])
     target = corner @ turn.T + shift
-    control = ControlPoints(tuple("ABCDE"), measured, target, np.full((5, 3), 0.3), share)
+    control = sighted(measured, target, station, 0.3)
     found = registered(seen, rng, control=control)
     assert found.datum == (reason("spheres.datum-control", points=5),)
     for k in range(4):
@@ -255,9 +254,16 @@ def targets(seen, seed, count, sd=0.3, off=None, sightings=2):
     point, s = np.repeat(np.arange(count), [len(one) for one in s]), np.concatenate(s)
     measured = as_measured(seen, places[point], s)
     measured += rng.normal(0.0, 0.5, measured.shape)
-    return ControlPoints(
-        tuple(f"T{k}" for k in point), measured, known[point], np.full(measured.shape, 0.5),
-        np.eye(len(seen.scanners))[s], point, np.full(len(point), sd),
+    return sighted(measured, known[point], s, 0.5, point, sd)
+
+
+def sighted(measured, target, station, seen_sd, point=None, sd=0.0):
+    """Sightings of targets T0, T1, ... by stations S1, S2, ...; without ``point`` each of a target of its own."""
+    point = np.arange(len(measured)) if point is None else point
+    return Sightings(
+        point=point, body=station, seen=measured, seen_sd=np.full(len(point), seen_sd), known=target,
+        known_sd=np.full(len(point), sd), point_name=tuple(f"T{k}" for k in point),
+        body_name=tuple(f"S{k + 1}" for k in station),
     )  # fmt: skip
 
 
@@ -287,7 +293,7 @@ def test_a_wrong_control_point_is_left_out_and_named():
         off[2] = [0.6 * size, 0.0, 0.8 * size]
         good, wrong = (
             registered(seen, np.random.default_rng(1), control=one)
-            for one in (targets(seen, 3, 5).only(np.repeat(np.arange(5) != 2, 2)), targets(seen, 3, 5, off=off))
+            for one in (targets(seen, 3, 5).take(np.repeat(np.arange(5) != 2, 2)), targets(seen, 3, 5, off=off))
         )
         assert wrong.control_used.tolist() == [1, 1, 1, 1, 0, 0, 1, 1, 1, 1]
         assert left_out(wrong) == [("spheres.control-left-out", "T2", None)]
@@ -302,18 +308,17 @@ def test_a_wrong_sighting_is_left_out_alone_and_named(sightings):
     _, seen, _ = frame(4, 5, 5, per_pair=40)
     right = targets(seen, 3, 5, sightings=sightings)
     for count in range(1, sightings // 2 + 1):
-        measured = right.measured.copy()
+        measured = right.seen.copy()
         rows = 2 * sightings + np.arange(count)  # of T2
         measured[rows] += [[0.0, 30.0, 0.0], [-18.0, 0.0, 0.0]][:count]
-        names = tuple(f"S{i + 1}" for i in range(len(seen.scanners)))
-        wrong = dataclasses.replace(right, measured=measured, scanners=names)
+        wrong = dataclasses.replace(right, seen=measured)
         found = registered(seen, np.random.default_rng(1), control=wrong)
         np.testing.assert_array_equal(np.flatnonzero(found.control_used == 0), rows)
         for row in rows:
-            scan = names[int(np.argmax(right.share[row]))]
+            scan = right.body_name[row]
             assert ("spheres.sighting-left-out", "T2", scan) in left_out(found)
             assert found.control_scan[row] == scan
-        good = registered(seen, np.random.default_rng(1), control=right.only(~np.isin(np.arange(len(measured)), rows)))
+        good = registered(seen, np.random.default_rng(1), control=right.take(~np.isin(np.arange(len(measured)), rows)))
         np.testing.assert_allclose(found.T_project_station, good.T_project_station, atol=ROUNDING)
 
 
@@ -321,7 +326,7 @@ def test_control_points_that_contradict_each_other_widen_the_intervals():
     """Of three none can be identified as wrong; a single one is contradicted by the stations' own scatter alone."""
     nodes, seen, _ = frame(4, 5, 5, per_pair=40)
     three = targets(seen, 3, 3)
-    away = three.target[0] - three.target[[2, 4]].mean(axis=0)
+    away = three.known[0] - three.known[[2, 4]].mean(axis=0)
     off = np.zeros((3, 3))
     off[0] = 30.0 * away / np.linalg.norm(away)  # no motion of all keeps the distances between them
     for control in (targets(seen, 3, 3, off=off), targets(seen, 3, 1, off=[0.0, 0.0, 60.0])):
@@ -356,13 +361,14 @@ def test_declared_common_shift_of_stations_is_added_to_the_datum_variance():
 
 def test_two_control_points_reduce_the_covariance_of_the_datum():
     nodes, seen, _ = frame(4, 5, 5, per_pair=40)
-    share = np.full((2, 4), 0.25)
-    control = ControlPoints(("A", "B"), nodes[[0, 24]] + [3.0, 0.0, 0.0], nodes[[0, 24]], np.full((2, 3), 0.1), share)
+    row, station = np.repeat([0, 24], 4), np.tile(np.arange(4), 2)  # each seen from all stations
+    seen_at = as_measured(seen, nodes[row], station) + np.array([30.0, 0.0, 0.0])
+    control = sighted(seen_at, nodes[row], station, 0.2, row)
     free, held = registered(seen, np.random.default_rng(1)), registered(seen, np.random.default_rng(1), control=control)
     before, after = (np.trace(one.datum_at(nodes[[12]])[0]) for one in (free, held))
     assert after < 0.05 * before  # 0.07 mm of two points against 1 mm of four stations is 0.005; turns are in it
     moved = held.T_project_station[:, 0, 3].mean() - free.T_project_station[:, 0, 3].mean()
-    assert moved < -2.5  # by the 3 mm that the points are off
+    assert moved == pytest.approx(-30.0, abs=4.0)  # by what the points are off; four stations are off by 2 mm each
     assert [one.code for one in held.datum] == ["spheres.datum-stations-and-control"]
 
 
@@ -583,7 +589,7 @@ def test_the_prior_of_a_free_common_motion_leaves_it_free():
     rng = np.random.default_rng(0)
     places = rng.normal(0.0, 1e4, (4, 3))
     target = rng.normal(0.0, 1e4, (3, 3))
-    control = ControlPoints(("A", "B", "C"), target, target, np.ones((3, 3)), np.full((3, 4), 0.25))
+    control = sighted(target, target, np.arange(3), 1.0)
     posterior = stations_posterior.Posterior(places, control)
     P = posterior._prior(posterior.variance)
     common = stations_posterior.common_motion(places - places.mean(axis=0))

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 from scipy.optimize import least_squares
 
+from processor.adjustment.robust_least_squares import sandwich
 from processor.model import Floats, Ints, Word
 
 MODEL_SHARE = 0.1  # of the depth, by which a place may deviate from the shape of a model
@@ -157,7 +158,4 @@ def _sd(J: Floats, residual: Floats, block: Ints) -> float:
 
     A sandwich over blocks (Liang and Zeger 1986): where the place is not quite of the model's shape, residuals agree.
     """
-    inverse = np.linalg.pinv(J.T @ J)
-    count = int(block.max()) + 1
-    pull = np.stack([np.bincount(block, J[:, k] * residual, count) for k in range(J.shape[1])], axis=1) @ inverse[0]
-    return float(np.sqrt(pull @ pull * count / max(count - J.shape[1], 1)))
+    return float(np.sqrt(sandwich(np.linalg.pinv(J.T @ J), J * residual[:, None], block)[0, 0]))

@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
+from processor.adjustment import body_motions
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.preassembly import topology
@@ -136,6 +137,7 @@ def adjust(
     observed = _observations(members, joint_points, joint_frames, sides)
     to_motion = _solve(observed, weight)
     x = to_motion @ observed.value
+    motions, centres = x.reshape(-1, 6), [member.centre for member in members]
     # Residuals by observations, after the motion.
     after = np.eye(len(observed.value)) + observed.A @ to_motion
     residual = after @ observed.value
@@ -165,7 +167,7 @@ def adjust(
         variances.append(variance)
         at_rest.append(at_rest_variance)
     adjusted = Adjusted(
-        motions=np.array([_as_motion(x[6 * i : 6 * i + 6], member.centre) for i, member in enumerate(members)]),
+        motions=np.array([body_motions.transform_about(*of_part) for of_part in zip(motions, centres, strict=True)]),
         motion_covariance=with_motion @ to_motion.T,
         motion_with_pose=to_motion @ observed.with_pose,
         gaps=gaps,
@@ -190,7 +192,7 @@ def _placed_by_design(
     for i, member in enumerate(members):
         own, first = (_edge_motion(member.edges, members[k].centre) for k in (i, 0))
         by_own, by_first = (
-            np.einsum("ki,ij,kj->k", motion, placing[k], motion).reshape(-1, 2) for motion, k in ((own, i), (first, 0))
+            body_motions.variances(motion, placing[k]).reshape(-1, 2) for motion, k in ((own, i), (first, 0))
         )
         variances.append(adjusted.departure_variance[i] + by_own)
         at_rest.append(adjusted.at_rest_variance[i] + by_own + by_first)
@@ -361,8 +363,3 @@ def _edge_motion(edges: EdgeDepartures, centre: Floats) -> Floats:
     """Return the derivative (2 k, 6) of departures by a motion about ``centre``."""
     derivative: Floats = np.einsum("kai,kij->kaj", edges.axes, rigid.motion(edges.points - centre)).reshape(-1, 6)
     return derivative
-
-
-def _as_motion(x: Floats, centre: Floats) -> Floats:
-    R = rigid.rotation_from_vector(x[:3])
-    return rigid.transform(R, centre - R @ centre + x[3:])

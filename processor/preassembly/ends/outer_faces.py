@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import kriging
-from processor.adjustment.patch_means import patch_means
+from processor.adjustment.point_groups import patch_means
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.model import Bools, Floats, Ints, Reason, reason

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from processor.adjustment import variance_components
+from processor.adjustment.point_groups import group_sums
 from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, reason
@@ -184,8 +185,7 @@ def _wall_covariance(part: RegisteredPart, x: Floats, angle: Floats, rows: Ints,
     covariance = by_noise = np.linalg.inv(basis.T @ basis / max(noise, FLOOR_MM**2) + expected)
     lack_of_fit = variance_components.lack_of_fit_variance([(residual, cell)], WALL)
     for group, variance in ((cell, lack_of_fit), (part.station[rows], part.between_stations)):
-        by_group = np.stack([np.bincount(group, column) for column in basis.T], axis=1)
-        gain = by_group @ by_noise / max(noise, FLOOR_MM**2)
+        gain = group_sums(basis, group) @ by_noise / max(noise, FLOOR_MM**2)
         covariance = covariance + variance * gain.T @ gain
     return covariance
 

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from processor.adjustment import global_test
-from processor.adjustment.patch_means import patch_numbers
+from processor.adjustment.point_groups import patch_numbers
 from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd, student_factor

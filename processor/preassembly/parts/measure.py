@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import variance_components
+from processor.adjustment.body_motions import distance_derivative
+from processor.adjustment.point_groups import group_sums
 from processor.geometry import box_girder_mesh, rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.geometry.mesh_distance import on_face
@@ -366,9 +368,8 @@ def _views(part: RegisteredPart, shape: attitude.Surface) -> _Views:
     side = (normals @ shape.axes)[np.arange(len(axis)), axis] > 0.0
     half = (points - middle) @ shape.axes[:, 0] > 0.0
     view = np.unique(4 * axis + 2 * side + half, return_inverse=True)[1].reshape(-1)
-    J = np.hstack([np.cross(points - middle, normals), normals])
-    sums = np.stack([np.bincount(view, column) for column in J.T], axis=1)
-    inverse = np.linalg.pinv(J.T @ J)
+    J = distance_derivative(points - middle, normals)
+    sums, inverse = group_sums(J, view), np.linalg.pinv(J.T @ J)
     rest = np.eye(len(sums)) - sums / np.bincount(view)[:, None] @ inverse @ sums.T
     pose = rigid.about_origin(inverse @ sums.T @ sums @ inverse, middle)
     return _Views(pose, min(float(np.mean(rest**2)) * len(rest), 1.0))

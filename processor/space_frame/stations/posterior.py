@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.adjustment import data_snooping
+from processor.adjustment.control_points import Sightings
+from processor.adjustment.data_snooping import Snooped
 from processor.geometry import rigid
 from processor.geometry.linalg_small import cholesky, product, solve
 from processor.model import Floats
-from processor.space_frame.stations.control_points import ControlPoints, Doubt, doubted, motions
+from processor.space_frame.stations import control_points
 from processor.space_frame.stations.residual_kernels import STATION
 
 # of turn (rad), translation and offset of the ranges (mm)
 START = (5e-5, 2.0, 0.5)  # sd: start of the iteration
 SMALLEST = (1e-8, 1e-3, 1e-3)
 LOOSE = (1e-2, 1e3, 1e2)
+OFF_LINE = 0.05  # least second extent of targets that determine the whole cloud's pose, as a share of the first
 LEAST_DETERMINED = 0.5  # number of motions that the data must determine for an estimate of their variance
 ALLOWED = 6.0  # in log density below the most likely variance
-
-
-def corrections(x: Floats, places: Floats) -> Floats:
-    """Return T (s, 4, 4) of the stations' unknowns x (7 s,): turns about places (s, 3), then translations."""
-    R, t = motions(x, places)
-    shift = places - np.einsum("sij,sj->si", R, places) + t
-    return np.array([rigid.transform(turn, move) for turn, move in zip(R, shift, strict=True)])
 
 
 def common_motion(places: Floats) -> Floats:
@@ -48,39 +45,37 @@ class Posterior:
     its posterior expectation (MacKay 1992).
     """
 
-    def __init__(self, places: Floats, control: ControlPoints | None, datum_mm: float = 0.0) -> None:
+    def __init__(self, places: Floats, control: Sightings | None, datum_mm: float = 0.0) -> None:
         self.places, self.datum_mm = places, datum_mm
         self.variance = np.array(START) ** 2
         self.M = common_motion(places - places.mean(axis=0))
         self.kind = np.tile(np.array([0, 0, 0, 1, 1, 1, 2]), len(places))
-        self.control: ControlPoints | None = None
+        self.control: Sightings | None = None
         self.hold(control)
 
-    def hold(self, control: ControlPoints | None) -> None:
+    def hold(self, control: Sightings | None) -> None:
         """Take control points into the equations, or none."""
         if self.control is None:
             self.untouched = self.variance.copy()
         self.control = control
-        self.free = control is not None and control.hold_all
+        # whether the control points alone determine the pose of the whole cloud: three of them, not on one line
+        self.free = control is not None and rigid.points_determine_motion(control.places, OFF_LINE)
         # of each kind, the number that is not common to all stations where a common motion is free
         self.number = np.array([3.0, 3.0, 1.0]) * len(self.places) - np.array([3.0, 3.0, 0.0]) * self.free
 
-    def doubted(self, H: Floats, g: Floats, x: Floats) -> Doubt:
-        """Test the control points against each other; H and g are the tubes' equations at x."""
+    def doubted(self, control: Sightings, H: Floats, g: Floats, x: Floats) -> Snooped:
+        """Test control points against each other and the stations; H and g are the tubes' equations at x."""
         # Where they do not fix the cloud alone, the variances were estimated with them, which would hide an outlier.
         P = self._prior(self.variance if self.free else self.untouched)
         if self.free:  # the rest without one of them may not fix the cloud
             gain = mean_gain(self.M, self.precision(self.variance))
             loose = np.repeat(np.array(LOOSE[:2]) ** -2.0, 3)
             P = P + product(np.ascontiguousarray(gain.T) * loose, gain)
-
-        def solved(some: ControlPoints) -> tuple[Floats, Floats]:
-            Hs, gs = some.added(H, g, x, self.places)
-            right = np.column_stack([gs - product(P, x[:, None])[:, 0], np.eye(len(x))])
-            solution = solve(cholesky(Hs + P), right)
-            return solution[:, 0], np.ascontiguousarray(solution[:, 1:])
-
-        return doubted(self.control or ControlPoints(), x, self.places, solved)
+        L, J = cholesky(H + P), control_points.derivative(control, self.places)
+        change = solve(L, (g - product(P, x[:, None])[:, 0])[:, None])
+        off = control_points.misfits(control, x, self.places).ravel() - product(J, change)[:, 0]
+        spread = product(J, solve(L, np.ascontiguousarray(J.T)))
+        return data_snooping.leave_out(control.point, off, control.covariance + 0.5 * (spread + spread.T))
 
     def step(self, H: Floats, g: Floats, x: Floats, rounds: int) -> tuple[Floats, Floats]:
         """Return the change of x (7 s,) and the posterior covariance; H and g are the tubes' equations at x.
@@ -153,7 +148,7 @@ class Posterior:
         return symmetric
 
     def _with_control(self, H: Floats, g: Floats, x: Floats) -> tuple[Floats, Floats]:
-        return (H, g) if self.control is None else self.control.added(H, g, x, self.places)
+        return (H, g) if self.control is None else control_points.added(self.control, H, g, x, self.places)
 
     def _estimate(self, x: Floats, C: Floats) -> None:
         motion, spread = x, np.diag(C)

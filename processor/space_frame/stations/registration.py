@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from processor.adjustment.control_points import Sightings
+from processor.adjustment.data_snooping import Snooped
 from processor.geometry import rigid
 from processor.geometry.linalg_small import product
 from processor.model import Bools, Floats, Ints, Reason, reason
@@ -25,8 +27,8 @@ from processor.robust_statistics import TUKEY, robust_sd
 from processor.space_frame.result import StationMotion
 from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
-from processor.space_frame.stations.control_points import ControlPoints, Doubt
-from processor.space_frame.stations.posterior import Posterior, common_motion, corrections
+from processor.space_frame.stations.control_points import corrections, doubts, misfits
+from processor.space_frame.stations.posterior import Posterior, common_motion
 from processor.space_frame.stations.records import Stations, StationStatus, TubePoints
 
 MOST_STATIONS = 10  # of those that see a tube: the others are far away and have few points on it
@@ -58,7 +60,7 @@ class _Estimate:
     scale: Floats  # (s,) of residuals, mm
     floor: float  # variance of observations beyond the points' noise, mm^2
     seen_by: Ints  # (s,) tubes that a station has in common with others
-    doubt: Doubt | None
+    doubt: Snooped | None
 
 
 def register(
@@ -67,7 +69,7 @@ def register(
     axis_directions: Floats,
     radii: Floats,
     scanners: Floats,
-    control: ControlPoints | None = None,
+    control: Sightings | None = None,
     datum_mm: float = 0.0,
 ) -> Stations:
     """Estimate the corrections of all stations from points on tubes with axes (m, 3), (m, 3) and radii (m,), mm.
@@ -117,7 +119,7 @@ def _estimated(
     axes: kernels.Axes,
     shared: Bools,
     posterior: Posterior,
-    control: ControlPoints | None,
+    control: Sightings | None,
 ) -> _Estimate:
     """Alternate robust residuals, the stations' unknowns, the tubes, and the weights of observations."""
     places = posterior.places
@@ -136,8 +138,8 @@ def _estimated(
         last = turn == ROUNDS - 1
         if turn and control is not None:  # after the tubes have aligned the stations with each other
             posterior.hold(control)
-            doubt = posterior.doubted(*normals.reduced(equations, layout, geometry), x)
-            posterior.hold(control.only(doubt.kept))
+            doubt = posterior.doubted(control, *normals.reduced(equations, layout, geometry), x)
+            posterior.hold(control.take(doubt.accepted))
         for _ in range(2 if last else 1):
             H, g = normals.reduced(equations, layout, geometry)
             step, C = posterior.step(H, g, x, 5)
@@ -293,11 +295,11 @@ def _datum(posterior: Posterior, before_mm: float) -> Reason:
         common = np.hypot(before_mm / np.sqrt(count), posterior.datum_mm)
         return reason("spheres.datum-stations", stations=count, sd=common)
     if posterior.free:
-        return reason("spheres.datum-control", points=posterior.control.count)
-    return reason("spheres.datum-stations-and-control", stations=count, points=posterior.control.count)
+        return reason("spheres.datum-control", points=len(posterior.control.places))
+    return reason("spheres.datum-stations-and-control", stations=count, points=len(posterior.control.places))
 
 
-def _controlled(stations: Stations, x: Floats, control: ControlPoints, doubt: Doubt) -> Stations:
+def _controlled(stations: Stations, x: Floats, control: Sightings, doubt: Snooped) -> Stations:
     """Add the deviations at the control points, and their contradictions to the covariance."""
     M = common_motion(stations.places)[:, 3:]
     shift = np.mean(x.reshape(-1, kernels.STATION)[:, 3:6], axis=0)
@@ -306,12 +308,12 @@ def _controlled(stations: Stations, x: Floats, control: ControlPoints, doubt: Do
     return replace(
         stations,
         status=StationStatus.WEAK if doubt.off.any() else stations.status,
-        messages=(*stations.messages, reason("spheres.datum", datum=stations.datum), shifted, *doubt.reasons),
+        messages=(*stations.messages, reason("spheres.datum", datum=stations.datum), shifted, *doubts(control, doubt)),
         covariance=C,
-        control=control.ids,
-        control_scan=control.scans,
-        control_off=control.off(x, stations.places),
-        control_used=doubt.kept.astype(np.int64),
+        control=control.point_name,
+        control_scan=control.body_name,
+        control_off=misfits(control, x, stations.places),
+        control_used=doubt.accepted.astype(np.int64),
     )
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.adjustment.control_points import Sightings
 from processor.model import InputError, Scene
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.points.source import SceneSource
-from processor.space_frame.stations.control_points import ControlPoints
 
 FARTHEST_MM = 1000.0  # control points farther from their sightings are in another frame
 
 
-def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
+def control_of(scene: Scene, source: SceneSource) -> Sightings | None:
     """Return the sightings of the scene's control points; None without any from a known scanner.
 
     Raises InputError where the control points are in another frame or unit than the scans.
@@ -47,13 +47,14 @@ def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
             f"{scene.name}: control points lie {off / 1000.0:.3g} m from where the scans have them (median); give "
             "the scans poses in the frame of the control points, or their coordinates in the scans' frame"
         )
-    return ControlPoints(
-        ids=tuple(control.ids[k] for k in point.tolist()),
-        measured=measured,
-        target=target,
-        sd=np.repeat(control.seen_sd[rows, None], 3, axis=1),
-        share=np.eye(len(source.scanners))[scanner[rows]],
+    names = source.names or tuple(f"station {i}" for i in range(len(source.scanners)))
+    return Sightings(
         point=point,
-        target_sd=control.sd[point],
-        scanners=source.names,
+        body=scanner[rows].astype(np.int64),
+        seen=measured,
+        seen_sd=control.seen_sd[rows],
+        known=target,
+        known_sd=control.sd[point],
+        point_name=tuple(control.ids[k] for k in point.tolist()),
+        body_name=tuple(names[k] for k in scanner[rows].tolist()),
     )

@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from processor.adjustment.scanner_class_errors import SCALE_SD, VIEW_SD_MM
 from processor.geometry import rigid
 from processor.model import Floats, Ints
+from processor.robust_statistics import huber
 from processor.stitching.fine.correspondences import KINDS, ON_PIECE, Blocks
 from processor.stitching.fine.normal_equations import Equations, linearize, unit_variance
 
@@ -201,8 +202,7 @@ def _robust_weights(blocks: Blocks, z: Floats) -> Floats:
 
     Of two scans it cannot be decided which one is wrong, and a single one would seem to fit without any misfit.
     """
-    huber = np.minimum(1.0, HUBER_SIGMAS / np.maximum(np.abs(z), 1e-9))
-    weight = np.where(np.abs(z) > REJECTION_SIGMAS, REJECTED_WEIGHT, huber)
+    weight = np.where(np.abs(z) > REJECTION_SIGMAS, REJECTED_WEIGHT, huber(z, HUBER_SIGMAS))
     left = np.bincount(blocks.piece, weight > LEAST_INLIER_WEIGHT, blocks.pieces)
     least = np.ones(blocks.pieces)
     np.minimum.at(least, blocks.piece, weight)

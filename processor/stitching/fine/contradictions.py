@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from processor.adjustment.body_motions import distance_derivative
 from processor.model import Columns, Floats, Ints
 from processor.stitching.fine import bundle_adjustment, correspondences, normal_equations
 from processor.stitching.fine.bundle_adjustment import REJECTION_SIGMAS, Solution
@@ -81,13 +82,12 @@ def _misfits(blocks: Blocks, solution: Solution) -> _Misfits:
     lean = (along**2 / np.maximum(others.variance[:, 1:], 1e-12)).sum(axis=1)
     variance = 1.0 / faces.count + (1.0 + lean) / np.maximum(others.count, 1e-12) + 2.0 * solution.tau[0] ** 2
     variance += solution.tau[KINDS] ** 2
-    arm = faces.mean - solution.T[blocks.scan, :3, 3]
-    n = others.normal
+    arm, n = faces.mean - solution.T[blocks.scan, :3, 3], others.normal
     return _Misfits(
         scan=blocks.scan[flat],
         offset=np.einsum("bi,bi->b", shift, n)[flat],
         variance=variance[flat],
-        by_pose=np.concatenate([np.cross(arm, n), n], axis=1)[flat],
+        by_pose=distance_derivative(arm, n)[flat],
     )
 
 

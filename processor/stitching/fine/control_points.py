@@ -15,9 +15,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from processor.adjustment import data_snooping
-from processor.adjustment.sighting_covariance import sighting_covariance
+from processor.adjustment.body_motions import variances
+from processor.adjustment.control_points import Sightings
 from processor.geometry import rigid
-from processor.model import Bools, Columns, Control, Floats, InputError, Ints, Reason, reason
+from processor.model import Bools, Control, Floats, InputError, Reason, reason
 from processor.stitching import common_point_checks
 from processor.stitching.result import ControlPoints, ControlSightings
 
@@ -28,27 +29,6 @@ GROSS_MM, LEAST_SPREAD_MM = 50.0, 300.0
 ROUNDS, STILL = 12, 1e-10
 MOST = 1000  # sightings; the equations are dense
 LOOSENED = 30  # rounds at most
-
-
-@dataclass(frozen=True)
-class Sightings(Columns):
-    """Sightings of control points by scans, a row per sighting; mm.
-
-    ``seen`` (m, 3) is in the frame of scan ``scan`` (m,) less its cloud's origin, ``known`` (m, 3) in that of the
-    control points less ``centre``. Rows of one ``point`` (m,) share the known place and its error.
-    """
-
-    point: Ints
-    scan: Ints
-    seen: Floats
-    seen_sd: Floats
-    known: Floats
-    known_sd: Floats
-
-    @property
-    def covariance(self) -> Floats:
-        """Covariance (3m, 3m) of known less seen places, without that of the scans' poses; the same along all axes."""
-        return sighting_covariance(self.point, self.known_sd, self.seen_sd)
 
 
 @dataclass(frozen=True)
@@ -65,7 +45,7 @@ class Fit:
     observed: Floats  # (3m, 3m) covariance of sightings and known places
     weight: Floats  # (3m, 3m) inverse of the misfit's covariance
     cofactor: Floats
-    by_scans: Floats  # (3m, 6k) derivative of the places by rotations of scans about their origins, and by shifts
+    J: Floats  # (3m, 6k) derivative of the places by rotations of scans about their origins, and by shifts
     covariance: Floats  # (6 + 6k, 6 + 6k) of the motion M and the scans' motions
 
     @property
@@ -108,34 +88,34 @@ def adjust(
     if len(control.scan) > MOST:
         raise InputError(f"{len(control.scan)} sightings of control points; expected {MOST} at most")
     k = len(T)
-    posed = np.array([np.isfinite(T[s]).all() and np.isfinite(_block(covariance, s)).all() for s in range(k)])
+    own = covariance.reshape(k, 6, k, 6)[np.arange(k), :, np.arange(k)]
+    posed: Bools = np.asarray(np.isfinite(T).all(axis=(1, 2)) & np.isfinite(own).all(axis=(1, 2)))
     of_posed = posed[control.scan]
     centre = control.positions[control.point[of_posed]].mean(axis=0) if of_posed.any() else np.zeros(3)
     point_mm = max(point_mm, LEAST_SD_MM)  # also where it is not known
     seen_sd = np.where(control.seen_sd > 0.0, control.seen_sd, point_mm)
     every = Sightings(
-        point=control.point, scan=control.scan, seen=control.seen - origins[control.scan],
+        point=control.point, body=control.scan, seen=control.seen - origins[control.scan],
         seen_sd=np.maximum(seen_sd, LEAST_SD_MM), known=control.positions[control.point] - centre,
-        known_sd=control.sd[control.point],
+        known_sd=control.sd[control.point], point_name=tuple(control.ids[p] for p in control.point),
+        body_name=tuple(names[s] for s in control.scan),
     )  # fmt: skip
     shortage = _shortage(every.take(of_posed))
     if shortage:
         return Placed(
             T=T, covariance=covariance, M=np.eye(4), centre=centre, contradictions=(None,) * k,
-            control=ControlPoints(sightings=_unused(control, names)),
+            control=ControlPoints(sightings=_unused(every)),
             reasons=(reason("stitch.control-not-used", shortage=shortage),),
         )  # fmt: skip
     rows = np.repeat(posed, 6)
     prior = np.where(rows[:, None] & rows, covariance, 0.0)
     prior = 0.5 * (prior + prior.T)
     poses = np.where(posed[:, None, None], T, np.eye(4))
-    fit, accepted, reasons, contradictions, factor = _without_blunders(
-        every.take(of_posed), poses, prior, control, names
-    )
+    fit, accepted, reasons, contradictions, factor = _without_blunders(every.take(of_posed), poses, prior)
     used = of_posed.copy()
     used[of_posed] = accepted
     off, sd, share = _residuals(every, used, of_posed, fit, factor)
-    sightings = replace(_unused(control, names), off=off, sd=sd, share=share, used=used)
+    sightings = replace(_unused(every), off=off, sd=sd, share=share, used=used)
     about = [reason(
         "stitch.control-used", points=len(np.unique(every.point[used])), sightings=int(used.sum()),
         rms_mm=float(np.sqrt((off[used] ** 2).mean())), redundancy=fit.free,
@@ -176,9 +156,10 @@ def fitted(sightings: Sightings, T: Floats, prior: Floats, factor: float = 1.0) 
     Raises InputError where the distances between control points suggest that units are mixed up.
     """
     Q = factor**2 * sightings.covariance
-    m, d = len(sightings.scan), np.zeros((len(T), 6))
-    M = rigid.fit(_placed(sightings, T), sightings.known)
-    scale = _scale(sightings, T)
+    m, d, k = len(sightings.point), np.zeros((len(T), 6)), len(T)
+    placed, known = sightings.placed(T), sightings.known
+    M = rigid.fit(placed, known)
+    scale = float(np.linalg.norm(known - known.mean(axis=0)) / np.linalg.norm(placed - placed.mean(axis=0)))
     slip = common_point_checks.units_slip(scale)
     if slip:
         raise InputError(
@@ -186,13 +167,11 @@ def fitted(sightings: Sightings, T: Floats, prior: Floats, factor: float = 1.0) 
         )
     for _ in range(ROUNDS):
         poses = rigid.moved_about_own_origins(T, d)
-        arm = np.einsum("mij,mj->mi", poses[sightings.scan, :3, :3], sightings.seen)
-        by_scan = np.zeros((m, 3, len(T), 6))
-        by_scan[np.arange(m), :, sightings.scan] = M[:3, :3] @ rigid.motion(arm)
-        J = by_scan.reshape(3 * m, -1)
-        placed = rigid.apply(M, _placed(sightings, poses))
+        placed = sightings.placed(poses)
+        by_scans = sightings.derivative(placed - poses[sightings.body, :3, 3], k).reshape(m, 3, -1)
+        J, placed = (M[:3, :3] @ by_scans).reshape(3 * m, -1), rigid.apply(M, placed)
         A = rigid.motion(placed).reshape(-1, 6)
-        b = (sightings.known - placed).ravel() + J @ d.ravel()
+        b = (known - placed).ravel() + J @ d.ravel()
         S = cho_factor(Q + J @ prior @ J.T, lower=True)
         weighted = cho_solve(S, A)
         motion = np.linalg.inv(A.T @ weighted)
@@ -209,35 +188,35 @@ def fitted(sightings: Sightings, T: Floats, prior: Floats, factor: float = 1.0) 
     joint = np.block([[motion, cross], [cross.T, of_scans]])
     return Fit(
         M=M, T=rigid.moved_about_own_origins(T, d), misfit=b, observed=Q, weight=weight,
-        cofactor=weight - weighted @ motion @ weighted.T, by_scans=J, covariance=0.5 * (joint + joint.T),
+        cofactor=weight - weighted @ motion @ weighted.T, J=J, covariance=0.5 * (joint + joint.T),
     )  # fmt: skip
 
 
 def _without_blunders(
-    used: Sightings, T: Floats, prior: Floats, control: Control, names: Sequence[str]
+    used: Sightings, T: Floats, prior: Floats
 ) -> tuple[Fit, Bools, list[Reason], tuple[Reason | None, ...], float]:
     """Leave out what the others contradict, one at a time; where it is undecided which, raise all standard deviations.
 
     Returns the fit, the sightings accepted (m,), reasons, contradictions of the scans' poses (k,), and the factor of
     the standard deviations.
     """
-    accepted, reasons = np.ones(len(used.scan), bool), list[Reason]()
+    accepted, reasons = np.ones(len(used.point), bool), list[Reason]()
     contradictions: list[Reason | None] = [None] * len(T)
     factor = 1.0
     while True:
         rest = used.take(accepted)
         fit = fitted(rest, T, prior)
-        suspicion = data_snooping.strongest(fit, rest.point, rest.scan)
+        suspicion = data_snooping.strongest(fit.misfit, fit.weight, fit.cofactor, fit.J, rest.point, rest.body)
         if suspicion is None:
             break
         out = np.zeros(len(accepted), bool)
         out[np.flatnonzero(accepted)[suspicion.rows]] = True
-        suspects = [_suspect(kind, number, rest, control.ids, names) for kind, number in suspicion.rivals]
+        suspects = [_suspect(kind, number, rest) for kind, number in suspicion.rivals]
         if len(suspects) > 1 or _shortage(used.take(accepted & ~out)):
             fit, factor = _loosened(rest, T, prior)
             reasons.append(reason("stitch.control-undecided", suspects=tuple(suspects[:3]), factor=factor))
             break
-        if suspicion.kind == "scan":
+        if suspicion.kind == "body":
             contradictions[suspicion.number] = reason("stitch.control-contradicts", shift_mm=suspicion.size_mm)
         else:
             reasons.append(reason("stitch.control-left-out", suspect=suspects[0], size_mm=suspicion.size_mm))
@@ -248,12 +227,12 @@ def _without_blunders(
     return fit, accepted, reasons, tuple(contradictions), factor
 
 
-def _suspect(kind: str, number: int, sightings: Sightings, ids: Sequence[str], names: Sequence[str]) -> Reason:
-    if kind == "scan":
-        return reason("stitch.suspect-pose", scan=names[number])
+def _suspect(kind: str, number: int, sightings: Sightings) -> Reason:
+    if kind == "body":
+        return reason("stitch.suspect-pose", scan=sightings.body_name[int(np.argmax(sightings.body == number))])
     if kind == "point":
-        return reason("stitch.suspect-point", point=ids[number])
-    point, scan = ids[sightings.point[number]], names[sightings.scan[number]]
+        return reason("stitch.suspect-point", point=sightings.point_name[int(np.argmax(sightings.point == number))])
+    point, scan = sightings.point_name[number], sightings.body_name[number]
     return reason("stitch.suspect-sighting", point=point, scan=scan)
 
 
@@ -271,26 +250,13 @@ def _loosened(sightings: Sightings, T: Floats, prior: Floats) -> tuple[Fit, floa
 
 def _shortage(sightings: Sightings) -> Reason | None:
     """Return why sightings do not determine the frame, or None: fewer than three points, or nearly on a line."""
-    first = np.unique(sightings.point, return_index=True)[1]
-    if len(first) < rigid.LEAST_POINTS:
-        return reason("stitch.control-few", points=len(first))
+    places = sightings.places
+    if len(places) < rigid.LEAST_POINTS:
+        return reason("stitch.control-few", points=len(places))
     sd = float(np.hypot(sightings.known_sd, sightings.seen_sd).max())
-    if not rigid.points_determine_motion(sightings.known[first], common_point_checks.LEAST_HEIGHT, CLEAR * sd):
+    if not rigid.points_determine_motion(places, common_point_checks.LEAST_HEIGHT, CLEAR * sd):
         return reason("stitch.control-on-a-line")
     return None
-
-
-def _scale(sightings: Sightings, T: Floats) -> float:
-    """Return the ratio of the distances between known places to those between the seen ones."""
-    placed, known = _placed(sightings, T), sightings.known
-    return float(np.linalg.norm(known - known.mean(axis=0)) / np.linalg.norm(placed - placed.mean(axis=0)))
-
-
-def _placed(sightings: Sightings, T: Floats) -> Floats:
-    """Return sightings (m, 3) in the frame that poses T (k, 4, 4) map to."""
-    poses = T[sightings.scan]
-    placed: Floats = np.einsum("mij,mj->mi", poses[:, :3, :3], sightings.seen) + poses[:, :3, 3]
-    return placed
 
 
 def _residuals(every: Sightings, used: Bools, placed: Bools, fit: Fit, factor: float) -> tuple[Floats, Floats, Floats]:
@@ -300,20 +266,20 @@ def _residuals(every: Sightings, used: Bools, placed: Bools, fit: Fit, factor: f
     """
     m = len(used)
     off, sd, share = np.full((m, 3), np.nan), np.full((m, 3), np.nan), np.full(m, np.nan)
-    off[placed] = (every.known - rigid.apply(fit.M, _placed(every, fit.T)))[placed]
+    off[placed] = (every.known - rigid.apply(fit.M, every.placed(fit.T)))[placed]
     left = fit.observed @ fit.cofactor
     sd[used] = np.sqrt(np.maximum(np.diag(left @ fit.observed), 0.0)).reshape(-1, 3)
     # Of correlated errors: the part of the square of one by its own covariance that is left in the misfits, 0 to 1.
     share[used] = (np.diag(fit.cofactor) / np.diag(np.linalg.inv(fit.observed))).reshape(-1, 3).mean(axis=1)
-    for i in np.flatnonzero(placed & ~used):
-        s, R = every.scan[i], fit.M[:3, :3]
-        arm = fit.T[s, :3, :3] @ every.seen[i]
-        F = np.zeros((3, len(fit.covariance)))
-        F[:, :6] = rigid.motion((every.known[i] - off[i])[None])[0]
-        F[:, 6 + 6 * s : 12 + 6 * s] = R @ rigid.motion(arm[None])[0]
-        variance = factor**2 * (every.seen_sd[i] ** 2 + every.known_sd[i] ** 2)
-        sd[i] = np.sqrt(np.diag(F @ fit.covariance @ F.T) + variance)
-        share[i] = 1.0
+    rest = placed & ~used
+    if rest.any():
+        unused = every.take(rest)
+        arm = unused.placed(fit.T) - fit.T[unused.body, :3, 3]
+        by_scans = fit.M[:3, :3] @ unused.derivative(arm, len(fit.T)).reshape(len(arm), 3, -1)
+        J = np.concatenate([rigid.motion(unused.known - off[rest]), by_scans], axis=2).reshape(3 * len(arm), -1)
+        own = factor**2 * (unused.seen_sd**2 + unused.known_sd**2)
+        sd[rest] = np.sqrt(variances(J, fit.covariance).reshape(-1, 3) + own[:, None])
+        share[rest] = 1.0
     return off, sd, share
 
 
@@ -332,14 +298,10 @@ def _in_control_frame(fit: Fit, T: Floats, posed: Bools) -> tuple[Floats, Floats
     return poses, covariance
 
 
-def _block(covariance: Floats, s: int) -> Floats:
-    return covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6]
-
-
-def _unused(control: Control, names: Sequence[str]) -> ControlSightings:
+def _unused(sightings: Sightings) -> ControlSightings:
     """Return the sightings, none of them used."""
-    m = len(control.scan)
+    m = len(sightings.point)
     return ControlSightings(
-        point=tuple(control.ids[p] for p in control.point), scan=tuple(names[s] for s in control.scan),
-        off=np.full((m, 3), np.nan), sd=np.full((m, 3), np.nan), share=np.full(m, np.nan), used=np.zeros(m, bool),
+        point=sightings.point_name, scan=sightings.body_name, off=np.full((m, 3), np.nan), sd=np.full((m, 3), np.nan),
+        share=np.full(m, np.nan), used=np.zeros(m, bool),
     )  # fmt: skip

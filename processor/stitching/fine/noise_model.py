@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from processor.model import Floats
+from processor.robust_statistics import huber
 from processor.stitching.planes.scan_planes import Cloud
 
 LEAST_DOF = 10.0  # of a piece
@@ -63,7 +64,6 @@ def _fitted(terms: Floats, v: Floats, dof: Floats) -> Floats:
         row = np.sqrt(weight) / (sd * model)
         share = nnls(terms * row[:, None], v * row)[0]
         model = np.maximum(terms @ share, 1e-3 * float(np.median(v)))
-        z = np.abs(v / model - 1.0) / sd
-        weight = np.minimum(1.0, HUBER / np.maximum(z, 1e-9))
+        weight = huber((v / model - 1.0) / sd, HUBER)
     sized: Floats = share * float(np.median(v / model))
     return sized

@@ -8,12 +8,12 @@ each scan and piece, with a standard deviation tau.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.adjustment.elimination import eliminate
 from processor.model import Floats, Ints
 from processor.stitching.fine.correspondences import FACE_END, Blocks
 from processor.stitching.planes import extraction, grouped_sums
@@ -38,26 +38,6 @@ class Equations:
     z: Floats
     offset: Floats
     variance: Floats
-
-
-class _Coupling(NamedTuple):
-    """Rows (b,) of poses and planes to be eliminated, sorted by piece, and their blocks of the normal matrix.
-
-    ``columns`` (b, q) are the unknowns of a row: the pose of its scan, the scan's range errors (offset, scale), its
-    face's, and its direction's where that is asked for; of blocks on no face, the face's is cut off.
-    ``Hsp`` (b, q, 3) couples them and the plane of the piece; ``inverse`` (p, 3, 3) is that of the planes'
-    block, ``gp`` (p, 3) their gradient. ``tilt`` (p, 3, 3) is the covariance of the ``normal`` (p, 3), ``along`` (b,)
-    the information of a row on the shift of its scan along the normal.
-    """
-
-    piece: Ints
-    columns: Ints
-    Hsp: Floats
-    inverse: Floats
-    gp: Floats
-    normal: Floats
-    tilt: Floats
-    along: Floats
 
 
 def linearize(
@@ -114,13 +94,13 @@ def _normal_matrix(
     N, g, spurious = np.zeros((size + 1, size + 1)), np.zeros(size + 1), np.zeros((size + 1, size + 1))
     np.add.at(N, (columns[:, :, None], columns[:, None, :]), Hss)
     np.add.at(g, columns, np.einsum("bij,bj->bi", Ls, Wr))
-    coupling = _Coupling(
-        piece=np.ascontiguousarray(blocks.piece), columns=columns, Hsp=LsW @ Lp.transpose(0, 2, 1), inverse=inverse,
-        gp=grouped_sums.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces), normal=planes.normal,
-        tilt=planes.axes[:, :, 1:] @ inverse[:, :2, :2] @ planes.axes[:, :, 1:].transpose(0, 2, 1),
-        along=np.einsum("bi,bij,bj->b", n, Hss[:, 3:6, 3:6], n),
-    )  # fmt: skip
-    eliminate(coupling, N, g, spurious)
+    Hsp = LsW @ Lp.transpose(0, 2, 1)
+    gp = grouped_sums.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
+    piece = np.ascontiguousarray(blocks.piece)
+    eliminate(piece, columns, Hsp, inverse, gp, N, g)
+    tilt = planes.axes[:, :, 1:] @ inverse[:, :2, :2] @ planes.axes[:, :, 1:].transpose(0, 2, 1)
+    along = np.einsum("bi,bij,bj->b", n, Hss[:, 3:6, 3:6], n)
+    add_spurious(piece, columns[:, 3], Hsp[:, 3:6], inverse, planes.normal, tilt, along, spurious)
     return N[:size, :size], g[:size], spurious[:size, :size], inverse
 
 
@@ -185,52 +165,38 @@ def _design_matrices(blocks: Blocks, T: Floats, planes: Planes) -> tuple[Floats,
 
 
 @njit(cache=True, nogil=True)
-def eliminate(coupling, N, g, spurious):  # type: ignore[no-untyped-def]
-    """Subtract Hsp Hpp^-1 Hps from N (m, m) and Hsp Hpp^-1 gp from g (m,); add the spurious part of N.
+def add_spurious(piece, shift, Hsp, inverse, normal, tilt, along, spurious):  # type: ignore[no-untyped-def]
+    """Add to ``spurious`` what rows (b,), sorted by piece, seem to determine of shifts by the tilt of their plane.
 
-    Sums run over the few scans of each piece; see :class:`_Coupling`.
+    The information on the shift (columns ``shift`` (b,) to + 2) along the normal (p, 3), the plane eliminated, is
+    spread over the axes by the covariance ``tilt`` (p, 3, 3) of the normal. ``Hsp`` (b, 3, 3) couples shift and plane,
+    ``along`` (b,) is the information of a row.
     """
-    piece, columns, Hsp, inverse = coupling.piece, coupling.columns, coupling.Hsp, coupling.inverse
-    normal, tilt = coupling.normal, coupling.tilt
     b = len(piece)
-    unknowns = columns.shape[1]
-    W, pull = np.empty((unknowns, 3)), np.empty(3)
-    start = 0
+    weighted, pull, start = np.empty(3), np.empty(3), 0
     while start < b:
         p = piece[start]
         end = start
         while end < b and piece[end] == p:
             end += 1
+        n0, n1, n2 = normal[p]
         for x in range(start, end):
-            s = columns[x, 3]
-            for i in range(unknowns):
-                for j in range(3):
-                    W[i, j] = 0.0
-                    for m in range(3):
-                        W[i, j] += Hsp[x, i, m] * inverse[p, m, j]
-                for j in range(3):
-                    g[columns[x, i]] -= W[i, j] * coupling.gp[p, j]
             for j in range(3):
-                pull[j] = normal[p, 0] * W[3, j] + normal[p, 1] * W[4, j] + normal[p, 2] * W[5, j]
+                for i in range(3):
+                    weighted[i] = 0.0
+                    for m in range(3):
+                        weighted[i] += Hsp[x, i, m] * inverse[p, m, j]
+                pull[j] = n0 * weighted[0] + n1 * weighted[1] + n2 * weighted[2]
             for i in range(3):
                 for j in range(3):
-                    spurious[s + i, s + j] += coupling.along[x] * tilt[p, i, j]
+                    spurious[shift[x] + i, shift[x] + j] += along[x] * tilt[p, i, j]
             for y in range(start, end):
-                t = columns[y, 3]
                 shared = 0.0
                 for m in range(3):
-                    shared += pull[m] * (
-                        normal[p, 0] * Hsp[y, 3, m] + normal[p, 1] * Hsp[y, 4, m] + normal[p, 2] * Hsp[y, 5, m]
-                    )
-                for i in range(unknowns):
-                    for j in range(unknowns):
-                        total = 0.0
-                        for m in range(3):
-                            total += W[i, m] * Hsp[y, j, m]
-                        N[columns[x, i], columns[y, j]] -= total
+                    shared += pull[m] * (n0 * Hsp[y, 0, m] + n1 * Hsp[y, 1, m] + n2 * Hsp[y, 2, m])
                 for i in range(3):
                     for j in range(3):
-                        spurious[s + i, t + j] -= shared * tilt[p, i, j]
+                        spurious[shift[x] + i, shift[y] + j] -= shared * tilt[p, i, j]
         start = end
 
 
