@@ -7,33 +7,20 @@ from collections.abc import Mapping
 from typing import Any
 
 from processor.model import WORST_FIRST, Status
-from processor.report.columns import Column
+from processor.report.columns import Column, named
 
 SummaryValues = dict[str, Any]
 COLUMNS: Mapping[str, Column] = {
-    column.name: column
-    for column in (
-        Column("steps", "steps"),  # with the status of those that did not end well
-        Column("verdict", "verdict"),  # the worst of all steps, against the limits
-        Column("joints_pass", "joints pass"),
-        Column("joints_fail", "joints fail"),
-        Column("joints_indeterminate", "joints indeterminate"),
-        Column("splicing_mean_mm", "splicing mean", "mm"),
-        Column("splicing_max_mm", "splicing max", "mm"),
-        Column("linear_mean_mm", "linear mean", "mm"),
-        Column("linear_max_mm", "linear max", "mm"),
-        Column("balls_found", "balls found"),
-        Column("balls_flagged", "balls flagged"),
-        Column("scans_stitched", "scans stitched"),
-        Column("scans_not_stitched", "scans not stitched"),
-        Column("deviation_min_mm", "deviation min", "mm"),
-        Column("deviation_max_mm", "deviation max", "mm"),
-        Column("deviation_significant_share", "deviation significant share"),
-        Column("defects", "defects"),
-        Column("checks_passed", "checks passed"),
-        Column("checks_missed", "checks missed"),
+    name: named(name)
+    for name in (
+        "steps",  # with the status of those that did not end well
+        "verdict",  # the worst of all steps, against the limits
+        *(f"joints_{verdict}" for verdict in ("pass", "fail", "indeterminate")),
+        *(f"{error}_{figure}_mm" for error in ("splicing", "linear") for figure in ("mean", "max")),
+        "balls_found", "balls_flagged", "scans_stitched", "scans_not_stitched", "deviation_min_mm", "deviation_max_mm",
+        "deviation_significant_share", "defects", "checks_passed", "checks_missed",
     )
-}
+}  # fmt: skip
 
 
 def summary_values(results: Mapping[str, Any]) -> SummaryValues:

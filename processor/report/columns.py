@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from processor.language.messages import Message
@@ -43,172 +43,61 @@ def given(*names: str) -> tuple[Column, ...]:
     return tuple(Column(name, name) for name in names)
 
 
-# --- by their units: words that are name and heading, and names with their headings -----------------------------------
+def named(name: str, headings: Mapping[str, str] | None = None) -> Column:
+    """Return the column of a name: its unit by the ending, as of UNITS, its heading the words before it, or given."""
+    ending = next((ending for ending in UNITS if name.endswith(ending)), "")
+    heading = (headings or {}).get(name, name.removesuffix(ending).replace("_", " ").strip())
+    return Column(name, heading, UNITS.get(ending, ""), are_names=name in OF_INPUT)
 
-_NAMES = (  # of what the input holds
-    (
-        "method", "joint", "component", "characteristic", "station", "point", "scan", "a", "b", "loop", "matrix",
-        "key", "of", "id",
-    ),
-    {"left_part": "left part", "right_part": "right part"},
+
+def _in_space(*patterns: str) -> list[str]:
+    return [pattern.format(axis) for pattern in patterns for axis in XYZ]
+
+
+UNITS = {
+    "mm": "mm", "mm2": "mm2", "mm3": "mm3", "_per_m": "1/m", "_m": "m", "mrad": "mrad", "_deg": "deg",
+    "_percent": "%", "_ppm": "ppm", "_C": "°C", "_mb": "MB", "seconds": "s",
+}  # fmt: skip
+# Headings that are not the words of the name: under a heading of their group, or beside another column of the kind
+SHORT = {
+    "input_sha256": "input SHA-256", "peak_mb": "peak memory", "seconds": "time",
+    "probability_now": "now", "probability_after": "after", "rotation_about": "about", "rotation_ci95_mrad": "ci95",
+    "misalignment_ci95_mm": "ci95", "least_groove_gap_mm": "gap", "least_groove_gap_ci95_mm": "ci95",
+    "greatest_groove_gap_mm": "gap", "greatest_groove_gap_ci95_mm": "ci95",
+    **{f"{kind}_{figure}_mm": figure for figure in ("mean", "max")
+       for kind in ("splicing", "linear", "foot1_best_fit_linear")},
+    **{f"{half}{gauge}_d{axis}_mm": f"{half}d{axis} {words}".replace("_", " ") for axis in XYZ for half in ("", "ci95_")
+       for gauge, words in (("design", "by design coordinates"), ("best_fit", "by best fit"))},
+}  # fmt: skip
+OF_INPUT = (
+    "method", "joint", "component", "characteristic", "station", "point", "scan", "a", "b", "loop", "matrix", "key",
+    "of", "id", "left_part", "right_part",
 )  # fmt: skip
-_WITHOUT_UNIT = (
-    (
-        "at", "axes", "balls", "beyond", "candidate", "check", "class", "clause", "code", "confidence", "day",
-        "doubtful", "edge", "edition", "evidence", "figure", "finding", "fit", "fitted", "flag", "folder", "follows",
-        "from", "input", "kept", "kind", "lambda", "limit", "log", "measure", "message", "n1", "n2", "name", "noise",
-        "nx", "ny", "nz", "otherwise", "outcome", "points", "probability", "proposal", "quantity", "ratio", "reason",
-        "remark", "report", "rivalry", "scanner", "serial", "shared", "significant", "since", "source", "statement",
-        "stations", "status", "step", "steps", "subject", "to", "tube", "unit", "used", "verdict", "what", "m00",
-        "m01", "m02", "m03", "m10", "m11", "m12", "m13", "m20", "m21", "m22", "m23", "m30", "m31", "m32", "m33", "xx",
-        "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz",
-    ),
-    {
-        "ball_a": "ball a",
-        "ball_b": "ball b",
-        "beyond_its_interval": "beyond its interval",
-        "beyond_widened": "beyond widened",
-        "by_chance_on_100_m2": "by chance on 100 m2",
-        "control_point": "control point",
-        "day_from": "day from",
-        "efficiency_centre": "efficiency centre",
-        "efficiency_lowest_z": "efficiency lowest z",
-        "efficiency_radius": "efficiency radius",
-        "further_joints": "further joints",
-        "gauge": "gauge",
-        "input_sha256": "input SHA-256",
-        "limit_from": "limit from",
-        "points_used": "points used",
-        "probability_after": "after",
-        "probability_now": "now",
-        "rotation_about": "about",
-        "visible_fraction": "visible fraction",
-        "what_would_decide": "what would decide",
-    },
-)  # fmt: skip
-_UNIT_STATED_ELSEWHERE = (  # in a column of its own, or it is that of the clouds compared
-    (
-        "actual", "change", "ci95", "departure", "deviation", "distance", "greatest", "high95", "least", "lod95",
-        "low95", "lower", "nominal", "std1", "std2", "upper", "value", "x", "y", "z",
-    ),
-    {"ci95_widened": "ci95 widened", "value_from": "value from", "value_to": "value to"},
-)  # fmt: skip
-_MM = {
-    "along_mm": "along",
-    "bound_sd_lowest_z_mm": "bound sd lowest z",
-    "bound_sd_radius_mm": "bound sd radius",
-    "bow_mm": "bow",
-    "ceiling_z_mm": "ceiling z",
-    "chainage_mm": "chainage",
-    "ci95_along_mm": "ci95 along",
-    "ci95_axis_mm": "ci95 axis",
-    "ci95_left_mm": "ci95 left",
-    "ci95_lowest_z_mm": "ci95 lowest z",
-    "ci95_mm": "ci95",
-    "ci95_movement_mm": "ci95 movement",
-    "ci95_radius_mm": "ci95 radius",
-    "ci95_up_mm": "ci95 up",
-    "depth_ci95_mm": "depth ci95",
-    "depth_max_mm": "depth max",
-    "depth_mean_mm": "depth mean",
-    "depth_mm": "depth",
-    "deviation_mm": "deviation",
-    "difference_mm": "difference",
-    "displacement_mm": "displacement",
-    "edge_mm": "edge",
-    "foot1_best_fit_ci95_mm": "foot1 best fit ci95",
-    "foot1_best_fit_deviation_mm": "foot1 best fit deviation",
-    "foot1_best_fit_linear_max_mm": "max",
-    "foot1_best_fit_linear_mean_mm": "mean",
-    "formal_ci95_lowest_z_mm": "formal ci95 lowest z",
-    "formal_ci95_radius_mm": "formal ci95 radius",
-    "greatest_groove_gap_ci95_mm": "ci95",
-    "greatest_groove_gap_mm": "gap",
-    "greatest_mm": "greatest",
-    "largest_mm": "largest",
-    "least_groove_gap_ci95_mm": "ci95",
-    "least_groove_gap_mm": "gap",
-    "least_mm": "least",
-    "left_mm": "left",
-    "length_mm": "length",
-    "limit_mm": "limit",
-    "linear_max_mm": "max",
-    "linear_mean_mm": "mean",
-    "lod95_mm": "lod95",
-    "lowest_z_mm": "lowest z",
-    "mean_mm": "mean",
-    "median_mm": "median",
-    "misalignment_ci95_mm": "ci95",
-    "misalignment_mm": "misalignment",
-    "mm": "",
-    "movement_mm": "movement",
-    "nominal_radius_mm": "nominal radius",
-    "off_mm": "off",
-    "quantile_95_mm": "quantile 95",
-    "radius_error_mm": "radius error",
-    "radius_mm": "radius",
-    "residual_mm": "residual",
-    "rms_mm": "rms",
-    "sd_mm": "sd",
-    "shift_mm": "shift",
-    "side_mm": "side",
-    "sideways_ci95_mm": "sideways ci95",
-    "sideways_mm": "sideways",
-    "size_mm": "size",
-    "splicing_max_mm": "max",
-    "splicing_mean_mm": "mean",
-    "true_radius_mm": "true radius",
-    "up_ci95_mm": "up ci95",
-    "up_mm": "up",
-    "value_mm": "value",
-    "width_mm": "width",
-    **{
-        name.format(axis): heading.format(axis)
-        for name, heading in (
-            ("{}_mm", "{}"),
-            ("{}t_mm", "{}t"),
-            ("d{}_mm", "d{}"),
-            ("ci95_{}_mm", "ci95 {}"),
-            ("ci95_d{}_mm", "ci95 d{}"),
-            ("design_d{}_mm", "d{} by design coordinates"),
-            ("ci95_design_d{}_mm", "ci95 d{} by design coordinates"),
-            ("best_fit_d{}_mm", "d{} by best fit"),
-            ("ci95_best_fit_d{}_mm", "ci95 d{} by best fit"),
-            ("sd_{}_mm", "sd {}"),
-            ("bound_sd_{}_mm", "bound sd {}"),
-            ("start_{}_mm", "start {}"),
-            ("end_{}_mm", "end {}"),
-        )
-        for axis in XYZ
-    },
-}
-_FURTHER_UNITS = {
-    "m": {"x_m": "x", "y_m": "y", "z_m": "z"},
-    "mm2": {"area_mm2": "area"},
-    "mm3": {"volume_mm3": "volume", "volume_ci95_mm3": "volume ci95"},
-    "1/m": {"curvature_per_m": "curvature"},
-    "mrad": {
-        "mrad": "",
-        "rotation_mrad": "rotation",
-        "rotation_ci95_mrad": "ci95",
-        **{f"ci95_about_{axis}_mrad": f"ci95 about {axis}" for axis in XYZ},
-        **{f"turn_{axis}_mrad": f"turn {axis}" for axis in XYZ},
-    },
-    "deg": {"turned_deg": "turned"},
-    "%": {"overlap_percent": "overlap", "share_percent": "share"},
-    "ppm": {"scale_ppm": "scale", "scale_ci95_ppm": "scale ci95"},
-    "°C": {"temperature_C": "temperature"},
-    "s": {"seconds": "time"},
-    "MB": {"peak_mb": "peak memory"},
-}
-
-
-def _all() -> Iterator[Column]:
-    for words, further in (_NAMES, _WITHOUT_UNIT, _UNIT_STATED_ELSEWHERE):
-        headings = {**{word: word for word in words}, **further}
-        yield from (Column(name, heading, are_names=words is _NAMES[0]) for name, heading in headings.items())
-    for unit, headings in {"mm": _MM, **_FURTHER_UNITS}.items():
-        yield from (Column(name, heading, unit) for name, heading in headings.items())
-
-
-COLUMNS: Mapping[str, Column] = {column.name: column for column in _all()}
+_FURTHER = """
+actual along_mm area_mm2 at axes ball_a ball_b balls beyond beyond_its_interval beyond_widened bound_sd_lowest_z_mm
+bound_sd_radius_mm bow_mm by_chance_on_100_m2 candidate ceiling_z_mm chainage_mm change check ci95 ci95_along_mm
+ci95_axis_mm ci95_left_mm ci95_lowest_z_mm ci95_mm ci95_movement_mm ci95_radius_mm ci95_up_mm ci95_widened class clause
+code confidence control_point curvature_per_m day day_from departure depth_ci95_mm depth_max_mm depth_mean_mm depth_mm
+deviation deviation_mm difference_mm displacement_mm distance doubtful edge edge_mm edition efficiency_centre
+efficiency_lowest_z efficiency_radius evidence figure finding fit fitted flag folder follows foot1_best_fit_ci95_mm
+foot1_best_fit_deviation_mm formal_ci95_lowest_z_mm formal_ci95_radius_mm from further_joints gauge greatest greatest_mm
+high95 input kept kind lambda largest_mm least least_mm left_mm length_mm limit limit_from limit_mm lod95 lod95_mm log
+low95 lower lowest_z_mm mean_mm measure median_mm message misalignment_mm mm movement_mm mrad n1 n2 name noise nominal
+nominal_radius_mm nx ny nz off_mm otherwise outcome overlap_percent points points_used probability proposal
+quantile_95_mm quantity radius_error_mm radius_mm ratio reason remark report residual_mm rivalry rms_mm rotation_mrad
+scale_ci95_ppm scale_ppm scanner sd_mm serial share_percent shared shift_mm side_mm sideways_ci95_mm sideways_mm
+significant since size_mm source statement stations status std1 std2 step steps subject temperature_C to true_radius_mm
+tube turned_deg unit up_ci95_mm up_mm upper used value value_from value_mm value_to verdict visible_fraction
+volume_ci95_mm3 volume_mm3 what what_would_decide width_mm
+"""
+COLUMNS: Mapping[str, Column] = {
+    name: named(name, SHORT)
+    for name in [
+        *SHORT, *OF_INPUT, *_FURTHER.split(),
+        *(f"m{row}{place}" for row in range(4) for place in range(4)), *(a + b for a in XYZ for b in XYZ),
+        *_in_space(
+            "{}", "{}_m", "{}_mm", "{}t_mm", "d{}_mm", "ci95_{}_mm", "ci95_d{}_mm", "sd_{}_mm", "bound_sd_{}_mm",
+            "start_{}_mm", "end_{}_mm", "ci95_about_{}_mrad", "turn_{}_mrad",
+        ),
+    ]
+}  # fmt: skip

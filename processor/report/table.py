@@ -8,7 +8,7 @@ import io
 import itertools
 import math
 import unicodedata
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +38,26 @@ class Table:
     on_page: bool = True
     on_terminal: bool = True
     folded: bool = False  # on the page: among the further tables, which a reader opens
+
+
+def tabulate(title: str | Message, cells: Mapping[str, Any], file: str = "", note: Any = "", **shown: Any) -> Table:
+    """Tabulate columns of one length n by their names.
+
+    A matrix (n, k) has the names of its k columns, with blanks between them. ``shown`` are further fields of a table.
+    """
+    header = columns(*(name for names in cells for name in names.split()))
+    return Table(title, header, rows_of(*cells.values()), file, note, **shown)
+
+
+def rows_of(*cells: Any) -> tuple[tuple[Any, ...], ...]:
+    """Return the rows of columns of one length n: arrays (n,) or (n, k), and sequences."""
+    columns_of = (np.atleast_2d(one.T).tolist() if isinstance(one, np.ndarray) else [one] for one in cells)
+    return tuple(zip(*itertools.chain.from_iterable(columns_of), strict=True))
+
+
+def yes_no(flags: Iterable[Any]) -> list[Text]:
+    """Word flags."""
+    return [text("yes") if flag else text("no") for flag in flags]
 
 
 def figures_of(title: str, runs: Sequence[StepRun], file: str) -> Table:

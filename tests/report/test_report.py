@@ -193,10 +193,26 @@ def test_full_headings_state_group_and_unit_and_csv_files_the_names():
     assert report_table.csv_text(table) == "joint,rotation_mrad,rotation_ci95_mrad,rotation_about\n"
 
 
-def test_a_name_stands_for_one_column():
-    every = list(report_columns._all())
-    assert len(every) == len(report_columns.COLUMNS)
-    assert Column("lod95_mm", "lod95", "mm") in every
+@pytest.mark.parametrize(
+    "column",
+    [
+        Column("lod95_mm", "lod95", "mm"),
+        Column("mm", "", "mm"),
+        Column("volume_ci95_mm3", "volume ci95", "mm3"),
+        Column("ci95_about_x_mrad", "ci95 about x", "mrad"),
+        Column("curvature_per_m", "curvature", "1/m"),
+        Column("x_m", "x", "m"),
+        Column("from", "from"),
+        Column("splicing_mean_mm", "mean", "mm"),
+        Column("ci95_best_fit_dz_mm", "ci95 dz by best fit", "mm"),
+        Column("seconds", "time", "s"),
+        Column("left_part", "left part", are_names=True),
+    ],
+    ids=lambda column: column.name,
+)
+def test_heading_and_unit_of_a_column_follow_from_its_name(column):
+    assert columns(column.name) == (column,)
+    assert list(report_columns.COLUMNS) == [one.name for one in report_columns.COLUMNS.values()]
 
 
 def test_long_tables_are_cut_on_the_terminal_with_a_remark():

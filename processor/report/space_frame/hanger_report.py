@@ -10,7 +10,7 @@ from processor.language.messages import Message, text
 from processor.model import Verdict
 from processor.report.columns import MM, columns
 from processor.report.style import COLOURS, DIVERGING_STOPS, CaptionedPngs, png
-from processor.report.table import Table, csv_of_rows
+from processor.report.table import Table, csv_of_rows, tabulate
 from processor.space_frame.result import Flag, Result
 
 PLAN, STAKE_OUT = "hangers.png", "stakeout.csv"
@@ -25,25 +25,21 @@ def tables(result: Result) -> list[Table]:
     hangers = result.hangers
     if hangers is None:
         return []
-    rows = tuple(
-        (
-            ball,
-            hangers.verdict[i],
-            float(hangers.length[i]),
-            float(hangers.ci95[i]),
-            *hangers.top[i].tolist(),
-            float(hangers.bottom[i, 2]),
-            result.balls.flag[i],
-        )
-        for i, ball in enumerate(hangers.names)
-    )
-    header = columns("id", "verdict", "length_mm", "ci95_mm", "x_mm", "y_mm", "z_mm", "ceiling_z_mm", "flag")
+    cells = {
+        "id": hangers.names,
+        "verdict": hangers.verdict,
+        "length_mm": hangers.length,
+        "ci95_mm": hangers.ci95,
+        "x_mm y_mm z_mm": hangers.top,
+        "ceiling_z_mm": hangers.bottom[:, 2],
+        "flag": result.balls.flag,
+    }
     note = text(
         "From each ball's lowest point x, y, z straight down to the ceiling; the input's own frame. Negative: the "
         "ball reaches below the ceiling. Cut to these lengths only after the process hole at the lowest point is "
         "allowed for."
     )
-    return [Table(text("Hangers"), header, rows, "hangers", note, units=MM, on_terminal=False)]
+    return [tabulate(text("Hangers"), cells, "hangers", note, units=MM, on_terminal=False)]
 
 
 def stake_out(result: Result) -> bytes:

@@ -15,15 +15,15 @@ from processor.language.messages import Message, text
 from processor.model import NORMAL_95, Floats, Status, StepRun, Verdict
 from processor.report.columns import MM, XYZ, columns, under
 from processor.report.space_frame import hanger_report
-from processor.report.table import NAN, Table
+from processor.report.table import NAN, Table, rows_of, tabulate
 from processor.robust_statistics import finite_median
 from processor.space_frame.result import Balls, Evidence, Flag, Result
 from processor.space_frame.spheres.baselines import SAME
 
-COORDINATES = tuple(f"{axis}_mm" for axis in XYZ)
-BY_GAUGE = tuple(
-    f"{half}{gauge}_d{axis}_mm" for gauge in ("design", "best_fit") for half in ("", "ci95_") for axis in XYZ
-)
+PLACE, SHIFT = (" ".join(pattern.format(axis) for axis in XYZ) for pattern in ("{}_mm", "d{}_mm"))
+PLACE_CI95, SHIFT_CI95 = (" ".join(f"ci95_{name}" for name in names.split()) for names in (PLACE, SHIFT))
+OF_FRAME: dict[str, Any] = {"units": MM, "on_terminal": False}
+OF_FILE: dict[str, Any] = {**OF_FRAME, "on_page": False}
 
 
 def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
@@ -49,29 +49,21 @@ def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
 def _formal(run: StepRun, true: Floats, file: str, first: StepRun) -> Table:
     """Balls by a method whose intervals are formal."""
     balls = run.result.balls
-    half = NORMAL_95 * _sd(balls)[:, 3]
-    rows = tuple(
-        (
-            ball,
-            *balls.centres[i].tolist(),
-            float(balls.radii[i]),
-            float(half[i]),
-            float(true[i]),
-            float(balls.radii[i] - true[i]),
-            float(balls.lowest[i, 2]),
-            NORMAL_95 * float(balls.lowest_sd[i]),
-            int(balls.points[i]),
-            balls.flag[i],
-            balls.reasons[i],
-        )
-        for i, ball in enumerate(balls.names)
-    )
-    header = columns(
-        "id", *COORDINATES, "radius_mm", "formal_ci95_radius_mm", "true_radius_mm", "radius_error_mm", "lowest_z_mm",
-        "formal_ci95_lowest_z_mm", "points", "flag", "remark",
-    )  # fmt: skip
+    cells = {
+        "id": balls.names,
+        PLACE: balls.centres,
+        "radius_mm": balls.radii,
+        "formal_ci95_radius_mm": NORMAL_95 * _sd(balls)[:, 3],
+        "true_radius_mm": true,
+        "radius_error_mm": balls.radii - true,
+        "lowest_z_mm": balls.lowest[:, 2],
+        "formal_ci95_lowest_z_mm": NORMAL_95 * balls.lowest_sd,
+        "points": balls.points,
+        "flag": balls.flag,
+        "remark": balls.reasons,
+    }
     note = "" if run is first else text("{reasons}", reasons=run.result.reasons)
-    return Table(_title(run.method), header, rows, file, note, units=MM, on_terminal=run is first)
+    return tabulate(_title(run.method), cells, file, note, units=MM, on_terminal=run is first)
 
 
 def _title(method: str) -> Message:
@@ -82,79 +74,60 @@ def _with_bounds(run: StepRun, true: Floats, file: str) -> Table:
     """All figures of each ball, for a CSV file."""
     balls = run.result.balls
     half = NORMAL_95 * _sd(balls)
-    rows = tuple(
-        (
-            ball,
-            *balls.centres[i].tolist(),
-            *half[i, :3].tolist(),
-            float(balls.radii[i]),
-            float(half[i, 3]),
-            float(balls.sizes[i]),
-            float(balls.nominal_radii[i]),
-            float(true[i]),
-            float(balls.radii[i] - true[i]),
-            float(balls.lowest[i, 2]),
-            NORMAL_95 * float(balls.lowest_sd[i]),
-            *balls.bound_sd[i].tolist(),
-            *balls.efficiency[i].tolist(),
-            int(balls.points[i]),
-            float(balls.visible_fraction[i]),
-            float(balls.rms[i]),
-            int(balls.axes[i]),
-            int(balls.stations[i]),
-            balls.evidence[i],
-            balls.flag[i],
-            balls.reasons[i],
-        )
-        for i, ball in enumerate(balls.names)
-    )
-    header = columns(
-        "id", *COORDINATES, *(f"ci95_{name}" for name in COORDINATES), "radius_mm", "ci95_radius_mm", "size_mm",
-        "nominal_radius_mm", "true_radius_mm", "radius_error_mm", "lowest_z_mm", "ci95_lowest_z_mm",
-        *(f"bound_sd_{name}_mm" for name in (*XYZ, "radius", "lowest_z")),
-        *(f"efficiency_{name}" for name in ("centre", "radius", "lowest_z")),
-        "points", "visible_fraction", "rms_mm", "axes", "stations", "evidence", "flag", "remark",
-    )  # fmt: skip
-    return Table(_title(run.method), header, rows, file, units=MM, on_page=False, on_terminal=False)
+    cells = {
+        "id": balls.names,
+        PLACE: balls.centres,
+        PLACE_CI95: half[:, :3],
+        "radius_mm": balls.radii,
+        "ci95_radius_mm": half[:, 3],
+        "size_mm": balls.sizes,
+        "nominal_radius_mm": balls.nominal_radii,
+        "true_radius_mm": true,
+        "radius_error_mm": balls.radii - true,
+        "lowest_z_mm": balls.lowest[:, 2],
+        "ci95_lowest_z_mm": NORMAL_95 * balls.lowest_sd,
+        " ".join(f"bound_sd_{name}_mm" for name in (*XYZ, "radius", "lowest_z")): balls.bound_sd,
+        " ".join(f"efficiency_{name}" for name in ("centre", "radius", "lowest_z")): balls.efficiency,
+        "points": balls.points,
+        "visible_fraction": balls.visible_fraction,
+        "rms_mm": balls.rms,
+        "axes": balls.axes,
+        "stations": balls.stations,
+        "evidence": balls.evidence,
+        "flag": balls.flag,
+        "remark": balls.reasons,
+    }
+    return tabulate(_title(run.method), cells, file, **OF_FILE)
 
 
 def _brief(result: Result, method: str) -> Table:
     """Balls as the page shows them."""
     balls = result.balls
-    half = NORMAL_95 * _sd(balls)[:, 3]
-    rows = tuple(
-        (
-            ball,
-            *balls.centres[i].tolist(),
-            float(balls.radii[i]),
-            float(half[i]),
-            float(balls.sizes[i]),
-            float(balls.lowest[i, 2]),
-            NORMAL_95 * float(balls.lowest_sd[i]),
-            balls.evidence[i],
-            balls.flag[i],
-        )
-        for i, ball in enumerate(balls.names)
-    )
-    header = columns(
-        "id", *COORDINATES, "radius_mm", "ci95_radius_mm", "size_mm", "lowest_z_mm", "ci95_lowest_z_mm", "evidence",
-        "flag",
-    )  # fmt: skip
+    cells = {
+        "id": balls.names,
+        PLACE: balls.centres,
+        "radius_mm": balls.radii,
+        "ci95_radius_mm": NORMAL_95 * _sd(balls)[:, 3],
+        "size_mm": balls.sizes,
+        "lowest_z_mm": balls.lowest[:, 2],
+        "ci95_lowest_z_mm": NORMAL_95 * balls.lowest_sd,
+        "evidence": balls.evidence,
+        "flag": balls.flag,
+    }
     note = text("Bounds, efficiencies and all other figures are in balls.csv.")
     # A few targets fit on a terminal, the balls of a frame do not.
-    return Table(_title(method), header, rows, note=note, units=MM, on_terminal=not len(result.tubes))
+    return tabulate(_title(method), cells, note=note, units=MM, on_terminal=not len(result.tubes))
 
 
 def _flagged(result: Result, method: str) -> list[Table]:
-    balls = result.balls
-    rows = tuple(
-        (ball, balls.flag[i], balls.reasons[i], *balls.centres[i].tolist(), float(balls.radii[i]))
-        for i, ball in enumerate(balls.names)
-        if balls.flag[i] is not Flag.OK
-    )
-    header = columns("id", "flag", "remark", *COORDINATES, "radius_mm")
-    title = text("Flagged balls, method {method}", method=method)
-    return [Table(title, header, rows, units=MM)] if rows else []
+    flagged = ~result.balls.flagged(Flag.OK)
+    if not flagged.any():
+        return []
+    balls = result.balls.take(flagged)
+    cells = {
+        "id": balls.names, "flag": balls.flag, "remark": balls.reasons, PLACE: balls.centres, "radius_mm": balls.radii,
+    }  # fmt: skip
+    return [tabulate(text("Flagged balls, method {method}", method=method), cells, units=MM)]
 
 
 def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
@@ -180,16 +153,18 @@ def _sd(balls: Balls) -> Floats:
 
 
 def _lowest(balls: Balls) -> Table:
-    rows = tuple(
-        (ball, *balls.lowest[i].tolist(), NORMAL_95 * float(balls.lowest_sd[i]), float(balls.radii[i]), balls.flag[i])
-        for i, ball in enumerate(balls.names)
-    )
-    header = columns("id", *COORDINATES, "ci95_z_mm", "radius_mm", "flag")
+    cells = {
+        "id": balls.names,
+        PLACE: balls.lowest,
+        "ci95_z_mm": NORMAL_95 * balls.lowest_sd,
+        "radius_mm": balls.radii,
+        "flag": balls.flag,
+    }
     note = text(
         "Lowest point of each ball's sphere, in the input's own frame; a process hole cuts it away. ci95 is the "
         "half-width of the 95 % interval."
     )
-    return Table(text("Lowest points"), header, rows, "lowest", note, units=MM, on_page=False, on_terminal=False)
+    return tabulate(text("Lowest points"), cells, "lowest", note, **OF_FILE)
 
 
 # --- the frame -----------------------------------------------------------------------------------------------------
@@ -235,44 +210,31 @@ def _nodes(result: Result) -> list[Table]:
     balls, reference = result.balls, result.movement_reference
     if reference is None:
         return []
-    rows = tuple(
-        (
-            ball,
-            *balls.movement[i].tolist(),
-            *balls.movement_ci95[i].tolist(),
-            float(balls.movement_size[i]),
-            float(balls.movement_size_ci95[i]),
-            reference.limit,
-            balls.verdict[i] if np.isfinite(balls.movement_size[i]) else "",
-            balls.flag[i],
-            balls.reasons[i],
-        )
-        for i, ball in enumerate(balls.names)
-    )
-    header = columns(
-        "id", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm", "movement_mm", "ci95_movement_mm",
-        "limit_mm", "verdict", "flag", "remark",
-    )  # fmt: skip
+    cells = {
+        "id": balls.names,
+        SHIFT: balls.movement,
+        SHIFT_CI95: balls.movement_ci95,
+        "movement_mm": balls.movement_size,
+        "ci95_movement_mm": balls.movement_size_ci95,
+        "limit_mm": [reference.limit] * len(balls),
+        "verdict": ["" if math.isnan(size) else verdict
+                    for size, verdict in zip(balls.movement_size, balls.verdict, strict=True)],
+        "flag": balls.flag,
+        "remark": balls.reasons,
+    }  # fmt: skip
     title, note = text("Nodes against the design"), _nodes_note(result)
     if result.gauges is None:  # of an earlier version
-        return [Table(title, header, rows, "nodes", note, units=MM, on_terminal=False)]
-    by_gauge = [_by_gauge(result, i) for i in range(len(balls))]
-    full = Table(
-        title, (*header, *columns("gauge", *BY_GAUGE)),
-        tuple((*row, *more) for row, more in zip(rows, by_gauge, strict=True)),
-        "nodes", note, units=MM, on_page=False, on_terminal=False,
-    )  # fmt: skip
-    return [Table(title, header, rows, note=note, units=MM, on_terminal=False), *_gauges(result), full]
-
-
-def _by_gauge(result: Result, i: int) -> tuple[Any, ...]:
-    """Return the gauge of a node's movement, and the movement with its intervals by each gauge."""
-    balls = result.balls
-    numbers = [
-        column[i].tolist() if len(column) else [NAN] * 3
-        for column in (balls.design_movement, balls.design_ci95, balls.best_fit_movement, balls.best_fit_ci95)
-    ]
-    return (balls.movement_gauge[i], *(number for three in numbers for number in three))
+        return [tabulate(title, cells, "nodes", note, **OF_FRAME)]
+    by_gauge = {
+        f"{half}{gauge}_d{axis}_mm": values[:, k] if len(values) else [NAN] * len(balls)
+        for gauge, half, values in (
+            ("design", "", balls.design_movement), ("design", "ci95_", balls.design_ci95),
+            ("best_fit", "", balls.best_fit_movement), ("best_fit", "ci95_", balls.best_fit_ci95),
+        )
+        for k, axis in enumerate(XYZ)
+    }  # fmt: skip
+    full = tabulate(title, {**cells, "gauge": balls.movement_gauge, **by_gauge}, "nodes", note, **OF_FILE)
+    return [tabulate(title, cells, note=note, **OF_FRAME), *_gauges(result), full]
 
 
 def _gauges(result: Result) -> list[Table]:
@@ -281,16 +243,13 @@ def _gauges(result: Result) -> list[Table]:
     if gauges is None or not len(balls.design_movement):
         return []
     difference = np.linalg.norm(balls.design_movement - balls.best_fit_movement, axis=1)
-    rows = tuple(
-        (ball, *balls.design_movement[i].tolist(), *balls.best_fit_movement[i].tolist(), float(difference[i]))
-        for i, ball in enumerate(balls.names)
-        if np.isfinite(difference[i])
-    )
-    axes = ("dx_mm", "dy_mm", "dz_mm")
+    known = np.isfinite(difference)
+    moved = balls.take(known)
+    rows = rows_of(moved.names, moved.design_movement, moved.best_fit_movement, difference[known])
     header = (
         *columns("id"),
-        *under(text("differences of coordinates"), *axes),
-        *under(text("relative to a best fit"), *axes),
+        *under(text("differences of coordinates"), *SHIFT.split()),
+        *under(text("relative to a best fit"), *SHIFT.split()),
         *columns("difference_mm"),
     )
     note = text(
@@ -300,7 +259,7 @@ def _gauges(result: Result) -> list[Table]:
         mean=float(np.linalg.norm(gauges.difference)),
         largest=gauges.largest_difference,
     )
-    return [Table(text("Movements by both gauges"), header, rows, note=note, units=MM, on_terminal=False)]
+    return [Table(text("Movements by both gauges"), header, rows, note=note, **OF_FRAME)]
 
 
 def _nodes_note(result: Result) -> Message:
@@ -333,27 +292,22 @@ def _tubes(result: Result) -> list[Table]:
     tubes = result.tubes
     if not len(tubes):
         return []
-    length, ends = np.linalg.norm(tubes.end - tubes.start, axis=1), tubes.ends
-    rows = tuple(
-        (
-            i,
-            *ends[i],
-            *tubes.start[i].tolist(),
-            *tubes.end[i].tolist(),
-            float(length[i]),
-            float(tubes.radii[i]),
-            float(tubes.radius_ci95[i]),
-            float(max(tubes.start_ci95[i].max(), tubes.end_ci95[i].max())),
-            float(tubes.bow[i]),
-        )
-        for i in range(len(tubes))
-    )
-    header = columns(
-        "tube", "ball_a", "ball_b", *(f"start_{one}" for one in COORDINATES), *(f"end_{one}" for one in COORDINATES),
-        "length_mm", "radius_mm", "ci95_radius_mm", "ci95_axis_mm", "bow_mm",
-    )  # fmt: skip
+    ball_a, ball_b = zip(*tubes.ends, strict=True)
+    start, end = tubes.start_ci95.max(axis=1), tubes.end_ci95.max(axis=1)
+    cells = {
+        "tube": range(len(tubes)),
+        "ball_a": ball_a,
+        "ball_b": ball_b,
+        "start_x_mm start_y_mm start_z_mm": tubes.start,
+        "end_x_mm end_y_mm end_z_mm": tubes.end,
+        "length_mm": np.linalg.norm(tubes.end - tubes.start, axis=1),
+        "radius_mm": tubes.radii,
+        "ci95_radius_mm": tubes.radius_ci95,
+        "ci95_axis_mm": np.where(end > start, end, start),
+        "bow_mm": tubes.bow,
+    }
     note = text("Axes between the ends of the scanned stretch; bow is the largest deviation from a straight line.")
-    return [Table(text("Tubes"), header, rows, "tubes", note, units=MM, on_page=False, on_terminal=False)]
+    return [tabulate(text("Tubes"), cells, "tubes", note, **OF_FILE)]
 
 
 def _stations(result: Result) -> list[Table]:
@@ -361,37 +315,34 @@ def _stations(result: Result) -> list[Table]:
     if not len(stations):
         return []
     middle = balls.centres[balls.placed].mean(axis=0) if balls.placed.any() else np.zeros(3)
-    rows = []
-    for name, T, reasons in zip(stations.names, stations.T, stations.reasons, strict=True):
-        R = T[:3, :3]
-        # Of a small turn. Where coordinates are large the translation is not meaningful, the shift at the balls is.
-        turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        shift = (R - np.eye(3)) @ middle + T[:3, 3]
-        rows.append((name, *shift.tolist(), *(1000.0 * turn).tolist(), reasons))
-    header = columns(
-        "station", "dx_mm", "dy_mm", "dz_mm", "turn_x_mrad", "turn_y_mrad", "turn_z_mrad", "remark",
-    )  # fmt: skip
+    R = stations.T[:, :3, :3]
+    # Of a small turn. Where coordinates are large the translation is not meaningful, the shift at the balls is.
+    turn = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    cells = {
+        "station": stations.names,
+        SHIFT: (R - np.eye(3)) @ middle + stations.T[:, :3, 3],
+        "turn_x_mrad turn_y_mrad turn_z_mrad": 1000.0 * turn,
+        "remark": stations.reasons,
+    }
     note = text(
         "Corrections of the stations, as registered, by which they agree with the tubes: shift at the middle of the "
         "balls, and turn; the transforms are in results.json."
     )
     if result.datum:
         note = text("{note} Datum of all stations: {datum}.", note=note, datum=result.datum)
-    return [Table(text("Stations against each other"), header, tuple(rows), "stations", note, units=("mm", "mrad"))]
+    return [tabulate(text("Stations against each other"), cells, "stations", note, units=("mm", "mrad"))]
 
 
 def _control(result: Result) -> list[Table]:
     control = result.control
-    rows = tuple(
-        (
-            name,
-            *off.tolist(),
-            float(np.linalg.norm(off)),
-            text("yes") if used else text("no, contradicts the others"),
-            scan,
-        )
-        for name, off, used, scan in zip(control.points, control.off, control.used, control.scans, strict=True)
-    )
-    header = columns("control_point", "dx_mm", "dy_mm", "dz_mm", "off_mm", "used", "scan")
+    if not len(control):
+        return []
+    cells = {
+        "control_point": control.points,
+        SHIFT: control.off,
+        "off_mm": np.linalg.norm(control.off, axis=1),
+        "used": [text("yes") if used else text("no, contradicts the others") for used in control.used],
+        "scan": control.scans,
+    }
     note = text("Known place minus sighting after the corrections of the stations; one row per sighting.")
-    return [Table(text("Control points"), header, rows, "control", note, units=MM)] if rows else []
+    return [tabulate(text("Control points"), cells, "control", note, units=MM)]
