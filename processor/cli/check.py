@@ -29,12 +29,12 @@ def check(context: click.Context, output: Path, as_json: bool) -> None:
     try:
         metrics = tuple(
             Metric(
-                str(c["step"]),
                 str(c["quantity"]),
                 _number(c["value"]),
                 Statistic(c["statistic"]),
                 unit=str(c["unit"]),
                 limit=_number(c["limit"]),
+                step=str(c["step"]),
                 method=str(c["method"]),
             )
             for c in results["checks"]

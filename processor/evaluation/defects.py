@@ -85,15 +85,15 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     expected = result.examined_mm2 / 1e8
     most = np.floor(expected + ALARM_SDS * np.sqrt(expected) + 1.0) if np.isfinite(expected) and limited else NAN
     metrics += [
-        Metric("defects", FALSE_ALARMS, float(false), Statistic.COUNT, limit=float(most)),
-        Metric("defects", "surface examined", result.examined_mm2 / 1e6, unit="m2", better=Better.HIGH),
+        Metric(FALSE_ALARMS, float(false), Statistic.COUNT, limit=float(most)),
+        Metric("surface examined", result.examined_mm2 / 1e6, unit="m2", better=Better.HIGH),
     ]
     if bodies is not None:
         metrics += _bodies(result.defects, truth.defects, rows, bodies, limited)
-        metrics.append(Metric("defects", "other sides of dents and bulges", float(behind), Statistic.COUNT))
+        metrics.append(Metric("other sides of dents and bulges", float(behind), Statistic.COUNT))
     if truth.pose is not None and result.T_design_project.size and result.covariance.size:
         pulls = pose_pulls(result.T_design_project, truth.pose.T_design_project, result.covariance)
-        metrics += covered_pulls("defects", "poses", pulls)
+        metrics += covered_pulls("poses", pulls)
     if (rows >= 0).any():
         metrics += _classes_and_depths(result.defects, truth.defects, rows, limited)
     return metrics
@@ -109,7 +109,7 @@ def _missed(truth: DefectTruth, rows: Ints, limited: bool) -> list[Metric]:
     classes = np.array(truth.classes)
     limit = 0.0 if limited else NAN
     return [
-        Metric("defects", missed_quantity(kind), float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=limit)
+        Metric(missed_quantity(kind), float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=limit)
         for kind in dict.fromkeys(truth.classes)
     ]
 
@@ -123,8 +123,8 @@ def _found_by_size(
         inside = (size >= low) & (size < high)
         if inside.any():
             share = 100.0 * float(found[inside].mean())
-            metrics.append(Metric("defects", quantity, share, Statistic.SHARE, unit="%", better=Better.HIGH))
-            metrics.append(Metric("defects", quantity, float(inside.sum()), Statistic.NUMBER))
+            metrics.append(Metric(quantity, share, Statistic.SHARE, unit="%", better=Better.HIGH))
+            metrics.append(Metric(quantity, float(inside.sum()), Statistic.NUMBER))
     return metrics
 
 
@@ -159,9 +159,9 @@ def _bodies(defects: Defects, truth: DefectTruth, rows: Ints, bodies: BodyTruth,
     not_one, others = sum(found[name] != 1 for name in moved), len(set(found) - moved)
     limit = 0.0 if limited else NAN
     return [
-        Metric("defects", "defects of another body than the true one", float(wrong), Statistic.COUNT, limit=limit),
-        Metric("defects", "moved bodies that are not one misalignment", float(not_one), Statistic.COUNT, limit=limit),
-        Metric("defects", "bodies called misaligned that did not move", float(others), Statistic.COUNT, limit=limit),
+        Metric("defects of another body than the true one", float(wrong), Statistic.COUNT, limit=limit),
+        Metric("moved bodies that are not one misalignment", float(not_one), Statistic.COUNT, limit=limit),
+        Metric("bodies called misaligned that did not move", float(others), Statistic.COUNT, limit=limit),
     ]
 
 
@@ -177,12 +177,12 @@ def _classes_and_depths(defects: Defects, truth: DefectTruth, rows: Ints, limite
     most_wrong = 100.0 * (1.0 - CLASS_SHARE) + 1e-9 if limited else NAN
     wrong_depths = float((size - allowed[measured] > 0.0).sum())
     return [
-        Metric("defects", "class wrong", 100.0 * wrong, Statistic.SHARE, unit="%", limit=most_wrong),
-        Metric("defects", WRONG_DEPTHS, wrong_depths, Statistic.COUNT, limit=0.0 if limited else NAN),
-        Metric("defects", DEPTH_ERROR, float(np.median(size)) if len(size) else NAN, Statistic.MEDIAN, unit="mm"),
-        Metric("defects", DEPTH_ERROR, float(size.max(initial=0.0)), Statistic.MAX, unit="mm"),
-        Metric("defects", "depths that are bounds alone", float(bound.sum()), Statistic.COUNT),
-        *covered("defects", "depths", error[measured], defects.depth_ci95[rows[measured]]),
+        Metric("class wrong", 100.0 * wrong, Statistic.SHARE, unit="%", limit=most_wrong),
+        Metric(WRONG_DEPTHS, wrong_depths, Statistic.COUNT, limit=0.0 if limited else NAN),
+        Metric(DEPTH_ERROR, float(np.median(size)) if len(size) else NAN, Statistic.MEDIAN, unit="mm"),
+        Metric(DEPTH_ERROR, float(size.max(initial=0.0)), Statistic.MAX, unit="mm"),
+        Metric("depths that are bounds alone", float(bound.sum()), Statistic.COUNT),
+        *covered("depths", error[measured], defects.depth_ci95[rows[measured]]),
         *_volumes_and_areas(defects, truth, rows, measured),
     ]
 
@@ -195,6 +195,6 @@ def _volumes_and_areas(
     volume = np.abs(defects.volume_mm3[found]) - np.abs(true)
     area = defects.area_mm2[found] / truth.area_mm2[measured] - 1.0
     return [
-        *covered("defects", "volumes", volume, defects.volume_ci95[found], unit="mm3"),
-        *signed("defects", "areas", 100.0 * area, unit="%"),
+        *covered("volumes", volume, defects.volume_ci95[found], unit="mm3"),
+        *signed("areas", 100.0 * area, unit="%"),
     ]

@@ -42,7 +42,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         return []
     true_pose = np.eye(4) if truth.pose is None else truth.pose.T_design_project
     if result.status == "ambiguous" and (turn := _otherwise(result, true_pose)) is not None:
-        return [Metric("deviation", OTHER_POSE, turn, unit="deg")]
+        return [Metric(OTHER_POSE, turn, unit="deg")]
     true = true_deviation(result, truth.structure, true_pose)
     error = result.core.distance - true
     known = np.isfinite(error) & np.isfinite(result.core.lod95)
@@ -52,19 +52,18 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     beyond = 100.0 * float(np.mean(size > result.core.lod95[known]))
     return [
         Metric(
-            "deviation",
             "core points farther from the truth than their LOD95",
             beyond,
             Statistic.SHARE,
             unit="%",
             limit=BEYOND_LIMIT if _limited(result) else NAN,
         ),
-        Metric("deviation", "deviation error", float(np.median(size)), Statistic.MEDIAN, unit="mm"),
-        Metric("deviation", "deviation error", float(np.quantile(size, 0.95)), Statistic.P95, unit="mm"),
-        Metric("deviation", "deviation error", float(np.mean(error[known])), Statistic.MEAN, unit="mm"),
-        Metric("deviation", "true deviation", float(np.sqrt(np.mean(true[known] ** 2))), Statistic.RMS, unit="mm"),
-        Metric("deviation", "LOD95", float(np.median(result.core.lod95[known])), Statistic.MEDIAN, unit="mm"),
-        *covered("deviation", "deviations", error, result.core.lod95),
+        Metric("deviation error", float(np.median(size)), Statistic.MEDIAN, unit="mm"),
+        Metric("deviation error", float(np.quantile(size, 0.95)), Statistic.P95, unit="mm"),
+        Metric("deviation error", float(np.mean(error[known])), Statistic.MEAN, unit="mm"),
+        Metric("true deviation", float(np.sqrt(np.mean(true[known] ** 2))), Statistic.RMS, unit="mm"),
+        Metric("LOD95", float(np.median(result.core.lod95[known])), Statistic.MEDIAN, unit="mm"),
+        *covered("deviations", error, result.core.lod95),
         *_extremes(result, true[known]),
         *_moved_and_not(result, truth.structure),
         *([] if truth.pose is None else _pose(result, truth.structure, truth.pose)),
@@ -78,7 +77,7 @@ def _extremes(result: Result, true: Floats) -> list[Metric]:
     intervals = np.array([result.min_ci95, result.max_ci95])
     errors = intervals.mean(axis=1) - [true.min(), true.max()]
     half = np.ptp(intervals, axis=1) / 2.0
-    return covered("deviation", "least and greatest deviations", errors, half)
+    return covered("least and greatest deviations", errors, half)
 
 
 def _pose(result: Result, truth: StructureTruth, truth_pose: PoseTruth) -> list[Metric]:
@@ -100,12 +99,12 @@ def _pose(result: Result, truth: StructureTruth, truth_pose: PoseTruth) -> list[
     shift_limit, turn_limit = (float(limit) for limit in limits)
     wrong = result.status == Status.OK and _otherwise(result, true_pose) is not None
     metrics = [
-        Metric("deviation", "wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
-        Metric("deviation", "pose, shift of the middle", float(np.linalg.norm(shift)), unit="mm", limit=shift_limit),
-        Metric("deviation", "pose, turn", 1e3 * float(np.linalg.norm(turn)), unit="mrad", limit=turn_limit),
+        Metric("wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
+        Metric("pose, shift of the middle", float(np.linalg.norm(shift)), unit="mm", limit=shift_limit),
+        Metric("pose, turn", 1e3 * float(np.linalg.norm(turn)), unit="mrad", limit=turn_limit),
     ]
     if result.covariance.size and still.mean() > LEAST_SHARE:
-        metrics += covered_pulls("deviation", "poses", pose_pulls(result.T_design_scan, true_pose, result.covariance))
+        metrics += covered_pulls("poses", pose_pulls(result.T_design_scan, true_pose, result.covariance))
     return metrics
 
 
@@ -136,8 +135,8 @@ def _moved_and_not(result: Result, truth: StructureTruth) -> list[Metric]:
         mean = float(result.core.distance[known].mean())
         half = 0.5 * float(np.ptp(result.mean_ci95)) if result.mean_ci95.size else 0.0
         limit = max(AS_DESIGNED_MM, half) if limited else NAN
-        metric = Metric("deviation", "mean of steel as designed", abs(mean), unit="mm", limit=limit)
-        return [metric, *(covered("deviation", "means", np.array([mean]), np.array([half])) if half > 0.0 else [])]
+        metric = Metric("mean of steel as designed", abs(mean), unit="mm", limit=limit)
+        return [metric, *(covered("means", np.array([mean]), np.array([half])) if half > 0.0 else [])]
     moved = known & (along > LODS * lod95)
     if not LEAST_SHARE < still.mean() < 1.0 or not moved.any():
         return []
@@ -145,8 +144,8 @@ def _moved_and_not(result: Result, truth: StructureTruth) -> list[Metric]:
     missed = 100.0 * float(np.mean((found <= lod95)[moved]))
     limits = (MOST_FALSE, MOST_MISSED) if limited else (NAN, NAN)
     return [
-        Metric("deviation", "unmoved steel beyond LOD95", false, Statistic.SHARE, unit="%", limit=limits[0]),
-        Metric("deviation", "moved steel within LOD95", missed, Statistic.SHARE, unit="%", limit=limits[1]),
+        Metric("unmoved steel beyond LOD95", false, Statistic.SHARE, unit="%", limit=limits[0]),
+        Metric("moved steel within LOD95", missed, Statistic.SHARE, unit="%", limit=limits[1]),
     ]
 
 

@@ -8,7 +8,7 @@ from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Metric, Statistic
 
 
-def signed(step: str, quantity: str, errors: Floats, bound: Floats | None = None, unit: str = "mm") -> list[Metric]:
+def signed(quantity: str, errors: Floats, bound: Floats | None = None, unit: str = "mm") -> list[Metric]:
     """Bias, standard deviation, 95 % error and number of errors, measured less true; NaN among them are left out.
 
     ``bound`` holds the least possible standard deviation of each (Cramér-Rao), of the same shape: then also the
@@ -31,10 +31,10 @@ def signed(step: str, quantity: str, errors: Floats, bound: Floats | None = None
         if bounded.any():
             rms = float(np.sqrt(np.mean((found[bounded] / least[bounded]) ** 2)))
             figures.append((Statistic.EFFICIENCY, 1.0 / rms if rms > 0.0 else nan, ""))
-    return [Metric(step, quantity, value, statistic, unit=own) for statistic, value, own in figures]
+    return [Metric(quantity, value, statistic, unit=own) for statistic, value, own in figures]
 
 
-def covered(step: str, quantity: str, errors: Floats, half_widths: Floats, unit: str = "mm") -> list[Metric]:
+def covered(quantity: str, errors: Floats, half_widths: Floats, unit: str = "mm") -> list[Metric]:
     """Share of errors within the half-widths of their 95 % intervals, with the figures of :func:`signed`.
 
     Errors without an interval (NaN) are left out. A quantity that has intervals always has this share.
@@ -44,8 +44,8 @@ def covered(step: str, quantity: str, errors: Floats, half_widths: Floats, unit:
         return []
     share = 100.0 * float(np.mean(np.abs(errors[known]) <= half_widths[known]))
     return [
-        Metric(step, quantity, share, Statistic.COVERAGE, unit="%"),
-        *signed(step, quantity, errors[known], unit=unit),
+        Metric(quantity, share, Statistic.COVERAGE, unit="%"),
+        *signed(quantity, errors[known], unit=unit),
     ]
 
 
@@ -62,13 +62,13 @@ def pose_pulls(T: Floats, true: Floats, covariance: Floats) -> Floats:
     return np.asarray(error / np.sqrt(np.where(variance > 0.0, variance, np.nan)))
 
 
-def covered_pulls(step: str, quantity: str, pulls: Floats) -> list[Metric]:
+def covered_pulls(quantity: str, pulls: Floats) -> list[Metric]:
     """Share of errors within their 95 % intervals, of errors in standard deviations; without figures in a unit."""
     known = pulls[np.isfinite(pulls)]
     if not len(known):
         return []
     share = 100.0 * float(np.mean(np.abs(known) <= NORMAL_95))
     return [
-        Metric(step, quantity, share, Statistic.COVERAGE, unit="%"),
-        Metric(step, quantity, float(len(known)), Statistic.NUMBER),
+        Metric(quantity, share, Statistic.COVERAGE, unit="%"),
+        Metric(quantity, float(len(known)), Statistic.NUMBER),
     ]

@@ -82,10 +82,9 @@ def against(truth: Truth, execution: Execution, source: str) -> ErrorReport:
             raise InputError(
                 f"{source}: the truth does not fit what step {run.step} found ({error!r}); is it of another scene?"
             ) from error
-        if run.step in answered:
-            found = [dataclasses.replace(metric, method=run.method) for metric in found]
+        method = run.method if run.step in answered else ""
+        metrics += [dataclasses.replace(metric, step=run.step, method=method) for metric in found]
         answered.add(run.step)
-        metrics += found
     true = truth.frame
     if true is None:
         return ErrorReport(tuple(metrics))

@@ -76,7 +76,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         known = np.isfinite(error)
         if known.any():
             rms = float(np.sqrt(np.mean(error[known] ** 2)))
-            metrics += [Metric("inspect", name, rms, Statistic.RMS, unit="mm"), *covered("inspect", name, error, half)]
+            metrics += [Metric(name, rms, Statistic.RMS, unit="mm"), *covered(name, error, half)]
     return metrics
 
 

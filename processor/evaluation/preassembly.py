@@ -69,19 +69,19 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     limit = 5.0 if truth.spacing_mm <= 5.0 else float("nan")
     true_gaps = _gaps_of_truth(scene.arch, result, truth.arch, true, true_poses)
     return [
-        Metric("preassemble", "wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
-        Metric("preassemble", "splicing error", result.splicing.mean, Statistic.MEAN, unit="mm", limit=limit),
-        Metric("preassemble", "splicing error", result.splicing.max, Statistic.MAX, unit="mm"),
-        Metric("preassemble", TRUE_SPLICING, _over(np.mean, np.abs(true_gaps)), Statistic.MEAN, unit="mm"),
-        Metric("preassemble", TRUE_SPLICING, _over(np.max, np.abs(true_gaps)), Statistic.MAX, unit="mm"),
-        Metric("preassemble", TRUE_LINEAR, mean, Statistic.MEAN, unit="mm"),
-        Metric("preassemble", TRUE_LINEAR, largest, Statistic.MAX, unit="mm"),
-        Metric("preassemble", "key points in the scan", _rms(errors_at_points), Statistic.RMS, unit="mm"),
+        Metric("wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
+        Metric("splicing error", result.splicing.mean, Statistic.MEAN, unit="mm", limit=limit),
+        Metric("splicing error", result.splicing.max, Statistic.MAX, unit="mm"),
+        Metric(TRUE_SPLICING, _over(np.mean, np.abs(true_gaps)), Statistic.MEAN, unit="mm"),
+        Metric(TRUE_SPLICING, _over(np.max, np.abs(true_gaps)), Statistic.MAX, unit="mm"),
+        Metric(TRUE_LINEAR, mean, Statistic.MEAN, unit="mm"),
+        Metric(TRUE_LINEAR, largest, Statistic.MAX, unit="mm"),
+        Metric("key points in the scan", _rms(errors_at_points), Statistic.RMS, unit="mm"),
         *_coverage(key_error, key_sd),
-        *signed("preassemble", "key points", errors_at_points),
+        *signed("key points", errors_at_points),
         *_gaps_by_objective(scene.arch, result, truth.arch, true),
         *_gap_coverage(result, true_gaps),
-        Metric("preassemble", "pose, largest turn", 1000.0 * max(turns, default=float("nan")), unit="mrad"),
+        Metric("pose, largest turn", 1000.0 * max(turns, default=float("nan")), unit="mrad"),
     ]
 
 
@@ -121,7 +121,7 @@ def _coverage(error: Floats, sd: Floats) -> list[Metric]:
     if not known.any():
         return []
     share = float((np.abs(error[known]) <= NORMAL_95 * sd[known]).mean())
-    return [Metric("preassemble", "key points", 100.0 * share, Statistic.COVERAGE, unit="%")]
+    return [Metric("key points", 100.0 * share, Statistic.COVERAGE, unit="%")]
 
 
 def _rms(vectors: Floats) -> float:
@@ -176,9 +176,9 @@ def _gaps_by_objective(design: ArchDesign, result: Result, truth: ArchTruth, tru
     error = (result.joints.gaps - assembly.gaps)[known]
     linear = np.linalg.norm(assembly.departures, axis=1)
     return [
-        Metric("preassemble", "gaps against the truth's", float(np.sqrt(np.mean(error**2))), Statistic.RMS, unit="mm"),
+        Metric("gaps against the truth's", float(np.sqrt(np.mean(error**2))), Statistic.RMS, unit="mm"),
         *_mean_max_coverage(result, assembly.gaps[known], linear),
-        *signed("preassemble", "gaps", error),
+        *signed("gaps", error),
         *_of_the_chain(design, result, truth, assembly, rows, ends),
     ]
 
@@ -189,7 +189,7 @@ def _gap_coverage(result: Result, true_gaps: Floats) -> list[Metric]:
     if not known.any():
         return []
     held = np.abs(result.joints.gaps - true_gaps)[known] <= result.joints.gap_ci95[known]
-    return [Metric("preassemble", "gaps", 100.0 * float(held.mean()), Statistic.COVERAGE, unit="%")]
+    return [Metric("gaps", 100.0 * float(held.mean()), Statistic.COVERAGE, unit="%")]
 
 
 def _of_the_chain(
@@ -208,7 +208,7 @@ def _of_the_chain(
     stated = result.adjustment
     if stated is None:
         return []
-    metrics = covered("preassemble", "spans", np.array([stated.span_departure - assembly.span]),
+    metrics = covered("spans", np.array([stated.span_departure - assembly.span]),
                       np.array([stated.span_ci95]))  # fmt: skip
     if len(stated.linear_offset) == len(assembly.departures) and np.allclose(
         result.linear.chainage, assembly.chainage, atol=1.0
@@ -216,15 +216,13 @@ def _of_the_chain(
         x, left, z = assembly.departures.T
         up = np.einsum("si,si->s", assembly.departures, assembly.up)
         true = np.stack([left, np.copysign(np.hypot(x, z), up)], axis=1)
-        metrics += covered("preassemble", "edges", stated.linear_offset - true, stated.linear_offset_ci95)
+        metrics += covered("edges", stated.linear_offset - true, stated.linear_offset_ci95)
     sides = zip(topology.sides_of(design.joined), design.joint_points, strict=True)
     off = np.array([ends[side.part][side.end] - at for both, at in sides for side in both])
     if np.isfinite(off).all() and np.abs(off).max() < AS_DESIGNED_MM:
         if np.isfinite(stated.closure).any():
-            metrics += covered_pulls(
-                "preassemble", "closures", NORMAL_95 * (stated.closure / stated.closure_ci95).ravel()
-            )
-        metrics += covered_pulls("preassemble", "poses", _pose_pulls(result, truth, assembly, rows))
+            metrics += covered_pulls("closures", NORMAL_95 * (stated.closure / stated.closure_ci95).ravel())
+        metrics += covered_pulls("poses", _pose_pulls(result, truth, assembly, rows))
     return metrics
 
 
@@ -249,8 +247,8 @@ def _mean_max_coverage(result: Result, gaps: Floats, linear: Floats) -> list[Met
     known = np.isfinite(true) & np.isfinite(stated)  # an assembly without bottom edges has no linear error
     share = float((np.abs(stated - true) <= result.errors_ci95[:4])[known].mean())
     return [
-        Metric("preassemble", "mean and largest errors", 100.0 * share, Statistic.COVERAGE, unit="%"),
-        Metric("preassemble", "mean and largest errors", float(known.sum()), Statistic.NUMBER),
+        Metric("mean and largest errors", 100.0 * share, Statistic.COVERAGE, unit="%"),
+        Metric("mean and largest errors", float(known.sum()), Statistic.NUMBER),
     ]
 
 

@@ -45,7 +45,6 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     limit = assessment.PAPER_RADIUS_ERROR_MM if result.method == "ransac" and scene.frame is not None else NAN
     metrics = [
         Metric(
-            "spheres",
             quantity,
             value,
             statistic,
@@ -59,20 +58,20 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     low = int((ok & (np.abs(lowest) > LOWEST_MM)).sum())
     sd = np.sqrt(np.einsum("kii->ki", balls.covariance[rows]))
     metrics += [
-        Metric("spheres", "balls not found", float(len(true.ids) - len(set(matches.tolist()))), Statistic.COUNT),
-        Metric("spheres", NEAR, _share(len(near), len(true.ids)), Statistic.SHARE, unit="%", better=Better.HIGH),
-        Metric("spheres", "nodes that are none", float(present.sum() - len(rows)), Statistic.COUNT),
-        Metric("spheres", WRONG_CENTRE, float(wrong), Statistic.COUNT, limit=0.0),
-        Metric("spheres", WRONG_LOWEST, float(low), Statistic.COUNT, limit=0.0 if result.method == "ray" else NAN),
+        Metric("balls not found", float(len(true.ids) - len(set(matches.tolist()))), Statistic.COUNT),
+        Metric(NEAR, _share(len(near), len(true.ids)), Statistic.SHARE, unit="%", better=Better.HIGH),
+        Metric("nodes that are none", float(present.sum() - len(rows)), Statistic.COUNT),
+        Metric(WRONG_CENTRE, float(wrong), Statistic.COUNT, limit=0.0),
+        Metric(WRONG_LOWEST, float(low), Statistic.COUNT, limit=0.0 if result.method == "ray" else NAN),
         *_coverage("centres", off, sd[:, :3], ok),
         *_coverage("radii", radius, sd[:, 3], ok),
         *_coverage("lowest points", lowest, balls.lowest_sd[rows], ok),
     ]
     bound = balls.bound_sd[rows] if len(balls.bound_sd) else np.full((len(rows), 5), NAN)
     metrics += [
-        *signed("spheres", "centres", off[ok], bound[ok, :3]),
-        *signed("spheres", "radii", radius[ok], bound[ok, 3]),
-        *signed("spheres", "lowest points", lowest[ok], bound[ok, 4]),
+        *signed("centres", off[ok], bound[ok, :3]),
+        *signed("radii", radius[ok], bound[ok, 3]),
+        *signed("lowest points", lowest[ok], bound[ok, 4]),
         *_movements(scene, result, true, rows, matches, ok),
         *_sizes(balls, true, rows, matches, result.method == "ray"),
         *_tubes(scene, result, truth, of_truth),
@@ -90,8 +89,8 @@ def _sizes(balls: Balls, true: FrameTruth, rows: Ints, matches: Ints, limited: b
     called = balls.flagged(Flag.WRONG_SIZE)[rows][known]
     limit = 0.0 if limited else NAN
     return [
-        Metric("spheres", "right sizes called wrong", float((called & ~wrong).sum()), Statistic.COUNT, limit=limit),
-        Metric("spheres", "wrong sizes called right", float((wrong & ~called).sum()), Statistic.COUNT),
+        Metric("right sizes called wrong", float((called & ~wrong).sum()), Statistic.COUNT, limit=limit),
+        Metric("wrong sizes called right", float((wrong & ~called).sum()), Statistic.COUNT),
     ]
 
 
@@ -119,8 +118,8 @@ def _movements(
     vector, rows = (places - nominal)[ok], rows[ok]
     size = np.linalg.norm(vector, axis=1)
     return [
-        *covered("spheres", "movements", balls.movement[rows] - vector, balls.movement_ci95[rows]),
-        *covered("spheres", "sizes of movements", balls.movement_size[rows] - size, balls.movement_size_ci95[rows]),
+        *covered("movements", balls.movement[rows] - vector, balls.movement_ci95[rows]),
+        *covered("sizes of movements", balls.movement_size[rows] - size, balls.movement_size_ci95[rows]),
     ]
 
 
@@ -143,7 +142,7 @@ def _tubes(scene: Scene, result: Result, truth: Truth, of_truth: Ints) -> list[M
         radii = {frozenset((int(i), int(j))): 0.5 * float(diameter) for i, j, diameter in design}
         ends = zip(true.ids[a].tolist(), true.ids[b].tolist(), strict=True)
         nominal = np.array([radii.get(frozenset(pair), NAN) for pair in ends])
-        metrics += covered("spheres", "radii of tubes", tubes.radii[joined] - nominal, tubes.radius_ci95[joined])
+        metrics += covered("radii of tubes", tubes.radii[joined] - nominal, tubes.radius_ci95[joined])
     if len(joined) and (truth.as_built is None or "eccentricity" not in truth.as_built.what):
         along = true.centres[b] - true.centres[a]
         along /= np.linalg.norm(along, axis=1)[:, None]
@@ -152,7 +151,7 @@ def _tubes(scene: Scene, result: Result, truth: Truth, of_truth: Ints) -> list[M
             gap = place[joined] - true.centres[a]
             off.append(gap - np.sum(gap * along, axis=1)[:, None] * along)
             half.append(ci95[joined])
-        metrics += covered("spheres", "axes of tubes", np.stack(off), np.stack(half))
+        metrics += covered("axes of tubes", np.stack(off), np.stack(half))
     return metrics
 
 
@@ -182,13 +181,12 @@ def _coverage(quantity: str, off: Floats, sd: Floats, ok: npt.NDArray[np.bool_])
         return []
     return [
         Metric(
-            "spheres",
             quantity,
             _share(int((np.abs(pull) < NORMAL_95).sum()), len(pull)),
             Statistic.COVERAGE,
             unit="%",
         ),
-        Metric("spheres", quantity, float(np.sqrt(np.mean(pull**2))), Statistic.PULL_RMS),
+        Metric(quantity, float(np.sqrt(np.mean(pull**2))), Statistic.PULL_RMS),
     ]
 
 

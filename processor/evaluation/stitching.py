@@ -40,7 +40,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     scans = result.scans
     known = dict(zip(truth.stations.ids, true_poses(truth.stations), strict=True))
     rows = [i for i, name in enumerate(scans.name) if name in known and scans.placed[i]]
-    metrics = [Metric("stitch", "scans not placed", float((~scans.placed).sum()), Statistic.COUNT)]
+    metrics = [Metric("scans not placed", float((~scans.placed).sum()), Statistic.COUNT)]
     if len(rows) < 2:
         return metrics
     T = scans.T_project_scan[rows]
@@ -56,19 +56,19 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     # The accuracy of points picked by hand is no limit of the software.
     position, rotation = (NAN, NAN) if result.method == "three-point" else (POSITION_MM, ROTATION_MRAD)
     metrics += [
-        Metric("stitch", AFTER_FIT, float(off.max()), Statistic.MAX, unit="mm", limit=position),
-        Metric("stitch", AFTER_FIT, float(np.sqrt((off**2).mean())), Statistic.RMS, unit="mm"),
-        Metric("stitch", "rotations after datum fit", float(turn.max()), Statistic.MAX, unit="mrad", limit=rotation),
-        Metric("stitch", WRONG_BUT_OK, float((off[ok] > WRONG_MM).sum()), Statistic.COUNT, limit=0.0),
+        Metric(AFTER_FIT, float(off.max()), Statistic.MAX, unit="mm", limit=position),
+        Metric(AFTER_FIT, float(np.sqrt((off**2).mean())), Statistic.RMS, unit="mm"),
+        Metric("rotations after datum fit", float(turn.max()), Statistic.MAX, unit="mrad", limit=rotation),
+        Metric(WRONG_BUT_OK, float((off[ok] > WRONG_MM).sum()), Statistic.COUNT, limit=0.0),
     ]
     if result.by_control:
         error = float(np.linalg.norm(T[:, :3, 3] - true[:, :3, 3], axis=1)[fit].max())
-        metrics.append(Metric("stitch", "station positions by control points", error, Statistic.MAX, unit="mm"))
+        metrics.append(Metric("station positions by control points", error, Statistic.MAX, unit="mm"))
     return [
         *metrics,
-        *covered_pulls("stitch", "pose components", pulls_of(result, rows, true)),
-        *covered_pulls("stitch", "poses of pairs", _pulls_of_pairs(result, known)),
-        *covered_pulls("stitch", "scales", _pulls_of_scales(result, truth.stations)),
+        *covered_pulls("pose components", pulls_of(result, rows, true)),
+        *covered_pulls("poses of pairs", _pulls_of_pairs(result, known)),
+        *covered_pulls("scales", _pulls_of_scales(result, truth.stations)),
     ]
 
 

@@ -263,17 +263,17 @@ METRIC_NAMES = {
 class Metric:
     """One figure compared with the truth. Without a limit (NaN) it informs and always passes.
 
-    ``quantity`` is an English name, of which a catalogue has the translation; ``method`` names the step's method where
-    the run was made for comparison.
+    ``quantity`` is an English name, of which a catalogue has the translation; ``step`` is set by the report of all
+    steps, and ``method``, of the step, where the run was made for comparison.
     """
 
-    step: str
     quantity: str
     value: float
     statistic: Statistic = Statistic.VALUE
     unit: str = ""
     limit: float = float("nan")
     better: Better | None = None  # None: as BETTER has it for the statistic
+    step: str = ""
     method: str = ""
 
     def __post_init__(self) -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from processor.model import Better, Metric, Statistic, Word
+from processor.model import Metric, Statistic, Word
 
 HASH_DIGITS = 16
 SEED_DIGITS = 7  # of a fresh seed, in base 16
@@ -81,29 +80,6 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class CheckValue:
-    """One check of a cell, as read from results.json or the history.
-
-    ``limit`` is NaN if there is none; a value of NaN passes no limit.
-    """
-
-    step: str
-    method: str
-    name: str
-    value: float
-    limit: float
-    unit: str
-    quantity: str = ""
-    statistic: str = ""
-    better: str = Better.LOW
-
-    @property
-    def passed(self) -> bool:
-        """Whether the value is within its limit."""
-        return math.isnan(self.limit) or self.value <= self.limit
-
-
-@dataclass(frozen=True)
 class Outcome:
     """How a cell ended: ``results`` is its results.json, empty if it ``failed``, which is then the reason."""
 
@@ -121,27 +97,17 @@ def fresh_seed(case: Case, number: int, i: int) -> int:
     return int(_digest([case.key, number, i])[:SEED_DIGITS], 16)
 
 
-def check_values(results: Mapping[str, Any]) -> list[CheckValue]:
-    """Read the checks of a results.json, each with the method it is of; names are without the method."""
+def checks_of(results: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the checks of a results.json, each with the method it is of; names are without the method."""
     main = {step: str(result.get("method", "")) for step, result in results["steps"].items()}
     return [
-        CheckValue(
-            step=check["step"],
-            method=check["method"] or main.get(check["step"], ""),
-            name=Metric(check["step"], check["quantity"], 0.0, Statistic(check["statistic"])).name,
-            value=_number(check["value"]),
-            limit=_number(check["limit"]),
-            unit=check["unit"],
-            quantity=check["quantity"],
-            statistic=check["statistic"],
-            better=check["better"],
-        )
+        {
+            **check,
+            "method": check["method"] or main.get(check["step"], ""),
+            "name": Metric(check["quantity"], 0.0, Statistic(check["statistic"])).name,
+        }
         for check in results["checks"]
     ]
-
-
-def _number(value: Any) -> float:
-    return float("nan") if value is None else float(value)
 
 
 def _digest(value: Any) -> str:

@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import special, stats
@@ -113,16 +113,7 @@ class Detected:
         return sorted(chosen, key=lambda change: (change.p, change.name))
 
 
-@dataclass(frozen=True)
-class _Test:
-    name: Name
-    test: str
-    size: float
-    p_worse: float
-    p_better: float = math.nan
-    cases: int = 0
-
-
+_Outcome = tuple[float, int, float, float]  # size of a change, cases, p of worse and of better
 _ByCase = dict[str, dict[str, list[float]]]  # values of the seeds of a night, by case and night
 
 
@@ -130,20 +121,14 @@ _ByCase = dict[str, dict[str, list[float]]]  # values of the seeds of a night, b
 class _Series:
     """All rows of one figure: fixed cells of this night and the last before it, seeds of this night and the earlier."""
 
-    unit: str = ""
-    quantity: str = ""
-    statistic: str = ""
-    better: str = ""
+    row: Row  # the latest
     last: dict[tuple[str, int], Row] = field(default_factory=dict)
     mine: dict[tuple[str, int], Row] = field(default_factory=dict)
     earlier: _ByCase = field(default_factory=dict)
     fresh: _ByCase = field(default_factory=dict)
 
     def add(self, row: Row, tonight: bool) -> None:
-        self.unit = row.unit
-        self.quantity = row.quantity or self.quantity
-        self.statistic = row.statistic or self.statistic
-        self.better = row.better or self.better
+        self.row = row
         if row.fixed:
             (self.mine if tonight else self.last)[row.case, row.seed] = row
         else:
@@ -160,47 +145,39 @@ def find(
     alarm is raised every night until the figure is back or accepted.
     """
     series, present = _by_figure(rows, night, worse)
-    measures = {
-        name: loss(name[2], figure.unit, Better(figure.better or Better.LOW), aims or {})
-        for name, figure in series.items()
-    }
-    tests: list[_Test] = []
+    tests: list[tuple[Change, float, float]] = []  # with p of worse and of better
     changes: list[Change] = []
-    moved: dict[Name, _Test] = {}
+    moved: list[Change] = []
     other_scenes: set[tuple[str, int]] = set()
-
-    def change(kind: ChangeKind, test: _Test, p: float, test_name: str = "") -> Change:
-        figure = series[test.name]
-        return Change(
-            name=test.name,
-            kind=kind,
-            test=test_name,
-            size=test.size,
-            is_ratio=kind != ChangeKind.LOST and measures[test.name].is_ratio,
-            unit=figure.unit,
-            p=p,
-            cases=test.cases,
-            quantity=figure.quantity,
-            statistic=figure.statistic,
-        )
-
     for name, figure in series.items():
-        pairs, lost, scenes = _pairs(figure, present, name, measures[name])
+        row = figure.row
+        measure = loss(name[2], row.unit, Better(row.better or Better.LOW), aims or {})
+        pairs, lost, scenes = _pairs(figure, present, name, measure)
         other_scenes |= scenes
+        unchanged = Change(
+            name=name, kind=ChangeKind.CHANGED, test="", size=math.inf, is_ratio=measure.is_ratio, unit=row.unit, p=1.0,
+            cases=lost, quantity=row.quantity, statistic=row.statistic,
+        )  # fmt: skip
         if lost:
-            changes.append(change(ChangeKind.LOST, _Test(name, "", math.inf, math.nan, cases=lost), 0.0))
+            changes.append(replace(unchanged, kind=ChangeKind.LOST, is_ratio=False, p=0.0))
+        outcomes: dict[str, _Outcome | None] = {"fresh": _fresh(figure.fresh, figure.earlier, measure)}
         if any(difference != 0.0 for _, difference, _ in pairs):
-            moved[name] = _paired(name, pairs, figure, measures[name])
-            tests += [moved[name]] if moved[name].p_worse == moved[name].p_worse else []
-        fresh = _fresh(name, figure.fresh, figure.earlier, measures[name])
-        tests += [] if fresh is None else [fresh]
-    for kind, side in ((ChangeKind.REGRESSION, "p_worse"), (ChangeKind.IMPROVEMENT, "p_better")):
-        for test in _holm(tests, side):
-            if all(known.name != test.name for known in changes):
-                changes.append(change(kind, test, getattr(test, side), test.test))
+            outcomes = {"paired": _paired(pairs, figure, measure), **outcomes}
+        for test, outcome in outcomes.items():
+            if outcome is None:
+                continue
+            size, cases, p_worse, p_better = outcome
+            tested = replace(unchanged, size=size, cases=cases)
+            moved += [tested] if test == "paired" else []
+            tests += [] if math.isnan(p_worse) else [(replace(tested, test=test), p_worse, p_better)]
+    of_worse, of_better = [(one, p) for one, p, _ in tests], [(one, p) for one, _, p in tests]
+    for kind, one_sided in ((ChangeKind.REGRESSION, of_worse), (ChangeKind.IMPROVEMENT, of_better)):
+        for tested, p in _holm(one_sided):
+            if all(known.name != tested.name for known in changes):
+                changes.append(replace(tested, kind=kind, p=p))
     known_names = {known.name for known in changes}
-    changes += [change(ChangeKind.CHANGED, test, 1.0) for name, test in moved.items() if name not in known_names]
-    paired = sum(test.test == "paired" for test in tests)
+    changes += [one for one in moved if one.name not in known_names]
+    paired = sum(tested.test == "paired" for tested, *_ in tests)
     return Detected(
         changes=tuple(changes),
         figures=sum(bool(figure.mine or figure.fresh) for figure in series.values()),
@@ -216,13 +193,13 @@ _Present = set[tuple[str, int, tuple[str, str]]]  # case, seed, and step with me
 
 def _by_figure(rows: Sequence[Row], night: str, worse: Mapping[Name, set[str]]) -> tuple[dict[Name, _Series], _Present]:
     """Sort rows by figure, without later nights and those that are no level; also what was measured this night."""
-    series: dict[Name, _Series] = defaultdict(_Series)
+    series: dict[Name, _Series] = {}
     present: _Present = set()
     for row in rows:  # by night, the earliest first
         tonight = row.night == night
         if not tonight and (row.night > night or row.night in worse.get(row.name, ())):
             continue
-        series[row.name].add(row, tonight)
+        series.setdefault(row.name, _Series(row)).add(row, tonight)
         if tonight:
             present.add((row.case, row.seed, row.name[:2]))
     return series, present
@@ -255,7 +232,7 @@ def _pairs(
     return pairs, lost, scenes
 
 
-def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Loss) -> _Test:
+def _paired(pairs: Sequence[_Pair], figure: _Series, measure: Loss) -> _Outcome:
     """Test the differences; p is NaN where there are too few."""
     groups: dict[tuple[str, int], list[float]] = defaultdict(list)
     for key, difference, _ in pairs:
@@ -264,7 +241,7 @@ def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Loss) 
     size = float(np.median([difference for _, difference, _ in pairs if difference != 0.0]))
     count = len(means)
     if count < LEAST_PAIRS:
-        return _Test(name, "paired", size, math.nan, cases=count)
+        return size, count, math.nan, math.nan
     margin = measure.margin + measure.margin_share * float(np.sqrt(np.mean([before**2 for *_, before in pairs])))
     spread = max(float(np.std(means, ddof=1)), LEAST_SPREAD)
     scales = [(spread, count - 1)]
@@ -276,7 +253,7 @@ def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Loss) 
         min(1.0, 2.0 * min(float(stats.t.sf((sign * mean - margin) * root / scale, dof)) for scale, dof in scales))
         for sign in (1.0, -1.0)
     )
-    return _Test(name, "paired", size, worse, p_better=better, cases=count)
+    return size, count, worse, better
 
 
 def _between_seeds(figure: _Series, measure: Loss) -> tuple[float, int]:
@@ -298,7 +275,7 @@ def _between_seeds(figure: _Series, measure: Loss) -> tuple[float, int]:
 # --- on the seeds of the night --------------------------------------------------------------------------------------
 
 
-def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Loss) -> _Test | None:
+def _fresh(now: _ByCase, before: _ByCase, measure: Loss) -> _Outcome | None:
     """Test this night's ranks among the earlier nights', over all cases; None where there is nothing to rank."""
     total, null = 0, np.ones(1)
     offset = 0
@@ -325,7 +302,7 @@ def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Loss) -> _Test | 
     at = total - offset
     enough = abs(size) > measure.margin
     worse, better = (float(part.sum()) if enough else 1.0 for part in (null[at:], null[: at + 1]))
-    return _Test(name, "fresh", size, worse, p_better=better, cases=len(sizes))
+    return size, len(sizes), worse, better
 
 
 def _mean(measure: Loss, values: Sequence[float]) -> float:
@@ -334,12 +311,8 @@ def _mean(measure: Loss, values: Sequence[float]) -> float:
     return mean if math.isfinite(mean) else math.inf
 
 
-def _holm(tests: Sequence[_Test], side: str) -> list[_Test]:
-    """Return the tests that Holm's procedure rejects at ALARM_RATE, those of the least p first."""
-    ranked = sorted(tests, key=lambda test: (getattr(test, side), test.name))
-    rejected = []
-    for i, test in enumerate(ranked):
-        if getattr(test, side) > ALARM_RATE / (len(ranked) - i):
-            break
-        rejected.append(test)
-    return rejected
+def _holm(tests: Sequence[tuple[Change, float]]) -> list[tuple[Change, float]]:
+    """Return the changes, each with its p, that Holm's procedure calls so at ALARM_RATE, those of the least p first."""
+    ranked = sorted(tests, key=lambda test: (test[1], test[0].name))
+    calls = (i for i, (_, p) in enumerate(ranked) if p > ALARM_RATE / (len(ranked) - i))
+    return ranked[: next(calls, len(ranked))]

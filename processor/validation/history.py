@@ -10,7 +10,6 @@ View ``rows`` has one row for every figure of every night, with all that made it
 from __future__ import annotations
 
 import json
-import math
 import sqlite3
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator
@@ -22,7 +21,7 @@ from typing import Any
 from processor.language.messages import Text
 from processor.model import InputError
 from processor.store.codec import value_from_json, value_to_json
-from processor.validation.cells import Cell, CheckValue, Origin, Outcome, check_values
+from processor.validation.cells import Cell, Origin, Outcome, checks_of
 from processor.validation.software_identity import Software
 
 VERSION = 3
@@ -188,7 +187,7 @@ class History:
     def add(self, night: str, cell: Cell, outcome: Outcome) -> None:
         """Write a cell with its figures, in place of an earlier attempt that failed."""
         case = cell.case
-        figures: list[CheckValue] = [] if outcome.failed else check_values(outcome.results)
+        checks = [] if outcome.failed else checks_of(outcome.results)
         with self._transaction():
             self.db.execute("DELETE FROM cells WHERE night = ? AND cell = ? AND failed != ''", [night, cell.key])
             added = self.db.execute(
@@ -202,24 +201,9 @@ class History:
             if added.rowcount:
                 self.db.executemany(
                     "INSERT INTO figures"
-                    " (night, cell, step, method, name, value, limit_, unit, quantity, statistic, better)"
-                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                    [
-                        [
-                            night,
-                            cell.key,
-                            f.step,
-                            f.method,
-                            f.name,
-                            _stored(f.value),
-                            _stored(f.limit),
-                            f.unit,
-                            f.quantity,
-                            str(f.statistic),
-                            str(f.better),
-                        ]
-                        for f in figures
-                    ],
+                    " (night, cell, step, method, name, value, limit_, unit, quantity, statistic, better) VALUES"
+                    " (:night, :cell, :step, :method, :name, :value, :limit, :unit, :quantity, :statistic, :better)",
+                    [{**check, "night": night, "cell": cell.key} for check in checks],
                 )
 
     def end(self, night: str, changes: Iterable[tuple[Name, str, dict[str, Any]]], line: Text, now: str) -> None:
@@ -292,19 +276,15 @@ class History:
             )
         }
 
-    def missed(self, night: str) -> dict[str, list[CheckValue]]:
-        """Return the figures of a night that are beyond their limits, by cell."""
-        beyond: dict[str, list[CheckValue]] = {}
-        for cell, step, method, name, value, limit, unit in self.db.execute(
+    def missed(self, night: str) -> list[dict[str, Any]]:
+        """Return the figures of a night beyond their limits: cell, step, method, name, value, limit and unit."""
+        keys = ("cell", "step", "method", "name", "value", "limit", "unit")
+        rows = self.db.execute(
             "SELECT cell, step, method, name, value, limit_, unit FROM figures"
             " WHERE night = ? AND limit_ IS NOT NULL AND (value IS NULL OR value > limit_)",
             [night],
-        ):
-            figure = CheckValue(
-                step=step, method=method, name=name, value=_number(value), limit=_number(limit), unit=unit
-            )
-            beyond.setdefault(cell, []).append(figure)
-        return beyond
+        )
+        return [dict(zip(keys, row, strict=True)) for row in rows]
 
     def cells(self, night: str) -> list[dict[str, Any]]:
         """Return the cells of a night: title, case, failed, seconds, peak_mb, fixed, seed and figures (a number)."""
@@ -329,10 +309,6 @@ class History:
 
     def _names(self, query: str, *values: str) -> list[Name]:
         return [(step, method, name) for step, method, name in self.db.execute(query, values)]
-
-
-def _stored(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _number(value: float | None) -> float:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree as ET
 
-from processor.validation.cells import CheckValue
 from processor.validation.change_detection import ALARMS, Detected
 from processor.validation.coverage import Coverage
 from processor.validation.coverage import missed as beyond_limits
@@ -15,7 +15,7 @@ from processor.validation.coverage import missed as beyond_limits
 def xml(
     night: str,
     cells: Sequence[Mapping[str, Any]],
-    missed: Mapping[str, Sequence[CheckValue]],
+    missed: Sequence[Mapping[str, Any]],
     detected: Detected,
     intervals: Sequence[Coverage] = (),
 ) -> bytes:
@@ -28,11 +28,16 @@ def xml(
         if cell["failed"]:
             errors += 1
             ET.SubElement(case, "error", message=_clean(cell["failed"]))
-        beyond = missed.get(cell["cell"], ())
+        beyond = [
+            "{step} ({method}), {name}: {shown:g} {unit}, limit {limit:g}".format(
+                **one, shown=math.nan if one["value"] is None else one["value"]
+            )
+            for one in missed
+            if one["cell"] == cell["cell"]
+        ]
         if beyond:
             failures += 1
-            lines = [f"{f.step} ({f.method}), {f.name}: {f.value:g} {f.unit}, limit {f.limit:g}" for f in beyond]
-            ET.SubElement(case, "failure", message=_clean(lines[0])).text = _clean("\n".join(lines))
+            ET.SubElement(case, "failure", message=_clean(beyond[0])).text = _clean("\n".join(beyond))
     _counts(suite, len(cells), failures, errors, sum(cell["seconds"] for cell in cells))
     if intervals:
         wrong = beyond_limits(intervals)

@@ -42,7 +42,8 @@ from pathlib import Path
 from typing import Any
 
 from processor.jobs.process import PROJECT
-from processor.model import InputError, UsageError
+from processor.model import InputError, UsageError, inputs
+from processor.model.inputs import Kind, Place, entry, hidden, listed, number, tables, text
 from processor.validation.cells import Case, Cell, Origin, fresh_seed
 from processor.validation.coverage import Limits
 from processor.writers.toml import as_toml
@@ -54,11 +55,58 @@ else:
 
 DEFAULT = Path(__file__).with_name("default_matrix.toml")
 FOREIGN = PROJECT / "tests" / "bench" / "foreign"  # part of the sources, not of an installed package
-TOP_KEYS = {"name", "about", "fixed_seeds", "fresh_seeds", "aim", "coverage", "cell"}
-CELL_KEYS = {"name", "recipe", "generator", "steps", "methods", "seeds", "fresh", "set", "params", "full"}
-AIMS = ("low", "high")
-MOST_SEED = 2**63
+MOST_SEED = 2**63  # a seed is stored as a 64-bit integer
 MOST_CELLS = 10_000
+
+
+def _aims(value: Any, _: Place) -> Mapping[str, str | float]:
+    aims = {**value}
+    if not all(isinstance(aim, int | float) or aim in ("low", "high") for aim in aims.values()):
+        raise ValueError
+    return aims
+
+
+TABLE = Kind("a table", lambda value, _: {**value}, {"type": "object"})
+AIMS = Kind("figures' names with low, high or a number", _aims, {"type": "object"})
+NAMES = listed(text(), "a list of names")
+SEEDS = listed(number(least=0, most=MOST_SEED - 1, whole=True), "a list of whole numbers from 0")
+COUNT = number(least=0, most=MOST_CELLS, whole=True)
+
+
+@dataclass(frozen=True)
+class _CellTable:
+    steps: tuple[str, ...] = entry(NAMES._replace(expected="the names of those to run"))
+    name: str = entry(text(), default="")
+    recipe: str = entry(text(expected="a name or a TOML file"), default="")
+    generator: str = entry(text(expected="a name or a Python file"), default="")
+    methods: tuple[str, ...] = entry(NAMES, default=())
+    seeds: tuple[int, ...] | None = entry(SEEDS, default=None)
+    fresh: int | None = entry(COUNT, default=None)
+    set: Mapping[str, Any] | None = entry(TABLE, default=None)
+    params: Mapping[str, Any] | None = entry(TABLE, default=None)
+    full: bool = False
+    where: str = hidden("")
+
+    def contradiction(self) -> str:
+        if not self.steps:
+            return "expected steps = the names of those to run"
+        if self.recipe and self.generator:
+            return "recipe and generator exclude each other"
+        return "" if self.recipe or self.generator else "expected recipe = a name or a TOML file"
+
+
+@dataclass(frozen=True)
+class _MatrixTable:
+    cell: tuple[_CellTable, ...] = entry(tables(_CellTable)._replace(expected="at least one [[cell]]"))
+    name: str = entry(text(), default="")
+    about: str = entry(text(empty=True), default="")
+    fixed_seeds: tuple[int, ...] = entry(SEEDS, default=(1,))
+    fresh_seeds: int = entry(COUNT, default=1)
+    aim: Mapping[str, str | float] | None = entry(AIMS, default=None)
+    coverage: Limits = Limits()
+
+    def contradiction(self) -> str:
+        return "" if self.cell else "expected at least one [[cell]]"
 
 
 @dataclass(frozen=True)
@@ -104,86 +152,60 @@ def read(path: Path, full: bool) -> Matrix:
         table: dict[str, Any] = tomllib.loads(raw.decode("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: expected a matrix in TOML, could not read it ({error})") from error
-    _check_keys(table, TOP_KEYS, str(path))
-    fixed = _seeds(table.get("fixed_seeds", [1]), f"{path}: fixed_seeds")
-    fresh = _count(table.get("fresh_seeds", 1), f"{path}: fresh_seeds")
-    aim = table.get("aim", {})
-    if not isinstance(aim, dict) or not all(isinstance(a, int | float) or a in AIMS for a in aim.values()):
-        raise UsageError(f"{path}: aim: expected figures' names with low, high or a number, got {aim!r}")
-    cells = table.get("cell")
-    if not isinstance(cells, list) or not cells or not all(isinstance(cell, dict) for cell in cells):
-        raise UsageError(f"{path}: expected at least one [[cell]]")
-    if path == DEFAULT and not FOREIGN.is_dir():
-        cells = [cell for cell in cells if "generator" not in cell]
+    declared = inputs.read(_MatrixTable, table, Place(str(path), UsageError))
     entries: list[Entry] = []
-    for i, cell in enumerate(cells):
-        where = f"{path}: cell {i + 1}"
-        _check_keys(cell, CELL_KEYS, where)
-        entries_of_cell = _entries(cell, path, where, fixed, fresh)
-        entries += entries_of_cell if full or not _flag(cell, where) else []
+    for cell in declared.cell:
+        if path == DEFAULT and cell.generator and not FOREIGN.is_dir():
+            continue
+        entries_of_cell = _entries(cell, path, declared)
+        entries += entries_of_cell if full or not cell.full else []
         if sum(len(entry.seeds) + entry.fresh for entry in entries) > MOST_CELLS:
-            raise UsageError(f"{where}: more than {MOST_CELLS} cells; set fewer values or seeds")
+            raise UsageError(f"{cell.where}: more than {MOST_CELLS} cells; set fewer values or seeds")
     if not entries:
         raise UsageError(f"{path}: every cell of it is for --full")
     return Matrix(
-        name=str(table.get("name", path.stem)),
+        name=declared.name or path.stem,
         sha256=hashlib.sha256(raw).hexdigest(),
         entries=tuple(entries),
-        aim=aim,
-        coverage=_limits(table.get("coverage", {}), f"{path}: coverage"),
+        aim=declared.aim or {},
+        coverage=declared.coverage,
     )
 
 
-def _entries(cell: dict[str, Any], path: Path, where: str, fixed: tuple[int, ...], fresh: int) -> list[Entry]:
+def _entries(cell: _CellTable, path: Path, defaults: _MatrixTable) -> list[Entry]:
+    """Return the entries of a cell, one a combination of its settings."""
     from processor import pipeline
 
-    foreign = "generator" in cell
-    if foreign and "recipe" in cell:
-        raise UsageError(f"{where}: recipe and generator exclude each other")
-    recipe = cell.get("generator" if foreign else "recipe")
-    if not isinstance(recipe, str) or not recipe:
-        expected = "generator = a name or a Python file" if foreign else "recipe = a name or a TOML file"
-        raise UsageError(f"{where}: expected {expected}, got {recipe!r}")
-    steps, methods = (_names(cell.get(key, []), f"{where}: {key}") for key in ("steps", "methods"))
-    if not steps:
-        raise UsageError(f"{where}: expected steps = the names of those to run")
-    params = cell.get("params", {})
-    if not isinstance(params, dict):
-        raise UsageError(f"{where}: params: expected a table per step, got {params!r}")
+    params = cell.params or {}
     try:
-        pipeline.plan(steps, methods, params, None)
+        pipeline.plan(cell.steps, cell.methods, params, None)
     except UsageError as error:
-        raise UsageError(f"{where}: {error}") from None
-    text, from_file = _generator(recipe, path, where) if foreign else _recipe(recipe, path, where)
-    seeds = _seeds(cell["seeds"], f"{where}: seeds") if "seeds" in cell else fixed
-    fresh = _count(cell.get("fresh", fresh), f"{where}: fresh")
+        raise UsageError(f"{cell.where}: {error}") from None
+    foreign = bool(cell.generator)
+    recipe = cell.generator or cell.recipe
+    recipe_text, from_file = _source(recipe, foreign, path, cell.where)
     stem = Path(recipe).stem if from_file else recipe
-    name = cell.get("name", stem)
-    if not isinstance(name, str):
-        raise UsageError(f"{where}: name: expected a text, got {name!r}")
     return [
         Entry(
             Case(
-                name=name,
+                name=cell.name or stem,
                 recipe=stem,
-                recipe_text=text,
+                recipe_text=recipe_text,
                 from_file=from_file,
                 settings=settings,
-                steps=steps,
-                methods=methods,
+                steps=cell.steps,
+                methods=cell.methods,
                 params=params,
                 origin=Origin.FOREIGN if foreign else Origin.OWN,
             ),
-            seeds,
-            fresh,
+            tuple(dict.fromkeys(defaults.fixed_seeds if cell.seeds is None else cell.seeds)),
+            defaults.fresh_seeds if cell.fresh is None else cell.fresh,
         )
-        for settings in _combinations(cell.get("set", {}), where)
+        for settings in _combinations(cell.set or {}, cell.where)
     ]
 
 
-def _combinations(table: Any, where: str) -> list[tuple[str, ...]]:
-    if not isinstance(table, dict):
-        raise UsageError(f"{where}: set: expected keys with values or lists of values, got {table!r}")
+def _combinations(table: Mapping[str, Any], where: str) -> list[tuple[str, ...]]:
     flat = _flat(table)
     lists = [value if isinstance(value, list) else [value] for value in flat.values()]
     if not all(lists):
@@ -194,76 +216,32 @@ def _combinations(table: Any, where: str) -> list[tuple[str, ...]]:
     ]
 
 
-def _flat(table: dict[str, Any], above: str = "") -> dict[str, Any]:
+def _flat(table: Mapping[str, Any], above: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for key, value in table.items():
         flat |= _flat(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
     return flat
 
 
-def _generator(name: str, path: Path, where: str) -> tuple[str, bool]:
-    """Return the script of a foreign generator, and whether it is a file of the user."""
-    from_file = name.endswith(".py")
-    file = path.parent / name if from_file else FOREIGN / f"{name}.py"
+def _source(name: str, foreign: bool, path: Path, where: str) -> tuple[str, bool]:
+    """Return the text of a recipe or of a foreign generator, and whether it is a file of the user."""
+    what, suffix, known = (
+        ("generator", ".py", "those of a name are part of the sources; or give a .py file beside the matrix")
+        if foreign
+        else ("recipe", ".toml", "designgen list names them")
+    )
+    from_file = name.endswith(suffix)
+    if from_file:
+        file = path.parent / name
+    elif foreign:
+        file = FOREIGN / f"{name}.py"
+    else:
+        designgen = importlib.util.find_spec("designgen")  # it is not imported
+        if designgen is None or not designgen.submodule_search_locations:
+            raise UsageError(f"{where}: scenes are made by designgen, which is not installed")
+        file = Path(designgen.submodule_search_locations[0]) / "recipes" / f"{name}.toml"
     try:
         return file.read_text("utf-8"), from_file
     except (OSError, UnicodeDecodeError) as error:
-        known = "" if from_file else " (those of a name are part of the sources; or give a .py file beside the matrix)"
-        raise UsageError(f"{where}: no generator {name!r}{known}: {error}") from error
-
-
-def _installed(where: str) -> Path:
-    """Return the folder of designgen, which is not imported."""
-    spec = importlib.util.find_spec("designgen")
-    if spec is None or not spec.submodule_search_locations:
-        raise UsageError(f"{where}: scenes are made by designgen, which is not installed")
-    return Path(spec.submodule_search_locations[0])
-
-
-def _recipe(recipe: str, path: Path, where: str) -> tuple[str, bool]:
-    """Return the recipe's text, and whether it is a file of the user."""
-    from_file = recipe.endswith(".toml")
-    file = path.parent / recipe if from_file else _installed(where) / "recipes" / f"{recipe}.toml"
-    try:
-        return file.read_text("utf-8"), from_file
-    except (OSError, UnicodeDecodeError) as error:
-        known = "" if from_file else " (designgen list names them)"
-        raise UsageError(f"{where}: no recipe {recipe!r}{known}: {error}") from error
-
-
-def _check_keys(table: dict[str, Any], keys: set[str], where: str) -> None:
-    unknown = sorted(set(table) - keys)
-    if unknown:
-        raise UsageError(f"{where}: unknown key {unknown[0]!r}; there are {', '.join(sorted(keys))}")
-
-
-def _flag(cell: dict[str, Any], where: str) -> bool:
-    full = cell.get("full", False)
-    if not isinstance(full, bool):
-        raise UsageError(f"{where}: full: expected true or false, got {full!r}")
-    return full
-
-
-def _names(value: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-        raise UsageError(f"{where}: expected a list of names, got {value!r}")
-    return tuple(value)
-
-
-def _seeds(value: Any, where: str) -> tuple[int, ...]:
-    if not isinstance(value, list) or not all(type(seed) is int and 0 <= seed < MOST_SEED for seed in value):
-        raise UsageError(f"{where}: expected a list of whole numbers from 0, got {value!r}")
-    return tuple(dict.fromkeys(value))
-
-
-def _limits(value: Any, where: str) -> Limits:
-    if not isinstance(value, dict) or not all(isinstance(n, int | float) for n in value.values()):
-        raise UsageError(f"{where}: expected numbers low, high, scene and least, got {value!r}")
-    _check_keys(value, {"low", "high", "scene", "least"}, where)
-    return Limits(**value)
-
-
-def _count(value: Any, where: str) -> int:
-    if type(value) is not int or not 0 <= value <= MOST_CELLS:
-        raise UsageError(f"{where}: expected a number from 0 to {MOST_CELLS}, got {value!r}")
-    return value
+        hint = "" if from_file else f" ({known})"
+        raise UsageError(f"{where}: no {what} {name!r}{hint}: {error}") from error

@@ -126,7 +126,7 @@ def _report(
     rows = history.rows(nights[-SEEN_NIGHTS:][0].night, night)
     detected = change_detection.find(rows, night, history.worse(night), matrix.aim)
     done = tuple(cell for cell in history.cells(night) if cell["cell"] in wanted)
-    missed = {key: figures for key, figures in history.missed(night).items() if key in wanted}
+    missed = [figure for figure in history.missed(night) if figure["cell"] in wanted]
     same = [each.night for each in nights if each.code == present.code]
     judged = {(name, module.Params().method) for name, module in pipeline.step_modules().items()}
     cases = {entry.case.key for entry in matrix.entries}

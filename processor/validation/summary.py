@@ -15,7 +15,7 @@ from processor.report.all_tables import figure_name
 from processor.robust_statistics import finite_median
 from processor.validation import change_detection
 from processor.validation import coverage as intervals
-from processor.validation.cells import CheckValue, Origin
+from processor.validation.cells import Origin
 from processor.validation.change_detection import ALARMS, Change, ChangeKind, Detected, Direction
 from processor.validation.coverage import Coverage
 from processor.validation.history import Name, Night, Row
@@ -39,12 +39,12 @@ TEST = text(
 
 @dataclass(frozen=True)
 class Summary:
-    """Cells of a night, figures beyond their limits by cell (``missed``), changes (``detected``), and coverage."""
+    """Cells of a night, figures beyond their limits (``missed``), changes (``detected``), and coverage."""
 
     night: str
     software: Software
     cells: tuple[Mapping[str, Any], ...]
-    missed: Mapping[str, Sequence[CheckValue]]
+    missed: Sequence[Mapping[str, Any]]
     detected: Detected
     coverage: tuple[Coverage, ...] = ()
 
@@ -66,7 +66,7 @@ class Summary:
     @property
     def line(self) -> Text:
         """The night on one line, for a chat channel."""
-        misses = sum(map(len, self.missed.values()))
+        misses = len(self.missed)
         failed, detected = len(self.failed), self.detected
         verdict = text("ok") if self.passed and not failed else text("NOT OK")
         parts = [text("{night} {verdict}", night=self.night, verdict=verdict), self._version()]
@@ -113,12 +113,7 @@ class Summary:
             "code": self.software.code,
             "software": self.software.versions,
             "cells": [dict(cell) for cell in self.cells],
-            "missed": [
-                {"cell": cell, "step": f.step, "method": f.method, "name": f.name, "value": _finite(f.value)}
-                | {"limit": f.limit, "unit": f.unit}
-                for cell, figures in self.missed.items()
-                for f in figures
-            ],
+            "missed": list(self.missed),
             "coverage": [asdict(one) for one in self.coverage],
             "changes": [change_object(change) for change in self.detected.of(*ChangeKind)],
             "test": {

@@ -350,15 +350,15 @@ def test_errors_without_an_interval_are_not_counted():
     nan = float("nan")
     told = {
         one.statistic: one.value
-        for one in error_statistics.covered("s", "x", np.array([0.5, 2.0, 1.0, nan]), np.array([1.0, 1.0, nan, 1.0]))
+        for one in error_statistics.covered("x", np.array([0.5, 2.0, 1.0, nan]), np.array([1.0, 1.0, nan, 1.0]))
     }
     assert (told[Statistic.COVERAGE], told[Statistic.NUMBER]) == (50.0, 2.0)
-    assert error_statistics.covered("s", "x", np.array([nan]), np.array([1.0])) == []
+    assert error_statistics.covered("x", np.array([nan]), np.array([1.0])) == []
 
 
 @pytest.mark.parametrize(("errors", "efficiency"), [([0.3, -0.4], np.sqrt(8.0)), ([0.0, 0.0], np.nan)])
 def test_the_efficiency_is_one_over_the_rms_of_errors_in_least_standard_deviations(errors, efficiency):
     """Errors of 0.3 and 0.4 of least standard deviations 1: 1 / sqrt(0.125); without errors there is none."""
-    figures = error_statistics.signed("s", "x", np.array(errors), np.ones(2))
+    figures = error_statistics.signed("x", np.array(errors), np.ones(2))
     assert figures[-1].statistic == Statistic.EFFICIENCY
     assert figures[-1].value == pytest.approx(efficiency, nan_ok=True)

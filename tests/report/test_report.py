@@ -285,7 +285,7 @@ def test_the_page_escapes_names_and_loads_nothing():
         arch_scene((bad, "rib1", "foot2")), name=bad, units_reason=(reason("units.as-stated", text=bad),)
     )
     text = render(
-        of_bridge(scene, names=(bad, "rib1", "foot2")), ErrorReport((Metric("s", bad, 1.0, unit=bad, limit=2.0),))
+        of_bridge(scene, names=(bad, "rib1", "foot2")), ErrorReport((Metric(bad, 1.0, unit=bad, limit=2.0, step="s"),))
     )
     found = TablesOfPage(text)
     assert found.tags.count("script") == 2  # the page's own, and its data

@@ -76,7 +76,13 @@ def test_key_of_a_cell_depends_on_all_settings_but_methods(tmp_path):
     [
         ("x = 1", "unknown key 'x'"),
         ("fixed_seeds = [1]", "at least one"),
-        ("[[cell]]\nrecipe = 3", "recipe = a name"),
+        ('[[cell]]\nrecipe = 3\nsteps = ["spheres"]', "a name or a TOML file as 'recipe', found 3"),
+        ('[[cell]]\nsteps = ["spheres"]', "recipe = a name"),
+        ("cell = []", "at least one"),
+        ('[[cell]]\nrecipe = "frame-small"\nsteps = []', "names of those to run"),
+        ('[[cell]]\nrecipe = "a"\nsteps = ["spheres"]\nfresh = -1', "from 0 to 10000 as 'fresh', found -1"),
+        ('[[cell]]\nrecipe = "a"\nsteps = ["spheres"]\nfull = 1', "true or false"),
+        ('[[cell]]\nrecipe = "a"\nsteps = ["spheres"]\nset = 1', "a table as 'set'"),
         ('[[cell]]\nrecipe = "frame-small"', "names of those to run"),
         (
             '[[cell]]\nrecipe = "frame-small"\nsteps = ["stich"]',
@@ -89,7 +95,11 @@ def test_key_of_a_cell_depends_on_all_settings_but_methods(tmp_path):
         ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nparams.spheres.x = 1', "spheres.x: unknown parameter"),
         ('[[cell]]\nrecipe = "a"\ngenerator = "b"\nsteps = ["spheres"]', "exclude each other"),
         ('[[cell]]\ngenerator = "nothing"\nsteps = ["spheres"]', "no generator 'nothing'"),
-        ('coverage.least = "few"\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]', "expected numbers"),
+        (
+            'coverage.least = "few"\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]',
+            "a whole number as 'least', found 'few'",
+        ),
+        ('aim = 1\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]', "low, high or a number as 'aim', found 1"),
         ('aim.x = "up"\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]', "low, high or a number"),
     ],
 )
@@ -130,14 +140,13 @@ def test_outside_a_checkout_the_default_matrix_has_the_scenes_of_designgen_alone
 def test_figures_are_separated_by_method():
     found = validation_nights.results({"radii, bias": 0.5, "ransac | radii, bias": None, "other: x": (2.0, 1.0, "%")})
     found["comparison"] = {"spheres": [{"method": "ransac"}]}
-    figures = cells.check_values(found)
-    assert [(f.method, f.name) for f in figures] == [
+    figures = cells.checks_of(found)
+    assert [(f["method"], f["name"]) for f in figures] == [
         ("ray", "radii, bias"),
         ("ransac", "radii, bias"),
         ("ray", "other: x"),
     ]
-    assert math.isnan(figures[1].value)
-    assert [f.passed for f in figures] == [True, True, False]
+    assert [(f["value"], f["limit"]) for f in figures] == [(0.5, None), (None, None), (2.0, 1.0)]
 
 
 # --- a night --------------------------------------------------------------------------------------------------------
@@ -545,7 +554,7 @@ def test_a_generator_beside_the_matrix(tmp_path):
     found = cell_runner.do(cell, scratch=str(tmp_path))
     assert not found.failed
     assert found.peak_mb > 50.0  # NumPy and SciPy alone
-    assert [figure.name for figure in cells.check_values(found.results)][:1] == ["scans not placed"]
+    assert [check["name"] for check in cells.checks_of(found.results)][:1] == ["scans not placed"]
     (tmp_path / "mine.py").write_text("import sys; sys.exit('no idea')", "utf-8")
     (cell,) = matrix.read(tmp_path / "m.toml", False).cells(1)
     assert cell_runner.do(cell, scratch=str(tmp_path)).failed == "mine: exit code 1: no idea"

@@ -146,16 +146,16 @@ def test_the_rank_test_is_exact():
     table = np.round(rng.lognormal(size=(3, 6)), 1)  # three cases, this night and five before it; with ties
     given = [row for n in range(1, 6) for row in rows(night_name(n), table[:, n], fixed=False)]
     given += rows(night_name(6), table[:, 0], fixed=False)
-    series = change_detection._Series()
+    series = change_detection._Series(given[0])
     for row in given:
         series.add(row, row.night == night_name(6))
-    test = change_detection._fresh(NAME, series.fresh, series.earlier, loss(NAME[2], "mm", Better.LOW, {}))
+    _, _, p_worse, p_better = change_detection._fresh(series.fresh, series.earlier, loss(NAME[2], "mm", Better.LOW, {}))
     scores = [np.rint(64 * stats.norm.ppf(stats.rankdata(own) / 7)) for own in table]
     seen = sum(own[0] for own in scores)
     sums = np.array([sum(one) for one in itertools.product(*scores)])
     # Counts of whole numbers: rounding of one quotient.
-    assert test.p_worse == pytest.approx((sums >= seen).mean(), abs=1e-12)
-    assert test.p_better == pytest.approx((sums <= seen).mean(), abs=1e-12)
+    assert p_worse == pytest.approx((sums >= seen).mean(), abs=1e-12)
+    assert p_better == pytest.approx((sums <= seen).mean(), abs=1e-12)
 
 
 def test_unaccepted_regression_is_not_the_new_reference():
@@ -166,16 +166,14 @@ def test_unaccepted_regression_is_not_the_new_reference():
 
 
 def test_holm_by_hand():
-    def tests(*values):
-        return [change_detection._Test(("s", "m", str(i)), "fresh", 1.0, p, 1.0, 3) for i, p in enumerate(values)]
+    def called(*values):
+        one = change_detection.Change(NAME, change_detection.ChangeKind.CHANGED, "fresh", 1.0, True, "mm", 1.0, 3)
+        tests = [(dataclasses.replace(one, name=("s", "m", str(i))), p) for i, p in enumerate(values)]
+        return [p for _, p in change_detection._holm(tests)]
 
-    called = change_detection._holm(tests(0.0012, 0.5, 0.0016, 0.0024), "p_worse")  # against 0.005 / 4, / 3, / 2, / 1
-    assert [one.p_worse for one in called] == [0.0012, 0.0016, 0.0024]
-    called = change_detection._holm(
-        tests(0.0017, 0.0001, 0.002, 0.9), "p_worse"
-    )  # 0.0017 is over 0.005 / 3: it ends there
-    assert [one.p_worse for one in called] == [0.0001]
-    assert change_detection._holm(tests(0.0013, 0.0013, 0.0013, 0.0013), "p_worse") == []
+    assert called(0.0012, 0.5, 0.0016, 0.0024) == [0.0012, 0.0016, 0.0024]  # against 0.005 / 4, / 3, / 2, / 1
+    assert called(0.0017, 0.0001, 0.002, 0.9) == [0.0001]  # 0.0017 is over 0.005 / 3: it ends there
+    assert called(0.0013, 0.0013, 0.0013, 0.0013) == []
 
 
 # --- an estimator made worse ----------------------------------------------------------------------------------------
