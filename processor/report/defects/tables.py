@@ -13,7 +13,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import text
 from processor.model import StepRun
 from processor.report.columns import MM, columns
-from processor.report.table import Table
+from processor.report.table import Table, tabulate, yes_no
 
 LIST_NOTE = text(
     "Centres in the design's frame; a depth inward is positive. ci95 is the half-width of the 95 % interval. The depth "
@@ -67,12 +67,9 @@ def _list(run: StepRun, is_first: bool) -> Table:
         "confidence": defects.confidence,
         "otherwise": defects.otherwise,
         "component": defects.component,
-        "x_mm": defects.centre[:, 0],
-        "y_mm": defects.centre[:, 1],
-        "z_mm": defects.centre[:, 2],
+        "x_mm y_mm z_mm": defects.centre,
         "area_mm2": defects.area_mm2,
-        "length_mm": defects.extent[:, 0],
-        "width_mm": defects.extent[:, 1],
+        "length_mm width_mm": defects.extent[:, :2],
         "depth_max_mm": defects.depth_max,
         "depth_ci95_mm": defects.depth_ci95,
         "depth_mean_mm": defects.depth_mean,
@@ -82,42 +79,25 @@ def _list(run: StepRun, is_first: bool) -> Table:
         "curvature_per_m": defects.curvature_per_m,
         "lod95_mm": defects.lod95,
         "by_chance_on_100_m2": defects.chance,
-        "doubtful": tuple("yes" if doubtful else "no" for doubtful in defects.doubtful),
+        "doubtful": yes_no(defects.doubtful),
         "remark": defects.reasons,
     }
-    rows = zip(*(x.tolist() if isinstance(x, np.ndarray) else x for x in cells.values()), strict=True)
     title = text("Defects, method {method}", method=run.method)
     file = "defects" if is_first else f"defects-{run.method}"
     note = LIST_NOTE if is_first else text("{reasons}", reasons=run.result.reasons)
-    return Table(title, columns(*cells), tuple(rows), file, note, units=MM, on_terminal=is_first)
+    return tabulate(title, cells, file, note, units=MM, on_terminal=is_first)
 
 
 def _least_depth(result: Result) -> Table:
     windows = result.least_depth
-    cells = (windows.side.tolist(), windows.depth.tolist(), windows.noise_inflation.tolist())
-    return Table(
-        title=text("Least depth found, by size of place"),
-        columns=columns("side_mm", "depth_mm", "noise"),
-        rows=tuple(zip(*cells, strict=True)),
-        file="defects-least",
-        note=LEAST_NOTE,
-        units=MM,
-        on_terminal=False,
-    )
+    cells = {"side_mm": windows.side, "depth_mm": windows.depth, "noise": windows.noise_inflation}
+    title = text("Least depth found, by size of place")
+    return tabulate(title, cells, "defects-least", LEAST_NOTE, units=MM, on_terminal=False)
 
 
 def _curves(result: Result) -> Table:
-    rows = tuple(
-        (id_, *row)
-        for id_, curve in zip(result.defects.id.tolist(), result.defects.deflection, strict=True)
-        for row in zip(curve.along.tolist(), curve.displacement.tolist(), curve.ci95.tolist(), strict=True)
-    )
-    return Table(
-        title=text("Deflection curves"),
-        columns=columns("id", "along_mm", "displacement_mm", "ci95_mm"),
-        rows=rows,
-        file="defects-curves",
-        units=MM,
-        on_page=False,
-        on_terminal=False,
-    )
+    curves = result.defects.deflection
+    cells = {"id": np.repeat(result.defects.id, [len(curve.along) for curve in curves])}
+    for name in ("along", "displacement", "ci95"):
+        cells[f"{name}_mm"] = np.concatenate([getattr(curve, name) for curve in curves])
+    return tabulate(text("Deflection curves"), cells, "defects-curves", units=MM, on_page=False, on_terminal=False)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from processor.evaluation.evaluate import ErrorReport
-from processor.inspection.result import Characteristics, InspectedComponent, Result
+from processor.inspection.result import Characteristics, Result
 from processor.language.messages import text
 from processor.model import StepRun
-from processor.report.columns import MM, columns
-from processor.report.table import Table
-
-__all__ = ["Characteristics", "step_tables"]
+from processor.report.columns import MM
+from processor.report.table import Table, tabulate
 
 NOTE = text(
     "Deviation: actual less nominal. ci95 is the half-width of its 95 % interval. Twist is the rotation of the end "
@@ -28,31 +28,22 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     result: Result = runs[0].result
     if not result.components:
         return []
-    header = columns("component", "characteristic", "quantity", "nominal", "actual", "deviation", "ci95",
-               "lower", "upper", "unit", "verdict", "clause", "remark")  # fmt: skip
-    rows = tuple(row for component in result.components for row in _rows(component))
-    tables = [Table(text("Characteristics of components"), header, rows, "inspect", NOTE, on_terminal=False)]
-    if any(len(component.axis) for component in result.components):
-        tables.append(_axes(result))
+    every = Characteristics.concat([component.characteristics for component in result.components])
+    cells: dict[str, Any] = {
+        "component": [component.name for component in result.components for _ in component.characteristics.id],
+        "characteristic": every.id,
+        "quantity": every.quantity,
+        **{name: getattr(every, name) for name in ("nominal", "actual", "deviation", "ci95", "lower", "upper", "unit")},
+        "verdict": every.verdict,
+        "clause": every.clause,
+        "remark": every.reasons,
+    }
+    tables = [tabulate(text("Characteristics of components"), cells, "inspect", NOTE, on_terminal=False)]
+    axes = {component.name: component.axis for component in result.components if len(component.axis)}
+    if axes:
+        cells = {"component": [name for name, axis in axes.items() for _ in axis.chainage]}
+        for name in ("chainage", "sideways", "sideways_ci95", "up", "up_ci95"):
+            cells[f"{name}_mm"] = np.concatenate([getattr(axis, name) for axis in axes.values()])
+        title = text("Axes of components against the design's")
+        tables.append(tabulate(title, cells, "inspect-axes", units=MM, on_page=False, on_terminal=False))
     return tables
-
-
-def _rows(component: InspectedComponent) -> Iterator[tuple[Any, ...]]:
-    for row in component.characteristics.items():
-        yield (component.name, *(one for name, one in row.items() if name not in ("limit", "verified")))
-
-
-def _axes(result: Result) -> Table:
-    rows = tuple(
-        (component.name, *row)
-        for component in result.components
-        for row in zip(
-            *(column.tolist() for column in (
-                component.axis.chainage, component.axis.sideways, component.axis.sideways_ci95, component.axis.up,
-                component.axis.up_ci95,
-            )), strict=True,
-        )
-    )  # fmt: skip
-    header = columns("component", "chainage_mm", "sideways_mm", "sideways_ci95_mm", "up_mm", "up_ci95_mm")
-    title = text("Axes of components against the design's")
-    return Table(title, header, rows, "inspect-axes", units=MM, on_page=False, on_terminal=False)

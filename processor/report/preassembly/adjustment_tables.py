@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
+
+import numpy as np
 
 from processor.geometry import rigid
 from processor.language.messages import Message, label, text
-from processor.preassembly.chain.joint_measures import JointQuantity
+from processor.model import Floats
+from processor.preassembly.chain.joint_measures import JointQuantity, MeasuredQuantities
 from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.result import Adjustment, Result
 from processor.preassembly.verdicts.joints import ComparedLimits
 from processor.report.characteristics import with_unverified
 from processor.report.columns import MM, columns, under
-from processor.report.table import NAN, Table
+from processor.report.table import NAN, Table, rows_of, tabulate, yes_no
 
 TO_DO, LIMITS, CHAIN = "what-to-do", "limits", "limits-chain"
 CLOSURE = (
@@ -25,6 +28,7 @@ CLOSURE = (
     text("closure about the axis across"),
     text("closure about the vertical"),
 )
+CLOSURE_UNITS = ("mm",) * 3 + ("mrad",) * 3
 _PAIRS = (JointQuantity.MISALIGNMENT, JointQuantity.GROOVE_GAP_LEAST, JointQuantity.GROOVE_GAP_GREATEST)
 WHAT_TO_DO = (
     *columns("joint", "verdict", "proposal"),
@@ -35,19 +39,6 @@ WHAT_TO_DO = (
     *under(text("probability that all limits hold"), "probability_now", "probability_after"),
 )
 PROPOSAL = 2  # column of WHAT_TO_DO
-MEASURES = {
-    JointQuantity.GROOVE_GAP_MEAN: text("groove gap mean"),
-    JointQuantity.GROOVE_GAP_LEAST: text("groove gap least"),
-    JointQuantity.GROOVE_GAP_GREATEST: text("groove gap greatest"),
-    JointQuantity.MISALIGNMENT: text("misalignment"),
-    JointQuantity.ECCENTRICITY: text("eccentricity"),
-    JointQuantity.ROTATION_X: text("rotation x"),
-    JointQuantity.ROTATION_Y: text("rotation y"),
-    JointQuantity.ROTATION_Z: text("rotation z"),
-    JointQuantity.OFFSET_X: text("offset x"),
-    JointQuantity.OFFSET_Y: text("offset y"),
-    JointQuantity.OFFSET_Z: text("offset z"),
-}
 _NOTE = text(
     "± is the 95 % half-width. Groove gap: right part minus left along the bridge, positive is open. Pass: the whole "
     "interval keeps the limit; fail: the whole interval exceeds it; indeterminate: the limit lies within it. "
@@ -91,22 +82,8 @@ def adjusted(result: Result, method: str) -> list[Table]:
         *_what_to_do(adjustment, method),
         _limits(adjustment, method),
         *_chain(adjustment, method),
-        Table(
-            text("Measures of the joints, method {method}", method=method),
-            columns("joint", "measure", "value", "ci95", "low95", "high95", "unit"),
-            tuple(_measures(adjustment)),
-            file="measures",
-            on_terminal=False,
-            folded=True,
-        ),
-        Table(
-            text("Span and closure, method {method}", method=method),
-            columns("figure", "departure", "ci95", "unit", "beyond_its_interval"),
-            tuple(_span_and_closure(adjustment)),
-            file="span",
-            note=SPAN_NOTE,
-            folded=True,
-        ),
+        _measures(adjustment, method),
+        _span_and_closure(adjustment, method),
         *_loops(adjustment, method),
         Table(
             text("Budget of the uncertainty, method {method}", method=method),
@@ -166,118 +143,117 @@ def _joint_rows(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
 
 
 def _limits(adjustment: Adjustment, method: str) -> Table:
-    header = columns(
-        "joint", "limit", "verdict", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability",
-        "clause",
-    )  # fmt: skip
-    rows = tuple(
-        (joint, *row)
-        for joint, conformity in zip(adjustment.joints.name, adjustment.joints.conformity, strict=True)
-        for row in _limit_rows(conformity.limits)
-    )
-    note = with_unverified(LIMITS_NOTE, [one.limits for one in adjustment.joints.conformity])
+    limits = [conformity.limits for conformity in adjustment.joints.conformity]
+    joints = [joint for joint, one in zip(adjustment.joints.name, limits, strict=True) for _ in one.key]
+    cells = {"joint": joints, **_cells_of_limits(ComparedLimits.concat(limits))}
     title = text("Limits, method {method}", method=method)
-    return Table(title, header, rows, file=LIMITS, note=note, units=MM, on_page=False)
+    return tabulate(title, cells, LIMITS, with_unverified(LIMITS_NOTE, limits), units=MM, on_page=False)
 
 
-def _limit_rows(limits: ComparedLimits) -> Iterator[tuple[Any, ...]]:
-    for row in limits.items():
-        numbers = (row[name] for name in ("value", "ci95", "low", "high", "probability"))
-        yield (label(row["what"]), row["verdict"], *numbers, label(row["clause"]))
+def _cells_of_limits(limits: ComparedLimits) -> dict[str, Any]:
+    return {
+        "limit": list(map(label, limits.what)),
+        "verdict": limits.verdict,
+        "value_mm": limits.value,
+        "ci95_mm": limits.ci95,
+        "least_mm": limits.low,
+        "greatest_mm": limits.high,
+        "probability": limits.probability,
+        "clause": list(map(label, limits.clause)),
+    }
 
 
 def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     """Yield the limits of the whole chain, and those stated ones that nothing is compared with."""
-    header = columns(
-        "limit", "verdict", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability", "clause",
-        "edition", "source",
-    )  # fmt: skip
-    rows = tuple(
-        (*row, edition, label(source))
-        for conformity in adjustment.chain
-        for row, edition, source in zip(
-            _limit_rows(conformity.limits), conformity.limits.edition, conformity.limits.source, strict=True
-        )
-    )
-    if rows:
+    limits = ComparedLimits.concat([conformity.limits for conformity in adjustment.chain])
+    if len(limits):
+        further = {"edition": limits.edition, "source": list(map(label, limits.source))}
         title = text("Limits of the whole chain, method {method}", method=method)
-        note = with_unverified(CHAIN_NOTE, [one.limits for one in adjustment.chain])
-        yield Table(title, header, rows, file=CHAIN, note=note, units=MM, on_page=False)
+        note = with_unverified(CHAIN_NOTE, [limits])
+        yield tabulate(title, {**_cells_of_limits(limits), **further}, CHAIN, note, units=MM, on_page=False)
     if adjustment.unused_limits:
-        yield Table(
+        yield tabulate(
             text("Limits that nothing is compared with"),
-            columns("key", "limit"),
-            tuple(zip(adjustment.unused_limits, map(label, adjustment.unused_limits_what), strict=True)),
-            file="limits-not-held",
-            note=text("They are given for this project, and no measured quantity corresponds to them."),
+            {"key": adjustment.unused_limits, "limit": list(map(label, adjustment.unused_limits_what))},
+            "limits-not-held",
+            text("They are given for this project, and no measured quantity corresponds to them."),
         )
 
 
 def _candidates(result: Result, adjustment: Adjustment) -> Iterator[Table]:
     """Yield both poses of ambiguous parts, to read and as matrices."""
-    rows, matrices = [], []
+    rows = []
     parts = result.components
     for name, rival in zip(adjustment.rivals.component, adjustment.rivals.T_rival_scan, strict=True):
         i = parts.name.index(name)
         pose, reasons = parts.T_bridge_scan[i], text("{reasons:;}", reasons=parts.reasons[i])
         turn = math.degrees(rigid.rotation_angle(rival[:3, :3] @ pose[:3, :3].T))
         for candidate, T, turned in ((text("as assembled"), pose, 0.0), (text("the other pose"), rival, turn)):
-            rows.append((name, candidate, turned, reasons))
-            matrices.append((name, candidate, turned, *T[:3].ravel().tolist(), reasons))
+            rows.append((name, candidate, turned, *T[:3].ravel().tolist(), reasons))
     if not rows:
         return
-    title = text("Parts that fit in two poses")
+    title, first, last = (
+        text("Parts that fit in two poses"),
+        ("component", "candidate", "turned_deg"),
+        "what_would_decide",
+    )
     yield Table(
         title,
-        columns("component", "candidate", "turned_deg", "what_would_decide"),
-        tuple(rows),
+        columns(*first, last),
+        tuple((*row[: len(first)], row[-1]) for row in rows),
         note=text("Both fit the design alike. The matrices of both, scan to bridge, are in candidates.csv, mm."),
     )
     places = ("xx", "xy", "xz", "xt_mm", "yx", "yy", "yz", "yt_mm", "zx", "zy", "zz", "zt_mm")
-    yield Table(
-        title,
-        columns("component", "candidate", "turned_deg", *places, "what_would_decide"),
-        tuple(matrices),
-        file="candidates",
-        on_page=False,
-        on_terminal=False,
-    )
+    yield Table(title, columns(*first, *places, last), tuple(rows), file="candidates", on_page=False, on_terminal=False)
 
 
-def _measures(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
-    for joint, measures in zip(adjustment.joints.name, adjustment.joints.measures, strict=True):
-        rows = measures.quantities
-        numbers_of = (rows.value.tolist(), rows.ci95.tolist(), rows.low.tolist(), rows.high.tolist(), rows.unit)
-        for name, *numbers in zip(rows.name, *numbers_of, strict=True):
-            yield (joint, MEASURES[name], *numbers)
+def _measures(adjustment: Adjustment, method: str) -> Table:
+    of_joints = [measures.quantities for measures in adjustment.joints.measures]
+    every = MeasuredQuantities.concat(of_joints)
+    cells = {
+        "joint": [joint for joint, rows in zip(adjustment.joints.name, of_joints, strict=True) for _ in rows.name],
+        "measure": [label(str(name).replace("_", " ")) for name in every.name],
+        "value": every.value,
+        "ci95": every.ci95,
+        "low95": every.low,
+        "high95": every.high,
+        "unit": every.unit,
+    }
+    title = text("Measures of the joints, method {method}", method=method)
+    return tabulate(title, cells, "measures", on_terminal=False, folded=True)
 
 
-def _span_and_closure(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
-    rows: list[tuple[Message, float, float, str]] = [
-        (text("span"), adjustment.span_departure, adjustment.span_ci95, "mm")
-    ]
-    values, halves = adjustment.closure.ravel().tolist(), adjustment.closure_ci95.ravel().tolist()
-    rows += zip(CLOSURE, values, halves, ["mm"] * 3 + ["mrad"] * 3, strict=False)
-    for name, value, half, unit in rows:
-        finite = math.isfinite(value) and math.isfinite(half)
-        beyond = (text("yes") if abs(value) > half else text("no")) if finite else ""
-        yield (name, value, half, unit, beyond)
+def _span_and_closure(adjustment: Adjustment, method: str) -> Table:
+    values = np.append(adjustment.span_departure, adjustment.closure)
+    cells = _departures((text("span"), *CLOSURE), ("mm", *CLOSURE_UNITS), values,
+                        np.append(adjustment.span_ci95, adjustment.closure_ci95))  # fmt: skip
+    return tabulate(text("Span and closure, method {method}", method=method), cells, "span", SPAN_NOTE, folded=True)
+
+
+def _departures(figures: Sequence[Message], units: Sequence[str], values: Floats, ci95: Floats) -> dict[str, Any]:
+    """Return the columns of departures (n,) with their half-widths; figures and units may be more."""
+    known = np.isfinite(values) & np.isfinite(ci95)
+    beyond = zip(known, yes_no(np.abs(values) > ci95), strict=True)
+    return {
+        "figure": figures[: len(values)],
+        "departure": values,
+        "ci95": ci95,
+        "unit": units[: len(values)],
+        "beyond_its_interval": [word if is_known else "" for is_known, word in beyond],
+    }
 
 
 def _loops(adjustment: Adjustment, method: str) -> list[Table]:
     """Tabulate the closure of each loop of parts; none without loops."""
-    loops, rows = adjustment.loops, []
+    loops = adjustment.loops
     if loops is None:
         return []
-    for i, joint in enumerate(loops.joint):
-        values, halves = loops.closure[i].ravel().tolist(), loops.closure_ci95[i].ravel().tolist()
-        for name, value, half, unit in zip(LOOP, values, halves, ["mm"] * 3 + ["mrad"] * 3, strict=True):
-            finite = math.isfinite(value) and math.isfinite(half)
-            beyond = (text("yes") if abs(value) > half else text("no")) if finite else ""
-            rows.append((joint, " > ".join(loops.joints[i]), name, value, half, unit, beyond))
-    header = columns("joint", "further_joints", "figure", "departure", "ci95", "unit", "beyond_its_interval")
-    title = text("Closure of loops of parts, method {method}", method=method)
-    return [Table(title, header, tuple(rows), file="loops", note=LOOP_NOTE)]
+    cells = {
+        "joint": [joint for joint in loops.joint for _ in LOOP],
+        "further_joints": [" > ".join(joints) for joints in loops.joints for _ in LOOP],
+        **_departures(LOOP * len(loops), CLOSURE_UNITS * len(loops), loops.closure.ravel(), loops.closure_ci95.ravel()),
+    }
+    return [tabulate(text("Closure of loops of parts, method {method}", method=method), cells, "loops", LOOP_NOTE)]
 
 
 def _trade_off(result: Result, adjustment: Adjustment, method: str) -> Table:
@@ -289,7 +265,7 @@ def _trade_off(result: Result, adjustment: Adjustment, method: str) -> Table:
             *under(text("splicing error"), "splicing_mean_mm", "splicing_max_mm"),
             *under(text("linear error"), "linear_mean_mm", "linear_max_mm"),
         ),
-        tuple((weight, *row) for weight, row in zip(trade.weight.tolist(), trade.figures.tolist(), strict=True)),
+        rows_of(trade.weight, trade.figures),
         file="trade-off",
         note=text("The result was made with lambda {weight:g}.", weight=adjustment.weight),
         units=MM,

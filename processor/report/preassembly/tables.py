@@ -14,7 +14,7 @@ from processor.model import KEY_POINTS, Floats, Status, StepRun
 from processor.preassembly.result import Result
 from processor.report.columns import MM, columns, under
 from processor.report.preassembly.adjustment_tables import adjusted
-from processor.report.table import NAN, Table
+from processor.report.table import NAN, Table, tabulate
 
 NO_VERDICT = text(
     "Mean and largest |d| of 8 point pairs and 3 axes. A verdict needs an uncertainty: pass where the largest |d| and "
@@ -88,8 +88,8 @@ def _half_widths(runs: Sequence[StepRun]) -> list[Text]:
 def _components(result: Result) -> Table:
     parts = result.components
     remarks = [text("{reasons:;}", reasons=reasons) for reasons in parts.reasons]
-    rows = tuple(zip(parts.name, parts.status, remarks, strict=True))
-    return Table(text("Components"), columns("component", "status", "remark"), rows, "components")
+    cells = {"component": parts.name, "status": parts.status, "remark": remarks}
+    return tabulate(text("Components"), cells, "components")
 
 
 def _others(runs: Sequence[StepRun]) -> list[Table]:
@@ -135,47 +135,33 @@ def _joint(result: Result, j: int) -> tuple[Any, ...]:
 
 def _gaps(run: StepRun, name: str) -> Table:
     joints, adjustment = run.result.joints, run.result.adjustment
-    rows = [
-        (joint, key, *joints.gaps[j, k], *joints.gap_ci95[j, k])
-        for j, joint in enumerate(joints.name)
-        for k, key in enumerate(KEY_POINTS)
-    ]
-    header = columns("joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm")
+    cells = {
+        "joint": [joint for joint in joints.name for _ in KEY_POINTS],
+        "point": KEY_POINTS * len(joints),
+        "dx_mm dy_mm dz_mm": joints.gaps.reshape(-1, 3),
+        "ci95_dx_mm ci95_dy_mm ci95_dz_mm": joints.gap_ci95.reshape(-1, 3),
+    }
     if adjustment is not None:  # in the joint's own axes as well
-        header += columns("along_mm", "left_mm", "up_mm", "ci95_along_mm", "ci95_left_mm", "ci95_up_mm")
         measures = adjustment.joints.measures
-        local = np.concatenate(
-            [[measure.gaps for measure in measures], [measure.gaps_ci95 for measure in measures]], axis=2
-        )
-        rows = [(*row, *further) for row, further in zip(rows, local.reshape(-1, 6), strict=True)]
+        cells["along_mm left_mm up_mm"] = np.reshape([one.gaps for one in measures], (-1, 3))
+        cells["ci95_along_mm ci95_left_mm ci95_up_mm"] = np.reshape([one.gaps_ci95 for one in measures], (-1, 3))
     title = text("Gaps at the joints, method {method}", method=run.method)
-    return Table(title, header, tuple(rows), name, on_page=False, on_terminal=False)
+    return tabulate(title, cells, name, on_page=False, on_terminal=False)
 
 
 def _linear(result: Result, method: str) -> Table:
-    linear = result.linear
-    rows = tuple(
-        zip(
-            linear.edge,
-            linear.chainage.tolist(),
-            *(
-                values.tolist() if len(values) else [NAN] * len(linear.edge)
-                for of in (linear.assembled, linear.best_fit)
-                for values in (of.deviation, of.ci95)
-            ),
-            strict=True,
-        )
-    )
-    return Table(
-        text("Linear error by chainage, method {method}", method=method),
-        columns(
-            "edge", "chainage_mm", "deviation_mm", "ci95_mm", "foot1_best_fit_deviation_mm", "foot1_best_fit_ci95_mm"
-        ),
-        rows,
-        file="linear",
-        on_page=False,
-        on_terminal=False,
-    )
+    linear, unknown = result.linear, [NAN] * len(result.linear.edge)
+    cells = {
+        "edge": linear.edge,
+        "chainage_mm": linear.chainage,
+        **{
+            f"{prefix}{name}_mm": values if len(values) else unknown
+            for prefix, of in (("", linear.assembled), ("foot1_best_fit_", linear.best_fit))
+            for name, values in (("deviation", of.deviation), ("ci95", of.ci95))
+        },
+    }
+    title = text("Linear error by chainage, method {method}", method=method)
+    return tabulate(title, cells, "linear", on_page=False, on_terminal=False)
 
 
 JOINTS_ABREAST = 4

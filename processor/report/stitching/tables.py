@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.language.messages import Message, text
+from processor.language.messages import text
 from processor.model import NORMAL_95, StepRun
 from processor.report.columns import MM, columns
-from processor.report.table import Table, csv_cell, csv_of_rows
+from processor.report.table import Table, csv_cell, csv_of_rows, tabulate, yes_no
 from processor.stitching.result import ProjectFrame, Result
 
 OF_SCAN = "stitch.of-scan"  # code of reasons that the table of scans has too
@@ -36,42 +36,31 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     tables: list[Table] = []
     for number, run in enumerate(runs):
         result, suffix = run.result, f"-{run.method}" if number else ""
-        # Tabulate the reasons that are of no single scan, for the terminal; the page has all reasons as a paragraph
-        rows = tuple((single,) for single in result.reasons if single.code != OF_SCAN)
         tables += [
             _scans(result, run.method, suffix),
             _pairs(result, run.method, suffix),
             _loops(result, run.method, suffix),
             _matrices(result, run.method),
             *_control(result, run.method, suffix),
-            *(
-                [Table(text("Remarks, method {method}", method=run.method), columns("remark"), rows, on_page=False)]
-                if rows
-                else []
-            ),
         ]
+        # Tabulate the reasons that are of no single scan, for the terminal; the page has all reasons as a paragraph
+        if remarks := [single for single in result.reasons if single.code != OF_SCAN]:
+            title = text("Remarks, method {method}", method=run.method)
+            tables.append(tabulate(title, {"remark": remarks}, on_page=False))
     return tables
 
 
 def _scans(result: Result, method: str, suffix: str) -> Table:
     scans = result.scans
-    ci95, turn_ci95 = NORMAL_95 * scans.position_sd, 1e3 * NORMAL_95 * scans.rotation_sd
-    rows = tuple(
-        (
-            name,
-            scans.status[i],
-            *scans.position[i].tolist(),
-            *ci95[i].tolist(),
-            *turn_ci95[i].tolist(),
-            float(scans.rivalry[i]),
-            scans.reasons[i],
-        )
-        for i, name in enumerate(scans.name)
-    )
-    header = columns(
-        "scan", "status", "x_mm", "y_mm", "z_mm", "ci95_x_mm", "ci95_y_mm", "ci95_z_mm", "ci95_about_x_mrad",
-        "ci95_about_y_mrad", "ci95_about_z_mrad", "rivalry", "message",
-    )  # fmt: skip
+    cells = {
+        "scan": scans.name,
+        "status": scans.status,
+        "x_mm y_mm z_mm": scans.position,
+        "ci95_x_mm ci95_y_mm ci95_z_mm": NORMAL_95 * scans.position_sd,
+        "ci95_about_x_mrad ci95_about_y_mrad ci95_about_z_mrad": 1e3 * NORMAL_95 * scans.rotation_sd,
+        "rivalry": scans.rivalry,
+        "message": scans.reasons,
+    }
     note = text(
         "Scanner positions. Half widths of 95 % intervals include the errors of control points. Rivalry: score of the "
         "next best pose over that of this one."
@@ -83,47 +72,42 @@ def _scans(result: Result, method: str, suffix: str) -> Table:
             reference=result.reference,
         )
     title = text("Scans in the project's frame, method {method}", method=method)
-    return Table(title, header, rows, f"stitch-scans{suffix}", note)
+    return tabulate(title, cells, f"stitch-scans{suffix}", note)
 
 
 def _pairs(result: Result, method: str, suffix: str) -> Table:
     pairs = result.pairs
-    rows = tuple(
-        (
-            a,
-            pairs.b[i],
-            100.0 * float(pairs.overlap[i]),
-            float(pairs.residual[i]),
-            int(pairs.shared[i]),
-            _yes_no(pairs.used[i]),
-            1e6 * float(pairs.scale[i] - 1.0),
-            1e6 * NORMAL_95 * float(pairs.scale_sd[i]),
-            pairs.reasons[i],
-        )
-        for i, a in enumerate(pairs.a)
-    )
-    header = columns(
-        "a", "b", "overlap_percent", "residual_mm", "shared", "used", "scale_ppm", "scale_ci95_ppm", "message",
-    )  # fmt: skip
+    cells = {
+        "a": pairs.a,
+        "b": pairs.b,
+        "overlap_percent": 100.0 * pairs.overlap,
+        "residual_mm": pairs.residual,
+        "shared": pairs.shared,
+        "used": yes_no(pairs.used),
+        "scale_ppm": 1e6 * (pairs.scale - 1.0),
+        "scale_ci95_ppm": 1e6 * NORMAL_95 * pairs.scale_sd,
+        "message": pairs.reasons,
+    }
     note = text(
         "Shared: planar pieces, or picked points, that both scans have. The scale of b in a is a diagnostic "
         "value unless it is free."
     )
-    return Table(text("Pairs of scans, method {method}", method=method), header, rows, f"stitch-pairs{suffix}", note)
+    return tabulate(text("Pairs of scans, method {method}", method=method), cells, f"stitch-pairs{suffix}", note)
 
 
 def _loops(result: Result, method: str, suffix: str) -> Table:
     closures = result.closures
-    rows = tuple(
-        (" > ".join(loop), float(closures.mm[i]), float(closures.mrad[i]), float(closures.ratio[i]))
-        for i, loop in enumerate(closures.loop)
-    )
+    cells = {
+        "loop": [" > ".join(loop) for loop in closures.loop],
+        "mm": closures.mm,
+        "mrad": closures.mrad,
+        "ratio": closures.ratio,
+    }
     note = text(
         "By the pairs' own poses. Ratio: squared misclosure over its expected value by the pairs' covariances; "
         "usually about 1."
     )
-    title = text("Misclosures of loops, method {method}", method=method)
-    return Table(title, columns("loop", "mm", "mrad", "ratio"), rows, f"stitch-loops{suffix}", note)
+    return tabulate(text("Misclosures of loops, method {method}", method=method), cells, f"stitch-loops{suffix}", note)
 
 
 def _matrices(result: Result, method: str) -> Table:
@@ -144,30 +128,19 @@ def _control(result: Result, method: str, suffix: str) -> list[Table]:
     if result.control is None:
         return []
     sightings = result.control.sightings
-    rows = tuple(
-        (
-            name,
-            sightings.scan[i],
-            *sightings.off[i].tolist(),
-            *sightings.sd[i].tolist(),
-            100.0 * float(sightings.share[i]),
-            _yes_no(sightings.used[i]),
-        )
-        for i, name in enumerate(sightings.point)
-    )
-    header = columns(
-        "point", "scan", "dx_mm", "dy_mm", "dz_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "share_percent", "used"
-    )
+    cells = {
+        "point": sightings.point,
+        "scan": sightings.scan,
+        "dx_mm dy_mm dz_mm": sightings.off,
+        "sd_x_mm sd_y_mm sd_z_mm": sightings.sd,
+        "share_percent": 100.0 * sightings.share,
+        "used": yes_no(sightings.used),
+    }
     note = text(
         "Known minus measured place after the adjustment, one row per sighting. Share: how much of an error of the "
         "sighting is visible here; the poses absorb the rest. The sd of an unused sighting is that of its prediction."
     )
-    title = text("Control points, method {method}", method=method)
-    return [Table(title, header, rows, f"control{suffix}", note, units=MM)]
-
-
-def _yes_no(value: np.bool_) -> Message:
-    return text("yes") if value else text("no")
+    return [tabulate(text("Control points, method {method}", method=method), cells, f"control{suffix}", note, units=MM)]
 
 
 def poses_csv(result: Result) -> bytes:
