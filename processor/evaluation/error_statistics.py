@@ -34,19 +34,19 @@ def signed(quantity: str, errors: Floats, bound: Floats | None = None, unit: str
     return [Metric(quantity, value, statistic, unit=own) for statistic, value, own in figures]
 
 
-def covered(quantity: str, errors: Floats, half_widths: Floats, unit: str = "mm") -> list[Metric]:
-    """Share of errors within the half-widths of their 95 % intervals, with the figures of :func:`signed`.
-
-    Errors without an interval (NaN) are left out. A quantity that has intervals always has this share.
-    """
+def coverage(quantity: str, errors: Floats, half_widths: Floats) -> list[Metric]:
+    """Share of errors within the half-widths of their 95 % intervals; those without either (NaN) are left out."""
     known = np.isfinite(errors) & np.isfinite(half_widths)
     if not known.any():
         return []
     share = 100.0 * float(np.mean(np.abs(errors[known]) <= half_widths[known]))
-    return [
-        Metric(quantity, share, Statistic.COVERAGE, unit="%"),
-        *signed(quantity, errors[known], unit=unit),
-    ]
+    return [Metric(quantity, share, Statistic.COVERAGE, unit="%")]
+
+
+def covered(quantity: str, errors: Floats, half_widths: Floats, unit: str = "mm") -> list[Metric]:
+    """:func:`coverage` with the figures of :func:`signed`; a quantity that has intervals always has both."""
+    with_interval = errors[np.isfinite(half_widths)]
+    return [*coverage(quantity, errors, half_widths), *signed(quantity, with_interval, unit=unit)]
 
 
 def pose_pulls(T: Floats, true: Floats, covariance: Floats) -> Floats:
@@ -64,11 +64,6 @@ def pose_pulls(T: Floats, true: Floats, covariance: Floats) -> Floats:
 
 def covered_pulls(quantity: str, pulls: Floats) -> list[Metric]:
     """Share of errors within their 95 % intervals, of errors in standard deviations; without figures in a unit."""
-    known = pulls[np.isfinite(pulls)]
-    if not len(known):
-        return []
-    share = 100.0 * float(np.mean(np.abs(known) <= NORMAL_95))
-    return [
-        Metric(quantity, share, Statistic.COVERAGE, unit="%"),
-        Metric(quantity, float(len(known)), Statistic.NUMBER),
-    ]
+    shares = coverage(quantity, pulls, np.full_like(pulls, NORMAL_95))
+    number = float(np.isfinite(pulls).sum())
+    return [*shares, Metric(quantity, number, Statistic.NUMBER)] if shares else []

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from processor import pipeline
 from processor.evaluation import truth_json
 from processor.evaluation.space_frame import true_rows
-from processor.model import Floats, InputError, Metric, PlainError, Scene, Truth
+from processor.model import Floats, InputError, Metric, PlainError, Truth
 from processor.pipeline import Execution
 from processor.scan_folder import folder
 from processor.space_frame import step as space_frame_step
@@ -36,13 +35,6 @@ class ErrorReport:
     def passed(self) -> bool:
         """Whether no limit was missed."""
         return all(metric.passed for metric in self.metrics)
-
-
-def _check_of(step: str) -> Callable[[Scene, Any, Truth], list[Metric]]:
-    """Return ``check`` of the step's module in this folder, which has the name of the step's package."""
-    found: Callable[[Scene, Any, Truth], list[Metric]]
-    found = importlib.import_module(f"processor.evaluation.{pipeline.package_of(step)}").check
-    return found
 
 
 def evaluate(path: Path, execution: Execution) -> ErrorReport:
@@ -75,7 +67,8 @@ def against(truth: Truth, execution: Execution, source: str) -> ErrorReport:
     answered: set[str] = set()
     for run in execution.runs:
         try:
-            found = _check_of(run.step)(execution.scene, run.result, truth)
+            module = importlib.import_module(f"processor.evaluation.{pipeline.package_of(run.step)}")
+            found: list[Metric] = module.check(execution.scene, run.result, truth)
         except PlainError:  # of points that are read here
             raise
         except (LookupError, ValueError) as error:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls, signed
+from processor.evaluation.error_statistics import coverage, covered, covered_pulls, pose_pulls, signed
 from processor.geometry import rigid
 from processor.geometry.lines_and_polylines import Polyline
 from processor.model import NORMAL_95, ArchDesign, ArchTruth, Bools, Floats, Metric, Scene, Statistic, Status, Truth
@@ -77,10 +77,10 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric(TRUE_LINEAR, mean, Statistic.MEAN, unit="mm"),
         Metric(TRUE_LINEAR, largest, Statistic.MAX, unit="mm"),
         Metric("key points in the scan", _rms(errors_at_points), Statistic.RMS, unit="mm"),
-        *_coverage(key_error, key_sd),
+        *coverage("key points", key_error, NORMAL_95 * key_sd),
         *signed("key points", errors_at_points),
         *_gaps_by_objective(scene.arch, result, truth.arch, true),
-        *_gap_coverage(result, true_gaps),
+        *coverage("gaps", result.joints.gaps - true_gaps, result.joints.gap_ci95),
         Metric("pose, largest turn", 1000.0 * max(turns, default=float("nan")), unit="mrad"),
     ]
 
@@ -113,15 +113,6 @@ def _at_ends(truth: ArchTruth, row: int, ends: Sequence[PartEnd], by_end: Floats
         at = (truth.branch_component == row) & (truth.branch_joint == end.joint)
         found[e] = by_branch[at][0] if at.any() else np.nan
     return found
-
-
-def _coverage(error: Floats, sd: Floats) -> list[Metric]:
-    """Share of key point coordinates within their 95 % intervals, where a method states any."""
-    known = np.isfinite(error) & np.isfinite(sd)
-    if not known.any():
-        return []
-    share = float((np.abs(error[known]) <= NORMAL_95 * sd[known]).mean())
-    return [Metric("key points", 100.0 * share, Statistic.COVERAGE, unit="%")]
 
 
 def _rms(vectors: Floats) -> float:
@@ -183,15 +174,6 @@ def _gaps_by_objective(design: ArchDesign, result: Result, truth: ArchTruth, tru
     ]
 
 
-def _gap_coverage(result: Result, true_gaps: Floats) -> list[Metric]:
-    """Share of gaps whose interval holds the gap of the true key points at the poses found."""
-    known = np.isfinite(result.joints.gaps) & np.isfinite(result.joints.gap_ci95)
-    if not known.any():
-        return []
-    held = np.abs(result.joints.gaps - true_gaps)[known] <= result.joints.gap_ci95[known]
-    return [Metric("gaps", 100.0 * float(held.mean()), Statistic.COVERAGE, unit="%")]
-
-
 def _of_the_chain(
     design: ArchDesign,
     result: Result,
@@ -244,11 +226,10 @@ def _mean_max_coverage(result: Result, gaps: Floats, linear: Floats) -> list[Met
     stated = np.array([result.splicing.mean, result.splicing.max, linear_error.mean, linear_error.max])
     size = np.abs(gaps)
     true = np.array([size.mean(), size.max(), _over(np.mean, linear), _over(np.max, linear)])
-    known = np.isfinite(true) & np.isfinite(stated)  # an assembly without bottom edges has no linear error
-    share = float((np.abs(stated - true) <= result.errors_ci95[:4])[known].mean())
+    error = stated - true  # NaN: an assembly without bottom edges has no linear error
     return [
-        Metric("mean and largest errors", 100.0 * share, Statistic.COVERAGE, unit="%"),
-        Metric("mean and largest errors", float(known.sum()), Statistic.NUMBER),
+        *coverage("mean and largest errors", error, result.errors_ci95[:4]),
+        Metric("mean and largest errors", float(np.isfinite(error).sum()), Statistic.NUMBER),
     ]
 
 

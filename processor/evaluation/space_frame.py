@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.evaluation.error_statistics import covered, signed
+from processor.evaluation.error_statistics import coverage, covered, signed
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Better, Floats, FrameTruth, Ints, Metric, Scene, Statistic, Truth
 from processor.space_frame.design.matching import robust_fit
@@ -59,7 +59,13 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     sd = np.sqrt(np.einsum("kii->ki", balls.covariance[rows]))
     metrics += [
         Metric("balls not found", float(len(true.ids) - len(set(matches.tolist()))), Statistic.COUNT),
-        Metric(NEAR, _share(len(near), len(true.ids)), Statistic.SHARE, unit="%", better=Better.HIGH),
+        Metric(
+            NEAR,
+            100.0 * len(near) / len(true.ids) if len(true.ids) else NAN,
+            Statistic.SHARE,
+            unit="%",
+            better=Better.HIGH,
+        ),
         Metric("nodes that are none", float(present.sum() - len(rows)), Statistic.COUNT),
         Metric(WRONG_CENTRE, float(wrong), Statistic.COUNT, limit=0.0),
         Metric(WRONG_LOWEST, float(low), Statistic.COUNT, limit=0.0 if result.method == "ray" else NAN),
@@ -176,22 +182,11 @@ def true_rows(scene: Scene, balls: Balls, true: FrameTruth) -> Ints:
 def _coverage(quantity: str, off: Floats, sd: Floats, ok: npt.NDArray[np.bool_]) -> list[Metric]:
     """Share of errors of balls flagged ok within their 95 % intervals, and their rms in standard deviations."""
     known = np.isfinite(off[ok]) & (sd[ok] > 0.0)
-    pull = off[ok][known] / sd[ok][known]
-    if not len(pull):
+    off, sd = off[ok][known], sd[ok][known]
+    if not len(off):
         return []
-    return [
-        Metric(
-            quantity,
-            _share(int((np.abs(pull) < NORMAL_95).sum()), len(pull)),
-            Statistic.COVERAGE,
-            unit="%",
-        ),
-        Metric(quantity, float(np.sqrt(np.mean(pull**2))), Statistic.PULL_RMS),
-    ]
-
-
-def _share(part: int, whole: int) -> float:
-    return 100.0 * part / whole if whole else NAN
+    rms = float(np.sqrt(np.mean((off / sd) ** 2)))
+    return [*coverage(quantity, off, NORMAL_95 * sd), Metric(quantity, rms, Statistic.PULL_RMS)]
 
 
 def _summary(errors: Floats) -> list[tuple[Statistic, float]]:
