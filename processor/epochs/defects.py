@@ -24,15 +24,17 @@ Found = list[tuple[int, int]]  # epoch and row of one defect
 
 def series(results: Sequence[Result | None]) -> Iterator[Series]:
     """Yield the greatest depth of each defect, inward positive."""
-    for same in _same_defects(results):
+    tables = [Defects() if result is None else result.defects for result in results]
+    for same in _same_defects(tables):
         e, row = same[-1]
-        newest = results[e]
-        assert newest is not None
-        table = newest.defects
+        table = tables[e]
         found = dict(same)
         values = [_depth(result, found.get(k), table, row) for k, result in enumerate(results)]
         value, half, doubt = np.array(values).T
-        covered = np.array([k not in found and _is_covered(results, k, (e, row)) for k in range(len(results))])
+        covered = np.array([
+            k not in found and any(_is_same(tables, (e, row), (k, other)) for other in range(len(one)))
+            for k, one in enumerate(tables)
+        ], np.bool_)  # fmt: skip
         x, y, z = table.centre[row].tolist()
         quantity = text(
             "{defect_class} at {x:.0f}, {y:.0f}, {z:.0f}, depth inward",
@@ -54,16 +56,16 @@ def remarks(results: Sequence[Result | None]) -> Iterator[Reason]:
         yield reason("epochs.defects-not-found")
 
 
-def _same_defects(results: Sequence[Result | None]) -> list[Found]:
+def _same_defects(tables: Sequence[Defects]) -> list[Found]:
     """Group the defects of all epochs that are one; each group has one an epoch at most."""
     groups: list[Found] = []
-    for e, result in enumerate(results):
-        new = [(e, row) for row in range(0 if result is None else len(result.defects))]
+    for e, table in enumerate(tables):
+        new = [(e, row) for row in range(len(table))]
         pairs = [
-            (_apart(results, group[-1], one), k, row)
+            (float(np.linalg.norm(_between(tables, group[-1], one))), k, row)
             for k, group in enumerate(groups)
             for row, one in enumerate(new)
-            if _is_same(results, group[-1], one)
+            if _is_same(tables, group[-1], one)
         ]
         known, placed = set(), set()
         for _, k, row in sorted(pairs):
@@ -75,29 +77,18 @@ def _same_defects(results: Sequence[Result | None]) -> list[Found]:
     return groups
 
 
-def _apart(results: Sequence[Result | None], one: tuple[int, int], other: tuple[int, int]) -> float:
-    """Distance of the centres of two defects, each an epoch and a row."""
-    a, b = results[one[0]], results[other[0]]
-    assert a is not None
-    assert b is not None
-    return float(np.linalg.norm(b.defects.centre[other[1]] - a.defects.centre[one[1]]))
+def _between(tables: Sequence[Defects], one: tuple[int, int], other: tuple[int, int]) -> Floats:
+    """Return the vector (3,) from the centre of a defect to that of another, each an epoch and a row."""
+    vector: Floats = tables[other[0]].centre[other[1]] - tables[one[0]].centre[one[1]]
+    return vector
 
 
-def _is_same(results: Sequence[Result | None], earlier: tuple[int, int], later: tuple[int, int]) -> bool:
-    a, b = results[earlier[0]], results[later[0]]
-    if a is None or b is None or earlier[0] == later[0]:
+def _is_same(tables: Sequence[Defects], earlier: tuple[int, int], later: tuple[int, int]) -> bool:
+    (a, i), (b, j) = earlier, later
+    if a == b or tables[a].component[i] != tables[b].component[j]:
         return False
-    i, j = earlier[1], later[1]
-    if a.defects.component[i] != b.defects.component[j]:
-        return False
-    between = b.defects.centre[j] - a.defects.centre[i]
-    return _covers(a.defects, i, between) or _covers(b.defects, j, -between)
-
-
-def _is_covered(results: Sequence[Result | None], e: int, one: tuple[int, int]) -> bool:
-    """Whether any defect of an epoch is at the place of a defect of another."""
-    result = results[e]
-    return result is not None and any(_is_same(results, one, (e, row)) for row in range(len(result.defects)))
+    between = _between(tables, earlier, later)
+    return _covers(tables[a], i, between) or _covers(tables[b], j, -between)
 
 
 def _covers(defects: Defects, row: int, away: Floats) -> bool:

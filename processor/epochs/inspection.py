@@ -8,10 +8,11 @@ chord over what all epochs have in common.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from processor.epochs.quantity_series import Kind, Series, strongest
+from processor.epochs.quantity_series import Kind, Series, by_key, strongest
 from processor.inspection.result import AxisDepartures, InspectedComponent, Quantity, Result
 from processor.language.messages import Message, label, text
 from processor.model import Floats, Reason, Status
@@ -33,8 +34,17 @@ def series(results: Sequence[Result | None]) -> Iterator[Series]:
             if any(quantity in OF_MEMBERS for part in known for quantity in part.characteristics.quantity)
             else Kind.PART
         )
-        for key in dict.fromkeys(key for part in known for key in part.characteristics.id):
-            yield _characteristic(name, kind, key, parts)
+        for (key, measured, unit), numbers in by_key(parts, _characteristics).items():
+            actual, deviation, ci95, doubtful = numbers
+            value = actual if np.isfinite(actual).any() else deviation
+            quantity: Message = label(key)
+            if measured in WITH_SIGN:
+                value, quantity = np.abs(value), text("size of {quantity}", quantity=quantity)
+            length = kind is Kind.MEMBER and measured is Quantity.LENGTH
+            yield Series(
+                component=name, kind=kind, quantity=quantity, value=value, ci95=ci95, unit=unit,
+                doubtful=doubtful > 0.0, between=tuple(name.split("-")) if length else (),
+            )  # fmt: skip
         yield from _along_axis(name, kind, parts)
 
 
@@ -43,28 +53,11 @@ def remarks(_: Sequence[Result | None]) -> Iterator[Reason]:
     yield from ()
 
 
-def _characteristic(name: str, kind: Kind, key: str, parts: Sequence[InspectedComponent | None]) -> Series:
-    values = np.array([_value(part, key) for part in parts]).reshape(-1, 4)
-    actual = np.where(np.isfinite(values[:, 0]).any(), values[:, 0], values[:, 1])
-    of = next(part.characteristics for part in parts if part is not None and key in part.characteristics.id)
-    row = of.id.index(key)
-    quantity: Message = label(key)
-    if of.quantity[row] in WITH_SIGN:
-        actual, quantity = np.abs(actual), text("size of {quantity}", quantity=quantity)
-    length = kind is Kind.MEMBER and of.quantity[row] is Quantity.LENGTH
-    return Series(
-        component=name, kind=kind, quantity=quantity, value=actual, ci95=values[:, 2], unit=of.unit[row],
-        doubtful=values[:, 3] > 0.0, between=tuple(name.split("-")) if length else (),
-    )  # fmt: skip
-
-
-def _value(part: InspectedComponent | None, key: str) -> tuple[float, float, float, float]:
-    """Return actual size, deviation, half-width, and 1 where they are doubtful."""
-    if part is None or key not in part.characteristics.id:
-        return np.nan, np.nan, np.nan, 0.0
-    table, row = part.characteristics, part.characteristics.id.index(key)
-    doubtful = float(part.status is not Status.OK)
-    return float(table.actual[row]), float(table.deviation[row]), float(table.ci95[row]), doubtful
+def _characteristics(part: InspectedComponent) -> Iterator[tuple[Any, ...]]:
+    """Yield id, quantity and unit of each characteristic, with actual size, deviation, half-width and doubt."""
+    doubtful = part.status is not Status.OK
+    for row in part.characteristics.items():
+        yield (row["id"], row["quantity"], row["unit"]), row["actual"], row["deviation"], row["ci95"], doubtful
 
 
 def _along_axis(name: str, kind: Kind, parts: Sequence[InspectedComponent | None]) -> Iterator[Series]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
 from processor.language.messages import Message
 from processor.model import Bools, Floats, Word
+
+T = TypeVar("T")
 
 
 class Kind(Word):
@@ -45,6 +49,18 @@ class Series:
     def __post_init__(self) -> None:
         if not len(self.doubtful):
             object.__setattr__(self, "doubtful", np.zeros(len(self.value), np.bool_))
+
+
+def by_key(results: Sequence[T | None], rows: Callable[[T], Iterable[tuple[Any, ...]]]) -> dict[Any, Floats]:
+    """Return numbers (k, e) at the epochs of everything that ``rows`` yields of a result, a key before k numbers.
+
+    NaN where an epoch lacks the key.
+    """
+    found: dict[Any, Floats] = {}
+    for e, result in enumerate(results):
+        for key, *numbers in () if result is None else rows(result):
+            found.setdefault(key, np.full((len(numbers), len(results)), np.nan))[:, e] = numbers
+    return found
 
 
 def strongest(value: Floats, ci95: Floats) -> int:
