@@ -39,6 +39,7 @@ MOST_VOXELS, MOST_ENTRIES = 20_000_000, 40_000_000
 FULL, EMPTY = 64, 8.0  # a facet's box is halved if it has more voxels than this, and as many times those of the facet
 PIECES = 64  # size of the stack of halved boxes
 ROUNDING_MM = 1e-6  # more than the errors of rounding of a distance
+ON_EDGE = 1e-9  # barycentric coordinates down to its negative are on a facet: no line passes between two of them
 GRAZING_COS = 0.02  # cosine of incidence below which a facet is seen edge-on
 
 
@@ -509,11 +510,11 @@ def _crossing(corner: Floats, start: Floats, ray: Floats) -> Any:
         return -1.0
     ax, ay, az = start[0] - corner[0, 0], start[1] - corner[0, 1], start[2] - corner[0, 2]
     u = (ax * px + ay * py + az * pz) / determinant
-    if u < 0.0 or u > 1.0:
+    if u < -ON_EDGE or u > 1.0 + ON_EDGE:
         return -1.0
     qx, qy, qz = ay * e1z - az * e1y, az * e1x - ax * e1z, ax * e1y - ay * e1x
     v = (ray[0] * qx + ray[1] * qy + ray[2] * qz) / determinant
-    if v < 0.0 or u + v > 1.0:
+    if v < -ON_EDGE or u + v > 1.0 + ON_EDGE:
         return -1.0
     return (e2x * qx + e2y * qy + e2z * qz) / determinant
 

@@ -10,18 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from processor.geometry import mesh_distance
 from processor.limits import judging, measurands, standards
 from processor.limits.judging import Judged, JudgedLimits, Measured
 from processor.model import NORMAL_95, Ceiling, Floats, Limit, Scene, worst
-from processor.space_frame import mesh_heights
-from processor.space_frame.mesh_heights import Plan
 from processor.space_frame.result import Balls, Evidence, Flag, Hangers, Result, Tubes
 
 PLACES_OF_A_TUBE = 41
+LEAST_SHARE = 1e-9  # of a facet's area seen from above; less is a wall, which no plumb line meets
 SOURCE = "project.toml"
 
 
@@ -30,9 +30,8 @@ def with_hangers(result: Result, scene: Scene) -> Result:
     ceiling = scene.ceiling
     if ceiling is None:
         return result
-    surface = _Surface.of(ceiling)
     balls = result.balls
-    length, sd, bottom = _lengths(balls, surface)
+    length, sd, bottom = _lengths(balls, ceiling)
     limits, tolerance = _limits(ceiling), standards.default_for(scene.tolerance)
     of_ball: list[list[Judged]] = []
     for name, flag, evidence, above, error in zip(balls.names, balls.flag, balls.evidence, length, sd, strict=True):
@@ -49,30 +48,36 @@ def with_hangers(result: Result, scene: Scene) -> Result:
         ci95=NORMAL_95 * sd,
         verdict=tuple(worst(row.verdict for row in rows) for rows in of_ball),
     )
-    of_tubes = (judging.judge(limits[0], one, tolerance) for one in _of_tubes(result.tubes, surface))
+    of_tubes = (judging.judge(limits[0], one, tolerance) for one in _of_tubes(result.tubes, ceiling))
     rows = [*(row for rows in of_ball for row in rows), *of_tubes]
     return replace(result, hangers=hangers, limits=JudgedLimits.joined((result.limits, judging.table(rows))))
 
 
-@dataclass(frozen=True)
-class _Surface:
-    """A ceiling, level or as a mesh seen from above."""
+def heights(ceiling: Ceiling, places: Floats) -> tuple[Floats, Floats]:
+    """Height (n,) of a ceiling, level or a mesh, and slopes (n, 2) at places (n, 2); NaN where there is none.
 
-    level: float
-    plan: Plan | None
-
-    @classmethod
-    def of(cls, ceiling: Ceiling) -> _Surface:
-        return cls(ceiling.level, mesh_heights.plan(ceiling.vertices, ceiling.faces) if len(ceiling.faces) else None)
-
-    def heights(self, places: Floats) -> tuple[Floats, Floats]:
-        """Height (n,) and slopes (n, 2) at places (n, 2); NaN where there is no ceiling."""
-        if self.plan is not None:
-            return self.plan.heights(places)
-        unknown = ~np.isfinite(places)
-        height, slope = np.full(len(places), self.level), np.zeros((len(places), 2))
-        height[unknown.any(axis=1)], slope[unknown.any(axis=1)] = np.nan, np.nan
+    Where surfaces lie above one another the highest counts.
+    """
+    height, slope = np.full(len(places), np.nan), np.full((len(places), 2), np.nan)
+    known = np.flatnonzero(np.isfinite(places).all(axis=1))
+    if not len(ceiling.faces):
+        height[known], slope[known] = ceiling.level, 0.0
         return height, slope
+    cross, double = mesh_distance.double_areas(ceiling.vertices, ceiling.faces)
+    plumb = np.abs(cross[:, 2]) > LEAST_SHARE * double
+    if not plumb.any():
+        return height, slope
+    faces, normals = ceiling.faces[plumb], cross[plumb] / double[plumb, None]
+    grid = mesh_distance.facet_grid(ceiling.vertices, faces, normals, float(np.sqrt(0.5 * double[plumb].mean())))
+    top, bottom = grid.corners[..., 2].max() + 1.0, grid.corners[..., 2].min() - 1.0
+    starts, ends = (np.column_stack([places[known], np.full(len(known), z)]) for z in (top, bottom))
+    row, facet, share = mesh_distance.crossings(grid, starts, ends, False)
+    order = np.lexsort((share, row))
+    row, first = np.unique(row[order], return_index=True)
+    facet, share = facet[order[first]], share[order[first]]
+    height[known[row]] = top - share * (top - bottom)
+    slope[known[row]] = -normals[facet, :2] / normals[facet, 2:]
+    return height, slope
 
 
 def _limits(ceiling: Ceiling) -> list[Limit]:
@@ -89,13 +94,13 @@ def _limits(ceiling: Ceiling) -> list[Limit]:
     return [clearance, longest]
 
 
-def _lengths(balls: Balls, surface: _Surface) -> tuple[Floats, Floats, Floats]:
+def _lengths(balls: Balls, ceiling: Ceiling) -> tuple[Floats, Floats, Floats]:
     """Length (k,) of each hanger, its standard deviation (k,), and its lower end (k, 3).
 
     The lowest point is at the centre in plan and a radius below it, so a length depends on the centre's x and y by the
     slopes there, and on height and radius as the lowest point does.
     """
-    height, slope = surface.heights(balls.lowest[:, :2])
+    height, slope = heights(ceiling, balls.lowest[:, :2])
     slope = np.nan_to_num(slope)
     covariance = balls.covariance
     across = np.einsum("ki,kij,kj->k", slope, covariance[:, :2, :2], slope)
@@ -105,7 +110,7 @@ def _lengths(balls: Balls, surface: _Surface) -> tuple[Floats, Floats, Floats]:
     return balls.lowest[:, 2] - height, np.sqrt(np.maximum(variance, 0.0)), bottom
 
 
-def _of_tubes(tubes: Tubes, surface: _Surface) -> Iterator[Measured]:
+def _of_tubes(tubes: Tubes, ceiling: Ceiling) -> Iterator[Measured]:
     """Yield the height of the lowest line of each tube where it is nearest to the ceiling."""
     share = np.linspace(0.0, 1.0, PLACES_OF_A_TUBE)[:, None]
     ends = tubes.ends
@@ -116,7 +121,7 @@ def _of_tubes(tubes: Tubes, surface: _Surface) -> Iterator[Measured]:
         down = np.array([0.0, 0.0, -1.0]) + along[2] * along  # across the axis
         size = float(np.linalg.norm(down))
         line = axis + tubes.radii[k] * down / size if size > 0.0 else axis
-        height, slopes = surface.heights(line[:, :2])
+        height, slopes = heights(ceiling, line[:, :2])
         above = line[:, 2] - height
         if not np.isfinite(above).any():
             continue

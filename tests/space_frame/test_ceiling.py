@@ -22,7 +22,7 @@ from processor.model import Ceiling, InputError, Scan, Scene, StepRun
 from processor.report.space_frame import dxf, hanger_report
 from processor.report.table import csv_text
 from processor.scan_folder import folder
-from processor.space_frame import mesh_heights
+from processor.space_frame import hanger_lengths
 from processor.space_frame.hanger_lengths import with_hangers
 from processor.space_frame.result import Tubes
 from tests.support.results.ball_results import balls, whole
@@ -50,14 +50,14 @@ def test_heights_are_those_of_an_independent_interpolation():
     mesh = Delaunay(plan)
     places = rng.uniform(-2_000.0, 22_000.0, (2000, 2))
     expected = LinearNDInterpolator(mesh, z)(places)
-    height, _ = mesh_heights.plan(np.column_stack([plan, z]), mesh.simplices).heights(places)
+    height, _ = hanger_lengths.heights(Ceiling(vertices=np.column_stack([plan, z]), faces=mesh.simplices), places)
     assert np.array_equal(np.isfinite(height), np.isfinite(expected))
     assert np.nanmax(np.abs(height - expected)) < 1e-6  # by slopes of triangles as thin as 1e-6
 
 
 def test_slopes_are_those_of_the_plane():
     given = slope(0.1, -0.2, 50.0)
-    height, found = mesh_heights.plan(given["vertices"], np.array(given["faces"])).heights(np.array([[300.0, 700.0]]))
+    height, found = hanger_lengths.heights(Ceiling(**given), np.array([[300.0, 700.0]]))
     assert height == pytest.approx([0.1 * 300.0 - 0.2 * 700.0 + 50.0])
     assert found[0] == pytest.approx([0.1, -0.2])
 
@@ -66,9 +66,9 @@ def test_the_highest_of_several_surfaces_counts_and_walls_do_not():
     low, high = slope(0.0, 0.0, 0.0), slope(0.0, 0.0, 12.0)
     vertices = np.vstack([low["vertices"], high["vertices"]])
     faces = np.vstack([low["faces"], np.array(high["faces"]) + 4, [[0, 1, 5], [0, 5, 4]]])
-    assert mesh_heights.plan(vertices, faces).heights(np.array([[1.0, 2.0]]))[0] == pytest.approx([12.0])
-    wall = mesh_heights.plan(vertices, faces[-2:])
-    assert np.isnan(wall.heights(np.array([[0.0, -1e5]]))[0]).all()
+    both, wall = (Ceiling(vertices=vertices, faces=some) for some in (faces, faces[-2:]))
+    assert hanger_lengths.heights(both, np.array([[1.0, 2.0]]))[0] == pytest.approx([12.0])
+    assert np.isnan(hanger_lengths.heights(wall, np.array([[0.0, -1e5]]))[0]).all()
 
 
 # --- hangers -------------------------------------------------------------------------------------------------------
