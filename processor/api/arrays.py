@@ -47,7 +47,6 @@ CORE_COVERS, BESIDE = 0.5, 0.05  # shares of the reference's extent: least exten
 UNITS_MM = (10.0, 25.4)  # cm and inches; larger ones are beyond MOST_RATIO
 UNIT_TOLERANCE = 0.3  # of a ratio of sizes along the axes: a scan is turned, and covers about its design
 LIKE_SIZE = 3.0  # ratio of sizes up to which nothing is stated
-FACING_MARGIN = 0.1  # difference of shares of points that face the scanner between two poses
 
 
 @dataclass(frozen=True)
@@ -246,7 +245,7 @@ def register(
     points : (n, 3), mm, of a scan; 100 or more.
     vertices, faces : (v, 3) in mm and (f, 3), a triangle mesh whose normals point outward.
     scanners : (3,) or (n, 3), from where each point was measured, in the points' frame. Of two poses that fit alike the
-        one is taken in which more of the surface faces the scanner. None = unknown.
+        one is taken in which the surface faces the scanner. None = unknown.
 
     Returns
     -------
@@ -267,47 +266,24 @@ def register(
     local = cloud - scan_origin
     seen_from = None if scanners is None else positions_of(scanners, "scanners", every.shape)[used] - scan_origin
     surface = mesh_distance.of_design(corners - origin, triangles)
-    of_body = surface_registration.body_of(local, surface)
     given = rigid.transform(np.eye(3), scan_origin - origin)
-    placed, rival = _placed(local, surface, given, seen_from, of_body)
+    placed = surface_registration.place(local, surface, given, "auto", seen_from)
     determined = bool(np.isfinite(placed.T_best_fit).all())
     T = placed.T_best_fit if determined else placed.T
-    body = local if of_body is None else local[of_body]
-    status, reasons = _assessed(body, surface, T, placed, ambiguous=rival is not None)
+    body = local if placed.of_body is None else local[placed.of_body]
+    status, reasons = _assessed(body, surface, T, placed)
     if status is not Status.OK and not 1.0 / LIKE_SIZE < ratio < LIKE_SIZE:
         reasons = (*reasons, _sizes(ratio))
     return Pose(
         T_design_scan=deviation_measure.global_pose(T, scan_origin, origin),
         covariance=rigid.about_origin(placed.covariance, origin),
         status=status,
-        rival=None if rival is None else deviation_measure.global_pose(rival, scan_origin, origin),
+        rival=deviation_measure.global_pose(placed.T_rival, scan_origin, origin) if placed.ambiguous else None,
         reasons=(*reasons, *coincident),
     )
 
 
-def _placed(
-    points: Floats, surface: MeshSurface, given: Floats, scanners: Floats | None, of_body: Bools | None
-) -> tuple[Placed, Floats | None]:
-    """Place points (n, 3) at a surface; of two poses that fit alike, at that which faces the scanners (n, 3).
-
-    ``of_body`` (n,) marks those that are not of ground or walls. Returns the other pose (4, 4) as well, None where
-    there is none.
-    """
-    placed = surface_registration.place_body(points, surface, given, "auto", None, of_body)
-    if not placed.ambiguous:
-        return placed, None
-    rival = placed.T_rival
-    if scanners is None:
-        return placed, rival
-    shares = [_facing_share(points, scanners, surface, T) for T in (placed.T, rival)]
-    if shares[1] > shares[0] + FACING_MARGIN:
-        placed = surface_registration.place(points, surface, rival, "fine")
-    return placed, None if abs(shares[1] - shares[0]) > FACING_MARGIN else rival
-
-
-def _assessed(
-    points: Floats, surface: MeshSurface, T: Floats, placed: Placed, *, ambiguous: bool
-) -> tuple[Status, tuple[Reason, ...]]:
+def _assessed(points: Floats, surface: MeshSurface, T: Floats, placed: Placed) -> tuple[Status, tuple[Reason, ...]]:
     """Return the status of points (n, 3), without ground and walls, placed by T (4, 4), and why it is not ok."""
     share = surface_registration.near_share(points, surface, T)
     if share < surface_registration.NEAR_SHARE:
@@ -317,13 +293,13 @@ def _assessed(
     if share < 1.0 - surface_registration.CLUTTER_SHARE:
         elsewhere = 100.0 * (1.0 - share)
         reasons.append(reason("register.points-elsewhere", share=elsewhere, near_mm=surface_registration.NEAR_MM))
-    if ambiguous:
+    if placed.ambiguous:
         reasons.append(reason("register.ambiguous"))
     if not np.isfinite(placed.T_best_fit).all():
         reasons.append(reason("register.undetermined"))
     elif placed.weak:
         reasons.append(reason("deviation.weak", motions=placed.weak))
-    status = Status.AMBIGUOUS if ambiguous else Status.WEAK if reasons else Status.OK
+    status = Status.AMBIGUOUS if placed.ambiguous else Status.WEAK if reasons else Status.OK
     return status, tuple(reasons)
 
 
@@ -333,16 +309,6 @@ def _sizes(ratio: float) -> Reason:
     if unit_mm is None:
         return reason("register.sizes-differ", ratio=ratio)
     return reason("register.unit-mistake", ratio=ratio, unit_mm=unit_mm)
-
-
-def _facing_share(points: Floats, scanners: Floats, surface: MeshSurface, T: Floats) -> float:
-    """Share of points (n, 3), placed by T (4, 4), whose facet faces the scanner, of those that lie on a facet."""
-    placed = rigid.apply(T, points)
-    facet, _, _ = surface.distances(placed, surface_registration.NEAR_MM)
-    on = facet >= 0
-    sight = rigid.apply(T, scanners)[on] - placed[on]
-    facing = np.einsum("ni,ni->n", surface.normals[facet[on]], sight) > 0.0
-    return float(facing.mean()) if on.any() else 0.0
 
 
 def m3c2(

@@ -20,9 +20,9 @@ from processor.deviation.params import Paper, Params
 from processor.deviation.result import ErrorSource, Result
 from processor.geometry import m3c2, mesh_distance, rigid
 from processor.geometry.thinning import thinned
+from processor.geometry.thread_ranges import each
 from processor.model import Floats, Ints, Scene, Status, StructureDesign, reason
 from processor.registration import icp, principal
-from processor.registration.principal import AMBIGUOUS, CoarsePose
 from processor.registration.surface_registration import Registration
 
 MOST_ICP_POINTS = 60_000
@@ -68,7 +68,7 @@ def _measured(design_of: StructureDesign, scan: ScanCloud, vertices: Floats, ori
             least=m3c2.PAPER_POINTS_A_CYLINDER,
         )
     ]
-    if ambiguity < AMBIGUOUS:
+    if ambiguity < principal.AMBIGUOUS:
         status = Status.AMBIGUOUS if status is Status.OK else status
         reasons.append(reason("deviation.paper-ambiguous", ratio=ambiguity))
     used = known if (known := distances.std2[np.isfinite(distances.lod95)]).size else np.array([NAN])
@@ -106,9 +106,8 @@ def _registered(scan: ScanCloud, core: Floats, origin: Floats, params: Params) -
     if params.register in ("none", "fine"):
         T, ambiguity = rigid.transform(np.eye(3), scan.origin - origin), NAN
     else:
-        pose = coarse(source, target)
-        T, ambiguity = pose.T_target_source, pose.ambiguity
-        diagnostics.note("principal axes", rms_mm=pose.rms_mm, rival_by_best=pose.ambiguity)
+        T, rms, ambiguity = coarse(source, target)
+        diagnostics.note("principal axes", rms_mm=rms, rival_by_best=ambiguity)
     error = 0.0
     if params.register != "none":
         fine = icp.point_to_point(source, target, T)
@@ -116,7 +115,7 @@ def _registered(scan: ScanCloud, core: Floats, origin: Floats, params: Params) -
         diagnostics.note("iterative closest point", rounds=fine.iterations, rms_mm=fine.rms)
         # What the same registration leaves between the points (n, 3) and a clone of them, rms in mm
         points = rigid.apply(T, source)
-        error = icp.point_to_point(points, points, coarse(points, points).T_target_source).rms
+        error = icp.point_to_point(points, points, coarse(points, points)[0]).rms
         diagnostics.note("clone", rms_mm=error)
     if np.isfinite(params.registration_error_mm):
         error = params.registration_error_mm
@@ -132,13 +131,23 @@ def _say_voxels(stage: str, points: Floats, means: Floats) -> None:
     diagnostics.note(stage, points=len(points), voxels=len(means), rate=len(means) / max(len(points), 1))
 
 
-def coarse(source: Floats, target: Floats) -> CoarsePose:
-    """Lay principal axes on each other: the pose with the least mean square distance (eq. 9) after a short ICP."""
-    few = thinned(source, COARSE_POINTS)
+def coarse(source: Floats, target: Floats) -> tuple[Floats, float, float]:
+    """Lay principal axes on each other: the pose with the least mean square distance (eq. 9) after a short ICP.
 
-    def refined(start: Floats) -> tuple[float, Floats]:
+    Paper 002 compares the poses as the axes give them. Axes are a little off, by as much as the poses of a nearly
+    symmetric structure differ. Returns T_target_source (4, 4), the rms in mm that it leaves, and the ratio of the rms
+    of the next best pose to it, NaN without one.
+    """
+    few, from_axes, to_axes = thinned(source, COARSE_POINTS), principal.of_points(source), principal.of_points(target)
+
+    def refined(turn: Floats) -> tuple[float, Floats]:
+        R = to_axes.axes @ turn @ from_axes.axes.T
+        start = rigid.transform(R, to_axes.centre - R @ from_axes.centre)
         T = icp.point_to_point(few, target, start, max_iterations=COARSE_ITERATIONS).T_target_source
         return icp.point_to_point(few, target, T, max_iterations=1).rms, T
 
     size = float(np.linalg.norm(np.ptp(target, axis=0)))
-    return principal.coarse(principal.of_points(source), principal.of_points(target), size, refined)
+    fits = each(refined, principal.possible_turns(to_axes.variances, from_axes.variances))
+    (rms, best), *others = sorted(fits, key=lambda fit: fit[0])
+    rivals = (error for error, T in others if principal.differ(T, best, from_axes.centre, size))
+    return best, rms, next(rivals, NAN) / max(rms, 1e-9)

@@ -86,8 +86,7 @@ def _doubted(result: Result, placement: Placement) -> Result:
     if not placement.lies and placement.placed.registration is Registration.COARSE:
         first, status = reason("deviation.not-at-design"), Status.FAILED
     elif placement.left_out:
-        names = ", ".join(one.name for one in placement.left_out)
-        points = sum(one.points for one in placement.left_out)
+        names, points = ", ".join(name for name, _ in placement.left_out), sum(count for _, count in placement.left_out)
         first = reason("deviation.scans-elsewhere", scans=names, points=points, read=result.points_read)
         status = Status.WEAK if status is Status.OK else status
     elif result.registration is Registration.COARSE and result.sigma >= surface_registration.most_scatter(

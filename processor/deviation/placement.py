@@ -23,20 +23,15 @@ MOST_TRIALS = 6  # scans that are placed one by one, if all together do not lie 
 
 
 @dataclass(frozen=True)
-class Elsewhere:
-    """A scan or station that was left out, as it does not lie at the design, and its number of points."""
-
-    name: str
-    points: int
-
-
-@dataclass(frozen=True)
 class Placement:
-    """A scan without what was left out of it, its pose, and whether anything of it lies at the design there."""
+    """A scan without what was left out of it, its pose, and whether anything of it lies at the design there.
+
+    ``left_out`` are the names of the scans and stations that do not lie at the design, and their numbers of points.
+    """
 
     scan: ScanCloud
     placed: Placed
-    left_out: tuple[Elsewhere, ...]
+    left_out: tuple[tuple[str, int], ...]
     lies: bool
 
 
@@ -64,7 +59,7 @@ def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> Pla
     lies = bool(len(at_design)) or surface_registration.fits_design(placed, scan.points, surface)
     if not len(at_design) or len(at_design) == len(everything):
         return Placement(scan, placed, (), lies)
-    left_out = tuple(Elsewhere(scan.views[k], int(count[k])) for k in everything if k not in at_design)
+    left_out = tuple((scan.views[k], int(count[k])) for k in everything if k not in at_design)
     return Placement(scan.of(at_design), placed, left_out, lies)
 
 

@@ -12,16 +12,15 @@ the odds of two poses is the sum over their pieces, and a pose is sure from SURE
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.distinct_rows import components, distinct
-from processor.geometry import mesh_distance, nearest_neighbours, rigid, thinning
-from processor.geometry.mesh_distance import FacetGrid, MeshSurface
-from processor.geometry.thread_ranges import over_ranges
+from processor.geometry import nearest_neighbours, rigid
+from processor.geometry.mesh_distance import GRAZING_COS, MeshSurface
+from processor.geometry.thinning import thinned
 from processor.model import Bools, Floats, Ints
 
 ERROR_RATE = 0.05  # probability that one group of points deviates so that it fits the wrong pose
@@ -32,35 +31,38 @@ ON, OFF = 2.0, 4.0  # times the median group's distance: up to ON on the design,
 LEAST_OFF_MM = 1.0  # plates may deviate by as much in thickness (EN 10029), so less distinguishes no pose
 REACH_MM = 60.0  # from the design, the most that the distance of a point counts
 SAMPLE = 200_000
-LEAST_RANGE = 2_000  # points per task of a thread
+CORNER_SAMPLES = 12  # nearest of the surface: some of them on each face that meets at a corner
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The row of the most probable pose, and the rows of the poses that are not improbable beside it."""
+def choose(
+    points: Floats, poses: Sequence[tuple[MeshSurface, Floats]], scanner: Floats | None = None, sample: int = SAMPLE
+) -> list[int]:
+    """Return the row of the pose that points (n, 3) support, then those of the poses that they do not rule out.
 
-    best: int
-    rivals: tuple[int, ...]
-
-
-def choose(points: Floats, surface: MeshSurface, poses: list[Floats], scanner: Floats | None = None) -> Choice:
-    """Choose between fitted poses (4, 4 each, design from scan) of points (n, 3).
-
-    ``scanner`` (n, 3) is the position each point was measured from, in the points' frame; a point is then compared with
-    facets that face it alone.
+    ``poses`` are (4, 4), each with its design: of one design, or of several. ``scanner`` (n, 3) is the position that
+    each point was measured from, if known: points are then compared with facets that face it alone. At most about
+    ``sample`` points are compared.
     """
     if len(poses) < 2:
-        return Choice(0, ())
-    few = thinning.thinned(points, SAMPLE)
-    seen_from = None if scanner is None else thinning.thinned(scanner, SAMPLE)
+        return list(range(len(poses)))
+    few = thinned(points, sample)
+    seen_from = None if scanner is None else thinned(scanner, sample)
     group, voxel = _groups(few)
-    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, REACH_MM)
-    distances = np.stack([_means(_distances(few, seen_from, grid, T), group) for T in poses])
+    placed = [
+        (surface, rigid.apply(T, few), None if seen_from is None else rigid.apply(T, seen_from)) for surface, T in poses
+    ]
+    every = np.stack([_from_facets(*one, np.full(len(few), REACH_MM)) for one in placed])
+    distances = np.stack([_means(row, group) for row in every])
     near = [row[row < REACH_MM] for row in distances]  # without clutter
     typical = min((float(np.median(row)) for row in near if len(row)), default=REACH_MM)
     typical = max(typical, 0.5 * LEAST_OFF_MM / OFF)
     least_off = max(OFF * typical, ON * typical + LEAST_OFF_MM)
-
+    for k, (surface, places, sight) in enumerate(placed):
+        rows = np.flatnonzero((group >= 0) & (distances[k] > ON * typical)[group])
+        every[k, rows] = _from_facets_about(
+            surface, places[rows], None if sight is None else sight[rows], every[k, rows]
+        )
+        distances[k] = _means(every[k], group)
     on, off = distances <= ON * typical, distances >= least_off
 
     def odds(i: int, j: int) -> float:
@@ -71,7 +73,7 @@ def choose(points: Floats, surface: MeshSurface, poses: list[Floats], scanner: F
     for other in range(1, len(poses)):
         best = other if odds(best, other) < 0.0 else best
     sure = np.log(SURE_ODDS) - 1e-9
-    return Choice(best, tuple(k for k in range(len(poses)) if k != best and odds(best, k) < sure))
+    return [best, *(k for k in range(len(poses)) if k != best and odds(best, k) < sure)]
 
 
 def _groups(points: Floats) -> tuple[Ints, Ints]:
@@ -84,31 +86,38 @@ def _groups(points: Floats) -> tuple[Ints, Ints]:
     return number[groups.number], groups.rows[full]
 
 
-def _distances(points: Floats, scanner: Floats | None, grid: FacetGrid, T: Floats) -> Floats:
-    """Return the distance (n,) of points (n, 3), placed by T (4, 4), from the design, each at most REACH_MM."""
-    placed = np.ascontiguousarray(rigid.apply(T, points))
-    if scanner is None:
-        seen_from, station = np.zeros((1, 3)), np.full(len(points), -1, np.int64)
-    else:
-        seen_from, station = np.ascontiguousarray(rigid.apply(T, scanner)), np.arange(len(points))
-    distance = np.empty(len(points))
+def off_surface(points: Floats, surface: MeshSurface, least_mm: float) -> Bools:
+    """Mark the points (n, 3) that lie farther than ``least_mm``, less than REACH_MM, from a surface."""
+    distance = _from_facets(surface, points, None, np.full(len(points), REACH_MM))
+    # Where nothing is in reach, no face is: the most of two poses' samples, and the costly ones to search for.
+    rows = np.flatnonzero((distance > least_mm) & (distance < REACH_MM))
+    distance[rows] = _from_facets_about(surface, points[rows], None, distance[rows])
+    marked: Bools = distance > least_mm
+    return marked
 
-    def fill(first: int, last: int) -> None:
-        part = placed[first:last]
-        facet, _ = mesh_distance.nearest_visible(grid, part, seen_from, station[first:last])
-        distance[first:last] = to_facets(grid.corners, part, facet, grid.reach)
 
-    over_ranges(fill, len(points), least=LEAST_RANGE)
+def _from_facets_about(surface: MeshSurface, placed: Floats, scanner: Floats | None, most: Floats) -> Floats:
+    """Return the distance (n,) of points (n, 3) from a surface as :func:`_from_facets`, also near its corners."""
+    distance = most
+    for facet in np.ascontiguousarray(surface.nearest(placed, REACH_MM, CORNER_SAMPLES)[0].T):
+        distance = _from_facets(surface, placed, scanner, distance, facet)
     return distance
 
 
-@njit(cache=True, nogil=True)
-def to_facets(corners: Floats, points: Floats, facet: Ints, most: float) -> Floats:
-    """Return the distance (n,) of points (n, 3) from their facets (n,); ``most`` where the facet is -1."""
-    distance = np.full(len(points), most)
-    for row in range(len(points)):
-        if facet[row] >= 0:
-            distance[row] = min(most, np.sqrt(mesh_distance.square_to(corners[facet[row]], points[row])))
+def _from_facets(
+    surface: MeshSurface, placed: Floats, scanner: Floats | None, most: Floats, facet: Ints | None = None
+) -> Floats:
+    """Return the distance (n,) of points (n, 3) from the face of a ``facet`` (n,), each at most ``most`` (n,).
+
+    Without facets they are those of the nearest samples: near a corner it may be on the other face, from which the
+    search over facets does not get round. A facet that does not face the ``scanner`` (n, 3) does not count.
+    """
+    facet, along, beyond = surface.distances(placed, REACH_MM, facet)
+    distance: Floats = np.fmin(np.hypot(along, beyond), most)
+    if scanner is not None:
+        sight = scanner - placed
+        slope = np.einsum("ni,ni->n", surface.normals[facet], sight)
+        distance = np.where(slope < GRAZING_COS * np.linalg.norm(sight, axis=1), most, distance)
     return distance
 
 

@@ -1,4 +1,4 @@
-"""Principal axes of point clouds and of meshes, and the coarse registration that lays one set of axes on another.
+"""Principal axes of point clouds and of meshes, and the rotations that lay one set of axes on another.
 
 Paper 000, section 2.2, and paper 002, section 2.3, without the four of the eight sign choices that are mirror images.
 """
@@ -6,20 +6,21 @@ Paper 000, section 2.2, and paper 002, section 2.3, without the four of the eigh
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from processor.geometry import rigid
+from processor.geometry import mesh_distance, rigid
+from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.thinning import voxel_means
-from processor.geometry.thread_ranges import each
 from processor.large_arrays import blocks, centroid, corners
 from processor.model import Floats, Ints
 
 ALIKE = 1.25  # ratio of the variances along two axes below which these may be swapped
 SAME_TURN, SAME_SHIFT = 0.02, 0.01  # rad, and share of the size: poses that differ by less are one pose
 SIZE_SHARE = 0.01  # of the longest size: scans of a part differ less from its sizes, by noise, form and voxels
+FACE_COS, MOST_AREA, FACE_ROUNDS = 0.9, 0.5, 5  # faces about along an axis, their least share of the area
 AMBIGUOUS = 1.3  # ratio of two poses' errors below which either may be right
 
 
@@ -30,19 +31,6 @@ class PrincipalAxes:
     centre: Floats
     axes: Floats
     variances: Floats
-
-
-@dataclass(frozen=True)
-class CoarsePose:
-    """``T_target_source`` (4, 4), the rms in mm that it leaves, and the ratio of the next best pose's rms to it.
-
-    ``T_rival`` (4, 4) is the next best pose, NaN where there is none.
-    """
-
-    T_target_source: Floats
-    rms_mm: float
-    ambiguity: float
-    T_rival: Floats
 
 
 def of_points(points: Floats) -> PrincipalAxes:
@@ -99,36 +87,23 @@ def turns(orders: Sequence[tuple[int, ...]]) -> list[Floats]:
     return rotations
 
 
-def possible_turns(target_variances: Floats, source_variances: Floats) -> list[Floats]:
-    """Proper rotations (3, 3) between two sets of axes with variances (3,): 4, up to 24 where variances are alike."""
+def possible_turns(target_variances: Floats, source_variances: Floats, *, either_cross: bool = False) -> list[Floats]:
+    """Proper rotations (3, 3) between two sets of axes with variances (3,): 4, up to 24 where variances are alike.
+
+    With ``either_cross`` the two shorter axes are alike in any case.
+    """
 
     def alike(variances: Floats, i: int, k: int) -> bool:
         a, b = variances[i], variances[k]
         return bool(max(a, b) <= ALIKE * min(a, b))
 
     def possible(order: tuple[int, ...]) -> bool:
+        if either_cross and order == (0, 2, 1):
+            return True
         swaps = [(i, k) for i, k in enumerate(order) if i != k]
         return all(alike(target_variances, i, k) or alike(source_variances, i, k) for i, k in swaps)
 
     return turns([order for order in itertools.permutations(range(3)) if possible(order)])
-
-
-def coarse(
-    source: PrincipalAxes, target: PrincipalAxes, size: float, refined: Callable[[Floats], tuple[float, Floats]]
-) -> CoarsePose:
-    """Lay principal axes on each other in every possible way and take the pose that leaves the least error.
-
-    Paper 002 compares the poses as the axes give them. Axes are a little off, by as much as the poses of a nearly
-    symmetric structure differ; so ``refined`` first improves each pose T_target_source (4, 4): it returns the rms in mm
-    left, and the better pose. Poses that differ by less than a share of the target's ``size`` (mm) count as one.
-    """
-    turned = [target.axes @ turn @ source.axes.T for turn in possible_turns(target.variances, source.variances)]
-    fits = each(refined, [rigid.transform(R, target.centre - R @ source.centre) for R in turned])
-    order = sorted(range(len(fits)), key=lambda k: (fits[k][0], k))
-    error, best = fits[order[0]]
-    rivals = (fits[k] for k in order[1:] if differ(fits[k][1], best, source.centre, size))
-    rival_error, rival = next(rivals, (float("nan"), np.full((4, 4), np.nan)))
-    return CoarsePose(best, error, rival_error / max(error, 1e-9), rival)
 
 
 def differ(T: Floats, other: Floats, centre: Floats, size: float) -> bool:
@@ -136,3 +111,22 @@ def differ(T: Floats, other: Floats, centre: Floats, size: float) -> bool:
     turn = rigid.rotation_angle(T[:3, :3] @ other[:3, :3].T)
     shift = float(np.linalg.norm(rigid.apply(T, centre) - rigid.apply(other, centre)))
     return turn > SAME_TURN or shift > SAME_SHIFT * size
+
+
+def along_faces(axes: Floats, surface: MeshSurface) -> Floats:
+    """Turn principal ``axes`` (3, 3) to the normals of the faces that look about along them, if most of the area does.
+
+    A part on a plate turns the plate's principal axes by degrees: a half turn about these would tilt the plate.
+    """
+    weighted, size = mesh_distance.double_areas(surface.vertices, surface.faces)
+    found = axes
+    for _ in range(FACE_ROUNDS):
+        along = weighted @ found
+        axis = np.argmax(np.abs(along), axis=1)
+        best = along[np.arange(len(axis)), axis]
+        near = np.abs(best) > FACE_COS * size
+        if size[near].sum() < MOST_AREA * size.sum():
+            return axes
+        towards = np.sign(best[near])[:, None] * weighted[near]
+        found = rigid.nearest_rotation(np.stack([towards[axis[near] == k].sum(axis=0) for k in range(3)], axis=1))
+    return found

@@ -1,27 +1,26 @@
 """Registration of a scan to the surface of its design: coarse by principal axes, then fine by least squares.
 
-The fine registration needs a pose that is right to a few millimetres; see :mod:`processor.registration.principal` for
+The fine registration needs a pose that is right to a few millimetres; see :mod:`processor.registration.pose_search` for
 the search from any pose, and :mod:`processor.registration.pose_choice` for the choice between the attitudes of a nearly
 symmetric structure. :func:`place` decides which of these a scan needs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from processor.adjustment import robust_least_squares
 from processor.adjustment.body_motions import distance_derivative, transform_about, variances
-from processor.geometry import mesh_distance, rigid
-from processor.geometry.mesh_distance import MeshSurface, Samples, on_face
-from processor.geometry.thinning import thinned, voxel_means
+from processor.geometry import rigid
+from processor.geometry.mesh_distance import MeshSurface, on_face
+from processor.geometry.thinning import thinned
 from processor.geometry.thread_ranges import each
 from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Word
-from processor.registration import icp, main_body, pose_choice, principal
-from processor.registration.principal import CoarsePose, PrincipalAxes
+from processor.registration import icp, main_body, pose_choice, pose_search, principal
+from processor.registration.pose_search import Candidate, DesignSurface
 from processor.robust_statistics import biweight, robust_sd
 
 # --- Fine registration
@@ -170,21 +169,17 @@ def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[Motion,
     return tuple(name for name, k in zip(Motion, order, strict=True) if spread[k] * arms[k] > WEAK_MM)
 
 
-# --- Coarse registration, and the choice between the two
+# --- Placement: coarse registration where a scan does not lie at its design, and the choice between attitudes
 
-COARSE_POINTS, COARSE_ITERATIONS = 3_000, 12
-COARSE_SAMPLES = 40_000
-GATE_SHARES = (0.05, 0.015, 0.005)  # of the design's size
-EVEN_CELLS = 200.0  # voxels along the scan's extent, for points of even density
+STRUCTURE_SAMPLES = (40_000, 40_000)  # of a small structure as well: its plates are thin
 NEAR_MM = 100.0  # of the design's surface
 NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
 FINE_POINTS = 30_000
 RIVAL_POINTS = 8_000  # enough to tell attitudes apart: the fit of the one that is chosen uses FINE_POINTS
+SYMMETRY_POINTS = 3_000  # of even density, aligned in each attitude that the design's symmetry allows
+# What the surface does not determine converges slowly, and distinguishes no attitude.
 RIVAL_ITERATIONS = 15
-SIDE_ROUNDS = 3  # one for each axis
-LEAST_SHIFT_MM = 2.0  # thinner plates are not told apart by the side of their surface
-FACE_COS, MOST_AREA, FACE_ROUNDS = 0.9, 0.5, 5  # faces about along an axis, their least share of the area
-PROMISING = 3.0  # ratio of two poses' errors after the coarse registration, below which the fine one decides
+PROMISING = 3.0  # ratio of two poses' misfits after the coarse registration, below which the fine one decides
 NAN = float("nan")
 
 
@@ -201,8 +196,9 @@ class Placed:
     """``T`` (4, 4) and ``T_best_fit`` (4, 4) map the scan's local frame to the design's; ``registration`` says how.
 
     ``covariance`` (6, 6) is that of the best fit. ``shift`` (3,) and ``turn`` are what the best fit does to the scan's
-    middle relative to T. ``ambiguity`` is the ratio of the coarse errors of the next best attitude and this one; the
-    pose is ``ambiguous`` if no surface distinguishes it from ``T_rival``.
+    middle relative to T. ``ambiguity`` is the ratio of the coarse misfits of the next best attitude and this one; the
+    pose is ``ambiguous`` if no surface distinguishes it from ``T_rival``. ``of_body`` (n,) marks the points that are
+    not of the ground or what stands about the structure; None where all are used.
     """
 
     T: Floats
@@ -215,8 +211,13 @@ class Placed:
     turn: float
     weak: tuple[Motion, ...]
     sigma_mm: float
-    ambiguous: bool
     T_rival: Floats  # (4, 4) of another attitude that fits as well; NaN without one
+    of_body: Bools | None
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether another attitude fits as well."""
+        return bool(np.isfinite(self.T_rival).all())
 
 
 def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner: Floats | None = None) -> Placed:
@@ -226,51 +227,42 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     where it is by ``auto``, and the best fit is only reported. ``scanner`` (n, 3) is the position that each point was
     measured from, if known: it helps to distinguish attitudes. Ground and what stands about the structure is left out.
     """
-    of_body = body_of(points, surface) if how in ("auto", "coarse") else None
-    return place_body(points, surface, given, how, scanner, of_body)
-
-
-def place_body(
-    points: Floats, surface: MeshSurface, given: Floats, how: str, scanner: Floats | None, of_body: Bools | None
-) -> Placed:
-    """Place a scan's points as :func:`place`, those of the structure being known, see :func:`body_of`."""
-    axes = principal.of_mesh(surface.vertices, surface.faces)
     few = thinned(points, FINE_POINTS)
     share = near_share(few, surface, given)
+    of_body = main_body.of_sizes(points, [principal.sizes(surface.samples())]) if how in ("auto", "coarse") else None
     if of_body is not None:
         few_of_body = thinned(points[of_body], FINE_POINTS)
         of_body_share = near_share(few_of_body, surface, given)
-        if share < NEAR_SHARE or of_body_share >= share:  # else it is something else beside the structure
+        if share < NEAR_SHARE or of_body_share >= share:
             few, share = few_of_body, of_body_share
             points, scanner = points[of_body], None if scanner is None else scanner[of_body]
-    registration, rivals, ambiguity = Registration.AS_GIVEN, [], NAN
+        else:  # it is something else beside the structure
+            of_body = None
+    axes, rivals, ambiguity = principal.of_mesh(surface.vertices, surface.faces).axes, [], NAN
+    start, registration = given, Registration.FINE if how == "fine" else Registration.AS_GIVEN
     if how == "coarse" or (how == "auto" and share < NEAR_SHARE):
-        registration = Registration.COARSE
-        poses = _attitudes(even(points), surface, axes)
-        starts = [T for error, T in poses if error <= PROMISING * poses[0][0]]
-        fits = _fits(points, few, surface, axes.axes, starts)
-        choice = pose_choice.choose(points, surface, [fit.T_design_scan for fit in fits], scanner)
-        start, fitted = starts[choice.best], fits[choice.best]
-        if choice.best:
-            fitted = fine(few, surface, axes.axes, start)
-        rivals = [fits[k].T_design_scan for k in choice.rivals]
-        others = [error for k, (error, _) in enumerate(poses) if k != choice.best]
-        ambiguity = min(others, default=NAN) / max(poses[choice.best][0], 1e-9)
-    else:
-        start, registration = given, Registration.FINE if how == "fine" else Registration.AS_GIVEN
-        fitted = fine(few, surface, axes.axes, given)
-        if how == "auto" and (turned := _surely_turned(points, surface, axes, fitted, scanner)):
-            fitted, rivals = turned[0], [fit.T_design_scan for fit in turned[1:]]
-            start, registration = fitted.T_design_scan, Registration.COARSE
+        registration, design = Registration.COARSE, pose_search.prepared(surface, STRUCTURE_SAMPLES)
+        candidates = pose_search.search(points, design)
+        promising = [c for c in candidates if c.misfit <= PROMISING * candidates[0].misfit]
+        best, *rivals = decide(points, design, promising, scanner)
+        start = best.T
+        others = [c.misfit for c in candidates if c.start is not best.start]
+        ambiguity = min(others, default=NAN) / max(best.misfit, 1e-9)
+    fitted = fine(few, surface, axes, start)
+    if how == "auto" and registration is Registration.AS_GIVEN and np.isfinite(fitted.T_design_scan).all():
+        turned = _surely_turned(points, surface, fitted.T_design_scan, scanner)
+        if turned:
+            start, rivals, registration = turned[0].T, turned[1:], Registration.COARSE
+            fitted = fine(few, surface, axes, start)
     determined = np.isfinite(fitted.covariance).all()
-    best = fitted.T_design_scan if determined else np.full((4, 4), NAN)
-    T = start if registration is Registration.AS_GIVEN or not determined else best
-    between = best @ rigid.invert(T) if determined else np.full((4, 4), NAN)
+    best_fit = fitted.T_design_scan if determined else np.full((4, 4), NAN)
+    T = start if registration is Registration.AS_GIVEN or not determined else best_fit
+    between = best_fit @ rigid.invert(T) if determined else np.full((4, 4), NAN)
     middle = rigid.apply(T, few.mean(axis=0))
     return Placed(
         T=T,
         registration=registration,
-        T_best_fit=best,
+        T_best_fit=best_fit,
         covariance=fitted.covariance,
         ambiguity=ambiguity,
         near_share=share,
@@ -278,29 +270,48 @@ def place_body(
         turn=rigid.rotation_angle(between[:3, :3]),
         weak=fitted.weak,
         sigma_mm=fitted.sigma_mm,
-        ambiguous=bool(rivals),
-        T_rival=rivals[0] if rivals else np.full((4, 4), NAN),
+        T_rival=rivals[0].T if rivals else np.full((4, 4), NAN),
+        of_body=of_body,
     )
 
 
-def _fits(points: Floats, few: Floats, surface: MeshSurface, axes: Floats, starts: list[Floats]) -> list[SurfaceFit]:
-    """Fit points (n, 3) from the starts (4, 4): ``few`` from the first, of the least error, RIVAL_POINTS from others.
+def decide(
+    points: Floats, design: DesignSurface, candidates: list[Candidate], scanner: Floats | None = None
+) -> list[Candidate]:
+    """Return the candidate whose own surface points (n, 3) show, then those that they do not rule out.
 
-    What the surface does not determine converges slowly, and distinguishes no attitude: RIVAL_ITERATIONS do for these.
+    Several candidates are refined first: surface that one pose alone has is compared to some millimetres.
     """
-    fewer = thinned(points, RIVAL_POINTS)
+    if len(candidates) > 1:
+        fewer = thinned(points, RIVAL_POINTS)
 
-    def fit(number: int) -> SurfaceFit:
-        if number == 0:
-            return fine(few, surface, axes, starts[0])
-        return fine(fewer, surface, axes, starts[number], RIVAL_ITERATIONS)
+        def refined(c: Candidate) -> Candidate:
+            return replace(c, T=fine(fewer, design.mesh, design.axes, c.T, RIVAL_ITERATIONS).T_design_scan)
 
-    return each(fit, range(len(starts)))
+        candidates = pose_search.distinct(each(refined, candidates), pose_search.box_of(points))
+    return [candidates[k] for k in pose_choice.choose(points, [(design.mesh, c.T) for c in candidates], scanner)]
 
 
-def body_of(points: Floats, surface: MeshSurface) -> Bools | None:
-    """Return which points (n, 3) are not of the ground or what stands about the structure; None where all are."""
-    return main_body.of_sizes(points, [principal.sizes(surface.samples())])
+def _surely_turned(points: Floats, surface: MeshSurface, given: Floats, scanner: Floats | None) -> list[Candidate]:
+    """Return another attitude, then its rivals, if surface rules out the ``given`` (4, 4) attitude; else none.
+
+    A scan in the design's frame may lie in it the wrong way round. Points of a plate slip along it, and each fit may
+    have slipped differently: the given attitude is ruled out only if it is so with the slip of the other fits, too.
+    """
+    design = pose_search.prepared(surface, STRUCTURE_SAMPLES)
+    few, fewer = pose_search.evenly(points, design)[0], thinned(points, RIVAL_POINTS)
+    turns = pose_search.symmetries(design)
+    kept = thinned(few, SYMMETRY_POINTS)
+    first, *others = each(lambda turn: pose_search.align(kept, design, Candidate(turn @ given, given)), turns)
+    fits, turned_back = [], []
+    for turn, other in zip(turns[1:], others, strict=True):
+        if other.misfit <= PROMISING * first.misfit:
+            T = fine(fewer, surface, design.axes, other.T).T_design_scan
+            fits.append(replace(other, T=T))
+            turned_back.append(rigid.invert(turn) @ T)
+    poses = [*(fit.T for fit in fits), given, *turned_back]
+    best, *rivals = pose_choice.choose(points, [(surface, T) for T in poses], scanner)
+    return [] if max(best, *rivals, 0) >= len(fits) else [fits[k] for k in (best, *rivals)]
 
 
 def near_share(points: Floats, surface: MeshSurface, T: Floats) -> float:
@@ -317,154 +328,6 @@ def fits_design(placed: Placed, points: Floats, surface: MeshSurface) -> bool:
 def is_unproven(reasons: Iterable[Reason]) -> bool:
     """Whether step deviation states that single points scatter as they do at a wrong pose; see :func:`most_scatter`."""
     return any(one.code == "deviation.no-fit" for one in reasons)
-
-
-def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:
-    """Register points (n, 3), even in density, from any pose to samples of a design with its principal axes."""
-    size = float(np.linalg.norm(np.ptp(design.points, axis=0)))
-    return principal.coarse(principal.of_points(points), axes, size, _refined(points, design, size))
-
-
-def _refined(points: Floats, design: Samples, size: float) -> Callable[[Floats], tuple[float, Floats]]:
-    """Return the function that improves a pose (4, 4) of points (n, 3), and returns the rms in mm left with it."""
-    tree, boxes = cKDTree(design.points), icp.boxes_of(design.points, design.normals)
-    few = thinned(points, COARSE_POINTS)
-    gates = tuple(share * size for share in GATE_SHARES)
-
-    def refined(start: Floats) -> tuple[float, Floats]:
-        T = icp.point_to_plane(few, boxes, start, gates_mm=gates, max_iterations=COARSE_ITERATIONS).T_target_source
-        return _rms(few, design, tree, T, gates[-1]), T
-
-    return refined
-
-
-def _surely_turned(
-    points: Floats, surface: MeshSurface, axes: PrincipalAxes, given: SurfaceFit, scanner: Floats | None
-) -> list[SurfaceFit]:
-    """Return the fit in another attitude, then its rivals, if surface rules out the ``given`` attitude; else none.
-
-    A scan in the design's frame may lie in it the wrong way round. Points of a plate slip along it, and each fit may
-    have slipped differently: the given attitude is ruled out only if it is so with the slip of the other fits, too.
-    """
-    if not np.isfinite(given.T_design_scan).all():
-        return []
-    design = _samples(surface)
-    refined = _refined(even(points), design, float(np.linalg.norm(np.ptp(design.points, axis=0))))
-    turns = _turns(axes, surface)
-    (error, _), *others = each(lambda turn: refined(turn @ given.T_design_scan), turns)
-    few = thinned(points, RIVAL_POINTS)
-    fits, turned_back = [], []
-    for turn, (rms, T) in zip(turns[1:], others, strict=True):
-        if rms <= PROMISING * error:
-            fits.append(fine(few, surface, axes.axes, T))
-            turned_back.append(rigid.invert(turn) @ fits[-1].T_design_scan)
-    poses = [*(fit.T_design_scan for fit in fits), given.T_design_scan, *turned_back]
-    choice = pose_choice.choose(points, surface, poses, scanner)
-    if choice.best >= len(fits) or any(rival >= len(fits) for rival in choice.rivals):
-        return []
-    best = fine(thinned(points, FINE_POINTS), surface, axes.axes, fits[choice.best].T_design_scan)
-    return [best, *(fits[rival] for rival in choice.rivals)]
-
-
-def _samples(surface: MeshSurface) -> Samples:
-    spacing = np.sqrt(mesh_distance.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
-    return mesh_distance.sampled(surface.vertices, surface.faces, spacing)
-
-
-def _turns(axes: PrincipalAxes, surface: MeshSurface) -> list[Floats]:
-    """Return the motions (4, 4) of a design about onto itself that its principal axes allow, the identity first."""
-    square = _along_faces(axes.axes, surface)
-    turns = [square @ turn @ square.T for turn in principal.possible_turns(axes.variances, axes.variances)]
-    turns.sort(key=rigid.rotation_angle)
-    return [rigid.transform(R, axes.centre - R @ axes.centre) for R in turns]
-
-
-def _along_faces(axes: Floats, surface: MeshSurface) -> Floats:
-    """Turn principal ``axes`` (3, 3) to the normals of the faces that look about along them, if most of the area does.
-
-    A part on a plate turns the plate's principal axes by degrees: a half turn about these would tilt the plate.
-    """
-    weighted, size = mesh_distance.double_areas(surface.vertices, surface.faces)
-    found = axes
-    for _ in range(FACE_ROUNDS):
-        along = weighted @ found
-        axis = np.argmax(np.abs(along), axis=1)
-        best = along[np.arange(len(axis)), axis]
-        near = np.abs(best) > FACE_COS * size
-        if size[near].sum() < MOST_AREA * size.sum():
-            return axes
-        towards = np.sign(best[near])[:, None] * weighted[near]
-        found = rigid.nearest_rotation(np.stack([towards[axis[near] == k].sum(axis=0) for k in range(3)], axis=1))
-    return found
-
-
-def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> list[tuple[float, Floats]]:
-    """Return the rms in mm and coarse pose (4, 4) of points (n, 3) in every attitude, the least rms first.
-
-    Attitudes are that of the best pose by principal axes, its rival, and the best turned as the design's principal axes
-    allow: the axes of a scan from one side are off, and may not lead to every attitude.
-    """
-    design = _samples(surface)
-    size = float(np.linalg.norm(np.ptp(design.points, axis=0)))
-    first = coarse(points, design, axes)
-    refined = _refined(points, design, size)
-    found = each(lambda turn: refined(turn @ first.T_target_source), _turns(axes, surface))
-    found.append((first.rms_mm, first.T_target_source))
-    if np.isfinite(first.T_rival).all():
-        found.append((first.ambiguity * first.rms_mm, first.T_rival))
-    square, centre = _along_faces(axes.axes, surface), points.mean(axis=0)
-    distinct = untried = _distinct(found, centre, size)
-    for _ in range(SIDE_ROUNDS):  # plates along several axes may lie on their other sides
-        least = distinct[0][0]
-        promising = [T for error, T in untried if error <= PROMISING * least]
-        shifted = each(refined, [start for T in promising for start in _other_sides(points, design.points, square, T)])
-        distinct = _distinct([*distinct, *shifted], centre, size)
-        untried = [one for one in distinct if any(one is other for other in shifted)]
-        if not distinct[0][0] < least:
-            break
-    return distinct
-
-
-def _distinct(found: list[tuple[float, Floats]], centre: Floats, size: float) -> list[tuple[float, Floats]]:
-    """Return the errors and poses of a body about ``centre`` that are not of one pose, the least error first."""
-    distinct: list[tuple[float, Floats]] = []
-    for k in sorted(range(len(found)), key=lambda k: (found[k][0], k)):
-        T = found[k][1]
-        if all(principal.differ(T, other, centre, size) for _, other in distinct):
-            distinct.append(found[k])
-    return distinct
-
-
-def _other_sides(points: Floats, design: Floats, axes: Floats, T: Floats) -> list[Floats]:
-    """Return poses (4, 4) shifted so that either side of the points (n, 3) lies at that side of the design (m, 3).
-
-    The side of a plate that was scanned alone may have come to lie on the plate's other side.
-    """
-    placed, designed = rigid.apply(T, points) @ axes, design @ axes
-    starts = []
-    for k in range(3):
-        for side in (np.min, np.max):
-            shift = float(side(designed[:, k]) - side(placed[:, k]))
-            if LEAST_SHIFT_MM < abs(shift) < NEAR_MM:
-                starts.append(rigid.transform(np.eye(3), shift * axes[:, k]) @ T)
-    return starts
-
-
-def even(points: Floats) -> Floats:
-    """Thin points (n, 3) to an even density: the dense part near a scanner must not attract the principal axes."""
-    widest = float(np.ptp(points, axis=0).max())
-    return voxel_means(points, max(widest / EVEN_CELLS, 1e-6))
-
-
-def _rms(points: Floats, design: Samples, tree: cKDTree, T: Floats, most: float) -> float:
-    """Rms distance along the design's normals of points (n, 3) placed by T, each at most ``most``, mm."""
-    placed = rigid.apply(T, points)
-    distance, index = tree.query(placed, distance_upper_bound=3.0 * most)
-    near = np.isfinite(distance)
-    r = np.full(len(points), most)
-    off = np.einsum("ni,ni->n", placed[near] - design.points[index[near]], design.normals[index[near]])
-    r[near] = np.minimum(np.abs(off), most)
-    return float(np.sqrt(np.mean(r**2)))
 
 
 def error_along(covariance: Floats, places: Floats, normals: Floats) -> float:

@@ -8,7 +8,7 @@ import trimesh
 
 from processor.geometry import rigid
 from processor.language.messages import messages
-from processor.model import DesignPart, Scene, reason
+from processor.model import Scene, reason
 from processor.preassembly import assemble
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.parts import assignment, attitude
@@ -16,6 +16,7 @@ from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.attitude import Shapes
 from processor.preassembly.result import Result
 from processor.preassembly.verdicts import reasons
+from processor.registration import pose_search
 from processor.scan_folder import folder
 from tests.support.clouds import arch_clouds
 from tests.support.scenes.foreign_scenes import foreign_scene
@@ -138,13 +139,11 @@ def test_a_bridge_of_wrong_scans_is_not_assembled(order):
     assert [one.code for one in result.adjustment.advice] == ["preassemble.assign-scans"]
 
 
-@pytest.mark.parametrize(("edge_mm", "count"), [(3_000.0, 60_000), (30.0, attitude.FEWEST_SAMPLES)])
+@pytest.mark.parametrize(("edge_mm", "count"), [(3_000.0, 60_000), (30.0, pose_search.SAMPLES[0])])
 def test_a_part_has_one_sample_on_each_square_of_the_spacing(edge_mm, count):
     """A cube of 3 m has 54 m2: 60,000 squares of 30 mm. A small one has the fewest that a registration needs."""
     box = trimesh.creation.box(3 * [edge_mm])
-    none = np.empty((0, 3))
-    part = DesignPart("cube", np.array(box.vertices), np.array(box.faces, np.int64), none, none)
-    assert len(attitude.samples_of(part).points) == count
+    assert len(pose_search.samples_of(np.array(box.vertices), np.array(box.faces, np.int64)).points) == count
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from processor.preassembly.ends import bottom_edges
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import assignment, attitude, identity, measure
-from processor.registration import principal
+from processor.registration import pose_search, principal
 from tests.support import arrays_in_files
 from tests.support.clouds import arch_clouds
 from tests.support.clouds.arch_clouds import random_pose
@@ -161,7 +161,7 @@ def test_ends_are_right_despite_stray_points_and_the_same_where_points_lie_in_fi
 
 
 def test_a_square_box_is_not_turned_by_a_quarter(monkeypatch):
-    monkeypatch.setattr(attitude, "FINE_POINTS", SEARCHED)
+    monkeypatch.setattr(pose_search, "FINE_POINTS", SEARCHED)
     parts, design = ribs(dataclasses.replace(SMALL, width_mm=1_000.0, height_mm=1_000.0, plate_web_mm=24.0))
     scan, T = scanned(cloud(parts[1], spacing_mm=24.0))
     found = attitude.find(scan.points, design.parts[1], shapes_of(design)[1])
@@ -192,7 +192,7 @@ def nested(reasons):
 @pytest.mark.parametrize(("of", "asked", "came"), [(ribs, 0, 2), pytest.param(bridge, 0, 4, marks=pytest.mark.slow)])
 def test_parts_of_one_shape_are_distinguished_by_their_mark(of, asked, came, monkeypatch):
     """Rib 3 turned round equals rib 1 but for its mark: it fits rib 1 to the noise."""
-    monkeypatch.setattr(attitude, "FINE_POINTS", SEARCHED)
+    monkeypatch.setattr(pose_search, "FINE_POINTS", SEARCHED)
     parts, design = of()
     scan, _ = scanned(cloud(parts[came], spacing_mm=30.0, sigma_mm=2.0))
     found = measured(design, asked, scan)
@@ -445,7 +445,7 @@ def on_trestles(points, rng, step=20.0):
 def test_a_part_on_trestles_above_a_floor_of_more_points_is_found_right(monkeypatch):
     """That the trestles' points make it no other part is the claim of test_assignment."""
     monkeypatch.setattr(assignment, "rather", lambda *_: None)
-    monkeypatch.setattr(attitude, "FINE_POINTS", SEARCHED)
+    monkeypatch.setattr(pose_search, "FINE_POINTS", SEARCHED)
     parts, design = ribs()
     points = cloud(parts[1], spacing_mm=24.0)
     everything = on_trestles(points, np.random.default_rng(4))
@@ -468,8 +468,8 @@ def test_a_scan_that_is_denser_at_one_end_starts_at_the_parts_place():
     dense = points[:, 0] < np.quantile(points[:, 0], 0.2)
     points = points[dense | (rng.random(len(points)) < 0.1)]
     scan, _ = scanned(points)
-    by_axes = attitude.principal_hypotheses(scan.points, design.parts[1])
-    starts = [attitude.at_extents(scan.points, design.parts[1], one) for one in by_axes]
+    by_axes = pose_search.by_principal_axes(scan.points, shapes_of(design)[1])
+    starts = [pose_search.at_extents(scan.points, shapes_of(design)[1], one) for one in by_axes]
 
     def off(poses):
         return min(np.linalg.norm(rigid.apply(one, scan.points) - points, axis=1).max() for one in poses)
@@ -477,7 +477,7 @@ def test_a_scan_that_is_denser_at_one_end_starts_at_the_parts_place():
     assert off(by_axes) > 500.0  # the mean of nine tenths of the points at a fifth of 9 m is metres off the middle
     assert off(starts) < 60.0  # by the extents: 0.2 % of the length at either end, and the tilt of the axes
     half = scan.points[points[:, 0] < np.median(points[:, 0])]
-    np.testing.assert_array_equal(attitude.at_extents(half, design.parts[1], by_axes[0]), by_axes[0])
+    np.testing.assert_array_equal(pose_search.at_extents(half, shapes_of(design)[1], by_axes[0]), by_axes[0])
 
 
 @pytest.mark.slow

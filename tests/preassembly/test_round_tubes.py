@@ -14,6 +14,7 @@ from processor.preassembly.ends import section, tube_end
 from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
 from processor.preassembly.parts import attitude
+from processor.registration import pose_search
 from tests.support.results import measured_parts
 from tests.support.results.reasons import codes
 from tests.support.scenes import known_attitudes
@@ -141,7 +142,7 @@ def assembled(monkeypatch, **kind):
     """Of two tubes of which the first one's attitude is searched for: the second is another of its kind."""
     sizes = Sizes(parts=2, length=1600.0, radius=200.0, **kind)
     scene, truth = round_tubes.scene(sizes, seed=1, spacing=14.0)
-    monkeypatch.setattr(attitude, "FINE_POINTS", 5_000)  # of the search; all points register what it finds
+    monkeypatch.setattr(pose_search, "FINE_POINTS", 5_000)  # of the search; all points register what it finds
     monkeypatch.setattr(attitude, "find", known_attitudes.find_by(truth, "tube1"))
     result = step.run(scene, step.Params())
     return scene, truth, result

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from processor.geometry import mesh_distance, rigid
-from processor.registration import pose_choice, principal, surface_registration
+from processor.registration import pose_choice, pose_search, principal, surface_registration
 
 GIRDER = (6000.0, 800.0, 1400.0)
 PLATE = (400.0, 140.0, 14.0)  # a bracket, its upper side in the girder's middle
@@ -106,20 +106,20 @@ def test_attitude_is_ambiguous_if_contradiction_equals_evidence():
     design = structure(bracket(-1500.0, 1.0), bracket(900.0, 1.0))
     points, surface = sampled(structure(bracket(-1500.0, 1.0)), 15_000, 1, 0.0)[0], surface_of(design)
     turned = rigid.transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-    assert pose_choice.choose(points, surface, [np.eye(4), turned]) == pose_choice.Choice(best=0, rivals=())
+    poses = [(surface, np.eye(4)), (surface, turned)]
+    assert pose_choice.choose(points, poses) == [0]
     both = structure(bracket(-1500.0, 1.0), bracket(1500.0, -1.0))  # one where each of the attitudes has one
     points = sampled(both, 15_000, 1, 0.0)[0]
-    assert len(pose_choice.choose(points, surface, [np.eye(4), turned]).rivals) == 1
+    assert len(pose_choice.choose(points, poses)) == 2
 
 
 def test_turns_of_a_plate_with_a_box_on_it_keep_the_plate_in_its_plane():
     # The box tilts the principal axes by 3 degrees; a scan that is turned about them would lie across the plate.
     box = trimesh.creation.box((240.0, 170.0, 160.0), rigid.transform(np.eye(3), [-170.0, -115.0, 90.0]))
     design = trimesh.util.concatenate([trimesh.creation.box((760.0, 640.0, 20.0)), box])
-    surface = surface_of(design)
-    axes = principal.of_mesh(surface.vertices, surface.faces)
-    assert np.abs(axes.axes[2]).max() < np.cos(np.radians(2.0))
-    turns = surface_registration._turns(axes, surface)
+    surface = pose_search.prepared(surface_of(design))
+    assert np.abs(surface.axes[2]).max() < np.cos(np.radians(2.0))
+    turns = pose_search.symmetries(surface)
     assert len(turns) == 4
     for turn in turns:
         np.testing.assert_allclose(np.abs(turn[:3, :3]), np.eye(3), atol=1e-9)  # float64
@@ -128,7 +128,7 @@ def test_turns_of_a_plate_with_a_box_on_it_keep_the_plate_in_its_plane():
 def test_axes_of_a_body_without_flat_faces_along_them_stay():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=100.0)
     axes = rigid.rotation_from_vector(np.array([0.3, -0.2, 0.1]))
-    np.testing.assert_array_equal(surface_registration._along_faces(axes, surface_of(ball)), axes)
+    np.testing.assert_array_equal(principal.along_faces(axes, surface_of(ball)), axes)
 
 
 def test_a_scan_at_its_design_stays_there_beside_another_structure_of_its_size():

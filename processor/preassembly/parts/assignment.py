@@ -14,14 +14,15 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from processor.geometry import box_girder_mesh, rigid
+from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.thinning import thinned
 from processor.model import Floats, Reason, reason
 from processor.preassembly.parts import attitude, same_shape
-from processor.preassembly.parts.attitude import LEAST_EVIDENCE, TELLING_MM, Shapes, Surface
-from processor.registration import principal, surface_registration
+from processor.preassembly.parts.attitude import TELLING_MM, Shapes
+from processor.registration import pose_choice, principal, surface_registration
+from processor.registration.pose_search import DesignSurface
 
 POINTS, NEAR_POINTS = 100_000, 3_000  # of a scan, by which rough poses are compared, and their share near a design
-SAMPLES = 50_000  # of each surface: tens on a mark, also on a part of 100 m2
 NEAR_MM = surface_registration.GATES_MM[1]
 
 
@@ -72,14 +73,14 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     pieces = not alike
 
     def rough(k: int, kept: int | None = attitude.ROUGH_KEPT) -> Floats:
-        return attitude.rough(few, shapes.design.parts[k], shapes[k], pieces=pieces, kept=kept)
+        return attitude.rough(few, shapes[k], pieces=pieces, kept=kept)
 
     best, T_best = index, rough(index)
     share = _near_share(few, T_best, shapes[index])
     for other in others:
         T = rough(other)
         share = max(share, _near_share(few, T, shapes[other]))
-        if _shows_other(few, (shapes[best], T_best), (shapes[other], T)):
+        if _shows_other(few, (shapes[best].mesh, T_best), (shapes[other].mesh, T)):
             best, T_best = other, T
     # Surfaces made from design curves are not whole: points of the right part lie off them, too.
     whole = all(part.source != box_girder_mesh.SOURCE for part in shapes.design.parts)
@@ -88,28 +89,20 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     if best == index:
         return None
     # The first rough pose may have missed the part itself: a scan is called wrong only after all that are promising.
-    own = shapes[index], rough(index, None)
-    return best if _shows_other(few, own, (shapes[best], T_best)) else None
+    own = shapes[index].mesh, rough(index, None)
+    return best if _shows_other(few, own, (shapes[best].mesh, T_best)) else None
 
 
-def _near_share(points: Floats, T: Floats, surface: Surface) -> float:
+def _near_share(points: Floats, T: Floats, surface: DesignSurface) -> float:
     """Share of points (n, 3), placed by T (4, 4), near a part's surface."""
     placed = rigid.apply(T, thinned(points, NEAR_POINTS))
     _, distance, beyond = surface.mesh.distances(placed, 2.0 * NEAR_MM)
     return float(((np.abs(distance) < NEAR_MM) & (beyond < TELLING_MM)).mean())
 
 
-def _shows_other(points: Floats, part: tuple[Surface, Floats], other: tuple[Surface, Floats]) -> bool:
+def _shows_other(points: Floats, part: tuple[MeshSurface, Floats], other: tuple[MeshSurface, Floats]) -> bool:
     """Whether points (n, 3) show surface that the other part alone has, each part with its T_bridge_scan (4, 4)."""
-    of_part, of_other = (_sparse(*part), _sparse(*other))
-    part_count = attitude.shown(points, part[1], attitude.only_in(*of_part, *of_other)[0])
-    other_count = attitude.shown(points, other[1], attitude.only_in(*of_other, *of_part)[0])
-    return other_count >= max(LEAST_EVIDENCE, 2 * part_count)
-
-
-def _sparse(surface: Surface, T: Floats) -> tuple[Surface, Floats]:
-    points, normals = thinned(surface.points, SAMPLES), thinned(surface.normals, SAMPLES)
-    return replace(surface, points=points, normals=normals, facet=thinned(surface.facet, SAMPLES)), T
+    return pose_choice.choose(points, [part, other]) == [1]
 
 
 def solve(scans: Sequence[ScanParts]) -> list[ScanParts]:

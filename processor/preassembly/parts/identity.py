@@ -19,7 +19,8 @@ from processor.geometry.mesh_distance import on_face
 from processor.geometry.thinning import thinned
 from processor.model import Floats, Reason, reason
 from processor.preassembly.parts import attitude, same_shape
-from processor.preassembly.parts.attitude import LEAST_EVIDENCE, SAMPLE_SPACING_MM
+from processor.preassembly.parts.attitude import LEAST_EVIDENCE
+from processor.registration.pose_search import SAMPLE_SPACING_MM, DesignSurface
 
 AROUND = 30_000  # points that show the surface's departure near a mark: one in 50 mm on a long part
 NEIGHBOURS = 64  # of them near a sample: a circle of some 0.2 m radius
@@ -102,15 +103,15 @@ def identify(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> 
 def _compare(
     points: Floats,
     T: Floats,
-    surface: attitude.Surface,
-    other_surface: attitude.Surface,
+    surface: DesignSurface,
+    other_surface: DesignSurface,
     T_part_other: Floats,
     on_design: _Surroundings,
 ) -> _Outcome:
     """Compare with another part laid on this one in one way; ``on_design`` are some of the points."""
     T_other = rigid.invert(T_part_other) @ T
-    of_part = attitude.only_in(surface, T, other_surface, T_other)
-    of_other = attitude.only_in(other_surface, T_other, surface, T)
+    of_part = attitude.only_in(surface, T, other_surface.mesh, T_other)
+    of_other = attitude.only_in(other_surface, T_other, surface.mesh, T)
     if len(of_part[0]) + len(of_other[0]) < LEAST_EVIDENCE:
         return _Outcome.SAME
     of_other = rigid.apply(T_part_other, of_other[0]), of_other[1] @ T_part_other[:3, :3].T

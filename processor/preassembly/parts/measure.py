@@ -38,6 +38,7 @@ from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.parts.part_residuals import PartResiduals, part_residuals
 from processor.registration import icp, main_body, surface_registration
+from processor.registration.pose_search import DesignSurface
 from processor.robust_statistics import MAD_TO_SD
 
 CELL_MM = 40.0  # points of a cell are looked up one after the other
@@ -313,7 +314,7 @@ def _reasons(
         yield from first.identity.open_questions
 
 
-def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Sequence[Floats]) -> RegisteredPart:
+def _registered(used: Sequence[_PlacedScan], shape: DesignSurface, joints: Sequence[Floats]) -> RegisteredPart:
     """Join the points of the scans used, on the design; ``joints`` are the key points (8, 3) of the part's joints."""
     points = rigid.placed([(scan.registration.T_design_scan, scan.points) for scan in used])
     station, done, first = allocate(len(points), dtype=np.int64), 0, 1  # -1: of no station
@@ -354,7 +355,7 @@ def _design_edges(part: DesignPart) -> tuple[Polyline, Polyline]:
     return Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right)
 
 
-def _views(part: RegisteredPart, shape: attitude.Surface) -> _Views:
+def _views(part: RegisteredPart, shape: DesignSurface) -> _Views:
     """Propagate errors of views into the registration of a part.
 
     A view is one side of one half of the part: neither the sides nor the ends of a part are seen from one place.
@@ -375,7 +376,7 @@ def _views(part: RegisteredPart, shape: attitude.Surface) -> _Views:
     return _Views(pose, min(float(np.mean(rest**2)) * len(rest), 1.0))
 
 
-def _between_stations(points: Floats, station: Ints, shape: attitude.Surface) -> float:
+def _between_stations(points: Floats, station: Ints, shape: DesignSurface) -> float:
     """Variance between the stations of points (n, 3) on the design, mm^2."""
     station = thinned(station, surface_registration.LAST_POINTS)
     if (station == station[0]).all():
@@ -498,7 +499,7 @@ def _misfit(registration: surface_registration.SurfaceFit) -> tuple[Reason, ...]
     return ()
 
 
-def _covered(points: Floats, T: Floats, shape: attitude.Surface) -> float:
+def _covered(points: Floats, T: Floats, shape: DesignSurface) -> float:
     """Share of the design's outer faces, in slices of its length, with points (n, 3) placed by T (4, 4) on them."""
     along = shape.points @ shape.axes[:, 0]
     bounds = np.linspace(along.min(), along.max(), SLICES + 1)[1:-1]

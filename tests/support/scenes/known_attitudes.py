@@ -5,11 +5,12 @@ import numpy as np
 from processor.geometry import rigid
 from processor.model import Status
 from processor.preassembly.parts import attitude
+from processor.registration import pose_search
 
 
 def attitude_of(points, part, T):
     """The attitude that the search would find: the best of the poses by principal axes, and the true one."""
-    hypotheses = attitude.principal_hypotheses(points, part)
+    hypotheses = pose_search.by_principal_axes(points, attitude.sample_surface(part))
     turns = [rigid.rotation_angle(one[:3, :3] @ T[:3, :3].T) for one in hypotheses]
     return attitude.Attitude(hypotheses[int(np.argmin(turns))], T, Status.OK)
 
