@@ -87,7 +87,7 @@ def _mesh(path: str, name: str, shape: Any, scale: float, size: float, exact: bo
 
     def mesh(mm: float) -> int:
         if exact:
-            return tessellation.mesh_edges_finer(shape, mm, brep_faces.is_meshed_finer, large=size > LARGE_MM)
+            return tessellation.mesh_faces(shape, mm, brep_faces.is_meshed_finer, large=size > LARGE_MM)
         return tessellation.mesh_faces(shape, mm / scale, large=size > LARGE_MM)
 
     return finest_mm(path, name, size, MOST_TRIANGLES, mesh)

@@ -24,23 +24,18 @@ from processor.model import Floats, Ints
 FINER = 0.1  # of the deviation aimed at: a face that no mesh could be made for may have one with more points
 
 
-def mesh_faces(shape: Any, tolerance_mm: float, *, large: bool = False) -> int:
+def mesh_faces(
+    shape: Any, tolerance_mm: float, finer: Callable[[Any], bool] | None = None, *, large: bool = False
+) -> int:
     """Mesh every face of a shape, in place of any earlier mesh; return the number of triangles.
 
-    ``large`` selects the kernel's other algorithm, whose time does not grow with the square of a face's triangles.
+    Faces for which ``finer`` is true are meshed EDGE_SHARE times as coarse. The kernel keeps the edges of faces that
+    have been meshed, so the other faces have finer edges, too. ``large`` selects the kernel's other algorithm, whose
+    time does not grow with the square of a face's triangles.
     """
     BRepTools.Clean_s(shape)
-    _mesh(shape, tolerance_mm, large)
-    return _triangles(shape)
-
-
-def mesh_edges_finer(shape: Any, tolerance_mm: float, finer: Callable[[Any], bool], *, large: bool = False) -> int:
-    """Mesh a shape as :func:`mesh_faces`, but the faces for which ``finer`` is true EDGE_SHARE times as coarse.
-
-    The kernel keeps the edges of faces that have been meshed, so the other faces have finer edges, too.
-    """
-    BRepTools.Clean_s(shape)
-    _mesh(_compound(face for face, _, _ in meshes(shape) if finer(face)), EDGE_SHARE * tolerance_mm, large)
+    if finer is not None:
+        _mesh(_compound(face for face, _, _ in meshes(shape) if finer(face)), EDGE_SHARE * tolerance_mm, large)
     _mesh(shape, tolerance_mm, large)
     return _triangles(shape)
 

@@ -77,7 +77,8 @@ def grade(points: Floats, fit: RobustFit, least_points: int, radius_held: bool, 
     ball, on, residual = fit.sphere, points[fit.inliers], fit.residuals[fit.inliers]
     if not determined(points, fit, least_points) or not redundant(on, fit, radius_held):
         return Grade.NONE
-    smooth = fit.scale <= ROUGHEST * ball.radius and misfit(on, residual, ball, fit.scale) <= largest_misfit(fit)
+    most_misfit = max(MISFIT * fit.scale, ROUND * ball.radius)  # systematic part of the residuals, mm
+    smooth = fit.scale <= ROUGHEST * ball.radius and misfit(on, residual, ball, fit.scale) <= most_misfit
     if not smooth and limits.likely_facing is None:
         return Grade.NONE
     rows = rows_of_cells(points, ball.radius / EVIDENCE_CELLS)
@@ -242,8 +243,3 @@ def misfit(points: Floats, residual: Floats, ball: Sphere, scale: float) -> floa
     count = np.bincount(cell)
     mean = np.bincount(cell, residual) / count
     return float(np.median(np.sqrt(np.maximum(mean**2 - scale**2 / count, 0.0))[cell]))
-
-
-def largest_misfit(fit: RobustFit) -> float:
-    """Return the systematic part of the residuals, mm, up to which a fit is that of a ball."""
-    return max(MISFIT * fit.scale, ROUND * fit.sphere.radius)

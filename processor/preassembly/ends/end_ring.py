@@ -26,10 +26,10 @@ from processor.preassembly.ends import plate_sides
 from processor.robust_statistics import robust_sd_about_median
 
 REACH = 4.0  # standard deviations from ring and walls
-LEAST_REACH_MM = 3.0
+LEAST_REACH_MM = 3.0  # of a quiet scan too: a cut edge is rough by less
 SECTORS = 24  # of the ring
 OUTLIER_SHARE = 0.005  # of the points, uniform over the window
-LEAST_POINTS = 40
+LEAST_POINTS = 40  # five a coefficient of the ring
 FLOOR_MM = 0.01  # of the noise
 
 
@@ -73,7 +73,7 @@ def fit(x: Floats, e: Floats, thickness: Floats, basis: Floats, sigma_mm: float)
         x0 = basis @ coefficients
         ring, wall, outlier, mass = _mixture(x - x0, e, t, sigma, densities, reach, x0 - window)
         z, total, edge = (x - x0) / sigma, ring + wall + outlier, (densities.outer + densities.inner) / mass
-        of_ring, of_wall, hazard = ring / total, wall / total, _hazard(-z)
+        of_ring, of_wall, hazard = ring / total, wall / total, _phi(-z) / np.maximum(ndtr(-z), 1e-300)
         slope = (of_ring * z + of_wall * hazard) / sigma
         # Minus the second derivative of log(density / mass), point by point (Louis 1982).
         bend = (of_ring * (1.0 - z**2) - of_wall * hazard * z) / sigma**2 + slope**2 - edge**2
@@ -147,9 +147,3 @@ def _mixture(
 def _phi(z: Floats) -> Floats:
     density: Floats = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
     return density
-
-
-def _hazard(z: Floats) -> Floats:
-    """phi(z) / Phi(z)."""
-    hazard: Floats = _phi(z) / np.maximum(ndtr(z), 1e-300)
-    return hazard

@@ -7,13 +7,14 @@ the plates at each end is tested; all tests of a bridge together fail by chance 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
 
 from processor.adjustment import global_test, kriging
-from processor.model import Bools, Reason, reason
+from processor.model import Reason, reason
 from processor.preassembly.ends import view_variance
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import FittedEnd
@@ -48,13 +49,15 @@ def find(parts: Sequence[Examined]) -> list[tuple[Reason, ...]]:
     for part, beyond in zip(parts, of_edges, strict=True):
         reasons = []
         for joint, end in part.ends:
+            faces = compress(end.place.section.faces, of_faces[number])
             why = (
-                *_of_faces(end, of_faces[number]),
+                *_of_faces("preassemble.face-contradicts-noise", (face.name for face in faces)),
                 *((reason("preassemble.plates-contradict-views"),) if of_plates[number] else ()),
             )
             reasons += [reason("preassemble.at", place=joint, reasons=why)] if why else []
             number += 1
-        found.append((*reasons, *_of_edges(beyond)))
+        names = (OF_EDGES[edge][axis] for edge, axis in np.argwhere(beyond))
+        found.append((*reasons, *_of_faces("preassemble.edge-contradicts-noise", names)))
     return found
 
 
@@ -69,13 +72,8 @@ def _of_no_other(end: FittedEnd, ends: Sequence[FittedEnd]) -> bool:
     return False
 
 
-def _of_faces(end: FittedEnd, beyond: Bools) -> tuple[Reason, ...]:
-    failed = {face.name for face, one in zip(end.place.section.faces, beyond, strict=True) if one}
-    names = tuple(name for name in PlateFace if name in failed)
-    return (reason("preassemble.face-contradicts-noise", faces=names),) if names else ()
-
-
-def _of_edges(beyond: Bools) -> tuple[Reason, ...]:
-    names = {OF_EDGES[edge][axis] for edge, axis in np.argwhere(beyond)}
-    faces = tuple(name for name in PlateFace if name in names)
-    return (reason("preassemble.edge-contradicts-noise", faces=faces),) if faces else ()
+def _of_faces(code: str, names: Iterable[PlateFace]) -> tuple[Reason, ...]:
+    """Return the reason of a code for the faces of these names, in the order of PlateFace; none for no face."""
+    given = set(names)
+    faces = tuple(name for name in PlateFace if name in given)
+    return (reason(code, faces=faces),) if faces else ()

@@ -18,7 +18,7 @@ from processor.report.charts.stepped_colours import Band
 from processor.report.deviation import core_points_csv, face_maps, figures
 from processor.report.step_report import StepReport
 from processor.report.style import CaptionedPngs, Drawn
-from processor.report.table import Table, figures_of
+from processor.report.table import figures_of
 
 MAP, HISTOGRAM = "deviation-map.png", "deviation-histogram.png"
 LIMIT = "deviation_mm"  # of a project
@@ -58,10 +58,6 @@ def _summary(result: Result) -> tuple[Message, Message]:
     if result.status is Status.OK:
         return head, body
     return head, text("{reason}. {rest}", reason=result.reasons[:1], rest=body)
-
-
-def _tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
-    return [figures_of("Deviation of the surface from the design", runs, "deviation-figures")]
 
 
 def _band(scene: Scene, run: StepRun) -> Band:
@@ -109,7 +105,7 @@ def _live(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
 REPORT = StepReport(
     title=text("Deviation"),
     summary=_summary,
-    tables=_tables,
+    tables=lambda runs, _: [figures_of("Deviation of the surface from the design", runs, "deviation-figures")],
     figures=lambda *given: Drawn(_figures(*given)),
     files=_files,
     interactive_data=_live,

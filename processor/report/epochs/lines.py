@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from processor.epochs.change import Component, Finding
 from processor.epochs.compare import History
 from processor.epochs.quantity_series import Kind
 from processor.language.messages import Message, text
 from processor.report.epochs.tables import day, ordered
 
-MOST_LINES, FEWEST_CHANGES = 15, 3
+MOST_LINES, FEWEST_CHANGES = 15, 3  # a terminal's half; of remarks some give way to changes
 WITH_KIND = (Kind.JOINT, Kind.BALL, Kind.PART, Kind.MEMBER)  # names that alone do not say what they are of
 COUNTED = {
     Kind.JOINT: "{changed} of {total} {total:?joint|joints}",
@@ -56,7 +54,11 @@ def counts(history: History) -> list[Message]:
 
 def lines(history: History, page: str) -> list[Message]:
     """Return the headline, what changed, what the epochs have in common, and where the page is."""
-    changed = list(_changed(history))
+    changed = [
+        _line(history, one)
+        for one in ordered(history)
+        if one.finding in (Finding.CHANGED, Finding.DOUBTFUL) and not one.follows and one.leading is not None
+    ]
     room = MOST_LINES - 2
     remarks: list[Message] = [text("note: {remark}", remark=remark) for remark in history.remarks]
     remarks = remarks[: room - min(len(changed), FEWEST_CHANGES)]
@@ -65,12 +67,6 @@ def lines(history: History, page: str) -> list[Message]:
         more = text("... and {count} more; --verbose prints the tables", count=len(changed) - left + 1)
         changed = [*changed[: left - 1], more]
     return [headline(history), *changed, *remarks, text("report: {page}", page=page)]
-
-
-def _changed(history: History) -> Iterator[Message]:
-    for one in ordered(history):
-        if one.finding in (Finding.CHANGED, Finding.DOUBTFUL) and not one.follows and one.leading is not None:
-            yield _line(history, one)
 
 
 def _line(history: History, one: Component) -> Message:

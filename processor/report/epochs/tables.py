@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from processor.epochs.change import Change, Component, Finding
+from processor.epochs.change import Component, Finding
 from processor.epochs.compare import History
 from processor.language.messages import Message, label, text
 from processor.report.columns import columns, given
@@ -64,7 +64,8 @@ def _components(history: History) -> Table:
         (
             one.name, one.finding, "" if one.leading is None else one.leading.series.quantity,
             *(NAN if one.leading is None else float(one.leading.series.value[e]) for e in epochs),
-            *_of_change(one.leading), "" if one.leading is None else one.leading.series.unit, day(history, one.since),
+            *((NAN, NAN) if one.leading is None else (one.leading.value, one.leading.ci95)),
+            "" if one.leading is None else one.leading.series.unit, day(history, one.since),
             one.step, ", ".join(one.follows),
         )
         for one in ordered(history)
@@ -83,10 +84,6 @@ def _components(history: History) -> Table:
         *columns("change", "ci95", "unit", "since", "step", "follows"),
     )
     return Table(text("Components over the epochs"), header, rows, COMPONENTS, note)
-
-
-def _of_change(change: Change | None) -> tuple[float, float]:
-    return (NAN, NAN) if change is None else (change.value, change.ci95)
 
 
 def _epochs(history: History) -> Table:
