@@ -34,7 +34,7 @@ INDEX = "index.csv"
 # Columns of the index by their numbers in the card.
 NUMBERS = {"surface": "points_surface", "mixed": "points_mixed", "outlier": "points_outlier", "defects": "defects"}
 MOST_SCENES = 99_999  # in one folder: file names number them by five digits
-MOST_SEED = 2**63
+MOST_SEED = 2**63  # seeds are stored as int64
 SOFTWARE = ("h5py", "numba", "numpy", "scipy")  # packages that a scene's bytes depend on; CAD solids are no part of it
 SCENE_FILE = re.compile(r".+-\d{5}-seed\d+\.h5")
 OF_SET = (INDEX, card.CARD_JSON, card.CARD_PAGE)

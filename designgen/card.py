@@ -20,7 +20,7 @@ CARD_JSON, CARD_PAGE = "card.json", "card.md"
 TRAIN, VALIDATION, TEST = "train", "validation", "test"
 # By the seed modulo 20: 70, 15 and 15 %, and any eight seeds in a row have all three.
 TURN = 20
-SPLITS = {**dict.fromkeys((3, 9, 15), VALIDATION), **dict.fromkeys((6, 12, 18), TEST)}
+SPLITS = {**dict.fromkeys((3, 9, 15), VALIDATION), **dict.fromkeys((6, 12, 18), TEST)}  # all other seeds train
 SPLIT_RULE = (
     "by the seed modulo 20: validation 3, 9, 15; test 6, 12, 18; train all others. Scenes of one seed are the same "
     "structure under other settings and stay in one split; a larger set later moves no scene."

@@ -14,7 +14,7 @@ from designgen.export import FORMATS
 from processor.plain_text import printable
 from processor.progress import stage
 
-DONE, IN_PART, ALL_FAILED = 0, 1, 2
+DONE, IN_PART, ALL_FAILED = 0, 1, 2  # exit codes; 2 is also that of wrong usage, after which nothing is made either
 json_option = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 debug_option = click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 

@@ -32,10 +32,10 @@ class NoRoomError(OSError):
     """The disk has no room for arrays."""
 
 
-BLOCK_ROWS = 1 << 18
+BLOCK_ROWS = 1 << 18  # of three float64: 6 MB, which a processor's cache holds in part; work, not result
 AT_ONCE = 1 << 20  # rows that are sorted in memory: more are sorted part by part, with the same result
 SUMMED = 128  # numbers that numpy adds in a loop
-PIVOTS = 255
+PIVOTS = 255  # numbers of a sample, between which all are counted in one pass: work, not result
 MEMORY_BYTES = 1 << 26  # of arrays in memory, about 2 million points
 LEAST_BYTES = 1 << 16  # of an array in a file
 TOUCHED_BYTES = 1 << 25  # written one after the other before their pages are given back

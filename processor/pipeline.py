@@ -31,7 +31,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-PIECEWISE_POINTS = 5_000_000
+PIECEWISE_POINTS = 5_000_000  # work, not result: 5 million points are 120 MB, and steps hold several times as much
 SAMPLED_TILES = 64  # of all scans of a scene file, a million points: where these are used once, all are
 SOFTWARE = ("numpy", "scipy", "h5py")
 

@@ -13,8 +13,8 @@ from typing import TypeVar
 from processor.plain_text import printable
 
 Item = TypeVar("Item")
-PATIENCE_S = 2.0
-REFRESH_S = 0.25
+PATIENCE_S = 2.0  # a shorter stage needs no line
+REFRESH_S = 0.25  # as often as a moving number can be read
 FIRST_LINE_S, LINE_S = 10.0, 30.0  # off a terminal: a log is read afterwards, or by somebody who waits
 COUNTED = "{desc}: {n_fmt} of {total_fmt} |{bar}| {elapsed}, {remaining} left"
 UNCOUNTED = "{desc}: {elapsed}"

@@ -16,12 +16,12 @@ from designgen.designs.arch_part import ArchPart, Hole, Plates
 from designgen.designs.space_frame import Frame
 from processor.model import AsBuilt, Floats, UsageError
 
-EXPANSION_PER_K = 12e-6
-MOST_GAP_MM = 500.0
+EXPANSION_PER_K = 12e-6  # of structural steel (EN 1993-1-1, 3.2.6)
+MOST_GAP_MM = 500.0  # chosen: no joint is welded across as much: a number was mistyped
 CORNER_REACH_MM = 1500.0  # distance from an end over which the errors of its corners fade out
-REFERENCE_C = 20.0
+REFERENCE_C = 20.0  # at which a design's lengths hold (ISO 1)
 MOST_DRAWS = 200  # attempts to find a place for a dent or a missing piece
-LEAST_PLATE_MM = 2.0
+LEAST_PLATE_MM = 2.0  # chosen: thinner than any plate of a bridge, so that its two sides stay apart
 LEAST_SHARE = 0.5  # least size of a section as a fraction of its design
 MOST_FILLED = 0.9  # largest fraction of a section's size that plates may take
 

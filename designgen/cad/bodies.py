@@ -16,7 +16,7 @@ EDGE_SHARE = 0.1  # of it at edges, where the forms of faces are known: a scanne
 ANGLE_RAD = 0.1  # largest angle between adjacent facets of a curved face
 COARSE_SHARE = 1e-3  # deviation of the first mesh as a fraction of the body's size
 COARSER = 10.0  # largest ratio of the deviations of a mesh and the next
-LARGEST_MM = 1e9
+LARGEST_MM = 1e9  # 1000 km: a unit is wrong; as large as a record allows a coordinate to be
 NO_UNIT = "states no known unit of length; name it with --units"
 UNITS_MM = {
     "millimetre": 1.0, "mm": 1.0, "centimetre": 10.0, "cm": 10.0, "decimetre": 100.0, "metre": 1000.0, "m": 1000.0,

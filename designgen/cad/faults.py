@@ -13,7 +13,7 @@ from processor.model import Bools, Floats, Ints
 TOUCHING_MM = 0.1  # bodies that run into each other by less are in contact: chords of round faces depart by half of it
 MOST_POINTS = 400  # of a body, by which it is tried whether it lies in another one
 MOST_PRODUCTS, ALL_PRODUCTS = 2_000_000, 100_000_000  # points times triangles of a pair, and of all
-MOST_PAIRS = 20_000
+MOST_PAIRS = 20_000  # work: bodies of one structure meet few others; what is beyond is not compared
 JITTER_MM = np.array([1.3e-5, 2.1e-5, 1.7e-5])  # so that no ray meets an edge between two triangles
 TINY_MM, HUGE_MM = 10.0, 1e6  # sizes of a structure beyond which its unit is doubtful
 

@@ -28,7 +28,7 @@ MAGIC, END = b"ISO-10303-21", b"END-ISO-10303-21"
 LIMIT_S = 600.0  # time for reading a file
 MEMORY_BYTES = 8 * 10**9  # memory for reading a file, where the platform can limit it
 CHILD = "from designgen.cad import process; process.serve()"
-FILE_NAME_BYTES = 200
+FILE_NAME_BYTES = 200  # file systems allow 255: a number and a suffix follow
 
 
 def unit_mm(name: str) -> float:

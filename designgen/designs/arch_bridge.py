@@ -12,7 +12,7 @@ from designgen.designs import arch_foot, arch_rib
 from designgen.designs.arch_part import ArchPart, Plates
 
 ABOUT = "arch bridge: two feet and ribs in a row along a parabola, catenary or circle"
-MOST_PARTS = 100
+MOST_PARTS = 100  # work: bridges have some ten
 
 
 @dataclass(frozen=True)

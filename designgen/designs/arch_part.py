@@ -17,11 +17,11 @@ from processor.model import Bools, Floats
 if TYPE_CHECKING:
     import cadquery as cq
 
-SECTION_STEP_MM = 250.0
+SECTION_STEP_MM = 250.0  # of a solid: its spline is off an arch of 20 m radius by 4e-6 mm
 BUILT_STEP_MM, STRIPS = 50.0, 8  # of a solid as built: sections along it, and strips of each of its sides
-EDGE_STEP_MM = 20.0
+EDGE_STEP_MM = 20.0  # of the polyline of an edge: its sagitta is 2.5 um at a radius of 20 m
 NET_STEP_MM, NET_ACROSS = 250.0, 6  # cells of the nets that rays meet before the surface itself
-PAD_SIZE_MM, PAD_HEIGHT_MM = 200.0, 20.0
+PAD_SIZE_MM, PAD_HEIGHT_MM = 200.0, 20.0  # of the mark that tells ends and attitudes apart
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 ABOUT = "bolt ball: sphere with milled flats, threaded holes and a process hole"
 CONE_EDGE_MM = 3.0  # by which the wide end of a cone is larger than the sleeve's corners
-PROCESS_HOLE_RADIUS_MM, PROCESS_HOLE_DEPTH_MM = 10.0, 35.0
+PROCESS_HOLE_RADIUS_MM, PROCESS_HOLE_DEPTH_MM = 10.0, 35.0  # chosen: M20, at the lowest point
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,7 @@ class Connection:
         return Connection(**{key: factor * size for key, size in dataclasses.asdict(self).items()})
 
 
+# By diameters of tubes that are usual in China; bolts, sleeves and cones are chosen, growing with the tube.
 CONNECTIONS = (
     Connection(60.0, 20.0, 34.0, 35.0, 50.0),
     Connection(75.5, 24.0, 41.0, 40.0, 60.0),

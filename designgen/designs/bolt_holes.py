@@ -18,7 +18,7 @@ from processor.model import Bools, Floats
 
 AROUND = 64  # knots of the net around a hole; a multiple of 8, so that the corners of the square are among them
 SQUARE = 1.4  # half the side of the square around a hole, in radii
-ON_MM = 1e-6
+ON_MM = 1e-6  # rounding: holes are placed on the edge of a face by the same numbers
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from designgen.designs.parametric_face import Patch
 from designgen.designs.sections import Section
 from processor.model import Bools, Floats, Ints
 
-NET_MM = 250.0
+NET_MM = 250.0  # work: of the net that rays meet before the plane itself, which is exact for any step
 PAD_SIZE_MM, PAD_HEIGHT_MM = 200.0, 20.0  # of the mark that tells a part's ends and attitudes apart
 JOINED_MM = 1e-6  # vertices this near to each other are one
 FADES_MM = 1500.0  # from an end, over which its errors fade out

@@ -20,7 +20,7 @@ from processor.model import Floats, InputError, Ints, UsageError
 
 PYTHON = ".py"
 SUFFIXES = (*files.STEP_SUFFIXES, *files.IFC_SUFFIXES, *mesh_files.SUFFIXES, PYTHON)
-MOST_NOTES = 12
+MOST_NOTES = 12  # lines: a screen half full; the rest is counted
 LOG = logging.getLogger("designgen")  # without a handler, its warnings are lines on standard error
 
 

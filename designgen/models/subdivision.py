@@ -13,7 +13,7 @@ from designgen.models.mesh_topology import edges_of
 from designgen.models.model import ModelBody
 from processor.model import Floats, Ints
 
-MOST_ROUNDS = 40
+MOST_ROUNDS = 40  # of halving: edges are shorter by 2**40 then, beyond any use
 # Corners and middles of edges (3: of corners 0 and 1, 4: of 1 and 2, 5: of 2 and 0) of the triangles that replace one,
 # by the number of its edges that are divided; with one the first edge is divided, with two the first and second.
 DIVIDED = {

@@ -12,7 +12,7 @@ from designgen.randomness import generator
 from processor.model import Bools, Floats, Picks, Scan, UsageError
 
 AWAY_FROM_A_LINE = 0.15  # least extent of the points across their line, as a fraction of their largest distance
-MOST_DRAWS = 10_000
+MOST_DRAWS = 10_000  # work: then places far enough apart are given up
 PLACES = ("points", "corners")
 CORNER_REACH_MM = 100.0  # from a corner that a scan saw to a point of it
 

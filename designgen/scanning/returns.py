@@ -26,9 +26,10 @@ from designgen.scanning.surfaces import Surfaces
 from processor.model import SOURCES, Bools, Codes, Floats, Labels, Shorts
 
 STRIP = 64  # columns processed at a time
+# Elevation of a scanner's rays: 300 degrees in a vertical plane, as of phase scanners; the base hides the rest.
 LOWEST_DEG, HIGHEST_DEG = -60.0, 90.0
 TAN_MOST = 20.0  # largest tangent of the angle of incidence, for the noise due to the footprint
-SPECKLE_LOOKS = 8.0
+SPECKLE_LOOKS = 8.0  # chosen: the signal scatters by 1 / sqrt(8) = 35 %, independent speckles in a footprint
 ENCODER_SIGMAS = 7.0  # bound of a normal deviate in 32 bits
 LEAST_SHARE = 0.25  # least fraction of the beam's energy that gives a return
 SURFACE, MIXED, OUTLIER = range(len(SOURCES))

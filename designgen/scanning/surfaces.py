@@ -20,7 +20,7 @@ from designgen.scanning import triangle_tree
 from designgen.scanning.triangle_tree import Tree
 from processor.model import Floats, Ints, Labels
 
-SPHERE, CONE, DISC, TRIANGLE = range(4)
+SPHERE, CONE, DISC, TRIANGLE = range(4)  # kinds of surfaces
 NUMBERS = 14  # of a shape: see Builder
 MANY = 20_000  # triangles of a scene from which a tree is used; the results are the same
 FLAT_MM = 1e-7  # a face this close to a plane is plane, and its net is exact

@@ -16,7 +16,7 @@ from designgen.scanning.surfaces import TRIANGLE
 from designgen.scanning.triangle_tree import STACK, Tree, enters
 from processor.model import Floats, Ints
 
-NO_CUTS = np.empty((0, 4))
+NO_CUTS = np.empty((0, 4))  # a triangle has no caps cut off
 
 
 class TreeView(NamedTuple):

@@ -15,9 +15,9 @@ from numba import njit
 from processor.model import Bools, Floats, Ints
 
 LEAF = 4  # triangles at which a node is not divided any more
-BINS = 16
+BINS = 16  # work: places tried for a cut along an axis; more hardly improve a tree (Wald 2007)
 MOST_DEPTH = 48  # of nodes divided by the surface area heuristic; deeper ones are halved
-STACK = 160
+STACK = 160  # entries, two a level: MOST_DEPTH and the 32 of halving 4e9 triangles
 SLACK = 1e-9  # of the largest coordinate: boxes are larger by it, as the test of a triangle has a slack, too
 MORE, LEAST_MORE = 1, 300_000  # pieces of long triangles in addition: by the number of triangles, and at least
 MOST_PIECES = 64  # of a triangle

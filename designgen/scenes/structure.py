@@ -38,7 +38,7 @@ from processor.model import (
 )
 
 NEXT_WINDOW_MM = 9_000.0  # from one scan of a station to the next, of a scanner that does not turn
-TRUTH_STEP_MM = 250.0
+TRUTH_STEP_MM = 250.0  # between places where the truth states a movement, which is smooth over metres
 Components = tuple[boxes_and_tubes.Component, ...]
 PartPatches = list[tuple[int, Patch]]  # the row of the component of each face
 OfDefects = Callable[[Floats, PointLabels], Labels]  # points in the design's frame -> defect of each

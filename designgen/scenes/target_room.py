@@ -19,8 +19,9 @@ from designgen.scenes import MADE_IN_MM
 from processor.model import Control, Floats, Scene, TargetKind, TargetSearch, TargetTruth, Truth, UsageError
 
 WALL, FLOOR, STEEL, WHITE, BLACK = 1.1, 0.7, 0.5, 1.8, 0.1  # multiples of the scan's reflectance
+# Board's thickness; column's side; least distance and rim of targets: chosen, no two images overlap.
 OFF_WALL_MM, COLUMN_MM, APART_MM, BORDER_MM = 4.0, 300.0, 700.0, 15.0
-MOST_DRAWS = 500
+MOST_DRAWS = 500  # work: far more than a room that has space for its targets takes
 DECOYS = ("edge", "square", "corner", "stripes", "cross", "chess", "disc", "diagonal")
 
 

@@ -21,11 +21,11 @@ from processor.adjustment import global_test
 from processor.adjustment.model_averaging import weights_by_others
 from processor.model import Floats
 
-SIZES_MM = (0.03, 0.1, 0.3, 1.0, 3.0)
-LENGTHS_MM = (100.0, 200.0, 400.0)
+SIZES_MM = (0.03, 0.1, 0.3, 1.0, 3.0)  # chosen: half a decade apart, from a mesh's error to a plate's waves
+LENGTHS_MM = (100.0, 200.0, 400.0)  # chosen: by factors of two, up to a zone's length
 # A process of size 0 has no length; every other size has all lengths with equal weight.
 HYPOTHESES = ((0.0, LENGTHS_MM[0]), *product(SIZES_MM, LENGTHS_MM))
-PRIOR = np.array([0.5, *(0.5 / (len(HYPOTHESES) - 1),) * (len(HYPOTHESES) - 1)])
+PRIOR = np.array([0.5, *(0.5 / (len(HYPOTHESES) - 1),) * (len(HYPOTHESES) - 1)])  # none: 0.5
 LEAST_SHARE = 1e-4  # a hypothesis of less weight is left out of the average
 
 

@@ -19,7 +19,7 @@ from processor.model import NORMAL_95, Floats
 
 DRAWS = 10_000  # of the errors, for the width of the band
 CLEAR_SD = 4.0  # a value this many standard deviations of their difference below the greatest is not the greatest
-EXACT_MM = 1e-9
+EXACT_MM = 1e-9  # rounding: values without an error that are equal stay among the greatest
 
 
 def of_independent(values: Floats, sd: Floats, axes: int = 1) -> tuple[float, float, float]:

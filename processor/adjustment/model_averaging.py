@@ -17,12 +17,13 @@ from scipy.special import chdtrc
 
 from processor.model import Bools, Floats, Ints
 
+# Chosen: from none through the noise of a mean to a bent part, half a decade apart.
 SIZES_MM = (0.0, 0.1, 1.0, 3.0, 10.0, 30.0)
 LEAST_SHARE = 1e-4  # a hypothesis of less weight is left out of the average
 LEAST_MM = 1e-4  # standard deviation that keeps a covariance invertible where a departure is known to be zero
 ROUNDS = 50  # until the weights that each other's rows determine have converged
 LENGTHS_MM = (400.0, 1200.0, 4000.0)  # correlation lengths of a curve along a part
-LEAST_VALUES = 5
+LEAST_VALUES = 5  # more than the three that a line and a scatter about it take
 
 
 @dataclass(frozen=True)

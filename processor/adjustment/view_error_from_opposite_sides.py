@@ -16,7 +16,7 @@ from processor.model import Floats, Ints
 from processor.robust_statistics import CHI2_MEDIAN
 
 FEWEST_PLACES = 3  # of a piece
-FEWEST_PAIRS = 8
+FEWEST_PAIRS = 8  # a variance of 8 is known to 50 % (sqrt(2 / 8)); of fewer the class of the scanner says more
 FLOOR_MM = 1e-3  # least noise, for scans without any
 BESIDE = 0.25  # of a piece's side, the most by which two sides lie beside each other
 OPPOSED = -0.9  # largest cosine between the normals of two sides

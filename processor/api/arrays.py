@@ -33,8 +33,8 @@ from processor.space_frame.result import Flag, Result
 from processor.space_frame.spheres import search_without_design
 from processor.targets import sphere_of_crop
 
-LEAST_POINTS = 10
-LEAST_SCAN_POINTS = 100
+LEAST_POINTS = 10  # of a sphere: four determine it, and six are left to show whether it is one
+LEAST_SCAN_POINTS = 100  # of a scan or cloud: the least that a registration uses
 LEAST_RADIUS_MM = 1.0  # no target is smaller: the radius is in metres
 MOST_RADIUS_SHARE = 5.0  # of the span of the points; a cap of a larger sphere cannot be told from a plane
 LEAST_RANGE_MM = 100.0  # median distance of the points; no scanner measures nearer than that

@@ -16,7 +16,7 @@ MARKS = (PROJECT, *DESIGNS)
 NOT_INPUTS = (*NOT_SCANS, TRUTH, RESULTS_H5)
 STATE = ".batch"  # folder of a batch's state, in that of its results
 PROSE = (".txt", ".csv", ".asc")  # may hold anything
-PEEK = 1 << 16
+PEEK = 1 << 16  # bytes, in which a text of points has a row of numbers
 POINT = re.compile(rb"^[^\w+-]*(?:[+-]?\d[\d.,eE+-]*[\s;,|]+){2}[+-]?\d", re.M)
 
 

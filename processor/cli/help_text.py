@@ -6,6 +6,7 @@ import click
 
 from processor.model import did_you_mean
 
+# As of processor.jobs.exit_codes.
 EXIT_CODES = (
     (0, "done"),
     (1, "done in part: a step, a scan or an input failed; standard error has the reason"),

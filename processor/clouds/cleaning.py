@@ -23,7 +23,7 @@ from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Bools, Floats
 from processor.writers.cloud import Block, Cloud
 
-NEIGHBOURS, RATIO = 20, 3.0
+NEIGHBOURS, RATIO = 20, 3.0  # as those of step deviation; beyond 3 standard deviations is 1 of 740 normal distances
 LEAST_RANGE_MM = 1.0
 HALO = 20.0  # spacings of a cloud, within which the neighbours of a point are searched beyond its slab
 OfDesign = Callable[[Floats], Bools]  # marks points (n, 3), less the origin of a cloud, that are of the design

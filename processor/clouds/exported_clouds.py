@@ -20,7 +20,7 @@ from processor.writers.cloud import BLOCK, COLOURS, COLUMN, GRID, INTENSITY, ROW
 
 FULL = 65535  # intensities up to here that are whole numbers are written as they are
 SINGLE = np.dtype(np.float32)
-SAME_MM = 1e-3
+SAME_MM = 1e-3  # rounding: copies of one scanner's place in several scans, far below any error of a station
 FOUND_MM = 200.0  # core points lie on the design's surface: its samples are nearer
 
 

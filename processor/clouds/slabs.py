@@ -16,7 +16,7 @@ from processor.writers.cloud import BLOCK, Block, Cloud
 from processor.writers.ply import records
 
 MOST = 1_500_000  # points of a slab, unless more lie within one bin across the axis
-BINS = 1 << 16
+BINS = 1 << 16  # work: 1 mm on 65 m; a slab is cut at one of them
 Records = npt.NDArray[np.void]
 
 

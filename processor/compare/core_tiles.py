@@ -21,7 +21,7 @@ from processor.tiles import Shared
 
 CORE_POINTS = 50_000  # of a tile
 CLOUD_POINTS = 1_000_000  # of a cloud about a tile: of more the tile is halved
-ROUNDING = 1.0 + 1e-9
+ROUNDING = 1.0 + 1e-9  # a box never leaves out a point that rounding puts within reach
 EQUALLY_NEAR = 4  # points at one place that are distinguished
 
 

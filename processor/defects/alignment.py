@@ -25,22 +25,22 @@ from processor.model import Columns, Floats, Ints
 from processor.robust_statistics import cauchy, robust_sd
 from processor.views import Views
 
-BLOCK_MM = 80.0
+BLOCK_MM = 80.0  # chosen: less than a plate's waves, so that a block has one deviation; many points in each
 BLOCK_RAD = 0.25  # of a block around a tube: within it, a movement of the tube is nearly one deviation
 # Largest and least standard deviations of a station's error: rotation (rad), translation (mm), range offset (mm).
 PRIOR = np.array([2e-4] * 3 + [3.0] * 3 + [2.0])
-LEAST_PRIOR = np.array([1e-6] * 3 + [0.02] * 3 + [0.02])
+LEAST_PRIOR = np.array([1e-6] * 3 + [0.02] * 3 + [0.02])  # 0.01 mm at 10 m, and 0.02 mm: no block shows as much
 # Of the class of scanners, whose error of a view is a translation and a range offset, with the degrees of freedom that
 # an uncertainty by a factor of two amounts to: two or three stations hardly show their own standard deviations.
 CLASS = np.array([0.0] * 3 + [np.sqrt(0.5) * scanner_class_errors.VIEW_SD_MM] * 4)
-CLASS_FREE = np.array([0.0] * 3 + [4.0] * 4)
+CLASS_FREE = np.array([0.0] * 3 + [4.0] * 4)  # nothing is known of the class's rotation
 GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of parameters with one variance component each
-WHOLE_PRIOR = np.array([5e-3] * 3 + [50.0] * 3)
+WHOLE_PRIOR = np.array([5e-3] * 3 + [50.0] * 3)  # of the whole (rad, mm): as far as a coarse pose is off
 FLOOR_MM = 0.15  # standard deviation of a block's mean: beams, encoders and the roughness of the steel
 FEWEST_COMPONENTS = 3  # to fit the whole by: of fewer, a component that moved cannot be identified
 ROUNDS, STILL_MM = 12, 1e-4  # a step of the whole that moves all blocks by less is the last
 MOST_ROUNDS, SETTLED = 40, 0.05  # of the stations' variance components, and the relative change of the last round
-CAUCHY = 2.385
+CAUCHY = 2.385  # 95 % efficient at the normal law (Holland and Welsch 1977)
 PAIRS_AT_ONCE = 1 << 18  # of cell and station, whose derivatives are in memory together
 MOST_COUPLED = 3_000_000  # blocks times stations, beyond which stations are not fitted
 

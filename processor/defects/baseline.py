@@ -31,16 +31,16 @@ from processor.model import NORMAL_95, Bools, Floats, Ints, Scene, Status, Struc
 from processor.registration import icp, pfh
 from processor.robust_statistics import robust_sd_about_median
 
-VOXEL_SPACINGS = 1.5
+VOXEL_SPACINGS = 1.5  # chosen: two or three points a voxel
 RADIUS_VOXELS = 2.5  # radius of the neighbourhood that density is counted in
-FEATURE_VOXELS = 3.6
+FEATURE_VOXELS = 3.6  # chosen: some 40 voxels of the surface are in a histogram
 CANDIDATES = 5  # places of the design with the nearest histograms, of which one is drawn
 ROBUST_TIMES = 4.0  # standard deviations of all distances, beyond which a point belongs to a defect
-DEFECT_POINTS = 8
+DEFECT_POINTS = 8  # chosen: points within the radius that make a cluster; fewer are noise
 DEFECT_RADII = 1.5  # radius of a defect's density clusters, by that of the noise removal
-HUBER_VOXELS = 2.0
-ICP_VOXELS = (20.0, 5.0)
-ICP_ITERATIONS = 40
+HUBER_VOXELS = 2.0  # chosen: farther pairs count linearly
+ICP_VOXELS = (20.0, 5.0)  # chosen: largest distance of pairs, at first for a poor pose, then for one within some voxels
+ICP_ITERATIONS = 40  # work: at most, of each
 LENGTH_VOXELS = 10.0  # largest difference of the sides of two triangles of a sample
 NOISE = -1
 

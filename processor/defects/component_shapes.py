@@ -19,12 +19,12 @@ from processor.distinct_rows import distinct
 from processor.model import NORMAL_95, Floats, Ints
 
 BLOCKS_ALONG, BLOCKS_ACROSS = 36, 16  # of a component's largest face, at least
-MOST_BLOCKS = 3000
-FEWEST_BLOCKS = 24
+MOST_BLOCKS = 3000  # work: of larger components blocks are larger
+FEWEST_BLOCKS = 24  # four for each unknown of a rigid motion
 FINER = 3  # times smaller blocks for the last fit
-FLOOR_MM = 0.02
+FLOOR_MM = 0.02  # of a block's mean: the design's mesh, and roughness that points of one block share
 DEFORMED_GAIN = 100.0  # of chi-square, above which a component is deformed
-JUMP_CELLS = 1.5
+JUMP_CELLS = 1.5  # cells that a step crosses, and as much as the half of one beside it
 LEAST_Z = 4.5  # of a shape: what stations have in common is known from few of them
 FEWEST_SEEN = 6  # cells of a face, whose mean movement is compared with that of others
 FACE_GAIN = 1.1  # from which on another face than the front shows a movement

@@ -15,7 +15,7 @@ from processor.model import NORMAL_95, Floats, Ints
 
 MOST_SIDE = 120  # cells of a picture
 MARGIN = 0.6  # of a defect's extent, shown beside it
-LEAST_MARGIN_CELLS = 12
+LEAST_MARGIN_CELLS = 12  # of a picture: a small defect is seen with what is about it
 SAME_SIDE_COS = 0.5  # between the defect's mean normal and that of a cell shown
 LEAST_SHARE = 0.3  # of a cell that the face covers
 MOST_PLACES = 50_000  # of the whole surface

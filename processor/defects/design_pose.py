@@ -16,7 +16,7 @@ from processor.registration import surface_registration
 from processor.registration.surface_registration import Registration
 
 DEFAULT_ERROR_MM = 1.0  # registration error of scans in the design's frame, where none is known
-SAMPLE = 200_000
+SAMPLE = 200_000  # points: more than the registration itself takes of any scan
 
 
 @dataclass(frozen=True)

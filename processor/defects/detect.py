@@ -40,11 +40,11 @@ from processor.large_arrays import every
 from processor.model import DesignBodies, Floats, InputError, Reason, Scene, Status, StructureDesign, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
-CELL_BOUNDS_MM = (5.0, 60.0)
-FIRST_CELL_MM = 50.0
-MOST_CELLS = 4_000_000
+CELL_BOUNDS_MM = (5.0, 60.0)  # below, a beam covers more than one; above, a dent of 100 mm less than two
+FIRST_CELL_MM = 50.0  # work: a coarse net to look for the points' density; it leaves no trace in the result
+MOST_CELLS = 4_000_000  # work: 32 MB an array of a number a cell
 AGAIN_MM = 2.0  # movement of the whole beyond which points are assigned to the design's faces again
-ROUNDS = 3
+ROUNDS = 3  # work: at most; the first that moves the whole by less than AGAIN_MM is the last
 UNITE_CELLS, UNITE_MM = 3.0, 25.0  # distance within which places are one defect, the larger
 SD_SAMPLES = 20_000  # cells by which alignments are compared
 

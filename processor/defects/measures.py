@@ -22,14 +22,14 @@ from processor.model import NORMAL_95, Bools, Floats, Ints
 SMOOTH_SHARE = 0.35  # of a region's radius, over which deviations are averaged to find the deepest place
 FIT_SHARE = 0.45  # of a region's radius, within which a paraboloid is fitted for its depth
 CURVE_SHARE = 0.65  # of a region's radius, for its curvature
-FEWEST_CELLS = 9
-BORDER_CELLS = 1.6
+FEWEST_CELLS = 9  # three by three: fewer leave nothing over from a paraboloid
+BORDER_CELLS = 1.6  # from the border of a face: a region's outermost cell, and half of one for rounding
 FEWEST_PROFILE, PROFILE_MARGIN = 6, 0.5  # cells of a region with a profile, and margin about it by its size
 VOLUME_BORDER = 0.25  # of a region's radius, that belongs to its volume
 DEEPEST_MM = 500.0  # of the design behind a place
 
 MARGIN_CELLS = 2  # about a region, of which points are used for a small bump
-FEWEST_POINTS = 12
+FEWEST_POINTS = 12  # twice the unknowns of a bump, and two
 EXPONENTS = (2.0, 12.0)  # of a bump: from round to flat-bottomed
 RIM_SHARE = 0.02  # of its depth, at which a bump ends: at the rim of a dent as round as a cosine
 ROBUST_SDS = 2.0  # of a point, from which on its weight decreases

@@ -24,7 +24,7 @@ from processor.model import Bools, Floats, InputError, Ints, Labels, Scene
 from processor.robust_statistics import MAD_TO_SD
 from processor.views import Views, views
 
-CHUNK = 500_000
+CHUNK = 500_000  # points in memory at once: work, not result
 PART_POINTS = 500_000  # that are sorted by their cells in memory
 BEHIND_MM = 4.0  # a face, from which on a beam must have passed through it as designed
 LEAST_COS = 0.2  # of incidence: points at a more oblique one are mostly of beams that hit two surfaces

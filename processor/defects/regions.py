@@ -12,11 +12,10 @@ from scipy.spatial import cKDTree
 from processor.defects import scan_statistic
 from processor.defects.classification import CRACK_RATIO
 from processor.defects.deviation_field import Field
-from processor.defects.scan_statistic import Finding, Levels
+from processor.defects.scan_statistic import EIGHT_NEIGHBOURS, Finding, Levels
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
 from processor.model import Floats, Ints
 
-EIGHT_NEIGHBOURS = np.ones((3, 3))
 EMPTY_SHARE = 0.15  # of the points expected, up to which a cell is empty
 LEAST_EXPECTED = 6.0  # points on cells that are judged together: with fewer, cells side by side are empty by chance
 COUNTED_SHARE = 0.5  # of the points expected: scanners return fewer where a surface reflects badly

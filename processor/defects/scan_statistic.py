@@ -29,9 +29,9 @@ FEWEST_WINDOWS = 60  # to estimate a scatter from
 GROWTH = 2.5  # standard deviations of a window of half the size, that cells of a region exceed
 PIECE_SHARE = 0.3  # of the largest piece within the same windows
 LINES_AFTER = 4  # side of the windows after which lines are searched
-LINE_CELLS, LINE_TURNS = (10, 25), 8
+LINE_CELLS, LINE_TURNS = (10, 25), 8  # chosen: lengths of cracks; 8 turns: none of 10 cells is off by one
 LINE_GROWTH = 0.7  # standard deviations of a cell, that cells of a line exceed
-EIGHT_NEIGHBOURS = np.ones((3, 3))
+EIGHT_NEIGHBOURS = np.ones((3, 3))  # cells that touch at a corner are connected
 
 
 @dataclass(frozen=True)

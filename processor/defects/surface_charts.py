@@ -19,7 +19,7 @@ from processor.geometry.mesh_distance import FacetGrid, MeshSurface
 from processor.model import Bools, DesignBodies, Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
-PIECE_COS = np.cos(np.radians(15.0))
+PIECE_COS = np.cos(np.radians(15.0))  # cells of one chart shrink by 3 % at most
 ROUND_SHARE = 0.02  # of the radius, the largest distance of a vertex from its cylinder
 MOST_SIDES = 60  # edges tried for the direction of a face
 PLANE, CYLINDER = 0, 1

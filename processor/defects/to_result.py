@@ -34,7 +34,7 @@ from processor.model import NORMAL_95, Bools, Floats, Ints, Reason, Status, reas
 from processor.robust_statistics import finite_median
 
 CHANCE_MM2 = 1e8  # the area that false alarms are counted on
-CURVE_STRIPS = 40
+CURVE_STRIPS = 40  # places of a deflection curve: drawn size
 SMALL_CELLS = 8.0  # of diameter, below which a bump is fitted to points instead of cells
 SHALLOW_SHARE = 0.1  # of the amplitude of a component's shape, by which the model may be wrong
 THROUGH_SHARE = 0.7  # of the points expected on a crack, below which rays went through

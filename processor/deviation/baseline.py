@@ -25,8 +25,8 @@ from processor.model import Floats, Ints, Scene, Status, StructureDesign, reason
 from processor.registration import icp, principal
 from processor.registration.surface_registration import Registration
 
-MOST_ICP_POINTS = 60_000
-COARSE_POINTS, COARSE_ITERATIONS = 3_000, 30
+MOST_ICP_POINTS = 60_000  # work: of point-to-point iterations along a whole structure
+COARSE_POINTS, COARSE_ITERATIONS = 3_000, 30  # work: to choose between attitudes; the pose is refined after it
 NAN = float("nan")
 
 

@@ -16,7 +16,7 @@ from processor.model import Floats, InputError, Ints, Scene
 from processor.views import views
 
 MOST_POINTS = 3_000_000  # of a scan that are held at once; of more an even sample is held
-SAMPLE_POINTS = 1_000_000
+SAMPLE_POINTS = 1_000_000  # work: points from which the spacing of a large scan is taken
 
 
 @dataclass(frozen=True)

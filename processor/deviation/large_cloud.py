@@ -20,11 +20,11 @@ from processor.large_arrays import allocate, blocks, release, taken
 from processor.model import Bools, Floats, Ints, Labels
 from processor.views import Views
 
-SLAB_POINTS = 500_000
+SLAB_POINTS = 500_000  # work, not result: a slab and what its search needs are tens of MB
 PASS_POINTS = 250_000  # in memory at once where no neighbours are searched for
 BINS = 1 << 16  # across the longest axis, of which slabs consist
 HALO = 20.0  # spacings about a slab: 20 neighbours of a point on a surface lie within three
-SPACING_SAMPLE = 20_000
+SPACING_SAMPLE = 20_000  # points of a slab whose neighbours are searched: the spacing is known to better than 1 %
 SAMPLE = 60_000  # points of a slab by which its spacing is estimated
 
 

@@ -18,7 +18,7 @@ from processor.registration.surface_registration import NEAR_MM, NEAR_SHARE, Pla
 # the structure lie nearer. The limit is half way between these shares.
 AT_DESIGN = 0.75
 FEWEST_SHARE, FEWEST_POINTS = 0.01, 20  # of a scan's points within twice NEAR_MM: fewer are there by chance
-SAMPLE = 20_000
+SAMPLE = 20_000  # points of a view: a share of them is known to 0.4 %
 MOST_TRIALS = 6  # scans that are placed one by one, if all together do not lie at the design
 
 

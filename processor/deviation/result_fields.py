@@ -11,7 +11,7 @@ from processor.deviation.result import NAN, CorePoints
 from processor.geometry.m3c2 import Distances
 from processor.model import Floats
 
-NEAR_MM = 10.0
+NEAR_MM = 10.0  # of the key within_10mm_share
 
 
 def core_points(points: Floats, normals: Floats, distances: Distances) -> CorePoints:

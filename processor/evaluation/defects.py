@@ -13,17 +13,17 @@ from processor.defects.result import DefectClass, Defects, Result
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls, signed
 from processor.model import Better, BodyTruth, DefectTruth, Floats, Ints, Metric, Scene, Statistic, Truth
 
-DEPTH_SHARE = 0.10
-DEPTH_LODS = 2.0
-CLASS_SHARE = 0.9
+DEPTH_SHARE = 0.10  # required: of the depth, or DEPTH_LODS where noise is more
+DEPTH_LODS = 2.0  # required: levels of detection
+CLASS_SHARE = 0.9  # required: of the defects found
 NAN = float("nan")
 FALSE_ALARMS, DEPTH_ERROR = "false alarms", "depth error"
 WRONG_DEPTHS = "depths off by more than a tenth and 2 LOD95"
-NEAR_MM = 30.0
+NEAR_MM = 30.0  # chosen: half the largest cell; a report farther off is of another place
 OPPOSITE = -0.9  # cosine between the normals of two sides of a plate
 # Sizes of true defects that detection is counted by, mm: depth, and diameter of a disc of the same area.
 DEPTHS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-DIAMETERS = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+DIAMETERS = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)  # and as many steps a decade
 FOUND_BY_DEPTH = {f"found of depth {low:g} to {high:g} mm": (low, high) for low, high in pairwise(DEPTHS)}
 FOUND_BY_AREA = {f"found of diameter {low:g} to {high:g} mm": (low, high) for low, high in pairwise(DIAMETERS)}
 ALARM_SDS = 3.0  # standard deviations of the number of false alarms that the limit allows

@@ -13,7 +13,7 @@ from processor.model import Bools, Floats, Ints, Metric, PoseTruth, Scene, Stati
 from processor.registration import principal
 from processor.registration.surface_registration import Registration
 
-NEIGHBOURS = 24
+NEIGHBOURS = 24  # looked through for one on a face alike: more than the corners of a small piece of the truth
 REACH_MM = 500.0  # of a core point: a movement is smooth
 LEAST_MM = 50.0  # nearer points count the same
 NAN = float("nan")

@@ -48,7 +48,7 @@ NAMES = {
 }
 OF_SIZE = (Quantity.SWEEP, Quantity.CAMBER, Quantity.BOW)
 REACH_MM, ALIKE = 50.0, 0.99  # of a true point to its facet, and cosine between their normals
-PIECE_MM, LEAST_FACE_MM = 100.0, 1.0
+PIECE_MM, LEAST_FACE_MM = 100.0, 1.0  # as pieces of a measurement are; faces down to 1 mm, as the truth has no noise
 
 
 def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:

@@ -24,7 +24,7 @@ from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.result import Result
 from processor.preassembly.topology import PartEnd
 
-WRONG_POSE_RAD = 0.1
+WRONG_POSE_RAD = 0.1  # 6 degrees: an attitude was mistaken; no error of a fit is as large
 TRUE_SPLICING = "splicing error of the true key points"
 TRUE_LINEAR = "linear error of the true edges"
 AS_DESIGNED_MM = 0.01  # key points this near to the design's are those of perfect parts

@@ -10,8 +10,8 @@ from processor.model import Floats, Metric, Scene, StationTruth, Statistic, Stat
 from processor.stitching import poses_with_scale
 from processor.stitching.result import Result
 
-POSITION_MM, ROTATION_MRAD = 0.5, 0.02
-WRONG_MM = 50.0
+POSITION_MM, ROTATION_MRAD = 0.5, 0.02  # required of automatic stitching
+WRONG_MM = 50.0  # a hundred times the limit of a position: another pose was taken, no error of a fit is as large
 AFTER_FIT = "station positions after datum fit"
 WRONG_BUT_OK = f"scans called ok, over {WRONG_MM:g} mm off"
 LEAST_OK = 3  # scans without a flag that determine the datum alone

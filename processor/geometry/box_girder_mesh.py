@@ -20,10 +20,10 @@ from processor.geometry import rigid
 from processor.model import DesignPart, Floats, InputError, Ints
 
 SOURCE = "curves"
-PLATE_MM = 20.0
+PLATE_MM = 20.0  # assumed where the design states none: a usual plate of box girders
 RING_SHARE = 0.7  # of a plate's thickness, so that points on the inner wall are not taken for the ring
 MESH_ERROR_MM = 0.002  # along the curve
-LONGEST_STEP_MM, SHORTEST_STEP_MM = 250.0, 5.0
+LONGEST_STEP_MM, SHORTEST_STEP_MM = 250.0, 5.0  # work: a straight part needs no more facets, a kink no smaller ones
 SAME_WIDTH = 0.002  # relative change of a foot's width below which its height is taken as constant
 OFF_JOINT = 0.05  # of the width: edges that end farther from a joint's P1 and P2 belong to another joint
 KINK_RATIO, KINK_RAD = 2.0, 0.002  # an edge has a kink where it turns by so much more than at adjacent points

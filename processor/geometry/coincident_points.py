@@ -33,7 +33,8 @@ BLOCK = 16  # places along an edge of a block: few neighbours lie in another blo
 DIRECTIONS = 3  # in which the neighbours lie of points on a line, the fewest
 FEWEST_PAIRS, SURE = 3.0, 3.0  # pairs that no share of points explains, and standard deviations of the pairs
 FEWEST_PLACES = 32  # that all have even numbers by chance once in 4e9 clouds
-NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)], np.int64)
+NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)], np.int64)  # of 26
+# Odd numbers that mix bits: of the golden ratio (SplitMix64), and two primes of xxHash64.
 MIXERS = tuple(np.uint64(number) for number in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9))
 
 

@@ -22,9 +22,9 @@ from processor.geometry.thread_ranges import over_ranges
 from processor.large_arrays import blocks
 from processor.model import Bools, Columns, Floats, InputError, Ints
 
-CELLS_PER_DIAMETER = 2.0
+CELLS_PER_DIAMETER = 2.0  # work, not result: a cylinder meets 3 x 3 columns of cells
 FEWEST_FOR_LOD = 4  # points of either cloud, below which there is no level of detection
-Z95 = 1.96
+Z95 = 1.96  # normal quantile of 97.5 %, as Lague et al. (2013) write it
 LEAST_RANGE = 256  # core points per task of a thread
 
 
@@ -137,15 +137,15 @@ def _along(
 # A cylinder holds this many points of the sparser cloud on average. Paper 002 asks for 20 at least; with 50 the
 # standard deviations are at most 1 % too small.
 POINTS_A_CYLINDER = 50.0
-PAPER_POINTS_A_CYLINDER = 20
+PAPER_POINTS_A_CYLINDER = 20  # paper 002
 NORMAL_TO_ROUGHNESS = 25.0  # Lague et al. 2013: 20 to 25 times
 # Least and greatest, in projection diameters. As in the paper the normal's sphere is at least twice as wide as the
 # cylinder: a normal fitted to the cylinder's own points would absorb some of their noise.
 NORMAL_SHARE = (2.0, 4.0)
 DEEPEST = 10.0  # projection diameters
-DEPTH_TO_DISTANCE = 2.0
+DEPTH_TO_DISTANCE = 2.0  # chosen: a cylinder ends twice as far away as nearly all of the other cloud lies
 FAR_QUANTILE = 0.95  # of the distances between the clouds, from which the depth is derived
-SCALE_SAMPLE = 5_000
+SCALE_SAMPLE = 5_000  # work: points of each cloud from which scales are chosen
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def _scale_sample(points: Floats) -> Floats:
 # --- The loops of M3C2 and of normals, compiled. Each place is independent, so that threads do not change results.
 
 
-FEWEST_OF_PLANE = 3
+FEWEST_OF_PLANE = 3  # three points determine a plane
 
 
 @njit(cache=True, nogil=True)

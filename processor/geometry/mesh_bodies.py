@@ -18,7 +18,7 @@ from processor.geometry.thread_ranges import each
 from processor.model import Bools, Floats, Ints
 
 WELD_MM = 0.01  # vertices nearer to each other are one
-TOUCH_MM = 0.5
+TOUCH_MM = 0.5  # chosen: above chords of round faces, below gaps left on purpose: nearer bodies are one component
 MOST_BODIES = 12  # of a component
 OUTSIDE_MM = 0.5  # above the surface: closer bodies are in contact
 JITTER_MM = np.array([1.3e-4, 2.1e-4, 1.7e-4])  # so that no ray meets an edge between two facets

@@ -28,14 +28,14 @@ from processor.model import Bools, Floats, Ints, Labels
 LEAST_AREA = 1e-9  # mm2, twice that of a facet; smaller ones are left out
 
 SHARP_COS = 0.94  # facets that meet at more than 20 deg belong to different faces
-WALK_STEPS = 24
+WALK_STEPS = 24  # from facet to neighbouring facet: in a fine mesh a point moves over fewer; then it is searched anew
 CELL_SPACINGS = 2.0  # edge of the cells of samples, in their mean spacing
 OUTER_SPACING_MM = 40.0  # of samples, for the outer face of a plate alone
 LEAST_RANGE = 5_000  # points per task of a thread
 EDGE_MM = 1.0  # a foot up to this far outside the edge of its face still counts as on it
 MOST_BULGE_MM = 1.0  # facets with a larger bulge are meant to be flat: no mesh is that coarse
 DESIGN_SAMPLES, DESIGN_SPACING_MM = 1_000_000, (8.0, 40.0)  # samples on a whole design; least and greatest spacing
-MOST_VOXELS, MOST_ENTRIES = 20_000_000, 40_000_000
+MOST_VOXELS, MOST_ENTRIES = 20_000_000, 40_000_000  # work: int64 and int32, 160 MB each
 FULL, EMPTY = 64, 8.0  # a facet's box is halved if it has more voxels than this, and as many times those of the facet
 PIECES = 64  # size of the stack of halved boxes
 ROUNDING_MM = 1e-6  # more than the errors of rounding of a distance

@@ -138,8 +138,8 @@ def visible_fraction(points: Floats, centre: Floats) -> float:
 # --- Random sample consensus for one ball in a crop (paper 001, section 2.2 and table 1)
 
 
-MINIMAL = 4
-BATCH = 32
+MINIMAL = 4  # points that determine a sphere
+BATCH = 32  # work: draws fitted at once
 
 
 @dataclass(frozen=True)

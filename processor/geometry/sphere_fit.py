@@ -18,14 +18,14 @@ from processor.robust_statistics import MAD_TO_SD, TUKEY
 LEAST_SCALE = 1e-8  # of the radius: below any noise, above the rounding of points without noise
 WINDOW = 4.0  # in scales: residuals within it determine the scale
 STEEPEST = 0.3  # cosine of incidence below which the beam is split at the limb, and errors of angles dominate
-ITERATIONS = 100
+ITERATIONS = 100  # work: a fit that has not converged by then is stated as such
 FREE_ITERATIONS = 40  # then the scale is fixed and rays that missed the ball stay out, so that the fit converges
-LEAST = 6
+LEAST = 6  # two more than a sphere's unknowns
 LONGEST_STEP = 0.2  # of the radius: on a flat cap an unlimited step may leave the ball
 SHORTEST_STEP = 1e-10  # of the radius: converged
 LARGEST_GROWTH = 1e3  # of the radius
-WORST_CONDITION = 1e12
-NO_FIT, FITTED, CONVERGED = range(3)
+WORST_CONDITION = 1e12  # float64 leaves four digits then: beyond it points do not determine the sphere
+NO_FIT, FITTED, CONVERGED = range(3)  # outcomes of the iteration
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,9 +24,9 @@ LATERAL = 0.2  # variance across the ray as a share of that along it: encoders a
 # Of a ray into the wall, as a cosine: at less the footprint lies on more of the wall than is seen as one surface.
 LEAST_SLOPE = 0.35
 UNNAMED_SHARE = 0.5  # of the class of one view, in the radii of bores that several unnamed views see
-ROUNDS = 30
-SETTLED_MM = 1e-4
-NO_PRIOR_MM = 1e4
+ROUNDS = 30  # work: at most; a fit has settled before
+SETTLED_MM = 1e-4  # far below what any bore's place is known to
+NO_PRIOR_MM = 1e4  # standard deviation of places and radii beforehand: far more than any hole may be off
 FLOOR_MM = 0.02  # least standard deviation of a point from the bore: its roughness and the design's mesh
 
 

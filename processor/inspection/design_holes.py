@@ -19,10 +19,10 @@ from processor.model import Floats, Ints
 
 FEWEST_CORNERS = 8  # of a polygon that is a circle
 ROUND_MM, ROUND_SHARE = 0.05, 0.002  # by which its corners may be off the circle, and as a share of the radius
-LEAST_RADIUS_MM, MOST_RADIUS_MM = 3.0, 150.0
+LEAST_RADIUS_MM, MOST_RADIUS_MM = 3.0, 150.0  # chosen: from M6 on; larger than 300 mm are openings
 MOST_DEPTH = 3.0  # in diameters: a deeper one is the bore of a tube
-SAME_MM, PARALLEL = 0.1, 0.9999
-SAME_PLACE_MM = 1e-3
+SAME_MM, PARALLEL = 0.1, 0.9999  # by which two ends of one hole may differ: a mesh's error; 0.8 degrees
+SAME_PLACE_MM = 1e-3  # rounding: vertices that files give twice
 
 
 class Hole(NamedTuple):

@@ -26,14 +26,14 @@ NORMALS, OFFSETS_MM = 1e-3, 0.5  # by which facets of one flat face may differ
 PIECE_DIAMETERS = 3.0  # side of a piece, in diameters of the core points' circles
 FEWEST_POINTS = 3  # of a piece
 FLOOR_MM = 0.004  # least standard deviation: of the design's mesh and of rounding
-SAME_PLACE_MM = 1e-3
+SAME_PLACE_MM = 1e-3  # rounding: places of core points computed twice from one mesh
 # Share of the shared variance by which the halves of a face differ, along it, across it and crosswise, if it is as
 # large as FAR_MM: a smaller one is seen from the same places all over.
 HALVES, FAR_MM = 0.5, 2000.0
 CLIP = 4.5  # robust standard deviations from the fitted shape beyond which a piece is left out
-ROUNDS = 5
+ROUNDS = 5  # work: of leaving out pieces, at most; the first that changes nothing is the last
 LEAST_SIDE = 0.5  # side of the smallest face that a body's size is taken from, in least widths of a measured face
-MOST_CONDITION = 1e6
+MOST_CONDITION = 1e6  # of a form's terms: pieces along one line tell them apart no more
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ from processor.model import Bools, Floats, Ints, reason
 
 REACH_MM, PITCH_SHARE = 25.0, 0.4  # of a hole from its designed place, and at most this share of the way to the next
 RING_MM = 15.0  # width of the ring of the face around a hole whose points give the height of its plate
-FEWEST_LEVEL = 20
+FEWEST_LEVEL = 20  # points: a median of them is known to 0.3 of the noise
 UNDER_MM = 1.0  # of a gauge pin below a hole's nominal diameter: a convention, see part_pass_through_ratio of limits
 SEED, DRAWS = 21, 2000  # of the errors, for the share of holes that a pin passes
-PARALLEL, SAME_PLATE_MM = 0.9999, 1.0
+PARALLEL, SAME_PLATE_MM = 0.9999, 1.0  # of holes of one group: cosine of axes, plates' height and thickness
 ROW_MM = 1.0  # across a row, from one hole to the next of it
 FEWEST_PLACED = 3  # holes of a group whose best fit is taken off
 

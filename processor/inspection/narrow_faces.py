@@ -50,7 +50,7 @@ OVERHANG_SHARE = 0.25  # weight of what a beam meets beyond a rim
 PARALLEL = 0.9999  # cosine between the normals of a flat face's facets
 RIM_MM = 3.5  # half of the widest beams near their scanner: nearer to a rim a beam may lie on another face as well
 CLIP = 3.0  # robust standard deviations from a face's level beyond which points have no weight
-LEAST_NOISE_MM = 0.1
+LEAST_NOISE_MM = 0.1  # of a point, for clouds without noise: views would be weighed by rounding
 
 Shift = Callable[[Floats], Floats]  # places (n, 3) of a body as designed -> by how much it has moved there (n, 3)
 

@@ -1,4 +1,4 @@
-"""Exit codes of the commands, but for 2, which click gives to wrong arguments."""
+"""Exit codes of the commands."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from processor.model import Verdict
 
-DONE, IN_PART, BAD_INPUT, LIMIT_MISSED, VERDICT = 0, 1, 3, 4, 5
+DONE, IN_PART, WRONG_USAGE, BAD_INPUT, LIMIT_MISSED, VERDICT = range(6)  # scripts of users read them; 2 is also click's
 ENDED_BY_LIMIT = BAD_INPUT  # of time or memory
 WITH_RESULTS = (DONE, IN_PART, LIMIT_MISSED, VERDICT)
 FAIL_ON = {

@@ -27,15 +27,15 @@ from processor.jobs.causes import EXIT_CODES, Cause
 from processor.jobs.child import Loss, Lost
 from processor.library_settings import ROOT
 
-PERIOD_S = 0.05
+PERIOD_S = 0.05  # between two looks at a process: memory beyond its limit lasts no longer
 LOOK_S = 0.5  # between two looks at what may stop a process, and at the processes that it has started
-ANSWER_LOOK_S = 0.1
+ANSWER_LOOK_S = 0.1  # between two looks at what may stop the wait for an answer: Ctrl-C is answered at once to a person
 LOG_BYTES = 1 << 18  # of one process, from its beginning
-TAIL_BYTES = 1 << 14
-MB, KB = 2**20, 2**10
+TAIL_BYTES = 1 << 14  # of standard error, kept for the reason of an end: a traceback has a few thousand
+MB, KB = 2**20, 2**10  # of binary units, as the kernel counts
 ATTEMPTS = 2  # at a job whose process dies
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-PROJECT = Path(__file__).resolve().parents[2]
+PROJECT = Path(__file__).resolve().parents[2]  # this checkout: the folder of the packages
 
 J = TypeVar("J")
 R = TypeVar("R")

@@ -16,9 +16,9 @@ import click
 
 from processor.jobs import address_space, garbage_collection
 from processor.jobs.causes import Cause, cause_of, one_line
+from processor.jobs.exit_codes import BAD_INPUT, WRONG_USAGE
 from processor.model import InputError, UsageError
 
-WRONG_USAGE, BAD_INPUT = 2, 3
 SIGNALLED = 128  # and the signal's number, as a shell reports it
 STOPPING = (signal.SIGTERM, signal.SIGHUP)
 

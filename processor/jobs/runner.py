@@ -21,7 +21,7 @@ from processor.jobs.causes import one_line
 from processor.jobs.child import Loss, Lost
 from processor.model import InputError, UsageError
 
-CONNECT_S = 10
+CONNECT_S = 10  # a scheduler of one network answers within seconds; a wrong address should not cost a minute
 LOOK_S = 0.1  # between two looks at what may stop the run
 
 J = TypeVar("J")

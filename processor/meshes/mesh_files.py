@@ -18,6 +18,7 @@ from processor.readers import ply
 from processor.readers.file_checks import errors_name_the_file
 
 SUFFIXES = (".ply", ".stl", ".obj")
+# Of binary STL: 80 bytes of text and a count, then 50 bytes a triangle.
 STL_HEADER, STL_RECORD = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
 INDICES = ("vertex_indices", "vertex_index")  # names of the list of a face's corners in PLY
 

@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-LONGEST_NAME = 256
+LONGEST_NAME = 256  # characters: longer names are not names, and comparing them would take seconds
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -20,7 +20,7 @@ def _plain(name: str) -> str:
     return "".join(character for character in name[:LONGEST_NAME].lower() if character.isalnum())
 
 
-LONGEST_WORD, LONGEST_MESSAGE = 1_000, 6_000
+LONGEST_WORD, LONGEST_MESSAGE = 1_000, 6_000  # characters: an array typed as a word is cut to a fifth
 
 
 class PlainError(ValueError):

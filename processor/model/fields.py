@@ -80,7 +80,7 @@ TUBE_PER_BALL = (
 FARTHEST_MM = 2e6  # 2 km: no structure is measured from farther; of scans in mm read as metres the scanners are
 SAMPLED_POINTS = 1_000  # of a scan, to be compared with its scanner
 MOST_NODES, MOST_MEMBERS, MOST_PARTS = 100_000, 400_000, 1_000  # a hundred times those of the largest known
-LONGEST_TEXT = 1 << 20
+LONGEST_TEXT = 1 << 20  # a WKT or a message of many lines has some thousands; more are no text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ RADIUS = Meaning(above=0.0, most=LARGEST_MM)
 AMOUNT = Meaning(least=0.0)  # a standard deviation, half-width, distance, area
 RATIO = Meaning(least=0.0, infinite=True)  # infinite over nothing
 SHARE = Meaning(least=0.0, most=1.0 + 1e-9)  # a quotient of sums may be rounded up
-DIRECTION = Meaning(least=-1.0 - 1e-9, most=1.0 + 1e-9)
+DIRECTION = Meaning(least=-1.0 - 1e-9, most=1.0 + 1e-9)  # a component of a unit vector may be rounded up
 COUNT = Meaning(least=0.0)
 END = Meaning(least=-1.0)  # the id of a node, -1 = none
 OPEN = Meaning(infinite=True)  # -inf or inf: without a bound
@@ -133,6 +133,7 @@ COVARIANCE = Meaning(covariance=True)
 NAMES = Meaning(unique=True)
 LONG = Meaning(longest=LONGEST_TEXT)
 LARGEST_GRID, GRID_CELLS_PER_POINT = 1 << 28, 1024  # cells of a scanner's grid; of the open sky few have returns
+# -1: none; rows and columns up to 16 million, a tenth of a second of arc.
 GRID_NUMBER = Meaning(least=-1, most=(1 << 24) - 1)
 
 

@@ -17,13 +17,13 @@ from numba import njit
 from processor.inner_kernels import inner
 from processor.model import Floats, Ints
 
-PIECE_BYTES = 4 << 20
+PIECE_BYTES = 4 << 20  # work, not result: read at once and parsed by the workers in parts
 PIECE_ROWS = 1 << 17  # more rows than a worker's part of a piece has
-MOST_WORKERS = 4
-LEAST_PART = 1 << 16
+MOST_WORKERS = 4  # work: lines are read and split by one thread, which more would wait for
+LEAST_PART = 1 << 16  # bytes: less is parsed sooner than a thread is started
 ODD_LIMIT = 4096  # numbers converted by float() before a piece ends
 ENDED, FULL, ODD, SHORT_ROW, LONG_ROW = range(5)  # reasons why parsing stopped
-LONGEST_LINE = 1 << 20
+LONGEST_LINE = 1 << 20  # bytes: a row of numbers has hundreds; a longer one is no table and would fill the memory
 NUMBERS = frozenset(b"+-0123456789.eE")
 WORDS = ("nan", "inf", "infinity")
 EXACT = 1 << 53  # whole numbers below are exact as float64

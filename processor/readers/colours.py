@@ -14,7 +14,7 @@ from processor.readers.columns import first_named
 from processor.readers.raw_scan import RawScan
 
 NAMES = (r"(diffuse_)?r(ed)?", r"(diffuse_)?g(reen)?", r"(diffuse_)?b(lue)?")
-MOST = 255
+MOST = 255  # of 8 bits
 STEP = 256  # of 16 bits a step of 8 bits
 
 

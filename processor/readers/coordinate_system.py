@@ -12,9 +12,11 @@ from processor.model import Reason, reason
 UNIT = "m"
 # Keys of GeoTIFF 1.1.
 MODEL_KEY, SYSTEM_KEY, LINEAR_UNIT_KEY, UNIT_SIZE_KEY, OTHER_UNIT_KEY = 1024, 3072, 3076, 3077, 4052
-VERTICAL_SYSTEM_KEY, VERTICAL_UNIT_KEY = 4096, 4099
+VERTICAL_SYSTEM_KEY, VERTICAL_UNIT_KEY = 4096, 4099  # of heights, as above
 GEOGRAPHIC, USER_DEFINED = 2, 32767  # values of MODEL_KEY, and of any key
+# Codes of units of length in the EPSG register.
 EPSG_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft", 9036: "km", 1025: "mm", 1033: "cm"}
+# The international foot and that of the US survey (NIST SP 811, appendix B).
 SIZES_M = {"m": 1.0, "ft": 0.3048, "us-ft": 1200.0 / 3937.0, "km": 1e3, "dm": 0.1, "cm": 0.01, "mm": 1e-3}
 # Of a size as written. The two feet differ by 6e-7 m, and the foot of Clarke from them by more.
 SIZE_TOLERANCE_M = 1e-7

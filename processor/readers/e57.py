@@ -26,13 +26,14 @@ from processor.readers.raw_scan import RawScan, build_scan, scan_name, without_e
 SUFFIXES = (".e57",)
 UNIT = "m"
 HEADER = struct.Struct("<8sIIQQQQ")  # signature, version, length, start and length of the XML, page
-PAGE, PAYLOAD = 1024, 1020
-XML_LIMIT = 64 << 20
-PIECE = 1 << 18
+PAGE, PAYLOAD = 1024, 1020  # bytes of a page and of its content, before the checksum (ASTM E2807)
+XML_LIMIT = 64 << 20  # bytes: a header of ten thousand scans has a tenth of it; a damaged length would fill the memory
+PIECE = 1 << 18  # points read at once: work, not result
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
-LONGEST_NAME = 100
+LONGEST_NAME = 100  # characters: longer names of scans are replaced by a number, as names become file names
 GRID = ("rowIndex", "columnIndex")
 COLOURS = ("colorRed", "colorGreen", "colorBlue")
+# Atomic time of E57 counts in seconds from there (ASTM E2807); 300 years later a clock was not set.
 GPS_BEGIN, LATEST_S = datetime.datetime(1980, 1, 6, tzinfo=datetime.timezone.utc), 1e10
 MOST_LINES = 2**31 - 1  # rows or columns of a grid: they are stored as int32
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")

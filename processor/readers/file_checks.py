@@ -36,7 +36,7 @@ def check_declared_points(path: Path, kind: str, declared: int, least_bytes: flo
         )
 
 
-TAIL_BYTES, TAIL_ROWS = 1 << 14, 20
+TAIL_BYTES, TAIL_ROWS = 1 << 14, 20  # twenty rows of text, of up to 800 bytes, show the usual number of decimals
 
 
 def check_last_row(path: Path, kind: str) -> None:

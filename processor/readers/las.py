@@ -22,9 +22,9 @@ from processor.readers.raw_scan import RawScan, build_scan, scan_name
 SUFFIXES = (".las", ".laz")
 # Bytes of the header and of records (LAS 1.4 R15, tables 3, 7 and 8).
 LEAST_HEADER, HEADER_1_4 = 227, 375
-VERSION_MINOR_AT, COUNTS_AT, POINT_FORMAT_AT, EXTENDED_AT = 25, 96, 104, 235
-VLR_HEADER, EVLR_HEADER = 54, 60
-PIECE = 1_000_000
+VERSION_MINOR_AT, COUNTS_AT, POINT_FORMAT_AT, EXTENDED_AT = 25, 96, 104, 235  # offsets
+VLR_HEADER, EVLR_HEADER = 54, 60  # lengths of the headers of records
+PIECE = 1_000_000  # points read at once: work, not result
 # Field of the flags, its bits for synthetic and withheld points: of point formats 0 to 5, and of later ones (table 16).
 FLAGS, LAST_OLD_FORMAT = (("raw_classification", 0x20, 0x80), ("classification_flags", 0x01, 0x04)), 5
 COLOURS = ("red", "green", "blue")

@@ -32,7 +32,7 @@ from processor.readers.file_checks import check_declared_points, errors_name_the
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".pcd",)
-HEADER_LIMIT = 65_536
+HEADER_LIMIT = 65_536  # bytes: headers have some hundreds; a file without an end of it is none
 PIECE = 1 << 15  # points
 LZF_LIMIT = 100  # a match of LZF turns 3 bytes into at most 264
 

@@ -32,7 +32,7 @@ from processor.readers.file_checks import check_declared_points, errors_name_the
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".ply",)
-HEADER_LIMIT = 65_536
+HEADER_LIMIT = 65_536  # bytes: headers have some hundreds; a file without an end of it is none
 SKIPPED_BYTES = 4 << 20  # that are read at once of elements before the vertices
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),

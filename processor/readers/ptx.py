@@ -21,7 +21,7 @@ from processor.readers.file_checks import check_declared_points, check_last_row,
 from processor.readers.raw_scan import RawScan, build_scan, scan_name, without_empty
 
 SUFFIXES = (".ptx",)
-UNIT, MM_PER_UNIT = "m", 1000.0
+UNIT, MM_PER_UNIT = "m", 1000.0  # of the format
 SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
 MOST_LINES = 2**31 - 1  # rows or columns of a grid: they are stored as int32
 RIGID_TOLERANCE = 1e-3  # of R^T R - I: matrices are often written with few digits

@@ -15,7 +15,7 @@ from processor.model import Checked, Codes, Floats, InputError, Ints, Labels, Re
 from processor.readers.encoding import file_name_as_text
 
 FAR = 10_000.0  # units; an origin is subtracted from coordinates beyond this
-ORIGIN_STEP = 1_000.0
+ORIGIN_STEP = 1_000.0  # units: round numbers, so that people and other software recognise the origin
 MOST_NAMED = 5  # scans in a remark
 
 

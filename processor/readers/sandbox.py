@@ -38,12 +38,12 @@ from processor.jobs.process import end, isolated, start
 from processor.model import InputError, Reason
 from processor.readers.raw_scan import RawScan
 
-SLACK_BYTES = 1 << 30
+SLACK_BYTES = 1 << 30  # memory beyond the points: for the buffers in which libraries decode
 LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # the libraries are much faster than this
 PATIENCE = 4.0  # ratio of elapsed to processor time: the machine may be busy
-START_S = 120.0
+START_S = 120.0  # imports of a first start on a slow disk; a child that takes longer does not come
 ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station", "grid_row", "grid_column", "colour")
-SMALL = 1 << 16
+SMALL = 1 << 16  # bytes: smaller arrays are sent as they are, as a shared file costs more
 BYTES_A_BYTE = 6.0  # of arrays per byte of a compressed file
 SHOWN_S = 0.5  # between two messages of how much is read
 START = "from processor.readers import sandbox; sandbox.serve()"

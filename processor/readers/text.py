@@ -30,7 +30,7 @@ from processor.readers.file_checks import check_declared_points, check_last_row,
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".asc", ".csv", ".pts", ".txt", ".xyz")
-SNIFFED = 65_536
+SNIFFED = 65_536  # bytes: hundreds of rows, from which separator, header and columns are told
 SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
 COMMENTS = ("#", "//", "%")
 COUNTED = 5  # rows by which a column of row numbers is recognised

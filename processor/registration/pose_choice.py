@@ -30,7 +30,7 @@ FEWEST_POINTS = 4  # of a group
 ON, OFF = 2.0, 4.0  # times the median group's distance: up to ON on the design, from OFF on off it
 LEAST_OFF_MM = 1.0  # plates may deviate by as much in thickness (EN 10029), so less distinguishes no pose
 REACH_MM = 60.0  # from the design, the most that the distance of a point counts
-SAMPLE = 200_000
+SAMPLE = 200_000  # work: points of which groups of 16 show the surface of a mark
 CORNER_SAMPLES = 12  # nearest of the surface: some of them on each face that meets at a corner
 
 

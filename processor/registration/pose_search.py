@@ -25,15 +25,15 @@ from processor.registration.principal import PrincipalAxes
 
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.1 m
 COARSE_SPACING_MM = 120.0  # for the coarse gates
-SAMPLES = (2_000, 400_000)  # the fewest and the most
+SAMPLES = (2_000, 400_000)  # work, the fewest and the most: enough for a mark; 10 MB
 # Gates for every hypothesis, and for the promising ones: of a part of 8 m and more, and shares of a smaller one's size.
 COARSE_GATES_MM, COARSE_GATE_SHARES = (400.0, 150.0), (0.05, 0.02)
-FINE_GATES_MM, FINE_GATE_SHARES = (50.0, 25.0, 12.0), (0.015, 0.01, 0.005)
-COARSE_POINTS, FINE_POINTS = 600, 20_000
+FINE_GATES_MM, FINE_GATE_SHARES = (50.0, 25.0, 12.0), (0.015, 0.01, 0.005)  # the last beyond form and noise
+COARSE_POINTS, FINE_POINTS = 600, 20_000  # work: the first for every hypothesis, the second for the promising ones
 WIDE_POINTS = 4_000  # at all gates but the last
 # Least misfit by noise and form of parts: where no hypothesis of a whole part is better, the scan may be of a piece.
 PIECE_MM = 5.0
-PIECE_POINTS, PIECE_ITERATIONS, PIECES_KEPT = 200, 6, 24
+PIECE_POINTS, PIECE_ITERATIONS, PIECES_KEPT = 200, 6, 24  # work: few points for many placements
 SAME_SIZE = 0.05  # relative difference of sizes along an axis that a piece of full size may have
 # A hypothesis whose misfit after the coarse gates exceeds PROMISING times the best plus PROMISING_MM is dropped; the
 # right one may have converged some millimetres off.

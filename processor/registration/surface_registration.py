@@ -25,17 +25,17 @@ from processor.robust_statistics import biweight, robust_sd
 
 # --- Fine registration
 
-POINTS, LAST_POINTS = 30_000, 250_000
-MOST_ITERATIONS = 30
+POINTS, LAST_POINTS = 30_000, 250_000  # work: first run; final pose: 1 um by so many at 0.5 mm noise
+MOST_ITERATIONS = 30  # work: at most
 CONVERGED_MM = 3e-4  # a step that moves the part by less is the last
 SMALL_MM = 0.3  # a step that moves the part by less leaves each point on its facet
 NO_FORM = 2.0  # ratio of the cells' mean squares to those of chance, below which a part has no form error of its own
-GATES_MM = (60.0, 30.0)
+GATES_MM = (60.0, 30.0)  # off the surface: as far as a coarse pose may be off; then, where clutter begins
 CUT = 4.5  # standard deviations
 FLOOR_MM = 0.01  # least sigma, for scans without noise
 LEAST_SHARE = 0.5  # of the points that must lie within the last gate
 NO_FIT_MM = (10.0, 4.0)  # sigma above which the scan is not of the design; the second where much clutter is beside it
-CLUTTER_SHARE = 0.15
+CLUTTER_SHARE = 0.15  # of points off the surface, from which on much stands beside the part
 CELL_MM = 500.0  # residuals on one face in one such length of the part are taken as dependent
 WEAK_MM = 5.0  # a motion that may move the part's ends by more (95 %) is weakly determined
 
@@ -65,7 +65,7 @@ class SurfaceFit:
     weak: tuple[Motion, ...] = ()
 
 
-NOWHERE = SurfaceFit(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), 0.0)
+NOWHERE = SurfaceFit(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), 0.0)  # no pose
 
 
 def fine(
@@ -174,7 +174,7 @@ def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[Motion,
 STRUCTURE_SAMPLES = (40_000, 40_000)  # of a small structure as well: its plates are thin
 NEAR_MM = 100.0  # of the design's surface
 NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
-FINE_POINTS = 30_000
+FINE_POINTS = 30_000  # work: as many as the first run of a fine fit takes
 RIVAL_POINTS = 8_000  # enough to tell attitudes apart: the fit of the one that is chosen uses FINE_POINTS
 SYMMETRY_POINTS = 3_000  # of even density, aligned in each attitude that the design's symmetry allows
 # What the surface does not determine converges slowly, and distinguishes no attitude.

@@ -17,7 +17,7 @@ COLUMNS = columns(
     "id", "verdict", "quantity", "nominal", "actual", "deviation", "ci95", "lower", "upper", "unit", "limit_from",
 )  # fmt: skip
 OF_LIMITS = columns("limit", "of", "verdict", "value", "ci95", "least", "greatest", "unit", "clause")
-MOST_NAMED = 4
+MOST_NAMED = 4  # of a summary of one or two lines
 NOTE = text(
     "Worst first. Deviation is actual less nominal, ci95 the half-width of its 95 % interval, lower and upper the "
     "deviations allowed; a dash is no bound, or not known."

@@ -34,10 +34,10 @@ MARKERS = ("o", "^", "s", "D")
 DIVERGING_STOPS = ("#7a3300", "#D55E00", "#e4e4e4", "#0072B2", "#00304d")
 DIVERGING = colors.LinearSegmentedColormap.from_list("residual", DIVERGING_STOPS)
 DECADES_APART = 20.0  # ratio between methods above which the axis is logarithmic
-LEAST_SHOWN_MM = 1e-3
+LEAST_SHOWN_MM = 1e-3  # of an axis that is logarithmic or without any error: a micrometre is nothing
 BEHIND_TEXT = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
-LONGEST_LABEL = 24
-DPI = 110
+LONGEST_LABEL = 24  # characters: drawn size, beside a figure's axis
+DPI = 110  # sharp at a page's width of 1000 pixels; twice as many are four times the bytes
 COMPRESSION = 3  # of PNGs, of 9: half the time of 6, and 1 % more bytes
 
 CaptionedPngs = dict[str, tuple[str | Message, bytes]]  # file name -> (caption, PNG)

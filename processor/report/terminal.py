@@ -17,7 +17,7 @@ from processor.report import table as report_table
 from processor.report.characteristics import worst_first
 from processor.report.reports_of_steps import step_report
 
-MOST_LINES, LONGEST = 15, 200
+MOST_LINES, LONGEST = 15, 200  # half a screen; characters: two or three lines of a terminal
 TO_DO, REASONS, LIMITS = 4, 3, 3  # most lines of each step
 MORE = text("... more in the report; --verbose prints the tables")
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from processor.language.messages import Message, Text, label, text
 from processor.model import Verdict
 
-MOST_NAMED = 3
+MOST_NAMED = 3  # of a headline, which is one line
 JOINTS = {
     Verdict.PASS: "all {count} joints pass",
     Verdict.FAIL: "{part} of {count} {count:?joint|joints} {part:?fails|fail}: {named}",

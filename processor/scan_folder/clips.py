@@ -13,7 +13,7 @@ from processor import large_arrays
 from processor.model import Bools, Clips, InputError, Scan, per_point_fields
 from processor.scan_folder.project_file import ClipBox
 
-FEWEST_POINTS = 4
+FEWEST_POINTS = 4  # a scan of fewer shows nothing: the box is elsewhere
 
 
 @dataclass

@@ -15,7 +15,7 @@ from processor.scan_folder.text_files import csv_rows
 from processor.scan_folder.units import MM_PER_UNIT, FileUnit
 
 COLUMNS = ("name", "scan", "x", "y", "z", "sd_mm")
-LARGEST_FILE = 16 * 2**20
+LARGEST_FILE = 16 * 2**20  # bytes: 200,000 rows; no network has a hundredth of it
 
 
 def read_control(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from processor.model import InputError
 
-BLOCK = 1 << 20
+BLOCK = 1 << 20  # bytes read at once: work, not result
 
 Signature = dict[str, tuple[int, ...]]
 

@@ -19,7 +19,7 @@ else:
 
 
 TEXT_BYTES = 32 * 2**20  # a design of 100,000 nodes has a third of it; JSON of empty lists takes 25 times as much
-TOML_BYTES = 4 * 2**20
+TOML_BYTES = 4 * 2**20  # 100,000 control points of forty bytes; a project file has some thousands
 MOST_KEYS = 32  # of a dotted key of TOML: each part becomes a table, and the reader takes their square in memory
 STRINGS_AND_REMARKS = re.compile(r'"""[\s\S]*?"""|"(?:[^"\\\n]|\\.)*"|#[^\n]*|' + r"'''[\s\S]*?'''|'[^'\n]*'")
 

@@ -25,7 +25,7 @@ KEYS = {  # with what they mean where their names do not say it
 }
 LOGO = "logo"
 FORMATS = ("PNG", "JPEG")
-MOST_KEYS, LONGEST, LONGEST_KEY = 30, 200, 40
+MOST_KEYS, LONGEST, LONGEST_KEY = 30, 200, 40  # what the title block on A4 has room for
 MOST_BYTES, MOST_PIXELS = 1_000_000, 4_000_000  # the logo is part of the page
 
 

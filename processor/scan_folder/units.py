@@ -11,6 +11,7 @@ from processor import large_arrays, unit_ratio
 from processor.column_names import UNIT_WORDS
 from processor.model import Floats, InputError, Reason, UsageError, reason
 
+# By definition; the foot of the US survey is 1200 / 3937 m (NIST SP 811, appendix B).
 MM_PER_UNIT = {
     "mm": 1.0,
     "cm": 10.0,
@@ -29,16 +30,16 @@ STRAY = 0.01  # share of a scan's points at either end of an axis that may be ou
 PART_RATIOS: tuple[float, ...] = (
     1000.0, 304.8, 100.0, 1 / 0.0254, 25.4, 10.0, 1 / 0.3048, 0.1, 1 / 25.4, 0.0254, 0.01, 1 / 304.8, 0.001,
 )  # fmt: skip
-FRAME_RATIOS: tuple[float, ...] = (1000.0, 304.8, 25.4, 1 / 304.8, 0.001)
-STRUCTURE_RATIOS: tuple[float, ...] = (1000.0, 304.8, 1 / 304.8, 0.001)
-RATIO_TOLERANCE = 0.25
+FRAME_RATIOS: tuple[float, ...] = (1000.0, 304.8, 25.4, 1 / 304.8, 0.001)  # frames are also drawn in inches
+STRUCTURE_RATIOS: tuple[float, ...] = (1000.0, 304.8, 1 / 304.8, 0.001)  # metre, foot and millimetre
+RATIO_TOLERANCE = 0.25  # relative: what a piece or the surroundings change; ratios of units are farther apart
 CERTAIN_RATIO = 100.0  # and its inverse: ratios that no surroundings of a part and no piece of one cause
 SHAPE_TOLERANCE = 2.0  # ratio of extents along the principal axes, of which a part seen from one side lacks some
 THIN = 0.05  # of the largest extent: such an extent is not compared
 SAMPLE = 100_000  # points
 # In metres no scan of a structure is larger, and none has points farther apart.
 LARGEST_M, WIDEST_SPACING_M = 2000.0, 0.5
-FEWEST_FOR_SPACING, SPACING_POINTS = 1000, 2000
+FEWEST_FOR_SPACING, SPACING_POINTS = 1000, 2000  # the median of 2000 is known to 2 %
 RANK_MARGIN = 0.01  # of all points: a sample of SAMPLE points misses a rank by far less
 
 

@@ -21,7 +21,7 @@ from processor.model import NORMAL_95, SUPPORTS, Bools, Floats, FrameDesign, Int
 from processor.space_frame.result import Balls, Evidence
 
 PERIMETER, MULTI_POINT = (number for number, _ in enumerate(SUPPORTS, 1))
-LEAST_OF_A_PLANE = 3
+LEAST_OF_A_PLANE = 3  # three points determine a plane
 LEAST_SPREAD = 1e-3  # of supports across the line through them, relative to along it; less fixes no plane
 
 

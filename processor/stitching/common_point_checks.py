@@ -5,7 +5,6 @@ from __future__ import annotations
 from processor import unit_ratio
 from processor.model import Word
 
-LEAST_POINTS = 3
 LEAST_HEIGHT = 1e-3  # of a triangle by its longest side: below this its corners count as on a line
 
 
@@ -21,6 +20,7 @@ class UnitSlip(Word):
     FEET_M = "feet and m"
 
 
+# By definition (an inch is 25.4 mm).
 FACTORS = {
     UnitSlip.M_MM: 1000.0,
     UnitSlip.FEET_MM: 304.8,

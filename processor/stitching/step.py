@@ -29,7 +29,7 @@ NAME = "stitch"
 NEEDS: tuple[str, ...] = ()
 PLACES = True  # steps that need this one do not run without the poses of its scans
 KIND = "structure"
-LEAST_POINTS = 100
+LEAST_POINTS = 100  # chosen: a scan of fewer shows no three planes
 
 
 def applies(scene: Scene) -> bool:

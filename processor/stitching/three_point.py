@@ -18,7 +18,7 @@ from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Picks, Reason, Scan, reason
 from processor.robust_statistics import student_factor
 from processor.stitching import poses_with_scale
-from processor.stitching.common_point_checks import LEAST_HEIGHT, LEAST_POINTS, units_slip
+from processor.stitching.common_point_checks import LEAST_HEIGHT, units_slip
 from processor.stitching.fine.pairs_and_loops import Pair
 
 LEAST_SD_MM = 1e-6  # of picks without any error, as in tests
@@ -79,7 +79,7 @@ def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
     parameters, two with seven. The scale is the least-squares one of the rotated points.
     """
     n = len(points_a)
-    if n < LEAST_POINTS:
+    if n < rigid.LEAST_POINTS:
         raise TooFewError(reason("stitch.few-points", points=n))
     middle_a, middle_b = points_a.mean(axis=0), points_b.mean(axis=0)
     a, b = points_a - middle_a, points_b - middle_b

@@ -24,7 +24,7 @@ from processor import large_arrays
 
 ATTRIBUTE = "sha256"
 NAME = ATTRIBUTE.encode()
-PART_ITEMS = 1 << 20
+PART_ITEMS = 1 << 20  # read at once: 8 MB; work, not result
 BLOCK = 1 << 20  # bytes
 # Columns found whole by this process. Steps read a column several times; later passes rely on the chunks' checksums.
 _WHOLE: set[tuple[object, ...]] = set()

@@ -26,7 +26,7 @@ import processor.store.joined_records as joined_records
 from processor import large_arrays
 from processor.model import VOCABULARIES, Reason, RecordError, Word
 
-CHUNK_ROWS = 65_536
+CHUNK_ROWS = 65_536  # of three float64: 1.5 MB, compressed at once
 PLAIN_ITEMS = 1_024  # arrays up to this size are stored plainly
 GZIP_LEVEL = 1
 

@@ -14,7 +14,7 @@ from processor.store.checksums import ChecksumError
 from processor.store.codec import DecodeError
 from processor.store.store import opened
 
-PIECE = 1 << 20
+PIECE = 1 << 20  # points read at once: 24 MB; work, not result
 
 
 @contextmanager

@@ -18,10 +18,10 @@ import numpy.typing as npt
 from processor import large_arrays
 from processor.model import Floats, Ints
 
-POINTS_PER_TILE = 16_384
+POINTS_PER_TILE = 16_384  # chosen: 200 KB compressed at once; fewer make many tiles, more are read in vain
 MOST_LEVELS = 8  # the finest grid has up to 2**MOST_LEVELS cells along the longest side
-STEPS_PER_MM = (10_000.0, 1_000.0)
-INT32_REACH = 2**31 - 16
+STEPS_PER_MM = (10_000.0, 1_000.0)  # 0.1 um, far below noise, where the extent allows it in int32 (429 m); else 1 um
+INT32_REACH = 2**31 - 16  # with some steps for rounding
 
 Column = npt.NDArray[np.generic]
 Array = npt.NDArray[Any]

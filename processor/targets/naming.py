@@ -20,7 +20,7 @@ from processor.model import Floats, Ints
 
 NEAR_MM = 100.0  # of a posed target from its control point
 SAME_MM = 10.0  # of a distance, and of a target moved to its control point
-LEAST = 3
+LEAST = 3  # three points determine a motion
 MOST = 40  # targets of a scan that motions are proposed from
 SPREAD_MM = 300.0  # least height of a triangle that proposes a motion
 

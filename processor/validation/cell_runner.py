@@ -25,7 +25,7 @@ from processor.writers import toml
 # Runs cells and yields each with its outcome as it comes; closing the generator stops those under way.
 Runner = Callable[[Sequence[Cell]], Generator[tuple[Cell, Outcome], None, None]]
 
-TIMEOUT_S = 3600.0
+TIMEOUT_S = 3600.0  # chosen: an hour: a cell that takes longer hangs
 TAIL = 500  # characters of an error message
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from processor.model import Metric, Statistic, Word
 
-HASH_DIGITS = 16
+HASH_DIGITS = 16  # 64 bits: two of a million settings have one with a chance of 3e-8
 SEED_DIGITS = 7  # of a fresh seed, in base 16
 
 

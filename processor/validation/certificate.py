@@ -34,7 +34,7 @@ else:
     import tomli as tomllib
 
 FORMAT, FORMAT_VERSION = "processor-certificate", "1.0"
-COVERAGE_FACTOR = 2.0
+COVERAGE_FACTOR = 2.0  # for 95 % (GUM, G.6.6)
 LEAST_SCENES = 3  # for a scatter between scenes
 METHOD = text(
     "After ISO 15530-3 (uncertainty from repeated measurement of a calibrated workpiece): the simulated structure is "

@@ -40,9 +40,9 @@ from processor.validation.loss import Loss, loss
 
 ALARM_RATE = 0.005  # of a night, for worse and for better each
 SAME = 1e-6  # relative: what another library's rounding may move
-LEAST_PAIRS = 3
+LEAST_PAIRS = 3  # two have a scatter of one degree of freedom, whose t test finds nothing
 LEAST_DOF = 5  # of the scatter from seed to seed
-LEAST_NIGHTS, MOST_NIGHTS = 5, 120
+LEAST_NIGHTS, MOST_NIGHTS = 5, 120  # the first of 6 ranks has 1 in 6; four months
 GRID = 64  # steps of normal scores in 1
 LEAST_SPREAD = 1e-9  # of differences: rounding remains where they agree to the last bit
 

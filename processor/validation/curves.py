@@ -23,7 +23,7 @@ from processor.report.charts.line_chart import Chart
 from processor.validation.history import Figures, Row, by_quantity
 
 FORMAT, FORMAT_VERSION = "processor-validation-curves", "1.0"
-NOMINAL = 95.0
+NOMINAL = 95.0  # % of intervals that hold the truth
 MOST_LINES = 8  # of a chart
 DECADE = 10.0  # ratio of the values of a chart above which its axis is logarithmic
 ERRORS = (Statistic.RMS, Statistic.MEDIAN, Statistic.MEAN)  # the first that a quantity has is drawn

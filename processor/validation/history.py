@@ -24,7 +24,7 @@ from processor.store.codec import value_from_json, value_to_json
 from processor.validation.cells import Cell, Origin, Outcome, checks_of
 from processor.validation.software_identity import Software
 
-VERSION = 3
+VERSION = 3  # of the tables below
 # Columns added by version. Earlier figures have no statistic: certificates are of the present software.
 ADDED = {2: ("figures.quantity", "figures.statistic", "figures.better", "nights.message"), 3: ("cells.origin",)}
 ADD = "ALTER TABLE {} ADD COLUMN {} TEXT NOT NULL DEFAULT ''"
@@ -32,7 +32,7 @@ UPGRADES = {
     version: tuple(ADD.format(*name.split(".")) for later in ADDED if later > version for name in ADDED[later])
     for version in range(1, VERSION)
 }
-BUSY_S = 60.0
+BUSY_S = 60.0  # another night may write for some seconds
 SCHEMA = """
 CREATE TABLE nights (
   night TEXT PRIMARY KEY,             -- YYYY-MM-DD

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from processor.model import Better
 
-TINY = 1e-12
-TARGETS = {Better.ZERO: 0.0, Better.ONE: 1.0, Better.NOMINAL_95: 95.0}
-RATIO_MARGIN = math.log(1.02)
+TINY = 1e-12  # of a logarithm: below any figure that is printed
+TARGETS = {Better.ZERO: 0.0, Better.ONE: 1.0, Better.NOMINAL_95: 95.0}  # at which a figure is best
+RATIO_MARGIN = math.log(1.02)  # 2 %: a smaller change is no news, however sure
 POINTS_MARGIN = 1.0  # of shares, in %
 BIAS_MARGIN = 0.1  # of the size that the figure has
 

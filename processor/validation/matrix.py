@@ -56,7 +56,7 @@ else:
 DEFAULT = Path(__file__).with_name("default_matrix.toml")
 FOREIGN = PROJECT / "tests" / "bench" / "foreign"  # part of the sources, not of an installed package
 MOST_SEED = 2**63  # a seed is stored as a 64-bit integer
-MOST_CELLS = 10_000
+MOST_CELLS = 10_000  # work: at some seconds each, more than a night
 
 
 def _aims(value: Any, _: Place) -> Mapping[str, str | float]:

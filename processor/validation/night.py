@@ -34,7 +34,7 @@ from processor.validation.summary import Summary
 LOCK, SCRATCH, CELLS, NIGHTS = ".validation", ".making", "cells", "nights"
 HISTORY = "history.sqlite"
 KEPT_NIGHTS = 14  # whose results.json of cells are kept
-SEEN_NIGHTS = change_detection.MOST_NIGHTS + 10
+SEEN_NIGHTS = change_detection.MOST_NIGHTS + 10  # some nights may lack a case
 
 
 def number_of(night: str) -> int:

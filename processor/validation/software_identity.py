@@ -18,7 +18,7 @@ PACKAGES = ("processor", "designgen")
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "cadquery", "cadquery-ocp")
 SOURCES = (".py", ".toml")
 NOT_DIGESTED = ("report",)  # of processor: tables, figures and pages, which no figure of a night is read from
-GIT_S = 10
+GIT_S = 10  # a repository on a network drive answers within seconds
 
 
 @dataclass(frozen=True)

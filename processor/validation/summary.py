@@ -23,7 +23,8 @@ from processor.validation.software_identity import Software
 
 FORMAT, FORMAT_VERSION = "processor-validation", "1.0"
 MOST_NAMED = 2  # changes that the line names
-SPARK_NIGHTS, SPARK_WIDTH, SPARK_HEIGHT = 60, 120, 22
+SPARK_NIGHTS, SPARK_WIDTH, SPARK_HEIGHT = 60, 120, 22  # two months, at 2 pixels a night, of a table's row
+# Numbers are of processor.validation.change_detection and processor.validation.loss.
 TEST = text(
     "Fixed seeds give the same scenes every night, so their figures change only with the software. Changed figures "
     "are tested by paired one-sided t tests over the scenes, with a margin of 2 % (1 point for shares). The scatter"

@@ -20,8 +20,8 @@ STANDARD = {INTENSITY: "intensity", ROW: "rowIndex", COLUMN: "columnIndex"}
 STANDARD |= {name: f"color{name.title()}" for name in COLOURS}
 PREFIX, EXTENSION = "ssc", "urn:steel-scan-check:scalar-fields"
 DESCRIPTION = "written by steel-scan-check"
-LARGEST = 2**31 - 1
-COLOUR_ENDS = (("Minimum", 0), ("Maximum", 255))
+LARGEST = 2**31 - 1  # of int32, as readers store rows and columns
+COLOUR_ENDS = (("Minimum", 0), ("Maximum", 255))  # of 8 bits
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 

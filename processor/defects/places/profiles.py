@@ -19,7 +19,7 @@ from processor.model import Floats, Ints, Word
 
 MODEL_SHARE = 0.1  # of the depth, by which a place may deviate from the shape of a model
 BLOCK_SHARE = 0.5  # of a place's half size: blocks of residuals that agree
-FEWEST_CELLS = 12
+FEWEST_CELLS = 12  # twice the unknowns of a model
 MOST_CELLS = 1500  # fitted; of more, an even sample
 AT_BORDER = 0.35  # of a place's width, the largest distance from a border of a bent edge
 MARGIN_CHI2 = 20.0  # by which a model must be better than a bump

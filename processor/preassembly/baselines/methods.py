@@ -43,7 +43,7 @@ from processor.preassembly.result import (
     overall_status,
 )
 
-NOWHERE = np.full((4, 4), np.nan)
+NOWHERE = np.full((4, 4), np.nan)  # no pose
 LINE_SPACING_MM = 5.0  # of points along the design's lines
 GAUGES = {"corner": Gauge.PRINCIPAL_AXES, "line": Gauge.PRINCIPAL_AXES, "design-aided": Gauge.LINES}
 

@@ -38,8 +38,8 @@ RAYLEIGH_95 = 2.447747  # radius that holds 95 % of a round normal distribution 
 
 # What counts as misalignment: rows of (point, axis), corners along both.
 ACROSS = ((0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (2, 2), (3, 1), (3, 2), (4, 2), (5, 1), (6, 2), (7, 1))
-_ROWS: Ints = np.array([3 * point + axis for point, axis in ACROSS])
-_ALONG: Ints = np.arange(0, 24, 3)
+_ROWS: Ints = np.array([3 * point + axis for point, axis in ACROSS])  # of the 24 gaps, three a point
+_ALONG: Ints = np.arange(0, 24, 3)  # x of each of the eight points
 
 
 class JointQuantity(Word):

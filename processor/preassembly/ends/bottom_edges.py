@@ -32,9 +32,9 @@ from processor.preassembly.ends.outer_faces import ALONG, RegisteredPart
 from processor.robust_statistics import robust_sd
 
 REACH_MM = 200.0  # across each face
-LEAST_POINTS = 30
+LEAST_POINTS = 30  # ten times the unknowns of a plane: fewer are of what hides the edge
 LEAST_KEPT = 0.7  # of the points of an interval: on the plane fitted to them
-FLOOR_MM = 0.004
+FLOOR_MM = 0.004  # of the design's mesh and of rounding
 PASS_POINTS = 50_000  # beside an edge, in memory at once
 
 

@@ -47,7 +47,7 @@ from processor.robust_statistics import robust_sd
 
 # Sizes of bending terms, the finest for scans without noise, and their prior weights: ends are cut by a plane.
 BENDS_MM = (0.0, 0.02, *SIZES_MM[1:])
-BEND_WEIGHTS = (0.5, 0.5, *(0.1,) * (len(SIZES_MM) - 1))
+BEND_WEIGHTS = (0.5, 0.5, *(0.1,) * (len(SIZES_MM) - 1))  # all larger ones together: 0.5
 RING = 8  # coefficients of the ring
 PLATE_SD_MM = 0.5  # of a plate's thickness: as delivered within -0.6 and +1.0 mm at 15 to 25 mm (EN 10029, class A)
 PASS_POINTS = 50_000  # of an end whose departures are computed at once

@@ -10,17 +10,17 @@ import numpy as np
 
 from processor.model import Bools, Floats, Ints
 
-BIN_MM = 3.0
+BIN_MM = 3.0  # chosen: wider than noise scatters, narrower than half a plate
 REACH_MM = 60.0  # inward and outward
 LAYER_MM = 9.0  # half the width of a layer; plates are thicker
 CLEAR_SHARE = 0.35  # of the fullest bin: fewer points are outliers and no layer
 SECOND_SHARE = 0.05  # of all points, inside the outermost layer: fewer are outliers
-FEWEST = 40
-FEWEST_OF_CELL = 12
+FEWEST = 40  # points of a layer or ring: fewer outliers together do not look like one
+FEWEST_OF_CELL = 12  # points of a cell of a layer: its plane has three unknowns
 FEWEST_BESIDE = 10  # points of the end face on one side of a layer, which show that the plate is there
 CLIMBS = 2  # a plate has two sides
 ONE_LAYER_SHARE = 0.7  # of the points above a layer that must lie on one surface, to be a layer themselves
-THINNEST_MM = 6.0
+THINNEST_MM = 6.0  # chosen: plates of sections are thicker; a step of less is the noise of one side
 FEW, STARTS = 500, (0.1, 0.5, 0.9)  # points by which two sides are looked for, and quantiles of heights to begin at
 RING_SHARE = 0.95  # quantile of a ring's points that is taken for this share of the thickness
 

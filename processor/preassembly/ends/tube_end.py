@@ -44,6 +44,8 @@ QUADRANTS = 4  # of the wall, each a plate whose two sides are compared
 AXIS_MM = 120.0  # of the end, in which the design's axis is straight
 ACROSS = 0.5  # cosine between a facet's normal and the axis, below which it is of a wall
 HALF_WALL = 0.5  # of the wall's thickness: larger departures may be of its other side
+# The ellipse of the two changes with half axes TURN_BOUND and twice that is the least that holds (sin r, cos r - 1) of
+# every turn r: sin^2 r + (cos r - 1)^2 / 4 is at most 4 / 3, at cos r = -1 / 3.
 TURN_BOUND = 2.0 / np.sqrt(3.0)
 SECOND = slice(3, 5)  # coefficients of wall and end face twice round
 

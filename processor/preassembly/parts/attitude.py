@@ -42,7 +42,7 @@ class Attitude:
     turn_known: bool = True  # about the axis of a round tube
 
 
-NOWHERE = Attitude(np.full((4, 4), np.nan), np.full((4, 4), np.nan), Status.FAILED)
+NOWHERE = Attitude(np.full((4, 4), np.nan), np.full((4, 4), np.nan), Status.FAILED)  # no pose
 
 
 class Shapes:

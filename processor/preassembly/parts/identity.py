@@ -24,9 +24,9 @@ from processor.registration.pose_search import SAMPLE_SPACING_MM, DesignSurface
 
 AROUND = 30_000  # points that show the surface's departure near a mark: one in 50 mm on a long part
 NEIGHBOURS = 64  # of them near a sample: a circle of some 0.2 m radius
-LEAST_NEIGHBOURS = 8
-REACH_MM = 60.0
-SAME_FACE_COS = 0.9
+LEAST_NEIGHBOURS = 8  # of them on the sample's own face: a median of fewer is a point's noise
+REACH_MM = 60.0  # of points off the design that show its departure: parts are within
+SAME_FACE_COS = 0.9  # 25 degrees: less than between the faces of a section, more than noise of normals
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ SLICES, LEAST_OF_TYPICAL = (
     0.1,
 )  # of a part's length; of the median number of points on a slice's side: it is covered
 ACROSS = 0.7  # cosine to the part's axis, below which a normal is of the part's sides
-LEAST_COVERED = 0.7
+LEAST_COVERED = 0.7  # chosen: of a part less seen, bow and twist are guesses; the doubt states the share
 RIGHT_PART = (reason("preassemble.right-part"),)
 AT_PART_MM = 60.0  # of the design, at which points of the ground may be of the part
 

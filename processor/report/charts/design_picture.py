@@ -15,6 +15,7 @@ from processor.report.style import COLOURS, DASHES, default_settings, drawable, 
 from processor.scan_folder.shapes.body import Body, Unsure
 
 Line = tuple[str, float, str]  # colour, width, dash
+# Drawn: thin grey, thick coloured, thin dark.
 EDGE, BOTTOM, MEMBER = ("0.7", 0.5, DASHES[0]), (COLOURS[2], 1.2, DASHES[1]), ("0.5", 0.8, DASHES[0])
 SURE, UNSURE = COLOURS[0], COLOURS[1]
 MOST_NAMED = 60  # names of nodes; of more the unsure ones alone

@@ -13,7 +13,7 @@ from processor.report.style import DIVERGING
 
 LEAST_BAND = 1e-3  # of a step of colour
 STEPS = 4  # of colour beyond the band, to either side
-COLOUR_QUANTILE = 0.995
+COLOUR_QUANTILE = 0.995  # the few largest do not take the steps from the rest; they have the last colour
 WITHIN = "#e9e9e9"
 
 

@@ -28,12 +28,12 @@ from processor.report.style import (
 )
 
 MAPS, CURVES = "defects-maps.png", "defects-curves.png"
-ACROSS = 3
-MOST_CURVES = 4
-MOST_MAPS = 12
+ACROSS = 3  # drawn size: maps beside each other are read on A4
+MOST_CURVES = 4  # drawn size: more curves cannot be told apart; the caption counts them
+MOST_MAPS = 12  # drawn size: four rows on the page; the document has all
 DOCUMENT = "defects.pdf"
 LINE = 0.07  # of a panel's height
-REMARK_WIDTH, REMARK_LINES = 52, 4
+REMARK_WIDTH, REMARK_LINES = 52, 4  # characters and lines: drawn size, of a map's margin
 
 
 def draw(result: Result) -> CaptionedPngs:

@@ -16,7 +16,7 @@ from processor.language.messages import Message, text
 from processor.report import style
 from processor.report.epochs.tables import ordered
 
-MOST, ACROSS = 12, 3
+MOST, ACROSS = 12, 3  # drawn size: four rows on the page
 CAPTION = text(
     "Change of each component's strongest value since its first epoch, with 95 % intervals of both epochs together; in "
     "orange what changed."

@@ -28,7 +28,7 @@ CLOSURE = (
     text("closure about the axis across"),
     text("closure about the vertical"),
 )
-CLOSURE_UNITS = ("mm",) * 3 + ("mrad",) * 3
+CLOSURE_UNITS = ("mm",) * 3 + ("mrad",) * 3  # of the shifts and turns above
 _PAIRS = (JointQuantity.MISALIGNMENT, JointQuantity.GROOVE_GAP_LEAST, JointQuantity.GROOVE_GAP_GREATEST)
 WHAT_TO_DO = (
     *columns("joint", "verdict", "proposal"),

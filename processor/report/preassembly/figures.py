@@ -35,6 +35,7 @@ CALLOUTS = {Verdict.FAIL: "#b34700", Verdict.PASS: "#005a94", Verdict.INDETERMIN
 GAP_SHARE = 0.04  # of the bridge's length: how long the largest gap is drawn
 SHOWN_LIVE = ("linear-error.png", "trade-off.png")  # the page's charts have the same lines
 OF_OTHER_METHODS = ("gaps-by-axis.png",)
+# Title, columns of the figures, and name of the line.
 TRADED = (("splicing error, mean |d|", 0, 2, "mean"), ("splicing error, largest |d|", 1, 3, "largest"))
 
 

@@ -18,8 +18,8 @@ from processor.report.table import shown
 from processor.store.json_values import json_ready
 
 MOST_POINTS = 24_000  # of all parts: about 0.6 MB of the page
-MOST_ON_AN_EDGE = 80
-MOST_CHAINAGES = 3_000
+MOST_ON_AN_EDGE = 80  # drawn size: a curve is smooth with as many
+MOST_CHAINAGES = 3_000  # drawn size: more than a screen has pixels across
 
 
 def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:

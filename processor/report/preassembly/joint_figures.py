@@ -17,7 +17,7 @@ from processor.preassembly.chain.joint_measures import RAYLEIGH_95, Measures
 from processor.preassembly.result import Result
 from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, png, printable_name, rounded
 
-MOST_JOINTS = 24
+MOST_JOINTS = 24  # drawn size: of more the page would be longer than anybody reads; tables have all
 ARROW_SHARE = 0.3  # of the section: how long the longest arrow is drawn
 # A thin line with a small head, which covers neither the start nor the end
 ARROW = {"arrowstyle": "-|>", "color": COLOURS[0], "lw": 1.4, "mutation_scale": 7, "shrinkA": 0, "shrinkB": 0}

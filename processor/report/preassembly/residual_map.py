@@ -20,9 +20,9 @@ from processor.report.style import LEAST_SHOWN_MM, png, printable_name
 from processor.robust_statistics import MAD_TO_SD
 
 FACES = ("bottom", "right", "top", "left")
-MOST_PARTS = 24
-ACROSS = 2
-POINTS_A_CELL = 6.0
+MOST_PARTS = 24  # drawn size: of more the page would be longer than anybody reads; tables have all
+ACROSS = 2  # drawn size: maps of long parts beside each other on A4
+POINTS_A_CELL = 6.0  # a cell's mean has 0.4 of the noise of a point, and few cells are empty
 SECTIONS = 30  # pieces of a part's length that the height of its section is read from
 
 

@@ -164,7 +164,7 @@ def _linear(result: Result, method: str) -> Table:
     return tabulate(title, cells, "linear", on_page=False, on_terminal=False)
 
 
-JOINTS_ABREAST = 4
+JOINTS_ABREAST = 4  # drawn size: three columns each fit on A4 across
 
 
 def _by_point(result: Result, title: Message, values: Floats) -> list[Table]:

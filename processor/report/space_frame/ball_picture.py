@@ -30,10 +30,10 @@ NOTHING, BESIDE, WITHIN = 0, 1, 2  # of a pixel: points before and behind the sl
 PAGE_DPI = 165  # of what the pages of a document share
 # In inches: the figure, and its panels (left, bottom, width, height).
 SIZE_IN = (12.4, 5.65)
-VIEWS_IN = ((0.72, 0.72, 4.03, 4.03), (5.57, 0.72, 4.03, 4.03))
+VIEWS_IN = ((0.72, 0.72, 4.03, 4.03), (5.57, 0.72, 4.03, 4.03))  # elevation and plan, to one scale
 NUMBERS_IN, NUMBERS_WIDTH_IN = (9.73, 5.02), 2.63  # upper left corner
 HEADING_IN, EDGE_IN = 5.07, 0.04  # lower edge of the heading; margin of the legend
-HEADING_LINES = 3
+HEADING_LINES = 3  # drawn size: more would lie over the views
 X_LABEL_IN, Y_LABEL_IN = 0.29, 0.53  # from a view to the labels of its axes
 VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of each
 

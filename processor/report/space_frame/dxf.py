@@ -23,7 +23,7 @@ MILLIMETRES = 4  # of $INSUNITS
 METRIC = 1  # of $MEASUREMENT
 # With the colours of AutoCAD's index.
 LAYERS = {"NODES": 5, "AXES": 8, "MOVEMENTS": 30, "IDS": 7, "LOWEST": 3, "HANGERS": 4, "CLASHES": 1}
-TEXT_HEIGHT_MM, CLASH_RADIUS_MM = 50.0, 150.0
+TEXT_HEIGHT_MM, CLASH_RADIUS_MM = 50.0, 150.0  # drawn size: 2.5 mm at 1:20; a circle as large as a ball
 
 
 def drawing(result: Result) -> bytes:

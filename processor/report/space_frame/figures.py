@@ -34,7 +34,7 @@ from processor.report.style import (
 from processor.robust_statistics import finite_median
 from processor.space_frame.result import LOCATED_FLAGS, Flag, Result
 
-MOST_LABELS = 30
+MOST_LABELS = 30  # drawn size: more lie over each other; the table names all
 ARROW_SHARE = 0.6  # of the way to the next ball: how long all but the longest arrows are drawn
 PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors.png"
 

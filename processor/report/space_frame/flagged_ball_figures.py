@@ -19,14 +19,14 @@ from processor.views import Views, views
 
 PREFIX = "flagged-ball-"
 MOST_BALLS = 12  # on the page
-MOST_PAGES = 100
+MOST_PAGES = 100  # work: where more are flagged something common to all is wrong
 DOCUMENT = "flagged-balls.pdf"
 ORDER = (Flag.WRONG_SIZE, Flag.NOT_FOUND, Flag.LOW_CONFIDENCE)  # of what is drawn first
 ROUND_MM = 60.0  # shown about the ball at least
 SCALE_MM = 10.0  # what is shown is a multiple of it, so that balls of a size are drawn to the same scale
 SLACK_MM = 0.1  # of a box, beyond what is shown
 MOST_KEPT = 200_000  # points of a ball, of which a panel shows a slice and the rest
-LEAST_RADIUS_MM = 30.0
+LEAST_RADIUS_MM = 30.0  # drawn size: shown about a place whose radius is not known
 CELL_MM, MOST_CELLS = 10.0, 1_000_000  # of the x axis, by which points near any ball are chosen
 
 

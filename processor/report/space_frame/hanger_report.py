@@ -14,8 +14,8 @@ from processor.report.table import Table, csv_of_rows, tabulate
 from processor.space_frame.result import Flag, Result
 
 PLAN, STAKE_OUT = "hangers.png", "stakeout.csv"
-MOST_NAMED = 30
-LENGTHS = LinearSegmentedColormap.from_list("length", DIVERGING_STOPS[2:])
+MOST_NAMED = 30  # drawn size: more lie over each other; the table names all
+LENGTHS = LinearSegmentedColormap.from_list("length", DIVERGING_STOPS[2:])  # the half of it from grey to blue
 COLUMNS = columns("name", "x_m", "y_m", "z_m", "code")
 LOWEST, CEILING = "LOWEST", "CEILING"
 

@@ -15,7 +15,7 @@ from processor.store.json_values import json_ready
 
 TONES = ("#0072B2", "#D55E00", "#000000")  # of LOCATED_FLAGS
 MOST_BALLS = 5_000  # about 1 MB of the page; flagged balls are always included
-MOST_TUBES = 15_000
+MOST_TUBES = 15_000  # three for each ball shown
 
 
 def interactive_data(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:

@@ -18,7 +18,7 @@ from processor.stitching.result import Result, Scans
 
 PLAN, OVERLAP = "stitch-plan.png", "stitch-overlap.png"
 PLAN_POINTS = 4000  # of each scan
-MOST_NAMED = 40
+MOST_NAMED = 40  # drawn size: more names lie over each other
 
 
 def draw(execution: Execution, runs: Sequence[StepRun], _: ErrorReport) -> CaptionedPngs:

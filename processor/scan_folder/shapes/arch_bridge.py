@@ -18,8 +18,8 @@ from processor.scan_folder.shapes.contact_faces import Contact, PlaneFace, conta
 from processor.scan_folder.shapes.sections import LEFT, STRAIGHT_MM, SectionPlane, corners, key_points, skin_at_end
 
 SAME_MM = 0.5  # between the corners of two ends, and between a corner and the skin's
-SKIN_MM = 0.5
-OVERLAP_MM = 0.2
+SKIN_MM = 0.5  # as SAME_MM, of an end's corners from the part's outer faces
+OVERLAP_MM = 0.2  # rounding and chords of a mesh; parts that overlap by more do not meet end to end
 PLAUSIBLE_MM = (150.0, 10_000.0)  # sizes of a section
 END_MM = 0.5  # between the end of a bottom edge and the corner of the next joint
 REACH_SHARE = 0.6  # of a foot's length that its bottom edges have to reach from the joint

@@ -17,12 +17,12 @@ from processor.scan_folder.shapes.body import Body, Mask
 
 SPAN = 0.62  # largest radius of a facet's circle by the sphere's: an icosahedron has 0.607
 SAME = 0.03  # of the radius: spheres of neighbouring edges that differ less in centre and radius are one
-FEWEST_EDGES = 6
+FEWEST_EDGES = 6  # 1.5 times the four that determine a sphere
 NET = 1.3  # least number of edges by their ends: 2 to 3 on a ball, 1 or 0.5 between two rings of a cone
 ON_SPHERE = 2e-3  # of the radius: distance of a corner from the sphere that it is on
 SURE_RESIDUAL = 1e-3  # of the radius, rms
 SURE_COVER = 0.15  # of the sphere's area: a fillet or a domed cap covers less
-LEAST_COVER = 0.05
+LEAST_COVER = 0.05  # of the sphere's area: a ball with less left of it is a fillet
 THIN = 0.03  # of the radius: least thickness of what is there of a ball
 TURNING, FEWEST_FACETS = 0.02, 24  # least variance of a ball's normals in any direction; a sphere has 0.33
 RADIAL, LOOSE = 0.95, 0.01  # cosine of its normals from the radius; rms by the radius

@@ -14,7 +14,7 @@ AT_CORNER_MM = 0.2  # distance of the first vertex from the corner
 BEVEL_MM, BEVEL_SLOPE = 60.0, 0.02  # how far behind the corner the edge may begin, and how far aside by that
 TURN_COS = np.cos(np.radians(35.0))  # an edge that turns more at a vertex has ended
 STEP_MM = 100.0  # between points of a curved edge
-STRAIGHT_MM = 1e-3
+STRAIGHT_MM = 1e-3  # rounding of a file in float32 at 10 m: an edge off its chord by less is straight
 
 
 def follow(body: Body, corner: Floats, inward: Floats) -> Floats:

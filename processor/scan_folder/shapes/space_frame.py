@@ -11,7 +11,7 @@ from processor.scan_folder.shapes.balls import Balls
 from processor.scan_folder.shapes.body import Body, Unsure
 from processor.scan_folder.shapes.tubes import Tubes
 
-FEWEST_BALLS, FEWEST_MEMBERS = 3, 2
+FEWEST_BALLS, FEWEST_MEMBERS = 3, 2  # a triangle's balls, and two of its members
 OFF_AXIS = 0.3  # of a ball's radius: its centre may lie so far from the axis of a tube that ends there
 TRUE_AXIS = 0.05  # of the radius: with more the design is eccentric, or the ball another's
 SHORT = 0.3  # of the clear distance between two balls: a shorter cylinder is a sleeve, a bolt or a bore

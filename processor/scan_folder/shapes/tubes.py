@@ -14,8 +14,8 @@ from processor.scan_folder.shapes.body import Body
 FLAT_COS = np.cos(np.radians(0.5))  # facets that turn less at an edge are one plane piece
 TURN_COS = np.cos(np.radians(50.0))  # a tube has 8 sides or more, a hexagonal sleeve 6
 PARALLEL = 2e-3  # rad: a cone's edges differ by more
-FEWEST_EDGES = 6
-FEWEST_FACETS = 12
+FEWEST_EDGES = 6  # of eight that turn: one side may be hidden
+FEWEST_FACETS = 12  # two triangles a side of six
 ACROSS, ABOUT, AXIAL_COS = 1e-3, 0.3, 0.98  # mean squares of the normals along the axis and across; of an edge along it
 ROUND = 5e-3  # of the radius: rms of the edges' distances from the axis
 LEAST_TURN = np.pi  # of the directions of the edges about the axis

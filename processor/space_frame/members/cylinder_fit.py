@@ -31,17 +31,17 @@ from processor.space_frame.points.line_crops import FIELD, HALF
 
 # Numbers of steps and parameters are passed as np.int64: numba compiles a kernel anew for every literal.
 
-BIN_MM = 10.0
+BIN_MM = 10.0  # of the length: an end is found to a bin, and TRIM_MM more is taken off
 ROUGH_TRIM_MM = 30.0  # off each rough end
-CUTS_MM = (30.0, 15.0)
-CUT_SIGMAS = 3.5
+CUTS_MM = (30.0, 15.0)  # chosen: of the first two rough fits: a line of voxels is off by as much
+CUT_SIGMAS = 3.5  # chosen: of normal errors 1 in 2,000 is lost; larger cuts take in the ends of cones
 LEAST_CUT_MM = 4.0  # of rough fits: stations may be shifted
 ROUGH_MM = 2.0  # errors of a straight axis and of the stations, beside the noise
 NEAR_M = 20.0  # of a station; beyond it errors of its attitude dominate
 FINE_MM = 0.7  # error of a bowed axis
 LEFT_MM = 0.02  # remaining change that stops the iteration: a tenth of an axis's error by noise
 TRIM_MM = 8.0  # off each end: the start of a cone is not sharp
-LEAST_SIGMA_MM = 0.05
+LEAST_SIGMA_MM = 0.05  # of the scatter about a tube, for scans without noise
 ROUGH_COS = 0.5  # of incidence, in rough fits
 COS_BINS = 8  # of 0.1 from GRAZING_COS to 1
 SECTORS = 24  # around a tube

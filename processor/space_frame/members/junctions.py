@@ -18,7 +18,7 @@ MISS_MM = 25.0  # largest distance of a rough line from its node
 LEAST_SINE = 0.2  # of the angle between two lines whose crossing is used
 SAME_RAY_COS = np.cos(np.deg2rad(8.0))  # rays within this angle are parts of one tube
 ONE_NODE_MM = 120.0  # nodes are not closer than this
-LEAST_RAYS = 3
+LEAST_RAYS = 3  # lines that meet: two cross anywhere
 UNSEEN_MM = 4000.0  # of a member that was seen in part only
 LEAST_COVER = 0.2  # share of the way between two nodes on which a line must be seen
 

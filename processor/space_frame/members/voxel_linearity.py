@@ -14,9 +14,9 @@ from processor.model import Floats, Ints
 from processor.space_frame.points.voxels import SIDE, Voxels
 
 SMALL2, LARGE2 = 6, 17  # squared radii of the two windows, voxels
-HALO = 4
-WIDE = SIDE + 2 * HALO
-LEAST_VOXELS = 4
+HALO = 4  # voxels: the radius of the larger window
+WIDE = SIDE + 2 * HALO  # of a block with what lies about it
+LEAST_VOXELS = 4  # three axes of a scatter and a mean take four
 
 
 class Linearity(NamedTuple):

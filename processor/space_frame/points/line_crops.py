@@ -21,10 +21,10 @@ from processor.geometry.thread_ranges import over_ranges, usable
 from processor.model import Floats, Ints, Labels
 from processor.space_frame.points.hash_sampling import REACH, STEPS_PER_MM, WHOLE, hashed
 
-CELL_MM = 200.0
+CELL_MM = 200.0  # work, not result: about as wide as the lines' reach
 FIELD = 21  # bits for each coordinate of a point less its line's middle
 HALF = 1 << (FIELD - 1)  # 10.5 m in steps of 0.01 mm
-CELL_FIELD = 20
+CELL_FIELD = 20  # bits for each coordinate of a cell: 105 km either way
 LEAST_RANGE = 50_000  # points that a thread takes at once
 
 

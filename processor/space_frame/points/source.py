@@ -15,7 +15,7 @@ from processor.model import Bools, Floats, Labels
 from processor.views import Views
 
 UNKNOWN_STATION = -1
-CHUNK_POINTS = 1 << 20
+CHUNK_POINTS = 1 << 20  # in memory at once: 25 MB; work, not result
 
 
 @dataclass(frozen=True)

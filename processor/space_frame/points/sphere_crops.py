@@ -22,7 +22,7 @@ from processor.space_frame.points.hash_sampling import WHOLE, hashed
 from processor.space_frame.points.source import Source
 
 GREATEST_REACH_MM = 1000.0  # 21 bits per axis
-BLOCK = 1 << 14
+BLOCK = 1 << 14  # points of a thread's task: work, not result
 MOST_POINTS = 2_000_000  # of all crops together, and of each
 LEAST_ROOM = 512  # of a crop, however many there are
 STEPS_PER_MM = 1000.0  # gathered coordinates are whole micrometres: sorting them is exact

@@ -38,10 +38,10 @@ from processor.space_frame.spheres.unnamed_view_errors import view_errors
 
 NAN = float("nan")
 MARGIN_MM = 26.0  # of a crop beyond the largest sphere: sleeves are measured there
-LARGEST_FREE_MM = 150.0
+LARGEST_FREE_MM = 150.0  # chosen: radius, above the bolt balls of catalogues
 FREE_SIZES = np.arange(20.0, LARGEST_FREE_MM + 1.0, 5.0)  # where a fit of a free radius starts
 MOST_MODEL_POINTS = 60.0  # points that the noise model is worth for one sphere, at most
-ROUNDS = 3
+ROUNDS = 3  # work: of noise, shifts of stations and fits in turn; two where there are no shifts
 NODES = 200  # of a tile
 VAGUE_MM = 50.0  # a node with a larger sd than this has no prior
 

@@ -39,15 +39,15 @@ from processor.space_frame.spheres.records import (
     ViewErrors,
 )
 
-LEAST_POINTS = 8
+LEAST_POINTS = 8  # twice the unknowns of a sphere
 LARGEST_LOWEST_SD_MM = 0.8  # an error of 3 mm is then nearly four standard deviations
 LARGEST_RADIUS_SD = 0.05  # in radii
-LARGEST_SCALE = 1.6
+LARGEST_SCALE = 1.6  # scatter by the noise model's: chance exceeds it once in 1,000 at 15 degrees of freedom
 UNLIKELY = 1e-3  # probability below which points and priors disagree
 LEAST_GAIN = 0.02  # share of a prior's variance that points must remove to be tested against it
 SURE = 3.0  # standard deviations beyond which an offset of all radii is reported
 UNLISTED = 6.0  # scatters of radii off its size, from which on a sphere is of no size of the catalogue
-FEW = 30
+FEW = 30  # chosen: points below which sizes of a catalogue fit almost alike, and FEW_MARGIN is asked for
 FEW_MARGIN = 10.0  # added to the margin that the runner-up must lose by, where points are few
 LEAST_VISIBLE = 0.05  # share of the sphere
 LEAST_INLIERS = 0.3  # share of the crop
@@ -55,7 +55,7 @@ LARGEST_RMS = 0.1  # of the residuals, in radii
 PAPER_RADIUS_ERROR_MM = 3.0  # paper 001, table 2: RANSAC keeps radii within 0-3 mm
 CENTRAL = 0.7  # of the radius: rays that pass the centre within this meet the sphere in spite of noise
 CLEAR = 1.5  # radii before or behind the centre: a ray that ends there does not end on the sphere
-LEAST_RAYS = 5
+LEAST_RAYS = 5  # chosen: that agree on what is at a place; fewer may be outliers
 UNKNOWN_RADIUS_MM = 40.0  # where neither design nor catalogue gives one
 DOWN = np.array([0.0, 0.0, 1.0, -1.0])  # height of the lowest point by (x, y, z, radius)
 

@@ -39,13 +39,13 @@ from processor.space_frame.spheres.records import (
     StochasticModel,
 )
 
-LEAST_COSINE = 0.15
+LEAST_COSINE = 0.15  # of incidence, 81 degrees: nearer to the limb a beam is split between ball and background
 MISSED, VISIBLE, MASKED = 0, 1, 2  # what a ray meets
 FULL_SD, CUT_SD = 3.0, 4.5  # residuals up to the first have weight 1, beyond the second weight 0
-GATE_MM = 40.0
+GATE_MM = 40.0  # chosen: from the sphere at the start: as far as crossings of axes may be off a centre
 AROUND_MM = 25.0  # points farther from a sphere's surface are not used
-COARSE_MM, FINE_MM = 1e-3, 1e-4
-TOLERANCE_MM = 1e-6
+COARSE_MM, FINE_MM = 1e-3, 1e-4  # step that ends an iteration before the last; which tolerances take one iteration less
+TOLERANCE_MM = 1e-6  # step that ends the last: rounding
 ITERATIONS = 4  # alternations of the scale and the fit by it
 LARGEST_BIAS = 0.3  # sd
 

@@ -29,7 +29,7 @@ from processor.space_frame.spheres import sleeve_radii
 
 REACH_MM = 240.0  # about a node: sleeve and cone of an ordinary ball
 POINTS = 512  # of a node, at most
-RADII = np.arange(25.0, 160.0, 2.5)
+RADII = np.arange(25.0, 160.0, 2.5)  # of balls, mm, as of catalogues, by half of their usual step
 LEAST_RATIO = 1.25  # of a ball's radius to that of its thinnest tube
 LUMP = 0.12  # rms departure of a cylinder or box from the nearest sphere, in radii
 BESIDE_MM = 25.0  # points this far from a surface are those of something else
@@ -41,7 +41,7 @@ CLAMP = 1.6  # tube radii from the node: no sleeve begins nearer
 CLEAR_MM = 5.0  # distance of a sleeve from ball or clamp
 MISTAKEN = 0.01  # probability that evidence of one kind is wrong as a whole, however many points it has
 UNLIKE = 0.2  # probability that a member joins a ball and something else
-ITERATIONS = 50
+ITERATIONS = 50  # of the shares of kinds (expectation maximisation): work; it has settled long before
 
 
 def nodes_with_ball(source: Source, measured: Measured, starts: Floats, threads: int = 0) -> Bools:

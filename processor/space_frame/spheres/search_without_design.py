@@ -22,7 +22,7 @@ from processor.space_frame.spheres.assessment import DOWN, LARGEST_SCALE, Row, a
 
 COARSE_MM = 1.0  # rounding to it adds noise of 0.3 mm, as much as that of a good scanner
 LEAST_ONE_SIDED = 0.2  # length of the mean of normals; 0.5 of half a sphere, 0 of one seen from all around
-FAR_RADII = 1e4
+FAR_RADII = 1e4  # of a scanner that is not known: rays are parallel to 1e-4 rad
 GRAZING_COS = 1e-3  # least cosine to the side that a sphere was seen from: its inverse must be finite
 STEEP_COS = 0.5  # of the incidence of a ray
 MOST_CELLS = 60  # of a sphere, else half as many: enough for correlations, and the time goes with the cube

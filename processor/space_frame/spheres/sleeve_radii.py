@@ -19,7 +19,7 @@ SLEEVE_OF_TUBE = 0.70  # corner radius of a sleeve with too few points, as a sha
 SLEEVE_MM = 25.0  # where the tube's radius is not known either
 FLAT_MM = 1.0  # by which a milled flat is wider than its sleeve
 AXIS_MM = 1.5  # allowance for the error of the axis at the node
-LEAST_POINTS = 8
+LEAST_POINTS = 8  # a median of eight is within 0.5 of their scatter
 RADIUS_BIN_MM = 4.0  # tubes whose radii round to the same multiple are taken to have equal sleeves
 
 

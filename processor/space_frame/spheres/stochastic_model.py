@@ -27,18 +27,18 @@ from processor.space_frame.points.sphere_crops import CropsWithRays
 from processor.space_frame.spheres.ball_fit import variance
 from processor.space_frame.spheres.records import Priors
 
-NOISE_POINTS = 60
-CELL_POINTS = 20
+NOISE_POINTS = 60  # a variance by the median of 60 is known to 21 % (sqrt(2.7 / n)); of fewer points the start is kept
+CELL_POINTS = 20  # as above, to 37 %
 NEAREST_MM, RATIO = 1000.0, 1.4  # of the bins of the range
-COSINES = np.array([0.15, 0.22, 0.3, 0.4, 0.55, 0.7, 0.85, 1.0 + 1e-9])
-LEAST_MM = 0.02
-LIMB_STEP, LIMB_POINTS = 0.05, 40
-LIMB = np.arange(0.15, 0.451, LIMB_STEP)
+COSINES = np.array([0.15, 0.22, 0.3, 0.4, 0.55, 0.7, 0.85, 1.0 + 1e-9])  # bins: narrow where tangents grow fast
+LEAST_MM = 0.02  # for scans without noise
+LIMB_STEP, LIMB_POINTS = 0.05, 40  # of the cosine; points of a band, whose median is known to 0.2 of the noise
+LIMB = np.arange(0.15, 0.451, LIMB_STEP)  # chosen: bands in which a cut beam may bias residuals
 RADII = 10  # the stated scatter of radii has the weight of as many spheres
 # In mm. The others must beat the first by EVIDENCE in chi-square.
 GRID = np.array([0.0, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8, 1.1, 1.6, 2.2, 3.2, 4.5, 6.4])
-EVIDENCE = 10.0
-LEAST_SPHERES = 5
+EVIDENCE = 10.0  # 1 in 600 for a single unknown: no shift is found in spheres without one
+LEAST_SPHERES = 5  # seen by several stations: fewer do not show what is common
 
 
 def variances_of(noise: Floats, cosines: Floats, ranges: Floats) -> Floats:

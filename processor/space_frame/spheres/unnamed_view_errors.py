@@ -38,8 +38,8 @@ from processor.space_frame.members.records import Members
 from processor.space_frame.points.sphere_crops import CropsWithRays
 from processor.space_frame.spheres.records import Fits, Priors, ViewErrors
 
-LEAST_POINTS = 30
-LEAST_CELLS = 8
+LEAST_POINTS = 30  # of a fit whose residuals are looked at: seven an unknown
+LEAST_CELLS = 8  # of it: twice the unknowns
 LEAST_COSINE = 0.1  # of incidence: no view shows a surface at less
 MOST_PAIRS = 20  # of neighbouring balls that the field is estimated from
 KNOTS = 12  # places whose fields stand for those of all balls

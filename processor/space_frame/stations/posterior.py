@@ -15,8 +15,8 @@ from processor.space_frame.stations.residual_kernels import STATION
 
 # of turn (rad), translation and offset of the ranges (mm)
 START = (5e-5, 2.0, 0.5)  # sd: start of the iteration
-SMALLEST = (1e-8, 1e-3, 1e-3)
-LOOSE = (1e-2, 1e3, 1e2)
+SMALLEST = (1e-8, 1e-3, 1e-3)  # sd: below anything that tubes show, and variances stay positive
+LOOSE = (1e-2, 1e3, 1e2)  # sd: as good as no prior, beside any motion of a registered station
 OFF_LINE = 0.05  # least second extent of targets that determine the whole cloud's pose, as a share of the first
 LEAST_DETERMINED = 0.5  # number of motions that the data must determine for an estimate of their variance
 ALLOWED = 6.0  # in log density below the most likely variance

@@ -32,7 +32,7 @@ from processor.space_frame.stations.posterior import Posterior, common_motion
 from processor.space_frame.stations.records import Stations, StationStatus, TubePoints
 
 MOST_STATIONS = 10  # of those that see a tube: the others are far away and have few points on it
-ROUNDS = 3
+ROUNDS = 3  # work: of linearised tubes; control points join from the second on
 STEEPEST = 0.3  # least cosine of incidence: below it the beam is split at the limb
 FIRST_CUT_MM = 15.0  # of Tukey's biweight in the first round
 BOW_SHARE = 0.6e-3  # of a tube's length: prior sd of its bow; uniform up to L/1000 has this one

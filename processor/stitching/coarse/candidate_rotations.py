@@ -11,13 +11,13 @@ from processor.model import Floats
 
 CONE_COS = float(np.cos(np.radians(6.0)))  # normals of one mode
 SEPARATION_COS = float(np.cos(np.radians(14.0)))  # between modes
-MOST_MODES = 12
+MOST_MODES = 12  # work: main directions: the six of a box, and six more
 LEAST_SHARE = 0.004  # of all normals in a mode
 LEAST_ANGLE_COS = float(np.cos(np.radians(20.0)))  # between two modes that define a frame
-ANGLE_TOLERANCE_RAD = float(np.radians(3.0))
-MATCHED_COS = float(np.cos(np.radians(5.0)))
+ANGLE_TOLERANCE_RAD = float(np.radians(3.0))  # between two modes: half a cone of theirs
+MATCHED_COS = float(np.cos(np.radians(5.0)))  # of a mode with its match: two modes' errors together
 DISTINCT_RAD = float(np.radians(5.0))  # between candidate rotations
-MOST_ROTATIONS = 12
+MOST_ROTATIONS = 12  # work: each is tried with many translations
 LEAST_OF_BEST = 0.45  # score of a candidate rotation
 CHUNK = 2000  # rotations scored at once
 

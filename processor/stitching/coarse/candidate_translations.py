@@ -15,7 +15,7 @@ from processor import large_arrays
 from processor.model import Floats, Ints
 from processor.stitching.planes.sampled_patches import Patches, facing
 
-LIKE_COS = float(np.cos(np.radians(10.0)))
+LIKE_COS = float(np.cos(np.radians(10.0)))  # rotations are known to 5 degrees, normals to as much
 MOST_VOTERS = 350  # patches of a scan that face one way
 BLOCK = 64  # patches that are compared with all others at once
 FEW = 20.0  # a direction with fewer patches than about this has less weight in all

@@ -12,9 +12,9 @@ from processor.model import Floats, Ints
 from processor.stitching.coarse import pairwise
 from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
 
-MOST_TRIED = 5
+MOST_TRIED = 5  # work: groups of competing poses of a scan that are scored with all others
 AMBIGUOUS = 0.75  # of the best pose's score: a competing pose that reaches it is as likely
-LEAST_OVERLAP = 0.08
+LEAST_OVERLAP = 0.08  # chosen: of patches: below it a pair agrees or disagrees by chance
 
 Pairs = dict[tuple[int, int], list[ScoredPose]]
 RankedPoses = list[tuple[float, Floats]]  # (score, pose), the best first

@@ -29,12 +29,12 @@ class Effort:
 
 # Lengths are in sides of the coarse cubes unless stated.
 SIDES = 48.0  # along the reach of the points
-LIKE_COS = float(np.cos(np.radians(15.0)))
+LIKE_COS = float(np.cos(np.radians(15.0)))  # of matching patches: patches of coarse cubes may hold an edge, and lean
 FEWEST = 6  # patches
 MOST = 4  # candidate poses of two scans
 FINE = 0.3  # side of the cubes of indexed patches
-QUICK = Effort(peaks=6, least_of_best=0.5, scored=60, refined=8)
-WIDE = Effort(peaks=15, least_of_best=0.3, scored=150, refined=20)
+QUICK = Effort(peaks=6, least_of_best=0.5, scored=60, refined=8)  # work: enough if SURE
+WIDE = Effort(peaks=15, least_of_best=0.3, scored=150, refined=20)  # work: two to three times as much
 # In halls of unequal bays right poses were the 414th by votes at worst, and by their rough scores the ninth.
 DEEP = Effort(peaks=100, least_of_best=0.05, scored=1000, refined=30)
 GATES = (0.7, 0.35, 0.2, 0.12)  # distance across of matches, from refinement to refinement

@@ -21,7 +21,7 @@ from processor.stitching.fine.normal_equations import Equations, linearize, unit
 
 HUBER_SIGMAS = 2.5  # misfit of a scan on a piece, from which on its weight decreases
 REJECTION_SIGMAS = 6.0  # misfit from which on a scan's points on a piece are outliers
-REJECTED_WEIGHT, LEAST_INLIER_WEIGHT = 1e-6, 1e-3
+REJECTED_WEIGHT, LEAST_INLIER_WEIGHT = 1e-6, 1e-3  # nothing, not singular; left out below
 REWEIGHTINGS = 8  # at fixed poses
 PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # weak priors on the poses: undetermined components stay as they are
 MEDIAN_OF_ABS_Z = 0.6745  # z standard normal

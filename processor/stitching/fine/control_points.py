@@ -26,7 +26,7 @@ CLEAR = 10.0  # least distance from a line in standard deviations; nearer points
 LEAST_SD_MM = 1e-3  # of a sighting; the covariance would be singular without
 # Of the sightings of a scan that give it a pose: greatest misfit, and least extent across their longest one.
 GROSS_MM, LEAST_SPREAD_MM = 50.0, 300.0
-ROUNDS, STILL = 12, 1e-10
+ROUNDS, STILL = 12, 1e-10  # of relinearisation, and the step (rad, mm) that ends it: rounding
 MOST = 1000  # sightings; the equations are dense
 LOOSENED = 30  # rounds at most
 

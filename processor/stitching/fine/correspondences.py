@@ -19,13 +19,13 @@ from processor.stitching.planes.sampled_patches import facing
 from processor.stitching.planes.scan_planes import LIMIT_SIGMAS, Cloud
 
 ON_PIECE, FACE_END = 0, 1  # kinds of blocks
-KINDS = 2
-LEVELS = 7
-SAME_COS = float(np.cos(np.radians(8.0)))
-MOST_NORMALS = 1500
+KINDS = 2  # how many of them
+LEVELS = 7  # times that cubes may be joined by eight: larger than any face
+SAME_COS = float(np.cos(np.radians(8.0)))  # of pieces of one face: noise of small pieces
+MOST_NORMALS = 1500  # work: of a sample that shows the main directions
 LEAST_POINTS = 6.0  # of a scan on a piece
 FLAT_SIGMAS, SLACK_SIGMAS = 1.6, 0.5  # scatter of a merged piece: by the noise across it, and beside that
-MOST_SCANS = 4096
+MOST_SCANS = 4096  # of a key of piece and scan; the equations take far fewer
 PRIOR_DOF = 20.0  # with which a piece's points are taken to scatter as the noise model states
 
 

@@ -19,7 +19,7 @@ from processor.stitching.planes.scan_planes import Cloud
 BEHIND_COS = -0.03  # a piece faces away from the scanner
 ACROSS_COS = 0.5  # between the step from ray to ray and the piece's normal
 SQUARE_COS = 0.85  # the two faces meet at an angle
-NEIGHBOURS = 12
+NEIGHBOURS = 12  # chosen: pieces looked at near an end, and ends at least that must see a motion
 ONE_FACE_MM = 10.0  # planes of two pieces of one face differ by less at an end
 REACH = 1.9  # half width of a piece by its standard deviation, with a margin
 LEAST_MM = 1.0  # standard deviation of an end, however close the rays
@@ -31,9 +31,9 @@ HARMONICS = 16  # of the pattern that an edge makes with the scanner's rows and 
 
 LOOSE_MM = 1.0  # standard deviation of a motion that faces alone do not determine
 LEVER_MM = 1e4  # a rotation counts as the shift at this distance
-SHIFT_STEP_MM = 2.0
-SLACK_MM = 3.0
-MOST_LOOSE = 12
+SHIFT_STEP_MM = 2.0  # of shifts tried: less than the room of an end
+SLACK_MM = 3.0  # chosen: of an end's room: noise and edges that are not sharp add to the gap of rays
+MOST_LOOSE = 12  # work: motions, each of which costs a search for ends
 LEAST_RATE = 0.1  # shift of an end across its piece, by the size of the motion
 
 

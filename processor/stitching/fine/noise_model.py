@@ -15,13 +15,13 @@ from processor.robust_statistics import huber
 from processor.stitching.planes.scan_planes import Cloud
 
 LEAST_DOF = 10.0  # of a piece
-FEWEST_PIECES = 10
+FEWEST_PIECES = 10  # chosen: of fewer the law's unknowns would follow single pieces
 RANGE_MM = 1e4  # unit of ranges in the model
 LEAST_SHARE = 0.05**2  # least variance across a face seen at grazing incidence, of that of the range
-LEAST_MM2 = 1e-8
+LEAST_MM2 = 1e-8  # (1e-4 mm)^2: of scans without noise
 ROUNDS = 8  # of reweighting
 PIECES_SD = 0.3  # of the variances of pieces of one incidence and range, relative: faces differ in brightness
-HUBER = 1.5
+HUBER = 1.5  # standard deviations: 96 % efficient at the normal law
 
 
 def variances(cloud: Cloud) -> Floats:

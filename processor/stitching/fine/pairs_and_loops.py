@@ -14,8 +14,8 @@ from processor.stitching.fine import bundle_adjustment, direction_errors
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import ON_PIECE, Blocks
 
-LEAST_PIECES = 6
-GROSS_PROBABILITY = 1e-6
+LEAST_PIECES = 6  # of a pair: as many as a pose's unknowns
+GROSS_PROBABILITY = 1e-6  # that a sound pair is called gross: networks have up to some thousand pairs
 
 
 @dataclass(frozen=True)

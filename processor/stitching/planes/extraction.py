@@ -14,9 +14,9 @@ import numpy.typing as npt
 from processor.model import Floats, Ints
 from processor.stitching.planes.grouped_sums import numbered, summed
 
-BITS = 19
+BITS = 19  # for each of three coordinates of a cell, and six for a group in an int64
 OFFSET = 1 << (BITS - 1)
-UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3))
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3))  # of 4 by 4
 _I = np.array([i for i, _ in UPPER])
 _J = np.array([j for _, j in UPPER])
 LEAST_WIDTH = 0.06  # of a cube's side: least standard deviation of a planar piece's points along its narrower axis

@@ -13,7 +13,7 @@ from processor import large_arrays
 from processor.model import Floats
 
 PIXELS = 320  # at most along each side of the six faces of the cube: 0.28 degrees
-FEWEST_PIXELS = 40
+FEWEST_PIXELS = 40  # along a side: 2.2 degrees; sparser scans are left with gaps
 SEEN_NEIGHBOURS = 5  # of 3 x 3 pixels, that must hold rays for a point to count as lying in free space
 FILLED = 0.85  # share of the pixels with points that must have so many neighbours: else pixels are too small
 RAYS = 2.0  # across a patch, that are sure to hit it

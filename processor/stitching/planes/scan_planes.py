@@ -18,11 +18,11 @@ from processor.stitching.planes.face_ends import Ends, ends_of
 from processor.stitching.planes.free_space import FreeSpace
 from processor.stitching.planes.grid_bands import GridBands
 
-POINTS_A_CELL = 5.0
+POINTS_A_CELL = 5.0  # a plane takes three, and two show its scatter
 MOST_CELLS_OF_SCAN, MOST_CELLS = 400_000, 2_400_000  # of one scan and of all, occupied: cells of more points are larger
-LEVELS = 6
+LEVELS = 6  # times that cubes may be joined by eight
 KEPT_BELOW = 2  # cells are kept this many levels finer than the piece they belong to
-LIMIT_SIGMAS = 2.5
+LIMIT_SIGMAS = 2.5  # chosen: scatter by the noise, above which points are on no plane; leaves room for rough steel
 # Widths of cells of directions, and shares of the pairs of points of a cell that follow each other in range. The
 # scanner can be at the origin if fewer pairs than this differ by more than DEPTH_STEP, in the narrowest with enough.
 NARROW = ((0.004, 0.1), (0.01, 0.15), (0.03, 0.25))
