@@ -49,9 +49,9 @@ def find(parts: Sequence[Examined]) -> list[tuple[Reason, ...]]:
     for part, beyond in zip(parts, of_edges, strict=True):
         reasons = []
         for joint, end in part.ends:
-            faces = compress(end.place.section.faces, of_faces[number])
+            beyond_noise = compress(end.place.section.faces, of_faces[number])
             why = (
-                *_of_faces("preassemble.face-contradicts-noise", (face.name for face in faces)),
+                *_of_faces("preassemble.face-contradicts-noise", (face.name for face in beyond_noise)),
                 *((reason("preassemble.plates-contradict-views"),) if of_plates[number] else ()),
             )
             reasons += [reason("preassemble.at", place=joint, reasons=why)] if why else []
