@@ -10,30 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from processor.inner_kernels import inner
-
-
-@inner
-def eliminate_group(first, last, columns, coupling, inverse, gradient, N, g):  # type: ignore[no-untyped-def]
-    """Subtract what the nuisance unknowns of the rows ``first`` to ``last`` determine; see :func:`eliminate`."""
-    u, p = coupling.shape[1], coupling.shape[2]
-    weighted = np.empty((u, p))
-    for x in range(first, last):
-        for i in range(u):
-            for j in range(p):
-                weighted[i, j] = 0.0
-                for m in range(p):
-                    weighted[i, j] += coupling[x, i, m] * inverse[m, j]
-            for j in range(p):
-                g[columns[x, i]] -= weighted[i, j] * gradient[j]
-        for y in range(first, last):
-            for i in range(u):
-                for j in range(u):
-                    total = 0.0
-                    for m in range(p):
-                        total += weighted[i, m] * coupling[y, j, m]
-                    N[columns[x, i], columns[y, j]] -= total
-
 
 @njit(cache=True, nogil=True)
 def eliminate(group, columns, coupling, inverse, gradient, N, g):  # type: ignore[no-untyped-def]
@@ -43,10 +19,27 @@ def eliminate(group, columns, coupling, inverse, gradient, N, g):  # type: ignor
     its group; its block of the normal matrix that couples both is ``coupling`` (b, u, p). ``inverse`` (groups, p, p) is
     that of the nuisance unknowns' own normal matrix, ``gradient`` (groups, p) their right side.
     """
-    first, b = 0, len(group)
+    b, u, p = coupling.shape
+    weighted = np.empty((u, p))
+    first = 0
     while first < b:
+        k = group[first]
         last = first
-        while last < b and group[last] == group[first]:
+        while last < b and group[last] == k:
             last += 1
-        eliminate_group(first, last, columns, coupling, inverse[group[first]], gradient[group[first]], N, g)
+        for x in range(first, last):
+            for i in range(u):
+                for j in range(p):
+                    weighted[i, j] = 0.0
+                    for m in range(p):
+                        weighted[i, j] += coupling[x, i, m] * inverse[k, m, j]
+                for j in range(p):
+                    g[columns[x, i]] -= weighted[i, j] * gradient[k, j]
+            for y in range(first, last):
+                for i in range(u):
+                    for j in range(u):
+                        total = 0.0
+                        for m in range(p):
+                            total += weighted[i, m] * coupling[y, j, m]
+                        N[columns[x, i], columns[y, j]] -= total
         first = last

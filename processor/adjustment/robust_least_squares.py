@@ -20,6 +20,13 @@ def normal_equations(J: Floats, weight: Floats, observed: Floats) -> tuple[Float
     return J.T @ weighted, weighted.T @ observed
 
 
+def inverse_of(N: Floats) -> Floats:
+    """Return the pseudo-inverse of a normal matrix N (u, u) of unknowns of any units; 0 where they are undetermined."""
+    scale = np.sqrt(np.maximum(np.diag(N), 1e-300))
+    inverse: Floats = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
+    return inverse
+
+
 def reweighted(
     x: Floats,
     weights: Callable[[Floats], Floats],

@@ -297,15 +297,10 @@ def _fit(
             break
         at_middle = scaling @ (robust_least_squares.sandwich(inverse, gradient[used], cell) + square) @ scaling
         at_origin = rigid.about_origin(at_middle, blocks.middle)
-        along = _error_along(at_origin, *places)
+        along = float(np.mean(np.sqrt(variances(distance_derivative(*places), at_origin))))
         if along > error:
             covariance, error = at_origin, along
         side *= 2.0
     if error < 0.0 or not np.linalg.cond(N) < MOST_CONDITION:
         return RigidFit(UNDETERMINED.motion, UNDETERMINED.covariance, error if error >= 0.0 else float("nan"), share)
     return RigidFit(transform_about(scaling @ motion, blocks.middle), covariance, error, share)
-
-
-def _error_along(covariance: Floats, points: Floats, normals: Floats) -> float:
-    """Mean over points (k, 3) of the standard deviation along normals (k, 3) that a motion's covariance causes, mm."""
-    return float(np.mean(np.sqrt(variances(distance_derivative(points, normals), covariance))))

@@ -12,7 +12,7 @@ from processor.model import reason
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM
 from processor.space_frame.points.line_crops import corridors, gather
 from processor.space_frame.result import StationMotion
-from processor.space_frame.stations import normal_equations, residual_kernels
+from processor.space_frame.stations import normal_equations, records, residual_kernels
 from processor.space_frame.stations import posterior as stations_posterior
 from processor.space_frame.stations.corrected_source import Corrected, corrected_gathered
 from processor.space_frame.stations.records import TubePoints
@@ -580,7 +580,8 @@ def test_the_effect_is_every_stations_motion_at_the_place():
     moved = draws[:, :, 3:6] + np.cross(draws[:, :, :3], arm)
     moved += draws[:, :, 6:] * (arm / np.linalg.norm(arm, axis=1)[:, None])
     sampled = np.cov(np.einsum("sdi,nsi->nd", influence[k], moved).T)
-    found = residual_kernels.effect(points, influence, places, C)[k]
+    J = records._by_stations(points, influence, places)[k]
+    found = J @ C @ J.T
     # A variance of 100,000 draws scatters by 0.4 %.
     np.testing.assert_allclose(found, sampled, atol=0.02 * np.abs(found).max())
 

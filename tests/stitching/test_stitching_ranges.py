@@ -84,7 +84,7 @@ def test_information_that_is_spurious_in_part_makes_a_covariance_wider():
     """Of shares s of the information the standard deviation is 1 / (1 - s) times as large, at most 100 times."""
     N, share = np.diag([4.0, 9.0, 25.0]), np.array([0.0, 0.5, 0.999])
     turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
-    found = bundle_adjustment._sandwich(turn @ N @ turn.T, turn @ (N * share) @ turn.T)
+    found = bundle_adjustment._genuine_covariance(turn @ N @ turn.T, turn @ (N * share) @ turn.T)
     exact = np.diag(1.0 / np.diag(N) / np.maximum(1.0 - share, 0.01) ** 2)
     np.testing.assert_allclose(turn.T @ found @ turn, exact, rtol=1e-9, atol=1e-9)  # float64
 

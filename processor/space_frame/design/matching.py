@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from processor.adjustment.robust_least_squares import inverse_of
 from processor.geometry import rigid
 from processor.model import (
     DESIGN_FRAMES,
@@ -471,16 +472,11 @@ def _full(T: Floats, origin: Floats, middle: Floats) -> Floats:
 def _covariance(placed: Floats, off: Floats, weight: Floats, middle: Floats) -> Floats:
     """Covariance (6, 6) of a fit, about the design frame's origin; ``placed`` (n, 3) nodes are less ``middle``."""
     J = rigid.motion(placed)
-    A = np.einsum("n,nip,niq->pq", weight, J, J)
-    scale = np.sqrt(np.diag(A))
-    inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
+    inverse = inverse_of(np.einsum("n,nip,niq->pq", weight, J, J))
     count = float(weight.sum()) ** 2 / max(float(np.sum(weight**2)), 1e-300)
     S = np.einsum("n,ni,nj->ij", weight**2, off, off) / float(np.sum(weight**2)) * count / max(count - 2.0, 1.0)
     meat = np.einsum("n,nip,ij,njq->pq", weight**2, J, S, J)
-    about = np.eye(6)
-    # a turn about the middle is one about the origin and a translation by - w x middle
-    about[3:, :3] = [[0.0, -middle[2], middle[1]], [middle[2], 0.0, -middle[0]], [-middle[1], middle[0], 0.0]]
-    C = about @ inverse @ meat @ inverse @ about.T
+    C = rigid.about_origin(inverse @ meat @ inverse, middle)
     symmetric: Floats = 0.5 * (C + C.T)
     return symmetric
 

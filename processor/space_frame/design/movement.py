@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.adjustment.robust_least_squares import inverse_of
 from processor.geometry import rigid
 from processor.limits import judging
 from processor.limits.judging import Measured
@@ -103,9 +104,7 @@ def movement(
 def _relative(nodes: Floats, C: Floats, changes: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Covariance (n, 3, 3) and changes (n, 3, q) of nodes (n, 3) relative to their own fit with weights (n,)."""
     J = rigid.motion(nodes - nodes.mean(axis=0))
-    A = np.einsum("n,nip,niq->pq", weight, J, J)
-    scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
+    inverse = inverse_of(np.einsum("n,nip,niq->pq", weight, J, J))
     gain = np.einsum("pq,niq,n->npi", inverse, J, weight)
     fit = np.einsum("npi,nij,nqj->pq", gain, C, gain)
     cross = np.einsum("nip,npj,njk->nik", J, gain, C)

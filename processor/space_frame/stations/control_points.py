@@ -7,25 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from processor.adjustment.body_motions import transform_about
 from processor.adjustment.control_points import Sightings
 from processor.adjustment.data_snooping import Snooped
+from processor.geometry import rigid
 from processor.geometry.linalg_small import cholesky, product, solve
 from processor.model import Floats, Reason, reason
 from processor.space_frame.stations.residual_kernels import STATION
-
-
-def corrections(x: Floats, places: Floats) -> Floats:
-    """Return T (s, 4, 4) of the stations' unknowns x (7 s,): turns about places (s, 3), then translations."""
-    return np.array([transform_about(own, place) for own, place in zip(x.reshape(-1, STATION), places, strict=True)])
 
 
 def misfits(control: Sightings, x: Floats, places: Floats) -> Floats:
     """Return known less seen places (c, 3) by the stations' unknowns x (7 s,)."""
     offset = x[STATION - 1 :: STATION]
     shorter = (offset - offset.mean())[control.body, None] * _rays(control, places)
-    off: Floats = control.known - replace(control, seen=control.seen - shorter).placed(corrections(x, places))
+    arm = control.seen - shorter - places[control.body]
+    off: Floats = control.known - replace(control, seen=arm).placed(moved(x, places))
     return off
+
+
+def moved(x: Floats, places: Floats) -> Floats:
+    """Return the poses T (s, 4, 4) of stations at places (s, 3), whose axes were the project's, by the unknowns x."""
+    T = np.array([rigid.transform(np.eye(3), place) for place in places])
+    return rigid.moved_about_own_origins(T, x.reshape(-1, STATION)[:, :6])
 
 
 def derivative(control: Sightings, places: Floats) -> Floats:

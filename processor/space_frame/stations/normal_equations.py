@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from processor.adjustment.elimination import eliminate_group
 from processor.geometry.linalg_small import assign, cholesky, solve
 from processor.geometry.thread_ranges import over_ranges
 from processor.inner_kernels import inner
@@ -79,38 +78,56 @@ def with_floor(N, b, floor):  # type: ignore[no-untyped-def]
 
 @inner
 def add_tube(j, equations, layout, geometry, H, g):  # type: ignore[no-untyped-def]
-    """Add to H and g the stations' equations by the observations of tube ``j``, eliminated."""
+    """Add to the upper half of H, and to g, the stations' equations by the observations of tube ``j``, eliminated."""
     N, b, weight, floor = equations
     first, station = layout.of_tube[j], layout.station
     number = layout.of_tube[j + 1] - first
+    width = STATION * number
     A, total = np.diag(geometry.prior[j]), np.zeros(TUBE)
-    columns, coupling = np.empty((number, STATION), np.int64), np.zeros((number, STATION, TUBE))
+    K = np.zeros((TUBE, width))
+    local, right = np.zeros((width, width)), np.zeros(width)
     for o in range(number):
         q = first + o
         M, y = with_floor(N[q], b[q], floor)
         G = arm(geometry, j, station[q])
-        for c in range(STATION):
-            columns[o, c] = STATION * station[q] + c
+        at = STATION * o
         for a in range(TUBE):
-            total[a] += weight[q] * y[a]
+            y[a] *= weight[q]
+            total[a] += y[a]
             for k in range(TUBE):
-                A[a, k] += weight[q] * M[a, k]
+                M[a, k] *= weight[q]
+                A[a, k] += M[a, k]
             for k in MOVED:
                 for c in range(STATION):
-                    coupling[o, c, a] -= weight[q] * M[a, k] * G[k, c]
+                    K[a, at + c] += M[a, k] * G[k, c]
+        for k in MOVED:
+            for c in range(STATION):
+                right[at + c] -= G[k, c] * y[k]
+                for d in range(STATION):
+                    local[at + c, at + d] += G[k, c] * K[k, at + d]
     L = cholesky(A)
     if np.isnan(L[0, 0]):
         return
-    for o in range(number):
-        q = first + o
-        _, y = with_floor(N[q], b[q], floor)
-        G = arm(geometry, j, station[q])
-        for k in MOVED:
+    S = np.empty((TUBE, width + 1))
+    for k in range(TUBE):
+        assign(S[k], K[k])
+        S[k, width] = total[k]
+    S = solve(L, S)
+    for c in range(width):
+        for k in range(TUBE):
+            value = K[k, c]
+            right[c] += value * S[k, width]
+            for d in range(STATION * (c // STATION), width):
+                local[c, d] -= value * S[k, d]
+    for o in range(number):  # observations are sorted by station
+        at = STATION * station[first + o]
+        for c in range(STATION):
+            g[at + c] += right[STATION * o + c]
+        for p in range(o, number):
+            to = STATION * station[first + p]
             for c in range(STATION):
-                g[columns[o, c]] -= weight[q] * G[k, c] * y[k]
                 for d in range(STATION):
-                    H[columns[o, c], columns[o, d]] -= coupling[o, c, k] * G[k, d]
-    eliminate_group(0, number, columns, coupling, solve(L, np.eye(TUBE)), total, H, g)
+                    H[at + c, to + d] += local[STATION * o + c, STATION * p + d]
 
 
 @njit(cache=True, nogil=True)
@@ -131,8 +148,8 @@ def reduced(equations: Equations, layout: Layout, geometry: Geometry, threads: i
     size = STATION * len(geometry.places)
     H, g = np.zeros((BLOCKS, size, size)), np.zeros((BLOCKS, size))
     over_ranges(partial(_reduced, equations, layout, geometry, H, g), BLOCKS, threads)
-    N = H.sum(axis=0)
-    return 0.5 * (N + N.T), g.sum(axis=0)
+    upper = H.sum(axis=0)
+    return np.triu(upper) + np.triu(upper, 1).T, g.sum(axis=0)
 
 
 @njit(cache=True, nogil=True)

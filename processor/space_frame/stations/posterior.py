@@ -22,6 +22,13 @@ LEAST_DETERMINED = 0.5  # number of motions that the data must determine for an 
 ALLOWED = 6.0  # in log density below the most likely variance
 
 
+def corrections(x: Floats, places: Floats) -> Floats:
+    """Return T (s, 4, 4) of the stations' unknowns x (7 s,): turns about places (s, 3), then translations."""
+    T = control_points.moved(x, places)
+    T[:, :3, 3] = places - np.einsum("sij,sj->si", T[:, :3, :3], places) + x.reshape(-1, STATION)[:, 3:6]
+    return T
+
+
 def common_motion(places: Floats) -> Floats:
     """Return derivatives (7 s, 6) of the unknowns by a turn of all stations about the origin and a translation."""
     M = np.zeros((len(places), STATION, 6))

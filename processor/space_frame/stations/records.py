@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.adjustment.body_motions import distance_derivative
 from processor.geometry import rigid
 from processor.geometry.linalg_small import product
+from processor.large_arrays import blocks
 from processor.model import Checked, Floats, Ints, Labels, Reason, Word, column, described, names, reasons
 from processor.space_frame.stations import residual_kernels as kernels
 from processor.space_frame.stations.posterior import common_motion, mean_gain
@@ -21,6 +23,9 @@ class StationStatus(Word):
     SINGLE = "single"  # there is one station
     UNKNOWN = "unknown"  # the stations have no tube in common
     DOUBTFUL = "doubtful"  # the beam's width may explain the stations' errors
+
+
+POINTS_AT_ONCE = 1 << 10  # whose derivatives by all stations are in memory together
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,11 @@ class Stations(Checked):
             M = common_motion(self.places)
             relative_part = np.eye(len(covariance)) - product(M, mean_gain(M, self._precision()))
             covariance = product(product(relative_part, covariance), np.ascontiguousarray(relative_part.T))
-        return kernels.effect(np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, covariance)
+        effects = np.empty((len(points), influence.shape[2], influence.shape[2]))
+        for rows in blocks(len(points), POINTS_AT_ONCE):
+            J = _by_stations(points[rows], influence[rows], self.places)
+            effects[rows] = J @ covariance @ np.swapaxes(J, 1, 2)
+        return effects
 
     def common(self, place: Floats) -> Floats:
         """Covariance (6, 6) of the motion common to all stations: turn about ``place`` (3,), translation.
@@ -128,3 +137,12 @@ class Stations(Checked):
     def _precision(self) -> Floats:
         station = np.repeat(np.array([self.before_rad, self.before_mm, self.range_offset_sd]), (3, 3, 1)) ** -2.0
         return np.tile(station, len(self.places))
+
+
+def _by_stations(points: Floats, influence: Floats, places: Floats) -> Floats:
+    """Return the derivative J (k, d, 7 s) of estimates by the stations' unknowns; see :meth:`Stations.effect`."""
+    k, stations, d, _ = influence.shape
+    arm = np.repeat(points[:, None] - places, d, axis=1).reshape(-1, 3)
+    rays = arm / np.maximum(np.linalg.norm(arm, axis=1), 1e-300)[:, None]
+    J = distance_derivative(arm, influence.reshape(-1, 3), rays).reshape(k, stations, d, -1)
+    return np.swapaxes(J, 1, 2).reshape(k, d, -1)

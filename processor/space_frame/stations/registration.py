@@ -27,8 +27,8 @@ from processor.robust_statistics import TUKEY, robust_sd
 from processor.space_frame.result import StationMotion
 from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
-from processor.space_frame.stations.control_points import corrections, doubts, misfits
-from processor.space_frame.stations.posterior import Posterior, common_motion
+from processor.space_frame.stations.control_points import doubts, misfits
+from processor.space_frame.stations.posterior import Posterior, common_motion, corrections
 from processor.space_frame.stations.records import Stations, StationStatus, TubePoints
 
 MOST_STATIONS = 10  # of those that see a tube: the others are far away and have few points on it

@@ -16,7 +16,6 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.thread_ranges import over_ranges
-from processor.large_arrays import read_only
 from processor.model import Floats, Ints, Labels
 
 TUBE = 8  # unknowns of an observation; a tube has the first seven
@@ -196,48 +195,6 @@ def observations(seen: Floats, layout: Layout, scale: Floats, cut: float, thread
     N, b = np.zeros((q, TUBE, TUBE)), np.zeros((q, TUBE))
     over_ranges(partial(_observations, seen, layout, scale, cut, N, b), q, threads, LEAST)
     return N, b
-
-
-@njit(cache=True, nogil=True)
-def _effect(points, influence, places, covariance, effects, first, last):  # type: ignore[no-untyped-def]
-    s_count, d_count = influence.shape[1], influence.shape[2]
-    for k in range(first, last):
-        rows, stations = np.zeros((s_count, d_count, STATION)), np.empty(s_count, np.int64)
-        number = 0
-        for s in range(s_count):
-            J = influence[k, s]
-            if not np.any(J != 0.0):
-                continue
-            x, y, z = points[k, 0] - places[s, 0], points[k, 1] - places[s, 1], points[k, 2] - places[s, 2]
-            for d in range(d_count):
-                a, b, c = J[d, 0], J[d, 1], J[d, 2]
-                # a . (w x p) = w . (p x a)
-                rows[number, d, 0], rows[number, d, 1], rows[number, d, 2] = y * c - z * b, z * a - x * c, x * b - y * a
-                rows[number, d, 3], rows[number, d, 4], rows[number, d, 5] = a, b, c
-                rows[number, d, 6] = (x * a + y * b + z * c) / max(np.sqrt(x * x + y * y + z * z), 1e-300)
-            stations[number] = s
-            number += 1
-        product = np.zeros((d_count, number, STATION))  # of the rows and the covariance
-        for p in range(number):
-            for i in range(STATION):
-                row = covariance[STATION * stations[p] + i]
-                for d in range(d_count):
-                    for q in range(number):
-                        for j in range(STATION):
-                            product[d, q, j] += rows[p, d, i] * row[STATION * stations[q] + j]
-        for d in range(d_count):
-            for e in range(d_count):
-                for q in range(number):
-                    for j in range(STATION):
-                        effects[k, d, e] += product[d, q, j] * rows[q, e, j]
-
-
-def effect(points: Floats, influence: Floats, places: Floats, covariance: Floats, threads: int = 0) -> Floats:
-    """Covariance (k, d, d) of estimates near points (k, 3) with derivatives ``influence`` (k, s, d, 3) by stations."""
-    effects = np.zeros((len(points), influence.shape[2], influence.shape[2]))
-    points, influence, places, covariance = (read_only(array) for array in (points, influence, places, covariance))
-    over_ranges(partial(_effect, points, influence, places, covariance, effects), len(points), threads, LEAST)
-    return effects
 
 
 @njit(cache=True, nogil=True)

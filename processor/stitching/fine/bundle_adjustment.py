@@ -92,13 +92,15 @@ def solve(
         if iteration and tau is None:
             common[:KINDS] = _estimate_tau(blocks, equations.offset, equations.variance, common)
             if blocks.faces:
-                N, rows = equations.N + prior_information(len(ranges), k, np.inf), 8 * k + np.arange(blocks.faces)
-                rest = unknowns[unknowns < 8 * k]
+                N = equations.N + np.diag(prior_information(len(ranges), k, np.inf))
+                rest, rows = unknowns[unknowns < 8 * k], 8 * k + np.arange(blocks.faces)
                 common[KINDS] = np.sqrt(variance_of_errors(N, equations.g, ranges[2 * k :], rest, rows))
         if iteration == EQUAL_ITERATIONS and initial.any():
             weight = _robust_weights(blocks, _with_slack(equations, slack_mm))
             continue
-        change = _newton_step(equations, unknowns, ranges, common[KINDS])
+        change = np.zeros(6 * k + len(ranges))
+        N, g = _with_priors(equations, unknowns, ranges, common[KINDS])
+        change[unknowns] = -np.linalg.solve(N, g)
         step, ranges = change[: 6 * k].reshape(k, 6), ranges + change[6 * k :]
         T = rigid.moved_about_own_origins(T, step)
         if robust:
@@ -106,8 +108,8 @@ def solve(
         if iteration > EQUAL_ITERATIONS and np.abs(step[:, 3:]).max(initial=0.0) < STILL_MM:
             break
     equations = linearize(blocks, T, ranges, common, weight)
-    at = np.ix_(unknowns, unknowns)
-    C = _sandwich((equations.N + prior_information(len(ranges), k, common[KINDS]))[at], equations.spurious[at])
+    N, _ = _with_priors(equations, unknowns, ranges, common[KINDS])
+    C = _genuine_covariance(N, equations.spurious[np.ix_(unknowns, unknowns)])
     covariance = np.full((6 * k, 6 * k), np.nan)
     covariance[np.ix_(poses, poses)] = C[: len(poses), : len(poses)]
     return Solution(
@@ -126,23 +128,20 @@ def weights_at(blocks: Blocks, solution: Solution) -> Floats:
     return weight
 
 
-def _newton_step(equations: Equations, unknowns: Ints, ranges: Floats, face_mm: float) -> Floats:
-    """Return the step of all unknowns; ``ranges`` (2k + f,) are drawn to 0 by their priors."""
-    size = len(equations.g)
-    prior = prior_information(len(ranges), (size - len(ranges)) // 6, face_mm)
-    g = equations.g.copy()
-    g[size - len(ranges) :] += np.diag(prior)[size - len(ranges) :] * ranges
-    step = np.zeros(size)
-    step[unknowns] = -np.linalg.solve((equations.N + prior)[np.ix_(unknowns, unknowns)], g[unknowns])
-    return step
+def _with_priors(equations: Equations, unknowns: Ints, ranges: Floats, face_mm: float) -> tuple[Floats, Floats]:
+    """Return the normal equations of ``unknowns`` with their priors, which draw ``ranges`` (2k + f,) to 0."""
+    first = len(equations.g) - len(ranges)
+    prior, g = prior_information(len(ranges), first // 6, face_mm), equations.g.copy()
+    g[first:] += prior[first:] * ranges
+    return (equations.N + np.diag(prior))[np.ix_(unknowns, unknowns)], g[unknowns]
 
 
 def prior_information(ranges: int, k: int, face_mm: float) -> Floats:
-    """Return the information of the priors: weak ones of k poses; range errors of scans by their class, of faces."""
+    """Return the information (8k + f,) of the priors: weak ones of k poses; range errors by class, and of faces."""
     of_poses = np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k)
     of_scans = np.repeat([VIEW_SD_MM**-2, SCALE_SD**-2], k)
     of_faces = np.full(ranges - 2 * k, max(face_mm, LEAST_FACE_MM) ** -2)
-    return np.diag(np.concatenate([of_poses, of_scans, of_faces]))
+    return np.concatenate([of_poses, of_scans, of_faces])
 
 
 def unknowns_of(blocks: Blocks, ranges: int, k: int, reference: int) -> Ints:
@@ -177,7 +176,7 @@ def variance_of_errors(N: Floats, g: Floats, errors: Floats, rest: Ints, own: In
     return float(brentq(slope, 0.0, MOST_COMMON_MM**2))
 
 
-def _sandwich(N: Floats, spurious: Floats) -> Floats:
+def _genuine_covariance(N: Floats, spurious: Floats) -> Floats:
     """Return the covariance of an estimate whose normal matrix N is spurious in part: the larger, the more of it is."""
     L = np.linalg.cholesky(N)
     S = np.linalg.solve(L, np.linalg.solve(L, spurious).T)

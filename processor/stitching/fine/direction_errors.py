@@ -49,8 +49,8 @@ def added_covariance(
     )
     N, g, own = equations.N.copy(), equations.g.copy(), size + np.arange(len(used))
     prior = bundle_adjustment.prior_information(len(ranges), k, solution.tau[KINDS])
-    N[:size, :size] += prior
-    g[6 * k : size] += np.diag(prior)[6 * k :] * ranges
+    N[:size, :size] += np.diag(prior)
+    g[6 * k : size] += prior[6 * k :] * ranges
     if variance is None:
         variance = bundle_adjustment.variance_of_errors(N, g, errors, unknowns, own)
     moved = np.linalg.solve(N[np.ix_(unknowns, unknowns)], N[np.ix_(unknowns, own)])[: len(poses)]
