@@ -12,6 +12,8 @@ MAD_TO_SD = 1.4826  # standard deviation of normal values over their median abso
 CHI2_MEDIAN = 0.4549  # median of the chi-square distribution with one degree of freedom
 TUKEY = 4.685  # standard deviations at which Tukey's biweight is 0: 95 % efficient for normal errors
 
+CAUCHY = 2.385  # standard deviations at which Cauchy's weight is one half: 95 % efficient for normal errors
+
 
 def finite_median(values: npt.ArrayLike) -> float:
     """Return the median of the finite values (n,); NaN if there is none."""

@@ -32,3 +32,10 @@ def variances(J: Floats, covariance: Floats) -> Floats:
     """Return the variances (n,) of n quantities with derivatives J (n, u) by unknowns of a covariance (u, u)."""
     propagated: Floats = np.maximum(np.einsum("ni,ij,nj->n", J, covariance, J), 0.0)
     return propagated
+
+
+def point_covariances(arm: Floats, covariance: Floats) -> Floats:
+    """Return the covariances (n, 3, 3) of points of a body by that (6, 6) of its motion; ``arm`` (n, 3) as above."""
+    J = rigid.motion(arm)
+    propagated: Floats = J @ covariance @ np.swapaxes(J, 1, 2)
+    return propagated

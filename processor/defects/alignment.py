@@ -22,7 +22,7 @@ from processor.defects.observations import Pairs
 from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
 from processor.model import Columns, Floats, Ints
-from processor.robust_statistics import cauchy, robust_sd
+from processor.robust_statistics import CAUCHY, cauchy, robust_sd
 from processor.views import Views
 
 BLOCK_MM = 80.0  # chosen: less than a plate's waves, so that a block has one deviation; many points in each
@@ -40,7 +40,6 @@ FLOOR_MM = 0.15  # standard deviation of a block's mean: beams, encoders and the
 FEWEST_COMPONENTS = 3  # to fit the whole by: of fewer, a component that moved cannot be identified
 ROUNDS, STILL_MM = 12, 1e-4  # a step of the whole that moves all blocks by less is the last
 MOST_ROUNDS, SETTLED = 40, 0.05  # of the stations' variance components, and the relative change of the last round
-CAUCHY = 2.385  # 95 % efficient at the normal law (Holland and Welsch 1977)
 PAIRS_AT_ONCE = 1 << 18  # of cell and station, whose derivatives are in memory together
 MOST_COUPLED = 3_000_000  # blocks times stations, beyond which stations are not fitted
 

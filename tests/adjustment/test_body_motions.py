@@ -30,3 +30,13 @@ def test_variances_are_those_of_drawn_unknowns():
     # A variance of 100,000 draws is known to 0.45 %.
     np.testing.assert_allclose(body_motions.variances(J, half @ half.T), drawn.var(axis=0), rtol=0.02)
     assert body_motions.variances(np.ones((1, 6)), -np.eye(6)) == 0.0  # rounding leaves no negative variance
+
+
+def test_covariances_of_points_are_those_of_drawn_motions():
+    rng = np.random.default_rng(5)
+    half = rng.normal(size=(6, 6)) * np.repeat([1e-3, 1.0], 3)[:, None]
+    arm = np.array([[1000.0, -400.0, 250.0]])
+    x = rng.normal(size=(100_000, 6)) @ half.T
+    drawn = np.cov((np.cross(x[:, :3], arm) + x[:, 3:]).T)
+    found = body_motions.point_covariances(arm, half @ half.T)[0]
+    np.testing.assert_allclose(found, drawn, atol=0.02 * np.abs(drawn).max())  # a variance of 100,000 draws: 0.45 %

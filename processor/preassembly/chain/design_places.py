@@ -45,7 +45,5 @@ def covariances(
         radius = np.sqrt(((points - middle) ** 2).sum(axis=1).mean())
         whole = sd_mm**2 * np.diag([radius**-2.0] * 3 + [1.0] * 3)
         for i in of_piece:
-            to_part = np.eye(6)
-            to_part[3:] = rigid.motion((members[i].centre - middle)[None])[0]
-            found[i] += to_part @ whole @ to_part.T
+            found[i] += rigid.about_origin(whole, middle - members[i].centre)
     return found

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.adjustment.body_motions import point_covariances
 from processor.adjustment.robust_least_squares import inverse_of
 from processor.geometry import rigid
 from processor.limits import judging
@@ -83,11 +84,11 @@ def movement(
     R = T[:3, :3]
     # offset less offset first: adding either to the nodes would lose digits
     positions = nodes.positions[rows] @ R.T + (R @ nodes.origin + T[:3, 3] - middle)
-    C = np.einsum("ij,njk,lk->nil", R, covariance[rows], R)
+    C = R @ covariance[rows] @ R.T
     changes = np.zeros((len(rows), 3, 0)) if shared is None else R @ shared[rows]
     if in_frame and datum is not None:
-        J = rigid.motion(nodes.positions[rows] - (np.zeros(3) if datum_place is None else datum_place))
-        C = C + np.einsum("ij,njp,pq,nkq,lk->nil", R, J, datum, J, R, optimize=False)
+        arm = nodes.positions[rows] - (np.zeros(3) if datum_place is None else datum_place)
+        C = C + R @ point_covariances(arm, datum) @ R.T
     elif not in_frame and len(rows):
         C, changes = _relative(positions, C, changes, matching.weight[rows])
     C = C + changes @ np.swapaxes(changes, 1, 2)
@@ -108,7 +109,7 @@ def _relative(nodes: Floats, C: Floats, changes: Floats, weight: Floats) -> tupl
     gain = np.einsum("pq,niq,n->npi", inverse, J, weight)
     fit = np.einsum("npi,nij,nqj->pq", gain, C, gain)
     cross = np.einsum("nip,npj,njk->nik", J, gain, C)
-    relative: Floats = C - cross - np.swapaxes(cross, 1, 2) + np.einsum("nip,pq,njq->nij", J, fit, J)
+    relative: Floats = C - cross - np.swapaxes(cross, 1, 2) + J @ fit @ np.swapaxes(J, 1, 2)
     return relative, changes - np.einsum("nip,pq->niq", J, np.einsum("npi,niq->pq", gain, changes))
 
 

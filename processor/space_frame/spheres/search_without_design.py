@@ -13,7 +13,7 @@ from processor.geometry import coincident_points
 from processor.geometry.sphere import Sphere, algebraic, sphere_cells
 from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit, bound, robust_fit
 from processor.model import NORMAL_95, Floats, Reason, Status, Tolerance, reason
-from processor.robust_statistics import TUKEY
+from processor.robust_statistics import TUKEY, biweight
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Flag, Result
@@ -163,7 +163,7 @@ def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int) -> t
     on, added = fit.inliers, np.zeros((4, 4))
     J, away = fit.derivatives[on, :free], cloud.points[on] - fit.sphere.centre
     normals = away / np.linalg.norm(away, axis=1)[:, None]
-    weights = (1.0 - (fit.residuals[on] / (TUKEY * fit.scale)) ** 2) ** 2
+    weights = biweight(fit.residuals[on] / (TUKEY * fit.scale))
     cells = sphere_cells(away, np.zeros(3))
     if len(np.unique(cells)) > MOST_CELLS:
         cells //= 2

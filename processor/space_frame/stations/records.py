@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.adjustment.body_motions import distance_derivative
-from processor.geometry import rigid
+from processor.adjustment.body_motions import distance_derivative, point_covariances
 from processor.geometry.linalg_small import product
 from processor.large_arrays import blocks
 from processor.model import Checked, Floats, Ints, Labels, Reason, Word, column, described, names, reasons
@@ -125,9 +124,7 @@ class Stations(Checked):
     def datum_at(self, points: Floats) -> Floats:
         """Covariance (k, 3, 3) that the motion common to all stations adds at points (k, 3)."""
         middle = points.mean(axis=0) if len(points) else np.zeros(3)
-        J = rigid.motion(points - middle)
-        covariance: Floats = np.einsum("kip,pq,kjq->kij", J, self.common(middle), J)
-        return covariance
+        return point_covariances(points - middle, self.common(middle))
 
     @property
     def between(self) -> Floats:

@@ -23,7 +23,7 @@ from processor.adjustment.data_snooping import Snooped
 from processor.geometry import rigid
 from processor.geometry.linalg_small import product
 from processor.model import Bools, Floats, Ints, Reason, reason
-from processor.robust_statistics import TUKEY, robust_sd
+from processor.robust_statistics import TUKEY, huber, robust_sd
 from processor.space_frame.result import StationMotion
 from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
@@ -229,7 +229,7 @@ def _reweighted(scores: Floats, shared: Bools, weight: Floats, floor: float) -> 
     score, mean, growth = scores.T
     mean = SCATTER * mean
     ratio = np.where(shared & (mean > 0.0), score / np.maximum(mean, 1e-300), 0.0)
-    new = np.minimum(1.0, DOUBT / np.sqrt(np.maximum(ratio, 1e-300)))
+    new = huber(np.sqrt(ratio), DOUBT)
     good = shared & (ratio < DOUBT**2) & (mean > 0.0)
     if not good.any():
         return new, floor
