@@ -142,19 +142,16 @@ def _html(
         (heading(COLUMNS[name], messages(lang)), any(row["cells"][i]["number"] for row in shown))
         for i, name in enumerate(names)
     ]
-    page: str = (
-        templates.environment("batch", lang)
-        .get_template("summary.html")
-        .render(
-            lang=lang,
-            title=text("{count} {count:?input|inputs}", count=len(rows)),
-            counted=text("{counts}.", counts=counted),
-            columns=headings,
-            rows=shown,
-            left_out=[(readable(name), _written(why, lang)) for name, why in sorted(left_out.items())],
-        )
+    return templates.render(
+        "batch",
+        "summary.html",
+        lang,
+        title=text("{count} {count:?input|inputs}", count=len(rows)),
+        counted=text("{counts}.", counts=counted),
+        columns=headings,
+        rows=shown,
+        left_out=[(readable(name), _written(why, lang)) for name, why in sorted(left_out.items())],
     )
-    return page
 
 
 def _steps(ending: Record) -> list[Text]:

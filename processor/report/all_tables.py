@@ -25,9 +25,12 @@ def tables_of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport)
 
 def checks_table(report: ErrorReport) -> Table:
     """Table of all checks against the truth."""
+    free, kept, missed = text("for information"), text("passed"), text("MISSED")
     rows = tuple(
-        (label(m.step), metric_name(m), m.value, m.limit, m.unit, _outcome(m.limit, m.passed)) for m in report.metrics
-    )
+        (label(m.step), metric_name(m), m.value, m.limit, m.unit,
+         free if math.isnan(m.limit) else kept if m.passed else missed)
+        for m in report.metrics
+    )  # fmt: skip
     header = columns("step", "check", "value", "limit", "unit", "outcome")
     return Table(text("Checks against the truth"), header, rows, "checks")
 
@@ -42,12 +45,6 @@ def figure_name(quantity: str, statistic: Statistic) -> Text:
     """Return the name of a figure without its method."""
     template = METRIC_NAMES.get(statistic, "{quantity}, {statistic}")
     return text(template, quantity=label(quantity), statistic=statistic)
-
-
-def _outcome(limit: float, passed: bool) -> Text:
-    if math.isnan(limit):
-        return text("for information")
-    return text("passed") if passed else text("MISSED")
 
 
 def tables_of_run(execution: Execution, report: ErrorReport) -> list[Table]:

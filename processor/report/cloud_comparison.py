@@ -189,17 +189,12 @@ def lines(result: Comparison) -> list[Message]:
 
 def _page(result: Comparison, record: dict[str, Any], drawn: list[tuple[Message, bytes]], lang: str) -> str:
     request = result.request
-    page: str = (
-        templates.environment("report", lang)
-        .get_template("comparison.html")
-        .render(
-            lang=lang,
-            title=text(
-                "From {reference} to {compared}", reference=request.reference.name, compared=request.compared.name
-            ),
-            lines=lines(result),
-            figures=[(caption, base64.b64encode(data).decode("ascii")) for caption, data in drawn],
-            provenance=json.dumps(record, indent=2, ensure_ascii=False),
-        )
+    return templates.render(
+        "report",
+        "comparison.html",
+        lang,
+        title=text("From {reference} to {compared}", reference=request.reference.name, compared=request.compared.name),
+        lines=lines(result),
+        figures=[(caption, base64.b64encode(data).decode("ascii")) for caption, data in drawn],
+        provenance=json.dumps(record, indent=2, ensure_ascii=False),
     )
-    return page

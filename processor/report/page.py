@@ -38,8 +38,6 @@ MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 1
 
 def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], lang: str = "en") -> str:
     """Render the page, with the figures of each step, in a language of CODES; every text is escaped."""
-    environment = templates.environment("report", lang)
-    environment.filters["say"] = messages(lang).text
     scene = execution.scene
     live = {
         run.step: data
@@ -47,16 +45,18 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
         if (data := step_report(run.step).interactive_data(scene, [run, *others])) is not None
     }
     script, digest = page_script.script()
-    page: str = environment.get_template("page.html").render(
+    return templates.render(
+        "report",
+        "page.html",
+        lang,
         title=scene.name,
         block=title_block.of(scene, execution.provenance),
-        running_foot=title_block.running_foot(execution.provenance),
-        running_head=title_block.running_head(scene),
+        running_foot=title_block.css_string(title_block.foot(execution.provenance)),
+        running_head=title_block.css_string(title_block.head(scene)),
         banner=_banner(execution),
         about=_about(scene),
         clipped=None if scene.clips is None else headline.clipped(scene.clips),
         targets=None if scene.targets is None else summary(scene),
-        lang=lang,
         live=page_script.embedded({"words": messages(lang).of_scripts(script), "steps": messages(lang).rendered(live)}),
         script=script,
         digest=digest,
@@ -64,7 +64,6 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
         sections=_sections(execution, report, figures, set(live), lang),
         provenance=json.dumps({key: execution.provenance[key] for key in PROVENANCE}, indent=2, ensure_ascii=False),
     )
-    return page
 
 
 def _about(scene: Scene) -> Text:

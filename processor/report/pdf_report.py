@@ -61,10 +61,7 @@ def _document(execution: Execution, figures: Mapping[str, Drawn], say: Messages)
     pages = [*_front(execution, say), *_characteristics(execution, say)]
     drawn = [(say.text(caption), png) for of_step in figures.values() for caption, png in of_step.figures.values()]
     count = len(pages) + len(drawn)
-    given = title_block.entries(execution.scene)
-    heads = [given.get(key, "") for key in ("company", "project", "drawing")]
-    head = drawable(" · ".join(filter(None, [*heads, execution.scene.name])))
-    foot = drawable(", ".join(value for _, value in title_block.facts(execution.provenance)))
+    head, foot = drawable(title_block.head(execution.scene)), drawable(title_block.foot(execution.provenance))
 
     def finished() -> Iterator[Figure]:
         for number in range(count):

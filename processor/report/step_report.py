@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.language.messages import Message
-from processor.model import Scene, StepRun, Verdict
+from processor.language.messages import Message, text
+from processor.model import Scene, Status, StepRun, Verdict
 from processor.pipeline import Execution
 from processor.report.style import Drawn
 from processor.report.table import Table
@@ -39,3 +39,14 @@ class StepReport:
     further_figures: tuple[str, ...] = ()  # file names of the pictures that stand among the further tables
     files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
     interactive_data: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None
+
+
+def not_ok(result: Any, table: Any) -> list[Message]:
+    """Return the reasons of the rows of a table (name, status, reasons) that are not ok; without any, the result's."""
+    rows = zip(table.name, table.status, table.reasons, strict=True)
+    found: list[Message] = [
+        text("{name} {status}: {reasons}", name=name, status=status, reasons=reasons)
+        for name, status, reasons in rows
+        if status != Status.OK
+    ]
+    return found or list(result.reasons)

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import jinja2
 
-from processor.language.messages import label, messages, text
+from processor.language.messages import NO_NUMBER, label, messages, text
 
 
-def environment(folder: str | Path, lang: str) -> jinja2.Environment:
-    """Return the environment of the templates in a folder of this package or of a path, for a language of CODES.
+def render(folder: str | Path, name: str, lang: str, /, **values: Any) -> str:
+    """Return a page by its template in a folder of this package or of a path, in a language of CODES.
 
-    They extend base.html of the reports. They name their texts by ``text`` and ``label``; filter ``say`` writes a
-    message, and all else as it is.
+    Templates extend base.html of the reports. They name their texts by ``text`` and ``label``; filter ``say`` writes a
+    message, and all else as it is; ``shown`` writes a number with some digits.
     """
     own = jinja2.FileSystemLoader(folder) if isinstance(folder, Path) else jinja2.PackageLoader("processor", folder)
     loader = jinja2.ChoiceLoader([own, jinja2.PackageLoader("processor", "report")])
     made = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    made.filters["say"] = messages(lang).text
+    made.filters |= {"say": messages(lang).text, "shown": _shown}
     made.globals |= {"text": text, "label": label}
-    return made
+    return made.get_template(name).render(lang=lang, **values)
+
+
+def _shown(value: float, digits: int = 3) -> str:
+    return f"{value:.{digits}g}" if math.isfinite(value) else NO_NUMBER

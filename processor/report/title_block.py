@@ -54,16 +54,15 @@ def facts(provenance: Mapping[str, Any]) -> list[tuple[Message, str]]:
     ]
 
 
-def running_head(scene: Scene) -> str:
-    """Return the line that stands on top of every printed page, as a string of CSS."""
+def head(scene: Scene) -> str:
+    """Return the line that stands on top of every printed page."""
     given = entries(scene)
-    parts = [given.get(key, "") for key in (COMPANY, "project", "drawing")]
-    return css_string(" · ".join(filter(None, [*parts, scene.name])))
+    return " · ".join(filter(None, [*(given.get(key, "") for key in (COMPANY, "project", "drawing")), scene.name]))
 
 
-def running_foot(provenance: Mapping[str, Any]) -> str:
-    """Return the line that stands below every printed page, as a string of CSS: what identifies input and software."""
-    return css_string(", ".join(value for _, value in facts(provenance)))
+def foot(provenance: Mapping[str, Any]) -> str:
+    """Return the line that stands below every printed page: what identifies input and software."""
+    return ", ".join(value for _, value in facts(provenance))
 
 
 def css_string(written: str) -> str:

@@ -15,16 +15,17 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
-from processor.language.messages import NO_NUMBER, text
+from processor.language.messages import text
 from processor.model import Statistic
 from processor.report import templates
 from processor.robust_statistics import finite_median
+from processor.store.json_values import json_ready
 from processor.validation.cells import Case, Origin
 from processor.validation.coverage import Coverage
-from processor.validation.history import Figures, Row, by_quantity
+from processor.validation.history import Figures, Row, by_quantity, of_items
 from processor.validation.matrix import Matrix
 from processor.validation.software_identity import Software
 
@@ -71,53 +72,6 @@ NOT_SHOWN = (
 )
 
 
-@dataclass(frozen=True)
-class Line:
-    """One quantity of one method on one kind of scene; NaN if it is not known. Lengths in ``unit``."""
-
-    origin: Origin
-    recipe: str
-    settings: tuple[str, ...]
-    scanner: str
-    noise: str
-    density: str
-    step: str
-    method: str
-    quantity: str
-    unit: str
-    scenes: int
-    number: int
-    bias: float
-    u_b: float
-    u_p: float
-    U95: float
-    error_95: float  # median over the scenes
-    coverage: float  # %
-    efficiency: float
-
-
-@dataclass(frozen=True)
-class Certificate:
-    """All lines, and what was run. ``nights``: those of the same software, from the first to the last."""
-
-    night: str
-    nights: tuple[str, ...]
-    commit: str
-    versions: Mapping[str, str]
-    matrix: str
-    matrix_sha256: str
-    recipes: Mapping[str, str]  # name -> hash of the recipe's text
-    lines: tuple[Line, ...] = ()
-    coverage: tuple[Coverage, ...] = ()
-
-    def of_origin(self, origin: Origin) -> tuple[tuple[Line, ...], tuple[Coverage, ...]]:
-        """Return the lines and the coverage of the scenes of one origin."""
-        return (
-            tuple(line for line in self.lines if line.origin == origin),
-            tuple(one for one in self.coverage if one.origin == origin),
-        )
-
-
 def make(
     night: str,
     rows: Sequence[Row],
@@ -125,11 +79,14 @@ def make(
     software: Software,
     matrix: Matrix,
     coverage: Sequence[Coverage] = (),
-) -> Certificate:
-    """Make the certificate from the figures of ``nights``, all made by the present software."""
+) -> dict[str, Any]:
+    """Return what certificate.json holds, from the figures of ``nights``, all made by the present software.
+
+    A line is of one quantity of one method on one kind of scene; what is not known is NaN, lengths are in its unit.
+    """
     cases = list({entry.case.key: entry.case for entry in matrix.entries}.values())
     of_case = {case.key: case for case in cases}
-    lines: list[Line] = []
+    lines: list[dict[str, Any]] = []
     for (_, step, method, quantity), scenes in by_quantity(rows, nights).items():
         for key, case in of_case.items():
             own = [figures for (of, _), figures in scenes.items() if of == key]
@@ -140,27 +97,32 @@ def make(
     origins = list(Origin)
     lines.sort(
         key=lambda line: (
-            origins.index(line.origin),
-            line.step,
-            by_title[line.recipe, line.settings],
-            line.method,
-            line.quantity,
+            origins.index(line["origin"]),
+            line["step"],
+            by_title[line["recipe"], line["settings"]],
+            line["method"],
+            line["quantity"],
         )
     )
-    return Certificate(
-        night=night,
-        nights=tuple(nights),
-        commit=software.commit,
-        versions=software.versions,
-        matrix=matrix.name,
-        matrix_sha256=matrix.sha256,
-        recipes={case.recipe: case.recipe_sha256 for case in cases},
-        lines=tuple(line for line in lines if line.scenes),
-        coverage=tuple(coverage),
-    )
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "k": COVERAGE_FACTOR,
+        "night": night,
+        "nights": list(nights),
+        "commit": software.commit,
+        "versions": software.versions,
+        "matrix": matrix.name,
+        "matrix_sha256": matrix.sha256,
+        "recipes": {case.recipe: case.recipe_sha256 for case in cases},  # hashes of their texts
+        "lines": [line for line in lines if line["scenes"]],
+        "coverage": [asdict(one) for one in coverage],
+        "method": str(METHOD),
+        "not_shown": list(map(str, NOT_SHOWN)),
+    }
 
 
-def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[Figures]) -> Line:
+def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[Figures]) -> dict[str, Any]:
     def of(statistic: Statistic) -> list[float]:
         return [scene[statistic].value if statistic in scene else math.nan for scene in scenes]
 
@@ -182,27 +144,27 @@ def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[Fi
     unit = next(scene[Statistic.BIAS].unit for scene in scenes if Statistic.BIAS in scene)
     known_u_b = u_b if math.isfinite(u_b) else (u_p / math.sqrt(total) if total > 1 else math.nan)
     scanner, noise, density = conditions(case)
-    return Line(
-        origin=case.origin,
-        recipe=case.recipe,
-        settings=case.settings,
-        scanner=scanner,
-        noise=noise,
-        density=density,
-        step=step,
-        method=method,
-        quantity=quantity,
-        unit=unit,
-        scenes=len(used),
-        number=int(total),
-        bias=bias,
-        u_b=u_b,
-        u_p=u_p,
-        U95=COVERAGE_FACTOR * math.hypot(u_p, known_u_b) + abs(bias),
-        error_95=finite_median(of(Statistic.ERROR_95)),
-        coverage=_weighted(of(Statistic.COVERAGE), numbers),
-        efficiency=_weighted(of(Statistic.EFFICIENCY), numbers),
-    )
+    return {
+        "origin": case.origin,
+        "recipe": case.recipe,
+        "settings": case.settings,
+        "scanner": scanner,
+        "noise": noise,
+        "density": density,
+        "step": step,
+        "method": method,
+        "quantity": quantity,
+        "unit": unit,
+        "scenes": len(used),
+        "number": int(total),
+        "bias": bias,
+        "u_b": u_b,
+        "u_p": u_p,
+        "U95": COVERAGE_FACTOR * math.hypot(u_p, known_u_b) + abs(bias),
+        "error_95": finite_median(of(Statistic.ERROR_95)),  # median over the scenes
+        "coverage": of_items(scenes, Statistic.COVERAGE)[0],  # %
+        "efficiency": of_items(scenes, Statistic.EFFICIENCY)[0],
+    }
 
 
 def conditions(case: Case) -> tuple[str, str, str]:
@@ -228,34 +190,22 @@ def conditions(case: Case) -> tuple[str, str, str]:
     return "none (sampled)", f"{scan.get('sigma_mm', '?')} mm", f"{scan.get('spacing_mm', '?')} mm"
 
 
-def _weighted(values: Sequence[float], weights: Sequence[float]) -> float:
-    used = [(v, w) for v, w in zip(values, weights, strict=True) if math.isfinite(v) and w > 0]
-    return sum(v * w for v, w in used) / sum(w for _, w in used) if used else math.nan
-
-
 # --- as files -------------------------------------------------------------------------------------------------------
 
 
-def as_json(certificate: Certificate) -> str:
+def as_json(certificate: Mapping[str, Any]) -> str:
     """Return the certificate as JSON; what is not known is null."""
-    content = {"format": FORMAT, "format_version": FORMAT_VERSION, "k": COVERAGE_FACTOR, **asdict(certificate)}
-    content["lines"] = [
-        {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in line.items()}
-        for line in content["lines"]
-    ]
-    content |= {"method": str(METHOD), "not_shown": list(map(str, NOT_SHOWN))}
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json.dumps(json_ready(certificate), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def as_html(certificate: Certificate, lang: str = "en") -> str:
+def as_html(certificate: Mapping[str, Any], lang: str = "en") -> str:
     """Return the certificate as a page in the language ``lang``."""
-    environment = templates.environment("validation", lang)
-    environment.filters["shown"] = _shown
-    page: str = environment.get_template("certificate.html").render(
-        certificate=certificate, origins=tuple(Origin), method=METHOD, not_shown=NOT_SHOWN, lang=lang
-    )
+    tables = {
+        origin: [[one for one in certificate[name] if one["origin"] == origin] for name in ("lines", "coverage")]
+        for origin in Origin
+    }
+    page = templates.render(
+        "validation", "certificate.html", lang, certificate=certificate, tables=tables, method=METHOD,
+        not_shown=NOT_SHOWN,
+    )  # fmt: skip
     return page + "\n"
-
-
-def _shown(value: float, digits: int = 3) -> str:
-    return f"{value:.{digits}g}" if math.isfinite(value) else NO_NUMBER

@@ -57,7 +57,7 @@ def accept(out: Path, history: Path | None, night: str | None) -> str:
     if not path.exists():
         raise InputError(f"{path}: there is no such history; name it with --history")
     with closing(History(path)) as opened:
-        known = [each.night for each in opened.nights()]
+        known = [each["night"] for each in opened.nights()]
         if night is not None and _night(night) not in known:
             raise UsageError(f"--night {night}: the history has no such night")
         if not known:

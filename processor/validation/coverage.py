@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from processor.model import Statistic, Word
 from processor.validation.cells import Origin
-from processor.validation.history import Quantity, Row, by_quantity
+from processor.validation.history import Quantity, Row, by_quantity, of_items
 
 AT_LEAST = ("mean and largest errors",)  # quantities whose intervals are stated to hold 95 % or more
 
@@ -59,20 +59,14 @@ def pooled(
     """Pool the rows of ``nights``; a fixed seed counts once. ``methods``: steps with the method that is judged."""
     found = []
     for key, of_scenes in sorted(by_quantity(rows, nights).items()):
-        shares = [
-            (scene[Statistic.COVERAGE].value, scene[Statistic.NUMBER].value if Statistic.NUMBER in scene else 0.0)
-            for scene in of_scenes.values()
-            if Statistic.COVERAGE in scene
-        ]
-        scenes = [(share, number) for share, number in shares if share == share]
-        number = sum(number for _, number in scenes)
-        if number and key[1:3] in methods:
-            found.append(_judged(key, scenes, int(number), limits))
+        share, scenes = of_items(of_scenes.values(), Statistic.COVERAGE)
+        if scenes and key[1:3] in methods:
+            found.append(_judged(key, share, scenes, limits))
     return tuple(found)
 
 
-def _judged(key: Quantity, scenes: Sequence[tuple[float, float]], number: int, limits: Limits) -> Coverage:
-    share = sum(s * n for s, n in scenes) / number
+def _judged(key: Quantity, share: float, scenes: Sequence[tuple[float, float]], limits: Limits) -> Coverage:
+    number = int(sum(n for _, n in scenes))
     least = min((s for s, n in scenes if n >= limits.least), default=100.0)
     holds = Holds.YES
     if number < limits.least:
@@ -82,14 +76,9 @@ def _judged(key: Quantity, scenes: Sequence[tuple[float, float]], number: int, l
     elif share > limits.high and key[3] not in AT_LEAST:
         holds = Holds.WIDE
     return Coverage(
-        Origin(key[0]),
-        *key[1:],
-        scenes=sum(bool(n) for _, n in scenes),
-        number=number,
-        share=share,
-        worst=min(s for s, n in scenes if n),
+        Origin(key[0]), *key[1:], scenes=len(scenes), number=number, share=share, worst=min(s for s, _ in scenes),
         holds=holds,
-    )
+    )  # fmt: skip
 
 
 def missed(found: Sequence[Coverage]) -> list[Coverage]:

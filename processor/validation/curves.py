@@ -20,7 +20,7 @@ from processor.model import Statistic, Word
 from processor.report import templates
 from processor.report.charts import line_chart
 from processor.report.charts.line_chart import Chart
-from processor.validation.history import Figures, Row, by_quantity
+from processor.validation.history import Figures, Row, by_quantity, of_items
 
 FORMAT, FORMAT_VERSION = "processor-validation-curves", "1.0"
 NOMINAL = 95.0  # % of intervals that hold the truth
@@ -139,14 +139,11 @@ def _curve(shown: CurveKind, common: _Common, statistic: Statistic, by_place: _P
 
 def _pooled(scenes: Sequence[Figures], statistic: Statistic, counted: bool) -> tuple[float, int, int]:
     """Return the median over scenes, or the share of all items together, with the numbers of scenes and of items."""
-    known = [one for one in scenes if statistic in one and math.isfinite(one[statistic].value)]
-    values = [one[statistic].value for one in known]
-    if not counted:
-        return (float(np.median(values)) if values else math.nan), len(values), 0
-    numbers = [one[Statistic.NUMBER].value if Statistic.NUMBER in one else 0.0 for one in known]
-    items = sum(numbers)
-    share = sum(value * number for value, number in zip(values, numbers, strict=True)) / items if items else math.nan
-    return share, sum(number > 0.0 for number in numbers), int(items)
+    if counted:
+        share, pairs = of_items(scenes, statistic)
+        return share, len(pairs), int(sum(number for _, number in pairs))
+    values = [one[statistic].value for one in scenes if statistic in one and math.isfinite(one[statistic].value)]
+    return (float(np.median(values)) if values else math.nan), len(values), 0
 
 
 def _numeric(setting: str) -> tuple[str, float]:
@@ -224,6 +221,4 @@ def html(curves: Sequence[Curve], night: str, lang: str) -> str:
     drawn: list[dict[str, Message | str]] = [
         {"title": chart.title, "image": line_chart.data_uri(line_chart.png(chart))} for chart in charts(curves)
     ]
-    template = templates.environment("validation", lang).get_template("curves.html")
-    page: str = template.render(lang=lang, night=night, charts=drawn)
-    return page + "\n"
+    return templates.render("validation", "curves.html", lang, night=night, charts=drawn) + "\n"

@@ -10,6 +10,7 @@ View ``rows`` has one row for every figure of every night, with all that made it
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from processor.language.messages import Text
-from processor.model import InputError
+from processor.model import InputError, Statistic
 from processor.store.codec import value_from_json, value_to_json
 from processor.validation.cells import Cell, Origin, Outcome, checks_of
 from processor.validation.software_identity import Software
@@ -104,17 +105,19 @@ def by_quantity(rows: Iterable[Row], nights: Collection[str]) -> dict[Quantity, 
     return found
 
 
-@dataclass(frozen=True)
-class Night:
-    """One night of the history."""
+def of_items(scenes: Iterable[Figures], statistic: Statistic) -> tuple[float, list[tuple[float, float]]]:
+    """Return a statistic of all items of scenes together, NaN without any, and (value, number) of each scene's.
 
-    night: str
-    code: str
-    commit: str
-    software: dict[str, str]
-    ended: str
-    line: str
-    message: Text | None = None  # the line; None of a history without it
+    Scenes without a value or without items are left out.
+    """
+    pairs = [
+        (scene[statistic].value, scene[Statistic.NUMBER].value)
+        for scene in scenes
+        if statistic in scene and Statistic.NUMBER in scene
+    ]
+    pairs = [(value, number) for value, number in pairs if math.isfinite(value) and number > 0.0]
+    whole = sum(number for _, number in pairs)
+    return (sum(value * number for value, number in pairs) / whole if whole else math.nan), pairs
 
 
 class History:
@@ -230,41 +233,35 @@ class History:
 
     # --- queries -----------------------------------------------------------------------------------------------------
 
-    def nights(self) -> list[Night]:
-        """Return all nights, the earliest first."""
-        return [
-            Night(
-                night=night,
-                code=code,
-                commit=commit,
-                software=json.loads(software),
-                ended=ended or "",
-                line=line,
-                message=_text_of(json.loads(message)) if message else None,
-            )
-            for night, code, commit, software, ended, line, message in self.db.execute(
-                "SELECT night, code, commit_, software, ended, line, message FROM nights ORDER BY night"
-            )
-        ]
+    def nights(self) -> list[dict[str, Any]]:
+        """Return all nights, the earliest first: night, code, commit, ended, line, and the line as a message or None.
+
+        ``ended`` is "" for a night that has not, ``message`` None of a history without it.
+        """
+        found = self._select(
+            "SELECT night, code, commit_ AS 'commit', IFNULL(ended, '') AS ended, line, message FROM nights"
+            " ORDER BY night"
+        )
+        return [{**one, "message": _text_of(json.loads(one["message"])) if one["message"] else None} for one in found]
 
     def rows(self, first: str, last: str) -> list[Row]:
         """Return the figures of the nights from ``first`` to ``last``, the earliest first."""
-        keys = ("night", "case", "recipe", "seed", "input_sha256", "unit", "quantity", "statistic", "better")
+        found = self._select(
+            "SELECT step, method, name, value, fixed, origin, night, case_ AS 'case', recipe, seed, input_sha256, unit,"
+            " quantity, statistic, better FROM figures JOIN cells USING (night, cell) WHERE night BETWEEN ? AND ?"
+            " ORDER BY night, case_, seed, step, method, name",
+            first,
+            last,
+        )
         return [
             Row(
-                name=(step, method, name),
-                value=_number(value),
-                fixed=bool(fixed),
-                origin=origin or Origin.OWN,
-                **dict(zip(keys, rest, strict=True)),
+                name=(one.pop("step"), one.pop("method"), one.pop("name")),
+                value=math.nan if (value := one.pop("value")) is None else value,
+                fixed=bool(one.pop("fixed")),
+                origin=one.pop("origin") or Origin.OWN,
+                **one,
             )
-            for step, method, name, value, fixed, origin, *rest in self.db.execute(
-                "SELECT step, method, name, value, fixed, origin,"
-                " night, case_, recipe, seed, input_sha256, unit, quantity, statistic, better"
-                " FROM figures JOIN cells USING (night, cell) WHERE night BETWEEN ? AND ?"
-                " ORDER BY night, case_, seed, step, method, name",
-                [first, last],
-            )
+            for one in found
         ]
 
     def settings(self, first: str, last: str) -> dict[str, tuple[str, tuple[str, ...]]]:
@@ -278,23 +275,20 @@ class History:
 
     def missed(self, night: str) -> list[dict[str, Any]]:
         """Return the figures of a night beyond their limits: cell, step, method, name, value, limit and unit."""
-        keys = ("cell", "step", "method", "name", "value", "limit", "unit")
-        rows = self.db.execute(
-            "SELECT cell, step, method, name, value, limit_, unit FROM figures"
+        return self._select(
+            "SELECT cell, step, method, name, value, limit_ AS 'limit', unit FROM figures"
             " WHERE night = ? AND limit_ IS NOT NULL AND (value IS NULL OR value > limit_)",
-            [night],
+            night,
         )
-        return [dict(zip(keys, row, strict=True)) for row in rows]
 
     def cells(self, night: str) -> list[dict[str, Any]]:
         """Return the cells of a night: title, case, failed, seconds, peak_mb, fixed, seed and figures (a number)."""
-        keys = ("cell", "title", "case", "failed", "seconds", "peak_mb", "fixed", "seed", "figures")
-        rows = self.db.execute(
-            "SELECT cell, title, case_, failed, seconds, peak_mb, fixed, seed, (SELECT COUNT(*) FROM figures f"
-            " WHERE f.night = c.night AND f.cell = c.cell) FROM cells c WHERE night = ? ORDER BY title, cell",
-            [night],
+        return self._select(
+            "SELECT cell, title, case_ AS 'case', failed, seconds, peak_mb, fixed, seed, (SELECT COUNT(*) FROM figures"
+            " f WHERE f.night = c.night AND f.cell = c.cell) AS figures FROM cells c WHERE night = ?"
+            " ORDER BY title, cell",
+            night,
         )
-        return [dict(zip(keys, row, strict=True)) for row in rows]
 
     def worse(self, before: str) -> dict[Name, set[str]]:
         """Return the nights before in which a figure was worse and not accepted: they are no level to compare with."""
@@ -307,12 +301,13 @@ class History:
             nights.setdefault((step, method, name), set()).add(night)
         return nights
 
+    def _select(self, query: str, *values: str) -> list[dict[str, Any]]:
+        """Return rows by the names of their columns."""
+        found = self.db.execute(query, values)
+        return [dict(zip((name for name, *_ in found.description), row, strict=True)) for row in found]
+
     def _names(self, query: str, *values: str) -> list[Name]:
         return [(step, method, name) for step, method, name in self.db.execute(query, values)]
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else float(value)
 
 
 def _json(value: Any) -> str:

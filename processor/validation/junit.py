@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
 from xml.etree import ElementTree as ET
 
-from processor.validation.change_detection import ALARMS, Detected
-from processor.validation.coverage import Coverage
-from processor.validation.coverage import missed as beyond_limits
+from processor.validation.change_detection import ALARMS
+from processor.validation.summary import Summary
 
 
-def xml(
-    night: str,
-    cells: Sequence[Mapping[str, Any]],
-    missed: Sequence[Mapping[str, Any]],
-    detected: Detected,
-    intervals: Sequence[Coverage] = (),
-) -> bytes:
+def xml(report: Summary) -> bytes:
     """Write cells (failed ones as errors, figures beyond their limits as failures), intervals and regressions."""
+    night, cells, intervals, detected = report.night, report.cells, report.coverage, report.detected
     root = ET.Element("testsuites", name="processor validate")
     suite = ET.SubElement(root, "testsuite", name=f"accuracy.{night}")
     failures = errors = 0
@@ -32,7 +24,7 @@ def xml(
             "{step} ({method}), {name}: {shown:g} {unit}, limit {limit:g}".format(
                 **one, shown=math.nan if one["value"] is None else one["value"]
             )
-            for one in missed
+            for one in report.missed
             if one["cell"] == cell["cell"]
         ]
         if beyond:
@@ -40,7 +32,7 @@ def xml(
             ET.SubElement(case, "failure", message=_clean(beyond[0])).text = _clean("\n".join(beyond))
     _counts(suite, len(cells), failures, errors, sum(cell["seconds"] for cell in cells))
     if intervals:
-        wrong = beyond_limits(intervals)
+        wrong = report.wrong_intervals
         suite = ET.SubElement(root, "testsuite", name=f"intervals.{night}")
         for one in intervals:
             case = _case(suite, f"intervals.{one.origin}.{one.step}.{one.method}", one.quantity, 0.0)

@@ -122,12 +122,12 @@ def _report(
     matrix: Matrix, out: Path, night: str, cells: tuple[Cell, ...], present: Software, history: History, lang: str
 ) -> Summary:
     wanted = {cell.key for cell in cells}
-    nights = [each for each in history.nights() if each.night <= night]
-    rows = history.rows(nights[-SEEN_NIGHTS:][0].night, night)
+    nights = [each for each in history.nights() if each["night"] <= night]
+    rows = history.rows(nights[-SEEN_NIGHTS:][0]["night"], night)
     detected = change_detection.find(rows, night, history.worse(night), matrix.aim)
     done = tuple(cell for cell in history.cells(night) if cell["cell"] in wanted)
     missed = [figure for figure in history.missed(night) if figure["cell"] in wanted]
-    same = [each.night for each in nights if each.code == present.code]
+    same = [each["night"] for each in nights if each["code"] == present.code]
     judged = {(name, module.Params().method) for name, module in pipeline.step_modules().items()}
     cases = {entry.case.key for entry in matrix.entries}
     intervals = coverage.pooled([row for row in rows if row.case in cases], same, judged, matrix.coverage)
@@ -137,7 +137,7 @@ def _report(
     certified = certificate.make(night, rows, same, present, matrix, intervals)
     files = {
         "summary.json": _json(report.as_object()).encode(),
-        "junit.xml": junit.xml(night, done, missed, detected, intervals),
+        "junit.xml": junit.xml(report),
         "certificate.json": certificate.as_json(certified).encode(),
         "certificate.html": certificate.as_html(certified, lang).encode(),
         "line.txt": f"{report.line}\n".encode(),
@@ -149,10 +149,10 @@ def _report(
         _write(out / name, data)
     changed = [(change.name, change.kind, summary.change_object(change)) for change in detected.changes]
     history.end(night, changed, report.line, _now())
-    drawn = curves.of_history(rows, same, history.settings(nights[-SEEN_NIGHTS:][0].night, night))
+    drawn = curves.of_history(rows, same, history.settings(nights[-SEEN_NIGHTS:][0]["night"], night))
     _write(out / "curves.json", _json(curves.as_object(drawn, night)).encode())
     _write(out / "curves.html", curves.html(drawn, night, lang).encode())
-    page = summary.nights_html(report, [each for each in history.nights() if each.night <= night], rows, lang)
+    page = summary.nights_html(report, [each for each in history.nights() if each["night"] <= night], rows, lang)
     _write(out / "nights.html", page.encode())
     return report
 

@@ -18,7 +18,7 @@ from processor.validation import coverage as intervals
 from processor.validation.cells import Origin
 from processor.validation.change_detection import ALARMS, Change, ChangeKind, Detected, Direction
 from processor.validation.coverage import Coverage
-from processor.validation.history import Name, Night, Row
+from processor.validation.history import Name, Row
 from processor.validation.software_identity import Software
 
 FORMAT, FORMAT_VERSION = "processor-validation", "1.0"
@@ -177,9 +177,9 @@ def _finite(value: float) -> float | None:
 # --- the page of all nights -----------------------------------------------------------------------------------------
 
 
-def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], lang: str = "en") -> str:
+def nights_html(summary: Summary, nights: Sequence[Mapping[str, Any]], rows: Sequence[Row], lang: str = "en") -> str:
     """Return the page in a language: the nights, the latest first, and every figure over the nights."""
-    shown = [night.night for night in nights][-SPARK_NIGHTS:]
+    shown = [night["night"] for night in nights][-SPARK_NIGHTS:]
     course: dict[tuple[int, Name], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     last: dict[tuple[int, Name], Row] = {}
     origins = list(Origin)
@@ -208,19 +208,10 @@ def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], 
                 "change": change.message if change else "",
             }
         )
-    page: str = (
-        templates.environment("validation", lang)
-        .get_template("nights.html")
-        .render(
-            lang=lang,
-            summary=summary,
-            nights=list(reversed(nights)),
-            figures=figures,
-            test=TEST,
-            width=SPARK_WIDTH,
-            height=SPARK_HEIGHT,
-        )
-    )
+    page = templates.render(
+        "validation", "nights.html", lang, summary=summary, nights=list(reversed(nights)), figures=figures, test=TEST,
+        width=SPARK_WIDTH, height=SPARK_HEIGHT,
+    )  # fmt: skip
     return page + "\n"
 
 

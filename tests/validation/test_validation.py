@@ -289,14 +289,14 @@ def test_a_history_of_an_earlier_version_keeps_its_nights(tmp_path, version):
     with closing(History(path)) as opened:
         opened.begin("2026-01-01", validation_nights.SOFTWARE, "made", "0", "")
         opened.end("2026-01-01", [], line, "now")
-        assert [(one.line, one.message) for one in opened.nights()] == [("2026-01-01 ok", line)]
+        assert [(one["line"], one["message"]) for one in opened.nights()] == [("2026-01-01 ok", line)]
     with closing(sqlite3.connect(path)) as db:
         for column in (name for later, names in history.ADDED.items() if later > version for name in names):
             db.execute("ALTER TABLE {} DROP COLUMN {}".format(*column.split(".")))
         db.execute(f"PRAGMA user_version = {version}")
     with closing(History(path)) as opened:
         kept = line if version > 1 else None
-        assert [(one.line, one.message) for one in opened.nights()] == [("2026-01-01 ok", kept)]
+        assert [(one["line"], one["message"]) for one in opened.nights()] == [("2026-01-01 ok", kept)]
 
 
 FORKS = multiprocessing.get_context("forkserver")  # of a process that has loaded this module once

@@ -109,25 +109,18 @@ def write(out: Path, history: History, lang: str = "en") -> dict[str, Any]:
 def _page(history: History, drawn: tuple[Message, bytes] | None, lang: str) -> str:
     first, others = tables.of_page(history)
     figure = None if drawn is None else {"caption": drawn[0], "data": base64.b64encode(drawn[1]).decode("ascii")}
-    written: str = (
-        templates.environment("report", lang)
-        .get_template("history.html")
-        .render(
-            lang=lang,
-            name=history.name,
-            banner=text("{counts}", counts=lines.counts(history)),
-            about=text(
-                "{epochs} epochs, {first} to {last}",
-                epochs=len(history.epochs),
-                first=tables.day(history, 0),
-                last=tables.day(history, -1),
-            ),
-            remarks=history.remarks,
-            figure=None if figure is None else {**figure, "twin": False},
-            first=[page.written_table(table, lang) for table in first],
-            others=[page.written_table(table, lang) for table in others],
-            running_head=title_block.css_string(history.name),
-            running_foot=title_block.css_string(f"processor {pipeline.software().get('processor', '')}"),
-        )
+    first_day, last_day = tables.day(history, 0), tables.day(history, -1)
+    return templates.render(
+        "report",
+        "history.html",
+        lang,
+        name=history.name,
+        banner=text("{counts}", counts=lines.counts(history)),
+        about=text("{epochs} epochs, {first} to {last}", epochs=len(history.epochs), first=first_day, last=last_day),
+        remarks=history.remarks,
+        figure=None if figure is None else {**figure, "twin": False},
+        first=[page.written_table(table, lang) for table in first],
+        others=[page.written_table(table, lang) for table in others],
+        running_head=title_block.css_string(history.name),
+        running_foot=title_block.css_string(f"processor {pipeline.software().get('processor', '')}"),
     )
-    return written

@@ -12,7 +12,7 @@ from processor.preassembly.result import Adjustment, MeanMax, Result
 from processor.preassembly.verdicts.joints import ComparedLimits
 from processor.report import verdict_counts
 from processor.report.preassembly import characteristics, figures, interactive_view, tables
-from processor.report.step_report import StepReport
+from processor.report.step_report import StepReport, not_ok
 from processor.report.style import Drawn
 
 # Reasons by which a joint that passes is not all there is to do.
@@ -113,17 +113,6 @@ def _to_do(result: Result) -> Iterator[Message]:
     yield from result.adjustment.advice[:1]
 
 
-def _why(result: Result) -> Iterator[Message]:
-    """Yield the reasons of the components that are not ok, those of the whole where there are none."""
-    parts = result.components
-    found = [
-        text("{part} {status}: {reasons}", part=name, status=status, reasons=reasons)
-        for name, status, reasons in zip(parts.name, parts.status, parts.reasons, strict=True)
-        if status != Status.OK
-    ]
-    yield from found or result.reasons
-
-
 def _limits(result: Result) -> list[ComparedLimits]:
     adjustment = result.adjustment
     if adjustment is None:
@@ -138,7 +127,7 @@ REPORT = StepReport(
     figures=lambda execution, runs, _: Drawn(figures.draw(execution.scene, runs)),
     further_verdicts=_further,
     to_do=_to_do,
-    why=_why,
+    why=lambda result: not_ok(result, result.components),
     limits=_limits,
     characteristics=characteristics.of_run,
     characteristics_note=characteristics.NOTE,

@@ -140,15 +140,7 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[Messag
     low, high = np.quantile(everything, (0.01, 0.99)) if len(everything) else (-1.0, 1.0)
     low, high = min(float(low), -LEAST_SHOWN_MM), max(float(high), LEAST_SHOWN_MM)
     for k, (run, error) in enumerate(zip(runs, errors, strict=True)):
-        histogram.hist(
-            np.clip(error, low, high),
-            bins=np.linspace(low, high, 31).tolist(),
-            histtype="stepfilled",
-            facecolor=translucent(COLOURS[k % 4]),
-            edgecolor=COLOURS[k % 4],
-            hatch=HATCHES[k % 4],
-            label=run.method,
-        )
+        _bars(histogram, np.clip(error, low, high), np.linspace(low, high, 31), run.method, k % 4)
         size = np.sort(np.maximum(np.abs(error), LEAST_SHOWN_MM))
         share = np.arange(1, len(size) + 1) / len(run.result.balls)
         cumulative.step(

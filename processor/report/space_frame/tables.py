@@ -22,6 +22,12 @@ from processor.space_frame.spheres.baselines import SAME
 
 PLACE, SHIFT = (" ".join(pattern.format(axis) for axis in XYZ) for pattern in ("{}_mm", "d{}_mm"))
 PLACE_CI95, SHIFT_CI95 = (" ".join(f"ci95_{name}" for name in names.split()) for names in (PLACE, SHIFT))
+SIZES = (
+    "id", PLACE, "radius_mm", "ci95_radius_mm", "true_radius_mm", "radius_error_mm", "lowest_z_mm", "ci95_lowest_z_mm",
+)  # fmt: skip
+BRIEF = (
+    "id", PLACE, "radius_mm", "ci95_radius_mm", "size_mm", "lowest_z_mm", "ci95_lowest_z_mm", "evidence", "flag",
+)  # fmt: skip
 OF_FRAME: dict[str, Any] = {"units": MM, "on_terminal": False}
 OF_FILE: dict[str, Any] = {**OF_FRAME, "on_page": False}
 
@@ -37,7 +43,10 @@ def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     for run in runs:
         true = report.true_radii.get(run.method, np.full(len(run.result.balls), NAN))
         file = "balls" if run is runs[0] else f"balls-{run.method}"
-        table = _with_bounds(run, true, file) if run.result.has_bounds else _formal(run, true, file, runs[0])
+        if run.result.has_bounds:
+            table = tabulate(_title(run.method), _cells(run.result.balls, true), file, **OF_FILE)
+        else:
+            table = _formal(run, true, file, runs[0])
         tables.append(replace(table, folded=run is not runs[0]))
     tables += hanger_report.tables(first)
     if whole:
@@ -48,20 +57,8 @@ def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
 
 def _formal(run: StepRun, true: Floats, file: str, first: StepRun) -> Table:
     """Balls by a method whose intervals are formal."""
-    balls = run.result.balls
-    cells = {
-        "id": balls.names,
-        PLACE: balls.centres,
-        "radius_mm": balls.radii,
-        "formal_ci95_radius_mm": NORMAL_95 * _sd(balls)[:, 3],
-        "true_radius_mm": true,
-        "radius_error_mm": balls.radii - true,
-        "lowest_z_mm": balls.lowest[:, 2],
-        "formal_ci95_lowest_z_mm": NORMAL_95 * balls.lowest_sd,
-        "points": balls.points,
-        "flag": balls.flag,
-        "remark": balls.reasons,
-    }
+    every = _cells(run.result.balls, true)
+    cells = {name.replace("ci95_", "formal_ci95_"): every[name] for name in (*SIZES, "points", "flag", "remark")}
     note = "" if run is first else text("{reasons}", reasons=run.result.reasons)
     return tabulate(_title(run.method), cells, file, note, units=MM, on_terminal=run is first)
 
@@ -70,11 +67,10 @@ def _title(method: str) -> Message:
     return text("Balls, method {method}", method=method)
 
 
-def _with_bounds(run: StepRun, true: Floats, file: str) -> Table:
-    """All figures of each ball, for a CSV file."""
-    balls = run.result.balls
+def _cells(balls: Balls, true: Floats) -> dict[str, Any]:
+    """Return all figures of each ball, with the true radii (k,)."""
     half = NORMAL_95 * _sd(balls)
-    cells = {
+    return {
         "id": balls.names,
         PLACE: balls.centres,
         PLACE_CI95: half[:, :3],
@@ -97,23 +93,12 @@ def _with_bounds(run: StepRun, true: Floats, file: str) -> Table:
         "flag": balls.flag,
         "remark": balls.reasons,
     }
-    return tabulate(_title(run.method), cells, file, **OF_FILE)
 
 
 def _brief(result: Result, method: str) -> Table:
     """Balls as the page shows them."""
-    balls = result.balls
-    cells = {
-        "id": balls.names,
-        PLACE: balls.centres,
-        "radius_mm": balls.radii,
-        "ci95_radius_mm": NORMAL_95 * _sd(balls)[:, 3],
-        "size_mm": balls.sizes,
-        "lowest_z_mm": balls.lowest[:, 2],
-        "ci95_lowest_z_mm": NORMAL_95 * balls.lowest_sd,
-        "evidence": balls.evidence,
-        "flag": balls.flag,
-    }
+    every = _cells(result.balls, np.full(len(result.balls), NAN))
+    cells = {name: every[name] for name in BRIEF}
     note = text("Bounds, efficiencies and all other figures are in balls.csv.")
     # A few targets fit on a terminal, the balls of a frame do not.
     return tabulate(_title(method), cells, note=note, units=MM, on_terminal=not len(result.tubes))

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 
 from processor.language.messages import Message, text
 from processor.model import Status, StepRun
 from processor.pipeline import Execution
-from processor.report.step_report import StepReport
+from processor.report.step_report import StepReport, not_ok
 from processor.report.stitching import figures, interactive_view, tables, targets
 from processor.report.style import Drawn
 from processor.stitching.result import Result
@@ -35,23 +34,12 @@ def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
     return {"stitch.csv": tables.poses_csv(run.result), **targets.files(execution.scene)}
 
 
-def _why(result: Result) -> Iterator[Message]:
-    """Yield the reasons of the scans that are not ok, those of the step where there are none."""
-    scans = result.scans
-    found = [
-        text("{scan} {status}: {reasons}", scan=name, status=status, reasons=reasons)
-        for name, status, reasons in zip(scans.name, scans.status, scans.reasons, strict=True)
-        if status != Status.OK
-    ]
-    yield from found or result.reasons
-
-
 REPORT = StepReport(
     title=text("Stitching"),
     summary=_summary,
     tables=tables.step_tables,
     figures=lambda *given: Drawn(figures.draw(*given)),
     files=_files,
-    why=_why,
+    why=lambda result: not_ok(result, result.scans),
     interactive_data=interactive_view.interactive_data,
 )

@@ -52,9 +52,7 @@ def html(
                 ],
             }
         )
-    template = templates.environment(Path(__file__).parent, lang).get_template("page.html")
-    page: str = template.render(lang=lang, line=line, rule=RULE, papers=papers)
-    return page + "\n"
+    return templates.render(Path(__file__).parent, "page.html", lang, line=line, rule=RULE, papers=papers) + "\n"
 
 
 def _cells(row: Row) -> dict[str, Any]:
