@@ -246,7 +246,8 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
         promising = [c for c in candidates if c.misfit <= PROMISING * candidates[0].misfit]
         best, *rivals = decide(points, design, promising, scanner)
         start = best.T
-        others = [c.misfit for c in candidates if c.start is not best.start]
+        middle = few.mean(axis=0)
+        others = [c.misfit for c in candidates if principal.differ(c.T, best.T, middle, design.size)]
         ambiguity = min(others, default=NAN) / max(best.misfit, 1e-9)
     fitted = fine(few, surface, axes, start)
     if how == "auto" and registration is Registration.AS_GIVEN and np.isfinite(fitted.T_design_scan).all():
