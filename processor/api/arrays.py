@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -349,54 +349,43 @@ def m3c2(
     """
     first, second = points_of(reference, "reference", 1, in_mm=False), points_of(compared, "compared", 1, in_mm=False)
     places = first if core is None else points_of(core, "core", 1, in_mm=False)
-    scales = _scales(normal_diameter, projection_diameter, max_depth)
+    normal_diameter, projection_diameter, max_depth = _lengths(
+        {"normal_diameter": normal_diameter, "projection_diameter": projection_diameter, "max_depth": max_depth}
+    )
     error = length_of(registration_error, "registration_error", zero=True, unit="")
     given = None if normals is None else normals_of(normals, places.shape)
-    _check_units(first, second, places, scales.projection_diameter)
+    _check_units(first, second, places, projection_diameter)
     first, _, of_first = _once(first, "reference")
     second, _, of_second = _once(second, "compared")
     origin = first.mean(axis=0)
-    directions = _fitted_normals(first - origin, places - origin, scales.normal_diameter) if given is None else given
+    directions = _fitted_normals(first - origin, places - origin, normal_diameter) if given is None else given
     measured = m3c2_distances.distances(
-        m3c2_distances.grid(first - origin, scales.projection_diameter),
-        m3c2_distances.grid(second - origin, scales.projection_diameter),
+        m3c2_distances.grid(first - origin, projection_diameter),
+        m3c2_distances.grid(second - origin, projection_diameter),
         places - origin,
         directions,
-        projection_diameter_mm=scales.projection_diameter,
-        max_depth_mm=scales.max_depth,
+        projection_diameter_mm=projection_diameter,
+        max_depth_mm=max_depth,
         registration_error_mm=error,
     )
     _check_reach(measured)
     return CorePoints(**vars(measured), core=places, normals=directions, reasons=(*of_first, *of_second))
 
 
-class _Scales(NamedTuple):
-    normal_diameter: float
-    projection_diameter: float
-    max_depth: float
-
-
-def _scales(normal_diameter: Any, projection_diameter: Any, max_depth: Any) -> _Scales:
+def _lengths(given: dict[str, Any]) -> list[float]:
     """Return the lengths. Raises ValueError where one must be in another unit; a depth may be as great as one likes."""
-    lengths = _Scales(
-        *(
-            length_of(value, name, unit=" in the unit of the coordinates")
-            for name, value in zip(_Scales._fields, (normal_diameter, projection_diameter, max_depth), strict=True)
-        )
-    )
-    pairs = (
+    lengths = {name: length_of(value, name, unit=" in the unit of the coordinates") for name, value in given.items()}
+    for name, other in (
         ("max_depth", "projection_diameter"),
         ("projection_diameter", "normal_diameter"),
         ("normal_diameter", "projection_diameter"),
-    )
-    for name, other in pairs:
-        small, large = getattr(lengths, name), getattr(lengths, other)
-        if small * MOST_LENGTH_RATIO < large:
+    ):
+        if lengths[name] * MOST_LENGTH_RATIO < lengths[other]:
             raise ValueError(
-                f"{name}: {small:g} is less than 1/{MOST_LENGTH_RATIO:g} of {other}, {large:g}; expected lengths of one"
-                " unit"
+                f"{name}: {lengths[name]:g} is less than 1/{MOST_LENGTH_RATIO:g} of {other}, {lengths[other]:g};"
+                " expected lengths of one unit"
             )
-    return lengths
+    return list(lengths.values())
 
 
 def _fitted_normals(reference: Floats, core: Floats, normal_diameter: float) -> Floats:

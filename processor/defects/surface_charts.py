@@ -173,7 +173,7 @@ def _hidden(surface: DesignSurface) -> Bools:
 
 def _near_bodies(surface: DesignSurface, body: Ints, halves: Floats) -> Bools:
     """Mark cells, with half sides (cells, 3), that reach into the box about a closed body: no other can be hidden."""
-    low, high = mesh_bodies.boxes(surface.vertices, surface.faces, body)
+    low, high = mesh_bodies.boxes(surface.vertices[surface.faces], body).swapaxes(0, 1)
     middles = surface.centres + mesh_bodies.OUTSIDE_MM * surface.outward
     first, last = middles - halves - mesh_bodies.WELD_MM, middles + halves + mesh_bodies.WELD_MM
     near = np.zeros(len(middles), np.bool_)

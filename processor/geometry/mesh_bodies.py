@@ -74,7 +74,7 @@ def enclosed(points: Floats, normals: Floats, grid: FacetGrid, body: Ints) -> Bo
     bodies than it enters; only bodies whose boxes contain the place count, and the ray ends where these boxes end.
     """
     places = points + OUTSIDE_MM * normals + JITTER_MM
-    longest, axis, about = int(np.argmax(grid.shape)), int(np.argmin(grid.shape)), _boxes(grid.corners, body)
+    longest, axis, about = int(np.argmax(grid.shape)), int(np.argmin(grid.shape)), boxes(grid.corners, body)
     order = np.argsort(places[:, longest], kind="stable")
     places, end = places[order], np.full(len(places), -np.inf)
     for low, high in about[np.isfinite(about).all(axis=(1, 2))]:
@@ -98,14 +98,11 @@ def enclosed(points: Floats, normals: Floats, grid: FacetGrid, body: Ints) -> Bo
     return marked
 
 
-def boxes(vertices: Floats, faces: Ints, body: Ints) -> tuple[Floats, Floats]:
-    """Return the corners low and high (b, 3) of boxes about the closed bodies; of other bodies they are empty."""
-    about = _boxes(vertices[faces], body)
-    return about[:, 0], about[:, 1]
+def boxes(corners: Floats, body: Ints) -> Floats:
+    """Return the low and high corners (b, 2, 3) of boxes about the bodies (f,) of facets (f, 3, 3).
 
-
-def _boxes(corners: Floats, body: Ints) -> Floats:
-    """Return the low and high corners (b, 2, 3) of boxes about the bodies (f,) of facets (f, 3, 3)."""
+    Of bodies that are not closed, -1, there are none.
+    """
     count = int(body.max(initial=-1)) + 1
     about = np.stack([np.full((count, 3), np.inf), np.full((count, 3), -np.inf)], axis=1)
     closed = body >= 0

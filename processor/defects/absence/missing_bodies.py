@@ -71,7 +71,7 @@ def _contacts(
     touched = np.flatnonzero(hidden.any(axis=1) & (charts.kind == PLANE)[chart_of_cells(surface)])
     places, inward, place_mm2 = _places_of(surface, touched)
     found = _points_on(observed, surface, touched)
-    low, high = mesh_bodies.boxes(surface.vertices, surface.faces, body)
+    low, high = mesh_bodies.boxes(surface.vertices[surface.faces], body).swapaxes(0, 1)
     typical = _density(field, surface) * charts.cell_mm**2
     for one in range(len(low)):
         only = np.where(body == one, 0, -1)
