@@ -38,10 +38,11 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format .
 	$(BIN)/mypy
 
-# docs/parameters.md and docs/schemas from the code; the rest of docs/ is written by hand.
+# docs/parameters.md, docs/schemas and docs/pictures/rooms.svg from the code; the rest of docs/ is written by hand.
 docs: $(VENV)/.test
 	$(BIN)/python -m docs.scripts.make_parameters
 	$(BIN)/python -m docs.scripts.make_schemas
+	$(BIN)/python -m docs.scripts.make_rooms
 
 bench: $(VENV)/.test
 	$(BIN)/python -m pip install --quiet --editable ".[designgen,test,bench]"

@@ -19,6 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import processor
 from processor import diagnostics, user_methods
 from processor.model import InputError, Reason, Scan, Scene, Status, StepRun, UsageError, did_you_mean, inputs, reason
 from processor.progress import stage
@@ -84,7 +85,7 @@ class Execution:
 @cache
 def step_modules() -> dict[str, ModuleType]:
     """All steps by name: the module ``step`` of each package of processor that has one, with the step's NAME."""
-    packages = [found.name for found in pkgutil.iter_modules([str(Path(__file__).parent)]) if found.ispkg]
+    packages = [found.name for found in pkgutil.iter_modules(processor.__path__) if found.ispkg]
     modules = [
         importlib.import_module(f"processor.{package}.step")
         for package in packages

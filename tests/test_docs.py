@@ -17,7 +17,7 @@ from click.testing import CliRunner
 import designgen.cli
 import processor.cli.main
 from designgen.scenes import model
-from docs.scripts import make_parameters
+from docs.scripts import make_parameters, make_rooms
 from processor import pipeline
 from processor.batch import batch
 from processor.evaluation import evaluate, truth_json
@@ -89,6 +89,7 @@ ELSEWHERE = {
     "processor run my-frame -o results --steps spheres --method ray,my_module:my_method": (
         "tests/pipeline/test_user_methods.py"
     ),
+    "processor run my-frame -o results --steps density": "tests/pipeline/test_written_step.py",
     "designgen make frame-1040 -o roof.h5 --seed 3": "make weekend",
     "designgen scan hall.ifczip -o hall.h5 --stations places.json --scanner pulse --set scan.step_mrad=0.5": (
         "tests/designgen/test_models.py"
@@ -284,6 +285,23 @@ def test_the_index_names_every_page():
     text = (ROOT / "docs/index.md").read_text("utf-8")
     pages = [path.relative_to(ROOT / "docs") for path in PAGES if path.is_relative_to(ROOT / "docs")]
     assert all(f"]({path.as_posix()})" in text for path in pages if path.name != "index.md")
+
+
+def test_the_tour_names_what_its_files_define():
+    tour = (ROOT / "docs/architecture.md").read_text("utf-8")
+    named = re.findall(r"\[`(\w+)`\]\((\S+\.py)\)", tour)
+    assert len(named) > 6
+    assert [
+        (name, file)
+        for name, file in named
+        if not re.search(rf"^(def|class) {name}\b", (ROOT / "docs" / file).read_text("utf-8"), re.M)
+    ] == []
+    files = [file for file in re.findall(r"`(processor/[\w./*-]+)`", tour) if "*" not in file]
+    assert [file for file in files if not (ROOT / file).exists()] == []
+
+
+def test_the_picture_of_the_rooms_is_that_of_the_imports():
+    assert make_rooms.PICTURE.read_text("utf-8") == make_rooms.picture(), "make docs"
 
 
 def test_readme_is_short_and_has_its_required_parts():

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ from processor.model import InputError, Reason, reason
 from processor.pipeline import package_of, step_modules
 
 BEYOND = (Finding.CHANGED, Finding.DOUBTFUL)
-NOT_COMPARED = ("stitch",)  # of scanners' places, which are others each time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +45,11 @@ def compare(epochs: Sequence[Epoch]) -> History:
     others = np.array([epoch.facts.get("design") != epochs[0].facts.get("design") for epoch in epochs], np.bool_)
     for step in step_modules():
         results = [epoch.result(step) for epoch in epochs]
-        if step in NOT_COMPARED or sum(result is not None for result in results) < 2:
+        package = package_of(step)
+        compared = importlib.util.find_spec(f"processor.epochs.{package}")  # places of scanners are others each time
+        if not compared or sum(result is not None for result in results) < 2:
             continue
-        module = _module(step)
+        module = importlib.import_module(f"processor.epochs.{package}")
         found = [_doubted(one, others) if module.BY_DESIGN else one for one in module.series(results)]
         components += _components(step, found)
         remarks += module.remarks(results)
@@ -65,10 +66,6 @@ def compare(epochs: Sequence[Epoch]) -> History:
         name=str(epochs[-1].facts.get("name", "")), epochs=tuple(epochs), components=followed,
         remarks=tuple(remarks),
     )  # fmt: skip
-
-
-def _module(step: str) -> ModuleType:
-    return importlib.import_module(f"processor.epochs.{package_of(step)}")
 
 
 def _doubted(series: Series, others: Any) -> Series:
