@@ -6,7 +6,6 @@ import importlib
 import importlib.util
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -50,8 +49,12 @@ def compare(epochs: Sequence[Epoch]) -> History:
         if not compared or sum(result is not None for result in results) < 2:
             continue
         module = importlib.import_module(f"processor.epochs.{package}")
-        found = [_doubted(one, others) if module.BY_DESIGN else one for one in module.series(results)]
-        components += _components(step, found)
+        by_name: dict[str, list[Series]] = {}
+        for one in module.series(results):
+            # Values by another design are doubtful
+            doubtful = one.doubtful | others if module.BY_DESIGN else one.doubtful
+            by_name.setdefault(one.component, []).append(replace(one, doubtful=doubtful))
+        components += [change.of_component(step, name, of_it) for name, of_it in by_name.items()]
         remarks += module.remarks(results)
     if not components:
         raise InputError(
@@ -66,19 +69,6 @@ def compare(epochs: Sequence[Epoch]) -> History:
         name=str(epochs[-1].facts.get("name", "")), epochs=tuple(epochs), components=followed,
         remarks=tuple(remarks),
     )  # fmt: skip
-
-
-def _doubted(series: Series, others: Any) -> Series:
-    """Doubt the values of epochs of another design."""
-    return replace(series, doubtful=series.doubtful | others) if others.any() else series
-
-
-def _components(step: str, found: Sequence[Series]) -> Iterator[Component]:
-    by_name: dict[str, list[Series]] = {}
-    for one in found:
-        by_name.setdefault(one.component, []).append(one)
-    for name, of_it in by_name.items():
-        yield change.of_component(step, name, of_it)
 
 
 def _following(component: Component, moved: set[str]) -> Component:

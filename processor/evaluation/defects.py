@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping
 from itertools import pairwise
@@ -72,31 +73,31 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     """Compare with limits: false alarms, one on 100 m2 and chance on top; depths, a tenth or 2 LOD95; classes."""
     if truth.defects is None:
         return []
-    limited = result.method != "paper"  # figures of the baseline have no limits
     bodies = truth.structure.bodies if truth.structure is not None else None
     if scene.structure is None or scene.structure.bodies is None:
         bodies = None  # components that are not named by the design have no true name
     rows = matched(result.defects, truth.defects, named=bodies is not None)
-    metrics = _missed(truth.defects, rows, limited)
+    metrics = _missed(truth.defects, rows)
     metrics += _found_by_size(np.abs(truth.defects.depth_max_mm), rows >= 0, FOUND_BY_DEPTH)
     metrics += _found_by_size(2.0 * np.sqrt(truth.defects.area_mm2 / np.pi), rows >= 0, FOUND_BY_AREA)
     behind = _other_sides(result.defects, truth.defects, rows) if bodies is not None else 0
     false = len(result.defects) - int((rows >= 0).sum()) - behind
     expected = result.examined_mm2 / 1e8
-    most = np.floor(expected + ALARM_SDS * np.sqrt(expected) + 1.0) if np.isfinite(expected) and limited else NAN
+    most = np.floor(expected + ALARM_SDS * np.sqrt(expected) + 1.0) if np.isfinite(expected) else NAN
     metrics += [
         Metric(FALSE_ALARMS, float(false), Statistic.COUNT, limit=float(most)),
         Metric("surface examined", result.examined_mm2 / 1e6, unit="m2", better=Better.HIGH),
     ]
     if bodies is not None:
-        metrics += _bodies(result.defects, truth.defects, rows, bodies, limited)
+        metrics += _bodies(result.defects, truth.defects, rows, bodies)
         metrics.append(Metric("other sides of dents and bulges", float(behind), Statistic.COUNT))
     if truth.pose is not None and result.T_design_project.size and result.covariance.size:
         pulls = pose_pulls(result.T_design_project, truth.pose.T_design_project, result.covariance)
         metrics += covered_pulls("poses", pulls)
     if (rows >= 0).any():
-        metrics += _classes_and_depths(result.defects, truth.defects, rows, limited)
-    return metrics
+        metrics += _classes_and_depths(result.defects, truth.defects, rows)
+    # Figures of the baseline have no limits
+    return [dataclasses.replace(one, limit=NAN) for one in metrics] if result.method == "paper" else metrics
 
 
 def missed_quantity(kind: str) -> str:
@@ -104,12 +105,11 @@ def missed_quantity(kind: str) -> str:
     return f"missed: {kind}"
 
 
-def _missed(truth: DefectTruth, rows: Ints, limited: bool) -> list[Metric]:
+def _missed(truth: DefectTruth, rows: Ints) -> list[Metric]:
     """Return the number of missed defects (rows (t,) -1) of each true class."""
     classes = np.array(truth.classes)
-    limit = 0.0 if limited else NAN
     return [
-        Metric(missed_quantity(kind), float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=limit)
+        Metric(missed_quantity(kind), float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=0.0)
         for kind in dict.fromkeys(truth.classes)
     ]
 
@@ -145,7 +145,7 @@ def _other_sides(defects: Defects, truth: DefectTruth, rows: Ints) -> int:
     return int(behind.sum())
 
 
-def _bodies(defects: Defects, truth: DefectTruth, rows: Ints, bodies: BodyTruth, limited: bool) -> list[Metric]:
+def _bodies(defects: Defects, truth: DefectTruth, rows: Ints, bodies: BodyTruth) -> list[Metric]:
     """Return how far defects are of the right bodies: each that moved is one misalignment, and no other is one."""
     found = Counter(
         name
@@ -157,15 +157,14 @@ def _bodies(defects: Defects, truth: DefectTruth, rows: Ints, bodies: BodyTruth,
         row >= 0 and defects.component[row] != name for row, name in zip(rows.tolist(), truth.components, strict=True)
     )
     not_one, others = sum(found[name] != 1 for name in moved), len(set(found) - moved)
-    limit = 0.0 if limited else NAN
     return [
-        Metric("defects of another body than the true one", float(wrong), Statistic.COUNT, limit=limit),
-        Metric("moved bodies that are not one misalignment", float(not_one), Statistic.COUNT, limit=limit),
-        Metric("bodies called misaligned that did not move", float(others), Statistic.COUNT, limit=limit),
+        Metric("defects of another body than the true one", float(wrong), Statistic.COUNT, limit=0.0),
+        Metric("moved bodies that are not one misalignment", float(not_one), Statistic.COUNT, limit=0.0),
+        Metric("bodies called misaligned that did not move", float(others), Statistic.COUNT, limit=0.0),
     ]
 
 
-def _classes_and_depths(defects: Defects, truth: DefectTruth, rows: Ints, limited: bool) -> list[Metric]:
+def _classes_and_depths(defects: Defects, truth: DefectTruth, rows: Ints) -> list[Metric]:
     """Return the metrics of those true defects that were found; a depth that is a lower bound has no error."""
     matches = rows >= 0
     bound: npt.NDArray[np.bool_] = np.zeros(len(rows), np.bool_)
@@ -174,11 +173,11 @@ def _classes_and_depths(defects: Defects, truth: DefectTruth, rows: Ints, limite
     measured = matches & ~bound & np.isfinite(error)  # parts that are gone have no depth
     size = np.abs(error[measured])
     wrong = float((np.array(defects.defect_class)[rows[matches]] != np.array(truth.classes)[matches]).mean())
-    most_wrong = 100.0 * (1.0 - CLASS_SHARE) + 1e-9 if limited else NAN
+    most_wrong = 100.0 * (1.0 - CLASS_SHARE) + 1e-9
     wrong_depths = float((size - allowed[measured] > 0.0).sum())
     return [
         Metric("class wrong", 100.0 * wrong, Statistic.SHARE, unit="%", limit=most_wrong),
-        Metric(WRONG_DEPTHS, wrong_depths, Statistic.COUNT, limit=0.0 if limited else NAN),
+        Metric(WRONG_DEPTHS, wrong_depths, Statistic.COUNT, limit=0.0),
         Metric(DEPTH_ERROR, float(np.median(size)) if len(size) else NAN, Statistic.MEDIAN, unit="mm"),
         Metric(DEPTH_ERROR, float(size.max(initial=0.0)), Statistic.MAX, unit="mm"),
         Metric("depths that are bounds alone", float(bound.sum()), Statistic.COUNT),

@@ -19,7 +19,7 @@ LIMITS = "-limits"  # ends the file of what a step compared with limits
 
 def tables_of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     """Tables of a step's result, with those of other methods on the same scene."""
-    limits = characteristics.limit_table(getattr(run.result, "limits", None), f"{run.step}{LIMITS}")
+    limits = characteristics.limit_table(characteristics.limits_of(run), f"{run.step}{LIMITS}")
     return [*limits, *step_report(run.step).tables((run, *others), report)]
 
 

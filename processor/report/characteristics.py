@@ -8,7 +8,7 @@ from typing import Any
 
 from processor.language.messages import Message, Text, label, text
 from processor.limits.judging import Judged, JudgedLimits
-from processor.model import WORST_FIRST, Verdict
+from processor.model import WORST_FIRST, StepRun, Verdict
 from processor.report.columns import columns
 from processor.report.table import NAN, Table
 
@@ -33,6 +33,12 @@ def worst_first(rows: Iterable[Judged]) -> list[Judged]:
     """Return what was judged with the worst first, else in its order."""
     order = {verdict: place for place, verdict in enumerate(WORST_FIRST)}
     return sorted(rows, key=lambda one: order.get(one.verdict, len(order)))
+
+
+def limits_of(run: StepRun) -> JudgedLimits | None:
+    """Return what the step of a run compared with limits; None where nothing is limited."""
+    limits: JudgedLimits | None = getattr(run.result, "limits", None)
+    return limits
 
 
 def limit_table(limits: JudgedLimits | None, file: str) -> list[Table]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from processor.language.messages import Text, messages, text
-from processor.limits.judging import JudgedLimits
 from processor.model import Clips, StepRun
 from processor.pipeline import Execution
 from processor.report import characteristics, verdict_counts
@@ -29,7 +28,7 @@ def of_step(run: StepRun) -> Text:
     """Return the headline of one step."""
     report_of = step_report(run.step)
     head = report_of.summary(run.result)[0]
-    limits: JudgedLimits | None = getattr(run.result, "limits", None)
+    limits = characteristics.limits_of(run)
     if limits is None:
         return text("{step}: {head}", step=report_of.title, head=head)
     verdicts = verdict_counts.summary(verdict_counts.LIMITS, limits.of, limits.verdict)
@@ -39,5 +38,5 @@ def of_step(run: StepRun) -> Text:
 def unverified(execution: Execution) -> list[str]:
     """Name the clauses of limits that were used and not compared with the published text of their standard."""
     runs = [run for run, _ in execution.by_step()]
-    every = [(getattr(run.result, "limits", None), *step_report(run.step).limits(run.result)) for run in runs]
+    every = [(characteristics.limits_of(run), *step_report(run.step).limits(run.result)) for run in runs]
     return characteristics.unverified(table for tables in every for table in tables if table is not None)

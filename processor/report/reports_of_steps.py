@@ -6,10 +6,10 @@ import importlib
 from dataclasses import replace
 
 from processor.language.messages import label
-from processor.limits.judging import Judged, JudgedLimits
+from processor.limits.judging import Judged
 from processor.model import Scene, StepRun
 from processor.pipeline import package_of
-from processor.report.characteristics import worst_first
+from processor.report.characteristics import limits_of, worst_first
 from processor.report.step_report import StepReport
 
 
@@ -21,7 +21,7 @@ def step_report(step: str) -> StepReport:
 
 def characteristics_of(scene: Scene, run: StepRun) -> list[Judged]:
     """Return the characteristics of a step, worst first, else in their order."""
-    limits: JudgedLimits | None = getattr(run.result, "limits", None)
+    limits = limits_of(run)
     worded = (
         replace(one, of=label(one.of), what=label(one.what), clause=label(one.clause))
         for one in ([] if limits is None else limits.rows)

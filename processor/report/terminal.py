@@ -8,13 +8,12 @@ from collections.abc import Iterator, Sequence
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, label, messages, text
-from processor.limits.judging import JudgedLimits
 from processor.model import Status, StepRun, Verdict
 from processor.pipeline import Execution
 from processor.plain_text import printable
 from processor.report import all_tables, headline
 from processor.report import table as report_table
-from processor.report.characteristics import worst_first
+from processor.report.characteristics import limits_of, worst_first
 from processor.report.reports_of_steps import step_report
 
 MOST_LINES, LONGEST = 15, 200  # half a screen; characters: two or three lines of a terminal
@@ -80,7 +79,7 @@ def _reasons(run: StepRun) -> Sequence[Message]:
 
 def _beyond_limits(run: StepRun) -> Iterator[Message]:
     """Yield the comparisons that did not pass, the worst first."""
-    limits: JudgedLimits | None = getattr(run.result, "limits", None)
+    limits = limits_of(run)
     if limits is None:
         return
     rows = [one for one in worst_first(limits.rows) if one.verdict != Verdict.PASS]
