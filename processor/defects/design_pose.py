@@ -49,46 +49,35 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
 
     Scans that lie at the design stay there; others are registered by principal axes and a best fit.
     """
-    before = earlier.get("deviation")
-    if before is not None and before.T_design_scan.size:
-        errors = (params.registration_error_mm, before.registration_error)
-        error = next((value for value in errors if math.isfinite(value)), DEFAULT_ERROR_MM)
-        source = reason("defects.placed-by-deviation", registration=before.registration)
+    before: Any = earlier.get("deviation")
+    known = before is not None and before.T_design_scan.size > 0
+    errors = (params.registration_error_mm, before.registration_error if known else DEFAULT_ERROR_MM)
+    error = next((value for value in errors if math.isfinite(value)), DEFAULT_ERROR_MM)
+    if known:
+        reasons: tuple[Reason, ...] = (reason("defects.placed-by-deviation", registration=before.registration),)
         if before.status == Status.FAILED:
-            return DesignPose(None, error, (source, *before.reasons))
-        if before.status == Status.AMBIGUOUS:
-            return _ambiguous(before.T_design_scan, error, (source,))
-        if surface_registration.is_unproven(before.reasons):
-            doubt = reason("defects.pose-unproven")
-            return DesignPose(before.T_design_scan, error, (source,), Status.WEAK, doubt)
-        return DesignPose(before.T_design_scan, error, (source,))
-    error = params.registration_error_mm if math.isfinite(params.registration_error_mm) else DEFAULT_ERROR_MM
-    assert scene.structure is not None
-    cloud = scene_cloud.merged(scene, with_scanner=False)
-    if len(cloud.points) < scene_cloud.FEWEST_POINTS:
-        return DesignPose(None, error, (reason("defects.too-few-points"),))
-    vertices, origin = scene_cloud.local_design(scene.structure)
-    few = cloud.points[:: max(1, len(cloud.points) // SAMPLE)]
-    given = rigid.transform(np.eye(3), cloud.origin - origin)
-    surface = mesh_distance.of_design(vertices, scene.structure.faces)
-    placed = surface_registration.place(few, surface, given, "auto")
-    if placed.registration is Registration.AS_GIVEN:
-        return DesignPose(np.eye(4), error)
-    if not np.isfinite(placed.T_best_fit).all():
-        return DesignPose(None, error, (reason("defects.not-placed"),))
-    T = rigid.transform(np.eye(3), origin) @ placed.T @ rigid.transform(np.eye(3), -cloud.origin)
-    reasons = (reason("defects.best-fit"),)
-    if not surface_registration.fits_design(placed, few, surface):
-        return DesignPose(None, error, (reason("defects.not-placed"),))
-    return _ambiguous(T, error, reasons) if placed.ambiguous else DesignPose(T, error, reasons)
-
-
-def _ambiguous(T: Floats, error_mm: float, reasons: tuple[Reason, ...]) -> DesignPose:
-    """Return a pose (4, 4) that another attitude fits as well as."""
-    return DesignPose(
-        T_design_project=T,
-        error_mm=error_mm,
-        reasons=(*reasons, reason("defects.ambiguous")),
-        status=Status.AMBIGUOUS,
-        doubt=reason("defects.pose-ambiguous"),
-    )
+            return DesignPose(None, error, (*reasons, *before.reasons))
+        T, ambiguous = before.T_design_scan, before.status == Status.AMBIGUOUS
+    else:
+        assert scene.structure is not None
+        cloud = scene_cloud.merged(scene, with_scanner=False)
+        if len(cloud.points) < scene_cloud.FEWEST_POINTS:
+            return DesignPose(None, error, (reason("defects.too-few-points"),))
+        vertices, origin = scene_cloud.local_design(scene.structure)
+        few = cloud.points[:: max(1, len(cloud.points) // SAMPLE)]
+        surface = mesh_distance.of_design(vertices, scene.structure.faces)
+        given = rigid.transform(np.eye(3), cloud.origin - origin)
+        placed = surface_registration.place(few, surface, given, "auto")
+        if placed.registration is Registration.AS_GIVEN:
+            return DesignPose(np.eye(4), error)
+        fits = np.isfinite(placed.T_best_fit).all() and surface_registration.fits_design(placed, few, surface)
+        if not fits:
+            return DesignPose(None, error, (reason("defects.not-placed"),))
+        T = rigid.transform(np.eye(3), origin) @ placed.T @ rigid.transform(np.eye(3), -cloud.origin)
+        reasons, ambiguous = (reason("defects.best-fit"),), placed.ambiguous
+    if ambiguous:
+        doubt = reason("defects.pose-ambiguous")
+        return DesignPose(T, error, (*reasons, reason("defects.ambiguous")), Status.AMBIGUOUS, doubt)
+    if known and surface_registration.is_unproven(before.reasons):
+        return DesignPose(T, error, reasons, Status.WEAK, reason("defects.pose-unproven"))
+    return DesignPose(T, error, reasons)
