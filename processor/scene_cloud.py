@@ -24,7 +24,7 @@ from processor.model import (
 )
 from processor.views import views
 
-ORIGIN_STEP_MM = 1000.0  # whole metres: people recognise the origin, and float64 subtracts it without rounding
+ORIGIN_STEP_MM = 1000.0  # whole metres, which people recognise
 UNPLACED = (Status.FAILED, Status.AMBIGUOUS)  # of a scan: its pose may be wrong
 FEWEST_POINTS = 100  # of a scan that is compared with a design
 

@@ -41,7 +41,7 @@ from processor.model import DesignBodies, Floats, InputError, Reason, Scene, Sta
 
 CELL_POINTS = 12.0  # in a cell, on the median
 CELL_BOUNDS_MM = (5.0, 60.0)  # below, a beam covers more than one; above, a dent of 100 mm less than two
-FIRST_CELL_MM = 50.0  # work: a coarse net to look for the points' density; it leaves no trace in the result
+FIRST_CELL_MM = 50.0  # a first net, until the points' density is known
 MOST_CELLS = 4_000_000  # work: 32 MB an array of a number a cell
 AGAIN_MM = 2.0  # movement of the whole beyond which points are assigned to the design's faces again
 ROUNDS = 3  # work: at most; the first that moves the whole by less than AGAIN_MM is the last

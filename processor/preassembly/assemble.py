@@ -38,7 +38,7 @@ from processor.preassembly.verdicts import chain as chain_verdicts
 from processor.preassembly.verdicts import joints, reasons, trim_and_build_up
 from processor.preassembly.verdicts.joints import Conformity
 
-TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)  # weights drawn: gaps alone to line alone, by decades
+TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)  # weights drawn: one objective alone, then by decades
 
 
 def assemble(

@@ -16,7 +16,7 @@ from processor.report import table as report_table
 from processor.report.characteristics import limits_of, worst_first
 from processor.report.reports_of_steps import step_report
 
-MOST_LINES, LONGEST = 15, 200  # half a screen; characters: two or three lines of a terminal
+MOST_LINES, LONGEST = 15, 200  # of a terminal of 24 lines; characters: two or three of these
 TO_DO, REASONS, LIMITS = 4, 3, 3  # most lines of each step
 MORE = text("... more in the report; --verbose prints the tables")
 

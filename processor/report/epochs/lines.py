@@ -8,7 +8,7 @@ from processor.epochs.quantity_series import Kind
 from processor.language.messages import Message, text
 from processor.report.epochs.tables import day, ordered
 
-MOST_LINES, FEWEST_CHANGES = 15, 3  # a terminal's half; of remarks some give way to changes
+MOST_LINES, FEWEST_CHANGES = 15, 3  # of a terminal of 24; of remarks some give way to changes
 WITH_KIND = (Kind.JOINT, Kind.BALL, Kind.PART, Kind.MEMBER)  # names that alone do not say what they are of
 COUNTED = {
     Kind.JOINT: "{changed} of {total} {total:?joint|joints}",

@@ -20,7 +20,7 @@ from processor.stitching.planes.scan_planes import LIMIT_SIGMAS, Cloud
 
 ON_PIECE, FACE_END = 0, 1  # kinds of blocks
 KINDS = 2  # how many of them
-LEVELS = 7  # times that cubes may be joined by eight: larger than any face
+LEVELS = 7  # times that cubes may be joined by eight
 SAME_COS = float(np.cos(np.radians(8.0)))  # of pieces of one face: noise of small pieces
 MOST_NORMALS = 1500  # work: of a sample that shows the main directions
 LEAST_POINTS = 6.0  # of a scan on a piece
