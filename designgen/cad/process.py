@@ -11,8 +11,10 @@ import json
 import math
 import os
 import re
+import resource
 import signal
 import sys
+from contextlib import suppress
 from typing import IO, Any
 
 import numpy as np
@@ -71,17 +73,11 @@ def answer(job: dict[str, Any], content: bytes, answers: IO[bytes]) -> None:
 
 
 def _limit(limit_s: float, memory_bytes: int) -> None:
-    """Limit the time, even if the parent has ended, and the memory, where the platform can."""
-    if hasattr(signal, "alarm"):
-        signal.alarm(math.ceil(limit_s) + 5)
-    try:
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
-        resource.setrlimit(resource.RLIMIT_FSIZE, (memory_bytes, memory_bytes))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    except (ImportError, ValueError, OSError):
-        pass
+    """Limit the time, even if the parent has ended, and the memory, where the system lets it."""
+    signal.alarm(math.ceil(limit_s) + 5)
+    for kind in (resource.RLIMIT_AS, resource.RLIMIT_FSIZE):
+        with suppress(ValueError, OSError):
+            resource.setrlimit(kind, (memory_bytes, memory_bytes))
 
 
 def _header(cad: CadFile) -> dict[str, Any]:

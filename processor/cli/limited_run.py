@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from processor.cli.common import print_error_line
 from processor.jobs import process
-from processor.jobs.causes import Cause
+from processor.jobs.causes import Cause, signal_name
 from processor.jobs.exit_codes import BAD_INPUT, ENDED_BY_LIMIT, WITH_RESULTS
 from processor.jobs.process import Ended
 from processor.model import InputError
@@ -64,9 +63,7 @@ def _why(ended: Ended, timeout_s: float | None, memory_mb: int | None) -> str:
             return "the run took more memory than it was given"
         return f"expected the run to take at most {memory_mb} MB (--memory-mb), it took more"
     if ended.cause is Cause.SIGNAL:
-        with suppress(ValueError):
-            return f"the run was ended by {signal.Signals(ended.code).name}"
-        return f"the run was ended by signal {ended.code}"
+        return f"the run was ended by {signal_name(ended.code)}"
     return ""
 
 

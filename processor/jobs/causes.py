@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import signal
 import sys
 import traceback
 from collections.abc import Iterator
@@ -49,6 +50,11 @@ def cause_of(error: BaseException | None) -> Cause | None:
 def one_line(error: BaseException) -> str:
     """Return type and message of an exception on one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def signal_name(number: int) -> str:
+    """Return the name of a signal, as SIGSEGV; of one without a name "signal 40"."""
+    return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
 
 
 @contextmanager

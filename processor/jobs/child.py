@@ -45,7 +45,11 @@ class Lost:
 
 
 def end_with_parent() -> None:
-    """Let this process end when the other end of standard input is closed, as it is after any death of the parent."""
+    """Let this process end when the other end of standard input is closed, as after any death of the parent.
+
+    Its own death leaves no core file.
+    """
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     threading.Thread(target=_wait_for_parent, daemon=True).start()
 
 
@@ -71,7 +75,6 @@ def guard(memory_mb: int) -> None:
         limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
         with suppress(ValueError, OSError):
             resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     end_with_parent()
 
 

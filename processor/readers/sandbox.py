@@ -33,6 +33,7 @@ import numpy.typing as npt
 import processor.readers.pieces as pieces
 from processor import large_arrays, progress
 from processor.jobs import address_space
+from processor.jobs.causes import signal_name
 from processor.jobs.child import end_with_parent
 from processor.jobs.process import end, isolated, start
 from processor.model import InputError, Reason
@@ -43,7 +44,7 @@ LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # the libraries are much faster than this
 PATIENCE = 4.0  # ratio of elapsed to processor time: the machine may be busy
 START_S = 120.0  # imports of a first start on a slow disk; a child that takes longer does not come
 ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station", "grid_row", "grid_column", "colour")
-SMALL = 1 << 16  # bytes: smaller arrays are sent as they are, as a shared file costs more
+SMALL = 1 << 16  # bytes: smaller arrays are copied, as each would take a page of its own
 BYTES_A_BYTE = 6.0  # of arrays per byte of a compressed file
 SHOWN_S = 0.5  # between two messages of how much is read
 START = "from processor.readers import sandbox; sandbox.serve()"
@@ -150,9 +151,7 @@ def _death(path: Path, helper: _Helper, error: BaseException) -> InputError:
     elif code == -signal.SIGKILL:
         return InputError("reading was killed, most likely for lack of memory; free some and run again", path=path)
     else:
-        reason = (
-            f"the library that reads it crashed ({signal.Signals(-code).name if code < 0 else f'exit code {code}'})"
-        )
+        reason = f"the library that reads it crashed ({signal_name(-code) if code < 0 else f'exit code {code}'})"
     return InputError(f"{reason}; the file is damaged: copy or export it again", path=path)
 
 
@@ -298,7 +297,6 @@ def serve() -> None:
     for number in (signal.SIGPROF, signal.SIGALRM):
         signal.signal(number, signal.SIG_DFL)  # ends the process even inside a library
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     with contextlib.suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

@@ -174,3 +174,7 @@ def test_lack_of_memory_is_one_line(error, monkeypatch):
     monkeypatch.setattr(program.address_space, "room", lambda: 1e6)
     assert program._line(SystemError("NULL")).startswith("not enough memory (")
     assert program._line(InputError("damaged")) == "damaged"
+
+
+def test_signals_have_their_names_and_those_without_one_their_number():
+    assert [causes.signal_name(number) for number in (9, 11, 40)] == ["SIGKILL", "SIGSEGV", "signal 40"]
