@@ -8,7 +8,7 @@ import trimesh
 
 import designgen
 import processor
-from processor.evaluation import evaluate
+from processor.evaluation import space_frame
 from processor.geometry import rigid
 from processor.model import InputError, Status, Truth, UsageError, reason
 from processor.scan_folder import design, text_files
@@ -301,6 +301,6 @@ def test_error_raised_by_a_check_is_not_replaced(monkeypatch):
         raise InputError("mine")
 
     results = processor.run(FRAME, steps="spheres", method="least-squares")
-    monkeypatch.setattr(evaluate, "_check_of", lambda step: check)
+    monkeypatch.setattr(space_frame, "check", check)
     with pytest.raises(InputError, match=r"^mine$"):
         processor.check(results, Truth())

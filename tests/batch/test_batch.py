@@ -187,7 +187,7 @@ def test_links_out_and_pipes_are_not_read(tmp_path):
 
 PLANTS = {
     "segfault": "crashed: SIGSEGV (signal 11)",
-    "hang": "took longer than 2 s (--timeout-s)",
+    "hang": "took longer than 4 s (--timeout-s)",
     "memory": "needs more memory than 200 MB (--memory-mb)",
     "memory elsewhere": "needs more memory than 200 MB (--memory-mb)",
     "panic": "ended with exit code 1 and without results: BaseException: panicked at src/lib.rs",
@@ -201,7 +201,7 @@ def test_every_way_to_fail_is_recorded_with_its_reason(tmp_path):
         folder(tmp_path / "root" / plant, plant)
     for name in ("good", "talk"):
         folder(tmp_path / "root" / name, name)
-    limits = ("--timeout-s", 2, "--memory-mb", 200, "--jobs", 4)
+    limits = ("--timeout-s", 4, "--memory-mb", 200, "--jobs", 4)
     done = run(tmp_path / "root", "-o", tmp_path / "out", *limits, code=1)
     found = said(tmp_path / "out")
     assert {name: one["reason"] for name, one in found.items() if one["status"] == "failed"} == PLANTS
@@ -215,7 +215,7 @@ def test_every_way_to_fail_is_recorded_with_its_reason(tmp_path):
     run(tmp_path / "root", "-o", tmp_path / "out", *limits, code=1)
     assert attempts(tmp_path / "out") == before == dict.fromkeys(before, 1)
     assert summaries(tmp_path / "out") == bytes_
-    run(tmp_path / "root", "-o", tmp_path / "out", "--timeout-s", 2.5, "--memory-mb", 200, code=1)
+    run(tmp_path / "root", "-o", tmp_path / "out", "--timeout-s", 4.5, "--memory-mb", 200, code=1)
     assert attempts(tmp_path / "out") == before | {"hang": 2}
     run(tmp_path / "root", "-o", tmp_path / "out", *limits, "--retry", code=1)
     assert attempts(tmp_path / "out") == {**dict.fromkeys(PLANTS, 2), "hang": 3, "good": 1, "talk": 1}

@@ -49,15 +49,15 @@ def find(parts: Sequence[Examined]) -> list[tuple[Reason, ...]]:
     for part, beyond in zip(parts, of_edges, strict=True):
         reasons = []
         for joint, end in part.ends:
-            beyond_noise = compress(end.place.section.faces, of_faces[number])
+            names = _in_order(face.name for face in compress(end.place.section.faces, of_faces[number]))
             why = (
-                *_of_faces("preassemble.face-contradicts-noise", (face.name for face in beyond_noise)),
+                *((reason("preassemble.face-contradicts-noise", faces=names),) if names else ()),
                 *((reason("preassemble.plates-contradict-views"),) if of_plates[number] else ()),
             )
             reasons += [reason("preassemble.at", place=joint, reasons=why)] if why else []
             number += 1
-        names = (OF_EDGES[edge][axis] for edge, axis in np.argwhere(beyond))
-        found.append((*reasons, *_of_faces("preassemble.edge-contradicts-noise", names)))
+        names = _in_order(OF_EDGES[edge][axis] for edge, axis in np.argwhere(beyond))
+        found.append((*reasons, *((reason("preassemble.edge-contradicts-noise", faces=names),) if names else ())))
     return found
 
 
@@ -72,8 +72,7 @@ def _of_no_other(end: FittedEnd, ends: Sequence[FittedEnd]) -> bool:
     return False
 
 
-def _of_faces(code: str, names: Iterable[PlateFace]) -> tuple[Reason, ...]:
-    """Return the reason of a code for the faces of these names, in the order of PlateFace; none for no face."""
+def _in_order(names: Iterable[PlateFace]) -> tuple[PlateFace, ...]:
+    """Return the names, each once, in the order of PlateFace."""
     given = set(names)
-    faces = tuple(name for name in PlateFace if name in given)
-    return (reason(code, faces=faces),) if faces else ()
+    return tuple(name for name in PlateFace if name in given)
