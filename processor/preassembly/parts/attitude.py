@@ -23,7 +23,7 @@ from processor.registration import pose_choice, pose_search, principal, surface_
 from processor.registration.pose_search import DesignSurface
 from processor.registration.principal import PrincipalAxes
 
-ROUGH_KEPT = 4  # of the promising hypotheses, for a rough pose
+ROUGH_KEPT, ROUGH_POINTS = 4, 30_000  # work: promising hypotheses for a rough pose, and points to decide among them
 NO_FIT_MM = 25.0  # misfit, about a plate's thickness, beyond which no pose explains the scan
 TELLING_MM = 10.0  # distance between two poses' surfaces beyond which the scan can distinguish the poses
 LEAST_EVIDENCE = 10  # samples of distinguishing surface that the scan shows
@@ -146,7 +146,7 @@ def rough(points: Floats, surface: DesignSurface, *, pieces: bool, kept: int | N
     found = pose_search.distinct(each(lambda start: pose_search.align(even[1], surface, start), starts), box)
     # A pose turned half round may have the least misfit of few points: the surface that only one pose has decides.
     found = pose_search.rivals_of(found) + pose_search.slid(even[1], surface, found[0], box)
-    return found[pose_choice.choose(points, [(surface.mesh, c.T) for c in found])[0]].T
+    return found[pose_choice.choose(points, [(surface.mesh, c.T) for c in found], sample=ROUGH_POINTS)[0]].T
 
 
 def _rival_reason(best: Floats, rival: Floats, surface: DesignSurface) -> Reason:
