@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
+from processor.geometry.linalg_small import cholesky, solve
 from processor.geometry.rigid import LEAST_POINTS
 from processor.model import Bools, Floats, Ints
 
@@ -28,12 +29,12 @@ SINGULAR = 1e-9  # relative eigenvalue: far above rounding (1e-15 n), far below 
 
 @dataclass(frozen=True)
 class Suspicion:
-    """The strongest suspicion: an error of ``number``, a point, a sighting or a scan, in the sightings ``rows``.
+    """The strongest suspicion: an error of ``number``, a point, a sighting or a body, in the sightings ``rows``.
 
     ``rivals`` are all suspicions that explain the misfits as well, this one first.
     """
 
-    kind: str  # point | sighting | scan
+    kind: str  # point | sighting | body
     number: int
     rows: Ints
     size_mm: float
@@ -148,12 +149,14 @@ def leave_out(point: Ints, misfit: Floats, covariance: Floats) -> Snooped:
 
     def ratios(kept: Bools) -> Ratio:
         rows = np.flatnonzero(np.repeat(kept, 3))
-        weight = np.asarray(np.linalg.inv(covariance[np.ix_(rows, rows)]))
+        L = cholesky(covariance[np.ix_(rows, rows)])
+        both = solve(L, np.column_stack([misfit[rows], np.eye(len(rows))]))
+        pull, weight = both[:, 0], both[:, 1:]
 
         def ratio(marked: Bools) -> tuple[float, Floats]:
-            G = np.eye(len(rows))[:, np.repeat(marked[kept], 3)]
-            square, dof, error = _explained(misfit[rows], weight, weight, G)
-            return square / float(chdtri(dof, UNLIKELY)), error.reshape(-1, 3).mean(axis=0)
+            own = np.flatnonzero(np.repeat(marked[kept], 3))
+            error = solve(cholesky(np.ascontiguousarray(weight[np.ix_(own, own)])), pull[own, None])[:, 0]
+            return float(pull[own] @ error) / float(chdtri(len(own), UNLIKELY)), error.reshape(-1, 3).mean(axis=0)
 
         return ratio
 

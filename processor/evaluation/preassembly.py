@@ -229,7 +229,7 @@ def _mean_max_coverage(result: Result, gaps: Floats, linear: Floats) -> list[Met
     error = stated - true  # NaN: an assembly without bottom edges has no linear error
     return [
         *coverage("mean and largest errors", error, result.errors_ci95[:4]),
-        Metric("mean and largest errors", float(np.isfinite(error).sum()), Statistic.NUMBER),
+        Metric("mean and largest errors", float(np.isfinite(error + result.errors_ci95[:4]).sum()), Statistic.NUMBER),
     ]
 
 

@@ -48,6 +48,8 @@ def choose(
     few = thinned(points, sample)
     seen_from = None if scanner is None else thinned(scanner, sample)
     group, voxel = _groups(few)
+    if not len(voxel):
+        return list(range(len(poses)))
     placed = [
         (surface, rigid.apply(T, few), None if seen_from is None else rigid.apply(T, seen_from)) for surface, T in poses
     ]

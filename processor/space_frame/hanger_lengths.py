@@ -112,26 +112,25 @@ def _lengths(balls: Balls, ceiling: Ceiling) -> tuple[Floats, Floats, Floats]:
 
 def _of_tubes(tubes: Tubes, ceiling: Ceiling) -> Iterator[Measured]:
     """Yield the height of the lowest line of each tube where it is nearest to the ceiling."""
-    share = np.linspace(0.0, 1.0, PLACES_OF_A_TUBE)[:, None]
-    ends = tubes.ends
-    for k in range(len(tubes)):
-        axis = tubes.start[k] + share * (tubes.end[k] - tubes.start[k])
-        along = tubes.end[k] - tubes.start[k]
-        along = along / np.linalg.norm(along)
-        down = np.array([0.0, 0.0, -1.0]) + along[2] * along  # across the axis
-        size = float(np.linalg.norm(down))
-        line = axis + tubes.radii[k] * down / size if size > 0.0 else axis
-        height, slopes = heights(ceiling, line[:, :2])
-        above = line[:, 2] - height
-        if not np.isfinite(above).any():
+    share = np.linspace(0.0, 1.0, PLACES_OF_A_TUBE)
+    along = tubes.end - tubes.start
+    axis = tubes.start[:, None] + share[:, None] * along[:, None]
+    along = along / np.linalg.norm(along, axis=1)[:, None]
+    down = np.array([0.0, 0.0, -1.0]) + along[:, 2:] * along  # across the axis
+    size = np.linalg.norm(down, axis=1)[:, None]
+    line = axis + (tubes.radii[:, None] * down / np.where(size > 0.0, size, 1.0))[:, None]
+    height, slopes = heights(ceiling, line[:, :, :2].reshape(-1, 2))
+    above = line[:, :, 2] - height.reshape(line.shape[:2])
+    for k, ends in enumerate(tubes.ends):
+        if not np.isfinite(above[k]).any():
             continue
-        nearest = int(np.nanargmin(above))
-        at = float(share[nearest, 0])
+        nearest = int(np.nanargmin(above[k]))
+        at = float(share[nearest])
         # Along x, y and z; how the errors of the axes are correlated is not known, so they may add up.
         of_axis = (1.0 - at) * tubes.start_ci95[k] + at * tubes.end_ci95[k]
-        of_height = of_axis[2] + np.abs(slopes[nearest]) @ of_axis[:2]
+        of_height = of_axis[2] + np.abs(slopes[k * len(share) + nearest]) @ of_axis[:2]
         half = float(np.hypot(of_height, tubes.radius_ci95[k])) + float(np.nan_to_num(tubes.bow[k]))
-        yield Measured.within(_name(k, *ends[k]), float(above[nearest]), half)
+        yield Measured.within(_name(k, *ends), float(above[k, nearest]), half)
 
 
 def _name(tube: int, a: int | str, b: int | str) -> str:

@@ -36,6 +36,7 @@ GATES = (0.25, 0.15, 0.08)  # distance of faces of different scans that are take
 REACH = 6.0  # the same along motions that only the ends of faces determine
 END_GATES = (0.1, 0.05)  # distance of ends from the faces that bound them, in the first adjustments with ends
 MOST_FINAL = 5  # adjustments without a gate
+DEEP_PAIRS, DEEP_ROUNDS = 8, 12  # work: pairs that are searched deeply at once, some seconds each, and how often
 STILL_MM = 0.02  # largest shift of a pose at convergence
 
 
@@ -111,7 +112,7 @@ def stitch(
             network.refuted(scores, len(scans), reference),
         ),
         links=sorted({*network.links(scores), *itertools.combinations(sorted(known), 2)}),
-        groups=network.groups(candidates, len(scans)),
+        groups=network.groups(candidates, len(scans), list(known)),
     )
 
 
@@ -120,7 +121,8 @@ def _find_candidates(
 ) -> network.Pairs:
     """Return the candidate poses of all pairs (a < b), the best first; of two scans of ``known`` poses that alone.
 
-    Groups of scans that no sure pose joins are searched for one once more, as deeply as would take too long for all.
+    Groups of scans that no sure pose joins are searched for one once more, as deeply as would take too long for all
+    pairs: those that a pose has joined meanwhile are left out, and so is what is beyond DEEP_ROUNDS.
     """
     most_tilt_rad = 2e-3 * params.levelled_mrad if params.levelled_mrad else np.inf
 
@@ -138,13 +140,19 @@ def _find_candidates(
 
     def deeper(key: tuple[int, int]) -> list[ScoredPose]:
         poses = pairwise.candidate_poses(patches[key[0]], patches[key[1]], most_tilt_rad, [pairwise.DEEP])
-        return poses if poses and poses[0].score > pairwise.SURE else found[key]
+        sure = [pose for pose in poses if pose.score > pairwise.SURE]
+        return sure + found[key] if sure else found[key]
 
     keys = list(itertools.combinations(range(len(patches)), 2))
     found = dict(zip(keys, thread_ranges.each(candidates, keys), strict=True))
-    group = network.groups(found, len(patches))
-    apart = [key for key in keys if group[key[0]] != group[key[1]]]
-    return found | dict(zip(apart, thread_ranges.each(deeper, apart), strict=True))
+    # Scans that follow each other overlap most often: those that lie nearest in the order of the scans come first.
+    todo = sorted(keys, key=lambda key: (key[1] - key[0], key))
+    for _ in range(DEEP_ROUNDS):
+        group = network.groups(found, len(patches), list(known))
+        todo = [key for key in todo if group[key[0]] != group[key[1]]]
+        some, todo = todo[:DEEP_PAIRS], todo[DEEP_PAIRS:]
+        found |= dict(zip(some, thread_ranges.each(deeper, some), strict=True))
+    return found
 
 
 def _pose_by_picks(a: ScanPatches, b: ScanPatches, in_a: Floats, in_b: Floats) -> list[ScoredPose]:

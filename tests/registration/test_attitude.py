@@ -111,6 +111,7 @@ def test_attitude_is_ambiguous_if_contradiction_equals_evidence():
     both = structure(bracket(-1500.0, 1.0), bracket(1500.0, -1.0))  # one where each of the attitudes has one
     points = sampled(both, 15_000, 1, 0.0)[0]
     assert len(pose_choice.choose(points, poses)) == 2
+    assert pose_choice.choose(points[:3], poses) == [0, 1]  # too few to show anything
 
 
 def test_turns_of_a_plate_with_a_box_on_it_keep_the_plate_in_its_plane():

@@ -141,7 +141,7 @@ def test_links_are_overlaps_that_free_space_does_not_contradict():
 
 def test_scan_of_another_place_is_in_a_group_of_its_own():
     good, bad = ([ScoredPose(HERE, 60.0, against, 0.3)] for against in (0.0, 9.0))
-    group = network.groups({(0, 1): bad, (0, 2): good, (1, 2): bad, (2, 3): good, (1, 3): []}, 4)
+    group = network.groups({(0, 1): bad, (0, 2): good, (1, 2): bad, (2, 3): good, (1, 3): []}, 4, [])
     assert group[0] == group[2] == group[3] != group[1]
 
 
@@ -171,5 +171,21 @@ def test_groups_that_no_sure_pose_joins_are_searched_deeper(monkeypatch):
     monkeypatch.setattr(pairwise, "candidate_poses", candidates)
     poses = automatic._find_candidates(patches, Params(), {}, {})
     assert sorted(deep) == [(0, 2), (0, 3), (1, 2), (1, 3)]
-    assert [key for key, (pose,) in poses.items() if pose is sure] == [(0, 1), (1, 2), (2, 3)]
-    assert network.groups(poses, 4).tolist() == [0, 0, 0, 0]
+    assert [key for key, (best, *_) in poses.items() if best is sure] == [(0, 1), (1, 2), (2, 3)]
+    assert poses[1, 2][1:] == [contradicted]  # as by picks, which remain candidates
+    assert network.groups(poses, 4, []).tolist() == [0, 0, 0, 0]
+
+
+def test_scans_of_known_poses_are_searched_no_deeper(monkeypatch):
+    """Control points decide between two scans that hardly overlap; a third is searched for beside both."""
+    patches = [SimpleNamespace(patches=SimpleNamespace(weight=np.ones(9)), side_mm=700.0, row=row) for row in range(3)]
+    by_control, elsewhere = ScoredPose(along(0.0), 1.0, 0.0, 0.01), ScoredPose(along(6e3), 60.0, 0.0, 0.3)
+    searched = []
+    monkeypatch.setattr(pairwise, "candidate_poses", lambda a, b, *_: searched.append((a.row, b.row)) or [elsewhere])
+    monkeypatch.setattr(pairwise, "refine", lambda a, b, T: (T, None))
+    monkeypatch.setattr(pairwise, "same", lambda *_: True)
+    monkeypatch.setattr(pairwise, "score_pose", lambda *_: by_control)
+    poses = automatic._find_candidates(patches, Params(), {}, {0: HERE, 1: HERE})
+    assert poses[0, 1] == [by_control]
+    assert (0, 1) not in searched
+    assert network.groups({(0, 1): [by_control]}, 3, [0, 1]).tolist() == [0, 0, 2]

@@ -98,7 +98,8 @@ class Stations(Checked):
         effects = np.empty((len(points), influence.shape[2], influence.shape[2]))
         for rows in blocks(len(points), POINTS_AT_ONCE):
             J = _by_stations(points[rows], influence[rows], self.places)
-            effects[rows] = J @ covariance @ np.swapaxes(J, 1, 2)
+            with_all = product(J.reshape(-1, len(covariance)), covariance).reshape(J.shape)  # in one order of sums
+            effects[rows] = np.einsum("kip,kjp->kij", with_all, J)
         return effects
 
     def common(self, place: Floats) -> Floats:

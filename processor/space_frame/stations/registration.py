@@ -229,7 +229,7 @@ def _reweighted(scores: Floats, shared: Bools, weight: Floats, floor: float) -> 
     score, mean, growth = scores.T
     mean = SCATTER * mean
     ratio = np.where(shared & (mean > 0.0), score / np.maximum(mean, 1e-300), 0.0)
-    new = huber(np.sqrt(ratio), DOUBT)
+    new = huber(np.sqrt(np.maximum(ratio, 0.0)), DOUBT)
     good = shared & (ratio < DOUBT**2) & (mean > 0.0)
     if not good.any():
         return new, floor

@@ -9,6 +9,7 @@ from processor.model import InputError, Scene
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.points.source import SceneSource
 
+LEAST_SD_MM = 1e-3  # of a sighting: the covariance of exact ones would be singular
 FARTHEST_MM = 1000.0  # control points farther from their sightings are in another frame
 
 
@@ -52,7 +53,7 @@ def control_of(scene: Scene, source: SceneSource) -> Sightings | None:
         point=point,
         body=scanner[rows].astype(np.int64),
         seen=measured,
-        seen_sd=control.seen_sd[rows],
+        seen_sd=np.maximum(control.seen_sd[rows], LEAST_SD_MM),
         known=target,
         known_sd=control.sd[point],
         point_name=tuple(control.ids[k] for k in point.tolist()),

@@ -237,9 +237,13 @@ def joint_score(network: Network, j: int, others: list[int], pose: Floats) -> fl
     return pairwise.score(agree, against, total)
 
 
-def groups(candidates: Pairs, count: int) -> Ints:
-    """Return the group (count,) of each scan: those joined by pairs with a pose that free space does not contradict."""
+def groups(candidates: Pairs, count: int, known: list[int]) -> Ints:
+    """Return the group (count,) of each scan: those joined by pairs with a pose that free space does not contradict.
+
+    Scans of ``known`` poses are one group.
+    """
     group: Ints = np.arange(count)
+    group[known] = min(known, default=0)
     for (i, j), poses in candidates.items():
         if poses and poses[0].score > pairwise.SURE:
             group[group == group[j]] = group[i]

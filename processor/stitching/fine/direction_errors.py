@@ -3,7 +3,8 @@
 A scanner errs alike over whole walls: its ranges drift while it turns, and depend on the incidence. The errors of a
 scan in each of 24 directions, quarters of the sides of a cube in its own frame, are taken as independent, with one
 variance for all scans. It is estimated from the misfits between scans, with all other unknowns eliminated, and
-propagated into the poses. A scan that something moved in, or whose scanner is bent, has such errors as well.
+propagated into the poses. A scan that something moved in, or whose ranges are bent, has such errors as well; so has a
+cloud of which the scanner's place is unknown, across its faces.
 """
 
 from __future__ import annotations
@@ -15,13 +16,18 @@ from processor.stitching.fine import bundle_adjustment
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import KINDS, Blocks
 from processor.stitching.fine.normal_equations import linearize
+from processor.stitching.planes import extraction
 
 DIRECTIONS = 24  # of a scan: 45 degrees wide. With 8 or 48 of them the estimates were within a tenth of the same
 
 
 def directions(blocks: Blocks) -> Ints:
-    """Return the direction (b,), 0 to 23, in which a scan's points on a piece lie, as seen by the scanner."""
+    """Return the direction (b,), 0 to 23, in which a scan's points on a piece lie, as seen by the scanner.
+
+    Where its place is unknown, as seen from the middle of the cloud.
+    """
     ray = blocks.rays[:, :, 3]  # sum of the unit vectors
+    ray = np.where((ray == 0.0).all(axis=1)[:, None], extraction.scatter(blocks.sums)[0], ray)
     axis = np.argmax(np.abs(ray), axis=1)
     below = ray < 0.0
     sides = np.stack([np.roll(row, -first) for row, first in zip(below, axis, strict=True)]) if len(ray) else below

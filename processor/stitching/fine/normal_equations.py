@@ -61,7 +61,10 @@ def linearize(
     W = _shifted(W, planes.mean[blocks.piece])
     t2 = tau[blocks.kind] ** 2 * unit_variance(blocks)
     by_columns, by_plane = _design_matrices(blocks, T, planes)
-    by_columns = np.concatenate([by_columns, by_columns[:, 6 : columns.shape[1] - 3]], axis=1)  # directions are offsets
+    if direction is not None:  # an offset of the ranges, or across the faces where the rays are unknown
+        offset = by_columns[:, 6:7].copy()
+        offset[~_rays_known(blocks), 0, 3] = 1.0
+        by_columns = np.concatenate([by_columns, offset], axis=1)
     # An offset common to a block's points, of variance t2 (b,), is eliminated from the moments (b, 7, 7)
     e, mass = W[:, :, 3], W[:, 3, 3]
     reduced = (W - (t2 / (1.0 + t2 * mass))[:, None, None] * e[:, :, None] * e[:, None, :]) * weight[:, None, None]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
+from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.geometry import rigid
 from processor.model import Floats
 from processor.stitching import poses_with_scale
@@ -58,14 +59,17 @@ def register_pair(blocks: Blocks, network: Solution, a: int, b: int, variance: f
     local = replace(of_pair, scan=(of_pair.scan == b).astype(np.int64))
     start = np.stack([np.eye(4), rigid.invert(network.T[a]) @ network.T[b]])
     solution = bundle_adjustment.solve(local, start, 0, iterations=3, robust=False, tau=network.tau)
-    covariance = (solution.covariance + direction_errors.added_covariance(local, solution, 0, variance)[0])[6:, 6:]
+    by_unit = direction_errors.added_covariance(local, solution, 0, 1.0)[0][6:, 6:]
+    covariance = solution.covariance[6:, 6:] + variance * by_unit
+    # What something that moved makes of the variance excuses no pair.
+    expected = solution.covariance[6:, 6:] + min(variance, VIEW_SD_MM**2) * by_unit
     d = poses_with_scale.difference(solution.T[1], start[1])[:6]
     points = local.kind == ON_PIECE
     weight = local.sums[points, 9]
     residual = float(np.sqrt((weight * solution.offset[points] ** 2).sum() / max(weight.sum(), 1e-12)))
     return Pair(
         a=a, b=b, pieces=local.pieces, T_a_b=solution.T[1], covariance=covariance, residual=residual,
-        chi2=float(d @ np.linalg.solve(covariance, d)),
+        chi2=float(d @ np.linalg.solve(expected, d)),
     )  # fmt: skip
 
 
