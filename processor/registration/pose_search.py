@@ -26,6 +26,7 @@ from processor.registration.principal import PrincipalAxes
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.1 m
 COARSE_SPACING_MM = 120.0  # for the coarse gates
 SAMPLES = (2_000, 400_000)  # work, the fewest and the most: enough for a mark; 10 MB
+STRUCTURE_SAMPLES = (40_000, 40_000)  # of a small structure as well: its plates are thin
 # Gates for every hypothesis, and for the promising ones: of a part of 8 m and more, and shares of a smaller one's size.
 COARSE_GATES_MM, COARSE_GATE_SHARES = (400.0, 150.0), (0.05, 0.02)
 FINE_GATES_MM, FINE_GATE_SHARES = (50.0, 25.0, 12.0), (0.015, 0.01, 0.005)  # the last beyond form and noise
@@ -64,10 +65,12 @@ class DesignSurface:
     variances: Floats  # (3,) along them
     size: float  # diagonal of the bounding box
     tube: PrincipalAxes | None = None  # of the wall of a round tube
+    is_structure: bool = False  # of any size, of which a scan shows some part: hypotheses lie farther off
 
     def gates(self, most_mm: tuple[float, ...], shares: tuple[float, ...]) -> tuple[float, ...]:
-        """Return gates in mm that are no wider than shares of the design's size."""
-        return tuple(min(gate, share * self.size) for gate, share in zip(most_mm, shares, strict=True))
+        """Return gates in mm: shares of the design's size, of a single part no wider than ``most_mm``."""
+        by_size = tuple(share * self.size for share in shares)
+        return by_size if self.is_structure else tuple(map(min, most_mm, by_size))
 
 
 @dataclass(frozen=True)
@@ -86,8 +89,9 @@ def samples_of(
     return mesh_distance.spread(vertices, faces, lambda area_mm2: int(np.clip(area_mm2 / spacing_mm**2, *bounds)))
 
 
-def prepared(mesh: MeshSurface, bounds: tuple[int, int] = SAMPLES) -> DesignSurface:
+def prepared(mesh: MeshSurface, is_structure: bool = False) -> DesignSurface:
     """Prepare a mesh for the search: a number of samples within bounds, boxes about them, principal axes."""
+    bounds = STRUCTURE_SAMPLES if is_structure else SAMPLES
     samples = samples_of(mesh.vertices, mesh.faces, bounds=bounds)
     few = samples_of(mesh.vertices, mesh.faces, COARSE_SPACING_MM, (SAMPLES[0], bounds[1]))
     axes = principal.of_mesh(mesh.vertices, mesh.faces)
@@ -101,6 +105,7 @@ def prepared(mesh: MeshSurface, bounds: tuple[int, int] = SAMPLES) -> DesignSurf
         axes=axes.axes,
         variances=axes.variances,
         size=float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))),
+        is_structure=is_structure,
     )
 
 

@@ -171,12 +171,12 @@ def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[Motion,
 
 # --- Placement: coarse registration where a scan does not lie at its design, and the choice between attitudes
 
-STRUCTURE_SAMPLES = (40_000, 40_000)  # of a small structure as well: its plates are thin
 NEAR_MM = 100.0  # of the design's surface
 NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
 FINE_POINTS = 30_000  # work: as many as the first run of a fine fit takes
 RIVAL_POINTS = 8_000  # enough to tell attitudes apart: the fit of the one that is chosen uses FINE_POINTS
 SYMMETRY_POINTS = 3_000  # of even density, aligned in each attitude that the design's symmetry allows
+MOST_REFINED = 24  # work: the attitudes of a box with three like sides; of a scan of something else all are as bad
 # What the surface does not determine converges slowly, and distinguishes no attitude.
 RIVAL_ITERATIONS = 15
 PROMISING = 3.0  # ratio of two poses' misfits after the coarse registration, below which the fine one decides
@@ -241,9 +241,9 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     axes, rivals, ambiguity = principal.of_mesh(surface.vertices, surface.faces).axes, [], NAN
     start, registration = given, Registration.FINE if how == "fine" else Registration.AS_GIVEN
     if how == "coarse" or (how == "auto" and share < NEAR_SHARE):
-        registration, design = Registration.COARSE, pose_search.prepared(surface, STRUCTURE_SAMPLES)
+        registration, design = Registration.COARSE, pose_search.prepared(surface, is_structure=True)
         candidates = pose_search.search(points, design)
-        promising = [c for c in candidates if c.misfit <= PROMISING * candidates[0].misfit]
+        promising = [c for c in candidates[:MOST_REFINED] if c.misfit <= PROMISING * candidates[0].misfit]
         best, *rivals = decide(points, design, promising, scanner)
         start = best.T
         middle = few.mean(axis=0)
@@ -299,7 +299,7 @@ def _surely_turned(points: Floats, surface: MeshSurface, given: Floats, scanner:
     A scan in the design's frame may lie in it the wrong way round. Points of a plate slip along it, and each fit may
     have slipped differently: the given attitude is ruled out only if it is so with the slip of the other fits, too.
     """
-    design = pose_search.prepared(surface, STRUCTURE_SAMPLES)
+    design = pose_search.prepared(surface, is_structure=True)
     few, fewer = pose_search.evenly(points, design)[0], thinned(points, RIVAL_POINTS)
     turns = pose_search.symmetries(design)
     kept = thinned(few, SYMMETRY_POINTS)

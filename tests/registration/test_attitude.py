@@ -1,5 +1,7 @@
 """Attitude of nearly symmetric structures: boxes with small plates on their sides, sampled with noise."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -63,6 +65,16 @@ def test_scanned_side_of_a_plate_is_registered_to_the_same_side(thickness):
     assert rigid.rotation_angle(off[:3, :3]) < 5e-4  # 0.2 mm at 400 mm
     assert np.abs(off[:3, 3]).max() < 0.2  # the shares of 15,000 points on each face: sd 0.6 / sqrt(1000) and more
     assert not ambiguous
+
+
+def test_gates_of_a_structure_grow_with_its_size():
+    """A scan of a hall of 34 m beside other things began 1.5 m off: 400 mm, enough for a part, did not reach it."""
+    hall, part = (pose_search.prepared(surface_of(structure()), is_structure=one) for one in (True, False))
+    shares, most = (0.05, 0.02), (400.0, 150.0)
+    assert hall.gates(most, shares) == pytest.approx([0.05 * hall.size, 0.02 * hall.size])
+    for size, expected in ((34_000.0, [400.0, 150.0]), (4_000.0, [200.0, 80.0])):
+        assert dataclasses.replace(part, size=size).gates(most, shares) == pytest.approx(expected)
+    assert dataclasses.replace(hall, size=34_000.0).gates(most, shares) == pytest.approx([1700.0, 680.0])
 
 
 def angle():
