@@ -99,6 +99,12 @@ def package_of(step: str) -> str:
     return step_modules()[step].__name__.split(".")[1]
 
 
+def module_of(folder: str, step: str) -> ModuleType | None:
+    """Return the module of a step in a folder of processor, named as the step's package; None where there is none."""
+    name = f"processor.{folder}.{package_of(step)}"
+    return importlib.import_module(name) if importlib.util.find_spec(name) else None
+
+
 def result_classes() -> dict[str, type]:
     """Return the Result record of every step, by the step's name."""
     return {name: module.Result for name, module in step_modules().items()}

@@ -27,7 +27,7 @@ def test_functions_have_at_most_sixty_lines_and_ten_arguments():
 
 
 # At most what there was on 2026-11-28, with the aim beside it: a change that needs less lowers the number.
-LINES = 90_564  # 75,000
+LINES = 90_561  # 75,000
 RECORD_CLASSES = 652  # 400
 CONSTANTS_WITHOUT_REASON = 0  # 0
 CALLED_ONCE, CALLED_ONCE_OF_FEW_LINES = 1025, 202  # 500, 150

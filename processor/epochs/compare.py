@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,7 +12,7 @@ from processor.epochs.change import Component, Finding
 from processor.epochs.epoch import Epoch
 from processor.epochs.quantity_series import Kind, Series
 from processor.model import InputError, Reason, reason
-from processor.pipeline import package_of, step_modules
+from processor.pipeline import module_of, step_modules
 
 BEYOND = (Finding.CHANGED, Finding.DOUBTFUL)
 
@@ -44,11 +42,9 @@ def compare(epochs: Sequence[Epoch]) -> History:
     others = np.array([epoch.facts.get("design") != epochs[0].facts.get("design") for epoch in epochs], np.bool_)
     for step in step_modules():
         results = [epoch.result(step) for epoch in epochs]
-        package = package_of(step)
-        compared = importlib.util.find_spec(f"processor.epochs.{package}")  # places of scanners are others each time
-        if not compared or sum(result is not None for result in results) < 2:
+        module = module_of("epochs", step)  # none of stitch: places of scanners are others each time
+        if module is None or sum(result is not None for result in results) < 2:
             continue
-        module = importlib.import_module(f"processor.epochs.{package}")
         by_name: dict[str, list[Series]] = {}
         for one in module.series(results):
             # Values by another design are doubtful

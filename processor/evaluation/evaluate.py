@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
-import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,11 +65,10 @@ def against(truth: Truth, execution: Execution, source: str) -> ErrorReport:
     metrics: list[Metric] = []
     answered: set[str] = set()
     for run in execution.runs:
-        package = f"processor.evaluation.{pipeline.package_of(run.step)}"
-        if not importlib.util.find_spec(package):
+        module = pipeline.module_of("evaluation", run.step)
+        if module is None:
             continue  # there are no metrics of this step
         try:
-            module = importlib.import_module(package)
             found: list[Metric] = module.check(execution.scene, run.result, truth)
         except PlainError:  # of points that are read here
             raise

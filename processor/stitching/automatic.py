@@ -81,14 +81,16 @@ def stitch(
     solution, blocks = _adjust(clouds, cells, coarse.T, reference)
     # All pairs that share enough pieces, each by itself
     with_pose = np.flatnonzero(np.isfinite(solution.T).all(axis=(1, 2)))
-    variance = direction_errors.added_covariance(blocks, solution, reference)[1]
+    added, variance = direction_errors.added_covariance(blocks, solution, reference)
     registered = [
         pairs_and_loops.register_pair(blocks, solution, a, b, variance)
         for a, b in itertools.combinations(with_pose.tolist(), 2)
     ]
     pairs = [pair for pair in registered if pair is not None]
-    solution, blocks = _without_gross_pairs(blocks, solution, pairs, reference)
-    added, _ = direction_errors.added_covariance(blocks, solution, reference)
+    gross = {(pair.a, pair.b) for pair in pairs if pair.is_gross}
+    if gross:
+        solution, blocks = _without_gross_pairs(blocks, solution, gross, reference)
+        added, _ = direction_errors.added_covariance(blocks, solution, reference)
     solution = replace(solution, covariance=solution.covariance + added)
     # All pairs of scans that have a pose
     placed = [s for s in range(len(solution.T)) if np.isfinite(solution.T[s]).all()]
@@ -195,12 +197,9 @@ def _adjust(clouds: list[Cloud], cells: CellTable, T: Floats, reference: int) ->
 
 
 def _without_gross_pairs(
-    blocks: Blocks, solution: Solution, pairs: list[Pair], reference: int
+    blocks: Blocks, solution: Solution, gross: set[tuple[int, int]], reference: int
 ) -> tuple[Solution, Blocks]:
-    """Adjust again without the pieces that only the two scans of a gross pair share, if there is such a pair."""
-    gross = {(pair.a, pair.b) for pair in pairs if pair.is_gross}
-    if not gross:
-        return solution, blocks
+    """Adjust again without the pieces that only the two scans (a, b) of a gross pair share."""
     scans_of: dict[int, set[int]] = {}
     for piece, scan in zip(blocks.piece.tolist(), blocks.scan.tolist(), strict=True):
         scans_of.setdefault(piece, set()).add(scan)

@@ -29,9 +29,8 @@ def directions(blocks: Blocks) -> Ints:
     ray = blocks.rays[:, :, 3]  # sum of the unit vectors
     ray = np.where((ray == 0.0).all(axis=1)[:, None], extraction.scatter(blocks.sums)[0], ray)
     axis = np.argmax(np.abs(ray), axis=1)
-    below = ray < 0.0
-    sides = np.stack([np.roll(row, -first) for row, first in zip(below, axis, strict=True)]) if len(ray) else below
-    direction: Ints = 8 * axis + sides @ np.array([4, 2, 1])
+    in_turn = (axis[:, None] + np.arange(3)) % 3
+    direction: Ints = 8 * axis + np.take_along_axis(ray < 0.0, in_turn, axis=1) @ np.array([4, 2, 1])
     return direction
 
 
@@ -53,7 +52,7 @@ def added_covariance(
     equations = linearize(
         blocks, solution.T, np.append(ranges, errors), np.array(solution.tau), solution.weight, number.ravel()
     )
-    N, g, own = equations.N.copy(), equations.g.copy(), size + np.arange(len(used))
+    N, g, own = equations.N, equations.g, size + np.arange(len(used))
     prior = bundle_adjustment.prior_information(len(ranges), k, solution.tau[KINDS])
     N[:size, :size] += np.diag(prior)
     g[6 * k : size] += prior[6 * k :] * ranges
