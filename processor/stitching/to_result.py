@@ -138,8 +138,11 @@ def _scans(
         reasons.append(() if why is None else (why,))
     unsure = tuple(name for name, state in zip(names, status, strict=True) if state == Status.AMBIGUOUS)
     for s in _not_joined(network.links, status, reference):
-        status[s] = Status.AMBIGUOUS
-        reasons[s] = (reason("stitch.rests-on", scans=unsure) if unsure else reason("stitch.joins-contradicted"),)
+        # Where no rival pose is known, what made it weak is said first and stays the answer: people walk through scans.
+        if unsure or status[s] is Status.OK:
+            status[s] = Status.AMBIGUOUS
+        joins = reason("stitch.rests-on", scans=unsure) if unsure else reason("stitch.joins-contradicted")
+        reasons[s] = (*reasons[s], joins)
     return Scans(
         name=tuple(names),
         status=tuple(status),

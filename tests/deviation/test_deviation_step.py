@@ -238,7 +238,7 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
 
 @pytest.mark.parametrize("elsewhere", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_scan_with_more_points_of_the_ground_than_of_the_structure_is_placed_right(elsewhere):
-    scene, _ = scene_of(12, still, count=4_000)
+    scene, _ = scene_of(12, still, count=6_000)
     points, rng = scene.scans[0].points, np.random.default_rng(12)
     low, high = points.min(axis=0) - 1_000.0, points.max(axis=0) + 1_000.0
     ground = rng.uniform(low, high, (3 * len(points), 3))
