@@ -124,7 +124,7 @@ def _iterate(
         T = transform_about(step, middle) @ T
         share = float(used.mean())
         if iteration >= 3:
-            gate = max(GATES_MM[1], 6.0 * sigma)
+            gate = min(max(GATES_MM[1], 6.0 * sigma), GATES_MM[0])
         move = float(np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.ptp(placed[:, 0]))
         if iteration == iterations - 1 or (move < CONVERGED_MM and (iteration > 4 or not even)):
             cell = cells(placed[used] @ axes, axis, n @ axes)
