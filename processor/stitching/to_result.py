@@ -141,8 +141,7 @@ def _scans(
         # Where no rival pose is known, what made it weak is said first and stays the answer: people walk through scans.
         if unsure or status[s] is Status.OK:
             status[s] = Status.AMBIGUOUS
-        joins = reason("stitch.rests-on", scans=unsure) if unsure else reason("stitch.joins-contradicted")
-        reasons[s] = (*reasons[s], joins)
+        reasons[s] += (reason("stitch.rests-on", scans=unsure) if unsure else reason("stitch.joins-contradicted"),)
     return Scans(
         name=tuple(names),
         status=tuple(status),

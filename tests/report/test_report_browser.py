@@ -30,7 +30,7 @@ def cells_below(shown, title):
     )
 
 
-@pytest.mark.parametrize("width", [1200, 500])
+@pytest.mark.parametrize("width", [pytest.param(1200, marks=pytest.mark.slow), 500])
 def test_a_bridge_in_space_reacts(tmp_path, width):
     path = written(tmp_path, rendered(of_bridge(names=(BAD, "rib1", "foot2"))), "<script>alert(1)<script>.html")
     with opened(path, width) as shown:

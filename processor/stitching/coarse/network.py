@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from processor.distinct_rows import components
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.stitching.coarse import pairwise
@@ -242,12 +243,9 @@ def groups(candidates: Pairs, count: int, known: list[int]) -> Ints:
 
     Scans of ``known`` poses are one group.
     """
-    group: Ints = np.arange(count)
-    group[known] = min(known, default=0)
-    for (i, j), poses in candidates.items():
-        if poses and poses[0].score > pairwise.SURE:
-            group[group == group[j]] = group[i]
-    return group
+    sure = [pair for pair, poses in candidates.items() if poses and poses[0].score > pairwise.SURE]
+    sure += [(known[0], other) for other in known[1:]]
+    return components(count, *np.reshape(np.array(sure, np.int64), (-1, 2)).T)
 
 
 def links(poses: dict[tuple[int, int], ScoredPose]) -> list[tuple[int, int]]:
