@@ -38,6 +38,13 @@ def biweight(scaled: Floats) -> Floats:
     return weight
 
 
+def biweight_slope(scaled: Floats) -> Floats:
+    """Return the derivative of the influence, the residual times Tukey's weight, scaled as in :func:`biweight`."""
+    square = scaled**2
+    slope: Floats = np.where(square < 1.0, (1.0 - square) * (1.0 - 5.0 * square), 0.0)
+    return slope
+
+
 def huber(z: Floats, limit: float) -> Floats:
     """Huber's weights of residuals ``z`` in standard deviations: 1 up to ``limit``, then as their inverse."""
     weight: Floats = np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-9))

@@ -14,7 +14,7 @@ from processor.adjustment import scanner_class_errors
 from processor.adjustment.body_motions import distance_derivative
 from processor.defects import (
     alignment,
-    component_shapes,
+    component_deviations,
     design_pose,
     deviation_field,
     expected_points,
@@ -27,7 +27,7 @@ from processor.defects import (
 )
 from processor.defects.absence import holes, missing_bodies
 from processor.defects.alignment import Alignment
-from processor.defects.component_shapes import ComponentShape
+from processor.defects.component_deviations import ComponentShape
 from processor.defects.deviation_field import Field
 from processor.defects.movement import face_offsets, moved_bodies
 from processor.defects.observations import Observed, Pairs
@@ -177,15 +177,17 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     alarms_per_mm2 = params.false_alarms / (1e6 * params.per_m2)
     aligned, field, shapes = _fitted_shapes(registered, error_mm, params)
     candidates = {fit.component: [s for s in fit.fitted.shapes if s.kind != "bump"] for fit in shapes}
-    residuals = field.minus(component_shapes.values(surface, shapes, candidates))
+    residuals = field.minus(component_deviations.values(surface, shapes, candidates))
     levels = scan_statistic.levels_of(residuals, surface, alarms_per_mm2, params.systematic_mm)
-    significant = component_shapes.significant(shapes, surface, field, aligned, levels, alarms_per_mm2)
+    significant = component_deviations.significant(shapes, surface, field, aligned, levels, alarms_per_mm2)
     chosen = {number: [judged.shape for judged in of_one] for number, of_one in significant.items()}
-    shape_values = component_shapes.values(surface, shapes, chosen)
-    shape_values += component_shapes.values(surface, shapes, component_shapes.unproven_motions(shapes, significant))
+    shape_values = component_deviations.values(surface, shapes, chosen)
+    shape_values += component_deviations.values(
+        surface, shapes, component_deviations.unproven_motions(shapes, significant)
+    )
     if not aligned.fitted:
         shape_values += face_offsets.unproven(field.minus(shape_values), surface)
-    residuals = field.minus(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
+    residuals = field.minus(shape_values).without(component_deviations.jumps(surface, shapes, chosen))
     searched = scan_statistic.widened(residuals, levels)
     finding = scan_statistic.search(searched, surface, levels)
     expected = expected_points.expected(pairs, surface, observed.stations)
@@ -247,7 +249,7 @@ def _fitted_shapes(
         return (aligned, *_shapes_of(registered, aligned, params))
 
     first = fitted(registered.alignment)
-    deformed = component_shapes.deformed(first[2])
+    deformed = component_deviations.deformed(first[2])
     if not (first[0].fitted and deformed):
         return first
     again = alignment.align(pairs, surface, stations, error_mm, deformed)
@@ -264,7 +266,7 @@ def _shapes_of(registered: Registered, aligned: Alignment, params: Params) -> tu
     if aligned.fitted:
         bias = deviation_field.common_bias(field, surface)
         field = dataclasses.replace(field, deviation=field.deviation - bias, bias=bias)
-    return field, component_shapes.fit_all(field, surface)
+    return field, component_deviations.fit_all(field, surface)
 
 
 def _median_sd(aligned: Alignment, surface: DesignSurface) -> float:

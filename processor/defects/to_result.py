@@ -12,7 +12,7 @@ import numpy as np
 from processor.defects import classification, defect_grids, measures
 from processor.defects.alignment import Alignment
 from processor.defects.classification import Classification
-from processor.defects.component_shapes import (
+from processor.defects.component_deviations import (
     ComponentShape,
     SignificantShape,
     cells_of_shape,

@@ -24,7 +24,7 @@ from processor.geometry import rigid
 from processor.geometry.m3c2 import Z95
 from processor.geometry.mesh_distance import Samples
 from processor.model import Floats, Ints
-from processor.robust_statistics import CHI2_MEDIAN, TUKEY, biweight
+from processor.robust_statistics import CHI2_MEDIAN, TUKEY, biweight, biweight_slope
 
 BLOCKS_ALONG = 40.0  # blocks along the extent of the structure
 BLOCK_DIAMETERS = 3.0  # least side of a block
@@ -134,10 +134,7 @@ def fits(
     worst, scale = _largest(levels, stable), levels[0].sd
     weight = biweight(worst / TUKEY)
     z = np.abs(blocks.value - blocks.J @ stable) / scale
-    # The derivative of the influence z w(z)
-    u = (z / TUKEY) ** 2
-    of_influence = np.where(u < 1.0, (1.0 - u) * (1.0 - 5.0 * u), 0.0)
-    slope = np.where(z < worst, weight, of_influence)
+    slope = np.where(z < worst, weight, biweight_slope(z / TUKEY))
     return Fits(
         best=_fit(blocks, best, 1.0 / variance, 1.0 / variance, 1.0, places),
         # What the larger blocks changed shows what is left of movements too small for any block.

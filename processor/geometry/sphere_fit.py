@@ -13,7 +13,7 @@ from processor.geometry.selection import median
 from processor.geometry.sphere import Sphere
 from processor.inner_kernels import inner, inner_ieee
 from processor.model import Bools, Floats, Ints
-from processor.robust_statistics import MAD_TO_SD, TUKEY
+from processor.robust_statistics import MAD_TO_SD, TUKEY, biweight, biweight_slope
 
 LEAST_SCALE = 1e-8  # of the radius: below any noise, above the rounding of points without noise
 WINDOW = 4.0  # in scales: residuals within it determine the scale
@@ -216,8 +216,7 @@ def _sandwich(J: Floats, u: Floats, scale: float) -> Floats:
     """Covariance of the estimate from derivatives J (n, p) and residuals u (n,) in scales."""
     near = np.abs(u) < TUKEY
     J, u = J[near], u[near]
-    q = 1.0 - (u / TUKEY) ** 2
-    psi, slope = u * q**2, q * (1.0 - 5.0 * (u / TUKEY) ** 2)
+    psi, slope = u * biweight(u / TUKEY), biweight_slope(u / TUKEY)
     n, p = J.shape
     A = (J * slope[:, None]).T @ J
     B = (J * (psi**2)[:, None]).T @ J

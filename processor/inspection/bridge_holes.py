@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from processor.components import bridge_parts
-from processor.inspection import design_cloud, flat_faces, holes
+from processor.inspection import flat_faces, holes, points_in_design_frame
 from processor.inspection.bore_fit import Fitted
-from processor.inspection.design_cloud import DesignCloud
 from processor.inspection.design_holes import Hole
+from processor.inspection.points_in_design_frame import DesignCloud
 from processor.limits.judging import Measured
 from processor.model import ArchDesign, Floats, Scene
 
@@ -44,7 +44,7 @@ def of_parts(scene: Scene, assembled: Any) -> list[DrilledGroup]:
     for placed in bridge_parts.of_bridge(scene, assembled, "inspect") if drilled else ():
         if placed.name in drilled and placed.scene is not None:
             origin, found = drilled[placed.name]
-            cloud = design_cloud.of_scene(placed.scene, np.eye(4), origin)
+            cloud = points_in_design_frame.of_scene(placed.scene, np.eye(4), origin)
             groups += _by_joint(scene.arch, placed.name, found, cloud, origin)
     return groups
 

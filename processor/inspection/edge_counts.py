@@ -14,10 +14,10 @@ import numpy as np
 
 from processor.geometry import mesh_distance
 from processor.inspection import bore_fit, narrow_faces
-from processor.inspection.design_cloud import SeenPoints
 from processor.inspection.flat_faces import FlatFace
 from processor.inspection.holes import REACH_MM
 from processor.inspection.narrow_faces import RIM_MM, Outline, Shift, Surroundings
+from processor.inspection.points_in_design_frame import SeenPoints
 from processor.model import Bools, Floats
 
 # From the edge as designed inward: points are counted to the first, their density is that up to the second.

@@ -15,8 +15,8 @@ from processor.adjustment import scanner_class_errors, thermal
 from processor.geometry import rigid
 from processor.inspection import bore_fit, characteristic
 from processor.inspection.bore_fit import BorePoints, Fitted
-from processor.inspection.design_cloud import DesignCloud
 from processor.inspection.design_holes import Hole
+from processor.inspection.points_in_design_frame import DesignCloud
 from processor.inspection.result import Quantity
 from processor.limits.judging import Measured
 from processor.model import Bools, Floats, Ints, reason

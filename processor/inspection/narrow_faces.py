@@ -20,9 +20,9 @@ from processor.geometry import mesh_distance, rigid
 from processor.geometry.mesh_distance import FacetGrid
 from processor.inspection import bore_fit, flat_faces
 from processor.inspection.bore_fit import RIM_SHARE
-from processor.inspection.design_cloud import DesignCloud, SeenPoints
 from processor.inspection.flat_faces import FLOOR_MM, FlatFace, Observed, Pieces
 from processor.inspection.holes import REACH_MM
+from processor.inspection.points_in_design_frame import DesignCloud, SeenPoints
 from processor.model import (
     Bools,
     Columns,

@@ -16,11 +16,11 @@ from numpy.polynomial.legendre import legvander
 from processor import scene_cloud
 from processor.adjustment import maximum_interval, scanner_class_errors, thermal
 from processor.geometry import rigid
-from processor.inspection import characteristic, design_cloud, edge_counts, flat_faces, holes, narrow_faces
-from processor.inspection.design_cloud import DesignCloud
+from processor.inspection import characteristic, edge_counts, flat_faces, holes, narrow_faces, points_in_design_frame
 from processor.inspection.flat_faces import Body, Fit, FlatFace, Pieces
 from processor.inspection.narrow_faces import Surroundings
 from processor.inspection.part_geometry import off_the_chord
+from processor.inspection.points_in_design_frame import DesignCloud
 from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.limits.judging import Measured
 from processor.model import Floats, Reason, Scene, Status, reason
@@ -78,7 +78,7 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     origin, placed = scene_cloud.local_design(scene.structure)[1], scene_cloud.stitched(scene, stitched)
     if not any(body.holes for body in found):
         placed = narrow_faces.near(placed, T, origin, _unmeasured(found), deviation.max_depth)
-    cloud = design_cloud.of_scene(placed, T, origin)
+    cloud = points_in_design_frame.of_scene(placed, T, origin)
     around = narrow_faces.surroundings(scene.structure, cloud, seen)
     unproven = surface_registration.is_unproven(deviation.reasons)
     doubtful = deviation.status is Status.AMBIGUOUS or unproven

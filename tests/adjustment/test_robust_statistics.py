@@ -26,6 +26,12 @@ def test_biweight_is_one_at_zero_and_zero_from_its_limit():
     np.testing.assert_allclose(weight, [1.0, 0.5625, 0.5625, 0.0, 0.0], rtol=1e-15)  # float64: exact in halves
 
 
+def test_slope_of_the_biweight_is_the_derivative_of_its_influence():
+    z, h = np.array([-3.0, -0.7, 0.0, 0.3, 0.44, 0.6, 0.99, 2.0]), 1e-6
+    rise = (z + h) * robust_statistics.biweight(z + h) - (z - h) * robust_statistics.biweight(z - h)
+    np.testing.assert_allclose(robust_statistics.biweight_slope(z), rise / (2.0 * h), atol=1e-9)  # h^2 and 1e-16 / h
+
+
 def test_biweight_mean_is_ninety_five_percent_efficient():
     """Variance of an M-estimate of the mean of normal values: E psi^2 / (E psi')^2, by quadrature."""
     z = np.linspace(-8.0, 8.0, 160_001)

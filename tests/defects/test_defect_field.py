@@ -12,7 +12,7 @@ from scipy.stats import norm
 from processor.adjustment import scanner_class_errors
 from processor.defects import (
     alignment,
-    component_shapes,
+    component_deviations,
     deviation_field,
     regions,
     scan_statistic,
@@ -21,7 +21,7 @@ from processor.defects import (
     to_result,
 )
 from processor.defects import step as defects_step
-from processor.defects.component_shapes import ComponentShape
+from processor.defects.component_deviations import ComponentShape
 from processor.defects.observations import Pairs
 from processor.model import Scan, Scene, StructureDesign
 from tests.support.scenes.at_design import AT_DESIGN
@@ -217,7 +217,7 @@ def test_a_bend_is_no_movement_where_the_pose_is_not_of_the_design(fitted, mean,
     bend = shape_models.Shape("bend", (0, 2), np.array([2.0]), np.array([[0.01]]))
     fit, levels = ComponentShape(0, frame, blocks, None), SimpleNamespace(common=np.array([0.1]), systematic_mm=0.2)
     of_pose = SimpleNamespace(fitted=fitted, sd=lambda points, _: np.full(len(points), 0.3))
-    value, own, sd, shared = component_shapes._errors(fit, bend, surface, field, of_pose, levels)
+    value, own, sd, shared = component_deviations._errors(fit, bend, surface, field, of_pose, levels)
     # Cells of a fiftieth of the length: a ten-thousandth. Signs are those of the front, above or below.
     np.testing.assert_allclose(np.abs(value - own), 2.0 * mean, rtol=1e-3)
     np.testing.assert_allclose(sd, 0.05 * np.abs(value), rtol=1e-9)

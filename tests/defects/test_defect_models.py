@@ -13,7 +13,7 @@ from scipy.stats import poisson
 from processor.adjustment import scanner_class_errors
 from processor.defects import (
     alignment,
-    component_shapes,
+    component_deviations,
     defect_grids,
     detect,
     measures,
@@ -22,7 +22,7 @@ from processor.defects import (
     surface_charts,
     to_result,
 )
-from processor.defects.component_shapes import ComponentShape, SignificantShape
+from processor.defects.component_deviations import ComponentShape, SignificantShape
 from processor.defects.movement import moved_bodies
 from processor.defects.regions import Region
 from processor.geometry import rigid
@@ -88,7 +88,7 @@ def test_a_movement_sweeps_the_volume_of_faces_that_were_seen():
     shape = shape_models.Shape(shape_models.RIGID, (), np.array([0.0, 0.0, -3.0, 0.0, 0.0, 0.0]))
     for up in (1.0, -1.0):
         seen = SimpleNamespace(seen=(up * surface.outward[:, 2] > 0.5).astype(float))
-        cells = component_shapes.swept_cells(surface, seen, ComponentShape(0, frame, None, None), shape)
+        cells = component_deviations.swept_cells(surface, seen, ComponentShape(0, frame, None, None), shape)
         np.testing.assert_allclose(surface.outward[cells], np.tile([0.0, 0.0, up], (len(cells), 1)), atol=1e-12)
         assert surface.share[cells].sum() * 20.0**2 == pytest.approx(200.0 * 100.0, rel=0.3)  # whole cells of 20 mm
 
@@ -110,7 +110,7 @@ def test_a_bias_of_the_scanner_moves_what_is_seen_from_one_side(seen_from, share
     still = SimpleNamespace(sd=lambda points, outward: np.zeros(len(points)), fitted=True)
     shape = dataclasses.replace(moved, covariance=np.zeros((6, 6)))
     fit = ComponentShape(0, frame, blocks, None)
-    shared = component_shapes._errors(fit, shape, surface, field, still, levels)[3]
+    shared = component_deviations._errors(fit, shape, surface, field, still, levels)[3]
     np.testing.assert_allclose(shared, share * scanner_class_errors.SURFACE_SD_MM, atol=0.01)
 
 
@@ -154,7 +154,7 @@ def test_a_face_that_lies_deeper_as_a_whole_has_the_volume_of_its_area():
 def test_a_shape_is_fitted_again_to_finer_blocks():
     """Exact deviations of a rigid motion; the fit to coarse blocks had half of it."""
     surface = surface_charts.of_mesh(*box_mesh(), 20.0)
-    frame = component_shapes._frame_of(surface, 0)
+    frame = component_deviations._frame_of(surface, 0)
     assert (sorted(frame.half), frame.front) == (pytest.approx([25.0, 50.0, 100.0]), pytest.approx(50.0))
     np.testing.assert_allclose(frame.origin, [100.0, 50.0, 25.0], atol=1e-9)
     factors = np.array([1.0, -2.0, 3.0, 0.4, -0.2, 0.6])
@@ -244,9 +244,9 @@ def test_cells_within_30_mm_of_a_steps_edge_mix_both_sides():
     frame = shape_models.Frame(np.array([100.0, 50.0, 25.0]), np.eye(3), np.array([100.0, 50.0, 25.0]), 50.0)
     step, bend = (shape_models.Shape(kind, (0, 0.25), np.ones(1)) for kind in ("step", "bend"))
     fit = ComponentShape(0, frame, None, None)
-    cells = component_shapes.jumps(surface, [fit], {0: [bend, step]})
+    cells = component_deviations.jumps(surface, [fit], {0: [bend, step]})
     np.testing.assert_array_equal(cells, np.flatnonzero(np.abs(surface.centres[:, 0] - 125.0) <= 30.0))
-    assert len(component_shapes.jumps(surface, [fit], {0: [bend]})) == 0
+    assert len(component_deviations.jumps(surface, [fit], {0: [bend]})) == 0
 
 
 def box_mesh():
@@ -299,7 +299,7 @@ def test_uncertainty_of_a_movement_at_an_unseen_corner_equals_its_scatter():
         (shape,) = seen.shapes([(shape_models.RIGID, ())])
         z.append(shape.values(frame, corners, up[:2]) / shape.sd(frame, corners, up[:2]))
         everywhere = np.abs(shape.values(frame, places, up)) / shape.sd(frame, places, up)
-        beyond += component_shapes.deviate_of_one(float(everywhere.max()), len(shape.factors)) > 1.96
+        beyond += component_deviations.deviate_of_one(float(everywhere.max()), len(shape.factors)) > 1.96
     # Four sds of a root mean square; and a bound, for the three factors that are seen of six.
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(z), axis=0)), 1.0, atol=4.0 / np.sqrt(2.0 * trials))
     assert beyond < 0.05 * trials + 3.0 * np.sqrt(0.05 * trials)

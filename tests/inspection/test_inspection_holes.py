@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from processor.inspection import bore_fit, design_cloud, design_holes, flat_faces, holes
+from processor.inspection import bore_fit, design_holes, flat_faces, holes, points_in_design_frame
 from processor.inspection.bore_fit import BorePoints
 from processor.inspection.design_holes import Hole
 from processor.model import StructureDesign
@@ -109,7 +109,7 @@ def group():
 
 
 def measured(points, source, scanners):
-    cloud = design_cloud.of_points(points, source, scanners)
+    cloud = points_in_design_frame.of_points(points, source, scanners)
     return {one.of: one for one in holes.characteristics(group(), holes.fitted(cloud, group()), 1)}
 
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from processor.deviation import step as deviation_step
-from processor.inspection import design_cloud, edge_counts, flat_faces, narrow_faces, structure_bodies
+from processor.inspection import edge_counts, flat_faces, narrow_faces, points_in_design_frame, structure_bodies
 from processor.inspection import step as inspection_step
 from processor.model import DesignBodies, Reason, Scan, Scene, StructureDesign
 from processor.robust_statistics import MAD_TO_SD
@@ -40,7 +40,9 @@ def on_end(rng, count=200, off=1.5, slope=0.0, noise=0.3):
 def around(structure, points, shared=0.0):
     """Surroundings with these points (n, 3), seen from STATION, and the faces of the first body by direction."""
     scan = Scan("s", points, position=STATION)
-    cloud = design_cloud.of_scene(Scene("x", "structure", (scan,), structure=structure), np.eye(4), np.zeros(3))
+    cloud = points_in_design_frame.of_scene(
+        Scene("x", "structure", (scan,), structure=structure), np.eye(4), np.zeros(3)
+    )
     of_view = np.full(1, shared)
     seen = flat_faces.Observed(np.zeros((1, 3)), np.zeros(1, np.int64), np.zeros(1), np.zeros(1), of_view, side=50.0)
     body = next(iter(flat_faces.bodies(structure, seen._replace(facet=np.zeros(1, np.int64)), 60.0)))
@@ -221,7 +223,7 @@ def test_lengths_and_squareness_of_plates_with_known_ends_are_covered():
             side = np.stack([x, sense * 150.0 + 0.3 * rng.standard_normal(300), rng.uniform(-5.0, 5.0, 300)], axis=1)
             scans.append(Scan(f"y{sense}", side, position=np.array([100.0, 4000.0 * sense, 500.0])))
         scene = Scene("x", "structure", tuple(scans), structure=structure)
-        cloud = design_cloud.of_scene(scene, np.eye(4), np.zeros(3))
+        cloud = points_in_design_frame.of_scene(scene, np.eye(4), np.zeros(3))
         of_view = flat_faces.Observed(np.zeros((1, 3)), np.zeros(1, np.int64), np.zeros(1), np.zeros(1),
                                       np.full(1, shift), side=50.0)  # fmt: skip
         surroundings = narrow_faces.surroundings(structure, cloud, of_view)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.defects.component_shapes import FEWEST_SEEN, LEAST_Z
+from processor.defects.component_deviations import FEWEST_SEEN, LEAST_Z
 from processor.defects.deviation_field import Field
 from processor.defects.surface_charts import DesignSurface
 from processor.model import Floats

@@ -11,7 +11,7 @@ import dataclasses
 
 import numpy as np
 
-from processor.defects.component_shapes import ComponentShape, SignificantShape
+from processor.defects.component_deviations import ComponentShape, SignificantShape
 from processor.defects.shape_models import RIGID, Shape
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import rigid

@@ -41,10 +41,12 @@ EVIDENCE = 10.0  # 1 in 600 for a single unknown: no shift is found in spheres w
 LEAST_SPHERES = 5  # seen by several stations: fewer do not show what is common
 
 
-def variances_of(noise: Floats, cosines: Floats, ranges: Floats) -> Floats:
+@njit(cache=True, nogil=True, error_model="numpy")
+def variances_of(noise, cosines, ranges):  # type: ignore[no-untyped-def]
     """Variances (n,) of ranges by the model's parts (3,)."""
-    c2 = np.maximum(cosines, 0.1) ** 2
-    variances: Floats = noise[0] + noise[1] * ranges**2 / np.sqrt(c2) + noise[2] * (1.0 - c2) / c2
+    variances = np.empty(len(ranges))
+    for i in range(len(ranges)):
+        variances[i] = variance(noise, ranges[i], max(cosines[i], 0.1))
     return variances
 
 
@@ -73,7 +75,7 @@ def noise_model(
             continue
         scale = MAD_TO_SD * float(np.median(e[members]))
         cos, far = float(np.median(c[members])), float(np.median(L[members]))
-        rows.append([1.0, far * far / cos, (1.0 - cos * cos) / (cos * cos)])
+        rows.append([variance(part, far, cos) for part in np.eye(3)])
         variances.append(max(scale, LEAST_MM) ** 2)
         counts.append(len(members))
     if len(rows) < 4:

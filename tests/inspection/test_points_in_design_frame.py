@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from processor import large_arrays
 from processor.geometry import rigid
-from processor.inspection import design_cloud
+from processor.inspection import points_in_design_frame
 from processor.model import Scan, Scene, Stations
 from tests.support import arrays_in_files
 
@@ -36,7 +36,7 @@ def test_points_near_places_are_those_of_a_search_tree_with_their_rays(large, mo
     if large:
         arrays_in_files.limit(monkeypatch, 500, 2000)
     with large_arrays.in_files(tmp_path):
-        cloud = design_cloud.of_scene(scene, T, origin)
+        cloud = points_in_design_frame.of_scene(scene, T, origin)
         places = rng.uniform(-800.0, 800.0, (40, 3)) + rigid.apply(T @ pose, np.zeros(3)) - origin
         seen = cloud.near(places, 180.0)
     placed = rigid.apply(T @ pose, np.concatenate([points, points + 3.0])) - origin
@@ -53,6 +53,6 @@ def test_points_near_places_are_those_of_a_search_tree_with_their_rays(large, mo
 
 def test_rays_are_unknown_where_the_place_of_any_scanner_is():
     scans = (Scan("a", along_x(3, 0.0), position=np.ones(3)), Scan("b", along_x(3, 900.0)))
-    seen = design_cloud.of_scene(Scene("x", "structure", scans), *NOWHERE).near(along_x(12, 0.0), 1.0)
+    seen = points_in_design_frame.of_scene(Scene("x", "structure", scans), *NOWHERE).near(along_x(12, 0.0), 1.0)
     assert len(seen.points) == 6
     assert np.isnan(seen.ray).all()
