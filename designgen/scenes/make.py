@@ -9,6 +9,8 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from designgen.models.model import Model
+from designgen.recipe_params import filled
+from designgen.scanning import processing
 from designgen.scanning.scan_settings import Scanning, scan_settings_of
 from designgen.scenes import arch_bridge, assembly, model, space_frame, structure, target_room
 from processor.model import Scene, Truth, UsageError
@@ -41,7 +43,7 @@ def make(
     if kind == "structure" and "model" in recipe:
         section, maker = "model", partial(model.make, model=of_model)
         of_part = isinstance(recipe["model"], Mapping) and bool(recipe["model"].get("part"))
-    keys = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section} | EXTRA.get(kind, set())
+    keys = {"about", "kind", "seed", "scan", "scanner", "processing", "asbuilt", section} | EXTRA.get(kind, set())
     keys |= {"bridge"} if of_part else set()
     if unknown := sorted(set(recipe) - keys):
         raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(keys))}")
@@ -50,4 +52,7 @@ def make(
         raise UsageError(f"recipe {name}: seed: expected a whole number from 0, got {used!r}")
     # The number of BLAS threads changes the order of its sums, and with it the last bits.
     with threadpool_limits(1, user_api="blas"):
-        return maker(name, recipe, scan_settings_of(recipe), used)
+        made = maker(name, recipe, scan_settings_of(recipe), used)
+        if "processing" not in recipe:
+            return made
+        return processing.process(*made, filled(processing.Params, recipe, "processing"), used)
