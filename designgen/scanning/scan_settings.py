@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from designgen.recipe_params import filled
-from designgen.scanning import sampler, scanner
+from designgen.scanning import sampler, scanner, surroundings
 from processor.model import UsageError
 
 
@@ -20,6 +20,7 @@ class ByRays:
     sigma_mm: ClassVar[float] = float("nan")
     params: scanner.Params
     device: scanner.Scanner
+    surroundings: surroundings.Params | None = None
 
 
 Scanning = sampler.Params | ByRays
@@ -51,8 +52,9 @@ def scan_settings_of(recipe: Mapping[str, Any]) -> Scanning:
     if mode not in (sampler.MODE, scanner.MODE):
         raise UsageError(f"scan.mode: expected {sampler.MODE} or {scanner.MODE}, got {mode!r}")
     if mode == sampler.MODE:
-        if "scanner" in recipe:
-            raise UsageError(f"scanner: there is a scanner only with scan.mode = {scanner.MODE!r}")
+        for section in ("scanner", "surroundings"):
+            if section in recipe:
+                raise UsageError(f"{section}: only with scan.mode = {scanner.MODE!r}, which scans by rays")
         sampling = filled(sampler.Params, recipe, "scan")
         _check_used(recipe, sampler.Params)
         return sampling
@@ -62,7 +64,8 @@ def scan_settings_of(recipe: Mapping[str, Any]) -> Scanning:
     if not isinstance(changes, Mapping):
         raise UsageError(f"scanner: expected a section, got {changes!r}")
     numbers = {**scanner.preset(params.scanner), **changes}
-    return ByRays(params, filled(scanner.Scanner, {"scanner": numbers}, "scanner"))
+    about = filled(surroundings.Params, recipe, "surroundings") if "surroundings" in recipe else None
+    return ByRays(params, filled(scanner.Scanner, {"scanner": numbers}, "scanner"), about)
 
 
 def _check_used(recipe: Mapping[str, Any], params: type) -> None:

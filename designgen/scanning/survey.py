@@ -15,6 +15,7 @@ from designgen.randomness import generator, small_motion
 from designgen.rigid import perpendicular, rigid, translation
 from designgen.scanning import returns, scanner
 from designgen.scanning.surfaces import Surfaces
+from designgen.scanning.surroundings import ABOVE_FLOOR_MM, SCANNER_MM, Box
 from processor.model import Floats, PointLabels, Scan, Shorts, Stations, StationTruth
 
 OF_ONE_MM = 4_000.0  # width of the area on which stations stand below a ball or a row of balls
@@ -45,19 +46,22 @@ def stations_below_box(low: Floats, high: Floats, params: scanner.Params, seed: 
 
 
 def stations_around_box(
-    axes: Floats, middle: Floats, half: Floats, params: scanner.Params, seed: int, prefix: str
+    box: Box, params: scanner.Params, seed: int, prefix: str, *, on_floor: bool = False
 ) -> dict[str, Floats]:
-    """Return poses T_scene_station around a box of ``axes`` (3, 3, rows), ``middle`` (3,), half sizes (3,), by name.
+    """Return poses T_scene_station around a box, by name.
 
     The stations lie on an ellipsoid ``distance_mm`` outside of the box, the first two near the ends of its first axis.
-    The middle of the box is on the horizon of each scanner. More stations leave the first unchanged.
+    The middle of the box is on the horizon of each scanner. More stations leave the first unchanged. Those ``on_floor``
+    stand above the floor on which a part lies on trestles.
     """
+    lowest = SCANNER_MM - ABOVE_FLOOR_MM - box.half[2] if on_floor else -np.inf
     poses = {}
     for i in range(math.prod(params.stations)):
         name = f"{prefix}S{i + 1}"
         rng = generator(seed, f"place {name}")
-        position = middle + (on_sphere(i) * (half + params.distance_mm) * rng.uniform(0.9, 1.1)) @ axes
-        ahead = (middle - position) / np.linalg.norm(middle - position)
+        local = on_sphere(i) * (box.half + params.distance_mm) * rng.uniform(0.9, 1.1)
+        position = box.at(np.append(local[:2], max(local[2], lowest)))
+        ahead = (box.middle - position) / np.linalg.norm(box.middle - position)
         up = perpendicular(ahead)
         T = rigid(np.stack([ahead, np.cross(up, ahead), up], axis=1), position)
         poses[name] = T @ levelled_pose(np.zeros(3), rng.uniform(0.0, 2.0 * np.pi))

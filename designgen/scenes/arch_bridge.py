@@ -14,7 +14,7 @@ from designgen.designs.parametric_face import Surface
 from designgen.randomness import generator, random_pose
 from designgen.recipe_params import filled
 from designgen.rigid import inverse, rigid
-from designgen.scanning import clutter, sampler, survey
+from designgen.scanning import clutter, sampler, surroundings, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
@@ -111,7 +111,9 @@ def _survey_part(
     axes = np.stack([along, [0.0, 1.0, 0.0], np.cross(along, [0.0, 1.0, 0.0])])
     middle = ends.mean(axis=0)
     half = np.abs((ends - middle) @ axes.T).max(axis=0)
-    poses = survey.stations_around_box(axes, middle, half, params, seed, f"{part.name}/")
+    box, about = surroundings.Box(axes, middle, half), scanning.surroundings
+    poses = survey.stations_around_box(box, params, seed, f"{part.name}/", on_floor=about is not None)
+    surroundings.add(builder, about, box, poses, seed, part.name)
     places = [T[:3, 3] for T in poses.values()]
     for i in range(params.clutter):
         rng = generator(seed, f"clutter {part.name} {i}")

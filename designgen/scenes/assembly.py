@@ -16,7 +16,7 @@ from designgen.designs.prismatic_parts import EndErrors, Part
 from designgen.randomness import generator, random_pose
 from designgen.recipe_params import filled
 from designgen.rigid import inverse
-from designgen.scanning import sampler, survey
+from designgen.scanning import sampler, surroundings, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scanning.survey import Survey
@@ -133,7 +133,9 @@ def _surveyed(part: Part, number: int, names: tuple[str, ...], scanning: ByRays,
     local = (box - T[:3, 3]) @ T[:3, :3]
     low, high = local.min(axis=0), local.max(axis=0)
     middle = T[:3, :3] @ (0.5 * (low + high)) + T[:3, 3]
-    poses = survey.stations_around_box(T[:3, :3].T, middle, 0.5 * (high - low), scanning.params, seed, f"{part.name}/")
+    around, about = surroundings.Box(T[:3, :3].T, middle, 0.5 * (high - low)), scanning.surroundings
+    poses = survey.stations_around_box(around, scanning.params, seed, f"{part.name}/", on_floor=about is not None)
+    surroundings.add(builder, about, around, poses, seed, part.name)
     return survey.survey(builder.to_surfaces(), names, poses, scanning.device, scanning.params, seed)
 
 

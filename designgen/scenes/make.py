@@ -43,7 +43,9 @@ def make(
     if kind == "structure" and "model" in recipe:
         section, maker = "model", partial(model.make, model=of_model)
         of_part = isinstance(recipe["model"], Mapping) and bool(recipe["model"].get("part"))
-    keys = {"about", "kind", "seed", "scan", "scanner", "processing", "asbuilt", section} | EXTRA.get(kind, set())
+    keys = {"about", "kind", "seed", "scan", "scanner", "surroundings", "processing", "asbuilt", section} | EXTRA.get(
+        kind, set()
+    )
     keys |= {"bridge"} if of_part else set()
     if unknown := sorted(set(recipe) - keys):
         raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(keys))}")

@@ -19,9 +19,9 @@ from designgen.models.model import Model, ModelBody
 from designgen.recipe_files import Recipe, overridden
 from designgen.recipe_params import filled
 from designgen.scanning import scanner as scanner_module
-from designgen.scanning import survey
+from designgen.scanning import surroundings, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
-from designgen.scanning.surfaces import Builder, Surfaces
+from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
 from processor.model import Floats, Scene, StructureDesign, Truth, UsageError
 
@@ -83,7 +83,9 @@ def make(
     names = tuple(body.name for body in model.bodies)
     built = as_built.build(model, body_deviations.params_of(recipe, names), seed)
     poses = _poses(model, recipe, scanning, seed)
-    surveyed = survey.survey(_surfaces(built.bodies), names, poses, scanning.device, params, seed)
+    builder = _surfaces(built.bodies)
+    surroundings.add(builder, scanning.surroundings, surroundings.Box.about(model.mesh()[0]), poses, seed)
+    surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
     scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
     if not params.registered:
         scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
@@ -123,13 +125,13 @@ def part_solid(name: str, recipe: Mapping[str, Any]) -> cq.Assembly:
     return cq.Assembly(name="bridge").add(arch_part.solid(parts[name]), name=name)
 
 
-def _surfaces(built: Sequence[ModelBody | None]) -> Surfaces:
+def _surfaces(built: Sequence[ModelBody | None]) -> Builder:
     """Return the surfaces of bodies as built; None for one that is left out."""
     builder = Builder()
     for part, body in enumerate(built):
         for patch, smooth in body.patches() if body is not None else ():
             builder.patch(part, patch, smooth)
-    return builder.to_surfaces()
+    return builder
 
 
 def _poses(model: Model, recipe: Mapping[str, Any], scanning: ByRays, seed: int) -> dict[str, Floats]:

@@ -11,7 +11,7 @@ from designgen.asbuilt import imperfections
 from designgen.designs import space_frame
 from designgen.randomness import generator
 from designgen.recipe_params import filled
-from designgen.scanning import clutter, sampler, space_frame_surfaces, survey
+from designgen.scanning import clutter, sampler, space_frame_surfaces, surroundings, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
@@ -36,6 +36,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         low, high = built.centres.min(axis=0), built.centres.max(axis=0)
         clutter.add_below_roof(builder, low, high, params.clutter, generator(seed, "clutter"))
         poses = survey.stations_below_box(low, high, params, seed)
+        surroundings.add(builder, scanning.surroundings, surroundings.Box.about(built.centres), poses, seed)
         surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
         scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
     else:

@@ -16,7 +16,7 @@ from designgen.designs.parametric_face import Displacement, Patch
 from designgen.low_discrepancy import van_der_corput
 from designgen.randomness import generator
 from designgen.recipe_params import filled
-from designgen.scanning import clutter, picking, sampler, scanner, survey
+from designgen.scanning import clutter, picking, sampler, scanner, surroundings, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
@@ -72,11 +72,13 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
             builder.patch(part, patch)
         poses = _places(kind, patches, params, seed)
         _add_poles(builder, poses, patches, params.clutter, seed)
+        corners = np.vstack([boxes_and_tubes.mesh_of((one,))[0] for one in components if one.name != "ground"])
+        box = surroundings.Box.about(corners)
+        surroundings.add(builder, scanning.surroundings, box, poses, seed, on_ground="ground" in names)
         surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
         if of_defects is not None:
             surveyed = _labelled(surveyed, of_defects)
         scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
-        corners = np.vstack([boxes_and_tubes.mesh_of((one,))[0] for one in components if one.name != "ground"])
         picks = _picks(recipe, scans, station_truth, params, corners + origin, seed)
         if not params.registered:
             scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)

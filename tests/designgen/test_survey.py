@@ -11,6 +11,7 @@ from designgen.designs import structure_registry
 from designgen.randomness import generator
 from designgen.scanning import scanner, survey
 from designgen.scanning.surfaces import Builder
+from designgen.scanning.surroundings import Box
 from designgen.scenes import make, structure
 from processor.model import UsageError
 
@@ -34,7 +35,7 @@ def test_a_station_more_leaves_the_others_where_they_are(count):
         params = scanner.Params(stations=(n,))
         found = [
             survey.stations_below_box(low, high, params, 3),
-            survey.stations_around_box(AXES, low, HALF, params, 3, "p/"),
+            survey.stations_around_box(Box(AXES, low, HALF), params, 3, "p/"),
         ]
         for name in ("stadium-roof", "truss-bridge", "plates-defects"):
             recipe = recipe_files.load(name)[1]
