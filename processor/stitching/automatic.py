@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from processor.distinct_rows import components
 from processor.geometry import rigid, thread_ranges
 from processor.model import Control, Floats, Ints, Scan
 from processor.stitching import three_point
@@ -98,6 +99,8 @@ def stitch(
         (a, b): pairwise.score_pose(patches[a], patches[b], rigid.invert(solution.T[a]) @ solution.T[b])
         for a, b in itertools.combinations(placed, 2)
     }
+    still = network.without_moved(patches, solution.T, scores)
+    links = sorted({*network.links(still), *itertools.combinations(sorted(known), 2)})
     return RegisteredScans(
         clouds=clouds,
         coarse=coarse,
@@ -111,10 +114,10 @@ def stitch(
         refuted=np.where(
             [s in known and reference in known for s in range(len(scans))],
             0.0,
-            network.refuted(scores, len(scans), reference),
+            network.refuted(still, len(scans), reference),
         ),
-        links=sorted({*network.links(scores), *itertools.combinations(sorted(known), 2)}),
-        groups=network.groups(candidates, len(scans), list(known)),
+        links=links,
+        groups=components(len(scans), *np.reshape(np.array(links, np.int64), (-1, 2)).T),
     )
 
 

@@ -1,6 +1,7 @@
 """Coarse registration of a scan beside those already placed, with given scores."""
 
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from processor.stitching.coarse.pairwise import ScoredPose
 from processor.stitching.fine.pairs_and_loops import Pair
 from processor.stitching.params import Params
 from processor.stitching.planes import free_space
+from tests.support.clouds import stitch_clouds
+from tests.support.scenes.stitched_rooms import adjusted
 
 HERE = np.eye(4)
 
@@ -189,3 +192,21 @@ def test_scans_of_known_poses_are_searched_no_deeper(monkeypatch):
     assert poses[0, 1] == [by_control]
     assert (0, 1) not in searched
     assert network.groups({(0, 1): [by_control]}, 3, [0, 1]).tolist() == [0, 0, 1]
+
+
+def test_what_moves_between_scans_does_not_contradict_their_poses():
+    """A crate stands elsewhere in each of four scans of a room, the others look through its place."""
+    T = stitch_clouds.four(step_mrad=200.0)[0]
+    crates = ((-1500.0, -2500.0), (500.0, 3000.0), (5000.0, 500.0), (2500.0, -3500.0))
+    scans = [
+        stitch_clouds.scan(
+            f"S{i + 1}", T[i], i, step_mrad=20.0,
+            things=(*stitch_clouds.THINGS, (np.array([x, y, 0.0]), np.array([x + 900.0, y + 900.0, 2200.0]))),
+        )
+        for i, (x, y) in enumerate(crates)
+    ]  # fmt: skip
+    result = adjusted(T, scans)
+    assert set(result.scans.status) == {"ok"}
+    with mock.patch.object(network, "without_moved", lambda scans, T, poses: poses):
+        before = adjusted(T, scans)
+    assert "ambiguous" in before.scans.status

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -246,6 +247,29 @@ def groups(candidates: Pairs, count: int, known: list[int]) -> Ints:
     sure = [pair for pair, poses in candidates.items() if poses and poses[0].score > pairwise.SURE]
     sure += [(known[0], other) for other in known[1:]]
     return components(count, *np.reshape(np.array(sure, np.int64), (-1, 2)).T)
+
+
+def without_moved(
+    scans: Sequence[ScanPatches], T: Floats, poses: dict[tuple[int, int], ScoredPose]
+) -> dict[tuple[int, int], ScoredPose]:
+    """Return the adjusted ``poses`` of pairs without what contradicts them because it moved between the scans.
+
+    A crane or truck is seen at its place by one scan alone, and several others look through that place. Where the poses
+    are wrong, what one scan looks through is seen there by others as well, or by no other at all.
+    """
+    placed = sorted({s for pair in poses for s in pair})
+    against: dict[tuple[int, int], Floats] = {}
+    for a in placed:
+        matches, refuters = np.zeros((2, len(scans[a].patches.weight)), np.int64)
+        for b in placed:
+            if a != b:
+                match, against[a, b] = pairwise.compare(scans[a], scans[b], rigid.invert(T[b]) @ T[a])
+                matches += match
+                refuters += against[a, b] > 0.0
+        for b in placed:
+            if a != b:
+                against[a, b] = against[a, b][(matches > 0) | (refuters < 2)].sum()
+    return {(a, b): replace(pose, against=float(against[a, b] + against[b, a])) for (a, b), pose in poses.items()}
 
 
 def links(poses: dict[tuple[int, int], ScoredPose]) -> list[tuple[int, int]]:

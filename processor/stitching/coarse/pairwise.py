@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import Floats
+from processor.model import Bools, Floats
 from processor.stitching.coarse import candidate_rotations, candidate_translations, face_index
 from processor.stitching.coarse.candidate_translations import WeightedPatches
 from processor.stitching.coarse.face_index import FaceIndex
@@ -174,19 +174,30 @@ def score_pose(a: ScanPatches, b: ScanPatches, T_a_b: Floats, rough: bool = Fals
 
     ``rough`` uses the voters only, with wider tolerances.
     """
-    near_mm, margin_mm = (x * a.side_mm for x in ((ROUGH_NEAR, ROUGH_MARGIN) if rough else (NEAR, MARGIN)))
     agree, against, total = 0.0, 0.0, 0.0
     for scan, other, T in ((a, b, rigid.invert(T_a_b)), (b, a, T_a_b)):  # T = T_other_scan
-        patches, weight = scan.voters if rough else scan.patches
-        match = np.empty(len(weight), np.bool_)
-        face_index.mark_matches(other.small, T, patches, MATCH_RADIUS * a.side_mm, near_mm, LIKE_COS, match)
+        weight = (scan.voters if rough else scan.patches).weight
+        match, looked_through = compare(scan, other, T, rough)
         agree += float(weight[match].sum())
         total += float(weight.sum())
-        if other.cloud.free_space is not None:
-            rest, normals = rigid.apply(T, patches.points[~match]), patches.normals[~match] @ T[:3, :3].T
-            sure = weight[~match] * other.cloud.free_space.resolved(rest, normals, a.side_mm)
-            against += float(sure @ other.cloud.free_space.contains(rest, margin_mm))
+        against += float(looked_through.sum())
     return ScoredPose(T_a_b, agree, against, agree / max(total, 1e-12))
+
+
+def compare(scan: ScanPatches, other: ScanPatches, T_other_scan: Floats, rough: bool = False) -> tuple[Bools, Floats]:
+    """Mark the patches (n,) of a scan that match the other's, and weigh (n,) those that the other looked through."""
+    near_mm, margin_mm = (x * scan.side_mm for x in ((ROUGH_NEAR, ROUGH_MARGIN) if rough else (NEAR, MARGIN)))
+    patches, weight = scan.voters if rough else scan.patches
+    match, looked_through = np.empty(len(weight), np.bool_), np.zeros(len(weight))
+    face_index.mark_matches(other.small, T_other_scan, patches, MATCH_RADIUS * scan.side_mm, near_mm, LIKE_COS, match)
+    if other.cloud.free_space is not None:
+        rest, normals = (
+            rigid.apply(T_other_scan, patches.points[~match]),
+            patches.normals[~match] @ T_other_scan[:3, :3].T,
+        )
+        sure = weight[~match] * other.cloud.free_space.resolved(rest, normals, scan.side_mm)
+        looked_through[~match] = sure * other.cloud.free_space.contains(rest, margin_mm)
+    return match, looked_through
 
 
 def slide(a: ScanPatches, b: ScanPatches, pose: ScoredPose) -> ScoredPose:
