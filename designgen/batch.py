@@ -342,7 +342,10 @@ def _outcomes(results: runner.Results[Job, Outcome | Lost], total: int) -> dict[
     try:
         with tqdm(total=total, unit="scene", disable=not sys.stderr.isatty()) as bar:
             for job, result in results:
-                outcome = Outcome(None, reason_of(result)) if isinstance(result, Lost) else result
+                if isinstance(result, Lost):
+                    outcome = Outcome(None, LOSSES[result.loss].format(error=result.error))
+                else:
+                    outcome = result
                 outcomes[job.file] = outcome
                 if outcome.replaced:
                     print_error_line(f"{job.file}: {outcome.replaced}")
@@ -351,11 +354,6 @@ def _outcomes(results: runner.Results[Job, Outcome | Lost], total: int) -> dict[
         print_error_line(f"stopped: {len(outcomes)} of {total} scene(s) are done; run again to go on")
         raise
     return outcomes
-
-
-def reason_of(lost: Lost) -> str:
-    """Return the reason in the index of a scene whose job has no result."""
-    return LOSSES[lost.loss].format(error=lost.error)
 
 
 def _summary(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> dict[str, Any]:

@@ -37,7 +37,7 @@ def mesh_faces(
     if finer is not None:
         _mesh(_compound(face for face, _, _ in meshes(shape) if finer(face)), EDGE_SHARE * tolerance_mm, large)
     _mesh(shape, tolerance_mm, large)
-    return _triangles(shape)
+    return sum(mesh.NbTriangles() for _, mesh, _ in meshes(shape) if mesh is not None)
 
 
 def _mesh(shape: Any, tolerance_mm: float, large: bool) -> None:
@@ -75,10 +75,6 @@ def _is_empty(mesh: Any) -> bool:
 def empty_faces(shape: Any) -> list[tuple[int, Any]]:
     """Return the faces of a meshed shape that have no triangles, each with its number from 1."""
     return [(row, face) for row, (face, mesh, _) in enumerate(meshes(shape), 1) if _is_empty(mesh)]
-
-
-def _triangles(shape: Any) -> int:
-    return sum(mesh.NbTriangles() for _, mesh, _ in meshes(shape) if mesh is not None)
 
 
 def facets(shape: Any) -> tuple[Floats, Ints, float]:

@@ -97,36 +97,14 @@ def _bore(x: float, start: list[float], end: list[float], radius: float) -> Bore
 
 
 def holed(wall: Patch, T: Floats, length: float, a: Floats, b: Floats, bores: Sequence[Bore]) -> list[Patch]:
-    """Return a wall of a girder over the edge from ``a`` to ``b`` (2,) of its section, with its holes cut out."""
-    holes = [(bore.x, s, bore) for bore, s in _on_edge(bores, b, a)]  # q of a wall runs from b to a
-    return _perforated(wall, (length, float(np.linalg.norm(b - a))), holes, T[:3, :3])
+    """Return a flat wall of a girder over the edge from ``a`` to ``b`` (2,) of its section, holes cut out, and rims.
 
-
-def _on_edge(bores: Sequence[Bore], a: Floats, b: Floats) -> list[tuple[Bore, float]]:
-    """Return the bores that come out at an edge of a section from ``a`` to ``b`` (2,), and how far along it."""
-    along = b - a
-    length = float(np.linalg.norm(along))
-    unit = along / length
-    found = []
-    for bore in bores:
-        for at in (bore.start, bore.end):
-            s = float((at - a) @ unit)
-            across = abs(float((at - a) @ np.array([-unit[1], unit[0]])))
-            square = abs(float((bore.end - bore.start) @ unit)) < ON_MM
-            if square and across < ON_MM and 0.0 < s < length:
-                found.append((bore, s))
-    return found
-
-
-def _perforated(
-    wall: Patch, size: tuple[float, float], holes: Sequence[tuple[float, float, Bore]], R: Floats
-) -> list[Patch]:
-    """Return a flat wall with holes cut out, and their rims; ``size`` and places are mm along p and q.
-
-    The wall's own knots and the cells that it has stay. R (3, 3) turns the girder's axes to the wall's frame.
+    The wall's own knots and the cells that it has stay. T maps the girder's axes to the wall's frame.
     """
+    holes = [(bore.x, s, bore) for bore, s in _on_edge(bores, b, a)]  # q of a wall runs from b to a
     if not holes:
         return [wall]
+    size = length, float(np.linalg.norm(b - a))  # mm along p and q
     p, q = wall.p, wall.q
     for u, v, bore in holes:
         half = SQUARE * bore.radius
@@ -144,8 +122,24 @@ def _perforated(
         half = SQUARE * bore.radius
         inside = np.outer(np.abs(middle_p * size[0] - u) < half, np.abs(middle_q * size[1] - v) < half)
         present &= ~inside
-        rims.append(_rim(f"{wall.name}-rim{k}", wall, size, (u, v), bore, R @ bore.shift))
+        rims.append(_rim(f"{wall.name}-rim{k}", wall, size, (u, v), bore, T[:3, :3] @ bore.shift))
     return [Patch(wall.name, wall.at, p, q, present), *rims]
+
+
+def _on_edge(bores: Sequence[Bore], a: Floats, b: Floats) -> list[tuple[Bore, float]]:
+    """Return the bores that come out at an edge of a section from ``a`` to ``b`` (2,), and how far along it."""
+    along = b - a
+    length = float(np.linalg.norm(along))
+    unit = along / length
+    found = []
+    for bore in bores:
+        for at in (bore.start, bore.end):
+            s = float((at - a) @ unit)
+            across = abs(float((at - a) @ np.array([-unit[1], unit[0]])))
+            square = abs(float((bore.end - bore.start) @ unit)) < ON_MM
+            if square and across < ON_MM and 0.0 < s < length:
+                found.append((bore, s))
+    return found
 
 
 def _distinct(knots: Floats) -> Floats:

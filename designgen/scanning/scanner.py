@@ -71,14 +71,9 @@ class Scanner:
         return result
 
 
-def presets() -> dict[str, dict[str, Any]]:
-    """Return the classes of scanners in scanners.toml by name, with their descriptions and sources."""
-    return packaged("scanners.toml")
-
-
 def preset(name: str) -> dict[str, Any]:
     """Return the numbers of a class of scanner; UsageError for an unknown one."""
-    classes = presets()
+    classes = packaged("scanners.toml")
     if name not in classes:
         raise UsageError(f"scan.scanner: expected one of {', '.join(classes)}, got {name!r}")
     return {key: value for key, value in classes[name].items() if key in Scanner.__dataclass_fields__}

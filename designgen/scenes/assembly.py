@@ -157,17 +157,14 @@ def _built(part: Part, errors: Errors, rng: np.random.Generator, ledger: Ledger)
 
 
 def _design(nominal: design_of.Assembly) -> ArchDesign:
+    ends = [end for part in nominal.parts for end in part.ends]
     return ArchDesign(
         tuple(DesignPart(part.name, *part.mesh()) for part in nominal.parts),
         tuple(joint.name for joint in nominal.joints),
         tuple(joint.left for joint in nominal.joints),
         tuple(joint.right for joint in nominal.joints),
-        np.array([_end_at(nominal, joint.name) for joint in nominal.joints]),
+        np.array([next(end for end in ends if end.joint == joint.name).key_points() for joint in nominal.joints]),
     )
-
-
-def _end_at(nominal: design_of.Assembly, joint: str) -> Floats:
-    return next(end.key_points() for part in nominal.parts for end in part.ends if end.joint == joint)
 
 
 def _truth(

@@ -23,7 +23,7 @@ from designgen.scanning import surroundings, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
-from processor.model import Floats, Scene, StructureDesign, Truth, UsageError
+from processor.model import Scene, StructureDesign, Truth, UsageError
 
 if TYPE_CHECKING:
     import cadquery as cq
@@ -82,7 +82,11 @@ def make(
     params, origin = scanning.params, np.array(scanning.params.origin_mm)
     names = tuple(body.name for body in model.bodies)
     built = as_built.build(model, body_deviations.params_of(recipe, names), seed)
-    poses = _poses(model, recipe, scanning, seed)
+    if section.stations:
+        poses = station_placement.read_stations(Path(section.stations), seed)
+    else:
+        distance = params.distance_mm if "distance_mm" in recipe.get("scan", {}) else None
+        poses = station_placement.place_stations(model, math.prod(params.stations), distance, scanning.device, seed)
     builder = _surfaces(built.bodies)
     surroundings.add(builder, scanning.surroundings, surroundings.Box.about(model.mesh()[0]), poses, seed)
     surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
@@ -132,12 +136,3 @@ def _surfaces(built: Sequence[ModelBody | None]) -> Builder:
         for patch, smooth in body.patches() if body is not None else ():
             builder.patch(part, patch, smooth)
     return builder
-
-
-def _poses(model: Model, recipe: Mapping[str, Any], scanning: ByRays, seed: int) -> dict[str, Floats]:
-    """Return the stations' poses, given or placed so that most of the surface is seen."""
-    given = filled(Params, recipe, "model").stations
-    if given:
-        return station_placement.read_stations(Path(given), seed)
-    distance = scanning.params.distance_mm if "distance_mm" in recipe.get("scan", {}) else None
-    return station_placement.place_stations(model, math.prod(scanning.params.stations), distance, scanning.device, seed)

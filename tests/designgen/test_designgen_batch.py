@@ -329,7 +329,7 @@ def test_dying_process_loses_its_job_alone(tmp_path):
     do = functools.partial(processes.in_process, dying_job.kill_own_process)
     found = {path.name: result for path, result in runner.Local(2).run(do, [tmp_path / "always", tmp_path / "once"])}
     assert found["always"] == Lost(Loss.DIED)
-    assert batch.reason_of(found["always"]).startswith("the process that made it died twice")
+    assert batch.LOSSES[found["always"].loss].startswith("the process that made it died twice")
     assert found["once"][:2] == ("once", "1")
     assert os.getpid() != found["once"][2]
 

@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 
 from designgen.designs import boxes_and_tubes, space_frame
 from designgen.designs.parametric_face import Patch
+from designgen.recipe_files import packaged
 from designgen.scanning import clutter, ray_kernels, raycast, scanner, space_frame_surfaces, survey
 from designgen.scanning import returns as scanning_returns
 from designgen.scanning.surfaces import Builder
@@ -618,7 +619,7 @@ def test_impossible_scanners_are_refused(changed, said):
 
 
 def test_presets_are_scanners_with_a_source():
-    for name, numbers in scanner.presets().items():
+    for name, numbers in packaged("scanners.toml").items():
         scanner.Scanner(**scanner.preset(name))
         assert set(numbers) - {"about", "source", "verified"} == {f.name for f in dataclasses.fields(scanner.Scanner)}
         assert len(numbers["source"]) > 5
