@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from processor.epochs.quantity_series import Kind, Series, by_key, strongest
-from processor.inspection.result import AxisDepartures, InspectedComponent, Quantity, Result
+from processor.inspection import part_geometry
+from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.language.messages import Message, label, text
-from processor.model import Floats, Reason, Status
+from processor.model import Reason, Status
 
 BY_DESIGN = True  # holes and bodies are numbered, and faces and lines to measure along chosen, by the design
 WITH_SIGN = (Quantity.SWEEP, Quantity.CAMBER)  # greatest departures, of which the interval is that of the size
@@ -71,11 +72,15 @@ def _along_axis(name: str, kind: Kind, parts: Sequence[InspectedComponent | None
     places = chainage[(chainage > start) & (chainage < end)]
     if not len(places):
         return
+    chord = np.array([start, *places, end])
+    off_the_chord = part_geometry.off_the_chord(chord)[1:-1]
     doubtful = np.array([part is not None and part.status is not Status.OK for part in parts], np.bool_)
     for column, quantity in (("sideways", Quantity.SWEEP), ("up", Quantity.CAMBER)):
         value, half = np.full((2, len(parts), len(places)), np.nan)
         for e, axis in axes.items():
-            value[e], half[e] = _off_the_chord(axis, column, np.array([start, *places, end]))
+            off, ci95 = (np.interp(chord, axis.chainage, getattr(axis, name)) for name in (column, f"{column}_ci95"))
+            # Half-widths are added up, as departures of one part have errors in common.
+            value[e], half[e] = off_the_chord @ off, np.abs(off_the_chord) @ ci95
         known = list(axes)
         k = strongest(value[known], half[known])
         yield Series(
@@ -83,15 +88,3 @@ def _along_axis(name: str, kind: Kind, parts: Sequence[InspectedComponent | None
             quantity=text("{quantity} at {chainage:.0f} mm", quantity=label(str(quantity)), chainage=float(places[k])),
             chosen_from=len(places),
         )  # fmt: skip
-
-
-def _off_the_chord(axis: AxisDepartures, column: str, places: Floats) -> tuple[Floats, Floats]:
-    """Departures at places but the first and the last from the line through these two, and their half-widths.
-
-    Half-widths are added up, as departures of one part have errors in common.
-    """
-    off, half = (np.interp(places, axis.chainage, getattr(axis, name)) for name in (column, f"{column}_ci95"))
-    share = (places - places[0]) / (places[-1] - places[0])
-    departure = off - (1.0 - share) * off[0] - share * off[-1]
-    added = half + (1.0 - share) * half[0] + share * half[-1]
-    return departure[1:-1], added[1:-1]
