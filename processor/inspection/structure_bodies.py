@@ -20,7 +20,6 @@ from processor.inspection import characteristic, edge_counts, flat_faces, holes,
 from processor.inspection.flat_faces import Body, Fit, FlatFace, Pieces
 from processor.inspection.narrow_faces import Surroundings
 from processor.inspection.part_geometry import off_the_chord
-from processor.inspection.points_in_design_frame import DesignCloud
 from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.limits.judging import Measured
 from processor.model import Floats, Reason, Scene, Status, reason
@@ -107,7 +106,10 @@ def _unmeasured(bodies: Sequence[Body]) -> list[FlatFace]:
 def _component(body: Body, scene: Scene, around: Surroundings, doubtful: bool) -> InspectedComponent | None:
     found, sizes = measured(body, scene.temperature_C, around)
     if body.holes:
-        found = [*found, *_holes(body, around.cloud, scene.temperature_C)]
+        first = 1  # holes are numbered over the whole body
+        for group in holes.groups(list(body.holes), [axis.direction for axis in body_axes(body)]):
+            found += holes.characteristics(group, holes.fitted(around.cloud, group, scene.temperature_C), first)
+            first += len(group.holes)
     if not found:
         return None
     if all(np.isnan(one.value) for one in found):
@@ -115,14 +117,6 @@ def _component(body: Body, scene: Scene, around: Surroundings, doubtful: bool) -
     return InspectedComponent(
         name=body.name, characteristics=characteristic.table(found, scene.tolerance, body.name, sizes, doubtful)
     )
-
-
-def _holes(body: Body, cloud: DesignCloud, temperature_C: float) -> Iterator[Measured]:
-    """Yield the characteristics of a body's holes, numbered over the whole body."""
-    first = 1
-    for group in holes.groups(list(body.holes), [axis.direction for axis in body_axes(body)]):
-        yield from holes.characteristics(group, holes.fitted(cloud, group, temperature_C), first)
-        first += len(group.holes)
 
 
 def measured(
