@@ -95,7 +95,11 @@ def run_job(job: Job, stopped: Callable[[], bool] = process.never) -> Record:
     """
 
     def batch_ended() -> bool:
-        return stopped() or _token(job) != job.batch_token
+        try:
+            token = job.token_file.read_text("utf-8")
+        except OSError:
+            token = ""
+        return stopped() or token != job.batch_token
 
     try:
         check_same(software(), job.software)
@@ -120,13 +124,6 @@ def run_job(job: Job, stopped: Callable[[], bool] = process.never) -> Record:
 def _failure_to_retry(job: Job, why: Reason) -> Record:
     """Record a failure that is tried again in the next run."""
     return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why)
-
-
-def _token(job: Job) -> str:
-    try:
-        return job.token_file.read_text("utf-8")
-    except OSError:
-        return ""
 
 
 def _still_valid_record(job: Job, identity: str) -> Record | None:

@@ -134,7 +134,10 @@ def _html(
             "verdict_tone": TONES.get(verdict, ""),
             "reason": _written(ending.reason, lang),
             "english": row["reason_code"] == ERROR and lang != "en",
-            "cells": [_cell_shown(_steps(ending) if name == "steps" else row.get(name), lang) for name in names],
+            "cells": [
+                {"number": isinstance(cell, int | float), "text": "" if cell is None else messages(lang).text(cell)}
+                for cell in (_steps(ending) if name == "steps" else row.get(name) for name in names)
+            ],
         }
         for row, ending, verdict in zip(rows, records, verdicts, strict=True)
     ]
@@ -160,7 +163,3 @@ def _steps(ending: Record) -> list[Text]:
         label(step) if status == Status.OK else text("{step} ({status})", step=label(step), status=Status(status))
         for step, status in ending.steps.items()
     ]
-
-
-def _cell_shown(cell: Any, lang: str) -> dict[str, Any]:
-    return {"number": isinstance(cell, int | float), "text": "" if cell is None else messages(lang).text(cell)}
