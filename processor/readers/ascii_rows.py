@@ -207,17 +207,12 @@ def _ends(text: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
 REACH = 60  # largest power of ten in the table
 
 
-def _powers() -> tuple[Floats, Floats]:
-    exact = [Fraction(10) ** e for e in range(-REACH, REACH + 1)]
-    high = [float(power) for power in exact]
-    low = [float(power - Fraction(near)) for power, near in zip(exact, high, strict=True)]
-    return np.array(high), np.array(low)
-
-
 # Separator, 0 for blanks, else a byte that blanks may surround; whether numbers may have decimal commas; whether // and
 # % begin comments, as # always does; whether a row has no more columns than slots.
 Form = tuple[int, bool, bool, bool]
-HIGH, LOW = _powers()  # compile-time constants: as arguments they cost more than the arithmetic
+# Powers of ten, and what float64 lacks of each; compile-time constants: as arguments they cost more than the arithmetic
+_POWERS = [Fraction(10) ** e for e in range(-REACH, REACH + 1)]
+HIGH, LOW = np.array([(float(power), float(power - Fraction(float(power)))) for power in _POWERS]).T.copy()
 
 
 @njit(cache=True, nogil=True)

@@ -49,7 +49,9 @@ def check_last_row(path: Path, kind: str) -> None:
         lines = file.read().splitlines(keepends=True)
     if len(lines) <= TAIL_ROWS + 1 or lines[-1].endswith((b"\n", b"\r")):
         return
-    decimals = [_last_decimals(line) for line in lines[-TAIL_ROWS - 1 :]]
+    # Decimals of the last number of each line; 0 for a whole number, -1 for another word
+    matches = [re.search(rb"(?:^|[\s,;])[+-]?\d+(?:[.,](\d*))?\s*$", line) for line in lines[-TAIL_ROWS - 1 :]]
+    decimals = [len(match.group(1) or b"") if match else -1 for match in matches]
     if len(set(decimals[:-1])) == 1 and decimals[0] > 0 and 0 <= decimals[-1] < decimals[0]:
         with path.open("rb") as file:
             number = sum(block.count(b"\n") for block in iter(lambda: file.read(1 << 20), b"")) + 1
@@ -59,9 +61,3 @@ def check_last_row(path: Path, kind: str) -> None:
             f"before, found the end of the file within a row ({text!r}); copy or export it again",
             path=path,
         )
-
-
-def _last_decimals(line: bytes) -> int:
-    """Return the number of decimals of the last number of a line; 0 for a whole number, -1 for another word."""
-    match = re.search(rb"(?:^|[\s,;])[+-]?\d+(?:[.,](\d*))?\s*$", line)
-    return len(match.group(1) or b"") if match else -1
