@@ -77,7 +77,11 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     if scene.structure is None or scene.structure.bodies is None:
         bodies = None  # components that are not named by the design have no true name
     rows = matched(result.defects, truth.defects, named=bodies is not None)
-    metrics = _missed(truth.defects, rows)
+    classes = np.array(truth.defects.classes)
+    metrics = [
+        Metric(missed_quantity(kind), float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=0.0)
+        for kind in dict.fromkeys(truth.defects.classes)
+    ]
     metrics += _found_by_size(np.abs(truth.defects.depth_max_mm), rows >= 0, FOUND_BY_DEPTH)
     metrics += _found_by_size(2.0 * np.sqrt(truth.defects.area_mm2 / np.pi), rows >= 0, FOUND_BY_AREA)
     behind = _other_sides(result.defects, truth.defects, rows) if bodies is not None else 0
@@ -103,15 +107,6 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
 def missed_quantity(kind: str) -> str:
     """Return the quantity of the metric of the missed defects of a true class."""
     return f"missed: {kind}"
-
-
-def _missed(truth: DefectTruth, rows: Ints) -> list[Metric]:
-    """Return the number of missed defects (rows (t,) -1) of each true class."""
-    classes = np.array(truth.classes)
-    return [
-        Metric(missed_quantity(kind), float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=0.0)
-        for kind in dict.fromkeys(truth.classes)
-    ]
 
 
 def _found_by_size(
@@ -175,25 +170,16 @@ def _classes_and_depths(defects: Defects, truth: DefectTruth, rows: Ints) -> lis
     wrong = float((np.array(defects.defect_class)[rows[matches]] != np.array(truth.classes)[matches]).mean())
     most_wrong = 100.0 * (1.0 - CLASS_SHARE) + 1e-9
     wrong_depths = float((size - allowed[measured] > 0.0).sum())
+    found = rows[measured]
+    volume = np.abs(defects.volume_mm3[found]) - np.abs(truth.volume_mm3[measured])
+    area = defects.area_mm2[found] / truth.area_mm2[measured] - 1.0
     return [
         Metric("class wrong", 100.0 * wrong, Statistic.SHARE, unit="%", limit=most_wrong),
         Metric(WRONG_DEPTHS, wrong_depths, Statistic.COUNT, limit=0.0),
         Metric(DEPTH_ERROR, float(np.median(size)) if len(size) else NAN, Statistic.MEDIAN, unit="mm"),
         Metric(DEPTH_ERROR, float(size.max(initial=0.0)), Statistic.MAX, unit="mm"),
         Metric("depths that are bounds alone", float(bound.sum()), Statistic.COUNT),
-        *covered("depths", error[measured], defects.depth_ci95[rows[measured]]),
-        *_volumes_and_areas(defects, truth, rows, measured),
-    ]
-
-
-def _volumes_and_areas(
-    defects: Defects, truth: DefectTruth, rows: Ints, measured: npt.NDArray[np.bool_]
-) -> list[Metric]:
-    """Return volumes against their intervals, and areas, which have none, in shares of the true ones."""
-    found, true = rows[measured], truth.volume_mm3[measured]
-    volume = np.abs(defects.volume_mm3[found]) - np.abs(true)
-    area = defects.area_mm2[found] / truth.area_mm2[measured] - 1.0
-    return [
+        *covered("depths", error[measured], defects.depth_ci95[found]),
         *covered("volumes", volume, defects.volume_ci95[found], unit="mm3"),
-        *signed("areas", 100.0 * area, unit="%"),
+        *signed("areas", 100.0 * area, unit="%"),  # they have no intervals
     ]
