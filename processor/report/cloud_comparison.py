@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import json
 import math
@@ -195,6 +194,6 @@ def _page(result: Comparison, record: dict[str, Any], drawn: list[tuple[Message,
         lang,
         title=text("From {reference} to {compared}", reference=request.reference.name, compared=request.compared.name),
         lines=lines(result),
-        figures=[(caption, base64.b64encode(data).decode("ascii")) for caption, data in drawn],
+        figures=drawn,
         provenance=json.dumps(record, indent=2, ensure_ascii=False),
     )

@@ -50,10 +50,6 @@ def named(name: str, headings: Mapping[str, str] | None = None) -> Column:
     return Column(name, heading, UNITS.get(ending, ""), are_names=name in OF_INPUT)
 
 
-def _in_space(*patterns: str) -> list[str]:
-    return [pattern.format(axis) for pattern in patterns for axis in XYZ]
-
-
 UNITS = {
     "mm": "mm", "mm2": "mm2", "mm3": "mm3", "_per_m": "1/m", "_m": "m", "mrad": "mrad", "_deg": "deg",
     "_percent": "%", "_ppm": "ppm", "_C": "°C", "_mb": "MB", "seconds": "s",
@@ -95,9 +91,9 @@ COLUMNS: Mapping[str, Column] = {
     for name in [
         *SHORT, *OF_INPUT, *_FURTHER.split(),
         *(f"m{row}{place}" for row in range(4) for place in range(4)), *(a + b for a in XYZ for b in XYZ),
-        *_in_space(
+        *(pattern.format(axis) for axis in XYZ for pattern in (
             "{}", "{}_m", "{}_mm", "{}t_mm", "d{}_mm", "ci95_{}_mm", "ci95_d{}_mm", "sd_{}_mm", "bound_sd_{}_mm",
             "start_{}_mm", "end_{}_mm", "ci95_about_{}_mrad", "turn_{}_mrad",
-        ),
+        )),
     ]
 }  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Container, Mapping
 from typing import Any
@@ -202,7 +201,7 @@ def _pictures(step: str, drawn: CaptionedPngs, live: bool) -> list[dict[str, Any
     return [
         {
             "caption": caption,
-            "data": base64.b64encode(png).decode("ascii"),
+            "data": png,
             "twin": name in twins,
             "further": name in report_of.further_figures,
         }

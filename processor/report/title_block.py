@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from typing import Any
 
 from processor.language.messages import Message, label, text
 from processor.model import Scene
+from processor.report.templates import data_uri
 
 LABELS: Mapping[str, Message] = {
     "project": text("Project"),
@@ -20,7 +20,6 @@ LABELS: Mapping[str, Message] = {
 COMPANY, OPERATOR, APPROVED = "company", "operator", "approved"
 SIGNATURES = ((text("Inspected"), OPERATOR), (text("Approved"), APPROVED))
 DIGEST = 16  # hexadecimal digits of the input's hash that are shown; all are in the provenance
-PNG = b"\x89PNG"
 
 
 def of(scene: Scene, provenance: Mapping[str, Any]) -> dict[str, Any]:
@@ -72,8 +71,4 @@ def css_string(written: str) -> str:
 
 def _address(scene: Scene) -> str:
     block = scene.title_block
-    if block is None or not len(block.logo):
-        return ""
-    data = block.logo.tobytes()
-    kind = "png" if data.startswith(PNG) else "jpeg"
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    return "" if block is None or not len(block.logo) else data_uri(block.logo.tobytes())

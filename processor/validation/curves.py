@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from processor.evaluation.defects import FOUND_BY_AREA, FOUND_BY_DEPTH
-from processor.language.messages import Message, Text, label, text
+from processor.language.messages import Text, label, text
 from processor.model import Statistic, Word
 from processor.report import templates
 from processor.report.charts import line_chart
@@ -218,7 +218,5 @@ def as_object(curves: Sequence[Curve], night: str) -> dict[str, Any]:
 
 def html(curves: Sequence[Curve], night: str, lang: str) -> str:
     """Return the page of the charts in a language."""
-    drawn: list[dict[str, Message | str]] = [
-        {"title": chart.title, "image": line_chart.data_uri(line_chart.png(chart))} for chart in charts(curves)
-    ]
+    drawn = [{"title": chart.title, "image": line_chart.png(chart)} for chart in charts(curves)]
     return templates.render("validation", "curves.html", lang, night=night, charts=drawn) + "\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,8 +61,3 @@ def png(chart: Chart) -> bytes:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
         return style.png(figure)
-
-
-def data_uri(image: bytes) -> str:
-    """Return an image as the address that a page holds it by."""
-    return "data:image/png;base64," + base64.b64encode(image).decode("ascii")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from pathlib import Path
 from typing import Any
@@ -108,7 +107,6 @@ def write(out: Path, history: History, lang: str = "en") -> dict[str, Any]:
 
 def _page(history: History, drawn: tuple[Message, bytes] | None, lang: str) -> str:
     first, others = tables.of_page(history)
-    figure = None if drawn is None else {"caption": drawn[0], "data": base64.b64encode(drawn[1]).decode("ascii")}
     first_day, last_day = tables.day(history, 0), tables.day(history, -1)
     return templates.render(
         "report",
@@ -118,7 +116,7 @@ def _page(history: History, drawn: tuple[Message, bytes] | None, lang: str) -> s
         banner=text("{counts}", counts=lines.counts(history)),
         about=text("{epochs} epochs, {first} to {last}", epochs=len(history.epochs), first=first_day, last=last_day),
         remarks=history.remarks,
-        figure=None if figure is None else {**figure, "twin": False},
+        figure=None if drawn is None else {"caption": drawn[0], "data": drawn[1], "twin": False},
         first=[page.written_table(table, lang) for table in first],
         others=[page.written_table(table, lang) for table in others],
         running_head=title_block.css_string(history.name),

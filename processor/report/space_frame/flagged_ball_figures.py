@@ -35,12 +35,13 @@ def draw(scene: Scene, result: Result, stored: Path | None = None) -> Drawn:
 
     ``stored`` is the scene's file, where its points were left there. Nothing is drawn without points.
     """
-    flagged = flagged_rows(scene, result)
+    nominal = designed_places(scene, result)
+    centres: Floats = np.where(np.isfinite(result.balls.centres), result.balls.centres, nominal)
+    placed = np.flatnonzero(np.isfinite(centres).all(axis=1)).tolist()
+    flagged = [i for flag in ORDER for i in placed if result.balls.flag[i] is flag]
     shown = flagged[:MOST_PAGES]
     if not shown or (stored is None and not all(len(scan.points) for scan in scene.scans)):
         return Drawn({})
-    nominal = designed_places(scene, result)
-    centres = _places(result, nominal)
     reach = [_reach(result, i) for i in shown]
     with points_of(stored) if stored is not None else nullcontext() as points:
         crops = crops_about(scene, centres[shown], np.array(reach), points)
@@ -67,18 +68,6 @@ def _caption(result: Result, i: int, flagged: int) -> Message:
         slice=SLICE_MM,
         more=more if flagged > MOST_BALLS else "",
     )
-
-
-def flagged_rows(scene: Scene, result: Result) -> list[int]:
-    """Rows of the flagged balls with a known place, in the order in which they are drawn."""
-    there = np.isfinite(_places(result, designed_places(scene, result))).all(axis=1)
-    return [i for flag in ORDER for i in np.flatnonzero(there).tolist() if result.balls.flag[i] is flag]
-
-
-def _places(result: Result, nominal: Floats) -> Floats:
-    """Return where each ball is (k, 3), or where the design has it."""
-    centres: Floats = np.where(np.isfinite(result.balls.centres), result.balls.centres, nominal)
-    return centres
 
 
 def crops_about(scene: Scene, centres: Floats, reach: Floats, stored: StoredPoints | None = None) -> list[Floats]:

@@ -46,7 +46,7 @@ def html(
             {
                 "number": number,
                 "rows": [_cells(row) for row in rows],
-                "charts": [{"title": one.title, "image": drawing.data_uri(drawing.png(one))} for one in charts],
+                "charts": [{"title": one.title, "image": drawing.png(one)} for one in charts],
                 "failures": [
                     f"{one.data_set.name} ({one.data_set.seed}): {one.failed}" for one in measured if one.failed
                 ],
