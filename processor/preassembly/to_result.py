@@ -136,7 +136,8 @@ def _joints(assembly: Assembly) -> tuple[Joints, MeanMax]:
     """Return the joints and their splicing error."""
     design, on = assembly.design, assembly.placement.steel[:, :, None]
     gaps = np.where(on, assembly.placement.gaps, np.nan)
-    sd = np.where(on, _gap_sd(assembly.adjusted), np.nan)
+    sd = np.sqrt(np.einsum("jkk->jk", assembly.adjusted.gap_covariance)).reshape(-1, 8, 3)
+    sd = np.where(on, sd, np.nan)
     mean, largest = splicing_error(gaps)
     joints = Joints(
         name=design.joint_names,
@@ -169,7 +170,10 @@ def _deviations(vectors: Floats, variance: Floats) -> Deviations:
 
 
 def _trade_off(by_weight: Mapping[float, Adjusted]) -> TradeOff:
-    figures = np.array([_trade_figures(adjusted) for adjusted in by_weight.values()])
+    figures = np.array([
+        (*splicing_error(one.gaps), *mean_max(np.concatenate([np.linalg.norm(d, axis=1) for d in one.departures])))
+        for one in by_weight.values()
+    ])  # fmt: skip
     return TradeOff(
         weight=np.array(list(by_weight)),
         splicing_mean=figures[:, 0],
@@ -227,22 +231,10 @@ def _shapes(parts: Sequence[MeasuredPart], design: ArchDesign) -> Iterator[PartS
         )
 
 
-def _gap_sd(adjusted: Adjusted) -> Floats:
-    """Return the standard deviations (j, 8, 3) of the gaps."""
-    sd: Floats = np.sqrt(np.einsum("jkk->jk", adjusted.gap_covariance)).reshape(-1, 8, 3)
-    return sd
-
-
 def _band(variance: Floats) -> Floats:
     """95 % half-width (s,) of the lengths of departures with variances (s, 2): their errors' lengths are within it."""
     band: Floats = RAYLEIGH_95 * np.sqrt(np.maximum(variance, 0.0).max(axis=1))
     return band
-
-
-def _trade_figures(adjusted: Adjusted) -> tuple[float, float, float, float]:
-    """Splicing mean and maximum, linear mean and maximum."""
-    sizes = np.concatenate([np.linalg.norm(departure, axis=1) for departure in adjusted.departures])
-    return (*splicing_error(adjusted.gaps), *mean_max(sizes))
 
 
 def _budget(parts: Sequence[MeasuredPart], design: ArchDesign, systematic: SystematicParams) -> Floats:

@@ -12,7 +12,7 @@ from processor.inspection.result import Characteristics, InspectedComponent, Qua
 from processor.inspection.result import Result as Inspection
 from processor.language.messages import CODES, messages
 from processor.model import Status, Verdict, reason
-from processor.preassembly import assemble, step, to_result, topology
+from processor.preassembly import assemble, step, topology
 from processor.preassembly.chain import adjustment, design_places, span_and_closure
 from processor.preassembly.ends import bottom_edges
 from processor.preassembly.parts.part_in_chain import Member
@@ -105,7 +105,8 @@ def test_what_moves_a_part_from_its_place_is_in_its_covariance():
 
 def test_gaps_have_the_standard_deviations_of_both_ends():
     """Those of independent errors; none where a side was not measured."""
-    found = to_result._gap_sd(adjusted(members(unmeasured={(0, 1)})))
+    variance = np.einsum("jkk->jk", adjusted(members(unmeasured={(0, 1)})).gap_covariance)
+    found = np.sqrt(variance).reshape(-1, 8, 3)
     assert np.isnan(found[0]).all()
     np.testing.assert_allclose(found[1:], np.sqrt(2.0) * NOISE_MM, rtol=1e-9)  # float64
 
