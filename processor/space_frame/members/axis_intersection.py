@@ -181,13 +181,16 @@ def _intersect(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Movements (k, 3), covariances, chi squared and degrees of freedom (k,); NaN where axes fix no point."""
     W = _inverse2(_total_covariance(ends, e2)) * used[:, None, None]
-    normal, right, chi2 = np.zeros((k, 3, 3)), np.zeros((k, 3)), np.zeros(k)
+    normal, right = np.zeros((k, 3, 3)), np.zeros((k, 3))
     add_ends(ends.node, ends.offsets, ends.across, W, normal, right)
     regular = np.linalg.eigvalsh(normal)[:, 0] > 1e-9
     cov: Floats = np.full((k, 3, 3), np.nan)
     cov[regular] = np.linalg.inv(normal[regular])
     x: Floats = np.einsum("kij,kj->ki", cov, right)
-    add_squares(ends.node, _miss(ends, x), W, chi2)
+    miss = _miss(ends, x)
+    square = np.einsum("ij,ijk,ik->i", miss, W, miss)
+    # An unknown miss (NaN) is left out.
+    chi2 = np.bincount(ends.node, np.where(np.isfinite(square), square, 0.0), k).astype(np.float64)
     dof = 2.0 * np.bincount(ends.node[used > 0.0], minlength=k).astype(np.float64) - 3.0
     return x, cov, chi2, dof
 
@@ -207,16 +210,6 @@ def add_ends(node, offsets, across, W, normal, right):  # type: ignore[no-untype
                     right[k, c] += v * along
                     for d in range(3):
                         normal[k, c, d] += v * across[i, a, d]
-
-
-@njit(cache=True, nogil=True)
-def add_squares(node, miss, W, chi2):  # type: ignore[no-untyped-def]
-    """Add the weighted square of every end's miss to that of its node; an unknown miss (NaN) is left out."""
-    for i in range(len(node)):
-        x, y = miss[i, 0], miss[i, 1]
-        v = W[i, 0, 0] * x * x + 2.0 * W[i, 0, 1] * x * y + W[i, 1, 1] * y * y
-        if np.isfinite(v):
-            chi2[node[i]] += v
 
 
 def _estimate_eccentricity2(ends: AxisEnds, used: npt.NDArray[np.bool_], k: int, floor_mm: float) -> float:
