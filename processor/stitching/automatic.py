@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -139,7 +140,10 @@ def _find_candidates(
             return [pairwise.score_pose(a, b, refined if pairwise.same(refined, T, a.side_mm, b) else T)]
         poses = pairwise.candidate_poses(a, b, most_tilt_rad)
         if key in picked and len(a.patches.weight) and len(b.patches.weight):
-            poses += _pose_by_picks(a, b, *picked[key][:2])
+            in_a, in_b = picked[key]
+            with suppress(three_point.TooFewError):
+                T = three_point.fit_pair(in_a - a.cloud.origin, in_b - b.cloud.origin, False).T_a_b
+                poses.append(pairwise.score_pose(a, b, pairwise.refine(a, b, T)[0]))
             poses.sort(key=lambda pose: -pose.score)
         return poses
 
@@ -158,15 +162,6 @@ def _find_candidates(
         some, todo = todo[:DEEP_PAIRS], todo[DEEP_PAIRS:]
         found |= dict(zip(some, thread_ranges.each(deeper, some), strict=True))
     return found
-
-
-def _pose_by_picks(a: ScanPatches, b: ScanPatches, in_a: Floats, in_b: Floats) -> list[ScoredPose]:
-    """Return the refined pose by picked points (n, 3) of both scans, or nothing if these determine none."""
-    try:
-        T = three_point.fit_pair(in_a - a.cloud.origin, in_b - b.cloud.origin, False).T_a_b
-    except three_point.TooFewError:
-        return []
-    return [pairwise.score_pose(a, b, pairwise.refine(a, b, T)[0])]
 
 
 def _adjust(clouds: list[Cloud], cells: CellTable, T: Floats, reference: int) -> tuple[Solution, Blocks]:

@@ -43,14 +43,16 @@ def difference(T: Floats, S: Floats) -> Floats:
     return np.concatenate([turn, T[:3, 3] - S[:3, 3], [np.log(scale_of(T) / scale_of(S))]])
 
 
-def adjoint(T: Floats, size: int = 7) -> Floats:
-    """Return the derivative (size, size) by which a small motion in T's source frame is one in its target frame.
+def transformed(covariance: Floats, T: Floats) -> Floats:
+    """Transform the covariance (6, 6) or (7, 7) of a small motion to the frame that T (4, 4) maps to.
 
-    Rotation, scale and shift are about the origins of the two frames.
+    Rotation, scale and shift are about the origins of the two frames; the derivative is the adjoint of T.
     """
     J, R = np.eye(7), rotation_of(T)
     J[:3, :3] = R
     J[3:6, :3] = rigid.cross_matrix(T[:3, 3]) @ R
     J[3:6, 3:6] = T[:3, :3]
     J[3:6, 6] = -T[:3, 3]
-    return J[:size, :size]
+    J = J[: len(covariance), : len(covariance)]
+    in_target: Floats = J @ covariance @ J.T
+    return in_target

@@ -115,20 +115,13 @@ def _loop(path: list[Pair], start: int) -> Loop:
         # With rotations about the origin of a's frame the adjoint transforms the covariance.
         covariance = rigid.about_origin(pair.covariance, pair.T_a_b[:3, 3])
         if forward:
-            C = C + _transformed(covariance, T)
+            C = C + poses_with_scale.transformed(covariance, T)
             T = T @ pair.T_a_b
         else:
             T = T @ poses_with_scale.invert(pair.T_a_b)
-            C = C + _transformed(covariance, T)
+            C = C + poses_with_scale.transformed(covariance, T)
         at = pair.b if forward else pair.a
         rows.append(at)
     xi = poses_with_scale.difference(T, np.eye(4))[:size]
     ratio = float(xi @ np.linalg.solve(C, xi)) / size
     return Loop(tuple(rows), float(np.linalg.norm(xi[3:6])), float(1e3 * np.linalg.norm(xi[:3])), ratio)
-
-
-def _transformed(covariance: Floats, T: Floats) -> Floats:
-    """Transform the covariance of a small motion to the frame that T (4, 4) maps to, by the adjoint of T."""
-    J = poses_with_scale.adjoint(T, len(covariance))
-    transformed: Floats = J @ covariance @ J.T
-    return transformed
