@@ -65,6 +65,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
             turns.append(turn)
             wrong += turn > WRONG_POSE_RAD and result.components.status[i] == Status.OK
     errors_at_points = key_error[np.isfinite(key_error).all(axis=1)]
+    rms = float(np.sqrt(_over(np.mean, np.sum(errors_at_points**2, axis=1))))
     mean, largest = _true_linear_error(scene.arch, result, truth.arch, true, true_poses)
     limit = 5.0 if truth.spacing_mm <= 5.0 else float("nan")
     true_gaps = _gaps_of_truth(scene.arch, result, truth.arch, true, true_poses)
@@ -76,7 +77,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric(TRUE_SPLICING, _over(np.max, np.abs(true_gaps)), Statistic.MAX, unit="mm"),
         Metric(TRUE_LINEAR, mean, Statistic.MEAN, unit="mm"),
         Metric(TRUE_LINEAR, largest, Statistic.MAX, unit="mm"),
-        Metric("key points in the scan", _rms(errors_at_points), Statistic.RMS, unit="mm"),
+        Metric("key points in the scan", rms, Statistic.RMS, unit="mm"),
         *coverage("key points", key_error, NORMAL_95 * key_sd),
         *signed("key points", errors_at_points),
         *_gaps_by_objective(scene.arch, result, truth.arch, true),
@@ -113,10 +114,6 @@ def _at_ends(truth: ArchTruth, row: int, ends: Sequence[PartEnd], by_end: Floats
         at = (truth.branch_component == row) & (truth.branch_joint == end.joint)
         found[e] = by_branch[at][0] if at.any() else np.nan
     return found
-
-
-def _rms(vectors: Floats) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1)))) if len(vectors) else float("nan")
 
 
 def _over(what: Callable[[Floats], Floats], values: Floats) -> float:
