@@ -76,7 +76,14 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     T = deviation.T_design_scan if deviation.T_design_scan.size else np.eye(4)
     origin, placed = scene_cloud.local_design(scene.structure)[1], scene_cloud.stitched(scene, stitched)
     if not any(body.holes for body in found):
-        placed = narrow_faces.near(placed, T, origin, _unmeasured(found), deviation.max_depth)
+        # Faces without pieces are measured by the points on them.
+        unmeasured = [
+            face
+            for body in found
+            for face, pieces in zip(body.faces, body.pieces, strict=True)
+            if len(pieces.value) < LEAST_FOUND
+        ]
+        placed = narrow_faces.near(placed, T, origin, unmeasured, deviation.max_depth)
     cloud = points_in_design_frame.of_scene(placed, T, origin)
     around = narrow_faces.surroundings(scene.structure, cloud, seen)
     unproven = surface_registration.is_unproven(deviation.reasons)
@@ -91,16 +98,6 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
         why = reason("inspect.pose-unproven") if unproven else reason("inspect.pose-ambiguous")
         remarks = (why, *remarks)
     return Result.of_components(components, method, remarks)
-
-
-def _unmeasured(bodies: Sequence[Body]) -> list[FlatFace]:
-    """Return the faces of bodies without pieces, which are measured by the points on them."""
-    return [
-        face
-        for body in bodies
-        for face, pieces in zip(body.faces, body.pieces, strict=True)
-        if len(pieces.value) < LEAST_FOUND
-    ]
 
 
 def _component(body: Body, scene: Scene, around: Surroundings, doubtful: bool) -> InspectedComponent | None:
