@@ -70,21 +70,18 @@ def write_results(
                 (making / name).write_bytes(data)
         (making / REPORT_PAGE).write_text(page.html(execution, report, drawn, lang), "utf-8")
         if execution.clouds:
-            step_clouds.write(making / STEPS, _of_stages(execution))
+            stages = [
+                step_clouds.OfRun(
+                    run.step,
+                    run.method,
+                    [one.cloud for one in execution.clouds if (one.step, one.method) == (run.step, run.method)],
+                    run.diagnostics,
+                )
+                for run in execution.runs
+            ]
+            step_clouds.write(making / STEPS, stages)
         if "pdf" in further:
             with default_settings():
                 (making / pdf_report.NAME).write_bytes(pdf_report.document(execution, drawn, lang))
         if "xlsx" in further:
             (making / workbook.NAME).write_bytes(workbook.workbook(execution, report))
-
-
-def _of_stages(execution: Execution) -> list[step_clouds.OfRun]:
-    return [
-        step_clouds.OfRun(
-            run.step,
-            run.method,
-            [one.cloud for one in execution.clouds if (one.step, one.method) == (run.step, run.method)],
-            run.diagnostics,
-        )
-        for run in execution.runs
-    ]

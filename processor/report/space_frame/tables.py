@@ -43,24 +43,20 @@ def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     for run in runs:
         true = report.true_radii.get(run.method, np.full(len(run.result.balls), NAN))
         file = "balls" if run is runs[0] else f"balls-{run.method}"
+        cells = _cells(run.result.balls, true)
         if run.result.has_bounds:
-            table = tabulate(_title(run.method), _cells(run.result.balls, true), file, **OF_FILE)
-        else:
-            table = _formal(run, true, file, runs[0])
+            table = tabulate(_title(run.method), cells, file, **OF_FILE)
+        else:  # its intervals are formal
+            names = (*SIZES, "points", "flag", "remark")
+            cells = {name.replace("ci95_", "formal_ci95_"): cells[name] for name in names}
+            note = "" if run is runs[0] else text("{reasons}", reasons=run.result.reasons)
+            table = tabulate(_title(run.method), cells, file, note, units=MM, on_terminal=run is runs[0])
         tables.append(replace(table, folded=run is not runs[0]))
     tables += hanger_report.tables(first)
     if whole:
         tables += [_brief(first, runs[0].method), _lowest(first.balls), *_nodes(first), *_tubes(first)]
         tables += [*_stations(first), *_control(first)]
     return tables
-
-
-def _formal(run: StepRun, true: Floats, file: str, first: StepRun) -> Table:
-    """Balls by a method whose intervals are formal."""
-    every = _cells(run.result.balls, true)
-    cells = {name.replace("ci95_", "formal_ci95_"): every[name] for name in (*SIZES, "points", "flag", "remark")}
-    note = "" if run is first else text("{reasons}", reasons=run.result.reasons)
-    return tabulate(_title(run.method), cells, file, note, units=MM, on_terminal=run is first)
 
 
 def _title(method: str) -> Message:
