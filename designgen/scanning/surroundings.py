@@ -19,7 +19,7 @@ from processor.model import Floats
 
 KINDS = ("workshop", "site", "room")
 ABOVE_FLOOR_MM = 800.0  # height of a part on trestles
-HIGHEST_TRESTLE_MM = 2_000.0
+HIGHEST_TRESTLE_MM = 2_000.0  # chosen: parts lie on some 0.8 m; what stands higher stands on its own
 SCANNER_MM = 400.0  # least height of a scanner above the floor: on a low tripod, which sees below the part
 ALBEDO = {"floor": 0.7, "wall": 1.3, "wood": 0.9}  # by the structure's: dusty concrete, paint, boards
 FLAT = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
