@@ -70,8 +70,8 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     rigid_fits = _fits(measured, params)
     if placed.registration is not Registration.AS_GIVEN and rigid_fits.determined:
         measured, rigid_fits, placed = _corrected(measured, rigid_fits, placed, params)
-    distance, error, source = distances(measured, rigid_fits, placed, params)
-    result = _result(scan, placed, measured, distance, rigid_fits, origin, params, (error, source))
+    registered = registration_error(measured, rigid_fits, placed, params)
+    result = _result(scan, placed, measured, registered, rigid_fits, origin, params)
     return _doubted(result, placement)
 
 
@@ -152,8 +152,7 @@ def _fitted_pose(scan: ScanCloud, curved: CurvedFacets, placed: Placed, params: 
 def _corrected(measured: Measured, fits: Fits, placed: Placed, params: Params) -> tuple[Measured, Fits, Placed]:
     """Move a scan by what is left of the fit that is wanted, which was found with fewer points."""
     motion = fits.of(params.fit).motion
-    core, back = measured.core, rigid.invert(motion)
-    left = np.einsum("ni,ni->n", rigid.apply(motion, core.points) - core.points, core.normals)
+    left, back = _displaced(measured.core, motion), rigid.invert(motion)
     best, stable = (replace(fit, motion=back @ fit.motion) for fit in (fits.best, fits.stable))
     return (
         replace(measured, moved=replace(measured.moved, along=measured.moved.along - left)),
@@ -162,32 +161,66 @@ def _corrected(measured: Measured, fits: Fits, placed: Placed, params: Params) -
     )
 
 
-def distances(measured: Measured, fits: Fits, placed: Placed, params: Params) -> tuple[Distances, float, ErrorSource]:
-    """Distances at core points with LOD95, the registration error in it (one sd, mm), and its source."""
-    moved = measured.moved
-    known = np.isfinite(moved.along)
-    covariance = placed.covariance
+class RegistrationError(NamedTuple):
+    """What the pose adds to LOD95: one standard deviation ``sd`` (mm) along the normals, and the ``source`` of it.
+
+    ``offset`` (k,) is by how much the pose given displaces each core point along its normal, relative to the steel that
+    stands still; 0 where the scan was registered, or where the error of its frame was stated.
+    """
+
+    sd: float
+    source: ErrorSource
+    offset: Floats
+
+    @property
+    def total(self) -> float:
+        """Rms of both over the core points, mm."""
+        return float(np.sqrt(self.sd**2 + np.mean(self.offset**2))) if len(self.offset) else self.sd
+
+
+def registration_error(measured: Measured, fits: Fits, placed: Placed, params: Params) -> RegistrationError:
+    """Return the error of the pose.
+
+    Nothing tells an error of the frame as given from a movement of the whole structure. Unless the error is stated,
+    the motion of the steel that stands still is therefore taken as an error of the pose.
+    """
+    core, covariance = measured.core, placed.covariance
+    known, none = np.isfinite(measured.moved.along), np.zeros(len(measured.core.points))
     if np.isfinite(params.registration_error_mm):
-        error, source = params.registration_error_mm, ErrorSource.GIVEN
-    elif np.isfinite(fits.of(params.fit).error_mm):
-        error, source = fits.of(params.fit).error_mm, ErrorSource.COVARIANCE
+        return RegistrationError(params.registration_error_mm, ErrorSource.GIVEN, none)
+    given = placed.registration is Registration.AS_GIVEN
+    fit = fits.of(params.fit)
+    if np.isfinite(fit.error_mm):
+        sd, motion = fit.error_mm, fit.motion
     elif np.isfinite(covariance).all() and known.any():
-        core = measured.core
-        error = surface_registration.error_along(covariance, core.points[known], core.normals[known])
-        source = ErrorSource.COVARIANCE
+        sd = surface_registration.error_along(covariance, core.points[known], core.normals[known])
+        motion = placed.T @ rigid.invert(placed.T_best_fit)
     else:
-        error, source = 0.0, ErrorSource.UNKNOWN
+        return RegistrationError(0.0, ErrorSource.UNKNOWN, none)
+    if not given or not np.isfinite(motion).all():
+        return RegistrationError(sd, ErrorSource.COVARIANCE, none)
+    return RegistrationError(sd, ErrorSource.STILL, np.where(known, _displaced(core, motion), 0.0))
+
+
+def _displaced(core: Samples, motion: Floats) -> Floats:
+    """Return by how much a motion (4, 4) displaces core points along their normals (k,)."""
+    left: Floats = np.einsum("ni,ni->n", rigid.apply(motion, core.points) - core.points, core.normals)
+    return left
+
+
+def distances(measured: Measured, registered: RegistrationError) -> Distances:
+    """Distances at core points with LOD95."""
+    moved = measured.moved
     number = np.maximum(moved.count, 1)
-    lod95 = m3c2.Z95 * (np.sqrt(measured.shared**2 + moved.sd**2 / number) + error)
-    found = Distances(
+    random = np.sqrt(measured.shared**2 + moved.sd**2 / number) + registered.sd
+    return Distances(
         distance=moved.along,
-        lod95=lod95,
+        lod95=m3c2.Z95 * random + np.abs(registered.offset),
         n1=moved.count,
         n2=moved.count,
         std1=measured.shared * np.sqrt(number),
         std2=moved.sd,
     )
-    return found, error, source
 
 
 def _depth(points: Floats, surface: MeshSurface) -> float:
@@ -203,13 +236,12 @@ def _result(
     scan: ScanCloud,
     placed: Placed,
     measured: Measured,
-    distance: Distances,
+    registered: RegistrationError,
     fits: Fits,
     origin: Floats,
     params: Params,
-    error: tuple[float, ErrorSource],
 ) -> Result:
-    core = measured.core
+    core, distance = measured.core, distances(measured, registered)
     total = distance_summary.of_distances(
         distance, core.points, core.normals, measured.diameter, m3c2.PAPER_POINTS_A_CYLINDER
     )
@@ -220,20 +252,21 @@ def _result(
         best = _shifted(scan, placed.T, rigid.invert(fits.best.motion) @ placed.T)
     stable = _shifted(scan, placed.T, rigid.invert(fits.stable.motion) @ placed.T)
     status, reasons = _status(placed, fits, total, params, (best, stable))
+    reasons += _of_pose(measured, registered, fits, params) if total.core_points > total.without_lod else ()
     reasons += _of_views(scan, placed, measured)
     if scan.unposed > 1:
         reasons.append(reason("deviation.unposed-scans", scans=scan.unposed))
     known = distance.std2[np.isfinite(distance.lod95)]
     area = 1e-6 * measured.spacing**2 * float(np.isfinite(measured.moved.along).sum())
-    covariance, mean_sd = _uncertainty(scan, placed, measured, fits, params)
+    covariance, half = _uncertainty(scan, placed, measured, fits, registered, params)
     return Result(
         status=status,
         method=params.method,
         reasons=tuple(reasons),
         T_design_scan=global_pose(placed.T, scan.origin, origin),
         registration=placed.registration,
-        registration_error=error[0],
-        registration_error_from=error[1],
+        registration_error=registered.total,
+        registration_error_from=registered.source,
         covariance=rigid.about_origin(covariance, origin),
         T_best_fit=global_pose(best.T, scan.origin, origin),
         best_fit_shift=best.shift,
@@ -255,23 +288,51 @@ def _result(
         max_depth=measured.depth,
         origin=origin,
         core=points,
-        mean_ci95=total.mean + m3c2.Z95 * mean_sd * np.array([-1.0, 1.0]),
+        mean_ci95=total.mean + half * np.array([-1.0, 1.0]),
         **result_fields.statistics(points, total),
     )
 
 
 def _uncertainty(
-    scan: ScanCloud, placed: Placed, measured: Measured, fits: Fits, params: Params
+    scan: ScanCloud, placed: Placed, measured: Measured, fits: Fits, registered: RegistrationError, params: Params
 ) -> tuple[Floats, float]:
-    """Return the covariance (6, 6) of the pose, and the standard deviation of the mean, with what scans share."""
-    core = measured.core
+    """Return the covariance (6, 6) of the pose, and half the 95 % interval of the mean, with what scans share."""
+    core, offset = measured.core, registered.offset
     covariance = fits.of(params.fit).covariance if fits.determined else placed.covariance
     common = scanner_class_errors.pose_covariance(core.points)
-    registered = placed.registration is not Registration.AS_GIVEN
-    covariance = covariance + common if registered else covariance
-    of_pose = covariance if registered and np.isfinite(covariance).all() else common
+    if placed.registration is not Registration.AS_GIVEN:
+        covariance = covariance + common
+        common = covariance if np.isfinite(covariance).all() else common
+    elif offset.any():
+        T = fits.of(params.fit).motion if fits.determined else placed.T @ rigid.invert(placed.T_best_fit)
+        off = np.concatenate([rigid.vector_from_rotation(T[:3, :3]), T[:3, 3]])
+        covariance = covariance + np.outer(off, off)
     overlap = stable_fit.overlap(measured.diameter, measured.spacing)
-    return covariance, mean_uncertainty.mean_sd(scan, placed.T, core, measured.moved, of_pose, overlap)
+    sd = mean_uncertainty.mean_sd(scan, placed.T, core, measured.moved, common, overlap)
+    known = np.isfinite(measured.moved.along)
+    return covariance, m3c2.Z95 * sd + abs(float(offset[known].mean()) if known.any() else 0.0)
+
+
+def _of_pose(measured: Measured, registered: RegistrationError, fits: Fits, params: Params) -> Iterator[Reason]:
+    """Yield what the steel that stands still says of a pose that was given, and how the result depends on it."""
+    if registered.source is ErrorSource.STILL:
+        without = distances(measured, registered._replace(offset=0.0 * registered.offset))
+        known = np.isfinite(without.lod95)
+        left = (without.distance - registered.offset)[known]
+        yield reason(
+            "deviation.pose-error",
+            rms=float(np.sqrt(np.mean(registered.offset[known] ** 2))),
+            share=100.0 * float(np.mean(np.abs(left) > without.lod95[known])),
+            least=float(left.min()),
+            greatest=float(left.max()),
+        )
+    elif registered.source is ErrorSource.GIVEN and fits.determined:
+        known = np.isfinite(measured.moved.along)
+        fit = fits.of(params.fit)
+        rms = float(np.sqrt(np.mean(_displaced(measured.core, fit.motion)[known] ** 2)))
+        allowed = np.linalg.norm([registered.sd, fit.error_mm, scanner_class_errors.SHIFT_SD_MM])
+        if rms > m3c2.Z95 * allowed:
+            yield reason("deviation.frame-error-exceeded", rms=rms, sd=registered.sd)
 
 
 def _of_views(scan: ScanCloud, placed: Placed, measured: Measured) -> Iterator[Reason]:

@@ -46,6 +46,6 @@ class Params(Parameters, table="deviation"):
     projection_diameter_mm: float = entry(LENGTH, default=0.0)
     max_depth_mm: float = entry(LENGTH, default=0.0)
     core_spacing_mm: float = entry(LENGTH, default=0.0)
-    # one standard deviation, as a length; NaN = from the registration's covariance
+    # one standard deviation, as a length; NaN = from the fits to the design
     registration_error_mm: float = entry(number(least=0, unknown=True), default=NAN)
     paper: Paper = field(default_factory=Paper)

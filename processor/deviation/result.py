@@ -47,6 +47,7 @@ class ErrorSource(Word):
 
     UNKNOWN = "not known: the scan does not determine the best fit"
     COVARIANCE = "covariance of the fit, mean over the core points"
+    STILL = "difference of the pose given from what stands still, rms over the core points"
     GIVEN = "given"
     CLONE = "a clone of the scan"
 
@@ -109,8 +110,8 @@ class Result(Checked):
     ``T_design_scan`` maps the frame of the scans as merged. ``T_best_fit`` is that of a best fit to all that was
     measured, ``T_stable_fit`` that of a fit to the largest part of it that agrees with one rigid motion to within
     ``stable_fit_limit``, applied or not, with the areas that they rest on. ``covariance`` (design frame, rotation about
-    its origin and translation) is that of the fit wanted. The statistics are of the core points that have a level of
-    detection.
+    its origin and translation) is that of the fit wanted, for a pose as given with its difference from that fit. The
+    statistics are of the core points that have a level of detection.
     """
 
     status: Status = described(words=Status)

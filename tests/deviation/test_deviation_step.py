@@ -183,6 +183,45 @@ def test_an_undamaged_structure_is_a_twentieth_beyond_where_the_frame_is_sure(se
     assert cautious.significant_share < result.significant_share
 
 
+def lowered(points):
+    """A fifth of the bracket is 8 mm lower; all else has not moved."""
+    low = points[:, 0] > np.quantile(points[:, 0], 0.8)
+    return np.column_stack([0.0 * low, 0.0 * low, -8.0 * low])
+
+
+@pytest.mark.parametrize("seed", [20, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(21, 26))])
+def test_the_error_of_a_pose_that_others_registered_is_stated_and_within_lod95(seed):
+    rng = np.random.default_rng(seed)
+    shift, turn = rng.normal(size=3), rng.normal(size=3)
+    off = pose(1e-4 * turn / np.linalg.norm(turn), 2.0 * shift / np.linalg.norm(shift))  # 2 mm and 0.1 mrad
+    scene, _ = scene_of(seed, lowered, rigid.invert(off), count=60_000)
+    result = run(scene)
+    assert (result.status, result.registration) == ("ok", "as given")
+    core = result.core
+    known = np.isfinite(core.lod95)
+    # Which core points are of the part that moved is not sure within its diameter of the border.
+    border = np.abs(core.points[:, 0] - np.quantile(scene.scans[0].points[:, 0], 0.8)) < result.projection_diameter
+    moved = np.einsum("ni,ni->n", lowered(core.points), core.normals)
+    for part in (known & ~border & (moved == 0.0), known & ~border & (np.abs(moved) > 1.0)):
+        assert np.mean(np.abs(core.distance - moved)[part] <= core.lod95[part]) >= 0.92
+    assert np.mean((np.abs(core.distance) > core.lod95)[known & ~border & (moved == 0.0)]) < 0.08
+    middle = scene.scans[0].points.mean(axis=0)
+    true = rigid.apply(rigid.invert(off), middle[None])[0] - middle
+    assert np.linalg.norm(result.stable_fit_shift - true) < 0.3  # a written requirement
+    along = np.einsum("ni,ni->n", rigid.apply(off, core.points) - core.points, core.normals)[known]
+    assert abs(result.registration_error - np.sqrt(np.mean(along**2))) < 0.3
+    (stated,) = (one.values for one in result.reasons if one.code == "deviation.pose-error")
+    fine = run(scene, register="fine")
+    assert stated["share"] == pytest.approx(100.0 * fine.significant_share, abs=2.0)
+    assert stated["least"] == pytest.approx(fine.min, abs=1.0)
+    low, high = result.mean_ci95
+    assert low < moved[known].mean() < high
+    sure = run(scene, registration_error_mm=0.1)
+    assert "deviation.frame-error-exceeded" in codes(sure)
+    assert np.mean((np.abs(core.distance) > sure.core.lod95)[known & (moved == 0.0)]) > 0.2  # as the user states
+    assert "deviation.frame-error-exceeded" not in codes(run(scene, registration_error_mm=2.0))
+
+
 def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not():
     scene, _ = scene_of(10, still, count=4_000)
     T = pose([0.0, 0.0, 1.0], [500.0, 0.0, 0.0])
@@ -474,7 +513,7 @@ def test_a_fitted_pose_is_that_of_a_scan_with_axes_of_its_own():
 
 def test_deviation_in_results_json_has_the_keys_of_the_interface(tmp_path):
     scene, truth = scene_of(9, count=8_000)
-    jobs = pipeline.plan(("deviation",), (), {"deviation": {"register": "none"}}, 0)
+    jobs = pipeline.plan(("deviation",), (), {"deviation": {"register": "none", "registration_error_mm": 0.2}}, 0)
     found = pipeline.execute(tmp_path / "scene.h5", scene, jobs)
     report = ErrorReport(tuple(deviation_evaluation.check(scene, found.runs[0].result, truth)))
     assert isinstance(found, Execution)

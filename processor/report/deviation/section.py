@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.deviation.result import Result
+from processor.deviation.result import CorePoints, Result
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.m3c2 import Z95
 from processor.language.messages import Message, text
@@ -51,13 +51,20 @@ def _summary(result: Result) -> tuple[Message, Message]:
         greatest_high=greatest_high,
         near=100.0 * result.within_10mm_share,
         lod95=result.lod95_median,
-        registration=Z95 * result.registration_error,
+        registration=_of_registration(result.core),
         measured=result.core_points_measured,
         core=result.core_points,
     )
     if result.status is Status.OK:
         return head, body
     return head, text("{reason}. {rest}", reason=result.reasons[:1], rest=body)
+
+
+def _of_registration(core: CorePoints) -> float:
+    """Return what the registration has of LOD95, mm: the median of what points and stations do not have of it."""
+    at = np.isfinite(core.lod95)
+    n1, n2 = np.maximum(core.n1[at], 1), np.maximum(core.n2[at], 1)
+    return float(np.median(core.lod95[at] - Z95 * np.sqrt(core.std1[at] ** 2 / n1 + core.std2[at] ** 2 / n2)))
 
 
 def _band(scene: Scene, run: StepRun) -> Band:
