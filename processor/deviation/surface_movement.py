@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from processor import tiles
 from processor.adjustment import mixed_pixels
-from processor.deviation import assignment, station_offsets
+from processor.deviation import assignment, station_offsets, surface_layers
 from processor.deviation.assignment import Aside, OnSurface
 from processor.deviation.local_translation import Movement, PartSums, Translations
 from processor.deviation.station_offsets import OnFaces, OnPieces, Pieces
@@ -29,6 +29,7 @@ from processor.tiles import Shared
 LEAST_COS = 0.5  # between the normals at a core point and below a scanned point
 NOISE_SHARE = 0.75  # quantile of the core points' standard deviations that is the noise: noise across edges is larger
 ABOUT = 2.0  # diameters about a core point within which all faces are taken to move alike, to find each point's face
+LAYER_POINTS = 1_000_000  # work: by which what stands against the structure is recognised
 RETURNS = 3.0  # standard deviations from the surface within which a point removed as an outlier is none
 
 
@@ -170,6 +171,7 @@ def _first(passes: _Passes) -> tuple[Movement, float]:
         near, points = near + counts[0], points + counts[1]
         release()
     _mark_mixed(passes, faces)
+    _leave_out_beside(passes)
     first = passes.fit.value.sums()
     close = (_Near(cloud.points, cloud.doubtful, aside) for cloud, aside in passes.near())
     for part in tiles.mapped(_first_of, close, passes.fit):
@@ -205,6 +207,29 @@ def _mark_mixed(passes: _Passes, faces: Sequence[_Faces]) -> None:
         passes.doubtful[row] = put_aside(doubtful | mixed[done : done + len(doubtful)])
         done += len(doubtful)
         release()
+
+
+def _leave_out_beside(passes: _Passes) -> None:
+    """Leave out the points near the surface that are of something which stands against the structure."""
+    fit = passes.fit.value
+    surface, core = fit.curved.surface, fit.core
+    step = max(1, sum(len(aside.rows) for aside in passes.asides) // LAYER_POINTS)
+
+    def seen(rows: slice, sure: bool) -> Iterator[OnSurface]:
+        for cloud, aside in passes.near():
+            at = aside.seen(cloud.points, fit.curved)
+            yield at.take(np.flatnonzero(~cloud.doubtful)[rows]) if sure else at
+
+    few = OnSurface.concat(list(seen(slice(None, None, step), sure=True)))
+    body = mesh_bodies.closed_bodies(surface.faces)[core.facet]
+    normals = surface.normals[few.facet]
+    layers = surface_layers.of_points(core, body, few.feet, few.distance, normals, fit.diameter)
+    for row, at in enumerate(seen(slice(None), sure=False)):
+        kept, aside = layers.of_structure(at.feet, at.distance), passes.asides[row]
+        passes.asides[row] = Aside(
+            aside.rows[kept], aside.facet[kept], aside.clearance[kept], aside.flat[kept]
+        ).put()  # fmt: skip
+        passes.doubtful[row] = put_aside(passes.doubtful[row][kept])
 
 
 @dataclass(frozen=True)
