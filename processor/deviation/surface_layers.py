@@ -28,10 +28,7 @@ WITHIN = 4.0  # standard deviations of the noise from a layer's plane: one point
 PART = 0.5  # of the points of the densest layer, that the innermost one has at least: fewer are strays
 STEEPEST = 0.1  # slope of steel from its design, one sd; steepest dents have twice that
 CURVATURE = 0.001  # 1 / mm, of a dent 20 mm deep and 600 mm wide: 0.5 * 20 * (pi / 300)**2
-LINKS, REACH = (
-    8,
-    1.5,
-)  # neighbours that a layer may continue to, and how far they are at most, by the median of the last
+LINKS, REACH = 8, 1.5  # neighbours that a layer may continue to, and how far they are, by the median of the last
 AROUND, PIECE, OTHER_BODY = 24, 3.0, 0.25  # pieces of faces about one, their side in diameters, weight of other bodies
 AGREES_MM, AGREE = 3.0, 0.1  # of the movement about it, to which a surface agrees; the least share of it that does
 ROUNDS = 20  # work: of least absolute residuals
