@@ -1,0 +1,1 @@
+"""What software has done to points between the scanner and the file."""
