@@ -42,7 +42,7 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
     if (principal.sizes(even) <= largest).all():
         return None
     left = np.ones(len(even), bool)
-    while (on := _plane(even[left], step, side)) is not None:
+    while (on := large_plane(even[left], step, side)) is not None:
         left[np.flatnonzero(left)[on]] = False
         if left.sum() < FEWEST:
             return None
@@ -82,7 +82,7 @@ def _misfit(points: Floats, sizes: Sequence[Floats]) -> float:
     return min(float(np.abs(own - size).max() / size.max()) for size in sizes)
 
 
-def _plane(points: Floats, step: float, least: float) -> Bools | None:
+def large_plane(points: Floats, step: float, least: float) -> Bools | None:
     """Return which points (n, 3) lie near the plane with most points; None if its area is at most ``least`` mm^2."""
     rng = np.random.default_rng(len(points))
     few = thinned(points, SAMPLE)

@@ -7,7 +7,7 @@ lie on a longer one to some millimetres, so that points near a design do not sho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from processor.geometry.thinning import thinned
 from processor.model import Floats, Reason, reason
 from processor.preassembly.parts import attitude, same_shape
 from processor.preassembly.parts.attitude import TELLING_MM, Shapes
-from processor.registration import pose_choice, principal, surface_registration
+from processor.registration import located_part, pose_choice, principal, surface_registration
 from processor.registration.pose_search import DesignSurface
 
 POINTS, NEAR_POINTS = 100_000, 3_000  # of a scan, by which rough poses are compared, and their share near a design
@@ -61,12 +61,7 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     Of parts with equal edges, which their marks alone distinguish, it is any: see :mod:`.identity`.
     """
     alike = of_size(points, shapes)
-    # One part of each other shape
-    different = [index]
-    for number in alike or range(len(shapes)):
-        if not any(number == one or same_shape.motions(shapes, one, number) for one in different):
-            different.append(number)
-    others = different[1:]
+    others = _other_shapes(index, alike or range(len(shapes)), shapes)
     if index in alike and not others:
         return None
     few = thinned(points, POINTS)
@@ -91,6 +86,36 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     # The first rough pose may have missed the part itself: a scan is called wrong only after all that are promising.
     own = shapes[index].mesh, rough(index, None)
     return best if _shows_other(few, own, (shapes[best].mesh, T_best)) else None
+
+
+def _other_shapes(index: int, numbers: Iterable[int], shapes: Shapes) -> list[int]:
+    """Return one part, of those in ``numbers``, of each shape that is not that of part ``index``."""
+    different = [index]
+    for number in numbers:
+        if not any(number == one or same_shape.motions(shapes, one, number) for one in different):
+            different.append(number)
+    return different[1:]
+
+
+def locate(points: Floats, index: int, shapes: Shapes) -> tuple[Floats, int, float] | None:
+    """Locate part ``index`` among points (n, 3) of a scan with surroundings; None where no part is shown.
+
+    Returns the pose T_bridge_scan (4, 4) of the part that the body there shows, which may be another than ``index``,
+    with its number, and how well another body in the scan shows the same shape: see :class:`located_part.Located`.
+    """
+    numbers = [index, *_other_shapes(index, range(len(shapes)), shapes)]
+    designs = [shapes[k] for k in numbers]
+    own = located_part.locate(points, designs[:1])[0]
+    region, body = points, None
+    if own.shown >= located_part.LEAST_SHOWN:
+        region = points[located_part.about_design(points, own.T, designs[0])]
+        body = thinned(region[located_part.at_design(region, own.T, designs[0])], POINTS)
+    located = [own, *located_part.locate(region, designs[1:], body)]
+    found = located_part.which(region, designs, located, named=0)
+    if not found:
+        return None
+    best = 0 if 0 in found else found[0]
+    return located[best].T, numbers[best], own.rival
 
 
 def _near_share(points: Floats, T: Floats, surface: DesignSurface) -> float:

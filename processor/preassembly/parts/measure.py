@@ -37,7 +37,7 @@ from processor.preassembly.parts import (
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.parts.part_residuals import PartResiduals, part_residuals
-from processor.registration import icp, main_body, surface_registration
+from processor.registration import icp, located_part, surface_registration
 from processor.registration.pose_search import DesignSurface
 from processor.robust_statistics import MAD_TO_SD
 
@@ -49,7 +49,6 @@ SLICES, LEAST_OF_TYPICAL = (
 ACROSS = 0.7  # cosine to the part's axis, below which a normal is of the part's sides
 LEAST_COVERED = 0.7  # chosen: of a part less seen, bow and twist are guesses; the doubt states the share
 RIGHT_PART = (reason("preassemble.right-part"),)
-AT_PART_MM = 60.0  # of the design, at which points of the ground may be of the part
 
 
 @dataclass(frozen=True)
@@ -398,21 +397,24 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
         points[rows] *= shrink
         station[rows] = scan.point_station[row[rows]] if len(scan.point_station) else 0
     del row
-    of_part = main_body.of_sizes(points, shapes.sizes)
-    if of_part is None:
+    if not located_part.holds_more(points, shapes.sizes):
         placed = _identified(scan, points, station, index, shapes)
         if shrink == 1.0 and placed.attitude is not attitude.NOWHERE and shapes[index].tube is None:
             shapes.attitudes[index] = placed.attitude
         return placed
+    located = assignment.locate(points, index, shapes)
+    if located is None:
+        return _identified(scan, points, station, index, shapes)
+    T, number, rival = located
+    of_part = located_part.at_design(points, T, shapes[number])
     placed = _identified(scan, chosen(points, of_part), chosen(station, of_part), index, shapes)
     if placed.rejected:
         return placed
-    # Where the part lies on the ground, points of its lower edge went with the ground.
-    for rows in blocks(len(points)):
-        rest = rows.start + np.flatnonzero(~of_part[rows])
-        off = shapes[index].mesh.distances(rigid.apply(placed.registration.T_design_scan, points[rest]), AT_PART_MM)
-        of_part[rest] = on_face(off[0], off[2]) & (np.abs(off[1]) < AT_PART_MM)
-    return replace(placed, points=chosen(points, of_part), station=chosen(station, of_part))
+    of_part = located_part.at_design(points, placed.registration.T_design_scan, shapes[index])
+    doubts = placed.doubts
+    if rival > located_part.SURE_RIVAL:
+        doubts += (reason("preassemble.another-of-shape", share=rival),)
+    return replace(placed, points=chosen(points, of_part), station=chosen(station, of_part), doubts=doubts)
 
 
 def _identified(scan: Scan, points: Floats, station: Ints, index: int, shapes: attitude.Shapes) -> _PlacedScan:
