@@ -444,16 +444,17 @@ def _stations(scans: list[Scan]) -> Stations | None:
 
 def _check_unit(path: Path, scan: Scan, unit: FileUnit, source: str, design: Design | None) -> None:
     """Raise InputError if a scan's size shows that its unit is wrong, by itself or beside its design."""
-    nominal, ratios = np.empty((0, 3)), units.STRUCTURE_RATIOS
+    nominal, ratios, faces = np.empty((0, 3)), units.STRUCTURE_RATIOS, None
     if isinstance(design, ArchDesign):
         part = next((part for part in design.parts if part.name == scan.component), None)
-        nominal, ratios = part.vertices if part else nominal, units.PART_RATIOS
+        ratios = units.PART_RATIOS
+        nominal, faces = (part.vertices, part.faces) if part else (nominal, None)
     elif isinstance(design, FrameDesign):
         nominal, ratios = design.centres if len(design.centres) > 2 else nominal, units.FRAME_RATIOS
     elif design is not None:
         nominal = design.vertices
     what, advice = f"{path}: scan {scan.name!r}", f"give its unit by --units or in {PROJECT}"
     units.check_ratio(
-        what, scan.points, nominal, ratios, unit.horizontal, source, f"{advice}, or correct the design's units"
+        what, scan.points, nominal, ratios, unit.horizontal, source, f"{advice}, or correct the design's units", faces
     )
     units.check_extent(what, scan.points, unit.horizontal, source, advice, units.STRAY)

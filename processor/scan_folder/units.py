@@ -9,7 +9,9 @@ from scipy.spatial import cKDTree
 
 from processor import large_arrays, unit_ratio
 from processor.column_names import UNIT_WORDS
-from processor.model import Floats, InputError, Reason, UsageError, reason
+from processor.geometry import mesh_distance
+from processor.model import Floats, InputError, Ints, Reason, UsageError, reason
+from processor.registration import located_part, pose_search, principal
 
 # By definition; the foot of the US survey is 1200 / 3937 m (NIST SP 811, appendix B).
 MM_PER_UNIT = {
@@ -37,6 +39,7 @@ CERTAIN_RATIO = 100.0  # and its inverse: ratios that no surroundings of a part 
 SHAPE_TOLERANCE = 2.0  # ratio of extents along the principal axes, of which a part seen from one side lacks some
 THIN = 0.05  # of the largest extent: such an extent is not compared
 SAMPLE = 100_000  # points
+LOCATED = 400_000  # points, among which a part is located
 # In metres no scan of a structure is larger, and none has points farther apart.
 LARGEST_M, WIDEST_SPACING_M = 2000.0, 0.5
 FEWEST_FOR_SPACING, SPACING_POINTS = 1000, 2000  # the median of 2000 is known to 2 %
@@ -159,13 +162,21 @@ def check_extent(what: str, points: Floats, unit: str, source: str, advice: str,
 
 
 def check_ratio(
-    what: str, points: Floats, nominal: Floats, ratios: tuple[float, ...], unit: str, source: str, advice: str
+    what: str,
+    points: Floats,
+    nominal: Floats,
+    ratios: tuple[float, ...],
+    unit: str,
+    source: str,
+    advice: str,
+    faces: Ints | None = None,
 ) -> None:
     """Raise InputError if the size of a scan's points (n, 3), mm, differs from its design's by a ratio of units.
 
     A mistaken unit scales all extents alike, a floor around a small part does not. ``nominal`` (m, 3) are the
     vertices of the design, or none; sizes are distances from the middle. ``what`` names file and scan, ``source``
-    how ``unit`` was found.
+    how ``unit`` was found. With the ``faces`` (k, 3) of a part's design, its unit is doubted only if the design's
+    surface is shown better by the points in the other unit.
     """
     size = radius(nominal) if len(nominal) else 0.0
     if not size > 0.0:
@@ -178,6 +189,15 @@ def check_ratio(
         (not 1.0 / CERTAIN_RATIO < factor < CERTAIN_RATIO) or _scaled_alike(sample, nominal, factor)
     ):
         return
+    if faces is not None and 1.0 / CERTAIN_RATIO < factor < CERTAIN_RATIO:
+        design = pose_search.prepared(mesh_distance.of_mesh(nominal, faces))
+        few = large_arrays.every(points, max(1, len(points) // LOCATED))
+        as_read, otherwise = (located_part.locate(few / scale, [design])[0].shown for scale in (1.0, factor))
+        if as_read >= max(otherwise, located_part.LEAST_SHOWN) or (
+            otherwise < located_part.LEAST_SHOWN
+            and located_part.holds_more(few / factor, [principal.sizes(design.points)])
+        ):
+            return
     likely = [name for name, mm in MM_PER_UNIT.items() if abs(MM_PER_UNIT[unit] / mm / factor - 1.0) < 0.01]
     raise InputError(
         f"{what} is {ratio:.4g} times as large as the design, close to {factor:.4g}: its unit was read as {unit} "
