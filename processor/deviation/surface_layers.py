@@ -39,7 +39,7 @@ class Layers:
     """Planes of the structure's surface at places (k, 3): ``height`` (k,) over the design and ``slope`` (k, 3).
 
     ``structure`` (k,) is False where the layer is of something else, ``noise`` the standard deviation of points, mm.
-    Points farther than ``radius`` from all places belong to none.
+    ``radius`` is that of the points that a plane is fitted to.
     """
 
     tree: cKDTree
@@ -54,9 +54,11 @@ class Layers:
         if not len(self.height) or not len(feet):
             return np.ones(len(feet), np.bool_)
         far, at = self.tree.query(feet, workers=-1)
-        off = distance - self.height[at] - np.einsum("ni,ni->n", self.slope[at], feet - self.tree.data[at])
-        on: Bools = (off <= WITHIN * self.noise + 0.5 * CURVATURE * far**2) & self.structure[at]
-        on |= far > self.radius
+        # Beyond its radius a plane says no more than that steel is not steeper.
+        near = far <= self.radius
+        slope = np.where(near, np.einsum("ni,ni->n", self.slope[at], feet - self.tree.data[at]), 0.0)
+        allowed = WITHIN * self.noise + np.where(near, 0.5 * CURVATURE * far**2, 2.0 * STEEPEST * far)
+        on: Bools = (distance - self.height[at] - slope <= allowed) & (self.structure[at] | ~near)
         return on
 
 
