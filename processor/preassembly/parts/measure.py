@@ -411,10 +411,16 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     if placed.rejected:
         return placed
     of_part = located_part.at_design(points, placed.registration.T_design_scan, shapes[index])
+    placed = replace(placed, points=chosen(points, of_part), station=chosen(station, of_part))
     doubts = placed.doubts
+    # Another part that lies on the design in part has lost the rest of its points with the surroundings.
+    covered = _covered(placed.points, placed.registration.T_design_scan, shapes[index])
+    if covered < LEAST_COVERED and not doubts:
+        away = 1.0 - float(of_part.mean())
+        doubts = (reason("preassemble.sides-not-covered", share=away, covered=covered), *RIGHT_PART)
     if rival > located_part.SURE_RIVAL:
         doubts += (reason("preassemble.another-of-shape", share=rival),)
-    return replace(placed, points=chosen(points, of_part), station=chosen(station, of_part), doubts=doubts)
+    return replace(placed, doubts=doubts)
 
 
 def _identified(scan: Scan, points: Floats, station: Ints, index: int, shapes: attitude.Shapes) -> _PlacedScan:
