@@ -38,6 +38,8 @@ def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str],
     if np.isfinite(scene.temperature_C) and what != "assembled":  # the assembled parts have their reference lengths
         lines.append(f"temperature_C = {scene.temperature_C!r}")
     lines += _tolerance(scene.tolerance)
+    if what in EACH_SCAN:
+        lines += _supports(run, scans, scale)
     if what == "merged":
         stations = exported_clouds.stations_of(run, scans)
         # The noise of a merged cloud is stated where it is the same in all scans
@@ -74,6 +76,21 @@ def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str],
         names = {one.number: Path(file).stem for one, file in zip(scans, files, strict=True)}
         _write_picks(folder / PICKS, run, scans, names, scale)
         _write_control(folder / CONTROL, scene.control, run, names, scale)
+
+
+def _supports(run: Run, scans: Sequence[Placed], scale: float) -> list[str]:
+    """Return the lines of what the exported components lay on, and of their steel."""
+    known, steel, lines = run.scene.part_supports, run.scene.steel, []
+    if steel is not None:
+        lines += ["", "[steel]", f"E_MPa = {steel.E_MPa!r}", f"density_kg_m3 = {steel.density_kg_m3!r}"]
+    factors = {one.scan.component: one.scale * scale for one in reversed(scans)}
+    for row, name in enumerate(() if known is None else known.component):
+        if known is not None and name in factors:
+            chainage = float(known.chainages[row])
+            at = f"at = {(factors[name] * known.places[row]).tolist()}"
+            lines += ["", "[[support]]", f"component = {as_toml(name)}"]
+            lines.append(f"chainage_mm = {chainage!r}" if np.isfinite(chainage) else at)
+    return lines
 
 
 def _tolerance(tolerance: Tolerance | None) -> list[str]:

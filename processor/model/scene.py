@@ -493,6 +493,27 @@ class TitleBlock(Checked):
     logo: Codes = column("bytes", dtype=np.uint8, means=Meaning())
 
 
+@dataclass(frozen=True)
+class PartSupports(Columns, Checked):
+    """What parts of a bridge lay on when they were scanned, a row a support, by its part's name.
+
+    ``places`` (k, 3) are in the frame of the part's first scan, mm; ``chainages`` (k,) are from the part's start, mm.
+    Each row has one of them, the other is NaN.
+    """
+
+    component: tuple[str, ...] = names("k", means=NAMES)
+    places: Floats = column("k", 3, means=Meaning(least=-LARGEST_MM, most=LARGEST_MM))
+    chainages: Floats = column("k", means=Meaning(least=-LARGEST_MM, most=LARGEST_MM))
+
+
+@dataclass(frozen=True)
+class Steel(Checked):
+    """The material of the parts: modulus of elasticity and density (EN 1993-1-1, 3.2.6; EN 1991-1-1, table A.4)."""
+
+    E_MPa: float = described(210_000.0, means=Meaning(finite=True, above=0.0))
+    density_kg_m3: float = described(7_850.0, means=Meaning(finite=True, above=0.0))
+
+
 def _units_as_stated(text: str) -> tuple[Reason, ...]:
     """Return the source of a unit that a scene file of before version 1.5 states as a text."""
     return (reason("units.as-stated", text=text),) if text else ()
@@ -520,6 +541,8 @@ class Scene(Checked):
     clips: Clips | None = newer()
     ceiling: Ceiling | None = newer()
     target_search: TargetSearch | None = newer()
+    part_supports: PartSupports | None = newer()
+    steel: Steel | None = newer()  # None: of structural steel
     targets: Targets | None = newer(hashed=False)  # those of Scene.control are hashed
     target_remarks: tuple[Reason, ...] = reasons(newer=True, hashed=False)  # on the search for targets
     # days of the scans by their files, YYYY-MM-DD, in order; no step reads them
@@ -545,6 +568,15 @@ class Scene(Checked):
             if parts and scan.component and scan.component not in parts:
                 text = f": expected a part of the design, found {scan.component!r}"
                 yield Fault(("scans", f"{i:04d}", "component"), text)
+        named = () if self.part_supports is None else self.part_supports.component
+        for row, name in enumerate(named):
+            if name not in parts:
+                yield Fault(
+                    ("part_supports", "component"), f", row {row}: expected a part of the design, found {name!r}"
+                )
+            elif named.count(name) < 2:
+                text = f", row {row}: expected two or more supports of {name!r}, found one"
+                yield Fault(("part_supports", "component"), text)
 
     def _stations_of(self, scan: Scan) -> list[tuple[int, Floats]]:
         """Return the stations that a scan's points name, or all if it is the only scan: rows and positions (3,)."""

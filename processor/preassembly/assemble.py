@@ -28,7 +28,7 @@ from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
 from processor.preassembly.params import AdjustParams, Params, TrimParams
-from processor.preassembly.parts import measure
+from processor.preassembly.parts import measure, straightening
 from processor.preassembly.parts.attitude import Attitude, Shapes
 from processor.preassembly.parts.each_part import each_part
 from processor.preassembly.parts.measure import MeasuredPart
@@ -57,7 +57,8 @@ def assemble(
     frames = np.array([joint_frame(points) for points in design.joint_points])
     shapes = Shapes(design, attitudes)
     fitted = each_part(lambda k: measure.fit(scans[k], k, shapes, shrink, params.systematic), scans)
-    parts = measure.assigned(measure.estimate(fitted, params.systematic))
+    as_scanned = measure.assigned(measure.estimate(fitted, params.systematic))
+    parts, of_bends = straightening.straighten(as_scanned, scene, design, params.systematic.gradient_K)
     curve = _adjust(parts, design, frames, params.adjust)
     adjusted = curve[params.adjust.weight]
     placed = assembled_parts.place(parts, adjusted, design, frames, _on_steel(shapes, design))
@@ -70,6 +71,7 @@ def assemble(
         temperature_corrected=shrink != 1.0,
         parts=reasons.placed_by_design(parts, in_pieces),
         in_pieces=in_pieces,
+        of_bends=of_bends,
         adjusted=adjusted,
         trade_off={weight: curve[weight] for weight in TRADE_OFF},
         placement=placed,

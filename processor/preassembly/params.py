@@ -24,17 +24,20 @@ class AdjustParams(Parameters, table="preassemble.adjust"):
 
 @dataclass(frozen=True)
 class SystematicParams(Parameters, table="preassemble.systematic"):
-    """Standard deviations of the errors common to all points of a scan; 0 = not stated."""
+    """Standard deviations of the errors common to all points of a scan; 0 = not stated, but for the gradient."""
 
     registration_mm: float = entry(AMOUNT, default=0.0)  # of the stations of one scan against each other, each axis
     offset_mm: float = entry(AMOUNT, default=0.0)  # zero offset of the scanner
     scale_ppm: float = entry(AMOUNT, default=0.0)
     temperature_C: float = entry(AMOUNT, default=0.0)  # of the steel's stated temperature
+    # of a difference of temperature across a part while it was scanned, along each of both axes; default: of 0 to 10 K
+    # in any direction; 0: none
+    gradient_K: float = entry(AMOUNT, default=4.1)
 
     @property
     def known(self) -> bool:
-        """Whether anything was stated."""
-        return any(value > 0.0 for value in self.__dict__.values())
+        """Whether anything was stated of the scanner, the stations or the mean temperature."""
+        return any(value > 0.0 for name, value in self.__dict__.items() if name != "gradient_K")
 
 
 @dataclass(frozen=True)

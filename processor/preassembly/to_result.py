@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.adjustment.thermal import EXPANSION_PER_K
 from processor.geometry.lines_and_polylines import Polyline
 from processor.model import NORMAL_95, ArchDesign, Bools, Floats, Reason, Tolerance, reason
 from processor.preassembly import topology
@@ -54,6 +55,7 @@ class Assembly:
     temperature_corrected: bool
     parts: Sequence[MeasuredPart]
     in_pieces: tuple[Reason, ...]
+    of_bends: tuple[Reason, ...]
     adjusted: Adjusted
     trade_off: Mapping[float, Adjusted]
     placement: Placement
@@ -267,6 +269,10 @@ def _reasons(assembly: Assembly) -> Iterator[Reason]:
         yield reason("preassemble.temperature-corrected")
     else:
         yield reason("preassemble.reference-temperature")
+        if not assembly.params.systematic.temperature_C:
+            longest = max(systematic_errors.chord(part) for part in assembly.design.parts)
+            yield reason("preassemble.one-kelvin", length=1e-3 * longest, change=EXPANSION_PER_K * longest)
+    yield from assembly.of_bends
     compared = [*assembly.joints.conformity, assembly.chain]
     standard = limits.standard or LimitOrigin.PROJECT
     if all(conformity.limits.verified.all() for conformity in compared):

@@ -19,10 +19,12 @@ from processor.model import (
     Floats,
     FrameDesign,
     InputError,
+    PartSupports,
     Reason,
     Scan,
     Scene,
     Stations,
+    Steel,
     StructureDesign,
     TargetSearch,
     UsageError,
@@ -146,7 +148,8 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     files |= dict.fromkeys(
         ("arch", "frame", "structure"), str(project.design.relative_to(folder) if project.design else PROJECT)
     )
-    files |= dict.fromkeys(("tolerance", "temperature_C", "name", "ceiling", "target_search"), PROJECT)
+    of_project = ("tolerance", "temperature_C", "name", "ceiling", "target_search", "part_supports", "steel")
+    files |= dict.fromkeys(of_project, PROJECT)
     return record_checks.check(scene, str(folder), {field: str(folder / file) for field, file in files.items()})
 
 
@@ -166,6 +169,25 @@ def _ceiling(given: CeilingEntry, unit: str, surface_unit: str) -> Ceiling:
         return Ceiling(level=given.level * MM_PER_UNIT[unit], clearance_mm=clearance, longest_mm=longest)
     vertices, faces = read_surface(given.surface, surface_unit)[:2]
     return Ceiling(vertices=vertices, faces=faces, clearance_mm=clearance, longest_mm=longest)
+
+
+def _supports(project: Project, scans: Sequence[Scan], units: Sequence[FileUnit]) -> PartSupports | None:
+    """Return the supports of a bridge's components, in mm; ``units`` are those of the scans."""
+    if not project.support:
+        return None
+    first = {scan.component: unit for scan, unit in reversed(list(zip(scans, units, strict=True)))}
+    for one in project.support:
+        if one.component not in first:
+            known = ", ".join(sorted(first)) or "none"
+            raise InputError(
+                f"{project.where}: [[support]] names {one.component!r}, of which there is no scan ({known})"
+            )
+    nowhere = np.full(3, np.nan)
+    return PartSupports(
+        tuple(one.component for one in project.support),
+        places=np.array([nowhere if s.at is None else s.at * first[s.component].factors for s in project.support]),
+        chainages=np.array([one.chainage_mm for one in project.support]),
+    )
 
 
 def _component_names(design: Design | None) -> Sequence[str]:
@@ -325,6 +347,8 @@ def _scene(
         target_search=search,
         title_block=project.report,
         clips=clipper.record(),
+        part_supports=_supports(project, scans, scan_units),
+        steel=None if project.steel is None else Steel(project.steel.E_MPa, project.steel.density_kg_m3),
         scanned=tuple(sorted(days)),
     )
 

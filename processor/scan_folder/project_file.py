@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from processor import record_checks
-from processor.model import DESIGN_FRAMES, KINDS, Floats, Reason, TitleBlock, Tolerance, reason
+from processor.model import DESIGN_FRAMES, KINDS, Floats, Reason, Steel, TitleBlock, Tolerance, reason
 from processor.model.inputs import FLAG, Kind, Place, array, entry, hidden, number, table, tables, text
 from processor.scan_folder.file_values import FILE, FILE_UNIT, UNIT
 from processor.scan_folder.files import PROJECT
@@ -115,6 +115,32 @@ class ClipBox:
 
 
 @dataclass(frozen=True)
+class SupportEntry:
+    """A table [[support]]: what a component of a bridge lay on when it was scanned."""
+
+    SCHEMA: ClassVar[Mapping[str, Any]] = {"oneOf": [{"required": ["at"]}, {"required": ["chainage_mm"]}]}
+
+    component: str = entry(text())
+    at: Floats | None = entry(array(3), default=None)  # in the frame and unit of the component's first scan
+    chainage_mm: float = entry(number(), default=NAN)  # from the component's start, along its bottom edge
+
+    def contradiction(self) -> str:
+        """Return that the place is given twice or not at all."""
+        if (self.at is None) == np.isnan(self.chainage_mm):
+            found = "neither" if self.at is None else "both"
+            return f"expected 'at', a place, or 'chainage_mm', found {found}; give one of them"
+        return ""
+
+
+@dataclass(frozen=True)
+class SteelEntry:
+    """The table [steel]."""
+
+    E_MPa: float = entry(number(above=0), default=Steel.E_MPa)  # modulus of elasticity
+    density_kg_m3: float = entry(number(above=0), default=Steel.density_kg_m3)  # density
+
+
+@dataclass(frozen=True)
 class CeilingEntry:
     """The table [ceiling]."""
 
@@ -185,6 +211,9 @@ class Project:
     # title block of the report: these keys and further ones, in their order; empty texts are left out
     report: TitleBlock | None = entry(TITLE_BLOCK, default=None)
     clip: tuple[ClipBox, ...] = entry(tables(ClipBox), default=())  # boxes that the scans are cut by as they are read
+    # of a bridge: what its components lay on when they were scanned, two or more each
+    support: tuple[SupportEntry, ...] = entry(tables(SupportEntry), default=())
+    steel: SteelEntry | None = entry(table(SteelEntry), default=None)  # of a bridge; default: structural steel
     # ceiling that hangs from a space frame: level or surface
     ceiling: CeilingEntry | None = entry(table(CeilingEntry), default=None)
     targets: Targets | None = entry(table(Targets), default=None)  # targets that the scans are searched for

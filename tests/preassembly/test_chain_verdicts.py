@@ -105,13 +105,15 @@ def test_unused_limits_are_reported():
     assert chain.unused_limits(GB) == []
     mixed = project_limits.override(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
     assert [limit.key for limit in chain.unused_limits(mixed)] == ["bow_mm"]
-    params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=SimpleNamespace(known=True))
+    systematic = SimpleNamespace(known=True, temperature_C=1.0)
+    params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=systematic)
     assembly = SimpleNamespace(
         params=params,
         limits=mixed,
         temperature_corrected=False,
         parts=(),
         in_pieces=(),
+        of_bends=(),
         joints=JudgedJoints(),
         chain=joints.Conformity(),
     )

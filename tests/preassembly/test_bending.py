@@ -1,0 +1,96 @@
+"""Deflections of parts as beams against Hermite's finite elements and closed forms."""
+
+import numpy as np
+import pytest
+
+from processor.model import DesignPart, Steel
+from processor.preassembly.parts import bending
+from tests.support.scenes import bent_girders
+from tests.support.scenes.bent_girders import Girder
+
+DOWN = np.array([0.0, 0.0, -1.0])
+CELL = 0.01  # of the largest deflection: cells of 125 mm, of which a support lies in the middle
+
+
+def beam(girder, plates=True, turned=False):
+    vertices, faces = bent_girders.mesh(girder, 0.0, plates)
+    return bending.beam(DesignPart("g", vertices, faces[:, ::-1] if turned else faces), np.zeros(3), Steel())
+
+
+def of_elements(girder, supports):
+    nodes = np.union1d(np.linspace(0.0, girder.length, 121), supports)
+    load = bent_girders.WEIGHT * girder.area
+    across, slope, carrying = bent_girders.finite_elements(
+        nodes, bent_girders.E_MPA * girder.inertia(True), load, 0.0, supports
+    )
+    return nodes, across, slope, carrying
+
+
+@pytest.mark.parametrize(
+    ("girder", "least", "most"),
+    [  # by beam theory: with the webs' shear up to a sixth more at 8 m
+        (Girder(8_000.0, 800.0, 1_000.0, 20.0, 16.0), 0.1, 0.15),
+        (Girder(20_000.0, 1_000.0, 1_000.0, 24.0, 16.0), 4.3, 4.7),
+        (Girder(8_000.0, 300.0, 300.0, 14.0, 10.0), 1.2, 1.4),
+    ],
+)
+def test_sags_of_three_boxes(girder, least, most):
+    found, carrying = bending.sag(beam(girder), DOWN, (0.0, girder.length))
+    assert least < -found.displacement(beam(girder), np.array([[girder.length / 2, 0.0, 0.0]]))[0, 2] < most
+    assert carrying == (0.0, girder.length)
+
+
+@pytest.mark.parametrize("supports", [(0.0, 25e3), (3e3, 19e3), (1e3, 14e3, 23e3), (0.5e3, 1.5e3, 24e3)])
+def test_deflections_are_those_of_finite_elements(supports):
+    girder = Girder(25_000.0, 900.0, 1_000.0, 20.0, 16.0)
+    nodes, across, slope, carrying = of_elements(girder, supports)
+    made = beam(girder)
+    made = made._replace(shear=0.0 * made.shear)  # these elements do not shear
+    found, pushed = bending.sag(made, DOWN, supports)
+    assert pushed == tuple(carrying)  # a support that would have to pull is left out
+    low, high = (np.column_stack([nodes, 0.0 * nodes, np.full(len(nodes), z)]) for z in (0.0, girder.height))
+    by_low, by_high = found.displacement(made, low), found.displacement(made, high)
+    np.testing.assert_allclose(-by_low[:, 2], across, atol=CELL * np.abs(across).max())
+    tilt = (by_low - by_high)[:, 0] / girder.height
+    np.testing.assert_allclose(tilt, -slope, atol=CELL * np.abs(slope).max())
+
+
+def test_webs_shear_over_a_short_span():
+    girder = Girder(8_000.0, 1_000.0, 1_000.0, 16.0, 16.0)
+    made, middle = beam(girder), np.array([[4_000.0, 0.0, 0.0]])
+    both, bent = (
+        -bending.sag(one, DOWN, (0.0, 8_000.0))[0].displacement(one, middle)[0, 2]
+        for one in (made, made._replace(shear=0.0 * made.shear))
+    )
+    webs = 0.5 * girder.area  # of a square box of one thickness
+    by_shear = bent_girders.WEIGHT * girder.area * 8_000.0**2 / (8.0 * 210_000.0 / 2.6 * webs)
+    assert both - bent == pytest.approx(by_shear, rel=5e-3)  # corners belong to both
+
+
+def test_a_mesh_without_plates_bends_as_thin_walls_of_one_thickness():
+    girder = Girder(20_000.0, 1_000.0, 1_000.0, 16.0, 16.0)
+    middle = np.array([[10_000.0, 0.0, 0.0]])
+    supports = (0.0, 20_000.0)
+    plates, outline, turned = (beam(girder), beam(girder, plates=False), beam(girder, turned=True))
+    assert (plates.plates, outline.plates, turned.plates) == (True, False, True)
+    sags = [bending.sag(one, DOWN, supports)[0].displacement(one, middle)[0, 2] for one in (plates, outline, turned)]
+    assert sags[1] == pytest.approx(sags[0], rel=0.05)  # the outline is the plates' outer side
+    assert sags[2] == pytest.approx(sags[0], rel=1e-9)
+
+
+def test_a_difference_of_temperature_bends_to_a_parabola():
+    girder = Girder(8_000.0)
+    made = beam(girder)
+    for axis, side in enumerate((made.depth[0, 0], made.depth[0, 1])):
+        found = bending.by_gradient(made, axis, (0.0, 8_000.0)).scaled(10.0)
+        most = 12e-6 * 10.0 / side * 8_000.0**2 / 8.0
+        assert np.abs(found.across[:, axis]).max() == pytest.approx(most, rel=1e-3)
+        assert np.abs(found.across[:, 1 - axis]).max() == 0.0
+
+
+def test_what_no_two_supports_carry():
+    made = beam(Girder(16_000.0))
+    assert bending.sag(made, DOWN, (9_000.0, 15_000.0)) is None  # the centre of gravity is outside of them
+    upright, _ = bending.sag(made, made.axes[0], (1_000.0, 15_000.0))  # gravity along the axis does not bend it
+    assert np.abs(upright.across).max() < 1e-12
+    assert bending.beam(DesignPart("p", *bent_girders.mesh(Girder(1_500.0), 0.0)), None, Steel()) is None
