@@ -137,5 +137,5 @@ def test_a_scan_that_is_not_levelled_bends_in_any_direction():
     (steep, *_), _ = straightening.straighten(turned, scene, scene.arch, 0.0)
     before = parts[0].member.ends[1].covariance
     by_axis = [np.diag(one.member.ends[1].covariance - before).reshape(8, 3).mean(axis=0) for one in (level, steep)]
-    assert min(by_axis[0][1:]) == pytest.approx(0.0, abs=1e-12)
-    assert min(by_axis[1][1:]) > 0.0
+    assert min(by_axis[0][1:]) < 1e-6 * max(by_axis[0][1:])  # the pad tilts the axis by some 1e-5
+    assert min(by_axis[1][1:]) > 0.1 * max(by_axis[1][1:])
