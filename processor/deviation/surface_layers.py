@@ -62,6 +62,12 @@ class Layers:
         return on
 
 
+# Where no point lies near the design
+NO_LAYERS = Layers(
+    cKDTree(np.zeros((1, 3))), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.bool_), noise=0.0, radius=0.0
+)
+
+
 class _Groups(NamedTuple):
     """Points (n,) by the core point ``at`` that they count at, and by distance; ``first``, ``size`` of groups (g,)."""
 
@@ -80,7 +86,7 @@ def of_points(core: Samples, body: Ints, feet: Floats, distance: Floats, normals
     """
     groups = _grouped(core, feet, distance, normals, 0.5 * diameter_mm)
     if not len(groups.first):
-        return Layers(cKDTree(np.zeros((1, 3))), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.bool_), 0.0, 0.0)
+        return NO_LAYERS
     noise = _noise(groups)
     on = _innermost(groups, 2.0 * WITHIN * noise)
     at = groups.at[groups.first]
@@ -88,7 +94,7 @@ def of_points(core: Samples, body: Ints, feet: Floats, distance: Floats, normals
     height, slope, known = _planes(groups, on, feet, places, noise)
     places, facing, height, slope = places[known], facing[known], height[known], slope[known]
     if not len(height):
-        return Layers(cKDTree(np.zeros((1, 3))), height, slope, known[:0], noise, 0.0)
+        return NO_LAYERS
     expected, spread = _expected(places, facing, height, body[at][known], PIECE * diameter_mm, noise)
     off = height - expected
     tree = cKDTree(places)
@@ -97,7 +103,7 @@ def of_points(core: Samples, body: Ints, feet: Floats, distance: Floats, normals
     agreeing = np.bincount(surface, np.abs(off) <= np.maximum(AGREES_MM, WITHIN * np.maximum(spread, noise))) / size
     before = np.bincount(surface, off) > 0.0
     beside = before & (agreeing < AGREE)
-    return Layers(tree, height, slope, ~beside[surface], noise, 0.5 * diameter_mm)
+    return Layers(tree, height, slope, ~beside[surface], noise=noise, radius=0.5 * diameter_mm)
 
 
 def _grouped(core: Samples, feet: Floats, distance: Floats, normals: Floats, radius: float) -> _Groups:
@@ -111,7 +117,7 @@ def _grouped(core: Samples, feet: Floats, distance: Floats, normals: Floats, rad
     order = np.lexsort((distance[row], at))
     at, row = at[order], row[order]
     _, first, group, size = np.unique(at, return_index=True, return_inverse=True, return_counts=True)
-    return _Groups(at, row, distance[row], group.reshape(-1), first, size)
+    return _Groups(at, row, distance[row], group=group.reshape(-1), first=first, size=size)
 
 
 def _noise(groups: _Groups) -> float:

@@ -58,7 +58,7 @@ class Located:
     rival: float = 0.0
 
 
-NOT_LOCATED = Located(np.full((4, 4), np.nan), 0.0)
+NOT_LOCATED = Located(np.full((4, 4), np.nan), 0.0)  # nothing of the design is shown
 
 
 def holds_more(points: Floats, sizes: Sequence[Floats]) -> bool:

@@ -303,8 +303,9 @@ def _scene(
     remarks: list[Reason] = []
     days: set[str] = set()
     reasons: dict[str, Reason] = {}  # why a unit was taken, by units
-    mm = MM_PER_UNIT[project.units or option or "m"]
-    clipper = Clipper([dataclasses.replace(one, box=one.box * mm) for one in project.clip], project.where)
+    of_project = project.units or option or "m"
+    boxes = [dataclasses.replace(one, box=one.box * MM_PER_UNIT[of_project]) for one in project.clip]
+    clipper = Clipper(boxes, project.where)
     for entry in tracked(project.scan):
         if entry.component and parts and entry.component not in parts:
             raise InputError(
@@ -324,13 +325,10 @@ def _scene(
     where = stations or _stations(scans)
     why_units = list(reasons.values())
     different = (one for i, one in enumerate(why_units) if one not in why_units[:i])  # reasons have no hash
-    targets = project.targets
-    search = None if targets is None else TargetSearch(targets.checkerboard_mm, targets.sphere_radius_mm)
-    of_project = project.units or option or "m"
-    of_guess: tuple[Reason, ...] = ()
-    if project.guessed is not None:
-        unsure = bool(project.guessed.doubts)
-        of_guess = (reason("units.design-guessed-unsure") if unsure else reason("units.design-guessed"),)
+    find, guessed = project.targets, project.guessed
+    search = None if find is None else TargetSearch(find.checkerboard_mm, find.sphere_radius_mm)
+    sure = guessed is None or not guessed.doubts
+    of_guess = reason("units.design-guessed") if sure else reason("units.design-guessed-unsure")
     return Scene(
         project.name,
         kind,
@@ -340,7 +338,7 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason=(*different, *of_guess, *summed(remarks)),
+        units_reason=(*different, *(() if guessed is None else (of_guess,)), *summed(remarks)),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
         control=control_points(project.measured, scans, scan_units, where, of_project, search is not None),

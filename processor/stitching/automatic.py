@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from processor.distinct_rows import components
 from processor.geometry import rigid, thread_ranges
-from processor.model import Control, Floats, Ints, Scan
+from processor.model import Control, Floats, Scan
 from processor.stitching import three_point
 from processor.stitching.coarse import network, pairwise
 from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
@@ -56,7 +55,6 @@ class RegisteredScans:
     refuted: Floats  # (k,), see network.refuted
     # pairs of scans that overlap, not contradicted by free space, and those whose relative pose is by control points
     links: list[tuple[int, int]]
-    groups: Ints  # (k,), see network.groups
 
 
 def stitch(
@@ -101,7 +99,6 @@ def stitch(
         for a, b in itertools.combinations(placed, 2)
     }
     still = network.without_moved(patches, solution.T, scores)
-    links = sorted({*network.links(still), *itertools.combinations(sorted(known), 2)})
     return RegisteredScans(
         clouds=clouds,
         coarse=coarse,
@@ -117,8 +114,7 @@ def stitch(
             0.0,
             network.refuted(still, len(scans), reference),
         ),
-        links=links,
-        groups=components(len(scans), *np.reshape(np.array(links, np.int64), (-1, 2)).T),
+        links=sorted({*network.links(still), *itertools.combinations(sorted(known), 2)}),
     )
 
 

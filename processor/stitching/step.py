@@ -100,7 +100,6 @@ def _automatic(scene: Scene, picked: Picked, reference: int, params: Params) -> 
         contradictions=registered.contradictions,
         refuted=registered.refuted,
         links=registered.links,
-        groups=registered.groups,
         estimated=(noise, solution.tau[0], solution.tau[1]),
         point_mm=noise,
         reasons=(by_class,) if unseen else (),

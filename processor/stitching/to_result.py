@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from processor.distinct_rows import components
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats, InputError, Ints, Reason, Scan, Scene, Status, reason
+from processor.model import NORMAL_95, Floats, InputError, Reason, Scan, Scene, Status, reason
 from processor.stitching import poses_with_scale
 from processor.stitching.coarse.network import AMBIGUOUS
 from processor.stitching.fine import control_points, pairs_and_loops
@@ -43,7 +44,6 @@ class Network:
     refuted: Floats = field(default_factory=lambda: np.empty(0))  # (k,), see :func:`network.refuted`
     contradictions: Sequence[Contradiction] = ()  # of each scan's pose by faces
     links: Sequence[tuple[int, int]] | None = None  # see :func:`network.links`; None: not known
-    groups: Ints | None = None  # (k,), see :func:`network.groups`; None: not known
     estimated: tuple[float, float, float] = (NAN, NAN, NAN)  # noise, patches, ends
     unplaced: Sequence[Reason] = ()  # why each scan has no pose, where it has none
     by_control: Sequence[Reason | None] = ()  # contradictions of each scan's pose by control points
@@ -181,11 +181,12 @@ def _not_joined(links: Sequence[tuple[int, int]] | None, status: Sequence[Status
 
 def _strangers(names: Sequence[str], network: Network, scans: Scans, reference: int) -> tuple[Reason, ...]:
     """Name the scans that do not belong to the network of most; the reference where it is not of the largest group."""
-    if network.groups is None:
+    if network.links is None:
         return ()
-    sizes = np.bincount(network.groups, minlength=len(names))
-    if sizes.max() > 1 and sizes[network.groups[reference]] < sizes.max():
-        out = np.flatnonzero(network.groups == network.groups[reference]).tolist()
+    groups = components(len(names), *np.reshape(np.array(network.links, np.int64), (-1, 2)).T)
+    sizes = np.bincount(groups)
+    if sizes.max() > 1 and sizes[groups[reference]] < sizes.max():
+        out = np.flatnonzero(groups == groups[reference]).tolist()
     else:
         out = [
             s

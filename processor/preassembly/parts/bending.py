@@ -17,8 +17,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from processor.adjustment.thermal import EXPANSION_PER_K
-from processor.geometry.mesh_sections import Sections, sections
 from processor.model import Bools, DesignPart, Floats, Steel
+from processor.preassembly.parts.mesh_sections import Sections, sections
 from processor.registration import principal
 
 CELLS = 200  # along a part: 4 cm of 8 m, while stiffness changes over metres

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.geometry.mesh_sections import sections
+from processor.preassembly.parts.mesh_sections import sections
 
 AXES = np.eye(3)
 ROUNDING = 1e-9  # float64 of products of metres in mm
