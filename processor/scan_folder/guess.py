@@ -5,8 +5,9 @@ A doubt is a reason why an entry may be wrong, or why it is missing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,14 @@ from scipy.optimize import linear_sum_assignment
 
 from processor import large_arrays, readers
 from processor.geometry import mesh_distance
+from processor.geometry.thinning import thinned
 from processor.language.messages import Text, messages, text
 from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints, Reason, reason
 from processor.readers import RawScan
-from processor.registration import main_body, principal
+from processor.registration import located_part, pose_search, principal
+from processor.registration.located_part import Located
+from processor.registration.pose_search import DesignSurface
 from processor.scan_folder import component_names
 from processor.scan_folder.design import read_design, read_json, read_surface
 from processor.scan_folder.file_values import existing_file_in
@@ -37,7 +41,8 @@ UNIT_TOLERANCE = 0.25  # relative difference of a scan's size from its design's
 LARGEST_M = 2000.0  # a scan larger than this is not in metres
 # Greatest difference of extents by the longest: of a scan of the part, of one with gaps, and of another part.
 SAME_SHAPE, LIKE_SHAPE, OTHER_SHAPE = principal.SIZE_SHARE, 0.05, 0.15
-SAMPLE = 100_000  # points that extents are measured from
+SAMPLE, SCAN_SAMPLE = 100_000, 400_000  # points that extents are measured from, and that a part is located among
+LARGEST_ROOM = 12.0  # times the longest part: surroundings that belong to a scan of it
 
 Surface = tuple[Floats, Ints]
 
@@ -99,7 +104,7 @@ def guess(folder: Path, design_units: str = "") -> Guess:
         raise InputError(
             f"expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none", path=folder
         )
-    shapes = _shapes(design) if isinstance(design, ArchDesign) else {}
+    shapes = _Shapes(design) if isinstance(design, ArchDesign) else None
     _guess_units(project, _sizes(design), shapes)
     if shapes:
         _guess_components(project, shapes)
@@ -236,7 +241,7 @@ def _within(folder: Path, error: InputError) -> str:
 
 def _sample(raws: Sequence[RawScan]) -> Floats:
     """Return every k-th point of a file, transformed by the poses of several scans, relative to the first origin."""
-    share = max(1, sum(len(raw.points) for raw in raws) // SAMPLE)
+    share = max(1, sum(len(raw.points) for raw in raws) // SCAN_SAMPLE)
     pieces = []
     for raw in raws:
         points = large_arrays.every(raw.points, share) + (raw.origin - raws[0].origin)
@@ -250,27 +255,65 @@ def _sample(raws: Sequence[RawScan]) -> Floats:
 # --- guesses ----------------------------------------------------------------------------------------------------------
 
 
-def _shapes(design: ArchDesign) -> dict[str, Floats]:
-    """Return the sizes (3,) of a design's parts along their principal axes, longest first, by their names."""
-    surfaces = {part.name: mesh_distance.spread(part.vertices, part.faces, lambda _: SAMPLE) for part in design.parts}
-    return {name: principal.sizes(surface.points) for name, surface in surfaces.items()}
+class _Shapes:
+    """The parts of a design: sizes (3,) along their principal axes, longest first, by name; and their surfaces."""
+
+    def __init__(self, design: ArchDesign) -> None:
+        surfaces = {
+            part.name: mesh_distance.spread(part.vertices, part.faces, lambda _: SAMPLE) for part in design.parts
+        }
+        self.design = design
+        self.located: dict[tuple[str, str], list[Located]] = {}  # in a file's scan, in a unit
+        self.sizes = {name: principal.sizes(surface.points) for name, surface in surfaces.items()}
+
+    @cached_property
+    def surfaces(self) -> dict[str, DesignSurface]:
+        """One part of each size, prepared for the search in scans with surroundings."""
+        different: list[str] = []
+        for name, size in self.sizes.items():
+            limits = (principal.SIZE_SHARE * self.sizes[one][0] for one in different)
+            if all(np.abs(self.sizes[one] - size).max() > limit for one, limit in zip(different, limits, strict=True)):
+                different.append(name)
+        parts = {part.name: part for part in self.design.parts}
+        return {
+            name: pose_search.prepared(mesh_distance.of_mesh(parts[name].vertices, parts[name].faces))
+            for name in different
+        }
 
 
-def _differences(scan: ScanGuess, unit: str, shapes: Mapping[str, Floats]) -> dict[str, float]:
+def _differences(scan: ScanGuess, unit: str, shapes: _Shapes, named: Sequence[str] = ()) -> dict[str, float]:
     """Return the largest difference of a scan's extents from each part's, by the part's longest size.
 
-    Ground and what stands about the part is left out.
+    The extents of a scan with surroundings are those of the part that is located in it: of one that is ``named``, if
+    it is shown as well as others.
     """
     points = scan.sample * MM_PER_UNIT[unit]
-    of_part = main_body.of_sizes(points, list(shapes.values()))
-    extents = principal.sizes(points if of_part is None else points[of_part])
-    return {name: float(np.abs(extents - shape).max() / shape[0]) for name, shape in shapes.items()}
+    sizes = list(shapes.sizes.values())
+    longest = max(float(np.linalg.norm(size)) for size in sizes)
+    extents = [principal.sizes(thinned(points, SAMPLE))]
+    spread = float(np.linalg.norm(np.ptp(points, axis=0)))
+    if spread < LARGEST_ROOM * longest and located_part.holds_more(points, sizes):
+        names, designs = list(shapes.surfaces), list(shapes.surfaces.values())
+        if (scan.file, unit) not in shapes.located:
+            shapes.located[scan.file, unit] = located_part.locate(points, designs)
+        located = shapes.located[scan.file, unit]
+        alike = [
+            k
+            for k, name in enumerate(names)
+            if any(np.abs(shapes.sizes[name] - shapes.sizes[one]).max() < 2.0 * SAME_SHAPE * longest for one in named)
+        ]
+        found = located_part.which(points, designs, located, named=alike[0] if len(alike) == 1 else -1)
+        extents = [shapes.sizes[names[k]] for k in found] or extents
+    return {
+        name: min(float(np.abs(one - shape).max() / shape[0]) for one in extents)
+        for name, shape in shapes.sizes.items()
+    }
 
 
-def _guess_units(project: Guess, nominal: Sequence[float], shapes: Mapping[str, Floats]) -> None:
+def _guess_units(project: Guess, nominal: Sequence[float], shapes: _Shapes | None) -> None:
     """Take the unit of the formats; else the one in which the scans have the design's size; else metres.
 
-    ``nominal`` are the radii of what is designed, ``shapes`` the sizes of an arch's parts.
+    ``nominal`` are the radii of what is designed, ``shapes`` an arch's parts.
     """
     without = [scan for scan in project.scans if not scan.units and not scan.error]
     if project.design and project.kind == "structure" and Path(project.design).suffix.lower() in MESH_SUFFIXES:
@@ -308,14 +351,15 @@ def _guess_units(project: Guess, nominal: Sequence[float], shapes: Mapping[str, 
     project.doubts.append(reason("init.units-taken", units=project.units, reason=why))
 
 
-def _guess_components(project: Guess, shapes: Mapping[str, Floats]) -> None:
+def _guess_components(project: Guess, shapes: _Shapes) -> None:
     """Assign components to scans by name and shape; contradictions and ambiguities are added to the doubts."""
-    names = list(shapes)
+    names = list(shapes.sizes)
     scans = [scan for scan in project.scans if not scan.error]
     for scan in scans:
-        scan.differences = _differences(scan, scan.units or project.units or "m", shapes)
+        named = component_names.components(scan.stem, names)
+        scan.differences = _differences(scan, scan.units or project.units or "m", shapes, named)
         scan.station = component_names.station(scan.stem)
-        _choose(scan, component_names.components(scan.stem, names))
+        _choose(scan, named)
     _assign_similar(scans, names)
     project.doubts += [_doubt(scan) for scan in scans if not scan.sure]
     files = {name: tuple(scan.file for scan in project.scans if scan.component == name) for name in names}
