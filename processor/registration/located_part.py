@@ -61,16 +61,6 @@ class Located:
 NOT_LOCATED = Located(np.full((4, 4), np.nan), 0.0)  # nothing of the design is shown
 
 
-def holds_more(points: Floats, sizes: Sequence[Floats]) -> bool:
-    """Whether points (n, 3) are larger than a part of any of ``sizes`` (3,), longest first, in mm."""
-    largest = np.max(sizes, axis=0)
-    step = _voxel_size(points, float(np.linalg.norm(largest)))
-    if not step > 0.0:
-        return False
-    even = voxel_means(points, step, least=2)
-    return len(even) >= main_body.FEWEST and bool((principal.sizes(even) > (1.0 + main_body.LARGER) * largest).any())
-
-
 def locate(points: Floats, designs: Sequence[DesignSurface], body: Floats | None = None) -> list[Located]:
     """Locate each of several designs among points (n, 3) of a scan with surroundings, or on a ``body`` (k, 3) in it."""
     step = _voxel_size(points, float(np.median([design.size for design in designs]))) if designs else 0.0

@@ -28,6 +28,14 @@ THIN = 0.25  # voxels by which points on a plane may lie off it
 LINK = 3.0  # voxels between points of one piece
 
 
+def holds_more(points: Floats, sizes: Sequence[Floats]) -> bool:
+    """Whether points (n, 3) are larger than a part of any of ``sizes`` (3,), longest first, in mm."""
+    step = _voxel_size(points)
+    even = voxel_means(points, step, least=2) if step > 0.0 else points[:0]
+    largest = np.max(sizes, axis=0) * (1.0 + LARGER)
+    return len(even) >= FEWEST and bool((principal.sizes(even) > largest).any())
+
+
 def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
     """Return which points (n, 3) belong to a part that has one of ``sizes`` (3,), longest first, in mm.
 

@@ -21,7 +21,7 @@ from processor.language.messages import Text, messages, text
 from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints, Reason, reason
 from processor.readers import RawScan
-from processor.registration import located_part, pose_search, principal
+from processor.registration import located_part, main_body, pose_search, principal
 from processor.registration.located_part import Located
 from processor.registration.pose_search import DesignSurface
 from processor.scan_folder import component_names
@@ -292,7 +292,7 @@ def _differences(scan: ScanGuess, unit: str, shapes: _Shapes, named: Sequence[st
     longest = max(float(np.linalg.norm(size)) for size in sizes)
     extents = [principal.sizes(thinned(points, SAMPLE))]
     spread = float(np.linalg.norm(np.ptp(points, axis=0)))
-    if spread < LARGEST_ROOM * longest and located_part.holds_more(points, sizes):
+    if spread < LARGEST_ROOM * longest and main_body.holds_more(points, sizes):
         names, designs = list(shapes.surfaces), list(shapes.surfaces.values())
         if (scan.file, unit) not in shapes.located:
             shapes.located[scan.file, unit] = located_part.locate(points, designs)

@@ -11,7 +11,7 @@ from processor import large_arrays, unit_ratio
 from processor.column_names import UNIT_WORDS
 from processor.geometry import mesh_distance
 from processor.model import Floats, InputError, Ints, Reason, UsageError, reason
-from processor.registration import located_part, pose_search, principal
+from processor.registration import located_part, main_body, pose_search, principal
 
 # By definition; the foot of the US survey is 1200 / 3937 m (NIST SP 811, appendix B).
 MM_PER_UNIT = {
@@ -195,7 +195,7 @@ def check_ratio(
         as_read, otherwise = (located_part.locate(few / scale, [design])[0].shown for scale in (1.0, factor))
         if as_read >= max(otherwise, located_part.LEAST_SHOWN) or (
             otherwise < located_part.LEAST_SHOWN
-            and located_part.holds_more(few / factor, [principal.sizes(design.points)])
+            and main_body.holds_more(few / factor, [principal.sizes(design.points)])
         ):
             return
     likely = [name for name, mm in MM_PER_UNIT.items() if abs(MM_PER_UNIT[unit] / mm / factor - 1.0) < 0.01]

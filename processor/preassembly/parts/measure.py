@@ -37,7 +37,7 @@ from processor.preassembly.parts import (
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.parts.part_residuals import PartResiduals, part_residuals
-from processor.registration import icp, located_part, surface_registration
+from processor.registration import icp, located_part, main_body, surface_registration
 from processor.registration.pose_search import DesignSurface
 from processor.robust_statistics import MAD_TO_SD
 
@@ -397,7 +397,7 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
         points[rows] *= shrink
         station[rows] = scan.point_station[row[rows]] if len(scan.point_station) else 0
     del row
-    if not located_part.holds_more(points, shapes.sizes):
+    if not main_body.holds_more(points, shapes.sizes):
         placed = _identified(scan, points, station, index, shapes)
         if shrink == 1.0 and placed.attitude is not attitude.NOWHERE and shapes[index].tube is None:
             shapes.attitudes[index] = placed.attitude
