@@ -24,7 +24,7 @@ from processor.geometry.thinning import thinned, voxel_means
 from processor.geometry.thread_ranges import each
 from processor.large_arrays import blocks, corners
 from processor.model import Bools, Floats
-from processor.registration import main_body, pose_choice, pose_search, principal
+from processor.registration import main_body, pose_choice, pose_search, principal, surface_registration
 from processor.registration.pose_search import Candidate, DesignSurface
 
 PART_VOXELS = (90.0, 70.0, 55.0, 40.0, 30.0)  # along the part's diagonal, the most that the points allow
@@ -88,11 +88,14 @@ def which(points: Floats, designs: Sequence[DesignSurface], located: Sequence[Lo
     first = named if named in well else max(well, key=lambda k: located[k].count)
     place = _place(located[first], designs[first])
     same = [k for k in well if k == first or _near(_place(located[k], designs[k]), place, designs[k])]
-    near = np.zeros(len(points), bool)
+    near, poses = np.zeros(len(points), bool), []
     for k in same:
-        near |= at_design(points, located[k].T, designs[k])
-    kept = pose_choice.choose(points[near], [(designs[k].mesh, located[k].T) for k in same])
-    return [same[k] for k in kept]
+        at = at_design(points, located[k].T, designs[k])
+        near |= at
+        fewer = thinned(points[at], surface_registration.RIVAL_POINTS)
+        fine = surface_registration.fine(fewer, designs[k].mesh, designs[k].axes, located[k].T).T_design_scan
+        poses.append((designs[k].mesh, fine))
+    return [same[k] for k in pose_choice.choose(points[near], poses)]
 
 
 def about_design(points: Floats, T: Floats, design: DesignSurface) -> Bools:
