@@ -343,11 +343,17 @@ def execute(
 
 
 def _with_points_once(scene: Scene, log: Callable[[str], None] = lambda _: None) -> tuple[Scene, tuple[Reason, ...]]:
-    """Return the scene without coincident points, and what was left out; its hash is that of what was read."""
+    """Return the scene without coincident points, what was left out, and what software has done to each scan.
+
+    Its hash is that of what was read.
+    """
     from processor import scene_cloud
+    from processor.adjustment.processing.point_processing import recognised, some_places
     from processor.language.messages import messages
 
     scene, reasons = scene_cloud.with_points_once(scene)
+    for scan in scene.scans:
+        reasons += recognised(some_places(scan.points)).reasons(scan.name)
     for one in reasons:
         log(messages("en").text(one))
     return scene, reasons

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from processor import fit_sphere
+from processor import fit_sphere, pipeline
 from processor.adjustment.processing.point_processing import recognised
 from processor.language.messages import messages
-from processor.model import NORMAL_95, Status
+from processor.model import NORMAL_95, Scan, Scene, Status
 
 RADIUS, CENTRE = 75.0, np.array([3210.4, -4127.9, 803.3])
 SEEDS = range(6)
@@ -55,7 +55,7 @@ def smoothed(points: np.ndarray, count: int) -> np.ndarray:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_points_of_a_scanner_have_no_trace(seed):
     trace = trace_of(ball(seed))
-    assert trace.reasons() == ()
+    assert trace.reasons("scan") == ()
     assert not trace.cell
     assert not trace.kernel
 
@@ -66,7 +66,7 @@ def test_edge_of_the_cells_that_hold_one_point(seed, nearest):
     trace = trace_of(in_cells(ball(seed), 5.0, nearest))
     assert trace.cell == pytest.approx(5.0, rel=0.02)
     assert not trace.kernel
-    assert [one.code for one in trace.reasons()] == ["points.thinned"]
+    assert [one.code for one in trace.reasons("scan")] == ["points.thinned"]
 
 
 @pytest.mark.parametrize("count", [8, 20])
@@ -106,7 +106,7 @@ def test_points_sampled_from_a_mesh():
     u, v = np.where(flip, 1.0 - u, u), np.where(flip, 1.0 - v, v)
     trace = trace_of(a + u * (b - a) + v * (c - a))
     assert trace.mesh
-    assert [one.code for one in trace.reasons()] == ["points.from-mesh"]
+    assert [one.code for one in trace.reasons("scan")] == ["points.from-mesh"]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -127,3 +127,15 @@ def test_radii_of_thinned_spheres_lie_within_their_intervals():
         assert "points.thinned" in [one.code for one in fit.reasons]
         inside += abs(fit.radius - RADIUS) < NORMAL_95 * np.sqrt(fit.covariance[3, 3])
     assert inside >= 10
+
+
+def test_the_processing_of_every_scan_is_stated_by_a_run():
+    """Two planes at an angle, as one scan of a merged scene: cells along the axes of the file."""
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(0.0, 400.0, (20_000, 2)), rng.normal(0.0, 1.0, 20_000)])
+    tilted = flat @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + 300.0
+    points = np.vstack([flat, tilted])
+    for cloud, codes in ((points, []), (in_cells(points, 6.0, nearest=True), ["points.thinned"])):
+        scan = Scan(name="S1", points=cloud)
+        scene = Scene(name="planes", kind="structure", scans=(scan,))
+        assert [one.code for one in pipeline._with_points_once(scene)[1]] == codes

@@ -54,19 +54,19 @@ class Processing:
     kernel: float = 0.0
     mesh: bool = False
 
-    def reasons(self) -> tuple[Reason, ...]:
-        """Return what each trace is of, and what to do."""
+    def reasons(self, cloud: str) -> tuple[Reason, ...]:
+        """Return what each trace of a cloud of this name is, and what to do."""
         names = []
         if self.step >= LEAST_STEP_MM:
-            names.append(reason("points.rounded", step=self.step))
+            names.append(reason("points.rounded", cloud=cloud, step=self.step))
         if self.cell > 0.0:
-            names.append(reason("points.thinned", cell=self.cell))
+            names.append(reason("points.thinned", cloud=cloud, cell=self.cell))
         if self.copies > 0.0:
-            names.append(reason("points.copied", share=100.0 * self.copies))
+            names.append(reason("points.copied", cloud=cloud, share=100.0 * self.copies))
         if self.mesh:
-            names.append(reason("points.from-mesh"))
+            names.append(reason("points.from-mesh", cloud=cloud))
         elif self.kernel > 0.0:
-            names.append(reason("points.smoothed", radius=self.kernel))
+            names.append(reason("points.smoothed", cloud=cloud, radius=self.kernel))
         return tuple(names)
 
 
@@ -97,8 +97,20 @@ def recognised(points: Floats, errors: Floats | None = None, normals: Floats | N
         thickness = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(off, 1, 2) @ off)[:, 0], 0.0))
         mesh = kernel > 0.0 and bool(np.mean(thickness < IN_PLANE * sd) > LEAST_IN_PLANE)
     # The fourth neighbour of chance points is about twice as far as the first, which may be a copy.
-    cell = _cell(points, tree, 0.5 * float(np.median(away[:, 4])))
+    cell = 0.0 if kernel > 0.0 else _cell(points, tree, 0.5 * float(np.median(away[:, 4])))
     return Processing(step=step, cell=cell, copies=copies, kernel=kernel, mesh=mesh)
+
+
+def some_places(points: Floats) -> Floats:
+    """Return points (m, 3) of some places of a cloud (n, 3), all that lie there: enough to recognise its processing."""
+    if len(points) <= PLACES * PLACE_POINTS:
+        return points
+    seeds = ((np.arange(PLACES) + 0.5) * len(points) / PLACES).astype(np.int64)
+    rows = [
+        np.argpartition(np.sum((points - points[seed]) ** 2, axis=1), PLACE_POINTS)[:PLACE_POINTS] for seed in seeds
+    ]
+    chosen: Floats = points[np.unique(np.concatenate(rows))]
+    return chosen
 
 
 # --- smoothing -------------------------------------------------------------------------------------------------------

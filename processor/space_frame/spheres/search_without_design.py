@@ -90,7 +90,7 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     distance = np.linalg.norm(away, axis=1)
     trace = point_processing.recognised(on, distance - candidate.fit.sphere.radius, away / distance[:, None])
     doubts: list[Reason] = []
-    remarks = trace.reasons()
+    remarks = trace.reasons("points")
     wrong = trace.kernel > 0.0
     if params.method != "least-squares":
         widened = _widened(cloud, candidate.fit, _held(params) is not None)
