@@ -501,7 +501,7 @@ class PartSupports(Columns, Checked):
     Each row has one of them, the other is NaN.
     """
 
-    component: tuple[str, ...] = names("k", means=NAMES)
+    component: tuple[str, ...] = names("k")
     places: Floats = column("k", 3, means=Meaning(least=-LARGEST_MM, most=LARGEST_MM))
     chainages: Floats = column("k", means=Meaning(least=-LARGEST_MM, most=LARGEST_MM))
 

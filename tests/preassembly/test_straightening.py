@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from processor.geometry import rigid
-from processor.model import PartSupports, Status, Steel
+from processor.model import InputError, PartSupports, Status, Steel
 from processor.preassembly import topology
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import straightening
 from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.parts.part_residuals import PartResiduals
+from processor.store import store
 from tests.support.results import measured_parts
 from tests.support.scenes import bent_girders
 from tests.support.scenes.bent_girders import Girder
@@ -139,3 +140,18 @@ def test_a_scan_that_is_not_levelled_bends_in_any_direction():
     by_axis = [np.diag(one.member.ends[1].covariance - before).reshape(8, 3).mean(axis=0) for one in (level, steep)]
     assert min(by_axis[0][1:]) < 1e-6 * max(by_axis[0][1:])  # the pad tilts the axis by some 1e-5
     assert min(by_axis[1][1:]) > 0.1 * max(by_axis[1][1:])
+
+
+def test_supports_are_stored_in_scene_files(tmp_path):
+    girder = GIRDERS[0]
+    lying = [bent_girders.drawn(girder, np.random.default_rng(1)) for _ in range(2)]
+    scene = bent_girders.scene(girder, lying, 1, spacing=300.0)[0]
+    store.write_scene(tmp_path / "s.h5", dataclasses.replace(scene, steel=Steel(206_000.0)), None, {})
+    back = store.read_scene(tmp_path / "s.h5")
+    assert back.steel == Steel(206_000.0)
+    assert back.part_supports.component == ("g1", "g1", "g2", "g2")
+    np.testing.assert_allclose(back.part_supports.places, scene.part_supports.places)
+    one = scene.part_supports.take(slice(0, 1))
+    store.write_scene(tmp_path / "one.h5", dataclasses.replace(scene, part_supports=one), None, {})
+    with pytest.raises(InputError, match="two or more supports of 'g1', found one"):
+        store.read_scene(tmp_path / "one.h5")
