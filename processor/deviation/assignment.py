@@ -48,7 +48,7 @@ class OnSurface(Columns):
 
 
 @dataclass(frozen=True)
-class Aside:
+class Aside(Columns):
     """What cannot be computed quickly of points on the design, where it takes least: rows (m,) of a block of them."""
 
     rows: Ints

@@ -36,6 +36,7 @@ DEPTH_POINTS = 100_000  # work: the share of a quantile of 98 % is known to 0.05
 FIT_POINTS, FIT_ROUNDS = 300_000, 2  # work: two rounds that place the scan; the result is measured with all its points
 UNCERTAIN = 0.5  # of a point's standard deviation: a registration no better than the mean of four points
 HALF = 0.5  # of the steel: the least that a stable fit is to rest on
+FARTHEST_FRAME_MM = 6.0  # three standard deviations of 2 mm, of clouds that were registered on a site
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,8 @@ def registration_error(measured: Measured, fits: Fits, placed: Placed, params: P
     """Return the error of the pose.
 
     Nothing tells an error of the frame as given from a movement of the whole structure. Unless the error is stated,
-    the motion of the steel that stands still is therefore taken as an error of the pose.
+    the motion of the steel that stands still is therefore taken as an error of the pose; where less than half of the
+    steel agrees with that motion, it does so only if a registration may be that far off.
     """
     core, covariance = measured.core, placed.covariance
     known, none = np.isfinite(measured.moved.along), np.zeros(len(measured.core.points))
@@ -199,7 +201,9 @@ def registration_error(measured: Measured, fits: Fits, placed: Placed, params: P
         return RegistrationError(0.0, ErrorSource.UNKNOWN, none)
     if not given or not np.isfinite(motion).all():
         return RegistrationError(sd, ErrorSource.COVARIANCE, none)
-    return RegistrationError(sd, ErrorSource.STILL, np.where(known, _displaced(core, motion), 0.0))
+    offset = np.where(known, _displaced(core, motion), 0.0)
+    stands_still = fit.share >= HALF or np.sqrt(np.mean(offset**2)) <= FARTHEST_FRAME_MM
+    return RegistrationError(sd, ErrorSource.STILL if stands_still else ErrorSource.COVARIANCE, offset * stands_still)
 
 
 def _displaced(core: Samples, motion: Floats) -> Floats:

@@ -226,9 +226,7 @@ def _leave_out_beside(passes: _Passes) -> None:
     layers = surface_layers.of_points(core, body, few.feet, few.distance, normals, fit.diameter)
     for row, at in enumerate(seen(slice(None), sure=False)):
         kept, aside = layers.of_structure(at.feet, at.distance), passes.asides[row]
-        passes.asides[row] = Aside(
-            aside.rows[kept], aside.facet[kept], aside.clearance[kept], aside.flat[kept]
-        ).put()  # fmt: skip
+        passes.asides[row] = aside.take(kept).put()
         passes.doubtful[row] = put_aside(passes.doubtful[row][kept])
 
 
