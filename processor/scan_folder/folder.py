@@ -301,6 +301,7 @@ def _scene(
     scans: list[Scan] = []
     scan_units: list[FileUnit] = []
     remarks: list[Reason] = []
+    doubted: list[InputError] = []
     days: set[str] = set()
     reasons: dict[str, Reason] = {}  # why a unit was taken, by units
     of_project = project.units or option or "m"
@@ -319,16 +320,17 @@ def _scene(
             scan = clipper.clip(_scan(raw, entry, unit, parts, stations))
             if any(scan.name == other.name for other in scans):
                 raise InputError(f"a second scan named {scan.name!r}; rename one of the files", path=entry.file)
-            _check_unit(entry.file, scan, unit, messages("en").text(why), design)
+            doubted += _doubts_of_unit(entry.file, scan, unit, why, design)
             scans.append(keep(scan))
             scan_units.append(unit)
+    if doubted and len(doubted) == len(scans):
+        raise doubted[0]
+    doubts = [reason("units.doubted", error=str(error)) for error in doubted]
     where = stations or _stations(scans)
     why_units = list(reasons.values())
     different = (one for i, one in enumerate(why_units) if one not in why_units[:i])  # reasons have no hash
-    find, guessed = project.targets, project.guessed
+    find = project.targets
     search = None if find is None else TargetSearch(find.checkerboard_mm, find.sphere_radius_mm)
-    sure = guessed is None or not guessed.doubts
-    of_guess = reason("units.design-guessed") if sure else reason("units.design-guessed-unsure")
     return Scene(
         project.name,
         kind,
@@ -338,7 +340,7 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason=(*different, *(() if guessed is None else (of_guess,)), *summed(remarks)),
+        units_reason=(*different, *_of_guess(project), *summed(remarks), *doubts),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
         control=control_points(project.measured, scans, scan_units, where, of_project, search is not None),
@@ -349,6 +351,27 @@ def _scene(
         steel=None if project.steel is None else Steel(project.steel.E_MPa, project.steel.density_kg_m3),
         scanned=tuple(sorted(days)),
     )
+
+
+def _of_guess(project: Project) -> Iterator[Reason]:
+    """Yield that the design was found in the files."""
+    if project.guessed is not None:
+        unsure = bool(project.guessed.doubts)
+        yield reason("units.design-guessed-unsure") if unsure else reason("units.design-guessed")
+
+
+def _doubts_of_unit(file: Path, scan: Scan, unit: FileUnit, why: Reason, design: Design | None) -> Iterator[InputError]:
+    """Yield that the unit of a part's scan seems wrong; raise InputError for one of any other design.
+
+    The other parts of a bridge are answered: at such a unit this one fits its design nowhere.
+    """
+    try:
+        _check_unit(file, scan, unit, messages("en").text(why), design)
+    except InputError as error:
+        low, high = large_arrays.corners(scan.points)
+        if not isinstance(design, ArchDesign) or (high - low).max() > units.LARGEST_KM * MM_PER_UNIT["km"]:
+            raise
+        yield error
 
 
 def _read_raws(entry: ScanEntry, scans: Sequence[Scan]) -> Iterator[RawScan]:
