@@ -67,6 +67,8 @@ def locate(points: Floats, designs: Sequence[DesignSurface], body: Floats | None
     if not step > 0.0:
         return [NOT_LOCATED] * len(designs)
     bodies = [body] if body is not None else _bodies(points, step, [principal.sizes(one.points) for one in designs])
+    if not bodies:
+        return [NOT_LOCATED] * len(designs)
     few = thinned(points, SHOWN_POINTS)
     search = _Search(few, cKDTree(few), step)
     found = [_located(search, bodies, design, pieces=False) for design in designs]
@@ -216,7 +218,7 @@ def _bodies(points: Floats, step: float, sizes: Sequence[Floats]) -> list[Floats
     pieces: list[Floats] = []
     for link in LINKS:
         pieces = pieces or _pieces(rest, link * step, LEAST_LENGTH * length)[:BODIES]
-    return pieces or [even]
+    return pieces
 
 
 def _pieces(points: Floats, link: float, least: float) -> list[Floats]:
