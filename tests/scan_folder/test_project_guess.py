@@ -268,3 +268,17 @@ def test_existing_project_file_is_kept_and_names_are_quoted(tmp_path):
         guess.guess(tmp_path)
     with pytest.raises(InputError, match="found nothing"):
         guess.guess(tmp_path / "none")
+
+
+def test_one_scan_in_a_wrong_unit_does_not_end_the_bridge(bridge):
+    entries = ""
+    for i, name in enumerate(ORDER):
+        scale = 304.8 if name == "rib1" else 1.0
+        write_scan(bridge / f"{name}.xyz", box_points(SIZES[name], i) * scale)
+        entries += f'[[scan]]\nfile = "{name}.xyz"\ncomponent = "{name}"\n'
+    (bridge / "project.toml").write_text(f'units = "m"\ndesign = "design.json"\n{entries}')
+    scene = folder.read_input(bridge)
+    assert len(scene.scans) == len(ORDER)
+    (doubt,) = [one for one in scene.units_reason if one.code == "units.doubted"]
+    assert "scan 'rib1'" in doubt.values["error"]
+    assert "project.toml" in doubt.values["error"]
