@@ -325,12 +325,10 @@ def _scene(
             scan_units.append(unit)
     if doubted and len(doubted) == len(scans):
         raise doubted[0]
-    doubts = [reason("units.doubted", error=str(error)) for error in doubted]
     where = stations or _stations(scans)
     why_units = list(reasons.values())
     different = (one for i, one in enumerate(why_units) if one not in why_units[:i])  # reasons have no hash
-    find = project.targets
-    search = None if find is None else TargetSearch(find.checkerboard_mm, find.sphere_radius_mm)
+    search = project.targets and TargetSearch(project.targets.checkerboard_mm, project.targets.sphere_radius_mm)
     return Scene(
         project.name,
         kind,
@@ -340,7 +338,7 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason=(*different, *_of_guess(project), *summed(remarks), *doubts),
+        units_reason=(*different, *_of_guess(project), *summed(remarks), *map(_doubt, doubted)),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
         control=control_points(project.measured, scans, scan_units, where, of_project, search is not None),
@@ -351,6 +349,10 @@ def _scene(
         steel=None if project.steel is None else Steel(project.steel.E_MPa, project.steel.density_kg_m3),
         scanned=tuple(sorted(days)),
     )
+
+
+def _doubt(error: InputError) -> Reason:
+    return reason("units.doubted", error=str(error))
 
 
 def _of_guess(project: Project) -> Iterator[Reason]:
