@@ -25,6 +25,7 @@ from functools import cache
 from typing import Any
 
 from processor.model import Reason, Word
+from processor.plain_text import printable
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -115,7 +116,8 @@ class Messages(string.Formatter):
             return self.text(value)
         if isinstance(value, float) and not format_spec:
             return f"{value:.3f}"
-        return format(value, format_spec)
+        # Names come from outside: a terminal may obey their control characters.
+        return format(printable(value) if isinstance(value, str) else value, format_spec)
 
     def sentences(self, messages: Iterable[Message]) -> str:
         """Write messages one after the other, as sentences; names keep their case."""

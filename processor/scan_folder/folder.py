@@ -328,7 +328,7 @@ def _scene(
     where = stations or _stations(scans)
     why_units = list(reasons.values())
     different = (one for i, one in enumerate(why_units) if one not in why_units[:i])  # reasons have no hash
-    search = project.targets and TargetSearch(project.targets.checkerboard_mm, project.targets.sphere_radius_mm)
+    search = TargetSearch(find.checkerboard_mm, find.sphere_radius_mm) if (find := project.targets) else None
     return Scene(
         project.name,
         kind,
