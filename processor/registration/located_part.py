@@ -18,8 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.distinct_rows import components
+from processor.distinct_rows import components, distinct
 from processor.geometry import rigid
+from processor.geometry.mesh_distance import on_face
 from processor.geometry.thinning import thinned, voxel_means
 from processor.geometry.thread_ranges import each
 from processor.large_arrays import blocks, corners
@@ -36,6 +37,7 @@ LEAST_FACE, FACES = 0.3, 3  # of the part's longest by its least size, of a face
 BODIES, START_POINTS, KEPT, POINTS = 6, (150, 600, 1_500), (8, 3), 4_000
 SHOWN_MM = 10.0  # off the plane of a sample, up to which a point shows it: as of surface that tells poses apart
 SHOWN_SAMPLES, SHOWN_POINTS = 4_000, 400_000  # work
+PATCH_MM, PATCH_OFF = 250.0, 8.0  # a face's patch, larger than a clamp; off it, in standard deviations
 BESIDE = 0.15  # of a design's length, by which a part of another shape may be longer
 SURE_RIVAL = 0.5  # of the part's points, from which on another body of its shape may be meant as well
 AT_PART_MM = 60.0  # off the design, up to which points may be the part's: as much as parts deviate
@@ -120,6 +122,27 @@ def at_design(points: Floats, T: Floats, design: DesignSurface) -> Bools:
         face, off, beyond = design.mesh.distances(placed[near], AT_PART_MM)
         near[near] = (face >= 0) & (np.hypot(off, beyond) < AT_PART_MM)
         marked[rows] = near
+    return marked
+
+
+def consistent(points: Floats, T: Floats, design: DesignSurface, sigma_mm: float) -> Bools:
+    """Mark the points (n, 3) at a design, placed by T (4, 4), that lie as far off its faces as most about them.
+
+    What touches the part, a trestle, clamp or cable, is off the face that the points about it show. ``sigma_mm`` is the
+    scatter of points about the faces. Points beyond the faces' edges stay: they may be of ends that are longer.
+    """
+    placed = rigid.apply(T, points)
+    face, off, beyond = design.mesh.distances(placed, AT_PART_MM)
+    on = on_face(face, beyond)
+    normals = design.mesh.normals[face[on]] @ design.axes
+    axis = np.argmax(np.abs(normals), axis=1)
+    side = 2 * axis + (normals[np.arange(len(axis)), axis] > 0.0)
+    cells = distinct(np.column_stack([np.floor(placed[on] @ design.axes / PATCH_MM).astype(np.int64), side])).number
+    order = np.lexsort((off[on], cells))
+    starts = np.searchsorted(cells[order], np.arange(cells.max(initial=-1) + 2))
+    typical = off[on][order][(starts[:-1] + starts[1:]) // 2]  # the median of each patch
+    marked: Bools = ~on
+    marked[on] = np.abs(off[on] - typical[cells]) < max(PATCH_OFF * sigma_mm, SHOWN_MM / 2.0)
     return marked
 
 

@@ -411,6 +411,8 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     if placed.rejected:
         return placed
     of_part = located_part.at_design(points, placed.registration.T_design_scan, shapes[index])
+    fit, at = placed.registration, np.flatnonzero(of_part)
+    of_part[at] = located_part.consistent(points[at], fit.T_design_scan, shapes[index], fit.sigma_mm)
     placed = replace(placed, points=chosen(points, of_part), station=chosen(station, of_part))
     doubts = placed.doubts
     # Another part that lies on the design in part has lost the rest of its points with the surroundings.
