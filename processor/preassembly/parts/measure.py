@@ -416,7 +416,7 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     placed = replace(placed, points=chosen(points, of_part), station=chosen(station, of_part))
     doubts = placed.doubts
     # Another part that lies on the design in part has lost the rest of its points with the surroundings.
-    covered = _covered(placed.points, placed.registration.T_design_scan, shapes[index])
+    covered = _covered(placed.points, placed.registration.T_design_scan, shapes[index], any_side=True)
     if covered < LEAST_COVERED and not doubts:
         away = 1.0 - float(of_part.mean())
         doubts = (reason("preassemble.sides-not-covered", share=away, covered=covered), *RIGHT_PART)
@@ -509,8 +509,11 @@ def _misfit(registration: surface_registration.SurfaceFit) -> tuple[Reason, ...]
     return ()
 
 
-def _covered(points: Floats, T: Floats, shape: DesignSurface) -> float:
-    """Share of the design's outer faces, in slices of its length, with points (n, 3) placed by T (4, 4) on them."""
+def _covered(points: Floats, T: Floats, shape: DesignSurface, *, any_side: bool = False) -> float:
+    """Share of the design's outer faces, in slices of its length, with points (n, 3) placed by T (4, 4) on them.
+
+    With ``any_side`` a slice is covered that has points on one of its sides: others may be hidden by what it lies on.
+    """
     along = shape.points @ shape.axes[:, 0]
     bounds = np.linspace(along.min(), along.max(), SLICES + 1)[1:-1]
     slices = np.digitize(along, bounds)
@@ -530,7 +533,10 @@ def _covered(points: Floats, T: Floats, shape: DesignSurface) -> float:
     placed = rigid.apply(T, thinned(points, surface_registration.POINTS))
     face, distance, beyond = shape.mesh.distances(placed, surface_registration.GATES_MM[0])
     near = on_face(face, beyond) & (np.abs(distance) < attitude.TELLING_MM)
-    counts = counted(placed[near], shape.mesh.normals[face[near]])[counted(shape.points, shape.normals) > 0.0]
+    counts, designed = counted(placed[near], shape.mesh.normals[face[near]]), counted(shape.points, shape.normals)
+    if any_side:
+        counts, designed = (of_sides.reshape(SLICES, -1).max(axis=1) for of_sides in (counts, designed))
+    counts = counts[designed > 0.0]
     return float((counts > LEAST_OF_TYPICAL * np.median(counts[counts > 0.0])).mean()) if counts.any() else 0.0
 
 
