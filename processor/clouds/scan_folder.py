@@ -100,6 +100,10 @@ def _tolerance(tolerance: Tolerance | None) -> list[str]:
     lines = ["", "[tolerance]"]
     if tolerance.standard:
         lines.append(f"standard = {as_toml(tolerance.standard)}")
+    if tolerance.rule is not None:
+        lines.append(f"rule = {as_toml(tolerance.rule)}")
+    if tolerance.risk is not None:
+        lines.append(f"risk = {tolerance.risk!r}")
     if tolerance.root_gap_mm:
         lines.append(f"root_gap_mm = {tolerance.root_gap_mm!r}")
     for limit in tolerance.limits:

@@ -12,6 +12,7 @@ from processor.model import (
     COORDINATE,
     NUMBER,
     OPEN,
+    SHARE,
     Bools,
     Checked,
     Floats,
@@ -58,7 +59,8 @@ class Characteristics(Rows):
 
     ``ci95`` is the half-width of the 95 % interval of the deviation, actual less nominal; that of a greatest departure
     is its wider side. ``lower`` and ``upper`` bound the deviation, -inf or inf without a bound, NaN where nothing
-    limits it or the bound depends on an unknown size. ``clause`` is of the standard, or the source of the limit.
+    limits it or the bound depends on an unknown size. ``risk_accept`` and ``risk_reject`` are the probabilities that it
+    is wrong to accept and to reject. ``clause`` is of the standard, or the source of the limit.
     """
 
     id: tuple[str, ...] = names("r")
@@ -71,6 +73,8 @@ class Characteristics(Rows):
     upper: Floats = column("r", means=OPEN)
     unit: tuple[str, ...] = names("r")
     verdict: tuple[Verdict, ...] = words("r", Verdict)
+    risk_accept: Floats = column("r", newer=True, means=SHARE)
+    risk_reject: Floats = column("r", newer=True, means=SHARE)
     limit: tuple[str, ...] = names("r")
     clause: tuple[str, ...] = names("r")
     verified: Bools = column("r", dtype=np.bool_)

@@ -1,26 +1,37 @@
 """Verdicts: quantities as measured, judged by limits.
 
 A step states what it measured as :class:`Measured`, a value with its 95 % interval; :func:`judge` alone decides and
-returns a row. A value passes where its interval lies within the limit and fails where it lies beyond. Otherwise it is
-indeterminate, as it is where the step flags the value as doubtful or a bound depends on a size that is not known (ISO
-14253-1).
+returns a row, by the rule of the project (JCGM 106, ILAC-G8):
+
+- guarded, the default: a value passes where its interval lies within the limit and fails where it lies beyond (ISO
+  14253-1: guard bands as wide as the interval);
+- simple: a value passes where it lies within the limit, else it fails;
+- risk: it passes where the limit is exceeded with at most the probability ``risk``, and fails where it is kept with at
+  most that.
+
+Otherwise it is indeterminate, as it is where the step flags the value as doubtful or a bound depends on a size that is
+not known.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 
 from processor.limits import limit_bounds
 from processor.model import (
     AMOUNT,
+    NORMAL_95,
     NUMBER,
     OPEN,
+    SHARE,
     Bools,
+    DecisionRule,
     Floats,
     Limit,
     Reason,
@@ -43,20 +54,30 @@ class JudgedLimits(Rows):
     ``of`` names what was measured: a component, node, pair of supports, scan. ``ci95`` is the half-width of the 95 %
     interval, NaN where that is open to a side or not known. ``low`` and ``high`` are allowed, -inf and inf without a
     bound, NaN where they depend on an unknown size. ``clause`` is of the standard, or the source where there is none.
+    ``risk_accept`` is the probability that accepting it is wrong, ``risk_reject`` that rejecting it is.
     """
 
     key: tuple[str, ...] = names("v", json="limit")
     what: tuple[str, ...] = names("v")
-    of: tuple[str, ...] = names("v")
+    of: tuple[str, ...] = names("v", newer=True)  # of joints it came later, as did the unit
     value: Floats = column("v", means=NUMBER)
     ci95: Floats = column("v", means=AMOUNT)
     low: Floats = column("v", means=OPEN)
     high: Floats = column("v", means=OPEN)
-    unit: tuple[str, ...] = names("v")
+    unit: tuple[str, ...] = names("v", newer=True)
     verdict: tuple[Verdict, ...] = words("v", Verdict)
+    probability: Floats = column("v", newer=True, means=SHARE)  # that the limit is kept, of joints and the chain
+    risk_accept: Floats = column("v", newer=True, means=SHARE)
+    risk_reject: Floats = column("v", newer=True, means=SHARE)
     clause: tuple[str, ...] = names("v")
+    edition: tuple[str, ...] = names("v", newer=True)
     source: tuple[str, ...] = names("v")
     verified: Bools = column("v", dtype=np.bool_)
+
+    @property
+    def bounds_known(self) -> Bools:
+        """Mark the limits (v,) that do not depend on an unknown size."""
+        return ~(np.isnan(self.low) | np.isnan(self.high))
 
     @property
     def overall(self) -> Verdict:
@@ -116,6 +137,7 @@ class Judged:
     """A quantity judged by a limit: a row of the tables of a result, whose columns have the names of these fields.
 
     ``of``, ``what`` and ``clause`` are messages where a report words them. ``probability``: that the limit is kept.
+    ``risk_accept`` and ``risk_reject``: that it is wrong to accept and to reject; NaN where that is not known.
     """
 
     of: Any
@@ -126,6 +148,8 @@ class Judged:
     high: float = NAN
     verdict: Verdict = Verdict.NONE
     probability: float = NAN
+    risk_accept: float = NAN
+    risk_reject: float = NAN
     nominal: float = 0.0
     unit: str = "mm"
     key: str = ""
@@ -152,7 +176,7 @@ def judge(
 
     Of many values ``measured`` is the least and ``greatest`` is given as well: each is compared with the bound on its
     side. The verdict is the worse of both, and the value stated is the one nearer to its bound. Without a limit there
-    is no verdict.
+    is no verdict. ``probability`` that the limit is kept is given where it is of more than one value.
     """
     if limit is None:
         return Judged(of=measured.of, value=measured.value, ci95=measured.ci95, nominal=measured.nominal)
@@ -160,16 +184,10 @@ def judge(
     sides = [(measured, low, high)]
     if greatest is not None:
         sides = [(measured, low, math.inf), (greatest, -math.inf, high)]
-    verdicts = []
-    for one, least, most in sides:
-        if one.unsigned:
-            least, most = -math.inf, min(-least, most)
-        unknown = one.doubtful or any(map(math.isnan, (low, high, one.low, one.high)))
-        if not unknown and least <= one.low and one.high <= most:
-            verdicts.append(Verdict.PASS)
-        else:
-            beyond = not unknown and (one.high < least or one.low > most)
-            verdicts.append(Verdict.FAIL if beyond else Verdict.INDETERMINATE)
+    known = not (math.isnan(low) or math.isnan(high))
+    each = [_beyond(one, least, most) if known else NAN for one, least, most in sides]
+    # Of two values at most the sum (Boole's inequality); NaN stays NaN
+    beyond = float(np.minimum(sum(each), 1.0)) if math.isnan(probability) else 1.0 - probability
     stated, *_ = min(sides, key=lambda side: min(side[0].value - side[1], side[2] - side[0].value))
     ci95 = 0.5 * (stated.high - stated.low) if math.isnan(stated.ci95) else stated.ci95
     return Judged(
@@ -179,8 +197,10 @@ def judge(
         ci95=ci95 if math.isfinite(ci95) else NAN,
         low=low,
         high=high,
-        verdict=worst(verdicts),
+        verdict=_decided(sides, each, beyond, tolerance),
         probability=probability,
+        risk_accept=beyond,
+        risk_reject=1.0 - beyond,
         nominal=stated.nominal,
         unit=limit.unit,
         key=limit.key,
@@ -189,6 +209,55 @@ def judge(
         source=limit.source,
         verified=limit.verified,
     )
+
+
+def _allowed(one: Measured, least: float, most: float) -> tuple[float, float]:
+    """Return the bounds of a quantity: the tighter one of a size whose sign is not sure."""
+    return (-math.inf, min(-least, most)) if one.unsigned else (least, most)
+
+
+def _decided(
+    sides: Sequence[tuple[Measured, float, float]], each: Sequence[float], beyond: float, tolerance: Tolerance
+) -> Verdict:
+    """Return the verdict on values with their bounds, by the probabilities that ``each`` and any lies ``beyond``."""
+    if tolerance.decision is DecisionRule.RISK and not math.isnan(beyond):
+        if beyond <= tolerance.largest_risk:
+            return Verdict.PASS
+        return Verdict.FAIL if 1.0 - beyond <= tolerance.largest_risk else Verdict.INDETERMINATE
+    verdicts = []
+    for (one, least, most), risk in zip(sides, each, strict=True):
+        least, most = _allowed(one, least, most)
+        low, high = one.low, one.high
+        if tolerance.decision is DecisionRule.SIMPLE:
+            low = high = abs(one.value) if one.unsigned else one.value
+        if math.isnan(risk):
+            verdicts.append(Verdict.INDETERMINATE)
+        elif least <= low and high <= most:
+            verdicts.append(Verdict.PASS)
+        else:
+            verdicts.append(Verdict.FAIL if high < least or low > most else Verdict.INDETERMINATE)
+    return worst(verdicts)
+
+
+def _beyond(one: Measured, least: float, most: float) -> float:
+    """Return the probability that a quantity lies beyond its bounds: on either side of its value half of a normal one.
+
+    Of a size whose sign is not sure the interval is that of the size. NaN where the interval is not known or in doubt.
+    """
+    if one.doubtful or math.isnan(one.low) or math.isnan(one.high):
+        return NAN
+    least, most = _allowed(one, least, most)
+    value = abs(one.value) if one.unsigned else one.value
+    if not one.low <= value <= one.high:  # the greatest of many noisy values is biased
+        value = 0.5 * (one.low + one.high)
+
+    def below(bound: float, exact: float) -> float:
+        sd = (one.high - value if bound > value else value - one.low) / NORMAL_95
+        if bound == value:
+            return exact if one.low == one.high else 0.5
+        return float(bound > value) if sd == 0.0 or math.isinf(bound) else float(ndtr((bound - value) / sd))
+
+    return below(least, exact=0.0) + 1.0 - below(most, exact=1.0)
 
 
 def limits_for(tolerance: Tolerance, measure: str, component: str = "") -> list[Limit]:

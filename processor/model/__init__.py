@@ -59,6 +59,7 @@ from processor.model.scene import (
     Ceiling,
     Clips,
     Control,
+    DecisionRule,
     DesignBodies,
     DesignFaults,
     DesignPart,
@@ -103,15 +104,15 @@ from processor.model.truth import (
 )
 
 __all__ = [
-    "AMOUNT", "BETTER", "COORDINATE", "COUNT", "COVARIANCE", "DESIGN_FRAMES", "DIRECTION", "END", "ENDS",
-    "FARTHEST_MM", "KEY_POINTS", "KINDS", "LARGEST_MM", "LONGEST_NAME", "MEASURES", "METRIC_NAMES", "NAMES",
-    "NORMAL_95", "NUMBER", "OPEN", "PLACE", "POSE", "RADIUS", "RATIO", "SAMPLED_POINTS", "SCALED_POSE", "SHARE",
-    "SOURCES", "SUPPORTS", "VOCABULARIES", "WORST_FIRST", "ArchDesign", "ArchTruth", "AsBuilt", "Better",
-    "BodyTruth", "Bools", "Ceiling", "Checked", "Clips", "Codes", "Columns", "Control", "DefectTruth", "DesignBodies",
-    "DesignFaults", "DesignPart", "Diagnostics", "Fault", "Floats", "FrameDesign", "FrameTruth", "InputError",
-    "Ints", "Labels", "Limit", "Meaning", "Metric", "PartSupports", "Picks", "PlainError", "PointLabels", "PoseTruth",
-    "Reason", "RecordError", "Rows", "Scan", "Scene", "Shorts", "StationTruth", "Stations", "Statistic", "Status",
-    "Steel", "StepRun", "StructureDesign", "StructureTruth", "TargetKind", "TargetSearch", "TargetTruth", "Targets",
+    "AMOUNT", "BETTER", "COORDINATE", "COUNT", "COVARIANCE", "DESIGN_FRAMES", "DIRECTION", "END", "ENDS", "FARTHEST_MM",
+    "KEY_POINTS", "KINDS", "LARGEST_MM", "LONGEST_NAME", "MEASURES", "METRIC_NAMES", "NAMES", "NORMAL_95", "NUMBER",
+    "OPEN", "PLACE", "POSE", "RADIUS", "RATIO", "SAMPLED_POINTS", "SCALED_POSE", "SHARE", "SOURCES", "SUPPORTS",
+    "VOCABULARIES", "WORST_FIRST", "ArchDesign", "ArchTruth", "AsBuilt", "Better", "BodyTruth", "Bools", "Ceiling",
+    "Checked", "Clips", "Codes", "Columns", "Control", "DecisionRule", "DefectTruth", "DesignBodies", "DesignFaults",
+    "DesignPart", "Diagnostics", "Fault", "Floats", "FrameDesign", "FrameTruth", "InputError", "Ints", "Labels",
+    "Limit", "Meaning", "Metric", "PartSupports", "Picks", "PlainError", "PointLabels", "PoseTruth", "Reason",
+    "RecordError", "Rows", "Scan", "Scene", "Shorts", "StationTruth", "Stations", "Statistic", "Status", "Steel",
+    "StepRun", "StructureDesign", "StructureTruth", "TargetKind", "TargetSearch", "TargetTruth", "Targets",
     "TitleBlock", "Tolerance", "Truth", "UsageError", "Verdict", "Word", "column", "described", "did_you_mean",
     "name_lists", "names", "newer", "optional", "per_point_fields", "reason", "reasons", "words", "worst",
 ]  # fmt: skip

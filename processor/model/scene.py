@@ -27,6 +27,7 @@ from processor.model.fields import (
     NAMES,
     PLACE,
     SAMPLED_POINTS,
+    SHARE,
     SIZE,
     SMALLEST_MM,
     TUBE_PER_BALL,
@@ -371,15 +372,41 @@ class Limit(Checked):
                 yield Fault((low,), text)
 
 
+class DecisionRule(Word):
+    """How a value with its uncertainty is judged by a limit, see :mod:`processor.limits.judging`."""
+
+    SIMPLE = "simple"
+    GUARDED = "guarded"
+    RISK = "risk"
+
+
+LARGEST_RISK = 0.05  # of a wrong decision, where a project states none: 95 % as of all intervals
+
+
 @dataclass(frozen=True)
 class Tolerance(Checked):
-    """The limits that results are compared with: those of a standard, of the project, or both (the project's win)."""
+    """The limits that results are compared with: those of a standard, of the project, or both (the project's win).
+
+    ``rule`` and ``risk`` are None where the project states none: see :attr:`decision` and :attr:`largest_risk`.
+    """
 
     standard: str = ""
     edition: str = described("", means=LONG)
     limits: tuple[Limit, ...] = ()
     # between two ends as assembled, by the design; their gap is compared with it
     root_gap_mm: float = described(0.0, means=PLACE)
+    rule: str | None = newer(means=Meaning(words=tuple(DecisionRule)))
+    risk: float | None = newer(means=SHARE)
+
+    @property
+    def decision(self) -> DecisionRule:
+        """The decision rule: guarded unless stated."""
+        return DecisionRule.GUARDED if self.rule is None else DecisionRule(self.rule)
+
+    @property
+    def largest_risk(self) -> float:
+        """The largest probability of a wrong decision, of rule ``risk``."""
+        return LARGEST_RISK if self.risk is None else self.risk
 
 
 @dataclass(frozen=True)

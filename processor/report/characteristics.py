@@ -13,18 +13,22 @@ from processor.report.columns import columns
 from processor.report.table import NAN, Table
 
 FILE = "characteristics"
+RISKS = ("risk_accept", "risk_reject")
 COLUMNS = columns(
-    "id", "verdict", "quantity", "nominal", "actual", "deviation", "ci95", "lower", "upper", "unit", "limit_from",
+    "id", "verdict", "quantity", "nominal", "actual", "deviation", "ci95", "lower", "upper", "unit", *RISKS,
+    "limit_from",
 )  # fmt: skip
-OF_LIMITS = columns("limit", "of", "verdict", "value", "ci95", "least", "greatest", "unit", "clause")
+OF_LIMITS = columns("limit", "of", "verdict", "value", "ci95", "least", "greatest", "unit", *RISKS, "clause")
 MOST_NAMED = 4  # of a summary of one or two lines
 NOTE = text(
     "Worst first. Deviation is actual less nominal, ci95 the half-width of its 95 % interval, lower and upper the "
-    "deviations allowed; a dash is no bound, or not known."
+    "deviations allowed; a dash is no bound, or not known. The risks are the probabilities that it is wrong to accept "
+    "and to reject."
 )
 NOTE_OF_LIMITS = text(
     "± is the 95 % half-width, a dash is no bound or no number. Pass: the whole interval keeps the limit; fail: the "
-    "whole interval exceeds it; indeterminate: the limit lies within it, or the value is in doubt."
+    "whole interval exceeds it; indeterminate: the limit lies within it, or the value is in doubt. With the decision "
+    "rule simple the value alone decides, with risk the probability that accepting or rejecting is wrong."
 )
 UNVERIFIED = "{note} Not verified: the limits from {sources} were not compared with the published text; do so first."
 
@@ -46,9 +50,12 @@ def limit_table(limits: JudgedLimits | None, file: str) -> list[Table]:
     if limits is None:
         return []
     rows = tuple(
-        (label(one.what), one.of, one.verdict, one.value, one.ci95, one.low, one.high, one.unit, label(one.clause))
+        (
+            label(one.what), one.of, one.verdict, one.value, one.ci95, one.low, one.high, one.unit,
+            one.risk_accept, one.risk_reject, label(one.clause),
+        )
         for one in worst_first(limits.rows)
-    )
+    )  # fmt: skip
     note = with_unverified(NOTE_OF_LIMITS, [limits])
     return [Table(text("Compared with limits"), OF_LIMITS, rows, file, note, on_page=False)]
 
@@ -73,7 +80,8 @@ def table(judged: Sequence[Judged], remark: str | Message = "") -> Table:
     rows = tuple(
         (
             one.of, one.verdict, one.what, one.nominal, one.actual, one.value, one.ci95,
-            *(bound if math.isfinite(bound) else NAN for bound in (one.low, one.high)), one.unit, one.clause,
+            *(bound if math.isfinite(bound) else NAN for bound in (one.low, one.high)), one.unit,
+            one.risk_accept, one.risk_reject, one.clause,
         )
         for one in judged
     )  # fmt: skip

@@ -57,6 +57,7 @@ UNITS = {
 # Headings that are not the words of the name: under a heading of their group, or beside another column of the kind
 SHORT = {
     "input_sha256": "input SHA-256", "peak_mb": "peak memory", "seconds": "time",
+    "risk_accept": "risk if accepted", "risk_reject": "risk if rejected",
     "probability_now": "now", "probability_after": "after", "rotation_about": "about", "rotation_ci95_mrad": "ci95",
     "misalignment_ci95_mm": "ci95", "least_groove_gap_mm": "gap", "least_groove_gap_ci95_mm": "ci95",
     "greatest_groove_gap_mm": "gap", "greatest_groove_gap_ci95_mm": "ci95",

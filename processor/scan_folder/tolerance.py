@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from processor.limits import limit_bounds, measurands, project_limits, standards
-from processor.model import Floats, InputError, Limit, Tolerance, did_you_mean
+from processor.model import DecisionRule, Floats, InputError, Limit, Tolerance, did_you_mean
 from processor.model.inputs import Kind, Place, array, entry, number, read, tables, text
 from processor.scan_folder.files import PROJECT
 
 COMPONENTS = "component"
+OF_DECISIONS = {"rule", "risk"}
 MOST_NAMES = 12  # components in a message
 OF_COMPONENTS = (measurands.DEVIATION, measurands.DEVIATION_SHARE, measurands.DEFECT_DEPTH, measurands.DEFECT_AREA)
 
@@ -27,6 +28,8 @@ def read_tolerance(given: Any, place: Place) -> Tolerance | None:
     standard = given.get("standard", "") if isinstance(given, Mapping) else ""
     try:
         base = standards.load(standard) if standard and isinstance(standard, str) else Tolerance()
+        if isinstance(given, Mapping) and not set(given) - OF_DECISIONS:
+            base = standards.default_for(None)
     except InputError as error:
         raise place.refused(str(error)) from None
     declared, choice = declared_limits(base.standard), project_limits.choice(base)
@@ -38,6 +41,9 @@ def read_tolerance(given: Any, place: Place) -> Tolerance | None:
     limits = read(declared, given, place)
     of_components = {limited.name: _given(limited, choice) for limited in limits.component}
     values = _given(limits, choice)
+    if limits.risk is not None and limits.rule != DecisionRule.RISK:
+        raise place.refused(f'risk is of the decision rule "{DecisionRule.RISK}"; add rule = "{DecisionRule.RISK}"')
+    base = dataclasses.replace(base, rule=limits.rule, risk=limits.risk)
     tolerance = project_limits.override(base, values, PROJECT, limits.root_gap_mm, of_components)
     _check_share(place, tolerance)
     return tolerance
@@ -58,6 +64,11 @@ def declared_limits(standard: str) -> Any:
     first = [
         ("standard", entry(text(), "a standard of processor/limits", default="")),
         ("root_gap_mm", entry(number(), "gap between two ends in the design", default=0.0)),
+        ("rule", entry(text(*DecisionRule), "decision rule", default=None)),
+        (
+            "risk",
+            entry(number(above=0, below=0.5), "largest probability of a wrong decision, of rule risk", default=None),
+        ),
     ]
     return _declared("Limits", first, choice, [(COMPONENTS, entry(tables(component), about, default=()))])
 

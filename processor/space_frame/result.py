@@ -110,7 +110,8 @@ class Balls(Rows):
 
     Only method ``ray`` fills the columns from ``sizes`` on. ``bound_sd`` are the Cramér-Rao bounds of x, y, z, radius
     and lowest point, ``efficiency`` is bound over standard deviation, as by the points alone, of centre, radius and
-    lowest point. Movements are in the design's frame; ``verdict`` compares them with the limit.
+    lowest point. Movements are in the design's frame; ``verdict`` compares them with the limit; the risks are
+    the probabilities that it is wrong to accept and to reject.
     """
 
     ids: Ints = column("k", dtype=np.int64, json="id", means=NAMES)
@@ -146,6 +147,8 @@ class Balls(Rows):
     movement_size: Floats = column("k", json="movement.size", where="movement", unit="mm", means=AMOUNT)
     movement_size_ci95: Floats = column("k", json="movement.size_ci95", where="movement", unit="mm", means=AMOUNT)
     verdict: tuple[Verdict, ...] = words("k", Verdict, json="movement.verdict", where="movement")
+    risk_accept: Floats = column("k", json="movement.risk_accept", where="movement", newer=True, means=SHARE)
+    risk_reject: Floats = column("k", json="movement.risk_reject", where="movement", newer=True, means=SHARE)
     movement_gauge: tuple[MovementGauge, ...] = words(
         "k", MovementGauge, json="movement.gauge", where="movement", newer=True
     )

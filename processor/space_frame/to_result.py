@@ -10,10 +10,11 @@ import numpy as np
 
 from processor.adjustment import thermal
 from processor.limits import measurands, standards
-from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
+from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Tolerance, Verdict, reason
 from processor.space_frame import ball_catalogue, supports_and_deflections
+from processor.space_frame.design import movement
 from processor.space_frame.design.matching import FrameRelation, Matching
-from processor.space_frame.design.movement import Movement, size_of, verdict_of
+from processor.space_frame.design.movement import Movement, size_of
 from processor.space_frame.extract import Extracted, Options, extract
 from processor.space_frame.members.records import Members
 from processor.space_frame.params import Params
@@ -85,7 +86,8 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
             limit=NAN if limit is None else limit.high,
             limit_source="" if limit is None else limit.source,
         )
-        balls = _with_movements(balls, movements, reference.limit, matched.status is Status.OK)
+        of_project = scene.tolerance or Tolerance()
+        balls = _with_movements(balls, movements, reference.limit, matched.status is Status.OK, of_project)
         balls = _by_gauge(balls, [movements, extracted.movement_otherwise])
         gauges = _gauges(balls, extracted, scene)
     if scene.frame is not None:
@@ -165,12 +167,16 @@ def _reasons(extracted: Extracted, scene: Scene) -> tuple[Reason, ...]:
     return (*reasons, *(() if extracted.matching is None else extracted.matching.reasons))
 
 
-def _with_movements(balls: Balls, movements: Movement, limit: float, matched: bool) -> Balls:
+def _with_movements(balls: Balls, movements: Movement, limit: float, matched: bool, tolerance: Tolerance) -> Balls:
     """Add the movements of nodes, and their verdicts; ``matched`` is False where the matching is not certain."""
     k, rows = len(balls), movements.found
     vector, ci95, covariance = np.full((k, 3), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan)
     vector[rows], ci95[rows], covariance[rows] = movements.vector, movements.ci95, movements.covariance
     size, size_ci95 = size_of(vector, covariance)
+    judged = [
+        movement.judge(length, half, limit, matched and evidence is not Evidence.AXES, tolerance)
+        for length, half, evidence in zip(size.tolist(), size_ci95.tolist(), balls.evidence, strict=True)
+    ]
     return replace(
         balls,
         movement=vector,
@@ -178,10 +184,9 @@ def _with_movements(balls: Balls, movements: Movement, limit: float, matched: bo
         movement_covariance=covariance,
         movement_size=size,
         movement_size_ci95=size_ci95,
-        verdict=tuple(
-            verdict_of(length, half, limit, matched and evidence is not Evidence.AXES)
-            for length, half, evidence in zip(size.tolist(), size_ci95.tolist(), balls.evidence, strict=True)
-        ),
+        verdict=tuple(one.verdict for one in judged),
+        risk_accept=np.array([one.risk_accept for one in judged]),
+        risk_reject=np.array([one.risk_reject for one in judged]),
     )
 
 

@@ -48,8 +48,8 @@ from processor.store.whole_output import replacing
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
 FORMAT_VERSION = "1.5"  # of scenes and truths
 READABLE = ("1.2", "1.3", "1.4", FORMAT_VERSION)  # fields added since may be absent
-RESULTS_VERSION = "2.4"
-RESULTS_READABLE = ("2.0", "2.1", "2.2", "2.3", RESULTS_VERSION)
+RESULTS_VERSION = "2.5"
+RESULTS_READABLE = ("2.0", "2.1", "2.2", "2.3", "2.4", RESULTS_VERSION)
 WITHOUT_CHECKSUMS = ("1.2", "1.3", "2.0")
 RESULTS_HISTORY = [
     "1.0 to 1.3: one flat record a step",
@@ -58,6 +58,7 @@ RESULTS_HISTORY = [
     "2.2: diagnostics of a step",
     "2.3: the components of an inspection as tables",
     "2.4: movements of nodes by both gauges",
+    "2.5: risks of wrong decisions beside verdicts",
 ]
 HISTORY = [
     "1.0: first",

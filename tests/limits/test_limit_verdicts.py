@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.integrate import quad
 from scipy.special import ndtri
 
 from processor.cli.main import commands
@@ -104,6 +105,54 @@ def test_verdict_follows_from_the_interval_of_the_value(value, ci95, verdict):
 def test_verdict_of_an_interval_against_bounds(interval, verdict):
     limit = Limit("k", "x", low=-1.0, high=2.0)
     assert judging.judge(limit, Measured("n", 0.5 * sum(interval), *interval), Tolerance()).verdict == verdict
+
+
+# value and the ends of its interval, by limits from least to greatest
+RISKS = [
+    (value, value - below, value + above, low, high)
+    for value, below, above in ((0.4, 1.0, 1.0), (1.9, 0.3, 0.3), (2.1, 0.5, 0.2), (-3.0, 0.4, 4.0), (2.0, 1.0, 2.0))
+    for low, high in ((-1.0, 2.0), (-math.inf, 2.0), (-1.0, math.inf), (1.8, 2.2))
+]
+
+
+@pytest.mark.parametrize(("value", "below", "above", "low", "high"), RISKS)
+def test_risks_are_integrals_of_the_density_beyond_the_limits(value, below, above, low, high):
+    def density(x):
+        sd = ((above - value) if x > value else (value - below)) / ndtri(0.975)
+        return math.exp(-0.5 * ((x - value) / sd) ** 2) / (sd * math.sqrt(2.0 * math.pi))
+
+    ends = [max(low, value - 10.0), min(high, value + 10.0)]  # 5 sd and more
+    within = [
+        quad(density, *sorted(np.clip([ends[0], value], *ends)))[0],
+        quad(density, np.clip(value, *ends), ends[1])[0],
+    ]
+    judged = judging.judge(Limit("k", "x", low=low, high=high), Measured("n", value, below, above), Tolerance())
+    assert judged.risk_reject == pytest.approx(sum(within), abs=1e-6)
+    assert judged.risk_accept == pytest.approx(1.0 - sum(within), abs=1e-6)
+
+
+# By hand: of a value z standard deviations within its limit the risk of accepting is 1 - Phi(z): .05 at z = 1.645
+@pytest.mark.parametrize(
+    ("value", "verdicts"),
+    [
+        (8.0, (PASS, PASS, PASS)),  # z = 2
+        (8.3, (PASS, OPEN, PASS)),  # 1.7: within the guard band, .045
+        (8.4, (PASS, OPEN, OPEN)),  # 1.6: .055
+        (10.1, (FAIL, OPEN, OPEN)),
+        (11.7, (FAIL, OPEN, FAIL)),  # 1.7 beyond
+        (12.0, (FAIL, FAIL, FAIL)),
+    ],
+)
+def test_the_rule_of_a_project_decides(value, verdicts):
+    limit, measured = Limit("k", "x", high=10.0), Measured.within("n", value, float(ndtri(0.975)))
+    rules = (Tolerance(rule="simple"), Tolerance(), Tolerance(rule="risk"))
+    assert tuple(judging.judge(limit, measured, rule).verdict for rule in rules) == verdicts
+    doubtful = dataclasses.replace(measured, doubtful=True)
+    for rule in rules:
+        judged = judging.judge(limit, doubtful, rule)
+        assert (judged.verdict, math.isnan(judged.risk_accept)) == (OPEN, True)
+    by_half = judging.judge(limit, measured, Tolerance(rule="risk", risk=0.499))
+    assert by_half.verdict is (PASS if value < 10.0 else FAIL)
 
 
 @pytest.mark.parametrize(

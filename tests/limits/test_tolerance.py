@@ -126,6 +126,33 @@ def test_a_projects_own_limits_win_and_go_through_the_store(tmp_path):
     assert store.scene_hash(scene) != store.scene_hash(dataclasses.replace(scene, tolerance=None))
 
 
+def test_the_decision_rule_goes_through_the_store_and_leaves_other_scenes_as_they_were(tmp_path):
+    before = folder.read_input(write_project(tmp_path, '[tolerance]\nstandard = "GB 50205-2020"\n'))
+    scene = folder.read_input(write_project(tmp_path, '[tolerance]\nrule = "risk"\nrisk = 0.1\n'))
+    assert (scene.tolerance.decision, scene.tolerance.largest_risk) == ("risk", 0.1)
+    assert (before.tolerance.decision, before.tolerance.largest_risk) == ("guarded", 0.05)
+    assert scene.tolerance.limits == before.tolerance.limits  # no limits of its own: those of the default standard
+    assert store.scene_hash(scene) != store.scene_hash(before)
+    unstated = dataclasses.replace(scene.tolerance, rule=None, risk=None)
+    assert store.scene_hash(dataclasses.replace(scene, tolerance=unstated)) == store.scene_hash(before)
+    store.write_scene(tmp_path / "s.h5", scene, None, {})
+    assert repr(store.read_scene(tmp_path / "s.h5").tolerance) == repr(scene.tolerance)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('rule = "shared"', "expected one of simple, guarded, risk"),
+        ("risk = 0.1", 'add rule = "risk"'),
+        ('rule = "guarded"\nrisk = 0.1', 'add rule = "risk"'),
+        ('rule = "risk"\nrisk = 0.5', "below 0.5"),
+    ],
+)
+def test_a_decision_rule_that_is_none_is_refused(tmp_path, text, said):
+    with pytest.raises(InputError, match=said):
+        folder.read_input(write_project(tmp_path, f"[tolerance]\n{text}\n"))
+
+
 def test_project_without_a_standard_has_its_own_limits_alone(tmp_path):
     scene = folder.read_input(write_project(tmp_path, "[tolerance]\nsplice_eccentricity_mm = 4.0\n"))
     assert [row.key for row in scene.tolerance.limits] == ["splice_eccentricity_mm"]

@@ -11,9 +11,9 @@ from designgen.scenes.make import make
 from processor import pipeline
 from processor.evaluation import space_frame
 from processor.geometry import rigid, thread_ranges
-from processor.model import FrameDesign, Scan, reason
+from processor.model import FrameDesign, Scan, Tolerance, reason
 from processor.space_frame import to_result
-from processor.space_frame.design.movement import verdict_of
+from processor.space_frame.design.movement import judge
 from processor.space_frame.points.source import SceneSource
 from processor.space_frame.spheres import baselines
 from processor.space_frame.step import Params, run
@@ -249,7 +249,7 @@ def test_a_ball_that_rays_went_through_is_missing_and_one_that_was_not_seen_has_
         assert reason("spheres.axes-alone", axes=8) in result.balls.reasons[row]
         found = result.balls
         verdicts = [
-            verdict_of(size, half, 1.0, evidence != "axes")
+            judge(size, half, 1.0, evidence != "axes", Tolerance()).verdict
             for size, half, evidence in zip(found.movement_size, found.movement_size_ci95, found.evidence, strict=True)
         ]
         assert verdicts[row] == ("none" if flag == "not-found" else "indeterminate")

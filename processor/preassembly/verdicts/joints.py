@@ -15,27 +15,20 @@ import numpy as np
 
 from processor.adjustment import normal_draws
 from processor.limits import judging, limit_bounds
-from processor.limits.judging import Judged
+from processor.limits.judging import Judged, JudgedLimits
 from processor.model import (
-    AMOUNT,
-    NUMBER,
-    OPEN,
     SHARE,
     Bools,
     Checked,
     Floats,
     Limit,
     Reason,
-    Rows,
     Tolerance,
     Verdict,
     Word,
-    column,
     described,
-    names,
     reason,
     reasons,
-    words,
     worst,
 )
 from processor.preassembly.chain.joint_measures import ACROSS, JointQuantity, Measures, motion_of
@@ -52,47 +45,19 @@ class LimitOrigin(Word):
 
 
 @dataclass(frozen=True)
-class ComparedLimits(Rows):
-    """Values compared with limits, a row per limit.
-
-    Of the groove gap the value is the extreme nearer to its limit, less the design's root gap. ``low`` and ``high`` are
-    allowed, -inf and inf without a bound; NaN: they depend on an unknown size. ``clause`` is of the standard, or the
-    source where there is none.
-    """
-
-    key: tuple[str, ...] = names("v", json="limit")
-    what: tuple[str, ...] = names("v")
-    value: Floats = column("v", means=NUMBER)
-    ci95: Floats = column("v", means=AMOUNT)
-    low: Floats = column("v", means=OPEN)
-    high: Floats = column("v", means=OPEN)
-    verdict: tuple[Verdict, ...] = words("v", Verdict)
-    probability: Floats = column("v", means=SHARE)
-    clause: tuple[str, ...] = names("v")
-    edition: tuple[str, ...] = names("v")
-    source: tuple[str, ...] = names("v")
-    verified: Bools = column("v", dtype=np.bool_)
-
-    @property
-    def bounds_known(self) -> Bools:
-        """Mark the limits (v,) that do not depend on an unknown size."""
-        return ~(np.isnan(self.low) | np.isnan(self.high))
-
-
-@dataclass(frozen=True)
 class Conformity(Checked):
     """Verdict on a joint or the chain, its comparison with each limit, and why a verdict is not possible."""
 
     verdict: Verdict = described(Verdict.INDETERMINATE, words=Verdict)
     probability: float = described(float("nan"), means=SHARE)  # that all limits are kept
-    limits: ComparedLimits = field(default_factory=ComparedLimits)
+    limits: JudgedLimits = field(default_factory=JudgedLimits)
     reasons: tuple[Reason, ...] = reasons()
 
     @classmethod
     def of_rows(cls, rows: Sequence[Judged], probability: float, doubts: tuple[Reason, ...] = ()) -> Conformity:
         """Return the verdict on all limits from that on each."""
         verdict = worst(row.verdict for row in rows)
-        return cls(verdict=verdict, probability=probability, limits=ComparedLimits.from_items(rows), reasons=doubts)
+        return cls(verdict=verdict, probability=probability, limits=JudgedLimits.from_items(rows), reasons=doubts)
 
 
 def joint_limits(tolerance: Tolerance) -> list[Limit]:

@@ -9,6 +9,7 @@ from processor.language.messages import Message, label, text
 from processor.limits.judging import Judged
 from processor.model import Scene, Status, StepRun, Verdict
 from processor.report import verdict_counts
+from processor.report.characteristics import RISKS
 from processor.report.inspection import tables
 from processor.report.step_report import StepReport
 from processor.report.style import Drawn
@@ -68,7 +69,7 @@ def _characteristics(_: Scene, run: StepRun) -> list[Judged]:
             low=row["lower"],
             high=row["upper"],
             clause=label(row["clause"]),
-            **{name: row[name] for name in ("nominal", "ci95", "unit", "verdict")},
+            **{name: row[name] for name in ("nominal", "ci95", "unit", "verdict", *RISKS) if name in row},
         )
         for component in run.result.components
         for row in component.characteristics.items()

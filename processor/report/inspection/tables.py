@@ -11,6 +11,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.inspection.result import Characteristics, Result
 from processor.language.messages import text
 from processor.model import StepRun
+from processor.report.characteristics import RISKS
 from processor.report.columns import MM
 from processor.report.table import Table, tabulate
 
@@ -19,7 +20,8 @@ NOTE = text(
     "section against the start section times the height; squareness is the tilt of an end face against the part's "
     "chord, times the width or height. Sweep (positive to the left) and camber (upward) are the greatest departures of "
     "the axis from the design's, measured from the chord between the part's own ends. Lower and upper bound the "
-    "deviation; verdicts follow ISO 14253-1."
+    "deviation; verdicts follow ISO 14253-1 unless the "
+    "project states another decision rule. The risks are the probabilities that it is wrong to accept and to reject."
 )
 
 
@@ -35,6 +37,7 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
         "quantity": every.quantity,
         **{name: getattr(every, name) for name in ("nominal", "actual", "deviation", "ci95", "lower", "upper", "unit")},
         "verdict": every.verdict,
+        **{name: getattr(every, name) for name in RISKS if len(getattr(every, name))},
         "clause": every.clause,
         "remark": every.reasons,
     }

@@ -10,11 +10,11 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.language.messages import Message, label, text
+from processor.limits.judging import JudgedLimits
 from processor.model import Floats
 from processor.preassembly.chain.joint_measures import JointQuantity, MeasuredQuantities
 from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.result import Adjustment, Result
-from processor.preassembly.verdicts.joints import ComparedLimits
 from processor.report.characteristics import with_unverified
 from processor.report.columns import MM, columns, under
 from processor.report.table import NAN, Table, rows_of, tabulate, yes_no
@@ -145,12 +145,12 @@ def _joint_rows(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
 def _limits(adjustment: Adjustment, method: str) -> Table:
     limits = [conformity.limits for conformity in adjustment.joints.conformity]
     joints = [joint for joint, one in zip(adjustment.joints.name, limits, strict=True) for _ in one.key]
-    cells = {"joint": joints, **_cells_of_limits(ComparedLimits.concat(limits))}
+    cells = {"joint": joints, **_cells_of_limits(JudgedLimits.concat(limits))}
     title = text("Limits, method {method}", method=method)
     return tabulate(title, cells, LIMITS, with_unverified(LIMITS_NOTE, limits), units=MM, on_page=False)
 
 
-def _cells_of_limits(limits: ComparedLimits) -> dict[str, Any]:
+def _cells_of_limits(limits: JudgedLimits) -> dict[str, Any]:
     return {
         "limit": list(map(label, limits.what)),
         "verdict": limits.verdict,
@@ -165,7 +165,7 @@ def _cells_of_limits(limits: ComparedLimits) -> dict[str, Any]:
 
 def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     """Yield the limits of the whole chain, and those stated ones that nothing is compared with."""
-    limits = ComparedLimits.concat([conformity.limits for conformity in adjustment.chain])
+    limits = JudgedLimits.concat([conformity.limits for conformity in adjustment.chain])
     if len(limits):
         further = {"edition": limits.edition, "source": list(map(label, limits.source))}
         title = text("Limits of the whole chain, method {method}", method=method)

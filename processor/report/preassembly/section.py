@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from processor.language.messages import Message, Text, text
+from processor.limits.judging import JudgedLimits
 from processor.model import Floats, Status, Verdict, worst
 from processor.preassembly.result import Adjustment, MeanMax, Result
-from processor.preassembly.verdicts.joints import ComparedLimits
 from processor.report import verdict_counts
 from processor.report.preassembly import characteristics, figures, interactive_view, tables
 from processor.report.step_report import StepReport, not_ok
@@ -113,7 +113,7 @@ def _to_do(result: Result) -> Iterator[Message]:
     yield from result.adjustment.advice[:1]
 
 
-def _limits(result: Result) -> list[ComparedLimits]:
+def _limits(result: Result) -> list[JudgedLimits]:
     adjustment = result.adjustment
     if adjustment is None:
         return []

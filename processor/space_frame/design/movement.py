@@ -18,19 +18,8 @@ from processor.adjustment.body_motions import point_covariances
 from processor.adjustment.robust_least_squares import inverse_of
 from processor.geometry import rigid
 from processor.limits import judging
-from processor.limits.judging import Measured
-from processor.model import (
-    NORMAL_95,
-    Checked,
-    Floats,
-    FrameDesign,
-    Ints,
-    Limit,
-    Tolerance,
-    Verdict,
-    column,
-    described,
-)
+from processor.limits.judging import Judged, Measured
+from processor.model import NORMAL_95, Checked, Floats, FrameDesign, Ints, Limit, Tolerance, column, described
 from processor.space_frame.design.matching import FrameRelation, Matching, NodePattern, expanded
 from processor.space_frame.result import MovementGauge
 
@@ -127,13 +116,12 @@ def size_of(vector: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     return size, NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
 
 
-def verdict_of(size: float, ci95: float, limit: float, certain: bool) -> Verdict:
-    """Judge the size of a movement with its half-width by a limit, mm; NaN = none.
+def judge(size: float, ci95: float, limit: float, certain: bool, tolerance: Tolerance) -> Judged:
+    """Judge the size of a movement with its half-width by a limit, mm, NaN = none, and the rule of a ``tolerance``.
 
     ``certain`` is False where other poses of the design fit the nodes as well, and for a sphere that was
     not seen: the point where its axes meet is not the sphere's centre. Such a movement is indeterminate.
     """
-    if np.isnan(size) or np.isnan(limit):
-        return Verdict.NONE
     measured = Measured.within("node", size, ci95, doubtful=not certain)
-    return judging.judge(Limit("node_place", "place of a node", high=limit), measured, Tolerance()).verdict
+    limited = not (np.isnan(size) or np.isnan(limit))
+    return judging.judge(Limit("node_place", "place of a node", high=limit) if limited else None, measured, tolerance)

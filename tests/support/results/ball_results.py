@@ -13,6 +13,7 @@ from processor.model import (
     Scan,
     Scene,
     StepRun,
+    Tolerance,
     reason,
 )
 from processor.pipeline import Execution
@@ -124,7 +125,7 @@ def whole(limit=10.0, T=None, matching="ok", changed=None, **changes):
     }
     size, ci95 = movement.size_of(np.asarray(columns["movement"]), np.asarray(columns["movement_covariance"]))
     verdict = tuple(
-        movement.verdict_of(one, half, limit, matching == "ok" and evidence != "axes")
+        movement.judge(one, half, limit, matching == "ok" and evidence != "axes", Tolerance()).verdict
         for one, half, evidence in zip(size, ci95, columns["evidence"], strict=True)
     )
     made = Result(
