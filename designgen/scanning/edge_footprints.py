@@ -88,13 +88,13 @@ def columns_over(reach, cosine, across):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def mark_edges(surface, t, thin, used, margin, grid, beam, offset, least):  # type: ignore[no-untyped-def]
+def mark_edges(surface, t, thin, used, margin, grid, beam, least):  # type: ignore[no-untyped-def]
     """Mark the rays (columns, rows) of a strip whose footprints may meet several surfaces; also their least range, mm.
 
     ``surface`` and ``t`` (columns, rows) are the number and range (mm) of the surface that each ray meets, -1 and
     infinite for none; ``thin`` is the range at which a footprint may touch a shape too thin for the rays. The ``used``
-    columns of the strip have ``margin.side`` columns on either side. Sub-rays lie within ``offset`` radii of the
-    ``beam``; nothing is nearer than ``least``, mm. Outside of the strip the results are False and infinite.
+    columns of the strip have ``margin.side`` columns on either side. All sub-rays lie
+    within the ``beam``; nothing is nearer than ``least``, mm. Outside of the strip the results are False and infinite.
     """
     side, edge_columns, whole_rows = margin.side, margin.edge_columns, margin.whole_rows
     across = 2.0 * np.pi / grid.columns
@@ -122,7 +122,7 @@ def mark_edges(surface, t, thin, used, margin, grid, beam, offset, least):  # ty
                     edge[j, i] = True
             if not differs and i > 0:  # the surface below the lowest row is unknown
                 continue
-            reach = offset * (beam.half_divergence + beam.exit_radius / nearest)
+            reach = beam.half_divergence + beam.exit_radius / nearest
             over = cells(reach / grid.step)
             for b in range(max(0, i - over), min(rows, i + over + 1)):
                 sideways = columns_over(reach, margin.cos_elevation[b], across)

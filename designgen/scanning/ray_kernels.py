@@ -347,7 +347,8 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
     best = np.full((count, m), np.inf)
     shape = np.full((count, m), MISS, np.int32)
     farthest = np.full(count, np.inf)  # range of each ray's sub-rays
-    broadest = angle.max() if count else 0.0
+    widest = np.sqrt((offsets[:, 0] ** 2 + offsets[:, 1] ** 2).max())
+    broadest = widest * angle.max() if count else 0.0
     rows = number.shape[1]
     level, rise = elevations(grid, rows)
     for b in range(len(windows)):
@@ -371,7 +372,9 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
                     continue
                 dx, dy, dz = direction(ca, sa, level[row], rise[row], jitter[j, row, 0], jitter[j, row, 1])
                 along = dx * cx + dy * cy + dz * cz
-                near = r + angle[ray] * abs(along) + 1e-6 * r  # the beam's edge may touch what its middle misses
+                near = (
+                    r + widest * angle[ray] * abs(along) + 1e-6 * r
+                )  # the beam's edge may touch what its middle misses
                 if along + r < 0.0 or along - r > farthest[ray] or c2 - along * along > near * near + 1e-9 * c2:
                     continue
                 changed = False

@@ -19,7 +19,7 @@ import numpy as np
 from designgen.randomness import generator
 from designgen.rigid import inverse
 from designgen.scanning import edge_footprints, ray_kernels, raycast
-from designgen.scanning.ray_kernels import Strip
+from designgen.scanning.ray_kernels import Beam, Strip
 from designgen.scanning.raycast import Grid, View
 from designgen.scanning.scanner import BEAM_RINGS, Params, Scanner
 from designgen.scanning.surfaces import Surfaces
@@ -73,6 +73,8 @@ class Echoes:
     cosine: Floats  # of the angle of incidence
     ray: Floats  # (n, 3) unit vector of the ray's middle, scanner's frame
     source: Codes  # row of SOURCES
+    spread: Floats  # standard deviation of the ranges in the footprint by their energies, mm
+    reflectance: Floats  # mean over the footprint by energy
 
 
 Columns = TypeVar("Columns", Returns, Echoes)
@@ -119,9 +121,11 @@ def scan_station(
     )
     T_scanner_scene = inverse(T_scene_scanner)
     nearest = np.array([max(scanner.min_range_mm, 1.0)])
-    spread = 2.0 * float(scanner.beam_angle(nearest)[0]) + ENCODER_SIGMAS * 1e-6 * scanner.encoder_urad
+    wide = float(scanner.beam_angle(nearest)[0]) * max(1.0, scanner.beam_aspect)
+    spread = 2.0 * wide + ENCODER_SIGMAS * 1e-6 * scanner.encoder_urad
     least = max(float(nearest[0]), edge_footprints.nearest_mm(surfaces, T_scene_scanner[:3, 3]))
-    margin = edge_footprints.margin(grid, outermost(params.sub_rays) * float(scanner.beam_angle(np.array([least]))[0]))
+    outermost = reach(scanner, params.sub_rays)
+    margin = edge_footprints.margin(grid, outermost.half_divergence + outermost.exit_radius / least)
     caster = _StationCaster(
         surfaces=surfaces,
         view=raycast.view(surfaces, T_scanner_scene, grid, STRIP, margin.side, scanner.max_range_mm, spread),
@@ -151,23 +155,24 @@ def scan_station(
     return StationScan(returns, (float(offset), float(scale), float(tilt[0]), float(tilt[1])))
 
 
-def beam(count: int) -> tuple[Floats, Floats]:
-    """Return the offsets (k, 2) of sub-rays in radii of the beam, the middle first, and their energies (k,), sum 1.
+def beam(count: int, aspect: float = 1.0) -> tuple[Floats, Floats]:
+    """Return the offsets (k, 2) of sub-rays in horizontal radii of the beam, the middle first, and their energies (k,).
 
-    The beam is Gaussian; at its radius the intensity is 1/e^2 of that in the middle.
+    The energies have the sum 1. The beam is Gaussian, with a vertical radius ``aspect`` times the horizontal one.
     """
-    places = [(0.0, 0.0)]
-    for radius, number in BEAM_RINGS[count]:
+    places, energy = [(0.0, 0.0)], [1.0 - sum(ring for *_, ring in BEAM_RINGS[count])]
+    for radius, number, ring in BEAM_RINGS[count]:
         turns = (np.arange(number) + 0.5) * 2.0 * np.pi / number
         places += list(zip(radius * np.cos(turns), radius * np.sin(turns), strict=True))
-    offsets = np.array(places)
-    energy = np.exp(-2.0 * (offsets**2).sum(axis=1))
-    return offsets, energy / energy.sum()
+        energy += [ring / number] * number
+    return np.array(places) * (1.0, aspect), np.array(energy)
 
 
-def outermost(count: int) -> float:
-    """Return the largest offset of a beam's sub-rays, in radii of the beam."""
-    return float(np.linalg.norm(beam(count)[0], axis=1).max())
+def reach(scanner: Scanner, count: int) -> Beam:
+    """Return a beam whose radius grows evenly with the range, and in which all sub-rays lie."""
+    widest = float(np.linalg.norm(beam(count, scanner.beam_aspect)[0], axis=1).max())
+    half = 0.5e-3 * scanner.divergence_mrad
+    return Beam(widest * (0.5 * scanner.beam_waist_mm + half * scanner.beam_focus_mm), widest * half)
 
 
 @dataclass(frozen=True)
@@ -201,15 +206,15 @@ class _StationCaster:
         rng = generator(self.seed, f"station {self.station}", number + 1)
         used, side = min(STRIP, self.grid.columns - strip.first), strip.side
         rays = self._rays(rng, used)
-        beam_ = ray_kernels.Beam(0.5 * self.scanner.beam_exit_mm, 0.5e-3 * self.scanner.divergence_mrad)
-        shape, t, thin = self.view.cast(number, self.grid, rays, beam_, self.margin.cast_columns)
+        outermost = reach(self.scanner, self.params.sub_rays)
+        shape, t, thin = self.view.cast(number, self.grid, rays, outermost, self.margin.cast_columns)
         inside = shape >= 0
         inside[:side], inside[side + used :] = False, False
         edge, near = np.zeros(shape.shape, bool), t
         if self.params.sub_rays > 1:
             surface = np.where(shape >= 0, self.surfaces.surface[shape], -1)
             edge, near = edge_footprints.mark_edges(
-                surface, t, thin, used, self.margin, self.grid, beam_, outermost(self.params.sub_rays), self.least
+                surface, t, thin, used, self.margin, self.grid, outermost, self.least
             )
             inside &= ~edge
         column, row = (index.astype(np.int32) for index in np.nonzero(inside))
@@ -251,6 +256,8 @@ class _StationCaster:
             cosine=cosine,
             ray=ray[met],
             source=np.full(len(t), SURFACE, np.uint8),
+            spread=np.zeros(len(t)),
+            reflectance=self.params.reflectance * self.surfaces.albedo[shape[met]],
         )
 
     def _at_edges(self, number: int, edge: Bools, near: Floats, rays: ray_kernels.Rays) -> list[Echoes]:
@@ -259,7 +266,7 @@ class _StationCaster:
         column, row = (index.astype(np.int32) for index in np.nonzero(edge))
         numbered = np.full(edge.shape, -1, np.int32)
         numbered[column, row] = np.arange(len(column), dtype=np.int32)
-        offsets = beam(self.params.sub_rays)[0]
+        offsets = beam(self.params.sub_rays, self.scanner.beam_aspect)[0]
         angle = self.scanner.beam_angle(near[column, row])
         subs, ranges = self.view.cast_around(number, self.grid, rays, numbered, angle, offsets)
         surface = np.where(subs >= 0, self.surfaces.surface[subs], -1)
@@ -281,7 +288,7 @@ class _StationCaster:
         rays: ray_kernels.Rays,
     ) -> Echoes:
         """Return the echoes of footprints on several surfaces, or partly on none; ``subs``, ``ranges`` (n, k)."""
-        offsets, share = beam(self.params.sub_rays)
+        offsets, share = beam(self.params.sub_rays, self.scanner.beam_aspect)
         jitter = rays.jitter[column, row]
         columns = (strip.first + column - strip.side).astype(np.int32)
         t, cosine = np.full(ranges.shape, np.nan), np.zeros(ranges.shape)
@@ -300,16 +307,20 @@ class _StationCaster:
         total = energy[back].sum(axis=1)
         most = np.argmax(energy[back], axis=1)[:, None]
         middle = np.where(hit[back, 0], t[back, 0], np.nan)
+        mean = (energy[back] * t[back]).sum(axis=1) / total
+        spread = np.sqrt((energy[back] * (t[back] - mean[:, None]) ** 2).sum(axis=1) / total)
         return Echoes(
             row=row[back],
             column=columns[back],
             shape=np.take_along_axis(subs[back], most, axis=1)[:, 0],
             t=middle,
-            range=(energy[back] * t[back]).sum(axis=1) / total,
+            range=mean,
             signal=total,
             cosine=np.take_along_axis(cosine[back], most, axis=1)[:, 0],
             ray=self.grid.directions(row[back], columns[back], jitter[back]),
             source=np.full(len(total), MIXED, np.uint8),
+            spread=spread,
+            reflectance=self.params.reflectance * (energy[back] * albedo[back]).sum(axis=1) / total,
         )
 
     def _returns(self, rng: np.random.Generator, echoes: Echoes) -> Returns:
@@ -318,9 +329,9 @@ class _StationCaster:
         speckle = rng.gamma(SPECKLE_LOOKS, 1.0 / SPECKLE_LOOKS, n)
         stray, where = rng.random(n) < self.scanner.flying_share, rng.random(n)
         tangent = np.minimum(np.sqrt(1.0 - echoes.cosine**2) / np.maximum(echoes.cosine, 1e-3), TAN_MOST)
-        sigma = self.scanner.noise(echoes.range, echoes.signal, tangent)
+        sigma = self.scanner.noise(echoes.range, echoes.signal, tangent, echoes.spread)
         low = self.scanner.min_range_mm
-        measured = echoes.range + sigma * rng.standard_normal(n)
+        measured = echoes.range + self.scanner.bias(echoes.reflectance) + sigma * rng.standard_normal(n)
         measured = np.where(stray, low + where * (echoes.range - low), measured)
         surface = self.surfaces.label[echoes.shape]
         bright = echoes.signal

@@ -3,8 +3,16 @@
 Noise is along the ray. The variance of a range R is
 
     noise_mm^2 + (noise_ppm R)^2 + (noise_signal_mm signal^signal_power)^2 + (footprint_share w tan(incidence))^2
+    + (noise_mixed spread)^2
 
-The signal is relative to that of a white matt surface at normal incidence and 10 m; w is the beam's radius at R.
+The signal is relative to that of a white matt surface at normal incidence and 10 m; nearer than noise_near_mm it does
+not lower the noise further. The spread is that of the ranges within a footprint over an edge, weighted by their energy.
+
+The beam is Gaussian; w is its radius to 1/e^2 of the intensity, horizontally, and beam_aspect w vertically:
+
+    2 w = sqrt(beam_waist_mm^2 + (divergence_mrad (R - beam_focus_mm))^2)
+
+Ranges have a bias of bias_signal_mm for each decade of a surface's reflectance above 0.5: dark ones are nearer.
 The returns of a ray are modelled in :mod:`designgen.scanning.returns`.
 """
 
@@ -22,8 +30,18 @@ from processor.model import Bools, Floats, UsageError
 
 MODE = "rays"
 SIGNAL_RANGE_MM = 10_000.0  # range at which the signal is 1
-# Sub-rays of a beam, by their number: rings of (radius in radii of the beam, number of sub-rays) about its middle.
-BEAM_RINGS: dict[int, list[tuple[float, int]]] = {1: [], 7: [(0.7, 6)], 19: [(0.45, 6), (0.9, 12)]}
+UNBIASED = 0.5  # reflectance whose bias is zero by definition: the offset of a station holds the rest
+# Sub-rays of a beam, by their number: rings of (radius in radii of the beam, number of sub-rays, energy of the ring)
+# about its middle, which has the rest. They integrate polynomials over a Gaussian beam exactly to degree 5 and 7 in the
+# radius (Gauss-Radau rules of the exponential weight: nodes 1; (3 -+ sqrt 3) / 2 for the squared radius).
+BEAM_RINGS: dict[int, list[tuple[float, int, float]]] = {
+    1: [],
+    7: [(1.0, 6, 0.5)],
+    19: [
+        (math.sqrt(1.5 - 0.5 * math.sqrt(3.0)), 6, (2.0 + math.sqrt(3.0)) / 6.0),
+        (math.sqrt(1.5 + 0.5 * math.sqrt(3.0)), 12, (2.0 - math.sqrt(3.0)) / 6.0),
+    ],
+}
 SPECULAR_POWER = 30.0  # of the cosine, in the specular part of a reflection
 
 
@@ -36,9 +54,14 @@ class Scanner:
     noise_ppm: float = 5.0
     noise_signal_mm: float = 0.2
     signal_power: float = -0.5
+    noise_near_mm: float = 0.0
+    noise_mixed: float = 0.0
+    bias_signal_mm: float = 0.0
     encoder_urad: float = 20.0
-    beam_exit_mm: float = 3.5
-    divergence_mrad: float = 0.3
+    beam_waist_mm: float = 2.6
+    beam_focus_mm: float = 2260.0
+    divergence_mrad: float = 0.71
+    beam_aspect: float = 1.1
     footprint_share: float = 0.1
     separation_mm: float = 0.0  # pulse: echoes closer than this merge
     min_range_mm: float = 400.0
@@ -53,22 +76,34 @@ class Scanner:
     def __post_init__(self) -> None:
         expect(self.behaviour in ("phase", "pulse"), "scanner.behaviour", self.behaviour, "phase or pulse")
         for key in self.__dataclass_fields__:
-            if key not in ("behaviour", "signal_power"):
+            if key not in ("behaviour", "signal_power", "bias_signal_mm"):
                 expect(getattr(self, key) >= 0.0, f"scanner.{key}", getattr(self, key), "0 or more")
         further = self.max_range_mm > self.min_range_mm
         expect(further, "scanner.max_range_mm", self.max_range_mm, "more than min_range_mm")
 
     def beam_angle(self, R: Floats) -> Floats:
-        """Return the angle (n,) subtended by the beam's radius at ranges R (n,), rad."""
-        angle: Floats = 0.5 * (1e-3 * self.divergence_mrad + self.beam_exit_mm / R)
+        """Return the angle (n,) subtended by the beam's horizontal radius at ranges R (n,), rad."""
+        angle: Floats = 0.5 * np.hypot(
+            self.beam_waist_mm / R, 1e-3 * self.divergence_mrad * (1.0 - self.beam_focus_mm / R)
+        )
         return angle
 
-    def noise(self, R: Floats, signal: Floats, tangent: Floats) -> Floats:
-        """Return the standard deviation (n,) of ranges R (n,), mm, by signal and tangent of the angle of incidence."""
+    def noise(self, R: Floats, signal: Floats, tangent: Floats, spread: Floats) -> Floats:
+        """Return the standard deviation (n,) of ranges R (n,), mm.
+
+        By signal, tangent of the angle of incidence, and ``spread`` (n,) of the ranges within the footprint, mm.
+        """
+        signal = signal * np.minimum(R / self.noise_near_mm, 1.0) ** 2 if self.noise_near_mm else signal
         by_signal = self.noise_signal_mm * np.maximum(signal, 1e-12) ** self.signal_power
-        spread = self.footprint_share * self.beam_angle(R) * R * tangent
-        result: Floats = np.sqrt(self.noise_mm**2 + (self.noise_ppm * 1e-6 * R) ** 2 + by_signal**2 + spread**2)
+        along = self.footprint_share * self.beam_angle(R) * R * tangent
+        terms = self.noise_mm**2 + (self.noise_ppm * 1e-6 * R) ** 2 + by_signal**2 + along**2
+        result: Floats = np.sqrt(terms + (self.noise_mixed * spread) ** 2)
         return result
+
+    def bias(self, reflectance: Floats) -> Floats:
+        """Return the bias (n,) of ranges, mm, by the reflectance (n,) of surfaces."""
+        found: Floats = self.bias_signal_mm * np.log10(np.maximum(reflectance, 1e-3) / UNBIASED)
+        return found
 
 
 def preset(name: str) -> dict[str, Any]:
