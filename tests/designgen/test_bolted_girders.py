@@ -6,18 +6,13 @@ import pytest
 
 from designgen.designs import bolt_holes, girder_assemblies, prismatic_solids
 from processor.model import UsageError
-from tests.support.scenes.bolted_girders import BOLTS, HOLES, QUIET, SIZES, bolted_girders
+from tests.support.scenes.bolted_girders import BOLTS, QUIET, SIZES, bolted_girders
 
 TOLERANCE_MM = 0.01
 
 
 def shells(shape):
     return cq.Compound.makeCompound([shell for solid in shape.Solids() for shell in solid.Shells()])
-
-
-def test_a_joint_has_24_holes():
-    for part in girder_assemblies.build(SIZES, BOLTS).parts:
-        assert len(part.girder.bores) == HOLES
 
 
 def test_the_mesh_of_a_girder_encloses_the_volume_of_its_solid():

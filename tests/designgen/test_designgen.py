@@ -304,7 +304,7 @@ def test_the_package_loads_at_once_and_software_of_a_scene_lists_the_libraries_t
     assert set(batch.SOFTWARE) <= loaded
     assert not {"cadquery", "OCP"} & loaded
     assert set(batch.software()) == {"designgen", *batch.SOFTWARE}
-    assert (ROOT / "designgen/py.typed").is_file()
+    assert all((ROOT / package / "py.typed").is_file() for package in ("designgen", "processor"))
 
 
 LAYERS = ("designs", "asbuilt", "scanning", "models", "scenes", "export")  # each imports those before it, cad none

@@ -434,39 +434,6 @@ def cluster(tmp_path):
         yield one
 
 
-@pytest.mark.slow
-def test_lost_worker_changes_no_file_and_lost_scheduler_is_reported(whole, tmp_path, cluster):
-    address, (scheduler, worker, _) = cluster
-    folder = tmp_path / "set"
-    process = started(folder, "--cluster", address)
-    until_scenes(folder, 2, process)
-    worker.kill()
-    _, said = process.communicate(timeout=120)
-    assert process.returncode == 0, said
-    assert digests(folder) == digests(whole)
-    # The same cluster, with the worker that it has left, loses its scheduler; the next run goes on without it.
-    folder = tmp_path / "another"
-    process = started(folder, "--cluster", address)
-    until_scenes(folder, 2, process)
-    scheduler.kill()
-    _, said = process.communicate(timeout=120)
-    assert process.returncode == 3, said
-    assert f"--cluster {address}: the connection is lost; run again to go on" in said
-    assert "Traceback" not in said
-    run("-o", folder, "--count", SCENES_OF_KILLED_RUNS, command=LONG)
-    assert digests(folder) == digests(whole)
-
-
-@pytest.mark.slow
-def test_unreachable_cluster_is_refused_before_anything_is_written(tmp_path):
-    (tmp_path / "set").mkdir()
-    (tmp_path / "set" / "index.csv").write_text("mine")
-    address = f"tcp://127.0.0.1:{dask_cluster.free_port()}"
-    done = run("-o", tmp_path / "set", "--count", 2, "--cluster", address, code=2)
-    assert f"--cluster {address}: expected the address of a Dask scheduler that answers" in done.stderr
-    assert os.listdir(tmp_path / "set") == ["index.csv"], "nothing was begun"
-
-
 def test_without_dask_the_error_states_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (

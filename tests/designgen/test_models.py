@@ -17,7 +17,6 @@ from designgen.models.model import of_mesh, unique_names
 from designgen.scanning import returns, scanner, surfaces, survey
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import make
-from designgen.scenes.model import recipe_of
 from processor.model import InputError, UsageError
 from processor.store import store
 from tests.support.processes import commands
@@ -42,10 +41,6 @@ EMPTY_STEP = (
 SPLINE = [(50, 0), (30, 40), (-35, 30), (-45, -20), (10, -45)]
 SOLIDS = {
     "plane": cq.Workplane().box(300, 200, 100),
-    "cylinder": cq.Workplane().circle(80).circle(60).extrude(300),
-    "cone": cq.Workplane(cq.Solid.makeCone(60, 20, 100)),
-    "sphere": cq.Workplane().sphere(100),
-    "torus": cq.Workplane(cq.Solid.makeTorus(60, 20)),
     "extruded spline": cq.Workplane().spline(SPLINE, periodic=True).close().extrude(80),
     "loft": cq.Workplane().rect(200, 150).workplane(offset=120).circle(60).workplane(offset=100).rect(60, 90).loft(),
     "fillets and holes": cq.Workplane().box(300, 200, 60).edges("|Z").fillet(40).faces("<Z").workplane().hole(25),
@@ -147,11 +142,7 @@ def test_labels_name_bodies_and_bodies_as_designed_have_no_defect(seen):
     assert not seen.truth.structure.displacement.any()
 
 
-# Those that points_lie_on_the_face has, too, by night.
-BY_NIGHT = ("plane", "cylinder", "cone", "sphere", "torus")
-
-
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k in BY_NIGHT else k for k in SOLIDS])
+@pytest.mark.parametrize("kind", [kind for kind in SOLIDS if kind != "plane"])
 def test_hits_lie_on_the_surface_of_the_solid(kind):
     hits = hits_on(loading.load(SOLIDS[kind]))
     assert len(hits) > 100
@@ -297,11 +288,7 @@ def test_a_moved_body_and_its_truth(built):
     truth, defects = built.truth.structure, built.truth.defects
     on_it = truth.points[:, 0] > 610.0
     assert on_it.sum() > 1000
-    np.testing.assert_allclose(
-        truth.displacement[on_it],
-        np.tile([10.0, 0.0, 0.0], (on_it.sum(), 1)),
-        atol=1e-9,  # float64
-    )
+    assert np.abs(truth.displacement[on_it] - [10.0, 0.0, 0.0]).max() < 1e-9  # float64
     assert dict(zip(defects.components, defects.classes, strict=True)) == {
         "moved": "misalignment",
         "dented": "dent",
@@ -337,20 +324,14 @@ def test_a_dent_has_its_shape(built):
     middle = np.hypot(*(truth.points - [200.0, 150.0, 200.0]).T[:2]) < 5.0
     middle &= truth.points[:, 2] > 199.0
     assert middle.any()
-    np.testing.assert_allclose(
-        truth.displacement[middle],
-        np.tile([0.0, 0.0, -8.0], (middle.sum(), 1)),
-        atol=0.15,  # 5 mm off the middle: 0.11
-    )
+    assert np.abs(truth.displacement[middle] - [0.0, 0.0, -8.0]).max() < 0.15  # 5 mm off the middle: 0.11
     defects = built.truth.defects
     assert defects.volume_mm3[1] == pytest.approx(np.pi * 60.0**2 * 8.0 / 3.0)  # 2 pi int r (1 - r2/R2)^2 dr
 
 
-@pytest.mark.parametrize("source", ["solid", pytest.param("mesh", marks=pytest.mark.slow)])
-def test_bodies_as_built_are_where_the_truth_has_them(source):
+def test_a_body_of_a_mesh_that_is_dented_and_moved_is_where_the_truth_has_it():
     plate = loading.load(cq.Workplane().box(1000, 400, 20))
-    if source == "mesh":
-        plate = loading.load((plate.bodies[0].vertices, plate.bodies[0].triangles))
+    plate = loading.load((plate.bodies[0].vertices, plate.bodies[0].triangles))
     name = plate.bodies[0].name
     params = body_deviations.Params(
         dent_mm=5.0, dent_radius_mm=90.0, dent_at_mm=(100.0, 20.0, 10.0), move_mm=(0.0, 0.0, 7.0)
@@ -363,12 +344,9 @@ def test_bodies_as_built_are_where_the_truth_has_them(source):
     share = np.minimum(((top[:, :2] - [100.0, 20.0]) ** 2).sum(axis=1) / 90.0**2, 1.0)
     off = top[:, 2] - (17.0 - 5.0 * (1.0 - share) ** 2)
     assert (share < 0.5).sum() > 15
-    assert np.abs(off).max() < (1e-5 if source == "solid" else TOLERANCE_MM)  # as refined, as promised
+    assert np.abs(off).max() < TOLERANCE_MM
     nearest = np.argmin(np.linalg.norm(built.movement.points - [100.0, 20.0, 10.0], axis=1))
-    assert built.movement.displacement[nearest, 2] == pytest.approx(
-        2.0,
-        abs=0.3,  # of the nearest sample, up to 15 mm off
-    )
+    assert abs(built.movement.displacement[nearest, 2] - 2.0) < 0.3  # of the nearest sample, up to 15 mm off
 
 
 def test_bodies_that_bend_turn_and_are_left_out():
@@ -386,17 +364,6 @@ def test_bodies_that_bend_turn_and_are_left_out():
     assert gone.defects.volume_mm3[0] == pytest.approx(2000.0 * 100.0 * 40.0)
     with pytest.raises(UsageError, match="no body of this name; there are 1, as model-1"):
         body_deviations.params_of({"asbuilt": {"modell-1": {}}}, ["model-1"])
-
-
-def test_a_recipe_names_a_model_beside_it(tmp_path):
-    (tmp_path / "part.stl").write_text(mesh_text(SIDES, name="part-1"))
-    (tmp_path / "part.toml").write_text(
-        'kind = "structure"\n[model]\nfile = "part.stl"\n[scan]\nmode = "rays"\nstations = 1\nstep_mrad = 6.0\n'
-        '[asbuilt."part-1"]\nmissing = false\nmove_mm = [0, 0, 5]\n'
-    )
-    scene, truth = designgen.make(tmp_path / "part.toml")
-    assert len(scene.scans[0].points) > 100
-    np.testing.assert_allclose(truth.structure.displacement, np.tile([0.0, 0.0, 5.0], (len(truth.structure.points), 1)))
 
 
 # --- bad models -------------------------------------------------------------------------------------------------------
@@ -505,5 +472,3 @@ def test_a_model_is_scanned_by_rays():
         make.make("x", recipe_files.overridden(recipe, []), 0)
     with pytest.raises(UsageError, match=r"set scan\.mode"):
         designgen.scan((CORNERS, SIDES), settings={"scan": {"mode": "surface"}})
-    with pytest.raises(UsageError, match=r"expected a number from 1 or a \.json file"):
-        recipe_of("a.step", "six", "phase", "", ())

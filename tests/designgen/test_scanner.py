@@ -603,27 +603,6 @@ def test_range_and_tilt_errors_of_a_station_equal_those_of_its_truth():
     assert abs(found.systematic[0]) > 0.0
 
 
-def test_a_station_does_not_depend_on_others_or_on_threads(monkeypatch):
-    surfaces = surfaces_of(frame_of_balls())
-    poses = {"S1": standing(2500.0, 2800.0, 1600.0), "S2": standing(100.0, 400.0, 1500.0)}
-    device, params = scanner.Scanner(), scanner.Params(step_mrad=8.0, registration_mm=2.0, registration_mrad=0.1)
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    one = survey.survey(surfaces, (), {"S2": poses["S2"]}, device, params, 5)
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    both = survey.survey(surfaces, (), poses, device, params, 5)
-    for field in dataclasses.fields(one.scans[0]):
-        np.testing.assert_array_equal(getattr(one.scans[0], field.name), getattr(both.scans[1], field.name))
-    np.testing.assert_array_equal(one.labels[0].range_error_mm, both.labels[1].range_error_mm)
-    other = survey.survey(surfaces, (), {"S2": poses["S2"]}, device, params, 6)
-    assert (
-        other.scans[0].points.shape != one.scans[0].points.shape or (other.scans[0].points != one.scans[0].points).any()
-    )
-    moved = both.registered @ np.linalg.inv(np.array(list(poses.values())))
-    shift = (both.registered - np.array(list(poses.values())))[:, :3, 3]
-    assert 0.0 < np.abs(shift).max() < 10.0  # five sd
-    np.testing.assert_allclose(np.linalg.det(moved[:, :3, :3]), 1.0)
-
-
 def test_merged_scans_lie_where_the_stations_saw_them():
     surfaces = surfaces_of(frame_of_balls())
     poses = {"S1": standing(2500.0, 2800.0, 1600.0), "S2": standing(100.0, 400.0, 1500.0)}

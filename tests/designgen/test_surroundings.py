@@ -32,9 +32,7 @@ def seen(recipe, **settings):
     return scene.scans[0].points, names, label.part >= 0
 
 
-@pytest.mark.parametrize(
-    "kind", [*(pytest.param(kind, marks=pytest.mark.slow) for kind in ("site", "room")), "workshop"]
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_part_stands_among_what_a_day_has(kind):
     points, names, of_part = (
         of_workshop() if kind == "workshop" else seen("arch-s1-rays", **{"surroundings.kind": kind})

@@ -142,12 +142,6 @@ def test_keys_that_a_kind_does_not_use_are_refused(name, setting, said):
     assert f" {key.removeprefix('scan.')}," not in str(refused.value).partition("there are")[2] + ","
 
 
-def test_a_stadium_is_scanned_from_within():
-    table = {key: value for key, value in recipe_files.load("stadium-roof")[1].items() if key != "scan"}
-    with pytest.raises(UsageError, match=r"scan\.distance_mm: not used for kind stadium-roof"):
-        make.make("x", recipe_files.overridden(table, ["scan.mode=rays", "scan.distance_mm=4000.0"]))
-
-
 def poles_of(monkeypatch, name, settings):
     """The poles (start, axis, radius, length) that a scene has, and the positions of its stations."""
     poles = []
