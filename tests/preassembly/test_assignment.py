@@ -36,10 +36,7 @@ def scanned(part, seed=1, spacing_mm=50.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("came", "asked", "found"),
-    [(0, 2, 0), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1, 2, 1), (2, 1, 2), (3, 0, 1)))],
-)
+@pytest.mark.parametrize(("came", "asked", "found"), [(0, 2, 0), (1, 2, 1), (2, 1, 2), (3, 0, 1)])
 def test_scan_of_another_size_is_assigned_to_the_parts_of_that_size(shapes, came, asked, found):
     """Ribs 1 and 3, and the feet, differ by their marks alone: any of them stands for both."""
     assert assignment.rather(scanned(came), asked, shapes) == found
@@ -50,17 +47,11 @@ def test_scan_of_its_own_part_gets_no_other_assignment(shapes, part):
     assert assignment.rather(scanned(part), part, shapes) is None
 
 
-@pytest.mark.slow  # by day the search for pieces is that of a scan of something else
+@pytest.mark.slow
 def test_scan_of_half_a_part_gets_no_other_assignment(shapes):
     points = scanned(1)
     along = (points - points.mean(axis=0)) @ np.linalg.svd(points[::10] - points[::10].mean(axis=0))[2][0]
     assert assignment.rather(points[along < 0.0], 1, shapes) is None
-
-
-@pytest.mark.slow
-def test_a_scan_of_something_else_is_of_no_part(shapes):
-    ball = np.random.default_rng(0).normal(size=(4_000, 3))
-    assert assignment.rather(3000.0 * ball / np.linalg.norm(ball, axis=1)[:, None], 1, shapes) == -1
 
 
 def scans_of(assigned, *parts):

@@ -8,12 +8,8 @@ import pytest
 
 from processor import diagnostics
 from processor.model import Scan
-from processor.preassembly import step as preassembly_step
 from processor.preassembly.parts import each_part as parts_in_turn
 from processor.preassembly.parts.each_part import each_part
-from processor.results.fields_to_json import as_object
-from processor.store.json_values import json_ready
-from tests.support.clouds import arch_clouds
 
 
 def scans(points=10, count=4):
@@ -87,13 +83,3 @@ def test_the_first_error_is_raised_and_no_further_part_begun(monkeypatch):
     with pytest.raises(ValueError, match="part 1"):
         each_part(function, scans(count=100))
     assert len(begun) < 50
-
-
-@pytest.mark.slow
-def test_a_bridge_is_the_same_on_threads_to_the_last_digit(monkeypatch):
-    scene, _ = arch_clouds.bridge(spacing_mm=20.0)
-    found = []
-    for threads in (1, 3):
-        monkeypatch.setattr(parts_in_turn, "usable", lambda threads=threads: threads)
-        found.append(json_ready(as_object(preassembly_step.run(scene, preassembly_step.Params()))))
-    assert found[0] == found[1]

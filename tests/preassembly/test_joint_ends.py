@@ -101,9 +101,8 @@ def test_the_outer_faces_are_those_that_the_corners_lie_on():
     assert np.isin(np.abs(outer.vertices[outer.faces][:, :, 1]), [B]).all()
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_corners_centimetres_off_are_found_within_their_intervals(seed):
-    rng = np.random.default_rng(seed)
+def test_corners_centimetres_off_are_found_within_their_intervals():
+    rng = np.random.default_rng(0)
     corners = rng.uniform(-20.0, 20.0, (4, 3))
     end = fitted(built(cloud(rng, 8.0), corners), rng)
     assert end.doubts == ()
@@ -149,9 +148,8 @@ def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
     assert np.abs(end.departure[list(on_side)] - corners[list(on_side)]).max() < 1.0  # not 26 mm
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_face_seen_as_one_strip_is_within_its_interval_where_it_was_not_seen(seed):
-    rng = np.random.default_rng(seed)
+def test_a_face_seen_as_one_strip_is_within_its_interval_where_it_was_not_seen():
+    rng = np.random.default_rng(0)
     points = cloud(rng, 12.0, inner=0.3)
     on_top = np.abs(points[:, 2] - H) < 0.1
     seen = ~on_top | (np.abs(points[:, 1] - 300.0) < 20.0)
@@ -349,20 +347,6 @@ def test_registration_error_is_common_to_both_ends_of_a_part():
     covariance = J @ stated.motion_covariance[6:, 6:] @ J.T + both + both.T + own @ pose @ own.T
     # As above.
     np.testing.assert_allclose(np.std(moved, axis=0), np.sqrt(np.diag(covariance)), rtol=0.15)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_an_outlier_beyond_a_strip_does_not_bend_the_face(seed):
-    """The strip's terms are as without it: it alone determines the bend, so no residual shows that it is wrong."""
-    rng = np.random.default_rng(seed)
-    x, w = rng.uniform(-60.0, 0.0, 200), rng.uniform(-1.0, 1.0, 200)
-    height = 1.5 + 0.5 * rng.standard_normal(200)
-    clean = ends_faces.least_squares(ends_faces.basis(x, w), height)
-    basis = ends_faces.basis(np.append(x, -480.0), np.append(w, 0.7))
-    coefficients, residual, used = ends_faces.least_squares(basis, np.append(height, -70.0))
-    assert not used[-1]
-    assert len(residual) == used.sum() >= 190
-    np.testing.assert_allclose(coefficients, clean[0], atol=1e-9)  # float64
 
 
 def test_a_face_seen_as_a_strip_and_one_outlier_keeps_its_corners():

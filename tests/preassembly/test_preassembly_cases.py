@@ -116,29 +116,9 @@ def assert_right(found, design, index, part, T, ends=("start", "end")):
         assert np.abs(pull).max() < PULL_MOST
 
 
-def without_half_a_web(part, points):
-    middle = part.key_points(0.5 * (part.s0 + part.s1))
-    left = points[:, 1] > 0.5 * SMALL.width_mm - 30.0
-    gone = left & (points[:, 2] > middle[7, 2] - 100.0) & (np.abs(points[:, 0] - middle[7, 0]) < 2_000.0)
-    assert gone.sum() > 5_000
-    return points[~gone]
-
-
 def with_strays(share, points):
     low, high = points.min(axis=0) - 300.0, points.max(axis=0) + 300.0
     return np.vstack([points, np.random.default_rng(3).uniform(low, high, (int(share * len(points)), 3))])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "change", [without_half_a_web, *(lambda _, points, s=share: with_strays(s, points) for share in (0.01, 0.02))]
-)
-def test_pose_and_ends_are_right_despite_what_is_missing_or_stray(change):
-    parts, design = ribs()
-    scan, T = scanned(change(parts[1], cloud(parts[1])))
-    found = measured(design, 1, scan)
-    assert found.status == "ok"
-    assert_right(found, design, 1, parts[1], T)
 
 
 def test_ends_are_right_despite_stray_points_and_the_same_where_points_lie_in_files(monkeypatch, tmp_path):
@@ -189,18 +169,16 @@ def nested(reasons):
     return [one for outer in reasons for one in (outer, *nested(outer.values.get("reasons", ())))]
 
 
-@pytest.mark.parametrize(("of", "asked", "came"), [(ribs, 0, 2), pytest.param(bridge, 0, 4, marks=pytest.mark.slow)])
-def test_parts_of_one_shape_are_distinguished_by_their_mark(of, asked, came, monkeypatch):
+def test_parts_of_one_shape_are_distinguished_by_their_mark(monkeypatch):
     """Rib 3 turned round equals rib 1 but for its mark: it fits rib 1 to the noise."""
     monkeypatch.setattr(pose_search, "FINE_POINTS", SEARCHED)
-    parts, design = of()
-    scan, _ = scanned(cloud(parts[came], spacing_mm=30.0, sigma_mm=2.0))
-    found = measured(design, asked, scan)
+    parts, design = ribs()
+    scan, _ = scanned(cloud(parts[2], spacing_mm=30.0, sigma_mm=2.0))
+    found = measured(design, 0, scan)
     assert found.status == "failed"
-    there = {"scan": "scan", "part": parts[came].name, "assigned": parts[asked].name}
     assert found.reasons == (
-        reason("preassemble.scan-of-other", **there),
-        reason("preassemble.mark-of-other", parts=(parts[came].name,)),
+        reason("preassemble.scan-of-other", scan="scan", part="rib3", assigned="rib1"),
+        reason("preassemble.mark-of-other", parts=("rib3",)),
     )
 
 
@@ -247,27 +225,15 @@ def test_mark_is_identified_on_a_plate_that_bulges_by_its_height():
     assert identity.identify(points, np.eye(4), 1, shapes_of(design)) == identity.Identity()
 
 
-@pytest.mark.parametrize(
-    ("of", "asked", "came", "said"),
-    [
-        (ribs, 1, 0, ("rib1", "rib3")),
-        *(
-            pytest.param(bridge, *one, marks=pytest.mark.slow)
-            for one in ((1, 2, ("rib2",)), (3, 0, ("foot1", "foot2")), (0, 3, ("rib1", "rib3")))
-        ),
-    ],
-)
-def test_neighbours_swapped_are_named(of, asked, came, said, monkeypatch):
+def test_neighbours_swapped_are_named(monkeypatch):
     """By its size, and by its name where a mark distinguishes the parts of this size."""
-    parts, design = of()
-    scan, T = scanned(cloud(parts[came], spacing_mm=30.0))
-    if parts[came].name != "rib3":  # rib 1 stands for rib 3, which lies on it the other way round
-        known(monkeypatch, T)
-    found = measured(design, asked, scan)
+    parts, design = ribs()
+    scan, T = scanned(cloud(parts[0], spacing_mm=30.0))
+    known(monkeypatch, T)
+    found = measured(design, 1, scan)
     assert found.status == "failed"
-    named = {"scan": "scan", "part": parts[came].name, "assigned": parts[asked].name}
-    assert found.reasons[0] == reason("preassemble.scan-of-other", **named)
-    assert found.reasons[-1] == reason("preassemble.size-of-other", parts=said)
+    assert found.reasons[0] == reason("preassemble.scan-of-other", scan="scan", part="rib1", assigned="rib2")
+    assert found.reasons[-1] == reason("preassemble.size-of-other", parts=("rib1", "rib3"))
 
 
 @pytest.fixture(scope="module")
@@ -281,12 +247,11 @@ def on_foot():
     return scene.arch, Scan("scan", (points - middle) @ R.T + middle)
 
 
-@pytest.mark.parametrize("mast", [pytest.param(0, marks=pytest.mark.slow), 900])
-def test_scan_that_covers_half_of_another_part_is_rejected(on_foot, mast, monkeypatch):
+def test_scan_that_covers_half_of_another_part_is_rejected(on_foot, monkeypatch):
     """The upper half of this foot has the rib's section, and the rest looks like clutter. A mast is left out."""
     design, scan = on_foot
     rng, top = np.random.default_rng(1), scan.points[np.argmax(scan.points[:, 2])]
-    beside = top + np.column_stack([rng.normal(0.0, 30.0, (mast, 2)), rng.uniform(0.0, 5000.0, mast)])
+    beside = top + np.column_stack([rng.normal(0.0, 30.0, (900, 2)), rng.uniform(0.0, 5000.0, 900)])
     scan = dataclasses.replace(scan, points=np.vstack([scan.points, beside]))
     known(monkeypatch, np.eye(4))
     monkeypatch.setattr(assignment, "rather", lambda *_: None)
@@ -294,18 +259,6 @@ def test_scan_that_covers_half_of_another_part_is_rejected(on_foot, mast, monkey
     assert 0.5 < found.registration.used_share < 0.7  # a half and some clutter
     assert codes(found.rejected) == ["preassemble.points-away", "preassemble.size-of-other"]
     assert found.rejected[1].values == {"parts": ("rib2",)}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("clutter", "index"), [(0.0, 0), (0.2, 0), (0.0, 4)])
-def test_another_part_is_not_taken_for_a_foot(clutter, index):
-    scene, _ = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=1)
-    points = scene.scans[2].points
-    floor = np.random.default_rng(1).uniform([-9e3, -9e3, -5e3], [9e3, 9e3, -4.9e3], (int(clutter * len(points)), 3))
-    every = np.vstack([points, floor + points.mean(axis=0)])
-    wrong, right = (measure._place(scanned(every)[0], k, shapes_of(scene.arch), 1.0) for k in (index, 2))
-    assert wrong.rejected or wrong.doubts or wrong.attitude.status != "ok"
-    assert (right.attitude.status, right.rejected, right.doubts) == ("ok", (), ())
 
 
 def test_covered_share_of_a_part_equals_the_share_seen():
@@ -329,8 +282,8 @@ def test_rival_pose_shifted_along_the_part_is_reported_as_a_shift():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in range(1, 8))])
-@pytest.mark.parametrize("upper", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("upper", [True, False])
 def test_half_a_part_is_found_however_it_lies_in_its_file(upper, seed):
     parts, design = bridge()
     part, own = parts[1], principal.of_mesh(design.parts[1].vertices, design.parts[1].faces)
