@@ -8,10 +8,7 @@ import pytest
 import trimesh
 from click.testing import CliRunner
 
-from designgen import batch, recipe_files
 from designgen.designs import girder_assemblies
-from designgen.export import folder as export_folder
-from processor.api import runs
 from processor.cli import main
 from processor.geometry.lines_and_polylines import Polyline
 from processor.language.messages import messages
@@ -365,18 +362,12 @@ def test_the_picture_marks_what_is_not_sure_and_a_design_that_is_there_is_not_ch
     assert (tmp_path / "design.json").read_bytes() == before
 
 
-UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4, "ft": 304.8}
-# By day one: no format states its unit, so that units do not depend on the format.
-BY_DAY = {("stl", "inch")}
-
-
 @pytest.mark.usefixtures("no_picture")
 @pytest.mark.parametrize(
     ("suffix", "unit", "size_mm"),
     [
-        pytest.param(suffix, unit, size, marks=() if (suffix, unit) in BY_DAY else pytest.mark.slow)
-        for suffix in WRITERS
-        for unit, size in UNITS.items()
+        ("stl", "inch", 25.4),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("obj", "mm", 1.0), ("ply", "m", 1000.0))),
     ],
 )
 def test_the_unit_comes_from_scans_that_state_theirs(tmp_path, suffix, unit, size_mm):
@@ -526,21 +517,3 @@ def test_spliced_girders_of_a_step_file_are_joined_where_they_end(tmp_path):
     write_lone_scans(tmp_path / "other", "S1", "S2")
     guessed = guess.guess(tmp_path / "other")
     assert (guessed.made, guessed.kind) == (None, "structure")
-
-
-@pytest.mark.slow
-def test_the_gaps_of_a_bridge_are_those_with_its_own_design(tmp_path):
-    name, recipe = recipe_files.load("arch-s1")
-    batch.make_scene(tmp_path / "s1.h5", name, recipe_files.overridden(recipe, ["scan.spacing_mm=20"]), 3)
-    given, left = tmp_path / "given", tmp_path / "left"
-    for place in (given, left):
-        export_folder.export(tmp_path / "s1.h5", place, "ply", with_truth=False)
-    (left / "design.json").unlink()
-    (left / "project.toml").unlink()
-    without = runs.run(left).steps["preassemble"]
-    init(left)
-    written, expected = runs.run(left).steps["preassemble"], runs.run(given).steps["preassemble"]
-    assert np.isfinite(expected.joints.gaps).all()
-    for result in (without, written):
-        # The edges of the two designs differ by the sag of chords, 2 microns.
-        assert result.joints.gaps == pytest.approx(expected.joints.gaps, abs=0.002)  # mm

@@ -122,10 +122,7 @@ def test_another_program_reads_pcd(tmp_path):
     np.testing.assert_allclose(cloud.point.positions.numpy(), scan.points / 1000.0, atol=1e-15)  # one division
 
 
-# A writer each; by day those whose formats have a time and identifiers.
-@pytest.mark.parametrize(
-    "format_", ["e57", "laz", *(pytest.param(one, marks=pytest.mark.slow) for one in ("ply", "ptx"))]
-)
+@pytest.mark.parametrize("format_", ["e57", "laz"])  # whose formats have a time and identifiers
 def test_the_same_scene_makes_the_same_files(format_, tmp_path):
     scene = stations_apart(np.zeros(3))
     digests = []

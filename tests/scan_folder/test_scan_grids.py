@@ -7,16 +7,10 @@ import pye57
 import pytest
 from pye57 import libe57
 
-from designgen import recipe_files
-from designgen.export import folder as export_folder
 from designgen.export import formats
-from designgen.scenes.make import make
 from processor import readers
-from processor.evaluation import stitching as stitching_evaluation
 from processor.scan_folder import folder, scanner_grid
-from processor.stitching import step as stitching_step
 from processor.stitching.planes import scan_planes
-from processor.store import store
 from processor.writers import e57
 from processor.writers.cloud import of_scan
 from tests.support.clouds import stitch_clouds
@@ -261,25 +255,3 @@ def test_stitching_finds_the_same_ends_in_files_as_in_the_scene(room, tmp_path):
         assert abs(len(want) - len(got)) <= 3  # PTX rounds, and some points lie at a limit
         # Three of more than 100 ends, which are metres apart, come or go.
         np.testing.assert_allclose(got.mean(axis=0), want.mean(axis=0), atol=1.0)
-
-
-@pytest.mark.slow
-def test_stitching_errors_from_files_equal_those_from_the_scene(tmp_path):
-    """Of the truss each scan sees other sides of the bars: without the grid they lie decimetres off, or end for end."""
-    name, recipe = recipe_files.load("truss-bridge")
-    scene, truth = make(name, recipe_files.overridden(recipe, ["scan.step_mrad=8"]))
-    store.write_scene(tmp_path / "s.h5", scene, truth, {})
-
-    def worst_mm(path):
-        read = folder.read_input(path)
-        figures = {
-            one.name: one.value
-            for one in stitching_evaluation.check(read, stitching_step.run(read, stitching_step.Params()), truth)
-        }
-        return figures["station positions after datum fit, max"]
-
-    expected = worst_mm(tmp_path / "s.h5")
-    assert expected < 2.0
-    for format_ in ("ptx", "e57"):
-        export_folder.export(tmp_path / "s.h5", tmp_path / format_, format_, with_truth=False)
-        assert abs(worst_mm(tmp_path / format_) - expected) < 0.05
