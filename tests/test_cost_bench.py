@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from docs.scripts import make_cost
-from tests.bench import cost, cost_peers, cost_run, cost_series
+from tests.bench import cost, cost_series
 
 SIZES = (1e5, 2e5, 4e5)
 CONTENT = {
@@ -46,26 +46,12 @@ def test_exponent_of_a_power_law_is_its_power(power):
     assert cost.exponent(sizes, scattered) == pytest.approx(power, abs=0.02)
 
 
-def test_exponent_of_one_size_is_no_number():
-    assert np.isnan(cost.exponent([1e6], [2.0]))
-    assert np.isnan(cost.exponent([1e6, 1e6], [2.0, 3.0]))
-
-
 def test_fitted_series_has_the_memory_of_the_smallest_scene_subtracted():
     rows = [{"size": n, "points": int(n), "step": 1e-5 * n, "mb": 100.0 + 100.0 * n / 2.0**20} for n in SIZES]
     found = cost.fitted(cost_series.SERIES[0], rows, {"mb": 100.0})
     assert found["exponent"] == pytest.approx(1.0)
     assert found["memory exponent"] == pytest.approx(1.0)
     assert found["bytes a point"] == pytest.approx(100.0)
-
-
-def test_timed_adds_the_processor_seconds_of_every_call():
-    seconds = {}
-    work = cost_run.timed(lambda count: sum(range(count)), "step", seconds)
-    assert work(1_000_000) == 499_999_500_000
-    once = seconds["step"]
-    work(1_000_000)
-    assert 0.0 < once < seconds["step"] < 5.0  # 0.04 s of work, with room for a busy machine
 
 
 def test_measured_returns_seconds_and_memory_of_a_child_process(tmp_path):
@@ -75,15 +61,6 @@ def test_measured_returns_seconds_and_memory_of_a_child_process(tmp_path):
     assert 0.01 < found["cpu"] < 5.0  # 0.1 s of work, with room for a busy machine
     with pytest.raises(RuntimeError, match="exit code 3"):
         cost.measured([sys.executable, "-S", "-c", "raise SystemExit(3)"], tmp_path)
-
-
-def test_series_are_of_growing_size_and_have_a_smallest_scene():
-    assert len({one.name for one in cost_series.SERIES}) == len(cost_series.SERIES)
-    for one in cost_series.SERIES:
-        assert one.step in cost_series.SMALLEST
-        assert 3 <= len(one.sizes) <= 4
-        counts = [size.count for size in one.sizes]
-        assert counts == sorted(counts)
 
 
 def test_tables_show_sizes_and_exponents():
@@ -112,10 +89,3 @@ def test_page_is_written_between_its_marks(tmp_path, monkeypatch, drawn_pictures
     assert "old" not in text
     assert "| spheres | points |" in text
     assert 1_000 < (tmp_path / "cost.png").stat().st_size < 150_000
-
-
-def test_beside_gives_ratios_to_the_first():
-    rows = cost_peers.beside({"ours": lambda: sum(range(300_000)), "theirs": lambda: sum(range(3_000_000))}, 1)
-    assert [row["name"] for row in rows] == ["ours", "theirs"]
-    assert rows[0]["ratio"] == 1.0
-    assert rows[1]["ratio"] > 2.0

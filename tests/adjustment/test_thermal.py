@@ -7,9 +7,6 @@ import pytest
 from processor.adjustment import thermal
 
 
-def test_ten_metres_of_steel_25_kelvin_warmer_are_3_mm_longer():
+def test_steel_is_longer_by_its_temperature_and_as_designed_where_that_is_unknown():
     assert 10_000.0 * (thermal.expansion(45.0) - 1.0) == pytest.approx(3.0)
-
-
-def test_expansion_at_an_unknown_temperature_is_one():
     assert thermal.expansion(math.nan) == 1.0

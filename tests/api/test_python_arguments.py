@@ -105,11 +105,23 @@ def test_a_scanner_that_cannot_have_measured_the_points(centre, true, given, mes
         (lambda p: [[1.0, 2.0, None]] * 20, "points: expected numbers, got list"),
         (lambda p: [[1, 2, 3], [1, 2]], "points: expected numbers in rows of one length, got list"),
         (lambda p: np.ma.array(p, mask=p > 60.0), "points: expected numbers, got a masked array"),
+        (lambda p: p / 1000.0, "in metres"),
+        (lambda p: p[:5], "10 points or more, got 5"),
+        (lambda p: p[:, :2], r"array \(n, 3\).*got shape"),
+        (lambda p: np.where(p > p.mean(), np.nan, p), "NaN or infinite"),
     ],
 )
 def test_arrays_of_no_points(change, message):
     with pytest.raises(ValueError, match=message):
         processor.fit_sphere(change(ball()))
+
+
+@pytest.mark.parametrize(
+    "scanner", [np.zeros(2), np.zeros((5, 3)), 0.0], ids=["two numbers", "five places", "a number"]
+)
+def test_a_scanner_is_one_place_or_one_of_each_point(scanner):
+    with pytest.raises(ValueError, match=r"scanner: expected shape \(3,\) or \(2000, 3\), got"):
+        processor.fit_sphere(ball(), scanner=scanner)
 
 
 # --- register
@@ -202,18 +214,11 @@ def test_normals_are_unit_vectors(length):
     ("change", "message"),
     [
         (lambda a, b: {"compared": b / 1000.0}, "compared: spans 2, the reference 2000; expected clouds of one unit"),
-        (
-            lambda a, b: {"core": a / 1000.0},
-            "core: spans 2, .*core points times 1000 lie all over it",
-        ),
-        (
-            lambda a, b: {"compared": b + 1e4},
-            "core: none of the 5000 core points has points of both",
-        ),
-        (
-            lambda a, b: {"core": a + 1e4},
-            "normal_diameter: within 200 no core point has enough",
-        ),
+        (lambda a, b: {"compared": b[:0]}, "compared: expected"),
+        (lambda a, b: {"reference": a[:, :2]}, r"array \(n, 3\) of coordinates, got"),
+        (lambda a, b: {"core": a / 1000.0}, "core: spans 2, .*core points times 1000 lie all over it"),
+        (lambda a, b: {"compared": b + 1e4}, "core: none of the 5000 core points has points of both"),
+        (lambda a, b: {"core": a + 1e4}, "normal_diameter: within 200 no core point has enough"),
         (lambda a, b: {name: value / 1000.0 for name, value in SCALES.items()}, "normal_diameter: within 0.2 no core"),
         (lambda a, b: {"max_depth": 0.05}, "max_depth: 0.05 is less than 1/300 of projection_diameter, 100"),
         (lambda a, b: {"projection_diameter": 0.1}, "projection_diameter: 0.1 is less than 1/300 of normal_diameter"),
@@ -254,10 +259,7 @@ def test_core_points_without_neighbours_are_nan_beside_others():
         (lambda: processor.export(3, "b"), "results: expected a path .*or Results, got int"),
         (lambda: processor.export("a", "b", spacing_mm="1"), "spacing_mm: expected 0 or a positive length in mm"),
         (lambda: designgen.scan((CORNERS, [[0, 1, 2.5]])), r"model: expected finite vertices \(v, 3\) and faces"),
-        (
-            lambda: designgen.scan((CORNERS, SIDES, SIDES)),
-            r"model: expected vertices \(v, 3\) .*found 3 arrays",
-        ),
+        (lambda: designgen.scan((CORNERS, SIDES, SIDES)), r"model: expected vertices \(v, 3\) .*found 3 arrays"),
         (lambda: designgen.scan((CORNERS, SIDES), stations=True), "stations: expected a number from 1 or a .json file"),
         (lambda: designgen.scan((CORNERS, SIDES), stations=2.5), "stations: expected a number from 1 or a .json file"),
         (lambda: designgen.scan((CORNERS, SIDES), settings=3), "settings: expected a mapping by .section.key., got 3"),

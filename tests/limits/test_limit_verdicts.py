@@ -25,8 +25,6 @@ from processor.defects.verdicts import depths_and_areas
 from processor.deviation import verdicts as of_surface
 from processor.deviation.result import ErrorSource
 from processor.deviation.result import Result as DeviationResult
-from processor.inspection import characteristic
-from processor.inspection.result import Quantity
 from processor.jobs import exit_codes
 from processor.language.messages import messages
 from processor.limits import judging, limit_bounds, measurands, project_limits, standards
@@ -79,17 +77,6 @@ def given(of_components=None, **limits):
 
 
 @pytest.mark.parametrize(
-    ("value", "ci95", "verdict"),
-    [(4.0, 0.9, PASS), (4.0, 1.1, OPEN), (6.0, 1.1, OPEN), (6.0, 0.9, FAIL), (4.0, math.nan, OPEN)],
-)
-def test_verdict_follows_from_the_interval_of_the_value(value, ci95, verdict):
-    tolerance = given(node_place_mm=5.0)
-    (limit,) = tolerance.limits
-    assert judging.judge(limit, Measured.within("n", value, ci95), tolerance).verdict is verdict
-    assert judging.judge(limit, Measured.within("n", value, ci95, doubtful=True), tolerance).verdict is OPEN
-
-
-@pytest.mark.parametrize(
     ("interval", "verdict"),
     [
         ((1.0, 2.0), "pass"),  # 1.5 +- 0.5 reaches the limit just so
@@ -104,7 +91,9 @@ def test_verdict_follows_from_the_interval_of_the_value(value, ci95, verdict):
 )
 def test_verdict_of_an_interval_against_bounds(interval, verdict):
     limit = Limit("k", "x", low=-1.0, high=2.0)
-    assert judging.judge(limit, Measured("n", 0.5 * sum(interval), *interval), Tolerance()).verdict == verdict
+    for doubtful, wanted in ((False, verdict), (True, "indeterminate")):
+        measured = Measured("n", 0.5 * sum(interval), *interval, doubtful=doubtful)
+        assert judging.judge(limit, measured, Tolerance()).verdict == wanted
 
 
 # value and the ends of its interval, by limits from least to greatest
@@ -211,14 +200,6 @@ def test_a_bound_by_number_and_size_is_unknown_with_the_size(size_mm):
         measured = {"span": (np.array([value]), np.array([0.01]))}
         found = chain.judge(measured, Tolerance(limits=(of_chain,)), size_mm)
         assert found.verdict is (OPEN if math.isnan(size_mm) else verdict)
-
-
-@pytest.mark.parametrize("ends", [(math.nan, -9.0), (8.0, math.nan), (8.0, math.inf), (math.nan, math.nan)])
-def test_a_characteristic_with_an_open_interval_is_indeterminate(ends):
-    limit = Limit("part_bow_mm", "bow", low=-5.0, high=5.0, measure="part bow")
-    one = Measured("bow", 7.0, *ends, what=Quantity.BOW)
-    table = characteristic.table([one], Tolerance(limits=(limit,)), "m1", {}, doubtful=False)
-    assert table.verdict == (OPEN,)
 
 
 def test_every_limit_is_compared_or_states_what_it_needs():
