@@ -55,13 +55,6 @@ def test_heights_are_those_of_an_independent_interpolation():
     assert np.nanmax(np.abs(height - expected)) < 1e-6  # by slopes of triangles as thin as 1e-6
 
 
-def test_slopes_are_those_of_the_plane():
-    given = slope(0.1, -0.2, 50.0)
-    height, found = hanger_lengths.heights(Ceiling(**given), np.array([[300.0, 700.0]]))
-    assert height == pytest.approx([0.1 * 300.0 - 0.2 * 700.0 + 50.0])
-    assert found[0] == pytest.approx([0.1, -0.2])
-
-
 def test_the_highest_of_several_surfaces_counts_and_walls_do_not():
     low, high = slope(0.0, 0.0, 0.0), slope(0.0, 0.0, 12.0)
     vertices = np.vstack([low["vertices"], high["vertices"]])

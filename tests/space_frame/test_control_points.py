@@ -34,14 +34,12 @@ def shifted(scene, seed, common=COMMON_MM, own=SHIFT_MM):
     return dataclasses.replace(scene, scans=tuple(scans))
 
 
-def control(scene, seed, sd=0.3, seen_sd=0.4, points=6, wrong=()):
+def control(scene, seed, sd=0.3, seen_sd=0.4, points=6):
     """Targets on the floor about the roof, each seen by two stations of the true ``scene``."""
     rng = np.random.default_rng(seed)
     low, high = scene.frame.centres.min(axis=0), scene.frame.centres.max(axis=0)
     places = np.column_stack([rng.uniform(low[:2], high[:2], (points, 2)), rng.uniform(0.0, low[2], points)])
     known = places + sd * rng.standard_normal(places.shape)
-    for which, off in wrong:
-        known[which] += off
     point, scan, seen = [], [], []
     for k, place in enumerate(places):
         for s in rng.permutation(len(scene.scans))[:2].tolist():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from processor.adjustment.scanner_class_errors import OFFSET_SD_MM
-from processor.geometry.linalg_small import inverse_of
 from processor.geometry.sphere_fit import residual
 from processor.model import reason
 from processor.space_frame import ball_catalogue
@@ -22,36 +21,8 @@ from processor.space_frame.spheres.ball_fit import (
     weight,
 )
 from processor.space_frame.spheres.records import Spheres, StochasticModel
-from processor.space_frame.spheres.stochastic_model import limb_cosine, noise_model, radius_offset, radius_scatter
+from processor.space_frame.spheres.stochastic_model import limb_cosine, noise_model, radius_offset
 from tests.bench import ball_fit
-
-
-def test_residual_of_a_square_and_of_a_slanting_ray():
-    # along z at a ball of 50 at height 1000: the sphere is met at 950; at 30 off the axis, at 960 with cosine 0.8
-    e, cosine, *J = residual(0.0, 0.0, 953.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1000.0, 50.0)
-    assert (e, cosine) == pytest.approx((3.0, 1.0))
-    assert pytest.approx([0.0, 0.0, -1.0, 1.0]) == J
-    e, cosine, *_ = residual(30.0, 0.0, 955.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1000.0, 50.0)
-    assert (e, cosine) == pytest.approx((-5.0, 0.8))
-    assert residual(51.0, 0.0, 955.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1000.0, 50.0)[:2] == (0.0, 0.0)
-    # without a ray: the distance from the surface
-    e, cosine, *J = residual(30.0, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 45.0)
-    assert (e, cosine) == pytest.approx((5.0, 1.0))
-    assert pytest.approx([-0.6, -0.8, 0.0, -1.0]) == J
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_jacobian_equals_finite_differences(known):
-    rng = np.random.default_rng(1)
-    p = np.array([18.0, -9.0, -41.0])
-    u = np.array([0.3, 0.1, 0.9]) / np.linalg.norm([0.3, 0.1, 0.9]) * known
-    state = np.append(rng.normal(0, 1, 3), 50.0)
-    J = np.array(residual(*p, *u, *state)[2:])
-    for i in range(4):
-        d = np.zeros(4)
-        d[i] = 1e-5
-        numeric = (residual(*p, *u, *(state + d))[0] - residual(*p, *u, *(state - d))[0]) / 2e-5
-        assert J[i] == pytest.approx(numeric, abs=1e-8)  # second order: 1e-10
 
 
 def test_selection_depends_on_the_ray_and_not_on_the_noisy_point():
@@ -75,15 +46,6 @@ def test_weight_is_one_for_small_and_zero_for_large_residuals():
     assert weight(3.75) == pytest.approx((1.0 - 0.25) ** 2)
     w = np.array([weight(x) for x in np.random.default_rng(2).standard_normal(10_000)])
     assert w.mean() > 0.998  # next to nothing of normal noise is lost
-
-
-def test_inverse_is_that_of_another_library():
-    rng = np.random.default_rng(3)
-    A = rng.normal(size=(7, 4))
-    out = np.empty((4, 4))
-    assert inverse_of(A.T @ A, out)
-    np.testing.assert_allclose(out, np.linalg.inv(A.T @ A), rtol=1e-9)  # rounding
-    assert not inverse_of(np.diag([1.0, 2.0, 0.0, 1.0]), out)
 
 
 def test_covariance_with_station_shifts_is_that_of_the_joint_problem():
@@ -236,19 +198,6 @@ def test_a_beam_cut_at_the_limb_does_not_raise_the_size():
     catalogue = ball_catalogue.of_radii([50.0, 55.0, 60.0, 65.0, 70.0, 75.0])
     found = alternating_fit.fit_crops(moved, stations, nodes, Members(), catalogue, params=params)
     np.testing.assert_array_equal(found.sizes, true)
-
-
-def test_the_scatter_of_radii_is_that_of_the_balls():
-    rng = np.random.default_rng(10)
-    sizes = np.resize([45.0, 60.0], 800)
-    true = sizes + rng.normal(0, 0.2, 800)
-    own = rng.uniform(0.1, 0.6, 800)  # sd of what points alone say
-    measured = true + own * rng.standard_normal(800)
-    weight_ = 1 / own**2 + 1 / 0.4**2
-    posterior = (measured / own**2 + sizes / 0.4**2) / weight_
-    # 800 radii of 0.2 mm and 0.35 mm of their own: 0.02 mm; of two the scatter stays the prior's.
-    assert radius_scatter(posterior, 1 / weight_, sizes, 0.4, 0.4) == pytest.approx(0.2, abs=0.04)
-    assert radius_scatter(posterior[:2], 1 / weight_[:2], sizes[:2], 0.4, 0.4) == pytest.approx(0.4, abs=0.08)
 
 
 def test_an_offset_that_all_radii_share_is_found_with_its_standard_deviation():

@@ -62,21 +62,6 @@ def test_rows_are_the_designs_nodes_in_its_order(roof, designed):
     assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3  # as above: 0.78 came
 
 
-@pytest.mark.slow  # every day: the square roof, below
-def test_a_design_of_another_frame_is_found(roof):
-    scene, truth = roof
-    R, t = rigid.rotation_from_vector(np.array([0.02, -0.01, 0.7])), np.array([5.0e8, 4.3e9, 1e3])
-    moved = dataclasses.replace(scene.frame, centres=scene.frame.centres @ R.T + t)
-    result = run(dataclasses.replace(scene, frame=moved), Params())
-    assert result.matching.status == "ok"
-    assert result.movement_reference.gauge == "best-fit"
-    assert errors(result, truth).max() < 0.6  # as above
-    turn = result.matching.T_design_scan[:3, :3] @ R.T
-    assert np.degrees(rigid.rotation_angle(turn)) < 0.1  # nodes move by 5 mm over 12 m
-    back = rigid.apply(result.matching.T_design_scan, result.balls.centres) - moved.centres
-    assert np.linalg.norm(back, axis=1).max() < 30.0
-
-
 @pytest.mark.parametrize("stated", [None, "own"])
 def test_a_list_of_nodes_in_coordinates_of_the_site_gives_the_sag_and_the_best_fit_beside_it(roof, stated):
     scene, truth = roof
@@ -99,37 +84,12 @@ def test_a_list_of_nodes_in_coordinates_of_the_site_gives_the_sag_and_the_best_f
     assert {f"spheres.{gauge}-{basis}"} < set(codes(result.reasons))
 
 
-def test_unbuilt_node_is_not_found_and_undesigned_node_is_extra(roof):
-    scene, truth = roof
-    frame = scene.frame
-    centres = frame.centres.copy()
-    centres[7] += [0.0, 0.0, -900.0]  # nothing is there
-    own = (frame.member_a != frame.ids[7]) & (frame.member_b != frame.ids[7])
-    names = "member_a", "member_b", "tube_diameters"
-    other = dataclasses.replace(frame, centres=centres, **{name: getattr(frame, name)[own] for name in names})
-    result = run(dataclasses.replace(scene, frame=other), Params())
-    assert result.balls.flag[7] == "not-found"
-    assert np.isnan(result.balls.centres[7]).all()
-    rest = np.arange(len(centres)) != 7
-    assert errors(result, truth, rest).max() < 0.6  # as above
-    assert result.status == "partial"
-
-
-def test_a_ball_of_another_size_is_named(roof):
-    scene, _ = roof
-    radii = scene.frame.radii.copy()
-    radii[3] += 10.0
-    result = run(dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, radii=radii)), Params())
-    assert [i for i, flag in enumerate(result.balls.flag) if flag == "wrong-size"] == [3]
-
-
-@pytest.mark.parametrize(("chunk", "threads_used"), [pytest.param(70_001, 1, marks=pytest.mark.slow), (12_345, 3)])
-def test_order_chunks_and_threads_give_the_same_bytes(roof, designed, chunk, threads_used, monkeypatch):
+def test_order_chunks_and_threads_give_the_same_bytes(roof, designed, monkeypatch):
     (scene, _), first = roof, designed
     pools, pool = set(), thread_ranges._pool
-    monkeypatch.setattr(thread_ranges, "usable", lambda: threads_used)
+    monkeypatch.setattr(thread_ranges, "usable", lambda: 3)
     monkeypatch.setattr(thread_ranges, "_pool", lambda count: (pools.add(count), pool(count))[1])
-    monkeypatch.setattr(to_result, "SceneSource", partial(SceneSource, chunk_size=chunk))
+    monkeypatch.setattr(to_result, "SceneSource", partial(SceneSource, chunk_size=12_345))
     rng = np.random.default_rng(1)
     scans = []
     for scan in scene.scans:
@@ -137,7 +97,7 @@ def test_order_chunks_and_threads_give_the_same_bytes(roof, designed, chunk, thr
         columns = {name: getattr(scan, name) for name in ("points", "intensity", "grid_row", "grid_column")}
         scans.append(dataclasses.replace(scan, **{k: v[order] if len(v) else v for k, v in columns.items()}))
     again = run(dataclasses.replace(scene, scans=tuple(scans)), Params())
-    assert pools == {threads_used} - {1}  # one thread needs no pool
+    assert pools == {3}
     for name in ("balls", "tubes", "stations", "matching"):
         for field in dataclasses.fields(getattr(first, name)):
             one, other = getattr(getattr(first, name), field.name), getattr(getattr(again, name), field.name)
@@ -199,7 +159,10 @@ def test_sizes_of_balls_decide_the_turn_of_a_square_roof(square):
     # The next pose is a quarter turn off; 0.009 came.
     assert np.degrees(rigid.rotation_angle(result.matching.T_design_scan[:3, :3] @ R.T)) < 0.05
     assert wrong_sizes(result) == truly_wrong(scene, truth) - set(without)
-    assert (np.array(result.balls.flag) == "not-found").sum() == len(beyond)
+    gone = np.array(result.balls.flag) == "not-found"
+    assert gone.sum() == len(beyond)
+    assert np.isnan(result.balls.centres[gone]).all()
+    assert result.status == "partial"
 
 
 def test_where_the_pose_stays_ambiguous_no_ball_is_called_wrong_on_its_account(square):

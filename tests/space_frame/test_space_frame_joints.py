@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from scipy.stats import norm
 
 from processor.space_frame import extract
 from processor.space_frame.members import member_extraction
@@ -43,12 +42,6 @@ def found(frame, sleeves=True, seed=3, **kinds):
     meeting = member_extraction.meeting(start.measured, member_extraction.Params().largest_scatter_mm)
     positions = start.measured.nodes.positions
     return positions[meeting], positions[meeting & start.balls]
-
-
-def test_the_density_of_residuals_is_the_normal_one():
-    for e, sd in ((0.0, 1.0), (1.5, 0.4), (-3.0, 2.0)):
-        # Rounding.
-        assert ball_joint_classification._normal(e, sd) == pytest.approx(norm.pdf(e, 0.0, sd), rel=1e-12)
 
 
 def test_no_ball_has_less_than_five_quarters_of_the_radius_of_its_thinnest_tube(monkeypatch):

@@ -1,6 +1,7 @@
 """Nodes and pairs from rough lines, worked by hand."""
 
 import numpy as np
+import pytest
 
 from processor.space_frame.members.junctions import Lines, graph
 
@@ -36,19 +37,18 @@ def test_a_tetrahedron_is_four_nodes_and_six_members():
     assert found.pairs.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
 
 
-def test_crossings_without_ends_are_no_nodes():
-    crossing = [([-1500, 0, 0], [1500, 0, 0]), ([0, -1500, 0], [0, 1500, 0]), ([0, 0, -1500], [0, 0, 1500])]
-    assert len(graph(lines_of(*crossing)).nodes) == 0
-    assert len(graph(lines_of(*crossing[:2])).nodes) == 0
+CROSSING = [([-1500, 0, 0], [1500, 0, 0]), ([0, -1500, 0], [0, 1500, 0]), ([0, 0, -1500], [0, 0, 1500])]
+NO_NODES = {
+    "three cross": CROSSING,
+    "two cross": CROSSING[:2],
+    "two, one of them broken": [toward(ORIGIN, X, last=1800.0), toward(ORIGIN, X, first=1800.0), toward(ORIGIN, Y)],
+    "miss each other": [toward(ORIGIN, X), toward([0, 0, 80], [0, 3000, 80]), toward([-80, 80, 0], [-80, 80, 3000])],
+    "one alone": [toward(ORIGIN, X)],
+}
 
 
-def test_two_lines_and_a_broken_one_are_no_node():
-    broken = [toward(ORIGIN, X, last=1800.0), toward(ORIGIN, X, first=1800.0), toward(ORIGIN, Y)]
-    assert len(graph(lines_of(*broken)).nodes) == 0
-
-
-def test_lines_that_miss_each_other_are_no_node():
-    ends = [toward(ORIGIN, X), toward([0, 0, 80], [0, 3000, 80]), toward([-80, 80, 0], [-80, 80, 3000])]
+@pytest.mark.parametrize("ends", NO_NODES.values(), ids=NO_NODES)
+def test_lines_that_make_no_node(ends):
     assert len(graph(lines_of(*ends)).nodes) == 0
 
 
@@ -84,6 +84,5 @@ def test_a_corner_of_two_members_is_a_node_where_both_lead_to_nodes():
     assert len(graph(lines_of(*[toward(corners[i], corners[j]) for i, j in ladder], *loose)).nodes) == 6
 
 
-def test_graph_of_no_or_one_line_has_no_nodes():
+def test_graph_of_no_lines_has_no_nodes():
     assert len(graph(Lines(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))).nodes) == 0
-    assert len(graph(lines_of(toward(ORIGIN, X))).nodes) == 0

@@ -59,10 +59,6 @@ def pull(nodes, rows, true):
     return np.einsum("ki,kij,kj->k", error, np.linalg.inv(nodes.covariance[rows]), error)
 
 
-def bytes_of(record):
-    return [np.asarray(getattr(record, name)).tobytes() for name in record.__dataclass_fields__]
-
-
 def test_all_nodes_and_members_are_found_without_a_design(frame, source):
     nodes, tubes = find(source)
     rows = matched(nodes, frame.nodes)
@@ -96,22 +92,6 @@ def test_a_design_20_mm_off_gives_the_same_nodes(frame, source):
     assert len(tubes.radii) == len(frame.members)
     sd = np.sqrt(nodes.covariance.trace(axis1=1, axis2=2))
     assert (np.linalg.norm(nodes.positions - frame.nodes, axis=1) < 4.0 * sd).all()  # four sds
-
-
-@pytest.mark.parametrize("how", ["order", "chunks", "threads"])
-def test_same_bytes_whatever_the_order_the_chunks_and_the_threads(source, how):
-    few = member_extraction.Params(kept_points=15_000, tube_points=128, threads=1)  # so that points have to be chosen
-    expected = find(source, few)
-    assert expected[0].count > 0
-    if how == "order":
-        order = np.random.default_rng(4).permutation(source.count)
-        other = find(InMemory(source.points[order], source.station[order], STATIONS), few)
-    elif how == "chunks":
-        other = find(InMemory(source.points, source.station, STATIONS, chunk_size=7_001), few)
-    else:
-        other = find(source, member_extraction.Params(kept_points=15_000, tube_points=128, threads=3))
-    for one, two in zip(expected, other, strict=True):
-        assert bytes_of(one) == bytes_of(two)
 
 
 def test_nodes_are_found_without_scanner_positions(frame, source):
@@ -176,7 +156,7 @@ def test_station_shifts_are_included_in_the_covariance_of_nodes(frame):
     assert np.median(formal) > 0.3  # the noise alone would make it 0.05
 
 
-@pytest.mark.parametrize("radius", [20.0, pytest.param(57.0, marks=pytest.mark.slow), 70.0])
+@pytest.mark.parametrize("radius", [20.0, 70.0])
 def test_tubes_of_other_radii_are_measured(radius):
     rng = np.random.default_rng(8)
     frame = frame_clouds.grid(3, 3, spacing=3500.0, depth=2400.0, rng=rng)

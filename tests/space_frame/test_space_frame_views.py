@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from processor.space_frame.ball_catalogue import of_radii
-from processor.space_frame.members.records import Members
 from processor.space_frame.spheres import alternating_fit
 from processor.space_frame.spheres.unnamed_view_errors import of_tubes
 from tests.support.clouds import ball_clouds
@@ -59,12 +58,7 @@ def test_intervals_of_tubes_of_a_merged_cloud_cover_shifted_views():
     found = fitted(1, 0.6)
     below, narrow = np.zeros((2, 24))
     below[12:], narrow[15:21] = 10.0, 10.0
-    tubes = Members(
-        points=np.zeros((2, 3)), directions=np.tile([1.0, 0.0, 0.0], (2, 1)), side=np.tile([0.0, 1.0, 0.0], (2, 1)),
-        lengths=np.full(2, 1000.0), radii=np.full(2, 30.0), bow=np.zeros((2, 2)), covariance=np.zeros((2, 5, 5)),
-        node_a=np.full(2, -1), node_b=np.full(2, -1), count=np.full(2, 100), rms=np.ones(2),
-        around=np.stack([below, narrow]),
-    )  # fmt: skip
+    tubes = ball_clouds.tubes(2, 1000.0, 30.0, node_a=np.full(2, -1), rms=np.ones(2), around=np.stack([below, narrow]))
     whole = of_tubes(found.views, tubes)
     assert (np.linalg.eigvalsh(whole) > 0.0).all()
     assert whole[1, 2, 2] > whole[0, 2, 2]

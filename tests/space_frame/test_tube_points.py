@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from processor.space_frame.members.records import Members
 from processor.space_frame.points import line_crops
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM
 from processor.space_frame.stations.tube_points import END_SHARE, NEAR_MM, tube_points
+from tests.support.clouds import ball_clouds
 
 HALF_LENGTH, RADIUS, BOW = 1000.0, 80.0, 20.0
 
@@ -22,12 +22,7 @@ def test_of_many_points_on_a_bowed_tube_so_many_are_chosen_of_all_of_it_and_of_f
     clear = (np.abs(np.abs(off) - NEAR_MM) > 0.02) & (np.abs(np.abs(along) - END_SHARE * HALF_LENGTH) > 0.02)
     points, station = points[clear], station[clear]
     usable = ((np.abs(off) < NEAR_MM) & (np.abs(along) < END_SHARE * HALF_LENGTH))[clear] & (station >= 0)
-    members = Members(
-        points=np.zeros((1, 3)), directions=np.array([[1.0, 0, 0]]), side=np.array([[0.0, 1, 0]]),
-        lengths=np.array([2.0 * HALF_LENGTH]), radii=np.array([RADIUS]), bow=np.array([[BOW, 0.0]]),
-        covariance=np.zeros((1, 5, 5)), bow_covariance=np.zeros((1, 2, 2)), node_a=np.array([0]), node_b=np.array([1]),
-        count=np.array([100]), rms=np.zeros(1), around=np.zeros((1, 24)),
-    )  # fmt: skip
+    members = ball_clouds.tubes(1, 2.0 * HALF_LENGTH, RADIUS, bow=np.array([[BOW, 0.0]]), node_b=np.array([1]))
     half = np.array([HALF_LENGTH + 50.0])
     lines = line_crops.corridors(members.points, members.directions, -half, half, 150.0)
     gathered = line_crops.gather([(points, station)], STEPS_PER_MM, lines, 8192)

@@ -3,21 +3,15 @@
 import numpy as np
 import pytest
 
-from processor.space_frame.members.records import Members
 from processor.space_frame.stations import station_error_propagation
 from processor.space_frame.stations.records import Stations, StationStatus
+from tests.support.clouds import ball_clouds
 
 RADIUS, OFFSET = 80.0, 0.5
 
 
 def tube():
-    """A tube along x about the origin."""
-    return Members(
-        points=np.zeros((1, 3)), directions=np.array([[1.0, 0, 0]]), side=np.array([[0.0, 1, 0]]),
-        lengths=np.array([2000.0]), radii=np.array([RADIUS]), bow=np.zeros((1, 2)), covariance=np.zeros((1, 5, 5)),
-        bow_covariance=np.zeros((1, 2, 2)), node_a=np.array([0]), node_b=np.array([1]), count=np.array([100]),
-        rms=np.zeros(1), around=np.zeros((1, 24)),
-    )  # fmt: skip
+    return ball_clouds.tubes(1, 2000.0, RADIUS, node_b=np.array([1]))
 
 
 def stations(places, covariance, **errors):

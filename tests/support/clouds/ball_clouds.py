@@ -65,21 +65,21 @@ def frame(rng, centres, radii, stations, step_mrad=1.2, sigma=2.0, node_sd=0.5, 
     m = len(units) * k
     axis, node = np.tile(units, (k, 1)), np.repeat(np.arange(k), len(units))
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)]) if m else np.empty((0, 3))
-    found = Members(
-        points=centres[node] + 500.0 * axis,
-        directions=axis,
-        side=side / np.linalg.norm(side, axis=1)[:, None] if m else side,
-        lengths=np.full(m, 800.0),
-        radii=np.full(m, TUBE),
-        bow=np.zeros((m, 2)),
-        covariance=np.zeros((m, 5, 5)),
-        node_a=node,
-        node_b=np.full(m, -1),
-        count=np.full(m, 100),
-        rms=np.full(m, 2.0),
-        around=np.zeros((m, 24)),
-    )
-    return source, nodes, found
+    side = side / np.linalg.norm(side, axis=1)[:, None] if m else side
+    places = {"points": centres[node] + 500.0 * axis, "directions": axis, "side": side, "node_a": node}
+    return source, nodes, tubes(m, 800.0, TUBE, **places, rms=np.full(m, 2.0))
+
+
+def tubes(m, length, radius, **columns):
+    """Straight tubes along x about the origin whose axes are known exactly, but for the columns that are given."""
+    known = {
+        "points": np.zeros((m, 3)), "directions": np.tile([1.0, 0.0, 0.0], (m, 1)),
+        "side": np.tile([0.0, 1.0, 0.0], (m, 1)), "lengths": np.full(m, length), "radii": np.full(m, radius),
+        "bow": np.zeros((m, 2)), "covariance": np.zeros((m, 5, 5)), "bow_covariance": np.zeros((m, 2, 2)),
+        "node_a": np.zeros(m, int), "node_b": np.full(m, -1), "count": np.full(m, 100), "rms": np.zeros(m),
+        "around": np.zeros((m, 24)),
+    }  # fmt: skip
+    return Members(**{**known, **columns})
 
 
 def grid_of_balls(k, radii, height=6000.0):
