@@ -29,6 +29,18 @@ def test_rays_fitted_to_a_grid_are_the_simulated_ones():
     np.testing.assert_allclose(np.sort(lost, axis=0), np.sort(true[~keep], axis=0), atol=ROUNDING)
 
 
+def rays_at(turn, up):
+    """Unit vectors of rays by their angles about z and above the horizon."""
+    return np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], axis=1)
+
+
+def plane(place, normal, variance=1.0):
+    return Planes(np.ones(1), np.array([place]), np.array([normal]), np.full((1, 3), variance), np.eye(3)[None])
+
+
+AHEAD = [-1.0, 0.0, 0.0]  # the normal of a face ahead
+
+
 def bands(points, row, column):
     """The points of a grid, each in a cell of its own."""
     return GridBands.of(points, row.astype(np.int32), column.astype(np.int32), np.arange(len(points)))
@@ -38,21 +50,17 @@ def post(width_mm, phase, step=5e-3, range_mm=20_000.0):
     """Ends of a post 20 m ahead against the sky, x along the ray; columns at (i + phase) steps, 30 rows."""
     column, row = np.meshgrid(np.arange(200), np.arange(30))
     turn = (column.ravel() - 100 + phase) * step
-    up = (row.ravel() - 10) * step
-    u = np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], axis=1)
+    u = rays_at(turn, (row.ravel() - 10) * step)
     p = u * (range_mm / u[:, 0])[:, None]
     # The ground below determines the columns of the grid.
     low = row.ravel() < 4
     hit = low | (np.abs(p[:, 1]) < 0.5 * width_mm)
     p[low] *= 0.6
-    plane = Planes(
-        np.ones(1), np.array([[range_mm, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.ones((1, 3)), np.eye(3)[None]
-    )
     r, c = row.ravel()[hit], column.ravel()[hit]
     piece = np.where(low[hit], -1, 0)
     piece[~low[hit] & (r % 7 > 0)] = -1  # in a planar piece in few rows only
     rays = scan_grid_directions.fitted(p[hit], r, c)
-    return face_ends.ends_of(bands(p[hit], r, c), piece, plane, 2.0, rays)
+    return face_ends.ends_of(bands(p[hit], r, c), piece, plane([range_mm, 0.0, 0.0], AHEAD), 2.0, rays)
 
 
 def test_ends_of_a_post_are_unbiased_for_all_phases_of_the_rays():
@@ -73,16 +81,15 @@ def test_ends_of_a_post_are_unbiased_for_all_phases_of_the_rays():
 def test_a_bar_that_one_ray_hits_has_an_end_on_either_side(height):
     """Be it the first or the last ray of a scan: rays 5 mrad apart at 20 m pass 50 mm beside it."""
     column, row = (grid.ravel() for grid in np.meshgrid(np.arange(200), np.arange(9)))
-    turn, up = (column - 100) * 5e-3, (row - height) * 5e-3
-    u = np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], axis=1)
+    u = rays_at((column - 100) * 5e-3, (row - height) * 5e-3)
     on_bar = (row == height) & (column == 100)
     p = u * np.where(on_bar, 20_000.0, 12_000.0)[:, None]  # other rows determine the columns of the grid
     kept = on_bar | (np.abs(row - 4) < 2)
-    plane = Planes(
-        np.ones(1), np.array([[20_000.0, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.ones((1, 3)), np.eye(3)[None]
-    )
     rays = scan_grid_directions.fitted(p[kept], row[kept], column[kept])
-    ends = face_ends.ends_of(bands(p[kept], row[kept], column[kept]), np.where(on_bar[kept], 0, -1), plane, 2.0, rays)
+    piece = np.where(on_bar[kept], 0, -1)
+    ends = face_ends.ends_of(
+        bands(p[kept], row[kept], column[kept]), piece, plane([20_000.0, 0.0, 0.0], AHEAD), 2.0, rays
+    )
     beside = np.abs(ends.across[:, 1]) > 50.0
     np.testing.assert_allclose(np.sort(ends.points[beside, 1]), [-50.0, 50.0], rtol=1e-4)  # squares of 5 mrad
 
@@ -151,19 +158,16 @@ def test_far_edges_of_an_inclined_face_are_unbiased():
     off, width = [], []
     for phase in np.linspace(0.0, 1.0, 25, endpoint=False):
         column, row = np.meshgrid(np.arange(60), np.arange(300))
-        turn, up = (column.ravel() - 30.3) * step, -0.4507 + (row.ravel() + phase) * step
-        u = np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], axis=1)
+        u = rays_at((column.ravel() - 30.3) * step, -0.4507 + (row.ravel() + phase) * step)
         p = u * (-height / u[:, 2])[:, None]
         hit = (u[:, 2] < 0.0) & (p[:, 0] < edge)
         beside = ~hit & (row.ravel() > 280)  # points above determine the rows of the grid
         p[beside] = 20_000.0 * u[beside]
         keep = hit | beside
-        plane = Planes(
-            np.ones(1), np.array([[0.0, 0.0, -height]]), np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3)), np.eye(3)[None]
-        )
         r, c = row.ravel()[keep], column.ravel()[keep]
         rays = scan_grid_directions.fitted(p[keep], r, c)
-        ends = face_ends.ends_of(bands(p[keep], r, c), np.where(hit[keep], 0, -1), plane, 2.0, rays)
+        floor = plane([0.0, 0.0, -height], [0.0, 0.0, 1.0])
+        ends = face_ends.ends_of(bands(p[keep], r, c), np.where(hit[keep], 0, -1), floor, 2.0, rays)
         far = (ends.across[:, 0] > 0.0) & (np.abs(ends.across[:, 1]) < 0.5 * ends.across[:, 0])
         assert far.sum() >= 40
         off += (ends.points[far, 0] - edge).tolist()
@@ -181,10 +185,8 @@ def test_points_next_to_another_face_are_left_out():
     points = np.vstack([front + np.array([0.0, 0.0, 40.0 * i]) for i in range(3)])
     grid = bands(points, *np.divmod(np.arange(45), 15))
     piece = np.where(points[:, 1] < 60.0, 0, -1)  # two columns of the side face are in the piece
-    plane = Planes(
-        np.ones(1), np.array([[5000.0, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.full((1, 3), 4.0), np.eye(3)[None]
-    )
-    clear = border_exclusion.inside(points, np.arange(45), grid, piece, plane).reshape(3, 15)
+    ahead = plane([5000.0, 0.0, 0.0], AHEAD, 4.0)
+    clear = border_exclusion.inside(points, np.arange(45), grid, piece, ahead).reshape(3, 15)
     ends_at = int((y < 0.0).sum())  # the first column there lies 4.5 mm behind the front, within the noise
     assert not clear[:, ends_at:].any()
     assert clear[:, 1:ends_at].all()
@@ -193,6 +195,6 @@ def test_points_next_to_another_face_are_left_out():
     behind = np.stack([np.full(8, 5080.0), np.tile([-40.0, 80.0], 4), np.repeat(40.0 * np.arange(4), 2)], axis=1)
     points, row = np.vstack([bar, behind]), np.tile(np.repeat(np.arange(4), 2), 2)
     grid = bands(points, row, np.concatenate([np.tile([1, 2], 4), np.tile([0, 3], 4)]))
-    clear = border_exclusion.inside(points, np.arange(16), grid, np.repeat([0, -1], 8), plane)
+    clear = border_exclusion.inside(points, np.arange(16), grid, np.repeat([0, -1], 8), ahead)
     assert clear[:8].all()
     assert not clear[8:].any()
