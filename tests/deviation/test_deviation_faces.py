@@ -20,20 +20,13 @@ def from_edge(core, thickness):
     return distance.min(axis=1)
 
 
-@pytest.mark.parametrize(
-    ("thickness", "positions", "sides"),
-    [
-        (5.0, True, 2), (5.0, False, 1),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((5.0, False, 2), (20.0, True, 1), (20.0, False, 2))),
-    ],
-)  # fmt: skip  # all pairs
-def test_a_plate_as_designed_deviates_nowhere(thickness, positions, sides):
-    """Of one of the plates the step itself finds that no other attitude fits better."""
-    scene = plate(thickness, 3, STATIONS[:sides], positions, count=40_000)
-    params = deviation_step.Params() if (thickness, positions, sides) == (5.0, True, 2) else AS_IT_LIES
-    core = deviation_step.run(scene, params).core
+@pytest.mark.parametrize(("positions", "sides"), [(True, 2), (False, 1)])
+def test_a_plate_as_designed_deviates_nowhere(positions, sides):
+    """Of the plate seen from both sides the step itself finds that no other attitude fits better."""
+    scene = plate(5.0, 3, STATIONS[:sides], positions, count=40_000)
+    core = deviation_step.run(scene, deviation_step.Params() if positions else AS_IT_LIES).core
     known = np.isfinite(core.lod95)
-    edge = from_edge(core, thickness)
+    edge = from_edge(core, 5.0)
     # A twentieth at most, as LOD95 holds a registration error too: six draws of noise gave 0.027 to 0.039.
     assert 0.02 < core.distances.significant[known].mean() < 0.07
     near = known & (edge < 5.0)

@@ -9,8 +9,6 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from designgen import recipe_files
-from designgen.scenes.make import make
 from processor import pipeline
 from processor.adjustment import scanner_class_errors
 from processor.defects import design_pose
@@ -534,14 +532,3 @@ def test_deviation_in_results_json_has_the_keys_of_the_interface(tmp_path):
     np.testing.assert_array_equal(data[:, 5], np.abs(data[:, 3]) > data[:, 4])
     assert (tmp_path / "out" / "figures" / "deviation-map.png").exists()
     assert to_json.step_json(found.runs[0])["status"] == "ok"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_roof_that_moved_is_measured_within_its_level_of_detection(seed):
-    scene, truth = make("roof", recipe_files.overridden(recipe_files.load("stadium-roof")[1], [f"seed={seed}"]))
-    result = run(scene)
-    assert all(one.passed for one in deviation_evaluation.check(scene, result, truth))
-    # The first seed gives 0.999 and 1.33 mm; of noise and frame of 1 mm each 2.8 would come.
-    assert np.isfinite(result.core.lod95).mean() > 0.95
-    assert np.nanmedian(result.core.lod95) < 2.0

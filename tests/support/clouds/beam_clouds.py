@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
 
-from processor.model import Scan, Scene, StructureDesign
+from processor.geometry import rigid
+from tests.support.clouds import plate_clouds
 
 SIZE = np.array([3000.0, 400.0, 300.0])
 STATIONS = np.array(
@@ -38,23 +38,10 @@ def moved(points, built):
     return points + off
 
 
-def beam(built, seed, sigma=1.0, registration=0.3, count=60_000, named=True, T=None):
+def beam(built, seed, sigma=1.0, registration=0.3, count=60_000, T=None):
     """A scene of the box from four stations; T (4, 4) moves what was built, not the design."""
-    rng = np.random.default_rng(seed)
-    mesh = trimesh.creation.box(SIZE)
-    points, facet = trimesh.sample.sample_surface(mesh, count, seed=seed)
-    points, normals = np.asarray(points), mesh.face_normals[facet]
-    sees = np.einsum("nki,ni->nk", STATIONS - points[:, None], normals) > 0.0
-    chosen = np.argmax(sees * rng.random(sees.shape), axis=1)
-    real = moved(points, built)
-    if T is not None:
-        real = real @ T[:3, :3].T + T[:3, 3]
-    scans = []
-    for k, station in enumerate(STATIONS):
-        some = real[sees.any(axis=1) & (chosen == k)]
-        ray = (some - station) / np.linalg.norm(some - station, axis=1)[:, None]
-        off = registration * rng.standard_normal(3)
-        place = {"position": station} if named else {}
-        scans.append(Scan(f"s{k}", some + rng.normal(0.0, sigma, len(some))[:, None] * ray + off, **place))
-    design = StructureDesign("beam", np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    return Scene("beam", "structure", tuple(scans), structure=design, units="mm")
+
+    def real(points):
+        return rigid.apply(np.eye(4) if T is None else T, moved(points, built))
+
+    return plate_clouds.seen(SIZE, real, STATIONS, True, count, seed, sigma, registration)
