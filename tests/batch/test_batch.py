@@ -548,11 +548,9 @@ def test_a_run_whose_input_changes_writes_nothing(site, tmp_path, monkeypatch):
     ("arguments", "code", "says"),
     [
         (["--jobs", "0"], 2, "--jobs"),
-        (["--timeout-s", "0"], 2, "--timeout-s"),
         (["--memory-mb", "1"], 2, "--memory-mb"),
         (["--jobs", "1", "--cluster", "tcp://127.0.0.1:1"], 2, "exclude each other"),
         (["--steps", "none"], 2, "no step 'none'"),
-        (["--method", "none"], 2, "no method 'none'"),
         (["--params", "/none.toml"], 2, "not a readable parameter file"),
     ],
 )

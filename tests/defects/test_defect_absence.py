@@ -104,12 +104,6 @@ def assert_found(found, expected):
         assert min(away) < 40.0, (kind, place)
 
 
-@pytest.mark.slow
-def test_steel_as_designed_has_no_missing_parts():
-    """The step itself finds that the cloud lies at the design."""
-    assert run(cloud_of(BOXES, 1), {}) == []
-
-
 def test_a_rib_that_is_gone_and_a_corner_are_missing_and_a_long_bite_is_edge_loss():
     """The rib by points on the web where it should stand, the corner by the steel around it on both sides.
 

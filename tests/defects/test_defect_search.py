@@ -64,33 +64,6 @@ def test_chance_detections_are_flagged_doubtful():
     assert "no defects found and" in str(section.REPORT.summary(result)[0])
 
 
-def from_behind(scene, inward, count, seed):
-    """The scene with a scan of the plates' backs, which ``inward`` (x, z) moves as it does the fronts."""
-    rng, station = np.random.default_rng(seed), np.array([0.5 * count * (SIDE + GAP), 4000.0, 600.0])
-    n = int((SIDE / 8.0) ** 2)
-    parts = []
-    for i in range(count):
-        x, z = i * (SIDE + GAP) + rng.uniform(0.0, SIDE, n), rng.uniform(0.0, SIDE, n)
-        parts.append(np.stack([x, THICK + inward(x, z), z], axis=1))
-    ray = np.vstack(parts) - station
-    away = np.linalg.norm(ray, axis=1)[:, None]
-    points = station + ray * (1.0 + rng.normal(0.0, 0.4, away.shape) / away)
-    scan = Scan("S3", points, position=station, T_project_scan=np.eye(4))
-    return dataclasses.replace(scene, scans=(*scene.scans, scan))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("depth", [4.0, -4.0])
-def test_a_plate_dented_through_is_one_defect_though_both_sides_show_it(depth):
-    pushed, pit = bump(depth, 90.0, (250.0, 300.0)), bump(3.0, 40.0, (1250.0, 350.0))
-    scene = scene_of(3, lambda x, z: pushed(x, z) + pit(x, z))
-    result = run(from_behind(scene, pushed, 3, 9))
-    assert sorted(name for _, name in found(result)) == ["component-1", "component-2"]
-    kind, _ = next(row for row in found(result) if row[1] == "component-1")
-    assert kind in ("dent", "bulge")
-    assert abs(result.defects.depth_max[result.defects.component.index("component-1")]) == pytest.approx(4.0, rel=DEEP)
-
-
 def test_a_dent_a_bulge_and_a_pit_are_measured():
     bumps = {"dent": (3.0, 90.0, (250.0, 300.0)), "bulge": (-2.0, 80.0, (1250.0, 350.0)),
              "pit": (4.0, 16.0, (2100.0, 200.0))}  # fmt: skip
@@ -173,13 +146,6 @@ def test_surface_in_the_shadow_of_clutter_is_not_missing():
     ("kind", "inward", "depth"),
     [
         ("bend", lambda x, z: 3.0 * np.cos(np.pi * (x - 1200.0) / SIDE), 3.0),
-        pytest.param(
-            "twist", lambda x, z: 0.006 * (x - 1200.0) / SIDE * (z - 300.0) * 2.0, 1.8, marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "waviness", lambda x, z: 1.0 * np.sin(2.0 * np.pi * (x - 1200.0) / 150.0), 1.0, marks=pytest.mark.slow
-        ),
-        pytest.param("step", lambda x, z: np.where(x > 1300.0, 1.5, 0.0), 1.5, marks=pytest.mark.slow),
         ("misalignment", lambda x, z: 2.0 + 0.003 * (z - 300.0), 2.9),
     ],
 )

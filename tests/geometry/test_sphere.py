@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 from processor.geometry.nearest_neighbours import nearest_crops
 from processor.geometry.sphere import (
@@ -198,18 +197,6 @@ def test_robust_fit_does_not_depend_on_its_start_and_moves_with_its_points():
     np.testing.assert_allclose(moved.centre, R @ here.centre + 1000.0, atol=1e-6)  # as above
     there = robust_fit(points + UTM, Sphere(UTM, 50.0, NOWHERE), 1.0).sphere
     np.testing.assert_allclose([*(there.centre - UTM), there.radius], [*here.centre, here.radius], atol=UTM_MM)
-
-
-def test_robust_fit_of_clean_points_is_scipys():
-    rng = np.random.default_rng(13)
-    points = cap(rng, 300, 50.0) + rng.normal(0.0, 0.1, (300, 3))
-    expected = least_squares(
-        lambda x: np.linalg.norm(points - x[:3], axis=1) - x[3], [0, 0, 0, 50.0], loss="soft_l1", f_scale=1.0
-    ).x
-    fit = robust_fit(points, Sphere(np.zeros(3), 50.0, NOWHERE), 1.0).sphere
-    # both near the same maximum of likelihood: apart by a fraction of the standard deviation
-    difference = np.append(fit.centre, fit.radius) - expected
-    assert difference @ np.linalg.solve(fit.covariance, difference) < 1.0
 
 
 def test_robust_intervals_cover_and_ranges_take_the_bias_away():

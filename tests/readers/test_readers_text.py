@@ -92,13 +92,6 @@ def read(tmp_path, name, text):
     return readers.read(tmp_path / name)
 
 
-def test_columns_are_recognised_by_surveying_names(tmp_path):
-    text = "Point,Northing (m),Easting (m),Height (m)\nA 1,20,10,30\n<b>,21,11,31\n"
-    (scan,) = read(tmp_path, "a.csv", text)
-    assert scan.points.tolist() == [[10, 20, 30], [11, 21, 31]]
-    assert scan.unit == "m"
-
-
 @pytest.mark.parametrize(
     "text",
     [

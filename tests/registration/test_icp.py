@@ -24,12 +24,6 @@ def test_mesh_axes_of_a_box_surface():
     assert np.linalg.det(found.axes) == pytest.approx(1.0)
 
 
-def test_the_sign_choices_are_rotations():
-    turns = principal.turns(((0, 1, 2),))
-    assert [np.linalg.det(turn) for turn in turns] == [1.0] * 4
-    assert len({tuple(np.diag(turn)) for turn in turns}) == 4
-
-
 def test_point_to_point_agrees_with_open3d():
     o3d = pytest.importorskip("open3d")
     rng = np.random.default_rng(2)
@@ -42,23 +36,6 @@ def test_point_to_point_agrees_with_open3d():
     theirs = o3d.pipelines.registration.registration_icp(*clouds, 80.0, np.eye(4), criteria=criteria)
     np.testing.assert_allclose(found.T_target_source, theirs.transformation, atol=1e-10)
     assert found.rms == pytest.approx(theirs.inlier_rmse, rel=1e-12)  # the same pairs, and so the same sums
-
-
-def test_point_to_plane_icp_recovers_the_pose_of_a_box():
-    rng = np.random.default_rng(3)
-    points = rng.uniform(-1.0, 1.0, (6000, 3)) * [3000.0, 900.0, 500.0]
-    axis = rng.integers(0, 3, len(points))
-    side = np.where(rng.uniform(size=len(points)) < 0.5, -1.0, 1.0)
-    normals = np.zeros_like(points)
-    points[np.arange(len(points)), axis] = side * np.array([3000.0, 900.0, 500.0])[axis]
-    normals[np.arange(len(points)), axis] = side
-    T_true = rigid.transform(rigid.rotation_from_vector(np.array([0.01, 0.02, -0.01])), np.array([40.0, -30.0, 20.0]))
-    source = rigid.apply(rigid.invert(T_true), points[::7]) + rng.normal(0.0, 0.5, (len(points[::7]), 3))
-    boxes = icp.boxes_of(points, normals)
-    found = icp.point_to_plane(source, boxes, np.eye(4), gates_mm=(200.0, 50.0, 10.0))
-    moved = rigid.apply(found.T_target_source @ rigid.invert(T_true), np.array([[3000.0, 900.0, 500.0]]))
-    # 850 points of 0.5 mm, 140 of a side: 0.04 mm of each motion at its corner, less the rest of the start.
-    assert np.linalg.norm(moved - [3000.0, 900.0, 500.0]) < 0.2
 
 
 def point_to_plane_by_arrays(source, points, normals, start, gates_mm, axes):

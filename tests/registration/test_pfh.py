@@ -67,15 +67,6 @@ def test_histograms_equal_the_definition_bin_by_bin(cloud, bins):
         np.testing.assert_allclose(found[query], expected, atol=1e-12)  # shares, float64
 
 
-def test_histograms_of_one_pair_fill_the_bin_computed_by_hand():
-    # Two points 2 apart on the x axis, both normals along +y: V = U x x = -z, W = U x V = -x,
-    # so alpha = V.N = 0, beta = U.x = 0, theta = atan2(W.N, U.N) = atan2(0, 1) = 0: the middle bin of all three.
-    points = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    normals = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
-    found = pfh.histograms(points, normals, 3.0, 5)
-    assert found[0, 2 + 5 * 2 + 25 * 2] == 1.0
-
-
 @pytest.mark.parametrize("normals", [lambda points: pfh.normals(points, 25.0), baseline._normals])
 @pytest.mark.parametrize("centre", [[0.0, 0, 0], [5e5, -3e5, 100.0]])
 def test_normals_of_a_sphere_point_outward(normals, centre):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processor import store
-from processor.model import InputError, Scan, Scene, Stations
+from processor.model import Scan, Scene, Stations
 from processor.space_frame.points.source import SceneSource
 from processor.store import points_of
 from processor.views import views
@@ -60,9 +60,3 @@ def test_a_scene_read_without_points_has_the_same_hash(path):
         assert store.scene_hash(store.read_scene(path, points=False), points.pieces) == store.scene_hash(
             store.read_scene(path)
         )
-
-
-def test_a_file_of_another_kind(tmp_path):
-    (tmp_path / "x.h5").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="expected a processor-scene file"), points_of(tmp_path / "x.h5"):
-        pass

@@ -154,12 +154,6 @@ def test_a_volume_of_points_is_no_sphere():
     assert processor.fit_sphere(points).status is Status.FAILED
 
 
-def test_every_point_given_twice_makes_no_doubt():
-    rng = np.random.default_rng(8)
-    points = (RADIUS + rng.normal(0.0, 0.5, (800, 1))) * directions(rng, 800)
-    assert processor.fit_sphere(np.repeat(points, 2, axis=0)).status is Status.OK
-
-
 def test_points_of_several_stations_have_a_position_each():
     rng = np.random.default_rng(9)
     points = seen(rng, RADIUS * (normals := directions(rng, 1500)), normals, 1.0)

@@ -7,8 +7,6 @@ import time
 
 import pytest
 
-from processor.jobs import runner
-from processor.model import UsageError
 from processor.validation import cell_runner
 from processor.validation.cells import Case, Cell, Outcome
 from processor.writers import toml
@@ -77,12 +75,3 @@ def test_cells_on_a_cluster(tmp_path, monkeypatch):
         found = {cell.seed: outcome for cell, outcome in run(cells)}
     assert {seed: outcome.results.get("seed") for seed, outcome in found.items()} == {1: 1, 2: None, 3: 3}
     assert found[2].failed == "a worker could not run it (MemoryError: none left)"
-
-
-def test_a_cluster_that_does_not_answer(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "CONNECT_S", 1)
-    with (
-        pytest.raises(UsageError, match="expected the address of a Dask scheduler that answers"),
-        cell_runner.cell_runner("tcp://127.0.0.1:1", 1, tmp_path, print),
-    ):
-        pass
