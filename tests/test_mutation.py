@@ -2,7 +2,6 @@
 
 import ast
 
-from tests.mutation import __main__ as mutation
 from tests.mutation.__main__ import drawn
 from tests.mutation.nearest import nearest_files
 from tests.mutation.sites import sites
@@ -43,19 +42,6 @@ def test_drawn_mutants_are_programs_of_many_kinds_and_the_same_for_a_seed():
         source = (ROOT / mutant.path).read_text("utf-8")
         assert source[mutant.site.start : mutant.site.end] == mutant.site.old
         ast.parse(mutant.site.applied(source))
-
-
-def test_what_is_drawn_stays_when_other_lines_change(tmp_path, monkeypatch):
-    monkeypatch.setattr(mutation, "ROOT", tmp_path)
-    (tmp_path / "core").mkdir()
-    lines = [f"def f{i}(a, b):\n    return a < b + {i}\n" for i in range(40)]
-    (tmp_path / "core/one.py").write_text("".join(lines))
-    before = {(one.site.old, one.site.new) for one in drawn(20, 1, ("core",))}
-    (tmp_path / "core/one.py").write_text(
-        "".join(["# moved\n", *lines[:20], "def g(a):\n    return a / 7\n", *lines[20:]])
-    )
-    after = {(one.site.old, one.site.new) for one in drawn(20, 1, ("core",))}
-    assert len(before & after) >= 15  # places of g() take the rest
 
 
 def test_the_nearest_tests_import_the_file():

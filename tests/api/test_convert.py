@@ -44,15 +44,15 @@ def full_disk(*_):
     raise OSError(28, "No space left on device")
 
 
-def in_memory(path, tmp_path, units=None):
+def in_memory(path, tmp_path):
     """The bytes of the scene file of an input that is read whole."""
     out = tmp_path / "whole.h5"
-    store.write_scene(out, folder.read_input(path, units), None, conversion._provenance(path))
+    store.write_scene(out, folder.read_input(path), None, conversion._provenance(path))
     return out.read_bytes()
 
 
-def converted(path, tmp_path, units=None):
-    processor.convert(path, tmp_path / "blocks.h5", units)
+def converted(path, tmp_path):
+    processor.convert(path, tmp_path / "blocks.h5")
     return (tmp_path / "blocks.h5").read_bytes()
 
 

@@ -2,7 +2,7 @@
 
 import ast
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -178,14 +178,6 @@ def positional_records(most=5):
             if name in records and len(node.args) > most:
                 found.append(f"{path.relative_to(ROOT)}:{node.lineno} {name}: {len(node.args)} positional arguments")
     return found
-
-
-def layer_groups():
-    """The first folder or file of each module below its package."""
-    groups = defaultdict(set)
-    for name in MODULES:
-        groups[".".join(name.split(".")[:2])].add(name)
-    return groups
 
 
 STEPS = ("defects", "deviation", "inspection", "preassembly", "space_frame", "stitching")

@@ -31,7 +31,3 @@ def ends_its_worker(tile, folder):
     if number == 2 and first:
         os._exit(9)
     return np.sqrt(tile)
-
-
-def always_ends_its_worker(_):
-    os._exit(9)
