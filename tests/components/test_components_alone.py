@@ -1,7 +1,5 @@
 """Parts of bridges and balls and tubes of frames as structures: where they are compared, and without false defects."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Characteristics of parts against numbers by hand, and their intervals against draws of the errors."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Bodies of structures inspected: a box built otherwise than designed in closed form, seen by stations with errors."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Holes: found in designs by CadQuery's solids, measured in points of bores that are made with numpy alone."""
 
-from __future__ import annotations
-
 import tracemalloc
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Members of frames by hand: lengths of their nodes' centres, bow and diameter of their tubes, with intervals."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Edges of plates too narrow for core points: closed forms, and plates scanned otherwise than designed."""
 
-from __future__ import annotations
-
 import cadquery as cq
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Points of a scene found by their places, beside a search tree over all of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree

@@ -1,7 +1,5 @@
 """A run with limits: the cause of its end is reported, and finished steps are stored."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

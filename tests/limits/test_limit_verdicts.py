@@ -1,7 +1,5 @@
 """One mechanism of verdicts for all steps: surfaces, defects, supports and deflections of frames, networks of scans."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

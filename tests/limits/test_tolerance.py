@@ -1,7 +1,5 @@
 """Limits as data: content of the files, limits of a project, and messages on mistakes."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

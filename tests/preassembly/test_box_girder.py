@@ -1,7 +1,5 @@
 """Parts without a mesh: their outer box against the generator's closed form, and the measurement with it."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measures and verdicts of a joint against closed forms, numbers by hand and draws of the errors."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

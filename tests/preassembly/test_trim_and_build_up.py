@@ -1,7 +1,5 @@
 """Trim and build-up of a joint: amounts by hand, optima by another solver, probabilities by independent draws."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

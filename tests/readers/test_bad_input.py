@@ -1,7 +1,5 @@
 """Bad files end in one InputError that names the file: never in a traceback, a hang or a silent wrong answer."""
 
-from __future__ import annotations
-
 import struct
 import time
 

@@ -1,7 +1,5 @@
 """Scan files made byte by byte, or by another library, and every real file there is."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A few damaged files of every format, read in watched processes; tests.bench.readers takes thousands by night."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

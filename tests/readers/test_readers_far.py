@@ -1,7 +1,5 @@
 """Map coordinates, units, memory and closed formats: what all readers have in common."""
 
-from __future__ import annotations
-
 import json
 import struct
 import tracemalloc

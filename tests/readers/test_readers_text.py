@@ -1,7 +1,5 @@
 """Numbers in text: rounding against float(), tables against NumPy, and tables that could be read in two ways."""
 
-from __future__ import annotations
-
 import io
 import random
 import struct

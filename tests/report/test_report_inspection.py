@@ -1,7 +1,5 @@
 """The report of an inspection: table, page in both languages, results.json and the store."""
 
-from __future__ import annotations
-
 import csv
 import io
 

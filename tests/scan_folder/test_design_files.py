@@ -1,7 +1,5 @@
 """Designs of arch bridges and space frames, and meshes: what is read, and each mistake named."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

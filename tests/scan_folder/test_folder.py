@@ -1,7 +1,5 @@
 """Scan folders: units, designs and paths; each mistake is named."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

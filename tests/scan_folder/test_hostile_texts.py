@@ -1,7 +1,5 @@
 """Damaged and hostile project.toml, design.json, stations.json and CSV tables: read, or refused by one plain error."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

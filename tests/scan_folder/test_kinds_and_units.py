@@ -1,7 +1,5 @@
 """A folder made by hand: kind and units that are read, the step that runs, or the advice."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Lists of a frame's nodes as surveyors have them: columns by the names of the trade, ids as texts, sizes in mm."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hangers of a ceiling below a space frame."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

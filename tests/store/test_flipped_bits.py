@@ -1,7 +1,5 @@
 """A bit that flips in scene.h5 or results.h5 is noticed, or all values are the same."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

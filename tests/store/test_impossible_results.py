@@ -4,8 +4,6 @@ For every field of numbers of every record an impossible value is drawn from wha
 is added later is tested without further code.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import types
 import typing

@@ -1,7 +1,5 @@
 """Scenes that are valid HDF5 and impossible in meaning are refused with the place, at every way in."""
 
-from __future__ import annotations
-
 import dataclasses
 import typing
 

@@ -1,7 +1,5 @@
 """The store: records come back as written, bytes repeat, boxes are cut right, and files are not trusted."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The structure of an HDF5 file is looked at in another process: what ends that process is an error of the file."""
 
-from __future__ import annotations
-
 import os
 import shutil
 

@@ -1,7 +1,5 @@
 """A small arch bridge made with numpy alone: circular soffit, box sections, five parts; for tests of the processor."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A straight box built otherwise than designed, in closed form, seen by stations with errors of their own."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Clouds of a wavy surface, and M3C2 of them by brute force."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

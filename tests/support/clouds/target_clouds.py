@@ -1,7 +1,5 @@
 """Clouds of targets, made without designgen: patterns seen through the beam's footprint by brute force."""
 
-from __future__ import annotations
-
 import numpy as np
 
 WHITE, BLACK = 0.9, 0.06

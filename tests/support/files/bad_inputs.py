@@ -1,7 +1,5 @@
 """Inputs of a batch that must fail, each in its own way, and small ones that are done."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processor.store import store

@@ -1,7 +1,5 @@
 """Small good files of every format, and ways to damage them; always the same ones."""
 
-from __future__ import annotations
-
 import functools
 import io
 import random

@@ -1,7 +1,5 @@
 """Bits flipped in a file, one after another, and what a reader makes of it."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 

@@ -1,7 +1,5 @@
 """Texts of a scan folder that are valid TOML, JSON and CSV and impossible in what they mean."""
 
-from __future__ import annotations
-
 import copy
 import json
 import re

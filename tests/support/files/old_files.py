@@ -1,7 +1,5 @@
 """Files as earlier versions wrote them, or as somebody else might: without checksums."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Scan files made byte by byte, and where the real ones are."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scan folders of a bridge of two parts, written with numpy alone."""
 
-from __future__ import annotations
-
 import numpy as np
 
 BOX = np.array([[x, y, z] for x in (0.0, 4.0) for y in (-0.4, 0.4) for z in (0.0, 0.9)])  # a part in metres

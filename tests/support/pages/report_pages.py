@@ -1,7 +1,5 @@
 """The report's page made and read: its tables, scripts, addresses and text."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import pickle

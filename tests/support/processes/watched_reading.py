@@ -1,7 +1,5 @@
 """Reads damaged files in watched processes: what crashes, hangs, takes memory or raises is counted, not suffered."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

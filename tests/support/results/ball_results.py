@@ -1,7 +1,5 @@
 """Results of balls, written by hand: of a few balls, and of a whole frame."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

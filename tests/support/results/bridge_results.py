@@ -1,7 +1,5 @@
 """Results of a preassembled bridge, written by hand: of a method that measures gaps, and of the adjustment."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

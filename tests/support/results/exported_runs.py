@@ -1,7 +1,5 @@
 """Runs whose results are given, so that what is exported of them is known; points by numpy alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -4,8 +4,6 @@ Nothing of the processor but its records is used. A part has two plates of one t
 and a pad that distinguishes its ends. Its scan's frame is levelled, z up. Lengths in mm, forces in N.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

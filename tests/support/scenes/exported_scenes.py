@@ -1,7 +1,5 @@
 """Random scenes of scans on grids, and their export as a scan folder."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from designgen.export import folder as export_folder

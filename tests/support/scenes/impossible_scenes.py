@@ -1,7 +1,5 @@
 """Scenes that are valid files and impossible in what they mean: a name, a scene and the place that an error names."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

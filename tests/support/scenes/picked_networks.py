@@ -1,7 +1,5 @@
 """Networks of scans with picked common points."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processor.model import Picks, Scan, Scene

@@ -1,7 +1,5 @@
 """A scene with a bit of all that the store keeps."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

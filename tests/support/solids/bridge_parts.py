@@ -3,8 +3,6 @@
 Its four outer edges are curves over x; skew and leaning planes cut them. Nothing is shared with designgen.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import brentq
 

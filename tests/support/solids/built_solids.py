@@ -1,7 +1,5 @@
 """Components as designed and as built, with errors of every kind, and their CadQuery solids."""
 
-from __future__ import annotations
-
 from designgen.asbuilt import imperfections
 from designgen.designs import arch_bridge, arch_part, closed_ring, girder_assemblies, prismatic_solids, space_frame
 from designgen.randomness import generator

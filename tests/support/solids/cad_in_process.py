@@ -3,8 +3,6 @@
 What is asked and answered stays the same. The processes themselves are tested in test_cad_files and test_cad_designs.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Meshes of the balls and tubes of a small space frame, made with trimesh."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 

@@ -1,7 +1,5 @@
 """Meshes of a body."""
 
-from __future__ import annotations
-
 import trimesh
 
 
