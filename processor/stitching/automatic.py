@@ -40,6 +40,8 @@ MOST_FINAL = 5  # adjustments without a gate
 DEEP_PAIRS, DEEP_ROUNDS = 8, 12  # work: pairs that are searched deeply at once, some seconds each, and how often
 STILL_MM = 0.02  # largest shift of a pose at convergence
 
+Given = tuple[Picked, Mapping[int, Floats], Mapping[int, Floats]]  # picks, poses by control points, poses in the files
+
 
 @dataclass(frozen=True)
 class RegisteredScans:
@@ -75,8 +77,13 @@ def stitch(
     side = pairwise.cube_side(clouds)
     patches = thread_ranges.each(lambda cloud: pairwise.prepare(cloud, side), clouds)
     known = control_points.poses_of_scans(control, [cloud.origin for cloud in clouds])
-    candidates = _find_candidates(patches, params, picked, known)
-    coarse = network.place(patches, candidates, reference)
+    starts = {
+        s: scan.T_project_scan @ rigid.transform(np.eye(3), cloud.origin)
+        for s, (scan, cloud) in enumerate(zip(scans, clouds, strict=True))
+        if scan.T_project_scan.size
+    }
+    placed = _place(patches, params, reference, (picked, known, starts))
+    candidates, coarse = placed.candidates, network.rated(placed, reference)
     cells = correspondences.gather(clouds)
     solution, blocks = _adjust(clouds, cells, coarse.T, reference)
     # All pairs that share enough pieces, each by itself
@@ -92,13 +99,7 @@ def stitch(
         solution, blocks = _without_gross_pairs(blocks, solution, gross, reference)
         added, _ = direction_errors.added_covariance(blocks, solution, reference)
     solution = replace(solution, covariance=solution.covariance + added)
-    # All pairs of scans that have a pose
-    placed = [s for s in range(len(solution.T)) if np.isfinite(solution.T[s]).all()]
-    scores = {
-        (a, b): pairwise.score_pose(patches[a], patches[b], rigid.invert(solution.T[a]) @ solution.T[b])
-        for a, b in itertools.combinations(placed, 2)
-    }
-    still = network.without_moved(patches, solution.T, scores)
+    scores = network.scores(patches, solution.T)
     return RegisteredScans(
         clouds=clouds,
         coarse=coarse,
@@ -112,52 +113,83 @@ def stitch(
         refuted=np.where(
             [s in known and reference in known for s in range(len(scans))],
             0.0,
-            network.refuted(still, len(scans), reference),
+            network.refuted(scores, len(scans), reference),
         ),
-        links=sorted({*network.links(still), *itertools.combinations(sorted(known), 2)}),
+        links=sorted({*network.links(scores), *itertools.combinations(sorted(known), 2)}),
     )
 
 
-def _find_candidates(
-    patches: list[ScanPatches], params: Params, picked: Picked, known: Mapping[int, Floats]
-) -> network.Pairs:
-    """Return the candidate poses of all pairs (a < b), the best first; of two scans of ``known`` poses that alone.
+def _place(patches: list[ScanPatches], params: Params, reference: int, given: Given) -> network.Network:
+    """Find the candidate poses of all pairs and place the scans by them, without what moved between the scans.
 
-    Groups of scans that no sure pose joins are searched for one once more, as deeply as would take too long for all
+    If the poses near those that are given join all scans, no more is searched for than their quick rivals. Groups of
+    scans that no sure pose joins are searched for one once more, as deeply as would take too long for all
     pairs: those that a pose has joined meanwhile are left out, and so is what is beyond DEEP_ROUNDS.
     """
-    most_tilt_rad = 2e-3 * params.levelled_mrad if params.levelled_mrad else np.inf
+    known = list(given[1])
+    if len(given[2]) == len(patches):
+        found = _find_candidates(patches, params, given, (pairwise.QUICK,))
+        placed = network.place(patches, found, reference)
+        if not network.groups(placed.candidates, len(patches), known).any():
+            return placed
+    placed = network.place(patches, _find_candidates(patches, params, given), reference)
+    found = dict(placed.candidates)
+
+    def deeper(key: tuple[int, int]) -> list[ScoredPose]:
+        a, b = (patches[s] if placed.still is None else pairwise.reduced(patches[s], placed.still[s]) for s in key)
+        poses = pairwise.candidate_poses(a, b, _most_tilt(params), [pairwise.DEEP])
+        sure = [pose for pose in poses if pose.score > pairwise.SURE]
+        return sure + found[key] if sure else found[key]
+
+    # Scans that follow each other overlap most often: those that lie nearest in the order of the scans come first.
+    todo, searched = sorted(found, key=lambda key: (key[1] - key[0], key)), False
+    for _ in range(DEEP_ROUNDS):
+        group = network.groups(found, len(patches), known)
+        todo = [key for key in todo if group[key[0]] != group[key[1]]]
+        some, todo = todo[:DEEP_PAIRS], todo[DEEP_PAIRS:]
+        found |= dict(zip(some, thread_ranges.each(deeper, some), strict=True))
+        searched |= bool(some)
+    return network.place(patches, found, reference) if searched else placed
+
+
+def _most_tilt(params: Params) -> float:
+    """Return the largest angle, rad, between the third axes of two scans."""
+    return 2e-3 * params.levelled_mrad if params.levelled_mrad else np.inf
+
+
+def _find_candidates(
+    patches: list[ScanPatches],
+    params: Params,
+    given: Given,
+    efforts: Sequence[pairwise.Effort] = (pairwise.QUICK, pairwise.WIDE),
+) -> network.Pairs:
+    """Return the candidate poses of all pairs (a < b), the best first; of two scans of known poses that alone.
+
+    A pose by picks, and the best one near the poses that are given, are among them.
+    """
+    picked, known, starts = given
 
     def candidates(key: tuple[int, int]) -> list[ScoredPose]:
         a, b = patches[key[0]], patches[key[1]]
-        if key[0] in known and key[1] in known and len(a.patches.weight) and len(b.patches.weight):
+        if not len(a.patches.weight) or not len(b.patches.weight):
+            return []
+        if key[0] in known and key[1] in known:
             T = rigid.invert(known[key[0]]) @ known[key[1]]
             refined = pairwise.refine(a, b, T)[0]
             return [pairwise.score_pose(a, b, refined if pairwise.same(refined, T, a.side_mm, b) else T)]
-        poses = pairwise.candidate_poses(a, b, most_tilt_rad)
-        if key in picked and len(a.patches.weight) and len(b.patches.weight):
+        poses = pairwise.candidate_poses(a, b, _most_tilt(params), efforts)
+        if key[0] in starts and key[1] in starts:
+            T = rigid.invert(starts[key[0]]) @ starts[key[1]]
+            poses += pairwise.candidate_poses(a, b, np.inf, [pairwise.BESIDE], T)[:1]
+        if key in picked:
             in_a, in_b = picked[key]
             with suppress(three_point.TooFewError):
                 T = three_point.fit_pair(in_a - a.cloud.origin, in_b - b.cloud.origin, False).T_a_b
                 poses.append(pairwise.score_pose(a, b, pairwise.refine(a, b, T)[0]))
-            poses.sort(key=lambda pose: -pose.score)
-        return poses
-
-    def deeper(key: tuple[int, int]) -> list[ScoredPose]:
-        poses = pairwise.candidate_poses(patches[key[0]], patches[key[1]], most_tilt_rad, [pairwise.DEEP])
-        sure = [pose for pose in poses if pose.score > pairwise.SURE]
-        return sure + found[key] if sure else found[key]
+        return sorted(poses, key=lambda pose: -pose.score)
 
     keys = list(itertools.combinations(range(len(patches)), 2))
-    found = dict(zip(keys, thread_ranges.each(candidates, keys), strict=True))
-    # Scans that follow each other overlap most often: those that lie nearest in the order of the scans come first.
-    todo = sorted(keys, key=lambda key: (key[1] - key[0], key))
-    for _ in range(DEEP_ROUNDS):
-        group = network.groups(found, len(patches), list(known))
-        todo = [key for key in todo if group[key[0]] != group[key[1]]]
-        some, todo = todo[:DEEP_PAIRS], todo[DEEP_PAIRS:]
-        found |= dict(zip(some, thread_ranges.each(deeper, some), strict=True))
-    return found
+    return dict(zip(keys, thread_ranges.each(candidates, keys), strict=True))
 
 
 def _adjust(clouds: list[Cloud], cells: CellTable, T: Floats, reference: int) -> tuple[Solution, Blocks]:

@@ -29,13 +29,18 @@ def shift(pose, other=HERE):
 
 
 def scans(count):
-    return [SimpleNamespace(side_mm=700.0)] * count
+    return [SimpleNamespace(side_mm=700.0, patches=SimpleNamespace(weight=np.ones(3)))] * count
+
+
+def placed_and_rated(count, candidates):
+    return network.rated(network.place(scans(count), candidates, 0), 0)
 
 
 @pytest.fixture
 def scored(monkeypatch):
     """Give poses by a function of (network, i, j, pose) for their scores; those within 500 mm are the same."""
     monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: shift(T, S) < 500.0)
+    monkeypatch.setattr(network.Network, "without_moved", lambda self, T: [np.ones(3, bool)] * len(T))
     return lambda score: monkeypatch.setattr(network.Network, "score_beside", score)
 
 
@@ -43,7 +48,7 @@ def test_a_group_of_equal_poses_has_the_score_of_its_best_member(scored):
     """Beside scan 0 the right pose of scan 2 is 250 mm off and contradicted by others; beside scan 1 it is exact."""
     right, near, turned = along(0.0), along(250.0), along(50_000.0)
 
-    def score(self, i, j, pose):
+    def score(self, i, j, pose, still=None):
         return ScoredPose(pose, 600.0, 10.0 if shift(pose, turned) < 1.0 else 0.05 * shift(pose, right), 0.4)
 
     scored(score)
@@ -78,16 +83,20 @@ def test_applied_motion_is_not_a_rival_of_the_resulting_pose(monkeypatch, scored
         poses.append(placed.T.copy())
         return [network.Move(scans=[1], M=along(100.0), ratio=2.0)]
 
-    scored(lambda self, i, j, pose: ScoredPose(HERE, 600.0, 0.0, 0.4))
+    scored(lambda self, i, j, pose, still=None: ScoredPose(HERE, 600.0, 0.0, 0.4))
     monkeypatch.setattr(network, "_moves", moves)
-    placed = network.place(scans(2), {(0, 1): [ScoredPose(HERE, 1.0, 0.0, 0.4)]}, 0)
+    placed = placed_and_rated(2, {(0, 1): [ScoredPose(HERE, 1.0, 0.0, 0.4)]})
     np.testing.assert_array_equal(poses[-1], placed.T)
     np.testing.assert_allclose((placed.T_rival[1] @ rigid.invert(placed.T[1]))[:3, 3], [100.0, 0.0, 0.0])
 
 
 def test_a_scan_that_overlaps_with_none_where_it_was_placed_loses_to_any_rival(scored):
     """Moved there with others, it has a score of 0, which is not ranked."""
-    scored(lambda self, i, j, pose: ScoredPose(pose, 60.0, 0.0, 0.3 if shift(pose, along(9000.0)) < 1.0 else 1e-9))
+    scored(
+        lambda self, i, j, pose, still=None: ScoredPose(
+            pose, 60.0, 0.0, 0.3 if shift(pose, along(9000.0)) < 1.0 else 1e-9
+        )
+    )
     candidates = {(0, 1): [ScoredPose(along(9000.0), 60.0, 0.0, 0.3)]}
     placed = network.Network(scans=scans(2), candidates=candidates, T=np.tile(HERE, (2, 1, 1)), placed=[0, 1])
     rated = network._rated(placed, 0)
@@ -101,7 +110,7 @@ def test_scans_beyond_a_rival_pose_are_ambiguous_together(scored, against, ambig
     step, off = along(6000.0), along(12000.0)
     T = np.stack([along(6000.0 * i) for i in range(4)])
 
-    def score(self, i, j, pose):
+    def score(self, i, j, pose, still=None):
         apart = (rigid.invert(self.T[i]) @ pose)[0, 3] / 6000.0 * (1 if j > i else -1)
         if abs(i - j) == 1 and apart == 1.0:
             return ScoredPose(pose, 60.0, 0.0, 0.3)
@@ -112,7 +121,7 @@ def test_scans_beyond_a_rival_pose_are_ambiguous_together(scored, against, ambig
     scored(score)
     poses = {(i, i + 1): [ScoredPose(step, 60.0, 0.0, 0.3)] for i in range(3)}
     poses[1, 2].append(ScoredPose(off, 60.0, 0.05, 0.3))
-    placed = network.place(scans(4), poses, 0)
+    placed = placed_and_rated(4, poses)
     np.testing.assert_allclose(placed.T, T)
     assert (placed.rivalry[2:] > network.AMBIGUOUS).tolist() == [ambiguous] * 2
     assert (placed.rivalry[:2] < network.AMBIGUOUS).all()
@@ -165,14 +174,15 @@ def test_groups_that_no_sure_pose_joins_are_searched_deeper(monkeypatch):
     sure, contradicted = ScoredPose(along(1.0), 60.0, 0.0, 0.3), ScoredPose(along(2.0), 90.0, 9.0, 0.4)
     deep = []
 
-    def candidates(a, b, most_tilt_rad, efforts=()):
+    def candidates(a, b, most_tilt_rad, efforts):
         if efforts == [pairwise.DEEP]:
             deep.append((a.row, b.row))
-        found = (a.row, b.row) in ((0, 1), (2, 3)) or (efforts and (a.row, b.row) == (1, 2))
+        found = (a.row, b.row) in ((0, 1), (2, 3)) or (efforts == [pairwise.DEEP] and (a.row, b.row) == (1, 2))
         return [sure if found else contradicted]
 
     monkeypatch.setattr(pairwise, "candidate_poses", candidates)
-    poses = automatic._find_candidates(patches, Params(), {}, {})
+    monkeypatch.setattr(network, "place", lambda scans, found, _: SimpleNamespace(candidates=found, still=None))
+    poses = automatic._place(patches, Params(), 0, ({}, {}, {})).candidates
     assert sorted(deep) == [(0, 2), (0, 3), (1, 2), (1, 3)]
     assert [key for key, (best, *_) in poses.items() if best is sure] == [(0, 1), (1, 2), (2, 3)]
     assert poses[1, 2][1:] == [contradicted]  # as by picks, which remain candidates
@@ -188,7 +198,7 @@ def test_scans_of_known_poses_are_searched_no_deeper(monkeypatch):
     monkeypatch.setattr(pairwise, "refine", lambda a, b, T: (T, None))
     monkeypatch.setattr(pairwise, "same", lambda *_: True)
     monkeypatch.setattr(pairwise, "score_pose", lambda *_: by_control)
-    poses = automatic._find_candidates(patches, Params(), {}, {0: HERE, 1: HERE})
+    poses = automatic._find_candidates(patches, Params(), ({}, {0: HERE, 1: HERE}, {}))
     assert poses[0, 1] == [by_control]
     assert (0, 1) not in searched
     assert network.groups({(0, 1): [by_control]}, 3, [0, 1]).tolist() == [0, 0, 1]
@@ -207,6 +217,9 @@ def test_what_moves_between_scans_does_not_contradict_their_poses():
     ]  # fmt: skip
     result = adjusted(T, scans)
     assert set(result.scans.status) == {"ok"}
-    with mock.patch.object(network, "without_moved", lambda scans, T, poses: poses):
+    every = mock.patch.object(
+        network.Network, "without_moved", lambda self, T: [np.ones(len(one.patches.weight), bool) for one in self.scans]
+    )
+    with every:
         before = adjusted(T, scans)
     assert "ambiguous" in before.scans.status

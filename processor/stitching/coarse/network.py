@@ -10,11 +10,15 @@ import numpy as np
 
 from processor.distinct_rows import components
 from processor.geometry import rigid
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 from processor.stitching.coarse import pairwise
 from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
 
 MOST_TRIED = 5  # work: groups of competing poses of a scan that are scored with all others
+MOST_PLACINGS = 4  # work: each leaves out what the poses of the one before say has moved
+MOVED_SHARE = (
+    0.1  # chosen: of a contradiction, if it is taken as of what moved: the fewer things must have moved the better
+)
 AMBIGUOUS = 0.75  # of the best pose's score: a competing pose that reaches it is as likely
 LEAST_OVERLAP = 0.08  # chosen: of patches: below it a pair agrees or disagrees by chance
 
@@ -40,14 +44,16 @@ class CoarsePoses:
 class Network:
     """All scans with the candidate poses of their pairs, and the poses T (k, 4, 4) of those placed so far.
 
-    Scores of relative poses are cached.
+    ``still`` marks the patches of each scan that are evidence; without it all are, under any poses. Comparisons of
+    pairs are cached.
     """
 
     scans: list[ScanPatches]
     candidates: Pairs
     T: Floats
     placed: list[int]
-    cache: dict[tuple[int, int, bytes, bytes], ScoredPose] = field(default_factory=dict)
+    still: list[Bools] | None = None
+    cache: dict[tuple[int, int, bytes], tuple[Bools, Floats]] = field(default_factory=dict)
 
     def poses_beside(self, i: int, j: int) -> list[tuple[Floats, float]]:
         """Return the candidate poses of scan j in scan i with their scores, in either order of the pair."""
@@ -55,36 +61,111 @@ class Network:
             return [(pose.T_a_b, pose.score) for pose in self.candidates[i, j]]
         return [(rigid.invert(pose.T_a_b), pose.score) for pose in self.candidates.get((j, i), [])]
 
-    def score_beside(self, i: int, j: int, pose: Floats) -> ScoredPose:
-        """Score a pose (4, 4) of scan j beside the placed scan i."""
-        key = (i, j, self.T[i].tobytes(), pose.tobytes())
+    def compared(self, a: int, b: int, T_b_a: Floats) -> tuple[Bools, Floats]:
+        """Compare the patches of scan a with scan b, see :func:`pairwise.compare`."""
+        key = (a, b, T_b_a.tobytes())
         if key not in self.cache:
-            self.cache[key] = pairwise.score_pose(self.scans[i], self.scans[j], rigid.invert(self.T[i]) @ pose)
+            self.cache[key] = pairwise.compare(self.scans[a], self.scans[b], T_b_a)
         return self.cache[key]
+
+    def score_of(self, a: int, b: int, T_a_b: Floats, still: list[Bools] | None = None) -> ScoredPose:
+        """Score a relative pose of two scans, by the patches ``still`` or those of the network."""
+        weights = [self.scans[s].patches.weight for s in (a, b)]
+        compared = [self.compared(a, b, rigid.invert(T_a_b)), self.compared(b, a, T_a_b)]
+        still = still or self.still
+        return pairwise.summed(T_a_b, weights, compared, *([] if still is None else [[still[a], still[b]]]))
+
+    def score_beside(self, i: int, j: int, pose: Floats, still: list[Bools] | None = None) -> ScoredPose:
+        """Score a pose (4, 4) of scan j beside the placed scan i."""
+        return self.score_of(i, j, rigid.invert(self.T[i]) @ pose, still)
+
+    def still_with(self, moving: Sequence[int], poses: Sequence[Floats]) -> list[Bools] | None:
+        """Return the patches that are evidence if the scans ``moving`` had other ``poses``; None: all, as by now."""
+        if self.still is None:
+            return None
+        T = self.T.copy()
+        for s, pose in zip(moving, poses, strict=True):
+            T[s] = pose
+        return self.without_moved(T)
+
+    def without_moved(self, T: Floats) -> list[Bools]:
+        """Mark the patches of scans at poses T (k, 4, 4) but those of what moved between the scans, and of panes.
+
+        A crane or truck is seen at its place by one scan, or by few where it slid along itself, and more others look
+        through that place. A scan that is wrong by itself looks through what the majority of the others sees, which
+        remains. Of patches that one scan alone saw and one other looked through, either may be wrong: they are left
+        out beside a larger weight of sure ones.
+        """
+        placed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
+        still = []
+        for a, scan in enumerate(self.scans):
+            weight = scan.patches.weight
+            matches, refuters = np.zeros((2, len(weight)), np.int64)
+            for b in set(placed) - {a} if a in placed else ():
+                match, against = self.compared(a, b, rigid.invert(T[b]) @ T[a])
+                matches += match
+                refuters += against > 0.0
+            moved = (refuters > 1) & (refuters > matches)
+            undecided = (refuters == 1) & (matches == 0)
+            if weight[undecided].sum() < weight[moved].sum():
+                moved |= undecided
+            still.append(~moved)
+        return still
 
     def same(self, T: Floats, S: Floats, j: int) -> bool:
         """Return whether two poses of scan j are the same."""
         return pairwise.same(T, S, self.scans[0].side_mm, self.scans[j])
 
 
-def place(scans: list[ScanPatches], candidates: Pairs, reference: int) -> CoarsePoses:
-    """Place all scans that have candidate poses, the most certain first; the reference at the identity."""
-    k = len(scans)
-    T = np.full((k, 4, 4), np.nan)
-    T[reference] = np.eye(4)
-    network = Network(scans=scans, candidates=candidates, T=T, placed=[reference])
+def place(scans: list[ScanPatches], candidates: Pairs, reference: int) -> Network:
+    """Place all scans that have candidate poses, without what the poses say has moved between the scans."""
+    network = _placed(Network(scans, candidates, np.full((len(scans), 4, 4), np.nan), []), reference)
+    for _ in range(MOST_PLACINGS):
+        still = network.without_moved(network.T)
+        if all(map(np.array_equal, still, network.still or [np.ones(len(some), bool) for some in still])):
+            break
+        network = replace(network, still=still)
+        found = {
+            (a, b): sorted((network.score_of(a, b, pose.T_a_b) for pose in poses), key=lambda pose: -pose.score)
+            for (a, b), poses in candidates.items()
+        }
+        network = _improved(_placed(replace(network, candidates=found), reference), reference)
+        rated(network, reference)  # moves groups of scans
+    return network
+
+
+def _placed(network: Network, reference: int) -> Network:
+    """Place scans one after another, the most certain first; the reference at the identity."""
+    network = replace(network, T=np.full_like(network.T, np.nan), placed=[reference])
+    network.T[reference] = np.eye(4)
     while (best := _most_certain(network)) is not None:
         j, pose = best
-        T[j] = pose
+        network.T[j] = pose
         network.placed.append(j)
+    return network
+
+
+def _improved(network: Network, reference: int) -> Network:
+    """Move single scans to poses that are better with what would have moved by these."""
+    for j in network.placed:
+        others = [i for i in network.placed if i != j]
+        if j != reference and (ranked := rank_poses(network, j, others, network.T[j])):
+            network.T[j] = ranked[0][1]
+    return network
+
+
+def rated(network: Network, reference: int) -> CoarsePoses:
+    """Move groups of placed scans while that is better, and compare the poses with those that compete with them."""
+    T = network.T
     coarse = _rated(network, reference)
     moves = _moves(network, coarse, reference)
-    for _ in range(k):
+    for _ in network.scans:
         better = max(moves, key=lambda move: move.ratio, default=None)
         if better is None or better.ratio <= 1.0:
             break
         for j in better.scans:
             T[j] = better.M @ T[j]
+        network = replace(network, still=network.still_with((), ()))
         coarse = _rated(network, reference)
         moves = _moves(network, coarse, reference)
     return _with_moves(coarse, moves)
@@ -125,21 +206,12 @@ def _moves(network: Network, coarse: CoarsePoses, reference: int) -> list[Move]:
 
 def _followers(network: Network, i: int, j: int, M: Floats) -> Move:
     """Return the motion of j by M (4, 4) while i stays, with the scans that follow as the score across rises."""
-    size = len(network.scans)
-    before, after = np.zeros((size, size, 3)), np.zeros((size, size, 3))
-    for a in network.placed:
-        for b in set(network.placed) - {a}:
-            for table, pose in ((before, network.T[b]), (after, M @ network.T[b])):
-                scored = network.score_beside(a, b, pose)
-                supports = scored.overlap > LEAST_OVERLAP
-                table[a, b] = (scored.agree, scored.against, scored.agree / scored.overlap) if supports else (
-                    0.0, scored.against, 0.0
-                )  # fmt: skip
 
     def ratio(moving: list[int]) -> float:
-        across = np.ix_([s for s in network.placed if s not in moving], moving)
-        first, second = (pairwise.score(*table[across].sum(axis=(0, 1))) for table in (after, before))
-        return first / max(second, 1e-12)
+        poses = [M @ network.T[s] for s in moving]
+        rest = [s for s in network.placed if s not in moving]
+        now = _across(network, rest, moving, [network.T[s] for s in moving], network.still)
+        return _across(network, rest, moving, poses, network.still_with(moving, poses)) / max(now, 1e-12)
 
     moving, rest = [j], [s for s in network.placed if s not in (i, j)]
     best = ratio(moving)
@@ -229,10 +301,18 @@ def rank_poses(network: Network, j: int, others: list[int], current: Floats | No
 
 def joint_score(network: Network, j: int, others: list[int], pose: Floats) -> float:
     """Return the score of a pose (4, 4) of scan j beside placed scans together; 0 if it overlaps with none of them."""
+    is_whole = len(others) + 1 == len(network.placed)  # else what few scans have seen does not show what moved
+    return _across(network, others, [j], [pose], network.still_with([j], [pose]) if is_whole else network.still)
+
+
+def _across(
+    network: Network, rest: list[int], moving: list[int], poses: list[Floats], still: list[Bools] | None
+) -> float:
+    """Return the score of scans ``moving`` at ``poses`` beside others together; 0 if no two of them overlap."""
     agree, against, total = 0.0, 0.0, 0.0
-    for i in others:
-        scored = network.score_beside(i, j, pose)
-        against += scored.against
+    for i, (j, pose) in itertools.product(rest, zip(moving, poses, strict=True)):
+        scored = network.score_beside(i, j, pose, still)
+        against += scored.against + MOVED_SHARE * scored.moved
         if scored.overlap > LEAST_OVERLAP:
             agree += scored.agree
             total += scored.agree / scored.overlap
@@ -249,27 +329,12 @@ def groups(candidates: Pairs, count: int, known: list[int]) -> Ints:
     return components(count, *np.reshape(np.array(sure, np.int64), (-1, 2)).T)
 
 
-def without_moved(
-    scans: Sequence[ScanPatches], T: Floats, poses: dict[tuple[int, int], ScoredPose]
-) -> dict[tuple[int, int], ScoredPose]:
-    """Return the adjusted ``poses`` of pairs without what contradicts them because it moved between the scans.
-
-    A crane or truck is seen at its place by one scan alone, and several others look through that place. Where the poses
-    are wrong, what one scan looks through is seen there by others as well, or by no other at all.
-    """
-    placed = sorted({s for pair in poses for s in pair})
-    against: dict[tuple[int, int], Floats] = {}
-    for a in placed:
-        matches, refuters = np.zeros((2, len(scans[a].patches.weight)), np.int64)
-        for b in placed:
-            if a != b:
-                match, against[a, b] = pairwise.compare(scans[a], scans[b], rigid.invert(T[b]) @ T[a])
-                matches += match
-                refuters += against[a, b] > 0.0
-        for b in placed:
-            if a != b:
-                against[a, b] = against[a, b][(matches > 0) | (refuters < 2)].sum()
-    return {(a, b): replace(pose, against=float(against[a, b] + against[b, a])) for (a, b), pose in poses.items()}
+def scores(scans: list[ScanPatches], T: Floats) -> dict[tuple[int, int], ScoredPose]:
+    """Score the relative poses of all pairs of scans with poses T (k, 4, 4), without what moved between the scans."""
+    placed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
+    network = Network(scans, {}, T, placed)
+    still = network.without_moved(T)
+    return {(a, b): network.score_beside(a, b, T[b], still) for a, b in itertools.combinations(placed, 2)}
 
 
 def links(poses: dict[tuple[int, int], ScoredPose]) -> list[tuple[int, int]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from processor.model import Bools, Floats
 from processor.stitching.coarse import candidate_rotations, candidate_translations, face_index
 from processor.stitching.coarse.candidate_translations import WeightedPatches
 from processor.stitching.coarse.face_index import FaceIndex
-from processor.stitching.planes.sampled_patches import sample
+from processor.stitching.planes.sampled_patches import Patches, sample
 from processor.stitching.planes.scan_planes import Cloud
 
 
@@ -37,6 +37,10 @@ QUICK = Effort(peaks=6, least_of_best=0.5, scored=60, refined=8)  # work: enough
 WIDE = Effort(peaks=15, least_of_best=0.3, scored=150, refined=20)  # work: two to three times as much
 # In halls of unequal bays right poses were the 414th by votes at worst, and by their rough scores the ninth.
 DEEP = Effort(peaks=100, least_of_best=0.05, scored=1000, refined=30)
+# Of a start: near it every peak of the votes is tried; a few are left by the bound on the distance.
+BESIDE = Effort(peaks=100, least_of_best=0.05, scored=20, refined=6)
+# Two scans whose poses are wrong by 0.3 m and 1 degree, over 30 m: 0.8 m and 1.4 degrees; with room for twice that.
+START_MM, START_RAD = 2000.0, 0.06
 GATES = (0.7, 0.35, 0.2, 0.12)  # distance across of matches, from refinement to refinement
 FEW_ABOVE = 0.3  # wider gates use the voters only
 STEPS = 4  # Gauss-Newton steps for each gate
@@ -72,13 +76,15 @@ class ScoredPose:
     """A pose of scan b in the frame of scan a with its support (``agree``) and contradiction (``against``).
 
     These are weighted counts of both scans' patches: matching one of the other, and lying in its free space.
-    ``overlap`` is the matching share of all patches' weight.
+    ``overlap`` is the matching share of all patches' weight, ``moved`` the contradiction by patches that are left out
+    as of what moved.
     """
 
     T_a_b: Floats
     agree: float
     against: float
     overlap: float
+    moved: float = 0.0
 
     @property
     def score(self) -> float:
@@ -122,31 +128,48 @@ def prepare(cloud: Cloud, side_mm: float) -> ScanPatches:
     )
 
 
+def reduced(scan: ScanPatches, keep: Bools) -> ScanPatches:
+    """Keep some (n,) of the patches of a scan as evidence; the indexed ones, which those of others match, stay."""
+    (points, normals), weight = scan.patches
+    patches = WeightedPatches(Patches(points[keep], normals[keep]), weight[keep])
+    return replace(scan, patches=patches, voters=candidate_translations.thinned(patches))
+
+
 def candidate_poses(
-    a: ScanPatches, b: ScanPatches, most_tilt_rad: float, efforts: Sequence[Effort] = (QUICK, WIDE)
+    a: ScanPatches,
+    b: ScanPatches,
+    most_tilt_rad: float,
+    efforts: Sequence[Effort] = (QUICK, WIDE),
+    start: Floats | None = None,
 ) -> list[ScoredPose]:
     """Return at most MOST poses of b in a, the best first; none if the scans have nothing alike.
 
-    If free space contradicts all poses of a search, as on a repetitive structure, the next effort follows.
+    If free space contradicts all poses of a search, as on a repetitive structure, the next effort follows. A ``start``
+    (4, 4) limits the search to what is near it.
     """
     poses: list[ScoredPose] = []
     if min(len(a.patches.weight), len(b.patches.weight)) < FEWEST:
         return poses
     for effort in efforts:
-        poses = _search(a, b, most_tilt_rad, effort)[:MOST]
+        poses = _search(a, b, most_tilt_rad, effort, start)[:MOST]
         if poses and poses[0].score > SURE:
             break
     return poses
 
 
-def _search(a: ScanPatches, b: ScanPatches, most_tilt_rad: float, effort: Effort) -> list[ScoredPose]:
+def _search(
+    a: ScanPatches, b: ScanPatches, most_tilt_rad: float, effort: Effort, start: Floats | None
+) -> list[ScoredPose]:
     """Vote, score roughly, refine, slide; returns the distinct poses, the best first."""
-    voted: list[tuple[float, Floats]] = []
+    voted: list[tuple[float, Floats]] = [] if start is None else [(0.0, start)]
     for R in candidate_rotations.candidate_rotations(a.modes, b.modes, most_tilt_rad):
+        if start is not None and rigid.rotation_angle(start[:3, :3].T @ R) > START_RAD:
+            continue
         shifts, votes = candidate_translations.candidate_translations(
             a.voters, b.voters, R, a.side_mm, effort.peaks, effort.least_of_best
         )
-        voted += [(float(v), rigid.transform(R, t)) for t, v in zip(shifts, votes, strict=True)]
+        found = [(float(v), rigid.transform(R, t)) for t, v in zip(shifts, votes, strict=True)]
+        voted += [one for one in found if start is None or _within(start, one[1], b, START_RAD, START_MM)]
     voted = sorted(voted, key=lambda pair: -pair[0])[: effort.scored]
     scored = [score_pose(a, b, T, rough=True) for _, T in voted]
     scored.sort(key=lambda pose: -pose.score)
@@ -163,10 +186,14 @@ def _search(a: ScanPatches, b: ScanPatches, most_tilt_rad: float, effort: Effort
 
 def same(T: Floats, S: Floats, side_mm: float, b: ScanPatches) -> bool:
     """Return whether two poses of b are the same within SAME_RAD and SAME_SHIFT cubes at the centre of its patches."""
+    return _within(T, S, b, SAME_RAD, SAME_SHIFT * side_mm)
+
+
+def _within(T: Floats, S: Floats, b: ScanPatches, most_rad: float, most_mm: float) -> bool:
     D = rigid.invert(T) @ S
     centre = b.patches.patches.points.mean(axis=0)
     shift = np.linalg.norm(rigid.apply(D, centre) - centre)
-    return bool(rigid.rotation_angle(D[:3, :3]) < SAME_RAD and shift < SAME_SHIFT * side_mm)
+    return bool(rigid.rotation_angle(D[:3, :3]) < most_rad and shift < most_mm)
 
 
 def score_pose(a: ScanPatches, b: ScanPatches, T_a_b: Floats, rough: bool = False) -> ScoredPose:
@@ -174,14 +201,24 @@ def score_pose(a: ScanPatches, b: ScanPatches, T_a_b: Floats, rough: bool = Fals
 
     ``rough`` uses the voters only, with wider tolerances.
     """
-    agree, against, total = 0.0, 0.0, 0.0
-    for scan, other, T in ((a, b, rigid.invert(T_a_b)), (b, a, T_a_b)):  # T = T_other_scan
-        weight = (scan.voters if rough else scan.patches).weight
-        match, looked_through = compare(scan, other, T, rough)
-        agree += float(weight[match].sum())
-        total += float(weight.sum())
-        against += float(looked_through.sum())
-    return ScoredPose(T_a_b, agree, against, agree / max(total, 1e-12))
+    weights = [(scan.voters if rough else scan.patches).weight for scan in (a, b)]
+    return summed(T_a_b, weights, (compare(a, b, rigid.invert(T_a_b), rough), compare(b, a, T_a_b, rough)))
+
+
+def summed(
+    T_a_b: Floats,
+    weights: Sequence[Floats],
+    compared: Sequence[tuple[Bools, Floats]],
+    still: Sequence[Bools | slice] = (slice(None), slice(None)),
+) -> ScoredPose:
+    """Sum what :func:`compare` says of the patches of scans a and b, of ``weights`` (n,) each, that are ``still``."""
+    agree, against, total, moved = 0.0, 0.0, 0.0, 0.0
+    for weight, (match, looked_through), some in zip(weights, compared, still, strict=True):
+        agree += float(weight[some][match[some]].sum())
+        against += float(looked_through[some].sum())
+        total += float(weight[some].sum())
+        moved += float(looked_through.sum())
+    return ScoredPose(T_a_b, agree, against, agree / max(total, 1e-12), moved - against)
 
 
 def compare(scan: ScanPatches, other: ScanPatches, T_other_scan: Floats, rough: bool = False) -> tuple[Bools, Floats]:
