@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from processor.space_frame import extract
 from processor.space_frame.members import member_extraction
 from processor.space_frame.spheres import ball_joint_classification
-from processor.space_frame.spheres.ball_joint_classification import UNLIKE, log_odds_of_ball, most_likely
+from processor.space_frame.spheres.ball_joint_classification import UNLIKE, log_odds_of_ball, most_likely, of_frame
 from tests.support.clouds import frame_clouds
 from tests.support.clouds.frame_clouds import STATIONS
 from tests.support.clouds.memory_source import InMemory
@@ -78,6 +78,18 @@ def test_round_looking_clamp_follows_the_neighbouring_clamps():
     sphere, neck = np.array([30.0] * 20 + [6.0, -5.0, -8.0, -6.0]), np.array([50.0] * 20 + [-40.0] * 4)
     pairs = np.array([(i, i + 1) for i in range(19)] + [(20, 21), (20, 22), (20, 23)])
     assert most_likely(log_odds_of_ball(sphere, neck), pairs).tolist() == [True] * 20 + [False] * 4
+
+
+def test_round_joints_without_sleeves_are_of_no_frame_with_sleeves():
+    """A frame of six balls, a lift of three round joints apart from it, a ball with a sleeve that nothing leads to."""
+    balls = np.array([True] * 6 + [True] * 3 + [True, False])
+    neck = np.array([60.0, 50.0, -1.0, 70.0, 55.0, 40.0, -90.0, 2.0, -80.0, 12.0, 30.0])
+    pairs = np.array([(i, i + 1) for i in range(5)] + [(6, 7), (7, 8)])
+    assert of_frame(balls, neck, pairs).tolist() == [True] * 6 + [False] * 3 + [True, False]
+    # The lift's joints are kept where a member leads from them to the frame, and where the frame has no sleeves.
+    assert of_frame(balls, neck, np.vstack([pairs, [[5, 6]]])).tolist() == balls.tolist()
+    assert of_frame(balls, -neck, pairs).tolist() == balls.tolist()
+    assert of_frame(balls[:0], neck[:0], pairs[:0]).tolist() == []
 
 
 @pytest.mark.parametrize("chain", [5, 9])

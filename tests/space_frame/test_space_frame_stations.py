@@ -394,6 +394,22 @@ def test_a_station_with_few_tubes_is_named():
     assert np.abs(left / np.sqrt(np.diag(found.covariance))[7 * 3 + 3 : 7 * 3 + 6]).max() < 4.0  # four sds
 
 
+def test_a_station_that_sees_no_tube_changes_nothing():
+    """The motions of the others, their variance and their common motion are those of a registration without it."""
+    seen = frame(3)[1]
+    few = only(seen, lambda station, tube: station < 3)
+    blind, without = (
+        registered(dataclasses.replace(few, scanners=seen.scanners[:n]), np.random.default_rng(4)) for n in (4, 3)
+    )
+    assert blind.before_mm == pytest.approx(without.before_mm, rel=1e-6)
+    np.testing.assert_allclose(blind.T_project_station[:3], without.T_project_station, atol=1e-6)
+    place = seen.scanners[0]
+    np.testing.assert_allclose(blind.common(place), without.common(place), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(blind.between[:3], without.between, rtol=1e-6, atol=1e-9)
+    assert blind.reasons[3]
+    assert blind.datum[0].values["stations"] == 3
+
+
 def test_one_station_is_its_own_datum_and_stations_without_ties_are_unknown():
     _, seen, rng = frame(1, grid=(1, 1), per_pair=10)
     one = registered(seen, rng)

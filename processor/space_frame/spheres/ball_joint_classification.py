@@ -4,7 +4,8 @@ Two properties of the points about a node distinguish them. A ball's surface lie
 clamps and crossing tubes differ from a sphere by a share of their size. And members of bolted balls narrow to sleeves
 before the ball: points are found nearer to the axis than the tube's radius, which a continuous tube would hide. Not all
 frames have sleeves: how often nodes of either kind have them is estimated from all nodes. What a node's own points
-leave open is decided by the nodes that its members lead to.
+leave open is decided by the nodes that its members lead to. What stands apart from a frame with sleeves and has none,
+as a scissor lift with round joints, is no part of it.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -18,6 +19,7 @@ from numba import njit
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
+from processor.distinct_rows import components
 from processor.geometry.sphere_fit import residual
 from processor.geometry.thread_ranges import over_ranges
 from processor.inner_kernels import inner_ieee
@@ -61,7 +63,8 @@ def nodes_with_ball(source: Source, measured: Measured, starts: Floats, threads:
     over_ranges(evidence_range, nodes.count, threads)
     joined = (members.node_a >= 0) & (members.node_b >= 0)
     pairs = np.unique(np.sort(np.stack([members.node_a, members.node_b], axis=1)[joined], axis=1), axis=0)
-    return most_likely(log_odds_of_ball(sphere, neck), pairs.reshape(-1, 2))
+    pairs = pairs.reshape(-1, 2)
+    return of_frame(most_likely(log_odds_of_ball(sphere, neck), pairs), neck, pairs)
 
 
 def log_odds_of_ball(sphere: Floats, neck: Floats) -> Floats:
@@ -106,6 +109,19 @@ def most_likely(odds: Floats, pairs: Ints) -> Bools:
     reached = np.zeros(k + 2, bool)
     reached[breadth_first_order(left, other, return_predecessors=False)] = True
     return ~reached[:k]
+
+
+def of_frame(balls: Bools, neck: Floats, pairs: Ints) -> Bools:
+    """Return the balls (k,) without those of structures that have no sleeves, where the surest structure has them.
+
+    A structure is what pairs (p, 2) of nodes connect. Whether it has sleeves is decided by all its balls together, by
+    their log likelihood ratios ``neck`` (k,).
+    """
+    structure = components(len(balls), *pairs.T)
+    sleeves = np.bincount(structure, np.where(balls, _bounded(neck), 0.0))
+    frame_has_sleeves = sleeves.size > 0 and sleeves[np.abs(sleeves).argmax()] > 0.0
+    kept: Bools = balls & (sleeves[structure] > 0.0) if frame_has_sleeves else balls
+    return kept
 
 
 def _bounded(ratio: Floats) -> Floats:

@@ -169,12 +169,18 @@ class Posterior:
                 self.variance[kind] = max(float(np.sum(motion[of_kind] ** 2)) / determined, least**2)
 
     def _resolution(self, H: Floats) -> Floats:
-        """Sd (3,) with which the data resolve a station's unknowns relative to the others', without a prior."""
+        """Sd (3,) with which the data resolve a station's unknowns relative to the others', without a prior.
+
+        A station that sees no tube says nothing of the others: it is left out of their mean.
+        """
         loose = np.array(LOOSE) ** 2
         C = solve(cholesky(H + self._prior(loose)), np.eye(len(H)))
-        gain = np.eye(len(H)) - product(self.M, mean_gain(self.M, self.precision(loose)))
-        spread = np.einsum("pq,pq->p", product(gain, C), gain)
-        return np.array([float(np.sqrt(np.median(spread[self.kind == kind]))) for kind in range(len(START))])
+        seen = np.repeat(np.diag(H).reshape(-1, STATION).any(axis=1), STATION)
+        seen |= ~seen.any()
+        weight = self.precision(loose) * seen
+        gain = (np.eye(len(H)) - product(self.M, mean_gain(self.M, weight)))[seen]
+        spread, of_seen = np.einsum("pq,pq->p", product(gain, C), gain), self.kind[seen]
+        return np.array([float(np.sqrt(np.median(spread[of_seen == kind]))) for kind in range(len(START))])
 
     def _allowed(
         self, H: Floats, g: Floats, x: Floats, sd: Floats, kind: int, resolved: Floats

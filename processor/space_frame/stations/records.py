@@ -105,7 +105,7 @@ class Stations(Checked):
     def common(self, place: Floats) -> Floats:
         """Covariance (6, 6) of the motion common to all stations: turn about ``place`` (3,), translation.
 
-        That motion is the best fit to the stations' motions, weighted by their prior variances.
+        That motion is the best fit to the motions of the stations that see tubes, weighted by their prior variances.
         """
         if not np.isfinite(self.before_mm):
             first: Floats = self.covariance[:6, :6].copy()
@@ -134,7 +134,8 @@ class Stations(Checked):
 
     def _precision(self) -> Floats:
         station = np.repeat(np.array([self.before_rad, self.before_mm, self.range_offset_sd]), (3, 3, 1)) ** -2.0
-        return np.tile(station, len(self.places))
+        seeing = self.observations > 0
+        return np.outer(seeing if seeing.any() else ~seeing, station).ravel()
 
 
 def _by_stations(points: Floats, influence: Floats, places: Floats) -> Floats:

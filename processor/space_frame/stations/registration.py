@@ -239,8 +239,9 @@ def _reweighted(scores: Floats, shared: Bools, weight: Floats, floor: float) -> 
 def _result(estimate: _Estimate, posterior: Posterior) -> Stations:
     x, C, shared = _without_mean_offset(estimate.x, estimate.C)
     places, count = posterior.places, len(posterior.places)
+    seeing = int(np.count_nonzero(estimate.seen_by)) or count
     before_rad, before_mm, offset_mm = np.sqrt(posterior.variance).tolist()
-    weak = _weak_motions(C, posterior)
+    weak = _weak_motions(C, posterior, seeing)
     messages = [reason("spheres.stations-before", mm=before_mm, mrad=1e3 * before_rad)]
     if abs(shared) > REPORTED_MM:
         messages.append(reason("spheres.range-offset", offset=shared))
@@ -270,7 +271,7 @@ def _result(estimate: _Estimate, posterior: Posterior) -> Stations:
         axis_points=estimate.axes.line[:, :3],
         axis_directions=estimate.axes.line[:, 3:],
         axis_radii=estimate.axes.radius,
-        datum=(_datum(posterior, before_mm),),
+        datum=(_datum(posterior, before_mm, seeing),),
     )
 
 
@@ -278,9 +279,8 @@ def _weak(motions: tuple[StationMotion, ...]) -> tuple[Reason, ...]:
     return (reason("spheres.weak-motions", motions=motions),) if motions else ()
 
 
-def _weak_motions(C: Floats, posterior: Posterior) -> tuple[tuple[StationMotion, ...], ...]:
-    """Motions of each station that the tubes hardly determine."""
-    count = len(posterior.places)
+def _weak_motions(C: Floats, posterior: Posterior, count: int) -> tuple[tuple[StationMotion, ...], ...]:
+    """Motions of each station that the tubes, which ``count`` stations see, hardly determine."""
     variance = np.diag(C).reshape(-1, kernels.STATION)[:, :6]
     remaining = variance / np.repeat(posterior.variance[:2], 3)
     # The common motion is never determined; its share of the variance is that of one station in their number.
@@ -289,8 +289,7 @@ def _weak_motions(C: Floats, posterior: Posterior) -> tuple[tuple[StationMotion,
     return tuple(tuple(motion for motion, is_weak in zip(StationMotion, row, strict=True) if is_weak) for row in weak)
 
 
-def _datum(posterior: Posterior, before_mm: float) -> Reason:
-    count = len(posterior.places)
+def _datum(posterior: Posterior, before_mm: float, count: int) -> Reason:
     if posterior.control is None:
         common = np.hypot(before_mm / np.sqrt(count), posterior.datum_mm)
         return reason("spheres.datum-stations", stations=count, sd=common)
