@@ -17,7 +17,7 @@ else:
     import tomli as tomllib
 
 DEFAULT = "plausible"
-ESTIMATED = "estimated"
+ESTIMATED, DESIGNED = "estimated", "design"
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Catalogue(Checked):
     radii: Floats = column("m")
     sd_mm: float = 0.4
     name: str = ""
-    verified: bool = False  # the sizes were compared with a published catalogue
+    verified: bool = False  # the sizes were compared with a published catalogue, or are the design's own
 
     @property
     def assumed(self) -> bool:

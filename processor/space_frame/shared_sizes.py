@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 
 from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.model import Floats
-from processor.space_frame.ball_catalogue import ESTIMATED, Catalogue
+from processor.space_frame.ball_catalogue import DESIGNED, ESTIMATED, Catalogue
 
 WELL_KNOWN = 0.5  # sd of a radius by its points, by the scatter of a size, up to which the ball shows its size
 GAP = 4.0  # scatters of a size between neighbouring radii, beyond which they are of two sizes: 1 in 15,000 of one size
@@ -22,20 +22,28 @@ UNLIKELY = 1e-3  # probability of the radii by the catalogue, below which their 
 def estimated(radii: Floats, variances: Floats, catalogue: Catalogue, nominal: Floats) -> Catalogue | None:
     """Return the sizes that balls share; None where the sizes of a catalogue explain their radii.
 
+    Where a design has sizes that the catalogue lacks and these explain the radii, they are the sizes, with those of
+    balls that are of none of them: sizes of two catalogues are often too close to each other to be told apart.
+
     Parameters
     ----------
     radii, variances : (k,) of the balls by their points alone, mm and mm^2
     catalogue : sizes that balls may have; those of the design, ``nominal`` (k,), NaN = none, belong to them
     """
     sd = catalogue.sd_mm
+    designed = np.unique(nominal[np.isfinite(nominal)])
+    listed = np.isclose(designed[:, None], catalogue.radii).any(axis=1).all()
     known = np.sort(radii[np.isfinite(radii) & (variances < (WELL_KNOWN * sd) ** 2)])
     if not len(known):
-        return None
+        return None if listed else Catalogue(designed, sd, DESIGNED, True)
     groups = np.split(known, np.flatnonzero(np.diff(known) > GAP * sd) + 1)
     count = np.array([len(group) for group in groups])
     size = np.array([group.mean() for group in groups])
-    sizes = np.union1d(catalogue.radii, nominal[np.isfinite(nominal)])
-    if explained(size[count >= SHARED], count[count >= SHARED], sizes, sd):
+    shared = count >= SHARED
+    if not listed and explained(size[shared], count[shared], designed, sd):
+        other = np.abs(size[:, None] - designed).min(axis=1) > GAP * sd
+        return Catalogue(np.union1d(designed, size[other]), sd, DESIGNED, True)
+    if explained(size[shared], count[shared], np.union1d(catalogue.radii, designed), sd):
         return None
     return Catalogue(size, sd, ESTIMATED, False)
 

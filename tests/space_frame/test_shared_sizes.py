@@ -42,8 +42,18 @@ def test_two_balls_of_a_wrong_size_are_no_size():
     assert shared_sizes.estimated(*radii([65.0, 84.0], [30, 2]), PLAUSIBLE, NO_DESIGN) is None
 
 
-def test_sizes_of_the_design_belong_to_the_catalogue():
-    assert shared_sizes.estimated(*radii([84.0], [40]), PLAUSIBLE, np.array([84.0, np.nan])) is None
+def test_sizes_of_the_design_that_the_catalogue_lacks_are_the_sizes():
+    """With that of a ball that is of none of them, and also where no ball shows its size."""
+    design = np.array([84.0, 58.8, np.nan])
+    found = shared_sizes.estimated(*radii([58.8, 71.0, 84.0], [9, 1, 40]), PLAUSIBLE, design)
+    assert found.radii == pytest.approx([58.8, 71.0, 84.0], abs=4.0 * 0.26)  # four sds: one ball
+    assert found.radii[[0, 2]].tolist() == [58.8, 84.0]
+    assert not found.estimated
+    hidden = shared_sizes.estimated(*radii([84.0], [40], sd=0.5), PLAUSIBLE, design)
+    assert hidden.radii.tolist() == [58.8, 84.0]
+    # Sizes that are listed leave the catalogue, and those of another maker contradict the design.
+    assert shared_sizes.estimated(*radii([60.0, 65.0], [9, 40]), PLAUSIBLE, np.array([65.0])) is None
+    assert shared_sizes.estimated(*radii([77.5], [40]), PLAUSIBLE, design).estimated
 
 
 def test_balls_that_hardly_show_their_radius_make_no_size():
