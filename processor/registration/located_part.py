@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.distinct_rows import components, distinct
+from processor.distinct_rows import distinct
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.thinning import thinned, voxel_means
@@ -65,7 +65,8 @@ NOT_LOCATED = Located(np.full((4, 4), np.nan), 0.0)  # nothing of the design is 
 
 def locate(points: Floats, designs: Sequence[DesignSurface], body: Floats | None = None) -> list[Located]:
     """Locate each of several designs among points (n, 3) of a scan with surroundings, or on a ``body`` (k, 3) in it."""
-    step = _voxel_size(points, float(np.median([design.size for design in designs]))) if designs else 0.0
+    size = float(np.median([design.size for design in designs])) if designs and len(points) else 0.0
+    step = main_body.voxel_size(points, size, PART_VOXELS, PER_VOXEL) if size > 0.0 else 0.0
     if not step > 0.0:
         return [NOT_LOCATED] * len(designs)
     bodies = [body] if body is not None else _bodies(points, step, [principal.sizes(one.points) for one in designs])
@@ -104,7 +105,7 @@ def which(points: Floats, designs: Sequence[DesignSurface], located: Sequence[Lo
 
 def about_design(points: Floats, T: Floats, design: DesignSurface) -> Bools:
     """Mark the points (n, 3) that, placed by T (4, 4), are in the box of a design or a share of its length beside."""
-    low, high = (pick(axis=0) for pick in (design.mesh.vertices.min, design.mesh.vertices.max))
+    low, high = corners(design.mesh.vertices)
     margin, marked = BESIDE * design.size, np.empty(len(points), bool)
     for rows in blocks(len(points)):
         placed = rigid.apply(T, points[rows])
@@ -115,7 +116,7 @@ def about_design(points: Floats, T: Floats, design: DesignSurface) -> Bools:
 def at_design(points: Floats, T: Floats, design: DesignSurface) -> Bools:
     """Mark the points (n, 3) that, placed by T (4, 4), lie at a design: the part's, and what touches it."""
     marked = np.empty(len(points), bool)
-    low, high = (pick(axis=0) for pick in (design.mesh.vertices.min, design.mesh.vertices.max))
+    low, high = corners(design.mesh.vertices)
     for rows in blocks(len(points)):
         placed = rigid.apply(T, points[rows])
         near = ((placed > low - AT_PART_MM) & (placed < high + AT_PART_MM)).all(axis=1)
@@ -220,39 +221,26 @@ def _shown(search: _Search, design: DesignSurface, c: Candidate) -> Located:
 
 
 def _place(located: Located, design: DesignSurface) -> Floats:
+    """Return where the centre of a design's surface lies in the scan, (3,)."""
     place: Floats = rigid.apply(rigid.invert(located.T), design.centre[None])[0]
     return place
 
 
 def _near(place: Floats, other: Floats, design: DesignSurface) -> bool:
-    """Whether two places (3,) of a design overlap: by a half of its least size, bodies beside each other do not."""
+    """Whether two places (3,) of a design are on one body: bodies beside each other are farther apart."""
     return float(np.linalg.norm(place - other)) < SAME_PLACE * design.size
 
 
 def _bodies(points: Floats, step: float, sizes: Sequence[Floats]) -> list[Floats]:
     """Return the points of bodies that may be a part of one of ``sizes``: those left without ground and walls."""
     even = voxel_means(points, step)
-    largest, length = np.max(sizes, axis=0) * (1.0 + main_body.LARGER), min(size[0] for size in sizes)
-    side = main_body.LARGER_AREA * float(largest[0] * largest[1])
-    left = np.ones(len(even), bool)
-    while left.sum() >= main_body.FEWEST and (on := main_body.large_plane(even[left], step, side)) is not None:
-        left[np.flatnonzero(left)[on]] = False
-    rest = even[left]
-    pieces: list[Floats] = []
+    rest = even[main_body.without_planes(even, step, sizes)]
+    least, found = LEAST_LENGTH * min(size[0] for size in sizes), list[Floats]()
     for link in LINKS:
-        pieces = pieces or _pieces(rest, link * step, LEAST_LENGTH * length)[:BODIES]
-    return pieces
-
-
-def _pieces(points: Floats, link: float, least: float) -> list[Floats]:
-    """Return the connected pieces of points (n, 3) that are longer than ``least``, those with most points first."""
-    if len(points) < main_body.FEWEST:
-        return []
-    number = components(len(points), *cKDTree(points).query_pairs(link, output_type="ndarray").T)
-    count = np.bincount(number)
-    order = np.argsort(-count, kind="stable")
-    pieces = (points[number == piece] for piece in order[: 2 * BODIES] if count[piece] >= main_body.FEWEST)
-    return [piece for piece in pieces if principal.sizes(piece)[0] > least]
+        if not found and len(rest):
+            pieces = (rest[rows] for rows in main_body.connected(rest, link * step)[: 2 * BODIES])
+            found = [piece for piece in pieces if principal.sizes(piece)[0] > least][:BODIES]
+    return found
 
 
 def _large_faces(body: Floats, step: float, least: float) -> list[Floats]:
@@ -265,17 +253,5 @@ def _large_faces(body: Floats, step: float, least: float) -> list[Floats]:
     ):
         rows = np.flatnonzero(left)[on]
         left[rows] = False
-        faces += _pieces(body[rows], LINKS[1] * step, 0.0)[:1]
+        faces += [body[rows][piece] for piece in main_body.connected(body[rows], LINKS[1] * step)[:1]]
     return faces
-
-
-def _voxel_size(points: Floats, size: float) -> float:
-    """Return the size of voxels, mm, so large that those of one surface touch; 0 if no such size divides the part."""
-    if not len(points):
-        return 0.0
-    low, high = corners(points)
-    for count in PART_VOXELS:
-        step = size / count
-        if np.prod(np.ceil((high - low) / step)) < 1e12 and len(voxel_means(points, step)) * PER_VOXEL <= len(points):
-            return step
-    return 0.0

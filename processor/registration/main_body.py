@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from processor.distinct_rows import components, distinct
 from processor.geometry.thinning import thinned, voxel_means
 from processor.large_arrays import blocks, corners
-from processor.model import Bools, Floats
+from processor.model import Bools, Floats, Ints
 from processor.registration import principal
 
 VOXELS = (200.0, 140.0, 100.0, 70.0)  # along the scan's diagonal, the most that the points allow
@@ -25,6 +25,7 @@ LARGER = 0.02  # of each size, by which a scan that holds more than its part is 
 LARGER_AREA = 1.3  # of a plane, by the part's largest side: cells at its rim are partly empty
 TRIALS, SAMPLE = 1000, 4000  # of random planes, and of points that they are compared with
 THIN = 0.25  # voxels by which points on a plane may lie off it
+MOST_VOXELS = 1e12  # whose numbers are exact in 64 bits by far
 LINK = 3.0  # voxels between points of one piece
 
 
@@ -32,8 +33,7 @@ def holds_more(points: Floats, sizes: Sequence[Floats]) -> bool:
     """Whether points (n, 3) are larger than a part of any of ``sizes`` (3,), longest first, in mm."""
     step = _voxel_size(points)
     even = voxel_means(points, step, least=2) if step > 0.0 else points[:0]
-    largest = np.max(sizes, axis=0) * (1.0 + LARGER)
-    return len(even) >= FEWEST and bool((principal.sizes(even) > largest).any())
+    return len(even) >= FEWEST and bool((principal.sizes(even) > _largest(sizes)).any())
 
 
 def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
@@ -45,23 +45,13 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
     even = voxel_means(points, step, least=2) if step > 0.0 else points[:0]
     if len(even) < FEWEST:
         return None
-    largest = np.max(sizes, axis=0) * (1.0 + LARGER)
-    side = LARGER_AREA * float(largest[0] * largest[1])
-    if (principal.sizes(even) <= largest).all():
+    if not (principal.sizes(even) > _largest(sizes)).any():
         return None
-    left = np.ones(len(even), bool)
-    while (on := large_plane(even[left], step, side)) is not None:
-        left[np.flatnonzero(left)[on]] = False
-        if left.sum() < FEWEST:
-            return None
-        if (principal.sizes(even[left]) <= largest).all():
-            break
+    left = without_planes(even, step, sizes)
+    if left.sum() < FEWEST:
+        return None
     piece = np.zeros(len(even), bool)
-    # The largest of the connected pieces
-    rest = even[left]
-    pairs = cKDTree(rest).query_pairs(LINK * step, output_type="ndarray")
-    number = components(len(rest), *pairs.T)
-    piece[np.flatnonzero(left)[number == np.argmax(np.bincount(number))]] = True
+    piece[np.flatnonzero(left)[connected(even[left], LINK * step)[0]]] = True
     best = piece if _misfit(even[piece], sizes) <= _misfit(even[left], sizes) else left
     if best.all():
         return None
@@ -71,15 +61,44 @@ def of_sizes(points: Floats, sizes: Sequence[Floats]) -> Bools | None:
     return found
 
 
-def _voxel_size(points: Floats) -> float:
-    """Return the size of voxels, mm, so large that those of one surface touch; 0 if no such size divides the scan."""
+def without_planes(points: Floats, step: float, sizes: Sequence[Floats]) -> Bools:
+    """Mark points (n, 3), one in each voxel of size ``step``, that are not of ground and walls about parts of sizes."""
+    left = np.ones(len(points), bool)
+    side = LARGER_AREA * float(np.prod(_largest(sizes)[:2]))
+    while left.sum() >= FEWEST and (on := large_plane(points[left], step, side)) is not None:
+        left[np.flatnonzero(left)[on]] = False
+        if left.sum() >= FEWEST and (principal.sizes(points[left]) <= _largest(sizes)).all():
+            break
+    return left
+
+
+def connected(points: Floats, link: float) -> list[Ints]:
+    """Return the rows of each piece of points (n, 3), linked by distances up to ``link``, the largest piece first."""
+    number = components(len(points), *cKDTree(points).query_pairs(link, output_type="ndarray").T)
+    count = np.bincount(number)
+    return [np.flatnonzero(number == piece) for piece in np.argsort(-count, kind="stable") if count[piece] >= FEWEST]
+
+
+def voxel_size(points: Floats, length: float, counts: Sequence[float], per_voxel: int) -> float:
+    """Return the size of voxels, mm, so large that those of one surface touch; 0 if none of the counts divides so.
+
+    They are ``counts`` on a ``length``, and have ``per_voxel`` points on average.
+    """
     low, high = corners(points)
-    diagonal = float(np.linalg.norm(high - low))
-    for count in VOXELS:
-        step = diagonal / count
-        if step > 0.0 and len(voxel_means(points, step)) * PER_VOXEL <= len(points):
+    for step in (length / count for count in counts):
+        few_enough = step > 0.0 and np.prod(np.ceil((high - low) / step)) < MOST_VOXELS
+        if few_enough and len(voxel_means(points, step)) * per_voxel <= len(points):
             return step
     return 0.0
+
+
+def _voxel_size(points: Floats) -> float:
+    return voxel_size(points, float(np.linalg.norm(np.subtract(*corners(points)))), VOXELS, PER_VOXEL)
+
+
+def _largest(sizes: Sequence[Floats]) -> Floats:
+    largest: Floats = np.max(sizes, axis=0) * (1.0 + LARGER)
+    return largest
 
 
 def _misfit(points: Floats, sizes: Sequence[Floats]) -> float:
@@ -94,11 +113,11 @@ def large_plane(points: Floats, step: float, least: float) -> Bools | None:
     """Return which points (n, 3) lie near the plane with most points; None if its area is at most ``least`` mm^2."""
     rng = np.random.default_rng(len(points))
     few = thinned(points, SAMPLE)
-    corners = few[rng.integers(len(few), size=(TRIALS, 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    drawn = few[rng.integers(len(few), size=(TRIALS, 3))]
+    normals = np.cross(drawn[:, 1] - drawn[:, 0], drawn[:, 2] - drawn[:, 0])
     length = np.linalg.norm(normals, axis=1)
     known = length > step**2
-    normals, origins = normals[known] / length[known, None], corners[known, 0]
+    normals, origins = normals[known] / length[known, None], drawn[known, 0]
     if not len(normals):
         return None
     on_each = [np.abs((few - at) @ normal) < THIN * step for normal, at in zip(normals, origins, strict=True)]
