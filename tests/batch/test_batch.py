@@ -29,6 +29,7 @@ from processor.model import InputError, UsageError
 from processor.scan_folder import fingerprint
 from tests.support.processes import dask_cluster
 from tests.support.processes.batches import ENV, FAILING, REAL, ROOT, folder, run, run_one
+from tests.support.processes.commands import until
 
 SPHERES = ("--steps", "spheres", "--method", "least-squares", "--seed", "3")
 SUMMARY = ("index.html", "summary.csv", "summary.json")
@@ -40,13 +41,6 @@ def command(*arguments):
 
 def started(*arguments):
     return subprocess.Popen(command(*arguments), stderr=subprocess.PIPE, text=True, env=ENV, start_new_session=True)
-
-
-def until(condition, seconds=60):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.01)
 
 
 def said(out):

@@ -13,7 +13,6 @@ import struct
 import subprocess
 import sys
 import termios
-import time
 from pathlib import Path
 
 import h5py
@@ -241,16 +240,9 @@ def started(folder, *more):
     )
 
 
-def until(condition, seconds=120):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.005)
-
-
 def until_scenes(folder, number, process):
     """Wait until a run has made some scenes and is still at work."""
-    until(lambda: process.poll() is not None or (folder.exists() and len(scenes(folder)) >= number))
+    commands.until(lambda: process.poll() is not None or (folder.exists() and len(scenes(folder)) >= number))
     assert process.poll() is None, process.communicate()[1]
     assert len(scenes(folder)) < SCENES_OF_KILLED_RUNS, "too late to disturb it"
 
@@ -268,7 +260,7 @@ def members(folder):
 
 
 def until_gone(folder):
-    until(lambda: not members(folder), 10)
+    commands.until(lambda: not members(folder), 10)
 
 
 def same_as(whole, folder):

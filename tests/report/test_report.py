@@ -22,7 +22,7 @@ from processor.report.columns import Column, columns, under
 from processor.results import to_json
 from processor.space_frame import step as space_frame_step
 from processor.store import store
-from tests.support.pages.report_pages import TablesOfPage, drawn
+from tests.support.pages.report_pages import TablesOfPage, by_file, drawn
 from tests.support.results import step_results
 from tests.support.results.ball_results import balls, whole
 from tests.support.results.bridge_results import KEYS, NAN, PROVENANCE, adjusted, arch_scene, assembled
@@ -112,27 +112,22 @@ def test_results_json_of_balls():
 # --- tables --------------------------------------------------------------------------------------------------------
 
 
-def by_file(execution, report, file):
-    (table,) = [one for one in all_tables.tables_of_run(execution, report) if one.file == file]
-    return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
-
-
 def test_csv_of_gaps_and_stations():
-    gaps = by_file(of_bridge(), ErrorReport(), "gaps")
+    gaps = by_file("gaps", of_bridge())
     assert len(gaps) == 16
     assert list(gaps[2].values()) == ["J1", "P3", "3.0", "-3.1", "3.2", "", "", ""]
     assert gaps[10]["dx_mm"] == ""
-    linear = by_file(of_bridge(), ErrorReport(), "linear")
+    linear = by_file("linear", of_bridge())
     assert (linear[61]["edge"], linear[61]["chainage_mm"], linear[61]["deviation_mm"]) == ("right", "200.0", "1.2")
 
 
 def test_csv_of_balls_holds_the_error_against_the_true_radius():
-    first, second, third = by_file(*of_frame(), "balls")
+    first, second, third = by_file("balls", *of_frame())
     assert (first["radius_mm"], first["true_radius_mm"], first["radius_error_mm"]) == ("45.5", "45.0", "0.5")
     assert second["radius_error_mm"] == "10.0"
     assert (third["radius_mm"], third["radius_error_mm"]) == ("", "")
     assert float(first["formal_ci95_radius_mm"]) == pytest.approx(1.96 * 0.2, abs=1e-4)  # written to 1e-4
-    (ransac, least) = by_file(*of_frame(), "summary")
+    (ransac, least) = by_file("summary", *of_frame())
     assert (ransac["fitted"], ransac["largest_mm"]) == ("2", "10.0")
     assert (least["fitted"], least["median_mm"]) == ("2", "0.5")
 

@@ -1,6 +1,5 @@
 """What the report shows of an adjustment: tables, pictures, and the live figures of the page."""
 
-import csv
 import dataclasses
 import io
 import json
@@ -17,11 +16,10 @@ from processor.pipeline import Execution
 from processor.preassembly.chain import joint_measures
 from processor.preassembly.result import Deviations
 from processor.report import all_figures, all_tables, page, style
-from processor.report import table as report_table
 from processor.report.preassembly import figures, joint_figures, residual_map
 from processor.report.style import Drawn, default_settings, rounded
 from processor.results import to_json
-from tests.support.pages.report_pages import Page, drawn, rendered
+from tests.support.pages.report_pages import Page, by_file, drawn, rendered
 from tests.support.results.bridge_results import (
     OWN,
     PROVENANCE,
@@ -37,11 +35,6 @@ from tests.support.results.bridge_results import (
 
 NAN = float("nan")
 CSV, PAGE = 1e-6, 5e-4  # what rounding leaves of a number in tables of files (6 decimals) and of the page (3)
-
-
-def of_file(execution, file):
-    (table,) = [one for one in all_tables.tables_of_run(execution, ErrorReport()) if one.file == file]
-    return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
 
 
 def bridge_and_step():
@@ -60,7 +53,7 @@ def number(text):
 def test_table_what_to_do_has_the_numbers_of_results_json():
     execution, step = bridge_and_step()
     on_page = Page(rendered(execution)).tables["Joints: what to do, method adjustment"][2:]
-    rows = of_file(execution, "what-to-do")
+    rows = by_file("what-to-do", execution)
     assert [row["joint"] for row in rows] == ["J1", "J2"]
     for row, shown, joint, verdict in zip(rows, on_page, step["joint_measures"], step["joints"], strict=True):
         assert row["verdict"] == verdict["verdict"] == "fail"
@@ -82,7 +75,7 @@ def test_table_what_to_do_has_the_numbers_of_results_json():
 
 def test_table_of_limits_has_clause_and_verification():
     execution, step = bridge_and_step()
-    rows = of_file(execution, "limits")
+    rows = by_file("limits", execution)
     wanted = [limit for joint in step["joint_measures"] for limit in joint["limits"]]
     assert len(rows) == len(wanted) == 4
     for row, limit in zip(rows, wanted, strict=True):
@@ -102,7 +95,7 @@ def test_limits_of_the_chain_stand_beside_those_of_joints():
     execution, step = bridge_and_step()
     (chain,) = step["chain_limits"]
     (limit,) = chain["limits"]
-    (row,) = of_file(execution, "limits-chain")
+    (row,) = by_file("limits-chain", execution)
     assert chain["verdict"] == row["verdict"] == limit["verdict"] == "indeterminate"
     stated = [limit[key] for key in ("limit", "source", "edition", "verified")]
     assert stated == ["span_mm", "project.toml", "1", False]
@@ -114,7 +107,7 @@ def test_limits_of_the_chain_stand_beside_those_of_joints():
     assert held["chain span"] == "indeterminate"
     # What was stated and is held against nothing is said.
     assert step["limits_not_held"] == ["bow_mm"]
-    assert of_file(execution, "limits-not-held") == [{"key": "bow_mm", "limit": "bow of a unit preassembled"}]
+    assert by_file("limits-not-held", execution) == [{"key": "bow_mm", "limit": "bow of a unit preassembled"}]
     on_terminal = [
         str(table.title) for table in all_tables.tables_of_run(execution, ErrorReport()) if table.on_terminal
     ]
@@ -123,7 +116,7 @@ def test_limits_of_the_chain_stand_beside_those_of_joints():
 
 def test_gaps_have_intervals_in_the_joints_axes_too():
     execution, step = bridge_and_step()
-    rows = of_file(execution, "gaps")
+    rows = by_file("gaps", execution)
     assert list(rows[0])[:8] == ["joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm"]
     for j, joint in enumerate(step["joint_measures"]):
         for k, key in enumerate(f"P{i}" for i in range(1, 9)):
@@ -132,11 +125,11 @@ def test_gaps_have_intervals_in_the_joints_axes_too():
             for one, value, ci95 in zip(("along", "left", "up"), gap, half, strict=True):
                 assert float(rows[8 * j + k][f"{one}_mm"]) == pytest.approx(value, abs=CSV)
                 assert float(rows[8 * j + k][f"ci95_{one}_mm"]) == pytest.approx(ci95, abs=CSV)
-    assert len(of_file(execution, "gaps-line")[0]) == 8
+    assert len(by_file("gaps-line", execution)[0]) == 8
 
 
 def test_ambiguous_part_is_listed_with_both_poses():
-    rows = of_file(of_bridge(), "candidates")
+    rows = by_file("candidates", of_bridge())
     assert [row["candidate"] for row in rows] == ["as assembled", "the other pose"]
     assert [float(row["turned_deg"]) for row in rows] == [0.0, 180.0]
     assert [float(row["xt_mm"]) for row in rows] == [0.0, 5.0]
@@ -144,7 +137,7 @@ def test_ambiguous_part_is_listed_with_both_poses():
 
 
 def test_accuracy_budget_is_written_and_shown_on_the_terminal():
-    rows = of_file(of_bridge(), "accuracy")
+    rows = by_file("accuracy", of_bridge())
     assert rows[0]["statement"].startswith("J1 P1: ± 0.087 mm (95 %), 69% of the variance from the end face")
     assert rows[1]["statement"].startswith("a scan of rib1 that shows more of the end face")
     assert any(
@@ -164,7 +157,7 @@ def linear_error(execution):
 
 def test_failed_method_is_listed_with_its_reason_and_not_drawn():
     execution = of_bridge()
-    (row,) = of_file(execution, "components-compared")
+    (row,) = by_file("components-compared", execution)
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
     caption, *shown = linear_error(execution)
     assert "without a band, because they state no uncertainty: line" in caption
@@ -184,14 +177,14 @@ def test_failed_method_is_listed_with_its_reason_and_not_drawn():
 
 def test_span_closure_budget_and_trade_off_as_tables():
     execution = of_bridge()
-    span, along, *rest = of_file(execution, "span")
+    span, along, *rest = by_file("span", execution)
     assert (span["departure"], span["ci95"], span["unit"], span["beyond_its_interval"]) == ("-1.25", "0.5", "mm", "yes")
     assert (along["departure"], along["ci95"], along["unit"]) == ("1.0", "0.25", "mm")
     assert [row["unit"] for row in rest] == ["mm", "mm", "mrad", "mrad", "mrad"]
     assert [row["beyond_its_interval"] for row in rest] == ["yes", "yes", "no", "no", "yes"]
-    assert of_file(execution, "budget")[2] == {"source": "scanner offset", "sd_mm": "0.2"}
-    assert [row["linear_max_mm"] for row in of_file(execution, "trade-off")] == ["2.0", "3.0", "9.0"]
-    measures = of_file(execution, "measures")
+    assert by_file("budget", execution)[2] == {"source": "scanner offset", "sd_mm": "0.2"}
+    assert [row["linear_max_mm"] for row in by_file("trade-off", execution)] == ["2.0", "3.0", "9.0"]
+    measures = by_file("measures", execution)
     assert len(measures) == 22
     low, value, high = (float(measures[0][name]) for name in ("low95", "value", "high95"))
     assert low < value < high

@@ -1,6 +1,5 @@
 """Balls of a whole frame as reported: results.json, tables, drawing and figures, from a result written by hand."""
 
-import csv
 import dataclasses
 import hashlib
 import io
@@ -21,7 +20,6 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.model import FrameDesign, RecordError, Scan, Scene, Stations, StepRun, Verdict, reason
 from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, page, write_results
-from processor.report import table as report_table
 from processor.report.columns import columns
 from processor.report.space_frame import ball_picture, dxf, flagged_ball_figures, interactive_view, section
 from processor.report.space_frame import figures as space_frame_figures
@@ -31,7 +29,7 @@ from processor.results import to_json
 from processor.space_frame import step
 from processor.space_frame.result import ControlDeviations, MovementReference, StationCorrections, Tubes
 from processor.store import store
-from tests.support.pages.report_pages import TablesOfPage
+from tests.support.pages.report_pages import TablesOfPage, by_file
 from tests.support.results.ball_results import (
     NAN,
     NOMINAL,
@@ -51,9 +49,8 @@ Z95 = 1e-4  # 1.96 here is 1.95996 in the program
 CSV = 1e-4  # of a half-width of 0.2 mm written with six decimals, and 1.96 for 1.95996
 
 
-def by_file(file, *args):
-    (table,) = [one for one in all_tables.tables_of_run(*of_frame(*args)) if one.file == file]
-    return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
+def of_file(file, *args):
+    return by_file(file, *of_frame(*args))
 
 
 # --- verdicts ------------------------------------------------------------------------------------------------------
@@ -165,8 +162,8 @@ def test_ids_that_are_texts_stand_in_results_tables_and_drawing():
     assert [(tube["a"], tube["b"]) for tube in result["tubes"]] == [("N001", "=N2"), ("N004", "")]
     safe = [name if name != "=N2" else "'=N2" for name in names]
     for file in ("balls", "nodes", "lowest"):
-        assert [row["id"] for row in by_file(file, made)] == safe
-    assert [(row["ball_a"], row["ball_b"]) for row in by_file("tubes", made)] == [("N001", "'=N2"), ("N004", "")]
+        assert [row["id"] for row in of_file(file, made)] == safe
+    assert [(row["ball_a"], row["ball_b"]) for row in of_file("tubes", made)] == [("N001", "'=N2"), ("N004", "")]
     drawing = ezdxf.read(io.StringIO(dxf.drawing(made).decode()))
     texts = [one.dxf.text for one in drawing.modelspace().query('TEXT[layer=="IDS"]')]
     assert texts == [name for name, there in zip(names, made.balls.placed, strict=True) if there]
@@ -194,7 +191,7 @@ def test_the_headline_says_which_gauge_the_movements_are_by_and_how_far_the_othe
 
 
 def test_csv_of_balls_and_of_lowest_points():
-    first, second, lost, *_ = by_file("balls", None, with_truth()[0])
+    first, second, lost, *_ = of_file("balls", None, with_truth()[0])
     assert float(first["ci95_x_mm"]) == pytest.approx(0.196, abs=CSV)
     assert float(first["ci95_radius_mm"]) == pytest.approx(0.098, abs=CSV)
     assert (first["size_mm"], first["nominal_radius_mm"], first["radius_error_mm"]) == ("45.0", "45.0", "0.1")
@@ -202,7 +199,7 @@ def test_csv_of_balls_and_of_lowest_points():
     assert (second["flag"], second["remark"]) == ("wrong-size", "size 60 mm instead of 50 mm")
     assert not [name for name in first if "formal" in name]
     assert lost["x_mm"] == lost["radius_mm"] == ""
-    crew = by_file("lowest")
+    crew = of_file("lowest")
     assert list(crew[0]) == ["id", "x_mm", "y_mm", "z_mm", "ci95_z_mm", "radius_mm", "flag"]
     assert (crew[0]["x_mm"], crew[0]["z_mm"], crew[0]["radius_mm"]) == ("3.0", "5954.9", "45.1")
     assert float(crew[1]["ci95_z_mm"]) == pytest.approx(0.392, abs=CSV)
@@ -210,17 +207,17 @@ def test_csv_of_balls_and_of_lowest_points():
 
 
 def test_csv_of_nodes_tubes_and_stations():
-    nodes = by_file("nodes")
+    nodes = of_file("nodes")
     assert (nodes[0]["dx_mm"], nodes[0]["dy_mm"], nodes[0]["movement_mm"]) == ("3.0", "4.0", "5.0")
     assert (nodes[0]["gauge"], nodes[0]["design_dz_mm"], nodes[0]["best_fit_dz_mm"]) == (
         "design-coordinates", "0.0", "2.0",
     )  # fmt: skip
     assert [row["verdict"] for row in nodes] == ["pass", "indeterminate", "", "pass", ""]
     assert {row["limit_mm"] for row in nodes} == {"10.0"}
-    one, open_end = by_file("tubes")
+    one, open_end = of_file("tubes")
     assert (one["ball_a"], one["ball_b"], one["length_mm"], one["bow_mm"]) == ("10", "11", "2800.0", "0.5")
     assert (open_end["ball_b"], open_end["start_y_mm"]) == ("", "3900.0")
-    still, moved = by_file("stations")
+    still, moved = of_file("stations")
     assert (still["dx_mm"], still["turn_z_mrad"]) == ("0.0", "0.0")
     assert (moved["station"], moved["dx_mm"], moved["dy_mm"], moved["dz_mm"]) == ("'=S2", "1.0", "-2.0", "3.0")
 
@@ -233,18 +230,11 @@ def test_shift_of_a_station_is_stated_at_the_middle_of_the_balls():
     centres = made.balls.centres + far
     middle = np.nanmean(centres, axis=0)
     T = np.array([pose(), pose(R, middle - R @ middle + [0.0, 0.0, 2.0])])
-    _, moved = by_file("stations", moved_to(made, centres, T))
+    balls, stations = dataclasses.replace(made.balls, centres=centres), dataclasses.replace(made.stations, T=T)
+    _, moved = of_file("stations", dataclasses.replace(made, balls=balls, stations=stations))
     # Rounding of float64 at 4e9 mm is 1e-6, of a turned frame some times that.
     assert [float(moved[name]) for name in ("dx_mm", "dy_mm", "dz_mm")] == pytest.approx([0.0, 0.0, 2.0], abs=2e-5)
     assert float(moved["turn_z_mrad"]) == pytest.approx(0.5, abs=1e-6)  # written with six decimals
-
-
-def moved_to(result, centres, T):
-    return dataclasses.replace(
-        result,
-        balls=dataclasses.replace(result.balls, centres=centres),
-        stations=dataclasses.replace(result.stations, T=T),
-    )
 
 
 def test_table_of_nodes_states_a_missing_or_uncertain_limit():
@@ -437,9 +427,8 @@ def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
     ):
         away = np.linalg.norm(points + origin - centre, axis=1)
         assert len(crop) == (away <= far).sum() > 0
-        np.testing.assert_allclose(
-            np.sort(np.linalg.norm(crop, axis=1)), np.sort(away[away <= far]), atol=1e-5
-        )  # at 3e9 mm
+        # At 3e9 mm.
+        np.testing.assert_allclose(np.sort(np.linalg.norm(crop, axis=1)), np.sort(away[away <= far]), atol=1e-5)
 
 
 def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path, monkeypatch):

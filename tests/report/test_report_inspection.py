@@ -1,15 +1,12 @@
 """The report of an inspection: table, page in both languages, results.json and the store."""
 
-import csv
-import io
-
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.report import all_tables, headline, page
-from processor.report.table import csv_text
+from processor.report import headline, page
 from processor.results.to_json import results_json
 from tests.support.pages.pages import left_in_english
+from tests.support.pages.report_pages import by_file
 from tests.support.results import step_results
 
 NAMES = ("length", "twist", "sweep", "end", "squareness", "over", "width", "rib1", "rib2", "inspect", "mm", "GB",
@@ -22,14 +19,13 @@ def execution():
 
 
 def test_the_table_has_a_row_a_characteristic(execution):
-    tables = {table.file: table for table in all_tables.tables_of_run(execution, ErrorReport())}
-    rows = list(csv.DictReader(io.StringIO(csv_text(tables["inspect"]))))
+    rows = by_file("inspect", execution)
     assert [row["characteristic"] for row in rows][-1] == "end-squareness-over-width"
     assert (rows[0]["component"], float(rows[0]["deviation"]), rows[0]["verdict"]) == ("rib1", 3.5, "pass")
     assert rows[3]["actual"] == ""
     assert rows[3]["unit"] == "mm"
     assert rows[3]["remark"] == "not measured at: end"
-    assert len(tables["inspect-axes"].rows) == 2
+    assert len(by_file("inspect-axes", execution)) == 2
 
 
 def test_results_json_has_the_keys_of_the_interface(execution):

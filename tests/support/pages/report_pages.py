@@ -1,14 +1,17 @@
 """The report's page made and read: its tables, scripts, addresses and text."""
 
 import copy
+import csv
 import hashlib
+import io
 import pickle
 from html.parser import HTMLParser
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.report import all_figures, page
+from processor.report import all_figures, all_tables, page
+from processor.report.table import csv_text
 
 BAD = "</script><script>alert(1)</script>"
 
@@ -26,6 +29,12 @@ def drawn(execution):
 
 def rendered(execution):
     return page.html(execution, ErrorReport(), drawn(execution))
+
+
+def by_file(file, execution, report=None):
+    """Return the rows of a table as its file has them."""
+    (table,) = [one for one in all_tables.tables_of_run(execution, report or ErrorReport()) if one.file == file]
+    return list(csv.DictReader(io.StringIO(csv_text(table))))
 
 
 class TablesOfPage(HTMLParser):

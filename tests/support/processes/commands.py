@@ -3,6 +3,7 @@
 import contextlib
 import io
 import sys
+import time
 from types import SimpleNamespace
 from unittest import mock
 
@@ -25,3 +26,11 @@ def here(program, *arguments, stderr=None):
     ):
         MAIN[program]()
     return SimpleNamespace(returncode=end.value.code or 0, stdout=out.getvalue(), stderr=err.getvalue())
+
+
+def until(condition, seconds=120):
+    """Wait for what another process does."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.005)
