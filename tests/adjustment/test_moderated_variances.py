@@ -33,9 +33,8 @@ def test_means_by_their_moderated_deviation_follow_students_law():
 def test_groups_of_one_variance_have_it():
     _, _, square, dof = groups(2, law=np.inf)
     found = moderated_variances.moderated(square, dof)
-    np.testing.assert_allclose(
-        found.variance, COMMON, rtol=0.2
-    )  # the common one by 6,000 degrees: 2 %; the law itself is estimated
+    # The common one by 6,000 degrees: 2 %; the law itself is estimated.
+    np.testing.assert_allclose(found.variance, COMMON, rtol=0.2)
     assert found.dof.min() > 50.0
 
 

@@ -38,9 +38,8 @@ def test_biweight_mean_is_ninety_five_percent_efficient():
     p = stats.norm.pdf(z) * (z[1] - z[0])
     psi = z * robust_statistics.biweight(z / robust_statistics.TUKEY)
     slope = np.gradient(psi, z)
-    assert (p @ slope) ** 2 / (p @ psi**2) == pytest.approx(
-        0.95, abs=1e-3
-    )  # the constant 4.685 is given to four figures
+    # The constant 4.685 is given to four figures.
+    assert (p @ slope) ** 2 / (p @ psi**2) == pytest.approx(0.95, abs=1e-3)
 
 
 def test_widened_standard_deviations_cover_as_students_t():

@@ -11,10 +11,6 @@ from tests.support.scenes.bolted_girders import BOLTS, QUIET, SIZES, bolted_gird
 TOLERANCE_MM = 0.01
 
 
-def shells(shape):
-    return cq.Compound.makeCompound([shell for solid in shape.Solids() for shell in solid.Shells()])
-
-
 def test_the_mesh_of_a_girder_encloses_the_volume_of_its_solid():
     for part in girder_assemblies.build(SIZES, BOLTS).parts:
         vertices, faces = part.mesh()
@@ -34,7 +30,7 @@ def test_scanned_points_of_a_girder_lie_on_its_drilled_solid(mode):
     drilled = girder_assemblies.build(SIZES, BOLTS, shifts)
     rng = np.random.default_rng(0)
     for part, scan, T in zip(drilled.parts, scene.scans, truth.arch.T_bridge_scan, strict=True):
-        solid = shells(prismatic_solids.solid(part.made_of))
+        solid = cq.Compound.makeCompound(prismatic_solids.solid(part.made_of).Shells())
         points = scan.points @ T[:3, :3].T + T[:3, 3]
         in_bore = np.zeros(len(points), bool)
         for bore in part.girder.bores:

@@ -136,9 +136,8 @@ def test_motion_by_station_errors_has_the_covariance_of_the_truth():
         draw[:] = solve @ np.einsum("ni,ni->n", moved - points, normals)
     stated = module["by_stations"](points, normals, of, stations, settings)
     root = np.linalg.inv(np.linalg.cholesky(stated))
-    np.testing.assert_allclose(
-        root @ np.cov(draws.T) @ root.T, np.eye(6), atol=0.12
-    )  # 1500 draws: 0.037 each on the diagonal, 0.026 beside it
+    # 1500 draws: 0.037 each on the diagonal, 0.026 beside it.
+    np.testing.assert_allclose(root @ np.cov(draws.T) @ root.T, np.eye(6), atol=0.12)
 
 
 def test_a_piece_that_reaches_two_borders_is_a_missing_part(tmp_path):

@@ -96,17 +96,13 @@ def run(*arguments):
     return commands.here("designgen", *arguments)
 
 
-def surfaces_of(model):
-    builder = Builder()
-    for part, body in enumerate(model):
-        for patch, smooth in body.patches():
-            builder.patch(part, patch, smooth)
-    return builder.to_surfaces()
-
-
 def hits_on(model, step_mrad=6.0, stations=2):
     """Places that the middles of whole footprints hit, in the model's frame."""
-    found, surfaces, params = [], surfaces_of(model.bodies), scanner.Params(step_mrad=step_mrad)
+    builder = Builder()
+    for part, body in enumerate(model.bodies):
+        for patch, smooth in body.patches():
+            builder.patch(part, patch, smooth)
+    found, surfaces, params = [], builder.to_surfaces(), scanner.Params(step_mrad=step_mrad)
     for name, T in station_placement.place_stations(model, stations, None, QUIET, 0).items():
         seen = returns.scan_station(surfaces, T, QUIET, params, 1, name, keep_hits=True).returns
         found.append(seen.hits[seen.source == 0] @ T[:3, :3].T + T[:3, 3])

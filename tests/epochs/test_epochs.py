@@ -111,9 +111,8 @@ def test_widening_of_a_value_does_not_depend_on_the_number_behind_another():
     one = of_values([0.0, 1.2], [0.7, 0.7])
     of_many = of_values([0.0, 0.0], [0.7, 0.7], chosen_from=900)
     pair = change.of_component("d", "c", [one, of_many])
-    assert pair.changes[0].widened == pytest.approx(
-        ndtri(1.0 - 0.025 / 2) / 1.959964 * 0.7 * np.sqrt(2.0), rel=1e-5
-    )  # digits of 1.959964
+    # Digits of 1.959964.
+    assert pair.changes[0].widened == pytest.approx(ndtri(1.0 - 0.025 / 2) / 1.959964 * 0.7 * np.sqrt(2.0), rel=1e-5)
     rng = np.random.default_rng(3)
     called, trials, n = 0, 1000, 50
     for _ in range(trials):

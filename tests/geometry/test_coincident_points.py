@@ -105,16 +105,12 @@ def test_m3c2_and_compare_count_doubled_points_once(tmp_path):
     assert [one.values["left_out"] for one in compared.notes] == [6000, 6000]
 
 
-def ball(count=3000, radius=100.0):
+def test_a_sphere_of_doubled_points_has_the_interval_of_each_once():
     rng = np.random.default_rng(4)
-    at = rng.normal(size=(count, 3))
+    at = rng.normal(size=(3000, 3))
     at /= np.linalg.norm(at, axis=1)[:, None]
     at = at[at[:, 0] < -0.2]
-    return (at * (radius + 0.5 * rng.normal(size=len(at)))[:, None] + [5000.0, 0, 0]).round(3)
-
-
-def test_a_sphere_of_doubled_points_has_the_interval_of_each_once():
-    once = ball()
+    once = (at * (100.0 + 0.5 * rng.normal(size=len(at)))[:, None] + [5000.0, 0, 0]).round(3)
     alone = processor.fit_sphere(once, scanner=[0.0, 0, 0])
     doubled = processor.fit_sphere(np.vstack([once, once]), scanner=np.zeros((2 * len(once), 3)))
     np.testing.assert_array_equal(doubled.covariance, alone.covariance)

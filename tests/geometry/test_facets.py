@@ -82,9 +82,8 @@ def test_facets_of_a_tube_are_as_round_as_the_tube():
     height = np.random.default_rng(12).uniform(-450.0, 450.0, 3000)
     points = np.column_stack([100.0 * np.cos(angle), 100.0 * np.sin(angle), height])
     facet, distance, _ = surface.distances(points, 50.0)
-    assert distance.max() == pytest.approx(
-        100.0 * (1.0 - np.cos(np.pi / 48)), rel=0.01
-    )  # facets lie inside; of 3000 points
+    # Facets lie inside; of 3000 points.
+    assert distance.max() == pytest.approx(100.0 * (1.0 - np.cos(np.pi / 48)), rel=0.01)
     feet = points - distance[:, None] * surface.normals[facet]
     left = distance - curved.heights(feet, facet)
     assert np.abs(left).max() < 0.01 * distance.max()

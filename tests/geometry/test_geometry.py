@@ -75,9 +75,8 @@ def test_ransac_line_passes_over_outliers():
     points[::3] += rng.uniform(20.0, 50.0, (14, 3))
     line = ransac_line(points, 1.0, 0.999, 500, rng)
     assert line is not None
-    assert abs(line.direction @ [0.6, 0.8, 0.0]) == pytest.approx(
-        1.0, abs=1e-5
-    )  # a cosine: 40 points of 0.1 mm over 100 mm turn by 1e-3
+    # A cosine: 40 points of 0.1 mm over 100 mm turn by 1e-3.
+    assert abs(line.direction @ [0.6, 0.8, 0.0]) == pytest.approx(1.0, abs=1e-5)
     assert ransac_line(np.zeros((5, 3)), 1.0, 0.99, 50, rng) is None
     assert abs(fit_line(points).direction @ [0.6, 0.8, 0.0]) < 0.99  # which least squares alone does not
 
@@ -113,9 +112,8 @@ def test_polyline_nearest_beside_all_pairs():
 def test_spacing_of_a_grid_and_of_random_points():
     x, y = np.meshgrid(np.arange(100.0) * 7.0, np.arange(100.0) * 7.0)
     grid = np.stack([x.ravel(), y.ravel(), 0.0 * x.ravel()], axis=1)
-    assert nearest_neighbours.surface_spacing(grid) == pytest.approx(
-        7.0, rel=0.15
-    )  # of a disc's neighbours: 11 % too far
+    # Of a disc's neighbours: 11 % too far.
+    assert nearest_neighbours.surface_spacing(grid) == pytest.approx(7.0, rel=0.15)
     rng = np.random.default_rng(4)
     loose = np.column_stack([rng.uniform(0.0, 700.0, (10_000, 2)), np.zeros(10_000)])
     assert nearest_neighbours.surface_spacing(loose) == pytest.approx(7.0, rel=0.10)  # 10,000 random points: 1.5 %

@@ -11,11 +11,6 @@ ROUNDING_MM = 1e-12  # of a metre, through sums of some ten points: 1e-13
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def brute_normal(cloud, place, diameter):
-    near = cloud[np.linalg.norm(cloud - place, axis=1) <= diameter / 2]
-    return np.linalg.svd(near - near.mean(axis=0))[2][2]
-
-
 def columns(found):
     return np.array([found.distance, found.lod95, found.n1, found.n2, found.std1, found.std2])
 
@@ -38,10 +33,10 @@ def test_normals_and_distances_equal_those_by_brute_force(case):
     known = np.isfinite(normals).all(axis=1)
     assert 60 < known.sum() < len(core)
     for place, normal in zip(core[known], normals[known], strict=True):
-        expected = brute_normal(reference, place, case[0])
-        np.testing.assert_allclose(
-            normal, expected * np.sign(expected[2]), atol=1e-11
-        )  # by singular values of ten points and more
+        near = reference[np.linalg.norm(reference - place, axis=1) <= case[0] / 2]
+        expected = np.linalg.svd(near - near.mean(axis=0))[2][2]
+        # By singular values of ten points and more.
+        np.testing.assert_allclose(normal, expected * np.sign(expected[2]), atol=1e-11)
     expected = brute(reference, compared, core[known], normals[known], *case[1:], 0.3)
     np.testing.assert_allclose(columns(found)[:, known], expected, atol=ROUNDING_MM)
     assert np.isnan(found.distance[~known]).all()

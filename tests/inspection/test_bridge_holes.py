@@ -8,15 +8,8 @@ from designgen.designs import girder_assemblies
 from processor.inspection import bridge_holes, splices
 from processor.model import Status
 from processor.preassembly.result import Components
+from tests.support.best_fit import without_motion
 from tests.support.scenes.bolted_girders import BOLTS, HOLES, SIZES, bolted_girders
-
-
-def without_motion(places, shifts):
-    """Shifts (n, 2) less the best-fit motion of the group (Kabsch)."""
-    a = places + shifts - (places + shifts).mean(axis=0)
-    b = places - places.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    return a @ u @ np.diag([1.0, np.linalg.det(u @ vt)]) @ vt - b
 
 
 def test_holes_of_girders_are_measured_where_they_were_drilled():
@@ -33,7 +26,7 @@ def test_holes_of_girders_are_measured_where_they_were_drilled():
         bores = part.girder.bores
         web = [k for k, bore in enumerate(bores) if abs(bore.end[0] - bore.start[0]) > 1e-6]
         places = np.array([bores[k].middle for k in web])[:, [0, 2]]
-        true = without_motion(places, shifts[part.name][web][:, [0, 2]])
+        true = without_motion(places + shifts[part.name][web][:, [0, 2]], places)
         centred = places - places.mean(axis=0)
         by_id = {one.of: one for one in found[part.name]}
         assert sum(id_.endswith("diameter") for id_ in by_id) == HOLES

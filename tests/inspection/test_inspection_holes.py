@@ -13,6 +13,7 @@ from processor.inspection import bore_fit, design_holes, flat_faces, holes, poin
 from processor.inspection.bore_fit import BorePoints
 from processor.inspection.design_holes import Hole
 from processor.model import StructureDesign
+from tests.support.best_fit import without_motion
 
 RADIUS, DEPTH = 12.0, 16.0
 PITCH = np.array([80.0, 70.0])
@@ -111,15 +112,6 @@ def measured(points, source, scanners):
     return {one.of: one for one in holes.characteristics(group(), holes.fitted(cloud, group()), 1)}
 
 
-def without_motion(departure):
-    """Departures less the best-fit motion of the group, by an independent fit: Kabsch on the places."""
-    built = GRID + departure
-    a, b = built - built.mean(axis=0), GRID - GRID.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    turn = u @ np.diag([1.0, np.linalg.det(u @ vt)]) @ vt
-    return a @ turn - b
-
-
 @pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_intervals_cover_drilled_places_pitches_and_diameters(known):
     held: dict[str, list[bool]] = {"along": [], "across": [], "pitch": [], "diameter": []}
@@ -127,7 +119,7 @@ def test_intervals_cover_drilled_places_pitches_and_diameters(known):
         rng = np.random.default_rng(seed)
         departure, radius = rng.normal(0.0, 0.7, GRID.shape), 0.2 * rng.normal()
         found = measured(*bore_cloud(rng, departure, radius, known=known))
-        true = without_motion(departure)
+        true = without_motion(GRID + departure, GRID)
         for k in range(len(GRID)):
             for a, name in enumerate(("along", "across")):
                 one = found[f"hole-{k + 1}-{name}"]
@@ -189,7 +181,7 @@ def test_mixed_pixels_in_the_bore_do_not_move_it():
         rng = np.random.default_rng(seed)
         departure = rng.normal(0.0, 0.7, GRID.shape)
         found = measured(*bore_cloud(rng, departure, mixed=0.15))
-        true = without_motion(departure)
+        true = without_motion(GRID + departure, GRID)
         errors += [found[f"hole-{k + 1}-along"].value - true[k, 0] for k in range(len(GRID))]
     assert np.sqrt(np.mean(np.square(errors))) < 0.1  # as hole centres are asked for
 

@@ -280,8 +280,7 @@ def test_the_tilt_that_views_leave_in_an_edge_widens_its_slope_alone(monkeypatch
     """The slope is that over half of the length, 150 mm: 2 mrad are 0.3 mm there; half of an overhang is its own."""
     structure = design(box(PLATE))
     surroundings, faces = around(structure, np.zeros((1, 3)))
-    nothing = flat_faces.Observed(np.empty((0, 3)), np.empty(0, int), NOTHING, NOTHING, NOTHING, side=50.0)
-    (body,) = flat_faces.bodies(structure, nothing, 60.0)
+    body = body_of(structure)
     y = np.linspace(-140.0, 140.0, 15)
     seen = flat_faces.Pieces(np.stack([0.0 * y + 200.0, y, 0.0 * y], axis=1), 0.0 * y, 0.0 * y + 0.01, 0.0)
 

@@ -52,10 +52,6 @@ def test_live_figures_are_translated_but_for_names():
 # --- Chinese -------------------------------------------------------------------------------------------------------
 
 
-def chinese_page(execution, report):
-    return page.html(execution, report, all_figures.draw_figures(execution, report), "zh")
-
-
 def a_frame():
     """A frame whose design was matched, with checks of both methods."""
     relation = reason("spheres.matched", frame=FrameRelation.REGISTERED, nodes=4, nominal=5, missing=1, extra=0)
@@ -70,7 +66,8 @@ def a_frame():
 
 @pytest.mark.parametrize("made", [lambda: (of_bridge(), ErrorReport()), a_frame], ids=["bridge", "frame"])
 def test_chinese_page_has_english_names_and_units_alone(made):
-    seen = Visible(chinese_page(*made()))
+    execution, report = made()
+    seen = Visible(page.html(execution, report, all_figures.draw_figures(execution, report), "zh"))
     assert seen.lang == "zh"
     assert len(seen.texts) > 100
     assert latin(seen.texts) == []

@@ -214,17 +214,13 @@ def test_ends_are_measured_as_with_meshes(without_meshes):
         assert np.mean(np.abs(known) < 3.5 * spread) > 0.97  # nearly all within 3.5 sds; errors of an end hang together
 
 
-def measured(scan, index, design):
-    systematic = SystematicParams()
-    return measure.estimate([measure.fit([scan], index, attitude.Shapes(design), 1.0, systematic)], systematic)[0]
-
-
 @pytest.mark.slow
 def test_a_wrong_part_is_not_called_ok(without_meshes):
     scene, _ = without_meshes
-    scans = {scan.component: scan for scan in scene.scans}
+    scans, systematic = {scan.component: scan for scan in scene.scans}, SystematicParams()
     for asked, came in ((1, "rib2"), (2, "rib1"), (0, "rib3")):
-        found = measured(scans[came], asked, scene.arch)
+        fitted = measure.fit([scans[came]], asked, attitude.Shapes(scene.arch), 1.0, systematic)
+        (found,) = measure.estimate([fitted], systematic)
         assert found.status != "ok", (asked, came, found.reasons)
 
 

@@ -128,9 +128,8 @@ def test_the_thickness_of_plates_by_the_facets_of_the_end_face(through):
     facets = np.array([4 * k + np.array(three) for k in range(4) for three in ((0, 1, 2), (0, 2, 3))])
     surface = mesh_distance.of_mesh(np.vstack(corners), facets)
     place = end_place(design()[1], 1.0)
-    np.testing.assert_allclose(
-        joint_end._design_thickness(surface, place), [flange, web, flange, web], atol=1e-9
-    )  # float64
+    # Rounding of float64.
+    np.testing.assert_allclose(joint_end._design_thickness(surface, place), [flange, web, flange, web], atol=1e-9)
 
 
 @pytest.mark.parametrize("side", [1, 2])  # a web, and a flange

@@ -24,6 +24,7 @@ from processor.registration import pose_search, principal
 from tests.support import arrays_in_files
 from tests.support.clouds import arch_clouds
 from tests.support.clouds.arch_clouds import random_pose
+from tests.support.results.reasons import codes, flat
 
 SMALL = arch_bridge.Params(
     span_mm=24_000.0, rise_mm=6_000.0, width_mm=900.0, height_mm=1_100.0, plate_bottom_mm=24.0, plate_top_mm=24.0,
@@ -116,14 +117,12 @@ def assert_right(found, design, index, part, T, ends=("start", "end")):
         assert np.abs(pull).max() < PULL_MOST
 
 
-def with_strays(share, points):
-    low, high = points.min(axis=0) - 300.0, points.max(axis=0) + 300.0
-    return np.vstack([points, np.random.default_rng(3).uniform(low, high, (int(share * len(points)), 3))])
-
-
 def test_ends_are_right_despite_stray_points_and_the_same_where_points_lie_in_files(monkeypatch, tmp_path):
     parts, design = ribs()
-    scan, T = scanned(with_strays(0.01, cloud(parts[1], spacing_mm=32.0)))
+    points = cloud(parts[1], spacing_mm=32.0)
+    low, high = points.min(axis=0) - 300.0, points.max(axis=0) + 300.0
+    strays = np.random.default_rng(3).uniform(low, high, (len(points) // 100, 3))
+    scan, T = scanned(np.vstack([points, strays]))
     known(monkeypatch, T)
     whole = measured(design, 1, scan)
     assert whole.status == "ok"
@@ -155,18 +154,8 @@ def test_erected_foot_is_registered_without_a_turn():
     found = measure._place(Scan("scan", cloud(parts[0], spacing_mm=30.0) + shift), 0, shapes_of(design), 1.0)
     assert (found.attitude.status, found.rejected, found.doubts) == ("ok", (), ())
     assert turn_deg(found.registration.T_design_scan, np.eye(4)) < TURNED_DEG
-    np.testing.assert_allclose(
-        found.registration.T_design_scan[:3, 3], -shift, atol=1.0
-    )  # 1 mm over the root of thousands of points
-
-
-def codes(reasons):
-    return [one.code for one in reasons]
-
-
-def nested(reasons):
-    """All reasons, and those that are values of others."""
-    return [one for outer in reasons for one in (outer, *nested(outer.values.get("reasons", ())))]
+    # 1 mm over the root of thousands of points.
+    np.testing.assert_allclose(found.registration.T_design_scan[:3, 3], -shift, atol=1.0)
 
 
 def test_parts_of_one_shape_are_distinguished_by_their_mark(monkeypatch):
@@ -200,15 +189,10 @@ def marks_places(part):
     return part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
 
 
-def without_the_marks_places(part, points):
-    """Points of a part without those near its mark, and near the mark of the part of the same shape."""
-    places = marks_places(part)
-    return points[(np.linalg.norm(points[:, None] - places, axis=2) > 400.0).all(axis=1)]
-
-
 def test_part_without_its_mark_in_the_scan_names_the_other_candidates(monkeypatch):
     parts, design = bridge()
-    scan, T = scanned(without_the_marks_places(parts[1], cloud(parts[1], spacing_mm=30.0)))
+    points, places = cloud(parts[1], spacing_mm=30.0), marks_places(parts[1])
+    scan, T = scanned(points[(np.linalg.norm(points[:, None] - places, axis=2) > 400.0).all(axis=1)])
     known(monkeypatch, T)
     found = measured(design, 1, scan)
     assert (found.status, found.reasons) == ("ok", (reason("preassemble.mark-not-seen", parts=("rib3",)),))
@@ -236,26 +220,22 @@ def test_neighbours_swapped_are_named(monkeypatch):
     assert found.reasons[-1] == reason("preassemble.size-of-other", parts=("rib1", "rib3"))
 
 
-@pytest.fixture(scope="module")
-def on_foot():
-    """The rib turned about the arch's middle until it ends where the foot does: half of it lies on the foot."""
+def test_scan_that_covers_half_of_another_part_is_rejected(monkeypatch):
+    """A rib turned about the arch's middle until it ends where the foot does: its upper half lies on the foot.
+
+    The rest looks like clutter. A mast is left out.
+    """
     scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=1.0, seed=1)
     points = rigid.apply(truth.arch.T_bridge_scan[2], scene.scans[2].points)
     turn = (arch_clouds.CUTS[1] - arch_clouds.CUTS[3]) * arch_clouds.ARC / arch_clouds.RADIUS
     middle = arch_clouds.RADIUS * np.array([np.sin(arch_clouds.HALF_ANGLE), 0.0, -np.cos(arch_clouds.HALF_ANGLE)])
     R = rigid.rotation_from_vector(np.array([0.0, turn, 0.0]))
-    return scene.arch, Scan("scan", (points - middle) @ R.T + middle)
-
-
-def test_scan_that_covers_half_of_another_part_is_rejected(on_foot, monkeypatch):
-    """The upper half of this foot has the rib's section, and the rest looks like clutter. A mast is left out."""
-    design, scan = on_foot
-    rng, top = np.random.default_rng(1), scan.points[np.argmax(scan.points[:, 2])]
-    beside = top + np.column_stack([rng.normal(0.0, 30.0, (900, 2)), rng.uniform(0.0, 5000.0, 900)])
-    scan = dataclasses.replace(scan, points=np.vstack([scan.points, beside]))
+    points = (points - middle) @ R.T + middle
+    rng, top = np.random.default_rng(1), points[np.argmax(points[:, 2])]
+    mast = top + np.column_stack([rng.normal(0.0, 30.0, (900, 2)), rng.uniform(0.0, 5000.0, 900)])
     known(monkeypatch, np.eye(4))
     monkeypatch.setattr(assignment, "rather", lambda *_: None)
-    found = measure._place(scan, 0, shapes_of(design), 1.0)
+    found = measure._place(Scan("scan", np.vstack([points, mast])), 0, shapes_of(scene.arch), 1.0)
     assert 0.5 < found.registration.used_share < 0.7  # a half and some clutter
     assert codes(found.rejected) == ["preassemble.points-away", "preassemble.size-of-other"]
     assert found.rejected[1].values == {"parts": ("rib2",)}
@@ -341,7 +321,7 @@ def test_two_scans_of_one_part_are_combined(monkeypatch):
     assert np.abs(rigid.apply(both.T_further_scans[0], at) - rigid.apply(true[further], at)).max() < 3.0
     alone = measured(design, RIB, scans[0])
     assert alone.status == "weak"
-    assert reason("preassemble.few-points-on-face", face="right") in nested(alone.reasons)
+    assert reason("preassemble.few-points-on-face", face="right") in flat(alone.reasons)
 
 
 def with_a_floor(points, axes, share, rng):

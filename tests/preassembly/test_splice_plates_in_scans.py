@@ -71,11 +71,6 @@ def test_what_a_part_rests_on_is_no_splice_plate(seed):
     assert not found(np.vstack([girder(rng, 1400.0), top, front]))
 
 
-def covered(local):
-    """Mark points (n, 3) of a girder that the plates cover."""
-    return (np.abs(local[:, 0]) < REACH) & (np.abs(local[:, 1]) < WIDTH) & (np.abs(local[:, 2]) > HALF[2] - 3.0)
-
-
 def test_a_girder_scanned_with_its_splice_plates_has_no_key_points(monkeypatch):
     recipe = {
         "kind": "assembly",
@@ -91,7 +86,8 @@ def test_a_girder_scanned_with_its_splice_plates_has_no_key_points(monkeypatch):
     rng, frame, first = np.random.default_rng(1), joint_frame(scene.arch.joint_points[0]), scene.scans[0]
     T = rigid.invert(frame) @ truth.arch.T_bridge_scan[0]
     local = rigid.apply(T, first.points + first.origin)
-    local = np.vstack([local[~covered(local)], plates(rng, spacing=8.0)])
+    covered = (np.abs(local[:, :2]) < [REACH, WIDTH]).all(axis=1) & (np.abs(local[:, 2]) > HALF[2] - 3.0)
+    local = np.vstack([local[~covered], plates(rng, spacing=8.0)])
     plated = Scan(first.name, rigid.apply(rigid.invert(T), local), component=first.component, sigma_mm=first.sigma_mm)
     systematic = SystematicParams()
     fitted = measure.fit([plated], 0, attitude.Shapes(scene.arch), 1.0, systematic)

@@ -89,9 +89,8 @@ def test_a_piece_as_designed_stays_and_is_as_sure_as_its_place_in_the_design():
     found = design_places.covariances(np.zeros((3, 6)), [rod, *halves], at, np.array([0, 1, 1]), SD_MM)
     np.testing.assert_allclose(found[0], np.diag([1e-4] * 3 + [100.0] * 3), atol=1e-12)  # float64
     turn = 100.0 / (1000.0**2 + 500.0**2)  # mean square of -1500, -500, 500, 1500
-    np.testing.assert_allclose(
-        np.diag(found[1]), [turn] * 3 + [100.0] + [100.0 + turn * 1000.0**2] * 2, rtol=1e-9
-    )  # float64
+    # Rounding of float64.
+    np.testing.assert_allclose(np.diag(found[1]), [turn] * 3 + [100.0] + [100.0 + turn * 1000.0**2] * 2, rtol=1e-9)
 
 
 def test_what_moves_a_part_from_its_place_is_in_its_covariance():

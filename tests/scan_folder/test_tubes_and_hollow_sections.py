@@ -19,18 +19,13 @@ CORNER_MM = 0.05  # tessellated to 0.02 and 0.05 mm of the surface
 RADIUS, WALL, LENGTH, GAP = 250.0, 16.0, 3000.0, 3.0
 
 
-def found(sizes):
-    meshes = [round_tubes.mesh(sizes, k) for k in range(sizes.parts)]
-    return arch_bridge.find([welded(f"tube{k + 1}", *mesh) for k, mesh in enumerate(meshes)])
-
-
 @pytest.mark.parametrize(
     "sizes",
     [Sizes(), Sizes(parts=4, bend=20_000.0), Sizes(radius=90.0, wall=8.0), Sizes(gusset=True)],
     ids=["straight", "arch", "narrow", "gusset"],
 )
 def test_key_points_of_tubes_are_at_45_degrees_on_their_outer_edge(sizes):
-    one = found(sizes)
+    one = arch_bridge.find([welded(f"tube{k + 1}", *round_tubes.mesh(sizes, k)) for k in range(sizes.parts)])
     expected = round_tubes.design(sizes)
     assert one.doubts == ()
     assert one.root_gap_mm == pytest.approx(GAP, abs=0.01)  # as it is printed

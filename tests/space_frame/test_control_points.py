@@ -17,11 +17,6 @@ COMMON_MM = np.array([1.2, -0.9, 1.3])  # 2 mm in all
 SHIFT_MM = 2.0  # sd an axis of each station's own
 
 
-@pytest.fixture(scope="module")
-def roof():
-    return made(make, "roof", recipe_files.overridden(recipe_files.load("frame-1040")[1], ROOF), 5)
-
-
 def shifted(scene, seed, common=COMMON_MM, own=SHIFT_MM):
     """The scene with each station's pose wrong by a shift of its own (mean taken off) and one that all share."""
     shift = own * np.random.default_rng(seed).standard_normal((len(scene.scans), 3))
@@ -59,8 +54,8 @@ def offsets(result, truth):
 
 
 @pytest.mark.slow
-def test_the_shift_all_stations_share_is_found_by_control_points_and_covered_without(roof):
-    scene, truth = roof
+def test_the_shift_all_stations_share_is_found_by_control_points_and_covered_without():
+    scene, truth = made(make, "roof", recipe_files.overridden(recipe_files.load("frame-1040")[1], ROOF), 5)
     wrong = shifted(scene, 1)
     held = space_frame_step.run(dataclasses.replace(wrong, control=control(scene, 2)), space_frame_step.Params())
     free = space_frame_step.run(wrong, space_frame_step.Params(datum_mm=1.5))

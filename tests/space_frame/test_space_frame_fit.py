@@ -145,9 +145,8 @@ def test_radius_without_rays_is_corrected_by_half_the_noise_bias():
     chance = 4.0 * sigma / np.sqrt(draws * count)
     off, variance = radii(rng.normal(0.0, sigma, (draws * count, 3)))
     assert off.mean() == pytest.approx(0.5 * most, abs=chance)
-    assert np.median(variance) == pytest.approx(
-        sigma**2 / count + most**2 / 12.0, rel=0.06
-    )  # a median of 150 of a few per cent
+    # A median of 150 of a few per cent.
+    assert np.median(variance) == pytest.approx(sigma**2 / count + most**2 / 12.0, rel=0.06)
     off, _ = radii(rng.normal(0.0, sigma, (draws * count, 1)) * normal)
     assert off.mean() == pytest.approx(-0.5 * most, abs=chance)
 

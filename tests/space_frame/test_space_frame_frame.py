@@ -18,6 +18,7 @@ from processor.space_frame.points.source import SceneSource
 from processor.space_frame.spheres import baselines
 from processor.space_frame.step import Params, run
 from tests.support.made import made
+from tests.support.results.reasons import codes
 
 ROOF = ["frame.nodes_x=6", "frame.nodes_y=5", "scan.stations=[2,2]", "scan.clutter=6", "scan.step_mrad=2.2"]
 
@@ -133,10 +134,6 @@ def elsewhere(frame, without=(), extra=(), radius=50.0):
         member_b=frame.member_b[own],
         tube_diameters=frame.tube_diameters[own],
     ), R  # fmt: skip
-
-
-def codes(reasons):
-    return {one.code for one in reasons}
 
 
 def wrong_sizes(result):

@@ -13,6 +13,7 @@ from processor.space_frame.design import matching
 from processor.space_frame.design.matching import NodePattern, match, match_members
 from processor.space_frame.design.movement import movement
 from processor.space_frame.result import MovementGauge
+from tests.support.best_fit import without_motion
 
 # Of a pose by 60 nodes or more that moved by up to 20 mm, 7 mm rms an axis: 1 mm at their middle, twice at their ends.
 POSE_MM = 4.0
@@ -297,20 +298,6 @@ def sagged(d, most=42.0):
     return np.column_stack([np.zeros((len(d.ids), 2)), -down])
 
 
-def at_the_site(d, origin, shift=(0.0, 0.0, 0.0)):
-    """A design in coordinates of the site, the movements of its nodes, and the nodes as found there."""
-    listed = dataclasses.replace(d, centres=d.centres + origin)
-    moved = sagged(d) + shift
-    return listed, moved, NodePattern(d.centres + moved, np.array(origin))
-
-
-def after_fit(places, nominal, weight):
-    """What is left of places (n, 3) less nominal ones after their fit by scipy."""
-    middle, goal = (np.average(x, axis=0, weights=weight) for x in (places, nominal))
-    turn, _ = Rotation.align_vectors(nominal - goal, places - middle, weights=weight)
-    return turn.apply(places - middle) - (nominal - goal)
-
-
 @pytest.mark.parametrize(
     ("stated", "shift", "relation", "status", "nearby", "code"),
     [
@@ -326,8 +313,9 @@ def after_fit(places, nominal, weight):
 def test_what_the_project_states_of_the_frame_decides_and_a_contradiction_is_flagged(
     stated, shift, relation, status, nearby, code
 ):
-    listed, moved, found = at_the_site(design(nx=6, ny=7), (0.0, 0.0, 0.0), (shift, 0.0, 0.0))
-    listed = dataclasses.replace(listed, coordinates=stated)
+    listed = dataclasses.replace(design(nx=6, ny=7), coordinates=stated)
+    moved = sagged(listed) + np.array([shift, 0.0, 0.0])
+    found = NodePattern(listed.centres + moved, np.zeros(3))
     matched = match(found, listed)
     assert (matched.relation, matched.status, matched.nearby) == (relation, status, nearby)
     assert code in ("", *(one.code for one in matched.reasons))
@@ -355,7 +343,7 @@ def test_intervals_of_movements_after_a_best_fit_cover():
         assert matched.relation == "registered"
         out = movement(matched, found, covariance, d)
         assert out.gauge == "best-fit"
-        off = after_fit(cloud.positions[out.found], d.centres[out.design], matched.weight[out.found])
+        off = without_motion(cloud.positions[out.found], d.centres[out.design], matched.weight[out.found])
         pulls.append((out.vector - off) / np.sqrt(np.einsum("nii->ni", out.covariance)))
     assert 0.95 < np.sqrt(np.mean(np.square(np.concatenate(pulls)))) < 1.05  # some 950 numbers: 2.3 %
 

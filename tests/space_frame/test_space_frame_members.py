@@ -163,6 +163,5 @@ def test_tubes_of_other_radii_are_measured(radius):
     points, station = frame_clouds.scanned(frame, rng, radius=radius, ball_radius=110.0, per_tube=600)
     nodes, tubes = find(InMemory(points, station, STATIONS))
     matched(nodes, frame.nodes)
-    assert np.median(tubes.radii) == pytest.approx(
-        radius, abs=0.3
-    )  # a tube of 2400 points of 2 mm: 0.1 mm, less in the median of 40
+    # A tube of 2400 points of 2 mm: 0.1 mm, less in the median of 40.
+    assert np.median(tubes.radii) == pytest.approx(radius, abs=0.3)

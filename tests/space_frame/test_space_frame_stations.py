@@ -290,9 +290,8 @@ def test_a_wrong_control_point_is_left_out_and_named():
         assert wrong.control_used.tolist() == [1, 1, 1, 1, 0, 0, 1, 1, 1, 1]
         assert left_out(wrong) == [("spheres.control-left-out", "T2", None)]
         np.testing.assert_allclose(wrong.T_project_station, good.T_project_station, atol=ROUNDING)
-        np.testing.assert_allclose(
-            wrong.control_off[4:6], np.tile(off[2], (2, 1)), atol=3.0
-        )  # of 0.5 and 0.3 mm and the datum's
+        # Of 0.5 and 0.3 mm and the datum's.
+        np.testing.assert_allclose(wrong.control_off[4:6], np.tile(off[2], (2, 1)), atol=3.0)
 
 
 @pytest.mark.parametrize("sightings", [2, 4])

@@ -61,9 +61,8 @@ def test_principal_axes_of_any_matrix():
             M = Q @ np.diag(scale) @ Q.T
             first, second, *axis = voxel_linearity.principal(M[0, 0], M[1, 1], M[2, 2], M[0, 1], M[0, 2], M[1, 2])
             values = np.linalg.eigvalsh(M)
-            assert (first, second) == pytest.approx(
-                (values[2], values[1]), abs=1e-7
-            )  # a closed form: roots of rounding
+            # A closed form: roots of rounding.
+            assert (first, second) == pytest.approx((values[2], values[1]), abs=1e-7)
             assert np.linalg.norm(axis) == pytest.approx(1.0)
             if scale[1] < 0.5 < scale[0]:
                 # As above.

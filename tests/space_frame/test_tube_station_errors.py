@@ -54,9 +54,8 @@ def fitted_radius_change(places, rng):
 def test_radius_changes_by_an_offset_of_ranges_as_a_fit_to_moved_points_does(places):
     one = stations(places, np.zeros((7 * len(places),) * 2), shared_offset=OFFSET)
     sd = float(np.sqrt(station_error_propagation.of_radii(tube(), one)[0]))
-    assert sd == pytest.approx(
-        abs(fitted_radius_change(places, np.random.default_rng(1))), rel=0.02
-    )  # rays that are not quite parallel
+    # Rays that are not quite parallel.
+    assert sd == pytest.approx(abs(fitted_radius_change(places, np.random.default_rng(1))), rel=0.02)
 
 
 def test_a_tube_seen_from_one_side_keeps_its_radius():

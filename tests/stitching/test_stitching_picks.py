@@ -14,6 +14,7 @@ from processor.stitching import three_point
 from processor.stitching.coarse import pairwise
 from processor.stitching.common_point_checks import UnitSlip
 from tests.support.clouds.stitch_clouds import four, pose
+from tests.support.results.reasons import codes
 from tests.support.scenes.picked_networks import network
 from tests.support.scenes.stitched_rooms import STEP_MRAD, errors
 
@@ -21,10 +22,6 @@ ROUNDING_MM = 1e-9  # at 40 km float64 is 7e-12 mm; it goes through some tens of
 SCALES = {"stitch.scale", "stitch.scale-by-blunder", "stitch.scale-of-units"}
 BLUNDERS = {"stitch.scale-by-blunder", "stitch.picks-scatter"}
 CORNERS = np.array([[0.0, 0.0, 0.0], [9000.0, 0.0, 500.0], [2000.0, 7000.0, 4000.0], [8000.0, 6000.0, 100.0]])
-
-
-def codes(reasons):
-    return [reason.code for reason in reasons]
 
 
 def of_pairs(result):
@@ -191,9 +188,8 @@ def test_automatic_accepts_a_pose_by_picks(monkeypatch):
     scene = Scene("room", "structure", scans[:2])
     assert stitching_step.run(scene, stitching_step.Params()).scans.status[1] == "failed"
     result = stitching_step.run(dataclasses.replace(scene, picks=picks), stitching_step.Params())
-    assert (
-        np.abs(errors(result.scans.T_project_scan, T[:2])[0]).max() < 0.3
-    )  # as by a search, whose ten seeds give 0.21
+    # As by a search, whose ten seeds give 0.21.
+    assert np.abs(errors(result.scans.T_project_scan, T[:2])[0]).max() < 0.3
 
 
 @pytest.mark.parametrize("scale", ["fixed", "free"])
@@ -262,7 +258,7 @@ def test_a_scan_that_cannot_be_placed_has_a_reason():
     scene = dataclasses.replace(scene, scans=(*scene.scans, lone), picks=few)
     result = picked(scene)
     assert result.scans.status[4:] == ("failed", "failed")
-    assert codes(result.scans.reasons[4]) == ["stitch.too-few-picks"]
+    assert [one.code for one in result.scans.reasons[4]] == ["stitch.too-few-picks"]
     shortages = result.scans.reasons[4][0].values["shortages"]
     assert [(one.values["scan"], one.values["shortage"].code) for one in shortages] == [
         ("S1", "stitch.few-points"), ("S4", "stitch.few-points"),

@@ -27,10 +27,6 @@ def _kinds(hint):
     return [kind for kind in parts if isinstance(kind, type) and issubclass(kind, Checked)]
 
 
-def _is_number(field, hint):
-    return ("shape" in field.metadata and field.metadata["dtype"] is not np.bool_) or hint in (int, float)
-
-
 def filled(kind):
     """A record of a kind with two rows in every table, all of it possible; optional records are there too."""
     hints, values = typing.get_type_hints(kind), {}
@@ -101,7 +97,7 @@ def fields_of(record, path=()):
             yield from fields_of(value, (*path, field.name))
         elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
             yield from fields_of(value[-1], (*path, field.name, str(len(value) - 1)))
-        elif _is_number(field, hints[field.name]):
+        elif field.metadata.get("dtype", np.bool_) is not np.bool_ or hints[field.name] in (int, float):
             yield (*path, field.name), field, value
 
 

@@ -35,16 +35,10 @@ COMPONENTS = (
 RESULT = Result(status=Status.PARTIAL, method="default", reasons=(), components=COMPONENTS)
 
 
-@pytest.fixture
-def results_file(tmp_path):
-    path = tmp_path / "results.h5"
-    store.write_results(path, (StepRun("inspect", "default", "{}", RESULT),), {})
-    return path
-
-
-def test_components_of_a_results_file_are_tables_and_come_back(results_file):
-    assert_equal(store.read_results(results_file, {"inspect": Result})[0].result, RESULT)
-    with h5py.File(results_file) as file:
+def test_components_of_a_results_file_are_tables_and_come_back(tmp_path):
+    store.write_results(tmp_path / "results.h5", (StepRun("inspect", "default", "{}", RESULT),), {})
+    assert_equal(store.read_results(tmp_path / "results.h5", {"inspect": Result})[0].result, RESULT)
+    with h5py.File(tmp_path / "results.h5") as file:
         components = file["results/0000/result/components"]
         assert list(components["name"].asstr()) == ["B1", "B2", "B3"]
         assert components["characteristics_rows"][:].tolist() == [2, 0, 1]

@@ -83,9 +83,8 @@ def test_a_free_radius_is_found_too(roof):
     found = fit_spheres(source, nodes, tubes, ball_catalogue.of_radii([]))
     good = np.array(found.flag) == "ok"
     assert good.sum() >= 9
-    assert (
-        np.abs((found.radii - radii) / np.sqrt(found.covariance[:, 3, 3]))[good].max() < 4.0
-    )  # of twelve: one in a thousand
+    # Of twelve: one in a thousand.
+    assert np.abs((found.radii - radii) / np.sqrt(found.covariance[:, 3, 3]))[good].max() < 4.0
     assert np.abs(off_lowest(found, roof))[good].max() < FREE_MM
 
 
