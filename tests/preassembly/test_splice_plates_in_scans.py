@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 
-from designgen.scenes import make as scenes
 from processor.geometry import rigid
 from processor.model import Scan, Status
 from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import EndPlace, joint_frame
 from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import attitude, beyond_ends, measure
-from tests.support.made import made
 from tests.support.results.reasons import codes
 from tests.support.scenes import known_attitudes
+from tests.support.scenes.bolted_girders import bolted_girders
 
 HALF = np.array([0.0, 210.0, 300.0])
 REACH, WIDTH, PLATE = 180.0, 200.0, 12.0  # of the splice plates, along from the joint, across, and their thickness
@@ -72,16 +71,7 @@ def test_what_a_part_rests_on_is_no_splice_plate(seed):
 
 
 def test_a_girder_scanned_with_its_splice_plates_has_no_key_points(monkeypatch):
-    recipe = {
-        "kind": "assembly",
-        "assembly": {
-            "type": "row", "section": "i", "parts": 2, "length_mm": 1400.0, "width_mm": 420.0, "height_mm": 600.0,
-            "flange_mm": 20.0, "web_mm": 12.0,
-        },
-        "bolts": {},
-        "scan": {"mode": "surface", "spacing_mm": 8.0, "sigma_mm": 0.5},
-    }  # fmt: skip
-    scene, truth = made(scenes.make, "bolted", recipe, 1)
+    scene, truth, _ = bolted_girders(1, {"spacing_mm": 8.0, "sigma_mm": 0.5})
     monkeypatch.setattr(attitude, "find", known_attitudes.find_by(truth))
     rng, frame, first = np.random.default_rng(1), joint_frame(scene.arch.joint_points[0]), scene.scans[0]
     T = rigid.invert(frame) @ truth.arch.T_bridge_scan[0]

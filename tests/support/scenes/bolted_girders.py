@@ -5,9 +5,11 @@ import numpy as np
 from designgen.designs import bolt_holes, girder_assemblies
 from designgen.scenes import make as scenes
 
-SIZES = girder_assemblies.Params(
-    type="row", section="i", parts=2, length_mm=1400.0, width_mm=420.0, height_mm=600.0, flange_mm=20.0, web_mm=12.0
-)
+ROW = {
+    "type": "row", "section": "i", "parts": 2, "length_mm": 1400.0, "width_mm": 420.0, "height_mm": 600.0,
+    "flange_mm": 20.0, "web_mm": 12.0,
+}  # fmt: skip
+SIZES = girder_assemblies.Params(**ROW)
 BOLTS = bolt_holes.Params()
 HOLES = 12  # of a girder's end: 24 a joint
 QUIET = {
@@ -23,14 +25,11 @@ def bolted_girders(seed, scan, mode="surface", hole_mm=1.0, bolts=True):
     """Scene and truth of a row of two girders, and by how much each hole (12, 3) of a part was drilled off, mm."""
     recipe = {
         "kind": "assembly",
-        "assembly": {
-            "type": "row", "section": "i", "parts": 2, "length_mm": 1400.0, "width_mm": 420.0, "height_mm": 600.0,
-            "flange_mm": 20.0, "web_mm": 12.0,
-        },
+        "assembly": ROW,
         **({"bolts": {}} if bolts else {}),
         "asbuilt": {"hole_mm": hole_mm},
         "scan": {"mode": mode, **scan},
-    }  # fmt: skip
+    }
     if mode == "rays":
         recipe["scanner"] = {"noise_mm": 0.0}
     scene, truth = scenes.make("bolted", recipe, seed)
