@@ -539,7 +539,6 @@ def test_limits_of_components_are_read(tmp_path):
     ("text", "said"),
     [
         ('standard = "GB50205"', r"unknown standard 'GB50205' \(did you mean 'GB 50205-2020'\?\)"),
-        ('standard = "jgj 7"', "did you mean 'JGJ 7-2010'"),
         ("deviation = [-1, 1]", "unknown key 'deviation' .did you mean 'deviation_mm'.*; known are standard, root_g"),
         (
             "deviation_mm = [3, -3]",
@@ -548,13 +547,9 @@ def test_limits_of_components_are_read(tmp_path):
         ("deviation_mm = 3", "expected numbers of shape 2 as 'deviation_mm'"),
         ("deviation_mm = [-1, 1]\ndeviation_share = 95", "expected a share above 0, at most 1.*95 % is 0.95"),
         ("deviation_share = 0.95", "deviation_share is the share of points that keep deviation_mm; give that"),
-        ("crack_area_mm2 = -1", "expected a number of 0 or more as 'crack_area_mm2'"),
-        ("cracks_area_mm2 = 1", "did you mean 'crack_area_mm2'"),
         ('[[tolerance.component]]\nname = "a"\nspan_mm = [-1, 1]', "component 1: unknown key 'span_mm'"),
         ("[[tolerance.component]]\ndeviation_mm = [-1, 1]", "expected a text as 'name', found nothing"),
         ("misalignment_mm = [0, 2]", "expected a number above 0 as 'misalignment_mm', found a list"),
-        ("root_gap_mm = 'no'", "expected a finite number as 'root_gap_mm'"),
-        ("standard = 5", "expected a text as 'standard'"),
     ],
 )
 def test_mistyped_limits_are_refused_in_one_line(tmp_path, text, said):

@@ -58,7 +58,6 @@ def test_measures_are_those_that_the_steps_give():
 @pytest.mark.parametrize(
     ("key", "value", "like"),
     [
-        ("measure", "part twsit", "part twist"),
         ("measure", "support_hieght", "support_height"),
         ("of", "lenght", "length"),
         ("rule", "smaler", "smaller"),

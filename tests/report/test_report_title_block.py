@@ -85,7 +85,6 @@ def bad_logos():
     """Files that are no logo, by their names."""
     return {
         "half.png": picture(size=(400, 400))[:-300],
-        "logo.gif": picture("GIF"),
         "logo.svg": b"<svg xmlns='http://www.w3.org/2000/svg'><script>alert(1)</script></svg>",
         "large.png": picture(size=(3000, 2000)),
         "long.png": picture() + bytes(1_000_000),
@@ -97,7 +96,6 @@ def bad_logos():
     [
         ("report = 3", "expected a table"),
         ("[report]\nproject = true", "expected a text, number or date as 'project', found true or false"),
-        ("[report]\nproject = ['a']", "found a list"),
         ("[report]\n'' = 'a'", "expected keys of 1 to 40 characters"),
         (f"[report]\nproject = '{'a' * 201}'", "expected at most 200 characters as 'project', found 201"),
         ("[report]\n" + "\n".join(f"k{i} = 1" for i in range(31)), "expected at most 30 keys, found 31"),
@@ -105,7 +103,6 @@ def bad_logos():
         ("[report]\nlogo = '../logo.png'", "leads out of the folder"),
         ("[report]\nlogo = 'scan.xyz'", "expected a picture in PNG or JPEG, found a file that is none"),
         ("[report]\nlogo = 'half.png'", "expected a picture in PNG or JPEG, found a file that is none, or is damaged"),
-        ("[report]\nlogo = 'logo.gif'", "expected a picture in PNG or JPEG"),
         ("[report]\nlogo = 'logo.svg'", "expected a picture in PNG or JPEG"),
         ("[report]\nlogo = 'large.png'", "3000 x 2000 pixels, more than"),
         ("[report]\nlogo = 'long.png'", "expected a logo of at most 1000000 bytes"),
