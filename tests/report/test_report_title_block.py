@@ -100,7 +100,6 @@ def bad_logos():
         (f"[report]\nproject = '{'a' * 201}'", "expected at most 200 characters as 'project', found 201"),
         ("[report]\n" + "\n".join(f"k{i} = 1" for i in range(31)), "expected at most 30 keys, found 31"),
         ("[report]\nlogo = 'none.png'", "there is no file 'none.png'"),
-        ("[report]\nlogo = '../logo.png'", "leads out of the folder"),
         ("[report]\nlogo = 'scan.xyz'", "expected a picture in PNG or JPEG, found a file that is none"),
         ("[report]\nlogo = 'half.png'", "expected a picture in PNG or JPEG, found a file that is none, or is damaged"),
         ("[report]\nlogo = 'logo.svg'", "expected a picture in PNG or JPEG"),

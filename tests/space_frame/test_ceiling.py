@@ -232,10 +232,7 @@ def test_a_surface_is_read_in_the_units_of_the_project(tmp_path):
         ("level = 1.0\nclearance_mm = -1", "of 0 or more as 'clearance_mm', found -1"),
         ("level = 1.0\nclearance_mm = 50\nhanger_longest_mm = 40", "'hanger_longest_mm' above it"),
         ("level = 1.0\nlongest_mm = 40", "did you mean 'hanger_longest_mm'"),
-        ('surface = "../x.ply"', "leads out of the folder"),
         ('surface = "none.ply"', "there is no file"),
-        ("level = 1.0\nlevle = 2", "unknown key 'levle'"),
-        ('level = "low"', "expected a finite number as 'level'"),
     ],
 )
 def test_a_ceiling_that_makes_no_sense_is_refused(tmp_path, text, said):

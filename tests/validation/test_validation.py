@@ -71,6 +71,9 @@ def test_key_of_a_cell_depends_on_all_settings_but_methods(tmp_path):
     assert validation_nights.case(methods=("ray", "ransac")).key == one.key  # its figures stay comparable
 
 
+CELL = '[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\n'
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -80,27 +83,19 @@ def test_key_of_a_cell_depends_on_all_settings_but_methods(tmp_path):
         ('[[cell]]\nsteps = ["spheres"]', "recipe = a name"),
         ("cell = []", "at least one"),
         ('[[cell]]\nrecipe = "frame-small"\nsteps = []', "names of those to run"),
-        ('[[cell]]\nrecipe = "a"\nsteps = ["spheres"]\nfresh = -1', "from 0 to 10000 as 'fresh', found -1"),
-        ('[[cell]]\nrecipe = "a"\nsteps = ["spheres"]\nfull = 1', "true or false"),
-        ('[[cell]]\nrecipe = "a"\nsteps = ["spheres"]\nset = 1', "a table as 'set'"),
+        (CELL + "fresh = -1", "from 0 to 10000 as 'fresh', found -1"),
         ('[[cell]]\nrecipe = "frame-small"', "names of those to run"),
-        (
-            '[[cell]]\nrecipe = "frame-small"\nsteps = ["stich"]',
-            r"cell 1: no step 'stich' \(did you mean 'stitch'\?\); there are",
-        ),
-        ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nmethods = ["magic"]', "no method 'magic'"),
-        ('[[cell]]\nrecipe = "nothing"\nsteps = ["spheres"]', "no recipe 'nothing'"),
-        ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nseeds = [-1]', "whole numbers from 0"),
-        ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nset."a.b" = []', "list of values is empty"),
-        ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nparams.spheres.x = 1', "spheres.x: unknown parameter"),
-        ('[[cell]]\nrecipe = "a"\ngenerator = "b"\nsteps = ["spheres"]', "exclude each other"),
+        (CELL.replace("spheres", "stich"), r"cell 1: no step 'stich' \(did you mean 'stitch'\?\); there are"),
+        (CELL + 'methods = ["magic"]', "no method 'magic'"),
+        (CELL.replace("frame-small", "nothing"), "no recipe 'nothing'"),
+        (CELL + "seeds = [-1]", "whole numbers from 0"),
+        (CELL + 'set."a.b" = []', "list of values is empty"),
+        (CELL + "params.spheres.x = 1", "spheres.x: unknown parameter"),
+        (CELL + 'generator = "b"', "exclude each other"),
         ('[[cell]]\ngenerator = "nothing"\nsteps = ["spheres"]', "no generator 'nothing'"),
-        (
-            'coverage.least = "few"\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]',
-            "a whole number as 'least', found 'few'",
-        ),
-        ('aim = 1\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]', "low, high or a number as 'aim', found 1"),
-        ('aim.x = "up"\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]', "low, high or a number"),
+        (f'coverage.least = "few"\n{CELL}', "a whole number as 'least', found 'few'"),
+        (f"aim = 1\n{CELL}", "low, high or a number as 'aim', found 1"),
+        (f'aim.x = "up"\n{CELL}', "low, high or a number"),
     ],
 )
 def test_mistakes_in_a_matrix_are_refused_by_name(tmp_path, text, said):
