@@ -20,6 +20,9 @@ Most of such a field is a shift and a change of radius, which no residual of one
 the field is. Its variance has the prior of the scanner's class, and the likelihood of the residuals with the states of
 all balls eliminated (restricted likelihood, Patterson and Thompson 1971). The posterior mean of the variance is used.
 It includes the uncertainty of the variance, which is large with few views, as in Student's t.
+
+A ball may also have errors of its own: it was fitted with a wrong size, or something touches it. Such balls are found
+as those of a mixture, have their own variance, and do not show the field.
 """
 
 from __future__ import annotations
@@ -50,6 +53,7 @@ MODES, TAKEN_UP = 16, 4
 # Combinations of modes that only few points at the edge of the visible surface determine are left out.
 LEAST_INFORMATION = 0.02
 SD_MM = np.geomspace(0.01, 5.0, 40)  # a smaller field is negligible, a larger one occurs in no registered cloud
+ODD = 0.01  # chosen: share of balls with errors of their own; gross ones are found at five times more or less
 LENGTHS_MM = np.array([1e3, 2e3, 4e3, 8e3, 16e3, 32e3, np.inf])  # stations are metres to tens of metres away
 
 
@@ -82,11 +86,17 @@ def view_errors(
             found[k] = fit
             seen[fit.cells] += fit.counts
     rows = [k for k, fit in found.items() if len(fit.cells) >= LEAST_CELLS and fit.counts.sum() >= LEAST_POINTS]
-    sampled = _neighbours(rows, places)
-    field = estimate_field([_residuals(found[k], places[k]) for k in sampled])
+    residuals = {k: _residuals(found[k], places[k]) for k in rows}
+    own_variance = np.zeros(len(places))
+    own_variance[rows] = odd_variances(list(residuals.values()))
+    sampled = _neighbours([k for k in rows if not own_variance[k]], places)
+    field = estimate_field([residuals[k] for k in sampled])
     cosines = _mean_cosines(seen)
     offset_sd, beam_sd = _offset_or_beam(list(found.values()), cosines, radius_offset, field.variance)
     shared, own = _of_spheres(found, field, cosines, places, offset_sd, beam_sd)
+    for k in np.flatnonzero(own_variance).tolist():
+        change = found[k].gain @ modes()[found[k].cells]
+        own[k] += own_variance[k] * change @ change.T
     between = field.correlation(cdist(places[sampled], places[sampled])).mean() if sampled else 0.0
     return ViewErrors(
         covariance=own + shared @ np.swapaxes(shared, 1, 2),
@@ -302,9 +312,7 @@ def modes() -> Floats:
 
 def estimate_field(balls: list[BallResiduals]) -> ViewField:
     """Estimate the field's variance and lengths, by the residuals of balls and the scanner's class."""
-    # Equal probability for equal ratios, to the class's error of a view; beyond it less, as of a Cauchy distribution.
-    prior = -np.log1p((SD_MM / VIEW_SD_MM) ** 2)
-    log_probability = np.tile(prior, (len(LENGTHS_MM), 1))
+    log_probability = np.tile(_log_prior(), (len(LENGTHS_MM), 1))
     known = [(ball.place, score) for ball in balls if (score := _score(ball)) is not None]
     if known:
         y, H = np.concatenate([y for _, (y, _) in known]), np.concatenate([H for _, (_, H) in known])
@@ -313,13 +321,42 @@ def estimate_field(balls: list[BallResiduals]) -> ViewField:
         distance = np.linalg.norm(places[:, None] - places[None], axis=2)[np.ix_(row, row)]
         product = H @ H.T
         for i, length in enumerate(LENGTHS_MM):
-            values, vectors = np.linalg.eigh(product * np.exp(-distance / length))
-            variances = 1.0 + SD_MM[:, None] ** 2 * np.maximum(values, 0.0)
-            log_probability[i] -= 0.5 * np.sum(np.log(variances) + (vectors.T @ y) ** 2 / variances, axis=1)
+            log_probability[i] += _log_likelihood(y, product * np.exp(-distance / length))
     probability = np.exp(log_probability - log_probability.max())
     by_length = (probability / probability.sum()) @ SD_MM**2
     variance = float(by_length.sum())
     return ViewField(variance, LENGTHS_MM, by_length / variance)
+
+
+def odd_variances(balls: list[BallResiduals]) -> Floats:
+    """Variances (b,), mm^2, of the errors of each ball that has errors of its own; 0 of balls that show the field.
+
+    The likelihood of each ball is that of the field's variance, the same for all, or the mean over all variances.
+    """
+    scores = [_score(ball) for ball in balls]
+    each = np.array([
+        np.zeros(len(SD_MM)) if score is None else _log_likelihood(score[0], score[1] @ score[1].T) for score in scores
+    ]).reshape(-1, len(SD_MM))  # fmt: skip
+    own = np.log(ODD / len(SD_MM)) + np.logaddexp.reduce(each, axis=1)
+    alike = np.log1p(-ODD) + each
+    best = int(np.argmax(_log_prior() + np.logaddexp(alike, own[:, None]).sum(axis=0)))
+    probability = np.exp(each + _log_prior() - (each + _log_prior()).max(axis=1, keepdims=True))
+    variances: Floats = (probability / probability.sum(axis=1, keepdims=True)) @ SD_MM**2
+    return np.where((own > alike[:, best]) & (variances > SD_MM[best] ** 2), variances, 0.0)
+
+
+def _log_prior() -> Floats:
+    """Equal probability for equal ratios, to the class's error of a view; beyond less, as of a Cauchy distribution."""
+    prior: Floats = -np.log1p((SD_MM / VIEW_SD_MM) ** 2)
+    return prior
+
+
+def _log_likelihood(y: Floats, covariance: Floats) -> Floats:
+    """Log likelihood by ``SD_MM`` of whitened residuals y (m,), which a field of unit variance gives a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    variances = 1.0 + SD_MM[:, None] ** 2 * np.maximum(values, 0.0)
+    log: Floats = -0.5 * np.sum(np.log(variances) + (vectors.T @ y) ** 2 / variances, axis=1)
+    return log
 
 
 def _score(ball: BallResiduals) -> tuple[Floats, Floats] | None:
