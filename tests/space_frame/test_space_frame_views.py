@@ -2,12 +2,14 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from processor.space_frame.ball_catalogue import of_radii
-from processor.space_frame.spheres import alternating_fit
+from processor.space_frame.members.records import Members
+from processor.space_frame.spheres import alternating_fit, assessment, records
 from processor.space_frame.spheres.unnamed_view_errors import (
     BallResiduals,
     directions,
@@ -58,6 +60,21 @@ def test_errors_of_views_common_to_all_spheres_are_part_of_the_whole():
     left = found.covariance - shared
     assert (np.linalg.eigvalsh(left).min(axis=1) > 0.0).all()
     assert (shared[:, 2, 2] > 0.2**2 - 1e-9).all()  # 0.2 mm is assumed at least
+    # What is the same for all spheres is a part of that.
+    assert (np.linalg.eigvalsh(shared - found.views.of_all) > -1e-9).all()
+    assert (found.views.of_all[:, 2, 2] > 0.2**2 - 1e-9).all()
+
+
+def test_an_error_that_all_spheres_share_is_no_doubt_of_one():
+    """Lowest points known to 1 mm: where 0.9 mm of it are common to all spheres, 0.44 mm are left."""
+    numbers = np.zeros((1, 8))
+    numbers[0, records.POINTS], numbers[0, records.SCALE] = 100.0, 1.0
+    fits = SimpleNamespace(numbers=numbers, second=np.array([65.0]))
+    whole, common = np.diag([0.0, 0.0, 1.0, 0.0]), np.diag([0.0, 0.0, 0.9**2, 0.0])
+    state = np.array([0.0, 0.0, 0.0, 60.0])
+    assert assessment._doubts(fits, 0, 100.0, state, whole, whole - common) == []
+    doubts = assessment._doubts(fits, 0, 100.0, state, whole, whole)
+    assert [doubt.code for doubt in doubts] == ["spheres.uncertain-lowest-point"]
 
 
 def test_intervals_of_tubes_of_a_merged_cloud_cover_shifted_views():

@@ -158,6 +158,8 @@ def _assessments(
     axes_known = np.asarray(np.isfinite(nodes.covariance).all(axis=(1, 2)))
     agreement = agreements(fits, nodes, context.radius_sd if sized else np.inf)
     margin = fits.margin
+    # An error that all spheres share is part of the intervals, and no doubt of one of them.
+    own = covariance if context.views is None else covariance - context.views.of_all
     evidence: list[Evidence] = []
     flags: list[Flag] = []
     reasons: list[tuple[Reason, ...]] = []
@@ -169,7 +171,7 @@ def _assessments(
         else:
             fused = axes_known[i] and fits.numbers[i, CENTRE_CHI2] > 0.0
             evidence.append(Evidence.FUSED if fused else Evidence.BALL)
-            doubts = _doubts(fits, i, margin[i], state[i], covariance[i])
+            doubts = _doubts(fits, i, margin[i], state[i], covariance[i], own[i])
             flag, causes = _assessment(
                 doubts, state[i], float(np.sqrt(covariance[i, 3, 3])), fits.sizes[i], nominal[i],
                 bool(agreement[i] < UNLIKELY), context,
@@ -187,10 +189,10 @@ def _without_points(axes: int, axes_known: bool, radius_known: bool) -> tuple[Fl
     return Flag.LOW_CONFIDENCE, (reason("spheres.axes-alone", axes=axes), source)
 
 
-def _doubts(fits: Fits, i: int, margin: float, state: Floats, C: Floats) -> list[Reason]:
-    """Reasons against relying on fit ``i``, from its points alone."""
+def _doubts(fits: Fits, i: int, margin: float, state: Floats, C: Floats, own: Floats) -> list[Reason]:
+    """Reasons against relying on fit ``i``, from its points alone; of its covariance C (4, 4) ``own`` is not shared."""
     n, scale = int(fits.numbers[i, POINTS]), fits.numbers[i, SCALE]
-    lowest_sd = float(np.sqrt(max(C[2, 2] + C[3, 3] - 2.0 * C[2, 3], 0.0)))
+    lowest_sd = float(np.sqrt(max(DOWN @ own @ DOWN, 0.0)))
     doubts: list[Reason] = []
     if n < LEAST_POINTS:
         doubts.append(reason("spheres.few-points", points=n, least=LEAST_POINTS))

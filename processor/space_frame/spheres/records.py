@@ -11,6 +11,7 @@ import numpy.typing as npt
 from processor.model import Checked, Floats, Ints, Reason, column, described, reasons, words
 from processor.space_frame.result import Evidence, Flag
 
+OF_ALL = 5  # first columns of shared changes: a shift along three axes, an offset of ranges, a wide beam
 AMBIGUOUS = 14.0  # in chi-square: below it the runner-up's size is more than a thousandth as likely
 POINTS, CELLS, STATIONS, RMS, SCALE, DEGREES, CENTRE_CHI2, FITTED = range(8)  # columns of ``Fits.numbers``
 
@@ -146,6 +147,12 @@ class ViewErrors:
     common_sd: float
     offset_sd: float
     seen: Floats
+
+    @property
+    def of_all(self) -> Floats:
+        """Covariances (k, 4, 4) by the shift of all views, the offset of all ranges and the width of the beam."""
+        shared = self.shared[:, :, :OF_ALL]
+        return shared @ np.swapaxes(shared, 1, 2)
 
 
 @dataclass(frozen=True)

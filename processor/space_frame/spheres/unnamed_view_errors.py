@@ -39,7 +39,7 @@ from processor.geometry.sphere import BANDS, SECTORS, sphere_cells
 from processor.model import NORMAL_95, Floats, Ints
 from processor.space_frame.members.records import Members
 from processor.space_frame.points.sphere_crops import CropsWithRays
-from processor.space_frame.spheres.records import Fits, Priors, ViewErrors
+from processor.space_frame.spheres.records import OF_ALL, Fits, Priors, ViewErrors
 
 LEAST_POINTS = 30  # of a fit whose residuals are looked at: seven an unknown
 LEAST_CELLS = 8  # of it: twice the unknowns
@@ -220,15 +220,14 @@ def _of_spheres(
     """Return changes (k, 4, q) of states by variates common to all, and the covariance (k, 4, 4) of each by itself."""
     factor, at_knots = modes(), _knots(field, places)
     count, knots = at_knots.shape
-    known = 5
-    shared, own = np.zeros((count, 4, known + factor.shape[1] * knots)), np.zeros((count, 4, 4))
+    shared, own = np.zeros((count, 4, OF_ALL + factor.shape[1] * knots)), np.zeros((count, 4, 4))
     shared[:, :3, :3] = SHIFT_SD_MM * np.eye(3)
     own_share = np.maximum(1.0 - np.sum(at_knots**2, axis=1), 0.0)
     for k, fit in found.items():
         change = np.sqrt(field.variance) * fit.gain @ factor[fit.cells]
         shared[k, :, 3] = -offset_sd * fit.gain @ cosines[fit.cells]
         shared[k, :, 4] = beam_sd * BEAM
-        shared[k, :, known:] = (change[:, :, None] * at_knots[k]).reshape(4, -1)
+        shared[k, :, OF_ALL:] = (change[:, :, None] * at_knots[k]).reshape(4, -1)
         own[k] = own_share[k] * change @ change.T
     # A node that is known from its axes alone was seen by the same views.
     seen = sorted(found)
