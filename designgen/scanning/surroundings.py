@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from designgen.checks import expect
 from designgen.randomness import generator
@@ -21,6 +22,7 @@ KINDS = ("workshop", "site", "room")
 ABOVE_FLOOR_MM = 800.0  # height of a part on trestles
 HIGHEST_TRESTLE_MM = 2_000.0  # chosen: parts lie on some 0.8 m; what stands higher stands on its own
 SCANNER_MM = 400.0  # least height of a scanner above the floor: on a low tripod, which sees below the part
+CLEAR_MM = 1_500.0  # chosen: from a scanner to a person; at 0.5 m he hides an eighth of the turn
 ALBEDO = {"floor": 0.7, "wall": 1.3, "wood": 0.9}  # by the structure's: dusty concrete, paint, boards
 FLAT = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
@@ -160,15 +162,25 @@ def _add_people_and_crates(
     """Add a person and two crates between the box and the stations, which stand on the floor."""
     for name in ("person", "crate", "crate"):
         towards = stations[rng.integers(len(stations)), :2] + rng.normal(0.0, 300.0, 2)
-        # Off the box, and off the scanner
+        # Off the box, and off the scanners: those below a roof stand within its box
         edge = float((box.half[:2] / np.maximum(np.abs(towards), 1.0)).min())
-        x, y = towards * min(1.0, edge + rng.uniform(0.3, 0.6) * max(1.0 - edge, 0.0))
+        at = towards * min(1.0, edge + rng.uniform(0.3, 0.6) * max(1.0 - edge, 0.0))
+        x, y = _clear_of(stations[:, :2], at)
         if name == "crate":
             half = rng.uniform(150.0, 300.0, 3)
             _add_box(builder, box, name, np.array([x, y, floor + half[2]]), half, "wood")
         else:
             clutter.add_bar(builder, name, box.at([x, y, floor]), box.axes[2], 200.0, 1_450.0)
             builder.sphere(-1, name, box.at([x, y, floor + 1_600.0]), 120.0, [])
+
+
+def _clear_of(stations: Floats, at: Floats) -> Floats:
+    """Return a place (2,), or if it is near a station (s, 2) that one of eight about it that is farthest from all."""
+    turn = np.arange(8) * np.pi / 4.0
+    places = np.vstack([at, at + CLEAR_MM * np.column_stack([np.cos(turn), np.sin(turn)])])
+    away = cdist(places, stations).min(axis=1)
+    place: Floats = places[0 if away[0] >= CLEAR_MM else away.argmax()]
+    return place
 
 
 def _add_box(builder: Builder, box: Box, name: str, centre: Floats, half: Floats, like: str = "floor") -> None:
