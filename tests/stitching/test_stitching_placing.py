@@ -204,6 +204,20 @@ def test_scans_of_known_poses_are_searched_no_deeper(monkeypatch):
     assert network.groups({(0, 1): [by_control]}, 3, [0, 1]).tolist() == [0, 0, 1]
 
 
+def test_patches_that_more_scans_look_through_than_see_are_no_evidence():
+    """Of scan 0: seen by all, alone, slid along itself, by all but a wrong scan, and alone with one against it."""
+    matches = np.array([[1, 1, 1], [0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 0]], bool)
+    against = np.array([[0, 0, 0], [0, 1, 1], [0, 1, 1], [0, 0, 1], [0, 1, 0]], float)
+    for undecided, last in ((1.0, False), (3.0, True)):  # less and more than what is sure, a weight of 2
+        weight = np.array([1.0, 1.0, 1.0, 1.0, undecided])
+        some = [SimpleNamespace(patches=SimpleNamespace(weight=weight))] * 4
+        placed = network.Network(some, {}, np.tile(HERE, (4, 1, 1)), [0, 1, 2, 3])
+        with mock.patch.object(
+            network.Network, "compared", lambda self, a, b, T: (matches[:, b - 1], against[:, b - 1])
+        ):
+            assert placed.without_moved(placed.T)[0].tolist() == [True, False, False, True, last]
+
+
 def test_what_moves_between_scans_does_not_contradict_their_poses():
     """A crate stands elsewhere in each of four scans of a room, the others look through its place."""
     T = stitch_clouds.four(step_mrad=200.0)[0]
