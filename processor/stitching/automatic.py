@@ -99,7 +99,7 @@ def stitch(
         solution, blocks = _without_gross_pairs(blocks, solution, gross, reference)
         added, _ = direction_errors.added_covariance(blocks, solution, reference)
     solution = replace(solution, covariance=solution.covariance + added)
-    scores = network.scores(patches, solution.T)
+    scores = network.scores(patches, solution.T, placed.still is not None)
     return RegisteredScans(
         clouds=clouds,
         coarse=coarse,
@@ -120,36 +120,41 @@ def stitch(
 
 
 def _place(patches: list[ScanPatches], params: Params, reference: int, given: Given) -> network.Network:
-    """Find the candidate poses of all pairs and place the scans by them, without what moved between the scans.
+    """Find the candidate poses of all pairs and place the scans by them.
 
-    If the poses near those that are given join all scans, no more is searched for than their quick rivals. Groups of
-    scans that no sure pose joins are searched for one once more, as deeply as would take too long for all
-    pairs: those that a pose has joined meanwhile are left out, and so is what is beyond DEEP_ROUNDS.
+    If scans that all have starts are joined at poses near these, no more is searched for than quick rivals. Groups of
+    scans that no sure pose joins are searched for one once more, as deeply as would take too long for all pairs: those
+    that a pose has joined meanwhile are left out, and so is what is beyond DEEP_ROUNDS. Where no pair is sure even
+    then, something is taken to move between any two scans.
     """
-    known = list(given[1])
-    if len(given[2]) == len(patches):
+    known, starts = list(given[1]), given[2]
+    if len(starts) == len(patches):
         found = _find_candidates(patches, params, given, (pairwise.QUICK,))
-        placed = network.place(patches, found, reference)
-        if not network.groups(placed.candidates, len(patches), known).any():
+        placed = network.place(patches, found, reference, network.nothing_sure(found))
+        if not network.groups(placed.candidates, len(patches), known).any() and all(
+            pairwise.is_beside(rigid.invert(starts[reference]) @ starts[s], placed.T[s], patch)
+            for s, patch in enumerate(patches)
+        ):
             return placed
-    placed = network.place(patches, _find_candidates(patches, params, given), reference)
-    found = dict(placed.candidates)
+    found = _find_candidates(patches, params, given)
+    evidence, is_moved = patches, False
 
     def deeper(key: tuple[int, int]) -> list[ScoredPose]:
-        a, b = (patches[s] if placed.still is None else pairwise.reduced(patches[s], placed.still[s]) for s in key)
-        poses = pairwise.candidate_poses(a, b, _most_tilt(params), [pairwise.DEEP])
+        poses = pairwise.candidate_poses(evidence[key[0]], evidence[key[1]], _most_tilt(params), [pairwise.DEEP])
         sure = [pose for pose in poses if pose.score > pairwise.SURE]
         return sure + found[key] if sure else found[key]
 
     # Scans that follow each other overlap most often: those that lie nearest in the order of the scans come first.
-    todo, searched = sorted(found, key=lambda key: (key[1] - key[0], key)), False
+    todo = sorted(found, key=lambda key: (key[1] - key[0], key))
     for _ in range(DEEP_ROUNDS):
         group = network.groups(found, len(patches), known)
         todo = [key for key in todo if group[key[0]] != group[key[1]]]
         some, todo = todo[:DEEP_PAIRS], todo[DEEP_PAIRS:]
         found |= dict(zip(some, thread_ranges.each(deeper, some), strict=True))
-        searched |= bool(some)
-    return network.place(patches, found, reference) if searched else placed
+        if not is_moved and network.nothing_sure(found):
+            is_moved, placed = True, network.place(patches, found, reference, True)
+            found, evidence = dict(placed.candidates), placed.evidence()
+    return network.place(patches, found, reference, is_moved)
 
 
 def _most_tilt(params: Params) -> float:

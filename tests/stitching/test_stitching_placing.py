@@ -29,18 +29,17 @@ def shift(pose, other=HERE):
 
 
 def scans(count):
-    return [SimpleNamespace(side_mm=700.0, patches=SimpleNamespace(weight=np.ones(3)))] * count
+    return [SimpleNamespace(side_mm=700.0)] * count
 
 
 def placed_and_rated(count, candidates):
-    return network.rated(network.place(scans(count), candidates, 0), 0)
+    return network.rated(network.place(scans(count), candidates, 0, False), 0)
 
 
 @pytest.fixture
 def scored(monkeypatch):
     """Give poses by a function of (network, i, j, pose) for their scores; those within 500 mm are the same."""
     monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: shift(T, S) < 500.0)
-    monkeypatch.setattr(network.Network, "without_moved", lambda self, T: [np.ones(3, bool)] * len(T))
     return lambda score: monkeypatch.setattr(network.Network, "score_beside", score)
 
 
@@ -181,7 +180,7 @@ def test_groups_that_no_sure_pose_joins_are_searched_deeper(monkeypatch):
         return [sure if found else contradicted]
 
     monkeypatch.setattr(pairwise, "candidate_poses", candidates)
-    monkeypatch.setattr(network, "place", lambda scans, found, _: SimpleNamespace(candidates=found, still=None))
+    monkeypatch.setattr(network, "place", lambda scans, found, *_: SimpleNamespace(candidates=found, still=None))
     poses = automatic._place(patches, Params(), 0, ({}, {}, {})).candidates
     assert sorted(deep) == [(0, 2), (0, 3), (1, 2), (1, 3)]
     assert [key for key, (best, *_) in poses.items() if best is sure] == [(0, 1), (1, 2), (2, 3)]
@@ -216,6 +215,8 @@ def test_patches_that_more_scans_look_through_than_see_are_no_evidence():
             network.Network, "compared", lambda self, a, b, T: (matches[:, b - 1], against[:, b - 1])
         ):
             assert placed.without_moved(placed.T)[0].tolist() == [True, False, False, True, last]
+            # Where nothing moves between any two scans
+            assert placed.without_moved(placed.T, False)[0].tolist() == [True, False, True, True, True]
 
 
 def test_what_moves_between_scans_does_not_contradict_their_poses():
@@ -232,7 +233,9 @@ def test_what_moves_between_scans_does_not_contradict_their_poses():
     result = adjusted(T, scans)
     assert set(result.scans.status) == {"ok"}
     every = mock.patch.object(
-        network.Network, "without_moved", lambda self, T: [np.ones(len(one.patches.weight), bool) for one in self.scans]
+        network.Network,
+        "without_moved",
+        lambda self, T, *_: [np.ones(len(one.patches.weight), bool) for one in self.scans],
     )
     with every:
         before = adjusted(T, scans)

@@ -88,13 +88,14 @@ class Network:
             T[s] = pose
         return self.without_moved(T)
 
-    def without_moved(self, T: Floats) -> list[Bools]:
+    def without_moved(self, T: Floats, is_moved: bool = True) -> list[Bools]:
         """Mark the patches of scans at poses T (k, 4, 4) but those of what moved between the scans, and of panes.
 
         A crane or truck is seen at its place by one scan, or by few where it slid along itself, and more others look
         through that place. A scan that is wrong by itself looks through what the majority of the others sees, which
         remains. Of patches that one scan alone saw and one other looked through, either may be wrong: they are left
-        out beside a larger weight of sure ones.
+        out beside a larger weight of sure ones. Unless something ``is_moved`` between any two scans, those alone are
+        left out that one scan saw and two or more look through.
         """
         placed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
         still = []
@@ -105,24 +106,37 @@ class Network:
                 match, against = self.compared(a, b, rigid.invert(T[b]) @ T[a])
                 matches += match
                 refuters += against > 0.0
-            moved = (refuters > 1) & (refuters > matches)
+            moved = (refuters > 1) & (refuters > (matches if is_moved else refuters * (matches > 0)))
             undecided = (refuters == 1) & (matches == 0)
-            if weight[undecided].sum() < weight[moved].sum():
+            if is_moved and weight[undecided].sum() < weight[moved].sum():
                 moved |= undecided
             still.append(~moved)
         return still
+
+    def evidence(self) -> list[ScanPatches]:
+        """Return the scans with the patches that are evidence alone."""
+        return self.scans if self.still is None else [*map(pairwise.reduced, self.scans, self.still)]
 
     def same(self, T: Floats, S: Floats, j: int) -> bool:
         """Return whether two poses of scan j are the same."""
         return pairwise.same(T, S, self.scans[0].side_mm, self.scans[j])
 
 
-def place(scans: list[ScanPatches], candidates: Pairs, reference: int) -> Network:
-    """Place all scans that have candidate poses, without what the poses say has moved between the scans."""
+def nothing_sure(candidates: Pairs) -> bool:
+    """Return whether free space contradicts all poses of all pairs, as where something moves between any two scans.
+
+    Else nothing is taken as moved: in a hall of equal bays scans that lie on each other explain all that tells bays
+    apart as moved, and only that nothing has to move speaks for the right poses.
+    """
+    return not any(pose.score > pairwise.SURE for poses in candidates.values() for pose in poses)
+
+
+def place(scans: list[ScanPatches], candidates: Pairs, reference: int, is_moved: bool) -> Network:
+    """Place all scans that have candidate poses; if something ``is_moved``, without what these poses say it is."""
     network = _placed(Network(scans, candidates, np.full((len(scans), 4, 4), np.nan), []), reference)
-    for _ in range(MOST_PLACINGS):
+    for _ in range(MOST_PLACINGS if is_moved else 0):
         still = network.without_moved(network.T)
-        if all(map(np.array_equal, still, network.still or [np.ones(len(some), bool) for some in still])):
+        if all(map(np.array_equal, still, network.still or map(np.ones_like, still))):
             break
         network = replace(network, still=still)
         found = {
@@ -329,11 +343,14 @@ def groups(candidates: Pairs, count: int, known: list[int]) -> Ints:
     return components(count, *np.reshape(np.array(sure, np.int64), (-1, 2)).T)
 
 
-def scores(scans: list[ScanPatches], T: Floats) -> dict[tuple[int, int], ScoredPose]:
-    """Score the relative poses of all pairs of scans with poses T (k, 4, 4), without what moved between the scans."""
+def scores(scans: list[ScanPatches], T: Floats, is_moved: bool) -> dict[tuple[int, int], ScoredPose]:
+    """Score the relative poses of all pairs of scans with poses T (k, 4, 4), without what moved between the scans.
+
+    Unless something ``is_moved`` between any two of them, this is what one scan alone saw and two or more look through.
+    """
     placed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
     network = Network(scans, {}, T, placed)
-    still = network.without_moved(T)
+    still = network.without_moved(T, is_moved)
     return {(a, b): network.score_beside(a, b, T[b], still) for a, b in itertools.combinations(placed, 2)}
 
 

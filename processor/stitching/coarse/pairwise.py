@@ -169,7 +169,7 @@ def _search(
             a.voters, b.voters, R, a.side_mm, effort.peaks, effort.least_of_best
         )
         found = [(float(v), rigid.transform(R, t)) for t, v in zip(shifts, votes, strict=True)]
-        voted += [one for one in found if start is None or _within(start, one[1], b, START_RAD, START_MM)]
+        voted += [one for one in found if start is None or is_beside(start, one[1], b)]
     voted = sorted(voted, key=lambda pair: -pair[0])[: effort.scored]
     scored = [score_pose(a, b, T, rough=True) for _, T in voted]
     scored.sort(key=lambda pose: -pose.score)
@@ -187,6 +187,11 @@ def _search(
 def same(T: Floats, S: Floats, side_mm: float, b: ScanPatches) -> bool:
     """Return whether two poses of b are the same within SAME_RAD and SAME_SHIFT cubes at the centre of its patches."""
     return _within(T, S, b, SAME_RAD, SAME_SHIFT * side_mm)
+
+
+def is_beside(start: Floats, T: Floats, b: ScanPatches) -> bool:
+    """Return whether a pose of b is as near to a start as starts are taken to be wrong."""
+    return _within(start, T, b, START_RAD, START_MM)
 
 
 def _within(T: Floats, S: Floats, b: ScanPatches, most_rad: float, most_mm: float) -> bool:
