@@ -1,5 +1,6 @@
 """Coarse registration of a scan beside those already placed, with given scores."""
 
+import itertools
 from types import SimpleNamespace
 from unittest import mock
 
@@ -13,7 +14,7 @@ from processor.stitching.coarse import network, pairwise
 from processor.stitching.coarse.pairwise import ScoredPose
 from processor.stitching.fine.pairs_and_loops import Pair
 from processor.stitching.params import Params
-from processor.stitching.planes import free_space
+from processor.stitching.planes import free_space, scan_planes
 from tests.support.clouds import stitch_clouds
 from tests.support.scenes.stitched_rooms import adjusted
 
@@ -219,17 +220,39 @@ def test_patches_that_more_scans_look_through_than_see_are_no_evidence():
             assert placed.without_moved(placed.T, False)[0].tolist() == [True, False, True, True, True]
 
 
-def test_what_moves_between_scans_does_not_contradict_their_poses():
-    """A crate stands elsewhere in each of four scans of a room, the others look through its place."""
+@pytest.fixture(scope="module")
+def with_crates():
+    """Poses and scans of a room, four of it, with a crate that stands elsewhere in each."""
     T = stitch_clouds.four(step_mrad=200.0)[0]
     crates = ((-1500.0, -2500.0), (500.0, 3000.0), (5000.0, 500.0), (2500.0, -3500.0))
-    scans = [
+    return T, [
         stitch_clouds.scan(
             f"S{i + 1}", T[i], i, step_mrad=20.0,
             things=(*stitch_clouds.THINGS, (np.array([x, y, 0.0]), np.array([x + 900.0, y + 900.0, 2200.0]))),
         )
         for i, (x, y) in enumerate(crates)
     ]  # fmt: skip
+
+
+def test_scans_are_joined_without_what_moved(with_crates):
+    """The others look through the place of each crate."""
+    T, scans = with_crates
+    clouds = [scan_planes.extract(scan) for scan in scans]
+    side = pairwise.cube_side(clouds)
+    patches = [pairwise.prepare(cloud, side) for cloud in clouds]
+    poses = {
+        (a, b): [pairwise.score_pose(patches[a], patches[b], rigid.invert(T[a]) @ T[b])]
+        for a, b in itertools.combinations(range(4), 2)
+    }
+    assert network.nothing_sure(poses)
+    placed = network.place(patches, poses, 0, True)
+    assert not network.groups(placed.candidates, 4, []).any()  # sure poses join all
+    assert network.rated(placed, 0).rivalry.max() < network.AMBIGUOUS
+
+
+def test_what_moves_between_scans_does_not_contradict_their_poses(with_crates):
+    """A crate stands elsewhere in each of four scans of a room, the others look through its place."""
+    T, scans = with_crates
     result = adjusted(T, scans)
     assert set(result.scans.status) == {"ok"}
     every = mock.patch.object(

@@ -36,7 +36,7 @@ def unsearched(T):
             found[a, b] = [pairwise.score_pose(patches[a], patches[b], refined)]
         return found
 
-    return mock.patch.object(automatic, "_find_candidates", candidates)
+    return mock.patch.multiple(automatic, _find_candidates=candidates, DEEP_PAIRS=0)
 
 
 def adjusted(T, scans):
