@@ -44,8 +44,8 @@ class CoarsePoses:
 class Network:
     """All scans with the candidate poses of their pairs, and the poses T (k, 4, 4) of those placed so far.
 
-    ``still`` marks the patches of each scan that are evidence; without it all are, under any poses. Comparisons of
-    pairs are cached.
+    ``still`` marks the patches of each scan that are evidence; without it all are, under any poses. Comparisons and
+    scores of pairs are cached.
     """
 
     scans: list[ScanPatches]
@@ -54,6 +54,7 @@ class Network:
     placed: list[int]
     still: list[Bools] | None = None
     cache: dict[tuple[int, int, bytes], tuple[Bools, Floats]] = field(default_factory=dict)
+    scores: dict[tuple[int, int, bytes], ScoredPose] = field(default_factory=dict)  # by all patches
 
     def poses_beside(self, i: int, j: int) -> list[tuple[Floats, float]]:
         """Return the candidate poses of scan j in scan i with their scores, in either order of the pair."""
@@ -70,10 +71,15 @@ class Network:
 
     def score_of(self, a: int, b: int, T_a_b: Floats, still: list[Bools] | None = None) -> ScoredPose:
         """Score a relative pose of two scans, by the patches ``still`` or those of the network."""
+        still = still or self.still
+        if still is None:
+            key = (a, b, T_a_b.tobytes())
+            if key not in self.scores:
+                self.scores[key] = pairwise.score_pose(self.scans[a], self.scans[b], T_a_b)
+            return self.scores[key]
         weights = [self.scans[s].patches.weight for s in (a, b)]
         compared = [self.compared(a, b, rigid.invert(T_a_b)), self.compared(b, a, T_a_b)]
-        still = still or self.still
-        return pairwise.summed(T_a_b, weights, compared, *([] if still is None else [[still[a], still[b]]]))
+        return pairwise.summed(T_a_b, weights, compared, [still[a], still[b]])
 
     def score_beside(self, i: int, j: int, pose: Floats, still: list[Bools] | None = None) -> ScoredPose:
         """Score a pose (4, 4) of scan j beside the placed scan i."""
@@ -220,12 +226,21 @@ def _moves(network: Network, coarse: CoarsePoses, reference: int) -> list[Move]:
 
 def _followers(network: Network, i: int, j: int, M: Floats) -> Move:
     """Return the motion of j by M (4, 4) while i stays, with the scans that follow as the score across rises."""
+    size = len(network.scans)
+    tables = np.zeros((2, size, size, 3))  # before and after, by all patches
+    for a, b in itertools.permutations(network.placed if network.still is None else (), 2):
+        for table, pose in zip(tables, (network.T[b], M @ network.T[b]), strict=True):
+            table[a, b] = _evidence(network.score_beside(a, b, pose))
 
     def ratio(moving: list[int]) -> float:
-        poses = [M @ network.T[s] for s in moving]
         rest = [s for s in network.placed if s not in moving]
-        now = _across(network, rest, moving, [network.T[s] for s in moving], network.still)
-        return _across(network, rest, moving, poses, network.still_with(moving, poses)) / max(now, 1e-12)
+        if network.still is None:
+            now, then = (pairwise.score(*table[np.ix_(rest, moving)].sum(axis=(0, 1))) for table in tables)
+        else:
+            poses = [M @ network.T[s] for s in moving]
+            now = _across(network, rest, moving, [network.T[s] for s in moving], network.still)
+            then = _across(network, rest, moving, poses, network.still_with(moving, poses))
+        return then / max(now, 1e-12)
 
     moving, rest = [j], [s for s in network.placed if s not in (i, j)]
     best = ratio(moving)
@@ -323,14 +338,18 @@ def _across(
     network: Network, rest: list[int], moving: list[int], poses: list[Floats], still: list[Bools] | None
 ) -> float:
     """Return the score of scans ``moving`` at ``poses`` beside others together; 0 if no two of them overlap."""
-    agree, against, total = 0.0, 0.0, 0.0
-    for i, (j, pose) in itertools.product(rest, zip(moving, poses, strict=True)):
-        scored = network.score_beside(i, j, pose, still)
-        against += scored.against + MOVED_SHARE * scored.moved
-        if scored.overlap > LEAST_OVERLAP:
-            agree += scored.agree
-            total += scored.agree / scored.overlap
-    return pairwise.score(agree, against, total)
+    found = [
+        _evidence(network.score_beside(i, j, pose, still))
+        for i, (j, pose) in itertools.product(rest, zip(moving, poses, strict=True))
+    ]
+    return pairwise.score(*np.sum(found, axis=0).tolist())
+
+
+def _evidence(scored: ScoredPose) -> tuple[float, float, float]:
+    """Return what speaks for and against a pose, and the weight of all patches, without support by little overlap."""
+    against = scored.against + MOVED_SHARE * scored.moved
+    supports = scored.overlap > LEAST_OVERLAP
+    return (scored.agree, against, scored.agree / scored.overlap) if supports else (0.0, against, 0.0)
 
 
 def groups(candidates: Pairs, count: int, known: list[int]) -> Ints:
