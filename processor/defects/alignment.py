@@ -19,7 +19,7 @@ from processor.adjustment import robust_least_squares, scanner_class_errors
 from processor.adjustment.body_motions import distance_derivative, transform_about, variances
 from processor.adjustment.elimination import eliminate
 from processor.defects.observations import Pairs
-from processor.defects.surface_charts import CYLINDER, DesignSurface
+from processor.defects.surface_charts import CYLINDER, DesignSurface, chart_of_cells
 from processor.geometry import rigid
 from processor.model import Columns, Floats, Ints
 from processor.robust_statistics import CAUCHY, cauchy, robust_sd
@@ -220,11 +220,6 @@ def corrected_pose(T_design_project: Floats, alignment: Alignment) -> Floats:
     moved = transform_about(alignment.whole, alignment.centre)
     T: Floats = rigid.invert(moved) @ T_design_project
     return T
-
-
-def chart_of_cells(surface: DesignSurface) -> Ints:
-    """Return the chart (cells,) of each cell."""
-    return np.repeat(np.arange(len(surface.charts.kind)), surface.charts.shape.prod(axis=1))
 
 
 def rays_to(points: Floats, positions: Floats) -> Floats:

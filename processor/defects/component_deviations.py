@@ -11,10 +11,10 @@ from scipy.special import chdtrc, ndtr, ndtri
 
 from processor.adjustment import scanner_class_errors
 from processor.defects import shape_models
-from processor.defects.alignment import Alignment, chart_of_cells
+from processor.defects.alignment import Alignment
 from processor.defects.deviation_field import Field, component_of_cells
 from processor.defects.scan_statistic import Levels
-from processor.defects.surface_charts import DesignSurface
+from processor.defects.surface_charts import DesignSurface, chart_of_cells
 from processor.distinct_rows import distinct
 from processor.model import NORMAL_95, Floats, Ints
 

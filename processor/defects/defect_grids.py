@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from processor.defects.alignment import chart_of_cells
 from processor.defects.deviation_field import Field
 from processor.defects.result import Curve, Picture, SurfacePlaces
-from processor.defects.surface_charts import DesignSurface
+from processor.defects.surface_charts import DesignSurface, chart_of_cells
 from processor.model import NORMAL_95, Floats, Ints
 
 MOST_SIDE = 120  # cells of a picture

@@ -156,6 +156,7 @@ def _registered(
         cell = params.cell_mm or observations.fitting_cell(observed, base, CELL_POINTS, CELL_BOUNDS_MM)
         cell = max(cell, float(np.sqrt(base.area_mm2 / MOST_CELLS)))
         surface = surface_charts.gridded(base, cell)
+        observed = observations.without_beside(observed, surface)
         pairs = observations.paired(observed, surface)
         if not params.align:
             aligned = alignment.none(surface, len(observed.stations.names), error_mm)
@@ -191,10 +192,11 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     searched = scan_statistic.widened(residuals, levels)
     finding = scan_statistic.search(searched, surface, levels)
     expected = expected_points.expected(pairs, surface, observed.stations)
-    missing = regions.missing(field, expected.points, surface, alarms_per_mm2)
+    missing = shaded = regions.missing(field, expected.points, surface, alarms_per_mm2)
     if missing:
         expected = expected_points.without_shade(expected, [one.cells for one in missing], surface, observed.stations)
         missing = regions.missing(field, expected.points, surface, alarms_per_mm2)
+    hidden = regions.hidden(expected.hidden | (observed.beside > 0), shaded, missing, field)
     missing += _inferred(scene, registered, field, missing, alarms_per_mm2)
     deviating = regions.of_finding(finding, surface)
     near_mm = max(UNITE_CELLS * surface.charts.cell_mm, UNITE_MM)
@@ -209,6 +211,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
         significant=significant,
         places=[group for group in united if regions.is_significant(group[0], searched, levels)],
         expected=expected.points,
+        hidden=hidden,
         shape_values=shape_values,
         points=measures.points_by_cell(observed, surface, aligned),
     )

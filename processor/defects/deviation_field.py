@@ -11,9 +11,9 @@ from scipy import ndimage
 from processor import tiles
 from processor.adjustment import moderated_variances, view_error_from_opposite_sides
 from processor.adjustment.scanner_class_errors import SURFACE_SD_MM
-from processor.defects.alignment import PAIRS_AT_ONCE, Alignment, chart_of_cells, rays_to, station_variance
+from processor.defects.alignment import PAIRS_AT_ONCE, Alignment, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs
-from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
+from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface, chart_of_cells
 from processor.model import NORMAL_95, Bools, Floats, Ints
 from processor.robust_statistics import robust_sd_about_median
 from processor.views import Views

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from processor.defects.alignment import chart_of_cells
 from processor.defects.observations import CHUNK, Pairs, cells_at
-from processor.defects.surface_charts import GRID_SHARE, DesignSurface
+from processor.defects.surface_charts import GRID_SHARE, DesignSurface, chart_of_cells
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import FacetGrid
 from processor.model import Bools, Floats, Ints
@@ -25,13 +24,14 @@ from processor.views import Views
 LEAST_COS = 0.34  # of incidence
 NEARER_MM = 100.0  # than the surface: an obstacle
 THROUGH_MM = 5.0  # behind a face, from which on a point was measured through it: thinner plates are not looked for
-SHADE_MM = 20.0  # before a face, from which on a point is not of the face: it may be bent, or seen at 70 degrees
+SHADE_MM = 5.0  # before a face, from which on a point is not of the face: four standard deviations of a scanner's noise
 BEFORE_MM = 1.0  # distance of a face of the design that hides a cell
 SEEN_SHARE = 0.5  # of the points expected, up to which a cell may be hidden
 LEAST_POINTS = 1e-6  # expected; less is the rounding of sums
 LEAST_BIN_RAD = 0.003  # 30 mm at 10 m: wider than a beam, narrower than a plate seen from there
 BIN_STEPS = 5.0  # angular steps of a scanner in a bin of directions
 FACE_SHARE = 0.2  # of a face's cells seen by a station, from which on the rest is expected
+SHADED = 0.2  # of the rays to a place, that ended before it: from which on the rest is no evidence
 SHARED_RAYS = 50.0  # of cells together, to know the share of them that is shaded: within 20 %
 CHANCE_SDS = 3.0  # of the difference of two Poisson numbers, up to which it may be by chance
 FEWEST_CELLS = 10  # with points, to estimate the density of points from
@@ -42,11 +42,13 @@ GAP_RAD = 0.5  # of azimuth without returns, that is still within the field of v
 class Expected:
     """Points that each station should have on the cells that it sees, and those measured through cells (cells,).
 
-    ``of_stations`` are the stations' numbers, cells (n,) and numbers of points (n,).
+    ``of_stations`` are the stations' numbers, cells (n,) and numbers of points (n,). ``hidden`` (cells,) are without
+    points and behind something that is not of the design.
     """
 
     of_stations: tuple[tuple[int, Ints, Floats], ...]
     through: Floats
+    hidden: Bools
 
     @property
     def points(self) -> Floats:
@@ -60,21 +62,30 @@ class Expected:
 def expected(pairs: Pairs, surface: DesignSurface, stations: Views) -> Expected:
     """Return the points expected of each station, of the design as scanned: see the head of this file."""
     cells = len(surface.share)
-    parts = []
+    parts, behind = list[tuple[int, Ints, Floats]](), list[tuple[int, Ints]]()
     order = np.argsort(pairs.station, kind="stable")
     for k, rows in enumerate(np.split(order, np.searchsorted(pairs.station[order], np.arange(1, len(stations.names))))):
         if np.isfinite(stations.positions[k]).all() and len(rows):
             count = np.zeros(cells)
             count[pairs.cell[rows]] = (pairs.count + pairs.stray)[rows]
-            parts.append((k, *_of_station(k, stations, count, surface)))
-    counted = np.bincount(pairs.cell, pairs.count + pairs.stray, cells)
-    empty = counted < SEEN_SHARE * Expected(tuple(parts), np.zeros(cells)).points
+            cell, number, obstructed = _of_station(k, stations, count, surface)
+            parts.append((k, cell, number))
+            behind.append((k, obstructed))
+    counted, hidden = np.bincount(pairs.cell, pairs.count + pairs.stray, cells), np.zeros(cells, np.bool_)
+
+    def behind_design(station: int, cell: Ints) -> Ints:
+        starts = surface.centres[cell] + BEFORE_MM * surface.outward[cell]
+        ends = np.repeat(stations.positions[station : station + 1], len(cell), axis=0)
+        return mesh_distance.crossings(surface.sight_grid, starts, ends, True)[0]
+
+    empty = counted < SEEN_SHARE * Expected(tuple(parts), np.zeros(cells), hidden).points
     for k, cell, number in parts:
         rows = np.flatnonzero(empty[cell])
-        starts = surface.centres[cell[rows]] + BEFORE_MM * surface.outward[cell[rows]]
-        ends = np.repeat(stations.positions[k : k + 1], len(rows), axis=0)
-        number[rows[mesh_distance.crossings(surface.sight_grid, starts, ends, True)[0]]] = 0.0
-    return Expected(tuple(parts), _through(counted, surface, stations))
+        number[rows[behind_design(k, cell[rows])]] = 0.0
+    for k, cell in behind:
+        cell = cell[counted[cell] == 0]
+        hidden[np.delete(cell, behind_design(k, cell))] = True
+    return Expected(tuple(parts), _through(counted, surface, stations), hidden)
 
 
 def without_shade(of: Expected, places: list[Ints], surface: DesignSurface, stations: Views) -> Expected:
@@ -91,16 +102,22 @@ def without_shade(of: Expected, places: list[Ints], surface: DesignSurface, stat
         rays[cell] = number
         for crossed in _crossed(k, surface, stations, facets, grid, places):
             shaded += np.bincount(crossed, minlength=len(shaded))
+        shaded[rays == 0.0] = 0.0  # hidden already
+        # Of what hides a place in part, rays may be lost as well: the station does not see it.
+        behind = [one for one in places if shaded[one].sum() > SHADED * rays[one].sum()]
         for chart in touched:
             of_chart = charts.image(rays, chart)
             # Single cells have too few rays for a share of them; what is left by chance is none.
             side = int(np.ceil(np.sqrt(SHARED_RAYS / max(float(of_chart.sum() / max((of_chart > 0.0).sum(), 1)), 1.0))))
-            on_clear = np.where(of_chart > 0.0, charts.image(shaded, chart), 0.0)  # others are hidden already
-            ends, due = (ndimage.uniform_filter(x, side, mode="constant") * side**2 for x in (on_clear, of_chart))
-            left = np.where((ends > 0.5) & (due - ends < CHANCE_SDS * np.sqrt(due + ends)), 0.0, due - ends)
+            of_both = charts.image(shaded, chart), of_chart
+            ends, due = (ndimage.uniform_filter(x, side, mode="constant") * side**2 for x in of_both)
+            by_chance = CHANCE_SDS * np.sqrt(np.maximum(due + ends, 0.0))
+            left = np.where((ends > 0.5) & (due - ends < by_chance), 0.0, due - ends)
             rays[charts.cells(chart)] *= np.clip(left / np.maximum(due, LEAST_POINTS), 0.0, 1.0).ravel()
+        for one in behind:
+            rays[one] = 0.0
         parts.append((k, cell, rays[cell]))
-    return Expected(tuple(parts), of.through)
+    return Expected(tuple(parts), of.through, of.hidden)
 
 
 def _through(counted: Ints, surface: DesignSurface, stations: Views) -> Floats:
@@ -165,10 +182,10 @@ def _towards(rays: Floats, places: list[Floats], cell_mm: float) -> Bools:
     return marked
 
 
-def _of_station(station: int, stations: Views, count: Floats, surface: DesignSurface) -> tuple[Ints, Floats]:
+def _of_station(station: int, stations: Views, count: Floats, surface: DesignSurface) -> tuple[Ints, Floats, Ints]:
     """Return cells (n,) that no scanned obstacle hides from a station, and the numbers (n,) of points expected there.
 
-    ``count`` (cells,) is the number of points that the station has on each cell.
+    Also returns the cells (m,) that one hides. ``count`` (cells,) are the points that the station has on each cell.
     """
     chart, charts = chart_of_cells(surface), len(surface.charts.kind)
     whole = np.bincount(chart, surface.share > 0.5, charts)
@@ -182,13 +199,14 @@ def _of_station(station: int, stations: Views, count: Floats, surface: DesignSur
     angle = surface.share[cell] * surface.charts.cell_mm**2 * cosine / distance**2
     occupied = count[cell] > 0
     if occupied.sum() < FEWEST_CELLS:
-        return np.empty(0, np.int64), np.empty(0)
+        return np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64)
     density = float(np.median(count[cell][occupied] / angle[occupied]))
     bin_rad = max(LEAST_BIN_RAD, BIN_STEPS / np.sqrt(density))
     nearest, inside = _nearest_ranges(station, stations, bin_rad, arm)
     slack = NEARER_MM + 3.0 * bin_rad * distance * np.sqrt(1.0 - cosine**2) / cosine
-    clear = inside & ~(nearest < distance - slack)
-    return cell[clear], density * angle[clear]
+    obstructed = nearest < distance - slack
+    clear = inside & ~obstructed
+    return cell[clear], density * angle[clear], cell[inside & obstructed]
 
 
 def _nearest_ranges(station: int, stations: Views, bin_rad: float, arm: Floats) -> tuple[Floats, Bools]:

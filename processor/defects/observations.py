@@ -7,7 +7,7 @@ Points are passed over in blocks; what is kept of each lies in files beside the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +16,12 @@ from numba import njit
 from processor import large_arrays
 from processor.adjustment import mixed_pixels
 from processor.adjustment.mixed_pixels import Block
-from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
-from processor.geometry import mesh_distance
-from processor.geometry.mesh_distance import FacetGrid
+from processor.defects.surface_charts import CYLINDER, DesignSurface, chart_of_cells, gridded, layout, placed
+from processor.geometry import mesh_bodies, mesh_distance
+from processor.geometry.mesh_distance import FacetGrid, Samples
 from processor.large_arrays import Array, allocate, blocks, in_parts
 from processor.model import Bools, Floats, InputError, Ints, Labels, Scene
+from processor.registration import surface_layers
 from processor.robust_statistics import MAD_TO_SD
 from processor.views import Views, views
 
@@ -31,6 +32,9 @@ LEAST_COS = 0.2  # of incidence: points at a more oblique one are mostly of beam
 GATE_SDS = 4.0  # robust standard deviations from the median of a cell, beyond which a point is stray
 LEAST_GATE_MM = 1.0
 FEWEST_POINTS = 4  # of a cell, for its median to identify stray points
+LAYER_POINTS, LAYER_CELLS = 1_000_000, 2.0  # work; diameter of the circles that a plane is fitted to: 40 points
+PIECE_MM = 150.0  # of faces: half as wide as a board, so that most of those about one are of steel
+ROUND_MM = 20.0  # before a round face: of one that moved by less, stations show different distances at one place
 FEWEST_OF_FACE = 40  # points of a station on a face, for their own robust standard deviation
 
 
@@ -39,7 +43,7 @@ class Observed:
     """Points on the design's faces: the chart, place on it, station and deviation (mm, outward positive) of each.
 
     ``mixed`` marks points whose beams may have hit something before the face as well: they show that something is
-    there, but not where.
+    there, but not where. ``beside`` (cells,) counts those of them that are of what stands against the structure.
     """
 
     chart: Labels
@@ -49,6 +53,7 @@ class Observed:
     mixed: Bools
     stations: Views
     points: int  # of the scene
+    beside: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 @dataclass(frozen=True)
@@ -169,6 +174,29 @@ class _Sights:
             done += len(on)
             smooth = np.where(facet >= 0, self.surface.part_of[facet], -1)
             yield Block(points, station, smooth, np.where(self.used[rows], facet, -1), height)
+
+
+def without_beside(observed: Observed, surface: DesignSurface) -> Observed:
+    """Mark as mixed what stands against the structure, as scaffold and boards do: it hides steel and shows none."""
+    step = max(1, -(-len(observed.chart) // LAYER_POINTS))
+    net = surface if step == 1 else gridded(surface, float(np.sqrt(step)) * surface.charts.cell_mm)
+    on = np.flatnonzero(net.share > 0.0)
+    core = Samples(net.centres[on], net.outward[on], on)
+    body = np.zeros(len(net.charts.kind), np.int64)
+    body[net.chart_of] = mesh_bodies.closed_bodies(net.faces)
+    few = np.arange(0, len(observed.chart), step)
+    few = few[~observed.mixed[few]]
+    feet, normals = placed(net.charts, observed.chart[few], observed.uv[few])
+    of_cell, diameter = body[chart_of_cells(net)[on]], LAYER_CELLS * net.charts.cell_mm
+    layers = surface_layers.of_points(core, of_cell, feet, observed.deviation[few], normals, diameter, PIECE_MM)
+    mixed, beside = allocate(len(observed.chart), dtype=np.bool_), np.zeros(len(surface.share), np.int64)
+    for rows in blocks(len(mixed)):
+        feet, _ = placed(surface.charts, observed.chart[rows], observed.uv[rows])
+        flat, deviation = surface.charts.kind[observed.chart[rows]] != CYLINDER, observed.deviation[rows]
+        off = ~layers.of_structure(feet, deviation) & (flat | (deviation > ROUND_MM))
+        beside += np.bincount(cells_of(observed, surface, rows)[off], minlength=len(beside))
+        mixed[rows] = observed.mixed[rows] | off
+    return replace(observed, mixed=mixed, beside=beside)
 
 
 def _sighted(

@@ -14,11 +14,12 @@ from processor.defects.classification import CRACK_RATIO
 from processor.defects.deviation_field import Field
 from processor.defects.scan_statistic import EIGHT_NEIGHBOURS, Finding, Levels
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
-from processor.model import Floats, Ints
+from processor.model import Bools, Floats, Ints
 
 EMPTY_SHARE = 0.15  # of the points expected, up to which a cell is empty
 LEAST_EXPECTED = 6.0  # points on cells that are judged together: with fewer, cells side by side are empty by chance
 COUNTED_SHARE = 0.5  # of the points expected: scanners return fewer where a surface reflects badly
+TOUCH_CELLS, TOUCHED = 2, 0.1  # about a place, and the share of it there, by which it borders on what is hidden
 LINE_CELLS = 1.6  # distance of a crack's piece from its line
 LINE_REACH = 3.0  # half lengths of a crack, within which further pieces lie
 
@@ -90,6 +91,28 @@ def _empty(count: Floats, expected: Floats) -> npt.NDArray[np.bool_]:
     about = [ndimage.uniform_filter(np.where(possible, x, 0.0), side, mode="constant") for x in (count, expected)]
     empty: npt.NDArray[np.bool_] = possible & (about[0] <= EMPTY_SHARE * about[1])
     return empty
+
+
+def hidden(behind: Bools, shaded: list[Region], missing: list[Region], field: Field) -> Bools:
+    """Return the cells (cells,) that could be examined if nothing stood before them.
+
+    That are cells without points of the structure ``behind`` (cells,) something, and those that seemed missing
+    (``shaded``) and are not, as rays to them ended before.
+    """
+    cells = behind.copy()
+    for way, part in ((True, shaded), (False, missing)):
+        for region in part:
+            cells[region.cells] = way
+    found: Bools = cells & (field.inner > 0.0) & (field.count == 0)
+    return found
+
+
+def touches(rows: Ints, cells: Bools, charts: Charts, chart: int) -> bool:
+    """Return whether a place, ``rows`` of cells of one face, borders on ``cells`` (cells,) by TOUCHED of it or more."""
+    place = np.zeros(tuple(charts.shape[chart]), np.bool_)
+    place.flat[rows - charts.first[chart]] = True
+    about = ndimage.binary_dilation(place, EIGHT_NEIGHBOURS, TOUCH_CELLS)
+    return bool(cells[charts.cells(chart)].reshape(about.shape)[about].mean() >= TOUCHED)
 
 
 def chernoff(mean: float, number: float, *, more: bool) -> float:

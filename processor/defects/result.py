@@ -139,7 +139,9 @@ class Defects(Rows):
     lod95: Floats = column("k", unit="mm", means=AMOUNT)  # of a mean over the defect
     z: Floats = column("k", means=OPEN)  # deviation by its standard deviation
     chance: Floats = column("k", json="by_chance_on_100_m2", means=RATIO)
-    doubtful: npt.NDArray[np.bool_] = column("k", dtype=np.bool_)  # chance above DOUBTFUL, or an ambiguous pose
+    doubtful: npt.NDArray[np.bool_] = column(
+        "k", dtype=np.bool_
+    )  # chance above DOUBTFUL, an ambiguous pose, or hidden beside
     reasons: tuple[tuple[Reason, ...], ...] = reasons("k")
     deflection: tuple[Curve, ...] = ()  # empty curves where a defect has none
 

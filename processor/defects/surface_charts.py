@@ -16,7 +16,7 @@ from numba import njit
 
 from processor.geometry import circle, mesh_bodies, mesh_distance
 from processor.geometry.mesh_distance import FacetGrid, MeshSurface
-from processor.model import Bools, DesignBodies, Floats, Ints
+from processor.model import Bools, DesignBodies, Floats, Ints, Labels
 
 FLAT_COS = np.cos(np.radians(1.0))
 PIECE_COS = np.cos(np.radians(15.0))  # cells of one chart shrink by 3 % at most
@@ -193,6 +193,11 @@ def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:
     return np.stack([local[:, 0], np.where(charts.kind[chart] == CYLINDER, around, local[:, 1])], axis=1)
 
 
+def chart_of_cells(surface: DesignSurface) -> Ints:
+    """Return the chart (cells,) of each cell."""
+    return np.repeat(np.arange(len(surface.charts.kind)), surface.charts.shape.prod(axis=1))
+
+
 def with_components(vertices: Floats, faces: Ints, bodies: DesignBodies | None = None) -> tuple[MeshSurface, Ints]:
     """Prepare a mesh for searches; also the component (f,) of each of its facets, numbered as in the defects' names.
 
@@ -329,23 +334,24 @@ def _longest(corners: Floats, out: Floats) -> Floats:
     return positive
 
 
+def placed(charts: Charts, chart: Ints | Labels, uv: Floats) -> tuple[Floats, Floats]:
+    """Return the places (n, 3) at u, v (n, 2) on charts (n,), and their outward normals (n, 3)."""
+    axes, u, v = charts.axes[chart], uv[:, :1], uv[:, 1:]
+    closed, radius = (charts.kind[chart] == CYLINDER)[:, None], charts.radius[chart][:, None]
+    turn = np.where(closed, v, 0.0) / np.where(closed, radius, 1.0)
+    away = np.sin(turn) * axes[:, 1] + np.cos(turn) * axes[:, 2]  # of a plane its normal
+    places: Floats = charts.origin[chart] + u * axes[:, 0] + np.where(closed, radius * away, v * axes[:, 1])
+    return places, np.where(closed, charts.way[chart][:, None] * away, away)
+
+
 def _cell_places(charts: Charts) -> tuple[Floats, Floats]:
     """Return the middles (cells, 3) of all cells and their outward normals."""
-    centres, outward = [np.empty((0, 3))], [np.empty((0, 3))]
+    parts = [(np.empty((0, 3)), np.empty((0, 3)))]
     for chart in range(len(charts.kind)):
         grid = np.indices(tuple(charts.shape[chart])).reshape(2, -1).T + 0.5
-        u, v = (charts.low[chart] + grid * charts.cell_mm).T
-        axes = charts.axes[chart]
-        if charts.kind[chart] == CYLINDER:
-            turn = v / charts.radius[chart]
-            away = np.outer(np.sin(turn), axes[1]) + np.outer(np.cos(turn), axes[2])
-            centres.append(charts.origin[chart] + np.outer(u, axes[0]) + charts.radius[chart] * away)
-            out = charts.way[chart] * away
-        else:
-            out = np.broadcast_to(axes[2], (len(u), 3))
-            centres.append(charts.origin[chart] + np.outer(u, axes[0]) + np.outer(v, axes[1]))
-        outward.append(out)
-    return np.concatenate(centres), np.concatenate(outward)
+        parts.append(placed(charts, np.full(len(grid), chart), charts.low[chart] + grid * charts.cell_mm))
+    centres, outward = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return centres, outward
 
 
 @njit(cache=True, nogil=True)

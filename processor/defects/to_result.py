@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.defects import classification, defect_grids, measures
+from processor.defects import classification, defect_grids, measures, regions
 from processor.defects.alignment import Alignment
 from processor.defects.classification import Classification
 from processor.defects.component_deviations import (
@@ -40,6 +40,8 @@ SHALLOW_SHARE = 0.1  # of the amplitude of a component's shape, by which the mod
 THROUGH_SHARE = 0.7  # of the points expected on a crack, below which rays went through
 SIDE_SHARE = 0.2  # of a plate's half width, that counts as its side
 HELD_SHARE = 0.2  # of the largest deviation, up to which a side stayed in place
+LEAST_HIDDEN = 0.02  # of what could be examined, that is stated: at edges of the design less is by its cells
+MUCH_HIDDEN = 0.2  # of the cells of a component's shape, from which on what hides them may be a part of it
 STEP_SHARE = 0.02  # of a step's height, above which a place belongs to it
 
 
@@ -56,6 +58,7 @@ class Search:
     significant: dict[int, list[SignificantShape]]
     places: list[list[Region]]
     expected: Floats  # points (cells,)
+    hidden: Bools  # (cells,) by what is not of the structure
     shape_values: Floats
     points: CellPoints
 
@@ -86,6 +89,9 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
     formal = np.sqrt(field.variance[seen]) * search.levels.inflation[0]
     examined = float(surface.share[seen].sum()) * cell**2
     reasons = [reason("defects.examined", examined=examined / 1e6, surface=surface.area_mm2 / 1e6)]
+    hidden = float(surface.share[search.hidden].sum()) * cell**2
+    if hidden > LEAST_HIDDEN * (examined + hidden):
+        reasons.append(reason("defects.hidden", hidden=hidden / 1e6, share=100.0 * hidden / (examined + hidden)))
     if not search.alignment.fitted:
         reasons.append(reason("defects.not-fitted"))
     drawn = [(d.values["centre"], d.cells, d.field, d.component) for d in defects[: params.pictures]]
@@ -119,7 +125,8 @@ def table(rows: Sequence[dict[str, Any]], origin: Floats, doubt: Reason | None =
         return Defects()
     columns: dict[str, Any] = {key: tuple(row[key] for row in rows) for key in rows[0]}
     columns["centre"] = np.array(columns["centre"]) + origin
-    columns["doubtful"] = np.array(columns["chance"]) > DOUBTFUL
+    beside = [any(one.code == "defects.beside" for one in of_row) for of_row in columns["reasons"]]
+    columns["doubtful"] = (np.array(columns["chance"]) > DOUBTFUL) | np.array(beside)
     if doubt is not None:
         columns["doubtful"] = np.ones(len(rows), bool)
         columns["confidence"] = np.minimum(columns["confidence"], classification.COIN)
@@ -219,7 +226,9 @@ def _shape_defect(search: Search, fit: ComponentShape, rows: Ints, judged: Signi
         z=judged.z,
         chance=judged.chance * CHANCE_MM2,
     )
-    seen = rows[(search.field.seen[rows] > 0) & part]
+    seen, hidden = rows[(search.field.seen[rows] > 0) & part], search.hidden[rows]
+    if hidden.sum() > MUCH_HIDDEN * (hidden.sum() + len(seen)):
+        values["reasons"] = (reason("defects.beside"),)
     if kind == "bend" and len(seen):
         along = frame.local(surface.centres[seen])[:, int(judged.shape.at[0])]
         bent = search.residuals.deviation[seen] + value[np.searchsorted(rows, seen)]
@@ -369,6 +378,8 @@ def _place_values(
                 measured, reasons = dataclasses.replace(measured, depth=thickness), (reason("defects.through"),)
         else:
             chosen, measured, reasons = _by_profile(search, region, measured, chosen, assumed, inflation, claimed)
+    if regions.touches(region.cells, search.hidden, surface.charts, region.chart):
+        reasons = (*reasons, reason("defects.beside"))
     return _row_of(measured, chosen, surface.names[component], region, reasons)
 
 

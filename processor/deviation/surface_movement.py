@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from processor import tiles
 from processor.adjustment import mixed_pixels
-from processor.deviation import assignment, station_offsets, surface_layers
+from processor.deviation import assignment, station_offsets
 from processor.deviation.assignment import Aside, OnSurface
 from processor.deviation.local_translation import Movement, PartSums, Translations
 from processor.deviation.station_offsets import OnFaces, OnPieces, Pieces
@@ -24,6 +24,7 @@ from processor.geometry import m3c2, mesh_bodies, mesh_distance
 from processor.geometry.mesh_distance import CurvedFacets, FacetGrid, Samples
 from processor.large_arrays import put_aside, release
 from processor.model import Bools, Columns, Floats, Ints, Labels
+from processor.registration import surface_layers
 from processor.tiles import Shared
 
 LEAST_COS = 0.5  # between the normals at a core point and below a scanned point

@@ -177,7 +177,8 @@ def test_a_step_covers_the_part_of_its_face_beyond_its_edge():
         shape=shape_models.Shape("step", (0, 0.25), np.array([-3.0, 0.0])),  # outward and across
         peak=-3.0, ci95=0.2, volume_ci95=700.0, z=9.0, chance=0.0, margin=9.0,
     )  # fmt: skip
-    search = SimpleNamespace(surface=surface, field=SimpleNamespace(seen=np.ones(len(surface.share))))
+    seen = np.ones(len(surface.share))
+    search = SimpleNamespace(surface=surface, field=SimpleNamespace(seen=seen), hidden=seen < 1.0)
     values = to_result._shape_defect(search, ComponentShape(0, frame, None, None), top.cells, judged).values
     assert values["extent"] == pytest.approx([75.0, 100.0])
     assert values["area_mm2"] == pytest.approx(75.0 * 100.0, rel=0.1)  # whole cells of 20 mm

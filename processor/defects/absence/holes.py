@@ -16,12 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from processor.defects.alignment import chart_of_cells
 from processor.defects.deviation_field import Field
 from processor.defects.places import other_side
 from processor.defects.regions import EMPTY_SHARE, Region, chernoff
 from processor.defects.scan_statistic import EIGHT_NEIGHBOURS
-from processor.defects.surface_charts import PLANE, DesignSurface
+from processor.defects.surface_charts import PLANE, DesignSurface, chart_of_cells
 from processor.geometry import mesh_distance
 from processor.model import Bools, Floats, Ints
 

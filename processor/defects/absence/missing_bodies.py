@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.defects.alignment import chart_of_cells
 from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, cells_of
 from processor.defects.regions import EMPTY_SHARE, Region, chernoff
-from processor.defects.surface_charts import PLANE, DesignSurface
+from processor.defects.surface_charts import PLANE, DesignSurface, chart_of_cells
 from processor.geometry import mesh_bodies, mesh_distance, rigid
 from processor.large_arrays import blocks
 from processor.model import Bools, Floats, Ints

@@ -29,7 +29,11 @@ PART = 0.5  # of the points of the densest layer, that the innermost one has at 
 STEEPEST = 0.1  # slope of steel from its design, one sd; steepest dents have twice that
 CURVATURE = 0.001  # 1 / mm, of a dent 20 mm deep and 600 mm wide: 0.5 * 20 * (pi / 300)**2
 LINKS, REACH = 8, 1.5  # neighbours that a layer may continue to, and how far they are, by the median of the last
-AROUND, PIECE, OTHER_BODY = 24, 3.0, 0.25  # pieces of faces about one, their side in diameters, weight of other bodies
+AROUND, PIECE, OTHER_BODY = (
+    96,
+    3.0,
+    0.05,
+)  # pieces of faces about one, their least side in diameters, weight of other bodies
 AGREES_MM, AGREE = 3.0, 0.1  # of the movement about it, to which a surface agrees; the least share of it that does
 ROUNDS = 20  # work: of least absolute residuals
 
@@ -79,7 +83,15 @@ class _Groups(NamedTuple):
     size: Ints
 
 
-def of_points(core: Samples, body: Ints, feet: Floats, distance: Floats, normals: Floats, diameter_mm: float) -> Layers:
+def of_points(
+    core: Samples,
+    body: Ints,
+    feet: Floats,
+    distance: Floats,
+    normals: Floats,
+    diameter_mm: float,
+    piece_mm: float = 0.0,
+) -> Layers:
     """Find the structure's surface by points with feet (n, 3), distances (n,) and normals (n, 3) of their facets.
 
     ``body`` (k,) is that of each core point.
@@ -95,7 +107,7 @@ def of_points(core: Samples, body: Ints, feet: Floats, distance: Floats, normals
     places, facing, height, slope = places[known], facing[known], height[known], slope[known]
     if not len(height):
         return NO_LAYERS
-    expected, spread = _expected(places, facing, height, body[at][known], PIECE * diameter_mm, noise)
+    expected, spread = _expected(places, facing, height, body[at][known], max(PIECE * diameter_mm, piece_mm), noise)
     off = height - expected
     tree = cKDTree(places)
     surface = _continued(tree, facing, height, slope, noise)
