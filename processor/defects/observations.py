@@ -34,6 +34,7 @@ LEAST_GATE_MM = 1.0
 FEWEST_POINTS = 4  # of a cell, for its median to identify stray points
 LAYER_POINTS, LAYER_CELLS = 1_000_000, 2.0  # work; diameter of the circles that a plane is fitted to: 40 points
 PIECE_MM = 150.0  # of faces: half as wide as a board, so that most of those about one are of steel
+BESIDE_SHARE = 0.1  # of a cell's points, from which on those before the steel are of something
 ROUND_MM = 20.0  # before a round face: of one that moved by less, stations show different distances at one place
 FEWEST_OF_FACE = 40  # points of a station on a face, for their own robust standard deviation
 
@@ -193,9 +194,13 @@ def without_beside(observed: Observed, surface: DesignSurface) -> Observed:
     for rows in blocks(len(mixed)):
         feet, _ = placed(surface.charts, observed.chart[rows], observed.uv[rows])
         flat, deviation = surface.charts.kind[observed.chart[rows]] != CYLINDER, observed.deviation[rows]
-        off = ~layers.of_structure(feet, deviation) & (flat | (deviation > ROUND_MM))
-        beside += np.bincount(cells_of(observed, surface, rows)[off], minlength=len(beside))
-        mixed[rows] = observed.mixed[rows] | off
+        mixed[rows] = ~layers.of_structure(feet, deviation) & (flat | (deviation > ROUND_MM))
+        beside += np.bincount(cells_of(observed, surface, rows)[mixed[rows]], minlength=len(beside))
+    # Less is the tail of noise, which is cut on both sides alike.
+    beside[beside < BESIDE_SHARE * _counts(observed, surface)] = 0
+    for rows in blocks(len(mixed)):
+        mixed[rows] &= beside[cells_of(observed, surface, rows)] > 0
+        mixed[rows] |= observed.mixed[rows]
     return replace(observed, mixed=mixed, beside=beside)
 
 
