@@ -22,6 +22,7 @@ from typing import Any
 import processor
 from processor import diagnostics, user_methods
 from processor.model import InputError, Reason, Scan, Scene, Status, StepRun, UsageError, did_you_mean, inputs, reason
+from processor.model.doubted import doubted
 from processor.progress import stage
 from processor.store import epoch
 from processor.store.json_values import json_ready
@@ -309,7 +310,7 @@ def execute(
         kept: dict[str, dict[str, Any]] = {}
         clouds: list[StepCloud] = []
         digest = store.scene_hash(scene, None if points is None else points.pieces)
-        scene, coincident = _with_points_once(scene, log)
+        scene, remarks, touched = _with_points_once(scene, log)
         scene = _with_targets(scene, log)
         for job in jobs:
             if so_far is not None:
@@ -333,8 +334,9 @@ def execute(
             with diagnostics.recording() as notes:
                 done = _run(path, scene, job, {**given, **needs}, log)
             result = done.result
-            if coincident:
-                result = dataclasses.replace(result, reasons=(*result.reasons, *coincident))
+            if remarks:
+                result = dataclasses.replace(result, reasons=(*result.reasons, *remarks))
+            result = doubted(result) if touched else result
             runs.append(dataclasses.replace(done, result=result, diagnostics=notes.table()))
             clouds += [StepCloud(job.step, job.method, cloud) for cloud in notes.clouds]
             answers.setdefault(job.step, runs[-1].result)
@@ -342,21 +344,24 @@ def execute(
         return dataclasses.replace(whole, clouds=tuple(clouds))
 
 
-def _with_points_once(scene: Scene, log: Callable[[str], None] = lambda _: None) -> tuple[Scene, tuple[Reason, ...]]:
+def _with_points_once(
+    scene: Scene, log: Callable[[str], None] = lambda _: None
+) -> tuple[Scene, tuple[Reason, ...], bool]:
     """Return the scene without coincident points, what was left out, and what software has done to each scan.
 
-    Its hash is that of what was read.
+    The last says whether that is more than any interval holds. The scene's hash is that of what was read.
     """
     from processor import scene_cloud
-    from processor.adjustment.processing.point_processing import recognised, some_places
+    from processor.adjustment.processing.point_processing import recognised
     from processor.language.messages import messages
 
     scene, reasons = scene_cloud.with_points_once(scene)
-    for scan in scene.scans:
-        reasons += recognised(some_places(scan.points)).reasons(scan.name)
+    traces = [recognised(scan.points) for scan in scene.scans]
+    for scan, trace in zip(scene.scans, traces, strict=True):
+        reasons += trace.reasons(scan.name)
     for one in reasons:
         log(messages("en").text(one))
-    return scene, reasons
+    return scene, reasons, any(trace.unbounded for trace in traces)
 
 
 def _with_targets(scene: Scene, log: Callable[[str], None] = lambda _: None) -> Scene:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor import scene_cloud, unit_ratio
+from processor.adjustment.scanner_class_errors import INSTRUMENTS
 from processor.api.argument_checks import (
     MOST_RATIO,
     extent_of,
@@ -97,7 +98,9 @@ class Pose:
     reasons: tuple[Reason, ...] = ()
 
 
-def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.ArrayLike | None = None) -> SphereFit:
+def fit_sphere(
+    points: npt.ArrayLike, radius: float | None = None, scanner: npt.ArrayLike | None = None, instrument: str = ""
+) -> SphereFit:
     """Fit a sphere to the points of one target, some of which may lie on other things.
 
     Spheres through four points, drawn from all, propose the sphere; where it is a small share of the points, patches
@@ -105,7 +108,7 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     ``scanner`` the difference of ranges along the ray, which has no bias where a sphere is partly seen. The covariance
     is that of an M-estimator (Huber and Ronchetti 2009, "Robust Statistics", 2nd ed., Wiley, eq. 6.6), with what
     beams at the limb add, by a second fit (by the other residual, or without the rays near the limb), with what
-    neighbouring points share, and by the class of scanners 0.5 mm of range a view and 0.3 mm of bias by incidence.
+    neighbouring points share, and by the class of the scanner what its ranges have in common, and bias by incidence.
 
     Parameters
     ----------
@@ -113,6 +116,8 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     radius : known radius in mm, held; None = estimated. Where the points have another one the
         covariance of the centre holds its effect; the status is weak if scanners do not explain it.
     scanner : (3,) position of the scanner, or (n, 3) that of each point, in the points' frame; None = unknown.
+    instrument : its class: "phase" (one standard deviation 0.5 mm of range a view and 0.3 mm of bias at 60 degrees of
+        incidence), "pulse" (0.6 and 0.36 mm) or "long-range" (2.5 and 1.5 mm); "" = as of phase.
 
     Returns
     -------
@@ -121,8 +126,11 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     Raises
     ------
     ValueError : wrong shape, NaN, too few points, points that coincide, coordinates that seem to be in metres, a radius
-        that no target has or the cloud cannot hold, a scanner that cannot have measured the points.
+        that no target has or the cloud cannot hold, a scanner that cannot have measured the points, an instrument of
+        no known class.
     """
+    if instrument not in ("", *INSTRUMENTS):
+        raise ValueError(f"instrument: expected one of {', '.join(INSTRUMENTS)}, got {instrument!r}")
     every = points_of(points, "points", LEAST_POINTS)
     cloud, used, coincident = _once(every, "points")
     held = None if radius is None else _radius(radius, extent_of(cloud))
@@ -131,32 +139,30 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     if scanner is not None:
         seen_from = positions_of(scanner, "scanner", every.shape)[used] - origin
         _check_scanner(cloud - origin, seen_from)
-    params = Params(radius_mm=float("nan") if held is None else held, max_balls=1)
+    params = Params(radius_mm=float("nan") if held is None else held, max_balls=1, instrument=instrument)
     measured = _measured(MergedCloud(cloud - origin, origin, seen_from), params, held)
     balls = measured.balls
     if not len(balls):
-        doubt = None if held is None else unit_mistakes.implausible(held)
-        return SphereFit(
-            centre=np.full(3, np.nan),
-            radius=float("nan"),
-            covariance=np.full((4, 4), np.nan),
-            status=Status.FAILED,
-            reasons=(*measured.reasons, *(() if doubt is None else (doubt,)), *coincident),
-            points=0,
-            rms=float("nan"),
-        )
+        return _no_sphere((*measured.reasons, *coincident), held)
     fitted = SphereFit(
         centre=balls.centres[0],
         radius=float(balls.radii[0]),
         covariance=balls.covariance[0],
         status=Status.OK if balls.flag[0] is Flag.OK else Status.WEAK,
-        reasons=(*balls.reasons[0], *coincident),
+        reasons=(*balls.reasons[0], *search_without_design.by_class(params), *coincident),
         points=int(balls.points[0]),
         rms=float(balls.rms[0]),
     )
     if seen_from is not None and fitted.status is Status.OK:
         _check_faces(cloud - fitted.centre, seen_from + origin - fitted.centre, fitted)
     return fitted
+
+
+def _no_sphere(reasons: tuple[Reason, ...], held: float | None) -> SphereFit:
+    doubt = None if held is None else unit_mistakes.implausible(held)
+    nowhere, unknown = np.full(3, np.nan), np.full((4, 4), np.nan)
+    reasons = (*reasons, *(() if doubt is None else (doubt,)))
+    return SphereFit(nowhere, float("nan"), unknown, Status.FAILED, reasons, points=0, rms=float("nan"))
 
 
 def _once(points: Floats, name: str) -> tuple[Floats, Bools | slice, tuple[Reason, ...]]:

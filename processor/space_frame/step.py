@@ -102,8 +102,9 @@ def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
         before = (reason("spheres.no-members"),)
     if not len(result.balls):
         return replace(result, method=params.method, reasons=(*before, *result.reasons))
-    reasons = (*before, *result.reasons, reason("spheres.by-class", sd=scanner_class_errors.VIEW_SD_MM))
     # Those of a search have it already.
+    of_view = scanner_class_errors.of_class(params.instrument if scene.frame is None else "").view_mm
+    reasons = (*before, *result.reasons, reason("spheres.by-class", sd=of_view))
     balls = result.balls if scene.frame is None else _with_class(result.balls)
     return replace(result, method=params.method, reasons=reasons, balls=balls)
 

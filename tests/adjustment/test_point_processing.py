@@ -1,13 +1,19 @@
 """What software has done to points, against the operations themselves: cells, means, copies, rounding by NumPy."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+import processor
 from processor import fit_sphere, pipeline
-from processor.adjustment.processing.point_processing import recognised
+from processor.adjustment.processing.point_processing import Processing, recognised
+from processor.geometry.coincident_points import used_once
 from processor.language.messages import messages
-from processor.model import NORMAL_95, Scan, Scene, Status
+from processor.model import NORMAL_95, Scan, Scene, Status, Verdict
+from processor.model.doubted import doubted
+from processor.space_frame.result import Flag
 
 RADIUS, CENTRE = 75.0, np.array([3210.4, -4127.9, 803.3])
 SEEDS = range(6)
@@ -25,12 +31,6 @@ def ball(seed: int, noise: float = 1.0, count: int = 3000, share: float = 0.3) -
     # A reflection takes the cap's middle to the axis
     normals -= np.outer(normals @ along, along) * 2.0 / (along @ along)
     return CENTRE + RADIUS * normals + noise * rng.normal(size=count)[:, None] * axis
-
-
-def trace_of(points: np.ndarray):
-    away = points - CENTRE
-    distance = np.linalg.norm(away, axis=1)
-    return recognised(points, distance - RADIUS, away / distance[:, None])
 
 
 def in_cells(points: np.ndarray, edge: float, nearest: bool) -> np.ndarray:
@@ -54,42 +54,65 @@ def smoothed(points: np.ndarray, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_points_of_a_scanner_have_no_trace(seed):
-    trace = trace_of(ball(seed))
+    trace = recognised(ball(seed))
     assert trace.reasons("scan") == ()
     assert not trace.cell
-    assert not trace.kernel
+    assert not trace.smoothed
 
 
 @pytest.mark.parametrize("nearest", [False, True])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_edge_of_the_cells_that_hold_one_point(seed, nearest):
-    trace = trace_of(in_cells(ball(seed), 5.0, nearest))
+    trace = recognised(in_cells(ball(seed), 5.0, nearest))
     assert trace.cell == pytest.approx(5.0, rel=0.02)
-    assert not trace.kernel
+    assert not trace.smoothed
     assert [one.code for one in trace.reasons("scan")] == ["points.thinned"]
+
+
+@pytest.mark.parametrize(("noise", "share", "count"), [(0.2, 0.5, 150), (0.5, 0.5, 400), (2.0, 0.15, 1000)])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_balls_of_few_points_are_not_smoothed(seed, noise, share, count):
+    points = ball(seed, noise, count, share)
+    errors = np.linalg.norm(points - CENTRE, axis=1) - RADIUS
+    assert not recognised(points).smoothed
+    assert not recognised(points, errors).smoothed
 
 
 @pytest.mark.parametrize("count", [8, 20])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_means_of_neighbours(seed, count):
-    trace = trace_of(smoothed(ball(seed), count))
-    # Of evenly scattered points: a disc that holds as many, within a factor of two
-    disc = np.sqrt(count * 4.0 * RADIUS**2 * 0.3 / 3000)
-    assert 0.5 * disc < trace.kernel < 2.0 * disc
+    assert recognised(smoothed(ball(seed), count)).smoothed
 
 
 @pytest.mark.parametrize("step", [0.1, 1.0, 5.0])
 def test_step_of_rounded_coordinates(step):
-    trace = trace_of(np.round(ball(1) / step) * step)
+    trace = recognised(np.round(ball(1) / step) * step)
     assert trace.step == pytest.approx(step)
-    assert not trace.kernel
+    assert not trace.smoothed
 
 
-def test_copies_beside_the_points():
+def test_copies_beside_the_points_count_once():
     points = ball(2)
-    trace = trace_of(np.vstack([points, points + 0.01]))
-    assert trace.copies == pytest.approx(1.0)
-    assert not trace.kernel
+    used = used_once(np.vstack([points, points + 0.01]))
+    assert np.mean(used[: len(points)]) > 0.98
+    assert not used[len(points) :].any()
+    assert used_once(points) is None
+
+
+def edges(seed: int) -> np.ndarray:
+    """Points (n, 3), mm, 20 mm apart, of girders of plates 150 mm wide: an edge near most points."""
+    rng = np.random.default_rng(seed)
+    along, across = rng.uniform(0.0, 4000.0, 6000), rng.uniform(-75.0, 75.0, 6000)
+    off, side = 0.8 * rng.normal(size=6000), rng.integers(0, 3, 6000)
+    web, flange = np.stack([along, off, across], axis=1), np.stack([along, across, off + 75.0], axis=1)
+    return np.where((side == 0)[:, None], web, flange - 150.0 * (side == 2)[:, None] * np.array([0.0, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize("seed", SEEDS[:3])
+def test_edges_are_no_smoothing(seed):
+    points = edges(seed)
+    assert recognised(points) == Processing()
+    assert recognised(smoothed(points, 12)).smoothed
 
 
 def test_points_sampled_from_a_mesh():
@@ -104,7 +127,7 @@ def test_points_sampled_from_a_mesh():
     u, v = rng.random((2, 8000, 1))
     flip = u + v > 1.0
     u, v = np.where(flip, 1.0 - u, u), np.where(flip, 1.0 - v, v)
-    trace = trace_of(a + u * (b - a) + v * (c - a))
+    trace = recognised(a + u * (b - a) + v * (c - a))
     assert trace.mesh
     assert [one.code for one in trace.reasons("scan")] == ["points.from-mesh"]
 
@@ -129,13 +152,71 @@ def test_radii_of_thinned_spheres_lie_within_their_intervals():
     assert inside >= 10
 
 
+@pytest.mark.parametrize(("instrument", "least"), [("", 0.5), ("phase", 0.5), ("pulse", 0.6), ("long-range", 2.5)])
+def test_intervals_hold_the_class_of_the_instrument(instrument, least):
+    """The offset of a view moves a ball along the rays by as much; the class that nobody states is said."""
+    fit = fit_sphere(ball(3), radius=RADIUS, instrument=instrument)
+    assert least < np.sqrt(np.trace(fit.covariance[:3, :3])) < 1.5 * least + 0.2
+    assert ("spheres.instrument-assumed" in [one.code for one in fit.reasons]) == (not instrument)
+
+
+def test_an_instrument_of_no_known_class_is_refused():
+    with pytest.raises(ValueError, match="instrument: expected one of phase, pulse, long-range, got 'total station'"):
+        fit_sphere(ball(1), instrument="total station")
+
+
 def test_the_processing_of_every_scan_is_stated_by_a_run():
     """Two planes at an angle, as one scan of a merged scene: cells along the axes of the file."""
     rng = np.random.default_rng(0)
-    flat = np.column_stack([rng.uniform(0.0, 400.0, (20_000, 2)), rng.normal(0.0, 1.0, 20_000)])
+    flat = np.column_stack([rng.uniform(0.0, 400.0, (20_000, 2)), rng.normal(3.0, 1.0, 20_000)])
     tilted = flat @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + 300.0
     points = np.vstack([flat, tilted])
-    for cloud, codes in ((points, []), (in_cells(points, 6.0, nearest=True), ["points.thinned"])):
-        scan = Scan(name="S1", points=cloud)
-        scene = Scene(name="planes", kind="structure", scans=(scan,))
-        assert [one.code for one in pipeline._with_points_once(scene)[1]] == codes
+    for cloud, codes, weak in (
+        (points, [], False),
+        (in_cells(points, 6.0, nearest=True), ["points.thinned"], False),
+        (in_cells(points, 15.0, nearest=False), ["points.thinned"], True),
+        (np.round(points), ["points.rounded"], False),
+        (np.round(points / 5.0) * 5.0, ["points.rounded"], True),
+        (smoothed(points, 10), ["points.smoothed"], True),
+    ):
+        scene = Scene(name="planes", kind="structure", scans=(Scan(name="S1", points=cloud),))
+        _, reasons, touched = pipeline._with_points_once(scene)
+        assert [one.code for one in reasons if one.code != "points.coincident"] == codes
+        assert touched is weak
+
+
+def test_of_a_smoothed_scene_nothing_is_sure_in_any_step():
+    """A ball in a scene of one scan: as found, and as a filter left it."""
+    for cloud, status, flag in (
+        (ball(4), Status.OK, Flag.OK),
+        (smoothed(ball(4), 12), Status.WEAK, Flag.LOW_CONFIDENCE),
+    ):
+        scene = Scene(name="ball", kind="structure", scans=(Scan(name="S1", points=cloud),))
+        [result] = processor.run(scene, steps=["spheres"]).steps.values()
+        assert result.status is status
+        assert result.balls.flag == (flag,)
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    verdict: tuple[Verdict, ...]
+    doubtful: np.ndarray
+    values: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    status: Status
+    table: Table
+    parts: tuple[Status, ...]
+
+
+def test_doubted_results_keep_their_numbers():
+    values = np.arange(3.0)
+    table = Table((Verdict.PASS, Verdict.FAIL, Verdict.NONE), np.array([False, True, False]), values)
+    less = doubted(Answer(Status.OK, table, (Status.OK, Status.FAILED, Status.AMBIGUOUS)))
+    assert less.status is Status.WEAK
+    assert less.parts == (Status.WEAK, Status.FAILED, Status.AMBIGUOUS)
+    assert less.table.verdict == (Verdict.INDETERMINATE, Verdict.INDETERMINATE, Verdict.NONE)
+    assert less.table.doubtful.all()
+    assert less.table.values is values

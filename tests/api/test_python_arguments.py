@@ -73,7 +73,7 @@ def test_a_ball_in_metres_among_clutter_is_weak():
     """The span of the clutter is one that a target in mm may have: the radius that is found shows the unit."""
     clutter = np.random.default_rng(1).uniform(-3000.0, 3000.0, (300, 3))
     cloud = np.vstack([ball(), clutter]) / 1000.0
-    fit = processor.fit_sphere(cloud)
+    fit = processor.fit_sphere(cloud, instrument="phase")
     assert fit.status is Status.WEAK
     assert [one.code for one in fit.reasons] == ["spheres.unit-mistake"]
     with pytest.raises(ValueError, match="span of the points"):

@@ -11,7 +11,7 @@ import designgen
 import processor
 from processor import pipeline
 from processor.geometry import rigid
-from processor.model import InputError, Scene, Status, UsageError, Verdict, reason
+from processor.model import InputError, Scene, Status, UsageError, Verdict
 from processor.space_frame.spheres import search_without_design
 from tests.support.made import made
 from tests.support.solids.meshes import bracket
@@ -90,7 +90,7 @@ def test_a_sphere_that_no_ranges_fit_is_weak(monkeypatch):
     monkeypatch.setattr(search_without_design, "robust_fit", lambda *_: None)
     fit = processor.fit_sphere(seen_by_a_beam(np.random.default_rng(0), 0.0))
     assert fit.status is Status.WEAK
-    assert fit.reasons == (reason("spheres.unknown-side"),)
+    assert [one.code for one in fit.reasons] == ["spheres.unknown-side", "spheres.instrument-assumed"]
 
 
 def test_interval_of_a_sphere_seen_from_all_around_stays_as_it_is():

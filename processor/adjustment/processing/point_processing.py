@@ -5,9 +5,12 @@ Points of a scanner have noise that neighbours do not share, and lie where its r
 - rounding: coordinates are multiples of a step;
 - thinning to one point in each cell, the centroid or the point nearest to the centre: coordinates repeat with the
   edge of a cell in a periodogram, and cells hold one point each, but cells of that size elsewhere hold several;
-- copies beside the points, as of a merge: the nearest neighbour is far nearer than the fourth (Clark and Evans 1954);
 - smoothing: residuals of neighbours differ by less than those of a surface scatter (von Neumann 1941);
 - sampling of a mesh: a point and its nearest neighbours lie in one plane, to the last digits.
+
+Copies of points count once (:mod:`processor.geometry.coincident_points`), and what rounding and thinning leave has
+errors of its own, as the points of a scanner have: no noise law changes. What smoothing and sampling did no residual
+shows: neighbours share their errors, edges are rounded and curved surfaces lie deeper. No interval holds it.
 """
 
 from __future__ import annotations
@@ -18,25 +21,31 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import coincident_points
-from processor.model import Floats, Reason, reason
+from processor.model import Floats, Ints, Reason, reason
 
 FEWEST = 100  # points that show a trace: the ratio of variances of as many is known to 15 %
 LEAST_STEP_MM = 0.05  # of rounding: an sd of 0.014 mm is far below the noise of any scanner
-PLACES, PLACE_POINTS = 4, 2000  # of a cloud where its cells are searched for, 45 cells wide
+# A face along an axis lies off by up to half a step, which more than 1 mm of no interval holds: the class of scanners
+# gives as much as a limit of 95 %. Of bridges whose points are 7 mm apart key points and gaps of cells of 10 mm were
+# within their intervals in 99 and 98 %, of 14 mm in 77 and 58 %: centroids round the edges.
+LARGEST_STEP_MM, LARGEST_CELL_MM = 2.0, 12.0
 FREQUENCIES = (0.25, 1.3)  # of cells, by the median distance of neighbours
 BIN, LEAST_PEAK = 0.125, 4.0  # width of bins in distances of neighbours; power, of which chance has 4 once in 1e5
 PEAKS, STEPS = 3, 7  # frequencies that are tried, and the steps of each about it
 # Shares of points beside others in their cells, and of the same cells half an edge further. Of 600 crops of scanners
 # the second was below 0.04, or the first above 0.9 of it; of thinned ones to two thirds it is above 0.1.
 LEAST_BESIDE, MOST_WITHIN = 0.08, 0.5
-COPY_RATIO, LEAST_COPIES = 0.05, 0.05  # of distances to the first and fourth neighbour; 0.8 % of chance points are so
-SAMPLE = 1000  # points whose neighbours are looked at
-NEIGHBOURS = 48  # of a point: wider than what filters take, 8 to 30
-RANKS = np.array([2, 4, 8, 16, 32, NEIGHBOURS])  # of neighbours; those to twice the rank before are about as far
-# Squared differences of the two nearest neighbours over those of white noise. Of 240 balls with tubes the least was
-# 0.67, of 120 scanned caps 0.93; means of 8 had 0.38 (95 %: 0.57), of 20 0.35 (0.54), samples of meshes at most 0.62.
-SMOOTH, TOUCHED = 0.65, 2.0
-REACHED, REACH = 0.8, 1.4  # share of the variance, and where means over a disc reach it, in radii of the disc
+LEAST_AGREE = 0.3  # of the places
+HALF_AN_EDGE = 0.5 * (1.0 - np.eye(3))
+WIDE = 8.0  # extent along an axis, in distances of neighbours, from which it holds cells: noise of a plane is below it
+PATCHES, PATCH_POINTS = 100, 64  # of a place, where a surface is fitted: wider than what filters take, 8 to 30 points
+TERMS, RIDGE = 6, 1e-9  # of a surface of second order, and what keeps it determined where points lie in lines
+FLATTEST, LEAST_FLAT = 8, 25  # of the patches one in as many counts, those without edges and other surfaces
+# Median squared difference of nearest neighbours over that of white noise. Of bridges, halls, frames and plates of
+# scanners with correlated noise it was 0.88 to 1.15, of means of 8 and 20 and moving least squares 0.26 to 0.65, of
+# samples of meshes 0.59 to 0.75.
+SMOOTH = 0.78
+CHANCE = 5.5  # over the root of the number of points: 3.7 standard deviations of that median of white noise
 IN_PLANE, LEAST_IN_PLANE = 0.02, 0.1  # thickness of five neighbours in sd of residuals; by chance 2e-4 are so thin
 
 
@@ -44,15 +53,19 @@ IN_PLANE, LEAST_IN_PLANE = 0.02, 0.1  # thickness of five neighbours in sd of re
 class Processing:
     """Traces of software in a cloud, mm; 0 = none.
 
-    ``step`` of rounding, ``cell`` that holds one point, ``copies`` = share of points that are beside their copies,
-    ``kernel`` = radius of the means that smoothed the points, and whether they were sampled from a ``mesh``.
+    ``step`` of rounding, ``cell`` that holds one point; whether the points were ``smoothed``, also as samples of a
+    ``mesh``.
     """
 
     step: float = 0.0
     cell: float = 0.0
-    copies: float = 0.0
-    kernel: float = 0.0
+    smoothed: bool = False
     mesh: bool = False
+
+    @property
+    def unbounded(self) -> bool:
+        """Whether it moved surfaces by more than intervals hold."""
+        return self.smoothed or self.cell > LARGEST_CELL_MM or self.step > LARGEST_STEP_MM
 
     def reasons(self, cloud: str) -> tuple[Reason, ...]:
         """Return what each trace of a cloud of this name is, and what to do."""
@@ -61,97 +74,91 @@ class Processing:
             names.append(reason("points.rounded", cloud=cloud, step=self.step))
         if self.cell > 0.0:
             names.append(reason("points.thinned", cloud=cloud, cell=self.cell))
-        if self.copies > 0.0:
-            names.append(reason("points.copied", cloud=cloud, share=100.0 * self.copies))
         if self.mesh:
             names.append(reason("points.from-mesh", cloud=cloud))
-        elif self.kernel > 0.0:
-            names.append(reason("points.smoothed", cloud=cloud, radius=self.kernel))
+        elif self.smoothed:
+            names.append(reason("points.smoothed", cloud=cloud))
         return tuple(names)
 
 
-def recognised(points: Floats, errors: Floats | None = None, normals: Floats | None = None) -> Processing:
+def recognised(points: Floats, errors: Floats | None = None) -> Processing:
     """Recognise what software has done to points (n, 3), mm, of one frame as their file has them, less any origin.
 
-    ``errors`` (n,) are their residuals to a surface that fits them, and ``normals`` (n, 3) that surface's: smoothing
-    is not recognised without.
+    ``errors`` (n,) are residuals to a known surface. Without, patches are fitted by bent ones, from which a ball seen
+    by few points departs: smoothing of fewer than a place's is not recognised. Copies are no trace here: leave them
+    out first.
     """
     step = float(coincident_points.lattice_of(points).step.max()) if len(points) else 0.0
     step = step if step >= LEAST_STEP_MM else 0.0
-    if len(points) < FEWEST:
+    rows = [rows for rows in coincident_points.some_places(points) if len(rows) >= FEWEST] if len(points) else []
+    if not rows:
         return Processing(step=step)
-    tree = cKDTree(points)
-    away, near = tree.query(points, k=5)
-    copied = away[:, 1] < COPY_RATIO * away[:, 4]
-    copies = float(np.mean(copied))
-    if copies < LEAST_COPIES or step > 0.1 * float(np.median(away[:, 4])):
-        copies, copied = 0.0, np.zeros(len(points), bool)
-    kernel, mesh = 0.0, False
-    # Errors of rounding are alike of neighbours by themselves.
-    if errors is not None and normals is not None and step <= (sd := float(np.std(errors))):
-        first = ~copied | (near[:, 1] > np.arange(len(points)))
-        kernel = _kernel(points[first], errors[first], normals[first])
-        # Means of the same neighbours are equal: no copies.
-        copies = copies if kernel == 0.0 else 0.0
-        off = points[near[:SAMPLE]] - points[near[:SAMPLE]].mean(axis=1, keepdims=True)
-        thickness = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(off, 1, 2) @ off)[:, 0], 0.0))
-        mesh = kernel > 0.0 and bool(np.mean(thickness < IN_PLANE * sd) > LEAST_IN_PLANE)
+    near = np.concatenate([of_place[_patches(points[of_place])] for of_place in rows])
+    patches = points[near] - points[near[:, :1]]
+    smoothed, mesh = False, False
+    if errors is not None or len(points) >= coincident_points.PLACE_POINTS:
+        smoothed, mesh = _smoothed(patches, None if errors is None else errors[near], step, len(points))
     # The fourth neighbour of chance points is about twice as far as the first, which may be a copy.
-    cell = 0.0 if kernel > 0.0 else _cell(points, tree, 0.5 * float(np.median(away[:, 4])))
-    return Processing(step=step, cell=cell, copies=copies, kernel=kernel, mesh=mesh)
-
-
-def some_places(points: Floats) -> Floats:
-    """Return points (m, 3) of some places of a cloud (n, 3), all that lie there: enough to recognise its processing."""
-    if len(points) <= PLACES * PLACE_POINTS:
-        return points
-    seeds = ((np.arange(PLACES) + 0.5) * len(points) / PLACES).astype(np.int64)
-    rows = [
-        np.argpartition(np.sum((points - points[seed]) ** 2, axis=1), PLACE_POINTS)[:PLACE_POINTS] for seed in seeds
-    ]
-    chosen: Floats = points[np.unique(np.concatenate(rows))]
-    return chosen
+    spacing = 0.5 * float(np.median(np.linalg.norm(patches[:, 4], axis=1)))
+    places = [points[of_place] - points[of_place].min(axis=0) for of_place in rows]
+    return Processing(step=step, cell=0.0 if smoothed else _cell(places, spacing), smoothed=smoothed, mesh=mesh)
 
 
 # --- smoothing -------------------------------------------------------------------------------------------------------
 
 
-def _kernel(points: Floats, errors: Floats, normals: Floats) -> float:
-    """Return the radius, mm, of means that make the errors (n,) of neighbours alike; 0 where they differ as noise.
+def _patches(place: Floats) -> Ints:
+    """Return some points of a place and their nearest neighbours, ascending, as rows (m, k)."""
+    sample = np.linspace(0, len(place) - 1, min(PATCHES, len(place))).astype(np.int64)
+    near: Ints = cKDTree(place).query(place[sample], k=PATCH_POINTS)[1]
+    return near
 
-    Neighbours are those along the surface: in space the nearest of several is that of the most similar error.
+
+def _smoothed(near: Floats, known: Floats | None, step: float, count: int) -> tuple[bool, bool]:
+    """Whether errors of neighbours are alike, and whether these also lie in one plane, as samples of a mesh.
+
+    To ``near`` (m, k, 3), patches of a cloud of ``count`` points, or the errors ``known`` (m, k) of their points, a
+    surface of second order is fitted. Neighbours are those along the surface: in space the nearest of several is that
+    of the most similar error.
     """
-    foot = points - errors[:, None] * normals
-    sample = np.linspace(0, len(points) - 1, min(SAMPLE, len(points))).astype(np.int64)
-    away, near = cKDTree(foot).query(foot[sample], k=min(NEIGHBOURS + 1, len(foot)))
-    square = 0.5 * (errors[near] - errors[sample][:, None]) ** 2
-    variances = np.var(errors[near], axis=1, ddof=1)
-    # Without places where another surface touches: points of it have like errors.
-    inner = variances <= TOUCHED * float(np.median(variances))
-    variance, away, square = float(np.mean(variances[inner])), away[inner], square[inner]
-    if not variance > 0.0 or float(np.mean(square[:, 1:3])) >= SMOOTH * variance:
-        return 0.0
-    last = 1
-    for last in RANKS[near.shape[1] > RANKS].tolist():
-        if float(np.mean(square[:, last // 2 + 1 : last + 1])) >= REACHED * variance:
-            break
-    # The mean square: where a filter takes a number of neighbours it reaches farther at grazing incidence
-    return float(np.sqrt(np.mean(away[:, last] ** 2))) / REACH
+    off = near - near.mean(axis=1, keepdims=True)
+    squares, axes = np.linalg.eigh(np.swapaxes(off, 1, 2) @ off)
+    size = np.sqrt(np.maximum(squares[:, -1:], np.finfo(float).tiny))
+    height, u, v = np.moveaxis(off @ axes / size[:, None], 2, 0)
+    height = height if known is None else known / size
+    A = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
+    normal = np.swapaxes(A, 1, 2)
+    fitted = A @ np.linalg.solve(normal @ A + RIDGE * np.eye(TERMS), normal @ height[..., None])
+    errors = (height - fitted[..., 0]) * size
+    variance = np.sum(errors**2, axis=1) / (near.shape[1] - TERMS)
+    flat = np.argsort(variance, kind="stable")[: max(len(variance) // FLATTEST, LEAST_FLAT)]
+    sd = float(np.sqrt(np.median(variance[flat])))
+    # Errors of rounding are alike of neighbours by themselves.
+    if not variance[flat[0]] > 0.0 or step > sd:
+        return False, False
+    away = (u[flat, :, None] - u[flat, None]) ** 2 + (v[flat, :, None] - v[flat, None]) ** 2
+    away[:, range(away.shape[1]), range(away.shape[1])] = np.inf
+    of_nearest = np.take_along_axis(errors[flat], np.argmin(away, axis=2), axis=1)
+    alike = 0.5 * np.mean((errors[flat] - of_nearest) ** 2, axis=1) / variance[flat]
+    if np.median(alike) >= min(SMOOTH, 1.0 - CHANCE / np.sqrt(count)):
+        return False, False
+    five = near[flat, :5] - near[flat, :5].mean(axis=1, keepdims=True)
+    thickness = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(five, 1, 2) @ five)[:, 0], 0.0))
+    return True, bool(np.mean(thickness < IN_PLANE * sd) > LEAST_IN_PLANE)
 
 
 # --- thinning --------------------------------------------------------------------------------------------------------
 
 
-def _cell(points: Floats, tree: cKDTree, spacing: float) -> float:
+def _cell(places: list[Floats], spacing: float) -> float:
     """Return the edge, mm, of cells that hold one point each; 0 without such cells."""
     if not spacing > 0.0:
         return 0.0
-    count = min(PLACE_POINTS, len(points))
-    number = max(1, min(PLACES, len(points) // count))
-    seeds = ((np.arange(number) + 0.5) * len(points) / number).astype(np.int64)
-    places = [points[tree.query(points[seed], k=count)[1]] for seed in seeds]
-    places = [place - place.min(axis=0) for place in places]
+    # A plane along two axes says nothing along the third, and where it lies between two cells both have points.
+    places = [np.where(np.ptp(place, axis=0) >= WIDE * spacing, place, 0.0) for place in places]
     extent = max(float(np.ptp(place, axis=0).max()) for place in places)
+    if not extent > 0.0:
+        return 0.0
     frequency, power = _periodogram(places, spacing, extent)
     inner = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
     inner = inner[power[inner] > LEAST_PEAK]
@@ -161,10 +168,12 @@ def _cell(points: Floats, tree: cKDTree, spacing: float) -> float:
         phases = [np.angle(_transform(place, tried)) / (2.0 * np.pi) for place in places]
         for step, f in enumerate(tried.tolist()):
             of_cells = [place * f - phase[step] for place, phase in zip(places, phases, strict=True)]
-            within = float(np.mean([_beside(one) for one in of_cells]))
-            further = float(np.mean([_beside(one + shift) for one in of_cells for shift in 0.5 * (1.0 - np.eye(3))]))
-            if further >= LEAST_BESIDE and within <= MOST_WITHIN * further and further - within > most:
-                edge, most = 1.0 / f, further - within
+            within = np.array([_beside(one) for one in of_cells])
+            further = np.array([np.mean([_beside(one + shift) for shift in HALF_AN_EDGE]) for one in of_cells])
+            agree = (further >= LEAST_BESIDE) & (within <= MOST_WITHIN * further)
+            clear = float(np.sum((further - within)[agree]))
+            if np.mean(agree) >= LEAST_AGREE and clear > most:
+                edge, most = 1.0 / f, clear
     return edge
 
 
@@ -172,15 +181,16 @@ def _periodogram(places: list[Floats], spacing: float, extent: float) -> tuple[F
     """Return frequencies (f,) and the power (f,) of coordinates at them, mean over places and axes; 1 of chance."""
     width = BIN * spacing
     bins = int(extent / width) + 1
-    total = np.zeros(0)
+    total, columns = np.zeros(0), 0
     for place in places:
-        for column in place.T:
+        for column in place.T[np.ptp(place, axis=0) > 0.0]:
+            columns += 1
             counts = np.bincount((column / width).astype(np.int64), minlength=bins)
             power = np.abs(np.fft.rfft(counts, 4 * bins)) ** 2 / len(place)
             total = power if not len(total) else total + power
     frequency = np.arange(len(total)) / (4 * bins * width)
     looked = (frequency >= FREQUENCIES[0] / spacing) & (frequency <= FREQUENCIES[1] / spacing)
-    return frequency[looked], total[looked] / (3 * len(places))
+    return frequency[looked], total[looked] / columns
 
 
 def _transform(points: Floats, frequency: Floats) -> Floats:

@@ -8,8 +8,6 @@ import numpy as np
 
 from processor.adjustment import residual_correlation, scanner_class_errors
 from processor.adjustment.processing import point_processing
-from processor.adjustment.processing.point_processing import Processing
-from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.distinct_rows import distinct_points
 from processor.geometry import coincident_points
 from processor.geometry.sphere import Sphere, algebraic, sphere_cells
@@ -29,6 +27,7 @@ GRAZING_COS = 1e-3  # least cosine to the side that a sphere was seen from: its 
 STEEP_COS = 0.5  # of the incidence of a ray
 MOST_CELLS = 60  # of a sphere, else half as many: enough for correlations, and the time goes with the cube
 FIRST_SCALE = 2.0  # of the second fit, in scales of the first: ranges scatter more than distances
+LARGEST_CELL = 0.1  # of the radius: rms by stated sd 1.1 at 0.08 of it, 1.5 at 0.11, caps of 30 %, noise of 2 mm
 THINNED = 2.0  # standard deviations: 1.7 measured of caps of 15 %, noise of 2 mm, cells of 8 mm
 CHANCE = 3.29  # standard deviations: 0.1 % of right radii are farther from a measured one
 
@@ -65,6 +64,8 @@ def measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Par
         messages.append(reason("spheres.robust-distances"))
     else:
         messages.append(reason("spheres.robust-ranges"))
+    if params.method != "least-squares":
+        messages += by_class(params)
     radius = _held(params)
     if radius is not None:
         messages.append(reason("spheres.radius-held", radius=radius))
@@ -73,6 +74,12 @@ def measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Par
         messages.append(reason("spheres.most-balls", balls=len(found)))
     result = as_result(rows, cloud.origin, params, tuple(messages), complete)
     return _with_bounds(result, rows) if params.method == "ray" else result
+
+
+def by_class(params: Params) -> tuple[Reason, ...]:
+    """Return what is assumed of a scanner whose class is not stated."""
+    view, incidence = scanner_class_errors.of_class(params.instrument)
+    return () if params.instrument else (reason("spheres.instrument-assumed", view=view, incidence=incidence),)
 
 
 def _held(params: Params) -> float | None:
@@ -86,20 +93,22 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
         sphere = algebraic(on)
     if sphere is None:
         return missing(id_, NAN, len(on), reason("spheres.no-sphere"))
-    away = on - candidate.fit.sphere.centre
-    distance = np.linalg.norm(away, axis=1)
-    trace = point_processing.recognised(on, distance - candidate.fit.sphere.radius, away / distance[:, None])
+    errors = np.linalg.norm(on - candidate.fit.sphere.centre, axis=1) - candidate.fit.sphere.radius
+    trace = point_processing.recognised(on, errors)
     doubts: list[Reason] = []
     remarks = trace.reasons("points")
-    wrong = trace.kernel > 0.0
+    wrong = trace.unbounded or trace.cell > LARGEST_CELL * candidate.fit.sphere.radius
     if params.method != "least-squares":
         widened = _widened(cloud, candidate.fit, _held(params) is not None)
         if widened is None:
             doubts.append(reason("spheres.unknown-side") if cloud.scanner is None else reason("spheres.at-limb"))
         else:
-            sphere = _with_processing(widened, candidate.fit.sphere, trace)
+            # Cells that hold one point give far points the weight of many near ones.
+            times = THINNED**2 if trace.cell > 0.0 else 1.0
+            fitted = candidate.fit.sphere.covariance
+            sphere = replace(widened, covariance=fitted + times * (widened.covariance - fitted))
         if _held(params) is not None:
-            moved, other_radius, doubted = _by_free_radius(cloud, candidate.fit)
+            moved, other_radius, doubted = _by_free_radius(cloud, candidate.fit, params.instrument)
             sphere = sphere.widened_by(moved)
             remarks, wrong = (*remarks, *other_radius), wrong or doubted
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
@@ -115,7 +124,7 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
     if params.method == "least-squares":
         return row
     free = 4 if _held(params) is None else 3
-    shared, stations = _by_neighbours_and_views(cloud, candidate.fit, free)
+    shared, stations = _by_neighbours_and_views(cloud, candidate.fit, free, params.instrument)
     return replace(
         row,
         sphere=replace(sphere, covariance=sphere.covariance + shared),
@@ -160,22 +169,7 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Sphere | 
     return ball.widened_by(start.moved_to(again.sphere), by_chance)
 
 
-def _with_processing(ball: Sphere, fitted: Sphere, trace: Processing) -> Sphere:
-    """Return a sphere, widened from the one ``fitted``, with what software that processed its points adds.
-
-    Of two copies one counts. Cells that hold one point give far points the weight of many near ones: what these move
-    the sphere by is found to be two standard deviations instead of one. The mean over a disc of radius h on a sphere
-    lies h^2 / (4 radius) below its surface.
-    """
-    covariance = (1.0 + trace.copies) * ball.covariance
-    if trace.cell > 0.0:
-        covariance += (THINNED**2 - 1.0) * (ball.covariance - fitted.covariance)
-    known = np.diag(fitted.covariance) > 0.0
-    covariance += (trace.kernel**2 / (4.0 * ball.radius)) ** 2 * np.diag(known)
-    return replace(ball, covariance=covariance)
-
-
-def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int) -> tuple[Floats, int]:
+def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int, instrument: str) -> tuple[Floats, int]:
     """Return what a fit's covariance (4, 4) lacks: errors that neighbouring points share, and those of their views.
 
     The second is the number of views, 0 where it is not known.
@@ -193,10 +187,10 @@ def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int) -> t
     if cloud.scanner is None:
         side = normals.mean(axis=0)
         if np.linalg.norm(side) < LEAST_ONE_SIDED:
-            added[:free, :free] += scanner_class_errors.VIEW_SD_MM**2 * np.eye(free)
+            added[:free, :free] += scanner_class_errors.of_class(instrument).view_mm ** 2 * np.eye(free)
             return added, 0
         cosines = np.maximum(normals @ side / np.linalg.norm(side), GRAZING_COS)
-        errors = scanner_class_errors.view_errors(np.zeros(len(J)), cosines, np.zeros(len(J), np.int64))
+        errors = scanner_class_errors.view_errors(np.zeros(len(J)), cosines, np.zeros(len(J), np.int64), instrument)
         errors, stations = errors * cosines[:, None], 0  # along the normals
     else:
         seen_from = cloud.scanner[on]
@@ -204,13 +198,13 @@ def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int) -> t
         view = np.zeros(len(J), np.int64) if one else distinct_points(seen_from)[1]
         stations = int(view.max()) + 1
         ranges = np.linalg.norm(cloud.points[on] - seen_from, axis=1)
-        errors = scanner_class_errors.view_errors(ranges, 1.0 / fit.derivatives[on, 3], view)
+        errors = scanner_class_errors.view_errors(ranges, 1.0 / fit.derivatives[on, 3], view, instrument)
     moved = np.linalg.solve(J.T @ J, J.T @ errors)
     added[:free, :free] += moved @ moved.T
     return added, stations
 
 
-def _by_free_radius(cloud: MergedCloud, fit: RobustFit) -> tuple[Floats, tuple[Reason, ...], bool]:
+def _by_free_radius(cloud: MergedCloud, fit: RobustFit, instrument: str) -> tuple[Floats, tuple[Reason, ...], bool]:
     """Return how far points move the centre of a fit with a held radius, (4,), the remark on it, and whether to doubt.
 
     A radius that is wrong by a little fits as well, with its centre elsewhere. So the radius is also estimated. Where
@@ -232,8 +226,9 @@ def _by_free_radius(cloud: MergedCloud, fit: RobustFit) -> tuple[Floats, tuple[R
         return nowhere, (), False
     centre = np.append(moved[:3], 0.0)
     shift, measured = float(np.linalg.norm(moved[:3])), free_sphere.radius
+    by_view = scanner_class_errors.of_class(instrument).view_mm
     remark = reason("spheres.other-radius", radius=measured, ci95=NORMAL_95 * sd, held=ball.radius, shift=shift)
-    return centre, (remark,) if away > CHANCE * sd else (), away > CHANCE * float(np.hypot(sd, VIEW_SD_MM))
+    return centre, (remark,) if away > CHANCE * sd else (), away > CHANCE * float(np.hypot(sd, by_view))
 
 
 def _with_bounds(result: Result, rows: list[Row]) -> Result:
