@@ -166,7 +166,7 @@ def test_points_of_several_stations_have_a_position_each():
 
 def test_a_fit_that_fails_without_the_limb_is_a_doubt(monkeypatch):
     monkeypatch.setattr(search_without_design, "robust_fit", lambda *_: None)
-    fit = processor.fit_sphere(ball_with_tubes(np.random.default_rng(0), 1.0), scanner=SCANNER)
+    fit = processor.fit_sphere(ball_with_tubes(np.random.default_rng(0), 1.0), scanner=SCANNER, instrument="phase")
     assert (fit.status, fit.reasons) == (Status.WEAK, (reason("spheres.at-limb"),))
 
 
