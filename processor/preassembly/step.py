@@ -35,7 +35,7 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
 
     The attitudes of the scans, and the features of the parts, common to the paper's three methods, are ``kept`` for the
     next of them.
-    Raises InputError without an arch design or with a part that has no scan, UsageError for an unknown method.
+    Raises InputError without an arch design or scans of its parts, UsageError for an unknown method.
     """
     if params.method not in METHODS:
         raise UsageError(f"preassemble: unknown method {params.method!r}; it has {', '.join(METHODS)}")
@@ -59,6 +59,11 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
         raise InputError(
             f"{scene.name}: method {params.method} needs the bottom edges of all components; use adjustment"
         )
+    missing = [part.name for part, (first, *_) in zip(design.parts, scans, strict=True) if not len(first.points)]
+    if missing:
+        raise InputError(
+            f"{scene.name}: method {params.method} needs scans of all components, {missing[0]} has none; use adjustment"
+        )
     several = [part.name for part, of_part in zip(design.parts, scans, strict=True) if len(of_part) > 1]
     if several:
         raise InputError(f"{scene.name}: method {params.method} takes one scan per part, {several[0]} has several")
@@ -80,13 +85,16 @@ def completed(result: Result, answers: Mapping[str, Any]) -> Result:
 
 
 def scans_in_order(scene: Scene, design: ArchDesign) -> list[list[Scan]]:
-    """Return the scans of each part in the design's order. Raises InputError for a part without any."""
+    """Return the scans of each part in the design's order, one without points of a part that has none.
+
+    Raises InputError where no part has any.
+    """
     scans = [[scan for scan in scene.scans if scan.component == part.name] for part in design.parts]
-    for part, of_part in zip(design.parts, scans, strict=True):
-        if not of_part:
-            named = ", ".join(sorted(scan.component or scan.name for scan in scene.scans))
-            raise InputError(
-                f"{scene.name}: expected a scan of component {part.name!r}, found none "
-                f"(scans are of: {named}); name them by 'component' in project.toml"
-            )
-    return scans
+    if not any(scans):
+        named = ", ".join(sorted(scan.component or scan.name for scan in scene.scans))
+        raise InputError(
+            f"{scene.name}: expected scans of components {', '.join(part.name for part in design.parts)}, found none "
+            f"(scans are of: {named}); name them by 'component' in project.toml"
+        )
+    nothing = np.empty((0, 3))
+    return [found or [Scan("", nothing, component=part.name)] for part, found in zip(design.parts, scans, strict=True)]

@@ -33,13 +33,15 @@ PER_VOXEL = 2  # points of an occupied voxel, on average
 LINKS = (1.8, 3.0)  # voxels between points of one piece: neighbours, corners included; across thin shadows
 LEAST_LENGTH = 0.4  # of the part's, of a body that may be the part
 LEAST_FACE, FACES = 0.3, 3  # of the part's longest by its least size, of a face that is no trestle's; of one body
-# work: bodies; points that hypotheses are aligned by in each round, and those kept; points of the last
-BODIES, START_POINTS, KEPT, POINTS = 6, (150, 600, 1_500), (8, 3), 4_000
+# work: bodies; points that hypotheses are aligned by in each round, and those kept; points of the last, and that
+# attitudes are told apart by
+BODIES, START_POINTS, KEPT, POINTS, RIVAL_POINTS = 6, (150, 600, 1_500), (8, 3), 4_000, 30_000
 SHOWN_MM = 10.0  # off the plane of a sample, up to which a point shows it: as of surface that tells poses apart
 SHOWN_SAMPLES, SHOWN_POINTS = 4_000, 400_000  # work
 PATCH_MM, PATCH_OFF = 250.0, 8.0  # a face's patch, larger than a clamp; off it, in standard deviations
 BESIDE = 0.15  # of a design's length, by which a part of another shape may be longer
-SURE_RIVAL = 0.5  # of the part's points, from which on another body of its shape may be meant as well
+SURE_RIVAL = 0.5  # of the part's points, from which on another body may be meant as well
+SHARED = 0.5  # of the points at a design, from which on two designs are placed on one body
 AT_PART_MM = 60.0  # off the design, up to which points may be the part's: as much as parts deviate
 # Share of a design's surface, inner faces included, that is shown of a part in its scan; of another's place, by the
 # most that is shown, from which it is as good a place; between places of one body, by the design's size.
@@ -48,59 +50,109 @@ LEAST_SHOWN, AS_WELL, SAME_PLACE = 0.3, 0.85, 0.08
 
 @dataclass(frozen=True)
 class Located:
-    """``T`` (4, 4) maps the scan to the design; ``shown`` is the share of its surface that points show there.
+    """A place of a design in a scan: ``T`` (4, 4) maps the scan to the design, whose surface points show a share of.
 
-    ``count`` is the number of points at the design, of a sample; ``rival`` that at another place of a body of the same
-    shape, as a share of it: 0 without one.
+    ``count`` is the number of points at the design there, of a sample.
     """
 
     T: Floats
     shown: float
     count: int = 0
-    rival: float = 0.0
 
 
 NOT_LOCATED = Located(np.full((4, 4), np.nan), 0.0)  # nothing of the design is shown
 
 
-def locate(points: Floats, designs: Sequence[DesignSurface], body: Floats | None = None) -> list[Located]:
-    """Locate each of several designs among points (n, 3) of a scan with surroundings, or on a ``body`` (k, 3) in it."""
+class Body(NamedTuple):
+    """A body in a scan: the numbers of the designs that it may be of, the best first, with a place of each."""
+
+    numbers: tuple[int, ...]
+    places: tuple[Located, ...]
+
+    @property
+    def count(self) -> int:
+        """The number of points at the first design."""
+        return self.places[0].count
+
+
+def locate(points: Floats, designs: Sequence[DesignSurface], body: Floats | None = None) -> list[list[Located]]:
+    """Locate each of several designs among points (n, 3) of a scan with surroundings, or on a ``body`` (k, 3) in it.
+
+    Returns the places on different bodies that each is shown at about as well, the one with most points first.
+    """
     size = float(np.median([design.size for design in designs])) if designs and len(points) else 0.0
     step = main_body.voxel_size(points, size, PART_VOXELS, PER_VOXEL) if size > 0.0 else 0.0
     if not step > 0.0:
-        return [NOT_LOCATED] * len(designs)
+        return [[] for _ in designs]
     bodies = [body] if body is not None else _bodies(points, step, [principal.sizes(one.points) for one in designs])
     if not bodies:
-        return [NOT_LOCATED] * len(designs)
+        return [[] for _ in designs]
     few = thinned(points, SHOWN_POINTS)
     search = _Search(few, cKDTree(few), step)
     found = [_located(search, bodies, design, pieces=False) for design in designs]
-    if max(one.shown for one in found) < LEAST_SHOWN:
+    if most_shown(found) < LEAST_SHOWN:
         found = [_located(search, bodies, design, pieces=True) for design in designs]
     return found
 
 
-def which(points: Floats, designs: Sequence[DesignSurface], located: Sequence[Located], named: int = -1) -> list[int]:
-    """Return the designs that the body in a scan's points (n, 3) may be of, the best first; () of none.
+def most_shown(located: Sequence[Sequence[Located]]) -> float:
+    """Return the largest share of a design's surface that is shown at any of its places."""
+    return max((one.shown for places in located for one in places), default=0.0)
 
-    It is the body with most points of those that show a design well. Where the design that is ``named`` is shown nearly
-    as well as any, it is that one.
+
+def which(
+    points: Floats, designs: Sequence[DesignSurface], located: Sequence[Sequence[Located]], named: int = -1
+) -> list[Body]:
+    """Return the bodies in a scan's points (n, 3) that may be the part that is meant; () of none.
+
+    It is the body with most points of those that show a design well, or the one that is of the design that is
+    ``named``. Others follow that have SURE_RIVAL of its points or more.
     """
-    most = max(one.shown for one in located)
+    most = most_shown(located)
     if most < LEAST_SHOWN:
         return []
-    well = [k for k, one in enumerate(located) if one.shown >= AS_WELL * most]
-    first = named if named in well else max(well, key=lambda k: located[k].count)
-    place = _place(located[first], designs[first])
-    same = [k for k in well if k == first or _near(_place(located[k], designs[k]), place, designs[k])]
-    near, poses = np.zeros(len(points), bool), []
-    for k in same:
-        at = at_design(points, located[k].T, designs[k])
+    few, groups = thinned(points, SHOWN_POINTS), list[tuple[Bools, dict[int, Located]]]()  # by points that are shared
+    every = [(k, one) for k, places in enumerate(located) for one in places]
+    for k, one in sorted(every, key=lambda item: -item[1].count):
+        at = at_design(few, one.T, designs[k])
+        known = next((places for marked, places in groups if (marked & at).sum() > SHARED * at.sum()), None)
+        if known is None:
+            groups.append((at, {k: one}))
+        else:
+            known.setdefault(k, one)
+    most_of = [most_shown([list(g.values())]) for _, g in groups]
+    shown = [
+        {k: one for k, one in g.items() if one.shown >= AS_WELL * of_body}
+        for of_body, (_, g) in zip(most_of, groups, strict=True)
+        if of_body >= AS_WELL * most
+    ]
+    counts = [max(one.count for one in g.values()) for g in shown]
+    bodies = [_body(points, designs, g) for g, n in zip(shown, counts, strict=True) if n >= SURE_RIVAL * max(counts)]
+    return sorted(bodies, key=lambda body: (named not in body.numbers, -body.count))
+
+
+def _body(points: Floats, designs: Sequence[DesignSurface], places: dict[int, Located]) -> Body:
+    """Decide which of the designs placed on one body in points (n, 3) it is of."""
+    numbers, near, poses = list(places), np.zeros(len(points), bool), []
+    if len(numbers) == 1:
+        return Body(tuple(numbers), tuple(places.values()))
+    for k, one in places.items():
+        at = at_design(points, one.T, designs[k])
         near |= at
-        fewer = thinned(points[at], surface_registration.RIVAL_POINTS)
-        fine = surface_registration.fine(fewer, designs[k].mesh, designs[k].axes, located[k].T).T_design_scan
-        poses.append((designs[k].mesh, fine))
-    return [same[k] for k in pose_choice.choose(points[near], poses)]
+        T = _attitude(thinned(points[at], RIVAL_POINTS), designs[k], one.T)
+        poses.append((designs[k].mesh, T))
+    chosen = [numbers[k] for k in pose_choice.choose(points[near], poses)]
+    return Body(tuple(chosen), tuple(places[k] for k in chosen))
+
+
+def _attitude(points: Floats, design: DesignSurface, T: Floats) -> Floats:
+    """Return the pose (4, 4) of all that turn a design onto itself that points (n, 3) at it show best."""
+    turned = [Candidate(turn @ T, T) for turn in pose_search.symmetries(design)]
+    aligned = each(partial(pose_search.align, thinned(points, POINTS), design), turned)
+    rivals = pose_search.rivals_of(pose_search.distinct(aligned, pose_search.box_of(points)))
+    best = surface_registration.decide(points, design, rivals)[0].T
+    fewer = thinned(points, surface_registration.RIVAL_POINTS)
+    return surface_registration.fine(fewer, design.mesh, design.axes, best).T_design_scan
 
 
 def about_design(points: Floats, T: Floats, design: DesignSurface) -> Bools:
@@ -155,8 +207,8 @@ class _Search(NamedTuple):
     step: float
 
 
-def _located(search: _Search, bodies: Sequence[Floats], design: DesignSurface, *, pieces: bool) -> Located:
-    """Locate a design on the one of the bodies that shows it well and has most points at it."""
+def _located(search: _Search, bodies: Sequence[Floats], design: DesignSurface, *, pieces: bool) -> list[Located]:
+    """Return the places of a design on those of the bodies that show it well, the one with most points at it first."""
     found = [_on_body(search, body, design, pieces=pieces) for body in bodies]
     first = int(np.argmax([one.shown for one in found]))
     size = principal.sizes(design.points)
@@ -166,20 +218,25 @@ def _located(search: _Search, bodies: Sequence[Floats], design: DesignSurface, *
             faces = _large_faces(body, search.step, LEAST_FACE * float(size[0] * size[2]))
             found += [_on_body(search, face, design, pieces=True) for face in faces]
     most = max(one.shown for one in found)
-    if not most > 0.0:
-        return NOT_LOCATED
-    found = [one for one in found if one.shown >= AS_WELL * most]
+    found = [one for one in found if one.shown > 0.0 and one.shown >= AS_WELL * most]
     found = [replace(one, count=int(at_design(search.few, one.T, design).sum())) for one in found]
-    best = max(found, key=lambda one: (one.count, one.shown))
-    place = _place(best, design)
-    best = max((one for one in found if _near(_place(one, design), place, design)), key=lambda one: one.shown)
-    others = [one.count for one in found if not _near(_place(one, design), place, design)]
-    # Few points constrain a part of even curvature along its length: see :func:`pose_search.slid`.
-    near = thinned(search.few[at_design(search.few, best.T, design)], POINTS)
-    slides = pose_search.slid(near, design, Candidate(best.T, best.T), pose_search.box_of(near))
-    slid = max((_shown(search, design, c) for c in slides), key=lambda one: one.shown, default=best)
-    T, shown = (slid.T, slid.shown) if slid.shown > best.shown else (best.T, best.shown)
-    return Located(T, shown, best.count, max(others, default=0) / max(best.count, 1))
+    places: list[Located] = []
+    for one in sorted(found, key=lambda one: (-one.count, -one.shown)):
+        known = next((k for k, place in enumerate(places) if _near(one, place, design)), None)
+        if known is None:
+            places.append(one)
+        elif one.shown > places[known].shown:
+            places[known] = replace(one, count=places[known].count)
+    places = [one for one in places if one.count >= SURE_RIVAL * places[0].count]
+    return [_best_slide(search, one, design) for one in places]
+
+
+def _best_slide(search: _Search, one: Located, design: DesignSurface) -> Located:
+    """Return a place slid along the part to where most is shown; see :func:`pose_search.slid`."""
+    near = thinned(search.few[at_design(search.few, one.T, design)], POINTS)
+    slides = pose_search.slid(near, design, Candidate(one.T, one.T), pose_search.box_of(near))
+    best = max((_shown(search, design, c) for c in slides), key=lambda slid: slid.shown, default=one)
+    return replace(best, count=one.count) if best.shown > one.shown else one
 
 
 def _on_body(search: _Search, body: Floats, design: DesignSurface, *, pieces: bool) -> Located:
@@ -220,15 +277,10 @@ def _shown(search: _Search, design: DesignSurface, c: Candidate) -> Located:
     return Located(c.T, float((np.abs(off) < SHOWN_MM).sum()) / len(samples))
 
 
-def _place(located: Located, design: DesignSurface) -> Floats:
-    """Return where the centre of a design's surface lies in the scan, (3,)."""
-    place: Floats = rigid.apply(rigid.invert(located.T), design.centre[None])[0]
-    return place
-
-
-def _near(place: Floats, other: Floats, design: DesignSurface) -> bool:
-    """Whether two places (3,) of a design are on one body: bodies beside each other are farther apart."""
-    return float(np.linalg.norm(place - other)) < SAME_PLACE * design.size
+def _near(one: Located, other: Located, design: DesignSurface) -> bool:
+    """Whether two places of a design are on one body: bodies beside each other are farther apart."""
+    at, beside = (rigid.apply(rigid.invert(place.T), design.centre[None])[0] for place in (one, other))
+    return float(np.linalg.norm(at - beside)) < SAME_PLACE * design.size
 
 
 def _bodies(points: Floats, step: float, sizes: Sequence[Floats]) -> list[Floats]:

@@ -319,9 +319,11 @@ def box_of(points: Floats) -> Floats:
 def distinct(candidates: list[Candidate], box: Floats) -> list[Candidate]:
     """Sort candidates by their misfit, and drop equal poses by the corners (8, 3) of the scan's box."""
     kept: list[Candidate] = []
+    placed = np.empty((len(candidates), *box.shape))  # of those kept
     for candidate in sorted(candidates, key=lambda c: c.misfit):
-        placed = rigid.apply(candidate.T, box)
-        if all(np.linalg.norm(placed - rigid.apply(c.T, box), axis=1).max() >= SAME_POSE_MM for c in kept):
+        at = rigid.apply(candidate.T, box)
+        if (np.linalg.norm(placed[: len(kept)] - at, axis=2).max(axis=1) >= SAME_POSE_MM).all():
+            placed[len(kept)] = at
             kept.append(candidate)
     return kept
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -171,12 +171,18 @@ def _ceiling(given: CeilingEntry, unit: str, surface_unit: str) -> Ceiling:
     return Ceiling(vertices=vertices, faces=faces, clearance_mm=clearance, longest_mm=longest)
 
 
-def _supports(project: Project, scans: Sequence[Scan], units: Sequence[FileUnit]) -> PartSupports | None:
-    """Return the supports of a bridge's components, in mm; ``units`` are those of the scans."""
-    if not project.support:
+def _supports(
+    project: Project, scans: Sequence[Scan], units: Sequence[FileUnit], refused: Collection[str]
+) -> PartSupports | None:
+    """Return the supports of a bridge's components, in mm, but for those whose scans are ``refused``.
+
+    ``units`` are those of the scans.
+    """
+    supports = [one for one in project.support if one.component not in refused]
+    if not supports:
         return None
     first = {scan.component: unit for scan, unit in reversed(list(zip(scans, units, strict=True)))}
-    for one in project.support:
+    for one in supports:
         if one.component not in first:
             known = ", ".join(sorted(first)) or "none"
             raise InputError(
@@ -184,9 +190,9 @@ def _supports(project: Project, scans: Sequence[Scan], units: Sequence[FileUnit]
             )
     nowhere = np.full(3, np.nan)
     return PartSupports(
-        tuple(one.component for one in project.support),
-        places=np.array([nowhere if s.at is None else s.at * first[s.component].factors for s in project.support]),
-        chainages=np.array([one.chainage_mm for one in project.support]),
+        tuple(one.component for one in supports),
+        places=np.array([nowhere if s.at is None else s.at * first[s.component].factors for s in supports]),
+        chainages=np.array([one.chainage_mm for one in supports]),
     )
 
 
@@ -289,6 +295,59 @@ def _open_scans(folder: Path, files: Sequence[Path]) -> list[Path]:
     return scans
 
 
+@dataclasses.dataclass
+class _Found:
+    """The scans of a project, what is to be said of them, and why those of some parts of a bridge are ``refused``."""
+
+    clipper: Clipper
+    scans: list[Scan] = dataclasses.field(default_factory=list)
+    units: list[FileUnit] = dataclasses.field(default_factory=list)
+    units_by: dict[str, Reason] = dataclasses.field(default_factory=dict)  # why a unit was taken, by units
+    remarks: list[Reason] = dataclasses.field(default_factory=list)
+    days: set[str] = dataclasses.field(default_factory=set)
+    doubted: list[InputError] = dataclasses.field(default_factory=list)
+    refused: dict[str, InputError] = dataclasses.field(default_factory=dict)
+
+    def faults(self) -> Iterator[Reason]:
+        """Yield what is wrong with scans of parts, the other parts of which are answered."""
+        yield from (reason("units.doubted", error=str(error)) for error in self.doubted)
+        yield from (reason("read.scan-refused", error=str(error)) for error in self.refused.values())
+
+
+def _read_scans(project: Project, design: Design | None, option: str, stations: Stations | None, keep: Keep) -> _Found:
+    """Read the scans of a project. Raises InputError for one that cannot be used, of a bridge only if none can."""
+    parts = {part.name for part in design.parts} if isinstance(design, ArchDesign) else set()
+    unit_of_boxes = MM_PER_UNIT[project.units or option or "m"]
+    found = _Found(
+        Clipper([dataclasses.replace(one, box=one.box * unit_of_boxes) for one in project.clip], project.where)
+    )
+    for entry in tracked(project.scan):
+        if entry.component and parts and entry.component not in parts:
+            raise InputError(
+                f"the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}", path=entry.file
+            )
+        try:
+            for raw in _read_raws(entry, found.scans):
+                unit, why = _unit(raw, entry, project, option)
+                scan = found.clipper.clip(_scan(raw, entry, unit, parts, stations))
+                if any(scan.name == other.name for other in found.scans):
+                    raise InputError(f"a second scan named {scan.name!r}; rename one of the files", path=entry.file)
+                found.doubted += _doubts_of_unit(entry.file, scan, unit, why, design)
+                found.days |= {raw.scanned} - {""}
+                found.units_by.setdefault(str(unit), why)
+                found.remarks += raw.remarks
+                found.scans.append(keep(scan))
+                found.units.append(unit)
+        except InputError as error:
+            if not parts:
+                raise
+            found.refused[entry.component or scan_name(entry.file)] = error
+    errors = [*found.doubted, *found.refused.values()]
+    if errors and len(found.doubted) == len(found.scans):
+        raise errors[0]
+    return found
+
+
 def _scene(
     project: Project, design: Design | None, option: str, stations: Stations | None = None, keep: Keep = as_read
 ) -> Scene:
@@ -297,36 +356,10 @@ def _scene(
     kind = "arch-bridge" if arch else "space-frame" if frame else project.kind or "structure"
     if project.kind and project.kind != kind:
         raise InputError(f"{project.design}: expected a design of kind {project.kind} by {PROJECT}, found {kind}")
-    parts = {part.name for part in arch.parts} if arch else set()
-    scans: list[Scan] = []
-    scan_units: list[FileUnit] = []
-    remarks: list[Reason] = []
-    doubted: list[InputError] = []
-    days: set[str] = set()
-    reasons: dict[str, Reason] = {}  # why a unit was taken, by units
-    of_project = project.units or option or "m"
-    boxes = [dataclasses.replace(one, box=one.box * MM_PER_UNIT[of_project]) for one in project.clip]
-    clipper = Clipper(boxes, project.where)
-    for entry in tracked(project.scan):
-        if entry.component and parts and entry.component not in parts:
-            raise InputError(
-                f"the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}", path=entry.file
-            )
-        for raw in _read_raws(entry, scans):
-            unit, why = _unit(raw, entry, project, option)
-            days |= {raw.scanned} - {""}
-            reasons.setdefault(str(unit), why)
-            remarks += raw.remarks
-            scan = clipper.clip(_scan(raw, entry, unit, parts, stations))
-            if any(scan.name == other.name for other in scans):
-                raise InputError(f"a second scan named {scan.name!r}; rename one of the files", path=entry.file)
-            doubted += _doubts_of_unit(entry.file, scan, unit, why, design)
-            scans.append(keep(scan))
-            scan_units.append(unit)
-    if doubted and len(doubted) == len(scans):
-        raise doubted[0]
+    found = _read_scans(project, design, option, stations, keep)
+    scans, reasons = found.scans, found.units_by
     where = stations or _stations(scans)
-    why_units = list(reasons.values())
+    of_project, why_units = project.units or option or "m", list(reasons.values())
     different = (one for i, one in enumerate(why_units) if one not in why_units[:i])  # reasons have no hash
     search = TargetSearch(find.checkerboard_mm, find.sphere_radius_mm) if (find := project.targets) else None
     return Scene(
@@ -338,21 +371,17 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason=(*different, *_of_guess(project), *summed(remarks), *map(_doubt, doubted)),
+        units_reason=(*different, *_of_guess(project), *summed(found.remarks), *found.faults()),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
-        control=control_points(project.measured, scans, scan_units, where, of_project, search is not None),
+        control=control_points(project.measured, scans, found.units, where, of_project, search is not None),
         target_search=search,
         title_block=project.report,
-        clips=clipper.record(),
-        part_supports=_supports(project, scans, scan_units),
+        clips=found.clipper.record(),
+        part_supports=_supports(project, scans, found.units, found.refused),
         steel=None if project.steel is None else Steel(project.steel.E_MPa, project.steel.density_kg_m3),
-        scanned=tuple(sorted(days)),
+        scanned=tuple(sorted(found.days)),
     )
-
-
-def _doubt(error: InputError) -> Reason:
-    return reason("units.doubted", error=str(error))
 
 
 def _of_guess(project: Project) -> Iterator[Reason]:

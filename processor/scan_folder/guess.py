@@ -263,7 +263,7 @@ class _Shapes:
             part.name: mesh_distance.spread(part.vertices, part.faces, lambda _: SAMPLE) for part in design.parts
         }
         self.design = design
-        self.located: dict[tuple[str, str], list[Located]] = {}  # in a file's scan, in a unit
+        self.located: dict[tuple[str, str], list[list[Located]]] = {}  # in a file's scan, in a unit
         self.sizes = {name: principal.sizes(surface.points) for name, surface in surfaces.items()}
 
     @cached_property
@@ -290,7 +290,7 @@ def _differences(scan: ScanGuess, unit: str, shapes: _Shapes, named: Sequence[st
     points = scan.sample * MM_PER_UNIT[unit]
     sizes = list(shapes.sizes.values())
     longest = max(float(np.linalg.norm(size)) for size in sizes)
-    extents = [principal.sizes(thinned(points, SAMPLE))]
+    extents, others = [principal.sizes(thinned(points, SAMPLE))], list[Floats]()
     spread = float(np.linalg.norm(np.ptp(points, axis=0)))
     if spread < LARGEST_ROOM * longest and main_body.holds_more(points, sizes):
         names, designs = list(shapes.surfaces), list(shapes.surfaces.values())
@@ -303,9 +303,15 @@ def _differences(scan: ScanGuess, unit: str, shapes: _Shapes, named: Sequence[st
             if any(np.abs(shapes.sizes[name] - shapes.sizes[one]).max() < 2.0 * SAME_SHAPE * longest for one in named)
         ]
         found = located_part.which(points, designs, located, named=alike[0] if len(alike) == 1 else -1)
-        extents = [shapes.sizes[names[k]] for k in found] or extents
+        of_bodies = [[shapes.sizes[names[k]] for k in body.numbers] for body in found]
+        extents, others = (of_bodies[0], [one for body in of_bodies[1:] for one in body]) if found else (extents, [])
     return {
-        name: min(float(np.abs(one - shape).max() / shape[0]) for one in extents)
+        # What another body is, the scan may be of as well, if rather of this one.
+        name: min(
+            *(float(np.abs(one - shape).max() / shape[0]) for one in extents),
+            *(max(float(np.abs(one - shape).max() / shape[0]), 0.5 * SAME_SHAPE) for one in others),
+            float("inf"),
+        )
         for name, shape in shapes.sizes.items()
     }
 

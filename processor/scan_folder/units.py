@@ -192,7 +192,9 @@ def check_ratio(
     if faces is not None and 1.0 / CERTAIN_RATIO < factor < CERTAIN_RATIO:
         design = pose_search.prepared(mesh_distance.of_mesh(nominal, faces))
         few = large_arrays.every(points, max(1, len(points) // LOCATED))
-        as_read, otherwise = (located_part.locate(few / scale, [design])[0].shown for scale in (1.0, factor))
+        as_read, otherwise = (
+            located_part.most_shown(located_part.locate(few / scale, [design])) for scale in (1.0, factor)
+        )
         if as_read >= max(otherwise, located_part.LEAST_SHOWN) or (
             otherwise < located_part.LEAST_SHOWN
             and main_body.holds_more(few / factor, [principal.sizes(design.points)])

@@ -10,7 +10,7 @@ from processor import diagnostics
 from processor.evaluation import preassembly as preassembly_evaluation
 from processor.geometry import rigid
 from processor.geometry.lines_and_polylines import Polyline
-from processor.model import InputError, Scene, UsageError, Verdict, reason
+from processor.model import InputError, Scene, Status, UsageError, Verdict, reason
 from processor.preassembly import assembly_errors
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import edge_features, joint_alignment, methods
@@ -379,12 +379,23 @@ def test_uncorrected_temperature_is_reported(together, monkeypatch):
     assert result.reasons == (reason("preassemble.temperature-not-corrected", temperature=31.5),)
 
 
+def test_a_part_without_a_scan_does_not_end_the_bridge(together):
+    scene, truth, *_ = together
+    with mock.patch.object(attitude, "find", known_attitudes.find_by(truth)):
+        found = preassembly_step.run(dataclasses.replace(scene, scans=scene.scans[:2]), preassembly_step.Params())
+    assert (found.status, found.components.status) == (Status.PARTIAL, (Status.WEAK, Status.WEAK, Status.FAILED))
+    assert [one.code for one in found.components.reasons[2]] == ["preassemble.no-scan"]
+    assert np.isfinite(found.joints.gap[0]).all()
+
+
 def test_missing_design_scan_or_method_is_refused(together):
     scene, *_ = together
     with pytest.raises(InputError, match="arch-bridge design"):
         preassembly_step.run(Scene("x", "arch-bridge", scene.scans), preassembly_step.Params())
-    with pytest.raises(InputError, match="expected a scan of component 'rib2', found none"):
-        preassembly_step.run(dataclasses.replace(scene, scans=scene.scans[:2]), preassembly_step.Params())
+    with pytest.raises(InputError, match="expected scans of components foot1, rib1, rib2"):
+        preassembly_step.run(dataclasses.replace(scene, scans=()), preassembly_step.Params())
+    with pytest.raises(InputError, match="needs scans of all components, rib2 has none"):
+        preassembly_step.run(dataclasses.replace(scene, scans=scene.scans[:2]), preassembly_step.Params(method="line"))
     twice = (*scene.scans, dataclasses.replace(scene.scans[1], name="again"))
     with pytest.raises(InputError, match=r"takes one scan per part, rib1 has several"):
         preassembly_step.run(dataclasses.replace(scene, scans=twice), preassembly_step.Params(method="line"))

@@ -92,6 +92,20 @@ def test_gaps_of_bent_girders_are_inside_their_intervals(supports, stated):
     assert max(widths, default=1.0) < 1.3
 
 
+def test_the_law_of_supports_has_the_tail_that_intervals_take():
+    rng = np.random.default_rng(2)
+
+    def end():
+        """An end's displacement by a curvature along a part on two trestles, over its standard deviation."""
+        low, high = rng.uniform(0.0, 1.0 / 3.0, (2, 1_000_000))
+        uneven = rng.uniform(0.0, 10.0, len(low)) * np.cos(rng.uniform(0.0, 2.0 * np.pi, len(low)))
+        moved = uneven * low * (1.0 - high)
+        return moved / moved.std()
+
+    quantile = np.quantile(np.abs(end() - end()), 0.95) / np.sqrt(2.0)
+    assert quantile / 1.96 == pytest.approx(straightening.TAIL, abs=0.01)  # its standard deviation is 0.001
+
+
 def test_sags_taken_out_are_known_to_their_stated_share():
     rng, every = np.random.default_rng(11), []
     for girder in GIRDERS * 3:

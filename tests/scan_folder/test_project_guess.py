@@ -282,3 +282,20 @@ def test_one_scan_in_a_wrong_unit_does_not_end_the_bridge(bridge):
     (doubt,) = [one for one in scene.units_reason if one.code == "units.doubted"]
     assert "scan 'rib1'" in doubt.values["error"]
     assert "project.toml" in doubt.values["error"]
+
+
+def test_one_file_that_cannot_be_read_does_not_end_the_bridge(bridge):
+    entries = '[[support]]\ncomponent = "rib1"\nchainage_mm = 300.0\n' * 2
+    for i, name in enumerate(ORDER):
+        write_scan(bridge / f"{name}.xyz", box_points(SIZES[name], i))
+        entries += f'[[scan]]\nfile = "{name}.xyz"\ncomponent = "{name}"\n'
+    (bridge / "rib1.xyz").write_bytes(b"\x00\xff" * 500)
+    (bridge / "project.toml").write_text(f'units = "m"\ndesign = "design.json"\n{entries}')
+    scene = folder.read_input(bridge)
+    assert [scan.name for scan in scene.scans] == [name for name in ORDER if name != "rib1"]
+    (refused,) = [one for one in scene.units_reason if one.code == "read.scan-refused"]
+    assert "rib1.xyz" in refused.values["error"]
+    for name in ORDER:
+        (bridge / f"{name}.xyz").write_bytes(b"\x00\xff" * 500)
+    with pytest.raises(InputError, match="xyz"):
+        folder.read_input(bridge)

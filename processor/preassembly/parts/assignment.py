@@ -101,21 +101,24 @@ def locate(points: Floats, index: int, shapes: Shapes) -> tuple[Floats, int, flo
     """Locate part ``index`` among points (n, 3) of a scan with surroundings; None where no part is shown.
 
     Returns the pose T_bridge_scan (4, 4) of the part that the body there shows, which may be another than ``index``,
-    with its number, and how well another body in the scan shows the same shape: see :class:`located_part.Located`.
+    with its number, and the points on another body of the same shape, as a share of those on this one.
     """
     numbers = [index, *_other_shapes(index, range(len(shapes)), shapes)]
     designs = [shapes[k] for k in numbers]
-    own = located_part.locate(points, designs[:1])[0]
-    region, body = points, None
-    if own.shown >= located_part.LEAST_SHOWN:
-        region = points[located_part.about_design(points, own.T, designs[0])]
-        body = thinned(region[located_part.at_design(region, own.T, designs[0])], POINTS)
-    located = [own, *located_part.locate(region, designs[1:], body)]
-    found = located_part.which(region, designs, located, named=0)
-    if not found:
-        return None
-    best = 0 if 0 in found else found[0]
-    return located[best].T, numbers[best], own.rival
+    (own,) = located_part.locate(points, designs[:1])
+    if located_part.most_shown([own]) < located_part.LEAST_SHOWN:
+        bodies = located_part.which(points, designs, [[], *located_part.locate(points, designs[1:])])
+        return (bodies[0].places[0].T, numbers[bodies[0].numbers[0]], 0.0) if bodies else None
+    found, other = list[located_part.Located](), None
+    for place in own:
+        region = points[located_part.about_design(points, place.T, designs[0])]
+        body = thinned(region[located_part.at_design(region, place.T, designs[0])], POINTS)
+        bodies = located_part.which(region, designs, [[place], *located_part.locate(region, designs[1:], body)], 0)
+        if bodies and 0 in bodies[0].numbers:
+            found.append(place)
+        elif bodies and other is None:
+            other = bodies[0].places[0].T, numbers[bodies[0].numbers[0]], 0.0
+    return (found[0].T, index, found[1].count / found[0].count if found[1:] else 0.0) if found else other
 
 
 def _near_share(points: Floats, T: Floats, surface: DesignSurface) -> float:

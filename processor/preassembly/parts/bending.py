@@ -17,6 +17,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from processor.adjustment.thermal import EXPANSION_PER_K
+from processor.geometry import mesh_distance
 from processor.model import Bools, DesignPart, Floats, Steel
 from processor.preassembly.parts.mesh_sections import Sections, sections
 from processor.registration import principal
@@ -104,6 +105,10 @@ def beam(part: DesignPart, start: Floats | None, steel: Steel) -> Beam | None:
     rows = axes.axes.T.copy()
     if start is not None and (axes.centre - start) @ rows[0] < 0.0:
         rows[0] *= -1.0
+    # Of a nearly square section they may be turned by up to 45 degrees, where its depth is not that between its faces.
+    side = principal.along_faces(axes.axes, mesh_distance.of_mesh(part.vertices, part.faces))[:, 1]
+    rows[1] = side - (side @ rows[0]) * rows[0]
+    rows[1] /= np.linalg.norm(rows[1])
     rows[2] = np.cross(rows[0], rows[1])
     along = part.vertices @ rows[0]
     origin = axes.centre + (along.min() - axes.centre @ rows[0]) * rows[0]

@@ -391,6 +391,9 @@ def _between_stations(points: Floats, station: Ints, shape: DesignSurface) -> fl
 
 def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _PlacedScan:
     """Register one scan, without the ground and what stands about the part, and check that it is of part ``index``."""
+    if not len(scan.points):
+        why = (reason("preassemble.no-scan"),)
+        return _PlacedScan(scan, scan.points, scan.point_station, attitude.NOWHERE, rejected=why)
     points, row = by_cell(scan.points, CELL_MM)
     station = allocate(len(points), dtype=np.int64)
     for rows in blocks(len(points)):
@@ -420,7 +423,7 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     if covered < LEAST_COVERED and not doubts:
         away = 1.0 - float(of_part.mean())
         doubts = (reason("preassemble.sides-not-covered", share=away, covered=covered), *RIGHT_PART)
-    if rival > located_part.SURE_RIVAL:
+    if rival > 0.0:
         doubts += (reason("preassemble.another-of-shape", share=rival),)
     return replace(placed, doubts=doubts)
 

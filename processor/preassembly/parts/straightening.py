@@ -30,6 +30,9 @@ from processor.preassembly.parts.measure import MeasuredPart
 
 # Two trestles, each at up to a third of the length from its end: the middles of four equal shares of that.
 PLAUSIBLE = tuple((k + 0.5) / 12.0 for k in range(4))
+# Half of the 95 % interval of a gap of two parts bent by differences of temperature on supports not known, by 1.96
+# standard deviations: of the law above, and of 0 to 10 K in any direction, the tails are longer than normal ones.
+TAIL = 1.07
 STEEP = 0.5  # sine of the axis' inclination from which no part lies on trestles: the scan is not levelled
 PLACE_SD_MM = 50.0  # of a stated support: half the width of its beam, and a tape measure
 WORTH_MM = 0.1  # one standard deviation of an end's sag, from which it is named whatever else is uncertain
@@ -115,7 +118,8 @@ def _on_any_supports(beam: Beam, gravity: Floats, gradient_K: float) -> _Bend:
     for supports in pairs:
         found = [bending.sag(beam, direction, supports) for direction in directions]
         by_weight += [one[0].scaled(share) for one in found if one is not None]
-        by_gradient += [bending.by_gradient(beam, axis, supports).scaled(share * gradient_K) for axis in range(2)]
+        scale = TAIL * share * gradient_K
+        by_gradient += [bending.by_gradient(beam, axis, supports).scaled(scale) for axis in range(2)]
     return _Bend(beam, (), tuple(by_weight), tuple(by_gradient))
 
 

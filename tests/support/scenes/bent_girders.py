@@ -176,6 +176,10 @@ def bent(girder, start, points, lying, weight=1.0):
         depth = girder.height if level else girder.width
         held = lying.supports if load else (lying.supports[0], lying.supports[-1])
         across, slope, _ = finite_elements(nodes, E_MPA * girder.inertia(level), load, EXPANSION * uneven / depth, held)
+        # Of a part that lifts off an outer support: where it lies as a whole is no bend
+        first, last = np.interp((lying.supports[0], lying.supports[-1]), nodes, across)
+        tilt = (last - first) / (lying.supports[-1] - lying.supports[0])
+        across, slope = across - first - tilt * (nodes - lying.supports[0]), slope - tilt
         moved += np.outer(np.interp(local[:, 0], nodes, across), axis)
         moved[:, 0] -= (local @ axis) * np.interp(local[:, 0], nodes, slope)
     return moved
