@@ -316,6 +316,12 @@ def _differences(scan: ScanGuess, unit: str, shapes: _Shapes, named: Sequence[st
     }
 
 
+def _misfit(scan: ScanGuess, unit: str, shapes: _Shapes) -> tuple[float, float]:
+    """Return how much a scan's extents differ from the nearest part's, and less the share of surface that is shown."""
+    least = min(_differences(scan, unit, shapes).values())
+    return least, -located_part.most_shown(shapes.located.get((scan.file, unit), []))
+
+
 def _guess_units(project: Guess, nominal: Sequence[float], shapes: _Shapes | None) -> None:
     """Take the unit of the formats; else the one in which the scans have the design's size; else metres.
 
@@ -330,12 +336,12 @@ def _guess_units(project: Guess, nominal: Sequence[float], shapes: _Shapes | Non
         project.units_reasons = (reason("init.units-by-formats", units=given),) if given else ()
         return
     if shapes:
+        # Of scans with surroundings a part is found in several units: in the right one more of its surface is shown.
         of_unit = {
-            unit: float(np.median([min(_differences(scan, unit, shapes).values()) for scan in without]))
-            for unit in UNITS
+            unit: np.median([_misfit(scan, unit, shapes) for scan in without], axis=0).tolist() for unit in UNITS
         }
         best = min(UNITS, key=of_unit.__getitem__)
-        if of_unit[best] <= LIKE_SHAPE:
+        if of_unit[best][0] <= LIKE_SHAPE:
             project.units, project.units_reasons = best, (reason("init.units-by-design"),)
             return
     if nominal:

@@ -1,6 +1,7 @@
 """`processor init`: kinds, units and components guessed from files; uncertain guesses are marked."""
 
 import json
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from click.testing import CliRunner
 from processor.cli import main
 from processor.language.messages import messages
 from processor.model import InputError, UsageError, reason
+from processor.registration import located_part
 from processor.scan_folder import component_names, folder, guess
 from tests.support.pages.pages import latin
 from tests.support.results.reasons import codes, values
@@ -299,3 +301,18 @@ def test_one_file_that_cannot_be_read_does_not_end_the_bridge(bridge):
         (bridge / f"{name}.xyz").write_bytes(b"\x00\xff" * 500)
     with pytest.raises(InputError, match="xyz"):
         folder.read_input(bridge)
+
+
+def test_a_raw_scan_has_the_unit_in_which_more_of_the_design_is_shown(monkeypatch):
+    scans = [guess.ScanGuess(f"{k}.ply") for k in range(3)]
+    shown = {"m": (0.33, 0.31, 0.6), "ft": (0.5, 0.6, 0.3)}
+    shapes = mock.Mock(located={
+        (scan.file, unit): [[located_part.Located(np.eye(4), share)], []]
+        for unit, shares in shown.items()
+        for scan, share in zip(scans, shares, strict=True)
+    })  # fmt: skip
+    found = lambda scan, unit, shapes: {"rib1": 0.0 if unit in shown else 0.5, "rib2": 0.2}  # noqa: E731
+    monkeypatch.setattr(guess, "_differences", found)
+    project = guess.Guess("f", "f", kind="arch-bridge", scans=scans)
+    guess._guess_units(project, [1.0], shapes)
+    assert (project.units, project.doubts) == ("ft", [])
