@@ -62,6 +62,7 @@ from processor.scan_folder.tolerance import check_components, read_tolerance
 from processor.scan_folder.units import MM_PER_UNIT, FileUnit, file_unit, known_unit
 
 FLOAT_STEP_MM = 1.0
+LARGEST_MM = units.LARGEST_KM * MM_PER_UNIT["km"]  # of a scan in a wrong unit that fills the memory
 UNIT_ADVICE = (
     "state its unit by --units, or by 'units' of its [[scan]] in project.toml (m, or m/us-ft where the heights have "
     "another), or export it in metres"
@@ -330,9 +331,12 @@ def _read_scans(project: Project, design: Design | None, option: str, stations: 
             for raw in _read_raws(entry, found.scans):
                 unit, why = _unit(raw, entry, project, option)
                 scan = found.clipper.clip(_scan(raw, entry, unit, parts, stations))
-                if any(scan.name == other.name for other in found.scans):
-                    raise InputError(f"a second scan named {scan.name!r}; rename one of the files", path=entry.file)
-                found.doubted += _doubts_of_unit(entry.file, scan, unit, why, design)
+                try:
+                    _check_unit(entry.file, scan, unit, messages("en").text(why), design)
+                except InputError as error:
+                    if not parts or np.ptp(large_arrays.corners(scan.points), axis=0).max() > LARGEST_MM:
+                        raise
+                    found.doubted.append(error)  # at such a unit a part fits its design nowhere
                 found.days |= {raw.scanned} - {""}
                 found.units_by.setdefault(str(unit), why)
                 found.remarks += raw.remarks
@@ -342,6 +346,9 @@ def _read_scans(project: Project, design: Design | None, option: str, stations: 
             if not parts:
                 raise
             found.refused[entry.component or scan_name(entry.file)] = error
+        names = [scan.name for scan in found.scans]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise InputError(f"a second scan named {twice[0]!r}; rename one of the files", path=entry.file)
     errors = [*found.doubted, *found.refused.values()]
     if errors and len(found.doubted) == len(found.scans):
         raise errors[0]
@@ -389,20 +396,6 @@ def _of_guess(project: Project) -> Iterator[Reason]:
     if project.guessed is not None:
         unsure = bool(project.guessed.doubts)
         yield reason("units.design-guessed-unsure") if unsure else reason("units.design-guessed")
-
-
-def _doubts_of_unit(file: Path, scan: Scan, unit: FileUnit, why: Reason, design: Design | None) -> Iterator[InputError]:
-    """Yield that the unit of a part's scan seems wrong; raise InputError for one of any other design.
-
-    The other parts of a bridge are answered: at such a unit this one fits its design nowhere.
-    """
-    try:
-        _check_unit(file, scan, unit, messages("en").text(why), design)
-    except InputError as error:
-        low, high = large_arrays.corners(scan.points)
-        if not isinstance(design, ArchDesign) or (high - low).max() > units.LARGEST_KM * MM_PER_UNIT["km"]:
-            raise
-        yield error
 
 
 def _read_raws(entry: ScanEntry, scans: Sequence[Scan]) -> Iterator[RawScan]:

@@ -385,7 +385,7 @@ def test_a_part_without_a_scan_does_not_end_the_bridge(together):
         found = preassembly_step.run(dataclasses.replace(scene, scans=scene.scans[:2]), preassembly_step.Params())
     assert (found.status, found.components.status) == (Status.PARTIAL, (Status.WEAK, Status.WEAK, Status.FAILED))
     assert [one.code for one in found.components.reasons[2]] == ["preassemble.no-scan"]
-    assert np.isfinite(found.joints.gap[0]).all()
+    assert np.isfinite(found.joints.gaps[0]).all()
 
 
 def test_missing_design_scan_or_method_is_refused(together):

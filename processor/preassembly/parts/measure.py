@@ -393,7 +393,7 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
     """Register one scan, without the ground and what stands about the part, and check that it is of part ``index``."""
     if not len(scan.points):
         why = (reason("preassemble.no-scan"),)
-        return _PlacedScan(scan, scan.points, scan.point_station, attitude.NOWHERE, rejected=why)
+        return _PlacedScan(scan, scan.points, np.empty(0, np.int64), attitude.NOWHERE, rejected=why)
     points, row = by_cell(scan.points, CELL_MM)
     station = allocate(len(points), dtype=np.int64)
     for rows in blocks(len(points)):
