@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from processor.space_frame.ball_catalogue import of_radii
-from processor.space_frame.members.records import Members
 from processor.space_frame.spheres import alternating_fit, assessment, records
 from processor.space_frame.spheres.unnamed_view_errors import (
     BallResiduals,
