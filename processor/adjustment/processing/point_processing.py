@@ -36,7 +36,7 @@ PEAKS, STEPS = 3, 7  # frequencies that are tried, and the steps of each about i
 # the second was below 0.04, or the first above 0.9 of it; of thinned ones to two thirds it is above 0.1.
 LEAST_BESIDE, MOST_WITHIN = 0.08, 0.5
 LEAST_AGREE = 0.3  # of the places
-HALF_AN_EDGE = 0.5 * (1.0 - np.eye(3))
+HALF_AN_EDGE = 0.5 * (1.0 - np.eye(3))  # along two axes each: where cells that hold one point hold none or two
 WIDE = 8.0  # extent along an axis, in distances of neighbours, from which it holds cells: noise of a plane is below it
 PATCHES, PATCH_POINTS = 100, 64  # of a place, where a surface is fitted: wider than what filters take, 8 to 30 points
 TERMS, RIDGE = 6, 1e-9  # of a surface of second order, and what keeps it determined where points lie in lines
