@@ -153,7 +153,8 @@ def _place(patches: list[ScanPatches], params: Params, reference: int, given: Gi
         found |= dict(zip(some, thread_ranges.each(deeper, some), strict=True))
         if not is_moved and network.nothing_sure(found):
             is_moved, placed = True, network.place(patches, found, reference, True)
-            found, evidence = dict(placed.candidates), placed.evidence()
+            found = dict(placed.candidates)
+            evidence = [*map(pairwise.reduced, patches, placed.still)] if placed.still else patches
     return network.place(patches, found, reference, is_moved)
 
 

@@ -119,10 +119,6 @@ class Network:
             still.append(~moved)
         return still
 
-    def evidence(self) -> list[ScanPatches]:
-        """Return the scans with the patches that are evidence alone."""
-        return self.scans if self.still is None else [*map(pairwise.reduced, self.scans, self.still)]
-
     def same(self, T: Floats, S: Floats, j: int) -> bool:
         """Return whether two poses of scan j are the same."""
         return pairwise.same(T, S, self.scans[0].side_mm, self.scans[j])
@@ -149,7 +145,10 @@ def place(scans: list[ScanPatches], candidates: Pairs, reference: int, is_moved:
             (a, b): sorted((network.score_of(a, b, pose.T_a_b) for pose in poses), key=lambda pose: -pose.score)
             for (a, b), poses in candidates.items()
         }
-        network = _improved(_placed(replace(network, candidates=found), reference), reference)
+        network = _placed(replace(network, candidates=found), reference)
+        for j in set(network.placed) - {reference}:  # to the poses that are best with what would have moved by them
+            if ranked := rank_poses(network, j, [i for i in network.placed if i != j], network.T[j]):
+                network.T[j] = ranked[0][1]
         rated(network, reference)  # moves groups of scans
     return network
 
@@ -162,15 +161,6 @@ def _placed(network: Network, reference: int) -> Network:
         j, pose = best
         network.T[j] = pose
         network.placed.append(j)
-    return network
-
-
-def _improved(network: Network, reference: int) -> Network:
-    """Move single scans to poses that are better with what would have moved by these."""
-    for j in network.placed:
-        others = [i for i in network.placed if i != j]
-        if j != reference and (ranked := rank_poses(network, j, others, network.T[j])):
-            network.T[j] = ranked[0][1]
     return network
 
 
