@@ -45,6 +45,9 @@ FLATTEST, LEAST_FLAT = 8, 25  # of the patches one in as many counts, those with
 # scanners with correlated noise it was 0.88 to 1.15, of means of 8 and 20 and moving least squares 0.26 to 0.65, of
 # samples of meshes 0.59 to 0.75.
 SMOOTH = 0.78
+# The same of the nearest on all sides, 1 or more of noise: points of one line of a scanner share its errors, those of
+# the next line do not.
+ABOUT, SMOOTH_ABOUT = 4, 0.92
 CHANCE = 5.5  # over the root of the number of points: 3.7 standard deviations of that median of white noise
 IN_PLANE, LEAST_IN_PLANE = 0.02, 0.1  # thickness of five neighbours in sd of residuals; by chance 2e-4 are so thin
 
@@ -138,9 +141,11 @@ def _smoothed(near: Floats, known: Floats | None, step: float, count: int) -> tu
         return False, False
     away = (u[flat, :, None] - u[flat, None]) ** 2 + (v[flat, :, None] - v[flat, None]) ** 2
     away[:, range(away.shape[1]), range(away.shape[1])] = np.inf
-    of_nearest = np.take_along_axis(errors[flat], np.argmin(away, axis=2), axis=1)
-    alike = 0.5 * np.mean((errors[flat] - of_nearest) ** 2, axis=1) / variance[flat]
-    if np.median(alike) >= min(SMOOTH, 1.0 - CHANCE / np.sqrt(count)):
+    nearest = np.argsort(away, axis=2)[:, :, :ABOUT].reshape(len(flat), -1)
+    of_nearest = np.take_along_axis(errors[flat], nearest, axis=1).reshape(len(flat), -1, ABOUT)
+    alike = 0.5 * np.mean((errors[flat][:, :, None] - of_nearest) ** 2, axis=1) / variance[flat, None]
+    first, about = float(np.median(alike[:, 0])), float(np.median(alike.mean(axis=1)))
+    if first >= min(SMOOTH, 1.0 - CHANCE / np.sqrt(count)) or about >= SMOOTH_ABOUT:
         return False, False
     five = near[flat, :5] - near[flat, :5].mean(axis=1, keepdims=True)
     thickness = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(five, 1, 2) @ five)[:, 0], 0.0))
