@@ -352,11 +352,11 @@ def _with_points_once(
     The last says whether that is more than any interval holds. The scene's hash is that of what was read.
     """
     from processor import scene_cloud
-    from processor.adjustment.processing.point_processing import recognised
+    from processor.adjustment.processing.point_processing import agreed, recognised
     from processor.language.messages import messages
 
     scene, reasons = scene_cloud.with_points_once(scene)
-    traces = [recognised(scan.points) for scan in scene.scans]
+    traces = agreed([recognised(scan.points) for scan in scene.scans])
     for scan, trace in zip(scene.scans, traces, strict=True):
         reasons += trace.reasons(scan.name)
     for one in reasons:

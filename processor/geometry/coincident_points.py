@@ -37,9 +37,10 @@ FEWEST_PAIRS, SURE = 3.0, 3.0  # pairs that no share of points explains, and sta
 FEWEST_PLACES = 32  # that all have even numbers by chance once in 4e9 clouds
 BESIDE = 5  # the point itself and four neighbours
 COPY_RATIO, LEAST_COPIES = 0.05, 0.05  # of distances to the first and fourth neighbour; 0.8 % of chance points are so
+FEWEST_COPIED = 100  # points of a cloud, of which 5 lie so by chance once in 700
 SMALL_STEP = 0.1  # of the distance to the fourth neighbour: coarser rounding makes neighbours of places
 PLACES, PLACE_POINTS = 8, 2000  # of a cloud that are looked at: 45 points wide
-EVERY = 4  # of the points of a place: shares of 5 % are known to 0.5 %
+LOOKED_AT = 500  # points of a place: a share of 5 % is known to 1 %
 NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)], np.int64)  # of 26
 # Odd numbers that mix bits: of the golden ratio (SplitMix64), and two primes of xxHash64.
 MIXERS = tuple(np.uint64(number) for number in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9))
@@ -138,10 +139,8 @@ def used_once_of(clouds: Sequence[Floats], offsets: Sequence[Floats]) -> list[Bo
     lattice = whole.lattice()
     if _are_duplicated(lattice, _sampled(whole, lattice)):
         used = _used(whole, lattice)
-    elif BESIDE <= whole.count <= large_arrays.AT_ONCE:
-        used = _without_copies(whole, float(lattice.step.max()))
-    else:
-        return None
+    else:  # within each: scans from one tripod lie beside each other, and are measurements of their own
+        used = np.concatenate([_without_copies(cloud, float(lattice.step.max())) for cloud in whole.clouds])
     return None if used.all() else np.split(used, np.cumsum([len(cloud) for cloud in clouds])[:-1])
 
 
@@ -158,11 +157,16 @@ def some_places(points: Floats) -> list[Ints]:
     return of_places
 
 
-def _without_copies(whole: _Clouds, step: float) -> Bools:
-    """Mark (n,) all points but those that lie beside an earlier one, if more do than by chance."""
-    points = np.concatenate([block + offset for _, block, offset in whole.blocks()])
+def _without_copies(points: Floats, step: float) -> Bools:
+    """Mark all points (n, 3) but those that lie beside an earlier one, if more do than by chance."""
     beside = np.zeros(len(points), bool)
-    near = [cKDTree(points[rows]).query(points[rows[::EVERY]], k=BESIDE)[0] for rows in some_places(points)]
+    if not FEWEST_COPIED <= len(points) <= large_arrays.AT_ONCE:
+        return ~beside
+    points = np.asarray(points)
+    near = [
+        cKDTree(points[rows]).query(points[rows[:: max(len(rows) // LOOKED_AT, 1)]], k=BESIDE)[0]
+        for rows in some_places(points)
+    ]
     away = np.concatenate(near)
     copied = away[:, 1] < COPY_RATIO * away[:, -1]
     if np.mean(copied) < LEAST_COPIES or step > SMALL_STEP * float(np.median(away[:, -1])):

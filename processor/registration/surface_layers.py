@@ -34,6 +34,8 @@ AROUND, PIECE, OTHER_BODY = (
     3.0,
     0.05,
 )  # pieces of faces about one, their least side in diameters, weight of other bodies
+# Of a body that lies before its design all about, by less than boards are thick, other plates or sections were built.
+LARGER_MM, HALF = 12.0, 0.5
 AGREES_MM, AGREE = 3.0, 0.1  # of the movement about it, to which a surface agrees; the least share of it that does
 ROUNDS = 20  # work: of least absolute residuals
 
@@ -114,8 +116,11 @@ def of_points(
     size = np.bincount(surface)
     agreeing = np.bincount(surface, np.abs(off) <= np.maximum(AGREES_MM, WITHIN * np.maximum(spread, noise))) / size
     before = np.bincount(surface, off) > 0.0
-    beside = before & (agreeing < AGREE)
-    return Layers(tree, height, slope, ~beside[surface], noise=noise, radius=0.5 * diameter_mm)
+    beside = (before & (agreeing < AGREE))[surface]
+    of_body = body[at][known] - body.min()  # -1 = of none
+    larger = np.bincount(of_body, beside & (off < LARGER_MM)) > HALF * np.bincount(of_body)
+    beside &= ~larger[of_body]
+    return Layers(tree, height, slope, ~beside, noise=noise, radius=0.5 * diameter_mm)
 
 
 def _grouped(core: Samples, feet: Floats, distance: Floats, normals: Floats, radius: float) -> _Groups:

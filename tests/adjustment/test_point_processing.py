@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 import processor
 from processor import fit_sphere, pipeline
-from processor.adjustment.processing.point_processing import Processing, recognised
+from processor.adjustment.processing.point_processing import Processing, agreed, recognised
 from processor.geometry.coincident_points import used_once
 from processor.language.messages import messages
 from processor.model import NORMAL_95, Scan, Scene, Status, Verdict
@@ -97,6 +97,15 @@ def test_copies_beside_the_points_count_once():
     assert np.mean(used[: len(points)]) > 0.98
     assert not used[len(points) :].any()
     assert used_once(points) is None
+
+
+def test_a_cell_counts_where_half_of_the_scans_have_it():
+    cells = [5.0, 5.02, 43.0, 43.7, 0.0]
+    kept = [trace.cell for trace in agreed([Processing(cell=cell) for cell in cells])]
+    assert kept == [0.0] * 5  # two of five
+    kept = [trace.cell for trace in agreed([Processing(cell=cell) for cell in cells[:3]])]
+    assert kept == [5.0, 5.02, 0.0]
+    assert agreed([]) == []
 
 
 def edges(seed: int) -> np.ndarray:

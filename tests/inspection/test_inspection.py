@@ -236,7 +236,9 @@ def test_parts_as_designed_are_inspected_from_their_scans(monkeypatch):
         known = np.isfinite(found.deviation)
         assert known.sum() == (27 if component.name == "rib1" else 11)  # with two ends at joints and with one
         held += (np.abs(found.deviation[known]) <= found.ci95[known]).tolist()
-        assert np.nanmax(found.ci95) < 0.5  # of a point each 20 mm, of 1 mm noise: 0.18 to 0.36 in three draws
+        # Of a point each 20 mm, of 1 mm noise: 0.18 to 0.36 in three draws; supports that nobody states add to sweep and
+        # camber of 6 m as much again.
+        assert np.nanmax(found.ci95) < np.hypot(0.36, 0.36)
     assert len(held) == 49
     assert np.mean(held) > 5 / 6
     found = {one.quantity: one.value for one in evaluation.check(scene, runs["inspect"], truth) if one.unit == "%"}
