@@ -236,8 +236,8 @@ def test_parts_as_designed_are_inspected_from_their_scans(monkeypatch):
         known = np.isfinite(found.deviation)
         assert known.sum() == (27 if component.name == "rib1" else 11)  # with two ends at joints and with one
         held += (np.abs(found.deviation[known]) <= found.ci95[known]).tolist()
-        # Of a point each 20 mm, of 1 mm noise: 0.18 to 0.36 in three draws; supports that nobody states add to sweep and
-        # camber of 6 m as much again.
+        # Of a point each 20 mm, of 1 mm noise: 0.18 to 0.36 in three draws; supports that nobody states add as much
+        # again to sweep and camber of 6 m.
         assert np.nanmax(found.ci95) < np.hypot(0.36, 0.36)
     assert len(held) == 49
     assert np.mean(held) > 5 / 6
