@@ -576,14 +576,9 @@ class Scene(Checked):
     scanned: tuple[str, ...] = names("days", newer=True, hashed=False)
 
     def contradictions(self) -> Iterable[Fault]:
-        """Yield scans of one name or station, scanners far away, and parts that the design does not have."""
+        """Yield scans of one name, scanners far away, and parts that the design does not have."""
         yield from _repeated("scans", tuple(scan.name for scan in self.scans))
-        seen: set[tuple[str, str]] = set()
-        for i, scan in enumerate(self.scans):
-            if scan.station and (scan.component, scan.station) in seen:
-                text = f": expected another station for each scan, found {scan.station!r} a second time"
-                yield Fault(("scans", f"{i:04d}", "station"), text)
-            seen.add((scan.component, scan.station))
+        for scan in self.scans:
             for row, position in self._stations_of(scan):
                 place = (position - scan.pose[:3, 3]) @ scan.pose[:3, :3] - scan.origin
                 far = list(_far(("stations", "positions"), f", row {row}", place, scan))

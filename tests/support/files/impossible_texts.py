@@ -76,7 +76,6 @@ PICKS = {
 MORE = {
     "design.json a key twice": ("design.json", '"units": "m",', '"units": "m", "units": "mm",', "units"),
     "stations.json a key twice": ("stations.json", '"S2"', '"S1"', "S1"),
-    "project.toml a station twice": ("project.toml", 'file = "b.xyz"', 'file = "b.xyz"\nstation = "S1"', "station"),
     "project.toml a key of 20,000 parts": ("project.toml", "[tolerance]", f"{'a.' * 20_000}a = 1\n[tolerance]", "parts"),  # noqa: E501
     "project.toml a table of 20,000 parts": ("project.toml", "[tolerance]", f"[{'a . ' * 20_000}a]\n[tolerance]", "parts"),  # noqa: E501
     "project.toml 5,001 boxes": (
