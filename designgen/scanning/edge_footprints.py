@@ -17,7 +17,7 @@ from designgen.scanning.raycast import Grid
 from designgen.scanning.surfaces import TRIANGLE, Surfaces
 from processor.model import Bools, Floats, Labels
 
-MOST_CELLS = 16  # work: wider footprints divide whole rows, with the same result
+MOST_CELLS = 32  # work: wider footprints divide whole rows, with the same result
 # An edge lies up to one cell beyond the last ray on a surface; this fraction of the cell is searched.
 RESERVE = 0.75
 
