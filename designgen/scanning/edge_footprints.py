@@ -17,7 +17,7 @@ from designgen.scanning.raycast import Grid
 from designgen.scanning.surfaces import TRIANGLE, Surfaces
 from processor.model import Bools, Floats, Labels
 
-MOST_CELLS = 32  # work: wider footprints divide whole rows, with the same result
+MOST_CELLS = 32  # work: wider footprints divide whole rows; the range of an edge is handed on as far
 # An edge lies up to one cell beyond the last ray on a surface; this fraction of the cell is searched.
 RESERVE = 0.75
 
@@ -93,8 +93,8 @@ def mark_edges(surface, t, thin, used, margin, grid, beam, least):  # type: igno
 
     ``surface`` and ``t`` (columns, rows) are the number and range (mm) of the surface that each ray meets, -1 and
     infinite for none; ``thin`` is the range at which a footprint may touch a shape too thin for the rays. The ``used``
-    columns of the strip have ``margin.side`` columns on either side. All sub-rays lie
-    within the ``beam``; nothing is nearer than ``least``, mm. Outside of the strip the results are False and infinite.
+    columns of the strip have ``margin.side`` columns on either side. All sub-rays lie within the ``beam``;
+    nothing is nearer than ``least``, mm. Outside of the strip the results are False and infinite.
     """
     side, edge_columns, whole_rows = margin.side, margin.edge_columns, margin.whole_rows
     across = 2.0 * np.pi / grid.columns

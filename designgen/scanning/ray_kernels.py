@@ -372,9 +372,8 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
                     continue
                 dx, dy, dz = direction(ca, sa, level[row], rise[row], jitter[j, row, 0], jitter[j, row, 1])
                 along = dx * cx + dy * cy + dz * cz
-                near = (
-                    r + widest * angle[ray] * abs(along) + 1e-6 * r
-                )  # the beam's edge may touch what its middle misses
+                # The beam's edge may touch what its middle misses.
+                near = r + widest * angle[ray] * abs(along) + 1e-6 * r
                 if along + r < 0.0 or along - r > farthest[ray] or c2 - along * along > near * near + 1e-9 * c2:
                     continue
                 changed = False

@@ -137,6 +137,7 @@ def scan_station(
         station=station,
         keep_hits=keep_hits,
         margin=margin,
+        outermost=outermost,
         least=least,
     )
     threads = int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
@@ -189,6 +190,7 @@ class _StationCaster:
     station: str
     keep_hits: bool
     margin: edge_footprints.Margin
+    outermost: Beam  # in which all sub-rays lie
     least: float  # lower bound of the range to any surface, mm
 
     def in_view(self, number: int) -> bool:
@@ -206,15 +208,14 @@ class _StationCaster:
         rng = generator(self.seed, f"station {self.station}", number + 1)
         used, side = min(STRIP, self.grid.columns - strip.first), strip.side
         rays = self._rays(rng, used)
-        outermost = reach(self.scanner, self.params.sub_rays)
-        shape, t, thin = self.view.cast(number, self.grid, rays, outermost, self.margin.cast_columns)
+        shape, t, thin = self.view.cast(number, self.grid, rays, self.outermost, self.margin.cast_columns)
         inside = shape >= 0
         inside[:side], inside[side + used :] = False, False
         edge, near = np.zeros(shape.shape, bool), t
         if self.params.sub_rays > 1:
             surface = np.where(shape >= 0, self.surfaces.surface[shape], -1)
             edge, near = edge_footprints.mark_edges(
-                surface, t, thin, used, self.margin, self.grid, outermost, self.least
+                surface, t, thin, used, self.margin, self.grid, self.outermost, self.least
             )
             inside &= ~edge
         column, row = (index.astype(np.int32) for index in np.nonzero(inside))

@@ -126,10 +126,14 @@ class Measured:
         return cls(of, value, value - half_width, value + half_width, **further)
 
     @property
+    def middle(self) -> float:
+        """The value, or its size where the sign is not sure: what the interval lies about."""
+        return abs(self.value) if self.unsigned else self.value
+
+    @property
     def wider_side(self) -> float:
-        """The wider side of the interval about the value, about its size where the sign is not sure."""
-        middle = abs(self.value) if self.unsigned else self.value
-        return max(self.high - middle, middle - self.low)
+        """The wider side of the interval about the value."""
+        return max(self.high - self.middle, self.middle - self.low)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,9 +231,8 @@ def _decided(
     verdicts = []
     for (one, least, most), risk in zip(sides, each, strict=True):
         least, most = _allowed(one, least, most)
-        low, high = one.low, one.high
-        if tolerance.decision is DecisionRule.SIMPLE:
-            low = high = abs(one.value) if one.unsigned else one.value
+        simple = tolerance.decision is DecisionRule.SIMPLE
+        low, high = (one.middle, one.middle) if simple else (one.low, one.high)
         if math.isnan(risk):
             verdicts.append(Verdict.INDETERMINATE)
         elif least <= low and high <= most:
@@ -247,9 +250,8 @@ def _beyond(one: Measured, least: float, most: float) -> float:
     if one.doubtful or math.isnan(one.low) or math.isnan(one.high):
         return NAN
     least, most = _allowed(one, least, most)
-    value = abs(one.value) if one.unsigned else one.value
-    if not one.low <= value <= one.high:  # the greatest of many noisy values is biased
-        value = 0.5 * (one.low + one.high)
+    # The greatest of many noisy values is biased, and may lie outside of its interval.
+    value = one.middle if one.low <= one.middle <= one.high else 0.5 * (one.low + one.high)
 
     def below(bound: float, exact: float) -> float:
         sd = (one.high - value if bound > value else value - one.low) / NORMAL_95

@@ -163,7 +163,7 @@ def test_radii_of_thinned_spheres_lie_within_their_intervals():
 
 @pytest.mark.parametrize(("instrument", "least"), [("", 0.5), ("phase", 0.5), ("pulse", 0.6), ("long-range", 2.5)])
 def test_intervals_hold_the_class_of_the_instrument(instrument, least):
-    """The offset of a view moves a ball along the rays by as much; the class that nobody states is said."""
+    """The offset of a view moves a ball along the rays by as much; a class that is assumed is stated."""
     fit = fit_sphere(ball(3), radius=RADIUS, instrument=instrument)
     assert least < np.sqrt(np.trace(fit.covariance[:3, :3])) < 1.5 * least + 0.2
     assert ("spheres.instrument-assumed" in [one.code for one in fit.reasons]) == (not instrument)

@@ -16,9 +16,7 @@ from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
 
 MOST_TRIED = 5  # work: groups of competing poses of a scan that are scored with all others
 MOST_PLACINGS = 4  # work: each leaves out what the poses of the one before say has moved
-MOVED_SHARE = (
-    0.1  # chosen: of a contradiction, if it is taken as of what moved: the fewer things must have moved the better
-)
+MOVED_SHARE = 0.1  # chosen: of a contradiction that is taken as of what moved: the fewer things moved the better
 AMBIGUOUS = 0.75  # of the best pose's score: a competing pose that reaches it is as likely
 LEAST_OVERLAP = 0.08  # chosen: of patches: below it a pair agrees or disagrees by chance
 
@@ -128,7 +126,7 @@ def nothing_sure(candidates: Pairs) -> bool:
     """Return whether free space contradicts all poses of all pairs, as where something moves between any two scans.
 
     Else nothing is taken as moved: in a hall of equal bays scans that lie on each other explain all that tells bays
-    apart as moved, and only that nothing has to move speaks for the right poses.
+    apart as moved, and the right poses are preferred only because nothing has to move.
     """
     return not any(pose.score > pairwise.SURE for poses in candidates.values() for pose in poses)
 
@@ -336,7 +334,7 @@ def _across(
 
 
 def _evidence(scored: ScoredPose) -> tuple[float, float, float]:
-    """Return what speaks for and against a pose, and the weight of all patches, without support by little overlap."""
+    """Return the support of a pose, 0 by little overlap, what contradicts it, and the weight of all patches."""
     against = scored.against + MOVED_SHARE * scored.moved
     supports = scored.overlap > LEAST_OVERLAP
     return (scored.agree, against, scored.agree / scored.overlap) if supports else (0.0, against, 0.0)
