@@ -45,6 +45,7 @@ NAMES = {
     Quantity.SQUARENESS: "squareness of end faces",
     Quantity.DIAMETER: "diameters",
     Quantity.BOW: "bows",
+    Quantity.ANGLE: "angles of sides",
 }
 OF_SIZE = (Quantity.SWEEP, Quantity.CAMBER, Quantity.BOW)
 REACH_MM, ALIKE = 50.0, 0.99  # of a true point to its facet, and cosine between their normals
@@ -62,21 +63,23 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         true = _of_bodies(scene.structure, truth.structure)
     else:
         return []
-    errors: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    errors: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for component in result.components:
         found, true_values = component.characteristics, true.get(component.name, {})
-        for id_, quantity, deviation, ci95 in zip(found.id, found.quantity, found.deviation, found.ci95, strict=True):
+        for id_, quantity, unit, deviation, ci95 in zip(
+            found.id, found.quantity, found.unit, found.deviation, found.ci95, strict=True
+        ):
             if id_ in true_values:
                 value = true_values[id_]
                 error = abs(deviation) - abs(value) if quantity in OF_SIZE else deviation - value
-                errors[NAMES[quantity]].append((float(error), float(ci95)))
+                errors[NAMES[quantity], unit].append((float(error), float(ci95)))
     metrics = []
-    for name, found_errors in sorted(errors.items()):
+    for (name, unit), found_errors in sorted(errors.items()):
         error, half = np.array(found_errors).T
         known = np.isfinite(error)
         if known.any():
             rms = float(np.sqrt(np.mean(error[known] ** 2)))
-            metrics += [Metric(name, rms, Statistic.RMS, unit="mm"), *covered(name, error, half)]
+            metrics += [Metric(name, rms, Statistic.RMS, unit=unit), *covered(name, error, half)]
     return metrics
 
 
@@ -139,7 +142,7 @@ def _of_bodies(design: StructureDesign, truth: StructureTruth) -> dict[str, dict
     seen = flat_faces.Observed(places=points, facet=facet, deviation=moved, noise=none, shared=none, side=PIECE_MM)
     return {
         body.name: {
-            one.of: one.value for one in structure_bodies.measured(body)[0] if one.what is not Quantity.FLATNESS
+            one.of: one.value for one in structure_bodies.measured(body, seen)[0] if one.what is not Quantity.FLATNESS
         }
         for body in flat_faces.bodies(design, seen, LEAST_FACE_MM)
     }

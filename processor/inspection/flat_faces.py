@@ -31,7 +31,8 @@ SAME_PLACE_MM = 1e-3  # rounding: places of core points computed twice from one 
 # large as FAR_MM: a smaller one is seen from the same places all over.
 HALVES, FAR_MM = 0.5, 2000.0
 CLIP = 4.5  # robust standard deviations from the fitted shape beyond which a piece is left out
-ROUNDS = 5  # work: of leaving out pieces, at most; the first that changes nothing is the last
+ROUNDS = 8  # work: of leaving out pieces and of weights, at most; the first that changes nothing is the last
+SAME_FORM = 0.05  # by which a variance of form may still change: weights by a twentieth hardly change a mean
 LEAST_SIDE = 0.5  # side of the smallest face that a body's size is taken from, in least widths of a measured face
 MOST_CONDITION = 1e6  # of a form's terms: pieces along one line tell them apart no more
 
@@ -92,6 +93,19 @@ class Fit(NamedTuple):
     covariance: Floats
 
 
+class Side(NamedTuple):
+    """A fitted face: its pieces, their places along and across it from -1 to 1, and the shape fitted, outward.
+
+    Coefficients are level, slope along, slope across, warp, and curvature along where it is fitted.
+    """
+
+    pieces: Pieces
+    along: Floats
+    across: Floats
+    fit: Fit
+    narrow: bool = False
+
+
 class Observed(NamedTuple):
     """Deviations (k,) outward at places (k, 3) on facets (k,) of the design, with noise, in mm and mm^2.
 
@@ -147,15 +161,17 @@ def bodies(design: StructureDesign, seen: Observed, least_mm: float) -> Iterator
     of_large = _members(of_facet[first[large]], len(names))
     of_body = _members(of_facet, len(names))
     for number, name in enumerate(names):
-        faces, pieces = [], []
+        faces, pieces_seen = [], []
         own = of_body[number]
         holes = design_holes.of_body(vertices, design.faces[own], normals[own], plane[own]) if len(own) else []
         for k in large[of_large[number]]:
             corners = vertices[design.faces[facets[k]]].reshape(-1, 3)
             faces.append(FlatFace(normals[first[k]], corners, float(area[k]), facets[k]))
-            wide = _width(faces[-1]) >= least_mm
-            pieces.append(_pieces(seen, normals, rows[k] if wide else rows[k][:0]))
-        yield Body(name, tuple(faces), tuple(pieces), tuple(holes))
+            on = rows[k][np.isfinite(seen.deviation[rows[k]])]
+            on = on if _width(faces[-1]) >= least_mm else on[:0]
+            cubes = point_groups.pieces(seen.places[on], normals[seen.facet[on]], seen.side) if len(on) else on
+            pieces_seen.append(pieces(seen, on, cubes))
+        yield Body(name, tuple(faces), tuple(pieces_seen), tuple(holes))
 
 
 def holes_of(vertices: Floats, faces: Ints) -> tuple[Floats, list[Hole]]:
@@ -208,12 +224,10 @@ def _width(face: FlatFace) -> float:
     return float(np.ptp(centred @ second))
 
 
-def _pieces(seen: Observed, normals: Floats, rows: Ints) -> Pieces:
-    """Combine what was seen at ``rows`` of a face into pieces."""
-    rows = rows[np.isfinite(seen.deviation[rows])]
+def pieces(seen: Observed, rows: Ints, piece: Ints) -> Pieces:
+    """Combine what was seen at ``rows`` (k,) of a face into pieces, by the number (k,) of the piece of each."""
     if not len(rows):
         return Pieces(np.empty((0, 3)), np.empty(0), np.empty(0), 0.0)
-    piece = point_groups.pieces(seen.places[rows], normals[seen.facet[rows]], seen.side)
     count = np.bincount(piece)
     enough = count >= FEWEST_POINTS
     return Pieces(
@@ -224,11 +238,12 @@ def _pieces(seen: Observed, normals: Floats, rows: Ints) -> Pieces:
     )
 
 
-def fit(basis: Floats, pieces: Pieces, along: Floats, across: Floats) -> Fit | None:
+def fit(basis: Floats, pieces: Pieces, along: Floats, across: Floats, clip: float = CLIP) -> Fit | None:
     """Fit a shape with ``basis`` (m, p) to pieces at (m,) along and across a face; None where it is not determined.
 
-    Pieces far off the shape (dents, other steel) have no weight. What the shape does not follow is a variance of the
-    pieces: the mean square of the residuals less the part by noise (Cochran 1954, Biometrics 10, 101-129).
+    Pieces off the shape by more than ``clip`` robust standard deviations (dents, other steel) have no weight. What the
+    shape does not follow is a variance of the pieces: the mean square of the residuals less the part by noise (Cochran
+    1954, Biometrics 10, 101-129).
     """
     used, form = np.ones(len(basis), bool), 0.0
     for _ in range(ROUNDS):
@@ -239,9 +254,10 @@ def fit(basis: Floats, pieces: Pieces, along: Floats, across: Floats) -> Fit | N
         solve = np.linalg.pinv(basis[kept] * root[:, None]) * root
         mean = solve @ pieces.value[kept]
         rest = pieces.value - basis @ mean
+        weighed_by = form
         form = max(float((rest[kept] ** 2).sum()) / dof - float(pieces.noise[kept].mean()), 0.0)
-        used = np.abs(rest) <= CLIP * np.maximum(robust_sd(rest[kept]), np.sqrt(pieces.noise))
-        if (used == kept).all():
+        used = np.abs(rest) <= clip * np.maximum(robust_sd(rest[kept]), np.sqrt(pieces.noise))
+        if (used == kept).all() and abs(form - weighed_by) <= SAME_FORM * form:
             break
     covariance = pieces.covariance(along, across, form)[np.ix_(kept, kept)]
     return Fit(mean, solve @ covariance @ solve.T)

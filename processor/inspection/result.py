@@ -51,6 +51,7 @@ class Quantity(Word):
     HOLE_DIAMETER = "hole-diameter"
     DIAMETER = "diameter"
     BOW = "bow"
+    ANGLE = "angle"
 
 
 @dataclass(frozen=True)

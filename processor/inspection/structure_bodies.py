@@ -14,10 +14,19 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from processor import scene_cloud
-from processor.adjustment import maximum_interval, scanner_class_errors, thermal
+from processor.adjustment import scanner_class_errors, thermal
 from processor.geometry import rigid
-from processor.inspection import characteristic, edge_counts, flat_faces, holes, narrow_faces, points_in_design_frame
-from processor.inspection.flat_faces import Body, Fit, FlatFace, Pieces
+from processor.inspection import (
+    characteristic,
+    edge_counts,
+    face_flatness,
+    flat_faces,
+    holes,
+    narrow_faces,
+    points_in_design_frame,
+    polygon_sides,
+)
+from processor.inspection.flat_faces import Body, Fit, FlatFace, Observed, Pieces, Side
 from processor.inspection.narrow_faces import Surroundings
 from processor.inspection.part_geometry import off_the_chord
 from processor.inspection.result import InspectedComponent, Quantity, Result
@@ -32,9 +41,7 @@ PLACES = np.linspace(-1.0, 1.0, 41)  # along a body, at which its axis is compar
 COLUMNS = 20.0  # pieces along half a face count as different
 DEGREES = ((6, 14), (4, 9), (2, 5))  # of the polynomial along a face, and least number of pieces along it
 BOWED = 8  # pieces along a face from which its curvature is fitted as well
-FEWEST_FLAT = 9  # pieces of a face whose flatness is stated
 UP = np.array([0.0, 0.0, 1.0])
-SEED, REPETITIONS = 20, 200  # of the noise, for the bias of a flatness
 LEAST_FOUND = 3  # pieces of a face that is fitted
 STRIPS = 0.3  # scatter across a narrow face from which it is of several strips, in halves of the body's size
 SLOPE_SD = 2e-3  # of a face that was seen along less than half of its length
@@ -46,19 +53,6 @@ class Axis(NamedTuple):
     direction: Floats
     faces: tuple[int, int]
     size: float
-
-
-class Side(NamedTuple):
-    """A fitted face: its pieces, their places along and across it from -1 to 1, and the shape fitted, outward.
-
-    Coefficients are level, slope along, slope across, warp, and curvature along where it is fitted.
-    """
-
-    pieces: Pieces
-    along: Floats
-    across: Floats
-    fit: Fit
-    narrow: bool = False
 
 
 Sides = Mapping[int, Side | Reason]  # by the row of the face; why it was not measured
@@ -89,7 +83,7 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     unproven = surface_registration.is_unproven(deviation.reasons)
     doubtful = deviation.status is Status.AMBIGUOUS or unproven
     components = tuple(
-        component for body in found if (component := _component(body, scene, around, doubtful)) is not None
+        component for body in found if (component := _component(body, scene, seen, around, doubtful)) is not None
     )
     remarks = () if scene.tolerance is not None else (reason("inspect.no-limits"),)
     if not components:
@@ -100,8 +94,10 @@ def inspect(scene: Scene, deviation: Any, stitched: Any, least_mm: float, method
     return Result.of_components(components, method, remarks)
 
 
-def _component(body: Body, scene: Scene, around: Surroundings, doubtful: bool) -> InspectedComponent | None:
-    found, sizes = measured(body, scene.temperature_C, around)
+def _component(
+    body: Body, scene: Scene, seen: Observed, around: Surroundings, doubtful: bool
+) -> InspectedComponent | None:
+    found, sizes = measured(body, seen, scene.temperature_C, around)
     if body.holes:
         first = 1  # holes are numbered over the whole body
         for group in holes.groups(list(body.holes), [axis.direction for axis in body_axes(body)]):
@@ -117,9 +113,9 @@ def _component(body: Body, scene: Scene, around: Surroundings, doubtful: bool) -
 
 
 def measured(
-    body: Body, temperature_C: float = float("nan"), around: Surroundings | None = None
+    body: Body, seen: Observed, temperature_C: float = float("nan"), around: Surroundings | None = None
 ) -> tuple[list[Measured], dict[str, float]]:
-    """Return the characteristics of a body and its sizes as designed; none of a body without flat sides.
+    """Return the characteristics of a body by what was ``seen``, and its sizes as designed; none without flat sides.
 
     Sizes are those at the reference temperature, if that of the steel is known. Faces without pieces, such as narrow
     ones, are measured by the points ``around`` them, if given.
@@ -138,6 +134,7 @@ def measured(
         found += [*_twist(axes, names, sides), *_bows(axes, sides)]
     else:
         found += _flatness(axes, names, sides)
+    found += polygon_sides.characteristics(body, axes[0].direction, seen, temperature_C)
     return found, {str(name): axis.size for name, axis in zip(names, axes, strict=True)}
 
 
@@ -421,43 +418,10 @@ def _axis_curve(sides: list[tuple[Side, float]]) -> tuple[Floats, Floats] | None
 
 
 def _flatness(axes: list[Axis], names: list[Quantity], sides: Sides) -> Iterator[Measured]:
-    """Yield the flatness of faces: the greatest less the least departure from their plane, noise taken out.
-
-    The plane is fitted to all of a face. The extremes of noisy values are too far apart: departures are shrunk by their
-    variance against their noise (empirical Bayes: Efron and Morris 1973, Journal of the American Statistical
-    Association 68), and what their noise still adds is taken off (bias by the parametric bootstrap: Efron and
-    Tibshirani 1993, An Introduction to the Bootstrap, chapters 6 and 10).
-    The interval is a simultaneous band over all pieces.
-    """
+    """Yield the flatness of the outermost faces."""
     for axis, name in zip(axes, names, strict=True):
         for row, sign in zip(axis.faces, "-+", strict=True):
             side = sides[row]
-            id_ = f"flatness-{name}{sign}"
-            if not isinstance(side, Side) or side.narrow or len(side.pieces.value) < FEWEST_FLAT:
+            if not isinstance(side, Side) or side.narrow or len(side.pieces.value) < face_flatness.FEWEST_PIECES:
                 continue
-            yield _peak_to_valley(id_, side)
-
-
-def _peak_to_valley(id_: str, side: Side) -> Measured:
-    plane = np.stack([np.ones_like(side.along), side.along, side.across], axis=1)
-    root = 1.0 / np.sqrt(side.pieces.noise)
-    solve = np.linalg.pinv(plane * root[:, None]) * root
-    off = np.eye(len(plane)) - plane @ solve
-    rest = off @ side.pieces.value
-    variance = np.maximum(np.einsum("ij,j,ij->i", off, side.pieces.noise, off), flat_faces.FLOOR_MM**2)
-    form = max(float(np.mean(rest**2 - variance)), 0.0)
-    gain, sd = form / (form + variance), np.sqrt(variance)
-    shrunk = gain * rest
-    # Of several pieces that are about equal the noise picks the extremes: its effect is found by repetition.
-    repeated = shrunk + gain * sd * np.random.default_rng(SEED).standard_normal((REPETITIONS, len(sd)))
-    by_noise = float(np.ptp(repeated, axis=1).mean() - np.ptp(shrunk))
-    _, high_low, high_high = maximum_interval.of_independent(rest, sd)
-    _, low_low, low_high = maximum_interval.of_independent(-rest, sd)
-    return Measured(
-        id_,
-        max(float(np.ptp(shrunk)) - by_noise, 0.0),
-        max(high_low + low_low, 0.0),
-        high_high + low_high,
-        what=Quantity.FLATNESS,
-        unsigned=True,
-    )
+            yield face_flatness.peak_to_valley(f"flatness-{name}{sign}", side.pieces, side.along, side.across)

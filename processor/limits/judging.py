@@ -183,7 +183,9 @@ def judge(
     is no verdict. ``probability`` that the limit is kept is given where it is of more than one value.
     """
     if limit is None:
-        return Judged(of=measured.of, value=measured.value, ci95=measured.ci95, nominal=measured.nominal)
+        return Judged(
+            of=measured.of, value=measured.value, ci95=measured.ci95, nominal=measured.nominal, unit=measured.unit
+        )
     low, high = limit_bounds.bounds(limit, measured.sizes_mm)
     sides = [(measured, low, high)]
     if greatest is not None:

@@ -331,7 +331,7 @@ MEASURES: Mapping[str, tuple[str, ...]] = {
     "inspect": (
         "part length", "part width", "part height", "part diagonal", "part diagonal-difference", "part twist",
         "part sweep", "part camber", "part flatness", "part squareness", "part thickness", "part hole-position",
-        "part hole-pitch", "part pass-through", "part hole-diameter", "part diameter", "part bow",
+        "part hole-pitch", "part pass-through", "part hole-diameter", "part diameter", "part bow", "part angle",
     ),
 }  # fmt: skip
 LIMITED_SIZES = ("length", "height", "thickness", "diameter", "spacing", "depth")

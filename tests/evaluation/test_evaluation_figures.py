@@ -284,6 +284,7 @@ def test_errors_of_characteristics_have_the_rms_of_their_kind():
     measured = SimpleNamespace(
         id=[*ids, "unknown"],
         quantity=[Quantity.LENGTH, Quantity.LENGTH, Quantity.LENGTH],
+        unit=["mm", "mm", "mm"],
         deviation=np.array([0.3, -0.4, 9.0]),
         ci95=np.array([0.35, 0.35, 1.0]),
     )

@@ -20,6 +20,9 @@ from tests.support.clouds import beam_clouds
 from tests.support.clouds.beam_clouds import SIZE, Built
 
 SEEDS, COUNT = 5, 40_000
+NOTHING_SEEN = flat_faces.Observed(
+    np.empty((0, 3)), np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0), side=50.0
+)
 FEW = 15_000  # points where what is asserted is within an interval, or no figure
 
 
@@ -133,9 +136,7 @@ def test_bodies_of_a_mesh_without_names_are_named_as_the_components_of_defects()
 def bodies_of(mesh, shift=(0.0, 0.0, 0.0)):
     """Bodies of a mesh of which nothing was seen."""
     design = StructureDesign("mesh", np.asarray(mesh.vertices) + np.array(shift), np.asarray(mesh.faces))
-    none = np.empty(0)
-    seen = flat_faces.Observed(np.empty((0, 3)), np.empty(0, np.int64), none, none, none, side=50.0)
-    return list(flat_faces.bodies(design, seen, 60.0))
+    return list(flat_faces.bodies(design, NOTHING_SEEN, 60.0))
 
 
 def flat_plate(wave, noise, seed):
@@ -149,7 +150,7 @@ def flat_plate(wave, noise, seed):
     pieces = list(body.pieces)
     top = next(k for k, face in enumerate(body.faces) if face.normal[2] > 0.9)
     pieces[top] = Pieces(places, value, np.full(len(x), noise**2 + 1e-6), 0.0)
-    return {one.of: one for one in structure_bodies.measured(Body("plate", body.faces, tuple(pieces)))[0]}
+    return {one.of: one for one in structure_bodies.measured(Body("plate", body.faces, tuple(pieces)), NOTHING_SEEN)[0]}
 
 
 @pytest.mark.parametrize(("size", "apart"), [(1000.0, 0.5), (2000.0, 1.0), (8000.0, 1.0)])
@@ -252,7 +253,7 @@ def test_twist_interval_of_a_half_hidden_flange_covers():
             value = level[1 * strip] + slope[1 * strip] * x + noise * rng.standard_normal(len(x))
             places = np.stack([x, y, np.full(len(x), 10.0 * face.normal[2])], axis=1)
             pieces.append(Pieces(places, value, np.full(len(x), noise**2), shared))
-        measured = structure_bodies.measured(Body("flange", body.faces, tuple(pieces)))[0]
+        measured = structure_bodies.measured(Body("flange", body.faces, tuple(pieces)), NOTHING_SEEN)[0]
         (twist,) = (one for one in measured if one.what is Quantity.TWIST)
         held += twist.low <= 0.0 <= twist.high
     assert held >= 20  # of 24 with 95 %: in 99 of 100 cases

@@ -225,7 +225,7 @@ def test_lengths_and_squareness_of_plates_with_known_ends_are_covered():
         of_view = flat_faces.Observed(np.zeros((1, 3)), np.zeros(1, np.int64), np.zeros(1), np.zeros(1),
                                       np.full(1, shift), side=50.0)  # fmt: skip
         surroundings = narrow_faces.surroundings(structure, cloud, of_view)
-        found = {one.of: one for one in structure_bodies.measured(body, around=surroundings)[0]}
+        found = {one.of: one for one in structure_bodies.measured(body, of_view, around=surroundings)[0]}
         for id_, true in (("length", longer), ("end-squareness-over-width", skew * PLATE[1])):
             held[id_] += found[id_].low <= true <= found[id_].high
     assert min(held.values()) >= 20, held
