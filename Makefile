@@ -10,7 +10,7 @@ DEPENDENCIES ?= newest
 # Modules stay compiled, also where the environment says otherwise: tests and demo start many processes.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-lowest lint docs bench compare mutants profile paper nightly weekend lock audit clean system
+.PHONY: demo test test-lowest lint docs bench real compare mutants profile paper nightly weekend lock audit clean system
 
 demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
@@ -54,6 +54,10 @@ bench: $(VENV)/.test
 	$(BIN)/python -m tests.bench.readers --speed --output $(OUT)/bench-readers.json
 	$(BIN)/python -m tests.bench.start --output $(OUT)/bench-start.json
 	$(BIN)/python -m tests.bench.cost --output $(OUT)/bench-cost.json
+
+# Real data that is on the machine, see docs/real.md: what was measured, against what, how far. Exit code 4: one is outside.
+real: $(VENV)/.test
+	$(BIN)/python -m tests.real.measured --output $(OUT)/real.json
 
 # Results of this code held against stored ones of the same scenes: see tests/bench/comparer. Without a reference one is
 # made, of the code as it is: make it before a change. COMPARE="--time 3" judges the time as well.

@@ -92,11 +92,11 @@ def test_a_line_that_reads_a_message_is_found(tmp_path):
 
 
 def test_tests_share_code_through_support():
-    foreign = re.compile(r"^\s*(?:from|import) tests\.(?!support\b|bench\b|mutation\b)", re.MULTILINE)
+    foreign = re.compile(r"^\s*(?:from|import) tests\.(?!support\b|bench\b|mutation\b|real\b)", re.MULTILINE)
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         if foreign.search(path.read_text("utf-8")):  # a line of a text, maybe: reading the code of all takes a second
             found = {name for name in imports(path) if within({name}, "tests")}
-            assert found == within(found, "tests.support", "tests.bench", "tests.mutation"), path.name
+            assert found == within(found, "tests.support", "tests.bench", "tests.mutation", "tests.real"), path.name
 
 
 @pytest.mark.parametrize("module", ["processor.cli.main", "designgen.cli"])

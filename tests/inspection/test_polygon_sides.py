@@ -1,13 +1,10 @@
 """Sides of polygonal sections: built with moved and turned planes, against the polygon that half-planes cut out."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import HalfspaceIntersection
 
-import processor
 from processor.inspection import flat_faces, polygon_sides
 from processor.inspection.flat_faces import Observed
 from processor.inspection.result import Quantity
@@ -15,7 +12,6 @@ from processor.model import StructureDesign
 
 COUNT, RADIUS, LENGTH, APART = 8, 100.0, 900.0, 5.0
 AXIS = np.array([0.0, 0.0, 1.0])
-COLUMN = Path(__file__).resolve().parents[2] / "../shared/data/steel_column/column_mm.csv"
 
 
 def prism(sections=COUNT, radius=RADIUS):
@@ -139,64 +135,3 @@ def test_inner_sides_of_a_hollow_section_are_no_sides():
     )
     sides = [polygon_sides.of_section(body, AXIS) for body in flat_faces.bodies(design, nothing_seen(), 1.0)]
     assert [len(one) for one in sides if one] == [6]
-
-
-@pytest.fixture(scope="module")
-def column(tmp_path_factory):
-    """The labels and points of a real column of 16 sides, and the results of its scan against its mean prism."""
-    if not COLUMN.is_file():
-        pytest.skip("the real scan of a column is not at hand")
-    table = np.loadtxt(COLUMN, delimiter=",", skiprows=1)
-    folder = tmp_path_factory.mktemp("column")
-    np.savetxt(folder / "column.xyz", table[:, :3], fmt="%.5f")
-    mesh = trimesh.creation.cylinder(132.40 / np.cos(np.pi / 16.0), 680.0, sections=16)
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 16.0, AXIS))
-    mesh.apply_translation(340.0 * AXIS)
-    mesh.export(folder / "design.ply")
-    (folder / "project.toml").write_text('units = "mm"\ndesign = "design.ply"\n[[scan]]\nfile = "column.xyz"\n')
-    return table[:, :3], table[:, 3].astype(int), processor.run(folder, steps=["deviation", "inspect", "defects"])
-
-
-def labelled_planes(points, label):
-    """Normals (16, 2) outward, distances and the points of each labelled facet, by least squares."""
-    planes = []
-    for k in range(1, 17):
-        own = points[label == k]
-        normal = np.linalg.svd(own - own.mean(axis=0), full_matrices=False)[2][2]
-        normal *= np.sign(normal[:2] @ own.mean(axis=0)[:2])
-        planes.append((normal, own.mean(axis=0), own))
-    return sorted(planes, key=lambda plane: np.arctan2(plane[0][1], plane[0][0]))
-
-
-def test_sides_of_a_real_column_are_those_of_its_labelled_facets(column):
-    """Widths within 0.3 mm and flatness within 0.05 mm of planes fitted to the labels; no defect is invented."""
-    points, label, results = column
-    planes = labelled_planes(points, label)
-    middle = np.array([0.0, 0.0, 340.0])
-    corners = []
-    for (a, at, _), (b, of, _) in zip(planes, planes[1:] + planes[:1], strict=True):
-        corners.append(np.linalg.solve(np.stack([a, b, AXIS]), [a @ at, b @ of, middle[2]]))
-    widths = np.linalg.norm(np.array(corners) - np.roll(corners, 1, axis=0), axis=1)
-    table = results.steps["inspect"].components[0].characteristics
-    value = dict(zip(table.id, table.actual, strict=True))
-    ours, flat = (np.array([value[f"side-{k + 1}-{what}"] for k in range(16)]) for what in ("width", "flatness"))
-    # Which side is which facet: the wide one of 55.8 mm tells, and the sense in which sides are counted.
-    ways = [np.roll(np.arange(16)[::sense], turn) for sense in (1, -1) for turn in range(16)]
-    way = min(ways, key=lambda way: np.std(ours - widths[way]))
-    assert np.abs(ours - widths[way]).max() < 0.3
-    # The extremes depend by some hundredths on where squares begin: what was asked holds in the middle.
-    of_id = dict(zip(table.id, table.ci95, strict=True))
-    off = np.abs(flat - np.array([departures(*plane) for plane in planes])[way])
-    assert np.median(off) < 0.05
-    assert (off < 0.05 + np.array([of_id[f"side-{k + 1}-flatness"] for k in range(16)])).all()
-    assert not len(results.steps["defects"].defects)
-
-
-def departures(normal, centre, points):
-    """Greatest less least mean departure from a facet's plane, over squares of a quarter of its width."""
-    along = np.cross(AXIS, normal)
-    place = np.stack([points @ along, points[:, 2]], axis=1)
-    place -= place.min(axis=0)
-    square = np.floor(place / (np.ptp(place[:, 0]) / 3.999)).astype(int) @ [1, 4]
-    means = [((points[square == k] - centre) @ normal).mean() for k in np.unique(square) if (square == k).sum() > 20]
-    return np.ptp(means)
