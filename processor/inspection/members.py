@@ -2,7 +2,8 @@
 
 A member is named by the ids of its nodes. Its length is the distance of the centres of its nodes' spheres, its bow the
 greatest distance of the tube's axis from the straight line through the ends of the tube as seen, its diameter that of
-the tube. None depends on where the member lies.
+the tube. None depends on where the member lies. Its alignment is how far one end lies, square to the member, from the
+line as designed through the other end: of a column it is out of plumb, of a beam out of level or line.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from processor.adjustment import scanner_class_errors, thermal
 from processor.components.frame_members import SEEN
+from processor.geometry import rigid
 from processor.inspection import characteristic
 from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.limits.judging import Measured
@@ -60,7 +62,7 @@ def _member(
     nodes = int(design.member_a[member]), int(design.member_b[member])
     length = _length(scene, design, nodes, rows, found, ball)
     row = tube.get(frozenset(nodes))
-    own = list(_of_tube(float(design.tube_diameters[member]), found, row))
+    own = [_alignment(design, nodes, rows, found, ball), *_of_tube(float(design.tube_diameters[member]), found, row)]
     sizes = {"length": length.nominal, "diameter": float(design.tube_diameters[member])}
     seen, name = row is not None or np.isfinite(length.value), name_of(design, member)
     return InspectedComponent(
@@ -95,6 +97,30 @@ def _length(
     flagged = [k for k in at if str(balls.flag[k]) != CERTAIN]
     why = tuple(reason("inspect.node-flagged", node=balls.names[k], flag=balls.flag[k]) for k in flagged)
     return replace(length, doubtful=bool(flagged), reasons=why)
+
+
+def _alignment(
+    design: FrameDesign, nodes: tuple[int, int], rows: tuple[int, int], found: Any, ball: dict[int, int]
+) -> Measured:
+    """Distance of a member's end, square to it, from the line as designed through its other end.
+
+    It is that of the movements of both nodes, by the same datum. What their errors have in common is not taken off.
+    """
+    line = np.subtract(*(design.centres[row] for row in rows[::-1]))
+    line /= np.linalg.norm(line)
+    at = [ball.get(node, -1) for node in nodes]
+    moved = found.balls.movement[at] if min(at) >= 0 and len(found.balls.movement) else np.full((2, 3), np.nan)
+    if not np.isfinite(moved).all():
+        return characteristic.absent("alignment", Quantity.ALIGNMENT, 0.0, reason("inspect.node-not-moved"))
+    off = moved[1] - moved[0]
+    off = off - (off @ line) * line
+    size = float(np.linalg.norm(off))
+    across = off / size if size > 0.0 else rigid.axes_across(line)[0]
+    half = NORMAL_95 * float(np.sqrt(across @ found.balls.movement_covariance[at].sum(axis=0) @ across))
+    return Measured(
+        "alignment", size, max(size - half, 0.0), size + half, what=Quantity.ALIGNMENT, unsigned=True,
+        doubtful=any(str(found.balls.flag[k]) != CERTAIN for k in at),
+    )  # fmt: skip
 
 
 def _of_tube(diameter: float, found: Any, row: int | None) -> Iterator[Measured]:

@@ -52,6 +52,7 @@ class Quantity(Word):
     DIAMETER = "diameter"
     BOW = "bow"
     ANGLE = "angle"
+    ALIGNMENT = "alignment"
 
 
 @dataclass(frozen=True)

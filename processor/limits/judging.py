@@ -210,7 +210,7 @@ def judge(
         nominal=stated.nominal,
         unit=limit.unit,
         key=limit.key,
-        clause=f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source,
+        clause=limit.source if of_project(limit) else f"{tolerance.standard} {limit.clause}".strip(),
         edition="" if of_project(limit) else tolerance.edition,
         source=limit.source,
         verified=limit.verified,

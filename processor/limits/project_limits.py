@@ -18,6 +18,7 @@ OF_HOLES_AND_MEMBERS = {
     "hole-diameter": "diameter of a hole less the design's",
     "diameter": "diameter of a tube less the design's",
     "bow": "bow of a tube",
+    "alignment": "place of a member's end, square to it, from the line as designed through its other end",
 }
 
 

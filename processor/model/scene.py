@@ -332,6 +332,7 @@ MEASURES: Mapping[str, tuple[str, ...]] = {
         "part length", "part width", "part height", "part diagonal", "part diagonal-difference", "part twist",
         "part sweep", "part camber", "part flatness", "part squareness", "part thickness", "part hole-position",
         "part hole-pitch", "part pass-through", "part hole-diameter", "part diameter", "part bow", "part angle",
+        "part alignment",
     ),
 }  # fmt: skip
 LIMITED_SIZES = ("length", "height", "thickness", "diameter", "spacing", "depth")

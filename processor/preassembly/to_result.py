@@ -273,12 +273,7 @@ def _reasons(assembly: Assembly) -> Iterator[Reason]:
             longest = max(systematic_errors.chord(part) for part in assembly.design.parts)
             yield reason("preassemble.one-kelvin", length=1e-3 * longest, change=EXPANSION_PER_K * longest)
     yield from assembly.of_bends
-    compared = [*assembly.joints.conformity, assembly.chain]
-    standard = limits.standard or LimitOrigin.PROJECT
-    if all(conformity.limits.verified.all() for conformity in compared):
-        yield reason("preassemble.limits", standard=standard)
-    else:
-        yield reason("preassemble.limits-not-verified", standard=standard)
+    yield reason("preassemble.limits", standard=limits.standard or LimitOrigin.PROJECT)
     unused = unused_limits(limits)
     if unused:
         yield reason("preassemble.unused-limits", limits=tuple(limit.key for limit in unused))

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any
 
-from processor.language.messages import Message, Text, label, text
+from processor.language.messages import Message, label, text
 from processor.limits.judging import Judged, JudgedLimits
 from processor.model import WORST_FIRST, StepRun, Verdict
 from processor.report.columns import columns
@@ -30,7 +29,6 @@ NOTE_OF_LIMITS = text(
     "whole interval exceeds it; indeterminate: the limit lies within it, or the value is in doubt. With the decision "
     "rule simple the value alone decides, with risk the probability that accepting or rejecting is wrong."
 )
-UNVERIFIED = "{note} Not verified: the limits from {sources} were not compared with the published text; do so first."
 
 
 def worst_first(rows: Iterable[Judged]) -> list[Judged]:
@@ -56,23 +54,7 @@ def limit_table(limits: JudgedLimits | None, file: str) -> list[Table]:
         )
         for one in worst_first(limits.rows)
     )  # fmt: skip
-    note = with_unverified(NOTE_OF_LIMITS, [limits])
-    return [Table(text("Compared with limits"), OF_LIMITS, rows, file, note, on_page=False)]
-
-
-def unverified(tables: Iterable[Any]) -> list[str]:
-    """Name the clauses of limits that were used and not compared with the published text of their standard.
-
-    ``tables`` are records with columns ``clause`` and ``verified``.
-    """
-    rows = (row for table in tables for row in zip(table.clause, table.verified, strict=True))
-    return sorted({clause for clause, verified in rows if clause and not verified})
-
-
-def with_unverified(note: Text, tables: Iterable[Any]) -> Text:
-    """Add to a note which limits were not compared with the published text, as of :func:`unverified`."""
-    sources = unverified(tables)
-    return text(UNVERIFIED, note=note, sources=", ".join(sources)) if sources else note
+    return [Table(text("Compared with limits"), OF_LIMITS, rows, file, NOTE_OF_LIMITS, on_page=False)]
 
 
 def table(judged: Sequence[Judged], remark: str | Message = "") -> Table:

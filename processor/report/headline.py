@@ -8,6 +8,8 @@ from processor.pipeline import Execution
 from processor.report import characteristics, verdict_counts
 from processor.report.reports_of_steps import step_report
 
+TO_CONFIRM = "Limits of {sources}: to be confirmed against the published text before verdicts are relied on."
+
 
 def clipped(clips: Clips) -> Text:
     """Say how many points were left out of what was read."""
@@ -35,8 +37,16 @@ def of_step(run: StepRun) -> Text:
     return text("{step}: {head}; {verdicts}", step=report_of.title, head=head, verdicts=verdicts)
 
 
-def unverified(execution: Execution) -> list[str]:
-    """Name the clauses of limits that were used and not compared with the published text of their standard."""
+def to_confirm(execution: Execution) -> Text | None:
+    """State which limits were used that were not compared with the published text of their standard; None of none."""
     runs = [run for run, _ in execution.by_step()]
     every = [(characteristics.limits_of(run), *step_report(run.step).limits(run.result)) for run in runs]
-    return characteristics.unverified(table for tables in every for table in tables if table is not None)
+    used = [
+        row
+        for tables in every
+        for one in tables
+        if one is not None
+        for row in zip(one.clause, one.verified, strict=True)
+    ]
+    sources = sorted({clause for clause, verified in used if clause and not verified})
+    return text(TO_CONFIRM, sources=sources) if sources else None

@@ -30,7 +30,6 @@ BANNER = {
     Verdict.INDETERMINATE: text("INDETERMINATE"),
     Verdict.NONE: text("No verdict"),
 }
-UNVERIFIED = "{sources}: not compared with the published text; do so before verdicts are relied on."
 TONES = {Verdict.PASS: "good", Verdict.FAIL: "bad", Verdict.INDETERMINATE: "open", Verdict.NONE: ""}
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
@@ -60,6 +59,7 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
         script=script,
         digest=digest,
         verdicts=_verdicts(execution, report),
+        footnote=headline.to_confirm(execution),
         sections=_sections(execution, report, figures, set(live), lang),
         provenance=json.dumps({key: execution.provenance[key] for key in PROVENANCE}, indent=2, ensure_ascii=False),
     )
@@ -93,11 +93,10 @@ def _banner(execution: Execution) -> dict[str, Any]:
     runs = [run for run, _ in execution.by_step()]
     verdict = worst(run.verdict for run in runs)
     told = characteristics.summary(one for run in runs for one in characteristics_of(execution.scene, run))
-    sentences, tone = [told], TONES[verdict]
-    if verdict is not Verdict.NONE and headline.unverified(execution):
-        tone = tone if verdict is Verdict.FAIL else "open"
-        sentences.append(text("Provisional: not all limits were checked against the standard's text."))
-    return {"tone": tone, "word": BANNER[verdict], "text": text("{sentences:.}", sentences=sentences)}
+    tone = TONES[verdict]
+    if verdict not in (Verdict.NONE, Verdict.FAIL) and headline.to_confirm(execution):
+        tone = "open"
+    return {"tone": tone, "word": BANNER[verdict], "text": text("{sentences:.}", sentences=[told])}
 
 
 def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]:
@@ -111,10 +110,6 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]
         verdicts.append({"tone": _tone(run), "head": headline.of_step(run), "text": method})
         verified = getattr(run.result, "verified", True)
         verdicts += [_further(verified, *further) for further in report_of.further_verdicts(run.result)]
-    if sources := headline.unverified(execution):
-        verdicts.append(
-            {"tone": "", "head": text("Limits that are not verified"), "text": text(UNVERIFIED, sources=sources)}
-        )
     return [*verdicts, _truth(report)]
 
 

@@ -86,8 +86,6 @@ def _front(execution: Execution, say: Messages) -> Iterator[Figure]:
         Line(""),
         *_wrapped(say.text(characteristics.summary(held))),
     ]
-    if verdict is not Verdict.NONE and headline.unverified(execution):
-        lines += _wrapped(say.text(text("Provisional: not all limits were checked against the standard's text.")))
     lines.append(Line(""))
     for name, value in title_block.entries(scene).items():
         lines += _wrapped(f"{say.text(title_block.LABELS.get(name, label(name.replace('_', ' '))))}: {value}")
@@ -102,6 +100,8 @@ def _front(execution: Execution, say: Messages) -> Iterator[Figure]:
         lines += _wrapped(say.text(headline.of_step(run)), weight="bold")
         reasons = getattr(run.result, "reasons", ())
         lines += [*_wrapped(say.sentences(reasons)), Line("")] if reasons else [Line("")]
+    if (to_confirm := headline.to_confirm(execution)) is not None:
+        lines += _wrapped(say.text(to_confirm))
     for start in range(0, len(lines), ROWS_A_PAGE):
         page = _page(lines[start : start + ROWS_A_PAGE])
         if start == 0 and scene.title_block is not None and len(scene.title_block.logo):

@@ -52,8 +52,8 @@ def failures(execution: Execution) -> Iterator[str]:
 
 def _middle(execution: Execution, report: ErrorReport) -> Iterator[Message]:
     firsts = [run for run, _ in execution.by_step()]
-    if sources := headline.unverified(execution):
-        yield text("not verified against the published text: limits from {sources}", sources=sources)
+    if (to_confirm := headline.to_confirm(execution)) is not None:
+        yield to_confirm
     for run in firsts:
         yield from _beyond_limits(run)
     for run in firsts:

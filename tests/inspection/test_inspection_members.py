@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from processor.deviation import step as deviation
 from processor.inspection import members, step
 from processor.language.messages import messages
-from processor.limits import project_limits
+from processor.limits import project_limits, standards
 from processor.model import NORMAL_95, FrameDesign, Scene, Status, Tolerance, UsageError, Verdict
 from processor.space_frame.result import Flag
 from tests.support.results import ball_results
@@ -130,3 +130,23 @@ def test_the_step_is_partial_if_a_member_was_not_seen_and_failed_if_none_was():
     nowhere = dataclasses.replace(found.tubes, a=np.full(len(found.tubes), -1))
     result = members.inspect(scene, dataclasses.replace(found, balls=hidden, tubes=nowhere), "default")
     assert (result.status, result.reasons[0].code) == (Status.FAILED, "inspect.none-seen")
+
+
+def test_alignment_is_the_difference_of_both_ends_square_to_the_member():
+    """Member 10-11 lies along x: of the difference (-3, -4, -12) of its nodes' movements 4 and 12 mm count."""
+    whole = ball_results.whole()
+    sure = dataclasses.replace(whole, balls=dataclasses.replace(whole.balls, flag=(Flag.OK,) * len(whole.balls)))
+    found = inspected(found=sure, tolerance=standards.load("AISC 303"))["10-11"]
+    alignment = by_id(found, "alignment")
+    assert alignment.actual == pytest.approx(np.hypot(4.0, 12.0))
+    row = found.characteristics.id.index("alignment")
+    # 1/500 of 3000 mm
+    assert (found.characteristics.upper[row], alignment.verdict) == (pytest.approx(6.0), Verdict.FAIL)
+    assert found.characteristics.clause[row] == "AISC 303 7.13.1.1"
+    assert by_id(inspected(tolerance=standards.load("AISC 303"))["10-11"], "alignment").verdict is Verdict.INDETERMINATE
+
+
+def test_alignment_of_a_node_without_a_movement_is_not_known():
+    unknown = by_id(inspected()["10-12"], "alignment")
+    assert np.isnan(unknown.actual)
+    assert unknown.reasons[0].code == "inspect.node-not-moved"

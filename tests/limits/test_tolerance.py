@@ -35,7 +35,7 @@ def test_every_limit_has_a_meaning_source_and_measure():
         for row in standard.limits:
             assert row.what, row.key
             assert row.source, row.key
-            assert row.key.endswith({"mm": "_mm", "arcmin": "_arcmin", "1": "_ratio"}[row.unit])
+            assert row.key.endswith({"mm": "_mm", "arcmin": "_arcmin", "deg": "_deg", "1": "_ratio"}[row.unit])
             assert (row.rule in ("smaller", "sum")) == (not math.isnan(row.high_ratio) and not math.isnan(row.high)), (
                 row.key
             )

@@ -39,8 +39,6 @@ def _summary(result: Result) -> tuple[Message, Message]:
         head = text("{head}; {verdicts}", head=head, verdicts=limits)
     verdicts = verdict_counts.each(every)
     body: list[Message] = [text("Limits: {verdicts}.", verdicts=verdicts)] if verdicts else []
-    if any(row["verdict"] is not Verdict.NONE and not row["verified"] for found in rows for row in found.items()):
-        body.insert(0, text("Limits not checked against the standard: verdicts are provisional."))
     body += [text("{name}: {reasons}.", name=c.name, reasons=c.reasons) for c in result.components if c.reasons]
     if result.status is Status.OK or not result.reasons:
         body += [text("{reasons:.}", reasons=result.reasons)] if result.reasons else []

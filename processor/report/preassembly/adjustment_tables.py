@@ -15,7 +15,6 @@ from processor.model import Floats
 from processor.preassembly.chain.joint_measures import JointQuantity, MeasuredQuantities
 from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.result import Adjustment, Result
-from processor.report.characteristics import with_unverified
 from processor.report.columns import MM, columns, under
 from processor.report.table import NAN, Table, rows_of, tabulate, yes_no
 
@@ -147,7 +146,7 @@ def _limits(adjustment: Adjustment, method: str) -> Table:
     joints = [joint for joint, one in zip(adjustment.joints.name, limits, strict=True) for _ in one.key]
     cells = {"joint": joints, **_cells_of_limits(JudgedLimits.concat(limits))}
     title = text("Limits, method {method}", method=method)
-    return tabulate(title, cells, LIMITS, with_unverified(LIMITS_NOTE, limits), units=MM, on_page=False)
+    return tabulate(title, cells, LIMITS, LIMITS_NOTE, units=MM, on_page=False)
 
 
 def _cells_of_limits(limits: JudgedLimits) -> dict[str, Any]:
@@ -169,8 +168,7 @@ def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     if len(limits):
         further = {"edition": limits.edition, "source": list(map(label, limits.source))}
         title = text("Limits of the whole chain, method {method}", method=method)
-        note = with_unverified(CHAIN_NOTE, [limits])
-        yield tabulate(title, {**_cells_of_limits(limits), **further}, CHAIN, note, units=MM, on_page=False)
+        yield tabulate(title, {**_cells_of_limits(limits), **further}, CHAIN, CHAIN_NOTE, units=MM, on_page=False)
     if adjustment.unused_limits:
         yield tabulate(
             text("Limits that nothing is compared with"),

@@ -42,8 +42,6 @@ def _summary(result: Result) -> tuple[Message, Message]:
         head = text("{verdicts}; assembly {head}", verdicts=told, head=head)
         chain = [limits for limits in result.adjustment.chain if len(limits.limits)]
         body += [text("Whole chain: {verdict}.", verdict=limits.verdict) for limits in chain]
-        if not result.verified:
-            body.insert(0, text("Limits not checked against the standard: verdicts are provisional."))
     return head, text("{sentences:.}", sentences=body)
 
 
