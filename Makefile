@@ -47,7 +47,7 @@ docs: $(VENV)/.test
 bench: $(VENV)/.test
 	$(BIN)/python -m pip install --quiet --editable ".[designgen,test,bench]"
 	$(BIN)/python -m tests.bench.m3c2 --output $(OUT)/bench-m3c2.json
-	$(BIN)/python -m tests.bench.peers_spheres --output $(OUT)/bench-peers-spheres.json
+	$(BIN)/python -m tests.bench.spheres.peers --output $(OUT)/bench-peers-spheres.json
 	$(BIN)/python -m tests.bench.bolt_balls --cases frame-1040 --seeds 1 --output $(OUT)/bench-frame-1040.json
 	$(BIN)/processor papers -o $(OUT)/bench-papers --only 001 --seeds 1
 	$(BIN)/python -m tests.bench.generator --whole --output $(OUT)/bench-generator.json

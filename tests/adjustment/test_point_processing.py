@@ -52,6 +52,12 @@ def smoothed(points: np.ndarray, count: int) -> np.ndarray:
     return points[cKDTree(points).query(points, k=count)[1]].mean(axis=1)
 
 
+def of_sphere(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (n, 3) and residuals (n,)."""
+    distance = np.linalg.norm(points - CENTRE, axis=1)
+    return (points - CENTRE) / distance[:, None], distance - RADIUS
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_points_of_a_scanner_have_no_trace(seed):
     trace = recognised(ball(seed))
@@ -73,15 +79,26 @@ def test_edge_of_the_cells_that_hold_one_point(seed, nearest):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_balls_of_few_points_are_not_smoothed(seed, noise, share, count):
     points = ball(seed, noise, count, share)
-    errors = np.linalg.norm(points - CENTRE, axis=1) - RADIUS
     assert not recognised(points).smoothed
-    assert not recognised(points, errors).smoothed
+    assert not recognised(points, of_sphere(points)).smoothed
 
 
 @pytest.mark.parametrize("count", [8, 20])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_means_of_neighbours(seed, count):
     assert recognised(smoothed(ball(seed), count)).smoothed
+
+
+@pytest.mark.parametrize(("noise", "count", "share"), [(3.0, 500, 0.1), (3.0, 2000, 0.5), (0.5, 500, 0.15)])
+def test_means_of_neighbours_of_few_points_on_a_sphere(noise, count, share):
+    """White noise has a ratio of 1 with an sd of 0.7 / root(500) = 0.03: none is taken for smoothed; errors that two
+    neighbours of four share by half leave 0.75."""
+    for seed in SEEDS:
+        raw = ball(seed, noise, count, share)
+        assert not recognised(raw, of_sphere(raw)).smoothed
+        for means in (8, 20):
+            points = smoothed(raw, means)
+            assert recognised(points, of_sphere(points)).smoothed
 
 
 @pytest.mark.parametrize("step", [0.1, 1.0, 5.0])

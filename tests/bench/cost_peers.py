@@ -1,7 +1,7 @@
 """Tasks of processor beside peers, in turn in one process: outlier removal, and a part registered without a start.
 
 Ratios are of processor seconds, of all threads together, the median of the rounds; compiled code is warm. M3C2 and the
-fit of balls stand beside peers in tests/bench/m3c2.py and tests/bench/peers_spheres.py.
+fit of balls stand beside peers in tests/bench/m3c2.py and tests/bench/spheres/peers.py.
 """
 
 from __future__ import annotations

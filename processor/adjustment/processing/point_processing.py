@@ -21,7 +21,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor.adjustment.processing import sphere_smoothness
 from processor.geometry import coincident_points
+from processor.geometry.coincident_points import BESIDE
 from processor.model import Floats, Ints, Reason, reason
 
 FEWEST = 100  # points that show a trace: the ratio of variances of as many is known to 15 %
@@ -87,23 +89,27 @@ class Processing:
         return tuple(names)
 
 
-def recognised(points: Floats, errors: Floats | None = None) -> Processing:
+def recognised(points: Floats, of_sphere: tuple[Floats, Floats] | None = None) -> Processing:
     """Recognise what software has done to points (n, 3), mm, of one frame as their file has them, less any origin.
 
-    ``errors`` (n,) are residuals to a known surface. Without, patches are fitted by bent ones, from which a ball seen
-    by few points departs: smoothing of fewer than a place's is not recognised. Copies are no trace here: leave them
-    out first.
+    ``of_sphere``: directions (n, 3) from its centre, and residuals (n,). Without, patches are fitted by bent ones, from
+    which a ball seen by few points departs: smoothing of fewer than a place's is not recognised. Copies are no trace
+    here: leave them out first.
     """
     step = float(coincident_points.lattice_of(points).step.max()) if len(points) else 0.0
     step = step if step >= LEAST_STEP_MM else 0.0
     rows = [rows for rows in coincident_points.some_places(points) if len(rows) >= FEWEST] if len(points) else []
+    # Errors of rounding are alike of neighbours by themselves.
+    smoothed = of_sphere is not None and step <= float(np.std(of_sphere[1])) and sphere_smoothness.smooth(*of_sphere)
     if not rows:
-        return Processing(step=step)
-    near = np.concatenate([of_place[_patches(points[of_place])] for of_place in rows])
+        return Processing(step=step, smoothed=smoothed)
+    by_patches, mesh = smoothed or (of_sphere is None and len(points) >= coincident_points.PLACE_POINTS), False
+    count = PATCH_POINTS if by_patches else BESIDE
+    near = np.concatenate([of_place[_patches(points[of_place], count)] for of_place in rows])
     patches = points[near] - points[near[:, :1]]
-    smoothed, mesh = False, False
-    if errors is not None or len(points) >= coincident_points.PLACE_POINTS:
-        smoothed, mesh = _smoothed(patches, None if errors is None else errors[near], step, len(points))
+    if by_patches:
+        alike, mesh = _smoothed(patches, step, len(points))
+        smoothed |= alike
     # The fourth neighbour of chance points is about twice as far as the first, which may be a copy.
     spacing = 0.5 * float(np.median(np.linalg.norm(patches[:, 4], axis=1)))
     places = [points[of_place] - points[of_place].min(axis=0) for of_place in rows]
@@ -124,25 +130,23 @@ def agreed(traces: Sequence[Processing]) -> list[Processing]:
 # --- smoothing -------------------------------------------------------------------------------------------------------
 
 
-def _patches(place: Floats) -> Ints:
-    """Return some points of a place and their nearest neighbours, ascending, as rows (m, k)."""
+def _patches(place: Floats, count: int) -> Ints:
+    """Return some points of a place and their nearest neighbours, ascending, as rows (m, count)."""
     sample = np.linspace(0, len(place) - 1, min(PATCHES, len(place))).astype(np.int64)
-    near: Ints = cKDTree(place).query(place[sample], k=PATCH_POINTS)[1]
+    near: Ints = cKDTree(place).query(place[sample], k=count)[1]
     return near
 
 
-def _smoothed(near: Floats, known: Floats | None, step: float, count: int) -> tuple[bool, bool]:
+def _smoothed(near: Floats, step: float, count: int) -> tuple[bool, bool]:
     """Whether errors of neighbours are alike, and whether these also lie in one plane, as samples of a mesh.
 
-    To ``near`` (m, k, 3), patches of a cloud of ``count`` points, or the errors ``known`` (m, k) of their points, a
-    surface of second order is fitted. Neighbours are those along the surface: in space the nearest of several is that
-    of the most similar error.
+    To ``near`` (m, k, 3), patches of a cloud of ``count`` points, a surface of second order is fitted. Neighbours are
+    those along the surface: in space the nearest of several is that of the most similar error.
     """
     off = near - near.mean(axis=1, keepdims=True)
     squares, axes = np.linalg.eigh(np.swapaxes(off, 1, 2) @ off)
     size = np.sqrt(np.maximum(squares[:, -1:], np.finfo(float).tiny))
     height, u, v = np.moveaxis(off @ axes / size[:, None], 2, 0)
-    height = height if known is None else known / size
     A = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
     normal = np.swapaxes(A, 1, 2)
     fitted = A @ np.linalg.solve(normal @ A + RIDGE * np.eye(TERMS), normal @ height[..., None])

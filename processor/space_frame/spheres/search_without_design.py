@@ -93,8 +93,9 @@ def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, pa
         sphere = algebraic(on)
     if sphere is None:
         return missing(id_, NAN, len(on), reason("spheres.no-sphere"))
-    errors = np.linalg.norm(on - candidate.fit.sphere.centre, axis=1) - candidate.fit.sphere.radius
-    trace = point_processing.recognised(on, errors)
+    off = on - candidate.fit.sphere.centre
+    distance = np.linalg.norm(off, axis=1)
+    trace = point_processing.recognised(on, (off / distance[:, None], distance - candidate.fit.sphere.radius))
     doubts: list[Reason] = []
     remarks = trace.reasons("points")
     wrong = trace.unbounded or trace.cell > LARGEST_CELL * candidate.fit.sphere.radius

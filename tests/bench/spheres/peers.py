@@ -1,6 +1,6 @@
 """Every ball of a frame without a design, beside the strongest peers, on the same points in the same run.
 
-    python -m tests.bench.peers_spheres --output out.json
+    python -m tests.bench.spheres.peers --output out.json
 
 CloudCompare's RANSAC_SD takes the whole cloud as ours does; pyransac3d and ``processor.fit_sphere`` fit the crop about
 every true ball, which is easier. A peer that is not installed is left out and named (CloudCompare: Debian's packages

@@ -1,6 +1,6 @@
 """The ray fit of balls against the Cramér-Rao bound, by Monte Carlo: no prior, the radius free, noise along the ray.
 
-    python -m tests.bench.ball_fit [--draws 1000] [--seeds 3] [--likelihood]
+    python -m tests.bench.spheres.ball_fit [--draws 1000] [--seeds 3] [--likelihood]
 
 A ball is seen from one station or from three; each ray meets a cap of the given share of the sphere, and rays are
 spread evenly over the cap's outline as a scanner spreads them. Printed: error rms over bound of centre, radius and
