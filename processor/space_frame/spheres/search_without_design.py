@@ -208,9 +208,9 @@ def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int, inst
 def _by_free_radius(cloud: MergedCloud, fit: RobustFit, instrument: str) -> tuple[Floats, tuple[Reason, ...], bool]:
     """Return how far points move the centre of a fit with a held radius, (4,), the remark on it, and whether to doubt.
 
-    A radius that is wrong by a little fits as well, with its centre elsewhere. So the radius is also estimated. Where
-    it differs by more than its interval, the difference of the centres is a standard deviation of the held one. By less
-    than what all points of a view have in common, a right radius may differ, too.
+    A radius that is wrong by a little fits as well, with its centre elsewhere. So the radius is also estimated. The
+    square of the difference of the centres, less its mean by chance, is a variance of the held one. By less than what
+    all points of a view have in common, a right radius may differ, too.
     """
     ball, nowhere = fit.sphere, np.zeros(4)
     off = cloud.points - ball.centre
@@ -223,9 +223,9 @@ def _by_free_radius(cloud: MergedCloud, fit: RobustFit, instrument: str) -> tupl
         return nowhere, (), False
     moved, sd = start.moved_to(free_sphere), float(np.sqrt(free_sphere.covariance[3, 3]))
     away = abs(float(moved[3]))
-    if not away > NORMAL_95 * sd:  # also where the points do not determine the radius: NaN
+    if not away > sd:  # also where the points do not determine the radius: NaN
         return nowhere, (), False
-    centre = np.append(moved[:3], 0.0)
+    centre = np.sqrt(1.0 - (sd / away) ** 2) * np.append(moved[:3], 0.0)
     shift, measured = float(np.linalg.norm(moved[:3])), free_sphere.radius
     by_view = scanner_class_errors.of_class(instrument).view_mm
     remark = reason("spheres.other-radius", radius=measured, ci95=NORMAL_95 * sd, held=ball.radius, shift=shift)
