@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
 
 from processor.geometry.linalg_small import eigen
+from processor.geometry.selection import least_first
 from processor.geometry.sphere import Sphere, canonical_order, sphere_cells, visible_fraction
 from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit
 from processor.model import Bools, Floats, Ints
@@ -21,6 +21,8 @@ NEIGHBOURHOODS = (0.1, 0.2, 0.4)  # of the ball's points, the least that is no l
 MOST_NORMALS = 200  # points of a ball that have normals
 OF_A_LINE = 0.05  # ratio of the variances along and across the neighbourhood of a line
 QUADRIC_TERMS, LEAST_F = 9, 4.0  # of the shape of an ellipsoid; chance exceeds 4 less than once in 10,000
+RIDGE = 1e-14  # of the trace: terms that a flat cap does not determine explain nothing
+MOST_NEAREST = 500  # points whose nearest neighbours are compared: the ratio of white noise is known to 0.04
 EXPLAINED = 0.3  # share of the residuals' squares that an ellipsoid may explain
 LARGEST_HALF_SD = 0.15  # of the radius or, where it is fixed, of the centre, in radii, by half of the points
 MISFIT = 0.5  # of the scale: cell means of residuals on a ball are noise alone
@@ -151,18 +153,18 @@ def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: Limits) -> 
     sd = float(np.sqrt(np.mean(residual**2)))
     if sd <= limits.small * ball.radius:
         return True
-    # By direction: in space the nearest of several at about one distance is that of the most similar residual. Of equal
-    # points the nearest is no neighbour.
+    # Of equal points the nearest is no neighbour.
     order = canonical_order(points)
     rows = order[np.append(True, (points[order[1:]] != points[order[:-1]]).any(axis=1))]  # of equal points the first
-    radial = _radial(points[rows], ball)
-    nearest = cKDTree(radial).query(radial, k=2)[1][:, 1]
-    if np.sqrt(np.mean((residual[rows] - residual[rows][nearest]) ** 2) / 2.0) < limits.white * sd:
+    radial, off = _radial(points[rows], ball), residual[rows]
+    some = np.arange(0, len(rows), max(1, len(rows) // MOST_NEAREST))
+    if np.sqrt(np.mean((off[some] - off[neighbouring(radial, some)[:, 0]]) ** 2) / 2.0) < limits.white * sd:
         return False
     # The part of the sum of squares of residuals (n,) that the shape of an ellipsoid explains
     x, y, z = _radial(points, ball).T
     A = np.column_stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, y * z, z * x])
-    left = residual - A @ np.linalg.lstsq(A, residual, rcond=None)[0]
+    normal = A.T @ A
+    left = residual - A @ np.linalg.solve(normal + RIDGE * np.trace(normal) * np.eye(QUADRIC_TERMS), A.T @ residual)
     explained, of_all = float(np.sum(residual**2) - np.sum(left**2)), float(np.sum(residual**2))
     if explained > EXPLAINED * of_all:
         return False
@@ -189,52 +191,68 @@ def facing(points: Floats, on: Bools, ball: Sphere) -> float:
     query = np.ascontiguousarray(points[on][:: max(1, count // MOST_NORMALS)])
     if not len(query):
         return 0.0
-    points = np.ascontiguousarray(points)
-    tree = cKDTree(points)
-    cosine, left = np.zeros(len(query)), np.arange(len(query))
-    for share in NEIGHBOURHOODS:
-        k = min(len(points), max(8, int(share * count)))
-        near = tree.query(query[left], k=k)[1].reshape(len(left), k)
-        line = np.zeros(len(left), bool)
-        _cosines(points, near, query, left, ball.centre, cosine, line)
-        left = left[line]
-        if not len(left):
-            break
+    sizes = np.minimum(np.maximum((np.array(NEIGHBOURHOODS) * count).astype(np.int64), 8), len(points))
+    cosine = np.zeros(len(query))
+    _cosines(np.ascontiguousarray(points.T), query, sizes, np.ascontiguousarray(ball.centre), cosine)
     return float(np.median(cosine))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cosines(points, near, places, rows, centre, cosine, line):  # type: ignore[no-untyped-def]
-    """Fill the cosines at some rows of places (m, 3) by neighbours ``near`` (k, j), and whether these are a line (k,).
+def _cosines(points, places, sizes, centre, cosine):  # type: ignore[no-untyped-def]
+    """Fill the cosines at places (m, 3) between the radius and the normal of the points (3, n) about them.
 
-    The cosine is between the radius and the normal of the neighbours: their direction of least variance.
+    A normal is the direction of least variance of the nearest points, of the first of ``sizes`` that is not a line.
     """
-    C, V, mean, order = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3, np.int64)
-    for q in range(len(rows)):
-        for a in range(3):
-            mean[a] = 0.0
-            for row in near[q]:
-                mean[a] += points[row, a] / near.shape[1]
-        for a in range(3):
-            for b in range(a + 1):
-                C[a, b] = 0.0
-                for row in near[q]:
-                    C[a, b] += (points[row, a] - mean[a]) * (points[row, b] - mean[b])
-                C[b, a] = C[a, b]
-        eigen(C, V)
-        for a in range(3):
-            order[a] = a
-        for a in range(1, 3):  # by insertion
-            for b in range(a, 0, -1):
-                if C[order[b], order[b]] < C[order[b - 1], order[b - 1]]:
-                    order[b], order[b - 1] = order[b - 1], order[b]
+    x, y, z, n = points[0], points[1], points[2], points.shape[1]
+    squares, near, found = np.empty(n), np.empty(n), np.empty(n, np.int64)
+    C, V, mean, off, order = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3, np.int64)
+    reach = np.inf  # of the search: the next place has its neighbours about as far away
+    for q in range(len(places)):
+        px, py, pz = places[q, 0], places[q, 1], places[q, 2]
+        for i in range(n):
+            squares[i] = (x[i] - px) ** 2 + (y[i] - py) ** 2 + (z[i] - pz) ** 2
+        for k in sizes:
+            count = 0
+            for i in range(n):
+                found[count], near[count] = i, squares[i]
+                count += squares[i] <= reach
+            if count < k:
+                for i in range(n):
+                    found[i], near[i] = i, squares[i]
+                count = n
+            least_first(near, count, k - 1)
+            limit, used = near[k - 1], 0
+            reach = 2.0 * limit
+            mean[:] = 0.0
+            C[:] = 0.0
+            for m in range(count):
+                i = found[m]
+                if squares[i] <= limit:
+                    off[0], off[1], off[2] = x[i] - px, y[i] - py, z[i] - pz
+                    used += 1
+                    for a in range(3):
+                        mean[a] += off[a]
+                        for b in range(a + 1):
+                            C[a, b] += off[a] * off[b]
+            for a in range(3):
+                for b in range(a + 1):
+                    C[a, b] -= mean[a] * mean[b] / used
+                    C[b, a] = C[a, b]
+            eigen(C, V)
+            for a in range(3):
+                order[a] = a
+            for a in range(1, 3):  # by insertion
+                for b in range(a, 0, -1):
+                    if C[order[b], order[b]] < C[order[b - 1], order[b - 1]]:
+                        order[b], order[b - 1] = order[b - 1], order[b]
+            if C[order[1], order[1]] >= OF_A_LINE * C[order[2], order[2]]:
+                break
         inner_product, length = 0.0, 0.0
         for a in range(3):
-            out = places[rows[q], a] - centre[a]
+            out = places[q, a] - centre[a]
             inner_product += V[a, order[0]] * out
             length += out * out
-        cosine[rows[q]] = abs(inner_product) / np.sqrt(length)
-        line[q] = C[order[1], order[1]] < OF_A_LINE * C[order[2], order[2]]
+        cosine[q] = abs(inner_product) / np.sqrt(length)
 
 
 def misfit(points: Floats, residual: Floats, ball: Sphere, scale: float) -> float:
