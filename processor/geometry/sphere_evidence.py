@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.linalg_small import eigen
+from processor.geometry.nearest_neighbours import nearest_four
 from processor.geometry.selection import least_first
 from processor.geometry.sphere import Sphere, canonical_order, sphere_cells, visible_fraction
 from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit
@@ -34,9 +35,6 @@ FLATTEST = 2.2  # rms of residuals of what is likely a sphere, in scales; 2.7 wh
 STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
 ABOUT = 0.4  # of the radius: points up to there outside are about a ball
 RADIUS_BAND = 0.15  # proposals within this share of a fixed radius
-NEAREST = 4  # those on all sides of a point: two along a line of the scanner and two across
-OF_A_CELL = 3.0  # work: points of a cell, as if they lay evenly on the two longest sides of their box
-MOST_CELLS = 64.0  # work: along a side
 EVIDENCE_CELLS = 12.0  # of a cloud thinned to one point a cell, in a ball's radius
 
 
@@ -158,7 +156,7 @@ def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: Limits) -> 
     rows = order[np.append(True, (points[order[1:]] != points[order[:-1]]).any(axis=1))]  # of equal points the first
     radial, off = _radial(points[rows], ball), residual[rows]
     some = np.arange(0, len(rows), max(1, len(rows) // MOST_NEAREST))
-    if np.sqrt(np.mean((off[some] - off[neighbouring(radial, some)[:, 0]]) ** 2) / 2.0) < limits.white * sd:
+    if np.sqrt(np.mean((off[some] - off[nearest_four(radial, some)[:, 0]]) ** 2) / 2.0) < limits.white * sd:
         return False
     # The part of the sum of squares of residuals (n,) that the shape of an ellipsoid explains
     x, y, z = _radial(points, ball).T
@@ -264,68 +262,3 @@ def misfit(points: Floats, residual: Floats, ball: Sphere, scale: float) -> floa
     count = np.bincount(cell)
     mean = np.bincount(cell, residual) / count
     return float(np.median(np.sqrt(np.maximum(mean**2 - scale**2 / count, 0.0))[cell]))
-
-
-def neighbouring(directions: Floats, rows: Ints) -> Ints:
-    """Return the nearest four (m, 4) of directions (n, 3) to those of ``rows`` (m,), the nearest first; -1 = none.
-
-    In space the nearest of several points at about one distance would be that of the most similar residual.
-    """
-    near = np.full((len(rows), NEAREST), -1, np.int64)
-    if not len(directions):
-        return near
-    low, extent = directions.min(axis=0), np.ptp(directions, axis=0)
-    sides = np.sort(extent)
-    edge = max(float(np.sqrt(OF_A_CELL * sides[1] * sides[2] / len(directions))), float(sides[2]) / MOST_CELLS, 1e-12)
-    _fill(np.ascontiguousarray(directions), low, edge, (extent / edge).astype(np.int64) + 1, rows, near)
-    return near
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fill(u, low, edge, size, wanted, near):  # type: ignore[no-untyped-def]
-    """Fill rows (m, 4) of the nearest to those wanted (m,), by cells of this edge, ``size`` (3,) along the axes.
-
-    About the cell of a point rings of cells are looked at until the fourth neighbour is nearer than what lies beyond.
-    """
-    n, k = len(u), near.shape[1]
-    nx, ny, nz = size[0], size[1], size[2]
-    cell, start, rows = np.empty((n, 3), np.int64), np.zeros(nx * ny * nz + 1, np.int64), np.empty(n, np.int64)
-    for i in range(n):
-        for a in range(3):
-            cell[i, a] = min(int((u[i, a] - low[a]) / edge), size[a] - 1)
-        start[(cell[i, 0] * ny + cell[i, 1]) * nz + cell[i, 2] + 1] += 1
-    for c in range(nx * ny * nz):
-        start[c + 1] += start[c]
-    for i in range(n - 1, -1, -1):
-        c = (cell[i, 0] * ny + cell[i, 1]) * nz + cell[i, 2] + 1
-        start[c] -= 1
-        rows[start[c]] = i
-    start[:-1] = start[1:]
-    start[-1] = n
-    squares = np.empty(k)
-    for q in range(len(wanted)):
-        i = wanted[q]
-        x, y, z = u[i, 0], u[i, 1], u[i, 2]
-        ring = 0
-        while True:
-            ring += 1
-            for m in range(k):
-                near[q, m], squares[m] = -1, np.inf
-            x0, x1 = max(cell[i, 0] - ring, 0), min(cell[i, 0] + ring, nx - 1)
-            y0, y1 = max(cell[i, 1] - ring, 0), min(cell[i, 1] + ring, ny - 1)
-            z0, z1 = max(cell[i, 2] - ring, 0), min(cell[i, 2] + ring, nz - 1)
-            for cx in range(x0, x1 + 1):
-                for cy in range(y0, y1 + 1):
-                    line = (cx * ny + cy) * nz
-                    for at in range(start[line + z0], start[line + z1 + 1]):
-                        row = rows[at]
-                        d = (u[row, 0] - x) ** 2 + (u[row, 1] - y) ** 2 + (u[row, 2] - z) ** 2
-                        if d >= squares[k - 1] or row == i:
-                            continue
-                        m = k - 1
-                        while m > 0 and squares[m - 1] > d:
-                            squares[m], near[q, m] = squares[m - 1], near[q, m - 1]
-                            m -= 1
-                        squares[m], near[q, m] = d, row
-            if squares[k - 1] <= (ring * edge) ** 2 or ring > max(nx, ny, nz):
-                break

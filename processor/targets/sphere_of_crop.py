@@ -4,7 +4,8 @@ Spheres through four points drawn from the crop are scored within bands about th
 best of each band are fitted robustly. The first that passes every test of a sphere is taken: in a narrow band what
 touches the sphere does not count. It is then fitted to more of the points, until these no longer agree with it. A
 sphere that is a small share of the points is searched for as in a whole cloud, see
-:mod:`processor.space_frame.spheres.sphere_detection`.
+:mod:`processor.space_frame.spheres.sphere_detection`. Where nearly all points are within the narrowest band of the
+sphere of least squares, that one comes before those drawn.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -28,8 +29,9 @@ from processor.geometry.sphere_evidence import (
     inlier_share,
     rows_of_cells,
 )
-from processor.geometry.sphere_fit import RobustFit, robust_fit
+from processor.geometry.sphere_fit import WORST_CONDITION, RobustFit, robust_fit
 from processor.model import Floats, Ints
+from processor.robust_statistics import TUKEY, robust_sd
 from processor.space_frame.spheres.sphere_detection import Ball
 
 BANDS = (0.02, 0.04, 0.08)  # half-widths about the surface, in radii
@@ -37,6 +39,7 @@ SETS = (1000, 10_000)  # of four points, at first and where these give no certai
 CELLS, MOST_SCORED = 40, 300  # along the diagonal of a crop, of which one point each is scored; such points
 SMALLEST, LARGEST = 0.15, 0.7  # radius of a sphere, in diagonals of the crop
 EACH_BAND, MOST_LOOKED = 2, 300  # spheres tried, of those with the best scores
+ALONE = 0.98  # least share of the points on the sphere of a crop that holds nothing else: rays at the limb are split
 APART = 0.2  # of their centres, in radii
 # No shape is as large as the noise: what a crop holds beside its sphere is little.
 LIMITS = Limits(facing=0.94, likely_facing=0.9, thinned=False, white=0.7, shape=0.005, small=0.002)
@@ -67,7 +70,8 @@ def find(points: Floats, least_points: int, radius_mm: float | None, scanner: Fl
     few = crop.every(len(points) // MOST_FITTED + 1)
     rng = np.random.default_rng(0)  # fixed: the result must not depend on a seed
     likely = None
-    for start, scale in chain.from_iterable(_starts(few.points, rng, sets, radius_mm) for sets in SETS):
+    drawn = (_starts(few.points, rng, sets, radius_mm) for sets in SETS)
+    for start, scale in chain(_alone(few.points, radius_mm), chain.from_iterable(drawn)):
         fit = few.fit(start, scale)
         outcome = Grade.NONE if fit is None else few.grade(fit)
         if fit is not None and few is not crop and outcome is not Grade.NONE:
@@ -139,6 +143,28 @@ def _in_place(crop: _Crop, fit: RobustFit, order: Ints, origin: Floats, *, certa
     return Found(Ball(fit.in_place(len(order), order, origin), share), certain)
 
 
+def _alone(crop: Floats, radius_mm: float | None) -> Iterator[tuple[Sphere, float]]:
+    """Yield the sphere of least squares, with the scale of the narrowest band, if nearly all points are within it."""
+    A = np.column_stack([2.0 * crop, np.ones(len(crop))])
+    normal = A.T @ A
+    if np.linalg.cond(normal) > WORST_CONDITION:
+        return
+    solution = np.linalg.solve(normal, A.T @ np.sum(crop**2, axis=1))
+    radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 0.0)))
+    low, high = _radii(crop, radius_mm)
+    off, scale = np.linalg.norm(crop - solution[:3], axis=1) - radius, 0.5 * BANDS[0] * radius
+    if low <= radius <= high and robust_sd(off) < scale and np.mean(np.abs(off) < TUKEY * robust_sd(off)) >= ALONE:
+        yield Sphere(solution[:3], radius, np.zeros((4, 4))), scale
+
+
+def _radii(crop: Floats, radius_mm: float | None) -> tuple[float, float]:
+    """Return the least and the greatest radius of what may be the sphere of a crop."""
+    if radius_mm is not None:
+        return (1.0 - RADIUS_BAND) * radius_mm, (1.0 + RADIUS_BAND) * radius_mm
+    diagonal = float(np.linalg.norm(np.ptp(crop, axis=0)))
+    return SMALLEST * diagonal, LARGEST * diagonal
+
+
 def _starts(
     crop: Floats, rng: np.random.Generator, sets: int, radius_mm: float | None
 ) -> Iterator[tuple[Sphere, float]]:
@@ -153,9 +179,7 @@ def _starts(
         return
     draws = rng.random((sets, MINIMAL))
     centres, radii = through_four(scored[(draws * len(scored)).astype(np.int64)])
-    low, high = (SMALLEST * diagonal, LARGEST * diagonal)
-    if radius_mm is not None:
-        low, high = (1.0 - RADIUS_BAND) * radius_mm, (1.0 + RADIUS_BAND) * radius_mm
+    low, high = _radii(crop, radius_mm)
     likely = (radii >= low) & (radii <= high)
     centres, radii = centres[likely], radii[likely]
     for band in BANDS:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.geometry.sphere_evidence import neighbouring
+from processor.geometry.nearest_neighbours import nearest_four
 from processor.model import Floats, Ints
 
 PART_POINTS = 180  # about; from 90 on means of 8, and from 150 on those of 20 and moving least squares are told apart
@@ -41,7 +41,7 @@ def ratio(directions: Floats, errors: Floats) -> float:
     left[parts], part[parts] = errors[parts] - fitted[..., 0], np.arange(len(parts))[:, None]
     variance = np.sum(left[parts] ** 2, axis=1) / (parts.shape[1] - TERMS)
     rows = parts[:, :: max(1, parts.size // LOOKED_AT)].ravel()
-    near = neighbouring(directions, rows)
+    near = nearest_four(directions, rows)
     within = (part[near] == part[rows, None]) & (near >= 0)
     squares = np.where(within, (left[near] - left[rows, None]) ** 2, 0.0)
     sums, pairs = (np.bincount(part[rows], one.sum(axis=1), len(parts)) for one in (squares, within))

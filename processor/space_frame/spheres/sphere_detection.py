@@ -18,7 +18,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from processor.geometry import point_grid
-from processor.geometry.linalg_small import assign
+from processor.geometry.linalg_small import assign, eigen
 from processor.geometry.sphere import Sphere, canonical_order
 from processor.geometry.sphere_evidence import (
     BAND,
@@ -370,12 +370,42 @@ def flat_noise(points: Floats, width: float) -> float:
     cloud = cloud - cloud.mean(axis=0)
     seeds = cloud[rows_of_cells(cloud, width)]
     seeds = seeds[:: len(seeds) // MOST_FLAT + 1]
-    found = []
-    for rows in cKDTree(cloud).query_ball_point(seeds, 0.5 * width, return_sorted=True):
-        if len(rows) < LEAST_CELLS:
-            continue
-        away = cloud[rows] - cloud[rows].mean(axis=0)
-        least, middle, _ = np.linalg.eigvalsh(away.T @ away / (len(rows) - 3))
-        if middle > (LEAST_SPREAD * width) ** 2:
-            found.append(np.sqrt(max(least, 0.0)))
+    found = np.full(len(seeds), np.nan)
+    _thicknesses(cloud, seeds, np.searchsorted(cloud[:, 0], seeds[:, 0] - 0.5 * width), 0.5 * width, found)
+    found = found[np.isfinite(found)]
     return float(np.median(found)) if len(found) >= LEAST_FLAT else float("nan")
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _thicknesses(points, places, first, reach, found):  # type: ignore[no-untyped-def]
+    """Fill the thickness (m,) of the points (n, 3), ascending in x, about each place (m, 3), ``first`` (m,) of them on.
+
+    NaN where they are few or lie in a line.
+    """
+    C, V, mean, off = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    for q in range(len(places)):
+        count = 0
+        mean[:] = 0.0
+        C[:] = 0.0
+        for i in range(first[q], len(points)):
+            off[0] = points[i, 0] - places[q, 0]
+            if off[0] > reach:
+                break
+            off[1], off[2] = points[i, 1] - places[q, 1], points[i, 2] - places[q, 2]
+            if off[0] ** 2 + off[1] ** 2 + off[2] ** 2 > reach * reach:
+                continue
+            count += 1
+            for a in range(3):
+                mean[a] += off[a]
+                for b in range(a + 1):
+                    C[a, b] += off[a] * off[b]
+        if count < LEAST_CELLS:
+            continue
+        for a in range(3):
+            for b in range(a + 1):
+                C[a, b] = (C[a, b] - mean[a] * mean[b] / count) / (count - 3)
+                C[b, a] = C[a, b]
+        eigen(C, V)
+        least, most = min(C[0, 0], C[1, 1], C[2, 2]), max(C[0, 0], C[1, 1], C[2, 2])
+        if C[0, 0] + C[1, 1] + C[2, 2] - least - most > (2.0 * LEAST_SPREAD * reach) ** 2:
+            found[q] = np.sqrt(max(least, 0.0))
