@@ -21,7 +21,7 @@ from processor.adjustment.elimination import eliminate
 from processor.defects.observations import Pairs
 from processor.defects.surface_charts import CYLINDER, DesignSurface, chart_of_cells
 from processor.geometry import rigid
-from processor.model import Columns, Floats, Ints
+from processor.model import Bools, Columns, Floats, Ints
 from processor.robust_statistics import CAUCHY, cauchy, robust_sd
 from processor.views import Views
 
@@ -37,6 +37,7 @@ CLASS_FREE = np.array([0.0] * 3 + [4.0] * 4)  # nothing is known of the class's 
 GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of parameters with one variance component each
 WHOLE_PRIOR = np.array([5e-3] * 3 + [50.0] * 3)  # of the whole (rad, mm): as far as a coarse pose is off
 FLOOR_MM = 0.15  # standard deviation of a block's mean: beams, encoders and the roughness of the steel
+SHARED_MM = FLOOR_MM / 3.0  # error of a mean by another place: blocks of a face have it in common, noise not
 FEWEST_COMPONENTS = 3  # to fit the whole by: of fewer, a component that moved cannot be identified
 ROUNDS, STILL_MM = 12, 1e-4  # a step of the whole that moves all blocks by less is the last
 MOST_ROUNDS, SETTLED = 40, 0.05  # of the stations' variance components, and the relative change of the last round
@@ -124,13 +125,13 @@ def align(
     blocks = _blocks(pairs, surface)
     if not len(blocks.block):
         return start
-    points, outward = surface.centres[blocks.cell], surface.outward[blocks.cell]
-    J = distance_derivative(points - start.centre, outward, rays_to(points, stations.positions[blocks.station]))
+    points = surface.centres[blocks.cell]
+    rays = rays_to(points, stations.positions[blocks.station])
+    J = distance_derivative(points - start.centre, surface.outward[blocks.cell], rays)
     component = surface.charts.component[chart_of_cells(surface)[blocks.cell]]
     used = ~np.isin(component, sorted(excluded))
-    # Of what moved by much, stations do not see the same place in one cell: they are compared on the rest.
     enough = len(np.unique(component[used])) >= FEWEST_COMPONENTS
-    compared = used if enough else np.ones_like(used)
+    compared = _of_one_place(blocks, J, points - start.centre, rays, component, surface)
     movements, station_covariance = station_movements(blocks.take(compared), J[compared], len(stations.names))
     start = replace(start, movements=movements, station_covariance=station_covariance)
     if not enough:
@@ -145,6 +146,31 @@ def align(
         covariance = covariance + scanner_class_errors.pose_covariance(points[used] - start.centre)
     response = _response(gain, J[used], blocks.station[used], len(stations.names))
     return replace(start, whole=whole, covariance=covariance, fitted=True, response=response)
+
+
+def _of_one_place(
+    blocks: StationBlocks, J: Floats, arm: Floats, rays: Floats, component: Ints, surface: DesignSurface
+) -> Bools:
+    """Mark the blocks (n,) in which a station sees what others see there, to SHARED_MM; ``arm`` (n, 3) as for J.
+
+    A point on a tube that lies elsewhere is given the place where its line of sight meets the tube as designed. That is
+    off along the face by the deviation times the tangent of incidence, to either side for stations on either side, and
+    the deviation changes along it as the tube moved. Each component is taken as a rigid body.
+    """
+    chart = chart_of_cells(surface)[blocks.cell]
+    around = np.cross(surface.charts.axes[chart, 0], surface.outward[blocks.cell])
+    out, along = np.zeros(len(blocks.mean)), np.zeros(len(blocks.mean))
+    for number in np.unique(component):
+        rows = component == number
+        N, g = robust_least_squares.normal_equations(J[rows, :6], 1.0 / blocks.variance[rows], blocks.mean[rows])
+        x = np.linalg.solve(N + np.diag(1.0 / WHOLE_PRIOR**2), g)
+        out[rows], along[rows] = J[rows, :6] @ x, distance_derivative(arm[rows], around[rows]) @ x
+    off = np.abs(blocks.mean * np.einsum("ni,ni->n", rays, around))
+    with np.errstate(divide="ignore", invalid="ignore"):  # no station sees along its face; of planes nothing is asked
+        turn = np.minimum(off / np.abs(J[:, 6]) / surface.charts.radius[chart], 0.5 * np.pi)
+    error = np.abs(along) * np.sin(turn) + np.abs(out) * (1.0 - np.cos(turn))
+    shared: Bools = (surface.charts.kind[chart] != CYLINDER) | (error <= SHARED_MM)
+    return shared
 
 
 def _response(gain: Floats, J: Floats, station: Ints, stations: int) -> Floats:

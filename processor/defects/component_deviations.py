@@ -139,37 +139,50 @@ def significant(
         if not candidates:
             continue
         front = front_of(surface, fit.component, field)
-        front = front[surface.share[front] > 0.5]
-        area = float(surface.share[front].sum()) * surface.charts.cell_mm**2
+        area = float(surface.share[front[surface.share[front] > 0.5]].sum()) * surface.charts.cell_mm**2
         threshold = max(LEAST_Z, float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shape_models.BASES)))))
-        # Noise of blocks; the common error of larger places is added below.
-        size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
-        inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
-        for shape in candidates:
-            value, own, noise, shared = _errors(fit, shape, surface, field, alignment, levels)
-            noise = inflation * noise
-            sd = np.hypot(noise, shared)
-            top = int(np.argmax(np.abs(value)))
-            z = deviate_of_one(float((np.abs(own) / sd).max()), len(shape.factors))
-            if z > threshold:
-                # The noise of places averages out in the volume, what they have in common does not.
-                cells = swept_cells(surface, field, fit, shape)
-                points, outward = surface.centres[cells], surface.outward[cells]
-                # 0 where the shape does not reach
-                swept = np.sign(shape.values(fit.frame, points, outward)) * surface.cell_areas[cells]
-                of_noise = inflation * shape.total_sd(fit.frame, points, outward, swept)
-                in_common = np.abs(swept).sum() * np.sqrt(np.mean(shared**2))
-                judged = SignificantShape(
-                    shape=shape,
-                    peak=float(value[top]),
-                    ci95=NORMAL_95 * float(sd[top]),
-                    volume_ci95=NORMAL_95 * float(np.hypot(of_noise, in_common)),
-                    z=z,
-                    chance=2.0 * float(ndtr(-z)) * len(shape_models.BASES) / area,
-                    margin=fit.fitted.margin / inflation**2,
-                )
-                chosen.setdefault(fit.component, []).append(judged)
+        of_all = [judged(fit, shape, surface, field, alignment, levels) for shape in candidates]
+        found = [
+            dataclasses.replace(one, chance=2.0 * float(ndtr(-one.z)) * len(shape_models.BASES) / area)
+            for one in of_all
+            if one.z > threshold
+        ]
+        if found:
+            chosen[fit.component] = found
     return chosen
+
+
+def judged(
+    fit: ComponentShape,
+    shape: shape_models.Shape,
+    surface: DesignSurface,
+    field: Field,
+    alignment: Alignment,
+    levels: Levels,
+) -> SignificantShape:
+    """Return a shape with its interval, whether or not it is significant; ``chance`` is left to the search."""
+    # Noise of blocks; the common error of larger places is added below.
+    size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
+    inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
+    value, own, noise, shared = _errors(fit, shape, surface, field, alignment, levels)
+    sd = np.hypot(inflation * noise, shared)
+    top = int(np.argmax(np.abs(value)))
+    # The noise of places averages out in the volume, what they have in common does not.
+    cells = swept_cells(surface, field, fit, shape)
+    points, outward = surface.centres[cells], surface.outward[cells]
+    # 0 where the shape does not reach
+    swept = np.sign(shape.values(fit.frame, points, outward)) * surface.cell_areas[cells]
+    of_noise = inflation * shape.total_sd(fit.frame, points, outward, swept)
+    in_common = np.abs(swept).sum() * np.sqrt(np.mean(shared**2))
+    return SignificantShape(
+        shape=shape,
+        peak=float(value[top]),
+        ci95=NORMAL_95 * float(sd[top]),
+        volume_ci95=NORMAL_95 * float(np.hypot(of_noise, in_common)),
+        z=deviate_of_one(float((np.abs(own) / sd).max()), len(shape.factors)),
+        chance=0.0,
+        margin=fit.fitted.margin / inflation**2,
+    )
 
 
 def _errors(

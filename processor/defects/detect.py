@@ -77,21 +77,12 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     search = _search(scene, registered, pose.error_mm, params)
     movements = moved_bodies.moved(search.shapes, search.significant)
     if movements:
-        # Of what moved, stations do not see one place in one cell: its movement is that by stations fitted elsewhere.
-        others = frozenset(movements)
-        aligned = alignment.align(
-            registered.pairs, registered.surface, registered.observed.stations, pose.error_mm, others
-        )
-        if aligned.fitted:
-            again_fitted = _shapes_of(registered, aligned, params)[1]
-            movements = moved_bodies.refitted(movements, again_fitted)
         changed = moved_bodies.design(design.name, registered.surface, movements)
         T = registered.T_design_project
-        again = _registered(scene, changed.vertices, changed, T, pose.error_mm, params, others)
+        again = _registered(scene, changed.vertices, changed, T, pose.error_mm, params, frozenset(movements))
         if again is not None:
-            registered, search = again, _search(scene, again, pose.error_mm, params)
-            shapes, significant = moved_bodies.together(movements, search.shapes, search.significant)
-            search = dataclasses.replace(search, shapes=shapes, significant=significant)
+            search = moved_bodies.together(movements, _search(scene, again, pose.error_mm, params))
+            registered = again
     result = to_result.result_of(search, params, origin, pose.doubt)
     T = alignment.corrected_pose(registered.T_design_project, search.alignment)
     return dataclasses.replace(

@@ -11,9 +11,11 @@ import dataclasses
 
 import numpy as np
 
+from processor.defects import component_deviations
 from processor.defects.component_deviations import ComponentShape, SignificantShape
 from processor.defects.shape_models import RIGID, Shape
 from processor.defects.surface_charts import DesignSurface
+from processor.defects.to_result import Search
 from processor.geometry import rigid
 from processor.model import DesignBodies, Floats, StructureDesign
 
@@ -34,19 +36,6 @@ def moved(shapes: list[ComponentShape], significant: Significant) -> dict[int, t
         others = max((abs(one.peak) for one in of_one if one.shape.kind != RIGID), default=0.0)
         if movements and abs(movements[0].peak) >= max(LEAST_MM, others / OTHERS_SHARE):
             found[number] = (fits[number], movements[0])
-    return found
-
-
-def refitted(
-    movements: dict[int, tuple[ComponentShape, SignificantShape]], shapes: list[ComponentShape]
-) -> dict[int, tuple[ComponentShape, SignificantShape]]:
-    """Return movements with the factors of another fit, where that has them."""
-    found = dict(movements)
-    for fit in shapes:
-        own = [shape for shape in fit.fitted.shapes if shape.kind == RIGID]
-        if fit.component in found and own:
-            judged = found[fit.component][1]
-            found[fit.component] = (fit, dataclasses.replace(judged, shape=own[0]))
     return found
 
 
@@ -71,21 +60,15 @@ def _at(shape: Shape, fit: ComponentShape, points: Floats) -> Floats:
     return after
 
 
-def together(
-    before: dict[int, tuple[ComponentShape, SignificantShape]], shapes: list[ComponentShape], significant: Significant
-) -> tuple[list[ComponentShape], Significant]:
-    """Return shapes and significant shapes of the search on the changed design, with the movements ``before`` added.
-
-    The uncertainty of a movement is that of the first fit, by its share of the whole.
-    """
-    fits = {fit.component: fit for fit in shapes}
-    total = {number: list(of_one) for number, of_one in significant.items()}
+def together(before: dict[int, tuple[ComponentShape, SignificantShape]], search: Search) -> Search:
+    """Return the search on the changed design, with the movements ``before`` added to what it found of them."""
+    fits = {fit.component: fit for fit in search.shapes}
+    total = dict(search.significant)
     for number, (fit, judged) in before.items():
-        fits.setdefault(number, fit)
-        rest = [one for one in total.get(number, []) if one.shape.kind == RIGID]
+        own = fits.setdefault(number, fit)
+        rest = [shape for shape in own.fitted.shapes if shape.kind == RIGID and own is not fit]
+        shape = dataclasses.replace(judged.shape, factors=sum((one.factors for one in rest), judged.shape.factors))
+        whole = component_deviations.judged(own, shape, search.surface, search.field, search.alignment, search.levels)
         others = [one for one in total.get(number, []) if one.shape.kind != RIGID]
-        factors = judged.shape.factors + sum((one.shape.factors for one in rest), np.zeros(6))
-        ci95 = rest[0].ci95 if rest else judged.ci95
-        whole = dataclasses.replace(judged, shape=dataclasses.replace(judged.shape, factors=factors), ci95=ci95)
-        total[number] = [whole, *others]
-    return [fits[number] for number in sorted(fits)], total
+        total[number] = [dataclasses.replace(whole, chance=judged.chance, margin=judged.margin), *others]
+    return dataclasses.replace(search, shapes=[fits[number] for number in sorted(fits)], significant=total)

@@ -41,9 +41,9 @@ def portal(gap):
     return whole
 
 
-def portal_scene(gap, settings):
+def portal_scene(gap, settings, seed=1):
     """A scan of the portal from five stations."""
-    return designgen.scan(portal(gap), stations=5, seed=1, settings=settings)[0]
+    return designgen.scan(portal(gap), stations=5, seed=seed, settings=settings)[0]
 
 
 def plates(departures):
