@@ -29,11 +29,9 @@ PART = 0.5  # of the points of the densest layer, that the innermost one has at 
 STEEPEST = 0.1  # slope of steel from its design, one sd; steepest dents have twice that
 CURVATURE = 0.001  # 1 / mm, of a dent 20 mm deep and 600 mm wide: 0.5 * 20 * (pi / 300)**2
 LINKS, REACH = 8, 1.5  # neighbours that a layer may continue to, and how far they are, by the median of the last
-AROUND, PIECE, OTHER_BODY = (
-    96,
-    3.0,
-    0.05,
-)  # pieces of faces about one, their least side in diameters, weight of other bodies
+# Pieces of faces about one, and of them the nearest, whose other sides show how it moved; their least side in
+# diameters, and the weight of other bodies
+AROUND, BEHIND, PIECE, OTHER_BODY = 96, 24, 3.0, 0.05
 # Of a body that lies before its design all about, by less than boards are thick, other plates or sections were built.
 LARGER_MM, HALF = 12.0, 0.5
 AGREES_MM, AGREE = 3.0, 0.1  # of the movement about it, to which a surface agrees; the least share of it that does
@@ -200,15 +198,30 @@ def _expected(
     of_body[piece] = body
     near = cKDTree(centre).query(centre, k=min(AROUND, len(centre)), workers=-1)[1].reshape(len(centre), -1)
     weight = np.where(of_body[near] == of_body[:, None], 1.0, OTHER_BODY)
-    u = np.zeros((len(centre), 3))
+    u, left = _translations(value[near], normal[near], weight, noise)
+    expected: Floats = np.einsum("ki,ki->k", facing, u[piece])
+    # What moved is moved on its other side as well, however little of the surface about it is.
+    near = near[:, :BEHIND]
+    cosine = np.einsum("pi,pki->pk", normal, normal[near])
+    weight = weight[:, :BEHIND] * (cosine < SAME_FACE)
+    u, _ = _translations(value[near], normal[near], weight, noise)
+    by_others = np.einsum("ki,ki->k", facing, u[piece])
+    seen = ((cosine < -SAME_FACE) & (weight == 1.0)).any(axis=1)[piece]
+    expected = np.where(seen & (np.abs(height - by_others) < np.abs(height - expected)), by_others, expected)
+    return expected, MAD_TO_SD * np.median(left, axis=1)[piece]
+
+
+def _translations(value: Floats, normal: Floats, weight: Floats, noise: float) -> tuple[Floats, Floats]:
+    """Return the translations (p, 3) of least absolute residuals to heights (p, k) along normals, and what is left."""
+    u = np.zeros((len(value), 3))
     for _ in range(ROUNDS):
-        left = np.abs(value[near] - np.einsum("pki,pi->pk", normal[near], u))
+        left = np.abs(value - np.einsum("pki,pi->pk", normal, u))
         w = weight / np.maximum(left, noise)
-        N = np.einsum("pk,pki,pkj->pij", w, normal[near], normal[near])
-        g = np.einsum("pk,pki,pk->pi", w, normal[near], value[near])
-        N += 1e-3 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        N = np.einsum("pk,pki,pkj->pij", w, normal, normal)
+        g = np.einsum("pk,pki,pk->pi", w, normal, value)
+        N += (1e-3 * np.trace(N, axis1=1, axis2=2) + 1e-9)[:, None, None] * np.eye(3)
         u = np.linalg.solve(N, g[:, :, None])[:, :, 0]
-    return np.einsum("ki,ki->k", facing, u[piece]), MAD_TO_SD * np.median(left, axis=1)[piece]
+    return u, left
 
 
 def _continued(tree: cKDTree, facing: Floats, height: Floats, slope: Floats, noise: float) -> Ints:
