@@ -219,7 +219,8 @@ def _located(search: _Search, bodies: Sequence[Floats], design: DesignSurface, *
     found = [one for one in found if one.shown > 0.0 and one.shown >= AS_WELL * most]
     found = [replace(one, count=int(at_design(search.few, one.T, design).sum())) for one in found]
     places: list[Located] = []
-    for one in sorted(found, key=lambda one: (-one.count, -one.shown)):
+    # In a wrong unit samples may be shown by points that are all beyond the faces' edges
+    for one in sorted((one for one in found if one.count), key=lambda one: (-one.count, -one.shown)):
         known = next((k for k, place in enumerate(places) if _near(one, place, design)), None)
         if known is None:
             places.append(one)

@@ -1,7 +1,10 @@
 """A part among surroundings: placed by its design's surface, and not on the neighbour or on what touches it."""
 
+from unittest import mock
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_distance, rigid
 from processor.registration import located_part, pose_search
@@ -60,6 +63,15 @@ def test_of_two_parts_the_one_that_goes_on_where_points_are_is_it(design):
     points = np.concatenate([box(rng, [0.0, 0.0, 700.0], SIZE), floor(rng, [-3000.0, -4000.0], [8000.0, 5000.0])])
     located = located_part.locate(points, [shorter, design])
     assert located_part.which(points, [shorter, design], located)[0].numbers == (1,)
+
+
+def test_a_place_whose_points_are_all_beyond_the_faces_is_none(design):
+    """Of a long box a sample of the plane of its bottom is near points of the floor beside it."""
+    away = located_part.Located(np.eye(4), 0.5)
+    points = np.random.default_rng(6).uniform([-500.0, -500.0, -5.0], [-100.0, -100.0, 5.0], (1000, 3))
+    with mock.patch.object(located_part, "_on_body", return_value=away):
+        search = located_part._Search(points, cKDTree(points), 50.0)
+        assert located_part._located(search, [points], design, pieces=False) == []
 
 
 def test_nothing_is_located_among_surroundings_alone(design):

@@ -316,3 +316,8 @@ def test_a_raw_scan_has_the_unit_in_which_more_of_the_design_is_shown(monkeypatc
     project = guess.Guess("f", "f", kind="arch-bridge", scans=scans)
     guess._guess_units(project, [1.0], shapes)
     assert (project.units, project.doubts) == ("ft", [])
+    tried = []
+    monkeypatch.setattr(guess, "_differences", lambda scan, unit, _: tried.append(unit) or found(scan, unit, _))
+    shapes.located = {key: [[located_part.Located(np.eye(4), 0.5)]] for key in shapes.located}
+    guess._guess_units(project, [1.0], shapes)
+    assert (project.units, set(tried)) == ("m", {"m"})  # of the part surely shown no other unit is tried
