@@ -1,6 +1,7 @@
 """The bend of parts as scanned, taken out or in their intervals, against finite elements (bent_girders)."""
 
 import dataclasses
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ from processor.model import InputError, PartSupports, Status, Steel
 from processor.preassembly import topology
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import SystematicParams
-from processor.preassembly.parts import straightening
+from processor.preassembly.parts import bending, straightening, supports_seen
 from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.parts.part_residuals import PartResiduals
+from processor.preassembly.parts.supports_seen import Seen
 from processor.store import store
 from tests.support.results import measured_parts
 from tests.support.scenes import bent_girders
@@ -113,6 +115,76 @@ def test_sags_taken_out_are_known_to_their_stated_share():
         every.append(pulls(*straightened(girder, lying, rng, gradient_K=0.0, weight=rng.normal(1.0, 0.1)))[0])
     assert np.mean(np.abs(np.concatenate(every)) < 1.96) > 0.92
     assert np.sqrt(np.mean(np.concatenate(every) ** 2)) < 1.25
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_gaps_by_supports_that_are_seen(count, monkeypatch):
+    """The sets of three trestles that may carry a part do so as often as each other."""
+    rng, every, widths = np.random.default_rng([count, 7]), [], []
+    for girder in GIRDERS * 3:
+        lying, seen = [], {}
+        for name in ("g1", "g2", "g3"):
+            one = bent_girders.drawn(girder, rng, count)
+            pairs = [some for some in combinations(one.supports, 2) if some[0] < 0.5 * girder.length < some[1]]
+            carrying = [one.supports, *pairs][rng.integers(len(pairs) + 1)]
+            lying.append(one._replace(carrying=carrying))
+            seen[name] = np.array(one.supports)
+        monkeypatch.setattr(
+            straightening.supports_seen,
+            "find",
+            lambda _, up, beam, part, seen=seen: Seen(seen[part.name], np.full(count, 30.0)),
+        )
+        parts, scene = straightened(girder, lying, rng, stated=False)
+        pull, sd = pulls(parts, scene)
+        every.append(pull)
+        assert all("preassemble.supports-seen" in codes(part) for part in parts)
+        monkeypatch.setattr(straightening.supports_seen, "find", lambda *_: None)
+        widths.append(np.median(sd) / np.median(pulls(*straightened(girder, lying, rng, stated=False))[1]))
+    inside = np.mean(np.abs(np.concatenate(every)) < 1.96)
+    assert inside > 0.95 - 3.0 * 0.027  # as above
+    assert np.sqrt(np.mean(np.concatenate(every) ** 2)) < 1.3
+    assert np.median(widths) < 1.0
+
+
+@pytest.mark.parametrize("quarters", [0, 1])
+@pytest.mark.parametrize("trestles", [(1_300.0, 9_100.0), (900.0, 6_200.0, 10_000.0)])
+def test_trestles_are_seen_beneath_a_part(quarters, trestles):
+    places = seen(GIRDERS[0], trestles, quarters)
+    np.testing.assert_allclose(places.places, trestles, atol=30.0)  # cells are 50 mm long
+    assert (places.sd < 50.0).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"trestles": (6_000.0,)},
+        {"lower": 150.0},  # it may touch where no scanner looks
+        {"unseen": (4_000.0, 5_000.0)},
+        {"sling": True},
+        {"floor": False},
+    ],
+)
+def test_supports_that_are_not_surely_seen(options):
+    assert seen(GIRDERS[0], options.pop("trestles", (1_300.0, 9_100.0)), 0, **options) is None
+
+
+def seen(girder, trestles, quarters, *, sling=False, floor=True, **options):
+    """Supports seen of a girder on trestles beside which somebody stands."""
+    rng = np.random.default_rng(quarters)
+    lying = bent_girders.Lying(quarters, (1_300.0, 9_100.0), (0.0, 0.0), 0.7)
+    scene, (T,), _ = bent_girders.scene(girder, [lying], 1, spacing=60.0)
+    scan = bent_girders.raw(girder, scene.scans[0], T, trestles, rng, **options)
+    part = scene.arch.parts[0]
+    made = bending.beam(part, np.zeros(3), Steel())
+    up = T[:3, 2]
+    add = [np.zeros((0, 3))]
+    if sling:
+        add.append([0.5 * girder.length, 0.0, 0.5 * girder.height] + rng.uniform(500.0, 2_000.0, (2_000, 1)) * up)
+    person = rng.uniform([2_000.0, 700.0, -300.0], [2_400.0, 1_000.0, 1_500.0], (3_000, 3))
+    points = np.vstack([rigid.apply(T, scan.points), person if quarters == 0 else add[0], *add])
+    above = (points - made.origin) @ up
+    points = points if floor else points[above > above.min() + 100.0]
+    return supports_seen.find([(np.eye(4), 1.0, points)], up, made, part)
 
 
 def test_what_is_said_of_a_part():

@@ -88,6 +88,10 @@ class Deflection(NamedTuple):
         """Return it times a factor."""
         return Deflection(factor * self.across, factor * self.turn)
 
+    def plus(self, other: Deflection, factor: float = 1.0) -> Deflection:
+        """Return the sum of it and another one times a factor."""
+        return Deflection(self.across + factor * other.across, self.turn + factor * other.turn)
+
     def displacement(self, beam: Beam, points: Floats) -> Floats:
         """Displacements (k, 3) of points (k, 3) of the part: sections stay plane."""
         local = (points - beam.origin) @ beam.axes.T
@@ -171,9 +175,9 @@ def sag(beam: Beam, gravity: Floats, supports: Sequence[float]) -> tuple[Deflect
         solution = np.linalg.solve(A / size / scale[:, None], right / scale) / size
         forces = solution[2:]
         if (forces >= 0.0).all():
-            every = [Deflection(f * one.across, f * one.turn) for f, one in zip(forces, pushed, strict=True)]
-            total = Deflection(own.across + sum(one.across for one in every), own.turn + sum(one.turn for one in every))
-            return total.through(beam, carrying), tuple(carrying)
+            for force, one in zip(forces.tolist(), pushed, strict=True):
+                own = own.plus(one, force)
+            return own.through(beam, carrying), tuple(carrying)
         carrying.pop(int(np.argmin(forces)))
     return None
 

@@ -1,8 +1,9 @@
 """The bend that parts had as they were scanned, taken out of their ends and edges, or part of their covariance.
 
 A part lies on supports while it is scanned, and bends by its weight and by the sun on one side of it. What is erected
-is the part without that bend. Where its supports are stated the sag is subtracted; where they are not, its second
-moment over plausible supports is added to the covariances, as is that of a difference of temperature across the part.
+is the part without that bend. Where its supports are stated, or seen in its scan, the sag is subtracted; where they are
+not, its second moment over plausible supports is added to the covariances, as is that of a difference of temperature
+across the part.
 All departures of an end share these errors, and so do all of the edges. A scan is taken to be levelled: gravity acts
 along -z of its frame.
 """
@@ -11,7 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from functools import reduce
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -24,9 +26,10 @@ from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.ends.outer_end import OuterEnd
-from processor.preassembly.parts import bending
+from processor.preassembly.parts import bending, supports_seen
 from processor.preassembly.parts.bending import Beam, Deflection
 from processor.preassembly.parts.measure import MeasuredPart
+from processor.preassembly.parts.supports_seen import Seen
 
 # Two trestles, each at up to a third of the length from its end: the middles of four equal shares of that.
 PLAUSIBLE = tuple((k + 0.5) / 12.0 for k in range(4))
@@ -34,6 +37,7 @@ PLAUSIBLE = tuple((k + 0.5) / 12.0 for k in range(4))
 # standard deviations: of the law above, and of 0 to 10 K in any direction, the tails are longer than normal ones.
 TAIL = 1.07
 STEEP = 0.5  # sine of the axis' inclination from which no part lies on trestles: the scan is not levelled
+LEVEL = 0.9998  # cosine of 1 degree, by which verticals of several scans of a part may differ: it lay as in the first
 PLACE_SD_MM = 50.0  # of a stated support: half the width of its beam, and a tape measure
 WORTH_MM = 0.1  # one standard deviation of an end's sag, from which it is named whatever else is uncertain
 
@@ -82,29 +86,77 @@ def _bend(
     if beam is None:
         return None, (reason("preassemble.no-beam"),) if stated else ()
     gravity = -part.T_bridge_scan[:3, 2]
-    if not stated:
+    if stated:
+        places = _stated_supports(part, scene, design.parts[i], beam)
+        beside = [s for s in places if not -PLACE_SD_MM <= s <= beam.length + PLACE_SD_MM]
+        found = None if beside or not places else bending.sag(beam, gravity, places)
+        if found is None:
+            why = reason("preassemble.supports-do-not-carry", places=_in_metres(places), length=1e-3 * beam.length)
+            return _on_any_supports(beam, gravity, gradient_K), (why,)
+        places = found[1]
+        sets = [(found[0], tuple(range(len(places))))]
+        return _on_supports(beam, gravity, Seen(np.array(places), np.full(len(places), PLACE_SD_MM)), sets, gradient_K)
+    seen = _seen(part, design.parts[i], beam)
+    sets = [] if seen is None else _carrying(beam, gravity, seen.places)
+    if seen is None or not sets:
         return _on_any_supports(beam, gravity, gradient_K), ()
-    supports = _stated_supports(part, scene, design.parts[i], beam)
-    beside = [s for s in supports if not -PLACE_SD_MM <= s <= beam.length + PLACE_SD_MM]
-    found = None if beside or not supports else bending.sag(beam, gravity, supports)
-    if found is None:
-        why = reason("preassemble.supports-do-not-carry", places=_in_metres(supports), length=1e-3 * beam.length)
-        return _on_any_supports(beam, gravity, gradient_K), (why,)
-    deflection, carrying = found
-    by_weight = [deflection.scaled(beam.relative_sd)]
-    for k, place in enumerate(carrying):
-        moved = bending.sag(beam, gravity, (*carrying[:k], place + PLACE_SD_MM, *carrying[k + 1 :]))
-        if moved is not None and len(moved[1]) == len(carrying):
-            by_weight.append(Deflection(*(a - b for a, b in zip(moved[0], deflection, strict=True))))
-    by_gradient = tuple(bending.by_gradient(beam, axis, carrying).scaled(gradient_K) for axis in range(2))
-    most = float(np.linalg.norm(deflection.across, axis=1).max())
-    values = {"places": _in_metres(carrying), "sag": most, "ci95": NORMAL_95 * beam.relative_sd * most}
+    bend, reasons = _on_supports(beam, gravity, seen, sets, gradient_K)
+    ci95 = NORMAL_95 * 1e-3 * float(seen.sd.max())
+    why = reason("preassemble.supports-seen", places=_in_metres(seen.places), ci95=ci95, sets=len(sets))
+    return bend, (why, *reasons)
+
+
+def _seen(part: MeasuredPart, of_design: DesignPart, beam: Beam) -> Seen | None:
+    """Return the supports that a part's scans show; None without, or where they are not all of one attitude."""
+    poses = (part.T_bridge_scan, *part.T_further_scans)
+    up = poses[0][:3, 2]
+    if abs(float(beam.axes[0] @ up)) > STEEP or any(float(T[:3, 2] @ up) < LEVEL for T in poses):
+        return None
+    placed = [(T, part.shrink, scan.points) for T, scan in zip(poses, part.scans, strict=True)]
+    return supports_seen.find(placed, up, beam, of_design)
+
+
+def _carrying(beam: Beam, gravity: Floats, places: Floats) -> list[tuple[Deflection, tuple[int, ...]]]:
+    """Return how a part bends on each set of supports that carries it, with the numbers of these supports.
+
+    Which do of three or more depends on heights that no scan shows.
+    """
+    found = []
+    for count in range(2, len(places) + 1):
+        for some in combinations(range(len(places)), count):
+            bent = bending.sag(beam, gravity, places[list(some)].tolist())
+            if bent is not None and len(bent[1]) == count:
+                found.append((bent[0], some))
+    return found
+
+
+def _on_supports(
+    beam: Beam, gravity: Floats, supports: Seen, sets: Sequence[tuple[Deflection, tuple[int, ...]]], gradient_K: float
+) -> tuple[_Bend, tuple[Reason, ...]]:
+    """Return how a part is bent that lies on one of several sets of supports, each as plausible, and what is said."""
+    places, share = supports.places.tolist(), 1.0 / np.sqrt(len(sets))
+    bent = [one.through(beam, places) for one, _ in sets]
+    known = reduce(Deflection.plus, bent).scaled(share**2)
+    by_weight = [known.scaled(beam.relative_sd), *(one.plus(known, -1.0).scaled(share) for one in bent)]
+    by_gradient = list[Deflection]()
+    for one, (_, some) in zip(bent, sets, strict=True):
+        at = [places[k] for k in some]
+        for k, number in enumerate(some):
+            moved = bending.sag(beam, gravity, (*at[:k], at[k] + float(supports.sd[number]), *at[k + 1 :]))
+            if moved is not None and len(moved[1]) == len(some):
+                by_weight.append(moved[0].through(beam, places).plus(one, -1.0).scaled(share))
+        for axis in range(2):
+            by_gradient.append(bending.by_gradient(beam, axis, at).through(beam, places).scaled(share * gradient_K))
+    where = int(np.argmax(np.linalg.norm(known.across, axis=1)))
+    sd = float(np.sqrt(sum(np.square(one.across[where]).sum() for one in by_weight)))
+    most = float(np.linalg.norm(known.across[where]))
+    values = {"places": _in_metres(places), "sag": most, "ci95": NORMAL_95 * sd}
     if beam.plates:
         mass = float(beam.weight.sum()) * beam.step / bending.GRAVITY
         why = reason("preassemble.sag", **values, mass=1e-3 * mass)
     else:
         why = reason("preassemble.sag-by-outline", **values)
-    return _Bend(beam, (deflection,), tuple(by_weight), by_gradient), (why,)
+    return _Bend(beam, (known,), tuple(by_weight), tuple(by_gradient)), (why,)
 
 
 def _on_any_supports(beam: Beam, gravity: Floats, gradient_K: float) -> _Bend:
@@ -161,7 +213,7 @@ def _stated_supports(part: MeasuredPart, scene: Scene, of_design: DesignPart, be
     return tuple(sorted(found))
 
 
-def _in_metres(supports: Sequence[float]) -> tuple[str, ...]:
+def _in_metres(supports: Sequence[float] | Floats) -> tuple[str, ...]:
     return tuple(f"{1e-3 * s:.1f}" for s in supports)
 
 

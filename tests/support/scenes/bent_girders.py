@@ -4,6 +4,7 @@ Nothing of the processor but its records is used. A part has two plates of one t
 and a pad that distinguishes its ends. Its scan's frame is levelled, z up. Lengths in mm, forces in N.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -144,12 +145,13 @@ def design(girder, count=3, plates=True):
 
 class Lying(NamedTuple):
     """How a part is scanned: turned by quarters about its axis, supports along it, difference of temperature up and
-    sideways of the scan's frame in K."""
+    sideways of the scan's frame in K; of the supports those that carry, () for all."""
 
     quarters: int
     supports: tuple[float, ...]
     gradient: tuple[float, float]
     heading: float
+    carrying: tuple[float, ...] = ()
 
 
 def drawn(girder, rng, supports=2, gradient=10.0):
@@ -174,7 +176,8 @@ def bent(girder, start, points, lying, weight=1.0):
     ):
         level = abs(axis[2]) > 0.5
         depth = girder.height if level else girder.width
-        held = lying.supports if load else (lying.supports[0], lying.supports[-1])
+        held = lying.carrying or lying.supports
+        held = held if load else (held[0], held[-1])
         across, slope, _ = finite_elements(nodes, E_MPA * girder.inertia(level), load, EXPANSION * uneven / depth, held)
         # Of a part that lifts off an outer support: where it lies as a whole is no bend
         first, last = np.interp((lying.supports[0], lying.supports[-1]), nodes, across)
@@ -214,3 +217,29 @@ def scene(girder, every, seed, stated=True, spacing=20.0, sigma=1.0, plates=True
     supports = PartSupports(tuple(names), np.array(places), np.full(len(names), np.nan)) if stated else None
     arch = design(girder, len(every), plates)
     return Scene("girders", "arch-bridge", tuple(scans), arch=arch, part_supports=supports), poses, np.array(true)
+
+
+def raw(girder, scan, T_bridge_scan, trestles, rng, lower=0.0, unseen=(0.0, 0.0)):
+    """Add to a girder's scan the floor, and trestles along it of which the last one ends ``lower`` than its underside.
+
+    Floor and underside are not seen between two places along it.
+    """
+    up = T_bridge_scan[:3, 2]
+    axes = np.stack([[1.0, 0.0, 0.0], np.cross(up, [1.0, 0.0, 0.0]), up])
+    part = (scan.points @ T_bridge_scan[:3, :3].T + T_bridge_scan[:3, 3]) @ axes.T
+    corners = key_points(girder, 0.0) @ axes.T
+    low, middle, half = corners[:, 2].min(), corners[:, 1].mean(), 0.5 * np.ptp(corners[:, 1])
+    floor, start = low - 800.0, part[:, 0].min()
+    size = np.array([girder.length, 2.0 * half]) + 2_000.0
+    on_floor = rng.uniform(-1_000.0, size - 1_000.0, (int(size.prod() / 50.0**2), 2)) + np.array([start, middle - half])
+    found = [np.column_stack([on_floor, np.full(len(on_floor), floor)]), part]
+    found = [
+        p[(np.abs(p[:, 0] - start - np.mean(unseen)) > 0.5 * np.ptp(unseen)) | (p[:, 2] > low + 20.0)] for p in found
+    ]
+    for k, at in enumerate(trestles):
+        top = low - (lower if k == len(trestles) - 1 else 0.0)
+        p = rng.uniform([-60.0, -1.1 * half, floor], [60.0, 1.1 * half, top], (4_000, 3))
+        p[:, 0] = np.sign(p[:, 0]) * 60.0  # the two sides that are seen beneath the part
+        found.append(p + np.array([start + at, middle, 0.0]))
+    points = np.vstack(found) @ axes + rng.normal(0.0, 1.0, (sum(map(len, found)), 3))
+    return dataclasses.replace(scan, points=(points - T_bridge_scan[:3, 3]) @ T_bridge_scan[:3, :3])
