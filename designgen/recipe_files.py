@@ -20,12 +20,6 @@ else:
 Recipe = dict[str, Any]
 
 
-def packaged(file: str) -> dict[str, Any]:
-    """Return the content of a TOML file in the package."""
-    content: dict[str, Any] = tomllib.loads((resources.files("designgen") / file).read_text("utf-8"))
-    return content
-
-
 def named() -> dict[str, Recipe]:
     """Return all named recipes, by name."""
     folder = resources.files("designgen") / "recipes"

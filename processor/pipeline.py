@@ -300,10 +300,11 @@ def execute(
 
     Raises InputError and UsageError as the steps do, and InputError for whatever else goes wrong within one.
     """
+    from processor.adjustment.scanner_class_errors import used
     from processor.store import store
     from processor.store.streaming import points_of
 
-    with points_of(path) if piecewise else nullcontext() as points:
+    with used(scene.instruments), points_of(path) if piecewise else nullcontext() as points:
         given = {} if points is None else {"points": points}
         runs: list[StepRun] = []
         answers: dict[str, Any] = {}

@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 
 from designgen.checks import expect, expect_all
-from designgen.recipe_files import packaged
-from processor.model import Bools, Floats, UsageError
+from processor.model import Bools, Floats, UsageError, instruments
 
 MODE = "rays"
 SIGNAL_RANGE_MM = 10_000.0  # range at which the signal is 1
@@ -108,7 +107,7 @@ class Scanner:
 
 def preset(name: str) -> dict[str, Any]:
     """Return the numbers of a class of scanner; UsageError for an unknown one."""
-    classes = packaged("scanners.toml")
+    classes = instruments.classes()
     if name not in classes:
         raise UsageError(f"scan.scanner: expected one of {', '.join(classes)}, got {name!r}")
     return {key: value for key, value in classes[name].items() if key in Scanner.__dataclass_fields__}

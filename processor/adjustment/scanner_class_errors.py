@@ -1,60 +1,102 @@
-"""Errors assumed for the class of terrestrial laser scanners, phase-shift and pulsed, where data cannot show them.
+"""Errors of the scanner where data cannot show them: those of its class, or those that a check of the instrument found.
 
-Standard deviations from data sheets and practice (type B evaluation of the GUM), not estimates from the scans.
+Standard deviations from data sheets and practice (type B evaluation of the GUM), or from a field check, not estimates
+from the scans. Which instrument it was is stated once for a run, see :func:`used`.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import NamedTuple
 
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import Floats, Ints
+from processor.model import Floats, Instrument, Ints, instruments
+from processor.robust_statistics import student_factor
 
-# What the points of one view have in common, relative to other views: data sheets give a range error of 1 mm for up to
-# 130 m, which is taken as the limit of 95 %.
-VIEW_SD_MM = 0.5
-# Scale of the ranges of one view, without unit: the same data sheets give 10 ppm beside 1 mm, as a limit of 95 %.
-SCALE_SD = 5e-6
 # Shift of all views together, along each axis: targets are measured to about 1 mm, and a network rests on some 25
 # sightings of them.
 SHIFT_SD_MM = 0.2
-# Zero offset of the ranges of a calibrated scanner, which all of its views have in common.
-OFFSET_SD_MM = 0.2
-# What all surfaces have in common along their normals: bias by incidence, by the signal of their paint, and its layer.
-# Black targets were measured 0.2 to 0.7 mm nearer than white ones, in 7 of 8 views of a pulsed scanner.
-SURFACE_SD_MM = 0.3
 
 
-class Instrument(NamedTuple):
-    """What the class of a scanner says of its ranges, one standard deviation: offset of a view, and bias by incidence.
+class ScannerErrors(NamedTuple):
+    """What is known of a scanner, one standard deviation each, such that 1.96 of them hold an error in 95 %.
 
-    The bias is that where the path through the footprint is twice as long as at normal incidence (60 degrees).
+    ``view_mm`` is what the points of one view have in common along their rays, relative to other views; ``offset_mm``
+    what all views have in common; ``scale`` that of the ranges of one view, without unit; ``incidence_mm`` the bias
+    where the path through the footprint is twice as long as at normal incidence (60 degrees), which stands for what all
+    surfaces have in common along their normals: by incidence, by the signal of their paint, and its layer;
+    ``direction_rad`` is the error of the direction to a target, across the ray.
     """
 
     view_mm: float
+    offset_mm: float
+    scale: float
     incidence_mm: float
+    direction_rad: float
 
 
-# By name; data sheets of pulsed scanners give 1.2 mm, those of long-range ones 5 mm, as a limit of 95 %, and longer
-# pulses and wider footprints move ranges at grazing incidence in proportion.
-INSTRUMENTS = {
-    "phase": Instrument(VIEW_SD_MM, SURFACE_SD_MM),
-    "pulse": Instrument(0.6, 0.36),
-    "long-range": Instrument(2.5, 1.5),
-}
-ASSUMED = "phase"  # where nobody says what the scanner was
+def errors_of(instrument: Instrument) -> ScannerErrors:
+    """Return the errors of an instrument; what its check is unsure of is in them.
+
+    A bias is not taken off the ranges: value and standard deviation add up. A standard deviation that is known by few
+    observations has the factor of Student's t, with v = value^2 / (2 sd^2) degrees of freedom (GUM, E.4.3).
+    """
+    found = {}
+    for term, (value, sd) in instrument.known.items():
+        error = math.hypot(value, sd)
+        if sd > 0.0 and term not in instruments.BIASES:
+            error = max(error, value * float(student_factor(0.5 * (value / sd) ** 2)))
+        found[term] = error
+    return ScannerErrors(
+        view_mm=found["view_mm"],
+        offset_mm=found["zero_mm"],
+        scale=1e-6 * found["scale_ppm"],
+        incidence_mm=found["incidence_mm"],
+        direction_rad=1e-6 * max(found["horizontal_urad"], found["vertical_urad"]),
+    )
 
 
-def of_class(instrument: str) -> Instrument:
-    """Return what is known of a class by its name; "" = not stated."""
-    return INSTRUMENTS[instrument or ASSUMED]
+CLASSES = {name: errors_of(instruments.of_class(name)) for name in instruments.class_names()}
+_used: ContextVar[ScannerErrors | None] = ContextVar("scanner", default=None)
+
+
+def stated() -> bool:
+    """Whether it is stated what the scanner is."""
+    return _used.get() is not None
+
+
+def known() -> ScannerErrors:
+    """Return the errors of the scanner in use; of the assumed class where nobody says what it is."""
+    return _used.get() or CLASSES[instruments.ASSUMED]
+
+
+@contextmanager
+def used(given: Sequence[Instrument]) -> Iterator[None]:
+    """Let the block's scanner be the instruments of a scene: of several the largest of each error; none = not stated.
+
+    Where a scan's instrument is not among them, but others' are, its class is assumed.
+    """
+    errors = [errors_of(one) for one in given]
+    before = _used.set(ScannerErrors(*map(max, zip(*errors, strict=True))) if errors else None)
+    try:
+        yield
+    finally:
+        _used.reset(before)
+
+
+def of_class(name: str) -> ScannerErrors:
+    """Return what is known of a class by its name; of "" that of the scanner in use."""
+    return CLASSES[name] if name else known()
 
 
 def scale_variance(length: float) -> float:
     """Return the variance, mm^2, of a length, mm, by the scale of the scanner."""
-    return (SCALE_SD * length) ** 2
+    return (known().scale * length) ** 2
 
 
 def view_errors(ranges: Floats, cosines: Floats, view: Ints, instrument: str = "") -> Floats:
@@ -63,11 +105,9 @@ def view_errors(ranges: Floats, cosines: Floats, view: Ints, instrument: str = "
     One variate a view (n,), numbered from 0, is its offset and its scale. The last is the bias by incidence that all
     surfaces have in common, of ``cosines`` (n,): a footprint is longer by 1 / cosine, and its mean range off with it.
     """
-    known = of_class(instrument)
-    of_view = np.sqrt(known.view_mm**2 + (SCALE_SD * ranges) ** 2)[:, None] * (
-        view[:, None] == np.arange(view.max() + 1)
-    )
-    return np.column_stack([of_view, known.incidence_mm * (1.0 / cosines - 1.0)])
+    of = of_class(instrument)
+    of_view = np.sqrt(of.view_mm**2 + (of.scale * ranges) ** 2)[:, None] * (view[:, None] == np.arange(view.max() + 1))
+    return np.column_stack([of_view, of.incidence_mm * (1.0 / cosines - 1.0)])
 
 
 def pose_covariance(points: Floats) -> Floats:
@@ -78,5 +118,5 @@ def pose_covariance(points: Floats) -> Floats:
     The offset of all ranges moves what is seen from one side, and the views' shifts rotate what lies between them.
     """
     arm = 0.5 * float(np.linalg.norm(np.ptp(points, axis=0)))
-    rotation, shift = SHIFT_SD_MM**2 / max(arm, 1.0) ** 2, SHIFT_SD_MM**2 + OFFSET_SD_MM**2
+    rotation, shift = SHIFT_SD_MM**2 / max(arm, 1.0) ** 2, SHIFT_SD_MM**2 + known().offset_mm ** 2
     return rigid.about_origin(np.diag(np.repeat([rotation, shift], 3)), points.mean(axis=0))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from processor import scene_cloud, unit_ratio
-from processor.adjustment.scanner_class_errors import INSTRUMENTS
+from processor.adjustment import scanner_class_errors
 from processor.api.argument_checks import (
     MOST_RATIO,
     extent_of,
@@ -24,9 +26,11 @@ from processor.geometry import coincident_points, mesh_distance, normal_orientat
 from processor.geometry import m3c2 as m3c2_distances
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import MeshSurface
-from processor.model import Bools, Floats, Reason, Status, reason
+from processor.model import Bools, Floats, Instrument, Reason, Status, instruments, reason
+from processor.model.inputs import Place
 from processor.registration import surface_registration
 from processor.registration.surface_registration import Placed
+from processor.scan_folder.text_files import read_toml
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import Params
@@ -99,7 +103,10 @@ class Pose:
 
 
 def fit_sphere(
-    points: npt.ArrayLike, radius: float | None = None, scanner: npt.ArrayLike | None = None, instrument: str = ""
+    points: npt.ArrayLike,
+    radius: float | None = None,
+    scanner: npt.ArrayLike | None = None,
+    instrument: str | Path = "",
 ) -> SphereFit:
     """Fit a sphere to the points of one target, some of which may lie on other things.
 
@@ -117,7 +124,7 @@ def fit_sphere(
         covariance of the centre holds its effect; the status is weak if scanners do not explain it.
     scanner : (3,) position of the scanner, or (n, 3) that of each point, in the points' frame; None = unknown.
     instrument : its class: "phase" (one standard deviation 0.5 mm of range a view and 0.3 mm of bias at 60 degrees of
-        incidence), "pulse" (0.6 and 0.36 mm) or "long-range" (2.5 and 1.5 mm); "" = as of phase.
+        incidence), "pulse" (0.6, 0.36) or "long-range" (2.5, 1.5); the path of a scanner.toml; "" = as of phase.
 
     Returns
     -------
@@ -127,10 +134,8 @@ def fit_sphere(
     ------
     ValueError : wrong shape, NaN, too few points, points that coincide, coordinates that seem to be in metres, a radius
         that no target has or the cloud cannot hold, a scanner that cannot have measured the points, an instrument of
-        no known class.
+        no class. InputError: a scanner.toml that cannot be used.
     """
-    if instrument not in ("", *INSTRUMENTS):
-        raise ValueError(f"instrument: expected one of {', '.join(INSTRUMENTS)}, got {instrument!r}")
     every = points_of(points, "points", LEAST_POINTS)
     cloud, used, coincident = _once(every, "points")
     held = None if radius is None else _radius(radius, extent_of(cloud))
@@ -139,8 +144,10 @@ def fit_sphere(
     if scanner is not None:
         seen_from = positions_of(scanner, "scanner", every.shape)[used] - origin
         _check_scanner(cloud - origin, seen_from)
-    params = Params(radius_mm=float("nan") if held is None else held, max_balls=1, instrument=instrument)
-    measured = _measured(MergedCloud(cloud - origin, origin, seen_from), params, held)
+    params = Params(radius_mm=float("nan") if held is None else held, max_balls=1)
+    with scanner_class_errors.used(_instrument(instrument)):
+        measured = _measured(MergedCloud(cloud - origin, origin, seen_from), params, held)
+        assumed = search_without_design.by_class(params)
     balls = measured.balls
     if not len(balls):
         return _no_sphere((*measured.reasons, *coincident), held)
@@ -149,13 +156,24 @@ def fit_sphere(
         radius=float(balls.radii[0]),
         covariance=balls.covariance[0],
         status=Status.OK if balls.flag[0] is Flag.OK else Status.WEAK,
-        reasons=(*balls.reasons[0], *search_without_design.by_class(params), *coincident),
+        reasons=(*balls.reasons[0], *assumed, *coincident),
         points=int(balls.points[0]),
         rms=float(balls.rms[0]),
     )
     if seen_from is not None and fitted.status is Status.OK:
         _check_faces(cloud - fitted.centre, seen_from + origin - fitted.centre, fitted)
     return fitted
+
+
+def _instrument(name: str | Path) -> Sequence[Instrument]:
+    if str(name) in instruments.class_names():
+        return (instruments.of_class(str(name)),)
+    if str(name).lower().endswith(".toml"):
+        return (instruments.from_file(read_toml(Path(name)), Place(str(name))),)
+    if str(name):
+        known = ", ".join(instruments.class_names())
+        raise ValueError(f"instrument: expected one of {known}, or a scanner.toml, got {str(name)!r}")
+    return ()
 
 
 def _no_sphere(reasons: tuple[Reason, ...], held: float | None) -> SphereFit:

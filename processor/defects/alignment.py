@@ -32,7 +32,7 @@ PRIOR = np.array([2e-4] * 3 + [3.0] * 3 + [2.0])
 LEAST_PRIOR = np.array([1e-6] * 3 + [0.02] * 3 + [0.02])  # 0.01 mm at 10 m, and 0.02 mm: no block shows as much
 # Of the class of scanners, whose error of a view is a translation and a range offset, with the degrees of freedom that
 # an uncertainty by a factor of two amounts to: two or three stations hardly show their own standard deviations.
-CLASS = np.array([0.0] * 3 + [np.sqrt(0.5) * scanner_class_errors.VIEW_SD_MM] * 4)
+CLASS_SHARE = np.array([0.0] * 3 + [np.sqrt(0.5)] * 4)
 CLASS_FREE = np.array([0.0] * 3 + [4.0] * 4)  # nothing is known of the class's rotation
 GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of parameters with one variance component each
 WHOLE_PRIOR = np.array([5e-3] * 3 + [50.0] * 3)  # of the whole (rad, mm): as far as a coarse pose is off
@@ -298,8 +298,8 @@ def station_movements(blocks: StationBlocks, J: Floats, stations: int) -> tuple[
     """Return the movements (k, 7) by which stations agree, with Cauchy's weights, and their covariance (7k, 7k).
 
     The deviation of a block is free. The movements' standard deviations are variance components of maximum likelihood
-    (expectation maximisation, Dempster et al. 1977), from PRIOR down, moderated by CLASS. Where stations do not show
-    one at all, as a single station does not, nothing is moved: an error that stations share is stated by the
+    (expectation maximisation, Dempster et al. 1977), from PRIOR down, moderated by the class. Where stations do not
+    show one at all, as a single station does not, nothing is moved: an error that stations share is stated by the
     parameters.
     """
     _, block = np.unique(blocks.block, return_inverse=True)
@@ -326,7 +326,7 @@ def station_movements(blocks: StationBlocks, J: Floats, stations: int) -> tuple[
             undetermined = iteration == 0 and known.sum() < 1.0
             expected = (x**2 + remaining)[seen, group]
             free = CLASS_FREE[group][0]
-            square = free * CLASS[group][0] ** 2 + float(expected.sum())
+            square = free * (CLASS_SHARE[group][0] * scanner_class_errors.known().view_mm) ** 2 + float(expected.sum())
             size = 0.0 if undetermined else float(np.sqrt(square / (free + expected.size)))
             prior[group] = max(size, LEAST_PRIOR[group][0])
         if iteration >= ROUNDS - 1 and np.abs(prior / before - 1.0).max() < SETTLED:

@@ -213,9 +213,9 @@ def _errors(
         registration = np.full_like(value, field.stations_sd(rows, free=True))
     # A surface that lies off as a whole, or from some place on, may be of another paint. Seen from all sides, a body
     # does not move by it.
-    bias = np.full_like(value, scanner_class_errors.SURFACE_SD_MM if shape.kind == "step" else 0.0)
+    bias = np.full_like(value, scanner_class_errors.known().incidence_mm if shape.kind == "step" else 0.0)
     if shape.kind == shape_models.RIGID:
-        bias = moved(np.full(len(fit.blocks.mean), scanner_class_errors.SURFACE_SD_MM))
+        bias = moved(np.full(len(fit.blocks.mean), scanner_class_errors.known().incidence_mm))
     of_scanner = np.sqrt(levels.common[-1] ** 2 + levels.systematic_mm**2 + field.drift**2)
     shared = np.sqrt(of_scanner**2 + bias**2 + registration**2)
     return value, own, shape.sd(fit.frame, points, outward), shared

@@ -114,7 +114,9 @@ def _of_views(search: to_result.Search) -> Iterator[Reason]:
     """Yield what is taken of the errors of views that are not named, and of those that all views share."""
     if search.points.observed.stations.unnamed and search.alignment.fitted:
         yield reason(
-            "defects.views-by-class", shift=scanner_class_errors.SHIFT_SD_MM, offset=scanner_class_errors.OFFSET_SD_MM
+            "defects.views-by-class",
+            shift=scanner_class_errors.SHIFT_SD_MM,
+            offset=scanner_class_errors.known().offset_mm,
         )
     if search.field.views > 0.0:
         yield reason("defects.views-differ", sd=search.field.views)

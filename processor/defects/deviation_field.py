@@ -9,8 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from processor import tiles
-from processor.adjustment import moderated_variances, view_error_from_opposite_sides
-from processor.adjustment.scanner_class_errors import SURFACE_SD_MM
+from processor.adjustment import moderated_variances, scanner_class_errors, view_error_from_opposite_sides
 from processor.defects.alignment import PAIRS_AT_ONCE, Alignment, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs
 from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface, chart_of_cells
@@ -136,7 +135,7 @@ def common_bias(field: Field, surface: DesignSurface) -> float:
     if len(level) < FEWEST_BODIES:
         return 0.0
     bias, sd = float(np.median(level)), robust_sd_about_median(level) / float(np.sqrt(len(level)))
-    return bias if SURE * sd < abs(bias) < NORMAL_95 * SURFACE_SD_MM else 0.0
+    return bias if SURE * sd < abs(bias) < NORMAL_95 * scanner_class_errors.known().incidence_mm else 0.0
 
 
 def _noise(pairs: Pairs, surface: DesignSurface, count: Floats) -> tuple[Floats, Floats]:

@@ -35,8 +35,8 @@ def mean_sd(scan: ScanCloud, T: Floats, core: Samples, moved: Movement, covarian
     noise = overlap * float((moved.sd[known] ** 2 / moved.count[known]).sum()) / len(known) ** 2
     J = distance_derivative(points, normals).mean(axis=0)
     shares = _shares(scan, T, points, normals)
-    own = scanner_class_errors.VIEW_SD_MM**2 * float((shares**2).sum())
-    common = scanner_class_errors.OFFSET_SD_MM**2 * float(shares.sum()) ** 2
+    own = scanner_class_errors.known().view_mm ** 2 * float((shares**2).sum())
+    common = scanner_class_errors.known().offset_mm ** 2 * float(shares.sum()) ** 2
     return float(np.sqrt(noise + J @ covariance @ J + own + common))
 
 

@@ -342,7 +342,7 @@ def _of_pose(measured: Measured, registered: RegistrationError, fits: Fits, para
 def _of_views(scan: ScanCloud, placed: Placed, measured: Measured) -> Iterator[Reason]:
     """Yield what is taken of the errors that all views have in common, where these placed the scan."""
     if placed.registration is not Registration.AS_GIVEN:
-        sizes = {"shift": scanner_class_errors.SHIFT_SD_MM, "offset": scanner_class_errors.OFFSET_SD_MM}
+        sizes = {"shift": scanner_class_errors.SHIFT_SD_MM, "offset": scanner_class_errors.known().offset_mm}
         if scan.unnamed_views:
             yield reason("deviation.views-by-class", **sizes)
         else:

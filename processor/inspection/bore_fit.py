@@ -80,7 +80,7 @@ def fit(bores: list[BorePoints], radius: Floats, reach: Floats, sources: int) ->
     of_rows, of_known = (3 * at[:, None] + np.arange(3) for at in (rows[known], np.flatnonzero(known)))
     covariance[np.ix_(of_rows.ravel(), of_rows.ravel())] = of_solved[np.ix_(of_known.ravel(), of_known.ravel())]
     if not np.isfinite(ray).all():  # offsets of ranges widen or narrow all bores alike: unknown rays do not show them
-        covariance[2::3, 2::3] += (UNNAMED_SHARE * scanner_class_errors.VIEW_SD_MM) ** 2
+        covariance[2::3, 2::3] += (UNNAMED_SHARE * scanner_class_errors.known().view_mm) ** 2
     points[rows] = count
     return Fitted(departure, covariance, points)
 
@@ -113,7 +113,11 @@ def _adjusted(
         [
             np.full(3 * holes, NO_PRIOR_MM),
             np.tile(
-                [scanner_class_errors.VIEW_SD_MM, scanner_class_errors.SHIFT_SD_MM, scanner_class_errors.SHIFT_SD_MM],
+                [
+                    scanner_class_errors.known().view_mm,
+                    scanner_class_errors.SHIFT_SD_MM,
+                    scanner_class_errors.SHIFT_SD_MM,
+                ],
                 sources,
             ),
         ]

@@ -132,7 +132,7 @@ def observed(design: StructureDesign, result: Any) -> Observed | None:
     shared = core.std1 / np.sqrt(np.maximum(core.n1, 1))
     if any(reason.code == "deviation.views-by-class" for reason in result.reasons):
         # Two opposite faces: their sum has twice the offset of all ranges.
-        by_class = scanner_class_errors.SHIFT_SD_MM**2 + 2.0 * scanner_class_errors.OFFSET_SD_MM**2
+        by_class = scanner_class_errors.SHIFT_SD_MM**2 + 2.0 * scanner_class_errors.known().offset_mm ** 2
         shared = np.sqrt(shared**2 + by_class)
     return Observed(
         places=core.points,

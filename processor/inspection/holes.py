@@ -96,7 +96,7 @@ def fitted(cloud: DesignCloud, group: Group, temperature_C: float = float("nan")
 def _referred(fitted: Fitted, places: Floats, radius: Floats, temperature_C: float) -> Fitted:
     """Bring holes to the reference temperature, and add the error of the scanner's scale to their covariance."""
     size = np.column_stack([places - places.mean(axis=0), radius])
-    expansion, by_scale = thermal.expansion(temperature_C), scanner_class_errors.SCALE_SD * size.ravel()
+    expansion, by_scale = thermal.expansion(temperature_C), scanner_class_errors.known().scale * size.ravel()
     return fitted._replace(
         departure=(size + fitted.departure) / expansion - size,
         covariance=fitted.covariance / expansion**2 + np.outer(by_scale, by_scale),

@@ -46,6 +46,7 @@ from processor.model.fields import (
     reasons,
     words,
 )
+from processor.model.instruments import Instrument
 from processor.model.scene import (
     DESIGN_FRAMES,
     ENDS,
@@ -109,8 +110,8 @@ __all__ = [
     "OPEN", "PLACE", "POSE", "RADIUS", "RATIO", "SAMPLED_POINTS", "SCALED_POSE", "SHARE", "SOURCES", "SUPPORTS",
     "VOCABULARIES", "WORST_FIRST", "ArchDesign", "ArchTruth", "AsBuilt", "Better", "BodyTruth", "Bools", "Ceiling",
     "Checked", "Clips", "Codes", "Columns", "Control", "DecisionRule", "DefectTruth", "DesignBodies", "DesignFaults",
-    "DesignPart", "Diagnostics", "Fault", "Floats", "FrameDesign", "FrameTruth", "InputError", "Ints", "Labels",
-    "Limit", "Meaning", "Metric", "PartSupports", "Picks", "PlainError", "PointLabels", "PoseTruth", "Reason",
+    "DesignPart", "Diagnostics", "Fault", "Floats", "FrameDesign", "FrameTruth", "InputError", "Instrument", "Ints",
+    "Labels", "Limit", "Meaning", "Metric", "PartSupports", "Picks", "PlainError", "PointLabels", "PoseTruth", "Reason",
     "RecordError", "Rows", "Scan", "Scene", "Shorts", "StationTruth", "Stations", "Statistic", "Status", "Steel",
     "StepRun", "StructureDesign", "StructureTruth", "TargetKind", "TargetSearch", "TargetTruth", "Targets",
     "TitleBlock", "Tolerance", "Truth", "UsageError", "Verdict", "Word", "column", "described", "did_you_mean",

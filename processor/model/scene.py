@@ -52,6 +52,7 @@ from processor.model.fields import (
     reasons,
     words,
 )
+from processor.model.instruments import Instrument
 
 # --- Vocabularies and constants
 
@@ -573,6 +574,8 @@ class Scene(Checked):
     steel: Steel | None = newer()  # None: of structural steel
     targets: Targets | None = newer(hashed=False)  # those of Scene.control are hashed
     target_remarks: tuple[Reason, ...] = reasons(newer=True, hashed=False)  # on the search for targets
+    # of the scanner, first those of single scans; () = not stated
+    instruments: tuple[Instrument, ...] = described((), newer=True, hashed=True)
     # days of the scans by their files, YYYY-MM-DD, in order; no step reads them
     scanned: tuple[str, ...] = names("days", newer=True, hashed=False)
 

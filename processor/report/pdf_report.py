@@ -89,6 +89,7 @@ def _front(execution: Execution, say: Messages) -> Iterator[Figure]:
     lines.append(Line(""))
     for name, value in title_block.entries(scene).items():
         lines += _wrapped(f"{say.text(title_block.LABELS.get(name, label(name.replace('_', ' '))))}: {value}")
+    lines += _wrapped(f"{say.text(text('Instrument'))}: {say.text(title_block.instrument(scene))}")
     for fact, value in title_block.facts(execution.provenance):
         lines += _wrapped(f"{say.text(fact)}: {value}")
     lines.append(Line(""))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from processor.language.messages import Message, label, text
-from processor.model import Scene
+from processor.language.messages import Message, Text, label, text
+from processor.model import Instrument, Scene, instruments
 from processor.report.templates import data_uri
 
 LABELS: Mapping[str, Message] = {
@@ -26,10 +26,10 @@ def of(scene: Scene, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the page shows: company, logo as a data address, rows of names and texts, and who signs."""
     given = entries(scene)
     elsewhere = (COMPANY, *(key for _, key in SIGNATURES))
-    rows = [
+    rows: list[tuple[Message, Message | str]] = [
         (LABELS.get(key) or label(key.replace("_", " ")), value) for key, value in given.items() if key not in elsewhere
     ]
-    rows += facts(provenance)
+    rows += [(text("Instrument"), instrument(scene)), *facts(provenance)]
     signed = scene.title_block is not None
     return {
         "company": given.get(COMPANY, ""),
@@ -43,6 +43,22 @@ def entries(scene: Scene) -> dict[str, str]:
     """Return the texts of the project's title block by their keys."""
     block = scene.title_block
     return {} if block is None else dict(zip(block.keys, block.values, strict=True))
+
+
+def instrument(scene: Scene) -> Text:
+    """Say whose errors the intervals hold, and by what check these are known."""
+    each = [_instrument(one) for one in scene.instruments]
+    return text("{each:;}", each=each) if each else text("{name} (class, assumed)", name=instruments.ASSUMED)
+
+
+def _instrument(one: Instrument) -> Text:
+    if one.checked:
+        found = text("{name} {serial}, checked {day}", name=one.name, serial=one.serial, day=one.checked)
+    elif one.name == one.scanner_class:
+        found = text("{name} (class)", name=one.name)
+    else:
+        found = text("{name} {serial}, not checked", name=one.name, serial=one.serial)
+    return text("{found} ({scans})", found=found, scans=list(one.scans)) if one.scans else found
 
 
 def facts(provenance: Mapping[str, Any]) -> list[tuple[Message, str]]:

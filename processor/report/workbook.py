@@ -58,6 +58,7 @@ def _front(execution: Execution) -> list[tuple[str, str]]:
     rows = [("name", execution.scene.name), ("verdict", str(worst(run.verdict for run, _ in execution.by_step())))]
     rows += [(run.step, str(headline.of_step(run))) for run, _ in execution.by_step()]
     rows += [*title_block.entries(execution.scene).items()]
+    rows.append(("instrument", messages("en").text(title_block.instrument(execution.scene))))
     rows += [(str(name), value) for name, value in title_block.facts(execution.provenance)]
     return [(printable(name), printable(value)) for name, value in rows]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import messages
-from processor.model import Scene, StepRun, worst
+from processor.model import Scene, StepRun, instruments, worst
 from processor.pipeline import Execution
 from processor.results.fields_to_json import as_object, reason_json
 from processor.results.file_names import FORMAT, FORMAT_VERSION
@@ -30,6 +30,7 @@ def results_json(execution: Execution, report: ErrorReport, headline: str = "") 
         "input_sha256": made["input_sha256"],
         "units": _units(execution.scene),
         **_clips(execution.scene),
+        "instruments": _instruments(execution.scene),
         **({"scanned": made["epoch"]["scanned"]} if made.get("epoch", {}).get("scanned") else {}),
         "seed": made["seed"],
         "software": made["software"],
@@ -81,6 +82,23 @@ def _units(scene: Scene) -> dict[str, Any]:
         "reasons": [reason_json(one) for one in scene.units_reason],
         "written_as": "mm",
     }
+
+
+def _instruments(scene: Scene) -> list[dict[str, Any]]:
+    """Write the scanners whose errors the intervals hold; one that nobody states has the class that is assumed."""
+    return [
+        {
+            "name": one.name,
+            "class": one.scanner_class,
+            "stated": bool(scene.instruments),
+            "serial": one.serial or None,
+            "checked": one.checked or None,
+            "source": one.source,
+            "scans": list(one.scans) or None,
+            "terms": {name: known._asdict() for name, known in one.known.items()},
+        }
+        for one in scene.instruments or [instruments.of_class()]
+    ]
 
 
 def _clips(scene: Scene) -> dict[str, Any]:

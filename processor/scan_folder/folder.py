@@ -19,6 +19,7 @@ from processor.model import (
     Floats,
     FrameDesign,
     InputError,
+    Instrument,
     PartSupports,
     Reason,
     Scan,
@@ -28,6 +29,7 @@ from processor.model import (
     StructureDesign,
     TargetSearch,
     UsageError,
+    instruments,
     reason,
 )
 from processor.model.inputs import Place, read, shown
@@ -149,7 +151,16 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     files |= dict.fromkeys(
         ("arch", "frame", "structure"), str(project.design.relative_to(folder) if project.design else PROJECT)
     )
-    of_project = ("tolerance", "temperature_C", "name", "ceiling", "target_search", "part_supports", "steel")
+    of_project = (
+        "tolerance",
+        "temperature_C",
+        "name",
+        "ceiling",
+        "target_search",
+        "part_supports",
+        "steel",
+        "instruments",
+    )
     files |= dict.fromkeys(of_project, PROJECT)
     return record_checks.check(scene, str(folder), {field: str(folder / file) for field, file in files.items()})
 
@@ -306,6 +317,7 @@ class _Found:
     units_by: dict[str, Reason] = dataclasses.field(default_factory=dict)  # why a unit was taken, by units
     remarks: list[Reason] = dataclasses.field(default_factory=list)
     days: set[str] = dataclasses.field(default_factory=set)
+    of_scans: dict[str, Instrument] = dataclasses.field(default_factory=dict)  # of scans with one of their own
     doubted: list[InputError] = dataclasses.field(default_factory=list)
     refused: dict[str, InputError] = dataclasses.field(default_factory=dict)
 
@@ -341,6 +353,8 @@ def _read_scans(project: Project, design: Design | None, option: str, stations: 
                 found.units_by.setdefault(str(unit), why)
                 found.remarks += raw.remarks
                 found.scans.append(keep(scan))
+                if entry.scanner is not None:
+                    found.of_scans[scan.name] = entry.scanner
                 found.units.append(unit)
         except InputError as error:
             if not parts:
@@ -388,7 +402,22 @@ def _scene(
         part_supports=_supports(project, scans, found.units, found.refused),
         steel=None if project.steel is None else Steel(project.steel.E_MPa, project.steel.density_kg_m3),
         scanned=tuple(sorted(found.days)),
+        instruments=_instruments(project.scanner, found),
     )
+
+
+def _instruments(of_all: Instrument | None, found: _Found) -> tuple[Instrument, ...]:
+    """Return the instruments of a project's scans: those of single scans, then that of the others.
+
+    Where other scans have none, its class is assumed; () where no scan has one.
+    """
+    if of_all is None and not found.of_scans:
+        return ()
+    alike: dict[str, tuple[Instrument, list[str]]] = {}
+    for scan, one in found.of_scans.items():
+        alike.setdefault(repr(one), (one, []))[1].append(scan)
+    own = [dataclasses.replace(one, scans=tuple(scans)) for one, scans in alike.values()]
+    return (*own, *([] if len(found.of_scans) == len(found.scans) else [of_all or instruments.of_class()]))
 
 
 def _of_guess(project: Project) -> Iterator[Reason]:

@@ -10,11 +10,23 @@ from typing import Any, ClassVar
 import numpy as np
 
 from processor import record_checks
-from processor.model import DESIGN_FRAMES, KINDS, Floats, Reason, Steel, TitleBlock, Tolerance, reason
+from processor.model import (
+    DESIGN_FRAMES,
+    KINDS,
+    Floats,
+    Instrument,
+    Reason,
+    Steel,
+    TitleBlock,
+    Tolerance,
+    instruments,
+    reason,
+)  # fmt: skip
 from processor.model.inputs import FLAG, Kind, Place, array, entry, hidden, number, table, tables, text
 from processor.scan_folder.file_values import FILE, FILE_UNIT, UNIT
 from processor.scan_folder.files import PROJECT
 from processor.scan_folder.guess import Guess
+from processor.scan_folder.text_files import read_toml
 from processor.scan_folder.title_block import TITLE_BLOCK
 from processor.scan_folder.tolerance import TOLERANCE
 from processor.scan_folder.units import FileUnit
@@ -34,6 +46,21 @@ def _pose(value: Any, place: Place) -> Floats:
 POSE = Kind(array(4, 4).expected, _pose, array(4, 4).schema)
 
 
+def _scanner(value: Any, place: Place) -> Instrument:
+    if not isinstance(value, str) or not value:
+        raise TypeError
+    if value in instruments.class_names():
+        return instruments.of_class(value)
+    if not value.lower().endswith(".toml"):
+        raise place.refused(instruments.no_class(value))
+    path = FILE.convert(value, place)
+    return instruments.from_file(read_toml(path), Place(str(path)))
+
+
+# A class of scanners, or the file of an instrument
+SCANNER = Kind("a class of scanners or a scanner.toml", _scanner, {"type": "string", "minLength": 1})
+
+
 @dataclass(frozen=True)
 class ScanEntry:
     """A table [[scan]], or a scan file without one."""
@@ -49,6 +76,8 @@ class ScanEntry:
     position: Floats | None = entry(array(3), default=None)  # of the scanner, in the scan's own frame and unit
     # of the scan, whatever its file states: a unit, or m/us-ft with that of the heights
     units: FileUnit | None = entry(FILE_UNIT, default=None)
+    # its instrument: phase, pulse, long-range, or a file, see docs/instruments.md; default: that of the project
+    scanner: Instrument | None = entry(SCANNER, default=None)
     units_by: Reason = hidden(reason("units.by-scan", file=PROJECT))  # who gives them
 
 
@@ -202,6 +231,9 @@ class Project:
     design: Path | None = entry(FILE, default=None)
     design_units: str = entry(UNIT, default="")  # of a design file that states no unit; default: units
     temperature_C: float = entry(number(), default=NAN)  # temperature of the steel during the scan; reference is 20
+    # instrument of all scans: phase, pulse, long-range, or a file, as processor field-check writes it; default: as of
+    # phase
+    scanner: Instrument | None = entry(SCANNER, default=None)
     # scans to read; default: all scan files in the folder and in scans/
     scan: tuple[ScanEntry, ...] = entry(tables(ScanEntry), default=())
     # limits: those of a standard, of the project, or both; the project's win

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from processor.adjustment.scanner_class_errors import INSTRUMENTS
 from processor.model import UsageError
 from processor.model.inputs import Parameters, entry, number, text
+from processor.model.instruments import class_names
 from processor.space_frame.members import member_extraction
 
 METHODS = ("ray", "ransac", "least-squares")  # the first is the default
@@ -40,7 +40,7 @@ class Params(Parameters, table="spheres"):
     # of spheres without members: the known radius, fixed; NaN = estimated
     radius_mm: float = entry(number(above=0, unknown=True), default=NAN)
     # of spheres without members: the class of the scanner, phase, pulse or long-range; "" = not known, as of phase
-    instrument: str = entry(text("", *INSTRUMENTS), default="")
+    instrument: str = entry(text("", *class_names()), default="")
     max_balls: int = entry(COUNT, default=10)  # without members: spheres to search for, in succession
 
     def check(self, has_design: bool) -> None:

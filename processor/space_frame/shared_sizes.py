@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtrc
 
-from processor.adjustment.scanner_class_errors import VIEW_SD_MM
+from processor.adjustment import scanner_class_errors
 from processor.model import Floats
 from processor.space_frame.ball_catalogue import DESIGNED, ESTIMATED, Catalogue
 
@@ -59,6 +59,6 @@ def explained(size: Floats, count: Floats, sizes: Floats, sd: float) -> bool:
     least = np.inf
     for start in (size[:, None] - sizes).ravel():  # each places a group at a size
         nearest = sizes[np.abs(size[:, None] - start - sizes).argmin(axis=1)]
-        error = weight @ (size - nearest) / (weight.sum() + VIEW_SD_MM**-2)
-        least = min(least, weight @ (size - error - nearest) ** 2 + (error / VIEW_SD_MM) ** 2)
+        error = weight @ (size - nearest) / (weight.sum() + scanner_class_errors.known().view_mm ** -2)
+        least = min(least, weight @ (size - error - nearest) ** 2 + (error / scanner_class_errors.known().view_mm) ** 2)
     return bool(chdtrc(len(size), least) > UNLIKELY)

@@ -111,6 +111,6 @@ def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
 
 def _with_class(balls: Balls) -> Balls:
     """Add what the views of a ball have in common, by the scanner's class: a ball alone does not show it."""
-    variance = np.full(4, scanner_class_errors.VIEW_SD_MM**2)
+    variance = np.full(4, scanner_class_errors.known().view_mm ** 2)
     lowest_sd = np.sqrt(balls.lowest_sd**2 + variance[2:].sum())  # of the centre's height and the radius
     return replace(balls, covariance=balls.covariance + np.diag(variance), lowest_sd=lowest_sd)

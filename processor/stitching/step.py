@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from processor import diagnostics, large_arrays
-from processor.adjustment.scanner_class_errors import VIEW_SD_MM
+from processor.adjustment import scanner_class_errors
 from processor.model import Floats, InputError, Reason, Scan, Scene, UsageError, reason
 from processor.stitching import automatic, three_point, to_result, verdicts
 from processor.stitching.fine.pairs_and_loops import Pair
@@ -80,8 +80,10 @@ def _automatic(scene: Scene, picked: Picked, reference: int, params: Params) -> 
     gross = [pair.is_gross for pair in registered.pairs]
     noise = float(np.median([cloud.sigma_mm for cloud in registered.clouds]))
     # Where the prior determines a scan's range error better than the faces.
-    unseen = np.flatnonzero(solution.ranges_sd > np.sqrt(0.5) * VIEW_SD_MM).tolist()
-    by_class = reason("stitch.ranges-by-class", scans=tuple(scans[s].name for s in unseen), sd_mm=VIEW_SD_MM)
+    unseen = np.flatnonzero(solution.ranges_sd > np.sqrt(0.5) * scanner_class_errors.known().view_mm).tolist()
+    by_class = reason(
+        "stitch.ranges-by-class", scans=tuple(scans[s].name for s in unseen), sd_mm=scanner_class_errors.known().view_mm
+    )
     return Network(
         T=solution.T,
         covariance=solution.covariance,

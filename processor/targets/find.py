@@ -87,7 +87,7 @@ def _spheres(points: Floats, scanner: Floats | None, radius_mm: float) -> Balls:
 
 
 def _of_board(one: Checkerboard, scan: int, station: int, origin: Floats) -> _Found:
-    sd = float(np.hypot(max(one.sd, LEAST_SD_MM), scanner_class_errors.VIEW_SD_MM))
+    sd = float(np.hypot(max(one.sd, LEAST_SD_MM), scanner_class_errors.known().view_mm))
     return _Found(
         kind=TargetKind.CHECKERBOARD, scan=scan, station=station, place=one.centre + origin, sd=sd,
         points=one.points, fit=one.fit,

@@ -116,7 +116,7 @@ def test_a_bias_of_the_scanner_moves_what_is_seen_from_one_side(seen_from, share
     shape = dataclasses.replace(moved, covariance=np.zeros((6, 6)))
     fit = ComponentShape(0, frame, blocks, None)
     shared = component_deviations._errors(fit, shape, surface, field, still, levels)[3]
-    np.testing.assert_allclose(shared, share * scanner_class_errors.SURFACE_SD_MM, atol=0.01)
+    np.testing.assert_allclose(shared, share * scanner_class_errors.known().incidence_mm, atol=0.01)
 
 
 def test_the_corrected_pose_takes_back_the_movement_of_the_whole():

@@ -11,11 +11,10 @@ from scipy.optimize import brentq
 
 from designgen.designs import boxes_and_tubes, space_frame
 from designgen.designs.parametric_face import Patch
-from designgen.recipe_files import packaged
 from designgen.scanning import clutter, ray_kernels, raycast, scanner, space_frame_surfaces, survey
 from designgen.scanning import returns as scanning_returns
 from designgen.scanning.surfaces import Builder
-from processor.model import UsageError
+from processor.model import UsageError, instruments
 
 QUIET = scanner.Scanner(**{**scanner.preset("plain-2mm"), "noise_mm": 0.0})
 ORIGIN = np.eye(4)
@@ -636,9 +635,11 @@ def test_impossible_scanners_are_refused(changed, said):
 
 
 def test_presets_are_scanners_with_a_source():
-    for name, numbers in packaged("scanners.toml").items():
+    for name, numbers in instruments.classes().items():
         scanner.Scanner(**scanner.preset(name))
-        assert set(numbers) - {"about", "source", "verified"} == {f.name for f in dataclasses.fields(scanner.Scanner)}
+        assert set(numbers) - {"about", "source", "verified", *instruments.TERMS} | {"scale_ppm"} == {
+            f.name for f in dataclasses.fields(scanner.Scanner)
+        }
         assert len(numbers["source"]) > 5
     with pytest.raises(UsageError, match="expected one of phase, pulse"):
         scanner.preset("magic")

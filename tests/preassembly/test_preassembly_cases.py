@@ -179,7 +179,7 @@ def test_parts_of_one_shape_are_right_where_they_belong(came, monkeypatch):
     known(monkeypatch, T)
     found = measured(design, came, scan)
     # The plates of a foot's only end show nothing of what views differ by.
-    by_class = (reason("preassemble.viewpoints-by-class", sd=scanner_class_errors.VIEW_SD_MM),)
+    by_class = (reason("preassemble.viewpoints-by-class", sd=scanner_class_errors.known().view_mm),)
     assert (found.status, found.reasons) == ("ok", by_class if came == 4 else ())
 
 

@@ -155,7 +155,7 @@ def test_a_plate_of_which_one_side_was_seen_has_no_thickness():
 
 
 def test_view_variances_unknown_from_plates_are_those_of_the_scanner_class():
-    term = scanner_class_errors.VIEW_SD_MM**2
+    term = scanner_class_errors.known().view_mm ** 2
     assert view_variance.variances([]).or_of_class() == view_variance.NONE._replace(level=term, ring=term)
     one = view_variance.variances([plate(np.random.default_rng(1), 0.3)])
     assert (one.level, one.or_of_class().level, one.or_of_class().ring) == (0.0, term, term)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.adjustment.scanner_class_errors import OFFSET_SD_MM
+from processor.adjustment import scanner_class_errors
 from processor.geometry.sphere_fit import residual
 from processor.model import reason
 from processor.space_frame import ball_catalogue
@@ -91,7 +91,9 @@ def test_errors_reach_the_bound_and_intervals_cover(radius, count, visible, sigm
         np.random.default_rng(7), draws, radius, count, visible, sigma, several
     )
     # Balls of free radii have the offset that scanners of the class may have, which these draws have not.
-    covariance = covariance - OFFSET_SD_MM**2 * np.outer([0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 1.0, 1.0])
+    covariance = covariance - scanner_class_errors.known().offset_mm ** 2 * np.outer(
+        [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 1.0, 1.0]
+    )
     chance = 2.5 / np.sqrt(2.0 * draws)  # of an rms, beyond which one in a hundred falls
     # The biweight's efficiency of 0.95 makes 1.03; four draws gave 0.97 to 1.11.
     assert max(ball_fit.ratios(errors, bounds)) < 1.05 + chance

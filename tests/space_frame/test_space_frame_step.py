@@ -159,7 +159,7 @@ def test_balls_searched_without_a_design_have_the_error_that_all_ranges_share(me
     points = 60.0 * normals[normals[:, 0] < 0.0] + rng.normal(0.0, 0.3, ((normals[:, 0] < 0.0).sum(), 3))
     result = run(Scene("s", "space-frame", (Scan("s", points + np.array([4e3, 0.0, 0.0])),)), Params(method=method))
     largest = np.sqrt(np.linalg.eigvalsh(result.balls.covariance[0, :3, :3])[-1])
-    assert scanner_class_errors.VIEW_SD_MM <= largest < 2.0 * scanner_class_errors.VIEW_SD_MM
+    assert scanner_class_errors.known().view_mm <= largest < 2.0 * scanner_class_errors.known().view_mm
 
 
 def test_ball_of_another_size_than_designed_is_flagged():

@@ -21,9 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from processor.adjustment import global_test
+from processor.adjustment import global_test, scanner_class_errors
 from processor.adjustment.point_groups import patch_numbers
-from processor.adjustment.scanner_class_errors import VIEW_SD_MM
 from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd, student_factor
 
@@ -67,7 +66,13 @@ class Variances(NamedTuple):
 
     def or_of_class(self) -> Variances:
         """Return the variances with the levels of the scanner's class where the plates do not show them."""
-        return self if self.known else self._replace(level=VIEW_SD_MM**2, ring=VIEW_SD_MM**2)
+        return (
+            self
+            if self.known
+            else self._replace(
+                level=scanner_class_errors.known().view_mm ** 2, ring=scanner_class_errors.known().view_mm ** 2
+            )
+        )
 
 
 NONE = Variances()
@@ -200,7 +205,7 @@ def _with_class(between: float, squares: float, by_noise: float, dof: int) -> fl
     95 % confidence limit of what the plates show: a network may be better than its class.
     """
     pairs = dof / OF_PAIR
-    both = (between * pairs + VIEW_SD_MM**2 * OF_CLASS) / (pairs + OF_CLASS)
+    both = (between * pairs + scanner_class_errors.known().view_mm ** 2 * OF_CLASS) / (pairs + OF_CLASS)
     return min(both, _estimate(squares, by_noise, dof) * pairs / float(chdtri(pairs, 0.95)))
 
 

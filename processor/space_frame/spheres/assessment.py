@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from scipy.special import chdtrc
 
-from processor.adjustment.scanner_class_errors import OFFSET_SD_MM, SHIFT_SD_MM
+from processor.adjustment import scanner_class_errors
 from processor.geometry.sphere import BANDS, SECTORS, Sphere, visible_fraction
 from processor.geometry.thread_ranges import over_ranges
 from processor.limits import limit_bounds, standards
@@ -133,7 +133,9 @@ def _states(fits: Fits, nodes: Nodes, nominal: Floats, context: FitContext) -> t
     covariance = fits.covariance * wider[:, None, None]
     if context.views is None:
         offset, offset_sd = context.radius_offset  # without sizes of balls, the class of the scanners bounds it
-        common = np.array([0.0, 0.0, 1.0, 1.0]) * (offset if np.isfinite(offset_sd) else OFFSET_SD_MM)
+        common = np.array([0.0, 0.0, 1.0, 1.0]) * (
+            offset if np.isfinite(offset_sd) else scanner_class_errors.known().offset_mm
+        )
         covariance = covariance + np.outer(common, common)
     else:  # they include the offset of radii
         covariance = covariance + context.views.covariance
@@ -251,7 +253,7 @@ def _messages(context: FitContext) -> tuple[Reason, ...]:
                 "spheres.unnamed-views",
                 sd=context.views.sd,
                 common=context.views.common_sd,
-                shift=SHIFT_SD_MM,
+                shift=scanner_class_errors.SHIFT_SD_MM,
                 offset=context.views.offset_sd,
             )
         )

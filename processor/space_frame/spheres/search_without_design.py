@@ -78,8 +78,10 @@ def measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Par
 
 def by_class(params: Params) -> tuple[Reason, ...]:
     """Return what is assumed of a scanner whose class is not stated."""
-    view, incidence = scanner_class_errors.of_class(params.instrument)
-    return () if params.instrument else (reason("spheres.instrument-assumed", view=view, incidence=incidence),)
+    if params.instrument or scanner_class_errors.stated():
+        return ()
+    assumed = scanner_class_errors.known()
+    return (reason("spheres.instrument-assumed", view=assumed.view_mm, incidence=assumed.incidence_mm),)
 
 
 def _held(params: Params) -> float | None:

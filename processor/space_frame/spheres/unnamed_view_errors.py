@@ -34,7 +34,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.spatial.distance import cdist
 
-from processor.adjustment.scanner_class_errors import OFFSET_SD_MM, SHIFT_SD_MM, VIEW_SD_MM
+from processor.adjustment import scanner_class_errors
 from processor.geometry.sphere import BANDS, SECTORS, sphere_cells
 from processor.model import NORMAL_95, Floats, Ints
 from processor.space_frame.members.records import Members
@@ -116,7 +116,9 @@ def of_tubes(views: ViewErrors, members: Members) -> Floats:
     J = np.column_stack([across, np.ones(sectors)])
     factor = correlation(across @ across.T)
     normals, cosines = directions(), _mean_cosines(views.seen)
-    covariance = np.tile(np.diag([SHIFT_SD_MM**2, SHIFT_SD_MM**2, 0.0]), (count, 1, 1))
+    covariance = np.tile(
+        np.diag([scanner_class_errors.SHIFT_SD_MM**2, scanner_class_errors.SHIFT_SD_MM**2, 0.0]), (count, 1, 1)
+    )
     for m, points in enumerate(members.around):
         weighted = (J * points[:, None]).T
         gain = np.linalg.pinv(weighted @ J, rcond=1e-6, hermitian=True) @ weighted
@@ -149,10 +151,12 @@ def _offset_or_beam(fits: list[_Fit], cosines: Floats, radius_offset: float, var
     by the scanner's class and the variance of the mean of the views. The rest is attributed to the width of the beam.
     """
     change = float(np.mean([fit.gain[3] @ cosines[fit.cells] for fit in fits])) if fits else 0.0
-    limit = NORMAL_95 * float(np.hypot(OFFSET_SD_MM, np.sqrt(variance)))
+    limit = NORMAL_95 * float(np.hypot(scanner_class_errors.known().offset_mm, np.sqrt(variance)))
     offset = radius_offset / change if abs(radius_offset) < limit * abs(change) else limit
     explained = 0.5 * (offset * change) ** 2
-    return float(np.hypot(OFFSET_SD_MM, np.sqrt(0.5) * offset)), float(np.sqrt(max(radius_offset**2 - explained, 0.0)))
+    return float(np.hypot(scanner_class_errors.known().offset_mm, np.sqrt(0.5) * offset)), float(
+        np.sqrt(max(radius_offset**2 - explained, 0.0))
+    )
 
 
 # --- spheres ---------------------------------------------------------------------------------------------------------
@@ -221,7 +225,7 @@ def _of_spheres(
     factor, at_knots = modes(), _knots(field, places)
     count, knots = at_knots.shape
     shared, own = np.zeros((count, 4, OF_ALL + factor.shape[1] * knots)), np.zeros((count, 4, 4))
-    shared[:, :3, :3] = SHIFT_SD_MM * np.eye(3)
+    shared[:, :3, :3] = scanner_class_errors.SHIFT_SD_MM * np.eye(3)
     own_share = np.maximum(1.0 - np.sum(at_knots**2, axis=1), 0.0)
     for k, fit in found.items():
         change = np.sqrt(field.variance) * fit.gain @ factor[fit.cells]
@@ -346,7 +350,7 @@ def odd_variances(balls: list[BallResiduals]) -> Floats:
 
 def _log_prior() -> Floats:
     """Equal probability for equal ratios, to the class's error of a view; beyond less, as of a Cauchy distribution."""
-    prior: Floats = -np.log1p((SD_MM / VIEW_SD_MM) ** 2)
+    prior: Floats = -np.log1p((SD_MM / scanner_class_errors.known().view_mm) ** 2)
     return prior
 
 

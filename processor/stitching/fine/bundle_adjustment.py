@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from processor.adjustment.scanner_class_errors import SCALE_SD, VIEW_SD_MM
+from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.robust_statistics import huber
@@ -82,7 +82,7 @@ def solve(
         none = np.empty(0)
         return Solution(
             T=T, covariance=covariance, offset=none, tau=tuple(common.tolist()), weight=none, ranges=ranges,
-            ranges_sd=np.full(k, VIEW_SD_MM),
+            ranges_sd=np.full(k, scanner_class_errors.known().view_mm),
         )  # fmt: skip
     weight = np.ones(len(blocks.piece))
     initial = _initial_tau(blocks) if robust and tau is None else np.zeros(KINDS + 1)
@@ -139,7 +139,7 @@ def _with_priors(equations: Equations, unknowns: Ints, ranges: Floats, face_mm: 
 def prior_information(ranges: int, k: int, face_mm: float) -> Floats:
     """Return the information (8k + f,) of the priors: weak ones of k poses; range errors by class, and of faces."""
     of_poses = np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k)
-    of_scans = np.repeat([VIEW_SD_MM**-2, SCALE_SD**-2], k)
+    of_scans = np.repeat([scanner_class_errors.known().view_mm ** -2, scanner_class_errors.known().scale ** -2], k)
     of_faces = np.full(ranges - 2 * k, max(face_mm, LEAST_FACE_MM) ** -2)
     return np.concatenate([of_poses, of_scans, of_faces])
 

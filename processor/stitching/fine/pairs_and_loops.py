@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from processor.adjustment.scanner_class_errors import VIEW_SD_MM
+from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
 from processor.model import Floats
 from processor.stitching import poses_with_scale
@@ -62,7 +62,7 @@ def register_pair(blocks: Blocks, network: Solution, a: int, b: int, variance: f
     by_unit = direction_errors.added_covariance(local, solution, 0, 1.0)[0][6:, 6:]
     covariance = solution.covariance[6:, 6:] + variance * by_unit
     # What something that moved makes of the variance excuses no pair.
-    expected = solution.covariance[6:, 6:] + min(variance, VIEW_SD_MM**2) * by_unit
+    expected = solution.covariance[6:, 6:] + min(variance, scanner_class_errors.known().view_mm ** 2) * by_unit
     d = poses_with_scale.difference(solution.T[1], start[1])[:6]
     points = local.kind == ON_PIECE
     weight = local.sums[points, 9]

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from processor.adjustment.scanner_class_errors import VIEW_SD_MM
+from processor.adjustment import scanner_class_errors
 from processor.space_frame.spheres import unnamed_view_errors as field
 
 ROUNDING = 1e-9  # of sums of float64 over some hundred cells
@@ -53,7 +53,10 @@ def test_the_variance_is_the_posterior_mean_over_sizes_and_lengths(scale):
         same_field = np.where(row[:, None] == row, 1.0, np.exp(-5000.0 / length))  # 3, 4, 5: the balls are 5 m apart
         for sd in field.SD_MM:
             covariance = np.eye(len(y)) + sd**2 * (H @ H.T) * same_field
-            log_p.append(multivariate_normal(cov=covariance).logpdf(y) - np.log(1.0 + (sd / VIEW_SD_MM) ** 2))
+            log_p.append(
+                multivariate_normal(cov=covariance).logpdf(y)
+                - np.log(1.0 + (sd / scanner_class_errors.known().view_mm) ** 2)
+            )
             variance.append(sd**2)
     p = np.exp(np.array(log_p) - logsumexp(log_p))
     expected = p @ np.array(variance)
@@ -66,5 +69,5 @@ def test_the_variance_is_the_posterior_mean_over_sizes_and_lengths(scale):
 
 
 def test_without_balls_the_variance_is_that_of_the_class():
-    prior = 1.0 / (1.0 + (field.SD_MM / VIEW_SD_MM) ** 2)
+    prior = 1.0 / (1.0 + (field.SD_MM / scanner_class_errors.known().view_mm) ** 2)
     assert field.estimate_field([]).variance == pytest.approx(prior @ field.SD_MM**2 / prior.sum())
