@@ -120,11 +120,11 @@ def fit_sphere(
     Parameters
     ----------
     points : (n, 3), mm; 10 or more, of which fewer than 40 give a failed fit.
-    radius : known radius in mm, held; None = estimated. Where the points have another one the
-        covariance of the centre holds its effect; the status is weak if scanners do not explain it.
+    radius : known radius in mm, held; None = estimated. Where the points have another one the covariance of the centre
+        holds its effect; the status is weak if scanners do not explain it.
     scanner : (3,) position of the scanner, or (n, 3) that of each point, in the points' frame; None = unknown.
-    instrument : its class: "phase" (one standard deviation 0.5 mm of range a view and 0.3 mm of bias at 60 degrees of
-        incidence), "pulse" (0.6, 0.36) or "long-range" (2.5, 1.5); the path of a scanner.toml; "" = as of phase.
+    instrument : "phase" (one sd 0.5 mm of range a view and 0.3 mm of bias at 60 degrees of incidence), "pulse" (0.6,
+        0.36) or "long-range" (2.5, 1.5); the path of a scanner.toml; "" = as of phase.
 
     Returns
     -------
@@ -132,9 +132,8 @@ def fit_sphere(
 
     Raises
     ------
-    ValueError : wrong shape, NaN, too few points, points that coincide, coordinates that seem to be in metres, a radius
-        that no target has or the cloud cannot hold, a scanner that cannot have measured the points, an instrument of
-        no class. InputError: a scanner.toml that cannot be used.
+    ValueError : wrong shape, NaN, too few points, points that coincide, coordinates in metres, a radius that the cloud
+        cannot hold, a scanner that cannot have measured the points, no class. InputError: an unusable scanner.toml.
     """
     every = points_of(points, "points", LEAST_POINTS)
     cloud, used, coincident = _once(every, "points")

@@ -173,10 +173,10 @@ def _without_copies(points: Floats, step: float) -> Bools:
     if np.mean(copied) < LEAST_COPIES or step > SMALL_STEP * float(np.median(away[:, -1])):
         return ~beside
     tree = cKDTree(points)
-    for rows in large_arrays.blocks(len(points)):
-        away, row = tree.query(points[rows], k=BESIDE)
-        earlier = row < np.arange(rows.start, rows.stop)[:, None]
-        beside[rows] = np.any(earlier & (away < COPY_RATIO * away[:, -1:]), axis=1)
+    for block in large_arrays.blocks(len(points)):
+        away, row = tree.query(points[block], k=BESIDE)
+        earlier = row < np.arange(block.start, block.stop)[:, None]
+        beside[block] = np.any(earlier & (away < COPY_RATIO * away[:, -1:]), axis=1)
     return ~beside
 
 
