@@ -83,11 +83,12 @@ paper: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/paper
 	$(BIN)/processor papers -o $(OUT)/papers --jobs $(JOBS)
 
-# Exit code 4: a limit was missed or a figure got worse. --again replaces a run of today by other software.
+# Exit code 4: a limit was missed; 6: a figure got worse. --again replaces a run of today by other software.
 nightly: $(VENV)/.demo
 	$(BIN)/processor validate -o $(OUT)/nightly --jobs $(JOBS) --again
 
 weekend: $(VENV)/.test paper
+	$(BIN)/processor validate --smallest -o $(OUT)/smallest --jobs $(JOBS)
 	$(BIN)/processor validate -o $(OUT)/nightly --jobs $(JOBS) --again --full
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term --cov-fail-under=85
 	$(BIN)/python -m tests.bench.bolt_balls --output $(OUT)/nightly-bolt-balls.json

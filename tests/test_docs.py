@@ -79,6 +79,7 @@ ELSEWHERE = {
     "processor batch /scans -o /results --cluster tls://10.0.0.1:8786": "tests/batch/test_batch.py",
     "processor run my-hall -o results --steps deviation --cluster tcp://10.0.0.1:8786": "tests/jobs/test_tiles.py",
     "processor compare before.laz after.laz -o change --cluster tcp://10.0.0.1:8786": "tests/jobs/test_tiles.py",
+    "processor validate --smallest -o nights --jobs 2": "make weekend",
     "processor validate mine.toml -o nights --jobs 2": "tests/validation/test_validation_running.py",
     "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": (
         "tests/validation/test_validation_running.py"

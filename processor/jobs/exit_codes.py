@@ -6,7 +6,9 @@ from collections.abc import Iterable
 
 from processor.model import Verdict
 
-DONE, IN_PART, WRONG_USAGE, BAD_INPUT, LIMIT_MISSED, VERDICT = range(6)  # scripts of users read them; 2 is also click's
+DONE, IN_PART, WRONG_USAGE, BAD_INPUT, LIMIT_MISSED, VERDICT, GOT_WORSE = range(
+    7
+)  # scripts of users read them; 2 is also click's
 ENDED_BY_LIMIT = BAD_INPUT  # of time or memory
 WITH_RESULTS = (DONE, IN_PART, LIMIT_MISSED, VERDICT)
 FAIL_ON = {

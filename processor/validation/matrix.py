@@ -53,7 +53,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-DEFAULT = Path(__file__).with_name("default_matrix.toml")
+DEFAULT, SMALLEST = (Path(__file__).with_name(f"{name}_matrix.toml") for name in ("default", "smallest"))
 FOREIGN = PROJECT / "tests" / "bench" / "foreign"  # part of the sources, not of an installed package
 MOST_SEED = 2**63  # a seed is stored as a 64-bit integer
 MOST_CELLS = 10_000  # work: at some seconds each, more than a night

@@ -55,9 +55,14 @@ class Summary:
         return [cell for cell in self.cells if cell["failed"]]
 
     @property
+    def keeps_limits(self) -> bool:
+        """Whether no limit was missed and all intervals hold what they state."""
+        return not self.missed and not self.wrong_intervals
+
+    @property
     def passed(self) -> bool:
         """Whether no limit was missed and nothing got worse."""
-        return not self.missed and not self.wrong_intervals and not self.detected.of(*ALARMS)
+        return self.keeps_limits and not self.detected.of(*ALARMS)
 
     @property
     def wrong_intervals(self) -> list[Coverage]:
@@ -70,6 +75,8 @@ class Summary:
         misses = len(self.missed)
         failed, detected = len(self.failed), self.detected
         verdict = text("ok") if self.passed and not failed else text("NOT OK")
+        if self.keeps_limits and not self.passed:
+            verdict = text("WORSE")
         parts = [text("{night} {verdict}", night=self.night, verdict=verdict), self._version()]
         counts = {"cells": len(self.cells) - failed, "figures": detected.figures}
         parts.append(text("{cells} {cells:?cell|cells}, {figures} {figures:?figure|figures}", **counts))
@@ -78,8 +85,9 @@ class Summary:
         for origin in Origin:
             wrong = [one for one in self.wrong_intervals if one.origin == origin]
             if wrong:
-                parts.append(text("intervals of {count} quantities do not hold, scenes of {origin}",
-                                  count=len(wrong), origin=origin))  # fmt: skip
+                parts.append(text("intervals of {count} quantities do not hold, scenes of {origin}: {first} {holds}",
+                                  count=len(wrong), origin=origin, first=wrong[0].quantity,
+                                  holds=wrong[0].holds))  # fmt: skip
         parts += [
             text("{count} {direction}: {changes}", count=len(changed), direction=direction, changes=_listed(changed))
             for kinds, direction in ((ALARMS, Direction.WORSE), ((ChangeKind.IMPROVEMENT,), Direction.BETTER))
