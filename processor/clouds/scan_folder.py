@@ -17,6 +17,7 @@ from processor.plain_text import spreadsheet_text
 from processor.scan_folder import picks as picks_table
 from processor.scan_folder.control_points import COLUMNS
 from processor.scan_folder.files import CONTROL, PICKS, PROJECT, STATIONS
+from processor.scan_folder.tolerance import AGREED
 from processor.writers import project
 from processor.writers.cloud import METRES
 from processor.writers.toml import as_toml
@@ -106,10 +107,14 @@ def _tolerance(tolerance: Tolerance | None) -> list[str]:
         lines.append(f"risk = {tolerance.risk!r}")
     if tolerance.root_gap_mm:
         lines.append(f"root_gap_mm = {tolerance.root_gap_mm!r}")
+    agreed = ""
     for limit in tolerance.limits:
-        if limit.source == PROJECT:
+        source, _, by = limit.source.partition(AGREED)
+        if source == PROJECT and limit.component is None:
             both = [limit.low, limit.high] if np.isfinite(limit.low) else limit.high
             lines.append(f"{limit.key} = {both!r}")
+            agreed = by
+    lines += [f"agreed_by = {as_toml(agreed)}"] if agreed else []
     return lines
 
 

@@ -17,6 +17,7 @@ from processor.scan_folder.files import PROJECT
 
 COMPONENTS = "component"
 OF_DECISIONS = {"rule", "risk"}
+AGREED = ", agreed by "
 MOST_NAMES = 12  # components in a message
 OF_COMPONENTS = (measurands.DEVIATION, measurands.DEVIATION_SHARE, measurands.DEFECT_DEPTH, measurands.DEFECT_AREA)
 
@@ -44,7 +45,8 @@ def read_tolerance(given: Any, place: Place) -> Tolerance | None:
     if limits.risk is not None and limits.rule != DecisionRule.RISK:
         raise place.refused(f'risk is of the decision rule "{DecisionRule.RISK}"; add rule = "{DecisionRule.RISK}"')
     base = dataclasses.replace(base, rule=limits.rule, risk=limits.risk)
-    tolerance = project_limits.override(base, values, PROJECT, limits.root_gap_mm, of_components)
+    source = f"{PROJECT}{AGREED}{limits.agreed_by}" if limits.agreed_by else PROJECT
+    tolerance = project_limits.override(base, values, source, limits.root_gap_mm, of_components)
     _check_share(place, tolerance)
     return tolerance
 
@@ -63,6 +65,7 @@ def declared_limits(standard: str) -> Any:
     about = "limits of single components, by a pattern of their names such as web*"
     first = [
         ("standard", entry(text(), "a standard of processor/limits", default="")),
+        ("agreed_by", entry(text(), "who has agreed to the project's own limits, and when", default="")),
         ("root_gap_mm", entry(number(), "gap between two ends in the design", default=0.0)),
         ("rule", entry(text(*DecisionRule), "decision rule", default=None)),
         (

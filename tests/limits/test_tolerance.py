@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from processor.clouds import scan_folder
 from processor.inspection.result import Quantity
 from processor.limits import limit_bounds, measurands, standards
 from processor.model import MEASURES, InputError, Limit, Scan, Scene, Tolerance
@@ -116,11 +117,20 @@ def test_a_projects_own_limits_win_and_go_through_the_store(tmp_path):
     assert standards.find(found, "span_mm").high == 5.0
     assert len(found.limits) == len(standards.load("GB 50205-2020").limits)
     assert found.root_gap_mm == 6.0
+    text = '[tolerance]\nmisalignment_mm = 1.5\nagreed_by = "A. Owner and B. Contractor, 2026-11-20"\n'
+    agreed = standards.find(folder.read_input(write_project(tmp_path, text)).tolerance, "misalignment_mm")
+    assert (agreed.source, agreed.clause) == ("project.toml, agreed by A. Owner and B. Contractor, 2026-11-20", "")
+    assert limits_of_export(agreed) == ["misalignment_mm = 1.5", 'agreed_by = "A. Owner and B. Contractor, 2026-11-20"']
     store.write_scene(tmp_path / "s.h5", scene, None, {})
     assert store.problems(tmp_path / "s.h5") == []
     back = store.read_scene(tmp_path / "s.h5").tolerance
     assert repr(back) == repr(found)
     assert store.scene_hash(scene) != store.scene_hash(dataclasses.replace(scene, tolerance=None))
+
+
+def limits_of_export(limit):
+    """The lines of project.toml that an exported folder has of a limit."""
+    return scan_folder._tolerance(Tolerance(limits=(limit,)))[2:]
 
 
 def test_the_decision_rule_goes_through_the_store_and_leaves_other_scenes_as_they_were(tmp_path):

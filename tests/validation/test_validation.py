@@ -429,9 +429,7 @@ def test_figures_of_own_and_foreign_scenes_are_never_pooled(tmp_path):
     assert suites[f"intervals.{NIGHT}"].get("failures") == "1"
 
 
-@pytest.mark.parametrize(
-    ("share", "scene", "holds"), [(97.9, 86.0, "as stated"), (93.0, 84.0, "too narrow")]
-)
+@pytest.mark.parametrize(("share", "scene", "holds"), [(97.9, 86.0, "as stated"), (93.0, 84.0, "too narrow")])
 def test_the_written_limits_of_coverage(share, scene, holds):
     limits, name = coverage.Limits(), ("spheres", "ray")
     rows = [
