@@ -26,6 +26,7 @@ from processor.geometry import coincident_points, mesh_distance, normal_orientat
 from processor.geometry import m3c2 as m3c2_distances
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import MeshSurface
+from processor.geometry.thread_ranges import one_blas_thread
 from processor.model import Bools, Floats, Instrument, Reason, Status, instruments, reason
 from processor.model.inputs import Place
 from processor.registration import surface_registration
@@ -33,9 +34,10 @@ from processor.registration.surface_registration import Placed
 from processor.scan_folder.text_files import read_toml
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.design import unit_mistakes
-from processor.space_frame.params import Params
-from processor.space_frame.result import Flag, Result
+from processor.space_frame.params import NAN, Params
+from processor.space_frame.result import Flag
 from processor.space_frame.spheres import search_without_design
+from processor.space_frame.spheres.assessment import Row, missing
 from processor.targets import sphere_of_crop
 
 LEAST_POINTS = 10  # of a sphere: four determine it, and six are left to show whether it is one
@@ -102,6 +104,7 @@ class Pose:
     reasons: tuple[Reason, ...] = ()
 
 
+@one_blas_thread()
 def fit_sphere(
     points: npt.ArrayLike,
     radius: float | None = None,
@@ -145,19 +148,18 @@ def fit_sphere(
         _check_scanner(cloud - origin, seen_from)
     params = Params(radius_mm=float("nan") if held is None else held, max_balls=1)
     with scanner_class_errors.used(_instrument(instrument)):
-        measured = _measured(MergedCloud(cloud - origin, origin, seen_from), params, held)
+        row = _measured(MergedCloud(cloud - origin, origin, seen_from), params, held)
         assumed = search_without_design.by_class(params)
-    balls = measured.balls
-    if not len(balls):
-        return _no_sphere((*measured.reasons, *coincident), held)
+    if row.sphere is None:
+        return _no_sphere((*row.reasons, *coincident), held)
     fitted = SphereFit(
-        centre=balls.centres[0],
-        radius=float(balls.radii[0]),
-        covariance=balls.covariance[0],
-        status=Status.OK if balls.flag[0] is Flag.OK else Status.WEAK,
-        reasons=(*balls.reasons[0], *assumed, *coincident),
-        points=int(balls.points[0]),
-        rms=float(balls.rms[0]),
+        centre=row.sphere.centre + origin,
+        radius=row.sphere.radius,
+        covariance=row.sphere.covariance,
+        status=Status.OK if row.flag is Flag.OK else Status.WEAK,
+        reasons=(*row.reasons, *assumed, *coincident),
+        points=row.points,
+        rms=row.rms,
     )
     if seen_from is not None and fitted.status is Status.OK:
         _check_faces(cloud - fitted.centre, seen_from + origin - fitted.centre, fitted)
@@ -191,21 +193,22 @@ def _once(points: Floats, name: str) -> tuple[Floats, Bools | slice, tuple[Reaso
     return points[used], used, (scene_cloud.coincident(left_out, len(used), name),)
 
 
-def _measured(cloud: MergedCloud, params: Params, held: float | None) -> Result:
-    """Return the sphere that fills most of a cloud, else the one that is found in it, else one that is only likely."""
+def _measured(cloud: MergedCloud, params: Params, held: float | None) -> Row:
+    """Return the sphere that fills most of a cloud, else the one that is found in it, else one that is only likely.
+
+    That may be another body, or be moved by what touches it.
+    """
     found = sphere_of_crop.find(cloud.points, search_without_design.fewest_points(params), held, cloud.scanner)
     if found is None or not found.certain:
-        measured = search_without_design.search(cloud, params)
-        if found is None or len(measured.balls):
-            return measured
-    measured = search_without_design.measured([found.ball], cloud, params)
-    return measured if found.certain else _doubted(measured)
-
-
-def _doubted(measured: Result) -> Result:
-    """Return the result of one sphere as one that may be another body, or be moved by what touches it."""
-    reasons = (*measured.balls.reasons[0], reason("spheres.not-only-sphere"))
-    return replace(measured, balls=replace(measured.balls, flag=(Flag.LOW_CONFIDENCE,), reasons=(reasons,)))
+        balls = search_without_design.detected(cloud, params)
+        if balls:
+            return search_without_design.fitted(0, balls[0], cloud, params)
+        if found is None:
+            return missing(0, NAN, 0, search_without_design.no_ball(cloud, params))
+    row = search_without_design.fitted(0, found.ball, cloud, params)
+    if found.certain:
+        return row
+    return replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, reason("spheres.not-only-sphere")))
 
 
 def _radius(radius: Any, extent: float) -> float:
@@ -255,6 +258,7 @@ def _check_faces(points: Floats, scanner: Floats, sphere: SphereFit) -> None:
         )
 
 
+@one_blas_thread()
 def register(
     points: npt.ArrayLike, vertices: npt.ArrayLike, faces: npt.ArrayLike, scanners: npt.ArrayLike | None = None
 ) -> Pose:
@@ -334,6 +338,7 @@ def _sizes(ratio: float) -> Reason:
     return reason("register.unit-mistake", ratio=ratio, unit_mm=unit_mm)
 
 
+@one_blas_thread()
 def m3c2(
     reference: npt.ArrayLike,
     compared: npt.ArrayLike,

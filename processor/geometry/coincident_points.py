@@ -165,8 +165,8 @@ def _without_copies(points: Floats, step: float) -> Bools:
         return ~beside
     points = np.asarray(points)
     near = []
-    for rows in some_places(points):
-        place, some = points[rows], np.arange(0, len(rows), max(len(rows) // LOOKED_AT, 1))
+    for of_place in some_places(points):
+        place, some = points[of_place], np.arange(0, len(of_place), max(len(of_place) // LOOKED_AT, 1))
         near.append(np.linalg.norm(place[nearest_four(place, some)[:, [0, -1]]] - place[some, None], axis=2))
     away = np.concatenate(near)
     copied = away[:, 0] < COPY_RATIO * away[:, -1]

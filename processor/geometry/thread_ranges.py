@@ -14,7 +14,7 @@ from itertools import pairwise
 from typing import TypeVar
 
 import scipy.linalg  # noqa: F401 - only a BLAS that is loaded already is limited
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -26,10 +26,18 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="kernels")
 
 
+@cache
+def _libraries() -> ThreadpoolController:
+    return ThreadpoolController()  # looks through all that is loaded, which takes as long as a fit
+
+
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Keep linear algebra to one thread: the last digits of its sums depend on the number of threads."""
-    with threadpool_limits(1, user_api="blas"):
+    """Keep linear algebra to one thread: the last digits of its sums depend on the number of threads.
+
+    Two threads also take longer for the small matrices here.
+    """
+    with _libraries().limit(limits=1, user_api="blas"):
         yield
 
 

@@ -34,11 +34,15 @@ CHANCE = 3.29  # standard deviations: 0.1 % of right radii are farther from a me
 
 def search(cloud: MergedCloud, params: Params) -> Result:
     """Search a cloud for spheres that stand out of it by themselves."""
+    return _measured(detected(cloud, params), cloud, params)
+
+
+def detected(cloud: MergedCloud, params: Params) -> list[sphere_detection.Ball]:
+    """Return the spheres that stand out of a cloud."""
     # fixed: the result must not depend on the seed
     fixed = generator(replace(params, seed=0), "search")
     least, held = fewest_points(params), _held(params)
-    found = sphere_detection.find_balls(cloud.points, fixed, params.max_balls, least, held, cloud.scanner)
-    return measured(found, cloud, params)
+    return sphere_detection.find_balls(cloud.points, fixed, params.max_balls, least, held, cloud.scanner)
 
 
 def fewest_points(params: Params) -> int:
@@ -46,17 +50,21 @@ def fewest_points(params: Params) -> int:
     return max(params.min_points, sphere_detection.LEAST_POINTS)
 
 
-def measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Params) -> Result:
+def no_ball(cloud: MergedCloud, params: Params) -> Reason:
+    """Return why there is no sphere in a cloud."""
+    count, least = len(cloud.points), fewest_points(params)
+    if count < least:
+        return reason("spheres.too-few-for-ball", points=count, least=least)
+    if (step := float(coincident_points.lattice_of(cloud.points).step.max())) >= COARSE_MM:
+        return reason("spheres.coordinates-rounded", step=step)
+    return reason("spheres.no-ball", points=count)
+
+
+def _measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Params) -> Result:
     """Return the result of spheres found in a cloud, fitted by the method."""
     if not found:
-        count, least = len(cloud.points), fewest_points(params)
-        why = reason("spheres.no-ball", points=count)
-        if count < least:
-            why = reason("spheres.too-few-for-ball", points=count, least=least)
-        elif (step := float(coincident_points.lattice_of(cloud.points).step.max())) >= COARSE_MM:
-            why = reason("spheres.coordinates-rounded", step=step)
-        return Result(Status.FAILED, params.method, (why,))
-    rows = [_searched(id_, candidate, cloud, params) for id_, candidate in enumerate(found)]
+        return Result(Status.FAILED, params.method, (no_ball(cloud, params),))
+    rows = [fitted(id_, candidate, cloud, params) for id_, candidate in enumerate(found)]
     messages = [reason("spheres.searched")]
     if params.method == "least-squares":
         messages.append(reason("spheres.algebraic-fit"))
@@ -88,7 +96,8 @@ def _held(params: Params) -> float | None:
     return None if np.isnan(params.radius_mm) else params.radius_mm
 
 
-def _searched(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, params: Params) -> Row:
+def fitted(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, params: Params) -> Row:
+    """Return a sphere of a cloud with its covariance, flag and reasons."""
     on = cloud.points[candidate.fit.inliers]
     sphere: Sphere | None = candidate.fit.sphere
     if params.method == "least-squares":
