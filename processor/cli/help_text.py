@@ -47,7 +47,10 @@ class RunCommand(click.Command):
         """Write what is listed."""
         from processor.limits import standards
 
-        steps = [(name, ", ".join(methods)) for name, methods in sorted(map(_named, _step_files()))]
+        steps = [
+            (name, ", ".join(methods))
+            for name, methods in sorted(map(_named, Path(processor.__path__[0]).glob("*/step.py")))
+        ]
         lists = (
             ("Steps, and their methods (the first is the default)", steps),
             ("Standards, for [tolerance] of project.toml", [(", ".join(standards.standards()), "")]),
@@ -60,10 +63,6 @@ class RunCommand(click.Command):
                     formatter.write_text(rows[0][0])
                 else:
                     formatter.write_dl(rows)
-
-
-def _step_files() -> list[Path]:
-    return list(Path(processor.__path__[0]).glob("*/step.py"))
 
 
 def _named(step_file: Path) -> tuple[str, tuple[str, ...]]:

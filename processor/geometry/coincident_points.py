@@ -21,7 +21,6 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from processor import large_arrays
-from processor.geometry.nearest_neighbours import nearest_four
 from processor.geometry.thinning import thinned
 from processor.model import Bools, Floats, Ints
 
@@ -164,12 +163,12 @@ def _without_copies(points: Floats, step: float) -> Bools:
     if not FEWEST_COPIED <= len(points) <= large_arrays.AT_ONCE:
         return ~beside
     points = np.asarray(points)
-    near = []
-    for of_place in some_places(points):
-        place, some = points[of_place], np.arange(0, len(of_place), max(len(of_place) // LOOKED_AT, 1))
-        near.append(np.linalg.norm(place[nearest_four(place, some)[:, [0, -1]]] - place[some, None], axis=2))
+    near = [
+        cKDTree(points[rows]).query(points[rows[:: max(len(rows) // LOOKED_AT, 1)]], k=BESIDE)[0]
+        for rows in some_places(points)
+    ]
     away = np.concatenate(near)
-    copied = away[:, 0] < COPY_RATIO * away[:, -1]
+    copied = away[:, 1] < COPY_RATIO * away[:, -1]
     if np.mean(copied) < LEAST_COPIES or step > SMALL_STEP * float(np.median(away[:, -1])):
         return ~beside
     tree = cKDTree(points)

@@ -33,9 +33,6 @@ CROP_CHUNK = 1 << 20  # points in memory at once: work, not result
 REACHED_CELL = 2.0  # edge of a cell, in reaches: a point's reach meets eight cells at most
 LEAST_POINTS = 20_000  # points per task of a thread that marks those within reach
 LEAST_SEARCHES = 5_000  # places per task of a thread that searches in a fine grid
-FOUR = 4  # those on all sides of a point: two along a line of the scanner and two across
-OF_A_CELL = 3.0  # work: points of a cell, as if they lay evenly on the two longest sides of their box
-MOST_CELLS = 64.0  # work: along a side
 FIRST_CELLS = 0.5  # search radius to begin with, in cells
 
 
@@ -431,68 +428,3 @@ def same_places(points: Floats, within_mm: float) -> Ints:
     if not len(distinct):
         return place
     return components(len(distinct), *cKDTree(distinct).query_pairs(within_mm, output_type="ndarray").T)[place]
-
-
-def nearest_four(points: Floats, rows: Ints) -> Ints:
-    """Return the rows (m, 4) of the points (n, 3) nearest to those of ``rows`` (m,), the nearest first; -1 = none.
-
-    For some thousand points on a surface, of which the search tree takes longer to build than to ask.
-    """
-    near = np.full((len(rows), FOUR), -1, np.int64)
-    if not len(points):
-        return near
-    low, extent = points.min(axis=0), np.ptp(points, axis=0)
-    sides = np.sort(extent)
-    edge = max(float(np.sqrt(OF_A_CELL * sides[1] * sides[2] / len(points))), float(sides[2]) / MOST_CELLS, 1e-12)
-    _fill_nearest(np.ascontiguousarray(points), low, edge, (extent / edge).astype(np.int64) + 1, rows, near)
-    return near
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fill_nearest(u, low, edge, size, wanted, near):  # type: ignore[no-untyped-def]
-    """Fill rows (m, 4) of the nearest to those wanted (m,), by cells of this edge, ``size`` (3,) along the axes.
-
-    About the cell of a point rings of cells are looked at until the fourth neighbour is nearer than what lies beyond.
-    """
-    n, k = len(u), near.shape[1]
-    nx, ny, nz = size[0], size[1], size[2]
-    cell, start, rows = np.empty((n, 3), np.int64), np.zeros(nx * ny * nz + 1, np.int64), np.empty(n, np.int64)
-    for i in range(n):
-        for a in range(3):
-            cell[i, a] = min(int((u[i, a] - low[a]) / edge), size[a] - 1)
-        start[(cell[i, 0] * ny + cell[i, 1]) * nz + cell[i, 2] + 1] += 1
-    for c in range(nx * ny * nz):
-        start[c + 1] += start[c]
-    for i in range(n - 1, -1, -1):
-        c = (cell[i, 0] * ny + cell[i, 1]) * nz + cell[i, 2] + 1
-        start[c] -= 1
-        rows[start[c]] = i
-    start[:-1] = start[1:]
-    start[-1] = n
-    squares = np.empty(k)
-    for q in range(len(wanted)):
-        i = wanted[q]
-        x, y, z = u[i, 0], u[i, 1], u[i, 2]
-        ring = 1
-        while True:
-            for m in range(k):
-                near[q, m], squares[m] = -1, np.inf
-            x0, x1 = max(cell[i, 0] - ring, 0), min(cell[i, 0] + ring, nx - 1)
-            y0, y1 = max(cell[i, 1] - ring, 0), min(cell[i, 1] + ring, ny - 1)
-            z0, z1 = max(cell[i, 2] - ring, 0), min(cell[i, 2] + ring, nz - 1)
-            for cx in range(x0, x1 + 1):
-                for cy in range(y0, y1 + 1):
-                    line = (cx * ny + cy) * nz
-                    for at in range(start[line + z0], start[line + z1 + 1]):
-                        row = rows[at]
-                        d = (u[row, 0] - x) ** 2 + (u[row, 1] - y) ** 2 + (u[row, 2] - z) ** 2
-                        if d >= squares[k - 1] or row == i:
-                            continue
-                        m = k - 1
-                        while m > 0 and squares[m - 1] > d:
-                            squares[m], near[q, m] = squares[m - 1], near[q, m - 1]
-                            m -= 1
-                        squares[m], near[q, m] = d, row
-            if squares[k - 1] <= (ring * edge) ** 2 or ring > max(nx, ny, nz):
-                break
-            ring *= 2

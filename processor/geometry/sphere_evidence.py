@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from scipy.spatial import cKDTree
 
 from processor.geometry.linalg_small import eigen
-from processor.geometry.nearest_neighbours import nearest_four
 from processor.geometry.selection import least_first
 from processor.geometry.sphere import Sphere, canonical_order, sphere_cells, visible_fraction
 from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit
@@ -156,7 +156,10 @@ def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: Limits) -> 
     rows = order[np.append(True, (points[order[1:]] != points[order[:-1]]).any(axis=1))]  # of equal points the first
     radial, off = _radial(points[rows], ball), residual[rows]
     some = np.arange(0, len(rows), max(1, len(rows) // MOST_NEAREST))
-    if np.sqrt(np.mean((off[some] - off[nearest_four(radial, some)[:, 0]]) ** 2) / 2.0) < limits.white * sd:
+    if (
+        np.sqrt(np.mean((off[some] - off[cKDTree(radial).query(radial[some], k=2)[1][:, 1]]) ** 2) / 2.0)
+        < limits.white * sd
+    ):
         return False
     # The part of the sum of squares of residuals (n,) that the shape of an ellipsoid explains
     x, y, z = _radial(points, ball).T

@@ -22,7 +22,7 @@ from processor.space_frame.spheres.ball_fit import (
 )
 from processor.space_frame.spheres.records import Spheres, StochasticModel
 from processor.space_frame.spheres.stochastic_model import limb_cosine, noise_model, radius_offset
-from tests.bench import ball_fit
+from tests.bench.spheres import ball_fit
 
 
 def test_selection_depends_on_the_ray_and_not_on_the_noisy_point():

@@ -23,7 +23,6 @@ from scipy.spatial import cKDTree
 
 from processor.adjustment.processing import sphere_smoothness
 from processor.geometry import coincident_points
-from processor.geometry.nearest_neighbours import nearest_four
 from processor.model import Floats, Ints, Reason, reason
 
 FEWEST = 100  # points that show a trace: the ratio of variances of as many is known to 15 %
@@ -104,13 +103,14 @@ def recognised(points: Floats, of_sphere: tuple[Floats, Floats] | None = None) -
     if not rows:
         return Processing(step=step, smoothed=smoothed)
     by_patches, mesh = smoothed or (of_sphere is None and len(points) >= coincident_points.PLACE_POINTS), False
+    count = PATCH_POINTS if by_patches else coincident_points.BESIDE
+    near = np.concatenate([of_place[_patches(points[of_place], count)] for of_place in rows])
+    patches = points[near] - points[near[:, :1]]
     if by_patches:
-        near = np.concatenate([of_place[_patches(points[of_place])] for of_place in rows])
-        alike, mesh = _smoothed(points[near] - points[near[:, :1]], step, len(points))
+        alike, mesh = _smoothed(patches, step, len(points))
         smoothed |= alike
     # The fourth neighbour of chance points is about twice as far as the first, which may be a copy.
-    fourth = np.concatenate([_fourth(points[of_place]) for of_place in rows])
-    spacing = 0.5 * float(np.median(np.linalg.norm(fourth, axis=1)))
+    spacing = 0.5 * float(np.median(np.linalg.norm(patches[:, 4], axis=1)))
     places = [points[of_place] - points[of_place].min(axis=0) for of_place in rows]
     return Processing(step=step, cell=0.0 if smoothed else _cell(places, spacing), smoothed=smoothed, mesh=mesh)
 
@@ -129,19 +129,10 @@ def agreed(traces: Sequence[Processing]) -> list[Processing]:
 # --- smoothing -------------------------------------------------------------------------------------------------------
 
 
-def _some(place: Floats) -> Ints:
-    return np.linspace(0, len(place) - 1, min(PATCHES, len(place))).astype(np.int64)
-
-
-def _fourth(place: Floats) -> Floats:
-    """Return where the fourth neighbours (m, 3) of some points of a place (n, 3) lie, from these."""
-    sample = _some(place)
-    return place[nearest_four(place, sample)[:, -1]] - place[sample]
-
-
-def _patches(place: Floats) -> Ints:
-    """Return some points of a place and their nearest neighbours, ascending, as rows (m, k)."""
-    near: Ints = cKDTree(place).query(place[_some(place)], k=PATCH_POINTS)[1]
+def _patches(place: Floats, count: int) -> Ints:
+    """Return some points of a place and their nearest neighbours, ascending, as rows (m, count)."""
+    sample = np.linspace(0, len(place) - 1, min(PATCHES, len(place))).astype(np.int64)
+    near: Ints = cKDTree(place).query(place[sample], k=count)[1]
     return near
 
 
