@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial import cKDTree
 
 import processor
@@ -139,6 +140,22 @@ def test_edges_are_no_smoothing(seed):
     points = edges(seed)
     assert recognised(points) == Processing()
     assert recognised(smoothed(points, 12)).smoothed
+
+
+@pytest.mark.parametrize(("correlation", "ratio"), [(0.5, 2), (0.7, 1), (0.7, 8), (0.9, 4)])
+@pytest.mark.parametrize("seed", SEEDS[:3])
+def test_lines_of_a_scanner_that_share_errors_are_no_smoothing(seed, correlation, ratio):
+    """Points 2 mm apart along lines that are ``ratio`` times as far apart; errors of a line are autoregressive."""
+    rng = np.random.default_rng(seed)
+    lines, along = (150, 150) if ratio == 1 else (100, 400)
+    white = rng.normal(size=(lines, along))
+    off = 0.8 * lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], white, axis=1)
+    u = 2.0 * (np.arange(along) + rng.random((lines, 1)))
+    v = np.broadcast_to(2.0 * ratio * np.arange(lines)[:, None], u.shape)
+    points = np.stack([u, v, off], axis=-1).reshape(-1, 3) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    assert not recognised(points).smoothed
+    if ratio <= 2:
+        assert recognised(smoothed(points, 20)).smoothed
 
 
 def test_points_sampled_from_a_mesh():

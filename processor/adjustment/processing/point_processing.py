@@ -5,7 +5,8 @@ Points of a scanner have noise that neighbours do not share, and lie where its r
 - rounding: coordinates are multiples of a step;
 - thinning to one point in each cell, the centroid or the point nearest to the centre: coordinates repeat with the
   edge of a cell in a periodogram, and cells hold one point each, but cells of that size elsewhere hold several;
-- smoothing: residuals of neighbours differ by less than those of a surface scatter (von Neumann 1941);
+- smoothing: residuals of neighbours differ by less than those of a surface scatter (von Neumann 1941), also across the
+  lines of a scanner, the points of which may share errors;
 - sampling of a mesh: a point and its nearest neighbours lie in one plane, to the last digits.
 
 Copies of points count once (:mod:`processor.geometry.coincident_points`), and what rounding and thinning leave has
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -41,17 +43,20 @@ LEAST_AGREE = 0.3  # of the places
 SAME_CELL, HALF = 0.01, 0.5  # relative difference of cells of two scans, and share of the scans that have the same
 HALF_AN_EDGE = 0.5 * (1.0 - np.eye(3))  # along two axes each: where cells that hold one point hold none or two
 WIDE = 8.0  # extent along an axis, in distances of neighbours, from which it holds cells: noise of a plane is below it
-PATCHES, PATCH_POINTS = 100, 64  # of a place, where a surface is fitted: wider than what filters take, 8 to 30 points
+# Patches of a place, where a surface is fitted, and their points. The larger ones show what lines of a scanner have in
+# common, and count unless their residuals are BENT times those of the smaller, as at edges and on small balls.
+PATCHES, PATCH_POINTS, FEWER_POINTS, BENT = 100, 160, 64, 2.0
 TERMS, RIDGE = 6, 1e-9  # of a surface of second order, and what keeps it determined where points lie in lines
 FLATTEST, LEAST_FLAT = 8, 25  # of the patches one in as many counts, those without edges and other surfaces
-# Median squared difference of nearest neighbours over that of white noise. Of bridges, halls, frames and plates of
-# scanners with correlated noise it was 0.88 to 1.15, of means of 8 and 20 and moving least squares 0.26 to 0.65, of
-# samples of meshes 0.59 to 0.75.
+# Median squared difference of nearest neighbours over that of white noise, in the smaller patches: after means of 6 to
+# 50 neighbours, moving least squares and of samples of meshes it was 0.1 to 0.72; of scanners, whose lines may share
+# errors, 0.3 to 1.4.
 SMOOTH = 0.78
-# The second greatest of the nearest four: points of one line of a scanner share its errors, those of the next line do
-# not. Of 14 scans whose lines are correlated by 0.3 it was 0.94 to 1.11 (the first 0.52 to 0.92), of smoothed ones and
-# samples of meshes up to 0.86.
-ABOUT, SMOOTH_ABOUT = 4, 0.9
+# The greater of two: the same of the second greatest of the nearest four, and of the nearest across lines. Lines share
+# no errors: of 120 scans (of three classes of scanners, merged, of lines with correlations of 0 to 0.9 that were 1 to 8
+# times as far apart as their points, real ones) it was 0.93 or more where SMOOTH is not kept, and of 84 smoothed clouds
+# and samples of meshes 0.83 or less, but of dense lines that were smoothed along themselves alone.
+ABOUT, ACROSS = 4, 0.9
 CHANCE = 5.5  # over the root of the number of points: 3.7 standard deviations of that median of white noise
 IN_PLANE, LEAST_IN_PLANE = 0.02, 0.1  # thickness of five neighbours in sd of residuals; by chance 2e-4 are so thin
 
@@ -103,8 +108,8 @@ def recognised(points: Floats, of_sphere: tuple[Floats, Floats] | None = None) -
     if not rows:
         return Processing(step=step, smoothed=smoothed)
     by_patches, mesh = smoothed or (of_sphere is None and len(points) >= coincident_points.PLACE_POINTS), False
-    count = PATCH_POINTS if by_patches else coincident_points.BESIDE
-    near = np.concatenate([of_place[_patches(points[of_place], count)] for of_place in rows])
+    size = min(PATCH_POINTS if by_patches else coincident_points.BESIDE, *map(len, rows))
+    near = np.concatenate([of_place[_patches(points[of_place], size)] for of_place in rows])
     patches = points[near] - points[near[:, :1]]
     if by_patches:
         alike, mesh = _smoothed(patches, step, len(points))
@@ -129,18 +134,44 @@ def agreed(traces: Sequence[Processing]) -> list[Processing]:
 # --- smoothing -------------------------------------------------------------------------------------------------------
 
 
-def _patches(place: Floats, count: int) -> Ints:
-    """Return some points of a place and their nearest neighbours, ascending, as rows (m, count)."""
+def _patches(place: Floats, size: int) -> Ints:
+    """Return some points of a place and their nearest neighbours, ascending, as rows (m, size)."""
     sample = np.linspace(0, len(place) - 1, min(PATCHES, len(place))).astype(np.int64)
-    near: Ints = cKDTree(place).query(place[sample], k=count)[1]
+    near: Ints = cKDTree(place).query(place[sample], k=size)[1]
     return near
 
 
 def _smoothed(near: Floats, step: float, count: int) -> tuple[bool, bool]:
     """Whether errors of neighbours are alike, and whether these also lie in one plane, as samples of a mesh.
 
-    To ``near`` (m, k, 3), patches of a cloud of ``count`` points, a surface of second order is fitted. Neighbours are
-    those along the surface: in space the nearest of several is that of the most similar error.
+    ``near`` (m, k, 3) are patches of a cloud of ``count`` points.
+    """
+    fewer, larger = (_alike(near[:, :size]) for size in (FEWER_POINTS, PATCH_POINTS))
+    # Errors of rounding are alike of neighbours by themselves.
+    if not fewer.sd > step:
+        return False, False
+    used = larger if larger.sd <= BENT * fewer.sd else fewer
+    if fewer.nearest >= min(SMOOTH, 1.0 - CHANCE / np.sqrt(count)) or used.others >= ACROSS:
+        return False, False
+    five = near[fewer.flat, :5] - near[fewer.flat, :5].mean(axis=1, keepdims=True)
+    thickness = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(five, 1, 2) @ five)[:, 0], 0.0))
+    return True, bool(np.mean(thickness < IN_PLANE * fewer.sd) > LEAST_IN_PLANE)
+
+
+class _Alike(NamedTuple):
+    """How alike errors of the nearest and of other neighbours are, 1 = not; their sd; the patches (f,) that count."""
+
+    nearest: float
+    others: float
+    sd: float
+    flat: Ints
+
+
+def _alike(near: Floats) -> _Alike:
+    """Compare the errors of neighbours in patches (m, k, 3), off a surface of second order.
+
+    Neighbours are those along the surface: in space the nearest of several is that of the most similar error. The sd is
+    0 where a patch has no errors.
     """
     off = near - near.mean(axis=1, keepdims=True)
     squares, axes = np.linalg.eigh(np.swapaxes(off, 1, 2) @ off)
@@ -152,21 +183,25 @@ def _smoothed(near: Floats, step: float, count: int) -> tuple[bool, bool]:
     errors = (height - fitted[..., 0]) * size
     variance = np.sum(errors**2, axis=1) / (near.shape[1] - TERMS)
     flat = np.argsort(variance, kind="stable")[: max(len(variance) // FLATTEST, LEAST_FLAT)]
-    sd = float(np.sqrt(np.median(variance[flat])))
-    # Errors of rounding are alike of neighbours by themselves.
-    if not variance[flat[0]] > 0.0 or step > sd:
-        return False, False
-    away = (u[flat, :, None] - u[flat, None]) ** 2 + (v[flat, :, None] - v[flat, None]) ** 2
+    if not variance[flat[0]] > 0.0:
+        return _Alike(1.0, 1.0, 0.0, flat)
+    place = u[flat] + 1j * v[flat]
+    step = place[:, None] - place[:, :, None]
+    away = np.abs(step)
     away[:, range(away.shape[1]), range(away.shape[1])] = np.inf
-    nearest = np.argsort(away, axis=2)[:, :, :ABOUT].reshape(len(flat), -1)
-    of_nearest = np.take_along_axis(errors[flat], nearest, axis=1).reshape(len(flat), -1, ABOUT)
-    alike = 0.5 * np.mean((errors[flat][:, :, None] - of_nearest) ** 2, axis=1) / variance[flat, None]
-    typical = np.median(alike, axis=0)
-    if typical[0] >= min(SMOOTH, 1.0 - CHANCE / np.sqrt(count)) or np.sort(typical)[-2] >= SMOOTH_ABOUT:
-        return False, False
-    five = near[flat, :5] - near[flat, :5].mean(axis=1, keepdims=True)
-    thickness = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(five, 1, 2) @ five)[:, 0], 0.0))
-    return True, bool(np.mean(thickness < IN_PLANE * sd) > LEAST_IN_PLANE)
+    nearest = np.argsort(away, axis=2)[:, :, :ABOUT]
+    # Lines run the way of most of the nearest neighbours.
+    way = np.angle(np.mean(np.sign(np.take_along_axis(step, nearest[:, :, :1], axis=2)) ** 2, axis=1))
+    turned = step * np.exp(-0.5j * way)[:, None]
+    away[np.abs(turned.imag) <= np.abs(turned.real)] = np.inf
+    other = np.concatenate([nearest, np.argmin(away, axis=2)[..., None]], axis=2)
+    seen = np.ones(other.shape)
+    seen[..., ABOUT] = np.isfinite(np.min(away, axis=2))
+    of_other = np.take_along_axis(errors[flat], other.reshape(len(flat), -1), axis=1).reshape(other.shape)
+    square = np.sum(seen * (errors[flat][:, :, None] - of_other) ** 2, axis=1) / np.maximum(np.sum(seen, axis=1), 1.0)
+    alike = np.median(np.where(seen.any(axis=1), 0.5 * square / variance[flat, None], 1.0), axis=0)
+    others = max(float(alike[ABOUT]), float(np.sort(alike[:ABOUT])[-2]))
+    return _Alike(float(alike[0]), others, float(np.sqrt(np.median(variance[flat]))), flat)
 
 
 # --- thinning --------------------------------------------------------------------------------------------------------
