@@ -83,9 +83,14 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
         return -1
     if best == index:
         return None
-    # The first rough pose may have missed the part itself: a scan is called wrong only after all that are promising.
-    own = shapes[index].mesh, rough(index, None)
-    return best if _shows_other(few, own, (shapes[best].mesh, T_best)) else None
+    # The first rough pose may have missed the part itself: a scan is called wrong only after all that are promising,
+    # and not by what millimetres of a rough pose show.
+    fewer = thinned(few, surface_registration.RIVAL_POINTS)
+    own, other = (
+        (shapes[k].mesh, surface_registration.fine(fewer, shapes[k].mesh, shapes[k].axes, T).T_design_scan)
+        for k, T in ((index, rough(index, None)), (best, T_best))
+    )
+    return best if _shows_other(few, own, other) else None
 
 
 def _other_shapes(index: int, numbers: Iterable[int], shapes: Shapes) -> list[int]:
@@ -113,7 +118,10 @@ def locate(points: Floats, index: int, shapes: Shapes) -> tuple[Floats, int, flo
     for place in own:
         region = points[located_part.about_design(points, place.T, designs[0])]
         body = thinned(region[located_part.at_design(region, place.T, designs[0])], POINTS)
-        bodies = located_part.which(region, designs, [[place], *located_part.locate(region, designs[1:], body)], 0)
+        # Points are counted in samples of one density: the region's are denser than those of the scan.
+        count = int(located_part.at_design(thinned(region, located_part.SHOWN_POINTS), place.T, designs[0]).sum())
+        there = [[replace(place, count=count)], *located_part.locate(region, designs[1:], body)]
+        bodies = located_part.which(region, designs, there, 0)
         if bodies and 0 in bodies[0].numbers:
             found.append(place)
         elif bodies and other is None:
