@@ -14,6 +14,7 @@ from scipy.spatial.distance import cdist
 
 from designgen.checks import expect
 from designgen.randomness import generator
+from designgen.rigid import rigid
 from designgen.scanning import clutter
 from designgen.scanning.surfaces import Builder
 from processor.model import Floats
@@ -41,11 +42,15 @@ class Params:
 
 @dataclass(frozen=True)
 class Box:
-    """A box about what is scanned: axes (3, 3, rows) along, across and up, middle (3,) and half sizes (3,), mm."""
+    """A box about what is scanned: axes (3, 3, rows) along, across and up, middle (3,) and half sizes (3,), mm.
+
+    ``bottom`` (n, 3) are points along an underside that is not the box's, in the scene's frame.
+    """
 
     axes: Floats
     middle: Floats
     half: Floats
+    bottom: Floats | None = None
 
     @classmethod
     def about(cls, points: Floats) -> Box:
@@ -57,6 +62,19 @@ class Box:
         """Return the places (n, 3) of local coordinates (n, 3)."""
         placed: Floats = self.middle + np.asarray(local) @ self.axes
         return placed
+
+    def lowest(self, along: float, half: float) -> float:
+        """Return the height of the underside between ``half`` on both sides of a place along."""
+        if self.bottom is None:
+            return -float(self.half[2])
+        local = (self.bottom - self.middle) @ self.axes.T
+        within = np.linspace(along - half, along + half, 9)
+        return float(np.interp(within, local[:, 0], local[:, 2]).min())
+
+    def levelled(self, T: Floats) -> Floats:
+        """Return a pose T_scan_scene (4, 4) with the heading and the place of another one, in which the box is up."""
+        c, s = T[:2, 0] / np.linalg.norm(T[:2, 0])
+        return rigid(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ self.axes, T[:3, 3])
 
 
 def add(
@@ -123,10 +141,10 @@ def _add_ground(builder: Builder, box: Box, reach: Floats, floor: float, rng: np
 
 
 def _add_trestles(builder: Builder, box: Box, floor: float, rng: np.random.Generator) -> None:
-    """Add two trestles that touch the box from below."""
-    half = np.array([75.0, 1.1 * box.half[1], 0.5 * (-box.half[2] - floor)])
+    """Add two trestles that touch what is in the box from below."""
     for side in (-1.0, 1.0):
         along = side * rng.uniform(0.45, 0.75) * box.half[0]
+        half = np.array([75.0, 1.1 * box.half[1], 0.5 * (box.lowest(along, 75.0) - floor)])
         _add_box(builder, box, "trestle", np.array([along, 0.0, floor + half[2]]), half)
 
 

@@ -53,12 +53,14 @@ def _made(
     registered: list[Floats] = []  # poses of each part's stations in the frame of its scan
     station_truths: list[StationTruth] = []
     for number, part in enumerate(built):
-        T_scan_bridge = random_pose(generator(seed, f"pose {part.name}"))
+        T_scan_bridge, box = random_pose(generator(seed, f"pose {part.name}")), _box(part)
+        if isinstance(scanning, ByRays) and scanning.surroundings is not None:  # by a scanner on the same floor
+            T_scan_bridge = box.levelled(T_scan_bridge)
         R, t = T_scan_bridge[:3, :3], T_scan_bridge[:3, 3]
         # The steel expands about the origin of its scan: p_scan = grown (R p_bridge + t).
         T_scan_grown = rigid(R, grown * t)
         if isinstance(scanning, ByRays):
-            surveyed = _survey_part(part, number, part_names, grown, scanning, seed)
+            surveyed = _survey_part(part, box, number, part_names, grown, scanning, seed)
             scan, label = survey.merged(surveyed, part.name, T_scan_grown, sum(map(len, registered)), part.name)
             registered.append(T_scan_grown @ surveyed.registered)
             poses_true = T_scan_grown @ surveyed.truth.T_project_station
@@ -96,28 +98,36 @@ def _made(
     )
 
 
+def _box(part: arch_part.ArchPart) -> surroundings.Box:
+    """Return the box about a part's ends, along its chord."""
+    ends = np.vstack([part.key_points(part.s0), part.key_points(part.s1)])
+    along = ends[8:].mean(axis=0) - ends[:8].mean(axis=0)
+    along = along / np.linalg.norm(along)
+    axes = np.stack([along, [0.0, 1.0, 0.0], np.cross(along, [0.0, 1.0, 0.0])])
+    middle = ends.mean(axis=0)
+    return surroundings.Box(axes, middle, np.abs((ends - middle) @ axes.T).max(axis=0), _bottom_edges(part)[0])
+
+
 def _survey_part(
-    part: arch_part.ArchPart, number: int, part_names: tuple[str, ...], grown: float, scanning: ByRays, seed: int
+    part: arch_part.ArchPart,
+    box: surroundings.Box,
+    number: int,
+    part_names: tuple[str, ...],
+    grown: float,
+    scanning: ByRays,
+    seed: int,
 ) -> survey.Survey:
     """Scan one part, enlarged by ``grown``, from stations around it, in the bridge's frame."""
-    params = scanning.params
+    params, about = scanning.params, scanning.surroundings
     builder = Builder()
     for patch in arch_part.ray_patches(part):
         builder.patch(number, dataclasses.replace(patch, at=_scaled(patch.at, grown)))
-    ends = np.vstack([part.key_points(part.s0), part.key_points(part.s1)])
-    along = ends[8:].mean(axis=0) - ends[:8].mean(axis=0)
-    length = float(np.linalg.norm(along))
-    along = along / length
-    axes = np.stack([along, [0.0, 1.0, 0.0], np.cross(along, [0.0, 1.0, 0.0])])
-    middle = ends.mean(axis=0)
-    half = np.abs((ends - middle) @ axes.T).max(axis=0)
-    box, about = surroundings.Box(axes, middle, half), scanning.surroundings
     poses = survey.stations_around_box(box, params, seed, f"{part.name}/", on_floor=about is not None)
     surroundings.add(builder, about, box, poses, seed, part.name)
     places = [T[:3, 3] for T in poses.values()]
     for i in range(params.clutter):
         rng = generator(seed, f"clutter {part.name} {i}")
-        clutter.add_pole(builder, places[i % len(places)], middle, axes[2], (0.3, 0.6), rng, on_ground=False)
+        clutter.add_pole(builder, places[i % len(places)], box.middle, box.axes[2], (0.3, 0.6), rng, on_ground=False)
     return survey.survey(builder.to_surfaces(), part_names, poses, scanning.device, params, seed)
 
 

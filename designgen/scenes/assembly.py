@@ -57,7 +57,9 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     for number, part in enumerate(parts):
         T = random_pose(generator(seed, f"pose {part.name}"))
         if isinstance(scanning, ByRays):
-            surveyed = _surveyed(part, number, names, scanning, seed)
+            box = _box(part)
+            T = T if scanning.surroundings is None else box.levelled(T)  # by a scanner on the same floor
+            surveyed = _surveyed(part, box, number, names, scanning, seed)
             before = sum(len(one.registered) for one in surveys)
             scan, label = survey.merged(surveyed, part.name, T, before, part.name)
             surveys.append(survey.moved(surveyed, T))
@@ -123,19 +125,26 @@ def _drilled(part: Part, errors: Errors, rng: np.random.Generator, ledger: Ledge
     return shifts
 
 
-def _surveyed(part: Part, number: int, names: tuple[str, ...], scanning: ByRays, seed: int) -> Survey:
+def _box(part: Part) -> surroundings.Box:
+    """Return the box about a part as designed, along its axis."""
+    points = np.concatenate([end.key_points() for end in part.ends] + [part.mesh()[0]])
+    T = part.ends[0].T if part.girder is None else part.girder.T
+    local = (points - T[:3, 3]) @ T[:3, :3]
+    low, high = local.min(axis=0), local.max(axis=0)
+    middle = T[:3, :3] @ (0.5 * (low + high)) + T[:3, 3]
+    return surroundings.Box(T[:3, :3].T, middle, 0.5 * (high - low))
+
+
+def _surveyed(
+    part: Part, box: surroundings.Box, number: int, names: tuple[str, ...], scanning: ByRays, seed: int
+) -> Survey:
     """Scan one part as built from stations around it, in the bridge's frame."""
     builder = Builder()
     for patch in part.built():
         builder.patch(number, patch)
-    box = np.concatenate([end.key_points() for end in part.ends] + [part.mesh()[0]])
-    T = part.ends[0].T if part.girder is None else part.girder.T
-    local = (box - T[:3, 3]) @ T[:3, :3]
-    low, high = local.min(axis=0), local.max(axis=0)
-    middle = T[:3, :3] @ (0.5 * (low + high)) + T[:3, 3]
-    around, about = surroundings.Box(T[:3, :3].T, middle, 0.5 * (high - low)), scanning.surroundings
-    poses = survey.stations_around_box(around, scanning.params, seed, f"{part.name}/", on_floor=about is not None)
-    surroundings.add(builder, about, around, poses, seed, part.name)
+    about = scanning.surroundings
+    poses = survey.stations_around_box(box, scanning.params, seed, f"{part.name}/", on_floor=about is not None)
+    surroundings.add(builder, about, box, poses, seed, part.name)
     return survey.survey(builder.to_surfaces(), names, poses, scanning.device, scanning.params, seed)
 
 
