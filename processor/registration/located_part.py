@@ -147,10 +147,15 @@ def _body(points: Floats, designs: Sequence[DesignSurface], places: dict[int, Lo
 
 def _attitude(points: Floats, design: DesignSurface, T: Floats) -> Floats:
     """Return the pose (4, 4) of all that turn a design onto itself that points (n, 3) at it show best."""
+    few, box = thinned(points, POINTS), pose_search.box_of(points)
     turned = [Candidate(turn @ T, T) for turn in pose_search.symmetries(design)]
-    aligned = each(partial(pose_search.align, thinned(points, POINTS), design), turned)
-    rivals = pose_search.rivals_of(pose_search.distinct(aligned, pose_search.box_of(points)))
-    best = surface_registration.decide(points, design, rivals)[0].T
+    aligned = each(partial(pose_search.align, few, design), turned)
+    rivals = pose_search.rivals_of(pose_search.distinct(aligned, box))
+    best = surface_registration.decide(points, design, rivals)[0]
+    # Plates that are seen from one side may lie on their other side: nothing but rings and marks shows it then.
+    shifted = pose_search.on_other_sides(pose_search.evenly(points, design), design, [best], box)
+    found = pose_search.distinct([best, *shifted], box)
+    best = surface_registration.decide(points, design, pose_search.rivals_of(found))[0].T
     fewer = thinned(points, surface_registration.RIVAL_POINTS)
     return surface_registration.fine(fewer, design.mesh, design.axes, best).T_design_scan
 

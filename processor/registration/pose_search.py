@@ -137,7 +137,7 @@ def search(points: Floats, design: DesignSurface) -> list[Candidate]:
     untried = candidates
     for _ in range(SIDE_ROUNDS):  # plates along several axes may lie on their other sides
         known = candidates
-        shifted = _on_other_sides(even, design, _promising(untried, box), box)
+        shifted = on_other_sides(even, design, _promising(untried, box), box)
         candidates = distinct(known + each(aligned, shifted), box)
         untried = [c for c in candidates if not any(c is other for other in known)]
         if not untried or not candidates[0].misfit < known[0].misfit:
@@ -259,7 +259,7 @@ def slid(points: Floats, design: DesignSurface, best: Candidate, box: Floats) ->
     return [c for c in distinct([replace(best, misfit=-np.inf), *found], box) if c.misfit >= 0.0]
 
 
-def _on_other_sides(
+def on_other_sides(
     even: tuple[Floats, Floats], design: DesignSurface, candidates: list[Candidate], box: Floats
 ) -> list[Candidate]:
     """Return stable poses that differ from the candidates by a shift of either side to that side of the design.
