@@ -68,6 +68,7 @@ RUN = (
 )
 # Commands that take minutes or need other machines, and what runs them, or the same with less to do.
 ELSEWHERE = {
+    "processor field-check my-check -o my-scanner": "tests/field_check/test_field_check.py",
     "processor run my-frame -o results --lang zh": "tests/report/test_browser_pages.py",
     "processor run my-bridge -o results": "make demo",
     "processor run my-bridge -o results --method adjustment,design-aided": "make demo",

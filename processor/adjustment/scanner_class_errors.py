@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from typing import NamedTuple
 
@@ -76,17 +76,28 @@ def known() -> ScannerErrors:
 
 
 @contextmanager
-def used(given: Sequence[Instrument]) -> Iterator[None]:
-    """Let the block's scanner be the instruments of a scene: of several the largest of each error; none = not stated.
-
-    Where a scan's instrument is not among them, but others' are, its class is assumed.
-    """
-    errors = [errors_of(one) for one in given]
-    before = _used.set(ScannerErrors(*map(max, zip(*errors, strict=True))) if errors else None)
+def _using(errors: ScannerErrors | None) -> Iterator[None]:
+    before = _used.set(errors)
     try:
         yield
     finally:
         _used.reset(before)
+
+
+def used(given: Sequence[Instrument]) -> AbstractContextManager[None]:
+    """Let the block's scanner be the instruments given: of several the largest of each error; none = not stated."""
+    errors = [errors_of(one) for one in given]
+    return _using(ScannerErrors(*map(max, zip(*errors, strict=True))) if errors else None)
+
+
+def without() -> AbstractContextManager[None]:
+    """Let the block's scanner have no errors but those that points show, as for a check of it."""
+    return _using(ScannerErrors(view_mm=0.0, offset_mm=0.0, scale=0.0, incidence_mm=0.0, direction_rad=0.0))
+
+
+def of_scan(given: Sequence[Instrument], name: str) -> Sequence[Instrument]:
+    """Return the one of a scene's instruments that measured a scan; none where it is not stated."""
+    return [one for one in given if name in one.scans or not one.scans][:1]
 
 
 def of_class(name: str) -> ScannerErrors:

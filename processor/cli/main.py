@@ -4,7 +4,21 @@ from __future__ import annotations
 
 import click
 
-from processor.cli import batch, check, compare, convert, export, history, init, papers, report, run, validate, verify
+from processor.cli import (
+    batch,
+    check,
+    compare,
+    convert,
+    export,
+    field_check,
+    history,
+    init,
+    papers,
+    report,
+    run,
+    validate,
+    verify,
+)
 from processor.cli.help_text import Suggesting
 from processor.version import __version__
 
@@ -19,5 +33,20 @@ def commands() -> None:
     """
 
 
-for module in (run, batch, check, compare, convert, export, history, init, report, validate, papers, verify):
+for module in (
+    run,
+    batch,
+    check,
+    compare,
+    field_check,
+    convert,
+    export,
+    field_check,
+    history,
+    init,
+    report,
+    validate,
+    papers,
+    verify,
+):
     commands.add_command(getattr(module, module.__name__.rpartition(".")[2]))

@@ -123,10 +123,11 @@ def of_class(name: str = ASSUMED) -> Instrument:
     numbers = classes()[name]
     place = Place("scanners.toml").within(name)
     known = {term: kind.value(numbers[term], term, place) for term, kind in TERMS.items()}
-    return _instrument(known, name=name, scanner_class=name, source=numbers["source"])
+    return made(known, name=name, scanner_class=name, source=numbers["source"])
 
 
-def _instrument(known: Mapping[str, Known], **about: Any) -> Instrument:
+def made(known: Mapping[str, Known], **about: Any) -> Instrument:
+    """Return the instrument of errors by their names; ``about`` are its other fields."""
     return Instrument(
         terms=tuple(known),
         value=np.array([one.value for one in known.values()]),
@@ -190,7 +191,7 @@ def from_file(content: Any, place: Place) -> Instrument:
     known = of_class(given.scanner_class).known | {
         term: found for term in TERMS if (found := getattr(given, term)) is not None
     }
-    return _instrument(
+    return made(
         known,
         name=given.about or given.scanner_class,
         scanner_class=given.scanner_class,

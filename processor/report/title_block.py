@@ -48,14 +48,14 @@ def entries(scene: Scene) -> dict[str, str]:
 def instrument(scene: Scene) -> Text:
     """Say whose errors the intervals hold, and by what check these are known."""
     each = [_instrument(one) for one in scene.instruments]
-    return text("{each:;}", each=each) if each else text("{name} (class, assumed)", name=instruments.ASSUMED)
+    return text("{each:;}", each=each) if each else text("{name} (class, assumed)", name=label(instruments.ASSUMED))
 
 
 def _instrument(one: Instrument) -> Text:
     if one.checked:
         found = text("{name} {serial}, checked {day}", name=one.name, serial=one.serial, day=one.checked)
     elif one.name == one.scanner_class:
-        found = text("{name} (class)", name=one.name)
+        found = text("{name} (class)", name=label(one.name))
     else:
         found = text("{name} {serial}, not checked", name=one.name, serial=one.serial)
     return text("{found} ({scans})", found=found, scans=list(one.scans)) if one.scans else found

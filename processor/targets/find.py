@@ -9,7 +9,7 @@ import numpy as np
 
 from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
-from processor.model import Control, Floats, Ints, Reason, Scene, TargetKind, Targets, reason
+from processor.model import Control, Floats, Ints, Reason, Scene, TargetKind, Targets, TargetSearch, reason
 from processor.scene_cloud import MergedCloud
 from processor.space_frame.params import Params
 from processor.space_frame.result import Balls, Flag
@@ -23,19 +23,26 @@ MOST_SPHERES = 30  # of a view
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Found:
+class Found:
     """A target in a scan, in the scan's frame; ``station`` as in Control.
 
-    ``sd`` has the error that all ranges of a view share: no fit of one target shows it.
+    ``covariance`` (3, 3) has what the class of the scanner, or its check, says of a sighting: no fit of one target
+    shows it. ``scanner`` (3,) is where it was seen from, None if not known.
     """
 
     kind: TargetKind
     scan: int
     station: int
     place: Floats
-    sd: float
+    scanner: Floats | None
+    covariance: Floats
     points: int
     fit: float
+
+    @property
+    def sd(self) -> float:
+        """The largest standard deviation along any direction, mm."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
 
 
 def with_targets(scene: Scene) -> Scene:
@@ -43,25 +50,11 @@ def with_targets(scene: Scene) -> Scene:
     search = scene.target_search
     if search is None or scene.targets is not None:
         return scene
-    seen = views(scene)
-    found: list[_Found] = []
+    found: list[Found] = []
     remarks: list[Reason] = []
     for row, scan in enumerate(scene.scans):
-        if not np.isnan(search.checkerboard_mm) and not np.isfinite(scan.intensity).any():
-            remarks.append(reason("targets.no-intensities", scan=scan.name))
-        for station, points, bright, scanner in _of_views(seen, row):
-            if not np.isnan(search.checkerboard_mm):
-                boards, left_out = checkerboard.search(points, bright, search.checkerboard_mm)
-                found += [_of_board(one, row, station, scan.origin) for one in boards]
-                if left_out:
-                    looked_at = checkerboard.MOST_SEEDS
-                    remarks.append(reason("targets.most-places", scan=scan.name, places=looked_at, left=left_out))
-            if not np.isnan(search.sphere_radius_mm):
-                balls = _spheres(points, scanner, search.sphere_radius_mm)
-                sure = [k for k, flag in enumerate(balls.flag) if flag is Flag.OK]
-                found += [_of_sphere(balls, k, row, station, scan.origin) for k in sure]
-                if len(balls) >= MOST_SPHERES:
-                    remarks.append(reason("targets.most-spheres", scan=scan.name, spheres=len(balls)))
+        with scanner_class_errors.used(scanner_class_errors.of_scan(scene.instruments, scan.name)):
+            found += found_in(scene, row, search, remarks)
     names = _names(scene, found, remarks)
     return replace(
         scene,
@@ -76,6 +69,27 @@ def with_targets(scene: Scene) -> Scene:
     )
 
 
+def found_in(scene: Scene, row: int, search: TargetSearch, remarks: list[Reason]) -> Iterator[Found]:
+    """Yield the targets of a scan; what is to be said of the search is added to ``remarks``."""
+    scan = scene.scans[row]
+    if not np.isnan(search.checkerboard_mm) and not np.isfinite(scan.intensity).any():
+        remarks.append(reason("targets.no-intensities", scan=scan.name))
+    for station, points, bright, scanner in _of_views(views(scene), row):
+        if not np.isnan(search.checkerboard_mm):
+            boards, left_out = checkerboard.search(points, bright, search.checkerboard_mm)
+            for one in boards:
+                yield _of_board(one, row, station, scan.origin, scanner)
+            if left_out:
+                looked_at = checkerboard.MOST_SEEDS
+                remarks.append(reason("targets.most-places", scan=scan.name, places=looked_at, left=left_out))
+        if not np.isnan(search.sphere_radius_mm):
+            balls = _spheres(points, scanner, search.sphere_radius_mm)
+            for k in (k for k, flag in enumerate(balls.flag) if flag is Flag.OK):
+                yield _of_sphere(balls, k, row, station, scan.origin, scanner)
+            if len(balls) >= MOST_SPHERES:
+                remarks.append(reason("targets.most-spheres", scan=scan.name, spheres=len(balls)))
+
+
 def _spheres(points: Floats, scanner: Floats | None, radius_mm: float) -> Balls:
     """Return the spheres among points (n, 3), flagged ones too, by the search of step ``spheres``.
 
@@ -86,20 +100,41 @@ def _spheres(points: Floats, scanner: Floats | None, radius_mm: float) -> Balls:
     return search_without_design.search(MergedCloud(points, np.zeros(3), seen_from), params).balls
 
 
-def _of_board(one: Checkerboard, scan: int, station: int, origin: Floats) -> _Found:
-    sd = float(np.hypot(max(one.sd, LEAST_SD_MM), scanner_class_errors.known().view_mm))
-    return _Found(
-        kind=TargetKind.CHECKERBOARD, scan=scan, station=station, place=one.centre + origin, sd=sd,
+def _of_board(one: Checkerboard, scan: int, station: int, origin: Floats, scanner: Floats | None) -> Found:
+    return Found(
+        kind=TargetKind.CHECKERBOARD, scan=scan, station=station, place=one.centre + origin,
+        scanner=None if scanner is None else scanner + origin,
+        covariance=_own(one.covariance) + _by_class(one.centre, scanner, of_range=True),
         points=one.points, fit=one.fit,
     )  # fmt: skip
 
 
-def _of_sphere(balls: Balls, row: int, scan: int, station: int, origin: Floats) -> _Found:
-    sd = float(np.sqrt(np.linalg.eigvalsh(balls.covariance[row, :3, :3])[-1]))
-    return _Found(
+def _of_sphere(balls: Balls, row: int, scan: int, station: int, origin: Floats, scanner: Floats | None) -> Found:
+    return Found(
         kind=TargetKind.SPHERE, scan=scan, station=station, place=balls.centres[row] + origin,
-        sd=max(sd, LEAST_SD_MM), points=int(balls.points[row]), fit=float("nan"),
+        scanner=None if scanner is None else scanner + origin,
+        # A ball's own has the range of the class.
+        covariance=_own(balls.covariance[row, :3, :3]) + _by_class(balls.centres[row], scanner, of_range=False),
+        points=int(balls.points[row]), fit=float("nan"),
     )  # fmt: skip
+
+
+def _own(covariance: Floats) -> Floats:
+    """Return the covariance (3, 3) of a target's fit, not below LEAST_SD_MM along its largest direction."""
+    least: Floats = covariance * max(LEAST_SD_MM**2 / float(np.linalg.eigvalsh(covariance)[-1]), 1.0)
+    return least
+
+
+def _by_class(place: Floats, scanner: Floats | None, of_range: bool) -> Floats:
+    """Return the covariance (3, 3) of a sighting by the scanner's errors: along its ray, and across it."""
+    known = scanner_class_errors.known()
+    if scanner is None:  # of unknown range: from any side
+        return known.view_mm**2 * np.eye(3) if of_range else np.zeros((3, 3))
+    length = float(np.linalg.norm(place - scanner))
+    along = np.outer(place - scanner, place - scanner) / max(length, 1e-9) ** 2
+    variance = known.view_mm**2 + (known.scale * length) ** 2 if of_range else 0.0
+    covariance: Floats = variance * along + (known.direction_rad * length) ** 2 * (np.eye(3) - along)
+    return covariance
 
 
 def _of_views(seen: Views, row: int) -> Iterator[tuple[int, Floats, Floats, Floats | None]]:
@@ -113,7 +148,7 @@ def _of_views(seen: Views, row: int) -> Iterator[tuple[int, Floats, Floats, Floa
         yield view if view < seen.stations else -1, scan.points[rows], bright[rows], at
 
 
-def _names(scene: Scene, found: list[_Found], remarks: list[Reason]) -> Ints:
+def _names(scene: Scene, found: list[Found], remarks: list[Reason]) -> Ints:
     """Return the row (t,) of the control point that each target is, -1 = none.
 
     A remark on targets that contradict the others is added to ``remarks``.
@@ -139,7 +174,7 @@ def _names(scene: Scene, found: list[_Found], remarks: list[Reason]) -> Ints:
     return rows
 
 
-def _with_sightings(control: Control | None, found: list[_Found], names: Ints) -> Control | None:
+def _with_sightings(control: Control | None, found: list[Found], names: Ints) -> Control | None:
     """Add the named targets to the sightings; one that the project states already stays as stated."""
     if control is None:
         return None

@@ -207,7 +207,7 @@ LAYERS = (
     STEPS,
     ("targets",),
     ("pipeline",),
-    ("compare", "evaluation"),
+    ("compare", "evaluation", "field_check"),
     ("results",),
     ("epochs",),
     ("report", "clouds"),

@@ -384,7 +384,9 @@ def test_interval_of_a_target_includes_the_common_range_error_of_a_view():
     scene, _ = scene_of_board()
     found = find.with_targets(scene)
     (one,) = boards_in(scene.scans[0].points, scene.scans[0].intensity)
-    assert found.targets.sd[0] == pytest.approx(np.hypot(0.5, max(one.sd, find.LEAST_SD_MM)))
+    # Along the ray, where the covariance of the fit is not the largest
+    length = np.linalg.norm(found.targets.places[0])
+    assert np.hypot(0.5, 5e-6 * length) < found.targets.sd[0] < np.linalg.norm([0.5, 5e-6 * length, one.sd])
     assert found.control.seen_sd[0] == found.targets.sd[0]
 
 
@@ -408,7 +410,17 @@ def test_contradicting_targets_are_reported():
     seen[2, 2] += 40.0
     control = Control(tuple(f"K{i}" for i in range(6)), positions=known, sd=np.full(6, 0.5))
     found = [
-        find._Found(kind="sphere", scan=0, station=-1, place=place, sd=0.1, points=100, fit=np.nan) for place in seen
+        find.Found(
+            kind="sphere",
+            scan=0,
+            station=-1,
+            place=place,
+            scanner=None,
+            covariance=0.01 * np.eye(3),
+            points=100,
+            fit=np.nan,
+        )
+        for place in seen
     ]
     scan = Scan("S1", np.zeros((1, 3)), T_project_scan=np.eye(4))
     remarks: list = []
