@@ -154,14 +154,16 @@ def adjust(seen: Sightings, places: Floats, poses: Floats, of_class: Mapping[str
         if step.max() < SETTLED:
             break
     known = len(system.y) > 3 * len(seen.places)
-    estimates = dict(zip(factors, _intervals(theta, by_class, Q, P, system.U), strict=True))
+    W = np.linalg.inv(system.U + np.tensordot(by_class, Q, 1))
+    WA = W @ system.A
+    of_class_P = W - WA @ np.linalg.solve(system.A.T @ WA, WA.T)
+    rest = of_class_P @ system.y
+    tests = [_test(limit, q, of_class_P, rest) for limit, q in zip(by_class, Q, strict=True)]
+    estimates = dict(zip(factors, _intervals(theta, Q, P, system.U, tests), strict=True))
     dof = estimates["range_view"].dof
     for name, row in {"range_offset": -1 - known, **({"scale": -1} if known else {})}.items():
         half = NORMAL_95 * float(np.sqrt(N[row, row]) * student_factor(dof))
         estimates[name] = Estimate(state.scale if name == "scale" else state.offset, half, dof)
-    W = np.linalg.inv(system.U + np.tensordot(by_class, Q, 1))
-    WA = W @ system.A
-    rest = W @ system.y - WA @ np.linalg.solve(system.A.T @ WA, WA.T @ system.y)
     residuals = system.y[: 3 * len(seen.places)].reshape(-1, 3)
     return Adjusted(state.places, residuals, estimates, float(system.y @ rest), len(system.y) - system.A.shape[1])
 
@@ -229,24 +231,32 @@ def _scored(theta: Floats, Q: Sequence[Floats], P: Floats, system: _System) -> F
     return np.maximum(0.5 * (found + theta), 0.0) if (theta > 0.0).all() else found
 
 
-def _intervals(theta: Floats, by_class: Floats, Q: Sequence[Floats], P: Floats, U: Floats) -> list[Estimate]:
-    """Return the standard deviations of the components, with intervals and their tests against the class."""
+def _test(limit: float, q: Floats, P: Floats, rest: Floats) -> tuple[float, float]:
+    """Return the chance that a scanner of the class shows as much of a component, and the power to see twice of it.
+
+    The score of the component where all are those of the class, which would not change with better ones: a scaled
+    chi-square. ``P`` (n, n) is the projector by the class, ``rest`` (n,) what it leaves of the observations.
+    """
+    Pq = P @ q
+    expected, square = float(np.trace(Pq)), float((Pq * Pq.T).sum())
+    dof = expected**2 / square
+    chance = chdtrc(dof, dof * float(rest @ q @ rest) / expected)
+    twice = expected + 3.0 * limit * square
+    return float(chance), float(chdtrc(dof, chdtri(dof, 0.05) * expected / twice))
+
+
+def _intervals(
+    theta: Floats, Q: Sequence[Floats], P: Floats, U: Floats, tests: Sequence[tuple[float, float]]
+) -> list[Estimate]:
+    """Return the standard deviations of the components, with intervals, and their ``tests`` against the class."""
     PQ, PU = [P @ q for q in Q], P @ U
     shared = np.array([[float((a * b.T).sum()) for b in PQ] for a in PQ])
     variance = np.diag(np.linalg.inv(0.5 * shared))
     own = np.array([float((pq * PU.T).sum()) for pq in PQ]) / np.diag(shared)
     found = []
-    for component, limit, u, v in zip(theta, by_class, own, variance, strict=True):
-        dof = max(float(2.0 * (component + u) ** 2 / v), 1.0)
-        statistic = dof * (component + u) / (limit + u)
-        most = float(chdtri(dof, 0.05))
-        found.append(
-            Estimate(
-                float(np.sqrt(component)), _half_width(float(np.sqrt(component)), float(u), dof), dof,
-                chance=float(chdtrc(dof, statistic)),
-                power=float(chdtrc(dof, most * (limit + u) / (4.0 * limit + u))),
-            )
-        )  # fmt: skip
+    for component, u, v, (chance, power) in zip(theta, own, variance, tests, strict=True):
+        dof, value = max(float(2.0 * (component + u) ** 2 / v), 1.0), float(np.sqrt(component))
+        found.append(Estimate(value, _half_width(value, float(u), dof), dof, chance, power))
     return found
 
 

@@ -145,7 +145,7 @@ def test_every_text_of_the_title_block_is_text(tmp_path):
 def test_without_a_title_block_there_are_no_signatures():
     found = title_block.of(of_bridge().scene, PROVENANCE)
     assert (found["company"], found["logo"], found["signatures"]) == ("", "", [])
-    assert [value for _, value in found["rows"]] == ["b.h5, SHA-256 00", "processor 0"]
+    assert [str(value) for _, value in found["rows"]] == ["phase (class, assumed)", "b.h5, SHA-256 00", "processor 0"]
 
 
 def test_the_page_has_no_date_but_those_of_the_input():

@@ -259,7 +259,7 @@ def test_found_targets_become_sightings_of_control_points():
     assert found.targets.name == ("K1",)
     assert found.control.seen[0] == pytest.approx(centre, abs=0.6)  # as of boards at ten metres
     assert (found.control.point.tolist(), found.control.scan.tolist()) == ([0], [0])
-    assert found.control.seen_sd[0] >= find.LEAST_SD_MM
+    assert found.control.seen_sd[0] >= np.sqrt(find.LEAST[0, 0])
     assert str(summary(found)) == "targets in 1 scan: 1 checkerboard; 1 of them are control points"
     assert "棋盘格" in messages("zh").text(summary(found))
     assert find.with_targets(found) is found
