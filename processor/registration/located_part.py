@@ -155,9 +155,9 @@ def _attitude(points: Floats, design: DesignSurface, T: Floats) -> Floats:
     # Plates that are seen from one side may lie on their other side: nothing but rings and marks shows it then.
     shifted = pose_search.on_other_sides(pose_search.evenly(points, design), design, [best], box)
     found = pose_search.distinct([best, *shifted], box)
-    best = surface_registration.decide(points, design, pose_search.rivals_of(found))[0].T
+    best = surface_registration.decide(points, design, pose_search.rivals_of(found))[0]
     fewer = thinned(points, surface_registration.RIVAL_POINTS)
-    return surface_registration.fine(fewer, design.mesh, design.axes, best).T_design_scan
+    return surface_registration.fine(fewer, design.mesh, design.axes, best.T).T_design_scan
 
 
 def about_design(points: Floats, T: Floats, design: DesignSurface, margin: float | None = None) -> Bools:

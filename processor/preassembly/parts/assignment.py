@@ -86,11 +86,11 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     # The first rough pose may have missed the part itself: a scan is called wrong only after all that are promising,
     # and not by what millimetres of a rough pose show.
     fewer = thinned(few, surface_registration.RIVAL_POINTS)
-    own, other = (
+    own, rival = (
         (shapes[k].mesh, surface_registration.fine(fewer, shapes[k].mesh, shapes[k].axes, T).T_design_scan)
         for k, T in ((index, rough(index, None)), (best, T_best))
     )
-    return best if _shows_other(few, own, other) else None
+    return best if _shows_other(few, own, rival) else None
 
 
 def _other_shapes(index: int, numbers: Iterable[int], shapes: Shapes) -> list[int]:
