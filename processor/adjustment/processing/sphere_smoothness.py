@@ -18,10 +18,10 @@ NEAREST = 5  # the point itself, two along a line of the scanner and two across
 LOOKED_AT = 500  # points whose neighbours are looked at: the ratio of white noise is known to 0.7 / root of it
 TERMS, RIDGE = 6, 1e-9  # of a surface of second order, and what keeps it determined where points lie in lines
 # White noise has 1. Errors correlated by 0.3 to 0.5 along the lines of a scanner, two of four neighbours, leave 0.85 to
-# 0.75; three real scans of a sphere of 50 mm 0.73 to 0.92, also with one point of 2 to 32; means of 8 and 20 and moving
-# least squares of 450 points or more 0.33 to 0.55, of points nearer than their noise up to 0.66. Smoothed points of
-# which there are some 100 have up to 0.86: they are not told from those of real scanners.
-SMOOTH = 0.7
+# 0.75; three real scans of a sphere of 50 mm 0.65 to 0.96; means of 8 and 20 and moving least squares of 450 points or
+# more 0.33 to 0.55, of points nearer than their noise up to 0.66. Some 100 smoothed points have up to
+# 0.86: neither of these are told from those of real scanners.
+SMOOTH = 0.62
 
 
 def smooth(directions: Floats, errors: Floats) -> bool:
