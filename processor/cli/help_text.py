@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 
-import processor
 from processor.model import did_you_mean
 
 # As of processor.jobs.exit_codes.
@@ -49,7 +48,7 @@ class RunCommand(click.Command):
 
         steps = [
             (name, ", ".join(methods))
-            for name, methods in sorted(map(_named, Path(processor.__path__[0]).glob("*/step.py")))
+            for name, methods in sorted(map(_named, Path(__file__).parents[1].glob("*/step.py")))
         ]
         lists = (
             ("Steps, and their methods (the first is the default)", steps),
@@ -74,5 +73,5 @@ def _named(step_file: Path) -> tuple[str, tuple[str, ...]]:
                 try:
                     values[name] = ast.literal_eval(node.value)
                 except ValueError:  # not written out
-                    values[name] = getattr(importlib.import_module(f"processor.{file.parent.name}.{file.stem}"), name)
+                    values[name] = getattr(importlib.import_module(f"processor.{step_file.parent.name}.params"), name)
     return str(values["NAME"]), tuple(values["METHODS"])
