@@ -56,6 +56,7 @@ class FrameParams:
     """Deviations of a frame from its design."""
 
     node_movement_mm: float = 0.0  # standard deviation along each axis
+    sag_mm: float = 0.0  # of the middle of the plan against its edges, by a parabola along either side
     wrong_sizes: int = 0  # number of balls of another size than designed
     radius_mm: float = 0.0  # standard deviation of a ball's radius
     eccentricity_mm: float = 0.0  # of each member's ends from the nodes, standard deviation across the axis
@@ -370,7 +371,13 @@ def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger:
         if getattr(params, key) > most:
             raise UsageError(f"asbuilt.{key}: expected at most {most}, all {of}, got {getattr(params, key)}")
     grown = expansion(params.temperature_C)
-    centres = (nominal.centres + params.node_movement_mm * rng.standard_normal((count, 3))) * grown
+    centres = nominal.centres + params.node_movement_mm * rng.standard_normal((count, 3))
+    if params.sag_mm:
+        plan = nominal.centres[:, :2]
+        low, extent = plan.min(axis=0), np.maximum(np.ptp(plan, axis=0), 1e-9)
+        centres[:, 2] -= params.sag_mm * np.prod(1.0 - (2.0 * (plan - low) / extent - 1.0) ** 2, axis=1)
+        ledger.note("sag of the middle", "frame", params.sag_mm, "mm")
+    centres = centres * grown
     radii = nominal.radii + params.radius_mm * rng.standard_normal(count)
     sizes = np.unique(nominal.radii)
     wrong = rng.permutation(count)[: params.wrong_sizes]

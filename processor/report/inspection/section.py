@@ -14,6 +14,8 @@ from processor.report.inspection import tables
 from processor.report.step_report import StepReport
 from processor.report.style import Drawn
 
+MOST_NAMED = 2  # of a headline
+
 
 def _summary(result: Result) -> tuple[Message, Message]:
     if not result.components:
@@ -37,12 +39,27 @@ def _summary(result: Result) -> tuple[Message, Message]:
         named, judged = zip(*compared, strict=True)
         limits = verdict_counts.summary(verdict_counts.LIMITS, named, judged)
         head = text("{head}; {verdicts}", head=head, verdicts=limits)
+    elif off := sorted(_off(result), key=lambda one: -one[0])[:MOST_NAMED]:
+        head = text("{head}; largest deviation: {named}", head=head, named=[named for _, named in off])
     verdicts = verdict_counts.each(every)
     body: list[Message] = [text("Limits: {verdicts}.", verdicts=verdicts)] if verdicts else []
     body += [text("{name}: {reasons}.", name=c.name, reasons=c.reasons) for c in result.components if c.reasons]
     if result.status is Status.OK or not result.reasons:
         body += [text("{reasons:.}", reasons=result.reasons)] if result.reasons else []
     return head, text("{sentences:.}", sentences=body) if body else text("")
+
+
+def _off(result: Result) -> Iterator[tuple[float, Message]]:
+    """Yield by how much the sizes of whole components are beyond their intervals, mm, with words for each."""
+    for component in result.components:
+        for row in component.characteristics.items():
+            beyond = abs(row["deviation"]) - row["ci95"]
+            if row["id"] == str(row["quantity"]) and row["unit"] == "mm" and beyond > 0.0:
+                yield beyond, text(
+                    "{component} {quantity} {deviation:+.1f} ± {ci95:.1f} mm",
+                    component=component.name, quantity=label(row["quantity"]), deviation=row["deviation"],
+                    ci95=row["ci95"],
+                )  # fmt: skip
 
 
 def _beyond(result: Result) -> Iterator[Message]:

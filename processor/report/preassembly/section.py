@@ -39,8 +39,11 @@ def _summary(result: Result) -> tuple[Message, Message]:
         body.append(text("Joints: {verdicts}.", verdicts=verdict_counts.each(result.joints.verdict) or text("none")))
     if result.adjustment is not None:
         told = verdict_counts.summary(verdict_counts.JOINTS, result.joints.name, result.joints.verdict)
-        head = text("{verdicts}; assembly {head}", verdicts=told, head=head)
         chain = [limits for limits in result.adjustment.chain if len(limits.limits)]
+        head = text("assembly {head}", head=head)
+        if (whole := worst(limits.verdict for limits in chain)) not in (Verdict.NONE, Verdict.PASS):
+            head = text("whole chain: {verdict}; {head}", verdict=whole, head=head)
+        head = text("{verdicts}; {head}", verdicts=told, head=head)
         body += [text("Whole chain: {verdict}.", verdict=limits.verdict) for limits in chain]
     return head, text("{sentences:.}", sentences=body)
 

@@ -15,6 +15,8 @@ from processor.report.step_report import StepReport
 from processor.report.stitching import targets
 from processor.space_frame.result import Flag, GaugeBasis, Gauges, MovementGauge, Result
 
+MOST_NAMED = 3  # balls of a headline
+
 
 def _summary(result: Result) -> tuple[Message, Message | str]:
     flags = collections.Counter(result.balls.flag)
@@ -27,6 +29,10 @@ def _summary(result: Result) -> tuple[Message, Message | str]:
         count=flags[Flag.OK],
         balls=len(result.balls),
     )
+    if flagged := [k for k, flag in enumerate(result.balls.flag) if flag is not Flag.OK][: MOST_NAMED + 1]:
+        named = [text("{node} {flag}", node=result.balls.names[k], flag=result.balls.flag[k]) for k in flagged]
+        named[MOST_NAMED:] = [text("...")] if len(named) > MOST_NAMED else []
+        head = text("{head} ({named})", head=head, named=named)
     if result.gauges is not None:
         head = text("{head}; {movements}", head=head, movements=_movements(result, result.gauges))
     return head, text("Flagged: {counts}.", counts=counts) if counts else ""
