@@ -154,14 +154,14 @@ def adjust(seen: Sightings, places: Floats, poses: Floats, of_class: Mapping[str
         if step.max() < SETTLED:
             break
     known = len(system.y) > 3 * len(seen.places)
-    W = np.linalg.inv(system.U + np.tensordot(by_class, Q, 1))
-    WA = W @ system.A
-    of_class_P = W - WA @ np.linalg.solve(system.A.T @ WA, WA.T)
+    V = np.linalg.inv(system.U + np.tensordot(by_class, Q, 1))
+    VA = V @ system.A
+    of_class_P = V - VA @ np.linalg.solve(system.A.T @ VA, VA.T)
     rest = of_class_P @ system.y
     tests = [_test(limit, q, of_class_P, rest) for limit, q in zip(by_class, Q, strict=True)]
     estimates = dict(zip(factors, _intervals(theta, Q, P, system.U, tests), strict=True))
-    dof = estimates["range_view"].dof
     for name, row in {"range_offset": -1 - known, **({"scale": -1} if known else {})}.items():
+        dof = _dof(W @ system.A @ N[:, row], float(N[row, row]), Q, P)
         half = NORMAL_95 * float(np.sqrt(N[row, row]) * student_factor(dof))
         estimates[name] = Estimate(state.scale if name == "scale" else state.offset, half, dof)
     residuals = system.y[: 3 * len(seen.places)].reshape(-1, 3)
@@ -229,6 +229,14 @@ def _scored(theta: Floats, Q: Sequence[Floats], P: Floats, system: _System) -> F
             break
         free &= found > 0.0
     return np.maximum(0.5 * (found + theta), 0.0) if (theta > 0.0).all() else found
+
+
+def _dof(gain: Floats, variance: float, Q: Sequence[Floats], P: Floats) -> float:
+    """Return the degrees of freedom of a parameter's ``variance`` (Satterthwaite) by its ``gain`` (n,) of the data."""
+    PQ = [P @ q for q in Q]
+    information = 0.5 * np.array([[float((a * b.T).sum()) for b in PQ] for a in PQ])
+    slope = np.array([float(gain @ q @ gain) for q in Q])
+    return max(2.0 * variance**2 / float(slope @ np.linalg.solve(information, slope)), 1.0)
 
 
 def _test(limit: float, q: Floats, P: Floats, rest: Floats) -> tuple[float, float]:
