@@ -382,7 +382,7 @@ def _scene(
     where = stations or _stations(scans)
     of_project, why_units = project.units or option or "m", list(reasons.values())
     different = (one for i, one in enumerate(why_units) if one not in why_units[:i])  # reasons have no hash
-    search = TargetSearch(find.checkerboard_mm, find.sphere_radius_mm) if (find := project.targets) else None
+    search = TargetSearch(find.side_mm, find.sphere_radius_mm) if (find := project.targets) else None
     return Scene(
         project.name,
         kind,

@@ -32,6 +32,9 @@ from processor.scan_folder.tolerance import TOLERANCE
 from processor.scan_folder.units import FileUnit
 
 NAN = float("nan")
+# Side of the square searched for over the diameter of a round target: the strip that tells whether a pattern goes on
+# begins at 0.56 of a side from the centre, and is to lie off the circle: from 0.89 on; real ones are found to 1.0.
+ROUND_SHARE = 0.9
 MOST_BOXES = 100  # of [[clip]]: each is compared with every point
 
 
@@ -201,13 +204,22 @@ class Targets:
     SCHEMA: ClassVar[Mapping[str, Any]] = {"minProperties": 1}
 
     checkerboard_mm: float = entry(number(above=0), default=NAN)  # side of the square of two by two fields
+    # diameter of a round target of four sectors, two of them dark, instead of a square
+    round_mm: float = entry(number(above=0), default=NAN)
     sphere_radius_mm: float = entry(number(above=0), default=NAN)
 
     def contradiction(self) -> str:
         """Return that nothing is to be searched for."""
-        if np.isnan([self.checkerboard_mm, self.sphere_radius_mm]).all():
-            return "expected 'checkerboard_mm' or 'sphere_radius_mm', found neither; give one or both"
+        if not np.isnan([self.checkerboard_mm, self.round_mm]).any():
+            return "expected 'checkerboard_mm' or 'round_mm', found both; search for one of them"
+        if np.isnan([self.checkerboard_mm, self.round_mm, self.sphere_radius_mm]).all():
+            return "expected 'checkerboard_mm', 'round_mm' or 'sphere_radius_mm', found none; give one"
         return ""
+
+    @property
+    def side_mm(self) -> float:
+        """The side of the square that is searched for; of a round target one whose strips beside lie off the circle."""
+        return ROUND_SHARE * self.round_mm if np.isnan(self.checkerboard_mm) else self.checkerboard_mm
 
 
 CONTROL_POINTS = tables(ControlPoint)

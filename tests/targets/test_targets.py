@@ -209,6 +209,22 @@ def test_painted_target_on_a_wall_is_found_at_its_centre():
     assert one.centre == pytest.approx([5000.0, 0.0, 0.0], abs=3.0 * one.sd + 0.2)
 
 
+@pytest.mark.parametrize("diameter", [115.0, 150.0])
+@pytest.mark.parametrize("around", [0.06, 0.55, 0.9])
+def test_a_round_target_is_found_by_its_diameter(tmp_path, diameter, around):
+    """Four sectors of a circle on a black, a grey and a white wall, with points every 3 mm."""
+
+    def colour(u, v):
+        return around if np.hypot(u, v) > 0.5 * diameter else 0.06 if u * v > 0.0 else 0.9
+
+    points, bright = painted(colour, step=3.0, half=120.0)
+    np.savetxt(tmp_path / "scan.xyz", points)
+    (tmp_path / "project.toml").write_text(f'units = "mm"\n[targets]\nround_mm = {diameter}')
+    side = folder.read_input(tmp_path).target_search.checkerboard_mm
+    (one,) = checkerboard.search(points, bright, side)[0]
+    assert one.centre == pytest.approx([5000.0, 0.0, 0.0], abs=3.0 * one.sd + 0.1)
+
+
 # --- names ---------------------------------------------------------------------------------------------------------
 
 
@@ -289,7 +305,8 @@ def test_a_merged_cloud_is_searched_station_by_station():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[targets]", "'checkerboard_mm' or 'sphere_radius_mm'"),
+        ("[targets]", "'checkerboard_mm', 'round_mm' or 'sphere_radius_mm'"),
+        ("[targets]\ncheckerboard_mm = 150\nround_mm = 115", "found both"),
         ("[targets]\ncheckerboard_mm = 0", "a number above 0"),
         ("[targets]\nchekerboard_mm = 150", "did you mean 'checkerboard_mm'"),
     ],
