@@ -85,7 +85,8 @@ def scan(
         Number of stations, placed where each adds most to the surface that is seen; or a JSON file of their positions
         in mm in the model's frame: ``{"S1": {"position": [x, y, z]}, ...}``.
     scanner
-        Class of scanner: phase, pulse, long-range or another of ``processor/model/scanners.toml``.
+        Class of scanner: phase, pulse, long-range or another of ``processor/model/scanners.toml``, or the path of a
+        scanner.toml.
     seed
         Seed of all random numbers, from 0.
     units

@@ -116,7 +116,7 @@ def make(
 @click.option(
     "--stations", default="6", metavar="N|FILE.json", help="number of stations, or their places  [default: 6]"
 )
-@click.option("--scanner", default="phase", help="class of scanner  [default: phase]")
+@click.option("--scanner", default="phase", help="class of scanner, or a scanner.toml  [default: phase]")
 @click.option("--units", default="", help="unit of the model's numbers, instead of that in the file: mm, m, inch, ...")
 @click.option("--seed", type=click.IntRange(min=0), default=0, help="of all random numbers  [default: 0]")
 @click.option(

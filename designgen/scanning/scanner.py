@@ -25,7 +25,9 @@ from typing import Any
 import numpy as np
 
 from designgen.checks import expect, expect_all
+from designgen.recipe_files import load
 from processor.model import Bools, Floats, UsageError, instruments
+from processor.model.inputs import Place
 
 MODE = "rays"
 SIGNAL_RANGE_MM = 10_000.0  # range at which the signal is 1
@@ -106,11 +108,15 @@ class Scanner:
 
 
 def preset(name: str) -> dict[str, Any]:
-    """Return the numbers of a class of scanner; UsageError for an unknown one."""
+    """Return the numbers of a class of scanner, or of a scanner.toml; UsageError for an unknown one."""
     classes = instruments.classes()
-    if name not in classes:
-        raise UsageError(f"scan.scanner: expected one of {', '.join(classes)}, got {name!r}")
-    return {key: value for key, value in classes[name].items() if key in Scanner.__dataclass_fields__}
+    if name.lower().endswith(".toml"):
+        numbers = instruments.simulated(load(name)[1], Place(name))
+    elif name in classes:
+        numbers = classes[name]
+    else:
+        raise UsageError(f"scan.scanner: expected one of {', '.join(classes)}, or a scanner.toml, got {name!r}")
+    return {key: value for key, value in numbers.items() if key in Scanner.__dataclass_fields__}
 
 
 @dataclass(frozen=True)

@@ -201,6 +201,15 @@ def from_file(content: Any, place: Place) -> Instrument:
     )
 
 
+def simulated(content: Any, place: Place) -> dict[str, Any]:
+    """Return the numbers of a file as read that the simulation takes, what it does not give by its class."""
+    made_of, given = from_file(content, place), dict(content)
+    if "view_mm" in given:
+        given["offset_mm"] = made_of.known["view_mm"].value
+    given["scale_ppm"] = math.hypot(*made_of.known["scale_ppm"])
+    return classes()[made_of.scanner_class] | given
+
+
 def no_class(name: str) -> str:
     """Say what is expected of a text that names a scanner, and what was found."""
     like = did_you_mean(name, class_names())

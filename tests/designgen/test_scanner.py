@@ -14,7 +14,7 @@ from designgen.designs.parametric_face import Patch
 from designgen.scanning import clutter, ray_kernels, raycast, scanner, space_frame_surfaces, survey
 from designgen.scanning import returns as scanning_returns
 from designgen.scanning.surfaces import Builder
-from processor.model import UsageError, instruments
+from processor.model import InputError, UsageError, instruments
 
 QUIET = scanner.Scanner(**{**scanner.preset("plain-2mm"), "noise_mm": 0.0})
 ORIGIN = np.eye(4)
@@ -643,3 +643,17 @@ def test_presets_are_scanners_with_a_source():
         assert len(numbers["source"]) > 5
     with pytest.raises(UsageError, match="expected one of phase, pulse"):
         scanner.preset("magic")
+
+
+def test_a_scanner_toml_is_a_scanner_too(tmp_path):
+    """The file that a field check writes: what it does not give is that of its class."""
+    path = tmp_path / "scanner.toml"
+    path.write_text(
+        'scanner_class = "pulse"\nnoise_mm = 0.2\nview_mm = {value = 0.3, sd = 0.1}\n'
+        "scale_ppm = {value = 3.0, sd = 4.0}\n"
+    )
+    changed = {"noise_mm": 0.2, "offset_mm": 0.3, "scale_ppm": 5.0}
+    assert scanner.preset(str(path)) == scanner.preset("pulse") | changed
+    path.write_text('scanner_class = "pulse"\nnoise_mm = -1.0\n')
+    with pytest.raises(InputError, match="expected a number of 0 or more as 'noise_mm', found -1"):
+        scanner.preset(str(path))
