@@ -34,7 +34,7 @@ LAW_SD = 0.2  # of the logarithm of a class's noise: instruments of a class diff
 REPEAT_SHARE = 0.2  # of the class's error of a view: repeats at one station share most of it
 LEAST_MM, LEAST_URAD = 0.01, 0.1  # in a scanner.toml
 UNITS = {"scale": "ppm", "angle_horizontal": "urad", "angle_vertical": "urad"}  # others: mm
-PER_UNIT = {"ppm": 1e6, "urad": 1e6, "mm": 1.0}  # of a ratio, a radian and a millimetre
+PER_UNIT = {"ppm": 1e6, "urad": 1e6, "mm": 1.0}  # millionths, and mm as inside
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -65,7 +65,7 @@ def _known(bias: bool, least: float, most: float) -> Kind:
     return Kind(expected, convert, {"anyOf": [one.schema, {"type": "object", "required": list(Known._fields)}]})
 
 
-SD = number(least=0.0, most=1e4)  # a standard deviation: 10 m, or 10,000 ppm, is that of no scanner
+SD = number(least=0.0, most=1e4)  # as the widest of TERMS
 # What is said of an instrument's errors. The bounds tell units apart: no scanner's set-up is known to a hundredth of a
 # millimetre, and none is off by a decimetre or by half a degree.
 TERMS: Mapping[str, Kind] = {
