@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from processor import large_arrays, pipeline, record_checks
+from processor.api import tables
 from processor.api.argument_checks import function_of, length_of, path_of, seed_of, text_of
 from processor.clouds import export as clouds_export
 from processor.clouds.export import Exported
@@ -26,10 +27,13 @@ from processor.results.file_names import RESULTS_H5
 from processor.scan_folder import files, fingerprint
 from processor.store import store, whole_output
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 Names = str | Sequence[str] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Results:
     """What a run found.
 
@@ -69,6 +73,42 @@ class Results:
     def verdict(self) -> Verdict:
         """The worst verdict of the steps."""
         return worst(run.verdict for run, _ in self.execution.by_step())
+
+    def table(self, *names: str) -> pd.DataFrame:
+        """Return the first table that the run has of these names, as its CSV file of that name.
+
+        Columns are named with their units. Raises UsageError where the run has none, ImportError without pandas.
+        """
+        return tables.frame(self.execution, self.report, *names)
+
+    @property
+    def balls(self) -> pd.DataFrame:
+        """The balls of step spheres, see :meth:`table`."""
+        return self.table("balls")
+
+    @property
+    def joints(self) -> pd.DataFrame:
+        """The joints of step preassemble, see :meth:`table`."""
+        return self.table("joints")
+
+    @property
+    def characteristics(self) -> pd.DataFrame:
+        """All that step inspect measured, else what any step compared with limits, see :meth:`table`."""
+        return self.table("inspect", "characteristics")
+
+    @property
+    def defects(self) -> pd.DataFrame:
+        """The defects of step defects, see :meth:`table`."""
+        return self.table("defects")
+
+    @property
+    def scans(self) -> pd.DataFrame:
+        """The scans with their poses by step stitch, see :meth:`table`."""
+        return self.table("stitch-scans")
+
+    def __repr__(self) -> str:
+        """Return the headline of the run."""
+        return f"<processor.Results {self.scene.name!r}: {self.verdict}; {headline.of_run(self.execution)}>"
 
 
 def read(path: str | Path, units: str | None = None) -> Scene:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -158,6 +159,25 @@ def test_a_scene_is_run_and_compared_with_its_truth():
     assert set(results.comparison["spheres"]) == {"ransac"}
     checks = processor.check(results, truth)
     assert {check.method for check in checks} == {"", "ransac"}
+
+
+def test_tables_are_data_frames_with_the_columns_of_their_files(tmp_path):
+    results = processor.run(made(designgen.make, str(FRAME_OF_FOUR), 1)[0], tmp_path / "out", steps="spheres,inspect")
+    for file, table in {
+        "balls": results.balls,
+        "inspect": results.characteristics,
+        "tubes": results.table("tubes"),
+    }.items():
+        written = pd.read_csv(tmp_path / "out" / f"{file}.csv")
+        assert list(table.columns) == list(written.columns)
+        assert len(table) == len(written) > 0
+    assert results.balls["x_mm"].dtype == np.float64
+    np.testing.assert_allclose(results.balls["radius_mm"], results.steps["spheres"].balls.radii)
+    with pytest.raises(UsageError, match=r"no table 'defects'; this run has .*balls"):
+        results.defects  # noqa: B018
+    assert repr(results).startswith("<processor.Results")
+    assert len(repr(results)) < 600
+    assert dir(processor) == sorted(processor.__all__)
 
 
 def test_a_scan_is_registered_to_its_mesh_from_any_pose():
