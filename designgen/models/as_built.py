@@ -11,10 +11,11 @@ import numpy as np
 
 from designgen.asbuilt.imperfections import Ledger
 from designgen.designs.parametric_face import Surface
-from designgen.models.body_deviations import Defect, Deviation, Params, Triangles, deviation_of, missing_part
+from designgen.models.body_deviations import Defect, Deviation, Params, deviation_of, missing_part
 from designgen.models.model import Model, ModelBody
 from designgen.models.subdivision import Spacing, subdivided
 from designgen.models.surface_samples import sample_surface, triangle_areas
+from designgen.scanning.facets import Facets
 from processor.model import AsBuilt, BodyTruth, DefectTruth, Floats, StructureTruth
 
 TRUTH_POINTS, LEAST_TRUTH_POINTS = 20_000, 60  # of the whole model, by area; of a body, at least
@@ -37,7 +38,8 @@ def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
     built: list[ModelBody | None] = []
     sampled = list[_SampledBody]()
     areas = np.array([triangle_areas(body).sum() for body in model.bodies])
-    triangles = Triangles.of(model) if params else None
+    vertices, triangles = model.mesh()
+    facets = Facets.of(vertices[triangles]) if params else None
     for row, (body, share) in enumerate(zip(model.bodies, areas / areas.sum(), strict=True)):
         count = max(LEAST_TRUTH_POINTS, int(TRUTH_POINTS * share))
         points, normals = sample_surface(body.vertices[body.triangles], count)
@@ -51,8 +53,8 @@ def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
             ledger.note("left out", body.name, 1.0, "count")
             defects.append(missing_part(body))
             continue
-        assert triangles is not None
-        deviation = deviation_of(body, of_body, triangles, seed)
+        assert facets is not None
+        deviation = deviation_of(body, of_body, facets, seed)
         built.append(_displaced(body, deviation))
         near = _sampled_about_dent(body, deviation)
         points, normals = np.concatenate([points, near[0]]), np.concatenate([normals, near[1]])

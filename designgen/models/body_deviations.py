@@ -16,13 +16,13 @@ import numpy as np
 
 from designgen.checks import expect_all
 from designgen.designs.parametric_face import Displacement
-from designgen.models.model import Model, ModelBody
+from designgen.models.model import ModelBody
 from designgen.models.subdivision import Spacing
 from designgen.models.surface_samples import sample_surface, triangle_areas, triangle_normals
 from designgen.randomness import generator
 from designgen.recipe_params import filled
-from designgen.scanning import triangle_tree
-from processor.model import Bools, Floats, UsageError
+from designgen.scanning.facets import Facets
+from processor.model import Floats, UsageError
 
 FACET_MM = 0.005  # largest departure of a displaced triangle from its curved surface, where a face is triangles alone
 DENT_EDGE_SHARE = 0.25  # of a dent's radius: longest edge of the triangles within it
@@ -72,25 +72,6 @@ class Defect:
     volume: float
 
 
-@dataclass(frozen=True)
-class Triangles:
-    """The triangles (f, 3, 3) of all bodies of a model, mm, in the order of their tree."""
-
-    tree: triangle_tree.Tree
-    corners: Floats
-
-    @classmethod
-    def of(cls, model: Model) -> Triangles:
-        """Return the triangles of a model."""
-        corners = np.concatenate([body.vertices[body.triangles] for body in model.bodies])
-        tree = triangle_tree.build(corners)
-        return cls(tree, corners[tree.order])
-
-    def free(self, start: Floats, end: Floats) -> Bools:
-        """Return which segments (n,) from ``start`` to ``end`` (n, 3), mm, meet no triangle."""
-        return triangle_tree.free(self.tree, self.corners, start, end, 1e-3)
-
-
 def params_of(recipe: Mapping[str, Any], names: Sequence[str]) -> dict[str, Params]:
     """Return the deviations of a recipe's bodies by name; UsageError for an unknown body or key."""
     section = recipe.get("asbuilt", {})
@@ -129,10 +110,10 @@ class ShapeChange:
     notes: tuple[tuple[str, float, str], ...]
 
 
-def deviation_of(body: ModelBody, params: Params, triangles: Triangles, seed: int) -> Deviation:
+def deviation_of(body: ModelBody, params: Params, facets: Facets, seed: int) -> Deviation:
     """Return the deviation of a body by its parameters."""
     bend = [_bend(body, params)] if params.bend_mm else []
-    dent = [_dent(body, params, triangles, seed)] if params.dent_mm else []
+    dent = [_dent(body, params, facets, seed)] if params.dent_mm else []
     changes, moved = bend + dent, _movement(body, params)
 
     def displacement(points: Floats) -> Floats:
@@ -185,9 +166,9 @@ def _bend(body: ModelBody, params: Params) -> ShapeChange:
     )
 
 
-def _dent(body: ModelBody, params: Params, triangles: Triangles, seed: int) -> ShapeChange:
+def _dent(body: ModelBody, params: Params, facets: Facets, seed: int) -> ShapeChange:
     """Return a round dent; it fades out in depth, so that an opposite wall stays."""
-    centre, inward = _dent_place(body, params, triangles, seed)
+    centre, inward = _dent_place(body, params, facets, seed)
     radius, depth = params.dent_radius_mm, params.dent_mm
 
     def field(points: Floats) -> Floats:
@@ -240,7 +221,7 @@ def _movement(body: ModelBody, params: Params) -> Displacement | None:
     return moved
 
 
-def _dent_place(body: ModelBody, params: Params, triangles: Triangles, seed: int) -> tuple[Floats, Floats]:
+def _dent_place(body: ModelBody, params: Params, facets: Facets, seed: int) -> tuple[Floats, Floats]:
     """Return the middle (3,) of a dent on the surface, and the unit normal (3,) into the body."""
     points, normals = sample_surface(body.vertices[body.triangles], 2000)
     at = np.array(params.dent_at_mm)
@@ -253,7 +234,7 @@ def _dent_place(body: ModelBody, params: Params, triangles: Triangles, seed: int
     on_face = np.abs(areas - areas.max()) < 0.01 * areas.max()
     rows = np.flatnonzero(on_face[body.face])
     points, normals = sample_surface(body.vertices[body.triangles[rows]], 500)
-    free = triangles.free(points + 1e-3 * normals, points + FREE_MM * normals)
+    free = facets.free(points, points + FREE_MM * normals)
     points, normals = (points[free], normals[free]) if free.any() else (points, normals)
     others = body.vertices[body.triangles[np.setdiff1d(np.arange(len(body.face)), rows)]]
     if len(others):

@@ -16,11 +16,10 @@ import numpy as np
 from designgen.models.model import Model
 from designgen.models.surface_samples import sample_surface
 from designgen.randomness import generator
-from designgen.scanning import triangle_tree
+from designgen.scanning.facets import Facets
 from designgen.scanning.returns import LOWEST_DEG
 from designgen.scanning.scanner import Scanner
 from designgen.scanning.survey import levelled_pose
-from designgen.scanning.triangle_tree import Tree
 from processor.model import Bools, Floats, InputError
 
 SAMPLES = 4000  # points of the surface by which candidates are compared
@@ -87,12 +86,10 @@ def place_stations(
     size = float((high - low).max())
     if distance_mm is None:
         distance_mm = min(max(DISTANCE_SHARE * size, NEAREST_MM, 1.5 * device.min_range_mm), FARTHEST_MM)
-    tree = triangle_tree.build(corners)
-    ordered = corners[tree.order]
+    facets = Facets.of(corners)
     points, normals = sample_surface(corners, SAMPLES)
     places = _candidates(low, high, distance_mm, _room(device), points)
-    margin = 1e-6 * size
-    seen = np.stack([_seen(tree, ordered, place, points, normals, device, margin) for place in places])
+    seen = np.stack([_seen(facets, place, points, normals, device) for place in places])
     worth, chosen = np.ones(len(points)), []
     for _ in range(count):
         gains = seen @ worth
@@ -127,9 +124,7 @@ def _candidates(low: Floats, high: Floats, distance: float, room: float, points:
     return np.array([*places, *np.array(inside)[free]])
 
 
-def _seen(
-    tree: Tree, corners: Floats, place: Floats, points: Floats, normals: Floats, device: Scanner, margin: float
-) -> Bools:
+def _seen(facets: Facets, place: Floats, points: Floats, normals: Floats, device: Scanner) -> Bools:
     """Return which points (n,) a scanner at a place sees at a fair incidence."""
     arm = points - place
     range_ = np.linalg.norm(arm, axis=1)
@@ -137,6 +132,5 @@ def _seen(
     facing &= (range_ > device.min_range_mm) & (range_ < device.max_range_mm)
     facing &= arm[:, 2] > range_ * np.sin(np.radians(LOWEST_DEG))
     rows = np.flatnonzero(facing)
-    starts = np.broadcast_to(place, (len(rows), 3)).copy()
-    facing[rows] = triangle_tree.free(tree, corners, starts, points[rows], margin)
+    facing[rows] = facets.free(place, points[rows])
     return facing

@@ -391,6 +391,91 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
 
 
 @njit(cache=True, nogil=True)
+def covered(windows, first, width, side, used, rows, beside):  # type: ignore[no-untyped-def]
+    """Return numbers (width + 2 side, rows) of the rays of a strip in windows (b, 5), -1 for others, and their count.
+
+    Beside the strip only the next ``beside`` (rows,) columns count.
+    """
+    number = np.full((width + 2 * side, rows), -1, np.int32)
+    for b in range(len(windows)):
+        for column in range(max(windows[b, 1], first - side), min(windows[b, 2], first + used - 1 + side) + 1):
+            number[column - first + side, windows[b, 3] : windows[b, 4] + 1] = 0
+    count = 0
+    for j in range(width + 2 * side):
+        outside = max(side - j, j - side - used + 1)
+        for row in range(rows):
+            if number[j, row] == 0:
+                number[j, row] = count if outside <= beside[row] else -1
+                count += outside <= beside[row]
+    return number, count
+
+
+@njit(cache=True, nogil=True)
+def directions(R, strip, grid, rays, number, angle, offsets):  # type: ignore[no-untyped-def]
+    """Return the directions (m k, 3) of the sub-rays of :func:`cast_around`, rotated by R (3, 3)."""
+    _, first, _, side = strip
+    jitter, k = rays.jitter, len(offsets)
+    result = np.empty((len(angle) * k, 3))
+    level, rise = elevations(grid, number.shape[1])
+    for j in range(number.shape[0]):
+        azimuth = 2.0 * np.pi * (first + j - side) / grid.columns
+        ca, sa = np.cos(azimuth), np.sin(azimuth)
+        for row in range(number.shape[1]):
+            ray = number[j, row]
+            if ray < 0:
+                continue
+            for o in range(k):
+                da = jitter[j, row, 0] + angle[ray] * offsets[o, 0]
+                de = jitter[j, row, 1] + angle[ray] * offsets[o, 1]
+                x, y, z = direction(ca, sa, level[row], rise[row], da, de)
+                for i in range(3):
+                    result[ray * k + o, i] = R[i, 0] * x + R[i, 1] * y + R[i, 2] * z
+    return result
+
+
+@njit(cache=True, nogil=True)
+def meet(corners, owner, place, rays, facet, max_range, shape, best):  # type: ignore[no-untyped-def]
+    """Replace shape and range (n,) where the ``facet`` (n,) that a ray (n, 3) from ``place`` meets is nearer.
+
+    ``corners`` (f, 3, 3) belong to the shapes ``owner`` (f,).
+    """
+    n, cuts = np.empty(9), np.empty((0, 4))
+    for r in range(len(facet)):
+        f = facet[r]
+        if f < 0:
+            continue
+        for i in range(9):
+            n[i] = corners[f, i // 3, i % 3] - place[i % 3]
+        dx, dy, dz = rays[r, 0], rays[r, 1], rays[r, 2]
+        t = hit(TRIANGLE, n, cuts, 0, 0, dx, dy, dz)
+        if t == np.inf:
+            t = pass_by(n, dx, dy, dz)
+        if t <= max_range and (t < best[r] or (t == best[r] and owner[f] < shape[r])):
+            best[r], shape[r] = t, owner[f]
+
+
+@njit(cache=True, nogil=True)
+def pass_by(n, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return the range at which the ray of a unit vector d is nearest to the edges of a triangle n (9,).
+
+    It misses the triangle by the resolution of float32; on the plane, a grazing ray would be far from the triangle.
+    """
+    least, at = np.inf, np.inf
+    for k in range(3):
+        a, b = 3 * k, 3 * ((k + 1) % 3)
+        ex, ey, ez = n[b] - n[a], n[b + 1] - n[a + 1], n[b + 2] - n[a + 2]
+        along, range_ = ex * dx + ey * dy + ez * dz, n[a] * dx + n[a + 1] * dy + n[a + 2] * dz
+        across = ex * ex + ey * ey + ez * ez - along * along
+        share = along * range_ - (n[a] * ex + n[a + 1] * ey + n[a + 2] * ez)
+        share = min(max(share / across, 0.0), 1.0) if across > 0.0 else 0.0
+        t = range_ + share * along
+        x, y, z = n[a] + share * ex - t * dx, n[a + 1] + share * ey - t * dy, n[a + 2] + share * ez - t * dz
+        if x * x + y * y + z * z < least:
+            least, at = x * x + y * y + z * z, t
+    return at
+
+
+@njit(cache=True, nogil=True)
 def normals(kind, numbers, shape, points):  # type: ignore[no-untyped-def]
     """Return unit normals (n, 3), of either sign, at points (n, 3) on shapes (n,)."""
     result = np.empty((len(shape), 3))

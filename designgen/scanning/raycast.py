@@ -1,8 +1,8 @@
 """Rays of a scanner's angular grid against exact surfaces, in float64.
 
 Every bounding sphere is drawn onto the grid; the rays it covers are intersected with its shape, and the nearest hit of
-each ray counts. Rays that meet nothing, as most rays of a scan of a roof, cost nothing. Many triangles are in a tree of
-boxes instead (:mod:`designgen.scanning.triangle_tree`).
+each ray counts. Rays that meet nothing, as most rays of a scan of a roof, cost nothing. Many triangles are in a tree in
+the scene's frame instead (:mod:`designgen.scanning.facets`).
 
 A scanner's frame has its origin at the scanner and z along its axis. Column j has azimuth 2 pi j / columns, counter-
 clockwise from x, row i has elevation ``lowest + i step``. Results depend on neither the thread nor the strip.
@@ -16,9 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from designgen.designs.parametric_face import Surface
-from designgen.scanning import angular_bounds, ray_kernels, tree_kernels
+from designgen.rigid import inverse
+from designgen.scanning import angular_bounds, ray_kernels
+from designgen.scanning.facets import Facets
 from designgen.scanning.surfaces import CONE, DISC, SPHERE, TRIANGLE, Surfaces
-from processor.model import Bools, Floats, Labels, Shorts
+from processor.model import Bools, Floats, Ints, Labels, Shorts
 
 WEIGHTS = (-3.0, 4.0)  # bounds of the weights of a net triangle's edges within which a hit on the face is sought
 POINTS = {SPHERE: (0,), CONE: (0,), DISC: (0,), TRIANGLE: (0, 3, 6)}  # columns of points in a shape's numbers
@@ -54,12 +56,14 @@ class View:
     shapes: ray_kernels.Shapes
     pieces: ray_kernels.Pieces
     strips: tuple[ray_kernels.Strip, ...]
-    tree: tree_kernels.TreeView | None
-    tree_windows: tuple[Labels, ...]  # of each strip, (b, 5)
+    facets: Facets | None
+    facet_shape: Ints  # (f,) their rows of Surfaces
+    facet_windows: tuple[Labels, ...]  # of each strip, (b, 5)
+    T_scene_scanner: Floats
 
     def occupied(self) -> list[int]:
         """Return the numbers of the strips in which rays may meet a shape."""
-        both = zip(self.strips, self.tree_windows, strict=True)
+        both = zip(self.strips, self.facet_windows, strict=True)
         return [i for i, (strip, windows) in enumerate(both) if len(strip.windows) or len(windows)]
 
     def cast(
@@ -68,8 +72,13 @@ class View:
         """Return shape, range and range of thin shapes of the rays of a strip, see ray_kernels.cast; no near hits."""
         strip = self.strips[number]
         shape, best, thin = ray_kernels.cast(self.shapes, self.pieces, strip, grid, rays, beam, beside)
-        if self.tree is not None:
-            tree_kernels.cast(self.tree, self.tree_windows[number], strip, grid, rays, beside, shape, best)
+        if self.facets is not None:
+            used = min(strip.width, grid.columns - strip.first)
+            ray, count = ray_kernels.covered(self.facet_windows[number], *strip[1:], used, shape.shape[1], beside)
+            met = ray >= 0
+            near = shape[met], best[met]
+            self._meet_facets(strip, grid, rays, ray, np.zeros(count), np.zeros((1, 2)), *near)
+            shape[met], best[met] = near
         ray_kernels.hide(shape, best, rays.min_range)
         return shape, best, thin
 
@@ -79,10 +88,29 @@ class View:
         """Return shape and range of sub-rays about the rays of a strip, see ray_kernels.cast_around; no near hits."""
         strip = self.strips[number]
         shape, best = ray_kernels.cast_around(self.shapes, self.pieces, strip, grid, rays, ray, angle, offsets)
-        if self.tree is not None:
-            tree_kernels.cast_around(self.tree, strip, grid, rays, ray, angle, offsets, shape, best)
+        if self.facets is not None:
+            self._meet_facets(strip, grid, rays, ray, angle, offsets, shape.reshape(-1), best.reshape(-1))
         ray_kernels.hide(shape, best, rays.min_range)
         return shape, best
+
+    def _meet_facets(
+        self,
+        strip: ray_kernels.Strip,
+        grid: Grid,
+        rays: ray_kernels.Rays,
+        ray: Labels,
+        angle: Floats,
+        offsets: Floats,
+        shape: Labels,
+        best: Floats,
+    ) -> None:
+        """Replace shape and range (m k,) of sub-rays where a facet is nearer."""
+        assert self.facets is not None
+        R, place = np.ascontiguousarray(self.T_scene_scanner[:3, :3]), self.T_scene_scanner[:3, 3]
+        directions = ray_kernels.directions(R, strip, grid, rays, ray, angle, offsets)
+        facet = self.facets.first(place, directions)
+        corners, owner = self.facets.corners, self.facet_shape
+        ray_kernels.meet(corners, owner, place, directions, facet, rays.max_range, shape, best)
 
 
 def view(
@@ -94,8 +122,12 @@ def view(
     greatest range (mm), ``spread`` the largest angle (rad) between a ray and its nominal direction.
     """
     R, t = T_scanner_scene[:3, :3], T_scanner_scene[:3, 3]
-    numbers = surfaces.numbers.copy()
+    facets, shape_of = surfaces.facets, surfaces.piece_shape
+    drawn = np.ones(len(shape_of), bool) if facets is None else surfaces.kind[shape_of] != TRIANGLE
+    numbers = surfaces.numbers.copy() if drawn.any() else surfaces.numbers
     for kind in POINTS:
+        if kind == TRIANGLE and facets is not None:
+            continue  # facets stay in the scene's frame
         rows = np.flatnonzero(surfaces.kind == kind)
         for columns, shift in ((POINTS[kind], t), (VECTORS.get(kind, ()), np.zeros(3))):
             for c in columns:
@@ -110,28 +142,22 @@ def view(
         windows, start = angular_bounds.by_strip(covered, width, -(-grid.columns // width), side)
         return [windows[start[i] : start[i + 1]] for i in range(len(start) - 1)]
 
-    tree, drawn = surfaces.tree, np.ones(len(surfaces.piece_shape), bool)
-    if tree is not None:
-        drawn = surfaces.kind[surfaces.piece_shape] != TRIANGLE
     centres, radii = surfaces.piece_centre[drawn] @ R.T + t, surfaces.piece_radius[drawn]
     strips = windows_of(centres, radii)
-    tree_view, tree_windows = None, [np.empty((0, 5), np.int32)] * len(strips)
-    if tree is not None:
-        rows = np.flatnonzero(surfaces.kind == TRIANGLE)[tree.order]
-        corners = np.ascontiguousarray(numbers[rows, :9])
-        tree_view = tree_kernels.TreeView(tree, corners, rows, np.ascontiguousarray(R.T), -R.T @ t)
-        box = tree.box[tree.top()]
-        middles, halves = 0.5 * (box[:, :3] + box[:, 3:]), 0.5 * np.linalg.norm(box[:, 3:] - box[:, :3], axis=1)
-        tree_windows = windows_of(middles @ R.T + t, halves)
+    facet_windows = [np.empty((0, 5), np.int32)] * len(strips)
+    if facets is not None:
+        facet_windows = windows_of(facets.centres @ R.T + t, facets.radii)
     return View(
         shapes=ray_kernels.Shapes(surfaces.kind, numbers, cuts, surfaces.cut_start),
-        pieces=ray_kernels.Pieces(surfaces.piece_shape[drawn], centres, radii),
+        pieces=ray_kernels.Pieces(shape_of[drawn], centres, radii),
         strips=tuple(
             ray_kernels.Strip(windows=windows, first=i * width, width=width, side=side)
             for i, windows in enumerate(strips)
         ),
-        tree=tree_view,
-        tree_windows=tuple(tree_windows),
+        facets=facets,
+        facet_shape=np.flatnonzero(surfaces.kind == TRIANGLE),
+        facet_windows=tuple(facet_windows),
+        T_scene_scanner=inverse(T_scanner_scene),
     )
 
 
@@ -147,6 +173,9 @@ def refine_hits(
     plain = surfaces.patch[shape] < 0
     points = ray[plain] * t[plain, None]
     normal[plain] = ray_kernels.normals(view.shapes.kind, view.shapes.numbers, shape[plain], points)
+    if view.facets is not None:
+        facet = plain & (surfaces.kind[shape] == TRIANGLE)
+        normal[facet] = normal[facet] @ T_scanner_scene[:3, :3].T
     if not plain.all():
         curved = ~plain
         range_[curved], normal[curved] = _on_patches(surfaces, T_scanner_scene, shape[curved], ray[curved], t[curved])
