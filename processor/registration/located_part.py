@@ -139,13 +139,13 @@ def _body(points: Floats, designs: Sequence[DesignSurface], places: dict[int, Lo
     for k, one in places.items():
         at = at_design(points, one.T, designs[k])
         near |= at
-        T = _attitude(thinned(points[at], RIVAL_POINTS), designs[k], one.T)
+        T = attitude(thinned(points[at], RIVAL_POINTS), designs[k], one.T)
         poses.append((designs[k].mesh, T))
     chosen = [numbers[k] for k in pose_choice.choose(points[near], poses)]
     return Body(tuple(chosen), tuple(places[k] for k in chosen))
 
 
-def _attitude(points: Floats, design: DesignSurface, T: Floats) -> Floats:
+def attitude(points: Floats, design: DesignSurface, T: Floats) -> Floats:
     """Return the pose (4, 4) of all that turn a design onto itself that points (n, 3) at it show best."""
     few, box = thinned(points, POINTS), pose_search.box_of(points)
     turned = [Candidate(turn @ T, T) for turn in pose_search.symmetries(design)]

@@ -54,6 +54,21 @@ def test_scan_of_half_a_part_gets_no_other_assignment(shapes):
     assert assignment.rather(points[along < 0.0], 1, shapes) is None
 
 
+@pytest.mark.parametrize("attitude_of_rough", [1, 3])
+def test_a_scan_whose_rough_pose_is_turned_half_round_gets_no_other_assignment(shapes, attitude_of_rough, monkeypatch):
+    """All attitudes of the part itself are tried before its scan is called another part's."""
+    rng = np.random.default_rng(1)
+    points = arch_clouds.scan_points(1, 50.0, 1.0, rng)
+    points = points[(along := points @ shapes[1].axes[:, 0]) < np.quantile(along, 0.85)]  # of no part's size
+    T, turn, rough = arch_clouds.random_pose(rng), pose_search.symmetries(shapes[1])[attitude_of_rough], attitude.rough
+
+    def turned(some, surface, **options):
+        return turn @ rigid.invert(T) if surface is shapes[1] else rough(some, surface, **options)
+
+    monkeypatch.setattr(attitude, "rough", turned)
+    assert assignment.rather(rigid.apply(T, points), 1, shapes) is None
+
+
 def scans_of(assigned, *parts):
     return [ScanParts(f"Scan_{i:03d}", name, one) for i, (name, one) in enumerate(zip(assigned, parts, strict=True), 1)]
 

@@ -84,10 +84,10 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     if best == index:
         return None
     # The first rough pose may have missed the part itself: a scan is called wrong only after all that are promising,
-    # and not by what millimetres of a rough pose show.
-    fewer = thinned(few, surface_registration.RIVAL_POINTS)
+    # and not by what millimetres of a rough pose, or a plate that lies on its other side, show.
+    fewer = thinned(few, located_part.RIVAL_POINTS)
     own, rival = (
-        (shapes[k].mesh, surface_registration.fine(fewer, shapes[k].mesh, shapes[k].axes, T).T_design_scan)
+        (shapes[k].mesh, located_part.attitude(fewer, shapes[k], T))
         for k, T in ((index, rough(index, None)), (best, T_best))
     )
     return best if _shows_other(few, own, rival) else None
