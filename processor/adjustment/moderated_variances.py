@@ -16,7 +16,7 @@ from processor.model import Floats
 
 FEWEST_FREE = 5.0  # degrees of freedom of a group, from which on it shows what groups have in common
 FEWEST_GROUPS = 3  # two have a variance, but of one degree of freedom, that says nothing of a law
-ASSUMED_FREE = 10.0  # of the law, where too few groups show it
+ASSUMED_FREE = 10.0  # of the law, where too few groups show it: its sd is known to 22 % (sqrt(2 / 10) / 2) then
 MOST_FREE = 1e4  # variances of groups differ by chance alone then: their law leaves them 1.4 % (sqrt(2 / 1e4))
 NEWTON_STEPS = 50  # work: Smyth's iteration (2004, appendix) converges in a few
 
@@ -40,6 +40,11 @@ def moderated(square: Floats, dof: Floats) -> Moderated:
         common = float(np.exp(e.mean() + digamma(0.5 * of_law) - np.log(0.5 * of_law)))
     total = of_law + dof
     return Moderated((of_law * common + square) / total, total)
+
+
+def by_class(square: float, dof: float, variance: float) -> float:
+    """Moderate the variance of one group by that of its class, which counts as ``ASSUMED_FREE`` degrees of freedom."""
+    return (ASSUMED_FREE * variance + square) / (ASSUMED_FREE + dof)
 
 
 def _inverse_trigamma(value: float) -> float:

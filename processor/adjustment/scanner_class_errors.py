@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from processor.adjustment import moderated_variances
 from processor.geometry import rigid
 from processor.model import Floats, Instrument, Ints, instruments
 from processor.robust_statistics import student_factor
@@ -108,6 +109,16 @@ def of_class(name: str) -> ScannerErrors:
 def scale_variance(length: float) -> float:
     """Return the variance, mm^2, of a length, mm, by the scale of the scanner."""
     return (known().scale * length) ** 2
+
+
+def mean_offset_sd(views: int, square: float = 0.0, dof: float = 0.0) -> float:
+    """Return the standard deviation, mm, of the offset that the ranges of so many views have in common.
+
+    It is that of the instrument, and the mean of the views' own. Data show these relative to their mean alone, by a sum
+    of squares with its degrees of freedom: of three or four views far too few without the class.
+    """
+    of_view = moderated_variances.by_class(square, dof, known().view_mm ** 2)
+    return math.hypot(known().offset_mm, math.sqrt(of_view / views))
 
 
 def view_errors(ranges: Floats, cosines: Floats, view: Ints, instrument: str = "") -> Floats:

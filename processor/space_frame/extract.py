@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.adjustment import scanner_class_errors
+from processor.adjustment.body_motions import point_covariances
 from processor.adjustment.control_points import Sightings
 from processor.geometry import rigid
 from processor.model import DESIGN_FRAMES, Bools, Floats, FrameDesign, Ints, Reason, Status, Tolerance, reason
@@ -29,7 +30,7 @@ from processor.space_frame.spheres import alternating_fit, assessment, ball_join
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
 from processor.space_frame.stations.corrected_source import Corrected, corrected_gathered
-from processor.space_frame.stations.records import Stations, StationStatus
+from processor.space_frame.stations.records import Stations, StationStatus, moved_by_offset
 from processor.space_frame.stations.tube_points import tube_points
 
 SAME_FRAME_SHARE = 0.6  # of the design's nodes that are found in their places: the frames are the same
@@ -114,14 +115,34 @@ class _Registered:
         """The stations, if their covariance may be used."""
         return self.stations if self.stations is not None and self.stations.status in USABLE else None
 
-    def shared_offset_at(self, points: Floats) -> Floats:
-        """Covariance (k, 3, 3) at points (k, 3) by an offset common to all ranges."""
-        return np.zeros((len(points), 3, 3)) if self.stations is None else self.stations.shared_offset_at(points)
+    @property
+    def mean_variance(self) -> float:
+        """Variance, mm^2, of the stations' mean place along an axis, where tubes do not correct it; of one alone 0.
+
+        Their errors are independent, and of the size by which they disagree: of one that is too small to be corrected
+        only the bound is known, any smaller one is as likely (GUM, 4.3.7).
+        """
+        known = self.stations is None or self.stations.status is not StationStatus.UNKNOWN
+        count = len(self.source.scanners)
+        variance = max(self.measured.station_sd_mm**2, LEAST_STATION_SD_MM**2 / 3.0)
+        return variance / count if known and count > 1 else 0.0
+
+    def by_shared_offset(self, points: Floats, unnamed: bool) -> Floats:
+        """Return the changes (k, 3) of points (k, 3) by an offset common to all ranges, one standard deviation.
+
+        No residual shows it. The errors of ``unnamed`` views have it already.
+        """
+        places = self.source.scanners
+        if unnamed or not len(places):
+            return np.zeros_like(points)
+        sd = scanner_class_errors.mean_offset_sd(len(places))
+        return (sd if self.stations is None else self.stations.shared_offset_sd) * moved_by_offset(points, places)
 
     def datum_at(self, points: Floats, datum_mm: float) -> Floats:
         """Covariance (k, 3, 3) at points (k, 3) by the motion common to all stations."""
         if self.trusted is None:
-            return np.tile(datum_mm**2 * np.eye(3), (len(points), 1, 1))
+            around = points - points.mean(axis=0)
+            return point_covariances(around, _of_mean(around, self.mean_variance)) + datum_mm**2 * np.eye(3)
         return self.trusted.datum_at(points)
 
 
@@ -144,13 +165,14 @@ def extract(
         return None
     measured, start = member_extraction.of_nodes(measured, kept), start.of_nodes(kept)
     nodes, spheres = _fit_spheres(registered.source, measured, start, design, catalogue, options, registered.trusted)
-    shared_offset = registered.shared_offset_at(spheres.centres)
+    by_offset = registered.by_shared_offset(spheres.centres, spheres.views is not None)
+    shared_offset = by_offset[:, :, None] * by_offset[:, None]
     if registered.stations is not None:
         spheres = assessment.with_shared_offset(spheres, shared_offset)
     matched, georeference_sd = None, NAN
     compared: list[Movement] = []
     if design is not None and (start.design_row >= 0).any():
-        matched, compared, georeference_sd = _compare(registered, spheres, shared_offset, design, start.pose, options)
+        matched, compared, georeference_sd = _compare(registered, spheres, by_offset, design, start.pose, options)
         if matched.status is Status.AMBIGUOUS:
             listed = start.pose is not None and len(start.pose.rivals) > 0
             spheres = assessment.with_ambiguous_matching(spheres, start.design_row >= 0, listed)
@@ -334,7 +356,7 @@ def _expected(start: Start, design: FrameDesign, origin: Floats, expansion: floa
 def _compare(
     registered: _Registered,
     spheres: Spheres,
-    shared_offset: Floats,
+    by_offset: Floats,
     design: FrameDesign,
     pose: Matching | None,
     options: Options,
@@ -349,9 +371,9 @@ def _compare(
     matched = _matched(pattern, design, pose, options.expansion)
     at, stations = pattern.positions.mean(axis=0), registered.trusted
     common = _georeference(registered, spheres, pattern, options) if stations is None else stations.common(at)
-    covariance = spheres.covariance[rows, :3, :3] + shared_offset[rows]
-    shared = None if spheres.views is None else spheres.views.shared[rows, :3]
-    if shared is not None:
+    covariance, shared = spheres.covariance[rows, :3, :3], by_offset[rows, :, None]
+    if spheres.views is not None:
+        shared = spheres.views.shared[rows, :3]
         covariance = covariance - shared @ np.swapaxes(shared, 1, 2)
     answer = partial(movement, matched, pattern, covariance, design, common, at, shared, expansion=options.expansion)
     gauges = [MovementGauge.BEST_FIT, *([MovementGauge.DESIGN] if matched.nearby else [])]
@@ -360,12 +382,11 @@ def _compare(
     movements = [answer(gauge=gauge) for gauge in gauges]
     assignment, weight = np.full(len(spheres.radii), -1, np.int64), np.zeros(len(spheres.radii))
     assignment[rows], weight[rows] = matched.assignment, matched.weight
-    shift = np.trace(common[3:, 3:]) / 3.0
-    georeference_sd = float(np.sqrt(shift if shared is None else shift + scanner_class_errors.SHIFT_SD_MM**2))
+    shift = np.trace(common[3:, 3:]) + np.sum(shared.mean(axis=0) ** 2)
     return (
         replace(matched, assignment=assignment, weight=weight),
         [replace(one, found=rows[one.found]) for one in movements],
-        georeference_sd,
+        float(np.sqrt(shift / 3.0)),
     )
 
 
@@ -376,16 +397,17 @@ def _georeference(registered: _Registered, spheres: Spheres, pattern: NodePatter
     size by which they disagree, else by the scanner's class. Errors of unnamed views have the shift already.
     """
     around = pattern.positions - pattern.positions.mean(axis=0)
-    common = scanner_class_errors.pose_covariance(around)
-    count, stations = len(registered.source.scanners), registered.stations
-    if count > 1 and (stations is None or stations.status is not StationStatus.UNKNOWN):
-        arm = max(0.5 * float(np.linalg.norm(np.ptp(around, axis=0))), 1.0)
-        mean = registered.measured.station_sd_mm**2 / count
-        common = np.diag(np.repeat([mean / arm**2, mean], 3))
-    elif spheres.views is not None:
+    common = _of_mean(around, registered.mean_variance or scanner_class_errors.SHIFT_SD_MM**2)
+    if spheres.views is not None and not registered.mean_variance:
         common[3:, 3:] = 0.0
     common[3:, 3:] += options.datum_mm**2 * np.eye(3)
     return common
+
+
+def _of_mean(around: Floats, variance: float) -> Floats:
+    """Covariance (6, 6) of a motion whose shift has a variance, mm^2, as has its turn at the ends of points (k, 3)."""
+    arm = max(0.5 * float(np.linalg.norm(np.ptp(around, axis=0))), 1.0)
+    return np.diag(np.repeat([variance / arm**2, variance], 3))
 
 
 def _pattern(spheres: Spheres, rows: Ints, joined: Members, origin: Floats) -> NodePattern:

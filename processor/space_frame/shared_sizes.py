@@ -56,9 +56,9 @@ def explained(size: Floats, count: Floats, sizes: Floats, sd: float) -> bool:
     if not len(size):
         return True
     weight = 1.0 / (sd**2 * (1.0 + 1.0 / count))
-    least = np.inf
+    least, of_class = np.inf, scanner_class_errors.known().view_mm ** 2
     for start in (size[:, None] - sizes).ravel():  # each places a group at a size
         nearest = sizes[np.abs(size[:, None] - start - sizes).argmin(axis=1)]
-        error = weight @ (size - nearest) / (weight.sum() + scanner_class_errors.known().view_mm ** -2)
-        least = min(least, weight @ (size - error - nearest) ** 2 + (error / scanner_class_errors.known().view_mm) ** 2)
+        ratio = weight @ (size - nearest) / (1.0 + of_class * weight.sum())  # of the common error to its variance
+        least = min(least, weight @ (size - of_class * ratio - nearest) ** 2 + of_class * ratio**2)
     return bool(chdtrc(len(size), least) > UNLIKELY)

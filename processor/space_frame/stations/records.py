@@ -114,14 +114,6 @@ class Stations(Checked):
         covariance: Floats = product(product(gain, self.covariance), np.ascontiguousarray(gain.T))
         return covariance
 
-    def shared_offset_at(self, points: Floats) -> Floats:
-        """Covariance (k, 3, 3) by an offset common to all ranges at points (k, 3): along the mean of their rays."""
-        ray = points[:, None] - self.places
-        squared = np.maximum(np.sum(ray**2, axis=2, keepdims=True), 1e-300)
-        near = np.sum(ray / squared**1.5, axis=1) / np.sum(1.0 / squared, axis=1)  # a station's points by its distance
-        covariance: Floats = self.shared_offset_sd**2 * near[:, :, None] * near[:, None]
-        return covariance
-
     def datum_at(self, points: Floats) -> Floats:
         """Covariance (k, 3, 3) that the motion common to all stations adds at points (k, 3)."""
         middle = points.mean(axis=0) if len(points) else np.zeros(3)
@@ -136,6 +128,17 @@ class Stations(Checked):
         station = np.repeat(np.array([self.before_rad, self.before_mm, self.range_offset_sd]), (3, 3, 1)) ** -2.0
         seeing = self.observations > 0
         return np.outer(seeing if seeing.any() else ~seeing, station).ravel()
+
+
+def moved_by_offset(points: Floats, places: Floats) -> Floats:
+    """Return how an offset of 1 mm of all ranges moves what stations at ``places`` (s, 3) see at points (k, 3).
+
+    It moves along the mean of the rays. Of a station's points there are more the nearer it is.
+    """
+    ray = points[:, None] - places
+    squared = np.maximum(np.sum(ray**2, axis=2, keepdims=True), 1e-300)
+    near: Floats = np.sum(ray / squared**1.5, axis=1) / np.sum(1.0 / squared, axis=1)
+    return near
 
 
 def _by_stations(points: Floats, influence: Floats, places: Floats) -> Floats:

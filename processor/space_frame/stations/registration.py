@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from processor.adjustment import scanner_class_errors
 from processor.adjustment.control_points import Sightings
 from processor.adjustment.data_snooping import Snooped
 from processor.geometry import rigid
@@ -246,7 +247,8 @@ def _result(estimate: _Estimate, posterior: Posterior) -> Stations:
     if abs(shared) > REPORTED_MM:
         messages.append(reason("spheres.range-offset", offset=shared))
     messages += [reason("spheres.weak-station", station=i, motions=names) for i, names in enumerate(weak) if names]
-    spread = float(np.std(x[6 :: kernels.STATION], ddof=1)) / np.sqrt(count) if count > 1 else 0.0
+    square = float(np.sum(x[6 :: kernels.STATION] ** 2 + np.diag(C)[6 :: kernels.STATION]))
+    spread = scanner_class_errors.mean_offset_sd(count, square, count - 1)
     # The effect of a wide beam on thin tubes grows with the range; over many stations that looks like a common bend.
     beam = posterior.control is None and abs(shared) > WIDE_MM + 3.0 * spread and abs(shared) > before_mm
     if beam:
@@ -262,7 +264,7 @@ def _result(estimate: _Estimate, posterior: Posterior) -> Stations:
         before_rad=before_rad,
         range_offset=x[6 :: kernels.STATION],
         range_offset_sd=offset_mm,
-        shared_offset_sd=abs(shared) if beam else spread,
+        shared_offset_sd=max(abs(shared), spread) if beam else spread,
         shared_offset=0.0 if beam else shared,
         observations=estimate.seen_by,
         reasons=tuple(map(_weak, weak)),

@@ -11,7 +11,7 @@ import numpy as np
 from processor import large_arrays
 from processor.model import Floats
 from processor.space_frame.members.records import Members
-from processor.space_frame.stations.records import Stations
+from processor.space_frame.stations.records import Stations, moved_by_offset
 
 SECTORS = 36  # around a tube
 MEMBERS = 1024  # at once: all sectors of tens of thousands, for all stations, would take a gigabyte
@@ -25,7 +25,8 @@ def of_axes(members: Members, stations: Stations, along: Floats) -> Floats:
     places = members.points + along[:, None] * members.directions
     nearness = 1.0 / np.maximum(np.sum((places[:, None] - stations.places) ** 2, axis=2), 1e-300)
     share = nearness / nearness.sum(axis=1, keepdims=True)
-    covariance = stations.effect(places, share) + stations.shared_offset_at(places)
+    offset = stations.shared_offset_sd * moved_by_offset(places, stations.places)
+    covariance = stations.effect(places, share) + offset[:, :, None] * offset[:, None]
     basis = np.stack([members.side, members.other], axis=2)
     return np.asarray(np.swapaxes(basis, 1, 2) @ covariance @ basis, np.float64)
 
