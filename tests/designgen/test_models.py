@@ -177,6 +177,8 @@ def test_rays_from_inside_a_closed_mesh_all_hit_it_at_its_edges_too():
     corners = np.add(ball.triangles, [40_000.0, 0.0, 0.0])
     share = np.random.default_rng(0).random((len(corners), 1))
     onto = np.concatenate([corners[:, 0] + share * (corners[:, 1] - corners[:, 0]), corners.mean(axis=1)])
+    # By 1 um off the edge: more than the slack of the test in float64, less than float32 resolves.
+    onto += np.random.default_rng(1).normal(0.0, 1e-3, onto.shape)
     place = np.array([44_990.0, 3.0, 2.0])  # 10 mm from the wall: many rays graze it
     rays = (onto - place) / np.linalg.norm(onto - place, axis=1)[:, None]
     facets = Facets.of(corners)
@@ -188,7 +190,7 @@ def test_rays_from_inside_a_closed_mesh_all_hit_it_at_its_edges_too():
     points = place + range_[:, None] * rays - [40_000.0, 0.0, 0.0]
     assert trimesh.proximity.closest_point(ball, points)[1].max() < TOLERANCE_MM
     assert not facets.free(np.broadcast_to(place, onto.shape), place + 2.0 * (onto - place)).any()
-    assert facets.free(np.broadcast_to(place, onto.shape), onto)[len(corners) :].mean() > 0.999
+    assert facets.free(np.broadcast_to(place, corners[:, 0].shape), corners.mean(axis=1)).mean() > 0.999  # a few graze
 
 
 def test_a_step_file_by_the_command(tmp_path, caplog):
