@@ -104,6 +104,16 @@ def lattice_of(points: Floats) -> Lattice:
     return Lattice(sample.min(axis=0), np.array([_step(np.unique(column), least) for column in sample.T]), least)
 
 
+def rounding_of(points: Floats) -> float:
+    """Return the step that the coordinates of points (n, 3) are rounded to; 0 = not rounded.
+
+    It is the least of the axes along which they differ: profiles at even distances, and the nodes of a grid in plan,
+    have greater steps along one or two axes, and other coordinates with all their digits.
+    """
+    step = lattice_of(points).step[np.ptp(points, axis=0) > 0.0]
+    return float(step.min()) if len(step) else 0.0
+
+
 def _step(values: Floats, least: float) -> float:
     """Return the greatest length that the differences of ascending values (n,) are multiples of (Euclid); 0 = none."""
     rest = np.diff(values)

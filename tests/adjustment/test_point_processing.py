@@ -109,6 +109,14 @@ def test_step_of_rounded_coordinates(step):
     assert not trace.smoothed
 
 
+@pytest.mark.parametrize("axes", [[2], [0, 1], [0, 1, 2]])
+def test_profiles_and_grids_at_even_distances_are_no_rounding(axes):
+    """Coordinates of a file have 0.01 mm; of some axes all are multiples of 1.5 mm."""
+    points = np.round(ball(1), 2)
+    points[:, axes] = np.round(points[:, axes] / 1.5) * 1.5
+    assert recognised(points).step == (1.5 if len(axes) == 3 else 0.0)
+
+
 def test_copies_beside_the_points_count_once():
     points = ball(2)
     used = used_once(np.vstack([points, points + 0.01]))

@@ -100,7 +100,7 @@ def recognised(points: Floats, of_sphere: tuple[Floats, Floats] | None = None) -
     which a ball seen by few points departs: smoothing of fewer than a place's is not recognised. Copies are no trace
     here: leave them out first.
     """
-    step = float(coincident_points.lattice_of(points).step.max()) if len(points) else 0.0
+    step = coincident_points.rounding_of(points) if len(points) else 0.0
     step = step if step >= LEAST_STEP_MM else 0.0
     rows = [rows for rows in coincident_points.some_places(points) if len(rows) >= FEWEST] if len(points) else []
     # Errors of rounding are alike of neighbours by themselves.

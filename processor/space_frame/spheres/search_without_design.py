@@ -55,7 +55,7 @@ def no_ball(cloud: MergedCloud, params: Params) -> Reason:
     count, least = len(cloud.points), fewest_points(params)
     if count < least:
         return reason("spheres.too-few-for-ball", points=count, least=least)
-    if (step := float(coincident_points.lattice_of(cloud.points).step.max())) >= COARSE_MM:
+    if (step := coincident_points.rounding_of(cloud.points)) >= COARSE_MM:
         return reason("spheres.coordinates-rounded", step=step)
     return reason("spheres.no-ball", points=count)
 
