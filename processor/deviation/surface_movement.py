@@ -226,7 +226,7 @@ def _leave_out_beside(passes: _Passes) -> None:
     normals = surface.normals[few.facet]
     layers = surface_layers.of_points(core, body, few.feet, few.distance, normals, fit.diameter)
     for row, at in enumerate(seen(slice(None), sure=False)):
-        kept, aside = layers.of_structure(at.feet, at.distance), passes.asides[row]
+        kept, aside = layers.of_structure(at.feet, at.distance, behind=False), passes.asides[row]
         passes.asides[row] = aside.take(kept).put()
         passes.doubtful[row] = put_aside(passes.doubtful[row][kept])
 

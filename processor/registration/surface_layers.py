@@ -53,8 +53,11 @@ class Layers:
     noise: float
     radius: float
 
-    def of_structure(self, feet: Floats, distance: Floats) -> Bools:
-        """Mark (n,) the points with feet (n, 3) on the design and distances (n,) that do not lie before its surface."""
+    def of_structure(self, feet: Floats, distance: Floats, *, behind: bool = True) -> Bools:
+        """Mark (n,) the points with feet (n, 3) on the design and distances (n,) that do not lie before its surface.
+
+        Those that lie ``behind`` it are what is seen past an edge or through a hole.
+        """
         if not len(self.height) or not len(feet):
             return np.ones(len(feet), np.bool_)
         far, at = self.tree.query(feet, workers=-1)
@@ -62,8 +65,9 @@ class Layers:
         near = far <= self.radius
         slope = np.where(near, np.einsum("ni,ni->n", self.slope[at], feet - self.tree.data[at]), 0.0)
         allowed = WITHIN * self.noise + np.where(near, 0.5 * CURVATURE * far**2, 2.0 * STEEPEST * far)
-        on: Bools = (distance - self.height[at] - slope <= allowed) & (self.structure[at] | ~near)
-        return on
+        before = distance - self.height[at] - slope
+        on: Bools = (before <= allowed) & (self.structure[at] | ~near)
+        return on if behind else on & ((before >= -allowed) | ~near)
 
 
 # Where no point lies near the design
@@ -198,21 +202,25 @@ def _expected(
     of_body[piece] = body
     near = cKDTree(centre).query(centre, k=min(AROUND, len(centre)), workers=-1)[1].reshape(len(centre), -1)
     weight = np.where(of_body[near] == of_body[:, None], 1.0, OTHER_BODY)
-    u, left = _translations(value[near], normal[near], weight, noise)
+    u, spread = _translations(value[near], normal[near], weight, noise)
     expected: Floats = np.einsum("ki,ki->k", facing, u[piece])
     # What moved is moved on its other side as well, however little of the surface about it is.
     near = near[:, :BEHIND]
-    cosine = np.einsum("pi,pki->pk", normal, normal[near])
-    weight = weight[:, :BEHIND] * (cosine < SAME_FACE)
-    u, _ = _translations(value[near], normal[near], weight, noise)
+    cosine, own = np.einsum("pi,pki->pk", normal, normal[near]), of_body[near] == of_body[:, None]
+    weight = np.where(own & (cosine < SAME_FACE), 1.0, 0.0)
+    u, spread_of_others = _translations(value[near], normal[near], weight, noise)
     by_others = np.einsum("ki,ki->k", facing, u[piece])
-    seen = ((cosine < -SAME_FACE) & (weight == 1.0)).any(axis=1)[piece]
-    expected = np.where(seen & (np.abs(height - by_others) < np.abs(height - expected)), by_others, expected)
-    return expected, MAD_TO_SD * np.median(left, axis=1)[piece]
+    seen = (own & (cosine < -SAME_FACE)).any(axis=1)[piece]
+    # Boards add to the thickness between both sides: that which is off by less is the steel's.
+    seen &= (np.abs(height - by_others) < np.abs(height - expected)) | (np.abs(by_others) < np.abs(expected))
+    return np.where(seen, by_others, expected), np.where(seen, spread_of_others[piece], spread[piece])
 
 
 def _translations(value: Floats, normal: Floats, weight: Floats, noise: float) -> tuple[Floats, Floats]:
-    """Return the translations (p, 3) of least absolute residuals to heights (p, k) along normals, and what is left."""
+    """Return the translations (p, 3) of least absolute residuals to heights (p, k) along normals, and sd (p,) of these.
+
+    It is infinite without any of weight.
+    """
     u = np.zeros((len(value), 3))
     for _ in range(ROUNDS):
         left = np.abs(value - np.einsum("pki,pi->pk", normal, u))
@@ -221,7 +229,9 @@ def _translations(value: Floats, normal: Floats, weight: Floats, noise: float) -
         g = np.einsum("pk,pki,pk->pi", w, normal, value)
         N += (1e-3 * np.trace(N, axis1=1, axis2=2) + 1e-9)[:, None, None] * np.eye(3)
         u = np.linalg.solve(N, g[:, :, None])[:, :, 0]
-    return u, left
+    left = np.sort(np.where(weight > 0.0, left, np.inf), axis=1)
+    middle = (np.count_nonzero(weight, axis=1) - 1) // 2
+    return u, MAD_TO_SD * np.take_along_axis(left, middle[:, None], axis=1)[:, 0]
 
 
 def _continued(tree: cKDTree, facing: Floats, height: Floats, slope: Floats, noise: float) -> Ints:

@@ -5,7 +5,9 @@ import pytest
 import trimesh
 
 from processor.deviation import step as deviation_step
+from processor.geometry.mesh_distance import Samples
 from processor.model import Scan, Scene, StructureDesign
+from processor.registration import surface_layers
 
 SIGMA = 0.7  # mm
 LENGTH, WIDTH = 6000.0, 400.0
@@ -65,3 +67,36 @@ def test_what_stands_against_steel_is_not_its_movement(seed):
     assert np.mean(error[known] <= core.lod95[known]) >= 0.92  # a written requirement
     assert (error[known] <= core.lod95[known] + 5.0).all()  # another
     assert known.mean() > 0.85  # what is hidden is a tenth
+
+
+def of_flange(below, tray=(0.0, 0.0), stray=0.0):
+    """Layers of a plate 20 mm thick, its feet (n, 3) and distances (n,); a share ``below`` is of its underside.
+
+    Of that a ``tray`` hides what lies between two places; a share ``stray`` above is seen past an edge, 60 mm behind.
+    """
+    rng = np.random.default_rng(1)
+    x, y, below = rng.uniform(0.0, 3000.0, 20_000), rng.uniform(0.0, 260.0, 20_000), rng.random(20_000) < below
+    below |= (x > tray[0] + 400.0) & (x < tray[1] - 700.0)
+    of_tray, behind = below & (x > tray[0]) & (x < tray[1]), ~below & (rng.random(len(x)) < stray)
+    feet = np.column_stack([x, y, np.where(below, 0.0, 20.0)])
+    distance = np.where(of_tray, 66.0, np.where(behind, -60.0, 0.0)) + 0.5 * rng.normal(size=len(x))
+    normals = np.where(below, -1.0, 1.0)[:, None] * [0.0, 0.0, 1.0]
+    body = np.zeros(len(feet) // 4, np.int64)
+    layers = surface_layers.of_points(
+        Samples(feet[::4], normals[::4], body), body, feet, distance, normals, diameter_mm=50.0
+    )
+    return layers, feet, distance, of_tray, behind
+
+
+def test_a_tray_below_most_of_a_flange_is_told_by_the_other_side():
+    layers, feet, distance, tray, _ = of_flange(0.7, tray=(200.0, 2800.0))
+    assert tray.mean() > 0.6
+    assert np.mean(layers.of_structure(feet, distance)[tray]) < 0.01
+
+
+def test_what_is_seen_past_an_edge_is_left_out_where_it_is_no_evidence():
+    layers, feet, distance, _, behind = of_flange(0.5, stray=0.03)
+    assert layers.of_structure(feet, distance)[behind].all()  # as in holes
+    kept = layers.of_structure(feet, distance, behind=False)
+    assert np.mean(kept[behind]) < 0.01
+    assert np.mean(kept[~behind]) > 0.99
