@@ -535,7 +535,10 @@ def test_limits_of_components_are_read(tmp_path):
     ("text", "said"),
     [
         ('standard = "GB50205"', r"unknown standard 'GB50205' \(did you mean 'GB 50205-2020'\?\)"),
-        ("deviation = [-1, 1]", "unknown key 'deviation' .did you mean 'deviation_mm'.*; known are standard, root_g"),
+        (
+            "deviation = [-1, 1]",
+            "unknown key 'deviation' .did you mean 'deviation_mm'.*; known are standard, agreed_by",
+        ),
         (
             "deviation_mm = [3, -3]",
             "deviation_mm: expected two numbers, least and greatest, found .*the least is not below the greatest",
