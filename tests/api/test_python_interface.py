@@ -1,5 +1,6 @@
 """The Python interface, called as a user calls it."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ import processor
 from processor import pipeline
 from processor.geometry import rigid
 from processor.model import InputError, Scene, Status, UsageError, Verdict
+from processor.report import all_tables
+from processor.report.table import csv_text
 from processor.space_frame.spheres import search_without_design
 from tests.support.made import made
 from tests.support.solids.meshes import bracket
@@ -161,16 +164,18 @@ def test_a_scene_is_run_and_compared_with_its_truth():
     assert {check.method for check in checks} == {"", "ransac"}
 
 
-def test_tables_are_data_frames_with_the_columns_of_their_files(tmp_path):
-    results = processor.run(made(designgen.make, str(FRAME_OF_FOUR), 1)[0], tmp_path / "out", steps="spheres,inspect")
+def test_tables_are_data_frames_with_the_columns_of_their_files():
+    results = processor.run(made(designgen.make, str(FRAME_OF_FOUR), 1)[0], steps="spheres,inspect")
     for file, table in {
         "balls": results.balls,
         "inspect": results.characteristics,
         "tubes": results.table("tubes"),
     }.items():
-        written = pd.read_csv(tmp_path / "out" / f"{file}.csv")
-        assert list(table.columns) == list(written.columns)
-        assert len(table) == len(written) > 0
+        (written,) = [one for one in all_tables.tables_of_run(results.execution, results.report) if one.file == file]
+        read = pd.read_csv(io.StringIO(csv_text(written)))
+        assert list(table.columns) == list(read.columns)
+        assert len(table) == len(read) > 0
+    assert list(results.balls)[:5] == ["id", "x_mm", "y_mm", "z_mm", "ci95_x_mm"]
     assert results.balls["x_mm"].dtype == np.float64
     np.testing.assert_allclose(results.balls["radius_mm"], results.steps["spheres"].balls.radii)
     with pytest.raises(UsageError, match=r"no table 'defects'; this run has .*balls"):

@@ -72,7 +72,7 @@ def codes(part):
     return [one.code for one in part.reasons]
 
 
-@pytest.mark.parametrize("supports", [2, 3])
+@pytest.mark.parametrize("supports", [2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("stated", [True, False])
 def test_gaps_of_bent_girders_are_inside_their_intervals(supports, stated):
     rng, every, widths = np.random.default_rng([supports, stated]), [], []
@@ -117,7 +117,7 @@ def test_sags_taken_out_are_known_to_their_stated_share():
     assert np.sqrt(np.mean(np.concatenate(every) ** 2)) < 1.25
 
 
-@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_gaps_by_supports_that_are_seen(count, monkeypatch):
     """The sets of three trestles that may carry a part do so as often as each other."""
     rng, every, widths = np.random.default_rng([count, 7]), [], []

@@ -4,7 +4,7 @@ import pytest
 
 from tests.real import measured
 
-SLOW = ("rooms", "steel_files")  # seconds of stitching, and of a CAD kernel
+SLOW = ("column", "rooms", "steel_files")  # seconds of inspection, of stitching, and of a CAD kernel
 
 
 @pytest.mark.parametrize(
