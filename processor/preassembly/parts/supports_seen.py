@@ -78,7 +78,7 @@ def find(scans: Sequence[tuple[Floats, float, Floats]], up: Floats, beam: Beam, 
     for first, last in _groups(near[touching, 0]):
         rows = body & (np.abs(near[:, 0] - 0.5 * (first + last)) < 0.5 * (last - first) + ONE_MM)
         middle = min(int(0.5 * (first + last) / CELL_MM), len(under.low) - 1)
-        height = float(under.low[middle]) - floor
+        height = max(float(under.low[middle]) - floor, 1.0)  # of a part that lies on the floor there is none
         steps = max(int(height / STEP_MM), 1)
         filled = np.unique(((near[rows, 2] - floor) / height * steps).astype(np.int64).clip(0, steps - 1))
         if len(filled) >= FILLED * steps:
