@@ -38,8 +38,7 @@ def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
     built: list[ModelBody | None] = []
     sampled = list[_SampledBody]()
     areas = np.array([triangle_areas(body).sum() for body in model.bodies])
-    vertices, triangles = model.mesh()
-    facets = Facets.of(vertices[triangles]) if params else None
+    facets = Facets.of(np.take(*model.mesh(), axis=0)) if params else None
     for row, (body, share) in enumerate(zip(model.bodies, areas / areas.sum(), strict=True)):
         count = max(LEAST_TRUTH_POINTS, int(TRUTH_POINTS * share))
         points, normals = sample_surface(body.vertices[body.triangles], count)

@@ -38,7 +38,6 @@ for module in (
     batch,
     check,
     compare,
-    field_check,
     convert,
     export,
     field_check,

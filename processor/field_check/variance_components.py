@@ -159,9 +159,10 @@ def adjust(seen: Sightings, places: Floats, poses: Floats, of_class: Mapping[str
     of_class_P = V - VA @ np.linalg.solve(system.A.T @ VA, VA.T)
     rest = of_class_P @ system.y
     tests = [_test(limit, q, of_class_P, rest) for limit, q in zip(by_class, Q, strict=True)]
-    estimates = dict(zip(factors, _intervals(theta, Q, P, system.U, tests), strict=True))
+    PQ, shared = _products(P, Q)
+    estimates = dict(zip(factors, _intervals(theta, PQ, shared, P @ system.U, tests), strict=True))
     for name, row in {"range_offset": -1 - known, **({"scale": -1} if known else {})}.items():
-        dof = _dof(W @ system.A @ N[:, row], float(N[row, row]), Q, P)
+        dof = _dof(W @ system.A @ N[:, row], float(N[row, row]), Q, shared)
         half = NORMAL_95 * float(np.sqrt(N[row, row]) * student_factor(dof))
         estimates[name] = Estimate(state.scale if name == "scale" else state.offset, half, dof)
     residuals = system.y[: 3 * len(seen.places)].reshape(-1, 3)
@@ -214,10 +215,15 @@ def _moved(state: _State, x: Floats, s: int, known: bool) -> _State:
     return _State(state.places + x[:t].reshape(-1, 3), poses, state.offset + float(offset), state.scale + float(scale))
 
 
+def _products(P: Floats, Q: Sequence[Floats]) -> tuple[list[Floats], Floats]:
+    """Return the products P Q of each matrix, and traces (c, c) of pairs of these: twice Fisher's information."""
+    PQ = [P @ q for q in Q]
+    return PQ, np.array([[float((a * b.T).sum()) for b in PQ] for a in PQ])
+
+
 def _scored(theta: Floats, Q: Sequence[Floats], P: Floats, system: _System) -> Floats:
     """Return the components (c,) after a step of Fisher's scoring; none is negative."""
-    PQ = [P @ q for q in Q]
-    information = np.array([[float((a * b.T).sum()) for b in PQ] for a in PQ])
+    PQ, information = _products(P, Q)
     Py = P @ system.y
     right = np.array([float(Py @ q @ Py) - float((pq * (P @ system.U).T).sum()) for q, pq in zip(Q, PQ, strict=True)])
     free = np.ones(len(Q), bool)
@@ -231,12 +237,10 @@ def _scored(theta: Floats, Q: Sequence[Floats], P: Floats, system: _System) -> F
     return np.maximum(0.5 * (found + theta), 0.0) if (theta > 0.0).all() else found
 
 
-def _dof(gain: Floats, variance: float, Q: Sequence[Floats], P: Floats) -> float:
+def _dof(gain: Floats, variance: float, Q: Sequence[Floats], shared: Floats) -> float:
     """Return the degrees of freedom of a parameter's ``variance`` (Satterthwaite) by its ``gain`` (n,) of the data."""
-    PQ = [P @ q for q in Q]
-    information = 0.5 * np.array([[float((a * b.T).sum()) for b in PQ] for a in PQ])
     slope = np.array([float(gain @ q @ gain) for q in Q])
-    return max(2.0 * variance**2 / float(slope @ np.linalg.solve(information, slope)), 1.0)
+    return max(2.0 * variance**2 / float(slope @ np.linalg.solve(0.5 * shared, slope)), 1.0)
 
 
 def _test(limit: float, q: Floats, P: Floats, rest: Floats) -> tuple[float, float]:
@@ -254,11 +258,9 @@ def _test(limit: float, q: Floats, P: Floats, rest: Floats) -> tuple[float, floa
 
 
 def _intervals(
-    theta: Floats, Q: Sequence[Floats], P: Floats, U: Floats, tests: Sequence[tuple[float, float]]
+    theta: Floats, PQ: Sequence[Floats], shared: Floats, PU: Floats, tests: Sequence[tuple[float, float]]
 ) -> list[Estimate]:
     """Return the standard deviations of the components, with intervals, and their ``tests`` against the class."""
-    PQ, PU = [P @ q for q in Q], P @ U
-    shared = np.array([[float((a * b.T).sum()) for b in PQ] for a in PQ])
     variance = np.diag(np.linalg.inv(0.5 * shared))
     own = np.array([float((pq * PU.T).sum()) for pq in PQ]) / np.diag(shared)
     found = []

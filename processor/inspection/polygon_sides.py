@@ -20,7 +20,7 @@ from processor.inspection import characteristic, face_flatness, flat_faces
 from processor.inspection.flat_faces import Body, FlatFace, Observed, Side
 from processor.inspection.result import Quantity
 from processor.limits.judging import Measured
-from processor.model import NORMAL_95, Floats, reason
+from processor.model import NORMAL_95, Floats, Ints, reason
 
 LENGTHWISE = 0.02  # cosine between a side's normal and the body's axis, at most
 MEET_MM = 1.0  # between the rims of neighbours as designed and the line in which their planes meet
@@ -56,10 +56,11 @@ def characteristics(body: Body, axis: Floats, seen: Observed, temperature_C: flo
     count = len(sides)
     # A side with the one before and the one after it.
     triples = [[(k - 1) % count, k, (k + 1) % count] for k in range(count)]
+    rows_of = [np.flatnonzero(np.isin(seen.facet, side.face.facets) & np.isfinite(seen.deviation)) for side in sides]
     rims = [side.rims for side in sides]
     fitted: list[Side | None] = []
     for _ in range(ROUNDS):
-        fitted = [_fitted(side, within, axis, seen) for side, within in zip(sides, rims, strict=True)]
+        fitted = [_fitted(*one, axis, seen) for one in zip(sides, rims, rows_of, strict=True)]
         shapes = [np.zeros(2) if one is None else one.fit.mean[:2] for one in fitted]
         planes = [side.plane(*shape) for side, shape in zip(sides, shapes, strict=True)]
         threes = [(planes[before], planes[own], planes[after]) for before, own, after in triples]
@@ -68,8 +69,8 @@ def characteristics(body: Body, axis: Floats, seen: Observed, temperature_C: flo
             for side, three in zip(sides, threes, strict=True)
         ]
     for k, (before, own, after) in enumerate(triples):
-        known = [one for row in (before, own, after) if (one := fitted[row]) is not None]
-        yield _width(f"side-{k + 1}-width", axis, [sides[row] for row in triples[k]], known, temperature_C)
+        three = [one for row in (before, own, after) if (one := fitted[row]) is not None]
+        yield _width(f"side-{k + 1}-width", axis, [sides[row] for row in triples[k]], three, temperature_C)
         yield _angle(f"side-{k + 1}-angle", sides[own], sides[after], fitted[own], fitted[after])
         side = fitted[own]
         if side is not None and len(side.pieces.value) >= face_flatness.FEWEST_PIECES:
@@ -108,20 +109,20 @@ def _corner(axis: Floats, one: Floats, other: Floats) -> Floats:
     return np.asarray(np.linalg.solve(planes[:, :3], planes[:, 3]), np.float64)
 
 
-def _fitted(side: SectionSide, rims: Floats, axis: Floats, seen: Observed) -> Side | None:
-    """Fit a plane to what was seen of a side between ``rims`` (2,); None where that does not determine it.
+def _fitted(side: SectionSide, rims: Floats, rows: Ints, axis: Floats, seen: Observed) -> Side | None:
+    """Fit a plane to the ``rows`` seen of a side between ``rims`` (2,); None where they do not determine it.
 
     It is the plane of the whole side, which heat has drawn beside a weld, and so no piece of it is left out. Core
     points whose circle reaches over a rim are: the circle holds points of two sides, and of a corner that is round.
     """
-    rows = np.flatnonzero(np.isin(seen.facet, side.face.facets) & np.isfinite(seen.deviation))
     reach = 0.5 * seen.side / flat_faces.PIECE_DIAMETERS
     low, high = rims + np.array([reach, -reach])
     at = seen.places[rows] @ side.along
-    rows = rows[(at > low) & (at < high)]
+    inside = (at > low) & (at < high)
+    rows, at = rows[inside], at[inside]
     if len(rows) < FEWEST_PIECES:
         return None
-    place = np.stack([seen.places[rows] @ axis, seen.places[rows] @ side.along - low], axis=1)
+    place = np.stack([seen.places[rows] @ axis, at - low], axis=1)
     pieces = flat_faces.pieces(seen, rows, point_groups.patch_numbers(place, (high - low) / COLUMNS))
     x = pieces.places @ axis - 0.5 * sum(side.face.extent(axis))
     y = pieces.places @ side.along - side.rims.mean()

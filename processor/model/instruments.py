@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from processor.model.errors import did_you_mean
 from processor.model.fields import LONG, NUMBER, Checked, Fault, Floats, Meaning, column, described, names
-from processor.model.inputs import NOTHING, Kind, Place, entry, number, read, shown, text
+from processor.model.inputs import NOTHING, Kind, Place, entry, number, read, text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -66,8 +65,8 @@ def _known(bias: bool, least: float, most: float) -> Kind:
 
 
 SD = number(least=0.0, most=1e4)  # as the widest of TERMS
-# What is said of an instrument's errors. The bounds tell units apart: no scanner's set-up is known to a hundredth of a
-# millimetre, and none is off by a decimetre or by half a degree.
+# Errors that a file may give. The bounds tell units apart: no scanner's set-up is known to a hundredth of a millimetre,
+# and none is off by a decimetre or by half a degree.
 TERMS: Mapping[str, Kind] = {
     "view_mm": _known(False, 0.01, 100.0),  # error of range that the points of one view share, one standard deviation
     "zero_mm": _known(True, 0.0, 100.0),  # offset of all ranges of the instrument: measured less true
@@ -208,9 +207,3 @@ def simulated(content: Any, place: Place) -> dict[str, Any]:
         given["offset_mm"] = made_of.known["view_mm"].value
     given["scale_ppm"] = math.hypot(*made_of.known["scale_ppm"])
     return classes()[made_of.scanner_class] | given
-
-
-def no_class(name: str) -> str:
-    """Say what is expected of a text that names a scanner, and what was found."""
-    like = did_you_mean(name, class_names())
-    return f"expected one of {', '.join(class_names())}, or a scanner.toml below the folder, found {shown(name)}{like}"

@@ -133,7 +133,7 @@ def _carrying(beam: Beam, gravity: Floats, places: Floats) -> list[tuple[Deflect
 def _on_supports(
     beam: Beam, gravity: Floats, supports: Seen, sets: Sequence[tuple[Deflection, tuple[int, ...]]], gradient_K: float
 ) -> tuple[_Bend, tuple[Reason, ...]]:
-    """Return how a part is bent that lies on one of several sets of supports, each as plausible, and what is said."""
+    """Return how a part is bent that lies on one of several sets of supports, each as plausible, and why."""
     places, share = supports.places.tolist(), 1.0 / np.sqrt(len(sets))
     bent = [one.through(beam, places) for one, _ in sets]
     known = reduce(Deflection.plus, bent).scaled(share**2)

@@ -2,7 +2,7 @@
 
 A support reaches from the floor to the underside of the part. Only what is below the part is looked at, so that what
 stands beside it counts nowhere. Where the space beneath the part is not seen to be free between supports one may be
-hidden there, and where something leads upward from the part it may hang: then nothing is said.
+hidden there, and where something leads upward from the part it may hang: then the supports are unknown.
 """
 
 from __future__ import annotations

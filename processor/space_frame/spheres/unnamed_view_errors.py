@@ -151,12 +151,11 @@ def _offset_or_beam(fits: list[_Fit], cosines: Floats, radius_offset: float, var
     by the scanner's class and the variance of the mean of the views. The rest is attributed to the width of the beam.
     """
     change = float(np.mean([fit.gain[3] @ cosines[fit.cells] for fit in fits])) if fits else 0.0
-    limit = NORMAL_95 * float(np.hypot(scanner_class_errors.known().offset_mm, np.sqrt(variance)))
+    of_class = scanner_class_errors.known().offset_mm
+    limit = NORMAL_95 * float(np.hypot(of_class, np.sqrt(variance)))
     offset = radius_offset / change if abs(radius_offset) < limit * abs(change) else limit
     explained = 0.5 * (offset * change) ** 2
-    return float(np.hypot(scanner_class_errors.known().offset_mm, np.sqrt(0.5) * offset)), float(
-        np.sqrt(max(radius_offset**2 - explained, 0.0))
-    )
+    return float(np.hypot(of_class, np.sqrt(0.5) * offset)), float(np.sqrt(max(radius_offset**2 - explained, 0.0)))
 
 
 # --- spheres ---------------------------------------------------------------------------------------------------------
