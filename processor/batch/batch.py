@@ -28,6 +28,7 @@ from processor.language.messages import messages
 from processor.model import InputError, UsageError, reason
 from processor.results.file_names import JOB_RECORD
 from processor.scan_folder.files import missing
+from processor.store.making import remove_leftovers
 from processor.store.whole_output import check_folder, replace_text
 
 LOGS = "logs"
@@ -156,7 +157,8 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
         replace_text(state / "params.toml", settings.params_toml.decode("utf-8"))
         run_options = (*run_options, "--params", str(state / "params.toml"))
     keys = {each.name: hashlib.sha256(os.fsencode(each.name)).hexdigest()[:32] for each in inputs.inputs}
-    for path in (state / "failed").iterdir():
+    remove_leftovers(state / "failed")  # of a batch that was killed while it wrote the record of a failure
+    for path in (state / "failed").glob("*.json"):
         if path.stem not in keys.values():
             path.unlink()
     threads = max(1, (os.cpu_count() or 1) // settings.at_once)

@@ -381,6 +381,15 @@ def test_killed_and_resumed_batch_equals_an_undisturbed_one(tmp_path, count, kil
     assert names[0] == names[1]
 
 
+def test_batch_killed_while_it_wrote_the_record_of_a_failure_goes_on(tmp_path):
+    folder(tmp_path / "root/a")
+    half = tmp_path / "out/.batch/failed" / f".{'0' * 16}.steel-scan-check"
+    half.mkdir(parents=True)
+    (half / "record.json").write_text("{")
+    run(tmp_path / "root", "-o", tmp_path / "out")
+    assert os.listdir(tmp_path / "out/.batch/failed") == []
+
+
 @pytest.mark.parametrize("stop", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_a_signal_stops_it_cleanly(tmp_path, stop):
     folder(tmp_path / "root/a")
