@@ -336,7 +336,7 @@ MEASURES: Mapping[str, tuple[str, ...]] = {
         "part alignment",
     ),
 }  # fmt: skip
-LIMITED_SIZES = ("length", "height", "thickness", "diameter", "spacing", "depth")
+LIMITED_SIZES = ("length", "height", "width", "thickness", "diameter", "spacing", "depth")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from processor.clouds import scan_folder
 from processor.inspection.result import Quantity
 from processor.limits import limit_bounds, measurands, standards
 from processor.model import MEASURES, InputError, Limit, Scan, Scene, Tolerance
+from processor.model.scene import LIMITED_SIZES
 from processor.preassembly.verdicts import chain, joints
 from processor.scan_folder import folder
 from processor.space_frame import supports_and_deflections
@@ -42,7 +43,7 @@ def test_every_limit_has_a_meaning_source_and_measure():
             )
             assert bool(row.of) == (not all(map(math.isnan, (row.high_ratio, row.above_mm, row.up_to_mm))))
             low, high = limit_bounds.bounds(
-                row, dict.fromkeys(("length", "thickness", "diameter", "spacing", "height"), 1000.0)
+                row, dict.fromkeys(LIMITED_SIZES, 1000.0)
             )
             assert low < high < math.inf
             assert not (row.verified and not row.clause), "a verified row has its clause"
