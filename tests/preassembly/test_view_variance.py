@@ -9,10 +9,12 @@ from scipy.stats import norm, t
 from processor.adjustment import scanner_class_errors
 from processor.preassembly.ends import view_variance
 
-FEW = 600  # points a side where views differ by 0.3 mm: noise of 1 mm makes 0.1 mm of a thickness, which is allowed for
+# Points a side. Noise of 1 mm on FEW makes 0.11 mm of a thickness: less than views that differ by 0.3 mm do. Of 0.1 mm
+# it is as much as is to be seen, which half of all draws show then: ENOUGH make 0.04 mm.
+FEW, ENOUGH = 600, 1_500
 
 
-def plate(rng, apart, thick=24.0, waves=0.0, off=None, count=1_500):
+def plate(rng, apart, thick=24.0, waves=0.0, off=None, count=ENOUGH):
     """Points on both sides of a plate of 500 by 900 mm; each side is ``off``, or by a draw of ``apart`` mm."""
     heights, places, inner = [], [], []
     off = apart * rng.standard_normal(2) if off is None else off
@@ -35,27 +37,30 @@ def test_waves_of_a_plate_do_not_change_its_thickness():
     assert found[:, 0].std() < 0.1
 
 
-def pair(rng, apart, thick=24.0):
+def pair(rng, apart, thick=24.0, count=FEW):
     """Two opposite plates of an end, seen from the same two sides: shifts of views point outward on one alone."""
     off = apart * rng.standard_normal(2)
-    return [plate(rng, apart, thick, off=one, count=FEW) for one in (off, -off[::-1])]
+    return [plate(rng, apart, thick, off=one, count=count) for one in (off, -off[::-1])]
 
 
 # Of 12 pairs of opposite plates less 3 means of equal thickness 9 are left. By Student's t they are widened by
 # 1.33 = (2.26 / 1.96)^2. The class counts for 2 more: (9 * 1.33 * 0.3^2 + 2 * 0.5^2) / 11 = 1.59 * 0.3^2. Of 0.1 mm
 # the 95 % limit is less than that: 9 / 3.33 = 2.71, by the 5 % quantile of chi-square.
-@pytest.mark.parametrize(("apart", "wider"), [pytest.param(0.1, 2.71, marks=pytest.mark.slow), (0.3, 1.59)])
-def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart, wider):
+@pytest.mark.parametrize(
+    ("apart", "count", "wider"), [pytest.param(0.1, ENOUGH, 2.71, marks=pytest.mark.slow), (0.3, FEW, 1.59)]
+)
+def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart, count, wider):
     rng = np.random.default_rng(1)
     found = [
         view_variance.variances(
-            [one for thick in (14.0, 20.0, 30.0) for _ in range(4) for one in pair(rng, apart, thick)]
+            [one for thick in (14.0, 20.0, 30.0) for _ in range(4) for one in pair(rng, apart, thick, count)]
         )
         for _ in range(60)
     ]
     # By 9 degrees of freedom a variance is known to 47 %, the mean of 60 to 6 %.
     assert np.mean([one.level for one in found]) == pytest.approx(wider * apart**2, rel=0.2)
-    assert all(one.evident for one in found)
+    # Noise may make as much once in a thousand; chi-square of 9 is a ninth of its mean, which is less, in 6 of 10,000.
+    assert sum(one.evident for one in found) >= 59
 
 
 def box(rng, apart, rolled, one_outer):
@@ -66,7 +71,7 @@ def box(rng, apart, rolled, one_outer):
         outer = outer if one_outer else apart * rng.standard_normal(4)
         inner = apart * rng.standard_normal(4)
         ends += [
-            plate(rng, apart, t, off=off, count=FEW if apart else 1_500)
+            plate(rng, apart, t, off=off, count=FEW if apart else ENOUGH)
             for t, *off in zip(thick, outer, inner, strict=True)
         ]
     return ends, [(k, 4 + k) for k in range(4)]
