@@ -415,7 +415,9 @@ def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _P
         return placed
     of_part = located_part.at_design(points, placed.registration.T_design_scan, shapes[index])
     fit, at = placed.registration, np.flatnonzero(of_part)
-    of_part[at] = located_part.consistent(points[at], fit.T_design_scan, shapes[index], fit.sigma_mm)
+    # On a surface made from design curves the inner sides of plates would be taken for what touches the part.
+    if shapes.design.parts[index].source != box_girder_mesh.SOURCE:
+        of_part[at] = located_part.consistent(points[at], fit.T_design_scan, shapes[index], fit.sigma_mm)
     placed = replace(placed, points=chosen(points, of_part), station=chosen(station, of_part))
     doubts = placed.doubts
     # Another part that lies on the design in part has lost the rest of its points with the surroundings.
