@@ -149,14 +149,14 @@ class MeshSurface:
         facet = np.repeat(np.arange(len(self.faces), dtype=np.int32), self.count)[grid.order]
         return _SampleGrid(grid.cells, facet)
 
-    def nearest(self, points: Floats, reach: float, count: int = 1) -> tuple[Ints, Floats]:
-        """Facets (n, count) of the samples nearest to points (n, 3), and their distances, mm, the nearest first.
+    def nearest(self, points: Floats, reach: float) -> tuple[Ints, Floats]:
+        """Facet (n,) of the sample nearest to each of points (n, 3), and its distance (n,), mm.
 
         The facet is -1 and the distance infinite where there is none nearer than ``reach``.
         """
         cells, facet = self._sampled
-        row, distance = nearest_neighbours.nearest_rows(cells, points, reach, count)
-        return np.where(row >= 0, facet[row].astype(np.int64), -1), distance
+        row, distance = nearest_neighbours.nearest_rows(cells, points, reach)
+        return np.where(row[:, 0] >= 0, facet[row[:, 0]].astype(np.int64), -1), distance[:, 0]
 
     def distances(self, points: Floats, reach: float, before: Ints | None = None) -> tuple[Ints, Floats, Floats]:
         """Facet (n,), signed distance (n,) from it, and how far (n,) the foot lies outside its face's edge; mm.
@@ -165,7 +165,7 @@ class MeshSurface:
         walks over smooth edges to the facet that the foot lies on. Points that moved little since an earlier search
         start at the facet ``before`` (n,) of that search instead.
         """
-        start = self.nearest(points, reach)[0][:, 0] if before is None else before
+        start = self.nearest(points, reach)[0] if before is None else before
         face = np.full(len(points), -1, np.int64)
         distance, beyond = np.full(len(points), np.nan), np.full(len(points), np.nan)
         facets = Facets(self.vertices, self.faces, self.normals, self.neighbours)

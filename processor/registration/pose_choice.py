@@ -18,8 +18,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.distinct_rows import components, distinct
-from processor.geometry import nearest_neighbours, rigid
-from processor.geometry.mesh_distance import GRAZING_COS, MeshSurface
+from processor.geometry import mesh_distance, nearest_neighbours, rigid
+from processor.geometry.mesh_distance import GRAZING_COS, FacetGrid, MeshSurface
 from processor.geometry.thinning import thinned
 from processor.model import Bools, Floats, Ints
 
@@ -31,7 +31,6 @@ ON, OFF = 2.0, 4.0  # times the median group's distance: up to ON on the design,
 LEAST_OFF_MM = 1.0  # plates may deviate by as much in thickness (EN 10029), so less distinguishes no pose
 REACH_MM = 60.0  # from the design, the most that the distance of a point counts
 SAMPLE = 200_000  # work: points of which groups of 16 show the surface of a mark
-CORNER_SAMPLES = 12  # nearest of the surface: some of them on each face that meets at a corner
 
 
 def choose(
@@ -59,11 +58,11 @@ def choose(
     typical = min((float(np.median(row)) for row in near if len(row)), default=REACH_MM)
     typical = max(typical, 0.5 * LEAST_OFF_MM / OFF)
     least_off = max(OFF * typical, ON * typical + LEAST_OFF_MM)
+    grids = {id(surface): _grid(surface) for surface, _ in poses}  # several poses are of one surface
     for k, (surface, places, sight) in enumerate(placed):
         rows = np.flatnonzero((group >= 0) & (distances[k] > ON * typical)[group])
-        every[k, rows] = _from_facets_about(
-            surface, places[rows], None if sight is None else sight[rows], every[k, rows]
-        )
+        seen_from_there = None if sight is None else sight[rows]
+        every[k, rows] = _from_nearest(grids[id(surface)], surface, places[rows], seen_from_there, every[k, rows])
         distances[k] = _means(every[k], group)
     on, off = distances <= ON * typical, distances >= least_off
 
@@ -93,17 +92,25 @@ def off_surface(points: Floats, surface: MeshSurface, least_mm: float) -> Bools:
     distance = _from_facets(surface, points, None, np.full(len(points), REACH_MM))
     # Where nothing is in reach, no face is: the most of two poses' samples, and the costly ones to search for.
     rows = np.flatnonzero((distance > least_mm) & (distance < REACH_MM))
-    distance[rows] = _from_facets_about(surface, points[rows], None, distance[rows])
+    distance[rows] = _from_nearest(_grid(surface), surface, points[rows], None, distance[rows])
     marked: Bools = distance > least_mm
     return marked
 
 
-def _from_facets_about(surface: MeshSurface, placed: Floats, scanner: Floats | None, most: Floats) -> Floats:
-    """Return the distance (n,) of points (n, 3) from a surface as :func:`_from_facets`, also near its corners."""
-    distance = most
-    for facet in np.ascontiguousarray(surface.nearest(placed, REACH_MM, CORNER_SAMPLES)[0].T):
-        distance = _from_facets(surface, placed, scanner, distance, facet)
-    return distance
+def _grid(surface: MeshSurface) -> FacetGrid:
+    return mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, REACH_MM)
+
+
+def _from_nearest(
+    grid: FacetGrid, surface: MeshSurface, placed: Floats, scanner: Floats | None, most: Floats
+) -> Floats:
+    """Return the distance (n,) of points (n, 3) from a surface as :func:`_from_facets`, also near its corners.
+
+    Of faces that meet at a corner one may have all samples near it: a strip in facets far smaller than it is wide.
+    """
+    none = np.full(len(placed), -1)
+    by_eye = (np.zeros((1, 3)), none) if scanner is None else (scanner, np.arange(len(placed)))
+    return _from_facets(surface, placed, scanner, most, mesh_distance.nearest_visible(grid, placed, *by_eye)[0])
 
 
 def _from_facets(

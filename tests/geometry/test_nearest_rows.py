@@ -56,7 +56,7 @@ def test_the_nearest_sample_of_a_mesh_is_on_its_facet():
     surface = mesh_distance.of_mesh(vertices, faces)
     samples, of_sample = surface.samples(), np.repeat(np.arange(4), surface.count)
     places = np.random.default_rng(3).uniform(-50.0, 950.0, (150, 3))
-    expected, away = by_all_distances(samples, places, 120.0, 1)
+    expected, away = (one[:, 0] for one in by_all_distances(samples, places, 120.0, 1))
     facet, distance = surface.nearest(places, 120.0)
     np.testing.assert_array_equal(facet, np.where(expected >= 0, of_sample[expected], -1))
     np.testing.assert_allclose(distance, away, rtol=1e-15)  # a square root

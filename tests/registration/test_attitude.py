@@ -126,6 +126,27 @@ def test_attitude_is_ambiguous_if_contradiction_equals_evidence():
     assert pose_choice.choose(points[:3], poses) == [0, 1]  # too few to show anything
 
 
+def strip(low, high, cells):
+    """A rectangle between two corners that share one coordinate, in so many cells along its last axis."""
+    low, high = np.array(low), np.array(high)
+    along, last = np.flatnonzero(low != high)
+    corners = np.repeat(low[None], 2 * (cells + 1), axis=0)
+    corners[:, last] = np.repeat(np.linspace(low[last], high[last], cells + 1), 2)
+    corners[1::2, along] = high[along]
+    first = 2 * np.arange(cells)[:, None]
+    return corners, np.vstack([first + np.array(facet) for facet in ((0, 1, 2), (1, 3, 2))])
+
+
+def test_points_beside_a_strip_of_small_facets_are_on_their_own_face():
+    """The samples nearest to it may all be of the strip, 8 mm off it, as those of the face are some 12 mm apart."""
+    plate, of_plate = strip([0.0, 0.0, 0.0], [500.0, 500.0, 0.0], 1)
+    end, of_end = strip([0.0, 0.0, 0.0], [0.0, 500.0, 24.0], 1600)
+    surface = mesh_distance.of_mesh(np.vstack([plate, end]), np.vstack([of_plate, of_end + len(plate)]))
+    rng = np.random.default_rng(1)
+    points = np.column_stack([np.full(20_000, 8.0), rng.uniform(0.0, 500.0, 20_000), np.zeros(20_000)])
+    assert not pose_choice.off_surface(points, surface, 7.0).any()
+
+
 def test_turns_of_a_plate_with_a_box_on_it_keep_the_plate_in_its_plane():
     # The box tilts the principal axes by 3 degrees; a scan that is turned about them would lie across the plate.
     box = trimesh.creation.box((240.0, 170.0, 160.0), rigid.transform(np.eye(3), [-170.0, -115.0, 90.0]))
