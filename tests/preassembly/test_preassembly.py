@@ -353,7 +353,11 @@ def test_origin_of_scans_does_not_change_the_gaps(bridge, runs):
 
 
 @pytest.mark.slow
-def test_missing_joint_end_breaks_the_chain_with_a_reason(bridge):
+@pytest.mark.parametrize(
+    ("off", "why"), [(0.0, "preassemble.no-joint-edges"), (600.0, "preassemble.joint-end-misplaced")]
+)
+def test_missing_joint_end_breaks_the_chain_with_a_reason(bridge, off, why):
+    """The rest of the part ends beyond the search, or within it where its principal axes are off towards the joint."""
     scene, truth = bridge
     rib = scene.scans[2]
     T = truth.arch.T_bridge_scan[2]
@@ -361,12 +365,22 @@ def test_missing_joint_end_breaks_the_chain_with_a_reason(bridge):
     middle = arch_clouds.position([start], [0.0], [550.0])
     near = np.linalg.norm(rigid.apply(T, rib.points) - middle, axis=1) < 1300.0  # its mark stays
     cut = dataclasses.replace(rib, points=rib.points[~near])
-    scans = (*scene.scans[:2], cut)
-    result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params(method="line"))
+    by_axes = rigid.transform(np.eye(3), np.array([-off, 0.0, 0.0])) @ T
+    known = {
+        name: attitude.Attitude(one, one, Status.OK)
+        for name, one in zip(truth.arch.names, truth.arch.T_bridge_scan, strict=True)
+    }
+    known[rib.component] = attitude.Attitude(by_axes, T, Status.OK)
+    with mock.patch.object(attitude, "find", lambda _, part, *__: known[part.name]):
+        scans = (*scene.scans[:2], cut)
+        result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params(method="line"))
     assert result.status == "partial"
     assert result.components.status == ("ok", "ok", "failed")
     (at_joint,) = (one for one in result.components.reasons[2] if one.code == "preassemble.at")
-    assert [one.code for one in at_joint.values["reasons"]] == ["preassemble.no-joint-edges"]
+    ((code, values),) = ((one.code, one.values) for one in at_joint.values["reasons"])
+    assert code == why
+    # The sphere cuts the edges 1,089 mm from the joint at the corners, 1,219 mm in the middle of the webs.
+    assert not off or 1_089.0 < values["distance"] < 1_219.0
     assert np.isnan(result.joints.gaps[1:]).all()
 
 
